@@ -1,0 +1,1 @@
+"""Noise-aware state estimation for UAV supply rails."""

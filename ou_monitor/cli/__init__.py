@@ -1,0 +1,1 @@
+"""The `ou-monitor` command, one module a verb."""

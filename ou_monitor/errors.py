@@ -1,0 +1,44 @@
+"""The two kinds of trouble that are not a property of the data.
+
+A caller's bug raises `ValueError` with the value and its unit.  Something a
+*user* can mend (a file, a topic, a key in a YAML) raises `InputError`, whose
+text is the one line that the user sees: what was wrong, where, what to do.
+A property of the data is neither: it is a `Status` in the result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+import difflib
+
+
+class InputError(Exception):
+    """
+    Something the user gave cannot be used; the text is one line for them.
+
+    Command-line programs print it after their name and exit with status 2;
+    nodes log it at FATAL and exit with status 2.
+    """
+
+
+def nearest(word: str, valid: Iterable[str]) -> str:
+    """
+    Return a hint that names the valid word nearest to a misspelt one.
+
+    Parameters
+    ----------
+    word : str
+        What the user wrote.
+    valid : iterable of str
+        What is accepted.
+
+    Returns
+    -------
+    str
+        ``did you mean 'x'?`` or, when nothing is near, the list of valid words.
+    """
+    choices = list(valid)
+    close = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
+    if close:
+        return f"did you mean '{close[0]}'?"
+    return 'valid: ' + ', '.join(sorted(choices))

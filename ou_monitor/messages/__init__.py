@@ -1,0 +1,1 @@
+"""A message, as msg_config/*.yaml describes it -> samples."""

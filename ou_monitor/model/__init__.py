@@ -1,0 +1,1 @@
+"""The mathematics: no data, no files, no ROS."""

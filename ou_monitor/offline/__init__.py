@@ -1,0 +1,1 @@
+"""On the bench: a recording -> answers."""

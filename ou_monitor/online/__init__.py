@@ -1,0 +1,1 @@
+"""Onboard: samples -> window -> estimate -> risk and cutoff."""

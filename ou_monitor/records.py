@@ -1,0 +1,255 @@
+"""What travels along the arrows: small frozen records, SI units.
+
+Limits first: a record says what was found and how well, never how it was
+found; unknown numbers are NaN, never 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import enum
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+NAN = float('nan')
+
+
+class Status(enum.Enum):
+    """
+    What became of an estimate; the value is the sentence for the pilot.
+
+    Only `OK` and `SHORT_WINDOW` carry numbers that may be acted on
+    (`Estimate.usable`); with every other status the numbers that could not be
+    had are NaN.
+    """
+
+    OK = 'Estimate is good.'
+    SHORT_WINDOW = (
+        'The window holds fewer than 25 relaxation times: alpha is uncertain by more '
+        'than a quarter; lengthen the window.')
+    NO_DATA = 'No voltage has arrived: check the topic name, the type and the publisher.'
+    TOO_FEW_SAMPLES = (
+        'Too few samples in the window for a fit: wait, or lengthen the window, or raise '
+        'the rate of the voltage topic.')
+    CONSTANT = (
+        'The voltage does not change at all in the window: the sensor is stuck, or its '
+        'step is larger than the noise.')
+    TOO_SHORT = (
+        'The window holds fewer than 5 relaxation times: alpha cannot be told; lengthen '
+        'the window.')
+    NO_RELAXATION = (
+        'No relaxation visible at this rate: neighbouring samples are uncorrelated, so '
+        'the rail is faster than the sampling, or the noise is the sensor\'s; raise the '
+        'sampling rate.')
+
+
+class Flag(enum.Enum):
+    """A caution about the input; the value is the sentence for the pilot."""
+
+    SLOW_RATE = (
+        'Sampling is slower than the rail (alpha dt > 1): alpha and sigma rest on few '
+        'correlated samples; raise the rate of the voltage topic.')
+    QUANTIZED = (
+        'The step of the ADC is larger than the noise: sigma is decided by rounding; use '
+        'a finer ADC range or AC coupling.')
+    LOWPASS_UPSTREAM = (
+        'Neighbouring increments rise together, as after a low-pass: something upstream '
+        'filters the voltage and sigma is too small; switch that filter off.')
+    HELD_SAMPLES = (
+        'The source repeats its last value between refreshes; the repeats were dropped.')
+    NO_EXCITATION = (
+        'Throttle did not move in the window: sag cannot be told from the level.')
+    SATURATED = (
+        'The voltage sits at the end of the ADC range: the true excursion is larger; '
+        'rescale the input.')
+    IRREGULAR = 'Samples are irregular or some were lost: see the counters.'
+    TREND = (
+        'The mean moves within the window in a way that throttle does not explain: alpha '
+        'is too low and Var_inf too high.')
+
+
+@dataclass(frozen=True)
+class Counters:
+    """
+    What became of every sample pushed so far; the parts add up to `pushed`.
+
+    Attributes
+    ----------
+    pushed : int
+        Samples given to `push`.
+    used : int
+        Samples that entered the window.
+    non_finite : int
+        NaN or infinite stamps or voltages, dropped.
+    late : int
+        Stamps at or before one already used, dropped.
+    held : int
+        Repeats of the last value by the logger, dropped.
+    resets : int
+        Times the window was cleared (gap, or a clock that jumped back).
+    """
+
+    pushed: int = 0
+    used: int = 0
+    non_finite: int = 0
+    late: int = 0
+    held: int = 0
+    resets: int = 0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """
+    The OU parameters of the window that ends at `t`.
+
+    dU = -alpha (U - u0) dt + sigma dW, seen through white noise `noise_std`.
+
+    Standard errors of `alpha`, `sigma`, `var_inf` are those of the *logarithm*
+    (dimensionless, relative): the 95 % interval is
+    ``alpha * exp(+-1.96 * alpha_se)``, see `interval`.  `u0_se` is in volts.
+
+    Attributes
+    ----------
+    t : float
+        Stamp of the newest sample, s.
+    alpha, alpha_se : float
+        Relaxation rate, 1/s, and the standard error of ln(alpha).
+    sigma, sigma_se : float
+        Noise intensity, V/sqrt(s), and the standard error of ln(sigma).
+    var_inf, var_inf_se : float
+        Stationary variance sigma^2 / (2 alpha), V^2, and the standard error
+        of its logarithm.
+    u0, u0_se : float
+        Mean level *at the present throttle*, V, and its standard error, V.
+    noise_std : float
+        White measurement noise, V (0 when none was found).
+    sag : float
+        Slope of the mean against throttle at the present throttle, V per unit
+        throttle (negative when the supply sags); NaN when throttle did not
+        move.
+    throttle : float
+        Newest throttle, 0..1; NaN when unknown.
+    status : Status
+        What became of the fit.
+    flags : tuple of Flag
+        Cautions about the input.
+    n : int
+        Samples in the window.
+    duration : float
+        Time spanned by the window, s.
+    rate : float
+        Mean rate of the samples in the window, Hz.
+    counters : Counters
+        What became of the samples pushed so far.
+    """
+
+    t: float = NAN
+    alpha: float = NAN
+    sigma: float = NAN
+    var_inf: float = NAN
+    u0: float = NAN
+    noise_std: float = NAN
+    alpha_se: float = NAN
+    sigma_se: float = NAN
+    var_inf_se: float = NAN
+    u0_se: float = NAN
+    sag: float = NAN
+    throttle: float = NAN
+    status: Status = Status.NO_DATA
+    flags: tuple[Flag, ...] = ()
+    n: int = 0
+    duration: float = 0.0
+    rate: float = NAN
+    counters: Counters = field(default_factory=Counters)
+
+    @property
+    def usable(self) -> bool:
+        """Whether the numbers may be acted on."""
+        return self.status in (Status.OK, Status.SHORT_WINDOW)
+
+    @property
+    def tau(self) -> float:
+        """Relaxation time 1/alpha, s."""
+        return 1.0 / self.alpha if self.alpha > 0.0 else NAN
+
+    def interval(self, name: str, z: float = 1.959963984540054) -> tuple[float, float]:
+        """
+        Return the interval of one parameter, symmetric on the log scale.
+
+        Parameters
+        ----------
+        name : {'alpha', 'sigma', 'var_inf'}
+            Parameter.
+        z : float
+            Half width in standard errors; the default gives 95 %.
+
+        Returns
+        -------
+        tuple of float
+            Lower and upper end, in the parameter's unit; NaN when unknown.
+
+        Raises
+        ------
+        ValueError
+            For a name that has no interval on the log scale.
+        """
+        if name not in ('alpha', 'sigma', 'var_inf'):
+            raise ValueError(f"no log-scale interval for '{name}': alpha, sigma or var_inf")
+        value: float = getattr(self, name)
+        factor = math.exp(z * getattr(self, name + '_se'))
+        return value / factor, value * factor
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """
+    One recording of a supply, whatever file it came from.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n,)
+        Stamps, s, strictly increasing.
+    voltage : ndarray, shape (n,)
+        Voltage, V, finite.
+    throttle : ndarray, shape (n,)
+        Throttle 0..1, the last value known at each stamp; NaN where unknown.
+    name : str
+        Where it came from, for people.
+    source : dict
+        Topics, types, units and files it was read from.
+    notes : tuple of str
+        What was dropped or mended on the way in, one sentence each.
+    """
+
+    t: FloatArray
+    voltage: FloatArray
+    throttle: FloatArray
+    name: str = ''
+    source: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that cannot be one recording."""
+        if not (self.t.shape == self.voltage.shape == self.throttle.shape and self.t.ndim == 1):
+            raise ValueError(
+                'a recording needs t, voltage and throttle of one shape (n,); got '
+                f'{self.t.shape}, {self.voltage.shape}, {self.throttle.shape}')
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return int(self.t.size)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample, s."""
+        return float(self.t[-1] - self.t[0]) if self.t.size else 0.0
+
+    @property
+    def has_throttle(self) -> bool:
+        """Whether any throttle is known."""
+        return bool(np.isfinite(self.throttle).any())
