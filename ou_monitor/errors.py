@@ -1,4 +1,5 @@
-"""The two kinds of trouble that are not a property of the data.
+"""
+The two kinds of trouble that are not a property of the data.
 
 A caller's bug raises `ValueError` with the value and its unit.  Something a
 *user* can mend (a file, a topic, a key in a YAML) raises `InputError`, whose
@@ -36,6 +37,7 @@ def nearest(word: str, valid: Iterable[str]) -> str:
     -------
     str
         ``did you mean 'x'?`` or, when nothing is near, the list of valid words.
+
     """
     choices = list(valid)
     close = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)

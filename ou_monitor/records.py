@@ -1,4 +1,5 @@
-"""What travels along the arrows: small frozen records, SI units.
+"""
+What travels along the arrows: small frozen records, SI units.
 
 Limits first: a record says what was found and how well, never how it was
 found; unknown numbers are NaN, never 0.
@@ -91,6 +92,7 @@ class Counters:
         Repeats of the last value by the logger, dropped.
     resets : int
         Times the window was cleared (gap, or a clock that jumped back).
+
     """
 
     pushed: int = 0
@@ -131,6 +133,8 @@ class Estimate:
         Slope of the mean against throttle at the present throttle, V per unit
         throttle (negative when the supply sags); NaN when throttle did not
         move.
+    voltage : float
+        Newest voltage, V.
     throttle : float
         Newest throttle, 0..1; NaN when unknown.
     status : Status
@@ -145,6 +149,7 @@ class Estimate:
         Mean rate of the samples in the window, Hz.
     counters : Counters
         What became of the samples pushed so far.
+
     """
 
     t: float = NAN
@@ -158,6 +163,7 @@ class Estimate:
     var_inf_se: float = NAN
     u0_se: float = NAN
     sag: float = NAN
+    voltage: float = NAN
     throttle: float = NAN
     status: Status = Status.NO_DATA
     flags: tuple[Flag, ...] = ()
@@ -196,6 +202,7 @@ class Estimate:
         ------
         ValueError
             For a name that has no interval on the log scale.
+
         """
         if name not in ('alpha', 'sigma', 'var_inf'):
             raise ValueError(f"no log-scale interval for '{name}': alpha, sigma or var_inf")
@@ -223,6 +230,7 @@ class Recording:
         Topics, types, units and files it was read from.
     notes : tuple of str
         What was dropped or mended on the way in, one sentence each.
+
     """
 
     t: FloatArray
@@ -241,7 +249,7 @@ class Recording:
 
     @property
     def n(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return int(self.t.size)
 
     @property

@@ -1,0 +1,118 @@
+"""
+The Ornstein-Uhlenbeck process: exact discretisation, moments, sample paths.
+
+dU = -alpha (U - u0) dt + sigma dW, alpha in 1/s, sigma in V/sqrt(s).
+Uhlenbeck & Ornstein, Phys. Rev. 36 (1930) 823.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import lfilter
+
+from ou_monitor.records import FloatArray
+
+
+def stationary_variance(alpha: float, sigma: float) -> float:
+    """Return Var_inf = sigma^2 / (2 alpha), V^2, for alpha in 1/s and sigma in V/sqrt(s)."""
+    return sigma * sigma / (2.0 * alpha)
+
+
+def transition(alpha: float, sigma: float, dt: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """
+    Return the exact one-step law over a time `dt`.
+
+    Parameters
+    ----------
+    alpha : float
+        Relaxation rate, 1/s, > 0.
+    sigma : float
+        Noise intensity, V/sqrt(s), >= 0.
+    dt : array_like
+        Steps, s, >= 0.
+
+    Returns
+    -------
+    phi, q : ndarray
+        Coefficient exp(-alpha dt) and innovation variance
+        Var_inf (1 - phi^2), V^2, of the shape of `dt`.
+
+    Raises
+    ------
+    ValueError
+        When alpha <= 0, sigma < 0 or a step is negative or not finite.
+
+    """
+    steps = np.asarray(dt, dtype=np.float64)
+    if not alpha > 0.0 or not math.isfinite(alpha):
+        raise ValueError(f'alpha must be positive and finite, got {alpha} 1/s')
+    if not sigma >= 0.0 or not math.isfinite(sigma):
+        raise ValueError(f'sigma must be zero or positive and finite, got {sigma} V/sqrt(s)')
+    if not (np.isfinite(steps).all() and (steps >= 0.0).all()):
+        raise ValueError('time steps must be finite and not negative, s')
+    phi = np.exp(-alpha * steps)
+    q = -stationary_variance(alpha, sigma) * np.expm1(-2.0 * alpha * steps)
+    return phi, q
+
+
+def simulate(
+    t: npt.ArrayLike, alpha: float, sigma: npt.ArrayLike, rng: np.random.Generator, *,
+    u0: npt.ArrayLike = 0.0, start: float | None = None,
+) -> FloatArray:
+    """
+    Draw a path at the given stamps, exact in law at any spacing.
+
+    Parameters
+    ----------
+    t : array_like, shape (n,)
+        Stamps, s, not decreasing.
+    alpha : float
+        Relaxation rate, 1/s, > 0.
+    sigma : float or array_like, shape (n,)
+        Noise intensity, V/sqrt(s); an array holds from the stamp before to
+        its own stamp.
+    rng : numpy.random.Generator
+        Source of randomness.
+    u0 : float or array_like, shape (n,)
+        Mean level added to the deviation, V (the level follows `u0` at once:
+        a sag, not a force).
+    start : float, optional
+        First deviation from `u0`, V; drawn from the stationary law when left
+        out.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Voltage, V.
+
+    Raises
+    ------
+    ValueError
+        When a parameter is out of range or `t` decreases.
+
+    """
+    stamps = np.asarray(t, dtype=np.float64)
+    if stamps.ndim != 1:
+        raise ValueError(f't must have shape (n,), got {stamps.shape}')
+    n = stamps.size
+    phi, unit_q = transition(alpha, 1.0, np.diff(stamps))
+    intensity = np.broadcast_to(np.asarray(sigma, dtype=np.float64), (n,))
+    if n and not (np.isfinite(intensity).all() and (intensity >= 0.0).all()):
+        raise ValueError('sigma must be zero or positive and finite, V/sqrt(s)')
+    noise = rng.standard_normal(n)
+    x = np.empty(n)
+    if n:
+        first = start
+        if first is None:
+            first = math.sqrt(stationary_variance(alpha, float(intensity[0]))) * noise[0]
+        x[0] = first
+        kicks = noise[1:] * intensity[1:] * np.sqrt(unit_q)
+        if phi.size and np.ptp(phi) < 1e-12:
+            x[1:] = lfilter([1.0], [1.0, -phi[0]], kicks, zi=[phi[0] * first])[0]
+        else:
+            for k in range(1, n):
+                x[k] = phi[k - 1] * x[k - 1] + kicks[k - 1]
+    return x + np.asarray(u0, dtype=np.float64)

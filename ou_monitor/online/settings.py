@@ -1,0 +1,204 @@
+"""
+Every parameter of the two nodes: name, default, range and sentence, once.
+
+The nodes declare their ROS parameters from these tables, the YAML in
+`config/` is tested against them, and the offline tools take their defaults
+from them, so that a name or a default exists in one place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+import math
+from typing import Any
+
+from ou_monitor.errors import nearest
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """
+    One parameter of a node.
+
+    Attributes
+    ----------
+    name : str
+        Dotted name as in YAML.
+    default : bool, int, float or str
+        Default; its type is the parameter's type.
+    description : str
+        One sentence with the unit.
+    low, high : float or None
+        Range, inclusive; None where the type has none.
+    choices : tuple of str
+        Accepted words; empty when free.
+
+    """
+
+    name: str
+    default: bool | int | float | str
+    description: str
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+
+
+ESTIMATOR_PARAMETERS: tuple[Parameter, ...] = (
+    Parameter('window', 2.0, 'Length of the sliding window, s.', 0.05, 3600.0),
+    Parameter('stale_after', 1.0, 'Silence after which the input counts as stale, s.',
+              0.01, 3600.0),
+    Parameter('brownout.voltage', 4.5,
+              'Supply voltage that must not be undershot, V (default: PX4\'s lower limit of '
+              'a 5 V rail).', 0.0, 1000.0),
+    Parameter('brownout.horizon', 5.0, 'Time ahead for which the risk is told, s.',
+              0.001, 3600.0),
+    Parameter('brownout.warn', 0.01, 'Risk from which the diagnostics warn, 0..1.', 0.0, 1.0),
+    Parameter('brownout.critical', 0.1, 'Risk from which the brown-out flag is set, 0..1.',
+              0.0, 1.0),
+)
+
+FILTER_PARAMETERS: tuple[Parameter, ...] = (
+    Parameter('order', 2, 'Order of the low-pass: 1, or 2 (Butterworth).', 1, 2),
+    Parameter('law', 'constant_noise', 'Law from sigma to cutoff.',
+              choices=('threshold', 'constant_noise')),
+    Parameter('fmin', 20.0, 'Lowest cutoff, Hz: the limit of the lag, so a safety limit.',
+              0.001, 1.0e6),
+    Parameter('fmax', 150.0, 'Highest cutoff, Hz.', 0.001, 1.0e6),
+    Parameter('sigma_ref', 0.3, 'Sigma up to which the cutoff stays at fmax, V/sqrt(s).',
+              1.0e-9, 1.0e6),
+    Parameter('fallback', 75.0, 'Cutoff when sigma is stale or unknown, Hz.', 0.001, 1.0e6),
+    Parameter('smoothing', 0.2, 'Time constant of the cutoff (in its logarithm), s.',
+              0.0, 3600.0),
+    Parameter('stale_after', 1.0, 'Age of sigma after which the fallback is used, s.',
+              0.01, 3600.0),
+)
+
+
+@dataclass(frozen=True)
+class MonitorSettings:
+    """Settings of `SupplyMonitor`; see `ESTIMATOR_PARAMETERS` for units."""
+
+    window: float = 2.0
+    stale_after: float = 1.0
+    brownout_voltage: float = 4.5
+    brownout_horizon: float = 5.0
+    brownout_warn: float = 0.01
+    brownout_critical: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range and contradictions."""
+        _check(ESTIMATOR_PARAMETERS, self)
+        if not self.brownout_warn < self.brownout_critical:
+            raise ValueError(
+                f'brownout.warn ({self.brownout_warn}) must be less than brownout.critical '
+                f'({self.brownout_critical})')
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """Settings of `AdaptiveLowPass`; see `FILTER_PARAMETERS` for units."""
+
+    order: int = 2
+    law: str = 'constant_noise'
+    fmin: float = 20.0
+    fmax: float = 150.0
+    sigma_ref: float = 0.3
+    fallback: float = 75.0
+    smoothing: float = 0.2
+    stale_after: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range and contradictions."""
+        _check(FILTER_PARAMETERS, self)
+        if not self.fmin < self.fmax:
+            raise ValueError(f'fmin ({self.fmin} Hz) must be less than fmax ({self.fmax} Hz)')
+        if not self.fmin <= self.fallback <= self.fmax:
+            raise ValueError(
+                f'fallback ({self.fallback} Hz) must lie within fmin..fmax '
+                f'({self.fmin}..{self.fmax} Hz)')
+
+    @classmethod
+    def from_options(cls, options: Mapping[str, object],
+                     base: FilterSettings | None = None) -> FilterSettings:
+        """
+        Return settings with the given options changed.
+
+        Where `fallback` is not given it is moved into fmin..fmax, so that a
+        caller who gives only the limits is not refused.
+
+        Raises
+        ------
+        ValueError
+            For an unknown option (the nearest is named) or a bad value.
+
+        """
+        known = {f.name for f in fields(cls)}
+        for name in options:
+            if name not in known:
+                raise ValueError(f"unknown filter option '{name}': {nearest(name, known)}")
+        values: dict[str, Any] = dict(options)
+        old = base or cls()
+        if 'fallback' not in values:
+            low, high = values.get('fmin', old.fmin), values.get('fmax', old.fmax)
+            if _is_number(low) and _is_number(high) and low < high:
+                values['fallback'] = min(max(old.fallback, low), high)
+        return replace(base, **values) if base else cls(**values)
+
+
+def monitor_settings(values: Mapping[str, object]) -> MonitorSettings:
+    """
+    Return settings from dotted parameter names.
+
+    Raises
+    ------
+    ValueError
+        One line that names the parameter, its value and the mend.
+
+    """
+    return MonitorSettings(**_by_field(ESTIMATOR_PARAMETERS, values))
+
+
+def filter_settings(values: Mapping[str, object]) -> FilterSettings:
+    """
+    Return settings from parameter names.
+
+    Raises
+    ------
+    ValueError
+        One line that names the parameter, its value and the mend.
+
+    """
+    return FilterSettings(**_by_field(FILTER_PARAMETERS, values))
+
+
+def _by_field(table: tuple[Parameter, ...], values: Mapping[str, object]) -> dict[str, Any]:
+    known = [parameter.name for parameter in table]
+    for name in values:
+        if name not in known:
+            raise ValueError(f"unknown parameter '{name}': {nearest(name, known)}")
+    return {name.replace('.', '_'): value for name, value in values.items()}
+
+
+def _is_number(value: object) -> bool:
+    return (isinstance(value, (int, float)) and not isinstance(value, bool)
+            and math.isfinite(value))
+
+
+def _check(table: tuple[Parameter, ...], settings: object) -> None:
+    for parameter in table:
+        value = getattr(settings, parameter.name.replace('.', '_'))
+        if parameter.choices:
+            if value not in parameter.choices:
+                raise ValueError(
+                    f"{parameter.name}: unknown '{value}': "
+                    f'{nearest(str(value), parameter.choices)}')
+        elif isinstance(parameter.default, (int, float)):
+            whole = isinstance(parameter.default, int)
+            if not _is_number(value) or (whole and value != int(value)):
+                raise ValueError(
+                    f"{parameter.name} must be {'an integer' if whole else 'a finite number'}, "
+                    f'got {value!r}')
+            low, high = parameter.low, parameter.high
+            if (low is not None and value < low) or (high is not None and value > high):
+                raise ValueError(f'{parameter.name} must lie within {low}..{high}, got {value}')
