@@ -175,7 +175,8 @@ class Estimate:
     @property
     def usable(self) -> bool:
         """Whether the numbers may be acted on."""
-        return self.status in (Status.OK, Status.SHORT_WINDOW)
+        return self.status in (Status.OK, Status.SHORT_WINDOW) and all(
+            map(math.isfinite, (self.alpha, self.sigma, self.var_inf, self.u0)))
 
     @property
     def tau(self) -> float:

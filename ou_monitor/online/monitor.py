@@ -143,14 +143,12 @@ class SupplyMonitor:
         return MonitorReport(e, risk, brownout, level, summary, silent)
 
     def _silence(self, age: float | None, e: Estimate) -> str:
-        if age is None:
-            if e.counters.non_finite:
-                return (f'No usable voltage: all {e.counters.non_finite} samples were NaN or '
-                        'infinite; check the sensor.')
-            return Status.NO_DATA.value
-        if age > self._settings.stale_after:
+        if age is not None and age > self._settings.stale_after:
             return (f'No voltage for {age:.1f} s (stale_after = {self._settings.stale_after:g} '
                     's): check the publisher.')
+        if e.counters.non_finite and not e.counters.used:
+            return (f'No usable voltage: all {e.counters.non_finite} samples were NaN or '
+                    'infinite; check the sensor.')
         if self._reset_reason:
             return f'The window was cleared ({self._reset_reason}) and is filling again.'
         return Status.NO_DATA.value
