@@ -21,9 +21,10 @@ setup(
     install_requires=['numpy', 'scipy', 'PyYAML', 'mcap', 'mcap-ros2-support'],
     extras_require={'test': ['pytest', 'hypothesis', 'rosbags']},
     python_requires='>=3.11',
-    zip_safe=True,
+    # The message descriptions are read as files beside the package.
+    zip_safe=False,
     maintainer='ou_monitor maintainers',
-    maintainer_email='maintainers@ou-monitor.org',
+    maintainer_email='maintainers@ou-monitor.example.org',
     description='Onboard noise-aware state estimation for UAV supply rails.',
     license='Apache-2.0',
     entry_points={

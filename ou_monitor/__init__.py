@@ -1,1 +1,54 @@
-"""Noise-aware state estimation for UAV supply rails."""
+"""
+Noise-aware state estimation for UAV supply rails.
+
+The public names are loaded on first use (PEP 562), so that ``import
+ou_monitor`` costs nothing and the onboard half never pays for the readers of
+the bench.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ou_monitor.errors import InputError
+    from ou_monitor.online.estimator import SlidingEstimator
+    from ou_monitor.online.lowpass import AdaptiveLowPass
+    from ou_monitor.online.risk import brownout_probability
+    from ou_monitor.recordings.read import read_recording
+    from ou_monitor.records import Estimate, Flag, Recording, Status
+
+__version__ = '0.1.0'
+
+_HOMES = {
+    'AdaptiveLowPass': 'ou_monitor.online.lowpass',
+    'Estimate': 'ou_monitor.records',
+    'Flag': 'ou_monitor.records',
+    'InputError': 'ou_monitor.errors',
+    'Recording': 'ou_monitor.records',
+    'SlidingEstimator': 'ou_monitor.online.estimator',
+    'Status': 'ou_monitor.records',
+    'brownout_probability': 'ou_monitor.online.risk',
+    'read_recording': 'ou_monitor.recordings.read',
+}
+
+__all__ = [
+    'AdaptiveLowPass', 'Estimate', 'Flag', 'InputError', 'Recording', 'SlidingEstimator',
+    'Status', '__version__', 'brownout_probability', 'read_recording',
+]
+
+
+def __getattr__(name: str) -> object:
+    """Load a public name from its home on first use."""
+    home = _HOMES.get(name)
+    if home is None:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    value: object = getattr(import_module(home), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names, loaded or not."""
+    return sorted(set(globals()) | set(__all__))

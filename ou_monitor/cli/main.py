@@ -1,0 +1,127 @@
+"""`ou-monitor COMMAND`: finds the command, runs it, turns trouble into one line."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from importlib import import_module
+import os
+import sys
+from typing import NoReturn
+
+from ou_monitor import __version__
+from ou_monitor.errors import InputError, nearest
+
+# One module a command.  Each has ``add_parser(subparsers)``, which sets the
+# default ``run``: a function of the parsed arguments that returns the exit
+# status.  What is slow to import is imported inside ``run``.
+COMMANDS = {
+    'analyze': 'ou_monitor.cli.analyze',
+    'convert': 'ou_monitor.cli.convert',
+}
+
+PROGRAM = 'ou-monitor'
+BAD_INPUT = 2
+# What a shell reports for a program that Ctrl-C ended.
+INTERRUPTED = 130
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line, without the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        """Report bad arguments in one line and exit with status 2."""
+        self.exit(BAD_INPUT, f"{self.prog}: {message} (see '{self.prog} --help')\n")
+
+
+def build_parser(commands: Sequence[str] | None = None) -> argparse.ArgumentParser:
+    """
+    Return the parser.
+
+    Parameters
+    ----------
+    commands : sequence of str, optional
+        Commands to load; all of them when left out.
+
+    Returns
+    -------
+    argparse.ArgumentParser
+        With one subparser a command.
+
+    """
+    parser = Parser(
+        prog=PROGRAM, allow_abbrev=False,
+        description='Ornstein-Uhlenbeck statistics of UAV supply rails, on the bench.',
+        epilog=f"'{PROGRAM} COMMAND --help' shows the options of a command.")
+    parser.add_argument('--version', action='version', version=f'{PROGRAM} {__version__}')
+    subparsers = parser.add_subparsers(
+        dest='command', metavar='COMMAND', title='commands', required=True)
+    for name in COMMANDS if commands is None else commands:
+        import_module(COMMANDS[name]).add_parser(subparsers)
+    return parser
+
+
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
+    """Return the parsed arguments; exit with one line when they are wrong."""
+    first = argv[0] if argv else ''
+    if first and not first.startswith('-') and first not in COMMANDS:
+        raise InputError(f"unknown command '{first}': {nearest(first, COMMANDS)}")
+    parser = build_parser([first] if first in COMMANDS else None)
+    args, extra = parser.parse_known_args(argv)
+    if extra:
+        options = _options(parser, args.command)
+        hint = nearest(extra[0].split('=')[0], options) if extra[0].startswith('-') else (
+            f'{args.command} takes no further argument')
+        raise InputError(f"{args.command}: unknown argument '{extra[0]}': {hint}")
+    return args
+
+
+def _options(parser: argparse.ArgumentParser, command: str) -> list[str]:
+    """Return the long options of a command."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            chosen = action.choices[command]
+            return [o for a in chosen._actions for o in a.option_strings if o.startswith('--')]
+    return []
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run a command.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments without the program; those of the process when left out.
+
+    Returns
+    -------
+    int
+        0 on success, 2 on bad input (one line on standard error), 130 when
+        interrupted.
+
+    """
+    given = list(sys.argv[1:] if argv is None else argv)
+    where = PROGRAM
+    try:
+        args = _parse(given)
+        where = f'{PROGRAM} {args.command}'
+        return int(args.run(args))
+    except InputError as error:
+        # One line, whatever a file name or a library's message may hold.
+        print(f"{where}: {' '.join(str(error).split())}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except BrokenPipeError:
+        # The reader (head, less) has gone.  Nothing more may be written, also
+        # not by the flush at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except SystemExit as stop:
+        # From argparse: --help, --version and bad arguments.
+        return stop.code if isinstance(stop.code, int) else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,113 @@
+"""
+Stamps for samples that travel in blocks: one continuous time line.
+
+A block of ADC samples carries one stamp, that of its LAST sample, and that
+stamp is an *arrival* time: it comes late by whatever the bus and the scheduler
+took, some milliseconds, different for every block.  The samples themselves
+were taken by a quartz at a steady rate.  So the time line runs at the stated
+rate and only leans slowly towards the stamps.
+
+Limits first: a constant delay of arrival stays in the time line; one lost
+block (within `max(2 blocks, 20 ms)`) cannot be told from jitter, is not
+counted as a gap, and is made up slowly.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ou_monitor.records import FloatArray
+
+# The time line leans towards the stamps with this time constant.  5 ms of
+# jitter then changes the spacing by at most 5e-4 (0.05 us at 10 kHz), and a
+# clock that is wrong by 100 ppm is followed 1 ms behind.
+FOLLOW = 10.0  # s
+
+# A difference beyond this, and beyond two blocks, is a real gap: schedulers
+# of companion computers delay by several ms, hardly by 20.
+GAP_LEAST = 0.020  # s
+
+
+class BlockClock:
+    """
+    Turns the stamps of blocks into stamps of samples.
+
+    Parameters
+    ----------
+    sample_rate : float
+        Rate of the samples within a block, Hz.
+
+    Attributes
+    ----------
+    gaps : int
+        Times the time line was started anew because a stamp was further than
+        max(2 blocks, 20 ms) from where it was expected.
+
+    Raises
+    ------
+    ValueError
+        When the rate is not positive and finite.
+
+    """
+
+    def __init__(self, sample_rate: float) -> None:
+        """Start without a time line: the first block sets it."""
+        if not (math.isfinite(sample_rate) and sample_rate > 0.0):
+            raise ValueError(f'sample_rate must be positive and finite, got {sample_rate} Hz')
+        self.gaps = 0
+        self._dt = 1.0 / sample_rate
+        # The time line as seconds since an anchor: added up on a clock that
+        # counts from 1970 they would be rounded to 0.24 us at every block, always
+        # the same way.
+        self._anchor: float | None = None
+        self._elapsed = 0.0
+
+    def reset(self) -> None:
+        """Forget the time line, as after a clock that jumped back; not a gap."""
+        self._anchor = None
+
+    def stamps(self, end_stamp: float, n: int) -> FloatArray:
+        """
+        Return the stamps of the samples of the next block.
+
+        Parameters
+        ----------
+        end_stamp : float
+            Stamp of the block = of its last sample, s.
+        n : int
+            Samples in the block.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            Stamps, s, evenly spaced; within one time line they go on from
+            block to block without a visible step.
+
+        Raises
+        ------
+        ValueError
+            When the stamp is not finite or `n` is negative.
+
+        """
+        if not math.isfinite(end_stamp):
+            raise ValueError(f'the stamp of a block must be finite, got {end_stamp} s')
+        if n < 0:
+            raise ValueError(f'a block cannot hold {n} samples')
+        if n == 0:
+            return np.empty(0)
+        length = n * self._dt
+        steps = np.arange(1, n + 1, dtype=np.float64)
+        if self._anchor is not None:
+            start = self._elapsed
+            error = (end_stamp - self._anchor) - (start + length)
+            if abs(error) <= max(2.0 * length, GAP_LEAST):
+                # The correction is spread over the block, so that no step
+                # shows where two blocks meet.
+                lean = error * -math.expm1(-length / FOLLOW)
+                self._elapsed = start + length + lean
+                return self._anchor + (start + steps * ((length + lean) / n))
+            self.gaps += 1
+        self._anchor, self._elapsed = end_stamp, 0.0
+        return end_stamp + (steps - n) * self._dt

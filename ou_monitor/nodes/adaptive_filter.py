@@ -1,0 +1,27 @@
+"""
+Executable `adaptive_filter`: a low-pass whose cutoff follows sigma.
+
+ros2 run ou_monitor adaptive_filter --ros-args -r sigma:=ou_estimator/sigma -r input:=/imu
+"""
+
+from __future__ import annotations
+
+import sys
+
+from ou_monitor.nodes.run import run, spin
+
+NAME = 'ou_adaptive_filter'
+
+
+def _work() -> int:
+    from ou_monitor.nodes.adaptive_filter_node import AdaptiveFilterNode
+    return spin(AdaptiveFilterNode(NAME))
+
+
+def main() -> int:
+    """Run the executable; return the exit status."""
+    return run(NAME, _work)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

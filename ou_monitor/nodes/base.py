@@ -1,0 +1,183 @@
+"""
+What both nodes share: parameters from a table, and callbacks that end the node cleanly.
+
+`estimator` and `adaptive_filter` declare what the tables of
+`ou_monitor.online.settings` say, so a name or a default exists once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+import functools
+import inspect
+import time
+from typing import Any
+
+from ou_monitor.errors import InputError, nearest
+from ou_monitor.online.settings import Parameter
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+from rclpy.timer import Timer
+
+# rclpy's own, never declared by us.
+_BUILT_IN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
+
+PUBLISH_RATE = Parameter('publish_rate', 10.0, 'How often the outputs are published, Hz.',
+                         0.01, 1000.0)
+
+
+class MonitorNode(Node):
+    """
+    Node whose parameters come from a table.
+
+    A parameter change is checked as a whole (`check` raises `ValueError` with
+    the reason and the old values stay) and then handed to `apply`, which must
+    not lose state.
+
+    Parameters
+    ----------
+    name : str
+        Node name.
+    table : sequence of Parameter
+        Parameters that may change at run time.
+    fixed : sequence of Parameter
+        Parameters that are read once, at the start.
+
+    """
+
+    def __init__(self, name: str, table: Sequence[Parameter],
+                 fixed: Sequence[Parameter] = ()) -> None:
+        super().__init__(name)
+        self.failure: BaseException | None = None
+        self._publishing: Timer | None = None
+        self.steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._table = {parameter.name: parameter for parameter in table}
+        declared = [*table, *fixed]
+        self._widen_overrides(declared)
+        for parameter in declared:
+            self.declare_parameter(parameter.name, parameter.default, _descriptor(
+                parameter, read_only=parameter.name not in self._table))
+        self._warn_misspelt()
+        try:
+            self.check(self.values())
+        except ValueError as error:
+            raise InputError(str(error)) from error
+        self.add_pre_set_parameters_callback(self._widen)
+        self.add_on_set_parameters_callback(self._on_set)
+        self.add_post_set_parameters_callback(self.guarded(self._after_set))
+
+    def values(self) -> dict[str, Any]:
+        """Return the run-time parameters in force."""
+        return {name: self.get_parameter(name).value for name in self._table}
+
+    def check(self, values: Mapping[str, Any]) -> None:
+        """Raise `ValueError` when the parameters contradict each other."""
+
+    def apply(self, values: Mapping[str, Any]) -> None:
+        """Bring checked parameters into force without losing state."""
+        period = round(1e9 / values[PUBLISH_RATE.name])
+        if self._publishing is not None and self._publishing.timer_period_ns != period:
+            self._publishing.timer_period_ns = period
+
+    def every(self, period: float, callback: Callable[[], None]) -> Timer:
+        """Call back every `period` s of real time: silence is told on simulated time too."""
+        return self.create_timer(period, self.guarded(callback), clock=self.steady)
+
+    def publish_every(self, callback: Callable[[], None]) -> None:
+        """Call back at `publish_rate`, which may change."""
+        self._publishing = self.every(1.0 / self.values()[PUBLISH_RATE.name], callback)
+
+    def guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
+        """
+        Return the callback such that what it raises ends the node, and is raised by `spin`.
+
+        Left to itself an exception becomes a SystemError in the EventsExecutor.
+        """
+        @functools.wraps(callback)
+        def call(*args: Any) -> Any:
+            try:
+                return callback(*args)
+            except Exception as error:
+                # After a shutdown by signal the publishers are gone: that is no failure.
+                if self.context.ok():
+                    self.failure = self.failure or error
+        return call
+
+    def with_info(self, callback: Callable[[Any, Any], None]) -> Callable[..., Any]:
+        """
+        Return a subscription callback of (message, info), guarded, for every executor.
+
+        rclpy 7.1's EventsExecutor hands over one tuple where the other
+        executors hand over two arguments.
+        """
+        inner = self.guarded(callback)
+
+        def call(*args: Any) -> None:
+            inner(*(args if len(args) == 2 else args[0]))
+        call.__signature__ = inspect.signature(callback)  # type: ignore[attr-defined]
+        return call
+
+    def steady_now(self) -> float:
+        """Return the monotonic time, s: silence is measured by it, never by the wall clock."""
+        return time.monotonic()
+
+    def stamp_now(self) -> float:
+        """Return the node's clock, s (simulated time when `use_sim_time`)."""
+        return float(self.get_clock().now().nanoseconds) * 1e-9
+
+    def _widen_overrides(self, declared: Sequence[Parameter]) -> None:
+        """Take `-p window:=2` for 2.0: YAML writes whole numbers without a point."""
+        floats = {p.name for p in declared if isinstance(p.default, float)}
+        overrides = self._parameter_overrides
+        for name in floats & overrides.keys():
+            overrides[name] = _as_double(overrides[name])
+
+    def _widen(self, parameters: list[RosParameter]) -> list[RosParameter]:
+        return [_as_double(p) if p.name in self._table
+                and isinstance(self._table[p.name].default, float) else p for p in parameters]
+
+    def _warn_misspelt(self) -> None:
+        """Name overrides that rclpy would ignore without a word."""
+        for name in self._parameter_overrides:
+            if not self.has_parameter(name) and not name.startswith(_BUILT_IN):
+                known = [key for key in self._parameters if not key.startswith(_BUILT_IN)]
+                self.get_logger().warning(
+                    f"parameter '{name}' does not exist and is ignored: {nearest(name, known)}")
+
+    def _on_set(self, parameters: list[RosParameter]) -> SetParametersResult:
+        changed = {p.name: p.value for p in parameters if p.name in self._table}
+        try:
+            if changed:
+                self.check({**self.values(), **changed})
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _after_set(self, parameters: list[RosParameter]) -> None:
+        if any(p.name in self._table for p in parameters):
+            self.apply(self.values())
+
+
+def _as_double(parameter: RosParameter) -> RosParameter:
+    if parameter.type_ is not RosParameter.Type.INTEGER:
+        return parameter
+    return RosParameter(parameter.name, RosParameter.Type.DOUBLE, float(parameter.value))
+
+
+def _descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
+    """Return what `ros2 param describe` shows."""
+    descriptor = ParameterDescriptor(
+        description=parameter.description, read_only=read_only,
+        additional_constraints=' | '.join(parameter.choices))
+    if parameter.low is not None and parameter.high is not None:
+        if isinstance(parameter.default, int):
+            descriptor.integer_range = [IntegerRange(
+                from_value=int(parameter.low), to_value=int(parameter.high), step=0)]
+        else:
+            descriptor.floating_point_range = [FloatingPointRange(
+                from_value=float(parameter.low), to_value=float(parameter.high), step=0.0)]
+    return descriptor

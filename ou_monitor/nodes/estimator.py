@@ -1,0 +1,27 @@
+"""
+Executable `estimator`: voltage and throttle -> OU estimate and brown-out risk.
+
+ros2 run ou_monitor estimator --ros-args -r voltage:=/battery_voltage -p msg_config:=std_float64
+"""
+
+from __future__ import annotations
+
+import sys
+
+from ou_monitor.nodes.run import run, spin
+
+NAME = 'ou_estimator'
+
+
+def _work() -> int:
+    from ou_monitor.nodes.estimator_node import EstimatorNode
+    return spin(EstimatorNode(NAME))
+
+
+def main() -> int:
+    """Run the executable; return the exit status."""
+    return run(NAME, _work)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,220 @@
+"""The node of `replay`: an absolute schedule, messages as recorded, and /clock."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+import gc
+import itertools
+import math
+import sys
+import time
+from typing import Any
+
+from ou_monitor.errors import InputError, nearest
+from ou_monitor.nodes.message_types import message_class
+from ou_monitor.nodes.pacing import SpacingError, wait_until
+from ou_monitor.nodes.prefetch import Prefetch
+from ou_monitor.recordings.bag import BagReader
+from rclpy.duration import Duration
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock as ClockMessage
+
+# Deep enough that a burst is not overwritten before the middleware has sent it.
+DEPTH = 1000
+# How long the end waits for reliable subscribers.
+FLUSH = Duration(seconds=1)
+
+RCLError = rclpy_implementation.RCLError
+
+Message = tuple[str, str, int, bytes]
+
+
+class Player(Node):
+    """
+    Publishes one bag.
+
+    Parameters
+    ----------
+    name : str
+        Node name.
+    bag : BagReader
+        What to play.
+    options : argparse.Namespace
+        Options of `replay`, checked.
+
+    Raises
+    ------
+    InputError
+        When a topic is not in the bag, or nothing is left to play.
+
+    """
+
+    def __init__(self, name: str, bag: BagReader, options: argparse.Namespace) -> None:
+        super().__init__(name, start_parameter_services=False)
+        self._bag = bag
+        self._options = options
+        self._types = self._chosen_topics()
+        self._skipped: dict[str, str] = {}
+        self._outputs: dict[str, Publisher] = {}
+        for topic, kind in self._types.items():
+            self._advertise(topic, kind)
+        if not self._outputs:
+            raise InputError(f"nothing to play in '{options.bag}': " + (
+                '; '.join(self._skipped.values()) or 'it holds no messages'))
+        self._clock_output = self.create_publisher(
+            ClockMessage, '/clock', 10) if options.clock > 0.0 else None
+        self._sent = dict.fromkeys(self._outputs, 0)
+        self._spacing = SpacingError()
+        self._passes = 0
+        self._span = (math.inf, -math.inf)
+
+    def _chosen_topics(self) -> dict[str, str]:
+        topics = dict(self._bag.topics)
+        for wanted in self._options.topics or ():
+            if wanted not in topics:
+                raise InputError(f"topic '{wanted}' is not in '{self._options.bag}': "
+                                 + nearest(wanted, topics))
+        return {topic: kind for topic, kind in topics.items()
+                if topic in (self._options.topics or topics)
+                and not (topic == '/clock' and self._options.clock > 0.0)}
+
+    def _advertise(self, topic: str, kind: str) -> None:
+        try:
+            self._outputs[topic] = self.create_publisher(message_class(kind), topic, DEPTH)
+        except InputError as error:
+            self._skipped[topic] = f"topic '{topic}' is left out: {error}"
+            self.get_logger().warning(self._skipped[topic])
+
+    def going(self) -> bool:
+        """Whether no signal has come."""
+        return bool(self.context.ok())
+
+    def play(self) -> dict[str, Any]:
+        """
+        Play until the end, or a signal; return what was done.
+
+        Returns
+        -------
+        dict
+            Ready for JSON; spacing errors in s of real time.
+
+        """
+        self._wait_for_subscriber()
+        # The garbage collector's pauses would be seen in the spacing.
+        gc.collect()
+        gc.freeze()
+        began = time.monotonic()
+        while self.going():
+            self._pass()
+            if not self._options.loop:
+                break
+        summary = self._summary(time.monotonic() - began)
+        self._flush()
+        self._log(summary)
+        return summary
+
+    def _wait_for_subscriber(self) -> None:
+        """Wait, so that the first samples find somebody."""
+        until = time.monotonic() + self._options.wait
+        while self.going() and time.monotonic() < until:
+            if any(output.get_subscription_count() for output in self._outputs.values()):
+                return
+            time.sleep(0.01)
+        if self._options.wait > 0.0 and self.going():
+            self.get_logger().warning(
+                f'nobody has subscribed within {self._options.wait:g} s: playing anyway')
+
+    def _messages(self) -> Iterator[Message]:
+        return iter(self._bag.raw_messages(self._outputs))
+
+    def _pass(self) -> None:
+        ahead = Prefetch(self._messages())
+        try:
+            ahead.fill()
+            self._spacing.restart()
+            self._schedule(iter(ahead))
+        finally:
+            ahead.close()
+
+    def _schedule(self, messages: Iterator[Message]) -> None:
+        """Send every message at start + (log time - first log time) / rate."""
+        first = next(messages, None)
+        if first is None:
+            raise InputError(f"'{self._options.bag}' holds no message of "
+                             + ', '.join(self._outputs))
+        origin, rate = first[2], self._options.rate
+        start = time.monotonic()
+        ticks = _Ticks(start, self._options.clock)
+        for topic, _, log_time, data in itertools.chain((first,), messages):
+            due = start + (log_time - origin) * 1e-9 / rate
+            while ticks.due <= due:
+                if not wait_until(ticks.due, self.going):
+                    return
+                self._tick(origin, start)
+                ticks.advance()
+            if not wait_until(due, self.going):
+                return
+            done = time.monotonic()
+            self._send(self._outputs[topic], data)
+            self._spacing.add(due, done)
+            self._sent[topic] += 1
+            self._span = min(self._span[0], log_time), max(self._span[1], log_time)
+        self._tick(origin, start)
+        self._passes += 1
+
+    def _tick(self, origin: int, start: float) -> None:
+        """Publish what the schedule's clock shows at this very moment."""
+        if self._clock_output is None:
+            return
+        now = origin + round((time.monotonic() - start) * self._options.rate * 1e9)
+        self._send(self._clock_output, ClockMessage(clock=Time(nanoseconds=max(now, 0)).to_msg()))
+
+    def _send(self, output: Publisher, message: Any) -> None:
+        try:
+            output.publish(message)
+        except RCLError:
+            # A signal has just ended the context: the loop is about to notice.
+            if self.going():
+                raise
+
+    def _flush(self) -> None:
+        """Let reliable subscribers fetch what they missed before the publishers go."""
+        if self.going():
+            for output in self._outputs.values():
+                output.wait_for_all_acked(FLUSH)
+
+    def _summary(self, duration: float) -> dict[str, Any]:
+        return {
+            'bag': str(self._options.bag), 'rate': self._options.rate, 'passes': self._passes,
+            'messages': sum(self._sent.values()), 'duration_s': duration,
+            'topics': {topic: {'type': self._types[topic], 'messages': n}
+                       for topic, n in self._sent.items()},
+            'skipped': self._skipped, 'damage': self._bag.damage,
+            'span_s': max((self._span[1] - self._span[0]) * 1e-9, 0.0),
+            'spacing_error_s': self._spacing.summary(),
+            'ended_by': 'end' if self.going() else 'signal'}
+
+    def _log(self, summary: dict[str, Any]) -> None:
+        error = summary['spacing_error_s']
+        quality = ', '.join(f'{key} {value * 1e3:.3f} ms' for key, value in error.items())
+        print(f"played {summary['messages']} messages in {summary['duration_s']:.2f} s"
+              + (f'; spacing error {quality}' if quality else '')
+              + (f"; damage: {summary['damage']}" if summary['damage'] else ''), file=sys.stderr)
+
+
+class _Ticks:
+    """Instants of /clock; those already past are left out: the clock is late, not a backlog."""
+
+    def __init__(self, start: float, frequency: float) -> None:
+        self._start, self._frequency, self._n = start, frequency, 0
+        self.due = start if frequency > 0.0 else math.inf
+
+    def advance(self) -> None:
+        """Go to the next instant that is still to come."""
+        passed = math.floor((time.monotonic() - self._start) * self._frequency)
+        self._n = max(self._n, passed) + 1
+        self.due = self._start + self._n / self._frequency

@@ -1,0 +1,145 @@
+"""
+Start, spin and end a node: the same for every executable.
+
+Exit status: 0 after SIGINT, SIGTERM or the end of the work; 2 when something
+the user gave cannot be used, with one FATAL line that says what and what to
+do; anything else is a bug and shows its traceback.  This module can be
+imported where ROS 2 is not installed, so that the executables can say so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import signal
+import sys
+from typing import Any
+
+from ou_monitor.errors import InputError
+
+BAD_INPUT = 2
+# Longest wait inside the executor, s; a signal wakes it anyway.
+NAP = 1.0
+
+
+def one_line(text: object) -> str:
+    """Return a text with its line breaks and runs of blanks made single blanks."""
+    return ' '.join(str(text).split())
+
+
+def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> int:
+    """
+    Initialise ROS 2, do the work, shut down; return the exit status.
+
+    Parameters
+    ----------
+    name : str
+        Name of the logger for what goes wrong before there is a node.
+    work : callable
+        Imports and builds the node and spins it; returns the exit status.
+    args : list of str, optional
+        Command line with the program first; `sys.argv` when omitted.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    """
+    # rclpy ends the context on SIGINT and SIGTERM and then calls the handler that was there
+    # before.  Python's own would raise KeyboardInterrupt inside whatever callback runs, and the
+    # EventsExecutor turns that into SystemError: so ours only notes the signal, from the start.
+    stopped: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    previous = [signal.signal(n, lambda number, frame: stopped.append(number)) for n in numbers]
+    try:
+        return _run(name, work, args, stopped)
+    finally:
+        for number, handler in zip(numbers, previous, strict=True):
+            signal.signal(number, handler)
+
+
+def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: list[int]) -> int:
+    try:
+        import rclpy
+        from rclpy.exceptions import NameValidationException, ParameterException
+        from rclpy.executors import ExternalShutdownException
+        from rclpy.impl.implementation_singleton import rclpy_implementation as binding
+    except ImportError as error:
+        print(f'{name}: ROS 2 is not installed: {one_line(error)}; source '
+              '/opt/ros/jazzy/setup.bash, or run ./scripts/demo once and use its .venv',
+              file=sys.stderr)
+        return BAD_INPUT
+    try:
+        _init(rclpy, binding, args)
+        return 0 if stopped else work()
+    except (InputError, ParameterException, NameValidationException) as error:
+        rclpy.logging.get_logger(name).fatal(one_line(error))
+        return BAD_INPUT
+    except ExternalShutdownException:
+        return 0
+    except binding.RCLError:
+        # A signal has ended the context while a node was being built: that is no failure.
+        if stopped and not rclpy.ok():
+            return 0
+        raise
+    finally:
+        rclpy.try_shutdown()
+
+
+def _init(rclpy: Any, binding: Any, args: list[str] | None) -> None:
+    """Initialise rclpy; a command line or parameter file it cannot read is bad input."""
+    try:
+        rclpy.init(args=args)
+    except (binding.RCLError, binding.RCLInvalidROSArgsError,
+            binding.UnknownROSArgsError) as error:
+        raise InputError(f'cannot read the ROS arguments: {one_line(error)}') from error
+
+
+def spin(node: Any) -> int:
+    """
+    Spin one node until its context ends, then destroy it.
+
+    The EventsExecutor takes 10 000 messages/s where the SingleThreadedExecutor
+    loses most of them; it is used where this rclpy has it.
+
+    Parameters
+    ----------
+    node : MonitorNode
+        Its `failure` holds what a callback raised, if one did.
+
+    Returns
+    -------
+    int
+        0.
+
+    Raises
+    ------
+    BaseException
+        Whatever a callback of the node raised.
+
+    """
+    from rclpy.executors import ExternalShutdownException
+    executor = make_executor()
+    executor.add_node(node)
+    try:
+        # Not spin(): in rclpy 7.1.6 the EventsExecutor's goes on for ever after a signal.
+        while node.context.ok() and node.failure is None:
+            executor.spin_once(timeout_sec=NAP)
+    except ExternalShutdownException:
+        node.context.try_shutdown()
+    finally:
+        executor.remove_node(node)
+        node.destroy_node()
+    if node.failure is not None:
+        raise node.failure
+    return 0
+
+
+def make_executor() -> Any:
+    """Return the EventsExecutor of this rclpy, or the plain one where there is none."""
+    try:
+        from rclpy.experimental.events_executor import EventsExecutor
+    except ImportError:
+        from rclpy.executors import SingleThreadedExecutor
+        return SingleThreadedExecutor()
+    return EventsExecutor()

@@ -1,0 +1,186 @@
+"""
+Which topic, type and field the voltage and the throttle are read from.
+
+Either a msg_config says so, or (`auto`) the type that a publisher offers on
+the topic chooses among the generic msg_configs.  Parameters override single
+entries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ou_monitor.errors import InputError
+from ou_monitor.messages.config import FieldSpec, list_msg_configs, load_msg_config
+from ou_monitor.messages.extract import Extractor
+from ou_monitor.nodes.message_types import message_class
+from ou_monitor.online.settings import Parameter
+
+AUTO = 'auto'
+
+SOURCE_PARAMETERS: tuple[Parameter, ...] = (
+    Parameter('msg_config', AUTO,
+              'Name or path of a msg_config; auto: chosen by the type of the publisher.'),
+    Parameter('voltage.topic', '', 'Topic of the voltage; empty: as the msg_config says.'),
+    Parameter('voltage.type', '', 'Message type of the voltage; empty: as the msg_config says.'),
+    Parameter('voltage.field', '', 'Field path of the voltage; empty: as the msg_config says.'),
+    Parameter('throttle.topic', '', 'Topic of the throttle; empty: as the msg_config says.'),
+    Parameter('throttle.type', '', 'Message type of the throttle; empty: as the msg_config says.'),
+    Parameter('throttle.field', '', 'Field path of the throttle; empty: as the msg_config says.'),
+    Parameter('adc.sample_rate', 0.0,
+              'True rate of the samples in a block, Hz; 0: as the msg_config says.', 0.0, 1.0e9),
+    Parameter('smooth_stamps', True,
+              'Whether samples without a stamp from a steady source are put on an even time line.'),
+)
+
+# In auto mode a bare scalar needs no msg_config of its own to be a throttle.
+_SCALARS = ('std_msgs/msg/Float32', 'std_msgs/msg/Float64')
+
+
+@dataclass(frozen=True)
+class Source:
+    """
+    One quantity: either known, or to be found out from its publisher.
+
+    Attributes
+    ----------
+    quantity : str
+        'voltage' or 'throttle'.
+    topic : str
+        Topic, relative or absolute.
+    spec : FieldSpec or None
+        Where the quantity is; None until a publisher shows its type.
+    config : str
+        Which msg_config said so.
+    install : str
+        What to install when the package of the type is missing.
+    candidates : tuple of Source
+        What may be chosen, in auto mode.
+
+    """
+
+    quantity: str
+    topic: str
+    spec: FieldSpec | None
+    config: str
+    install: str = ''
+    candidates: tuple[Source, ...] = ()
+
+    def choose(self, types: Sequence[str]) -> Source | None:
+        """Return the candidate for one of the types on offer; None when there is none."""
+        for candidate in self.candidates:
+            if candidate.spec is not None and candidate.spec.type in types:
+                return candidate
+        return None
+
+    @property
+    def known_types(self) -> list[str]:
+        """Return the types that can be chosen from."""
+        return list(dict.fromkeys(c.spec.type for c in self.candidates if c.spec is not None))
+
+    def open(self) -> tuple[Any, Extractor]:
+        """
+        Return the message class and the extractor, tried on an empty message.
+
+        Raises
+        ------
+        InputError
+            When the package is not installed, or the message has no such
+            field.
+
+        """
+        if self.spec is None:
+            raise InputError(f'the type of the {self.quantity} is not known yet')
+        message = message_class(self.spec.type, self.install)
+        extractor = Extractor(self.spec)
+        extractor.extract(message())
+        return message, extractor
+
+
+def find_source(quantity: str, values: Mapping[str, Any]) -> Source | None:
+    """
+    Return where a quantity comes from, by the parameters.
+
+    Parameters
+    ----------
+    quantity : {'voltage', 'throttle'}
+        Quantity.
+    values : mapping
+        `SOURCE_PARAMETERS` by name.
+
+    Returns
+    -------
+    Source or None
+        None when the msg_config has no such quantity.
+
+    Raises
+    ------
+    InputError
+        For an unknown msg_config, or overrides that do not suffice.
+
+    """
+    topic, kind, field = (str(values[f'{quantity}.{key}']) for key in ('topic', 'type', 'field'))
+    rate = float(values['adc.sample_rate']) if quantity == 'voltage' else 0.0
+    if values['msg_config'] == AUTO:
+        offered = _generic(quantity)
+    else:
+        config = load_msg_config(values['msg_config'])
+        spec = getattr(config, quantity)
+        offered = [] if spec is None else [
+            Source(quantity, spec.topic, spec, config.name, config.install)]
+    if kind:
+        offered = [s for s in offered if s.spec is not None and s.spec.type == kind] or [
+            _by_hand(quantity, topic or _topic_of(offered, quantity), kind, field)]
+    elif topic and not offered:
+        raise InputError(
+            f"msg_config '{values['msg_config']}' has no {quantity}: give {quantity}.type and "
+            f'{quantity}.field with {quantity}.topic')
+    offered = [_overridden(source, topic, field, rate) for source in offered]
+    if values['msg_config'] == AUTO and not kind:
+        return Source(quantity, topic or quantity, None, AUTO, candidates=tuple(offered))
+    return offered[0] if offered else None
+
+
+def _generic(quantity: str) -> list[Source]:
+    """Return what the generic msg_configs say of a quantity, one of a type."""
+    found: dict[str, Source] = {}
+    for config in list_msg_configs().values():
+        spec: FieldSpec | None = getattr(config, quantity)
+        if config.generic and spec is not None:
+            found.setdefault(
+                spec.type, Source(quantity, spec.topic, spec, config.name, config.install))
+    if quantity == 'throttle':
+        for kind in _SCALARS:
+            found.setdefault(kind, Source(
+                quantity, quantity, FieldSpec(quantity, kind, 'data'), AUTO))
+    return list(found.values())
+
+
+def _topic_of(offered: Sequence[Source], quantity: str) -> str:
+    return offered[0].topic if len(offered) == 1 else quantity
+
+
+def _by_hand(quantity: str, topic: str, kind: str, field: str) -> Source:
+    """Return a source of any installed type; a header's stamp is used when it has one."""
+    if not field:
+        raise InputError(
+            f"{quantity}.type is '{kind}', which no generic msg_config describes: give "
+            f'{quantity}.field too')
+    fields = message_class(kind).get_fields_and_field_types()
+    stamp = 'header.stamp' if fields.get('header') == 'std_msgs/Header' else None
+    return Source(quantity, topic, FieldSpec(topic, kind, field, stamp_field=stamp),
+                  'parameters')
+
+
+def _overridden(source: Source, topic: str, field: str, rate: float) -> Source:
+    spec = source.spec
+    if spec is None:
+        return source
+    # A rate makes a block of a field only where the message config says it is one, or where the
+    # user named the field.
+    block = rate > 0.0 and (spec.sample_rate is not None or source.config == 'parameters')
+    spec = replace(spec, topic=topic or spec.topic, field=field or spec.field,
+                   sample_rate=rate if block else spec.sample_rate)
+    return replace(source, topic=spec.topic, spec=spec)

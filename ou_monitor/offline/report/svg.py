@@ -1,0 +1,264 @@
+"""
+Plots as inline SVG, drawn here: no plotting library, no script, no network.
+
+Colours are CSS classes (``s0`` .. ``s7`` for series), so that `page` can give
+them a light and a dark form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+from ou_monitor.offline.report.scale import Scale, span, thin, tick_text
+from ou_monitor.records import FloatArray
+
+SERIES = 8
+
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 30, 42
+# Width of a letter of the 12-pixel sans serif, generously.
+_LETTER = 7.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Curve:
+    x: FloatArray
+    y: FloatArray
+    high: FloatArray | None
+    label: str
+    style: str
+    kind: str
+
+
+class Plot:
+    """
+    One plot with two axes.
+
+    Parameters
+    ----------
+    title : str
+        What is shown; stands above the plot and is read by screen readers.
+    x_label, y_label : str
+        Quantity and unit.
+    width, height : int
+        Size, pixels of the drawing; the page scales it.
+    log_x, log_y : bool
+        Logarithmic axes.
+    legend_low : bool
+        A legend that does not fit beside the title goes to the lower left of
+        the axes instead of the upper right.
+
+    """
+
+    def __init__(self, title: str, x_label: str, y_label: str, *, width: int = 860,
+                 height: int = 240, log_x: bool = False, log_y: bool = False,
+                 legend_low: bool = False) -> None:
+        self.title = title
+        self._x_label, self._y_label = x_label, y_label
+        self._width, self._height = width, height
+        self._log_x, self._log_y = log_x, log_y
+        self._legend_low = legend_low
+        self._curves: list[_Curve] = []
+        self._spans: list[tuple[float, float, str, str]] = []
+        self._marks: list[tuple[float, str]] = []
+        self._x_range: tuple[float, float] | None = None
+        self._y_range: tuple[float, float] | None = None
+
+    def line(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0,
+             style: str = '') -> Plot:
+        """
+        Add a line; NaN breaks it.
+
+        Parameters
+        ----------
+        x, y : ndarray, shape (n,)
+            Points.
+        label : str
+            Name in the legend; none when empty.
+        colour : int
+            Number of the series.
+        style : str
+            Further CSS classes: ``dash``, ``thick``, ``faint``.
+
+        Returns
+        -------
+        Plot
+            This plot.
+
+        """
+        self._curves.append(_Curve(np.asarray(x, float), np.asarray(y, float), None, label,
+                                   f's{colour % SERIES} {style}'.strip(), 'line'))
+        return self
+
+    def steps(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0) -> Plot:
+        """Add a line that holds each value until the next point."""
+        x, y = thin(np.asarray(x, float), np.asarray(y, float), self._width)
+        return self.line(np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1], label, colour)
+
+    def band(self, x: FloatArray, low: FloatArray, high: FloatArray, label: str = '',
+             colour: int = 0) -> Plot:
+        """
+        Add a shaded band; NaN breaks it.
+
+        Parameters
+        ----------
+        x, low, high : ndarray, shape (n,)
+            Edges of the band.
+        label : str
+            Name in the legend; none when empty.
+        colour : int
+            Number of the series.
+
+        Returns
+        -------
+        Plot
+            This plot.
+
+        """
+        self._curves.append(_Curve(
+            np.asarray(x, float), np.asarray(low, float), np.asarray(high, float), label,
+            f's{colour % SERIES}', 'band'))
+        return self
+
+    def shade(self, start: float, stop: float, colour: int = 0, label: str = '') -> Plot:
+        """Shade a stretch of the x axis; its label is drawn where there is room."""
+        self._spans.append((start, stop, f's{colour % SERIES}', label))
+        return self
+
+    def mark(self, x: float, label: str) -> Plot:
+        """Add a labelled vertical line."""
+        self._marks.append((x, label))
+        return self
+
+    def limits(self, x: tuple[float, float] | None = None,
+               y: tuple[float, float] | None = None) -> Plot:
+        """Set the ends of an axis; what is not set follows the data."""
+        self._x_range = x or self._x_range
+        self._y_range = y or self._y_range
+        return self
+
+    def svg(self) -> str:
+        """
+        Return the drawing.
+
+        Returns
+        -------
+        str
+            An ``<svg>`` element; well-formed XML.
+
+        """
+        right, bottom = self._width - _RIGHT, self._height - _BOTTOM
+        ends = [c.y for c in self._curves] + [c.high for c in self._curves if c.high is not None]
+        x_low, x_high = self._x_range or span([c.x for c in self._curves], self._log_x, pad=0.0)
+        y_low, y_high = self._y_range or span(ends, self._log_y)
+        x = Scale(x_low, x_high, _LEFT, right, self._log_x)
+        y = Scale(y_low, y_high, bottom, _TOP, self._log_y)
+        # A nested drawing clips what leaves the axes, and needs no id.
+        inner = f'{_LEFT} {_TOP} {right - _LEFT} {bottom - _TOP}'
+        parts = [
+            f'<svg viewBox="0 0 {self._width} {self._height}" role="img" '
+            f'aria-label="{escape(self.title, quote=True)}">',
+            f'<text class="title" x="{_LEFT}" y="16">{escape(self.title)}</text>',
+            *self._axes(x, y, right, bottom),
+            f'<svg x="{_LEFT}" y="{_TOP}" width="{right - _LEFT}" height="{bottom - _TOP}" '
+            f'viewBox="{inner}">']
+        for start, stop, style, label in self._spans:
+            a, b = np.clip(x(np.array([start, stop])), _LEFT, right)
+            parts.append(f'<rect class="shade {style}" x="{a:.1f}" y="{_TOP}" '
+                         f'width="{max(b - a, 0.5):.1f}" height="{bottom - _TOP}"/>')
+            if label and b - a > _LETTER * len(label) + 8.0:
+                parts.append(f'<text class="note" text-anchor="middle" '
+                             f'x="{0.5 * (a + b):.1f}" y="{_TOP + 13}">{escape(label)}</text>')
+        # Bands lie behind lines.
+        for curve in sorted(self._curves, key=lambda c: c.kind != 'band'):
+            parts.append(self._draw(curve, x, y))
+        parts.append('</svg>')
+        for where, label in self._marks:
+            pixel = float(x(where))
+            if _LEFT <= pixel <= right:
+                parts.append(f'<line class="mark" x1="{pixel:.1f}" y1="{_TOP}" '
+                             f'x2="{pixel:.1f}" y2="{bottom}"/><text class="note" '
+                             f'x="{pixel + 4:.1f}" y="{_TOP + 12}">{escape(label)}</text>')
+        return '\n'.join([*parts, *self._legend(right, bottom), '</svg>'])
+
+    def _axes(self, x: Scale, y: Scale, right: int, bottom: int) -> list[str]:
+        parts = []
+        for ticks, scale, across in ((x.ticks(7), x, True), (y.ticks(5), y, False)):
+            uneven = scale.log or len(ticks) < 2
+            for value in ticks:
+                step = abs(value) if uneven else ticks[1] - ticks[0]
+                text, pixel = escape(tick_text(value, step or 1.0)), float(scale(value))
+                if across:
+                    parts.append(f'<line class="grid" x1="{pixel:.1f}" y1="{_TOP}" '
+                                 f'x2="{pixel:.1f}" y2="{bottom}"/><text class="tick" '
+                                 f'text-anchor="middle" x="{pixel:.1f}" y="{bottom + 16}">'
+                                 f'{text}</text>')
+                else:
+                    parts.append(f'<line class="grid" x1="{_LEFT}" y1="{pixel:.1f}" '
+                                 f'x2="{right}" y2="{pixel:.1f}"/><text class="tick" '
+                                 f'text-anchor="end" x="{_LEFT - 6}" y="{pixel + 4:.1f}">'
+                                 f'{text}</text>')
+        middle = 0.5 * (_TOP + bottom)
+        parts.append(f'<text class="label" text-anchor="middle" x="{0.5 * (_LEFT + right):.0f}" '
+                     f'y="{self._height - 6}">{escape(self._x_label)}</text>')
+        parts.append(f'<text class="label" text-anchor="middle" transform="translate(14 '
+                     f'{middle:.0f}) rotate(-90)">{escape(self._y_label)}</text>')
+        return parts
+
+    def _draw(self, curve: _Curve, x: Scale, y: Scale) -> str:
+        if curve.high is not None:
+            pieces = []
+            px, low, high = x(curve.x), y(curve.y), y(curve.high)
+            for run in _stretches(np.isfinite(px) & np.isfinite(low) & np.isfinite(high)):
+                there = _points(px[run], low[run])
+                back = _points(px[run][::-1], high[run][::-1])
+                pieces.append(f'M{there}L{back}Z')
+            return f'<path class="band {curve.style}" d="{"".join(pieces)}"/>'
+        px, py = thin(x(curve.x), y(curve.y), self._width)
+        pieces = [f'M{_points(px[run], py[run])}'
+                  for run in _stretches(np.isfinite(px) & np.isfinite(py))]
+        return f'<path class="line {curve.style}" d="{"".join(pieces)}"/>'
+
+    def _legend(self, right: int, bottom: int) -> list[str]:
+        """Return the legend: beside the title, or in a corner of the axes."""
+        named = [c for c in self._curves if c.label]
+        if not named:
+            return []
+        widths = [_LETTER * len(c.label) + 34.0 for c in named]
+        if _LEFT + 1.15 * _LETTER * len(self.title) + sum(widths) < right:
+            starts = right - np.cumsum(widths[::-1])[::-1]
+            return [_legend_entry(c, float(x), 16) for c, x in zip(named, starts)]
+        width, height = max(widths), 16 * len(named) + 8
+        left, top = (_LEFT + 2.0, bottom - height) if self._legend_low else (right - width, _TOP)
+        return [f'<rect class="panel" x="{left:.0f}" y="{top + 1}" width="{width:.0f}" '
+                f'height="{height}"/>',
+                *[_legend_entry(c, left + 4.0, top + 16 + 16 * k) for k, c in enumerate(named)]]
+
+
+def _legend_entry(curve: _Curve, x: float, y: int) -> str:
+    swatch = (f'<rect class="band {curve.style}" x="{x:.0f}" y="{y - 9}" width="18" height="10"/>'
+              if curve.kind == 'band' else
+              f'<path class="line thick {curve.style}" '
+              f'd="M{x:.0f},{y - 4}L{x + 18:.0f},{y - 4}"/>')
+    return f'{swatch}<text class="legend" x="{x + 22:.0f}" y="{y}">{escape(curve.label)}</text>'
+
+
+def _stretches(good: np.ndarray) -> list[slice]:
+    """Return the unbroken stretches of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], good.astype(np.int8), [0]))))
+    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2])]
+
+
+def _points(x: FloatArray, y: FloatArray) -> str:
+    # One wild value must not make a coordinate that a renderer chokes on.
+    y = np.clip(y, -1e4, 1e4)
+    x = np.clip(x, -1e4, 1e4)
+    return 'L'.join(f'{a:.1f},{b:.1f}' for a, b in zip(x, y))
+
+
+def join(plots: Sequence[Plot]) -> str:
+    """Return several drawings one below the other."""
+    return '\n'.join(plot.svg() for plot in plots)

@@ -1,0 +1,120 @@
+"""
+Read a CSV with the columns `time_s`, `voltage_v` and, if there is one, `throttle`.
+
+Limits first: one header line is required; the decimal mark is a point.  Other
+columns are ignored, as are blank lines and lines that begin with '#'; commas
+or semicolons separate.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from ou_monitor.errors import InputError, nearest
+from ou_monitor.records import FloatArray
+
+TIME, VOLTAGE, THROTTLE = 'time_s', 'voltage_v', 'throttle'
+
+# What loggers write for a number they do not have.
+_MISSING = frozenset(('', 'nan', 'null', 'none', 'na', 'n/a'))
+
+
+def read_csv(path: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """
+    Return the columns of a CSV as they stand, unsorted and with NaN kept.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        File.
+
+    Returns
+    -------
+    tuple of ndarray, each of shape (n,)
+        Stamps, s; voltage, V; throttle, 0..1.  An empty cell is NaN; so is the
+        whole throttle when there is no such column.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, a column is missing (with the nearest
+        one), or a cell is not a number (with its line).
+
+    """
+    try:
+        with path.open(encoding='utf-8-sig', newline='') as file:
+            return _read(path, file)
+    except OSError as error:
+        raise InputError(f'cannot read {path}: {error.strerror}') from error
+    except UnicodeDecodeError as error:
+        raise InputError(f'{path} is not text (byte {error.start} is not UTF-8)') from error
+    except csv.Error as error:
+        raise InputError(f'{path} is not a CSV: {error}') from error
+
+
+class _Lines:
+    """The lines that count, and the number of the last one handed out."""
+
+    def __init__(self, file: Iterator[str]) -> None:
+        self._file = file
+        self.number = 0
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield lines that are neither blank nor comments."""
+        for line in self._file:
+            self.number += 1
+            if line.strip() and not line.lstrip().startswith('#'):
+                yield line
+
+
+def _read(path: Path, file: Iterator[str]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    lines = _Lines(file)
+    texts = iter(lines)
+    first = next(texts, None)
+    if first is None:
+        raise InputError(f'{path} is empty: expected a header with {TIME},{VOLTAGE}[,{THROTTLE}]')
+    delimiter = ';' if first.count(';') > first.count(',') else ','
+    header = [name.strip() for name in next(csv.reader([first], delimiter=delimiter))]
+    for name in (TIME, VOLTAGE):
+        if name not in header:
+            raise InputError(
+                f"{path}:{lines.number}: no column '{name}': {_hint(name, header)}")
+    for name in (TIME, VOLTAGE, THROTTLE):
+        if header.count(name) > 1:
+            raise InputError(f"{path}:{lines.number}: column '{name}' is there twice")
+    names = [name for name in (TIME, VOLTAGE, THROTTLE) if name in header]
+    places = [header.index(name) for name in names]
+    columns = [array('d') for _ in names]
+    for row in csv.reader(texts, delimiter=delimiter):
+        for name, place, column in zip(names, places, columns):
+            column.append(_cell(row, place, name, path, lines.number))
+    arrays = [np.array(column, dtype=np.float64) for column in columns]
+    if THROTTLE not in names:
+        arrays.append(np.full(arrays[0].shape, np.nan))
+    return arrays[0], arrays[1], arrays[2]
+
+
+def _cell(row: list[str], place: int, name: str, path: Path, number: int) -> float:
+    if place >= len(row):
+        raise InputError(f"{path}:{number}: the line ends before column '{name}'")
+    text = row[place]
+    try:
+        return float(text)
+    except ValueError:
+        if text.strip().lower() in _MISSING:
+            return float('nan')
+        raise InputError(
+            f"{path}:{number}: column '{name}' holds '{text.strip()}', not a number") from None
+
+
+def _hint(name: str, header: list[str]) -> str:
+    try:
+        [float(cell) for cell in header]
+    except ValueError:
+        return nearest(name, header)
+    return f'the first line holds numbers; add a header line {TIME},{VOLTAGE}[,{THROTTLE}]'

@@ -1,0 +1,249 @@
+"""
+Read and write `metadata.yaml`, the table of contents of a rosbag2 directory.
+
+Written as version 9, the one of ROS 2 Jazzy; read in every version, for only
+the list of files and the QoS of the topics are used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import yaml
+
+from ou_monitor.errors import InputError
+
+FILE = 'metadata.yaml'
+_ROOT = 'rosbag2_bagfile_information'
+
+# rosbag2 writes "for ever" of the middleware as the greatest duration.
+_FOR_EVER = {'sec': 9223372036, 'nsec': 854775807}
+
+# Before version 9 policies were numbers (rmw/types.h).
+_RELIABILITY: dict[Any, str] = {1: 'reliable', 2: 'best_effort'}
+_DURABILITY: dict[Any, str] = {1: 'transient_local', 2: 'volatile'}
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """
+    One topic of a bag.
+
+    Attributes
+    ----------
+    name : str
+        Topic name, absolute.
+    type : str
+        Message type, 'package/msg/Type'.
+    count : int
+        Number of messages.
+    reliability, durability : str
+        QoS that the publisher offered.
+    depth : int
+        Depth of the publisher's history, messages.
+
+    """
+
+    name: str
+    type: str
+    count: int
+    reliability: str = 'reliable'
+    durability: str = 'volatile'
+    depth: int = 10
+
+
+def qos_profile(topic: TopicInfo) -> list[dict[str, Any]]:
+    """Return the offered QoS of a topic as rosbag2 writes it."""
+    return [{
+        'history': 'keep_last', 'depth': topic.depth, 'reliability': topic.reliability,
+        'durability': topic.durability, 'deadline': dict(_FOR_EVER),
+        'lifespan': dict(_FOR_EVER), 'liveliness': 'automatic',
+        'liveliness_lease_duration': dict(_FOR_EVER),
+        'avoid_ros_namespace_conventions': False,
+    }]
+
+
+def parse_qos(text_or_list: Any) -> tuple[str, str, int]:
+    """
+    Return (reliability, durability, depth) of a recorded QoS.
+
+    Parameters
+    ----------
+    text_or_list : str or list
+        YAML text (versions to 8, and MCAP channels) or the list itself.
+
+    Returns
+    -------
+    tuple of str, str, int
+        The defaults of ROS 2 where the bag says nothing usable.
+
+    """
+    profiles = text_or_list
+    if isinstance(profiles, str):
+        try:
+            profiles = yaml.safe_load(profiles)
+        except yaml.YAMLError:
+            # A QoS nobody can read is no reason to refuse the messages.
+            profiles = None
+    first: dict[str, Any] = {}
+    if isinstance(profiles, list) and profiles and isinstance(profiles[0], dict):
+        first = profiles[0]
+    reliability = first.get('reliability')
+    durability = first.get('durability')
+    depth = first.get('depth')
+    reliability = _RELIABILITY.get(reliability, reliability)
+    durability = _DURABILITY.get(durability, durability)
+    return (
+        str(reliability) if reliability in _RELIABILITY.values() else 'reliable',
+        str(durability) if durability in _DURABILITY.values() else 'volatile',
+        depth if isinstance(depth, int) and depth > 0 else 10)
+
+
+def read_metadata(folder: Path) -> tuple[list[Path], dict[str, Any]]:
+    """
+    Return the MCAP files of a rosbag2 directory, and the QoS of its topics.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Directory with a metadata.yaml.
+
+    Returns
+    -------
+    tuple
+        Paths in recorded order, and topic name -> offered QoS.
+
+    Raises
+    ------
+    InputError
+        When metadata.yaml is not what it should be, the storage is not MCAP,
+        or a file is missing.
+
+    """
+    path = folder / FILE
+    try:
+        content = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f'cannot read {path}: {error}') from error
+    except yaml.YAMLError as error:
+        raise InputError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    info = content.get(_ROOT) if isinstance(content, dict) else None
+    if not isinstance(info, dict):
+        raise InputError(f"{path} has no '{_ROOT}': it is not the metadata of a rosbag2")
+    storage = info.get('storage_identifier')
+    if storage != 'mcap':
+        raise InputError(
+            f"{folder}: the storage is '{storage}', only mcap is read: convert it with "
+            "'ros2 bag convert' to the storage mcap")
+    names = info.get('relative_file_paths')
+    if not isinstance(names, list) or not names:
+        raise InputError(f"{path} names no file in 'relative_file_paths'")
+    # Old versions wrote the folder before the name.
+    files = [folder / PurePosixPath(str(name)).name for name in names]
+    for file in files:
+        if not file.is_file():
+            raise InputError(f"{path} names '{file.name}', which is not in {folder}")
+    qos: dict[str, Any] = {}
+    for entry in info.get('topics_with_message_count') or ():
+        topic = entry.get('topic_metadata') if isinstance(entry, dict) else None
+        if isinstance(topic, dict):
+            qos[str(topic.get('name'))] = topic.get('offered_qos_profiles')
+    return files, qos
+
+
+def find_files(path: Path, partial: bool) -> tuple[list[Path], dict[str, Any], str]:
+    """
+    Return what a path to a bag stands for.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        An .mcap file, a rosbag2 directory, or its metadata.yaml.
+    partial : bool
+        Whether a directory without metadata.yaml (rosbag2 writes it last, so
+        a recording that was cut off has none) is taken as its MCAP files.
+
+    Returns
+    -------
+    tuple
+        MCAP files in order, topic name -> offered QoS, and what is missing
+        ('' when nothing is).
+
+    Raises
+    ------
+    InputError
+        When there is nothing at `path`, or it is not a bag.
+
+    """
+    if path.name == FILE and path.is_file():
+        path = path.parent
+    if not path.exists():
+        raise InputError(f'there is no bag {path}: check the path')
+    if not path.is_dir():
+        return [path], {}, ''
+    if (path / FILE).exists():
+        return *read_metadata(path), ''
+    # NAME_0.mcap .. NAME_10.mcap: the shorter name is the earlier one.
+    files = sorted(path.glob('*.mcap'), key=lambda file: (len(file.name), file.name))
+    if not files:
+        raise InputError(f'{path} is not a bag: it holds neither {FILE} nor an .mcap file')
+    missing = f'{FILE} is missing: the recording was cut off'
+    if not partial:
+        raise InputError(f'{path}: {missing}; use --partial to take what it still holds')
+    return files, {}, missing
+
+
+def write_metadata(
+    folder: Path, file: str, topics: Iterable[TopicInfo], hashes: dict[str, str],
+    start_ns: int, end_ns: int,
+) -> None:
+    """
+    Write metadata.yaml (version 9) of a directory with one MCAP file.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Where to write.
+    file : str
+        Name of the MCAP file.
+    topics : iterable of TopicInfo
+        Topics with their counts.
+    hashes : dict of str to str
+        Type -> RIHS01 hash; '' for types that are not in it.
+    start_ns, end_ns : int
+        Log times of the first and last message, ns.
+
+    """
+    infos = list(topics)
+    count = sum(topic.count for topic in infos)
+    content = {_ROOT: {
+        'version': 9,
+        'storage_identifier': 'mcap',
+        'duration': {'nanoseconds': end_ns - start_ns},
+        'starting_time': {'nanoseconds_since_epoch': start_ns},
+        'message_count': count,
+        'topics_with_message_count': [{
+            'topic_metadata': {
+                'name': topic.name, 'type': topic.type, 'serialization_format': 'cdr',
+                'offered_qos_profiles': qos_profile(topic),
+                'type_description_hash': hashes.get(topic.type, ''),
+            },
+            'message_count': topic.count,
+        } for topic in infos],
+        'compression_format': '',
+        'compression_mode': '',
+        'relative_file_paths': [file],
+        'files': [{
+            'path': file,
+            'starting_time': {'nanoseconds_since_epoch': start_ns},
+            'duration': {'nanoseconds': end_ns - start_ns},
+            'message_count': count,
+        }],
+        'custom_data': None,
+        'ros_distro': 'jazzy',
+    }}
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=False)
+    (folder / FILE).write_text(text, encoding='utf-8')

@@ -1,0 +1,145 @@
+"""`ou-monitor analyze`: CSV in; table, JSON and page out; every bad input one line."""
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+
+from ou_monitor.cli.main import main
+from ou_monitor.model.ou import simulate
+
+ALPHA, SECONDS = 63.0, 6.0
+SIGMA = {0.1: 0.3156, 0.4: 0.632}
+
+
+@pytest.fixture(scope='module')
+def flight(tmp_path_factory):
+    """Return a CSV that holds two load levels of the paper, 6 s each at 500 Hz."""
+    t = np.arange(int(2 * SECONDS * 500)) / 500.0
+    throttle = np.where(t < SECONDS, 0.1, 0.4)
+    sigma = np.where(t < SECONDS, SIGMA[0.1], SIGMA[0.4])
+    voltage = simulate(t, ALPHA, sigma, np.random.default_rng(1), u0=5.0 - 0.5 * throttle)
+    path = tmp_path_factory.mktemp('csv') / 'flight <b>.csv'
+    write(path, t, voltage, throttle)
+    return path
+
+
+def write(path, t, voltage, throttle=None):
+    """Write a CSV as the contract has it."""
+    columns = [t, voltage] if throttle is None else [t, voltage, throttle]
+    np.savetxt(path, np.column_stack(columns), '%.9g', ',', comments='',
+               header=','.join(['time_s', 'voltage_v', 'throttle'][:len(columns)]))
+
+
+def strict(text):
+    """Parse JSON; NaN and Infinity are errors."""
+    def refuse(word):
+        raise ValueError(f'{word} is not JSON')
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def failure(capsys, *argv):
+    """Run a command that must fail; return its one line."""
+    assert main([str(word) for word in argv]) == 2
+    out, err = capsys.readouterr()
+    assert out == ''
+    assert re.fullmatch(r'ou-monitor( analyze)?: [^\n]+\n', err)
+    return err
+
+
+def test_json_on_standard_output_is_alone_and_true(flight, capsys):
+    """
+    Both levels, within 4 standard errors of the truth.
+
+    T = 6 s: ln alpha and ln Var_inf scatter by sqrt(2/(63*6)) = 7.3 %; ln
+    sigma by about 1/sqrt(2*3000) = 1.3 %, 1.5 % with alpha unknown.
+    """
+    assert main(['analyze', str(flight), '--json', '-']) == 0
+    out, err = capsys.readouterr()
+    assert err == ''
+    data = strict(out)
+    assert (data['n'], data['recording']) == (6000, 'flight <b>.csv')
+    assert [level['throttle'] for level in data['levels']] == pytest.approx([0.1, 0.4])
+    for level in data['levels']:
+        sigma = SIGMA[round(level['throttle'], 2)]
+        assert abs(math.log(level['sigma'] / sigma)) < 4 * 0.015
+        assert abs(math.log(level['alpha'] / ALPHA)) < 4 * 0.073
+        assert abs(math.log(level['var_inf'] * 2 * ALPHA / sigma ** 2)) < 4 * 0.073
+        assert level['sigma_ci95'][0] < level['sigma'] < level['sigma_ci95'][1]
+        assert level['status'] == 'OK' and level['process_type'] == 'diffusion'
+
+
+def test_table_fits_a_terminal(flight, capsys):
+    """Everything within 100 columns, units in the heads, one row a level."""
+    assert main(['analyze', str(flight)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    heads = [k for k, line in enumerate(lines) if line.startswith('throttle ')]
+    assert len(heads) == 2 and all(len(line) <= 100 for line in lines)
+    for k in heads:
+        rows = lines[k:k + 4]
+        assert rows[2].split()[:2] == ['10', '%'] and rows[3].split()[:2] == ['40', '%']
+    assert 'Vrms mV' in lines[heads[0]] and 'sigma V/sqrt(s) [95 %]' in lines[heads[1]]
+
+
+def test_report_and_json_files(flight, tmp_path, capsys):
+    """Both are written; the page says how to repeat itself, quoted for a shell."""
+    report, data = tmp_path / 'r.html', tmp_path / 'r.json'
+    assert main(['analyze', str(flight), '--levels', '0.4,0.1', '--window', '1.5',
+                 '--brownout-voltage', '4.5', '--report', str(report),
+                 '--json', str(data)]) == 0
+    assert f'Report: {report}' in capsys.readouterr().out
+    sliding = strict(data.read_text())['sliding']
+    assert (sliding['window_s'], sliding['brownout_voltage']) == (1.5, 4.5)
+    assert all(0.0 <= p <= 1.0 for p in sliding['brownout_risk'])
+    html = report.read_text(encoding='utf-8')
+    assert '<b>' not in html and '&lt;b&gt;' in html
+    command = re.search('<code>(.*)</code>', html).group(1)
+    assert '--levels 0.4,0.1 --window 1.5 --brownout-voltage 4.5' in command
+    assert '.csv&#x27; --levels' in command
+
+
+def test_unknown_is_null(tmp_path, capsys):
+    """A stuck sensor without throttle: status and nulls, exit status 0."""
+    path = tmp_path / 'stuck.csv'
+    write(path, np.arange(100) / 100.0, np.full(100, 5.0))
+    assert main(['analyze', str(path), '--json', '-']) == 0
+    (level,) = strict(capsys.readouterr().out)['levels']
+    assert level['throttle'] is None and level['sigma'] is None
+    assert level['sigma_ci95'] == [None, None] and level['status'] == 'CONSTANT'
+
+
+@pytest.mark.parametrize('options, word', [
+    (['--levels', '5,10'], "'5'"), (['--levels', 'a'], "'a'"), (['--levels', ''], "''"),
+    (['--levels', '0.1,0.1'], 'twice'), (['--levels', 'nan'], "'nan'"),
+    (['--window', '0'], '--window'), (['--window', 'inf'], '--window'),
+    (['--window', 'x'], '--window'), (['--brownout-voltage', 'x'], '--brownout-voltage'),
+    (['--brownout-horizon', '-1'], '--brownout-horizon'),
+    (['--report', '-'], '--report'), (['--report', '/nowhere/r.html'], '/nowhere'),
+    (['--json', '/nowhere/r.json'], '/nowhere'), (['--report', '/'], 'folder'),
+])
+def test_bad_options_are_named(flight, options, word, capsys):
+    """One line with the option or the value."""
+    assert word in failure(capsys, 'analyze', flight, *options)
+
+
+@pytest.mark.parametrize('content, word', [
+    (None, 'bad.csv'), ('', 'empty'), ('time_s,voltage_v\n', 'no usable sample'),
+    ('time_s,voltage_v\n0,5\n', '1 usable sample'), ('time_s,volts\n0,5\n1,5\n', 'volt'),
+    ('time_s,voltage_v\n0,nan\n1,nan\n', 'no usable sample'),
+])
+def test_bad_recordings_are_named(tmp_path, content, word, capsys):
+    """Missing, empty, header only, one sample, wrong column, nothing but NaN."""
+    path = tmp_path / 'bad.csv'
+    if content is not None:
+        path.write_text(content)
+    assert word in failure(capsys, 'analyze', path)
+
+
+def test_levels_need_a_throttle(tmp_path, capsys):
+    """--levels on a recording without throttle cannot be meant."""
+    path = tmp_path / 'plain.csv'
+    write(path, np.arange(100) / 100.0, 5.0 + 0.01 * np.sin(np.arange(100)))
+    assert 'no throttle' in failure(capsys, 'analyze', path, '--levels', '0.1')

@@ -1,0 +1,127 @@
+"""`ou-monitor`: which command, which exit status, one line on standard error."""
+
+import subprocess
+import sys
+
+import pytest
+
+import ou_monitor
+from ou_monitor.cli import main as cli
+from ou_monitor.errors import InputError
+
+
+def failure(capsys, *argv):
+    """Run a command that must fail; return its one line."""
+    assert cli.main(argv) == 2
+    out, err = capsys.readouterr()
+    assert out == ''
+    assert err.endswith('\n') and err.count('\n') == 1
+    assert 'Traceback' not in err
+    return err
+
+
+def test_version_and_help(capsys):
+    """Both leave with 0; the help lists exactly the commands that exist."""
+    assert cli.main(['--version']) == 0
+    assert capsys.readouterr().out == f'ou-monitor {ou_monitor.__version__}\n'
+    assert cli.main(['--help']) == 0
+    lines = capsys.readouterr().out.splitlines()
+    start = lines.index('  COMMAND') + 1
+    listed = {line.split()[0] for line in lines[start:lines.index('', start)]
+              if line.startswith('    ') and line[4] != ' '}
+    assert listed == set(cli.COMMANDS)
+
+
+@pytest.mark.parametrize('command', sorted(cli.COMMANDS))
+def test_every_command_has_help_and_json(command, capsys):
+    """As the contract asks."""
+    assert cli.main([command, '--help']) == 0
+    assert '--json FILE' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('argv, words', [
+    ([], 'COMMAND'),
+    (['analyse', 'x'], "did you mean 'analyze'?"),
+    (['qqqq'], 'valid: analyze'),
+    (['--bogus'], 'COMMAND'),
+    (['analyze'], 'RECORDING'),
+    (['analyze', 'x', '--reprot', 'y'], "did you mean '--report'?"),
+    (['analyze', 'x', '--reprot=y'], "did you mean '--report'?"),
+    (['analyze', 'x', 'y'], 'no further argument'),
+    (['analyze', 'x', '--json'], 'expected one argument'),
+])
+def test_bad_arguments_are_one_line(argv, words, capsys):
+    """Status 2 and what to write instead; options are never guessed from a prefix."""
+    assert words in failure(capsys, *argv)
+
+
+def stand_in(monkeypatch, action):
+    """Make the command `analyze` do something else."""
+    def add_parser(subparsers):
+        subparsers.add_parser('analyze').set_defaults(run=action)
+
+    monkeypatch.setattr('ou_monitor.cli.analyze.add_parser', add_parser)
+
+
+def test_input_errors_are_one_line_whatever_their_text(monkeypatch, capsys):
+    """A line feed in a file name does not make a second line."""
+    def run(args):
+        raise InputError("cannot read 'a\nb'")
+
+    stand_in(monkeypatch, run)
+    assert failure(capsys, 'analyze') == "ou-monitor analyze: cannot read 'a b'\n"
+
+
+def test_interrupt_is_quiet(monkeypatch, capsys):
+    """Ctrl-C: 130 and no text."""
+    def run(args):
+        raise KeyboardInterrupt
+
+    stand_in(monkeypatch, run)
+    assert cli.main(['analyze']) == 130
+    assert capsys.readouterr() == ('', '')
+
+
+def test_a_bug_is_not_dressed_up_as_bad_input(monkeypatch):
+    """What is not InputError keeps its traceback: it must be reported, not hidden."""
+    def run(args):
+        raise ZeroDivisionError
+
+    stand_in(monkeypatch, run)
+    with pytest.raises(ZeroDivisionError):
+        cli.main(['analyze'])
+
+
+def test_a_reader_that_goes_away_is_quiet():
+    """`ou-monitor ... | head`: no traceback, also not from the flush at exit."""
+    program = ('import sys; from ou_monitor.cli import analyze, main\n'
+               'def run(args):\n'
+               '    for k in range(100000): print("x" * 100)\n'
+               '    return 0\n'
+               'analyze.add_parser = lambda s: s.add_parser("analyze").set_defaults(run=run)\n'
+               'sys.exit(main.main(["analyze"]))')
+    process = subprocess.Popen([sys.executable, '-c', program], stdout=subprocess.PIPE,
+                               stderr=subprocess.PIPE)
+    process.stdout.readline()
+    process.stdout.close()
+    err = process.stderr.read()
+    process.stderr.close()
+    assert process.wait(timeout=60) == 0
+    assert err == b''
+
+
+def test_commands_load_nothing_heavy_for_help():
+    """SciPy, the readers and ROS wait for work to do; NumPy comes with the output."""
+    program = ('import sys; from ou_monitor.cli.main import main; main(["--help"]); '
+               'heavy = [m for m in ("scipy", "mcap", "rclpy") if m in sys.modules]; '
+               'sys.exit(" ".join(heavy) or 0)')
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
+                          timeout=60)
+    assert (done.returncode, done.stderr) == (0, '')
+
+
+def test_module_runs_as_a_program():
+    """`python -m ou_monitor.cli.main` is the command."""
+    done = subprocess.run([sys.executable, '-m', 'ou_monitor.cli.main', 'bogus'],
+                          capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and done.stderr.count('\n') == 1

@@ -1,0 +1,84 @@
+"""Tables, strict JSON, files and progress of the commands."""
+
+import enum
+import io
+import json
+import math
+
+import numpy as np
+import pytest
+
+from ou_monitor.cli import output
+from ou_monitor.errors import InputError
+
+
+class Colour(enum.Enum):
+    """An enum whose value is a sentence."""
+
+    RED = 'It is red.'
+
+
+def test_plain_is_strict_json_at_any_depth():
+    """All of NaN and infinities are null; arrays, tuples, NumPy numbers and enums are plain."""
+    data = {'a': math.nan, 'b': [math.inf, (1, -math.inf)], 'c': np.array([[1.0, math.nan]]),
+            'd': {1: np.float64('nan'), 'e': np.int64(3)}, 'f': Colour.RED, 'g': np.bool_(True)}
+    plain = output.plain(data)
+    assert plain == {'a': None, 'b': [None, [1, None]], 'c': [[1.0, None]],
+                     'd': {'1': None, 'e': 3}, 'f': 'RED', 'g': True}
+    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
+
+
+def test_write_json_to_a_file_and_to_standard_output(tmp_path, capsys):
+    """Both hold the same text, UTF-8, one object."""
+    target = tmp_path / 'x.json'
+    output.write_json({'unit': 'V/√s', 'x': math.nan}, str(target))
+    output.write_json({'unit': 'V/√s', 'x': math.nan}, '-')
+    assert target.read_text(encoding='utf-8') == capsys.readouterr().out
+    assert json.loads(target.read_text(encoding='utf-8')) == {'unit': 'V/√s', 'x': None}
+
+
+def test_what_cannot_be_written_is_named(tmp_path):
+    """A missing folder, a folder, and a file used as a folder; the last only when written."""
+    (tmp_path / 'file').write_text('')
+    for target in (tmp_path / 'no' / 'x.json', tmp_path):
+        with pytest.raises(InputError, match='cannot write'):
+            output.check_writable(str(target))
+        with pytest.raises(InputError, match='cannot write'):
+            output.write_text('x', target)
+    output.check_writable(None)
+    output.check_writable('-')
+    output.check_writable(str(tmp_path / 'new.json'))
+
+
+def test_table_is_aligned():
+    """Numbers flush right, words flush left, no trailing blanks."""
+    text = output.table(['n', 'word'], [['1', 'a'], ['1000', 'long one']], left=[1])
+    assert text.splitlines() == ['   n  word', '----  --------', '   1  a', '1000  long one']
+
+
+def test_progress_is_silent_without_a_terminal(capsys):
+    """Nothing reaches a log file."""
+    with output.Progress('work') as progress:
+        progress(0.5)
+        progress(1.0)
+    assert capsys.readouterr() == ('', '')
+
+
+class Terminal(io.StringIO):
+    """A standard error that is a terminal."""
+
+    def isatty(self):
+        """Say so."""
+        return True
+
+
+def test_progress_draws_and_wipes_on_a_terminal(monkeypatch):
+    """The bar fills to 100 % and is gone at the end, also after an exception."""
+    terminal = Terminal()
+    monkeypatch.setattr('sys.stderr', terminal)
+    with pytest.raises(KeyboardInterrupt):
+        with output.Progress('work') as progress:
+            progress(1.0)
+            assert 'work [####' in terminal.getvalue() and '100%' in terminal.getvalue()
+            raise KeyboardInterrupt
+    assert terminal.getvalue().endswith('\r\x1b[K')

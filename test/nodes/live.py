@@ -1,0 +1,214 @@
+"""Real processes over DDS: start them, listen to them, end them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import itertools
+import math
+import os
+from pathlib import Path
+import random
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+BAGS = ROOT / 'bags'
+# Slow, shared machines: a deadline is only ever reached by a failure.
+DEADLINE = 20.0
+_counter = itertools.count()
+
+
+def new_domain() -> int:
+    """Return a ROS domain nobody else of this test run uses just now: 10..59."""
+    worker = int(re.sub(r'\D', '', os.environ.get('PYTEST_XDIST_WORKER', '')) or 0)
+    return 10 + (worker * 13 + next(_counter)) % 50
+
+
+def wait_until(predicate: Callable[[], Any], timeout: float = DEADLINE, what: str = '') -> Any:
+    """Return what the predicate returns once it is true; fail after the timeout, s."""
+    until = time.monotonic() + timeout
+    while True:
+        value = predicate()
+        if value:
+            return value
+        if time.monotonic() > until:
+            pytest.fail(f'not within {timeout:g} s: {what or predicate}')
+        time.sleep(0.02)
+
+
+class Process:
+    """One executable of the package, its output in files."""
+
+    def __init__(self, name: str, arguments: list[str], domain: int, folder: Path) -> None:
+        self.name = name
+        self._out = folder / f'{name}_{next(_counter)}.out'
+        self._err = self._out.with_suffix('.err')
+        # The bootstrapper of the ROS wheels leaves its mark in a process that it has set up.
+        inherited = {key: value for key, value in os.environ.items()
+                     if key != '_ROS_WHEELS_BOOTSTRAP_COMPLETE'}
+        env = {**inherited, 'ROS_DOMAIN_ID': str(domain), 'PYTHONUNBUFFERED': '1',
+               'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_LOG_DIR': str(folder),
+               'PYTHONPATH': os.pathsep.join(
+                   [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])])}
+        with self._out.open('w') as out, self._err.open('w') as err:
+            self.popen = subprocess.Popen(
+                [sys.executable, '-m', f'ou_monitor.nodes.{name}', *arguments],
+                stdout=out, stderr=err, env=env, cwd=folder)
+
+    @property
+    def out(self) -> str:
+        """Return what it has written to stdout."""
+        return self._out.read_text()
+
+    @property
+    def err(self) -> str:
+        """Return what it has written to stderr."""
+        return self._err.read_text()
+
+    def wait(self, timeout: float = DEADLINE) -> int:
+        """Return the exit status."""
+        try:
+            return self.popen.wait(timeout)
+        except subprocess.TimeoutExpired:
+            pytest.fail(f'{self.name} did not end within {timeout:g} s:\n{self.err}')
+
+    def stop(self, number: int = signal.SIGINT) -> int:
+        """Send a signal; return the exit status."""
+        self.popen.send_signal(number)
+        return self.wait()
+
+    def kill(self) -> None:
+        """End it whatever it does."""
+        if self.popen.poll() is None:
+            self.popen.kill()
+            self.popen.wait()
+
+
+class Probe:
+    """A node in this process: it listens, publishes and sets parameters of others."""
+
+    def __init__(self, domain: int) -> None:
+        import rclpy
+        from rclpy.experimental.events_executor import EventsExecutor
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.node = rclpy.create_node('probe', context=self.context)
+        self._executor = EventsExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self._closing = False
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        from rclpy.executors import ExternalShutdownException
+        try:
+            while not self._closing:
+                self._executor.spin_once(timeout_sec=0.1)
+        except ExternalShutdownException:
+            return
+
+    def listen(self, topic: str, kind: Any, qos: Any = 100) -> list[Any]:
+        """Return the list to which messages of a topic will be added."""
+        got: list[Any] = []
+        self.node.create_subscription(kind, topic, got.append, qos)
+        return got
+
+    def publisher(self, topic: str, kind: Any, qos: Any = 10) -> Any:
+        """Return a publisher."""
+        return self.node.create_publisher(kind, topic, qos)
+
+    def call(self, kind: Any, service: str, request: Any) -> Any:
+        """Return the answer of a service."""
+        client = self.node.create_client(kind, service)
+        wait_until(client.service_is_ready, what=f'service {service}')
+        future = client.call_async(request)
+        wait_until(future.done, what=f'answer of {service}')
+        return future.result()
+
+    def set_parameter(self, node: str, name: str, value: Any) -> Any:
+        """Set a parameter as `ros2 param set` does; return successful, reason."""
+        from rcl_interfaces.srv import SetParameters
+        from rclpy.parameter import Parameter
+        request = SetParameters.Request(
+            parameters=[Parameter(name, value=value).to_parameter_msg()])
+        return self.call(SetParameters, f'{node}/set_parameters', request).results[0]
+
+    def close(self) -> None:
+        """End it."""
+        self._closing = True
+        self._thread.join(5.0)
+        self._executor.remove_node(self.node)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+class World:
+    """One ROS domain with processes and probes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.domain = new_domain()
+        self.folder = folder
+        self._processes: list[Process] = []
+        self._probes: list[Probe] = []
+        # The middleware of this process reads it at the first context.
+        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        os.environ['ROS_LOG_DIR'] = str(folder)
+
+    def start(self, name: str, *arguments: str) -> Process:
+        """Start an executable."""
+        self._processes.append(Process(name, [str(a) for a in arguments], self.domain,
+                                       self.folder))
+        return self._processes[-1]
+
+    def probe(self) -> Probe:
+        """Return a new probe."""
+        self._probes.append(Probe(self.domain))
+        return self._probes[-1]
+
+    def close(self) -> None:
+        """End everything; a traceback anywhere is a failure, whatever the test looked at."""
+        for process in self._processes:
+            process.kill()
+        for probe in self._probes:
+            probe.close()
+        for process in self._processes:
+            assert 'Traceback' not in process.err, process.err
+
+
+def values_of(status: Any) -> dict[str, str]:
+    """Return the key/value pairs of a DiagnosticStatus."""
+    return {pair.key: pair.value for pair in status.values}
+
+
+def seconds(stamp: Any) -> float:
+    """Return a builtin_interfaces/Time in s."""
+    return float(stamp.sec + stamp.nanosec * 1e-9)
+
+
+def diagnosis(messages: list[Any], name: str) -> Any:
+    """Return the newest status with a name out of DiagnosticArrays; None when there is none."""
+    for message in reversed(messages):
+        for status in message.status:
+            if status.name == name:
+                return status
+    return None
+
+
+def ou_path(n: int, dt: float, seed: int, alpha: float = 63.0, sigma: float = 0.3,
+            u0: float = 5.0) -> list[float]:
+    """Return n samples of an OU process, V, exactly discretised."""
+    rng = random.Random(seed)
+    phi = math.exp(-alpha * dt)
+    step = sigma * math.sqrt((1.0 - phi * phi) / (2.0 * alpha))
+    u, path = 0.0, []
+    for _ in range(n):
+        u = phi * u + step * rng.gauss(0.0, 1.0)
+        path.append(u0 + u)
+    return path

@@ -1,0 +1,126 @@
+"""The shipped parameter file and launch file agree with the program."""
+
+import ast
+import re
+import sys
+from types import ModuleType
+
+from live import ROOT
+from ou_monitor.nodes.adaptive_filter_node import FIXED
+from ou_monitor.nodes.base import PUBLISH_RATE
+from ou_monitor.nodes.sources import SOURCE_PARAMETERS
+from ou_monitor.online.settings import ESTIMATOR_PARAMETERS, FILTER_PARAMETERS
+import pytest
+import yaml
+
+DECLARED = {
+    'ou_estimator': (*ESTIMATOR_PARAMETERS, PUBLISH_RATE, *SOURCE_PARAMETERS),
+    'ou_adaptive_filter': (*FILTER_PARAMETERS, PUBLISH_RATE, *FIXED),
+}
+FILE = ROOT / 'config' / 'ou_monitor.yaml'
+LAUNCH = ROOT / 'launch' / 'ou_monitor_launch.py'
+
+
+def flat(group, prefix=''):
+    """Return nested keys as dotted names."""
+    found = {}
+    for key, value in group.items():
+        if isinstance(value, dict):
+            found.update(flat(value, f'{prefix}{key}.'))
+        else:
+            found[prefix + key] = value
+    return found
+
+
+@pytest.mark.parametrize('node', DECLARED)
+def test_every_parameter_at_its_default(node):
+    """No key that is not declared, none missing, same value, same type."""
+    content = yaml.safe_load(FILE.read_text())
+    assert set(content) == {f'/**/{name}' for name in DECLARED}
+    listed = flat(content[f'/**/{node}']['ros__parameters'])
+    defaults = {p.name: p.default for p in DECLARED[node]}
+    assert listed == defaults
+    assert {k: type(v) for k, v in listed.items()} == {k: type(v) for k, v in defaults.items()}
+
+
+def test_every_key_has_a_comment():
+    """The line above it."""
+    lines = FILE.read_text().splitlines()
+    for above, line in zip(lines, lines[1:]):
+        if re.match(r' {4,}\w+: \S', line):
+            assert above.strip().startswith('#'), line
+
+
+class Call:
+    """Stands for a class of launch; remembers how it was made."""
+
+    def __init__(self, *args, **kwargs):
+        self.args, self.kwargs = args, kwargs
+
+    def __eq__(self, other):
+        return (self.args, self.kwargs) == (other.args, other.kwargs)
+
+
+@pytest.fixture
+def described(monkeypatch):
+    """Give what the launch file describes, made with stand-ins of the launch package."""
+    kinds = {'launch': ['LaunchDescription'], 'launch.actions': ['DeclareLaunchArgument'],
+             'launch.substitutions': ['LaunchConfiguration'], 'launch_ros': [],
+             'launch_ros.actions': ['Node']}
+    for module, classes in kinds.items():
+        stand_in = ModuleType(module)
+        for name in classes:
+            setattr(stand_in, name, type(name, (Call,), {}))
+        monkeypatch.setitem(sys.modules, module, stand_in)
+    space = {'__file__': str(LAUNCH), '__name__': 'launch_file'}
+    exec(compile(LAUNCH.read_text(), str(LAUNCH), 'exec'), space)
+    return space['generate_launch_description']().args[0]
+
+
+def of_kind(described, kind):
+    """Return the entries of one class."""
+    return [entry for entry in described if type(entry).__name__ == kind]
+
+
+def test_launch_arguments(described):
+    """Namespace, parameter file, simulated time; the file is the shipped one."""
+    arguments = {a.args[0]: a.kwargs['default_value']
+                 for a in of_kind(described, 'DeclareLaunchArgument')}
+    assert arguments == {'namespace': '', 'params_file': str(FILE), 'use_sim_time': 'false'}
+
+
+def test_launch_nodes(described):
+    """Executables that setup.py makes, names that the file has, sigma wired to the estimator."""
+    nodes = of_kind(described, 'Node')
+    assert [n.kwargs['name'] for n in nodes] == list(DECLARED)
+    setup = ast.unparse(ast.parse((ROOT / 'setup.py').read_text()))
+    for node in nodes:
+        name = node.kwargs['executable']
+        assert node.kwargs['package'] == 'ou_monitor'
+        assert f'{name} = ou_monitor.nodes.{name}:main' in setup
+        assert node.kwargs['namespace'].args == ('namespace',)
+        file, extra = node.kwargs['parameters']
+        assert file.args == ('params_file',)
+        assert extra['use_sim_time'].args == ('use_sim_time',)
+    assert nodes[1].kwargs['remappings'] == [('sigma', 'ou_estimator/sigma')]
+
+
+def test_the_file_is_taken_in_any_namespace(world):
+    """The wildcard matches the bare node and one in a namespace, without a warning."""
+    from live import wait_until
+    from rcl_interfaces.srv import GetParameters
+    changed = world.folder / 'changed.yaml'
+    changed.write_text(FILE.read_text().replace('window: 2.0', 'window: 7.5').replace(
+        'fmax: 150.0', 'fmax: 111.0'))
+    probe = world.probe()
+    processes = [
+        world.start(name, '--ros-args', '--params-file', str(changed), '-r', f'__ns:={space}')
+        for name in ('estimator', 'adaptive_filter') for space in ('/', '/n/m')]
+    for node, key, value in (('ou_estimator', 'window', 7.5),
+                             ('ou_adaptive_filter', 'fmax', 111.0)):
+        for space in ('', '/n/m'):
+            answer = probe.call(GetParameters, f'{space}/{node}/get_parameters',
+                                GetParameters.Request(names=[key]))
+            assert answer.values[0].double_value == value
+    assert all('[WARN]' not in process.err for process in processes)
+    wait_until(lambda: [process.stop() for process in processes] == [0] * 4)

@@ -1,0 +1,254 @@
+"""Two real estimators on one machine: silence, NaN, time going back, parameters, types."""
+
+import math
+import time
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from live import ou_path, values_of, wait_until
+import pytest
+from sensor_msgs.msg import BatteryState
+from std_msgs.msg import Bool, Float32, Float32MultiArray, Float64, String
+
+OK, WARN, STALE = b'\x00', b'\x01', b'\x03'
+DT = 0.001
+
+
+class Rig:
+    """An estimator in a namespace, fed with stamped messages; time is what their stamps say."""
+
+    def __init__(self, world, probe, namespace, *arguments):
+        self.namespace, self.probe = namespace, probe
+        self.node = f'/{namespace}/ou_estimator'
+        self.states = probe.listen(f'{self.node}/state', DiagnosticArray)
+        self.alpha = probe.listen(f'{self.node}/alpha', Float64)
+        self.flags = probe.listen(f'{self.node}/brownout', Bool)
+        self.process = world.start(
+            'estimator', '--ros-args', '-r', f'__ns:=/{namespace}', *arguments)
+        self.output = None
+        self.t = 1000.0
+
+    def connect(self, kind, topic='voltage'):
+        """Publish a type; wait until the estimator has subscribed."""
+        self.output = self.probe.publisher(f'/{self.namespace}/{topic}', kind, 1000)
+        wait_until(self.output.get_subscription_count, what='subscription')
+
+    def feed(self, voltages, dt=DT):
+        """Send stamped samples, dt apart; do not flood best effort."""
+        for k, voltage in enumerate(voltages):
+            self.t += dt
+            whole = math.floor(self.t)
+            message = BatteryState(voltage=voltage)
+            message.header.stamp = Time(sec=whole, nanosec=round((self.t - whole) * 1e9) % 10**9)
+            self.output.publish(message)
+            if k % 20 == 19:
+                time.sleep(0.002)
+
+    @property
+    def status(self):
+        """Return the newest status."""
+        return self.states[-1].status[0]
+
+    def field(self, name):
+        """Return a field of the newest state."""
+        return values_of(self.status)[name]
+
+    def count(self, name):
+        """Return a counter of the newest state."""
+        return int(self.field(name))
+
+    def settle(self, pushed):
+        """Wait until so many samples have been counted, lost ones allowed for (1 in 20)."""
+        wait_until(lambda: self.count('pushed') >= 0.95 * pushed, what=f'{pushed} samples')
+
+
+@pytest.fixture(scope='module')
+def rigs(shared_world):
+    """Give two estimators in namespaces, the first one fed."""
+    probe = shared_world.probe()
+    made = [Rig(shared_world, probe, name) for name in ('a', 'b')]
+    for rig in made:
+        wait_until(lambda rig=rig: rig.states, what='first state')
+    made[0].connect(BatteryState)
+    return made
+
+
+@pytest.fixture
+def rig(rigs):
+    """Give the estimator that is fed."""
+    return rigs[0]
+
+
+def test_one_does_not_hear_the_other(rigs):
+    """Relative names follow the namespace."""
+    fed, silent = rigs
+    fed.feed(ou_path(2000, DT, seed=1))
+    fed.settle(2000)
+    wait_until(lambda: fed.status.level in (OK, WARN), what='an estimate')
+    assert silent.status.level == STALE
+    assert silent.status.message == 'Waiting for a publisher on /b/voltage.'
+    assert silent.count('pushed') == 0
+    assert math.isnan(silent.alpha[-1].data) and silent.flags == []
+
+
+def test_silence(rig):
+    """After `stale_after`: STALE, NaN, and no flag that says false."""
+    rig.feed(ou_path(500, DT, seed=2))
+    wait_until(lambda: rig.status.level == STALE, what='STALE')
+    assert 'No voltage for' in rig.status.message
+    # The estimate goes out before its state, so the newest number is that old at most.
+    wait_until(lambda: math.isnan(rig.alpha[-1].data), 2.0)
+    time_of_silence = len(rig.flags)
+    states = len(rig.states)
+    wait_until(lambda: len(rig.states) > states + 5)
+    assert len(rig.flags) == time_of_silence
+    rig.feed(ou_path(500, DT, seed=3))
+    wait_until(lambda: rig.status.level in (OK, WARN), what='life again')
+
+
+def test_nan_is_counted_and_never_used(rig):
+    """Single NaN and infinities are dropped; nothing but NaN is silence, and said to be so."""
+    before, used = rig.count('non_finite'), rig.count('used')
+    bad = [math.nan, math.inf, -math.inf] * 10
+    good = ou_path(600, DT, seed=4)
+    rig.feed([v for pair in zip(good[:30], bad) for v in pair] + good[30:])
+    wait_until(lambda: rig.count('used') >= used + 570, what='the good ones')
+    assert 25 <= rig.count('non_finite') - before <= 30
+    assert math.isfinite(float(rig.field('sigma')))
+    used = rig.count('used')
+
+    def only_nan():
+        rig.feed([math.nan] * 5)
+        return rig.status.level == STALE
+    wait_until(only_nan, what='STALE of NaN')
+    assert 'holds no finite voltage' in rig.status.message
+    assert rig.count('used') == used
+
+
+def test_time_going_back_clears_the_window(rig):
+    """A log that is replayed anew: counted, and nothing of the old pass stays."""
+    rig.feed(ou_path(1000, DT, seed=5))
+    wait_until(lambda: float(rig.field('t')) > rig.t - 0.01, what='the newest sample')
+    resets = rig.count('resets')
+    rig.t = 500.0
+    rig.feed(ou_path(300, DT, seed=6))
+    wait_until(lambda: abs(float(rig.field('t')) - 500.3) < 0.01, what='the new pass')
+    assert rig.count('resets') == resets + 1
+    assert 250 <= rig.count('n') <= 300
+
+
+def test_parameter_change_keeps_the_window(rig):
+    """Longer, shorter, brown-out level: n counts on, nothing is reset."""
+    rig.feed(ou_path(1500, DT, seed=7))
+    wait_until(lambda: float(rig.field('t')) > rig.t - 0.01, what='the newest sample')
+    n, resets = rig.count('n'), rig.count('resets')
+    for name, value in (('window', 5.0), ('brownout.voltage', 4.8), ('stale_after', 1.5),
+                        ('window', 4)):
+        result = rig.probe.set_parameter(rig.node, name, value)
+        assert result.successful, result.reason
+    states = len(rig.states)
+    wait_until(lambda: len(rig.states) > states + 1)
+    assert (rig.count('n'), rig.count('resets')) == (n, resets)
+    # A shorter window keeps what is inside it.
+    assert rig.probe.set_parameter(rig.node, 'window', 0.5).successful
+    wait_until(lambda: rig.count('n') <= 502, what='the shorter window')
+    assert rig.count('n') >= 450 and rig.count('resets') == resets
+    assert rig.probe.set_parameter(rig.node, 'window', 2.0).successful
+
+
+@pytest.mark.parametrize('name, value, words', [
+    ('window', -1.0, 'out of range'),
+    ('window', math.nan, 'out of range'),
+    ('window', 'long', 'Wrong parameter type'),
+    ('brownout.warn', 0.5, 'must be less than brownout.critical'),
+    ('msg_config', 'px4', 'read-only'),
+])
+def test_bad_parameters_are_refused(rig, name, value, words):
+    """With the reason; the old value stays."""
+    result = rig.probe.set_parameter(rig.node, name, value)
+    assert not result.successful and words in result.reason
+    from rcl_interfaces.srv import GetParameters
+    answer = rig.probe.call(GetParameters, f'{rig.node}/get_parameters',
+                            GetParameters.Request(names=['window', 'brownout.warn']))
+    assert [v.double_value for v in answer.values] == [2.0, 0.01]
+
+
+def test_publish_rate_changes_at_run_time(rig):
+    """From 10 to 50 Hz: 30 more states come within a time in which 10 Hz gives 20."""
+    assert rig.probe.set_parameter(rig.node, 'publish_rate', 50.0).successful
+    states = len(rig.states)
+    wait_until(lambda: len(rig.states) > states + 30, 2.0, '50 Hz')
+    assert rig.probe.set_parameter(rig.node, 'publish_rate', 10.0).successful
+
+
+def test_descriptors_tell_range_and_meaning(rig):
+    """What `ros2 param describe` shows."""
+    from rcl_interfaces.srv import DescribeParameters
+    answer = rig.probe.call(DescribeParameters, f'{rig.node}/describe_parameters',
+                            DescribeParameters.Request(names=['window', 'msg_config']))
+    window, config = answer.descriptors
+    assert 'sliding window' in window.description and not window.read_only
+    assert (window.floating_point_range[0].from_value, window.floating_point_range[0].to_value) \
+        == (0.05, 3600.0)
+    assert config.read_only
+
+
+def test_slow_input_is_said_to_be_too_slow(world):
+    """PX4's 1 Hz cannot carry alpha = 63 1/s: a warning, not a number."""
+    rig = Rig(world, world.probe(), 'slow', '-p', 'window:=60.0')
+    wait_until(lambda: rig.states)
+    rig.connect(BatteryState)
+    rig.feed(ou_path(60, 1.0, seed=8), dt=1.0)
+    wait_until(lambda: rig.count('n') >= 55)
+    wait_until(lambda: rig.status.level == WARN, 1.0)
+    assert 'raise' in rig.status.message and 'rate' in rig.status.message
+
+
+def test_a_type_nobody_knows_is_named(world):
+    """And so is what to do; the right type is taken when it comes."""
+    rig = Rig(world, world.probe(), 'odd')
+    wait_until(lambda: rig.states)
+    odd = rig.probe.publisher('/odd/voltage', String)
+    wait_until(lambda: 'std_msgs/msg/String' in rig.status.message, what='complaint')
+    assert 'voltage.type' in rig.status.message
+    rig.probe.node.destroy_publisher(odd)
+    # The middleware does not let one process change the type of a topic.
+    rig.probe = world.probe()
+    rig.connect(Float64)
+    wait_until(lambda: 'std_float64' in rig.field('msg_config'))
+    assert rig.process.stop() == 0
+
+
+def test_another_type_than_configured_is_named(world):
+    """DDS would drop it without a word."""
+    probe = world.probe()
+    rig = Rig(world, probe, 'c', '-p', 'msg_config:=std_float32')
+    wait_until(lambda: rig.states)
+    keep = probe.publisher('/c/voltage', Float64)
+    wait_until(lambda: 'expects std_msgs/msg/Float32' in rig.status.message, what='complaint')
+    assert keep and rig.status.level == b'\x02'
+
+
+def test_blocks_of_adc_samples(world):
+    """Blocks of 100 at 10 kHz without a stamp: every sample counts, sigma is the truth."""
+    rig = Rig(world, world.probe(), 'adc')
+    wait_until(lambda: rig.states)
+    throttle = rig.probe.publisher('/adc/throttle', Float32)
+    wait_until(throttle.get_subscription_count)
+    # The throttle is there before the voltage: the node waits on.
+    states = len(rig.states)
+    wait_until(lambda: len(rig.states) > states + 1)
+    assert rig.status.message == 'Waiting for a publisher on /adc/voltage.'
+    rig.connect(Float32MultiArray)
+    path = ou_path(20000, 1e-4, seed=9, sigma=0.3)
+    start = time.monotonic()
+    for k in range(200):
+        time.sleep(max(start + 0.01 * k - time.monotonic(), 0.0))
+        throttle.publish(Float32(data=0.25))
+        rig.output.publish(Float32MultiArray(data=path[100 * k:100 * (k + 1)]))
+    rig.settle(20000)
+    wait_until(lambda: rig.count('n') >= 18000)
+    # se of sigma at 20000 samples: 0.5 %; a machine that pauses shifts the time line by per cents.
+    assert float(rig.field('sigma')) == pytest.approx(0.3, rel=0.08)
+    assert float(rig.field('rate')) == pytest.approx(10000.0, rel=0.08)
+    assert float(rig.field('throttle')) == 0.25

@@ -1,0 +1,174 @@
+"""A stamped bag at four times its speed into the real estimator: every number against the truth."""
+
+import math
+import statistics
+
+from diagnostic_msgs.msg import DiagnosticArray
+from live import BAGS, seconds, values_of, wait_until
+import numpy as np
+from ou_monitor import SlidingEstimator
+from ou_monitor.recordings.bag import BagReader
+import pytest
+from rclpy.qos import ReliabilityPolicy
+from std_msgs.msg import Bool, Float64
+import yaml
+
+BAG = BAGS / 'load_40'
+TRUTH = yaml.safe_load((BAG / 'truth.yaml').read_text())['parameters']
+WINDOW = 2.0
+NUMBERS = ('alpha', 'sigma', 'var_inf', 'brownout_risk')
+# 20 s of bag are at most 10 independent windows; a normal error beyond 4.5 se in one of them has
+# a probability of 7e-5 for each parameter.
+SIGMAS = 4.5
+
+
+@pytest.fixture(scope='module')
+def run(shared_world):
+    """Play the bag once; give what was heard."""
+    probe = shared_world.probe()
+    heard = {name: probe.listen(f'/uav1/ou_estimator/{name}', Float64) for name in NUMBERS}
+    heard['brownout'] = probe.listen('/uav1/ou_estimator/brownout', Bool)
+    heard['state'] = probe.listen('/uav1/ou_estimator/state', DiagnosticArray)
+    heard['diagnostics'] = probe.listen('/diagnostics', DiagnosticArray)
+    # A barrier of 2.5 standard deviations: a risk that is neither 0 nor 1.
+    level = TRUTH['u0'] - 2.5 * math.sqrt(TRUTH['var_inf'])
+    estimator = shared_world.start(
+        'estimator', '--ros-args', '-r', '__ns:=/uav1', '-p', 'use_sim_time:=true',
+        '-r', 'voltage:=/voltage', '-r', 'throttle:=/throttle',
+        '-p', f'brownout.voltage:={level}', '-p', 'brownout.horizon:=0.5')
+    wait_until(lambda: heard['state'], what='first state')
+    heard['waiting'] = heard['state'][0]
+    heard['endpoints'] = probe.node.get_publishers_info_by_topic
+    replay = shared_world.start('replay', str(BAG), '--rate', '4', '--wait', '15')
+    wait_until(lambda: probe.node.get_subscriptions_info_by_topic('/voltage'),
+               what='subscription of the estimator')
+    heard['inputs'] = probe.node.get_subscriptions_info_by_topic('/voltage')
+    assert replay.wait(40.0) == 0, replay.err
+    wait_until(lambda: heard['state'][-1].status[0].level == b'\x03', what='STALE at the end')
+    assert estimator.stop() == 0, estimator.err
+    heard['log'] = estimator.err
+    return heard
+
+
+@pytest.fixture(scope='module')
+def states(run):
+    """Give the fields of the states that are good, as numbers where they are numbers."""
+    good = []
+    for message in run['state']:
+        fields = values_of(message.status[0])
+        if fields['status'] == 'OK' and message.status[0].level != b'\x03':
+            good.append((message, fields))
+    assert len(good) > 10
+    return good
+
+
+def test_says_what_it_waits_for(run):
+    """Before the replay starts, and which msg_config it then chose."""
+    status = run['waiting'].status[0]
+    assert status.level == b'\x03'
+    assert status.message == 'Waiting for a publisher on /voltage.'
+    assert "msg_config 'battery_state'" in run['log']
+
+
+def test_quality_of_service(run):
+    """Inputs best effort, whatever the publisher offers."""
+    assert [end.qos_profile.reliability for end in run['inputs']] == [
+        ReliabilityPolicy.BEST_EFFORT]
+
+
+@pytest.mark.parametrize('name', ['alpha', 'sigma', 'var_inf'])
+def test_values_are_the_truth(states, name):
+    """Each estimate within 4.5 of its own standard errors, and those are small."""
+    errors = [math.log(float(f[name]) / TRUTH[name]) / float(f[name + '_se']) for _, f in states]
+    assert max(map(abs, errors)) < SIGMAS
+    # Floor: sqrt(2 / (alpha T)) = 12.6 % for alpha and var_inf, 1.6 % for sigma; a wrong factor
+    # of two in var_inf, or of sqrt(2) in sigma, is seen in the mean over 20 s.
+    mean = statistics.fmean(math.log(float(f[name]) / TRUTH[name]) for _, f in states)
+    assert abs(mean) < (0.03 if name == 'sigma' else 0.25)
+
+
+def test_standard_errors_have_power(states):
+    """An estimator that says `I do not know` would pass the test before."""
+    fields = states[-1][1]
+    assert float(fields['sigma_se']) < 0.03 and float(fields['alpha_se']) < 0.2
+
+
+def test_the_mean_level(states):
+    """U0 within 4.5 standard errors of the mean of an OU over the window."""
+    spread = math.sqrt(2.0 * TRUTH['var_inf'] / (TRUTH['alpha'] * WINDOW))
+    for _, fields in states:
+        assert abs(float(fields['u0']) - TRUTH['u0']) < SIGMAS * spread
+
+
+def test_one_instant(states, run):
+    """All fields of a state belong together, and the plain topics say the same numbers."""
+    sent = {name: {m.data for m in run[name]} for name in NUMBERS}
+    for message, fields in states:
+        var_inf = float(fields['sigma']) ** 2 / (2.0 * float(fields['alpha']))
+        assert float(fields['var_inf']) == pytest.approx(var_inf, rel=1e-9)
+        assert seconds(message.header.stamp) == pytest.approx(float(fields['t']), abs=1e-6)
+    # States and numbers go out one after the other: the last ones may be cut off by the stop.
+    for name in NUMBERS:
+        assert {float(f[name]) for _, f in states[:-1]} <= sent[name]
+
+
+def test_the_same_numbers_as_offline(states):
+    """Node and library are one estimator: the same samples give the same estimate."""
+    samples = [(m.message.header.stamp.sec + m.message.header.stamp.nanosec * 1e-9,
+                m.message.voltage) for m in BagReader(BAG).decoded(['/voltage'])]
+    t, v = np.array(samples).T
+    compared = 0
+    for _, fields in states:
+        end = float(fields['t'])
+        inside = (t >= end - WINDOW) & (t <= end)
+        if int(fields['n']) != inside.sum():
+            continue
+        # The constant throttle of this bag takes no part in the fit.
+        offline = SlidingEstimator(window=WINDOW)
+        offline.push(t[inside], v[inside], np.full(inside.sum(), TRUTH['throttle']))
+        e = offline.estimate()
+        assert float(fields['alpha']) == pytest.approx(e.alpha, rel=1e-6)
+        assert float(fields['sigma']) == pytest.approx(e.sigma, rel=1e-6)
+        compared += 1
+    # Best effort may lose a message, but not in most windows.
+    assert compared > len(states) / 2
+
+
+def test_risk_and_flag(states, run):
+    """Risk is a probability that follows the barrier; the flag is told only with a risk."""
+    risks = [float(f['brownout_risk']) for _, f in states]
+    assert all(0.0 < risk <= 1.0 for risk in risks)
+    known = [m for m in run['brownout_risk'] if not math.isnan(m.data)]
+    # Critical from 0.1: the flags are those of the risks, one for one (the stop may cut one).
+    flags = [m.data for m in run['brownout']]
+    assert flags[:len(known) - 1] == [m.data >= 0.1 for m in known][:len(flags)][:len(known) - 1]
+    assert abs(len(flags) - len(known)) <= 1
+
+
+def test_what_is_not_known_is_nan(run):
+    """Before the first voltage and after the last: never 0."""
+    for name in NUMBERS:
+        assert math.isnan(run[name][0].data) and math.isnan(run[name][-1].data)
+
+
+def test_throttle_is_in_the_state(states):
+    """From its own topic, without a stamp of its own."""
+    assert float(states[-1][1]['throttle']) == pytest.approx(TRUTH['throttle'])
+
+
+def test_stamps_are_those_of_the_bag(states):
+    """Not those of the day of the test."""
+    bag = BagReader(BAG)
+    stamps = [seconds(m.header.stamp) for m, _ in states]
+    assert stamps == sorted(stamps)
+    assert bag.start_ns * 1e-9 <= stamps[0] and stamps[-1] <= bag.end_ns * 1e-9 + 1e-6
+
+
+def test_diagnostics(run):
+    """On the absolute topic, by the full name of the node, at simulated time."""
+    mine = [m for m in run['diagnostics'] if m.status[0].name == 'uav1/ou_estimator: supply']
+    assert len(mine) >= 5
+    fields = values_of(mine[-1].status[0])
+    assert fields['messages'] == fields['pushed'] and fields['non_finite'] == '0'
+    bag = BagReader(BAG)
+    assert seconds(mine[-1].header.stamp) == pytest.approx(bag.end_ns * 1e-9, abs=0.1)

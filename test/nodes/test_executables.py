@@ -1,0 +1,89 @@
+"""Start and end of every executable: signals, bad input, misspelt parameters."""
+
+import os
+import signal
+import subprocess
+import sys
+
+from live import ROOT, wait_until
+import pytest
+
+NODES = {'estimator': 'ou_estimator', 'adaptive_filter': 'ou_adaptive_filter'}
+
+
+def names(probe):
+    """Return the full names of the nodes that can be seen."""
+    return probe.node.get_fully_qualified_node_names()
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=['SIGINT', 'SIGTERM'])
+def test_signals_end_the_nodes(world, number):
+    """Status 0, no traceback, and the nodes are gone from the graph at once."""
+    probe = world.probe()
+    processes = [world.start(name, '--ros-args', '-r', '__ns:=/x/y') for name in NODES]
+    expected = {f'/x/y/{node}' for node in NODES.values()}
+    wait_until(lambda: expected <= set(names(probe)), what='nodes')
+    for process in processes:
+        process.popen.send_signal(number)
+    assert [process.wait() for process in processes] == [0, 0]
+    assert all('Traceback' not in p.err and 'rror' not in p.err for p in processes)
+    # A node that was destroyed says goodbye; one that was not is missed only after 20 s.
+    wait_until(lambda: not expected & set(names(probe)), 5.0, 'the nodes to be gone')
+
+
+@pytest.mark.parametrize('name, arguments, words', [
+    ('estimator', ['-p', 'window:=-1.0'], 'window out of range'),
+    ('estimator', ['-p', 'window:=long'], "'window' to 'long'"),
+    ('estimator', ['-p', 'window:=.nan'], 'window out of range'),
+    ('estimator', ['-p', 'brownout.warn:=0.5'], 'must be less than brownout.critical'),
+    ('estimator', ['-p', 'msg_config:=std_flaot64'], "did you mean 'std_float64'?"),
+    ('estimator', ['-p', 'msg_config:=px4'], 'clone https://github.com/PX4/px4_msgs'),
+    ('estimator', ['-p', 'msg_config:=std_float32', '-p', 'voltage.field:=daat'],
+     "did you mean 'data'?"),
+    ('estimator', ['--params-file', 'no_such.yaml'], 'cannot read the ROS arguments'),
+    ('adaptive_filter', ['-p', 'law:=constant_nose'], "did you mean 'constant_noise'?"),
+    ('adaptive_filter', ['-p', 'fmin:=200.0'], 'fmin'),
+    ('adaptive_filter', ['-p', 'input_type:=std_msgs/msg/String'], 'cannot filter'),
+    ('adaptive_filter', ['-r', '__node:=9 lives'], 'cannot read the ROS arguments'),
+], ids=lambda value: '' if isinstance(value, list) else value[:24])
+def test_what_is_refused(world, name, arguments, words):
+    """Exit status 2 and one FATAL line that says why."""
+    process = world.start(name, '--ros-args', *arguments)
+    assert process.wait() == 2
+    # The C library of ROS may add a line of its own before.
+    lines = [line for line in process.err.strip().splitlines() if 'FATAL' in line]
+    assert len(lines) == 1 and words in lines[0], process.err
+
+
+def test_a_misspelt_parameter_is_named(world, tmp_path):
+    """ROS ignores it without a word: by -p and in a file, with the nearest name."""
+    path = tmp_path / 'params.yaml'
+    path.write_text('/**:\n  ros__parameters:\n    brownout:\n      horizn: 2.0\n')
+    process = world.start('estimator', '--ros-args', '-p', 'windw:=3.0', '-p', 'window:=3',
+                          '--params-file', str(path))
+    wait_until(lambda: process.err.count('[WARN]') == 2, what='two warnings')
+    assert "'windw' does not exist and is ignored: did you mean 'window'?" in process.err
+    assert "'brownout.horizn' does not exist" in process.err
+    assert "did you mean 'brownout.horizon'?" in process.err
+    assert process.stop() == 0
+
+
+def test_the_throttles_package_is_not_needed(world):
+    """MAVROS without mavros_msgs: voltage works, one warning for the throttle."""
+    probe = world.probe()
+    process = world.start('estimator', '--ros-args', '-p', 'msg_config:=mavros')
+    wait_until(lambda: probe.node.get_subscriptions_info_by_topic('/mavros/battery'))
+    assert process.err.count('mavros_msgs') and process.err.count('[WARN]') == 1
+    assert process.stop() == 0
+
+
+@pytest.mark.parametrize('name', ['estimator', 'adaptive_filter', 'replay'])
+def test_without_ros_one_line_says_so(tmp_path, name):
+    """An rclpy that cannot be imported stands for none."""
+    (tmp_path / 'rclpy.py').write_text("raise ImportError('No module named rclpy')\n")
+    path = os.pathsep.join([str(tmp_path), str(ROOT)])
+    done = subprocess.run(
+        [sys.executable, '-m', f'ou_monitor.nodes.{name}', 'x.mcap'], cwd=tmp_path, text=True,
+        capture_output=True, env={**os.environ, 'PYTHONPATH': path}, check=False)
+    assert done.returncode == 2
+    assert done.stderr.count('\n') == 1 and 'ROS 2 is not installed' in done.stderr

@@ -1,0 +1,143 @@
+"""Messages to samples: pairing, jumps, blocks, what is missing."""
+
+import math
+from types import SimpleNamespace
+
+from ou_monitor.messages.config import FieldSpec
+from ou_monitor.messages.extract import Extractor
+from ou_monitor.nodes.sample_stream import SampleStream
+import pytest
+
+
+class Sink:
+    """Stands where the monitor stands; notes what it gets."""
+
+    def __init__(self):
+        self.t, self.v, self.u, self.resets = [], [], [], []
+
+    def push(self, t, voltage, throttle):
+        """Note samples."""
+        self.t += t.tolist()
+        self.v += voltage.tolist()
+        self.u += throttle.tolist()
+
+    def reset(self, reason):
+        """Note a reset."""
+        self.resets.append(reason)
+
+
+def plain(value):
+    """Return a message without a stamp."""
+    return SimpleNamespace(data=value)
+
+
+def stamped(stamp, value):
+    """Return a message with a stamp."""
+    whole = math.floor(stamp)
+    time = SimpleNamespace(sec=whole, nanosec=round((stamp - whole) * 1e9))
+    return SimpleNamespace(data=value, stamp=time)
+
+
+def stream_of(voltage_stamp=None, throttle_stamp=None, **voltage):
+    """Return a stream of field `data` and its sink."""
+    sink = Sink()
+    stream = SampleStream(sink)
+    stream.open_voltage(Extractor(FieldSpec(
+        'voltage', 'x/msg/X', 'data', stamp_field=voltage_stamp, **voltage)))
+    stream.open_throttle(Extractor(FieldSpec(
+        'throttle', 'x/msg/X', 'data', stamp_field=throttle_stamp)))
+    return stream, sink
+
+
+def test_pairs_by_stamp_on_one_clock():
+    """The throttle that held at the voltage's stamp, though it came after it."""
+    stream, sink = stream_of('stamp', 'stamp')
+    stream.take_throttle(stamped(0.5, 0.1), None)
+    for k in range(4):
+        stream.take_voltage(stamped(1.0 + k, 5.0), None)
+    stream.take_throttle(stamped(2.5, 0.7), None)
+    stream.flush()
+    assert sink.u == [0.1, 0.1, 0.7, 0.7]
+
+
+def test_pairs_by_arrival_when_only_one_is_stamped():
+    """The source time of the throttle cannot be compared with a driver's stamp."""
+    stream, sink = stream_of('stamp', None)
+    stream.take_voltage(stamped(1.0, 5.0), None)
+    stream.take_throttle(plain(0.3), lambda: 1.0)
+    stream.take_voltage(stamped(2.0, 5.0), None)
+    stream.take_throttle(plain(0.4), lambda: 1.5)
+    stream.flush()
+    assert math.isnan(sink.u[0]) and sink.u[1] == 0.3
+
+
+def test_pairs_by_arrival_when_the_clocks_differ():
+    """Microseconds since boot beside the wall clock."""
+    stream, sink = stream_of('stamp', 'stamp')
+    stream.take_throttle(stamped(12.0, 0.2), None)
+    stream.take_voltage(stamped(1.7e9, 5.0), None)
+    stream.flush()
+    assert sink.u == [0.2]
+
+
+def test_missing_values_go_on_as_nan():
+    """So that the monitor counts them; the message is not a usable one."""
+    stream, sink = stream_of()
+    assert stream.take_voltage(plain(5.0), lambda: 1.0)
+    assert not stream.take_voltage(plain(math.nan), lambda: 2.0)
+    assert not stream.take_voltage(plain(math.inf), lambda: 3.0)
+    stream.flush()
+    assert sink.v[0] == 5.0 and all(map(math.isnan, sink.v[1:])) and len(sink.v) == 3
+
+
+def test_without_a_time_nothing_is_placed():
+    """Under use_sim_time before /clock came."""
+    stream, sink = stream_of()
+    assert not stream.take_voltage(plain(5.0), lambda: math.nan)
+    stream.flush()
+    assert sink.v == [] and stream.unplaced == 1
+
+
+def test_stamps_that_go_back_clear_the_window_once():
+    """What came before the step is handed over first, then cleared."""
+    stream, sink = stream_of('stamp')
+    for stamp in (10.0, 10.1, 10.05, 3.0, 3.1):
+        stream.take_voltage(stamped(stamp, 5.0), None)
+    stream.flush()
+    assert sink.t == [10.0, 10.1, 10.05, 3.0, 3.1]
+    assert len(sink.resets) == 1 and '7.1 s' in sink.resets[0]
+    stream.reset('twice')
+    stream.reset('the window is empty already')
+    assert sink.resets[1:] == ['twice']
+
+
+def test_blocks_are_spread_over_the_time_line():
+    """The stamp is that of the last sample."""
+    stream, sink = stream_of(sample_rate=100.0)
+    stream.take_voltage(plain([1.0, 2.0, math.nan, 4.0]), lambda: 10.0)
+    assert stream.take_voltage(plain([]), lambda: 10.0) is False
+    stream.flush()
+    assert sink.t == pytest.approx([9.97, 9.98, 9.99, 10.0])
+    assert sink.v[:2] == [1.0, 2.0] and math.isnan(sink.v[2]) and sink.v[3] == 4.0
+
+
+def test_a_block_of_nan_is_not_usable():
+    """Every sample is counted, none is a voltage."""
+    stream, sink = stream_of(sample_rate=100.0)
+    assert not stream.take_voltage(plain([math.nan, math.nan]), lambda: 10.0)
+    assert stream.take_voltage(plain([math.nan, 5.0]), lambda: 10.02)
+
+
+@pytest.mark.parametrize('stamps', [(None, None), ('stamp', None)])
+def test_a_lost_throttle_is_unknown(stamps):
+    """From then on, whether paired by stamp or by arrival; until it speaks again."""
+    stream, sink = stream_of(*stamps)
+    stream.take_throttle(plain(0.5), lambda: 0.0)
+    for k in range(3):
+        stream.take_voltage(stamped(1.0 + k, 5.0), lambda: 1.0 + k)
+    stream.lose_throttle()
+    stream.take_voltage(stamped(4.0, 5.0), lambda: 4.0)
+    stream.take_throttle(plain(0.6), lambda: 4.5)
+    stream.take_voltage(stamped(5.0, 5.0), lambda: 5.0)
+    stream.flush()
+    assert sink.u[:2] == [0.5, 0.5] and math.isnan(sink.u[3]) and sink.u[4] == 0.6

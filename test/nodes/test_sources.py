@@ -1,0 +1,110 @@
+"""Where voltage and throttle come from: msg_config, overrides, what is not installed."""
+
+from ou_monitor.errors import InputError
+from ou_monitor.nodes.message_types import message_class
+from ou_monitor.nodes.sources import find_source, SOURCE_PARAMETERS
+import pytest
+
+
+def values(**changed):
+    """Return the parameters, some changed (`__` stands for the dot)."""
+    found = {p.name: p.default for p in SOURCE_PARAMETERS}
+    for name, value in changed.items():
+        assert name.replace('__', '.') in found
+        found[name.replace('__', '.')] = value
+    return found
+
+
+def test_auto_chooses_by_type():
+    """Each generic type has its field; a foreign type has none."""
+    source = find_source('voltage', values())
+    assert source.spec is None and source.topic == 'voltage'
+    kinds = {'std_msgs/msg/Float32': 'data', 'std_msgs/msg/Float64': 'data',
+             'sensor_msgs/msg/BatteryState': 'voltage',
+             'std_msgs/msg/Float32MultiArray': 'data'}
+    for kind, field in kinds.items():
+        chosen = source.choose(['std_msgs/msg/String', kind])
+        assert (chosen.spec.type, chosen.spec.field) == (kind, field)
+        message, extractor = chosen.open()
+        assert message is message_class(kind) and extractor.spec is chosen.spec
+    assert source.choose(['std_msgs/msg/String']) is None
+
+
+@pytest.mark.parametrize('kind', ['std_msgs/msg/Float32', 'std_msgs/msg/Float64'])
+def test_auto_takes_any_scalar_throttle(kind):
+    """Without a msg_config that says so."""
+    assert find_source('throttle', values()).choose([kind]).spec.field == 'data'
+
+
+def test_a_named_config_says_all():
+    """Topic, type, field."""
+    source = find_source('voltage', values(msg_config='battery_state'))
+    assert (source.spec.type, source.spec.field, source.config) == (
+        'sensor_msgs/msg/BatteryState', 'voltage', 'battery_state')
+
+
+def test_overrides_change_single_entries():
+    """The rest stays as the msg_config says."""
+    source = find_source('voltage', values(
+        msg_config='adc_block', voltage__topic='/adc', adc__sample_rate=250.0))
+    assert (source.topic, source.spec.topic, source.spec.sample_rate, source.spec.field) == (
+        '/adc', '/adc', 250.0, 'data')
+
+
+def test_a_rate_does_not_make_a_block_of_a_scalar():
+    """In auto mode the rate belongs to blocks alone."""
+    source = find_source('voltage', values(adc__sample_rate=250.0))
+    assert source.choose(['std_msgs/msg/Float32']).spec.sample_rate is None
+    assert source.choose(['std_msgs/msg/Float32MultiArray']).spec.sample_rate == 250.0
+
+
+def test_any_installed_type_by_name_and_path():
+    """The header's stamp is used where the message has a header."""
+    source = find_source('voltage', values(
+        voltage__type='sensor_msgs/msg/Temperature', voltage__field='temperature'))
+    assert source.spec.stamp_field == 'header.stamp' and source.open()
+    source = find_source('voltage', values(
+        voltage__type='geometry_msgs/msg/Vector3', voltage__field='z', voltage__topic='/v'))
+    assert source.spec.stamp_field is None and source.topic == '/v'
+
+
+def test_a_config_without_throttle():
+    """ArduPilot's has none, unless the user names one."""
+    assert find_source('throttle', values(msg_config='ardupilot_dds')) is None
+    named = values(msg_config='ardupilot_dds', throttle__topic='/t',
+                   throttle__type='std_msgs/msg/Float32', throttle__field='data')
+    assert find_source('throttle', named).topic == '/t'
+
+
+@pytest.mark.parametrize('changed, words', [
+    ({'msg_config': 'std_float3'}, "did you mean 'std_float32'?"),
+    ({'msg_config': 'nowhere/x.yaml'}, 'nowhere/x.yaml'),
+    ({'voltage__type': 'geometry_msgs/msg/Vector3'}, 'give voltage.field'),
+    ({'voltage__type': 'px4_msgs/msg/X', 'voltage__field': 'v'}, 'ros-jazzy-px4-msgs'),
+])
+def test_refusals(changed, words):
+    """One line that says what to do."""
+    with pytest.raises(InputError) as caught:
+        find_source('voltage', values(**changed))
+    assert words in str(caught.value) and '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('name, words', [
+    ('Float32', "write 'package/msg/Type'"),
+    ('std_msgs/Float32', "write 'package/msg/Type'"),
+    ('os/msg/path; x', "write 'package/msg/Type'"),
+    ('std_msgs/msg/Float23', "did you mean 'Float32'?"),
+    ('px4_msgs/msg/BatteryStatus', "package 'px4_msgs', which is not installed"),
+])
+def test_types_that_cannot_be_had(name, words):
+    """Malformed, misspelt, not installed."""
+    with pytest.raises(InputError, match='.') as caught:
+        message_class(name)
+    assert words in str(caught.value)
+
+
+def test_a_wrong_field_is_told_before_any_message():
+    """Opening tries the path on an empty message."""
+    source = find_source('voltage', values(msg_config='std_float32', voltage__field='dat'))
+    with pytest.raises(InputError, match="did you mean 'data'?"):
+        source.open()

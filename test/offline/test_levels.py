@@ -1,0 +1,114 @@
+"""Load levels: found, given, split at pauses, settled."""
+
+import numpy as np
+import pytest
+
+from ou_monitor.offline.levels import find_levels, HALF_WIDTH, SETTLE
+
+RATE = 200.0
+
+
+def profile(*parts):
+    """Return stamps and throttle for (throttle, seconds) parts."""
+    throttle = np.concatenate([np.full(int(s * RATE), u) for u, s in parts])
+    return np.arange(throttle.size) / RATE, throttle
+
+
+def test_the_papers_levels_are_told_apart():
+    """0, 5, 10 and 40 % with the jitter of a stick are four levels."""
+    t, throttle = profile((0.0, 3), (0.05, 2), (0.10, 4), (0.40, 3), (0.05, 2))
+    jitter = np.random.default_rng(1).uniform(-0.005, 0.005, t.size)
+    levels = find_levels(t, throttle + jitter)
+    assert [round(level.throttle, 2) for level in levels] == [0.0, 0.05, 0.10, 0.40]
+    assert [len(level.segments) for level in levels] == [1, 2, 1, 1]
+
+
+def test_every_sample_of_a_level_is_at_its_throttle():
+    """Also in a profile that wanders, segments hold only their level and do not overlap."""
+    rng = np.random.default_rng(2)
+    t = np.arange(8000) / RATE
+    throttle = np.clip(0.3 + np.cumsum(rng.normal(0.0, 0.004, t.size)), 0.0, 1.0)
+    seen = np.zeros(t.size, dtype=int)
+    levels = find_levels(t, throttle)
+    assert levels
+    for level in levels:
+        for s in level.segments:
+            seen[s.start:s.stop] += 1
+            # The centre is where most time is; the name is the median, at
+            # most one half width away from it.
+            assert np.ptp(throttle[s.start:s.stop]) <= 2.0 * HALF_WIDTH + 1e-6
+    assert seen.max() == 1
+
+
+def test_settling_is_left_out_after_a_step_only():
+    """A step costs SETTLE seconds; jitter across the edge of a level costs nothing."""
+    t, throttle = profile((0.1, 2), (0.4, 2))
+    low, high = find_levels(t, throttle)
+    assert low.segments[0].start == 0
+    assert t[high.segments[0].start] == pytest.approx(2.0 + SETTLE, abs=1.5 / RATE)
+    t, throttle = profile((0.1, 2), (0.13, 0.05), (0.1, 2))
+    (level,) = find_levels(t, throttle, (0.1,))
+    assert level.settling == 0.0
+    assert sum(s.stop - s.start for s in level.segments) == int(4 * RATE)
+
+
+def test_a_pause_breaks_a_segment():
+    """Samples on both sides of a gap are not one stretch."""
+    t, throttle = profile((0.1, 4))
+    t[400:] += 1.0
+    (level,) = find_levels(t, throttle)
+    assert [(s.start, s.stop) for s in level.segments] == [(0, 400), (400, 800)]
+
+
+def test_given_levels_share_the_samples_between_them():
+    """Levels given closer than the half width split at the middle."""
+    t, throttle = profile((0.10, 2), (0.12, 2))
+    low, high = find_levels(t, throttle, (0.12, 0.10))
+    assert (low.throttle, high.throttle) == (0.10, 0.12)
+    assert low.segments[0].stop == high.segments[0].start == int(2 * RATE)
+
+
+def test_a_level_that_was_never_flown_is_empty():
+    """It stays in the table, without segments."""
+    t, throttle = profile((0.1, 2))
+    levels = find_levels(t, throttle, (0.1, 0.9))
+    assert levels[1].throttle == 0.9 and levels[1].segments == ()
+
+
+def test_without_throttle_there_is_one_level():
+    """It is NaN and holds everything."""
+    t, throttle = profile((0.1, 2))
+    (level,) = find_levels(t, np.full_like(throttle, np.nan))
+    assert np.isnan(level.throttle)
+    assert [(s.start, s.stop) for s in level.segments] == [(0, t.size)]
+
+
+def test_a_throttle_that_never_rests_is_one_level():
+    """A ramp through 4 % in less than MIN_TIME has no level; everything stays in one."""
+    t = np.arange(1000) / RATE
+    (level,) = find_levels(t, np.linspace(0.0, 1.0, t.size))
+    assert np.isnan(level.throttle)
+    assert [(s.start, s.stop) for s in level.segments] == [(0, t.size)]
+
+
+def test_unknown_throttle_belongs_to_no_level():
+    """Samples before the first throttle are left out."""
+    t, throttle = profile((0.1, 2))
+    throttle[:100] = np.nan
+    (level,) = find_levels(t, throttle)
+    # What came before the first is unknown, so it may have been a step.
+    assert t[level.segments[0].start] == pytest.approx(t[99] + SETTLE, abs=1.5 / RATE)
+
+
+@pytest.mark.parametrize('given, word', [((0.1, 1.2), '1.2'), ((0.1, 0.1), 'twice'),
+                                         ((float('nan'),), 'nan'), ((-0.1,), '-0.1')])
+def test_bad_levels_are_refused(given, word):
+    """The value is in the message."""
+    t, throttle = profile((0.1, 2))
+    with pytest.raises(ValueError, match=word):
+        find_levels(t, throttle, given)
+
+
+def test_no_samples_no_levels():
+    """An empty recording has none."""
+    assert find_levels(np.zeros(0), np.zeros(0)) == ()

@@ -1,0 +1,113 @@
+"""Segments of one level: pooled when they agree, doubted when they do not."""
+
+from dataclasses import replace
+import math
+
+from made_recordings import ALPHA, recording
+import numpy as np
+import pytest
+
+from ou_monitor.offline.pooling import fit_stretch, pool, standardised_increments
+from ou_monitor.online.estimator import SlidingEstimator
+from ou_monitor.records import Estimate, Status
+
+
+def one(alpha=63.0, se=0.1, duration=1.0, **changes):
+    """Return a usable estimate."""
+    values = {'alpha': alpha, 'sigma': 0.3, 'var_inf': 0.3 ** 2 / (2.0 * alpha),
+              'alpha_se': se, 'sigma_se': 0.05, 'var_inf_se': 0.1, 'u0': 5.0, 'u0_se': 0.01,
+              'status': Status.OK, 'n': 1000, 'duration': duration, 'rate': 1000.0}
+    return Estimate(**{**values, **changes})
+
+
+def test_a_stretch_gets_the_estimator_that_flies():
+    """All samples of the stretch enter, and nothing else."""
+    made = recording(1)
+    e = fit_stretch(made, 1000, 4000)
+    node = SlidingEstimator(window=10.0)
+    node.push(made.t[1000:4000], made.voltage[1000:4000], made.throttle[1000:4000])
+    assert e == node.estimate()
+    assert e.n == 3000
+
+
+def test_equal_segments_shrink_the_error_by_the_root_of_their_number():
+    """The mean of equal logs, with se over sqrt(4)."""
+    pooled, scatter = pool([one()] * 4)
+    assert scatter == 1.0
+    assert pooled.alpha == pytest.approx(63.0)
+    assert pooled.alpha_se == pytest.approx(0.05)
+    assert (pooled.n, pooled.duration) == (4000, 4.0)
+
+
+def test_weights_are_the_durations():
+    """Logs are averaged with weights 1 : 3."""
+    pooled, _ = pool([one(60.0), one(70.0, duration=3.0)])
+    assert math.log(pooled.alpha) == pytest.approx(0.25 * math.log(60) + 0.75 * math.log(70))
+
+
+def test_pooling_does_not_favour_what_came_out_high():
+    """
+    Forty 1 s segments give back alpha within 4 standard errors of the truth.
+
+    se(ln alpha) of 40 s is sqrt(2 / (63 * 40)) = 2.8 %.  Weights by each
+    segment's own standard error would add about se^2 = 3 % a segment, which
+    this alone cannot see; the weights are pinned by the test above.
+    """
+    made = recording(3, levels=((0.1, 0.3),), seconds=40.0)
+    pooled, scatter = pool([fit_stretch(made, k, k + 1000) for k in range(0, 40000, 1000)])
+    assert abs(math.log(pooled.alpha / ALPHA)) < 4.0 * math.sqrt(2.0 / (ALPHA * 40.0))
+    assert pooled.alpha_se == pytest.approx(math.sqrt(2.0 / (ALPHA * 40.0)), rel=0.25)
+    # sqrt(chi2 / 39): 1 +- 0.11.
+    assert scatter < 1.5
+
+
+def test_segments_that_differ_widen_the_interval():
+    """Two alphas 10 standard errors apart are not one process."""
+    pooled, scatter = pool([one(40.0, se=0.1), one(40.0 * math.exp(1.0), se=0.1)])
+    # chi2 = 2 (0.5 / 0.1)^2 with one degree of freedom; Var_inf differs alike.
+    assert scatter == pytest.approx(math.sqrt(50.0))
+    assert pooled.alpha_se == pytest.approx(scatter * 0.1 / math.sqrt(2.0))
+
+
+def test_most_segments_denying_relaxation_decide():
+    """One lucky segment in four does not speak for the level."""
+    denied = Estimate(status=Status.NO_RELAXATION, n=1000, duration=1.0, rate=1000.0)
+    pooled, _ = pool([one(), denied, denied, denied])
+    assert pooled.status is Status.NO_RELAXATION and math.isnan(pooled.alpha)
+
+
+def test_a_segment_that_knows_nothing_has_no_say():
+    """An alpha without information is left out, however long the segment."""
+    vague = one(alpha=5000.0, se=9.0, duration=1.0)
+    pooled, _ = pool([one(), one(), vague])
+    assert pooled.alpha == pytest.approx(63.0)
+    pooled, _ = pool([one(), vague, vague])
+    assert pooled.status is Status.NO_RELAXATION
+
+
+def test_one_segment_is_left_as_it_is():
+    """Nothing is pooled, nothing doubted."""
+    e = one(se=3.0)
+    assert pool([e]) == (e, 1.0)
+
+
+def test_nothing_to_pool_is_a_callers_bug():
+    """No estimates: ValueError."""
+    with pytest.raises(ValueError, match='no estimates'):
+        pool([])
+
+
+def test_increments_of_an_ou_have_unit_variance_at_any_spacing():
+    """
+    Standardised by the law at each step, irregular steps included.
+
+    The sample variance of n = 5000 has a standard error of sqrt(2/n) = 2 %.
+    """
+    made = recording(5, levels=((0.1, 0.3),), seconds=20.0)
+    keep = np.random.default_rng(6).uniform(size=made.n) < 0.25
+    thinned = replace(made, t=made.t[keep], voltage=made.voltage[keep],
+                      throttle=made.throttle[keep])
+    truth = one(alpha=ALPHA, var_inf=0.3 ** 2 / (2 * ALPHA), noise_std=0.0)
+    z = standardised_increments(thinned, 0, thinned.n, truth)
+    # Increments of an OU have correlations that sum to little: 4 * 2 % * 1.2.
+    assert np.mean(z ** 2) == pytest.approx(1.0, abs=0.1)

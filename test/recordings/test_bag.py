@@ -1,0 +1,271 @@
+"""Bags: written and read here, and by the independent rosbags library."""
+
+import shutil
+from types import SimpleNamespace
+
+from mcap.writer import CompressionType, IndexType, Writer
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.recordings import bag as bag_module
+from ou_monitor.recordings.bag import BagReader, BagWriter
+from ou_monitor.recordings.cdr import encode_scalars, FLOAT32
+from ou_monitor.recordings.schemas import SCHEMAS
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosReliability
+import yaml
+
+START = 1_704_067_200_000_000_000
+RAIL = 'string name\nfloat64[2] volts\nuint8 state\n'
+
+
+def rows(reader, topics=None):
+    """Return messages without their bytes' identity."""
+    return [(m.topic, m.type, m.log_time_ns, m.data) for m in reader.raw_messages(topics)]
+
+
+def write_two(path, n=2000):
+    """Write a fast and a slow topic; return what was written, in time order."""
+    expected = []
+    with BagWriter(path) as bag:
+        bag.add_topic('voltage', FLOAT32, reliability='best_effort')
+        bag.add_topic('/throttle', FLOAT32)
+        for k, data in enumerate(encode_scalars(FLOAT32, np.linspace(4.0, 5.0, n))):
+            t = START + k * 1_000_000
+            bag.write('/voltage', t, data)
+            expected.append(('/voltage', FLOAT32, t, data))
+            if k % 100 == 0:
+                # Written late: the order in the file is not that of time.
+                early = encode_scalars(FLOAT32, [k / n])[0]
+                bag.write('throttle', t - 500_000 + 1_000_000 * (k == 0), early)
+                expected.append(('/throttle', FLOAT32, t - 500_000 + 1_000_000 * (k == 0), early))
+    return sorted(expected, key=lambda row: row[2])
+
+
+@pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
+def test_round_trip(tmp_path, name):
+    """Every message comes back, in the order of log times, by topic if asked."""
+    expected = write_two(tmp_path / name)
+    reader = BagReader(tmp_path / name)
+    assert reader.topics == {'/voltage': FLOAT32, '/throttle': FLOAT32}
+    assert reader.info['/voltage'].count == 2000
+    assert reader.info['/throttle'].count == 20
+    assert (reader.info['/voltage'].reliability, reader.info['/throttle'].reliability) == (
+        'best_effort', 'reliable')
+    assert (reader.start_ns, reader.end_ns) == (expected[0][2], expected[-1][2])
+    assert (reader.message_count, reader.damage, reader.notes) == (2020, None, ())
+    assert rows(reader) == expected
+    # A second pass, one topic, and the scanning reader see the same.
+    throttle = [row for row in expected if row[0] == '/throttle']
+    assert rows(reader, ['/throttle']) == throttle
+    assert rows(BagReader(tmp_path / name, partial=True)) == expected
+
+
+def test_rosbags_reads_it(tmp_path):
+    """The independent library sees the same messages, types, times and QoS."""
+    expected = write_two(tmp_path / 'bag')
+    with AnyReader([tmp_path / 'bag']) as reader:
+        found = [(c.topic, c.msgtype, t, bytes(data)) for c, t, data in reader.messages()]
+        qos = {c.topic: c.ext.offered_qos_profiles[0].reliability for c in reader.connections}
+    assert sorted(found, key=lambda row: (row[2], row[0])) == sorted(
+        expected, key=lambda row: (row[2], row[0]))
+    assert qos == {'/voltage': QosReliability.BEST_EFFORT, '/throttle': QosReliability.RELIABLE}
+
+
+def test_metadata_is_version_9(tmp_path):
+    """The keys and kinds that rosbag2 of Jazzy asks for."""
+    write_two(tmp_path / 'bag')
+    with (tmp_path / 'bag/metadata.yaml').open() as file:
+        info = yaml.safe_load(file)['rosbag2_bagfile_information']
+    assert info['version'] == 9
+    assert (info['storage_identifier'], info['ros_distro']) == ('mcap', 'jazzy')
+    assert info['relative_file_paths'] == ['bag_0.mcap'] == [f['path'] for f in info['files']]
+    assert info['message_count'] == 2020 == info['files'][0]['message_count']
+    assert info['starting_time']['nanoseconds_since_epoch'] == START
+    assert info['duration']['nanoseconds'] == 1999 * 1_000_000
+    assert (info['compression_format'], info['compression_mode']) == ('', '')
+    assert info['custom_data'] is None
+    for entry in info['topics_with_message_count']:
+        topic = entry['topic_metadata']
+        assert topic['serialization_format'] == 'cdr'
+        assert isinstance(topic['offered_qos_profiles'], list)
+        assert topic['type_description_hash'].startswith('RIHS01_')
+
+
+def test_any_type_by_its_definition(tmp_path):
+    """A message given as fields is serialized; dict and object are the same."""
+    with BagWriter(tmp_path / 'bag.mcap') as bag:
+        bag.add_topic('rail', 'my_msgs/msg/Rail', schema=RAIL)
+        content = {'name': 'main', 'volts': [1.5, 2.5], 'state': 3}
+        bag.write('rail', 1, content)
+        bag.write('rail', 2, SimpleNamespace(**content))
+    first, second = BagReader(tmp_path / 'bag.mcap').decoded()
+    for found in (first, second):
+        assert found.message.name == 'main'
+        assert list(found.message.volts) == [1.5, 2.5]
+        assert found.message.state == 3
+    assert (first.topic, first.type, first.log_time_ns) == ('/rail', 'my_msgs/msg/Rail', 1)
+
+
+@pytest.mark.parametrize('options', [
+    {'use_chunking': False}, {'compression': CompressionType.NONE},
+    {'compression': CompressionType.LZ4}, {'index_types': IndexType.NONE},
+    {'use_statistics': False}, {'chunk_size': 100}, {'enable_crcs': False},
+    {'use_chunking': False, 'use_statistics': False, 'index_types': IndexType.NONE,
+     'use_summary_offsets': False, 'repeat_channels': False, 'repeat_schemas': False}])
+def test_every_kind_of_mcap(tmp_path, options):
+    """Chunked or not, indexed or not, in any compression, in any order of time."""
+    path = tmp_path / 'other.mcap'
+    times = [int(t) for t in np.random.default_rng(1).permutation(500)]
+    with path.open('wb') as file:
+        writer = Writer(file, **{'chunk_size': 2000, **options})
+        writer.start(profile='ros2', library='test')
+        schema = writer.register_schema(FLOAT32, 'ros2msg', SCHEMAS[FLOAT32].encode())
+        channel = writer.register_channel('/u', 'cdr', schema)
+        for t in times:
+            writer.add_message(channel, t, encode_scalars(FLOAT32, [t])[0], t)
+        writer.finish()
+    reader = BagReader(path)
+    found = [(m.log_time_ns, m.message.data) for m in reader.decoded()]
+    assert found == [(t, float(t)) for t in range(500)]
+    assert (reader.start_ns, reader.end_ns, reader.info['/u'].count) == (0, 499, 500)
+
+
+def test_memory_holds_overlapping_chunks_only(tmp_path, monkeypatch):
+    """A long bag is never in memory as a whole: chunks are read when they are due."""
+    write_two(tmp_path / 'bag.mcap', n=30_000)
+    reader = BagReader(tmp_path / 'bag.mcap')
+    file = reader._files[0]
+    assert len(file.spans) > 5
+    read = []
+    original = file.read
+    monkeypatch.setattr(file, 'read', lambda span, wanted: read.append(span) or original(
+        span, wanted))
+    messages = reader.raw_messages()
+    for _ in range(100):
+        next(messages)
+    assert len(read) <= 2
+
+
+def test_several_files_are_one_bag(tmp_path):
+    """A split rosbag2 is played through; its files may overlap in time."""
+    folder = tmp_path / 'bag'
+    write_two(folder)
+    with BagWriter(tmp_path / 'more.mcap') as bag:
+        bag.add_topic('voltage', FLOAT32)
+        for k in range(10):
+            bag.write('voltage', START + 1_990_000_000 + 2_000_000 * k,
+                      encode_scalars(FLOAT32, [k])[0])
+    shutil.move(tmp_path / 'more.mcap', folder / 'bag_1.mcap')
+    text = (folder / 'metadata.yaml').read_text()
+    (folder / 'metadata.yaml').write_text(
+        text.replace('  - bag_0.mcap\n', '  - bag_0.mcap\n  - bag_1.mcap\n'))
+    reader = BagReader(folder)
+    assert reader.info['/voltage'].count == 2010
+    times = [m.log_time_ns for m in reader.raw_messages()]
+    assert len(times) == 2030 and times == sorted(times)
+    assert reader.end_ns == START + 2_008_000_000
+
+
+def test_qos_of_older_bags(tmp_path):
+    """Versions up to 8 wrote QoS as text with numbers."""
+    folder = tmp_path / 'bag'
+    write_two(folder)
+    info = yaml.safe_load((folder / 'metadata.yaml').read_text())
+    for entry in info['rosbag2_bagfile_information']['topics_with_message_count']:
+        entry['topic_metadata']['offered_qos_profiles'] = (
+            '- history: 1\n  depth: 7\n  reliability: 2\n  durability: 1\n')
+    (folder / 'metadata.yaml').write_text(yaml.safe_dump(info))
+    found = BagReader(folder).info['/throttle']
+    assert (found.reliability, found.durability, found.depth) == (
+        'best_effort', 'transient_local', 7)
+
+
+def other_encoding(path, with_ros2):
+    """Write a JSON topic, and a ROS 2 one if asked."""
+    with path.open('wb') as file:
+        writer = Writer(file)
+        writer.start(profile='', library='test')
+        schema = writer.register_schema('Thing', 'jsonschema', b'{}')
+        writer.add_message(writer.register_channel('/json', 'json', schema), 1, b'{}', 1)
+        if with_ros2:
+            schema = writer.register_schema(FLOAT32, 'ros2msg', SCHEMAS[FLOAT32].encode())
+            writer.add_message(writer.register_channel('/u', 'cdr', schema), 2,
+                               encode_scalars(FLOAT32, [1.0])[0], 2)
+        writer.finish()
+
+
+def test_topics_that_are_not_ros2(tmp_path):
+    """They are left out with a note; a bag of nothing else is refused."""
+    other_encoding(tmp_path / 'mixed.mcap', True)
+    reader = BagReader(tmp_path / 'mixed.mcap')
+    assert list(reader.topics) == ['/u']
+    assert [m.topic for m in reader.raw_messages()] == ['/u']
+    assert "'/json'" in reader.notes[0] and 'not ROS 2' in reader.notes[0]
+    other_encoding(tmp_path / 'json.mcap', False)
+    with pytest.raises(InputError, match="'/json' was left out.*not ROS 2"):
+        BagReader(tmp_path / 'json.mcap')
+
+
+def test_the_writer_refuses(tmp_path):
+    """What exists is not touched; what cannot be written is said in one line."""
+    existing = tmp_path / 'there.mcap'
+    existing.write_text('mine')
+    with pytest.raises(InputError, match='exists already'):
+        BagWriter(existing)
+    assert existing.read_text() == 'mine'
+    with pytest.raises(InputError, match='exists already'):
+        BagWriter(tmp_path)
+    with pytest.raises(InputError, match='no folder'):
+        BagWriter(tmp_path / 'no' / 'bag.mcap')
+    # Nobody, not even root, may make files there.
+    for name in ('bag', 'bag.mcap'):
+        with pytest.raises(InputError, match='cannot write /sys/'):
+            BagWriter(f'/sys/{name}')
+
+
+@pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
+def test_a_failed_write_leaves_nothing(tmp_path, name):
+    """Half a bag would be taken for a whole one by the next reader."""
+    with pytest.raises(RuntimeError, match='power'):
+        with BagWriter(tmp_path / name) as bag:
+            bag.add_topic('u', FLOAT32)
+            bag.write('u', 1, encode_scalars(FLOAT32, [1.0])[0])
+            raise RuntimeError('power cut')
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_one_line(tmp_path, monkeypatch):
+    """An error of the disk at the end removes the bag and names it."""
+    def full(*_):
+        raise OSError(28, 'No space left on device')
+    monkeypatch.setattr(bag_module.Writer, 'finish', full)
+    with pytest.raises(InputError, match='bag.mcap: No space left'):
+        with BagWriter(tmp_path / 'bag.mcap') as bag:
+            bag.add_topic('u', FLOAT32)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_writers_caller_errs(tmp_path):
+    """Bugs of the caller are not the user's."""
+    with BagWriter(tmp_path / 'bag.mcap') as bag:
+        bag.add_topic('u', FLOAT32)
+        with pytest.raises(ValueError, match='added before'):
+            bag.add_topic('/u', FLOAT32)
+        with pytest.raises(ValueError, match='schema'):
+            bag.add_topic('v', 'my_msgs/msg/Rail')
+        with pytest.raises(ValueError, match='not added'):
+            bag.write('w', 1, b'')
+        with pytest.raises(ValueError, match='negative'):
+            bag.write('u', -1, b'')
+        bag.write('u', 1, encode_scalars(FLOAT32, [1.0])[0])
+    assert BagReader(tmp_path / 'bag.mcap').message_count == 1
+
+
+def test_a_stream_of_messages_that_do_not_fit(tmp_path):
+    """Bytes that are no message of their type are one line."""
+    with BagWriter(tmp_path / 'bag.mcap') as bag:
+        bag.add_topic('u', FLOAT32)
+        bag.write('u', 1, b'\x00\x01\x00\x00\x01')
+    with pytest.raises(InputError, match='std_msgs/msg/Float32 cannot be decoded'):
+        list(BagReader(tmp_path / 'bag.mcap').decoded())

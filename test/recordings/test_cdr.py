@@ -1,0 +1,117 @@
+"""Bulk CDR against two independent decoders."""
+
+from mcap.records import Schema
+from mcap_ros2.decoder import DecoderFactory
+import numpy as np
+from ou_monitor.recordings import cdr
+from ou_monitor.recordings.schemas import SCHEMAS, TYPE_HASHES
+import pytest
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+STAMPS = np.array([1_704_067_200_123_456_789, 1, 0], dtype=np.int64)
+VOLTS = [5.0, 4.875, -0.5]
+
+
+def mcap_decode(kind, data):
+    """Return the message as the MCAP library decodes it with our schema."""
+    schema = Schema(id=1, name=kind, encoding='ros2msg', data=SCHEMAS[kind].encode())
+    return DecoderFactory().decoder_for('cdr', schema)(data)
+
+
+@pytest.mark.parametrize('kind', sorted(SCHEMAS))
+def test_schemas_are_those_of_jazzy(kind):
+    """The definition hashes to what the independent library computes from its own."""
+    mine = get_typestore(Stores.EMPTY)
+    mine.register(get_types_from_msg(SCHEMAS[kind], kind))
+    assert mine.hash_rihs01(kind) == STORE.hash_rihs01(kind) == TYPE_HASHES[kind]
+
+
+@pytest.mark.parametrize('kind', [cdr.FLOAT32, cdr.FLOAT64])
+def test_scalars(kind):
+    """Bytes are those of the independent encoder, and come back."""
+    messages = cdr.encode_scalars(kind, VOLTS)
+    for data, volts in zip(messages, VOLTS, strict=True):
+        theirs = STORE.deserialize_cdr(data, kind)
+        assert theirs.data == volts
+        assert bytes(STORE.serialize_cdr(theirs, kind)) == data
+        assert mcap_decode(kind, data).data == volts
+    stamps, values = cdr.decode_scalars(kind, 'data', messages)
+    assert stamps is None
+    assert values.tolist() == VOLTS
+
+
+def test_battery():
+    """Every field: stamp, voltage, and all the rest not measured."""
+    messages = cdr.encode_battery(STAMPS, VOLTS)
+    for data, ns, volts in zip(messages, STAMPS.tolist(), VOLTS, strict=True):
+        theirs = STORE.deserialize_cdr(data, cdr.BATTERY_STATE)
+        assert bytes(STORE.serialize_cdr(theirs, cdr.BATTERY_STATE)) == data
+        stamp = theirs.header.stamp
+        assert stamp.sec * 1_000_000_000 + stamp.nanosec == ns
+        assert (theirs.voltage, theirs.present, theirs.location) == (volts, True, '')
+        assert (theirs.power_supply_status, theirs.serial_number) == (0, '')
+        for name in ('current', 'charge', 'capacity', 'design_capacity', 'percentage',
+                     'temperature'):
+            assert np.isnan(getattr(theirs, name))
+        assert mcap_decode(cdr.BATTERY_STATE, data).voltage == volts
+    stamps, values = cdr.decode_scalars(cdr.BATTERY_STATE, 'voltage', messages)
+    assert stamps.tolist() == STAMPS.tolist()
+    assert values.tolist() == VOLTS
+
+
+@pytest.mark.parametrize('frame', ['', 'b', 'bat', 'base', 'base_link', 'a/long/frame_id'])
+def test_the_voltage_is_found_behind_any_frame_id(frame):
+    """Text of every length modulo 4 moves it."""
+    message = STORE.deserialize_cdr(
+        cdr.encode_battery(STAMPS[:1], [4.5])[0], cdr.BATTERY_STATE)
+    message.header.frame_id = frame
+    message.location = 'belly'
+    data = bytes(STORE.serialize_cdr(message, cdr.BATTERY_STATE))
+    stamps, values = cdr.decode_scalars(cdr.BATTERY_STATE, 'voltage', [data, data])
+    assert values.tolist() == [4.5, 4.5]
+    assert stamps.tolist() == [int(STAMPS[0])] * 2
+
+
+@pytest.mark.parametrize('n', [0, 1, 100])
+def test_block(n):
+    """Samples and layout as the independent decoder sees them."""
+    samples = np.linspace(4.0, 5.0, n).astype(np.float32)
+    data = cdr.encode_block(samples)
+    theirs = STORE.deserialize_cdr(data, cdr.FLOAT32_ARRAY)
+    assert bytes(STORE.serialize_cdr(theirs, cdr.FLOAT32_ARRAY)) == data
+    np.testing.assert_array_equal(theirs.data, samples)
+    assert [(d.label, d.size) for d in theirs.layout.dim] == [('samples', n)]
+    np.testing.assert_array_equal(cdr.decode_block(data), samples.astype(np.float64))
+
+
+@pytest.mark.parametrize('labels', [[], ['a'], ['rows', 'columns'], ['x' * 7, 'y' * 8]])
+def test_block_with_any_layout(labels):
+    """Dimensions are skipped, whatever they are called."""
+    message = STORE.deserialize_cdr(cdr.encode_block([1.5, 2.5]), cdr.FLOAT32_ARRAY)
+    dim = message.layout.dim[0]
+    message.layout.dim = [type(dim)(label, 2, 2) for label in labels]
+    data = bytes(STORE.serialize_cdr(message, cdr.FLOAT32_ARRAY))
+    assert cdr.decode_block(data).tolist() == [1.5, 2.5]
+
+
+def test_where_the_shortcut_does_not_apply():
+    """Other types and fields, big endian, unequal or short messages go the general way."""
+    good = cdr.encode_scalars(cdr.FLOAT32, [1.0])[0]
+    big = b'\x00\x00' + good[2:]
+    battery = cdr.encode_battery(STAMPS[:1], [1.0])[0]
+    assert cdr.decode_scalars('my_msgs/msg/Rail', 'data', [good]) is None
+    assert cdr.decode_scalars(cdr.BATTERY_STATE, 'percentage', [battery]) is None
+    assert cdr.decode_scalars(cdr.FLOAT32, 'data', []) is None
+    assert cdr.decode_scalars(cdr.FLOAT32, 'data', [good, big]) is None
+    assert cdr.decode_scalars(cdr.FLOAT32, 'data', [good, good + b'\0']) is None
+    assert cdr.decode_scalars(cdr.FLOAT64, 'data', [good]) is None
+    assert cdr.decode_scalars(cdr.BATTERY_STATE, 'voltage', [battery[:16]]) is None
+    assert cdr.decode_scalars(cdr.BATTERY_STATE, 'voltage', [battery[:22]]) is None
+    assert cdr.decode_block(big) is None
+
+
+@pytest.mark.parametrize('cut', range(0, 44, 3))
+def test_a_block_that_is_cut_off(cut):
+    """No sample is made up."""
+    assert cdr.decode_block(cdr.encode_block([1.0, 2.0])[:cut]) is None

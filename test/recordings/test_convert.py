@@ -1,0 +1,118 @@
+"""`ou-monitor convert`: a CSV becomes a bag."""
+
+import csv
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+from ou_monitor.cli.main import main
+from ou_monitor.recordings.read import read_recording
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import get_typestore, Stores
+
+GOOD = 'time_s,voltage_v,throttle\n0.5,5.0,0.1\n0.6,5.1,0.1\n0.6,5.2,0.2\n0.7,5.3,0.3\n'
+
+
+@pytest.fixture
+def log(tmp_path):
+    """Return a small CSV."""
+    path = tmp_path / 'log.csv'
+    path.write_text(GOOD)
+    return path
+
+
+@pytest.mark.parametrize('name', ['out', 'out.mcap'])
+@pytest.mark.parametrize('kind', ['battery_state', 'float32', 'float64'])
+def test_convert(log, tmp_path, capsys, name, kind):
+    """The bag reads back, and what was mended is said."""
+    out = tmp_path / name
+    assert main(['convert', str(log), str(out), '--type', kind]) == 0
+    text = capsys.readouterr().out
+    assert '3 samples' in text and 'note: 1 sample dropped' in text
+    back = read_recording(out)
+    np.testing.assert_allclose(back.t, [0.5, 0.6, 0.7], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(back.voltage, [5.0, 5.1, 5.3], rtol=1e-7)
+    np.testing.assert_allclose(back.throttle, [0.1, 0.1, 0.3], rtol=1e-7)
+
+
+def test_json(log, tmp_path, capsys):
+    """To standard output, and nothing else there; to a file."""
+    assert main(['convert', str(log), str(tmp_path / 'a'), '--json', '-']) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content['n'] == 3
+    assert content['topics'] == {'/voltage': 'sensor_msgs/msg/BatteryState',
+                                 '/throttle': 'std_msgs/msg/Float32'}
+    assert content['duration_s'] == pytest.approx(0.2)
+    assert len(content['notes']) == 1
+    target = tmp_path / 'b.json'
+    assert main(['convert', str(log), str(tmp_path / 'b'), '--json', str(target)]) == 0
+    assert json.loads(target.read_text())['out'] == str(tmp_path / 'b')
+
+
+@pytest.mark.parametrize('log_text, arguments, words', [
+    (None, ['no.csv', 'out'], ["no log 'no.csv'"]),
+    (GOOD, ['log.csv', 'log.csv'], ['.mcap', 'folder']),
+    (GOOD, ['log.csv', 'there'], ['exists already']),
+    (GOOD, ['log.csv', 'no/out'], ['no folder']),
+    (GOOD, ['log.csv', '/sys/out.mcap'], ['cannot write']),
+    (GOOD, ['log.csv', 'out', '--json', 'no/x.json'], ['no/x.json']),
+    (GOOD, ['log.csv', 'out', '--type', 'adc_block'], ['steady 10000 Hz']),
+    (GOOD, ['log.csv', 'out', '--type', 'adc'], ['adc']),
+    ('time,voltage_v\n0,5\n', ['log.csv', 'out'], ["'time_s'"]),
+    ('', ['log.csv', 'out'], ['empty']),
+    ('', ['log.ulg', 'out'], ['.csv', 'formats read today']),
+    ('', ['log', 'out'], ['.csv', 'formats read today']),
+])
+def test_bad_input(tmp_path, monkeypatch, capsys, log_text, arguments, words):
+    """Exit status 2, one line on standard error, no bag."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'there').mkdir()
+    if log_text is not None:
+        (tmp_path / arguments[0]).write_text(log_text)
+    try:
+        status = main(['convert', *arguments])
+    except SystemExit as end:
+        status = end.code
+    captured = capsys.readouterr()
+    assert status == 2
+    assert captured.out == ''
+    assert captured.err.count('\n') == 1
+    for word in words:
+        assert word in captured.err
+    assert not (tmp_path / 'out').exists()
+
+
+@pytest.fixture
+def real():
+    """Return a real flight; its folder is not part of the project."""
+    folder = os.environ.get('OU_MONITOR_REALDATA')
+    if folder is None:
+        pytest.skip('OU_MONITOR_REALDATA is not set: recordings of others are not shipped')
+    return Path(folder) / 'bf_gecko_a.csv'
+
+
+def test_a_real_flight(real, tmp_path):
+    """Every row of a real log is a message for the independent library."""
+    with real.open(newline='') as file:
+        table = [(float(r['time_s']), float(r['voltage_v']), float(r['throttle']))
+                 for r in csv.DictReader(file)]
+    assert main(['convert', str(real), str(tmp_path / 'bag')]) == 0
+    found, throttle, held = [], float('nan'), []
+    with AnyReader([tmp_path / 'bag'],
+                   default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        for connection, t, data in reader.messages():
+            message = reader.deserialize(data, connection.msgtype)
+            if connection.topic == '/throttle':
+                throttle = message.data
+            else:
+                stamp = message.header.stamp
+                assert stamp.sec * 1_000_000_000 + stamp.nanosec == t
+                found.append((t, message.voltage))
+                held.append(throttle)
+    assert [t for t, _ in found] == [round(row[0] * 1e9) for row in table]
+    np.testing.assert_array_equal(
+        [v for _, v in found], np.array([row[1] for row in table], dtype=np.float32))
+    # rosbags gives messages of one instant in the order of the file: throttle first.
+    np.testing.assert_array_equal(held, np.array([row[2] for row in table], dtype=np.float32))

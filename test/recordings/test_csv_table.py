@@ -1,0 +1,97 @@
+"""CSV recordings, good and bad."""
+
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.csv_table import read_csv
+from ou_monitor.recordings.read import read_recording
+import pytest
+
+
+def written(tmp_path, text, encoding='utf-8'):
+    """Write a CSV."""
+    path = tmp_path / 'log.csv'
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+@pytest.mark.parametrize('text', [
+    'time_s,voltage_v,throttle\n0,5.0,0.1\n1,5.5,0.2\n',
+    'time_s;voltage_v;throttle\r\n0;5.0;0.1\r\n1;5.5;0.2\r\n',
+    '\ufeff# made by hand\n\nnote, throttle ,voltage_v, time_s\n'
+    'a,0.1,5.0,0\n\n# more\n"b, ""c""",0.2,5.5,1\n',
+    'time_s,voltage_v,throttle,note\n0,5.0,0.1,"two\nlines"\n1,5.5,0.2,x\n',
+])
+def test_good_ones(tmp_path, text):
+    """Delimiters, order, extra columns, comments, blank lines and quotes."""
+    t, voltage, throttle = read_csv(written(tmp_path, text))
+    assert t.tolist() == [0.0, 1.0]
+    assert voltage.tolist() == [5.0, 5.5]
+    assert throttle.tolist() == [0.1, 0.2]
+    assert t.dtype == voltage.dtype == throttle.dtype == np.float64
+
+
+def test_without_throttle(tmp_path):
+    """Unknown, not zero."""
+    recording = read_recording(written(tmp_path, 'time_s,voltage_v\n0,5\n1,5.5\n'))
+    assert not recording.has_throttle
+    assert recording.n == 2
+
+
+@pytest.mark.parametrize('text, words', [
+    ('', ['empty', 'time_s,voltage_v']),
+    ('# only\n\n', ['empty']),
+    ('time,voltage_v\n0,5\n', [':1:', "'time_s'", "did you mean 'time'"]),
+    ('time_s,volt_v\n0,5\n', [':1:', "'voltage_v'", "did you mean 'volt_v'"]),
+    ('# x\n0.0,5.0\n0.1,5.1\n', [':2:', 'header']),
+    ('time_s,voltage_v,voltage_v\n0,5,5\n', [':1:', "'voltage_v'", 'twice']),
+    ('time_s,voltage_v\n0,5\n\n# x\n1,5.x\n', [':5:', "'voltage_v'", "'5.x'"]),
+    ('time_s,voltage_v\n0,5\n1\n', [':3:', 'ends before', "'voltage_v'"]),
+    ('time_s,voltage_v\n', ['no usable sample']),
+    ('time_s,voltage_v\n0,nan\nnan,5\n', ['no usable sample', '2 samples', 'finite']),
+])
+def test_bad_ones(tmp_path, text, words):
+    """One line with the place."""
+    path = written(tmp_path, text)
+    with pytest.raises(InputError) as caught:
+        read_recording(path)
+    found = str(caught.value)
+    assert '\n' not in found and 'log.csv' in found
+    for word in words:
+        assert word in found
+
+
+def test_not_text(tmp_path):
+    """A binary file by the name of a CSV."""
+    path = tmp_path / 'log.csv'
+    path.write_bytes(bytes(range(256)))
+    with pytest.raises(InputError, match='not text'):
+        read_recording(path)
+    with pytest.raises(InputError, match='cannot read'):
+        read_recording(tmp_path / 'no.csv')
+
+
+def test_what_is_mended(tmp_path):
+    """Not finite: dropped. Unsorted: sorted. Repeated: the first kept. Each is counted."""
+    text = ('time_s,voltage_v,throttle\n0,5.0,0.0\n2,5.2,\n1,5.1,inf\n1,9.9,0.5\n'
+            '3,NaN,0.5\n4,inf,0.5\n5,,0.5\ninf,5,0.5\n6,5.6,0.6\n')
+    recording = read_recording(written(tmp_path, text))
+    assert recording.t.tolist() == [0.0, 1.0, 2.0, 6.0]
+    assert recording.voltage.tolist() == [5.0, 5.1, 5.2, 5.6]
+    np.testing.assert_array_equal(recording.throttle, [0.0, np.nan, np.nan, 0.6])
+    assert len(recording.notes) == 3
+    assert recording.notes[0].startswith('4 samples dropped: not a finite')
+    assert recording.notes[1].startswith('1 sample came before')
+    assert recording.notes[2].startswith('1 sample dropped: the stamp was there')
+
+
+def test_one_sample(tmp_path):
+    """It is a recording; what can be said about it is not decided here."""
+    recording = read_recording(written(tmp_path, 'time_s,voltage_v\n3,5\n'))
+    assert (recording.n, recording.duration) == (1, 0.0)
+
+
+def test_options_of_bags(tmp_path):
+    """A CSV has no topics."""
+    path = written(tmp_path, 'time_s,voltage_v\n3,5\n')
+    with pytest.raises(InputError, match='--msg-config is for bags'):
+        read_recording(path, msg_config='px4')

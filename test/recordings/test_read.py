@@ -1,0 +1,281 @@
+"""Bags -> Recording: which topics, which stamps, what was mended."""
+
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.bag import BagWriter
+from ou_monitor.recordings.cdr import (
+    BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, FLOAT64)
+from ou_monitor.recordings.read import read_recording
+import pytest
+from rosbags.typesys import get_typestore, Stores
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+MS = 1_000_000
+STRING = 'std_msgs/msg/String'
+PX4_BATTERY, PX4_STICK = 'px4_msgs/msg/BatteryStatus', 'px4_msgs/msg/ManualControlSetpoint'
+TEXT = {
+    STRING: 'string data\n',
+    PX4_BATTERY: 'uint64 timestamp\nbool connected\nfloat32 voltage_v\n',
+    PX4_STICK: 'uint64 timestamp\nfloat32 roll\nfloat32 throttle\n',
+}
+
+
+def make(path, *topics):
+    """Write (name, type, [(t_ns, message), ...]) each."""
+    with BagWriter(path) as bag:
+        for name, kind, messages in topics:
+            bag.add_topic(name, kind, schema=TEXT.get(kind))
+            for t, message in messages:
+                bag.write(name, t, message)
+    return path
+
+
+def scalars(values, kind=FLOAT32, start=MS, step=MS):
+    """Return timed messages of a standard scalar."""
+    return [(start + k * step, data) for k, data in enumerate(encode_scalars(kind, values))]
+
+
+def battery(stamps, values, late=5 * MS):
+    """Return BatteryStates logged later than their stamps."""
+    stamps = np.array(stamps, dtype=np.int64)
+    return [(int(t) + late, data) for t, data in zip(stamps, encode_battery(stamps, values))]
+
+
+def big_endian(values):
+    """Return Float32 messages as a big-endian middleware writes them."""
+    return [(MS * (k + 1), b'\x00\x00\x00\x00' + np.array([v], '>f4').tobytes())
+            for k, v in enumerate(values)]
+
+
+def complaint(path, **options):
+    """Return the one line with which a bag is refused."""
+    with pytest.raises(InputError) as caught:
+        read_recording(path, **options)
+    assert '\n' not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize('kind, config', [(FLOAT32, 'std_float32'), (FLOAT64, 'std_float64')])
+def test_scalars(tmp_path, kind, config):
+    """The log time is the stamp; the throttle is the last at or before it."""
+    path = make(tmp_path / 'bag.mcap', ('voltage', kind, scalars([5.0, 5.5, 4.5], kind)),
+                ('throttle', FLOAT32, scalars([0.25, 0.75], start=2 * MS)))
+    recording = read_recording(path)
+    np.testing.assert_allclose(recording.t, [1e-3, 2e-3, 3e-3], rtol=0, atol=1e-12)
+    assert recording.voltage.tolist() == [5.0, 5.5, 4.5]
+    np.testing.assert_array_equal(recording.throttle, [np.nan, 0.25, 0.75])
+    assert recording.source['msg_config'] == config
+    assert recording.source['voltage_topic'] == '/voltage'
+    assert recording.source['throttle_topic'] == '/throttle'
+    assert recording.notes == ()
+
+
+def test_header_stamps(tmp_path):
+    """The header's stamp is the stamp; a zero one is none, and the log time counts."""
+    path = make(tmp_path / 'bag.mcap', (
+        'voltage', BATTERY_STATE, battery([100 * MS, 101 * MS, 0], [5.0, 5.1, 5.2], 200 * MS)))
+    recording = read_recording(path)
+    np.testing.assert_allclose(recording.t, [0.1, 0.101, 0.2], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(recording.voltage, [5.0, 5.1, 5.2], rtol=1e-7)
+    assert 'throttle is unknown' in recording.notes[0]
+
+
+@pytest.mark.parametrize('frame', ['x', 'base_link'])
+def test_header_stamps_the_general_way(tmp_path, frame):
+    """Messages of unequal length are decoded one by one, with the same outcome."""
+    messages = []
+    for t, data in battery([100 * MS, 101 * MS], [5.0, 5.25]):
+        message = STORE.deserialize_cdr(data, BATTERY_STATE)
+        message.header.frame_id = frame * (1 + t % 2)
+        message.cell_voltage = np.array([4.0] * len(messages), dtype=np.float32)
+        messages.append((t, bytes(STORE.serialize_cdr(message, BATTERY_STATE))))
+    recording = read_recording(make(tmp_path / 'b.mcap', ('voltage', BATTERY_STATE, messages)))
+    np.testing.assert_allclose(recording.t, [0.1, 0.101], rtol=0, atol=1e-12)
+    assert recording.voltage.tolist() == [5.0, 5.25]
+
+
+def test_big_endian(tmp_path):
+    """What the shortcut does not know, the general decoder does."""
+    path = make(tmp_path / 'bag.mcap', ('voltage', FLOAT32, big_endian([5.0, 5.5])))
+    assert read_recording(path).voltage.tolist() == [5.0, 5.5]
+
+
+def test_blocks(tmp_path):
+    """Samples are spread over the time before the stamp of their block; NaN keeps its place."""
+    blocks = [[5.0] * 100, [5.0] * 99 + [np.nan], [4.0] * 100]
+    path = make(tmp_path / 'bag.mcap', ('voltage', FLOAT32_ARRAY, [
+        (10 * MS * (k + 1), encode_block(block)) for k, block in enumerate(blocks)]))
+    recording = read_recording(path)
+    assert recording.n == 299
+    expected = np.delete(np.arange(1, 301) * 1e-4, 199)
+    np.testing.assert_allclose(recording.t, expected, rtol=0, atol=1e-9)
+    assert recording.voltage[-100:].tolist() == [4.0] * 100
+    assert any(note.startswith('1 sample dropped') for note in recording.notes)
+
+
+def test_a_gap_between_blocks_is_noted(tmp_path):
+    """It stays in the stamps."""
+    path = make(tmp_path / 'bag.mcap', ('voltage', FLOAT32_ARRAY, [
+        (t * MS, encode_block([5.0] * 100)) for t in (10, 20, 1020)]))
+    recording = read_recording(path)
+    assert any('1 gap' in note for note in recording.notes)
+    assert np.diff(recording.t).max() == pytest.approx(0.9901, abs=1e-6)
+
+
+def px4(tmp_path):
+    """Write a bag as PX4 gives it: stamps in microseconds, the stick -1..1."""
+    return make(
+        tmp_path / 'px4.mcap',
+        ('/fmu/out/battery_status', PX4_BATTERY, [
+            (k * MS, {'timestamp': 1000 * k, 'connected': True, 'voltage_v': 16.0 + k})
+            for k in range(1, 4)]),
+        ('/fmu/out/manual_control_setpoint', PX4_STICK, [
+            (k * MS, {'timestamp': 1000 * k, 'roll': 0.3, 'throttle': k - 2.0})
+            for k in range(1, 4)]))
+
+
+def test_px4(tmp_path):
+    """A type nobody has installed here is read by the definition in the bag."""
+    recording = read_recording(px4(tmp_path))
+    assert recording.source['msg_config'] == 'px4'
+    np.testing.assert_allclose(recording.t, [1e-3, 2e-3, 3e-3], rtol=0, atol=1e-12)
+    assert recording.voltage.tolist() == [17.0, 18.0, 19.0]
+    assert recording.throttle.tolist() == [0.0, 0.5, 1.0]
+
+
+def test_in_a_namespace(tmp_path):
+    """A topic that ends with the config's is meant; the throttle is the one beside it."""
+    path = make(tmp_path / 'bag.mcap', ('/uav1/voltage', FLOAT32, scalars([5.0, 5.1])),
+                ('/uav1/throttle', FLOAT32, scalars([0.5])),
+                ('/uav2/throttle', FLOAT32, scalars([0.9])))
+    recording = read_recording(path)
+    assert recording.source['voltage_topic'] == '/uav1/voltage'
+    assert recording.throttle.tolist() == [0.5, 0.5]
+    path = make(tmp_path / 'two.mcap', ('/uav1/voltage', FLOAT32, scalars([5.0])),
+                ('/uav2/voltage', FLOAT32, scalars([6.0])))
+    text = complaint(path)
+    assert '/uav1/voltage, /uav2/voltage' in text and '--voltage-topic' in text
+    assert read_recording(path, voltage_topic='uav2/voltage').voltage.tolist() == [6.0]
+
+
+def test_by_type_alone(tmp_path):
+    """The only BatteryState is the voltage, whatever its name; a lone throttle is not."""
+    path = make(tmp_path / 'bag.mcap', ('/power/state', BATTERY_STATE, battery([MS], [12.0])),
+                ('/throttle', FLOAT32, scalars([0.5])))
+    assert read_recording(path).voltage.tolist() == [12.0]
+    path = make(tmp_path / 'throttle.mcap', ('/throttle', FLOAT32, scalars([0.5])))
+    assert 'no topic looks like a supply voltage' in complaint(path)
+
+
+def test_several_choices(tmp_path):
+    """The bag leaves two configs: they are listed, and one is taken when named."""
+    path = make(tmp_path / 'bag.mcap', ('/voltage', FLOAT32, scalars([5.0])),
+                ('/mavros/battery', BATTERY_STATE, battery([MS], [12.0])))
+    text = complaint(path)
+    for word in ('std_float32', 'mavros', '--msg-config', '/mavros/battery', BATTERY_STATE):
+        assert word in text
+    assert read_recording(path, msg_config='mavros').voltage.tolist() == [12.0]
+    assert read_recording(path, voltage_topic='/voltage').voltage.tolist() == [5.0]
+
+
+def test_topics_that_are_not_there(tmp_path):
+    """What there is is listed; a misspelt topic gets the nearest."""
+    path = make(tmp_path / 'bag.mcap', ('/camera', STRING, [(MS, {'data': 'x'})]))
+    text = complaint(path)
+    assert 'no topic looks like' in text and '/camera (std_msgs/msg/String)' in text
+    text = complaint(path, msg_config='px4')
+    assert "'/fmu/out/battery_status'" in text and '/camera (std_msgs/msg/String)' in text
+    assert "did you mean '/camera'" in complaint(path, voltage_topic='camer')
+    assert "did you mean '/camera'" in complaint(path, throttle_topic='camer')
+    assert "no msg config 'px5'" in complaint(path, msg_config='px5')
+
+
+def test_wrong_types(tmp_path):
+    """The type in the bag and the type expected are both named."""
+    path = make(tmp_path / 'bag.mcap', ('/voltage', STRING, [(MS, {'data': '5 V'})]))
+    assert '/voltage (std_msgs/msg/String)' in complaint(path)
+    text = complaint(path, msg_config='std_float32')
+    assert STRING in text and FLOAT32 in text and '--msg-config' in text
+    assert STRING in complaint(path, msg_config='std_float32', voltage_topic='/voltage')
+
+
+def test_throttle_by_name(tmp_path):
+    """A throttle topic may be named; a Float64 one is read too; a foreign type is refused."""
+    path = make(tmp_path / 'bag.mcap', ('/voltage', FLOAT32, scalars([5.0])),
+                ('/rc/thr', FLOAT64, scalars([0.5], FLOAT64)),
+                ('/name', STRING, [(MS, {'data': 'x'})]))
+    recording = read_recording(path)
+    assert not recording.has_throttle and '--throttle-topic' in recording.notes[0]
+    assert read_recording(path, throttle_topic='/rc/thr').throttle.tolist() == [0.5]
+    assert STRING in complaint(path, throttle_topic='/name')
+
+
+def test_a_config_of_ones_own(tmp_path):
+    """A YAML file by its path: unit, sign, offset and a nested field."""
+    kind = 'my_msgs/msg/Pack'
+    TEXT[kind] = 'Cell[] cells\n' + 80 * '=' + '\nMSG: my_msgs/Cell\nint32 mv\n'
+    path = make(tmp_path / 'bag.mcap', ('/pack', kind, [
+        (MS, {'cells': [{'mv': 0}, {'mv': -4200}]}), (2 * MS, {'cells': []}),
+        (3 * MS, {'cells': [{'mv': 0}, {'mv': -4000}]})]))
+    (tmp_path / 'pack.yaml').write_text(
+        'description: a pack\npackage: my_msgs\ninstall: my_msgs\ngeneric: false\n'
+        f'voltage:\n  topic: /pack\n  type: {kind}\n  field: cells[1].mv\n'
+        '  unit_factor: 0.001\n  sign: -1\n  offset: 0.5\n')
+    recording = read_recording(path, msg_config=tmp_path / 'pack.yaml')
+    np.testing.assert_allclose(recording.voltage, [4.7, 4.5], rtol=1e-12)
+    assert any(note.startswith('1 sample dropped') for note in recording.notes)
+    text = (tmp_path / 'pack.yaml').read_text().replace('cells[1].mv', 'cells[1].volts')
+    (tmp_path / 'pack.yaml').write_text(text)
+    assert "no 'volts'" in complaint(path, msg_config=tmp_path / 'pack.yaml')
+
+
+@pytest.mark.parametrize('kind', [FLOAT32, BATTERY_STATE])
+def test_what_is_mended(tmp_path, kind):
+    """Values that are not finite dropped, order restored, repeats dropped; each is noted."""
+    values = [5.0, np.nan, 5.2, np.inf, 5.1, 9.0, 5.5]
+    stamps = np.array([1, 2, 4, 5, 3, 3, 6]) * MS
+    if kind == FLOAT32:
+        # By log time a bag is always in order: only repeats can be.
+        stamps = np.array([1, 2, 3, 4, 5, 5, 6]) * MS
+        messages = list(zip(stamps.tolist(), encode_scalars(kind, values)))
+    else:
+        messages = [(int(k + 1) * MS, data)
+                    for k, data in enumerate(encode_battery(stamps, values))]
+    recording = read_recording(make(tmp_path / 'bag.mcap', ('voltage', kind, messages)))
+    notes = ' '.join(recording.notes)
+    assert '2 samples dropped: not a finite' in notes
+    assert '1 sample dropped: the stamp was there' in notes
+    assert ('came before' in notes) == (kind == BATTERY_STATE)
+    expected = [5.0, 5.2, 5.1, 5.5] if kind == FLOAT32 else [5.0, 5.1, 5.2, 5.5]
+    np.testing.assert_allclose(recording.voltage, expected, rtol=1e-7)
+    assert (np.diff(recording.t) > 0).all()
+
+
+def test_no_sample_and_one(tmp_path):
+    """None usable is refused, one is a recording."""
+    path = make(tmp_path / 'nan.mcap', ('voltage', FLOAT32, scalars([np.nan, np.inf])))
+    assert 'no usable sample: 2 samples dropped' in complaint(path)
+    path = make(tmp_path / 'nan2.mcap', ('voltage', BATTERY_STATE, battery([MS], [np.nan])))
+    assert 'no usable sample: 1 sample dropped' in complaint(path)
+    path = make(tmp_path / 'one.mcap', ('voltage', FLOAT32, scalars([5.0])))
+    assert read_recording(path).n == 1
+
+
+def test_throttle_that_is_not_a_number(tmp_path):
+    """The last value that was one holds."""
+    path = make(tmp_path / 'bag.mcap', ('voltage', FLOAT32, scalars([5.0, 5.1, 5.2])),
+                ('throttle', FLOAT32, scalars([0.5, np.nan])))
+    recording = read_recording(path)
+    assert recording.throttle.tolist() == [0.5, 0.5, 0.5]
+    assert '1 throttle value dropped' in recording.notes[0]
+
+
+def test_epochs_are_kept_to_what_a_float_holds(tmp_path):
+    """Seconds since 1970 in float64: 0.24 us, and no more is lost."""
+    stamps = 1_704_067_200_000_000_000 + np.arange(1000, dtype=np.int64) * 100_000
+    path = make(tmp_path / 'bag.mcap', (
+        'voltage', BATTERY_STATE, battery(stamps, np.full(1000, 5.0))))
+    recording = read_recording(path)
+    exact = np.arange(1000) * 1e-4
+    assert np.abs(recording.t - 1_704_067_200 - exact).max() <= 2.0**-22
+    assert recording.n == 1000

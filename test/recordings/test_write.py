@@ -1,0 +1,102 @@
+"""Recording -> bag -> Recording, and what cannot be written."""
+
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.bag import BagReader
+from ou_monitor.recordings.read import read_recording
+from ou_monitor.recordings.write import TYPES, write_recording
+from ou_monitor.records import Recording
+import pytest
+
+RATE = 10_000.0
+
+
+def recording(n=2500, start=0.0, throttle=True):
+    """Return noise at 10 kHz with a throttle that steps once."""
+    t = start + np.arange(n) / RATE
+    voltage = 5.0 + 0.1 * np.random.default_rng(2).standard_normal(n)
+    held = np.where(np.arange(n) < n // 2, 0.25, 0.75) if throttle else np.full(n, np.nan)
+    return Recording(t, voltage, held, 'made')
+
+
+@pytest.mark.parametrize('type', sorted(TYPES))
+@pytest.mark.parametrize('start', [0.0, 100.0])
+def test_round_trip(tmp_path, type, start):
+    """Stamps to the ns, voltage to the resolution of the message, throttle exactly."""
+    rec = recording(start=start)
+    assert write_recording(rec, tmp_path / 'bag', type=type) == ()
+    back = read_recording(tmp_path / 'bag')
+    # 0.5 ns of rounding to whole ns; in blocks, a stamp is rounded once a block.
+    np.testing.assert_allclose(back.t, rec.t, rtol=0, atol=1.1e-9)
+    exact = rec.voltage if type == 'float64' else rec.voltage.astype(np.float32)
+    np.testing.assert_array_equal(back.voltage, exact)
+    np.testing.assert_array_equal(back.throttle, rec.throttle)
+    assert back.notes == ()
+
+
+def test_start_is_added(tmp_path):
+    """Log times are exact in ns, whatever the epoch."""
+    start = 1_704_067_200_000_000_000
+    write_recording(recording(100), tmp_path / 'bag', type='float32', start_ns=start)
+    messages = BagReader(tmp_path / 'bag').raw_messages(['/voltage'])
+    assert [m.log_time_ns for m in messages] == [start + 100_000 * k for k in range(100)]
+
+
+def test_throttle_is_sent_when_it_changes_and_once_a_second(tmp_path):
+    """First sample, each change, and once a second at least; ahead of its sample."""
+    t = np.arange(400) / 100.0
+    throttle = np.where(t < 2.505, 0.25, 0.75)
+    write_recording(Recording(t, np.full(400, 5.0), throttle), tmp_path / 'bag')
+    messages = list(BagReader(tmp_path / 'bag').decoded())
+    sent = [(m.log_time_ns // 10_000_000, m.message.data)
+            for m in messages if m.topic == '/throttle']
+    assert sent == [(0, 0.25), (100, 0.25), (200, 0.25), (251, 0.75), (300, 0.75)]
+    # At one instant the throttle comes first.
+    assert [m.topic for m in messages[:2]] == ['/throttle', '/voltage']
+
+
+def test_without_throttle(tmp_path):
+    """Nothing is made up."""
+    write_recording(recording(throttle=False), tmp_path / 'bag')
+    assert list(BagReader(tmp_path / 'bag').topics) == ['/voltage']
+
+
+def test_throttle_known_only_later(tmp_path):
+    """Before its first value it is unknown."""
+    rec = recording(100)
+    rec.throttle[:10] = np.nan
+    write_recording(rec, tmp_path / 'bag')
+    np.testing.assert_array_equal(read_recording(tmp_path / 'bag').throttle, rec.throttle)
+
+
+def test_negative_stamps_are_moved(tmp_path):
+    """A bag holds none; spacing is kept and a note says by how much."""
+    rec = recording(100, start=-2.0)
+    notes = write_recording(rec, tmp_path / 'bag')
+    assert len(notes) == 1 and '2.0' in notes[0]
+    back = read_recording(tmp_path / 'bag')
+    np.testing.assert_allclose(back.t, rec.t + 2.0, rtol=0, atol=1.1e-9)
+
+
+def test_what_does_not_fit(tmp_path):
+    """One line, and nothing is left behind."""
+    uneven = recording(100)
+    uneven.t[50:] += 1e-3
+    for rec, options, words in [
+            (recording(100), {'type': 'battery'}, "'battery_state'"),
+            (recording(0), {}, 'no sample'),
+            (recording(100, start=2.0**31), {}, '2\\^31'),
+            (uneven, {'type': 'adc_block'}, 'steady 10000 Hz'),
+            (recording(100), {'type': 'adc_block', 'sample_rate': 5000.0}, 'steady 5000 Hz'),
+            (recording(100), {'type': 'adc_block', 'sample_rate': 0.0}, 'above 0 Hz')]:
+        with pytest.raises(InputError, match=words):
+            write_recording(rec, tmp_path / 'bag', **options)
+    assert list(tmp_path.iterdir()) == []
+    write_recording(recording(100, start=2.0**31), tmp_path / 'late', type='float32')
+
+
+def test_progress(tmp_path):
+    """It grows from 0 towards 1."""
+    shares = []
+    write_recording(recording(10_000), tmp_path / 'bag', progress=shares.append)
+    assert shares == sorted(shares) and 0.0 < shares[0] < 0.2 and 0.8 < shares[-1] <= 1.0

@@ -1,0 +1,184 @@
+"""The arrows of doc/architecture.md, walked import by import."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+from project import ROOT
+import pytest
+
+PACKAGE = 'ou_monitor'
+# A module may import only from its own part and from parts of a lower level.
+LEVEL = {
+    'errors': 0, 'records': 0, 'model': 1, 'online': 2, 'messages': 3, 'recordings': 4,
+    'offline': 5, 'nodes': 6, 'cli': 6,
+}
+# What users reach as `from ou_monitor import ...`: above all but the programs.
+FACADE_LEVEL = 5
+PLOTTING = {'matplotlib', 'plotly', 'seaborn', 'bokeh', 'PIL'}
+MCAP = {'mcap', 'mcap_ros2', 'rosbags', 'rosbag2_py'}
+CORE = {'numpy', 'scipy'}
+# What each part may import beyond the standard library; ROS is for nodes alone.
+ALLOWED = {
+    'errors': set(), 'records': CORE, 'model': CORE, 'online': CORE,
+    'messages': CORE | {'yaml'}, 'recordings': CORE | {'yaml'}, 'offline': CORE | {'yaml'},
+    'cli': CORE | {'yaml'}, '__init__': CORE,
+}
+
+
+def imports_of(source: str, module: str) -> Iterator[tuple[int, str]]:
+    """Yield line and absolute name of every import, wherever it stands in the source."""
+    words = module.split('.')
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield node.lineno, alias.name
+        elif isinstance(node, ast.ImportFrom):
+            base = words[:-node.level] if node.level else []
+            name = '.'.join(base + ([node.module] if node.module else []))
+            # `from ou_monitor import online` names a part by its last word.
+            for alias in node.names:
+                yield node.lineno, f'{name}.{alias.name}'
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            # Tables of modules loaded on first use, as in ou_monitor/__init__.py.
+            if re.fullmatch(r'ou_monitor(\.\w+)+', node.value):
+                yield node.lineno, node.value
+        elif isinstance(node, ast.Call) and node.args:
+            called = getattr(node.func, 'attr', getattr(node.func, 'id', ''))
+            first = node.args[0]
+            if called in ('import_module', '__import__') and isinstance(first, ast.Constant):
+                # Those of our own are found as the table's strings are.
+                if not str(first.value).startswith(PACKAGE + '.'):
+                    yield node.lineno, str(first.value)
+
+
+def part_of(module: str) -> str:
+    """Return the folder, or the top-level module, that a dotted name belongs to."""
+    words = module.split('.')
+    return words[1] if len(words) > 1 and words[1] in LEVEL else '__init__'
+
+
+def wrong_imports(source: str, module: str) -> list[str]:
+    """
+    Return one sentence for each import that the house does not allow.
+
+    Parameters
+    ----------
+    source : str
+        Text of the module.
+    module : str
+        Its dotted name; a package's own file ends in ``.__init__``.
+
+    Returns
+    -------
+    list of str
+        Empty when all arrows point the right way.
+
+    """
+    part = part_of(module)
+    level = LEVEL.get(part, FACADE_LEVEL)
+    wrong = []
+    for line, name in imports_of(source, module):
+        top = name.split('.')[0]
+        where = f'{module}:{line}: {name}'
+        if top == PACKAGE:
+            other = part_of(name)
+            other_level = LEVEL.get(other, FACADE_LEVEL)
+            if other == '__init__' and part != '__init__' and name != f'{PACKAGE}.__version__':
+                wrong.append(f'{where}: import from the module that holds it, not the package')
+            elif other_level > level or (other_level == level and other != part and level):
+                wrong.append(f'{where}: {part} may not know {other}')
+        elif top in sys.stdlib_module_names:
+            continue
+        elif part == 'nodes' and top not in PLOTTING | MCAP:
+            continue
+        elif top in MCAP and module == f'{PACKAGE}.recordings.bag':
+            continue
+        elif top in PLOTTING and module.startswith(f'{PACKAGE}.offline.report'):
+            continue
+        elif top == 'numba' and module.split('.')[1] in ('model', 'online') and \
+                module.split('.')[-1].startswith('compiled'):
+            continue
+        elif top not in ALLOWED.get(part, set()):
+            wrong.append(f'{where}: {part} may not import {top}')
+    return wrong
+
+
+def modules() -> dict[str, Path]:
+    """Return every module of the package by its dotted name."""
+    return {
+        '.'.join(path.relative_to(ROOT).with_suffix('').parts): path
+        for path in sorted((ROOT / PACKAGE).rglob('*.py'))}
+
+
+def test_the_arrows_hold():
+    """No module imports against the arrows."""
+    wrong = [sentence for module, path in modules().items()
+             for sentence in wrong_imports(path.read_text(encoding='utf-8'), module)]
+    assert not wrong, '\n'.join(wrong)
+
+
+def test_the_walk_sees_the_house():
+    """Every part is on disk, so that the test above cannot pass on nothing."""
+    parts = {part_of(module) for module in modules()}
+    assert parts == set(LEVEL) | {'__init__'}
+
+
+@pytest.mark.parametrize('module, source', [
+    ('ou_monitor.model.ou', 'from ou_monitor.online.risk import x'),
+    ('ou_monitor.model.ou', 'from ou_monitor import online'),
+    ('ou_monitor.model.ou', 'from ..online.risk import x'),
+    ('ou_monitor.model.__init__', 'from ..online import x'),
+    ('ou_monitor.errors', 'import numpy'),
+    ('ou_monitor.online.risk', 'import rclpy'),
+    ('ou_monitor.online.risk', 'def f():\n    from std_msgs.msg import Float64\n'),
+    ('ou_monitor.online.risk', 'import importlib\nimportlib.import_module("rclpy")\n'),
+    ('ou_monitor.online.risk', 'import matplotlib.pyplot as plt'),
+    ('ou_monitor.online.risk', 'import numba'),
+    ('ou_monitor.offline.analyze', 'import matplotlib'),
+    ('ou_monitor.offline.analyze', 'import mcap.reader'),
+    ('ou_monitor.offline.analyze', 'if True:\n    import ou_monitor.cli.main'),
+    ('ou_monitor.recordings.csv', 'from mcap.reader import make_reader'),
+    ('ou_monitor.nodes.estimator', 'from ou_monitor.cli import main'),
+    ('ou_monitor.nodes.estimator', 'import matplotlib'),
+    ('ou_monitor.cli.main', 'from ou_monitor.nodes import estimator'),
+    ('ou_monitor.cli.main', 'from ou_monitor import SlidingEstimator'),
+    ('ou_monitor.__init__', 'HOMES = {"Estimator": "ou_monitor.nodes.estimator"}'),
+    ('ou_monitor.__init__', 'def f():\n    from ou_monitor.nodes import estimator'),
+    ('ou_monitor.recordings.bag', 'from ou_monitor.offline.analyze import analyze'),
+])
+def test_a_wrong_import_is_found(module, source):
+    """Each kind of leak is one finding: the checker can fail."""
+    assert len(wrong_imports(source, module)) == 1
+
+
+@pytest.mark.parametrize('module, source', [
+    ('ou_monitor.model.ou', 'import math\nimport numpy as np\nfrom scipy import optimize'),
+    ('ou_monitor.model.ou', 'from . import passage\nfrom .passage import x'),
+    ('ou_monitor.model.__init__', 'from .ou import x\nfrom . import ou'),
+    ('ou_monitor.model.compiled_kalman', 'import numba'),
+    ('ou_monitor.online.risk', 'from ou_monitor.model.passage import x'),
+    ('ou_monitor.recordings.bag', 'import mcap.reader\nfrom mcap_ros2.decoder import D'),
+    ('ou_monitor.offline.report.page', 'import matplotlib'),
+    ('ou_monitor.nodes.estimator', 'import rclpy\nfrom ou_monitor.online.monitor import M'),
+    ('ou_monitor.__init__', 'from ou_monitor.online.estimator import SlidingEstimator'),
+])
+def test_a_right_import_passes(module, source):
+    """What the house allows is no finding."""
+    assert wrong_imports(source, module) == []
+
+
+@pytest.mark.parametrize('statement', [
+    'import ou_monitor; ou_monitor.SlidingEstimator',
+    'import ou_monitor.cli.main',
+])
+def test_no_ros_and_no_mcap_until_needed(statement):
+    """The core and the command line start without ROS and without the bag reader."""
+    heavy = ('rclpy', 'mcap', 'matplotlib')
+    code = f'{statement}\nimport sys\nprint([m for m in {heavy} if m in sys.modules])'
+    done = subprocess.run(
+        [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout.strip()) == (0, '[]'), done.stderr

@@ -1,0 +1,71 @@
+"""Style, types and shell syntax: ament's own linters with ament's own settings."""
+
+import re
+import subprocess
+import sys
+
+from ament_flake8.main import main_with_errors as flake8
+from ament_pep257.main import main as pep257
+from mypy import api as mypy
+from project import project_files, ROOT
+import pytest
+
+FOLDERS = [
+    str(ROOT / name) for name in ('ou_monitor', 'test', 'scripts', 'launch', 'benchmarks')
+    if any((ROOT / name).rglob('*.py'))] + [str(ROOT / 'setup.py')]
+SHELL = [ROOT / 'scripts/demo', ROOT / 'scripts/test', ROOT / 'scripts/common.sh',
+         ROOT / '.ci/run']
+# Folders that a machine has and another has not; written in two parts so as not to find itself.
+MACHINE_PATH = re.compile(rb'/(?:ho' rb'me|ro' rb'ot|Us' rb'ers|wo' rb'rk)/')
+
+
+@pytest.mark.filterwarnings('ignore')
+def test_flake8():
+    """Ament's flake8 finds nothing."""
+    code, errors = flake8(argv=FOLDERS)
+    assert code == 0, '\n'.join(errors)
+
+
+@pytest.mark.filterwarnings('ignore')
+def test_pep257(capsys):
+    """Ament's PEP 257 finds nothing."""
+    code = pep257(argv=FOLDERS)
+    assert code == 0, capsys.readouterr().err
+
+
+def test_types():
+    """Strict mypy (setup.cfg) finds nothing in the package."""
+    out, err, code = mypy.run(['--config-file', str(ROOT / 'setup.cfg'), '--cache-dir',
+                               str(ROOT / '.mypy_cache'), str(ROOT / 'ou_monitor')])
+    assert code == 0, out + err
+
+
+def test_strict_where_there_is_no_ros(tmp_path):
+    """The settings refuse an untyped function in the core, so they are strict there."""
+    module = tmp_path / 'core.py'
+    module.write_text('def f(x):\n    return x\n', encoding='utf-8')
+    out, err, code = mypy.run(['--config-file', str(ROOT / 'setup.cfg'), '--cache-dir',
+                               str(tmp_path / 'cache'), str(module)])
+    assert code == 1 and 'no-untyped-def' in out, out + err
+
+
+@pytest.mark.parametrize('script', SHELL, ids=lambda path: path.name)
+def test_shell_syntax(script):
+    """Bash can read the script, and runs it directly unless it is sourced."""
+    done = subprocess.run(['bash', '-n', script], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert script.suffix == '.sh' or script.stat().st_mode & 0o111 == 0o111
+
+
+def test_no_machine_paths():
+    """Nothing in the project names a folder of somebody's machine."""
+    files = project_files()
+    assert ROOT / 'setup.py' in files
+    found = [f'{path.relative_to(ROOT)}: {match.group().decode()}' for path in files
+             if path.suffix != '.mcap' and (match := MACHINE_PATH.search(path.read_bytes()))]
+    assert not found, '\n'.join(found)
+
+
+def test_python_is_supported():
+    """The suite runs on one of the two versions that the package is for."""
+    assert sys.version_info[:2] in ((3, 11), (3, 12))

@@ -1,0 +1,225 @@
+"""What users get: a colcon package, a pip package, and scripts that set both up."""
+
+from collections.abc import Iterator
+from email.utils import parseaddr
+import os
+from pathlib import Path
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import sysconfig
+import time
+import venv
+import xml.etree.ElementTree as ElementTree
+
+from project import project_files, ROOT
+import pytest
+import yaml
+
+EXECUTABLES = ['adaptive_filter', 'estimator', 'ou-monitor', 'replay']
+# Starting Python, ROS and DDS on a busy machine.
+START_TIMEOUT = 60.0
+DOMAIN = '60'
+
+
+def clean_environment(**extra: str) -> dict[str, str]:
+    """Return the environment without what would let the source tree be found by chance."""
+    # The bootstrapper of the ROS wheels leaves its mark in a process that it has set up.
+    kept = {key: value for key, value in os.environ.items()
+            if key != '_ROS_WHEELS_BOOTSTRAP_COMPLETE'}
+    path = kept.pop('PYTHONPATH', '').split(os.pathsep)
+    rest = [place for place in path if place and Path(place).resolve() != ROOT]
+    return kept | ({'PYTHONPATH': os.pathsep.join(rest)} if rest else {}) | extra
+
+
+def run(*command: object, **options: object) -> subprocess.CompletedProcess:
+    """Run a command to its end, outputs as text."""
+    options.setdefault('env', clean_environment())
+    return subprocess.run([str(word) for word in command], capture_output=True, text=True,
+                          timeout=300, **options)
+
+
+@pytest.fixture(scope='module')
+def tree(tmp_path_factory) -> Path:
+    """Return a copy of the project's files, in a folder with a space in its name."""
+    copy = tmp_path_factory.mktemp('some folder') / 'ou monitor'
+    for path in project_files():
+        target = copy / path.relative_to(ROOT)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, target)
+    return copy
+
+
+@pytest.fixture(scope='module')
+def python(tmp_path_factory) -> Path:
+    """Return the interpreter under a name that a script's first line can hold (no spaces)."""
+    if ' ' not in sys.executable:
+        return Path(sys.executable)
+    link = tmp_path_factory.mktemp('python') / 'environment'
+    link.symlink_to(sys.prefix)
+    return link / 'bin' / Path(sys.executable).name
+
+
+def colcon(python: Path, workspace: Path, *arguments: object) -> subprocess.CompletedProcess:
+    """Run colcon in a workspace."""
+    return run(python, '-m', 'colcon', '--log-base', workspace / 'log', *arguments,
+               cwd=workspace)
+
+
+@pytest.fixture(scope='module', params=[[], ['--symlink-install']], ids=['copied', 'symlinked'])
+def installed(request, tree, python, tmp_path_factory) -> Path:
+    """Return the package's folder in a colcon workspace's install space."""
+    workspace = tmp_path_factory.mktemp('workspace')
+    shutil.copytree(tree, workspace / 'src' / 'ou_monitor')
+    done = colcon(python, workspace, 'build', *request.param)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return workspace / 'install' / 'ou_monitor'
+
+
+def test_colcon_recognises_the_package(tree, python):
+    """Colcon takes the repository for an ament_python package."""
+    assert colcon(python, tree, 'list').stdout.split() == ['ou_monitor', '.', '(ros.ament_python)']
+
+
+def test_colcon_installs_what_ros2_looks_for(installed):
+    """Executables, index entry, message descriptions, launch and parameter files are there."""
+    assert sorted(os.listdir(installed / 'lib' / 'ou_monitor')) == EXECUTABLES
+    share = installed / 'share'
+    assert (share / 'ament_index/resource_index/packages/ou_monitor').exists()
+    for folder in ('msg_config', 'launch', 'config'):
+        expected = {path.name for path in (ROOT / folder).iterdir() if path.is_file()}
+        assert expected and set(os.listdir(share / 'ou_monitor' / folder)) == expected
+
+
+def environment_of(installed: Path, python: Path) -> dict[str, str]:
+    """Return the environment that the workspace's own setup file makes."""
+    done = run('bash', '-c', 'source "$0" && env -0', installed.parent / 'local_setup.bash',
+               env=clean_environment(ROS_DOMAIN_ID=DOMAIN, COLCON_PYTHON_EXECUTABLE=str(python),
+                                     ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST'))
+    assert done.returncode == 0, done.stderr
+    return dict(word.split('=', 1) for word in done.stdout.split('\0') if '=' in word)
+
+
+@pytest.fixture
+def listener() -> Iterator[object]:
+    """Yield a node of another process than the one under test, in the same domain."""
+    import rclpy
+    from rclpy.context import Context
+    context = Context()
+    rclpy.init(context=context, domain_id=int(DOMAIN))
+    node = rclpy.create_node('listener', context=context)
+    yield node
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def test_installed_estimator_starts_and_stops(installed, python, listener, tmp_path):
+    """The installed executable takes ROS arguments, is seen over DDS and ends on SIGINT."""
+    log = tmp_path / 'estimator.log'
+    with log.open('wb') as out:
+        process = subprocess.Popen(
+            [installed / 'lib/ou_monitor/estimator', '--ros-args', '-p', 'publish_rate:=5.0'],
+            cwd=tmp_path, env=environment_of(installed, python), stdout=out, stderr=out)
+    try:
+        deadline = time.monotonic() + START_TIMEOUT
+        while '/ou_estimator/state' not in dict(listener.get_topic_names_and_types()):
+            assert process.poll() is None, log.read_text()
+            assert time.monotonic() < deadline, log.read_text()
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(START_TIMEOUT) == 0, log.read_text()
+        assert 'Traceback' not in log.read_text()
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture(scope='module')
+def offline(tree, tmp_path_factory) -> Path:
+    """Return the bin folder of an environment without ROS, with the wheel of the project."""
+    folder = tmp_path_factory.mktemp('no ros')
+    done = run(sys.executable, '-m', 'pip', 'wheel', '--quiet', '--no-deps',
+               '--no-build-isolation', '--wheel-dir', folder, tree)
+    assert done.returncode == 0, done.stderr
+    (wheel,) = folder.glob('ou_monitor-*.whl')
+    venv.create(folder / 'venv', with_pip=False, symlinks=True)
+    python = folder / 'venv/bin/python'
+    site = Path(run(python, '-c', 'import sysconfig; print(sysconfig.get_path("purelib"))')
+                .stdout.strip())
+    # What pip would fetch, without the network: links to the packages that are here already.
+    here = [Path(sysconfig.get_path('purelib')), Path(sysconfig.get_path('platlib'))]
+    for name in ('numpy', 'numpy.libs', 'scipy', 'scipy.libs', 'yaml', '_yaml', 'mcap',
+                 'mcap_ros2', 'lz4', 'zstandard', 'zstandard.libs', 'mcap_ros2_support'):
+        for source in {place / name for place in here if (place / name).exists()}:
+            (site / name).symlink_to(source)
+    done = run(sys.executable, '-m', 'pip', '--python', python, 'install', '--quiet', '--no-deps',
+               '--no-index', '--disable-pip-version-check', wheel)
+    assert done.returncode == 0, done.stderr
+    return folder / 'venv/bin'
+
+
+def test_pip_gives_the_offline_half(offline, tmp_path):
+    """The command and the import work where there is no ROS."""
+    shown = run(offline / 'ou-monitor', '--help', cwd=tmp_path)
+    assert shown.returncode == 0 and 'analyze' in shown.stdout, shown.stderr
+    code = ('import sys, ou_monitor; from ou_monitor import SlidingEstimator as S; '
+            'S(window=2.0).estimate(); print(ou_monitor.__file__); '
+            'sys.exit("rclpy" in sys.modules)')
+    done = run(offline / 'python', '-c', code, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.strip()).is_relative_to(offline.parent)
+
+
+def test_pip_installs_the_message_descriptions(offline, tmp_path):
+    """The installed package finds all of msg_config."""
+    code = 'from ou_monitor.messages.config import list_msg_configs as f; print(*f())'
+    done = run(offline / 'python', '-c', code, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == sorted(path.stem for path in ROOT.glob('msg_config/*.yaml'))
+
+
+@pytest.mark.parametrize('name', ['adaptive_filter', 'estimator', 'replay'])
+def test_nodes_without_ros_say_so(offline, tmp_path, name):
+    """An executable that needs ROS says that it is missing, in one line, with status 2."""
+    done = run(offline / name, *(['some.mcap'] if name == 'replay' else []), cwd=tmp_path)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1 and 'ROS 2' in done.stderr
+
+
+def test_offline_analyze(offline, tmp_path):
+    """The installed command reads a bag of the library."""
+    done = run(offline / 'ou-monitor', 'analyze', ROOT / 'bags' / 'load_10', '--json', '-',
+               cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+def test_package_xml_agrees_with_setup_py(tree):
+    """Name, version, licence and maintainer are the same for ROS and for pip."""
+    package = ElementTree.parse(ROOT / 'package.xml').getroot()
+    asked = run(sys.executable, 'setup.py', '--quiet', '--name', '--version', '--license',
+                '--maintainer-email', cwd=tree)
+    maintainer = package.find('maintainer').get('email')
+    assert asked.stdout.split() == [
+        package.findtext('name'), package.findtext('version'), package.findtext('license'),
+        maintainer], asked.stderr
+    assert parseaddr(maintainer)[1] == maintainer and re.fullmatch(r'[^@\s]+@[^@\s]+\.\w+',
+                                                                   maintainer)
+    assert package.findtext('license') == 'Apache-2.0'
+    assert 'Version 2.0, January 2004' in (ROOT / 'LICENSE').read_text(encoding='utf-8')
+
+
+def test_requirements_agree_with_setup_py():
+    """The demo's requirements are the package's requirements."""
+    setup = (ROOT / 'setup.py').read_text(encoding='utf-8')
+    listed = [line for line in (ROOT / 'scripts/requirements-run.txt').read_text().splitlines()
+              if line and not line.startswith('#')]
+    declared = re.search(r'install_requires=\[(.*?)\]', setup, re.DOTALL).group(1)
+    assert sorted(re.findall(r"'(.+?)'", declared)) == sorted(listed)
+
+
+def test_parameter_files_are_yaml():
+    """Each file of parameters can be read."""
+    files = sorted((ROOT / 'config').glob('*.yaml'))
+    assert files and all(isinstance(yaml.safe_load(path.read_text()), dict) for path in files)

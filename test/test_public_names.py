@@ -1,0 +1,44 @@
+"""`import ou_monitor`: quick, complete, and honest about what is not there."""
+
+import pathlib
+import re
+import subprocess
+import sys
+
+import pytest
+
+import ou_monitor
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+
+
+@pytest.mark.parametrize('name', ou_monitor.__all__)
+def test_every_public_name_is_there(name):
+    """It can be had, is listed, and is the same the second time."""
+    value = getattr(ou_monitor, name)
+    assert name in dir(ou_monitor) and getattr(ou_monitor, name) is value
+
+
+def test_unknown_names_are_attribute_errors():
+    """As of any module; hasattr and `from ... import` behave."""
+    assert not hasattr(ou_monitor, 'no_such_name')
+    with pytest.raises(AttributeError, match='no_such_name'):
+        ou_monitor.no_such_name
+    with pytest.raises(ImportError):
+        exec('from ou_monitor import no_such_name', {})
+
+
+def test_import_loads_nothing_else():
+    """NumPy, SciPy and mcap wait for the first name; the estimator never loads mcap."""
+    program = ('import sys, ou_monitor\n'
+               'assert not {"numpy", "scipy", "mcap"} & set(sys.modules)\n'
+               'ou_monitor.SlidingEstimator\n'
+               'assert not {"mcap", "yaml", "rclpy"} & set(sys.modules)')
+    subprocess.run([sys.executable, '-c', program], check=True, timeout=60)
+
+
+def test_version_is_that_of_the_package():
+    """One number in __init__, setup.py and package.xml."""
+    setup = re.search(r"version='([^']+)'", (ROOT / 'setup.py').read_text()).group(1)
+    package = re.search(r'<version>([^<]+)<', (ROOT / 'package.xml').read_text()).group(1)
+    assert ou_monitor.__version__ == setup == package

@@ -1,0 +1,100 @@
+"""README.md names only what exists: files, options, modules, keys, and an example that runs."""
+
+import re
+import subprocess
+import sys
+
+from project import ROOT
+import pytest
+
+README = (ROOT / 'README.md').read_text(encoding='utf-8')
+
+
+def blocks(language: str) -> list[str]:
+    """Return the fenced blocks in one language."""
+    return re.findall(rf'^```{language}\n(.*?)^```', README, re.MULTILINE | re.DOTALL)
+
+
+def run(*command: str) -> subprocess.CompletedProcess:
+    """Run a command in the repository."""
+    return subprocess.run([sys.executable, *command], cwd=ROOT, capture_output=True, text=True,
+                          timeout=120)
+
+
+def test_the_quick_start_is_the_two_commands():
+    """The first commands are the demo and the tests, and both can be started."""
+    first = blocks('console')[0].split()
+    assert first == ['./scripts/demo', './scripts/test']
+    assert all((ROOT / path).stat().st_mode & 0o111 for path in first)
+
+
+@pytest.mark.parametrize('path', sorted(set(re.findall(
+    r'(?<![\w/.])((?:bags|doc|scripts|msg_config|launch|config|benchmarks|test|ou_monitor)'
+    r'/[\w./]*)', README)) | set(re.findall(r'`(\w+\.yaml)`', README)) - {'my_adc.yaml'}))
+def test_what_is_named_exists(path):
+    """Every file and folder named is there."""
+    assert (ROOT / path).exists() or (ROOT / 'msg_config' / path).exists()
+
+
+def test_launch_file_exists():
+    """The launch file that is started is there."""
+    for name in re.findall(r'ros2 launch ou_monitor (\S+)', README):
+        assert (ROOT / 'launch' / name).is_file()
+
+
+@pytest.mark.parametrize('command', sorted(set(re.findall(r'ou-monitor (\w+)', README))))
+def test_commands_exist(command):
+    """Each command of ou-monitor that is named has its help, with the options named beside it."""
+    shown = run('-m', 'ou_monitor.cli.main', command, '--help')
+    assert shown.returncode == 0, shown.stderr
+    for line in README.splitlines():
+        if f'ou-monitor {command}' in line:
+            for option in re.findall(r'--\w+', line):
+                assert option in shown.stdout
+
+
+def test_no_command_is_missing():
+    """The table lists every command there is."""
+    from ou_monitor.cli.main import COMMANDS
+    assert set(COMMANDS) == set(re.findall(r'^\| `ou-monitor (\w+)', README, re.MULTILINE))
+
+
+def test_executables_exist():
+    """Each executable that is named is an entry point, and replay has the options named."""
+    setup = (ROOT / 'setup.py').read_text(encoding='utf-8')
+    for name in re.findall(r'ros2 run ou_monitor (\w+)', README):
+        assert f"'{name} = ou_monitor.nodes.{name}:main'" in setup
+    line = next(line for line in README.splitlines() if 'run ou_monitor replay' in line)
+    shown = run('-m', 'ou_monitor.nodes.replay', '--help')
+    assert shown.returncode == 0, shown.stderr
+    for option in re.findall(r'--\w+', line):
+        assert option in shown.stdout
+
+
+def test_python_example_runs():
+    """The example runs and its intervals hold the values it was made with."""
+    (code,) = blocks('python')
+    scope: dict[str, object] = {}
+    exec(compile(code, 'README.md', 'exec'), scope)
+    e = scope['e']
+    assert e.usable
+    # Seeded; four standard errors instead of two leave room for another numpy's random stream.
+    for name in ('alpha', 'sigma'):
+        low, high = e.interval(name, z=4.0)
+        assert low < scope[name] < high
+
+
+def test_message_example_is_accepted(tmp_path):
+    """The example of a message description is one that the package reads."""
+    from ou_monitor.messages.config import load_msg_config
+    (text,) = blocks('yaml')
+    path = tmp_path / 'my_adc.yaml'
+    path.write_text(text, encoding='utf-8')
+    config = load_msg_config(str(path))
+    assert config.voltage.unit_factor == 1e-3 and config.throttle is None
+
+
+def test_options_are_seen():
+    """The pattern above sees an option that is named."""
+    line = next(line for line in README.splitlines() if 'ou-monitor analyze R' in line)
+    assert re.findall(r'--\w+', line) == ['--report']
