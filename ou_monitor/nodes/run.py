@@ -61,14 +61,15 @@ def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> in
 def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: list[int]) -> int:
     try:
         import rclpy
-        from rclpy.exceptions import NameValidationException, ParameterException
-        from rclpy.executors import ExternalShutdownException
         from rclpy.impl.implementation_singleton import rclpy_implementation as binding
     except ImportError as error:
         print(f'{name}: ROS 2 is not installed: {one_line(error)}; source '
               '/opt/ros/jazzy/setup.bash, or run ./scripts/demo once and use its .venv',
               file=sys.stderr)
         return BAD_INPUT
+    from rclpy.exceptions import InvalidHandle, NameValidationException
+    from rclpy.exceptions import NotInitializedException, ParameterException
+    from rclpy.executors import ExternalShutdownException
     try:
         _init(rclpy, binding, args)
         return 0 if stopped else work()
@@ -77,7 +78,7 @@ def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: li
         return BAD_INPUT
     except ExternalShutdownException:
         return 0
-    except binding.RCLError:
+    except (binding.RCLError, InvalidHandle, NotInitializedException):
         # A signal has ended the context while a node was being built: that is no failure.
         if stopped and not rclpy.ok():
             return 0

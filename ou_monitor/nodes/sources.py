@@ -32,7 +32,7 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('adc.sample_rate', 0.0,
               'True rate of the samples in a block, Hz; 0: as the msg_config says.', 0.0, 1.0e9),
     Parameter('smooth_stamps', True,
-              'Whether samples without a stamp from a steady source are put on an even time line.'),
+              'Whether unstamped samples of a steady source are put on an even time line.'),
 )
 
 # In auto mode a bare scalar needs no msg_config of its own to be a throttle.

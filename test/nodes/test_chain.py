@@ -6,7 +6,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from live import BAGS, values_of, wait_until
 import numpy as np
 import pytest
-from rclpy.qos import qos_profile_sensor_data, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float32, Float64
 import yaml
 
@@ -21,7 +21,7 @@ def chain(shared_world):
     """Play until 5000 messages are through, then Ctrl-C to all."""
     probe = shared_world.probe()
     heard = {
-        'input': probe.listen('/voltage', Float32, qos_profile_sensor_data),
+        'input': probe.listen('/voltage', Float32, QoSProfile(depth=2000)),
         'output': probe.listen('/ou_adaptive_filter/output', Float32),
         'cutoff': probe.listen('/ou_adaptive_filter/cutoff', Float64),
         'sigma': probe.listen('/ou_estimator/sigma', Float64),

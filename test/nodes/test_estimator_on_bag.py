@@ -1,4 +1,4 @@
-"""A stamped bag at four times its speed into the real estimator: every number against the truth."""
+"""A stamped bag at four times its speed into the estimator: every number against the truth."""
 
 import math
 import statistics

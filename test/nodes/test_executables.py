@@ -1,9 +1,12 @@
 """Start and end of every executable: signals, bad input, misspelt parameters."""
 
 import os
+from pathlib import Path
+import re
 import signal
 import subprocess
 import sys
+import time
 
 from live import ROOT, wait_until
 import pytest
@@ -29,6 +32,19 @@ def test_signals_end_the_nodes(world, number):
     assert all('Traceback' not in p.err and 'rror' not in p.err for p in processes)
     # A node that was destroyed says goodbye; one that was not is missed only after 20 s.
     wait_until(lambda: not expected & set(names(probe)), 5.0, 'the nodes to be gone')
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=['SIGINT', 'SIGTERM'])
+def test_a_signal_at_any_moment_of_the_start(world, number):
+    """While it imports, while it makes its node: status 0 all the same."""
+    for delay in (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8):
+        process = world.start('estimator')
+        # Before `main` Python's own handlers are in force; then SIGTERM, number 15, is caught.
+        state = Path(f'/proc/{process.popen.pid}/status')
+        wait_until(lambda state=state: int(
+            re.search(r'SigCgt:\s*(\w+)', state.read_text())[1], 16) >> 14 & 1)
+        time.sleep(delay)
+        assert process.stop(number) == 0, process.err
 
 
 @pytest.mark.parametrize('name, arguments, words', [

@@ -130,7 +130,7 @@ def test_stale_sigma_falls_back_and_warns(rig):
 
 
 def test_bad_samples_are_counted_and_not_passed_on(rig):
-    """NaN in any axis; the output after it is finite."""
+    """A bad value in any axis; the output after it is finite."""
     rig.send((0.0, 0.0, 0.0))
     for bad in (math.nan, math.inf):
         rig.send((0.0, bad, 0.0))

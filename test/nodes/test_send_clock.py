@@ -102,7 +102,7 @@ def test_a_change_of_rate_is_followed():
         clock(0.001 * k)
     stamps = [clock(1.0 + 0.005 * k) for k in range(1600)]
     assert clock.rate == pytest.approx(200.0, rel=1e-6)
-    # 0.25 s (`GAP`) is the most that it can be off; 1200 messages later, 6 s, that is exp(-6) of it.
+    # It can be off by 0.25 s (`GAP`) at most; 1200 messages, 6 s, later by exp(-6) of that.
     assert stamps[-1] == pytest.approx(1.0 + 0.005 * 1599, abs=0.001)
 
 

@@ -69,7 +69,7 @@ def test_any_installed_type_by_name_and_path():
 
 
 def test_a_config_without_throttle():
-    """ArduPilot's has none, unless the user names one."""
+    """There is none, unless the user names one."""
     assert find_source('throttle', values(msg_config='ardupilot_dds')) is None
     named = values(msg_config='ardupilot_dds', throttle__topic='/t',
                    throttle__type='std_msgs/msg/Float32', throttle__field='data')

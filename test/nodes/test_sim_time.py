@@ -1,0 +1,60 @@
+"""Replay in a loop, three times as fast, without header stamps: all time comes from /clock."""
+
+import math
+
+from diagnostic_msgs.msg import DiagnosticArray
+from live import ou_path, values_of, wait_until
+from ou_monitor.recordings.bag import BagWriter
+import pytest
+
+T0 = 1_700_000_000_000_000_000
+SECONDS, RATE = 6, 3
+SIGMA = 0.3
+
+
+def test_loop_on_simulated_time(world):
+    """Stamps and sigma are those of the bag; each pass clears the window once or twice."""
+    path = world.folder / 'plain.mcap'
+    with BagWriter(path) as bag:
+        topic = bag.add_topic('/voltage', 'std_msgs/msg/Float32')
+        for k, voltage in enumerate(ou_path(1000 * SECONDS, 0.001, seed=11, sigma=SIGMA)):
+            bag.write(topic, T0 + k * 1_000_000, {'data': voltage})
+    probe = world.probe()
+    states = probe.listen('/ou_estimator/state', DiagnosticArray)
+    estimator = world.start('estimator', '--ros-args', '-p', 'use_sim_time:=true')
+    wait_until(lambda: states)
+    replay = world.start('replay', path, '--loop', '--rate', RATE, '--wait', '15')
+
+    def fields():
+        return values_of(states[-1].status[0])
+    # Two full passes: 2 * 6 / 3 s.
+    wait_until(lambda: int(fields()['resets']) >= 2, 30.0, 'two passes')
+    resets = int(fields()['resets'])
+    wait_until(lambda: int(fields()['resets']) > resets, 30.0, 'another pass')
+    assert [replay.stop(), estimator.stop()] == [0, 0]
+    seen = [values_of(message.status[0]) for message in states]
+    stamps = [float(f['t']) for f in seen if math.isfinite(float(f['t']))]
+    # The line through /clock may run on by some ticks where a pass ends.
+    assert T0 * 1e-9 - 0.1 < min(stamps) and max(stamps) < T0 * 1e-9 + SECONDS + 0.3
+    assert sum(b < a for a, b in zip(stamps, stamps[1:])) >= 2
+    full = [float(f['sigma']) for f in seen if int(f['n']) > 1500 and f['status'] == 'OK']
+    # By source time alone sigma would come out sqrt(3) times as large.
+    assert sorted(full)[len(full) // 2] == pytest.approx(SIGMA, rel=0.15)
+    rates = [float(f['rate']) for f in seen if int(f['n']) > 1500]
+    assert sorted(rates)[len(rates) // 2] == pytest.approx(1000.0, rel=0.05)
+
+
+def test_without_a_clock_it_says_so(world):
+    """The node is told to run on simulated time, and nothing publishes it."""
+    from std_msgs.msg import Float32
+    probe = world.probe()
+    states = probe.listen('/ou_estimator/state', DiagnosticArray)
+    output = probe.publisher('/voltage', Float32)
+    estimator = world.start('estimator', '--ros-args', '-p', 'use_sim_time:=true')
+
+    def said():
+        output.publish(Float32(data=5.0))
+        return states and 'nothing comes on /clock' in states[-1].status[0].message
+    wait_until(said, what='complaint')
+    assert states[-1].status[0].level == b'\x03'
+    assert estimator.stop() == 0
