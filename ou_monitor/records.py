@@ -44,8 +44,8 @@ class Status(enum.Enum):
         'the window.')
     NO_RELAXATION = (
         'No relaxation visible at this rate: neighbouring samples are uncorrelated, so '
-        'the rail is faster than the sampling, or the noise is the sensor\'s; raise the '
-        'sampling rate.')
+        'the rail is faster than the sampling, or the noise is that of the sensor; raise '
+        'the sampling rate.')
 
 
 class Flag(enum.Enum):

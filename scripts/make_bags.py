@@ -24,7 +24,7 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from ou_monitor.model.ou import simulate  # noqa: E402
+from ou_monitor.model.ou import simulate  # noqa: E402, I100
 from ou_monitor.recordings.write import TYPES, write_recording  # noqa: E402
 from ou_monitor.records import FloatArray, Recording  # noqa: E402
 
@@ -68,7 +68,7 @@ class Bag:
 
     name: str
     description: str
-    type: str
+    type: str  # noqa: A003
     rate: float
     seed: int
     recording: Recording
@@ -80,13 +80,14 @@ def grid(duration: float, rate: float) -> FloatArray:
     return np.arange(round(duration * rate)) / rate
 
 
-def steady(name: str, throttle: float, duration: float, rate: float, type: str, seed: int) -> Bag:
+def steady(name: str, throttle: float, duration: float, rate: float, kind: str,
+           seed: int) -> Bag:
     """Return OU noise at a constant throttle."""
     t = grid(duration, rate)
     sigma = SIGMA[throttle]
     u = simulate(t, ALPHA, sigma, np.random.default_rng(seed), u0=U0)
     return Bag(
-        name, f'OU noise at a constant throttle of {throttle:.0%}', type, rate, seed,
+        name, f'OU noise at a constant throttle of {throttle:.0%}', kind, rate, seed,
         Recording(t, u, np.full(t.shape, throttle), name),
         {'alpha': ALPHA, 'sigma': sigma, 'var_inf': sigma**2 / (2.0 * ALPHA), 'u0': U0,
          'noise_std': 0.0, 'throttle': throttle})

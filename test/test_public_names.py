@@ -5,9 +5,8 @@ import re
 import subprocess
 import sys
 
-import pytest
-
 import ou_monitor
+import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 

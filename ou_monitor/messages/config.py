@@ -15,10 +15,9 @@ from pathlib import Path
 import re
 from typing import Any
 
-import yaml
-
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.messages.field_path import parse_field_path
+import yaml
 
 NAN_RULES = ('drop', 'unknown')
 
@@ -60,7 +59,7 @@ class FieldSpec:
     """
 
     topic: str
-    type: str
+    type: str  # noqa: A003
     field: str
     unit_factor: float = 1.0
     sign: int = 1

@@ -14,10 +14,9 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from ou_monitor.records import FloatArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize_scalar
-
-from ou_monitor.records import FloatArray
 
 
 @dataclass(frozen=True)

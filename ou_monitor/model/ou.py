@@ -11,9 +11,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
-
 from ou_monitor.records import FloatArray
+from scipy.signal import lfilter
 
 
 def stationary_variance(alpha: float, sigma: float) -> float:

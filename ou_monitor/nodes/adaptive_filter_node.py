@@ -5,7 +5,8 @@ Inputs (relative names): `sigma` (std_msgs/Float64), `input` (a type of
 `filter_channels.CHANNELS`).  Outputs: `~/output` (type and stamp of the
 input), `~/cutoff` (std_msgs/Float64, Hz) at `publish_rate`, `/diagnostics`.
 
-Limits: of an IMU the angular velocity is filtered, the rest passes through;
+Limits: of an IMU the angular velocity is filtered and of a BatteryState the
+voltage, the rest passes through;
 a message with a non-finite signal is counted and not passed on.
 """
 
@@ -19,7 +20,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.nodes.base import MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.diagnostics import diagnostic
-from ou_monitor.nodes.filter_channels import Channels, CHANNELS
+from ou_monitor.nodes.filter_channels import CHANNELS, Channels
 from ou_monitor.nodes.inputs import INPUT_QOS, Silence, Stamper, types_on
 from ou_monitor.nodes.message_types import message_class
 from ou_monitor.online.lowpass import AdaptiveLowPass

@@ -146,7 +146,7 @@ class EstimatorNode(MonitorNode):
         self.create_subscription(message, source.topic, self.with_info(take), INPUT_QOS)
         self._opened[source.quantity] = source
         self.get_logger().info(
-            f"{source.quantity} from {topic}: {extractor.spec.type} field "
+            f'{source.quantity} from {topic}: {extractor.spec.type} field '
             f"'{extractor.spec.field}' (msg_config '{source.config}')")
 
     # -- messages in

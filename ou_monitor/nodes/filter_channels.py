@@ -32,6 +32,10 @@ def _put_data(message: Any, values: Sequence[float]) -> None:
     message.data = values[0]
 
 
+def _put_voltage(message: Any, values: Sequence[float]) -> None:
+    message.voltage = values[0]
+
+
 def _take_gyro(message: Any) -> Sequence[float]:
     rate = message.angular_velocity
     return rate.x, rate.y, rate.z
@@ -48,5 +52,7 @@ _DATA = Channels(('data',), lambda message: (message.data,), _put_data)
 CHANNELS: dict[str, Channels] = {
     'std_msgs/msg/Float32': _DATA,
     'std_msgs/msg/Float64': _DATA,
+    'sensor_msgs/msg/BatteryState': Channels(
+        ('voltage',), lambda message: (message.voltage,), _put_voltage),
     'sensor_msgs/msg/Imu': Channels(('x', 'y', 'z'), _take_gyro, _put_gyro),
 }

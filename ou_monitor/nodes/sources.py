@@ -80,7 +80,7 @@ class Source:
         """Return the types that can be chosen from."""
         return list(dict.fromkeys(c.spec.type for c in self.candidates if c.spec is not None))
 
-    def open(self) -> tuple[Any, Extractor]:
+    def open(self) -> tuple[Any, Extractor]:  # noqa: A003
         """
         Return the message class and the extractor, tried on an empty message.
 

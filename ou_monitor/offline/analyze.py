@@ -13,11 +13,10 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-
 from ou_monitor.offline.levels import find_levels, LoadLevel, Segment
 from ou_monitor.offline.pooling import fit_stretch, pool, standardised_increments
 from ou_monitor.offline.process_type import classify, excess_kurtosis, ProcessType
-from ou_monitor.offline.sliding import Sliding, slide
+from ou_monitor.offline.sliding import slide, Sliding
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Recording, Status
 
 Progress = Callable[[float], None]

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.signal import welch
-
 from ou_monitor.offline.analyze import LevelResult
 from ou_monitor.records import FloatArray, Recording
+from scipy.signal import welch
 
 _MIN_LENGTH = 32
 # About this many averages: the estimate scatters by 1/sqrt(8), and there is

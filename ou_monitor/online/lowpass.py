@@ -94,7 +94,7 @@ class AdaptiveLowPass:
         self._settings = FilterSettings.from_options(options, base=self._settings)
         self._cutoff = min(max(self._cutoff, self._settings.fmin), self._settings.fmax)
 
-    def filter(self, t: npt.ArrayLike, x: npt.ArrayLike,
+    def filter(self, t: npt.ArrayLike, x: npt.ArrayLike,  # noqa: A003
                sigma: npt.ArrayLike) -> FloatArray | float:
         """
         Filter samples.

@@ -49,7 +49,7 @@ ESTIMATOR_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('stale_after', 1.0, 'Silence after which the input counts as stale, s.',
               0.01, 3600.0),
     Parameter('brownout.voltage', 4.5,
-              'Supply voltage that must not be undershot, V (default: PX4\'s lower limit of '
+              'Supply voltage that must not be undershot, V (default: the lower limit of PX4 for '
               'a 5 V rail).', 0.0, 1000.0),
     Parameter('brownout.horizon', 5.0, 'Time ahead for which the risk is told, s.',
               0.001, 3600.0),

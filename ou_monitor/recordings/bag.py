@@ -22,14 +22,13 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
-import yaml
-
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag_target import BagTarget
 from ou_monitor.recordings.mcap_file import in_time_order, McapFile, RawMessage
 from ou_monitor.recordings.rosbag2_metadata import (
     find_files, parse_qos, qos_profile, TopicInfo)
 from ou_monitor.recordings.schemas import SCHEMAS, TYPE_HASHES
+import yaml
 
 __all__ = ['BagReader', 'BagWriter', 'DecodedMessage', 'RawMessage', 'TopicInfo']
 
@@ -42,7 +41,7 @@ class DecodedMessage(NamedTuple):
     """One message with its fields as attributes."""
 
     topic: str
-    type: str
+    type: str  # noqa: A003
     log_time_ns: int
     message: Any
 
@@ -270,7 +269,8 @@ class BagWriter:
         self._writer.start(profile='ros2', library='ou_monitor')
 
     def add_topic(
-        self, name: str, type: str, *, schema: str | None = None, reliability: str = 'reliable',
+        self, name: str, type: str, *,  # noqa: A002
+        schema: str | None = None, reliability: str = 'reliable',
     ) -> str:
         """
         Announce a topic.

@@ -29,7 +29,7 @@ class RawMessage(NamedTuple):
     """One message as recorded; `data` is CDR, `log_time_ns` in ns."""
 
     topic: str
-    type: str
+    type: str  # noqa: A003
     log_time_ns: int
     data: bytes
 
@@ -55,7 +55,7 @@ class TopicRecord:
     """A channel of one file: what its messages are."""
 
     name: str
-    type: str
+    type: str  # noqa: A003
     schema: Any
     qos: str
 

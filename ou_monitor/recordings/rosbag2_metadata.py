@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import yaml
-
 from ou_monitor.errors import InputError
+import yaml
 
 FILE = 'metadata.yaml'
 _ROOT = 'rosbag2_bagfile_information'
@@ -48,7 +47,7 @@ class TopicInfo:
     """
 
     name: str
-    type: str
+    type: str  # noqa: A003
     count: int
     reliability: str = 'reliable'
     durability: str = 'volatile'

@@ -41,8 +41,9 @@ THROTTLE, VOLTAGE = 0, 1
 
 
 def write_recording(
-    rec: Recording, path: str | Path, *, type: str = 'battery_state', start_ns: int = 0,
-    sample_rate: float = 10000.0, block: int = 100,
+    rec: Recording, path: str | Path, *,
+    type: str = 'battery_state',  # noqa: A002
+    start_ns: int = 0, sample_rate: float = 10000.0, block: int = 100,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[str, ...]:
     """
@@ -110,7 +111,7 @@ def write_recording(
 
 
 def _voltage(
-    stamps: npt.NDArray[np.int64], rec: Recording, type: str, block: int,
+    stamps: npt.NDArray[np.int64], rec: Recording, type: str, block: int,  # noqa: A002
 ) -> Iterator[Timed]:
     if type == 'adc_block':
         for first in range(0, rec.n, block):

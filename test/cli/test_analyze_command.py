@@ -5,10 +5,9 @@ import math
 import re
 
 import numpy as np
-import pytest
-
 from ou_monitor.cli.main import main
 from ou_monitor.model.ou import simulate
+import pytest
 
 ALPHA, SECONDS = 63.0, 6.0
 SIGMA = {0.1: 0.3156, 0.4: 0.632}

@@ -3,11 +3,10 @@
 import subprocess
 import sys
 
-import pytest
-
 import ou_monitor
 from ou_monitor.cli import main as cli
 from ou_monitor.errors import InputError
+import pytest
 
 
 def failure(capsys, *argv):

@@ -6,10 +6,9 @@ import json
 import math
 
 import numpy as np
-import pytest
-
 from ou_monitor.cli import output
 from ou_monitor.errors import InputError
+import pytest
 
 
 class Colour(enum.Enum):

@@ -32,7 +32,7 @@ def chain(shared_world):
         '-r', 'input:=voltage', '-p', f'sigma_ref:={SIGMA_REF}', '-p', 'fmin:=2.0',
         '-p', 'smoothing:=0.05')
     # Both must be there: replay starts with its first subscriber, which is this probe.
-    wait_until(lambda: heard['sigma'] and heard['cutoff'], what='both nodes')
+    wait_until(lambda: heard['sigma'] and heard['cutoff'] and statuses(heard), what='both nodes')
     heard['fallback'] = heard['cutoff'][0].data
     replay = shared_world.start('replay', str(BAG), '--clock', '0')
     wait_until(lambda: len(heard['output']) > ENOUGH, 60.0, '5000 filtered messages')

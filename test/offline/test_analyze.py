@@ -4,13 +4,12 @@ import math
 
 from made_recordings import ALPHA, recording, without_throttle
 import numpy as np
-import pytest
-
 from ou_monitor.offline.analyze import analyze
 from ou_monitor.offline.process_type import ProcessType
 from ou_monitor.offline.sliding import slide
 from ou_monitor.online.estimator import SlidingEstimator
 from ou_monitor.records import Recording, Status
+import pytest
 
 TRUTH = ((0.1, 0.3156), (0.4, 0.632))
 

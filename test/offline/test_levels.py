@@ -1,9 +1,8 @@
 """Load levels: found, given, split at pauses, settled."""
 
 import numpy as np
-import pytest
-
 from ou_monitor.offline.levels import find_levels, HALF_WIDTH, SETTLE
+import pytest
 
 RATE = 200.0
 

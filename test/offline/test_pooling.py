@@ -5,11 +5,10 @@ import math
 
 from made_recordings import ALPHA, recording
 import numpy as np
-import pytest
-
 from ou_monitor.offline.pooling import fit_stretch, pool, standardised_increments
 from ou_monitor.online.estimator import SlidingEstimator
 from ou_monitor.records import Estimate, Status
+import pytest
 
 
 def one(alpha=63.0, se=0.1, duration=1.0, **changes):

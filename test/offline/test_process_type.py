@@ -3,10 +3,9 @@
 import math
 
 import numpy as np
-import pytest
-
 from ou_monitor.offline.process_type import classify, excess_kurtosis, ProcessType
 from ou_monitor.records import Estimate, Flag, Status
+import pytest
 
 USABLE = Estimate(alpha=63.0, sigma=0.3, var_inf=7e-4, u0=5.0, alpha_se=0.1, sigma_se=0.1,
                   var_inf_se=0.1, status=Status.OK, n=10000, duration=10.0, rate=1000.0)

@@ -8,14 +8,13 @@ from xml.etree import ElementTree
 from hypothesis import given, strategies as st
 from made_recordings import recording, without_throttle
 import numpy as np
-import pytest
-
 from ou_monitor.offline.analyze import analyze
 from ou_monitor.offline.report import page
 from ou_monitor.offline.report.analysis_page import analysis_page
 from ou_monitor.offline.report.scale import linear_ticks, log_ticks, Scale, span, thin, tick_text
 from ou_monitor.offline.report.svg import Plot
 from ou_monitor.records import Recording
+import pytest
 
 ends = st.floats(-1e6, 1e6)
 

@@ -4,10 +4,9 @@ import math
 
 from made_recordings import ALPHA, recording
 import numpy as np
-import pytest
-
 from ou_monitor.offline.analyze import analyze
 from ou_monitor.offline.spectrum import level_spectrum, ou_spectrum
+import pytest
 
 
 def test_the_curve_holds_the_whole_variance():

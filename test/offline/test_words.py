@@ -4,11 +4,10 @@ from dataclasses import replace
 import math
 
 from made_recordings import recording, without_throttle
-import pytest
-
 from ou_monitor.offline.analyze import analyze
 from ou_monitor.offline.words import as_data, cautions, headline, NOISE_UNKNOWN, number
 from ou_monitor.records import Flag
+import pytest
 
 TRUTH = ((0.1, 0.3156), (0.4, 0.632))
 LEVEL_KEYS = {

@@ -21,7 +21,7 @@ def recording(n=2500, start=0.0, throttle=True):
 
 @pytest.mark.parametrize('type', sorted(TYPES))
 @pytest.mark.parametrize('start', [0.0, 100.0])
-def test_round_trip(tmp_path, type, start):
+def test_round_trip(tmp_path, type, start):  # noqa: A002
     """Stamps to the ns, voltage to the resolution of the message, throttle exactly."""
     rec = recording(start=start)
     assert write_recording(rec, tmp_path / 'bag', type=type) == ()

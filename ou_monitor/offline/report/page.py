@@ -10,7 +10,7 @@ from html import escape
 _LIGHT = ('#0072b2', '#d55e00', '#009e73', '#cc79a7', '#b07d00', '#3a9bd9', '#6b4fa0', '#5f6b6d')
 _DARK = ('#5cb3f0', '#ff8a45', '#35cfa0', '#ea9cc9', '#e6b84a', '#9bd2f7', '#b59cf0', '#a9b4b6')
 
-_STYLE = '''
+_STYLE = """
 :root { color-scheme: light dark; --paper: #ffffff; --ink: #1c2326; --soft: #5d686c;
   --rule: #dde3e5; --panel: #f5f7f8; --warn: #9a4a00; LIGHT }
 @media (prefers-color-scheme: dark) { :root { --paper: #14191b; --ink: #e6eaeb;
@@ -48,7 +48,7 @@ svg .faint { opacity: .55; } svg .band { stroke: none; opacity: .22; }
 svg .panel { fill: var(--paper); opacity: .8; }
 svg .shade { stroke: none; opacity: .10; }
 @media print { body { max-width: none; } section { break-inside: avoid; } }
-'''
+"""
 
 
 def _stylesheet() -> str:
