@@ -1,0 +1,261 @@
+"""
+From pushes of any size to clean, ordered, evenly thinned samples.
+
+`push` only copies into a buffer; the work is done in batches, when the buffer
+is full or an estimate is asked for, so its cost per sample is that of a
+memory copy.  Sorting, dropping and counting happen here and nowhere else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from ou_monitor.online.series import IntArray
+from ou_monitor.records import Counters, FloatArray, NAN
+
+# Samples collected before a batch is worked off: large enough that NumPy's
+# overhead per call vanishes, small enough to stay in the cache.
+BATCH = 16384
+# Samples from which the rate is told.
+MIN_FOR_RATE = 8
+# A step that differs from the usual one by more than this share breaks the run.
+UNEVEN = 0.5
+# The usual step is taken anew when a batch's median differs by this factor.
+NEW_RATE = 1.3
+
+
+@dataclass(frozen=True)
+class Batch:
+    """
+    Clean samples in order.
+
+    Attributes
+    ----------
+    t, y, u : ndarray, shape (n,)
+        Stamps (s, strictly increasing), voltage (V), throttle (NaN: unknown).
+    restart : bool
+        Whether everything before this batch is to be forgotten.
+
+    """
+
+    t: FloatArray
+    y: FloatArray
+    u: FloatArray
+    restart: bool
+
+
+class Intake:
+    """Buffer in front of the window, and the account of every sample pushed."""
+
+    def __init__(self) -> None:
+        self._t = np.empty(BATCH)
+        self._y = np.empty(BATCH)
+        self._u = np.empty(BATCH)
+        self._fill = 0
+        self.counters = Counters()
+        self.newest = -math.inf
+
+    @property
+    def waiting(self) -> int:
+        """Return the number of samples not yet worked off."""
+        return self._fill
+
+    def room(self) -> int:
+        """Return how many samples fit before the next batch."""
+        return BATCH - self._fill
+
+    def put(self, t: FloatArray, y: FloatArray, u: FloatArray | float) -> None:
+        """Copy samples into the buffer; there must be room for them."""
+        begin = self._fill
+        end = begin + t.size
+        self._t[begin:end] = t
+        self._y[begin:end] = y
+        self._u[begin:end] = u
+        self._fill = end
+
+    def put_one(self, t: float, y: float, u: float) -> None:
+        """Copy one sample into the buffer; there must be room for it."""
+        at = self._fill
+        self._t[at], self._y[at], self._u[at] = t, y, u
+        self._fill = at + 1
+
+    def count(self, **more: int) -> None:
+        """Add to the counters."""
+        c = self.counters
+        self.counters = replace(c, **{k: getattr(c, k) + v for k, v in more.items() if v})
+
+    def forget(self) -> None:
+        """Take the next sample as the first one."""
+        self.newest = -math.inf
+
+    def work_off(self, window: float) -> list[Batch]:
+        """
+        Empty the buffer.
+
+        Parameters
+        ----------
+        window : float
+            Length of the window, s: a step back or a pause longer than this
+            starts a new window.
+
+        Returns
+        -------
+        list of Batch
+            Usually one.
+
+        """
+        n = self._fill
+        self._fill = 0
+        t, y, u = self._t[:n], self._y[:n], self._u[:n]
+        self.count(pushed=n)
+        # One pass says whether all is finite: a sum of finite stamps and volts is.
+        if not math.isfinite(float(t.sum()) + float(y.sum())):
+            good = np.isfinite(t) & np.isfinite(y)
+            self.count(non_finite=n - int(good.sum()))
+            t, y, u = t[good], y[good], u[good]
+        if not t.size:
+            return []
+        steps = np.diff(t, prepend=self.newest)
+        if float(steps.min()) > 0.0 and float(steps.max()) <= window:
+            self._accept(t)
+            return [Batch(t.copy(), y.copy(), u.copy(), restart=False)]
+        return self._untangle(t, y, u, window)
+
+    def _accept(self, t: FloatArray) -> None:
+        self.count(used=t.size)
+        self.newest = float(t[-1])
+
+    def _untangle(self, t: FloatArray, y: FloatArray, u: FloatArray, window: float
+                  ) -> list[Batch]:
+        """Split where time starts anew, sort what is late, drop repeats."""
+        newest = np.maximum.accumulate(np.concatenate(([self.newest], t)))[:-1]
+        fresh = (t < newest - window) | (t > newest + window)
+        batches: list[Batch] = []
+        begin = 0
+        # Where time jumps, the running maximum starts again: one split at a time.
+        while begin < t.size:
+            jumps = np.flatnonzero(fresh[begin:])
+            restart = bool(jumps.size and jumps[0] == 0) and math.isfinite(self.newest)
+            later = jumps[jumps > 0]
+            end = begin + int(later[0]) if later.size else t.size
+            part = slice(begin, end)
+            batch = self._ordered(t[part], y[part], u[part], restart)
+            if batch is not None:
+                batches.append(batch)
+            begin = end
+            if begin < t.size:
+                rest = np.concatenate(([self.newest], t[begin:]))
+                rest[0] = -math.inf
+                newest = np.maximum.accumulate(rest)[:-1]
+                fresh[begin:] = (t[begin:] < newest - window) | (t[begin:] > newest + window)
+                fresh[begin] = True
+        return batches
+
+    def _ordered(self, t: FloatArray, y: FloatArray, u: FloatArray, restart: bool
+                 ) -> Batch | None:
+        if restart:
+            self.newest = -math.inf
+            self.count(resets=1)
+        order = np.argsort(t, kind='stable')
+        t, y, u = t[order], y[order], u[order]
+        keep = np.diff(t, prepend=self.newest) > 0.0
+        self.count(late=t.size - int(keep.sum()))
+        t, y, u = t[keep], y[keep], u[keep]
+        if not t.size:
+            return None
+        self._accept(t)
+        return Batch(t, y, u, restart)
+
+
+class Thinner:
+    """
+    Averages over blocks of m samples where the source is faster than needed.
+
+    Parameters
+    ----------
+    fastest : float
+        Highest rate at which samples are kept, Hz.
+
+    """
+
+    def __init__(self, fastest: float) -> None:
+        self._fastest = fastest
+        self.m = 0
+        self.step = NAN
+        self._rest: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        self._last_t = NAN
+
+    @property
+    def known(self) -> bool:
+        """Whether the rate has been told."""
+        return self.m > 0
+
+    def forget(self) -> None:
+        """Take the next samples as the first ones; the rate stays known."""
+        self._rest, self._last_t = None, NAN
+
+    def learn(self, t: FloatArray) -> bool:
+        """
+        Take the usual step from a batch; return whether it is a new one.
+
+        Parameters
+        ----------
+        t : ndarray, shape (n,)
+            Stamps, s; fewer than `MIN_FOR_RATE` tell nothing.
+
+        """
+        if t.size < MIN_FOR_RATE:
+            return False
+        step = float(np.median(np.diff(t)))
+        if self.known and self.step / NEW_RATE < step < self.step * NEW_RATE:
+            return False
+        self.step = step
+        self.m = max(1, round(1.0 / (step * self._fastest)))
+        self.forget()
+        return True
+
+    def thin(self, batch: Batch) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+        """
+        Return t, y, u of the blocks, and before which of them time breaks.
+
+        The stamp of a block is the mean of its stamps.  Samples that do not
+        fill a block wait for the next batch, or are left out before a break.
+        """
+        t, y, u = batch.t, batch.y, batch.u
+        if self.m == 1:
+            steps = np.diff(t, prepend=self._last_t)
+            uneven = ~(np.abs(steps - self.step) <= UNEVEN * self.step)
+            self._last_t = float(t[-1])
+            return t, y, u, np.flatnonzero(uneven)
+        if self._rest is not None:
+            t, y, u = (np.concatenate(pair) for pair in zip(self._rest, (t, y, u)))
+        gaps = np.diff(t) > (1.0 + self.m * UNEVEN) * self.step
+        starts = [0, *(np.flatnonzero(gaps) + 1).tolist(), t.size]
+        parts: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+        breaks: list[int] = []
+        count = 0
+        for low, high in zip(starts[:-1], starts[1:]):
+            whole = (high - low) // self.m
+            if low > 0 or math.isnan(self._last_t):
+                breaks.append(count)
+            stop = low + whole * self.m
+            parts.append((
+                t[low:stop].reshape(whole, self.m).mean(axis=1),
+                y[low:stop].reshape(whole, self.m).mean(axis=1),
+                u[low:stop].reshape(whole, self.m).mean(axis=1)))
+            count += whole
+            self._rest = (t[stop:high].copy(), y[stop:high].copy(), u[stop:high].copy())
+            if whole:
+                self._last_t = float(t[stop - 1])
+        joined = [np.concatenate(column) for column in zip(*parts)]
+        return joined[0], joined[1], joined[2], np.array(
+            [b for b in breaks if b < count], dtype=np.int64)
+
+
+def as_column(values: npt.ArrayLike) -> FloatArray:
+    """Return values as a float64 array of shape (n,); a scalar becomes one sample."""
+    return np.atleast_1d(np.asarray(values, dtype=np.float64))
