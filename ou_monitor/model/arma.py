@@ -56,10 +56,29 @@ def block_autocovariance(a: float, m: int) -> tuple[float, float]:
 
 def noise_free_theta(a: float, m: int) -> float:
     """Return theta without measurement noise: 0 for samples, negative for block means."""
-    if m == 1:
-        return 0.0
+    return 0.0 if m == 1 else theta_at(a, m, 0.0)
+
+
+def theta_at(a: float, m: int, share: float) -> float:
+    """
+    Return the moving-average coefficient at a noise share.
+
+    Parameters
+    ----------
+    a, m :
+        As in `block_autocovariance`.
+    share : float
+        Noise variance of one block mean in units of sigma^2 D, >= 0.
+
+    Returns
+    -------
+    float
+        theta, |theta| < 1.
+
+    """
     phi = math.exp(-a)
     gamma0, gamma1 = block_autocovariance(a, m)
+    gamma0 += share
     ratio = 2.0 * (phi * gamma0 - gamma1) / (gamma0 * (1.0 + phi * phi) - 2.0 * phi * gamma1)
     return ratio / (1.0 + math.sqrt(max(1.0 - ratio * ratio, 0.0)))
 

@@ -26,6 +26,8 @@ MIN_FOR_RATE = 8
 UNEVEN = 0.5
 # The usual step is taken anew when a batch's median differs by this factor.
 NEW_RATE = 1.3
+# Stamps remembered for that from batch to batch.
+MEMORY = 32
 
 
 @dataclass(frozen=True)
@@ -173,7 +175,7 @@ class Intake:
 
 class Thinner:
     """
-    Averages over blocks of m samples where the source is faster than needed.
+    Learns the rate of the source, and averages blocks of m samples where it is too fast.
 
     Parameters
     ----------
@@ -186,74 +188,92 @@ class Thinner:
         self._fastest = fastest
         self.m = 0
         self.step = NAN
-        self._rest: tuple[FloatArray, FloatArray, FloatArray] | None = None
-        self._last_t = NAN
-
-    @property
-    def known(self) -> bool:
-        """Whether the rate has been told."""
-        return self.m > 0
+        self.forget()
 
     def forget(self) -> None:
         """Take the next samples as the first ones; the rate stays known."""
-        self._rest, self._last_t = None, NAN
+        self._rest = np.empty((3, 0))
+        self._stamps = np.empty(0)
+        self._continues = False
 
-    def learn(self, t: FloatArray) -> bool:
+    @property
+    def waiting(self) -> int:
+        """Return the number of samples that wait for the rate, or for a whole block."""
+        return int(self._rest.shape[1])
+
+    def take(self, t: FloatArray, y: FloatArray, u: FloatArray
+             ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray, bool]:
         """
-        Take the usual step from a batch; return whether it is a new one.
+        Return the samples to keep.
 
         Parameters
         ----------
-        t : ndarray, shape (n,)
-            Stamps, s; fewer than `MIN_FOR_RATE` tell nothing.
+        t, y, u : ndarray, shape (n,)
+            Clean samples (see `Batch`).
+
+        Returns
+        -------
+        t, y, u : ndarray, shape (k,)
+            Samples or block means; the stamp of a block is the mean stamp.
+        breaks : ndarray of int
+            Before which of them equal spacing is broken.
+        restart : bool
+            Whether the block size changed, so that what came before does not
+            go with these.
 
         """
-        if t.size < MIN_FOR_RATE:
-            return False
-        step = float(np.median(np.diff(t)))
-        if self.known and self.step / NEW_RATE < step < self.step * NEW_RATE:
-            return False
-        self.step = step
-        self.m = max(1, round(1.0 / (step * self._fastest)))
-        self.forget()
-        return True
-
-    def thin(self, batch: Batch) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-        """
-        Return t, y, u of the blocks, and before which of them time breaks.
-
-        The stamp of a block is the mean of its stamps.  Samples that do not
-        fill a block wait for the next batch, or are left out before a break.
-        """
-        t, y, u = batch.t, batch.y, batch.u
+        restart = False
+        stamps = np.concatenate([self._stamps, t])
+        steps = np.diff(stamps)[-t.size:] if stamps.size > t.size else np.diff(
+            t, prepend=-math.inf)
+        even = np.abs(steps - self.step) <= UNEVEN * self.step
+        if self.m == 0 or not even.all():
+            restart = self._learn(stamps)
+            even = np.abs(steps - self.step) <= UNEVEN * self.step
+        self._stamps = stamps[-MEMORY:]
+        if self.m == 0:
+            self._rest = np.concatenate([self._rest, [t, y, u]], axis=1)
+            empty = np.empty(0)
+            return empty, empty, empty, np.empty(0, dtype=np.int64), False
         if self.m == 1:
-            steps = np.diff(t, prepend=self._last_t)
-            uneven = ~(np.abs(steps - self.step) <= UNEVEN * self.step)
-            self._last_t = float(t[-1])
-            return t, y, u, np.flatnonzero(uneven)
-        if self._rest is not None:
-            t, y, u = (np.concatenate(pair) for pair in zip(self._rest, (t, y, u)))
-        gaps = np.diff(t) > (1.0 + self.m * UNEVEN) * self.step
-        starts = [0, *(np.flatnonzero(gaps) + 1).tolist(), t.size]
-        parts: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-        breaks: list[int] = []
-        count = 0
+            if self._rest.size:
+                t, y, u = np.concatenate([self._rest, [t, y, u]], axis=1)
+                even = np.abs(np.diff(t, prepend=-math.inf) - self.step) <= UNEVEN * self.step
+                self._rest = np.empty((3, 0))
+            return t, y, u, np.flatnonzero(~even), restart
+        return (*self._blocks(np.concatenate([self._rest, [t, y, u]], axis=1)), restart)
+
+    def _learn(self, stamps: FloatArray) -> bool:
+        """Take the usual step anew; return whether the block size changed."""
+        if stamps.size < MIN_FOR_RATE:
+            return False
+        step = float(np.median(np.diff(stamps[-BATCH:])))
+        if self.m and self.step / NEW_RATE < step < self.step * NEW_RATE:
+            return False
+        before, self.step = self.m, step
+        self.m = max(1, round(1.0 / (step * self._fastest)))
+        return before not in (0, self.m)
+
+    def _blocks(self, columns: FloatArray
+                ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+        """Average whole blocks; what is left waits, or is left out before a break."""
+        t, m = columns[0], self.m
+        gaps = np.flatnonzero(np.abs(np.diff(t) - self.step) > UNEVEN * m * self.step) + 1
+        starts = [0, *gaps.tolist(), t.size]
+        parts, breaks, count = [], [], 0
+        if not self._continues:
+            breaks.append(0)
         for low, high in zip(starts[:-1], starts[1:]):
-            whole = (high - low) // self.m
-            if low > 0 or math.isnan(self._last_t):
+            if low:
                 breaks.append(count)
-            stop = low + whole * self.m
-            parts.append((
-                t[low:stop].reshape(whole, self.m).mean(axis=1),
-                y[low:stop].reshape(whole, self.m).mean(axis=1),
-                u[low:stop].reshape(whole, self.m).mean(axis=1)))
+            whole = (high - low) // m
+            stop = low + whole * m
+            parts.append(columns[:, low:stop].reshape(3, whole, m).mean(axis=2))
             count += whole
-            self._rest = (t[stop:high].copy(), y[stop:high].copy(), u[stop:high].copy())
-            if whole:
-                self._last_t = float(t[stop - 1])
-        joined = [np.concatenate(column) for column in zip(*parts)]
-        return joined[0], joined[1], joined[2], np.array(
-            [b for b in breaks if b < count], dtype=np.int64)
+            self._rest = columns[:, stop:high]
+        t, y, u = np.concatenate(parts, axis=1)
+        self._continues = bool(len(parts[-1][0])) or (self._continues and len(parts) == 1)
+        return t, y, u, np.array([b for b in breaks if b < count], dtype=np.int64)
 
 
 def as_column(values: npt.ArrayLike) -> FloatArray:
