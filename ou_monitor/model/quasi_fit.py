@@ -20,8 +20,9 @@ import math
 MAX_STEPS = 60
 # No step moves alpha by more than a factor exp(1.5).
 _LONGEST = 1.5
-# Settled: ln(alpha) and theta (relative to its distance from 1) move less.
-_SETTLED = 1e-9
+# Settled: ln(alpha) and theta (relative to its distance from 1) move less; what
+# is left is the square of it.
+_SETTLED = 1e-6
 
 
 def objective(c0: float, c: Sequence[float], free: float, log_a: float, theta: float,

@@ -41,7 +41,7 @@ _JITTER = 0.1
 # step: D >= (0.7 step / sigma)^2 (doc/estimation.md).
 _DITHER = 0.7
 # The quality of the input is looked at this many times per window.
-_LOOKS = 8
+_LOOKS = 4
 
 
 class SlidingEstimator:
@@ -71,6 +71,7 @@ class SlidingEstimator:
         self._finest = Resolution(self._window)
         self._tail = np.empty(0)
         self._quality = Quality()
+        self._jitter = 0.0
         self._looked = -math.inf
         self._start: tuple[float, float] | None = None
         self._cached: Estimate | None = None
@@ -185,6 +186,7 @@ class SlidingEstimator:
         """Examine the raw samples, now and then."""
         if not 0.0 <= t - self._looked < self._window / _LOOKS:
             self._quality = examine(self._tail)
+            self._jitter = float(np.std(np.diff(self._finest.series.column(T)[-TAIL:])))
             self._looked = t
         return self._quality
 
@@ -207,7 +209,7 @@ class SlidingEstimator:
         status = None
         if n < MIN_SAMPLES:
             status = Status.TOO_FEW_SAMPLES
-        elif not np.ptp(y) > 0.0:
+        elif y[0] == y[-1] and not np.ptp(y) > 0.0:
             status = Status.CONSTANT
         if status is not None:
             return replace(base, status=status, flags=tuple(
@@ -239,8 +241,7 @@ class SlidingEstimator:
         if fit.correlated:
             smoothness = _smoothness(sums.spread[:, 0, 0] / np.maximum(sums.pairs, 1.0),
                                      fit.a, m)
-            jitter = float(np.std(np.diff(series.column(T)))) if series.size <= MOST else 0.0
-            if m == 1 and jitter * fit.a / step > _JITTER:
+            if m == 1 and series.size <= MOST and self._jitter * fit.a / step > _JITTER:
                 return fit_irregular(series.columns(series.first, series.end), moves), NAN
         # Coarser where noise, or an ADC step, hides what the lags can hold.
         while fit.correlated and resolution.series.size >= FACTOR * FEWEST and (
@@ -258,9 +259,10 @@ class SlidingEstimator:
 
     def _step(self, t: FloatArray) -> float:
         """Return the mean step between evenly spaced samples, s."""
-        runs = self._finest.series.runs(self._finest.series.first, self._finest.series.end)
-        if bool((runs[1:] > 0).all()):
+        series = self._finest.series
+        if series.even:
             return float(t[-1] - t[0]) / (t.size - 1)
+        runs = series.runs(series.first, series.end)
         return float(np.diff(t)[runs[1:] > 0].mean())
 
 

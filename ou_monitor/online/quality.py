@@ -16,7 +16,7 @@ import numpy as np
 from ou_monitor.records import FloatArray
 
 # Raw samples looked at.
-TAIL = 2048
+TAIL = 1024
 # Fewest samples from which anything is told.
 _ENOUGH = 64
 # A lattice needs this many different steps, all whole multiples of one, and

@@ -85,6 +85,7 @@ class Series:
         self._reach = reach
         self._behind = 0
         self._last_move = -1
+        self._last_break = -1
         self.first = 0
 
     @property
@@ -106,6 +107,11 @@ class Series:
     def moves(self) -> bool:
         """Whether throttle, or its lag, moved in the window."""
         return self._last_move >= self.first
+
+    @property
+    def even(self) -> bool:
+        """Whether equal spacing is unbroken in the window."""
+        return self._last_break <= self.first
 
     def columns(self, begin: int, end: int) -> FloatArray:
         """Return columns (5, end - begin) of the samples numbered begin..end-1 (a view)."""
@@ -143,23 +149,31 @@ class Series:
         at = slice(self._tail, self._tail + n)
         had = self.size
         self._data[T, at], self._data[Y, at], self._data[U, at] = t, y, u
+        self._lag(t, u, at, had)
+        run = np.arange(1, n + 1)
+        run += int(self._run[self._tail - 1]) if had or self._behind else -1
+        for position in breaks:
+            run[position:] = np.arange(n - position)
+            self._last_break = self.end + int(position)
+        np.minimum(run, self._reach, out=self._run[at])
+        self._tail += n
+
+    def _lag(self, t: FloatArray, u: FloatArray, at: slice, had: bool) -> None:
+        """Fill the lagged throttle, and note where throttle last moved."""
+        if math.isnan(u[0]) and bool(np.isnan(u).all()):
+            self._data[FAST:, at] = math.nan
+            return
         for which, tau in ((FAST, LOAD_LAGS[0]), (SLOW, LOAD_LAGS[1])):
             before = (math.nan,) * 3
             if had:
                 before = (self.last(T), self.last(U), self.last(which))
             self._data[which, at] = lagged(t, u, tau, before)
-        run = np.arange(1, n + 1)
-        run += int(self._run[self._tail - 1]) if had or self._behind else -1
-        for position in breaks:
-            run[position:] = np.arange(n - position)
-        self._run[at] = np.minimum(run, self._reach)
         moving = (u != self._data[SLOW, at]) | (u != self._data[FAST, at])
         moving &= ~np.isnan(u)
         if had:
             moving[0] |= u[0] != self.last(U)
         if moving.any():
             self._last_move = self.end + int(np.flatnonzero(moving)[-1])
-        self._tail += n
 
     def drop_before(self, number: int) -> None:
         """Forget the samples numbered below `number`."""
