@@ -18,13 +18,14 @@ import numpy.typing as npt
 
 from ou_monitor.model import arma
 from ou_monitor.online import judgement
+from ou_monitor.online.compiled import kernels
 from ou_monitor.online.fitted import Fitted, from_window
-from ou_monitor.online.intake import as_column, Intake, Thinner
+from ou_monitor.online.intake import as_column, BATCH, Intake, Thinner
 from ou_monitor.online.irregular import fit_irregular, fresh_columns, MOST
 from ou_monitor.online.quality import examine, Quality, TAIL
 from ou_monitor.online.resolution import FACTOR, FEWEST, LAGS, Resolution
 from ou_monitor.online.series import T, U, Y
-from ou_monitor.online.window_fit import fit_window
+from ou_monitor.online.window_fit import fit_window, Minimise, plain_minimise
 from ou_monitor.records import Estimate, FloatArray, NAN, Status
 
 # Samples from which a fit is tried.
@@ -42,6 +43,8 @@ _JITTER = 0.1
 _DITHER = 0.7
 # The quality of the input is looked at this many times per window.
 _LOOKS = 4
+_DOUBLE = np.dtype(np.float64)
+_ONE = (float, int, type(None))
 
 
 class SlidingEstimator:
@@ -75,6 +78,7 @@ class SlidingEstimator:
         self._looked = -math.inf
         self._start: tuple[float, float] | None = None
         self._cached: Estimate | None = None
+        kernels()
 
     @property
     def window(self) -> float:
@@ -120,37 +124,34 @@ class SlidingEstimator:
 
         """
         self._cached = None
-        intake = self._intake
-        if isinstance(t, float) and isinstance(voltage, float):
-            if not intake.room():
+        put = self._intake.put
+        # What the fast sources send, with as few steps as can be.
+        if type(t) is float and type(voltage) is float and type(throttle) in _ONE:
+            if not self._intake.put_one(t, voltage, throttle):  # type: ignore[arg-type]
                 self._work_off()
-            if throttle is None or isinstance(throttle, (float, int)):
-                intake.put_one(t, voltage, NAN if throttle is None else throttle)
-                return
-        stamps, volts = as_column(t), as_column(voltage)
-        if stamps.ndim != 1 or stamps.shape != volts.shape:
-            raise ValueError(
-                f't and voltage must have one shape (n,): got {stamps.shape} and {volts.shape}')
-        load: FloatArray | float = NAN
-        if throttle is not None:
-            given = np.asarray(throttle, dtype=np.float64)
-            if given.ndim > 0 and given.shape != stamps.shape:
-                raise ValueError(
-                    f'throttle must be one number or have the shape of t, {stamps.shape}: got '
-                    f'{given.shape}')
-            load = given if given.ndim else float(given)
-        n = stamps.size
-        if n <= intake.room():
-            intake.put(stamps, volts, load)
+                self._intake.put_one(t, voltage, throttle)  # type: ignore[arg-type]
             return
-        begin = 0
-        while begin < n:
-            if not intake.room():
-                self._work_off()
-            part = slice(begin, begin + min(n - begin, intake.room()))
-            intake.put(stamps[part], volts[part],
-                       load[part] if isinstance(load, np.ndarray) else load)
-            begin = part.stop
+        if not (type(t) is np.ndarray is type(voltage) and t.dtype is _DOUBLE
+                and voltage.dtype is _DOUBLE and t.ndim == 1):
+            t, voltage = as_column(t), as_column(voltage)
+        if t.shape != voltage.shape or t.ndim != 1:
+            raise ValueError(
+                f't and voltage must have one shape (n,): got {t.shape} and {voltage.shape}')
+        load: FloatArray | float | None = None
+        if throttle is not None:
+            load = np.asarray(throttle, dtype=np.float64)
+            if load.ndim == 0:
+                load = float(load)
+            elif load.shape != t.shape:
+                raise ValueError(
+                    f'throttle must be one number or have the shape of t, {t.shape}: got '
+                    f'{load.shape}')
+        if put(t, voltage, load):
+            return
+        for begin in range(0, t.size, BATCH):
+            part = slice(begin, begin + BATCH)
+            self._work_off()
+            put(t[part], voltage[part], load[part] if isinstance(load, np.ndarray) else load)
 
     def estimate(self) -> Estimate:
         """Return the estimate for the window that ends at the newest sample."""
@@ -163,11 +164,13 @@ class SlidingEstimator:
         """Move what has been pushed into the window."""
         if not self._intake.waiting:
             return
-        for batch in self._intake.work_off(self._window):
+        for batch in self._intake.work_off(self._window, self._thinner.step):
             if batch.restart:
                 self._forget()
-            self._tail = np.concatenate([self._tail, batch.y])[-TAIL:]
-            *kept, restart = self._thinner.take(batch.t, batch.y, batch.u)
+            y = batch.y
+            self._tail = y[-TAIL:].copy() if y.size >= TAIL else np.concatenate(
+                [self._tail, y])[-TAIL:]
+            *kept, restart = self._thinner.take(batch)
             if restart:
                 # Block means of another size do not go with the old ones.
                 self._intake.count(resets=1)
@@ -227,22 +230,23 @@ class SlidingEstimator:
         series = self._finest.series
         moves = series.moves and bool(np.isfinite(series.column(U)).all())
         if quality.held > 1 and self._thinner.m == 1:
-            columns = fresh_columns(series.columns(series.first, series.end), quality.held)
+            columns = fresh_columns(series.all_columns(), quality.held)
             return fit_irregular(columns[:, -MOST:], moves), NAN
         sums = self._finest.sums.total()
         if self._thinner.m == 1 and series.size <= MOST and (
                 sums.pairs[-1] < _EVEN * (sums.n - LAGS)):
-            return fit_irregular(series.columns(series.first, series.end), moves), NAN
+            return fit_irregular(series.all_columns(), moves), NAN
         resolution, m = self._finest, self._thinner.m
         step = self._step(series.column(T))
-        fit = fit_window(sums, m, self._start)
+        minimise = _minimise()
+        fit = fit_window(sums, m, self._start, minimise)
         self._start = (math.log(fit.a), fit.theta) if fit.correlated else None
         smoothness = NAN
         if fit.correlated:
             smoothness = _smoothness(sums.spread[:, 0, 0] / np.maximum(sums.pairs, 1.0),
                                      fit.a, m)
             if m == 1 and series.size <= MOST and self._jitter * fit.a / step > _JITTER:
-                return fit_irregular(series.columns(series.first, series.end), moves), NAN
+                return fit_irregular(series.all_columns(), moves), NAN
         # Coarser where noise, or an ADC step, hides what the lags can hold.
         while fit.correlated and resolution.series.size >= FACTOR * FEWEST and (
                 fit.theta ** LAGS > _LOST
@@ -251,7 +255,7 @@ class SlidingEstimator:
             m *= FACTOR
             step *= FACTOR
             sums = resolution.sums.total()
-            coarse = fit_window(sums, m)
+            coarse = fit_window(sums, m, None, minimise)
             if not coarse.correlated:
                 break
             fit = coarse
@@ -264,6 +268,12 @@ class SlidingEstimator:
             return float(t[-1] - t[0]) / (t.size - 1)
         runs = series.runs(series.first, series.end)
         return float(np.diff(t)[runs[1:] > 0].mean())
+
+
+def _minimise() -> Minimise:
+    """Return the compiled search when it is ready, else the plain one."""
+    fast = kernels()
+    return plain_minimise if fast is None else fast.minimise
 
 
 def _smoothness(variogram: FloatArray, a: float, m: int) -> float:

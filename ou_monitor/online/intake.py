@@ -14,12 +14,13 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from ou_monitor.online.compiled import kernels
 from ou_monitor.online.series import IntArray
 from ou_monitor.records import Counters, FloatArray, NAN
 
 # Samples collected before a batch is worked off: large enough that NumPy's
 # overhead per call vanishes, small enough to stay in the cache.
-BATCH = 16384
+BATCH = 32768
 # Samples from which the rate is told.
 MIN_FOR_RATE = 8
 # A step that differs from the usual one by more than this share breaks the run.
@@ -28,17 +29,22 @@ UNEVEN = 0.5
 NEW_RATE = 1.3
 # Stamps remembered for that from batch to batch.
 MEMORY = 32
+_NONE = np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
 class Batch:
     """
-    Clean samples in order.
+    Clean samples in order; views that hold until the next push.
 
     Attributes
     ----------
-    t, y, u : ndarray, shape (n,)
-        Stamps (s, strictly increasing), voltage (V), throttle (NaN: unknown).
+    t, y : ndarray, shape (n,)
+        Stamps (s, strictly increasing) and voltage (V).
+    u : ndarray, shape (n,), or None
+        Throttle, NaN where unknown; None: unknown throughout.
+    shortest, longest : float
+        Least and largest step, from the sample before on, s.
     restart : bool
         Whether everything before this batch is to be forgotten.
 
@@ -46,7 +52,9 @@ class Batch:
 
     t: FloatArray
     y: FloatArray
-    u: FloatArray
+    u: FloatArray | None
+    shortest: float
+    longest: float
     restart: bool
 
 
@@ -56,7 +64,8 @@ class Intake:
     def __init__(self) -> None:
         self._t = np.empty(BATCH)
         self._y = np.empty(BATCH)
-        self._u = np.empty(BATCH)
+        self._u = np.full(BATCH, NAN)
+        self._loaded = False
         self._fill = 0
         self.counters = Counters()
         self.newest = -math.inf
@@ -66,24 +75,32 @@ class Intake:
         """Return the number of samples not yet worked off."""
         return self._fill
 
-    def room(self) -> int:
-        """Return how many samples fit before the next batch."""
-        return BATCH - self._fill
-
-    def put(self, t: FloatArray, y: FloatArray, u: FloatArray | float) -> None:
-        """Copy samples into the buffer; there must be room for them."""
+    def put(self, t: FloatArray, y: FloatArray, u: FloatArray | float | None) -> bool:
+        """Copy samples into the buffer; return False, and do nothing, without room."""
         begin = self._fill
         end = begin + t.size
+        if end > BATCH:
+            return False
         self._t[begin:end] = t
         self._y[begin:end] = y
-        self._u[begin:end] = u
+        if u is not None:
+            self._u[begin:end] = u
+            self._loaded = True
         self._fill = end
+        return True
 
-    def put_one(self, t: float, y: float, u: float) -> None:
-        """Copy one sample into the buffer; there must be room for it."""
+    def put_one(self, t: float, y: float, u: float | None) -> bool:
+        """Copy one sample into the buffer; return False, and do nothing, without room."""
         at = self._fill
-        self._t[at], self._y[at], self._u[at] = t, y, u
+        if at == BATCH:
+            return False
+        self._t[at] = t
+        self._y[at] = y
+        if u is not None:
+            self._u[at] = u
+            self._loaded = True
         self._fill = at + 1
+        return True
 
     def count(self, **more: int) -> None:
         """Add to the counters."""
@@ -94,7 +111,7 @@ class Intake:
         """Take the next sample as the first one."""
         self.newest = -math.inf
 
-    def work_off(self, window: float) -> list[Batch]:
+    def work_off(self, window: float, step: float) -> list[Batch]:
         """
         Empty the buffer.
 
@@ -103,35 +120,52 @@ class Intake:
         window : float
             Length of the window, s: a step back or a pause longer than this
             starts a new window.
+        step : float
+            The usual step, s; NaN when not known.
 
         Returns
         -------
         list of Batch
-            Usually one.
+            Usually one; good until the next `put`.
 
         """
         n = self._fill
         self._fill = 0
-        t, y, u = self._t[:n], self._y[:n], self._u[:n]
+        t, y = self._t[:n], self._y[:n]
+        u = self._u[:n] if self._loaded else None
+        if self._loaded:
+            # The next batch may come without throttle.
+            u = self._u[:n].copy()
+            self._u[:n] = NAN
+            self._loaded = False
         self.count(pushed=n)
+        fast = kernels()
+        if fast is not None and (1.0 + UNEVEN) * step < window and fast.check(
+                t, y, self.newest, (1.0 - UNEVEN) * step, (1.0 + UNEVEN) * step):
+            self._accept(t)
+            return [Batch(t, y, u, step, step, restart=False)]
         # One pass says whether all is finite: a sum of finite stamps and volts is.
         if not math.isfinite(float(t.sum()) + float(y.sum())):
             good = np.isfinite(t) & np.isfinite(y)
             self.count(non_finite=n - int(good.sum()))
-            t, y, u = t[good], y[good], u[good]
+            t, y, u = t[good], y[good], None if u is None else u[good]
         if not t.size:
             return []
-        steps = np.diff(t, prepend=self.newest)
-        if float(steps.min()) > 0.0 and float(steps.max()) <= window:
+        shortest = longest = float(t[0]) - self.newest
+        if t.size > 1:
+            steps = t[1:] - t[:-1]
+            shortest = min(shortest, float(steps.min()))
+            longest = max(longest, float(steps.max()))
+        if shortest > 0.0 and (longest <= window or longest == math.inf):
             self._accept(t)
-            return [Batch(t.copy(), y.copy(), u.copy(), restart=False)]
+            return [Batch(t, y, u, shortest, longest, restart=False)]
         return self._untangle(t, y, u, window)
 
     def _accept(self, t: FloatArray) -> None:
         self.count(used=t.size)
         self.newest = float(t[-1])
 
-    def _untangle(self, t: FloatArray, y: FloatArray, u: FloatArray, window: float
+    def _untangle(self, t: FloatArray, y: FloatArray, u: FloatArray | None, window: float
                   ) -> list[Batch]:
         """Split where time starts anew, sort what is late, drop repeats."""
         newest = np.maximum.accumulate(np.concatenate(([self.newest], t)))[:-1]
@@ -145,7 +179,8 @@ class Intake:
             later = jumps[jumps > 0]
             end = begin + int(later[0]) if later.size else t.size
             part = slice(begin, end)
-            batch = self._ordered(t[part], y[part], u[part], restart)
+            batch = self._ordered(
+                t[part], y[part], None if u is None else u[part], restart)
             if batch is not None:
                 batches.append(batch)
             begin = end
@@ -157,20 +192,21 @@ class Intake:
                 fresh[begin] = True
         return batches
 
-    def _ordered(self, t: FloatArray, y: FloatArray, u: FloatArray, restart: bool
+    def _ordered(self, t: FloatArray, y: FloatArray, u: FloatArray | None, restart: bool
                  ) -> Batch | None:
         if restart:
             self.newest = -math.inf
             self.count(resets=1)
         order = np.argsort(t, kind='stable')
-        t, y, u = t[order], y[order], u[order]
+        t, y, u = t[order], y[order], None if u is None else u[order]
         keep = np.diff(t, prepend=self.newest) > 0.0
         self.count(late=t.size - int(keep.sum()))
-        t, y, u = t[keep], y[keep], u[keep]
+        t, y, u = t[keep], y[keep], None if u is None else u[keep]
         if not t.size:
             return None
+        steps = np.diff(t, prepend=self.newest)
         self._accept(t)
-        return Batch(t, y, u, restart)
+        return Batch(t, y, u, float(steps.min()), float(steps.max()), restart)
 
 
 class Thinner:
@@ -194,6 +230,7 @@ class Thinner:
         """Take the next samples as the first ones; the rate stays known."""
         self._rest = np.empty((3, 0))
         self._stamps = np.empty(0)
+        self._last = -math.inf
         self._continues = False
 
     @property
@@ -201,15 +238,15 @@ class Thinner:
         """Return the number of samples that wait for the rate, or for a whole block."""
         return int(self._rest.shape[1])
 
-    def take(self, t: FloatArray, y: FloatArray, u: FloatArray
-             ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray, bool]:
+    def take(self, batch: Batch
+             ) -> tuple[FloatArray, FloatArray, FloatArray | None, IntArray, bool]:
         """
         Return the samples to keep.
 
         Parameters
         ----------
-        t, y, u : ndarray, shape (n,)
-            Clean samples (see `Batch`).
+        batch : Batch
+            Clean samples.
 
         Returns
         -------
@@ -222,26 +259,35 @@ class Thinner:
             go with these.
 
         """
+        t, y, u = batch.t, batch.y, batch.u
         restart = False
-        stamps = np.concatenate([self._stamps, t])
-        steps = np.diff(stamps)[-t.size:] if stamps.size > t.size else np.diff(
-            t, prepend=-math.inf)
-        even = np.abs(steps - self.step) <= UNEVEN * self.step
-        if self.m == 0 or not even.all():
-            restart = self._learn(stamps)
-            even = np.abs(steps - self.step) <= UNEVEN * self.step
-        self._stamps = stamps[-MEMORY:]
+        even = self._is_even(batch.shortest) and self._is_even(batch.longest)
+        if not even:
+            restart = self._learn(np.concatenate([self._stamps, t]))
+        if t.size >= MEMORY:
+            self._stamps = t[-MEMORY:].copy()
+        else:
+            self._stamps = np.concatenate([self._stamps, t])[-MEMORY:]
         if self.m == 0:
-            self._rest = np.concatenate([self._rest, [t, y, u]], axis=1)
+            self._rest = np.concatenate([self._rest, _stack(t, y, u)], axis=1)
             empty = np.empty(0)
-            return empty, empty, empty, np.empty(0, dtype=np.int64), False
-        if self.m == 1:
-            if self._rest.size:
-                t, y, u = np.concatenate([self._rest, [t, y, u]], axis=1)
-                even = np.abs(np.diff(t, prepend=-math.inf) - self.step) <= UNEVEN * self.step
-                self._rest = np.empty((3, 0))
-            return t, y, u, np.flatnonzero(~even), restart
-        return (*self._blocks(np.concatenate([self._rest, [t, y, u]], axis=1)), restart)
+            return empty, empty, empty, _NONE, False
+        if self.m > 1:
+            return (*self._blocks(np.concatenate([self._rest, _stack(t, y, u)], axis=1)),
+                    restart)
+        if self._rest.size:
+            t, y, u = np.concatenate([self._rest, _stack(t, y, u)], axis=1)
+            self._rest = np.empty((3, 0))
+            self._last = -math.inf
+        breaks = _NONE
+        if not even:
+            steps = np.diff(t, prepend=self._last)
+            breaks = np.flatnonzero(~(np.abs(steps - self.step) <= UNEVEN * self.step))
+        self._last = float(t[-1])
+        return t, y, u, breaks, restart
+
+    def _is_even(self, step: float) -> bool:
+        return abs(step - self.step) <= UNEVEN * self.step
 
     def _learn(self, stamps: FloatArray) -> bool:
         """Take the usual step anew; return whether the block size changed."""
@@ -270,10 +316,14 @@ class Thinner:
             stop = low + whole * m
             parts.append(columns[:, low:stop].reshape(3, whole, m).mean(axis=2))
             count += whole
-            self._rest = columns[:, stop:high]
+            self._rest = columns[:, stop:high].copy()
         t, y, u = np.concatenate(parts, axis=1)
         self._continues = bool(len(parts[-1][0])) or (self._continues and len(parts) == 1)
         return t, y, u, np.array([b for b in breaks if b < count], dtype=np.int64)
+
+
+def _stack(t: FloatArray, y: FloatArray, u: FloatArray | None) -> FloatArray:
+    return np.stack([t, y, np.full(t.size, NAN) if u is None else u])
 
 
 def as_column(values: npt.ArrayLike) -> FloatArray:

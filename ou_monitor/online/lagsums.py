@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ou_monitor.online.series import FAST, Series, SLOW, T, U, Y
+from ou_monitor.online.compiled import kernels
+from ou_monitor.online.series import Series, T, Y
 from ou_monitor.records import FloatArray
 
 # Variables while throttle moves: voltage, throttle, its square, its two lags.
@@ -123,16 +124,22 @@ class LagSums:
         series, lags = self._series, self._lags
         begin, end = edges[0], edges[-1]
         back = min(lags, begin - series.first + series.behind)
-        data = series.columns(begin - back, end)
+        y = series.columns(begin - back, end)[Y] - self.reference
         if self._c == 1:
-            z = (data[Y] - self.reference)[None, :]
+            z = y[None, :]
         else:
-            u, fast, slow = np.where(np.isfinite(data[U]), data[[U, FAST, SLOW]], 0.0)
-            z = np.stack([data[Y] - self.reference, u, u * u, fast, slow])
+            load = series.load(begin - back, end)
+            u, fast, slow = np.where(np.isfinite(load), load, 0.0)
+            z = np.stack([y, u, u * u, fast, slow])
         runs = series.runs(begin, end)
         if back < lags:
             runs = np.minimum(runs, back + np.arange(end - begin))
             z = np.concatenate([np.zeros((self._c, lags - back)), z], axis=1)
+        fast_sums = kernels()
+        if fast_sums is not None:
+            rows = np.empty((len(edges) - 1, self._ends[-1]))
+            fast_sums.slot_sums(z, runs.astype(np.int64), np.array(edges) - begin, lags, rows)
+            return rows
         own = z[:, lags:]
         windows = np.lib.stride_tricks.sliding_window_view(z, end - begin, axis=1)
         difference = own[:, None, :] - windows[:, lags - 1::-1, :]

@@ -76,12 +76,12 @@ class Moments:
         turn[1:, 1:] = basis
         return Moments(n, mean, turn.T @ zero @ turn, turn.T @ lag @ turn, basis)
 
-    def residual(self, b: FloatArray) -> tuple[float, list[float]]:
+    def residual(self, b: FloatArray) -> tuple[float, FloatArray]:
         """Return autocovariances, V^2, of the voltage less b times regressors: lag 0, 1..K."""
         if not b.size:
-            return float(self.at_zero[0, 0]), self.at_lag[:, 0, 0].tolist()
+            return float(self.at_zero[0, 0]), np.ascontiguousarray(self.at_lag[:, 0, 0])
         w = np.concatenate(([1.0], -b))
-        return float(w @ self.at_zero @ w), ((self.at_lag @ w) @ w).tolist()
+        return float(w @ self.at_zero @ w), (self.at_lag @ w) @ w
 
     def information(self, log_a: float, theta: float) -> FloatArray:
         """Return x' K^-1 z over all columns, per sample, for unit innovation variance."""
@@ -127,7 +127,7 @@ def _with_time(sums: Sums, mean: FloatArray, zero: FloatArray, lag: FloatArray
     return np.concatenate([mean, [0.0]]), wide, wide_lag
 
 
-def trend_score(sums: Sums, c0: float, c: list[float], log_a: float, theta: float) -> float:
+def trend_score(sums: Sums, c0: float, c: FloatArray, log_a: float, theta: float) -> float:
     """
     Return a bare trend over its standard error, for a window without load.
 
@@ -146,7 +146,7 @@ def trend_score(sums: Sums, c0: float, c: list[float], log_a: float, theta: floa
         Signed score, dimensionless.
 
     """
-    n, lags = sums.n, len(c)
+    n, lags = sums.n, c.size
     phi = math.exp(-math.exp(log_a))
     lead = 1.0 + phi * phi - 2.0 * phi * theta
     tail = 2.0 * (1.0 - phi * theta) * (theta - phi)
@@ -158,7 +158,7 @@ def trend_score(sums: Sums, c0: float, c: list[float], log_a: float, theta: floa
     drop = float(powers @ (sums.change[:, 0] * k / (2.0 * np.maximum(sums.pairs, 1.0))))
     xx = lead * own + tail * (own * total - 0.5 * float(powers @ (k * k)))
     xy = lead * with_y + tail * (with_y * total - drop)
-    yy = lead * c0 + tail * float(powers @ np.array(c))
+    yy = lead * c0 + tail * float(powers @ c)
     rest = (yy - xy * xy / xx) * xx / n if xx > 0.0 else 0.0
     return xy / math.sqrt(rest) if rest > 0.0 else 0.0
 

@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from ou_monitor.online.lagsums import LagSums
-from ou_monitor.online.series import IntArray, Series, T, U, Y
+from ou_monitor.online.series import IntArray, Series, T
 from ou_monitor.records import FloatArray
 
 # Lags of the sums: enough while theta^24 is small; beyond, a coarser
@@ -62,7 +62,8 @@ class Resolution:
         self.sums.restart(self._window / SLOTS)
         self._coarser = None
 
-    def add(self, t: FloatArray, y: FloatArray, u: FloatArray, breaks: IntArray) -> None:
+    def add(self, t: FloatArray, y: FloatArray, u: FloatArray | None, breaks: IntArray
+            ) -> None:
         """Add samples (see `Series.append`) and slide the window."""
         if t.size:
             self.series.append(t, y, u, breaks)
@@ -105,7 +106,8 @@ class Resolution:
         if not edges or edges[0] != 0:
             edges = [0, *edges]
         edges.append(fine.end - begin)
-        columns = fine.columns(begin, fine.end)[[T, Y, U]]
+        columns = np.concatenate([fine.columns(begin, fine.end),
+                                  fine.load(begin, fine.end)[:1]])
         is_start = set(starts.tolist())
         parts, breaks, count = [], [], 0
         for low, high in zip(edges[:-1], edges[1:]):

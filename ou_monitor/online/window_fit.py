@@ -8,7 +8,7 @@ regressed on throttle (load.py).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 import math
 
@@ -84,7 +84,7 @@ class WindowFit:
 
 
 def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None,
-               minimise: Minimise = quasi_fit.minimise) -> WindowFit:
+               minimise: Minimise | None = None) -> WindowFit:
     """
     Fit the OU, the noise and the mean.
 
@@ -96,8 +96,8 @@ def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None,
         Raw samples in each of its samples.
     start : tuple of float, optional
         ln(a) and theta of an earlier fit.
-    minimise : callable
-        `quasi_fit.minimise`, or its compiled twin.
+    minimise : callable, optional
+        `plain_minimise`, the default, or its compiled twin.
 
     Returns
     -------
@@ -122,7 +122,7 @@ def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None,
             return _uncorrelated(moments, b, trend, c0, c)
         before = log_a, theta
         log_a, theta, on_bound = _search(
-            minimise, c0, c, sums.n - 1.0 - moments.rank, log_a, theta, m, tilt)
+            minimise or plain_minimise, c0, c, sums.n - 1.0 - moments.rank, log_a, theta, m, tilt)
         if not trend:
             trend = _drifts(sums, moments, c0, c, log_a, theta)
             if trend:
@@ -137,19 +137,23 @@ def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None,
     return _finish(moments, b, trend, log_a, theta, on_bound, m)
 
 
-def _drifts(sums: Sums, moments: Moments, c0: float, c: list[float], log_a: float,
+def _drifts(sums: Sums, moments: Moments, c0: float, c: FloatArray, log_a: float,
             theta: float) -> bool:
     """Whether time explains the voltage by itself, beyond what the load does."""
     if not moments.rank:
         return abs(trend_score(sums, c0, c, log_a, theta)) > TREND_SCORE
     full = Moments.of(sums, True)
     b, cov = full.regress(log_a, theta)
-    q = quasi_fit.innovation(*full.residual(b), log_a, theta)
+    q = _innovation(*full.residual(b), log_a, theta)
     time = full.basis[-1]
     return float(time @ b) ** 2 > TREND_SCORE ** 2 * float(time @ cov @ time) * q / sums.n
 
 
-def _uncorrelated(moments: Moments, b: FloatArray, trend: bool, c0: float, c: list[float]
+def _innovation(c0: float, c: FloatArray, log_a: float, theta: float) -> float:
+    return quasi_fit.innovation(c0, c.tolist(), log_a, theta)
+
+
+def _uncorrelated(moments: Moments, b: FloatArray, trend: bool, c0: float, c: FloatArray
                   ) -> WindowFit:
     beta = moments.basis @ b
     return WindowFit(math.nan, math.nan, math.nan, math.nan, math.nan, moments.mean, beta,
@@ -157,14 +161,21 @@ def _uncorrelated(moments: Moments, b: FloatArray, trend: bool, c0: float, c: li
                      c[0] / c0 if c0 > 0.0 else math.nan)
 
 
-def _start(c0: float, c: Sequence[float]) -> tuple[float, float]:
+def plain_minimise(c0: float, c: FloatArray, *rest: float
+                   ) -> tuple[float, float, float, bool, int]:
+    """Return `quasi_fit.minimise`, whose loops are quicker over a list."""
+    return quasi_fit.minimise(c0, c.tolist(), *rest)
+
+
+def _start(c0: float, c: FloatArray) -> tuple[float, float]:
     """Return a first guess: noise by extrapolating the variogram to lag zero."""
-    noise = min(max(0.0, 2.0 * (c0 - c[0]) - (c0 - c[1])), 0.9 * c0)
-    phi = min(max(c[0] / (c0 - noise), 0.02), 1.0 - 1e-6)
+    first, second = float(c[0]), float(c[1])
+    noise = min(max(0.0, 2.0 * (c0 - first) - (c0 - second)), 0.9 * c0)
+    phi = min(max(first / (c0 - noise), 0.02), 1.0 - 1e-6)
     return math.log(-math.log(phi)), 0.1 * phi
 
 
-def _search(minimise: Minimise, c0: float, c: Sequence[float], free: float, log_a: float,
+def _search(minimise: Minimise, c0: float, c: FloatArray, free: float, log_a: float,
             theta: float, m: int, tilt: tuple[float, float]) -> tuple[float, float, bool]:
     """Minimise with the bound on theta, which bends with ln a for block means."""
     theta = min(theta, 0.9 * math.exp(-math.exp(log_a)))
@@ -196,7 +207,7 @@ def _finish(moments: Moments, b: FloatArray, trend: bool, log_a: float, theta: f
         log_a += i_at / i_aa * pull
     a = math.exp(log_a)
     c0, c = moments.residual(b)
-    q = quasi_fit.innovation(c0, c, log_a, theta) * n / free
+    q = _innovation(c0, c, log_a, theta) * n / free
     beta_cov = np.empty((0, 0))
     if moments.rank:
         beta_cov = moments.basis @ moments.regress(log_a, theta)[1] @ moments.basis.T * q / n
