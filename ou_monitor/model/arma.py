@@ -154,10 +154,8 @@ def log_covariance(a: float, theta: float, m: int, n: int) -> tuple[float, float
     # a = -ln phi.
     s_phi, s_theta = d_a / phi, -d_t
     a_phi = -1.0 / (phi * a)
-    v_phi_part = s_phi - a_phi
-
-    def variance(x: float, y: float) -> float:
-        return x * x * v_phi + 2.0 * x * y * v_cross + y * y * v_theta
-
-    log_sigma2 = 2.0 / n + variance(s_phi, s_theta)
-    return variance(a_phi, 0.0), log_sigma2 / 4.0, 2.0 / n + variance(v_phi_part, s_theta)
+    v_part = s_phi - a_phi
+    last = 2.0 / n + s_theta * s_theta * v_theta
+    return (a_phi * a_phi * v_phi,
+            (last + s_phi * s_phi * v_phi + 2.0 * s_phi * s_theta * v_cross) / 4.0,
+            last + v_part * v_part * v_phi + 2.0 * v_part * s_theta * v_cross)

@@ -2,7 +2,7 @@
 The same arithmetic compiled with Numba, where Numba is installed.
 
 Optional: without Numba nothing here is used and nothing is missing but speed.
-The scalar search of model/quasi_fit.py is compiled from its own text; the two
+The scalar fit of model/still_fit.py is compiled from its own text; the two
 loops over samples are written out here and tested against their NumPy twins to
 1e-9.  Compiling takes seconds (half a second from Numba's cache), so it runs
 in a thread; until it is done, and if it fails, NumPy does the work.
@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 import importlib.util
 import logging
+import math
 import os
 import threading
 import types
@@ -22,7 +23,16 @@ from typing import Any
 
 import numpy as np
 
-from ou_monitor.model import quasi_fit
+from ou_monitor.model import arma, quasi_fit, still_fit
+
+# Compiled from their own text, each after those it calls.
+_SCALAR = (
+    *((arma, name) for name in (
+        'block_autocovariance', 'theta_at', 'noise_free_theta', 'noise_share',
+        'innovation_variance', 'log_covariance')),
+    *((quasi_fit, name) for name in ('objective', 'innovation', 'information', 'minimise')),
+    *((still_fit, name) for name in (
+        'guess', 'search', 'finish', 'trend_score', 'fit_still')))
 
 
 @dataclass(frozen=True)
@@ -32,8 +42,8 @@ class Kernels:
 
     Attributes
     ----------
-    minimise : callable
-        `quasi_fit.minimise`, for an array of autocovariances.
+    fit_still, search, finish : callable
+        Those of `still_fit`, for arrays of autocovariances.
     slot_sums : callable
         Sums over one slot, see `slot_sums`.
     check : callable
@@ -41,7 +51,9 @@ class Kernels:
 
     """
 
-    minimise: Callable[..., tuple[float, float, float, bool, int]]
+    fit_still: Callable[..., tuple[float, ...]]
+    search: Callable[..., tuple[float, float, bool]]
+    finish: Callable[..., tuple[float, ...]]
     slot_sums: Callable[..., None]
     check: Callable[..., bool]
 
@@ -167,8 +179,8 @@ def build() -> Kernels:
 
     compile_one = numba.njit(cache=True, nogil=True)
     names: dict[str, Any] = {}
-    for name in ('information', 'objective', 'minimise'):
-        plain = getattr(quasi_fit, name)
+    for module, name in _SCALAR:
+        plain = getattr(module, name)
         own = types.FunctionType(plain.__code__, {**plain.__globals__, **names}, name,
                                  plain.__defaults__)
         own.__module__ = plain.__module__
@@ -176,9 +188,16 @@ def build() -> Kernels:
     # Sums may be reordered, which lets them run several at a time; NaN and
     # infinity keep their meaning.
     sums = numba.njit(cache=True, nogil=True, fastmath={'reassoc', 'contract', 'nsz'})(slot_sums)
-    kernels = Kernels(names['minimise'], sums, compile_one(check))
+    kernels = Kernels(names['fit_still'], names['search'], names['finish'], sums,
+                      compile_one(check))
     # One call each with the types that are used, so that no caller waits.
-    kernels.minimise(1.0, np.array([0.9, 0.8]), 100.0, -3.0, 0.1, 0.0, 0.0, -20.0, 2.0, 0.0, 0.0)
+    c = np.array([0.9, 0.8])
+    pairs = np.full(2, 99.0)
+    kernels.fit_still(1.0, c, 100, 0.0, np.zeros(2), pairs, math.nan, math.nan, 1)
+    # Rows of the sums are views with gaps between them.
+    kernels.fit_still(1.0, c, 100, 0.0, np.zeros((2, 5))[:, 0], pairs, -3.0, 0.1, 1)
+    kernels.search(1.0, c, 97.0, -3.0, 0.1, 1, 0.0, 0.0)
+    kernels.finish(1.0, c, 100, 97.0, -3.0, 0.1, False, 1)
     edges = np.array([0, 4])
     for c in (1, 5):
         width = 1 + 2 * c + c * c + 2 * (1 + c + c * c)

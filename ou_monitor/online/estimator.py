@@ -25,7 +25,7 @@ from ou_monitor.online.irregular import fit_irregular, fresh_columns, MOST
 from ou_monitor.online.quality import examine, Quality, TAIL
 from ou_monitor.online.resolution import FACTOR, FEWEST, LAGS, Resolution
 from ou_monitor.online.series import T, U, Y
-from ou_monitor.online.window_fit import fit_window, Minimise, plain_minimise
+from ou_monitor.online.window_fit import fit_window
 from ou_monitor.records import Estimate, FloatArray, NAN, Status
 
 # Samples from which a fit is tried.
@@ -238,8 +238,7 @@ class SlidingEstimator:
             return fit_irregular(series.all_columns(), moves), NAN
         resolution, m = self._finest, self._thinner.m
         step = self._step(series.column(T))
-        minimise = _minimise()
-        fit = fit_window(sums, m, self._start, minimise)
+        fit = fit_window(sums, m, self._start)
         self._start = (math.log(fit.a), fit.theta) if fit.correlated else None
         smoothness = NAN
         if fit.correlated:
@@ -250,12 +249,12 @@ class SlidingEstimator:
         # Coarser where noise, or an ADC step, hides what the lags can hold.
         while fit.correlated and resolution.series.size >= FACTOR * FEWEST and (
                 fit.theta ** LAGS > _LOST
-                or step < (_DITHER * quality.step) ** 2 * step / fit.sigma2_step):
+                or step < (_DITHER * quality.step) ** 2 * step / fit.scale):
             resolution = resolution.coarser()
             m *= FACTOR
             step *= FACTOR
             sums = resolution.sums.total()
-            coarse = fit_window(sums, m, None, minimise)
+            coarse = fit_window(sums, m)
             if not coarse.correlated:
                 break
             fit = coarse
@@ -268,12 +267,6 @@ class SlidingEstimator:
             return float(t[-1] - t[0]) / (t.size - 1)
         runs = series.runs(series.first, series.end)
         return float(np.diff(t)[runs[1:] > 0].mean())
-
-
-def _minimise() -> Minimise:
-    """Return the compiled search when it is ready, else the plain one."""
-    fast = kernels()
-    return plain_minimise if fast is None else fast.minimise
 
 
 def _smoothness(variogram: FloatArray, a: float, m: int) -> float:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import enum
 import math
 
-from ou_monitor.model import arma
 from ou_monitor.online.window_fit import WindowFit
 from ou_monitor.records import FloatArray
 
@@ -96,7 +95,6 @@ def from_window(fit: WindowFit, step: float, m: int, n: int, reference: float) -
                       (math.nan,) * 3, fit.variance, level, fit.beta, fit.beta_cov, fit.trend, n,
                       math.nan)
     return Fitted(
-        Outcome.FOUND, fit.a / step, math.sqrt(fit.sigma2_step / step),
-        fit.noise_share * fit.sigma2_step * m, fit.noise_score,
-        arma.log_covariance(fit.a, fit.theta, m, n), fit.variance, level, fit.beta,
+        Outcome.FOUND, fit.a / step, math.sqrt(fit.scale / step),
+        fit.noise_share * fit.scale * m, fit.noise_score, fit.log_var, fit.variance, level, fit.beta,
         fit.beta_cov, fit.trend, n, fit.a)

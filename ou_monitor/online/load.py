@@ -63,8 +63,6 @@ class Moments:
         zero = sums.second / n - mean[:, None] * mean
         pairs = np.maximum(sums.pairs, 1.0)
         lag = zero - sums.spread / (2.0 * pairs)[:, None, None]
-        if c == 1 and not trend:
-            return Moments(n, mean, zero, lag, np.empty((0, 0)))
         if trend:
             mean, zero, lag = _with_time(sums, mean, zero, lag)
             c += 1
@@ -78,8 +76,6 @@ class Moments:
 
     def residual(self, b: FloatArray) -> tuple[float, FloatArray]:
         """Return autocovariances, V^2, of the voltage less b times regressors: lag 0, 1..K."""
-        if not b.size:
-            return float(self.at_zero[0, 0]), np.ascontiguousarray(self.at_lag[:, 0, 0])
         w = np.concatenate(([1.0], -b))
         return float(w @ self.at_zero @ w), (self.at_lag @ w) @ w
 
@@ -125,42 +121,6 @@ def _with_time(sums: Sums, mean: FloatArray, zero: FloatArray, lag: FloatArray
     wide_lag[:, :c, c] = wide_lag[:, c, :c] = wide[:c, c] - cross
     wide_lag[:, c, c] = wide[c, c] - 0.5 * k * k
     return np.concatenate([mean, [0.0]]), wide, wide_lag
-
-
-def trend_score(sums: Sums, c0: float, c: FloatArray, log_a: float, theta: float) -> float:
-    """
-    Return a bare trend over its standard error, for a window without load.
-
-    Parameters
-    ----------
-    sums : Sums
-        Of the window, voltage only.
-    c0, c :
-        Autocovariances of the voltage, V^2, at lag 0 and lags 1..K.
-    log_a, theta : float
-        Noise.
-
-    Returns
-    -------
-    float
-        Signed score, dimensionless.
-
-    """
-    n, lags = sums.n, c.size
-    phi = math.exp(-math.exp(log_a))
-    lead = 1.0 + phi * phi - 2.0 * phi * theta
-    tail = 2.0 * (1.0 - phi * theta) * (theta - phi)
-    powers = theta ** np.arange(lags)
-    k = np.arange(1.0, lags + 1.0) / n
-    total = float(powers.sum())
-    own = (1.0 - 1.0 / (n * n)) / 12.0
-    with_y = float(sums.place[0] / n - 0.5 * (n - 1) * sums.first[0] / n) / n
-    drop = float(powers @ (sums.change[:, 0] * k / (2.0 * np.maximum(sums.pairs, 1.0))))
-    xx = lead * own + tail * (own * total - 0.5 * float(powers @ (k * k)))
-    xy = lead * with_y + tail * (with_y * total - drop)
-    yy = lead * c0 + tail * float(powers @ c)
-    rest = (yy - xy * xy / xx) * xx / n if xx > 0.0 else 0.0
-    return xy / math.sqrt(rest) if rest > 0.0 else 0.0
 
 
 def load_at(throttle: float) -> FloatArray:

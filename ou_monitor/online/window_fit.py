@@ -2,8 +2,9 @@
 From the sums of a window to OU parameters.
 
 Restricted quasi-likelihood (model/quasi_fit.py) of the ARMA(1,1) that samples
-or block means of an OU in white noise are (model/arma.py), with the mean
-regressed on throttle (load.py).
+or block means of an OU in white noise are (model/arma.py).  With throttle
+still the whole fit is model/still_fit.py; while it moves, or when the voltage
+drifts, the mean is regressed along with it (load.py).
 """
 
 from __future__ import annotations
@@ -14,27 +15,18 @@ import math
 
 import numpy as np
 
-from ou_monitor.model import arma, quasi_fit
+from ou_monitor.model import still_fit
+from ou_monitor.online.compiled import kernels
 from ou_monitor.online.lagsums import Sums
-from ou_monitor.online.load import Moments, trend_score
+from ou_monitor.online.load import Moments
 from ou_monitor.records import FloatArray
 
 # A trend is taken into the model from this many standard errors on: by chance
 # once in 16 000 windows.
 TREND_SCORE = 4.0
-# alpha D beyond which neighbouring samples say nothing of relaxation.
-FASTEST = 4.6
-# ln(a) and theta settle to this when the mean is fitted along with them; the
-# error left in them is its square.
-_STEADY = 1e-3
-_LOW = math.log(1e-9)
-_HIGH = math.log(2.0 * FASTEST)
-# Pull of theta towards "no measurement noise" where the data cannot tell: a
-# clamped estimate is high by 0.4 standard errors on average when there is no
-# noise; this takes a third of it away and fades within two standard errors.
-_PULL = 0.4
-
-Minimise = Callable[..., tuple[float, float, float, bool, int]]
+# Neighbouring samples correlated by less than this many standard errors are
+# not correlated.
+_CORRELATED = 2.0
 
 
 @dataclass(frozen=True)
@@ -46,12 +38,14 @@ class WindowFit:
     ----------
     a, theta : float
         alpha times the step, and the moving-average coefficient.
-    sigma2_step : float
+    scale : float
         sigma^2 times the step, V^2.
     noise_share : float
-        Noise variance of one sample in units of sigma2_step.
+        Noise variance of one sample in units of `scale`.
     noise_score : float
         Distance of theta from "no noise" in standard errors.
+    log_var : tuple of float
+        Variances of ln(alpha), ln(sigma), ln(Var_inf).
     level : ndarray, shape (c,)
         Means of voltage (less its reference) and load variables.
     beta : ndarray, shape (c - 1,)
@@ -61,30 +55,28 @@ class WindowFit:
     trend : bool
         Whether a trend was needed.
     correlated : bool
-        Whether neighbouring samples are correlated at all.
+        Whether neighbouring samples are correlated at all; if not, a to
+        log_var are NaN.
     variance : float
         Variance about the mean, V^2.
-    first_lag : float
-        Correlation of neighbours.
 
     """
 
     a: float
     theta: float
-    sigma2_step: float
+    scale: float
     noise_share: float
     noise_score: float
+    log_var: tuple[float, float, float]
     level: FloatArray
     beta: FloatArray
     beta_cov: FloatArray
     trend: bool
     correlated: bool
     variance: float
-    first_lag: float
 
 
-def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None,
-               minimise: Minimise | None = None) -> WindowFit:
+def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None) -> WindowFit:
     """
     Fit the OU, the noise and the mean.
 
@@ -96,8 +88,6 @@ def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None,
         Raw samples in each of its samples.
     start : tuple of float, optional
         ln(a) and theta of an earlier fit.
-    minimise : callable, optional
-        `plain_minimise`, the default, or its compiled twin.
 
     Returns
     -------
@@ -105,113 +95,92 @@ def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None,
         The fit.
 
     """
-    trend = False
+    if sums.first.size > 1:
+        return _fit_moving(sums, m, start, trend=False)
+    n = sums.n
+    mean = float(sums.first[0]) / n
+    c0 = float(sums.second[0, 0]) / n - mean * mean
+    pairs = sums.pairs
+    if not pairs[-1] > 0.0:
+        pairs = np.maximum(pairs, 1.0)
+    c = c0 - sums.spread[:, 0, 0] / (2.0 * pairs)
+    level = np.array([mean])
+    if not _correlated(c0, c, n):
+        return _uncorrelated(level, _EMPTY, False, c0)
+    place = (float(sums.place[0]) - 0.5 * (n - 1) * float(sums.first[0])) / n / n
+    log_a, theta = start or (math.nan, math.nan)
+    fast = kernels()
+    if fast is not None:
+        end = fast.fit_still(c0, c, n, place, sums.change[:, 0], pairs, log_a, theta, m)
+    else:
+        end = still_fit.fit_still(c0, c.tolist(), n, place, sums.change[:, 0].tolist(),
+                                  pairs.tolist(), log_a, theta, m)
+    if abs(end[9]) > TREND_SCORE:
+        return _fit_moving(sums, m, (math.log(end[0]), end[1]), trend=True)
+    return WindowFit(end[0], end[1], end[3], end[4], end[5], end[6:9], level, _EMPTY, _NO_COV,
+                     False, end[0] < still_fit.FASTEST, c0)
+
+
+_EMPTY = np.empty(0)
+_NO_COV = np.empty((0, 0))
+
+
+def _correlated(c0: float, c: FloatArray, n: int) -> bool:
+    return c0 > 0.0 and float(c[0]) > _CORRELATED * c0 / math.sqrt(n)
+
+
+def _uncorrelated(level: FloatArray, beta: FloatArray, trend: bool, c0: float) -> WindowFit:
+    nan = math.nan
+    return WindowFit(nan, nan, nan, nan, nan, (nan, nan, nan), level, beta,
+                     np.full((beta.size, beta.size), nan), trend, False, c0)
+
+
+def _fit_moving(sums: Sums, m: int, start: tuple[float, float] | None, trend: bool
+                ) -> WindowFit:
+    """Fit noise and mean in turn; the mean hardly moves, so two rounds are usual."""
+    search, finish = _functions()
     moments = Moments.of(sums, trend)
-    b = np.empty(0)
-    c0, c = moments.residual(b)
-    log_a, theta = start or _start(c0, c)
-    if moments.rank:
-        b = moments.regress(-20.0, 0.0)[0] if start is None else moments.regress(log_a, theta)[0]
+    at = start
+    b = moments.regress(*at)[0] if at else moments.regress(-20.0, 0.0)[0]
     on_bound = False
     for _ in range(8):
-        tilt = (0.0, 0.0)
-        if moments.rank:
-            c0, c = moments.residual(b)
-            tilt = moments.tilt(log_a, theta)
-        if not c0 > 0.0 or c[0] <= 2.0 * c0 / math.sqrt(sums.n):
-            return _uncorrelated(moments, b, trend, c0, c)
+        c0, c = moments.residual(b)
+        if not _correlated(c0, c, sums.n):
+            return _uncorrelated(moments.mean, moments.basis @ b, trend, c0)
+        log_a, theta = at or still_fit.guess(c0, c.tolist())
+        tilt = moments.tilt(log_a, theta)
         before = log_a, theta
-        log_a, theta, on_bound = _search(
-            minimise or plain_minimise, c0, c, sums.n - 1.0 - moments.rank, log_a, theta, m, tilt)
-        if not trend:
-            trend = _drifts(sums, moments, c0, c, log_a, theta)
-            if trend:
-                moments = Moments.of(sums, True)
-                b = moments.regress(log_a, theta)[0]
-                continue
-        if not moments.rank:
-            break
+        log_a, theta, on_bound = search(c0, c, sums.n - 1.0 - moments.rank, log_a, theta, m,
+                                        *tilt)
+        at = log_a, theta
         b = moments.regress(log_a, theta)[0]
-        if abs(log_a - before[0]) < _STEADY and abs(theta - before[1]) < _STEADY:
+        if max(abs(log_a - before[0]), abs(theta - before[1])) < still_fit.STEADY:
             break
-    return _finish(moments, b, trend, log_a, theta, on_bound, m)
+    if not trend and _drifts(sums, log_a, theta):
+        return _fit_moving(sums, m, at, trend=True)
+    c0, c = moments.residual(b)
+    end = finish(c0, c, sums.n, sums.n - 1.0 - moments.rank, log_a, theta, on_bound, m)
+    cov = moments.regress(math.log(end[0]), end[1])[1] * end[2] / sums.n
+    return WindowFit(end[0], end[1], end[3], end[4], end[5], end[6:9], moments.mean,
+                     moments.basis @ b, moments.basis @ cov @ moments.basis.T, trend,
+                     end[0] < still_fit.FASTEST, c0)
 
 
-def _drifts(sums: Sums, moments: Moments, c0: float, c: FloatArray, log_a: float,
-            theta: float) -> bool:
-    """Whether time explains the voltage by itself, beyond what the load does."""
-    if not moments.rank:
-        return abs(trend_score(sums, c0, c, log_a, theta)) > TREND_SCORE
+def _drifts(sums: Sums, log_a: float, theta: float) -> bool:
+    """Whether time explains the voltage beyond what the load does."""
     full = Moments.of(sums, True)
     b, cov = full.regress(log_a, theta)
-    q = _innovation(*full.residual(b), log_a, theta)
+    c0, c = full.residual(b)
+    q = still_fit.innovation(c0, c.tolist(), log_a, theta)
     time = full.basis[-1]
     return float(time @ b) ** 2 > TREND_SCORE ** 2 * float(time @ cov @ time) * q / sums.n
 
 
-def _innovation(c0: float, c: FloatArray, log_a: float, theta: float) -> float:
-    return quasi_fit.innovation(c0, c.tolist(), log_a, theta)
-
-
-def _uncorrelated(moments: Moments, b: FloatArray, trend: bool, c0: float, c: FloatArray
-                  ) -> WindowFit:
-    beta = moments.basis @ b
-    return WindowFit(math.nan, math.nan, math.nan, math.nan, math.nan, moments.mean, beta,
-                     np.full((beta.size, beta.size), math.nan), trend, False, c0,
-                     c[0] / c0 if c0 > 0.0 else math.nan)
-
-
-def plain_minimise(c0: float, c: FloatArray, *rest: float
-                   ) -> tuple[float, float, float, bool, int]:
-    """Return `quasi_fit.minimise`, whose loops are quicker over a list."""
-    return quasi_fit.minimise(c0, c.tolist(), *rest)
-
-
-def _start(c0: float, c: FloatArray) -> tuple[float, float]:
-    """Return a first guess: noise by extrapolating the variogram to lag zero."""
-    first, second = float(c[0]), float(c[1])
-    noise = min(max(0.0, 2.0 * (c0 - first) - (c0 - second)), 0.9 * c0)
-    phi = min(max(first / (c0 - noise), 0.02), 1.0 - 1e-6)
-    return math.log(-math.log(phi)), 0.1 * phi
-
-
-def _search(minimise: Minimise, c0: float, c: FloatArray, free: float, log_a: float,
-            theta: float, m: int, tilt: tuple[float, float]) -> tuple[float, float, bool]:
-    """Minimise with the bound on theta, which bends with ln a for block means."""
-    theta = min(theta, 0.9 * math.exp(-math.exp(log_a)))
-    floor = slope = 0.0
-    on_bound = False
-    for _ in range(4):
-        if m > 1:
-            a = math.exp(log_a)
-            floor = arma.noise_free_theta(a, m)
-            slope = (arma.noise_free_theta(1.001 * a, m) - floor) / math.log(1.001)
-        before = log_a
-        log_a, theta, _, on_bound, _ = minimise(
-            c0, c, free, log_a, theta, floor, slope, _LOW, _HIGH, *tilt)
-        if m == 1 or not on_bound or abs(log_a - before) < _STEADY:
-            break
-    return log_a, theta, on_bound
-
-
-def _finish(moments: Moments, b: FloatArray, trend: bool, log_a: float, theta: float,
-            on_bound: bool, m: int) -> WindowFit:
-    n, free = moments.n, moments.n - 1.0 - moments.rank
-    floor = arma.noise_free_theta(math.exp(log_a), m)
-    i_aa, i_at, i_tt = quasi_fit.information(log_a, theta)
-    spread = math.sqrt(i_aa / (i_aa * i_tt - i_at * i_at) / n)
-    score = 0.0 if on_bound else max(theta - floor, 0.0) / spread
-    if score > 0.0:
-        pull = min(_PULL * math.exp(-score * score / 8.0), score) * spread
-        theta -= pull
-        log_a += i_at / i_aa * pull
-    a = math.exp(log_a)
-    c0, c = moments.residual(b)
-    q = _innovation(c0, c, log_a, theta) * n / free
-    beta_cov = np.empty((0, 0))
-    if moments.rank:
-        beta_cov = moments.basis @ moments.regress(log_a, theta)[1] @ moments.basis.T * q / n
-    scale = q / arma.innovation_variance(a, theta, m)
-    share = max(arma.noise_share(a, theta, m), 0.0) if score > 0.0 else 0.0
-    return WindowFit(a, theta, scale, share, score, moments.mean, moments.basis @ b, beta_cov,
-                     trend, a < FASTEST, c0, c[0] / c0)
+def _functions() -> tuple[Callable[..., tuple[float, float, bool]],
+                          Callable[..., tuple[float, ...]]]:
+    """Return search and finish, compiled where they are ready."""
+    fast = kernels()
+    if fast is not None:
+        return fast.search, fast.finish
+    return (lambda c0, c, *rest: still_fit.search(c0, c.tolist(), *rest),
+            lambda c0, c, *rest: still_fit.finish(c0, c.tolist(), *rest))
