@@ -42,6 +42,12 @@ class Status(enum.Enum):
     TOO_SHORT = (
         'The window holds fewer than 5 relaxation times: alpha cannot be told; lengthen '
         'the window.')
+    UNBOUND = (
+        'No restoring force visible: the voltage wanders through the whole window; lengthen '
+        'the window, or look for drift and load changes.')
+    BURIED = (
+        'The relaxation is buried in measurement noise: alpha is uncertain by more than a '
+        'factor; lengthen the window or use a finer ADC.')
     NO_RELAXATION = (
         'No relaxation visible at this rate: neighbouring samples are uncorrelated, so '
         'the rail is faster than the sampling, or the noise is that of the sensor; raise '
@@ -128,7 +134,7 @@ class Estimate:
     u0, u0_se : float
         Mean level *at the present throttle*, V, and its standard error, V.
     noise_std : float
-        White measurement noise, V (0 when none was found).
+        White measurement noise of one sample, V (0 when none was found).
     sag : float
         Slope of the mean against throttle at the present throttle, V per unit
         throttle (negative when the supply sags); NaN when throttle did not

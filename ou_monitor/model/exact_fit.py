@@ -1,11 +1,11 @@
 """
-Exact Gaussian likelihood of an OU seen without measurement noise.
+Exact Gaussian likelihood of an OU in white noise at irregular stamps.
 
-Stamps may be irregular.  For each alpha the level, the regressors and the
-variance have closed forms, so the search is over ln(alpha) alone.  Restricted
-(REML) likelihood: half of the small-sample bias of alpha comes from the
-unknown mean, and this form does not have it (Tang & Chen, J. Econometrics 149
-(2009) 65; Yu, J. Econometrics 169 (2012) 114).
+The inverse covariance of a sampled OU is tridiagonal, so the likelihood costs
+O(n) in LAPACK (`pttrf`): K = K_ou + nu I with A = I + nu K_ou^-1 tridiagonal,
+K^-1 = K_ou^-1 A^-1 and log|K| = log|K_ou| + log|A|.  It is the likelihood of
+the Kalman filter, restricted to the contrasts of the regressors (REML:
+Harville, J. Am. Stat. Assoc. 72 (1977) 320).
 """
 
 from __future__ import annotations
@@ -14,9 +14,14 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from scipy.linalg.lapack import dpttrf, dpttrs
+from scipy.optimize import minimize
+
 from ou_monitor.records import FloatArray
-from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import minimize_scalar
+
+# Search range of the noise share nu / mean step: ten thousand times the
+# diffusion of one step hides any OU.
+_MOST_NOISE = 1e4
 
 
 @dataclass(frozen=True)
@@ -27,38 +32,79 @@ class ExactFit:
     Attributes
     ----------
     alpha : float
-        Relaxation rate, 1/s, as maximised (no bias correction).
-    var_inf : float
-        Stationary variance, V^2.
+        Relaxation rate, 1/s, at the maximum (no bias correction).
+    sigma : float
+        Noise intensity, V/sqrt(s).
+    noise_var : float
+        Variance of the white noise, V^2.
     beta, beta_cov : ndarray
         Coefficients of the regressors (V per unit of each) and covariance.
-    at_low, at_high : bool
-        Whether alpha ran into the end of the search: no restoring force
-        visible, or no correlation visible.
+    log_likelihood : float
+        Restricted log-likelihood at the maximum, nats.
+    edge : int
+        -1, 0 or 1: alpha ran into the slow end of the search (no restoring
+        force visible), settled inside, or ran into the fast end (no
+        correlation visible).
 
     """
 
     alpha: float
-    var_inf: float
+    sigma: float
+    noise_var: float
     beta: FloatArray
     beta_cov: FloatArray
-    at_low: bool
-    at_high: bool
+    log_likelihood: float
+    edge: int
 
 
-def _whiten(columns: FloatArray, dt: FloatArray, alpha: float) -> tuple[FloatArray, float]:
-    """Return columns made white by the OU of rate alpha, and log-determinant."""
-    phi = np.exp(-alpha * dt)
-    scale = -np.expm1(-2.0 * alpha * dt)
-    out = np.empty_like(columns)
-    out[0] = columns[0]
-    out[1:] = (columns[1:] - phi[:, None] * columns[:-1]) / np.sqrt(scale)[:, None]
-    return out, float(np.log(scale).sum())
+class _Likelihood:
+    """Restricted likelihood of one data set, profiled over scale and mean."""
+
+    def __init__(self, t: FloatArray, y: FloatArray, regressors: FloatArray) -> None:
+        self.dt = np.diff(t)
+        self.step = float(self.dt.mean())
+        self.shift = float(y.mean())
+        self.table = np.column_stack([regressors, y - self.shift])
+        self.n, self.p = regressors.shape
+
+    def solve(self, log_alpha: float, share: float
+              ) -> tuple[float, float, FloatArray, FloatArray]:
+        """
+        Return minus the log-likelihood, sigma^2, beta and its covariance.
+
+        `share` is the noise variance in units of sigma^2 times the mean step.
+        """
+        alpha, nu = math.exp(log_alpha), share * self.step
+        rho = np.exp(-alpha * self.dt)
+        rest = -np.expm1(-2.0 * alpha * self.dt)
+        diag = np.ones(self.n)
+        diag[1:] /= rest
+        diag[:-1] += rho * rho / rest
+        diag *= 2.0 * alpha
+        off = -2.0 * alpha * rho / rest
+        log_det = float(np.log(rest).sum()) - self.n * math.log(2.0 * alpha)
+        w = self.table
+        if nu > 0.0:
+            d, e, _ = dpttrf(1.0 + nu * diag, nu * off)
+            log_det += float(np.log(d).sum())
+            w = dpttrs(d, e, self.table)[0]
+        kw = diag[:, None] * w
+        kw[1:] += off[:, None] * w[:-1]
+        kw[:-1] += off[:, None] * w[1:]
+        gram = self.table.T @ kw
+        xx, xy = gram[:self.p, :self.p], gram[:self.p, self.p]
+        inverse = np.linalg.inv(xx)
+        beta = inverse @ xy
+        free = self.n - self.p
+        scale = max(float(gram[self.p, self.p] - xy @ beta) / free, np.finfo(float).tiny)
+        value = 0.5 * (free * math.log(scale) + log_det - math.log(np.linalg.det(inverse))
+                       + free * (1.0 + math.log(2.0 * math.pi)))
+        return value, scale, beta, inverse * scale
 
 
 def fit_exact(t: FloatArray, y: FloatArray, regressors: FloatArray) -> ExactFit:
     """
-    Fit alpha, Var_inf and the mean by restricted maximum likelihood.
+    Fit alpha, sigma, the white noise and the mean by restricted likelihood.
 
     Parameters
     ----------
@@ -67,7 +113,7 @@ def fit_exact(t: FloatArray, y: FloatArray, regressors: FloatArray) -> ExactFit:
     y : ndarray, shape (n,)
         Voltage, V.
     regressors : ndarray, shape (n, p)
-        Columns of the mean, of full rank, n > p + 1.
+        Columns of the mean, the first one constant, of full rank; n > p + 2.
 
     Returns
     -------
@@ -75,33 +121,25 @@ def fit_exact(t: FloatArray, y: FloatArray, regressors: FloatArray) -> ExactFit:
         The fit.
 
     """
-    dt = np.diff(t)
-    n, p = regressors.shape
-    table = np.column_stack([regressors, y - y.mean()])
-
-    def profile(log_alpha: float) -> tuple[float, float, FloatArray, FloatArray]:
-        white, log_det = _whiten(table, dt, math.exp(log_alpha))
-        x, z = white[:, :p], white[:, p]
-        gram = x.T @ x
-        factor = cho_factor(gram)
-        beta = cho_solve(factor, x.T @ z)
-        rss = float(((z - x @ beta) ** 2).sum())
-        var = max(rss / (n - p), np.finfo(float).tiny)
-        log_gram = 2.0 * float(np.log(np.diag(factor[0])).sum())
-        value = 0.5 * ((n - p) * math.log(var) + log_det + log_gram)
-        return value, var, beta, cho_solve(factor, np.eye(p)) * var
-
+    likelihood = _Likelihood(t, y, regressors)
     # Slowest rate worth a name: one relaxation in ten windows; fastest: the
     # correlation of neighbours is below 1e-4.
-    low = math.log(0.1 / (t[-1] - t[0]))
-    high = math.log(9.2 / float(np.median(dt)))
-    grid = np.linspace(low, high, 12)
-    best = int(np.argmin([profile(a)[0] for a in grid]))
-    left, right = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
-    found = minimize_scalar(lambda a: profile(a)[0], bounds=(left, right), method='bounded',
-                            options={'xatol': 1e-6})
-    _, var, beta, cov = profile(float(found.x))
+    low = math.log(0.1 / float(t[-1] - t[0]))
+    high = math.log(9.2 / likelihood.step)
+    # lam = x^2 keeps the noise share positive and smooth at zero.
+    starts = [(a, x) for a in np.linspace(low, high, 7)[1:-1] for x in (0.1, 1.0)]
+    values = [likelihood.solve(a, x * x)[0] for a, x in starts]
+    found = minimize(lambda z: likelihood.solve(z[0], z[1] * z[1])[0],
+                     starts[int(np.argmin(values))], method='L-BFGS-B',
+                     bounds=[(low, high), (0.0, math.sqrt(_MOST_NOISE))],
+                     options={'ftol': 1e-13, 'gtol': 1e-7})
+    log_alpha, share = float(found.x[0]), float(found.x[1]) ** 2
+    value, scale, beta, cov = likelihood.solve(log_alpha, share)
+    clean = likelihood.solve(log_alpha, 0.0)
+    if clean[0] <= value:
+        share, (value, scale, beta, cov) = 0.0, clean
     beta = beta.copy()
-    beta[0] += y.mean()
-    return ExactFit(math.exp(float(found.x)), var, beta, cov,
-                    at_low=found.x < low + 1e-3, at_high=found.x > high - 1e-3)
+    beta[0] += likelihood.shift
+    edge = -1 if log_alpha < low + 1e-3 else 1 if log_alpha > high - 1e-3 else 0
+    return ExactFit(math.exp(log_alpha), math.sqrt(scale), share * scale * likelihood.step,
+                    beta, cov, -value, edge)

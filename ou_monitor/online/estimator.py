@@ -1,30 +1,50 @@
 """
 The sliding-window OU estimator, used by the node and by the offline tools.
 
-Limits: no white measurement noise in the model yet (noise_std is NaN, and
-noise is taken for diffusion); the cost of `estimate` grows with the samples
-in the window.
+voltage = level + response to throttle + OU(alpha, sigma) + white noise, all
+estimated together.  Limits: one relaxation (no second pole, no resonance);
+sigma constant within the window; alpha known no better than sqrt(2/(alpha T));
+sources faster than `fastest` are averaged down to it.  Measured accuracy and
+cost: doc/estimation.md.
 """
 
 from __future__ import annotations
 
-from collections import deque
+from dataclasses import replace
 import math
 
 import numpy as np
 import numpy.typing as npt
 
-from ou_monitor.model.exact_fit import fit_exact
-from ou_monitor.records import Counters, Estimate, Flag, FloatArray, NAN, Status
+from ou_monitor.model import arma
+from ou_monitor.online import judgement
+from ou_monitor.online.compiled import kernels
+from ou_monitor.online.fitted import Fitted, from_window
+from ou_monitor.online.intake import as_column, BATCH, Intake, Thinner
+from ou_monitor.online.irregular import fit_irregular, fresh_columns, MOST
+from ou_monitor.online.quality import examine, Quality, TAIL
+from ou_monitor.online.resolution import FACTOR, FEWEST, LAGS, Resolution
+from ou_monitor.online.series import T, U, Y
+from ou_monitor.online.window_fit import fit_window
+from ou_monitor.records import Estimate, FloatArray, NAN, Status
 
-MIN_SAMPLES = 16
-MIN_RELAXATIONS = 5.0
-GOOD_RELAXATIONS = 25.0
-# A pause longer than this share of the window ends the window: what lies
-# behind it says nothing of the rail now.
-GAP_SHARE = 1.0
-# Throttle that moves less than this (rms, of full scale) cannot tell sag.
-MIN_THROTTLE_STD = 0.005
+# Samples from which a fit is tried.
+MIN_SAMPLES = 20
+# theta^LAGS beyond this: the lags no longer hold the noise, go coarser.
+_LOST = 0.05
+# Share of samples with a partner at the longest lag below which the window
+# counts as uneven.
+_EVEN = 0.5
+# Jitter of the stamps, in relaxation times, from which they are taken as they
+# are: an even grid is then wrong by its square.
+_JITTER = 0.1
+# An ADC step is white noise only where the OU crosses several codes within a
+# step: D >= (0.7 step / sigma)^2 (doc/estimation.md).
+_DITHER = 0.7
+# The quality of the input is looked at this many times per window.
+_LOOKS = 4
+_DOUBLE = np.dtype(np.float64)
+_ONE = (float, int, type(None))
 
 
 class SlidingEstimator:
@@ -34,22 +54,31 @@ class SlidingEstimator:
     Parameters
     ----------
     window : float
-        Length of the window, s, > 0.
+        Length of the window, s, > 0; resolved to 1/40 of itself
+        (`Estimate.duration` tells the exact length).
+    fastest : float
+        Highest rate kept, Hz; sources faster than this are averaged in blocks,
+        and the fit knows it.
 
     Raises
     ------
     ValueError
-        When the window is not a positive finite number.
+        When the window or the rate is not a positive finite number.
 
     """
 
-    def __init__(self, window: float = 2.0) -> None:
-        self._window = _checked_window(window)
-        self._blocks: deque[tuple[FloatArray, FloatArray, FloatArray]] = deque()
-        self._last_t = -math.inf
-        self._last_throttle = NAN
-        self._pushed = self._used = self._non_finite = self._late = self._resets = 0
+    def __init__(self, window: float = 2.0, *, fastest: float = 1.0e4) -> None:
+        self._window = _positive('window', window, 's')
+        self._intake = Intake()
+        self._thinner = Thinner(_positive('fastest', fastest, 'Hz'))
+        self._finest = Resolution(self._window)
+        self._tail = np.empty(0)
+        self._quality = Quality()
+        self._jitter = 0.0
+        self._looked = -math.inf
+        self._start: tuple[float, float] | None = None
         self._cached: Estimate | None = None
+        kernels()
 
     @property
     def window(self) -> float:
@@ -59,15 +88,17 @@ class SlidingEstimator:
     @window.setter
     def window(self, value: float) -> None:
         """Change the length; samples still inside the new length stay."""
-        self._window = _checked_window(value)
-        self._forget()
+        self._work_off()
+        self._window = _positive('window', value, 's')
+        self._finest.set_window(self._window)
+        self._cached = None
 
     def reset(self) -> None:
         """Clear the window; the counters go on."""
-        self._blocks.clear()
-        self._last_t = -math.inf
-        self._last_throttle = NAN
-        self._resets += 1
+        self._work_off()
+        self._intake.forget()
+        self._intake.count(resets=1)
+        self._forget()
         self._cached = None
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
@@ -78,8 +109,9 @@ class SlidingEstimator:
         Parameters
         ----------
         t : float or array_like, shape (n,)
-            Stamps, s.  Samples at or before the newest one are dropped and
-            counted; a step back by more than the window clears it.
+            Stamps, s.  Late samples are sorted in when they come in one batch
+            with what they are late for, else dropped and counted; a step back
+            or a pause longer than the window clears it.
         voltage : float or array_like, shape (n,)
             Voltage, V.  NaN and infinite samples are dropped and counted.
         throttle : float or array_like, shape (n,), optional
@@ -91,117 +123,166 @@ class SlidingEstimator:
             When the shapes differ.
 
         """
-        stamps = np.atleast_1d(np.asarray(t, dtype=np.float64))
-        volts = np.atleast_1d(np.asarray(voltage, dtype=np.float64))
-        if stamps.ndim != 1 or stamps.shape != volts.shape:
-            raise ValueError(
-                f't and voltage must have one shape (n,): got {stamps.shape} and {volts.shape}')
-        given = np.asarray(NAN if throttle is None else throttle, dtype=np.float64)
-        if given.ndim > 0 and given.shape != stamps.shape:
-            raise ValueError(
-                f'throttle must be one number or have the shape of t, {stamps.shape}: got '
-                f'{given.shape}')
-        load = np.broadcast_to(given, stamps.shape)
-        self._pushed += stamps.size
-        good = np.isfinite(stamps) & np.isfinite(volts)
-        self._non_finite += int(stamps.size - good.sum())
-        stamps, volts, load = stamps[good], volts[good], load[good]
-        if not stamps.size:
-            return
-        if stamps[0] < self._last_t - self._window:
-            self.reset()
-        elif stamps[0] - self._last_t > GAP_SHARE * self._window and self._blocks:
-            self.reset()
-        newest = np.maximum.accumulate(np.concatenate(([self._last_t], stamps)))[:-1]
-        fresh = stamps > newest
-        self._late += int(stamps.size - fresh.sum())
-        stamps, volts, load = stamps[fresh], volts[fresh], load[fresh]
-        if not stamps.size:
-            return
-        self._used += stamps.size
-        self._blocks.append((stamps, volts, np.array(load)))
-        self._last_t = float(stamps[-1])
-        self._last_throttle = float(load[-1])
-        self._forget()
-
-    def _forget(self) -> None:
-        """Drop what has left the window."""
         self._cached = None
-        edge = self._last_t - self._window
-        while self._blocks and self._blocks[0][0][-1] < edge:
-            self._blocks.popleft()
-        if self._blocks and self._blocks[0][0][0] < edge:
-            t, v, u = self._blocks[0]
-            keep = int(np.searchsorted(t, edge))
-            self._blocks[0] = (t[keep:], v[keep:], u[keep:])
+        put = self._intake.put
+        # What the fast sources send, with as few steps as can be.
+        if type(t) is float and type(voltage) is float and type(throttle) in _ONE:
+            if not self._intake.put_one(t, voltage, throttle):  # type: ignore[arg-type]
+                self._work_off()
+                self._intake.put_one(t, voltage, throttle)  # type: ignore[arg-type]
+            return
+        if not (type(t) is np.ndarray is type(voltage) and t.dtype is _DOUBLE
+                and voltage.dtype is _DOUBLE and t.ndim == 1):
+            t, voltage = as_column(t), as_column(voltage)
+        if t.shape != voltage.shape or t.ndim != 1:
+            raise ValueError(
+                f't and voltage must have one shape (n,): got {t.shape} and {voltage.shape}')
+        load: FloatArray | float | None = None
+        if throttle is not None:
+            load = np.asarray(throttle, dtype=np.float64)
+            if load.ndim == 0:
+                load = float(load)
+            elif load.shape != t.shape:
+                raise ValueError(
+                    f'throttle must be one number or have the shape of t, {t.shape}: got '
+                    f'{load.shape}')
+        if put(t, voltage, load):
+            return
+        for begin in range(0, t.size, BATCH):
+            part = slice(begin, begin + BATCH)
+            self._work_off()
+            put(t[part], voltage[part], load[part] if isinstance(load, np.ndarray) else load)
 
     def estimate(self) -> Estimate:
         """Return the estimate for the window that ends at the newest sample."""
         if self._cached is None:
-            self._cached = self._fit()
+            self._work_off()
+            self._cached = self._estimate()
         return self._cached
 
-    def _counters(self) -> Counters:
-        return Counters(pushed=self._pushed, used=self._used, non_finite=self._non_finite,
-                        late=self._late, resets=self._resets)
+    def _work_off(self) -> None:
+        """Move what has been pushed into the window."""
+        if not self._intake.waiting:
+            return
+        for batch in self._intake.work_off(self._window, self._thinner.step):
+            if batch.restart:
+                self._forget()
+            y = batch.y
+            self._tail = y[-TAIL:].copy() if y.size >= TAIL else np.concatenate(
+                [self._tail, y])[-TAIL:]
+            *kept, restart = self._thinner.take(batch)
+            if restart:
+                # Block means of another size do not go with the old ones.
+                self._intake.count(resets=1)
+                self._finest.clear()
+                self._start = None
+            self._finest.add(*kept)
 
-    def _fit(self) -> Estimate:
-        if not self._blocks:
-            return Estimate(counters=self._counters())
-        t, v, u = (np.concatenate(part) for part in zip(*self._blocks))
+    def _forget(self) -> None:
+        self._thinner.forget()
+        self._finest.clear()
+        self._tail = np.empty(0)
+        self._looked = -math.inf
+        self._start = None
+
+    def _look(self, t: float) -> Quality:
+        """Examine the raw samples, now and then."""
+        if not 0.0 <= t - self._looked < self._window / _LOOKS:
+            self._quality = examine(self._tail)
+            self._jitter = float(np.std(np.diff(self._finest.series.column(T)[-TAIL:])))
+            self._looked = t
+        return self._quality
+
+    def _estimate(self) -> Estimate:
+        """Fit the window."""
+        series, intake = self._finest.series, self._intake
+        if not series.size:
+            n = self._thinner.waiting
+            return Estimate(t=intake.newest if n else NAN, n=n, counters=intake.counters,
+                            voltage=float(self._tail[-1]) if n else NAN,
+                            status=Status.TOO_FEW_SAMPLES if n else Status.NO_DATA)
+        y, t = series.column(Y), series.column(T)
         duration = float(t[-1] - t[0])
-        rate = (t.size - 1) / duration if duration > 0.0 else NAN
+        m, n = self._thinner.m, series.size
+        base = Estimate(
+            t=intake.newest, voltage=float(self._tail[-1]), throttle=series.last(U),
+            n=n * m, duration=duration, counters=intake.counters,
+            rate=(n - 1) * m / duration if duration > 0.0 else NAN, u0=float(y.mean()))
+        quality = self._look(intake.newest)
+        status = None
+        if n < MIN_SAMPLES:
+            status = Status.TOO_FEW_SAMPLES
+        elif y[0] == y[-1] and not np.ptp(y) > 0.0:
+            status = Status.CONSTANT
+        if status is not None:
+            return replace(base, status=status, flags=tuple(
+                judgement.input_flags(intake.counters, quality, NAN)))
+        throttle_std = 0.0
+        if series.moves:
+            throttle_std = float(np.std(series.column(U)))
+        elif math.isnan(series.last(U)):
+            throttle_std = NAN
+        fit, smoothness = self._fit(quality)
+        return judgement.judge(fit, base, quality, throttle_std, smoothness)
 
-        def unusable(status: Status) -> Estimate:
-            return Estimate(t=float(t[-1]), status=status, n=t.size, duration=duration,
-                            rate=rate, u0=float(v.mean()), voltage=float(v[-1]),
-                            throttle=self._last_throttle,
-                            counters=self._counters())
+    def _fit(self, quality: Quality) -> tuple[Fitted, float]:
+        """Return the fit, and how much smoother than it neighbouring increments are."""
+        series = self._finest.series
+        moves = series.moves and bool(np.isfinite(series.column(U)).all())
+        if quality.held > 1 and self._thinner.m == 1:
+            columns = fresh_columns(series.all_columns(), quality.held)
+            return fit_irregular(columns[:, -MOST:], moves), NAN
+        sums = self._finest.sums.total()
+        if self._thinner.m == 1 and series.size <= MOST and (
+                sums.pairs[-1] < _EVEN * (sums.n - LAGS)):
+            return fit_irregular(series.all_columns(), moves), NAN
+        resolution, m = self._finest, self._thinner.m
+        step = self._step(series.column(T))
+        fit = fit_window(sums, m, self._start)
+        self._start = (math.log(fit.a), fit.theta) if fit.correlated else None
+        smoothness = NAN
+        if fit.correlated:
+            smoothness = _smoothness(sums.spread[:, 0, 0] / np.maximum(sums.pairs, 1.0),
+                                     fit.a, m)
+            if m == 1 and series.size <= MOST and self._jitter * fit.a / step > _JITTER:
+                return fit_irregular(series.all_columns(), moves), NAN
+        # Coarser where noise, or an ADC step, hides what the lags can hold.
+        while fit.correlated and resolution.series.size >= FACTOR * FEWEST and (
+                fit.theta ** LAGS > _LOST
+                or step < (_DITHER * quality.step) ** 2 * step / fit.scale):
+            resolution = resolution.coarser()
+            m *= FACTOR
+            step *= FACTOR
+            sums = resolution.sums.total()
+            coarse = fit_window(sums, m)
+            if not coarse.correlated:
+                break
+            fit = coarse
+        return from_window(fit, step, m, sums.n, resolution.sums.reference), smoothness
 
-        if t.size < MIN_SAMPLES:
-            return unusable(Status.TOO_FEW_SAMPLES)
-        if np.ptp(v) == 0.0:
-            return unusable(Status.CONSTANT)
-        flags: list[Flag] = []
-        known = bool(np.isfinite(u).all())
-        moves = known and float(u.std()) > MIN_THROTTLE_STD
-        columns = [np.ones(t.size)]
-        if moves:
-            columns.append(u - u[-1])
-        elif known:
-            flags.append(Flag.NO_EXCITATION)
-        fit = fit_exact(t, v, np.column_stack(columns))
-        if fit.at_high:
-            return unusable(Status.NO_RELAXATION)
-        # What the restricted likelihood leaves of the bias of alpha: 2/T.
-        alpha = fit.alpha - 2.0 / duration
-        if fit.at_low or fit.alpha * duration < MIN_RELAXATIONS or alpha <= 0.0:
-            return unusable(Status.TOO_SHORT)
-        sigma = math.sqrt(2.0 * fit.alpha * fit.var_inf)
-        dt = duration / (t.size - 1)
-        if alpha * dt > 1.0:
-            flags.append(Flag.SLOW_RATE)
-        relaxations = alpha * duration
-        # Information of a clean AR(1): Var ln(phi) gives alpha, n/2 gives the
-        # innovation variance; their sum gives sigma and Var_inf.
-        spread = math.expm1(2.0 * alpha * dt) / (t.size * (alpha * dt) ** 2)
-        shared = 1.0 - 2.0 * alpha * dt / math.expm1(2.0 * alpha * dt)
-        sigma_var = 2.0 / t.size + shared ** 2 * spread
-        var_log = 2.0 / (t.size * math.tanh(alpha * dt))
-        return Estimate(
-            t=float(t[-1]), alpha=alpha, sigma=sigma, var_inf=sigma * sigma / (2.0 * alpha),
-            u0=float(fit.beta[0]), alpha_se=math.sqrt(spread),
-            sigma_se=0.5 * math.sqrt(sigma_var), var_inf_se=math.sqrt(var_log),
-            u0_se=math.sqrt(float(fit.beta_cov[0, 0])),
-            sag=float(fit.beta[1]) if moves else NAN, voltage=float(v[-1]),
-            throttle=self._last_throttle,
-            status=Status.OK if relaxations >= GOOD_RELAXATIONS else Status.SHORT_WINDOW,
-            flags=tuple(flags), n=t.size, duration=duration, rate=rate,
-            counters=self._counters())
+    def _step(self, t: FloatArray) -> float:
+        """Return the mean step between evenly spaced samples, s."""
+        series = self._finest.series
+        if series.even:
+            return float(t[-1] - t[0]) / (t.size - 1)
+        runs = series.runs(series.first, series.end)
+        return float(np.diff(t)[runs[1:] > 0].mean())
 
 
-def _checked_window(window: float) -> float:
-    value = float(window)
-    if not (math.isfinite(value) and value > 0.0):
-        raise ValueError(f'window must be a positive number of seconds, got {window}')
-    return value
+def _smoothness(variogram: FloatArray, a: float, m: int) -> float:
+    """
+    Return how much more neighbouring increments are correlated than in an OU.
+
+    From E(z_j - z_{j-1})^2 and E(z_j - z_{j-2})^2: their correlation is
+    D_2 / (2 D_1) - 1.
+    """
+    gamma0, gamma1 = arma.block_autocovariance(a, m)
+    of_ou = (gamma0 - gamma1 * math.exp(-a)) / (2.0 * (gamma0 - gamma1)) - 1.0
+    return float(variogram[1] / (2.0 * variogram[0])) - 1.0 - of_ou
+
+
+def _positive(name: str, value: float, unit: str) -> float:
+    number = float(value)
+    if not (math.isfinite(number) and number > 0.0):
+        raise ValueError(f'{name} must be a positive number of {unit}, got {value}')
+    return number

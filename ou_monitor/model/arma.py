@@ -1,0 +1,161 @@
+"""
+The ARMA(1,1) that a sampled or block-averaged OU with white noise is.
+
+Samples of an OU are AR(1); white noise on top, or averaging over blocks, makes
+them ARMA(1,1): z_j - phi z_{j-1} = e_j - theta e_{j-1}, with phi = exp(-alpha D)
+for the step D.  Averages over blocks *without* noise have theta < 0; noise
+raises theta towards phi.  Everything below is in units of sigma^2 D, so that
+the shape depends on a = alpha D, on the samples per block m and on the noise
+share lam = noise variance of one z / (sigma^2 D) alone.
+
+Source of the block autocovariances: the double sums of phi^(|i-j|/m), closed
+by the geometric series; Hamilton, Time Series Analysis (1994), ch. 3, for the
+ARMA identities.
+"""
+
+from __future__ import annotations
+
+import math
+
+
+def block_autocovariance(a: float, m: int) -> tuple[float, float]:
+    """
+    Return the autocovariances of noise-free block means at lags 0 and 1.
+
+    Parameters
+    ----------
+    a : float
+        alpha D, relaxation rate times the step between blocks, > 0.
+    m : int
+        Samples averaged per block; 1 for plain samples.
+
+    Returns
+    -------
+    gamma0, gamma1 : float
+        In units of sigma^2 D.
+
+    """
+    variance = 0.5 / a
+    if m == 1:
+        return variance, variance * math.exp(-a)
+    r = math.exp(-a / m)
+    short, long = -math.expm1(-a / m), -math.expm1(-a)
+    if a < 1e-3:
+        # The two terms of gamma0 cancel to order a; the series keeps 1e-9 here:
+        # 1 - mean |i-j|/m a + mean (|i-j|/m)^2 a^2/2 - mean (|i-j|/m)^3 a^3/6.
+        k = float(m)
+        one = (k * k - 1.0) / (3.0 * k * k)
+        two = (k * k - 1.0) / (6.0 * k * k)
+        three = (k * k - 1.0) * (3.0 * k * k - 2.0) / (30.0 * k ** 4)
+        gamma0 = variance * (1.0 - a * one + a * a * two / 2.0 - a ** 3 * three / 6.0)
+    else:
+        gamma0 = variance * (m * short * (1.0 + r) - 2.0 * r * long) / (m * short) ** 2
+    gamma1 = variance * r * (long / (m * short)) ** 2
+    return gamma0, gamma1
+
+
+def noise_free_theta(a: float, m: int) -> float:
+    """Return theta without measurement noise: 0 for samples, negative for block means."""
+    return 0.0 if m == 1 else theta_at(a, m, 0.0)
+
+
+def theta_at(a: float, m: int, share: float) -> float:
+    """
+    Return the moving-average coefficient at a noise share.
+
+    Parameters
+    ----------
+    a, m :
+        As in `block_autocovariance`.
+    share : float
+        Noise variance of one block mean in units of sigma^2 D, >= 0.
+
+    Returns
+    -------
+    float
+        theta, |theta| < 1.
+
+    """
+    phi = math.exp(-a)
+    gamma0, gamma1 = block_autocovariance(a, m)
+    gamma0 += share
+    ratio = 2.0 * (phi * gamma0 - gamma1) / (gamma0 * (1.0 + phi * phi) - 2.0 * phi * gamma1)
+    return ratio / (1.0 + math.sqrt(max(1.0 - ratio * ratio, 0.0)))
+
+
+def noise_share(a: float, theta: float, m: int) -> float:
+    """
+    Return lam, the noise variance of one z in units of sigma^2 D.
+
+    Parameters
+    ----------
+    a : float
+        alpha D.
+    theta : float
+        Moving-average coefficient, below exp(-a).
+    m : int
+        Samples per block.
+
+    Returns
+    -------
+    float
+        Noise share; negative when theta is below `noise_free_theta`.
+
+    """
+    phi = math.exp(-a)
+    gamma0, gamma1 = block_autocovariance(a, m)
+    kappa = theta / (1.0 + theta * theta)
+    return gamma1 * (1.0 - 2.0 * kappa * phi) / (phi - kappa * (1.0 + phi * phi)) - gamma0
+
+
+def innovation_variance(a: float, theta: float, m: int) -> float:
+    """Return the one-step innovation variance in units of sigma^2 D; arguments as above."""
+    phi = math.exp(-a)
+    gamma0, gamma1 = block_autocovariance(a, m)
+    total = gamma0 + noise_share(a, theta, m)
+    return (total * (1.0 + phi * phi) - 2.0 * phi * gamma1) / (1.0 + theta * theta)
+
+
+def log_covariance(a: float, theta: float, m: int, n: int) -> tuple[float, float, float]:
+    """
+    Return the variances of ln(alpha), ln(sigma) and ln(Var_inf) from n blocks.
+
+    The information of an ARMA(1,1) in (phi, theta, ln q) is n times
+    [[1/(1-phi^2), -1/(1-phi theta)], [., 1/(1-theta^2)]] and n/2 (Box &
+    Jenkins, Time Series Analysis, 7.2.6); the delta method carries it to the
+    logarithms, with derivatives in the logit of theta and the logarithm of a
+    taken numerically.
+
+    Parameters
+    ----------
+    a, theta, m :
+        As above.
+    n : int
+        Number of blocks.
+
+    Returns
+    -------
+    tuple of float
+        Variances, dimensionless.
+
+    """
+    phi = math.exp(-a)
+    i_pp = 1.0 / -math.expm1(-2.0 * a)
+    i_tt = 1.0 / (1.0 - theta * theta)
+    i_pt = -1.0 / (1.0 - phi * theta)
+    det = i_pp * i_tt - i_pt * i_pt
+    v_phi, v_theta, v_cross = i_tt / det / n, i_pp / det / n, -i_pt / det / n
+    # ln sigma^2 = ln q - ln q~(a, theta): derivatives of ln q~.
+    step_a, step_t = 1e-4 * a, 1e-4 * min(1.0 - theta, phi - theta, 0.5)
+    d_a = (math.log(innovation_variance(a + step_a, theta, m))
+           - math.log(innovation_variance(a - step_a, theta, m))) / (2.0 * step_a)
+    d_t = (math.log(innovation_variance(a, theta + step_t, m))
+           - math.log(innovation_variance(a, theta - step_t, m))) / (2.0 * step_t)
+    # a = -ln phi.
+    s_phi, s_theta = d_a / phi, -d_t
+    a_phi = -1.0 / (phi * a)
+    v_part = s_phi - a_phi
+    last = 2.0 / n + s_theta * s_theta * v_theta
+    return (a_phi * a_phi * v_phi,
+            (last + s_phi * s_phi * v_phi + 2.0 * s_phi * s_theta * v_cross) / 4.0,
+            last + v_part * v_part * v_phi + 2.0 * v_part * s_theta * v_cross)

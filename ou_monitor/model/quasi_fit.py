@@ -1,0 +1,200 @@
+"""
+Restricted quasi-likelihood of an ARMA(1,1) from its sample autocovariances.
+
+The Gaussian likelihood needs the data only through c_0..c_K: the inverse of
+the covariance of an ARMA(1,1) is, away from the ends, the Toeplitz matrix of
+its inverse autocovariances, which fall as theta^k (so K lags do when theta^K
+is small).  Restricted form: the level, and other regressors of the mean
+through `tilt`, are integrated out.  One evaluation costs K multiplications; no data is touched.
+
+The same text runs in plain Python and, where Numba is installed, compiled
+(`ou_monitor.online.compiled`): scalars and loops only, hence no classes here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+
+# Newton-like steps settle in 5 to 12; this many means they did not.
+MAX_STEPS = 60
+# No step moves alpha by more than a factor exp(1.5).
+_LONGEST = 1.5
+# Settled: ln(alpha) and theta (relative to its distance from 1) move less; what
+# is left is the square of it.
+_SETTLED = 1e-6
+
+
+def objective(c0: float, c: Sequence[float], free: float, log_a: float, theta: float,
+              tilt_a: float, tilt_t: float) -> tuple[float, float, float]:
+    """
+    Return minus the log-likelihood and its gradient in (ln a, theta).
+
+    Parameters
+    ----------
+    c0 : float
+        Sample variance of the residual, V^2.
+    c : sequence of float, length K
+        Sample autocovariances at lags 1..K, V^2.
+    free : float
+        Samples less regressors.
+    log_a, theta : float
+        ln(alpha D) and the moving-average coefficient, theta < phi.
+    tilt_a, tilt_t : float
+        Gradient of what other regressors than the level add (half the
+        log-determinant of their information), taken linear.
+
+    Returns
+    -------
+    value, by_log_a, by_theta : float
+        Nats; value is inf where the parameters contradict the data.
+
+    """
+    a = math.exp(log_a)
+    phi = math.exp(-a)
+    g = 0.0
+    dg = 0.0
+    for k in range(len(c) - 1, -1, -1):
+        dg = dg * theta + g
+        g = g * theta + c[k]
+    one = 1.0 - theta * theta
+    cross = 1.0 - phi * theta
+    lead = 1.0 + phi * phi - 2.0 * phi * theta
+    tail = cross * (theta - phi)
+    s = (lead * c0 + 2.0 * tail * g) / one
+    if s <= 0.0:
+        return math.inf, 0.0, 0.0
+    s_phi = (2.0 * (phi - theta) * c0 - 2.0 * (theta * (theta - phi) + cross) * g) / one
+    s_theta = (-2.0 * phi * c0 + 2.0 * (cross - phi * (theta - phi)) * g
+               + 2.0 * tail * dg + 2.0 * theta * s) / one
+    rest = -math.expm1(-a)
+    rest2 = -math.expm1(-2.0 * a)
+    half = 0.5 * free
+    value = (half * math.log(s) + math.log(rest / (1.0 - theta)) + math.log(cross)
+             - 0.5 * math.log(rest2 * one) + tilt_a * log_a + tilt_t * theta)
+    by_phi = half * s_phi / s - 1.0 / rest - theta / cross + phi / rest2
+    by_theta = half * s_theta / s + 1.0 / (1.0 - theta) - phi / cross + theta / one
+    return value, tilt_a - a * phi * by_phi, tilt_t + by_theta
+
+
+def innovation(c0: float, c: Sequence[float], log_a: float, theta: float) -> float:
+    """Return the mean square one-step innovation, V^2, at given parameters."""
+    phi = math.exp(-math.exp(log_a))
+    g = 0.0
+    for k in range(len(c) - 1, -1, -1):
+        g = g * theta + c[k]
+    lead = 1.0 + phi * phi - 2.0 * phi * theta
+    tail = (1.0 - phi * theta) * (theta - phi)
+    return (lead * c0 + 2.0 * tail * g) / (1.0 - theta * theta)
+
+
+def information(log_a: float, theta: float) -> tuple[float, float, float]:
+    """Return the information per sample in (ln a, theta): aa, at, tt."""
+    a = math.exp(log_a)
+    weight = a * math.exp(-a)
+    return (weight * weight / -math.expm1(-2.0 * a),
+            weight / (1.0 - math.exp(-a) * theta),
+            1.0 / (1.0 - theta * theta))
+
+
+def minimise(c0: float, c: Sequence[float], free: float, log_a: float, theta: float,
+             floor: float, slope: float, low: float, high: float, tilt_a: float, tilt_t: float,
+             ) -> tuple[float, float, float, bool, int]:
+    """
+    Minimise `objective` over ln a and theta >= floor + slope (ln a - start).
+
+    Quasi-Newton (BFGS) from the expected information, with step halving; on
+    the bound (no measurement noise) the search goes along it.
+
+    Parameters
+    ----------
+    c0, c, free :
+        As in `objective`.
+    log_a, theta : float
+        Start.
+    floor, slope : float
+        Least theta at the start (`arma.noise_free_theta`) and its derivative
+        in ln a, taken linear.
+    low, high : float
+        Range of ln a.
+    tilt_a, tilt_t : float
+        As in `objective`.
+
+    Returns
+    -------
+    log_a, theta, value : float
+        The minimiser and the value there.
+    on_bound : bool
+        Whether theta ended on its bound.
+    steps : int
+        Iterations; `MAX_STEPS` when it did not settle.
+
+    """
+    start = log_a
+    theta = max(theta, floor)
+    on_bound = theta <= floor
+    value, g_a, g_t = objective(c0, c, free, log_a, theta, tilt_a, tilt_t)
+    fresh = True
+    h_aa = h_at = h_tt = 0.0
+    steps = 0
+    while steps < MAX_STEPS:
+        steps += 1
+        if on_bound and g_t < 0.0:
+            on_bound = False
+            fresh = True
+        if fresh:
+            i_aa, i_at, i_tt = information(log_a, theta)
+            det = i_aa * i_tt - i_at * i_at
+            if on_bound:
+                h_aa = 1.0 / (free * (i_aa + 2.0 * slope * i_at + slope * slope * i_tt))
+            else:
+                h_aa, h_at, h_tt = (i_tt / det / free, -i_at / det / free,
+                                    i_aa / det / free)
+            fresh = False
+        if on_bound:
+            d_a = -h_aa * (g_a + slope * g_t)
+            d_t = slope * d_a
+        else:
+            d_a = -(h_aa * g_a + h_at * g_t)
+            d_t = -(h_at * g_a + h_tt * g_t)
+        size = min(1.0, _LONGEST / max(abs(d_a), 1e-300))
+        moved = False
+        landed = on_bound
+        new_value, new_a, new_t, n_a, n_t = value, log_a, theta, g_a, g_t
+        for _ in range(40):
+            new_a = min(max(log_a + size * d_a, low), high)
+            least = floor + slope * (new_a - start)
+            new_t = least if on_bound else theta + size * d_t
+            landed = on_bound or new_t <= least
+            new_t = max(new_t, least)
+            if new_t < math.exp(-math.exp(new_a)) * (1.0 - 1e-9):
+                new_value, n_a, n_t = objective(c0, c, free, new_a, new_t,
+                                                tilt_a, tilt_t)
+                if new_value <= value:
+                    moved = True
+                    break
+            size *= 0.5
+        if not moved:
+            break
+        s_a, s_t = new_a - log_a, new_t - theta
+        y_a, y_t = n_a - g_a, n_t - g_t
+        if landed != on_bound:
+            fresh = True
+        elif on_bound:
+            y = y_a + slope * y_t
+            if y * s_a > 0.0:
+                h_aa = s_a / y
+        else:
+            sy = s_a * y_a + s_t * y_t
+            if sy > 1e-300:
+                hy_a = h_aa * y_a + h_at * y_t
+                hy_t = h_at * y_a + h_tt * y_t
+                f = (1.0 + (y_a * hy_a + y_t * hy_t) / sy) / sy
+                h_aa += f * s_a * s_a - 2.0 * s_a * hy_a / sy
+                h_at += f * s_a * s_t - (s_a * hy_t + hy_a * s_t) / sy
+                h_tt += f * s_t * s_t - 2.0 * s_t * hy_t / sy
+        log_a, theta, on_bound = new_a, new_t, landed
+        value, g_a, g_t = new_value, n_a, n_t
+        if not fresh and abs(s_a) < _SETTLED and abs(s_t) < _SETTLED * (1.0 - theta):
+            break
+    return log_a, theta, value, on_bound, steps

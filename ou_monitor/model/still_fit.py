@@ -1,0 +1,191 @@
+"""
+The whole fit of a window whose throttle is still, from its autocovariances.
+
+What `online.window_fit` does step by step when the mean needs regressors is
+one function of scalars here: search, test for a trend, scale, noise and
+information.  Like `quasi_fit` it is written in scalars and loops so that the
+same text runs in plain Python and compiled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+
+from ou_monitor.model.arma import (
+    innovation_variance, log_covariance, noise_free_theta, noise_share)
+from ou_monitor.model.quasi_fit import information, innovation, minimise
+
+# ln(a) settles to this when something else is fitted along with it; the error
+# left in it is the square.
+STEADY = 1e-3
+# alpha D beyond which neighbouring samples say nothing of relaxation, and the
+# range of the search in ln(alpha D).
+FASTEST = 4.6
+LOW = math.log(1e-9)
+HIGH = math.log(2.0 * FASTEST)
+# Pull of theta towards "no measurement noise" where the data cannot tell: a
+# clamped estimate is high by 0.4 standard errors on average when there is no
+# noise; this takes a third of it away and fades within two standard errors.
+PULL = 0.4
+
+
+def guess(c0: float, c: Sequence[float]) -> tuple[float, float]:
+    """Return a first ln(a) and theta: noise by extrapolating the variogram to lag zero."""
+    noise = min(max(0.0, 2.0 * (c0 - c[0]) - (c0 - c[1])), 0.9 * c0)
+    phi = min(max(c[0] / (c0 - noise), 0.02), 1.0 - 1e-6)
+    return math.log(-math.log(phi)), 0.1 * phi
+
+
+def search(c0: float, c: Sequence[float], free: float, log_a: float, theta: float, m: int,
+           tilt_a: float, tilt_t: float) -> tuple[float, float, bool]:
+    """
+    Minimise `quasi_fit.objective` with the bound on theta, which bends with ln a.
+
+    Parameters
+    ----------
+    c0, c, free, tilt_a, tilt_t :
+        As in `quasi_fit.objective`.
+    log_a, theta : float
+        Start.
+    m : int
+        Raw samples in each sample.
+
+    Returns
+    -------
+    log_a, theta : float
+        The minimiser.
+    on_bound : bool
+        Whether no measurement noise was found.
+
+    """
+    theta = min(theta, 0.9 * math.exp(-math.exp(log_a)))
+    floor = 0.0
+    slope = 0.0
+    on_bound = False
+    for _ in range(4):
+        if m > 1:
+            a = math.exp(log_a)
+            floor = noise_free_theta(a, m)
+            slope = (noise_free_theta(1.001 * a, m) - floor) / math.log(1.001)
+        before = log_a
+        log_a, theta, _, on_bound, _ = minimise(
+            c0, c, free, log_a, theta, floor, slope, LOW, HIGH, tilt_a, tilt_t)
+        if m == 1 or not on_bound or abs(log_a - before) < STEADY:
+            break
+    return log_a, theta, on_bound
+
+
+def finish(c0: float, c: Sequence[float], n: int, free: float, log_a: float, theta: float,
+           on_bound: bool, m: int
+           ) -> tuple[float, float, float, float, float, float, float, float, float]:
+    """
+    Return scale, noise and errors at the minimiser.
+
+    Returns
+    -------
+    a, theta : float
+        alpha D and the moving-average coefficient, pulled (see `PULL`).
+    q : float
+        Innovation variance, V^2.
+    scale : float
+        sigma^2 D, V^2.
+    share : float
+        Noise variance of one sample in units of scale.
+    score : float
+        Distance from "no noise" in standard errors.
+    log_alpha_var, log_sigma_var, log_var_inf_var : float
+        Variances of the logarithms.
+
+    """
+    floor = noise_free_theta(math.exp(log_a), m)
+    i_aa, i_at, i_tt = information(log_a, theta)
+    spread = math.sqrt(i_aa / (i_aa * i_tt - i_at * i_at) / n)
+    score = 0.0
+    if not on_bound:
+        score = max(theta - floor, 0.0) / spread
+    if score > 0.0:
+        pull = min(PULL * math.exp(-score * score / 8.0), score) * spread
+        theta -= pull
+        log_a += i_at / i_aa * pull
+    a = math.exp(log_a)
+    q = innovation(c0, c, log_a, theta) * n / free
+    scale = q / innovation_variance(a, theta, m)
+    share = 0.0
+    if score > 0.0:
+        share = max(noise_share(a, theta, m), 0.0)
+    errors = log_covariance(a, theta, m, n)
+    return a, theta, q, scale, share, score, errors[0], errors[1], errors[2]
+
+
+def trend_score(c0: float, c: Sequence[float], n: int, place: float, change: Sequence[float],
+                pairs: Sequence[float], log_a: float, theta: float) -> float:
+    """
+    Return a trend over its standard error.
+
+    Parameters
+    ----------
+    c0, c :
+        Autocovariances of the voltage, V^2, at lag 0 and lags 1..K.
+    n : int
+        Samples.
+    place : float
+        Covariance of voltage and sample number, in windows, V.
+    change, pairs : sequence of float, length K
+        Sums of z_j - z_{j-k}, V, and of pairs.
+    log_a, theta : float
+        Noise.
+
+    Returns
+    -------
+    float
+        Signed score, dimensionless.
+
+    """
+    phi = math.exp(-math.exp(log_a))
+    lead = 1.0 + phi * phi - 2.0 * phi * theta
+    tail = 2.0 * (1.0 - phi * theta) * (theta - phi)
+    own = (1.0 - 1.0 / (float(n) * n)) / 12.0
+    xx = lead * own
+    xy = lead * place
+    yy = lead * c0
+    power = tail
+    for i in range(len(c)):
+        k = (i + 1.0) / n
+        xx += power * (own - 0.5 * k * k)
+        xy += power * (place - change[i] * k / (2.0 * max(pairs[i], 1.0)))
+        yy += power * c[i]
+        power *= theta
+    if xx <= 0.0:
+        return 0.0
+    rest = (yy - xy * xy / xx) * xx / n
+    return xy / math.sqrt(rest) if rest > 0.0 else 0.0
+
+
+def fit_still(c0: float, c: Sequence[float], n: int, place: float, change: Sequence[float],
+              pairs: Sequence[float], log_a: float, theta: float, m: int
+              ) -> tuple[float, float, float, float, float, float, float, float, float, float]:
+    """
+    Fit a window whose mean is a constant.
+
+    Parameters
+    ----------
+    c0, c, n, place, change, pairs :
+        As in `trend_score`.
+    log_a, theta : float
+        Start; NaN for none.
+    m : int
+        Raw samples in each sample.
+
+    Returns
+    -------
+    tuple of float
+        What `finish` returns, and the trend score.
+
+    """
+    if math.isnan(log_a):
+        log_a, theta = guess(c0, c)
+    log_a, theta, on_bound = search(c0, c, n - 1.0, log_a, theta, m, 0.0, 0.0)
+    score = trend_score(c0, c, n, place, change, pairs, log_a, theta)
+    end = finish(c0, c, n, n - 1.0, log_a, theta, on_bound, m)
+    return (end[0], end[1], end[2], end[3], end[4], end[5], end[6], end[7], end[8], score)

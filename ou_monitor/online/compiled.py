@@ -1,0 +1,262 @@
+"""
+The same arithmetic compiled with Numba, where Numba is installed.
+
+Optional: without Numba nothing here is used and nothing is missing but speed.
+The scalar fit of model/still_fit.py is compiled from its own text; the two
+loops over samples are written out here and tested against their NumPy twins to
+1e-9.  Compiling takes seconds (half a second from Numba's cache), so it runs
+in a thread; until it is done, and if it fails, NumPy does the work.
+Set OU_MONITOR_COMPILED=0 to keep to NumPy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import importlib.util
+import logging
+import math
+import os
+import threading
+import types
+from typing import Any
+
+import numpy as np
+
+from ou_monitor.model import arma, quasi_fit, still_fit
+
+# Compiled from their own text, each after those it calls.
+_SCALAR = (
+    *((arma, name) for name in (
+        'block_autocovariance', 'theta_at', 'noise_free_theta', 'noise_share',
+        'innovation_variance', 'log_covariance')),
+    *((quasi_fit, name) for name in ('objective', 'innovation', 'information', 'minimise')),
+    *((still_fit, name) for name in (
+        'guess', 'search', 'finish', 'trend_score', 'fit_still')))
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """
+    Compiled functions.
+
+    Attributes
+    ----------
+    fit_still, search, finish : callable
+        Those of `still_fit`, for arrays of autocovariances.
+    slot_sums : callable
+        Sums over one slot, see `slot_sums`.
+    check : callable
+        Whether samples are finite and evenly spaced, see `check`.
+
+    """
+
+    fit_still: Callable[..., tuple[float, ...]]
+    search: Callable[..., tuple[float, float, bool]]
+    finish: Callable[..., tuple[float, ...]]
+    slot_sums: Callable[..., None]
+    check: Callable[..., bool]
+
+
+def slot_sums(z, runs, edges, lags, rows):  # type: ignore[no-untyped-def]
+    """
+    Fill rows of `LagSums`, one per slot.
+
+    Parameters
+    ----------
+    z : ndarray, shape (c, lags + n)
+        Variables, `lags` samples before the first slot included.
+    runs : ndarray of int, shape (n,)
+        Equal steps behind each sample that may be used.
+    edges : ndarray of int, shape (s + 1,)
+        Where slots begin; the last one is n.
+    lags : int
+        K.
+    rows : ndarray, shape (s, width)
+        Each receives n, first, place, second, pairs, change, spread.
+
+    """
+    c = z.shape[0]
+    at_place = 1 + c
+    at_second = at_place + c
+    at_pairs = at_second + c * c
+    at_change = at_pairs + lags
+    at_spread = at_change + lags * c
+    for slot in range(edges.size - 1):
+        begin = edges[slot]
+        end = edges[slot + 1]
+        row = rows[slot]
+        row[:] = 0.0
+        row[0] = end - begin
+        whole = True
+        for j in range(begin, end):
+            if runs[j] < lags:
+                whole = False
+        for p in range(c):
+            one = z[p, lags + begin:lags + end]
+            first = 0.0
+            place = 0.0
+            for j in range(end - begin):
+                first += one[j]
+                place += one[j] * j
+            row[1 + p] = first
+            row[at_place + p] = place
+            for q in range(p + 1):
+                two = z[q, lags + begin:lags + end]
+                second = 0.0
+                for j in range(end - begin):
+                    second += one[j] * two[j]
+                row[at_second + p * c + q] = second
+                row[at_second + q * c + p] = second
+        for k in range(1, lags + 1):
+            pairs = end - begin
+            if not whole:
+                pairs = 0
+                for j in range(begin, end):
+                    if runs[j] >= k:
+                        pairs += 1
+            row[at_pairs + k - 1] = pairs
+            base = at_spread + (k - 1) * c * c
+            for p in range(c):
+                one = z[p, lags + begin:lags + end]
+                one_back = z[p, lags + begin - k:lags + end - k]
+                change = 0.0
+                if whole:
+                    for j in range(end - begin):
+                        change += one[j] - one_back[j]
+                else:
+                    for j in range(end - begin):
+                        if runs[begin + j] >= k:
+                            change += one[j] - one_back[j]
+                row[at_change + (k - 1) * c + p] = change
+                for q in range(p + 1):
+                    two = z[q, lags + begin:lags + end]
+                    two_back = z[q, lags + begin - k:lags + end - k]
+                    spread = 0.0
+                    if whole:
+                        for j in range(end - begin):
+                            spread += (one[j] - one_back[j]) * (two[j] - two_back[j])
+                    else:
+                        for j in range(end - begin):
+                            if runs[begin + j] >= k:
+                                spread += (one[j] - one_back[j]) * (two[j] - two_back[j])
+                    row[base + p * c + q] = spread
+                    row[base + q * c + p] = spread
+
+
+def check(t, y, before, low, high):  # type: ignore[no-untyped-def]
+    """
+    Return whether samples are finite and evenly spaced.
+
+    Parameters
+    ----------
+    t, y : ndarray, shape (n,)
+        Stamps and voltages, n >= 1.
+    before : float
+        Stamp before the first.
+    low, high : float
+        Range of an even step, low > 0.
+
+    Returns
+    -------
+    bool
+        False as soon as anything asks for a closer look.
+
+    """
+    bad = 0 if low <= t[0] - before <= high else 1
+    for j in range(1, t.size):
+        step = t[j] - t[j - 1]
+        bad += 0 if (step >= low) & (step <= high) else 1
+    for j in range(t.size):
+        # A NaN or infinite voltage differs from itself times one less itself.
+        bad += 0 if y[j] - y[j] == 0.0 else 1
+    return bad == 0
+
+
+def build() -> Kernels:
+    """Compile all kernels now; raises what Numba raises."""
+    import numba
+
+    compile_one = numba.njit(cache=True, nogil=True)
+    names: dict[str, Any] = {}
+    for module, name in _SCALAR:
+        plain = getattr(module, name)
+        own = types.FunctionType(plain.__code__, {**plain.__globals__, **names}, name,
+                                 plain.__defaults__)
+        own.__module__ = plain.__module__
+        names[name] = compile_one(own)
+    # Sums may be reordered, which lets them run several at a time; NaN and
+    # infinity keep their meaning.
+    sums = numba.njit(cache=True, nogil=True, fastmath={'reassoc', 'contract', 'nsz'})(slot_sums)
+    kernels = Kernels(names['fit_still'], names['search'], names['finish'], sums,
+                      compile_one(check))
+    # One call each with the types that are used, so that no caller waits.
+    c = np.array([0.9, 0.8])
+    pairs = np.full(2, 99.0)
+    kernels.fit_still(1.0, c, 100, 0.0, np.zeros(2), pairs, math.nan, math.nan, 1)
+    # Rows of the sums are views with gaps between them.
+    kernels.fit_still(1.0, c, 100, 0.0, np.zeros((2, 5))[:, 0], pairs, -3.0, 0.1, 1)
+    kernels.search(1.0, c, 97.0, -3.0, 0.1, 1, 0.0, 0.0)
+    kernels.finish(1.0, c, 100, 97.0, -3.0, 0.1, False, 1)
+    edges = np.array([0, 4])
+    for c in (1, 5):
+        width = 1 + 2 * c + c * c + 2 * (1 + c + c * c)
+        kernels.slot_sums(np.zeros((c, 6)), np.zeros(4, dtype=np.int64), edges, 2,
+                          np.zeros((1, width)))
+    kernels.check(np.zeros(2), np.zeros(2), 0.0, 1.0, 2.0)
+    return kernels
+
+
+class _Background:
+    """Compiles once, in a thread."""
+
+    def __init__(self) -> None:
+        self.ready: Kernels | None = None
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> threading.Thread | None:
+        """Start compiling, once; return the thread, None where there is nothing to do."""
+        with self._lock:
+            if self._thread is None and wanted():
+                self._thread = threading.Thread(target=self._work, daemon=True,
+                                                name='ou_monitor-compile')
+                self._thread.start()
+            return self._thread
+
+    def _work(self) -> None:
+        try:
+            self.ready = build()
+        except Exception as error:  # a broken Numba must not stop the estimator: it is said
+            logging.getLogger(__name__).warning('Numba is not used: %s', error)
+
+
+_background = _Background()
+
+
+def wanted() -> bool:
+    """Whether Numba is installed and not switched off."""
+    return (os.environ.get('OU_MONITOR_COMPILED', '1') != '0'
+            and importlib.util.find_spec('numba') is not None)
+
+
+def kernels(wait: bool = False) -> Kernels | None:
+    """
+    Return the compiled kernels if they are ready; start compiling if not.
+
+    Parameters
+    ----------
+    wait : bool
+        Whether to wait for them (benchmarks, tests).
+
+    Returns
+    -------
+    Kernels or None
+        None: use NumPy.
+
+    """
+    if _background.ready is None:
+        thread = _background.start()
+        if wait and thread is not None:
+            thread.join()
+    return _background.ready

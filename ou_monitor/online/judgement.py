@@ -1,0 +1,154 @@
+"""
+From a fit to what is published: bias corrections, honest errors, status, flags.
+
+Small-sample corrections.  The restricted likelihood leaves 2/T of the bias of
+alpha (Tang & Chen, J. Econometrics 149 (2009) 65: 4/T with unknown mean, half
+of it from the mean).  Var_inf = sigma^2 / (2 alpha) is convex in alpha, so its
+own bias is half as large: it is taken at alpha - 1/T.  The published
+parameters are each corrected for their own bias, so that var_inf equals
+sigma^2 / (2 alpha) only up to 1/(alpha T).
+"""
+
+from __future__ import annotations
+
+import math
+
+from ou_monitor.online.fitted import Fitted, Outcome
+from ou_monitor.online.load import load_at, slope_at
+from ou_monitor.online.quality import Quality
+from ou_monitor.records import Counters, Estimate, Flag, NAN, Status
+
+# Relaxation times in the window from which alpha is told at all, and from
+# which it is told to a quarter (doc/estimation.md).
+MIN_RELAXATIONS = 5.0
+GOOD_RELAXATIONS = 25.0
+# Standard error of ln(alpha) beyond which alpha is not known to a factor.
+_BURIED = 1.0
+# Below some 50 relaxations ln(alpha) has wider tails than its information
+# says: its standard error grows by this over alpha T (measured, doc/estimation.md).
+_WIDER = 2.5
+# Throttle that moves less than this (standard deviation) cannot tell sag.
+MIN_THROTTLE_STD = 0.005
+# Correlation of neighbouring increments, above that of an OU, from which a
+# low-pass upstream is suspected, and in standard errors.
+_SMOOTH, _SMOOTH_SCORE = 0.05, 5.0
+
+
+def log_errors(fit: Fitted, duration: float) -> tuple[float, float, float]:
+    """
+    Return the standard errors of ln(alpha), ln(sigma), ln(Var_inf).
+
+    Where no noise was found, theta sits on its bound or near it and the
+    information overstates the error of sigma: it shrinks by the width of a
+    half-normal there (its variance with one side cut is 0.68 of the whole,
+    and theta makes up most of the variance of sigma).
+
+    Parameters
+    ----------
+    fit : Fitted
+        The fit.
+    duration : float
+        Length of the window, s.
+
+    Returns
+    -------
+    tuple of float
+        Dimensionless.
+
+    """
+    wider = 1.0 + _WIDER / (fit.alpha * duration)
+    near = math.exp(-0.5 * fit.noise_score ** 2)
+    return (math.sqrt(fit.log_var[0]) * wider,
+            math.sqrt(fit.log_var[1] * (1.0 - 0.32 * near)),
+            math.sqrt(fit.log_var[2]) * wider)
+
+
+def judge(fit: Fitted, base: Estimate, quality: Quality, throttle_std: float,
+          smoothness: float) -> Estimate:
+    """
+    Return the published estimate.
+
+    Parameters
+    ----------
+    fit : Fitted
+        The fit.
+    base : Estimate
+        Stamp, throttle, voltage, n, duration, rate and counters.
+    quality : Quality
+        Findings about the raw samples.
+    throttle_std : float
+        Standard deviation of the throttle in the window; NaN when unknown.
+    smoothness : float
+        Correlation of neighbouring increments above that of the fit; NaN when
+        not told.
+
+    Returns
+    -------
+    Estimate
+        With status and flags.
+
+    """
+    flags = input_flags(base.counters, quality, throttle_std)
+    if fit.trend:
+        flags.append(Flag.TREND)
+    moves = bool(fit.beta.size > 1) and throttle_std > MIN_THROTTLE_STD
+    level, sag = _level(fit, base.throttle, moves)
+    noise = math.sqrt(max(fit.noise_var, 0.0))
+    known = dict(u0=level, sag=sag, noise_std=noise)
+    if fit.outcome is Outcome.UNCORRELATED:
+        return _with(base, Status.NO_RELAXATION, flags, **known)
+    duration = base.duration
+    se = log_errors(fit, duration)
+    if fit.alpha_step > 1.0:
+        flags.append(Flag.SLOW_RATE)
+    if math.isfinite(smoothness) and smoothness > max(
+            _SMOOTH, _SMOOTH_SCORE / math.sqrt(fit.n)):
+        flags.append(Flag.LOWPASS_UPSTREAM)
+    known.update(sigma=fit.sigma, sigma_se=se[1])
+    relaxations = fit.alpha * duration - 2.0
+    if fit.outcome is Outcome.UNBOUND or relaxations < MIN_RELAXATIONS:
+        unbound = relaxations < 0.5
+        return _with(base, Status.UNBOUND if unbound else Status.TOO_SHORT, flags, **known)
+    if se[0] > _BURIED:
+        return _with(base, Status.BURIED, flags, **known)
+    alpha = fit.alpha - 2.0 / duration
+    var_inf = fit.sigma ** 2 / (2.0 * (fit.alpha - 1.0 / duration))
+    # The mean of an OU over a long window has variance 2 Var_inf / (alpha T).
+    level_var = 2.0 * var_inf / (alpha * duration)
+    if moves:
+        x = load_at(base.throttle) - fit.level[1:5]
+        level_var += float(x @ fit.beta_cov[:4, :4] @ x)
+    return _with(
+        base, Status.OK if relaxations >= GOOD_RELAXATIONS else Status.SHORT_WINDOW, flags,
+        alpha=alpha, alpha_se=se[0], var_inf=var_inf, var_inf_se=se[2],
+        u0_se=math.sqrt(max(level_var, 0.0)), **known)
+
+
+def input_flags(counters: Counters, quality: Quality, throttle_std: float) -> list[Flag]:
+    """Return the cautions that need no fit."""
+    flags: list[Flag] = []
+    if quality.step > quality.rms_increment:
+        flags.append(Flag.QUANTIZED)
+    if quality.held > 1:
+        flags.append(Flag.HELD_SAMPLES)
+    if quality.saturated:
+        flags.append(Flag.SATURATED)
+    if throttle_std <= MIN_THROTTLE_STD:
+        flags.append(Flag.NO_EXCITATION)
+    if counters.late or counters.non_finite:
+        flags.append(Flag.IRREGULAR)
+    return flags
+
+
+def _level(fit: Fitted, throttle: float, moves: bool) -> tuple[float, float]:
+    """Return the mean at the present throttle, V, and its slope, V per unit throttle."""
+    if not moves or math.isnan(throttle):
+        return float(fit.level[0]), NAN
+    shift = (load_at(throttle) - fit.level[1:5]) @ fit.beta[:4]
+    return float(fit.level[0] + shift), slope_at(throttle, fit.beta)
+
+
+def _with(base: Estimate, status: Status, flags: list[Flag], **values: float) -> Estimate:
+    fields = {name: getattr(base, name) for name in (
+        't', 'voltage', 'throttle', 'n', 'duration', 'rate', 'counters')}
+    return Estimate(**fields, **values, status=status, flags=tuple(flags))

@@ -1,0 +1,148 @@
+"""
+What is wrong with the input, told from the samples before any model.
+
+In a diffusion equal neighbours have probability zero, so repeats, lattices
+and mass at the extremes are exact findings.  Done on the newest samples, and
+not at every estimate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from ou_monitor.records import FloatArray
+
+# Raw samples looked at.
+TAIL = 1024
+# Fewest samples from which anything is told.
+_ENOUGH = 64
+# A lattice needs this many different steps, all whole multiples of one, and
+# at most this many codes: fewer distinct steps are chance, more are a fine ADC.
+_FEWEST_STEPS = 3
+# Share of samples at the extreme from which the ADC range counts as left, and
+# how many times more often than the code beside it.
+_CLIPPED_SHARE = 0.01
+_CLIPPED_EXCESS = 3.0
+
+
+@dataclass(frozen=True)
+class Quality:
+    """
+    Findings about raw samples.
+
+    Attributes
+    ----------
+    step : float
+        ADC step, V; 0 when the values lie on no lattice.
+    held : int
+        Samples per refresh of a source that repeats its last value; 1: none.
+    saturated : bool
+        Whether samples pile up at an extreme.
+    rms_increment : float
+        Root mean square of the steps between fresh samples, V.
+
+    """
+
+    step: float = 0.0
+    held: int = 1
+    saturated: bool = False
+    rms_increment: float = math.nan
+
+
+def examine(y: FloatArray) -> Quality:
+    """
+    Return what the raw samples show.
+
+    Parameters
+    ----------
+    y : ndarray, shape (n,)
+        Voltages in order, V, finite.
+
+    Returns
+    -------
+    Quality
+        Findings; the defaults when there are too few samples.
+
+    """
+    if y.size < _ENOUGH:
+        return Quality()
+    steps = np.diff(y)
+    changes = np.flatnonzero(steps)
+    if changes.size < _FEWEST_STEPS:
+        return Quality()
+    sizes = np.abs(steps[changes])
+    held = _refresh(steps == 0.0)
+    fresh = sizes if held > 1 else steps
+    return Quality(lattice(sizes), held, _piles_up(y, held),
+                   float(np.sqrt(np.mean(fresh * fresh))))
+
+
+def lattice(sizes: FloatArray) -> float:
+    """
+    Return the common step of increments, V; 0 when there is none.
+
+    Float32 values of a lattice miss it by their rounding, which is allowed
+    for; a lattice finer than a thousandth of the largest step is not told.
+    """
+    ordered = np.unique(sizes)
+    least = float(ordered[0])
+    # Rounding splits one step into several: join what is within 1e-3 of the least.
+    near = ordered[ordered < 1.001 * least]
+    unit = float(near.mean())
+    multiples = np.rint(ordered / unit)
+    if multiples[-1] > 1000.0 or np.unique(multiples).size < _FEWEST_STEPS:
+        return 0.0
+    unit = float((ordered @ multiples) / (multiples @ multiples))
+    return unit if bool((np.abs(ordered - multiples * unit) < 0.02 * unit).all()) else 0.0
+
+
+def _refresh(tie: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> int:
+    """
+    Return samples per refresh: 1 unless changes avoid following each other.
+
+    A coarse ADC makes ties too, but they cluster; a logger that repeats makes
+    a change *less* likely right after a change.  Counts are compared with
+    independence at five standard deviations.
+    """
+    n, ties = tie.size, int(tie.sum())
+    share = 1.0 - ties / n
+    if share > 0.9 or share == 0.0:
+        return 1
+    follow = int((~tie[1:] & ~tie[:-1]).sum())
+    expected = share * share * (n - 1)
+    if follow > 0.25 * expected or expected - follow < 5.0 * math.sqrt(expected):
+        return 1
+    gaps = np.diff(np.flatnonzero(~tie))
+    # Refreshes that happen to repeat a value double a gap: the usual gap counts.
+    return max(1, int(np.median(gaps)))
+
+
+def fresh_samples(y: FloatArray, held: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """
+    Return which samples are refreshes of a source that repeats its last value.
+
+    A long run holds refreshes that happened to give the same value: they are
+    put at their usual distance, so that dropping repeats does not select
+    changes.
+    """
+    change = np.concatenate(([True], y[1:] != y[:-1]))
+    starts = np.flatnonzero(change)
+    place = np.arange(y.size) - np.repeat(starts, np.diff(np.append(starts, y.size)))
+    lengths = np.repeat(np.diff(np.append(starts, y.size)), np.diff(np.append(starts, y.size)))
+    # The last refresh of a run must leave it at least half a refresh long.
+    return (place % held == 0) & ((place == 0) | (lengths - place > held // 2))
+
+
+def _piles_up(y: FloatArray, held: int) -> bool:
+    """Whether one extreme is far more common than the value next to it."""
+    values, counts = np.unique(y, return_counts=True)
+    if values.size < _FEWEST_STEPS:
+        return False
+    least = max(10.0 * held, _CLIPPED_SHARE * y.size)
+    for edge, beside in ((0, 1), (-1, -2)):
+        if counts[edge] >= least and counts[edge] > _CLIPPED_EXCESS * counts[beside]:
+            return True
+    return False

@@ -1,0 +1,186 @@
+"""
+From the sums of a window to OU parameters.
+
+Restricted quasi-likelihood (model/quasi_fit.py) of the ARMA(1,1) that samples
+or block means of an OU in white noise are (model/arma.py).  With throttle
+still the whole fit is model/still_fit.py; while it moves, or when the voltage
+drifts, the mean is regressed along with it (load.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from ou_monitor.model import still_fit
+from ou_monitor.online.compiled import kernels
+from ou_monitor.online.lagsums import Sums
+from ou_monitor.online.load import Moments
+from ou_monitor.records import FloatArray
+
+# A trend is taken into the model from this many standard errors on: by chance
+# once in 16 000 windows.
+TREND_SCORE = 4.0
+# Neighbouring samples correlated by less than this many standard errors are
+# not correlated.
+_CORRELATED = 2.0
+
+
+@dataclass(frozen=True)
+class WindowFit:
+    """
+    What the sums of a window say.
+
+    Attributes
+    ----------
+    a, theta : float
+        alpha times the step, and the moving-average coefficient.
+    scale : float
+        sigma^2 times the step, V^2.
+    noise_share : float
+        Noise variance of one sample in units of `scale`.
+    noise_score : float
+        Distance of theta from "no noise" in standard errors.
+    log_var : tuple of float
+        Variances of ln(alpha), ln(sigma), ln(Var_inf).
+    level : ndarray, shape (c,)
+        Means of voltage (less its reference) and load variables.
+    beta : ndarray, shape (c - 1,)
+        Coefficients of the load, V per unit; of time last when `trend`.
+    beta_cov : ndarray
+        Their covariance, V^2.
+    trend : bool
+        Whether a trend was needed.
+    correlated : bool
+        Whether neighbouring samples are correlated at all; if not, a to
+        log_var are NaN.
+    variance : float
+        Variance about the mean, V^2.
+
+    """
+
+    a: float
+    theta: float
+    scale: float
+    noise_share: float
+    noise_score: float
+    log_var: tuple[float, float, float]
+    level: FloatArray
+    beta: FloatArray
+    beta_cov: FloatArray
+    trend: bool
+    correlated: bool
+    variance: float
+
+
+def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None) -> WindowFit:
+    """
+    Fit the OU, the noise and the mean.
+
+    Parameters
+    ----------
+    sums : Sums
+        Of the window, at one resolution.
+    m : int
+        Raw samples in each of its samples.
+    start : tuple of float, optional
+        ln(a) and theta of an earlier fit.
+
+    Returns
+    -------
+    WindowFit
+        The fit.
+
+    """
+    if sums.first.size > 1:
+        return _fit_moving(sums, m, start, trend=False)
+    n = sums.n
+    mean = float(sums.first[0]) / n
+    c0 = float(sums.second[0, 0]) / n - mean * mean
+    pairs = sums.pairs
+    if not pairs[-1] > 0.0:
+        pairs = np.maximum(pairs, 1.0)
+    c = c0 - sums.spread[:, 0, 0] / (2.0 * pairs)
+    level = np.array([mean])
+    if not _correlated(c0, c, n):
+        return _uncorrelated(level, _EMPTY, False, c0)
+    place = (float(sums.place[0]) - 0.5 * (n - 1) * float(sums.first[0])) / n / n
+    log_a, theta = start or (math.nan, math.nan)
+    fast = kernels()
+    if fast is not None:
+        end = fast.fit_still(c0, c, n, place, sums.change[:, 0], pairs, log_a, theta, m)
+    else:
+        end = still_fit.fit_still(c0, c.tolist(), n, place, sums.change[:, 0].tolist(),
+                                  pairs.tolist(), log_a, theta, m)
+    if abs(end[9]) > TREND_SCORE:
+        return _fit_moving(sums, m, (math.log(end[0]), end[1]), trend=True)
+    return WindowFit(end[0], end[1], end[3], end[4], end[5], end[6:9], level, _EMPTY, _NO_COV,
+                     False, end[0] < still_fit.FASTEST, c0)
+
+
+_EMPTY = np.empty(0)
+_NO_COV = np.empty((0, 0))
+
+
+def _correlated(c0: float, c: FloatArray, n: int) -> bool:
+    return c0 > 0.0 and float(c[0]) > _CORRELATED * c0 / math.sqrt(n)
+
+
+def _uncorrelated(level: FloatArray, beta: FloatArray, trend: bool, c0: float) -> WindowFit:
+    nan = math.nan
+    return WindowFit(nan, nan, nan, nan, nan, (nan, nan, nan), level, beta,
+                     np.full((beta.size, beta.size), nan), trend, False, c0)
+
+
+def _fit_moving(sums: Sums, m: int, start: tuple[float, float] | None, trend: bool
+                ) -> WindowFit:
+    """Fit noise and mean in turn; the mean hardly moves, so two rounds are usual."""
+    search, finish = _functions()
+    moments = Moments.of(sums, trend)
+    at = start
+    b = moments.regress(*at)[0] if at else moments.regress(-20.0, 0.0)[0]
+    on_bound = False
+    for _ in range(8):
+        c0, c = moments.residual(b)
+        if not _correlated(c0, c, sums.n):
+            return _uncorrelated(moments.mean, moments.basis @ b, trend, c0)
+        log_a, theta = at or still_fit.guess(c0, c.tolist())
+        tilt = moments.tilt(log_a, theta)
+        before = log_a, theta
+        log_a, theta, on_bound = search(c0, c, sums.n - 1.0 - moments.rank, log_a, theta, m,
+                                        *tilt)
+        at = log_a, theta
+        b = moments.regress(log_a, theta)[0]
+        if max(abs(log_a - before[0]), abs(theta - before[1])) < still_fit.STEADY:
+            break
+    if not trend and _drifts(sums, log_a, theta):
+        return _fit_moving(sums, m, at, trend=True)
+    c0, c = moments.residual(b)
+    end = finish(c0, c, sums.n, sums.n - 1.0 - moments.rank, log_a, theta, on_bound, m)
+    cov = moments.regress(math.log(end[0]), end[1])[1] * end[2] / sums.n
+    return WindowFit(end[0], end[1], end[3], end[4], end[5], end[6:9], moments.mean,
+                     moments.basis @ b, moments.basis @ cov @ moments.basis.T, trend,
+                     end[0] < still_fit.FASTEST, c0)
+
+
+def _drifts(sums: Sums, log_a: float, theta: float) -> bool:
+    """Whether time explains the voltage beyond what the load does."""
+    full = Moments.of(sums, True)
+    b, cov = full.regress(log_a, theta)
+    c0, c = full.residual(b)
+    q = still_fit.innovation(c0, c.tolist(), log_a, theta)
+    time = full.basis[-1]
+    return float(time @ b) ** 2 > TREND_SCORE ** 2 * float(time @ cov @ time) * q / sums.n
+
+
+def _functions() -> tuple[Callable[..., tuple[float, float, bool]],
+                          Callable[..., tuple[float, ...]]]:
+    """Return search and finish, compiled where they are ready."""
+    fast = kernels()
+    if fast is not None:
+        return fast.search, fast.finish
+    return (lambda c0, c, *rest: still_fit.search(c0, c.tolist(), *rest),
+            lambda c0, c, *rest: still_fit.finish(c0, c.tolist(), *rest))
