@@ -142,6 +142,7 @@ def minimise(c0: float, c: Sequence[float], free: float, log_a: float, theta: fl
         if on_bound and g_t < 0.0:
             on_bound = False
             fresh = True
+        newly = fresh
         if fresh:
             i_aa, i_at, i_tt = information(log_a, theta)
             det = i_aa * i_tt - i_at * i_at
@@ -166,6 +167,11 @@ def minimise(c0: float, c: Sequence[float], free: float, log_a: float, theta: fl
             least = floor + slope * (new_a - start)
             new_t = least if on_bound else theta + size * d_t
             landed = on_bound or new_t <= least
+            if landed and not on_bound:
+                # The best point *on* the bound, not the one the bound cuts off.
+                over = least - theta - size * d_t
+                new_a = min(max(new_a + h_at / h_tt * over, low), high)
+                least = floor + slope * (new_a - start)
             new_t = max(new_t, least)
             if new_t < math.exp(-math.exp(new_a)) * (1.0 - 1e-9):
                 new_value, n_a, n_t = objective(c0, c, free, new_a, new_t,
@@ -175,7 +181,10 @@ def minimise(c0: float, c: Sequence[float], free: float, log_a: float, theta: fl
                     break
             size *= 0.5
         if not moved:
-            break
+            if newly:
+                break
+            fresh = True
+            continue
         s_a, s_t = new_a - log_a, new_t - theta
         y_a, y_t = n_a - g_a, n_t - g_t
         if landed != on_bound:

@@ -197,10 +197,13 @@ class SlidingEstimator:
         """Fit the window."""
         series, intake = self._finest.series, self._intake
         if not series.size:
-            n = self._thinner.waiting
-            return Estimate(t=intake.newest if n else NAN, n=n, counters=intake.counters,
-                            voltage=float(self._tail[-1]) if n else NAN,
-                            status=Status.TOO_FEW_SAMPLES if n else Status.NO_DATA)
+            n, since = self._thinner.waiting, self._thinner.waits_since
+            if not n:
+                return Estimate(counters=intake.counters)
+            duration = intake.newest - since
+            return Estimate(t=intake.newest, voltage=float(self._tail[-1]), n=n,
+                            duration=duration, rate=(n - 1) / duration if duration else NAN,
+                            counters=intake.counters, status=Status.TOO_FEW_SAMPLES)
         y, t = series.column(Y), series.column(T)
         duration = float(t[-1] - t[0])
         m, n = self._thinner.m, series.size

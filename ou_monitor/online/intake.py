@@ -238,6 +238,11 @@ class Thinner:
         """Return the number of samples that wait for the rate, or for a whole block."""
         return int(self._rest.shape[1])
 
+    @property
+    def waits_since(self) -> float:
+        """Return the stamp of the first sample that waits, s; NaN for none."""
+        return float(self._rest[0, 0]) if self._rest.shape[1] else NAN
+
     def take(self, batch: Batch
              ) -> tuple[FloatArray, FloatArray, FloatArray | None, IntArray, bool]:
         """

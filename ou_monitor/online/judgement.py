@@ -1,12 +1,12 @@
 """
 From a fit to what is published: bias corrections, honest errors, status, flags.
 
-Small-sample corrections.  The restricted likelihood leaves 2/T of the bias of
+Small-sample correction.  The restricted likelihood leaves 2/T of the bias of
 alpha (Tang & Chen, J. Econometrics 149 (2009) 65: 4/T with unknown mean, half
-of it from the mean).  Var_inf = sigma^2 / (2 alpha) is convex in alpha, so its
-own bias is half as large: it is taken at alpha - 1/T.  The published
-parameters are each corrected for their own bias, so that var_inf equals
-sigma^2 / (2 alpha) only up to 1/(alpha T).
+of it from the mean).  Var_inf = sigma^2 / (2 alpha) is convex in alpha and
+unbiased already at alpha - 1/T.  Both are published, and users divide one by
+the other, so one correction serves both: 1.5/T, which leaves each high by
+0.5/(alpha T), a thirtieth of its standard error at alpha T = 126.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from ou_monitor.online.load import load_at, slope_at
 from ou_monitor.online.quality import Quality
 from ou_monitor.records import Counters, Estimate, Flag, NAN, Status
 
+# What alpha is high by, in 1/T (see above).
+_HIGH_BY = 1.5
 # Relaxation times in the window from which alpha is told at all, and from
 # which it is told to a quarter (doc/estimation.md).
 MIN_RELAXATIONS = 5.0
@@ -105,14 +107,14 @@ def judge(fit: Fitted, base: Estimate, quality: Quality, throttle_std: float,
             _SMOOTH, _SMOOTH_SCORE / math.sqrt(fit.n)):
         flags.append(Flag.LOWPASS_UPSTREAM)
     known.update(sigma=fit.sigma, sigma_se=se[1])
-    relaxations = fit.alpha * duration - 2.0
+    relaxations = fit.alpha * duration - _HIGH_BY
     if fit.outcome is Outcome.UNBOUND or relaxations < MIN_RELAXATIONS:
         unbound = relaxations < 0.5
         return _with(base, Status.UNBOUND if unbound else Status.TOO_SHORT, flags, **known)
     if se[0] > _BURIED:
         return _with(base, Status.BURIED, flags, **known)
-    alpha = fit.alpha - 2.0 / duration
-    var_inf = fit.sigma ** 2 / (2.0 * (fit.alpha - 1.0 / duration))
+    alpha = fit.alpha - _HIGH_BY / duration
+    var_inf = fit.sigma ** 2 / (2.0 * alpha)
     # The mean of an OU over a long window has variance 2 Var_inf / (alpha T).
     level_var = 2.0 * var_inf / (alpha * duration)
     if moves:

@@ -56,6 +56,11 @@ class Sums:
     spread: FloatArray
 
 
+def slot_numbers(t: FloatArray, slot: float) -> FloatArray:
+    """Return the slot of each stamp; edges are met to 1e-6, as stamps are sums of steps."""
+    return np.floor(t / slot + 1e-6)
+
+
 class LagSums:
     """
     Slots over one `Series`.
@@ -110,7 +115,7 @@ class LagSums:
         self._summed = max(self._summed, series.first)
         begins, rows = self._begins, self._rows
         if self._summed < series.end:
-            slots = np.floor(series.columns(self._summed, series.end)[T] / self._slot)
+            slots = slot_numbers(series.columns(self._summed, series.end)[T], self._slot)
             cuts = (np.flatnonzero(slots[1:] != slots[:-1]) + 1 + self._summed).tolist()
             edges = [self._summed, *cuts, series.end]
             rows = np.concatenate([self._rows, self._sum(edges)])

@@ -19,6 +19,8 @@ from ou_monitor.records import FloatArray
 # Directions of the load that vary less than this share of the largest are
 # left out: the window does not show them.
 _UNSEEN = 1e-5
+# A load variable of less variance than this (full scale squared) is constant.
+_STILL = 1e-12
 
 
 @dataclass(frozen=True)
@@ -66,9 +68,7 @@ class Moments:
         if trend:
             mean, zero, lag = _with_time(sums, mean, zero, lag)
             c += 1
-        scale = np.sqrt(np.maximum(zero.diagonal()[1:], 1e-300))
-        values, vectors = np.linalg.eigh(zero[1:, 1:] / (scale[:, None] * scale))
-        basis = (vectors / scale[:, None])[:, values > _UNSEEN * values[-1]]
+        basis = _independent(zero[1:, 1:])
         turn = np.zeros((c, 1 + basis.shape[1]))
         turn[0, 0] = 1.0
         turn[1:, 1:] = basis
@@ -104,6 +104,19 @@ class Moments:
         here = half_log_det(log_a, theta)
         return ((half_log_det(log_a - step_a, theta) - here) / -step_a,
                 (half_log_det(log_a, theta - step_t) - here) / -step_t)
+
+
+def _independent(cov: FloatArray) -> FloatArray:
+    """Return the independent, unit-variance combinations (columns) of variables that vary."""
+    used = np.flatnonzero(cov.diagonal() > _STILL)
+    if not used.size:
+        return np.empty((cov.shape[0], 0))
+    scale = np.sqrt(cov.diagonal()[used])
+    values, vectors = np.linalg.eigh(cov[np.ix_(used, used)] / (scale[:, None] * scale))
+    seen = values > _UNSEEN * values[-1]
+    basis = np.zeros((cov.shape[0], int(seen.sum())))
+    basis[used] = vectors[:, seen] / scale[:, None]
+    return basis
 
 
 def _with_time(sums: Sums, mean: FloatArray, zero: FloatArray, lag: FloatArray

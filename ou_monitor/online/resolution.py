@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from ou_monitor.online.lagsums import LagSums
+from ou_monitor.online.lagsums import LagSums, slot_numbers
 from ou_monitor.online.series import IntArray, Series, T
 from ou_monitor.records import FloatArray
 
@@ -74,13 +74,17 @@ class Resolution:
         if not self.series.size:
             return
         slot = self._window / SLOTS
-        newest = self.series.last(T)
-        # The edge is met to 1e-6 of a slot: stamps are sums of rounded steps.
-        edge = math.ceil((newest - self._window) / slot - 1e-6) * slot
+        oldest = math.ceil((self.series.last(T) - self._window) / slot - 1e-6)
         stamps = self.series.column(T)
-        if stamps[0] < edge - 1e-6 * slot:
-            begin = int(np.searchsorted(stamps, edge - 1e-6 * slot))
-            self.series.drop_before(self.series.first + begin)
+        if slot_numbers(stamps[0], slot) >= oldest:
+            return
+        begin = int(np.searchsorted(stamps, oldest * slot))
+        # Where the edge was met only nearly, the sums decide which side it is.
+        while begin > 0 and slot_numbers(stamps[begin - 1], slot) >= oldest:
+            begin -= 1
+        while slot_numbers(stamps[begin], slot) < oldest:
+            begin += 1
+        self.series.drop_before(self.series.first + begin)
 
     def coarser(self) -> Resolution:
         """Return the next coarser resolution, up to date."""
