@@ -24,10 +24,11 @@ STEADY = 1e-3
 FASTEST = 4.6
 LOW = math.log(1e-9)
 HIGH = math.log(2.0 * FASTEST)
-# Pull of theta towards "no measurement noise" where the data cannot tell: a
-# clamped estimate is high by 0.4 standard errors on average when there is no
-# noise; this takes a third of it away and fades within two standard errors.
-PULL = 0.4
+# Pull of theta towards "no measurement noise" where the data cannot tell, in
+# standard errors, fading within two of them: a clamped estimate is high by 0.4
+# on average when there is no noise.  A larger pull costs more at 5 mV than it
+# gains when clean (doc/estimation.md).
+PULL = 0.1
 
 
 def guess(c0: float, c: Sequence[float]) -> tuple[float, float]:

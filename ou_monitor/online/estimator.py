@@ -189,7 +189,8 @@ class SlidingEstimator:
         """Examine the raw samples, now and then."""
         if not 0.0 <= t - self._looked < self._window / _LOOKS:
             self._quality = examine(self._tail)
-            self._jitter = float(np.std(np.diff(self._finest.series.column(T)[-TAIL:])))
+            steps = np.diff(self._finest.series.column(T)[-TAIL:])
+            self._jitter = float(np.std(steps)) if steps.size else 0.0
             self._looked = t
         return self._quality
 
@@ -220,22 +221,24 @@ class SlidingEstimator:
         if status is not None:
             return replace(base, status=status, flags=tuple(
                 judgement.input_flags(intake.counters, quality, NAN)))
-        throttle_std = 0.0
-        if series.moves:
-            throttle_std = float(np.std(series.column(U)))
-        elif math.isnan(series.last(U)):
-            throttle_std = NAN
         fit, smoothness = self._fit(quality)
-        return judgement.judge(fit, base, quality, throttle_std, smoothness)
+        return judgement.judge(fit, base, quality, self._throttle_std(), smoothness)
+
+    def _throttle_std(self) -> float:
+        """Return the standard deviation of throttle in the window; NaN when unknown."""
+        series = self._finest.series
+        if not series.known:
+            return NAN
+        return self._finest.sums.throttle_std if series.moves else 0.0
 
     def _fit(self, quality: Quality) -> tuple[Fitted, float]:
         """Return the fit, and how much smoother than it neighbouring increments are."""
         series = self._finest.series
-        moves = series.moves and bool(np.isfinite(series.column(U)).all())
+        moves = series.moves and series.known
+        sums = self._finest.sums.total()
         if quality.held > 1 and self._thinner.m == 1:
             columns = fresh_columns(series.all_columns(), quality.held)
             return fit_irregular(columns[:, -MOST:], moves), NAN
-        sums = self._finest.sums.total()
         if self._thinner.m == 1 and series.size <= MOST and (
                 sums.pairs[-1] < _EVEN * (sums.n - LAGS)):
             return fit_irregular(series.all_columns(), moves), NAN

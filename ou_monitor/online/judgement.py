@@ -29,6 +29,8 @@ _BURIED = 1.0
 # Below some 50 relaxations ln(alpha) has wider tails than its information
 # says: its standard error grows by this over alpha T (measured, doc/estimation.md).
 _WIDER = 2.5
+# Width of the zone beside "no noise" in which errors of sigma shrink (measured).
+_NEAR = 0.75
 # Throttle that moves less than this (standard deviation) cannot tell sag.
 MIN_THROTTLE_STD = 0.005
 # Correlation of neighbouring increments, above that of an OU, from which a
@@ -43,7 +45,8 @@ def log_errors(fit: Fitted, duration: float) -> tuple[float, float, float]:
     Where no noise was found, theta sits on its bound or near it and the
     information overstates the error of sigma: it shrinks by the width of a
     half-normal there (its variance with one side cut is 0.68 of the whole,
-    and theta makes up most of the variance of sigma).
+    and theta makes up most of the variance of sigma), within `_NEAR` standard
+    errors of the bound.
 
     Parameters
     ----------
@@ -59,7 +62,7 @@ def log_errors(fit: Fitted, duration: float) -> tuple[float, float, float]:
 
     """
     wider = 1.0 + _WIDER / (fit.alpha * duration)
-    near = math.exp(-0.5 * fit.noise_score ** 2)
+    near = math.exp(-0.5 * (fit.noise_score / _NEAR) ** 2)
     return (math.sqrt(fit.log_var[0]) * wider,
             math.sqrt(fit.log_var[1] * (1.0 - 0.32 * near)),
             math.sqrt(fit.log_var[2]) * wider)

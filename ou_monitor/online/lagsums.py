@@ -12,6 +12,7 @@ z_j z_{j-k} lose accuracy at the ends (doc/estimation.md).
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 
@@ -56,11 +57,6 @@ class Sums:
     spread: FloatArray
 
 
-def slot_numbers(t: FloatArray, slot: float) -> FloatArray:
-    """Return the slot of each stamp; edges are met to 1e-6, as stamps are sums of steps."""
-    return np.floor(t / slot + 1e-6)
-
-
 class LagSums:
     """
     Slots over one `Series`.
@@ -72,13 +68,14 @@ class LagSums:
     lags : int
         Number of lags K.
     slot : float
-        Length of a slot, s.
+        Length of a slot, s; slots are counted from `origin`, s.
 
     """
 
     def __init__(self, series: Series, lags: int, slot: float) -> None:
         self._series = series
         self._lags = lags
+        self.origin = 0.0
         self.restart(slot)
 
     def restart(self, slot: float, variables: int = 1) -> None:
@@ -91,17 +88,31 @@ class LagSums:
         self._begins: list[int] = []
         self._rows = np.empty((0, self._ends[-1]))
         self._summed = self._series.first
+        self._open = math.nan
         self._reference: float | None = None
+        self._last = Sums(0, *(np.zeros(0) for _ in range(6)))
 
     @property
     def reference(self) -> float:
         """Return the voltage that moments are taken against, V."""
         return self._reference or 0.0
 
+    def slots_of(self, t: FloatArray) -> FloatArray:
+        """Return the slot of each stamp; edges are met to 1e-6, as stamps are sums of steps."""
+        return np.floor((t - self.origin) / self._slot + 1e-6)
+
+    @property
+    def throttle_std(self) -> float:
+        """Return the standard deviation of throttle at the last `total`; 0 while still."""
+        if self._c == 1 or not self._last.n:
+            return 0.0
+        mean = self._last.first[1] / self._last.n
+        return math.sqrt(max(float(self._last.second[1, 1]) / self._last.n - mean * mean, 0.0))
+
     def total(self) -> Sums:
         """Return the sums over the window; the load takes part while throttle moves."""
         series = self._series
-        variables = LOAD_VARIABLES if series.moves else 1
+        variables = LOAD_VARIABLES if series.moves and series.known else 1
         if variables != self._c:
             self.restart(self._slot, variables)
         if self._reference is None and series.size:
@@ -113,16 +124,28 @@ class LagSums:
             del self._begins[:gone]
             self._rows = self._rows[gone:]
         self._summed = max(self._summed, series.first)
-        begins, rows = self._begins, self._rows
         if self._summed < series.end:
-            slots = slot_numbers(series.columns(self._summed, series.end)[T], self._slot)
-            cuts = (np.flatnonzero(slots[1:] != slots[:-1]) + 1 + self._summed).tolist()
-            edges = [self._summed, *cuts, series.end]
-            rows = np.concatenate([self._rows, self._sum(edges)])
-            begins = self._begins + edges[:-1]
-            # The last slot is still open: it is summed again next time.
-            self._begins, self._rows, self._summed = begins[:-1], rows[:-1], edges[-2]
-        return self._added(begins, rows)
+            self._take()
+        self._last = self._added()
+        return self._last
+
+    def _take(self) -> None:
+        """Sum what is new; the first part of it may go on in the slot that is open."""
+        series, begin = self._series, self._summed
+        slots = self.slots_of(series.columns(begin, series.end)[T])
+        cuts = (np.flatnonzero(slots[1:] != slots[:-1]) + 1 + begin).tolist()
+        edges = [begin, *cuts, series.end]
+        rows = self._sum(edges)
+        begins = edges[:-1]
+        if self._begins and slots[0] == self._open:
+            offset = begin - self._begins[-1]
+            first, place = slice(1, self._ends[1]), slice(self._ends[1], self._ends[2])
+            rows[0, place] += offset * rows[0, first]
+            self._rows[-1] += rows[0]
+            rows, begins = rows[1:], begins[1:]
+        self._rows = np.concatenate([self._rows, rows])
+        self._begins += begins
+        self._summed, self._open = series.end, float(slots[-1])
 
     def _sum(self, edges: list[int]) -> FloatArray:
         """Return one row per slot between the edges."""
@@ -179,11 +202,11 @@ class LagSums:
             row[at_change:] = (by_lag @ by_lag.transpose(0, 2, 1)).ravel()
         return rows
 
-    def _added(self, begins: list[int], rows: FloatArray) -> Sums:
-        c, lags = self._c, self._lags
+    def _added(self) -> Sums:
+        rows, c, lags = self._rows, self._c, self._lags
         _, at_first, at_place, at_second, at_pairs, at_change, _ = self._ends
         total = rows.sum(axis=0)
-        offsets = np.array(begins, dtype=np.float64) - self._series.first
+        offsets = np.array(self._begins, dtype=np.float64) - self._series.first
         return Sums(
             n=int(total[0]), first=total[1:at_first],
             place=total[at_first:at_place] + offsets @ rows[:, 1:at_first],

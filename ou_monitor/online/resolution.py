@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from ou_monitor.online.lagsums import LagSums, slot_numbers
+from ou_monitor.online.lagsums import LagSums
 from ou_monitor.online.series import IntArray, Series, T
 from ou_monitor.records import FloatArray
 
@@ -66,6 +66,10 @@ class Resolution:
             ) -> None:
         """Add samples (see `Series.append`) and slide the window."""
         if t.size:
+            if not self.series.size:
+                # Slots are counted from the first sample, so that a window's worth of
+                # samples fills the window.
+                self.sums.origin = self._parent.sums.origin if self._parent else float(t[0])
             self.series.append(t, y, u, breaks)
             self.slide()
 
@@ -74,15 +78,16 @@ class Resolution:
         if not self.series.size:
             return
         slot = self._window / SLOTS
-        oldest = math.ceil((self.series.last(T) - self._window) / slot - 1e-6)
+        origin, slots_of = self.sums.origin, self.sums.slots_of
+        oldest = math.ceil((self.series.last(T) - origin - self._window) / slot - 1e-6)
         stamps = self.series.column(T)
-        if slot_numbers(stamps[0], slot) >= oldest:
+        if slots_of(stamps[:1])[0] >= oldest:
             return
-        begin = int(np.searchsorted(stamps, oldest * slot))
+        begin = int(np.searchsorted(stamps, origin + oldest * slot))
         # Where the edge was met only nearly, the sums decide which side it is.
-        while begin > 0 and slot_numbers(stamps[begin - 1], slot) >= oldest:
+        while begin > 0 and slots_of(stamps[begin - 1:begin])[0] >= oldest:
             begin -= 1
-        while slot_numbers(stamps[begin], slot) < oldest:
+        while slots_of(stamps[begin:begin + 1])[0] < oldest:
             begin += 1
         self.series.drop_before(self.series.first + begin)
 
@@ -110,8 +115,10 @@ class Resolution:
         if not edges or edges[0] != 0:
             edges = [0, *edges]
         edges.append(fine.end - begin)
-        columns = np.concatenate([fine.columns(begin, fine.end),
-                                  fine.load(begin, fine.end)[:1]])
+        throttle = fine.throttle(begin, fine.end)
+        columns = fine.columns(begin, fine.end)
+        if throttle is not None:
+            columns = np.concatenate([columns, throttle[None, :]])
         is_start = set(starts.tolist())
         parts, breaks, count = [], [], 0
         for low, high in zip(edges[:-1], edges[1:]):
@@ -119,8 +126,8 @@ class Resolution:
                 breaks.append(count)
             whole = (high - low) // FACTOR
             stop = low + whole * FACTOR
-            parts.append(columns[:, low:stop].reshape(3, whole, FACTOR).mean(axis=2))
+            parts.append(columns[:, low:stop].reshape(len(columns), whole, FACTOR).mean(axis=2))
             count += whole
             self._taken = begin + (stop if high == edges[-1] else high)
-        t, y, u = np.concatenate(parts, axis=1)
-        self.add(t, y, u, np.array([b for b in breaks if b < count], dtype=np.int64))
+        joined = np.concatenate(parts, axis=1)
+        self.add(joined[0], joined[1], joined[2] if throttle is not None else None, np.array([b for b in breaks if b < count], dtype=np.int64))

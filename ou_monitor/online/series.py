@@ -30,6 +30,8 @@ COLUMNS = 5
 _SPAN = 300.0
 # A lagged throttle this near to the throttle has settled.
 _SETTLED = 1e-7
+# After this long without a change of throttle all lags have settled, s.
+_MEMORY = 16.0 * LOAD_LAGS[1]
 
 
 def lagged(t: FloatArray, u: FloatArray, tau: float, before: tuple[float, float, float]
@@ -94,7 +96,9 @@ class Series:
         self._tail = 0
         self._reach = reach
         self._behind = 0
-        self._last_move = self._last_break = -1
+        self._last_break = self._last_unknown = -1
+        self._moved_at = -math.inf
+        self._lagged_to = 0
         self.first = 0
 
     @property
@@ -109,13 +113,18 @@ class Series:
 
     @property
     def behind(self) -> int:
-        """Return how many samples before `first` can still be read."""
-        return self._behind
+        """Return how many samples before `first` can still be paired with."""
+        return min(self._behind, self._reach)
 
     @property
     def moves(self) -> bool:
         """Whether throttle, or its lag, moved in the window."""
-        return self._last_move >= self.first
+        return self.size > 0 and float(self._main[T, self._head]) <= self._moved_at + _MEMORY
+
+    @property
+    def known(self) -> bool:
+        """Whether throttle is known throughout the window."""
+        return self._load is not None and self._last_unknown < self.first
 
     @property
     def even(self) -> bool:
@@ -131,6 +140,7 @@ class Series:
         """Return throttle and its lags (3, end - begin); NaN where unknown."""
         if self._load is None:
             return np.full((3, end - begin), math.nan)
+        self._lag()
         shift = self._head - self.first
         return self._load[:, begin + shift:end + shift]
 
@@ -139,6 +149,13 @@ class Series:
         if which < U:
             return self._main[which, self._head:self._tail]
         return self.load(self.first, self.end)[which - U]
+
+    def throttle(self, begin: int, end: int) -> FloatArray | None:
+        """Return the throttle of samples begin..end-1 (a view); None when never known."""
+        if self._load is None:
+            return None
+        shift = self._head - self.first
+        return self._load[0, begin + shift:end + shift]
 
     def all_columns(self) -> FloatArray:
         """Return the whole window, shape (5, n) (a copy)."""
@@ -156,7 +173,11 @@ class Series:
             return math.nan
         if which < U:
             return float(self._main[which, self._tail - 1])
-        return math.nan if self._load is None else float(self._load[which - U, self._tail - 1])
+        if self._load is None:
+            return math.nan
+        if which > U:
+            self._lag()
+        return float(self._load[which - U, self._tail - 1])
 
     def append(self, t: FloatArray, y: FloatArray, u: FloatArray | None, breaks: IntArray
                ) -> None:
@@ -177,11 +198,15 @@ class Series:
         n = t.size
         self._make_room(n)
         at = slice(self._tail, self._tail + n)
-        had = self.size > 0
+        had = self.size > 0 or self._behind > 0
         self._main[T, at], self._main[Y, at] = t, y
-        if u is not None or self._load is not None:
-            self._take_load(t, u, at, had)
-        before = int(self._run[self._tail - 1]) if had or self._behind else -1
+        if u is not None:
+            self._take_throttle(t, u, at, had)
+        elif self._load is not None:
+            self._load[0, at] = math.nan
+        if u is None:
+            self._last_unknown = self.end + n - 1
+        before = int(self._run[self._tail - 1]) if had else -1
         run = self._run[at]
         run[:] = self._reach
         first = min(n, max(self._reach - before, 0))
@@ -193,41 +218,63 @@ class Series:
             self._last_break = self.end + position
         self._tail += n
 
-    def _take_load(self, t: FloatArray, u: FloatArray | None, at: slice, had: bool) -> None:
-        """Fill throttle and its lags, and note where throttle last moved."""
+    def _take_throttle(self, t: FloatArray, u: FloatArray, at: slice, had: bool) -> None:
+        """Store the throttle, and note where it was unknown and where it last moved."""
         if self._load is None:
             self._load = np.full((3, self._run.size), math.nan)
-        load = self._load
-        if u is None or (math.isnan(u[0]) and bool(np.isnan(u).all())):
-            load[:, at] = math.nan
+            self._lagged_to = self.end
+        before = float(self._load[0, self._tail - 1]) if had else math.nan
+        self._load[0, at] = u
+        change = u[1:] != u[:-1]
+        if math.isnan(float(u.sum())):
+            unknown = np.isnan(u)
+            self._last_unknown = self.end + int(np.flatnonzero(unknown)[-1])
+            change &= ~(unknown[1:] | unknown[:-1])
+        places = np.flatnonzero(change)
+        if places.size:
+            self._moved_at = float(t[places[-1] + 1])
+        elif before != u[0] and not math.isnan(before) and not math.isnan(u[0]):
+            self._moved_at = float(t[0])
+
+    def _lag(self) -> None:
+        """Bring the lagged throttle up to date."""
+        load, shift = self._load, self._head - self.first
+        begin, end = max(self._lagged_to, self.first - self._behind), self.end
+        if load is None or begin >= end:
             return
-        before, stamp = self.last(U), self.last(T)
-        lags = [self.last(FAST), self.last(SLOW)]
-        if had and before == lags[0] == lags[1] and bool((u == before).all()):
-            load[:, at] = before
-            return
-        load[0, at] = u
-        for row, tau, state in ((1, LOAD_LAGS[0], lags[0]), (2, LOAD_LAGS[1], lags[1])):
-            load[row, at] = lagged(t, u, tau, (stamp, before, state))
-        moving = (u != load[1, at]) | (u != load[2, at])
-        moving &= ~np.isnan(u)
-        if had:
-            moving[0] |= u[0] != before
-        if moving.any():
-            self._last_move = self.end + int(np.flatnonzero(moving)[-1])
+        at = slice(begin + shift, end + shift)
+        t, u = self._main[T, at], load[0, at]
+        for row, tau in ((1, LOAD_LAGS[0]), (2, LOAD_LAGS[1])):
+            before = (math.nan,) * 3
+            if begin > self.first - self._behind:
+                last = at.start - 1
+                before = (float(self._main[T, last]), float(load[0, last]),
+                          float(load[row, last]))
+            load[row, at] = lagged(t, u, tau, before)
+        self._lagged_to = end
 
     def drop_before(self, number: int) -> None:
         """Forget the samples numbered below `number`."""
         count = min(max(number - self.first, 0), self.size)
         self._head += count
         self.first += count
-        self._behind = min(self._behind + count, self._reach)
+        self._behind += count
+        keep = self._reach
+        if self._load is not None and self._head:
+            # The lags remember longer than the pairs do.
+            start = self._head - self._behind
+            stamps = self._main[T, start:self._head]
+            at = min(self._head, self._run.size - 1)
+            keep = max(keep, stamps.size - int(np.searchsorted(
+                stamps, self._main[T, at] - _MEMORY)))
+        self._behind = min(self._behind, keep)
 
     def clear(self) -> None:
         """Forget all samples; numbering goes on."""
         self.first = self.end
         self._head = self._tail = self._behind = 0
-        self._last_move = self._last_break = -1
+        self._last_break = self._last_unknown = -1
+        self._moved_at = -math.inf
         self._load = None
 
     def _make_room(self, n: int) -> None:
@@ -235,14 +282,17 @@ class Series:
             return
         begin = self._head - self._behind
         kept = self._tail - begin
-        # Three times what is needed: a sample is moved once in two windows.
-        wanted = 3 * (kept + n) + 256
-        main, run = np.empty((2, wanted)), np.empty(wanted, dtype=np.int8)
+        wanted = 2 * (kept + n) + 256
+        main, run, load = self._main, self._run, self._load
+        if wanted > run.size or 4 * wanted < run.size:
+            # Half as much again as is needed to move each sample but once.
+            size = wanted + wanted // 2
+            main, run = np.empty((2, size)), np.empty(size, dtype=np.int8)
+            load = None if load is None else np.full((3, size), math.nan)
+        # Never overlaps: what is kept is less than half, and lies in the other half.
         main[:, :kept] = self._main[:, begin:self._tail]
         run[:kept] = self._run[begin:self._tail]
-        if self._load is not None:
-            load = np.full((3, wanted), math.nan)
+        if load is not None and self._load is not None:
             load[:, :kept] = self._load[:, begin:self._tail]
-            self._load = load
-        self._main, self._run = main, run
+        self._main, self._run, self._load = main, run, load
         self._head, self._tail = self._behind, kept

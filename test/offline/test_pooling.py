@@ -25,8 +25,11 @@ def test_a_stretch_gets_the_estimator_that_flies():
     e = fit_stretch(made, 1000, 4000)
     node = SlidingEstimator(window=10.0)
     node.push(made.t[1000:4000], made.voltage[1000:4000], made.throttle[1000:4000])
-    assert e == node.estimate()
-    assert e.n == 3000
+    other = node.estimate()
+    # Two windows cut the same samples into other slots: equal to rounding.
+    for name in ('alpha', 'sigma', 'var_inf', 'u0', 'alpha_se', 'duration', 'rate'):
+        assert getattr(e, name) == pytest.approx(getattr(other, name), rel=1e-9)
+    assert (e.status, e.flags, e.n) == (other.status, other.flags, 3000)
 
 
 def test_equal_segments_shrink_the_error_by_the_root_of_their_number():
