@@ -21,89 +21,137 @@ from ou_monitor.records import FloatArray
 _UNSEEN = 1e-5
 # A load variable of less variance than this (full scale squared) is constant.
 _STILL = 1e-12
+# Steps of the differences that give the gradient of a log-determinant.
+_STEP = 1e-3
 
 
 @dataclass(frozen=True)
+class Regression:
+    """
+    The mean, fitted at one choice of noise.
+
+    Attributes
+    ----------
+    b : ndarray, shape (r,)
+        Coefficients of the regressors, V.
+    inverse : ndarray, shape (r, r)
+        Their covariance per unit innovation variance, times n.
+    tilt : tuple of float
+        Gradient of half the log-determinant of their information in ln a and
+        theta (see `quasi_fit.objective`).
+
+    """
+
+    b: FloatArray
+    inverse: FloatArray
+    tilt: tuple[float, float]
+
+
 class Moments:
     """
     Sample autocovariances of the voltage and of what may explain its mean.
 
-    The regressors are independent combinations of the load and, if wanted,
-    time; `basis` leads back.
+    Parameters
+    ----------
+    sums : Sums
+        Of the window; lags without pairs count as uncorrelated.
+    trend : bool
+        Whether time is a regressor.
 
     Attributes
     ----------
     n : int
         Samples.
     mean : ndarray, shape (c,)
-        Means of voltage (less its reference), load, and time.
-    at_zero : ndarray, shape (1 + r, 1 + r)
-        Covariance at lag 0 of voltage and regressors.
-    at_lag : ndarray, shape (K, 1 + r, 1 + r)
-        Covariance at lags 1..K, symmetrised.
+        Means of voltage (less its reference), load, and time (0).
     basis : ndarray, shape (c - 1, r)
-        Load (and time) coefficients of each regressor.
+        Load and time coefficients of each of the r regressors, which are
+        independent combinations of them; the last row is time.
 
     """
 
-    n: int
-    mean: FloatArray
-    at_zero: FloatArray
-    at_lag: FloatArray
-    basis: FloatArray
+    def __init__(self, sums: Sums, trend: bool) -> None:
+        n, c, lags = sums.n, sums.first.size, sums.pairs.size
+        self.n = n
+        mean = sums.first / n
+        self.mean = np.append(mean, 0.0)
+        pairs = np.maximum(sums.pairs, 1.0)
+        # Lag 0, then lags 1..K; time, counted from the middle in windows, comes last.
+        raw = np.empty((lags + 1, c + 1, c + 1))
+        zero = sums.second / n - mean[:, None] * mean
+        raw[0, :c, :c] = zero
+        raw[1:, :c, :c] = zero - sums.spread / (2.0 * pairs)[:, None, None]
+        with_time = (sums.place / n - 0.5 * (n - 1) * mean) / n
+        k = np.arange(lags + 1.0) / n
+        raw[:, :c, c] = with_time
+        raw[1:, :c, c] -= sums.change * (k[1:] / (2.0 * pairs))[:, None]
+        raw[:, c, :c] = raw[:, :c, c]
+        raw[:, c, c] = (1.0 - 1.0 / (n * n)) / 12.0 - 0.5 * k * k
+        self._raw = raw
+        self._turn = np.zeros((c + 1, 1))
+        self._turn[0, 0] = 1.0
+        self.use_time(trend)
+
+    def use_time(self, trend: bool) -> None:
+        """Choose the regressors: the load, and time if wanted."""
+        size = self.mean.size
+        used = slice(1, size if trend else size - 1)
+        independent = _independent(self._raw[0, used, used])
+        self.basis = np.zeros((size - 1, independent.shape[1]))
+        self.basis[:independent.shape[0]] = independent
+        turn = np.zeros((size, 1 + self.rank))
+        turn[0, 0] = 1.0
+        turn[1:, 1:] = self.basis
+        self._at = turn.T @ self._raw @ turn
+        self._flat = self._at.reshape(self._at.shape[0], -1)
 
     @property
     def rank(self) -> int:
         """Return the number of regressors."""
         return int(self.basis.shape[1])
 
-    @staticmethod
-    def of(sums: Sums, trend: bool) -> Moments:
-        """Return the moments of a window; lags without pairs count as uncorrelated."""
-        n, c = sums.n, sums.first.size
-        mean = sums.first / n
-        zero = sums.second / n - mean[:, None] * mean
-        pairs = np.maximum(sums.pairs, 1.0)
-        lag = zero - sums.spread / (2.0 * pairs)[:, None, None]
-        if trend:
-            mean, zero, lag = _with_time(sums, mean, zero, lag)
-            c += 1
-        basis = _independent(zero[1:, 1:])
-        turn = np.zeros((c, 1 + basis.shape[1]))
-        turn[0, 0] = 1.0
-        turn[1:, 1:] = basis
-        return Moments(n, mean, turn.T @ zero @ turn, turn.T @ lag @ turn, basis)
-
     def residual(self, b: FloatArray) -> tuple[float, FloatArray]:
         """Return autocovariances, V^2, of the voltage less b times regressors: lag 0, 1..K."""
         w = np.concatenate(([1.0], -b))
-        return float(w @ self.at_zero @ w), (self.at_lag @ w) @ w
+        c = (self._at @ w) @ w
+        return float(c[0]), c[1:]
 
-    def information(self, log_a: float, theta: float) -> FloatArray:
-        """Return x' K^-1 z over all columns, per sample, for unit innovation variance."""
-        phi = math.exp(-math.exp(log_a))
-        lead = 1.0 + phi * phi - 2.0 * phi * theta
-        tail = (1.0 - phi * theta) * (theta - phi)
-        powers = theta ** np.arange(self.at_lag.shape[0])
-        lagged = (powers @ self.at_lag.reshape(powers.size, -1)).reshape(self.at_zero.shape)
-        return (lead * self.at_zero + 2.0 * tail * lagged) / (1.0 - theta * theta)
+    def regress(self, log_a: float, theta: float) -> Regression:
+        """Fit the mean by generalised least squares with the noise of (ln a, theta)."""
+        step = _STEP * (1.0 - theta)
+        gram = (_weights(np.array([log_a, log_a - _STEP, log_a]),
+                         np.array([theta, theta, theta - step]), self._at.shape[0])
+                @ self._flat).reshape(3, *self._at.shape[1:])
+        inner = gram[:, 1:, 1:]
+        inverse = np.linalg.inv(inner[0])
+        half = 0.5 * np.linalg.slogdet(inner)[1]
+        return Regression(inverse @ gram[0, 1:, 0], inverse,
+                          (float(half[0] - half[1]) / _STEP, float(half[0] - half[2]) / step))
 
-    def regress(self, log_a: float, theta: float) -> tuple[FloatArray, FloatArray]:
-        """Return coefficients and covariance per unit innovation variance over n."""
-        gram = self.information(log_a, theta)
+    def trend_score(self, log_a: float, theta: float) -> float:
+        """Return a trend beyond the load, over its standard error; theta as in `regress`."""
+        weights = _weights(np.array([log_a]), np.array([theta]), self._raw.shape[0])
+        gram = (weights @ self._raw.reshape(self._raw.shape[0], -1)).reshape(
+            self._raw.shape[1:])
+        turn = np.zeros((self.mean.size, 2 + self.rank))
+        turn[0, 0] = turn[-1, 1] = 1.0
+        turn[1:, 2:] = self.basis
+        gram = turn.T @ gram @ turn
         inverse = np.linalg.inv(gram[1:, 1:])
-        return inverse @ gram[1:, 0], inverse
+        b = inverse @ gram[1:, 0]
+        rest = float(gram[0, 0] - gram[0, 1:] @ b)
+        spread = float(inverse[0, 0]) * max(rest, 0.0) / self.n
+        return float(b[0]) / math.sqrt(spread) if spread > 0.0 else 0.0
 
-    def tilt(self, log_a: float, theta: float) -> tuple[float, float]:
-        """Return the gradient of half the log-determinant of the regressors' information."""
-        step_a, step_t = 1e-3, 1e-3 * (1.0 - theta)
 
-        def half_log_det(x: float, y: float) -> float:
-            return 0.5 * float(np.linalg.slogdet(self.information(x, y)[1:, 1:])[1])
-
-        here = half_log_det(log_a, theta)
-        return ((half_log_det(log_a - step_a, theta) - here) / -step_a,
-                (half_log_det(log_a, theta - step_t) - here) / -step_t)
+def _weights(log_a: FloatArray, theta: FloatArray, count: int) -> FloatArray:
+    """Return what each lag counts in x' K^-1 z, shape (points, count), lag 0 first."""
+    phi = np.exp(-np.exp(log_a))
+    weights = np.empty((theta.size, count))
+    weights[:, 0] = 1.0 + phi * phi - 2.0 * phi * theta
+    tail = 2.0 * (1.0 - phi * theta) * (theta - phi)
+    weights[:, 1:] = tail[:, None] * theta[:, None] ** np.arange(count - 1)
+    return weights / (1.0 - theta * theta)[:, None]
 
 
 def _independent(cov: FloatArray) -> FloatArray:
@@ -117,23 +165,6 @@ def _independent(cov: FloatArray) -> FloatArray:
     basis = np.zeros((cov.shape[0], int(seen.sum())))
     basis[used] = vectors[:, seen] / scale[:, None]
     return basis
-
-
-def _with_time(sums: Sums, mean: FloatArray, zero: FloatArray, lag: FloatArray
-               ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Join time, counted from the middle in windows, as the last variable."""
-    n, c, lags = sums.n, mean.size, sums.pairs.size
-    wide = np.zeros((c + 1, c + 1))
-    wide[:c, :c] = zero
-    wide[:c, c] = wide[c, :c] = (sums.place / n - 0.5 * (n - 1) * mean) / n
-    wide[c, c] = (1.0 - 1.0 / (n * n)) / 12.0
-    k = np.arange(1.0, lags + 1.0) / n
-    wide_lag = np.empty((lags, c + 1, c + 1))
-    wide_lag[:, :c, :c] = lag
-    cross = sums.change * (k / (2.0 * np.maximum(sums.pairs, 1.0)))[:, None]
-    wide_lag[:, :c, c] = wide_lag[:, c, :c] = wide[:c, c] - cross
-    wide_lag[:, c, c] = wide[c, c] - 0.5 * k * k
-    return np.concatenate([mean, [0.0]]), wide, wide_lag
 
 
 def load_at(throttle: float) -> FloatArray:

@@ -27,6 +27,8 @@ TREND_SCORE = 4.0
 # Neighbouring samples correlated by less than this many standard errors are
 # not correlated.
 _CORRELATED = 2.0
+# ln(alpha D) of noise that is as good as white.
+_WHITE = 3.0
 
 
 @dataclass(frozen=True)
@@ -139,41 +141,37 @@ def _fit_moving(sums: Sums, m: int, start: tuple[float, float] | None, trend: bo
                 ) -> WindowFit:
     """Fit noise and mean in turn; the mean hardly moves, so two rounds are usual."""
     search, finish = _functions()
-    moments = Moments.of(sums, trend)
+    moments = Moments(sums, trend)
     at = start
-    b = moments.regress(*at)[0] if at else moments.regress(-20.0, 0.0)[0]
+    # Without a start: ordinary least squares, as for white noise.
+    mean = moments.regress(*(at or (_WHITE, 0.0)))
     on_bound = False
     for _ in range(8):
-        c0, c = moments.residual(b)
+        c0, c = moments.residual(mean.b)
         if not _correlated(c0, c, sums.n):
-            return _uncorrelated(moments.mean, moments.basis @ b, trend, c0)
+            return _uncorrelated(moments.mean, moments.basis @ mean.b, trend, c0)
         log_a, theta = at or still_fit.guess(c0, c.tolist())
-        tilt = moments.tilt(log_a, theta)
+        tilt = mean.tilt if at else (0.0, 0.0)
         before = log_a, theta
         log_a, theta, on_bound = search(c0, c, sums.n - 1.0 - moments.rank, log_a, theta, m,
                                         *tilt)
+        settled = at is not None and max(
+            abs(log_a - before[0]), abs(theta - before[1])) < still_fit.STEADY
         at = log_a, theta
-        b = moments.regress(log_a, theta)[0]
-        if max(abs(log_a - before[0]), abs(theta - before[1])) < still_fit.STEADY:
+        mean = moments.regress(log_a, theta)
+        if not settled:
+            continue
+        if trend or abs(moments.trend_score(log_a, theta)) < TREND_SCORE:
             break
-    if not trend and _drifts(sums, log_a, theta):
-        return _fit_moving(sums, m, at, trend=True)
-    c0, c = moments.residual(b)
+        trend = True
+        moments.use_time(True)
+        mean = moments.regress(log_a, theta)
+    c0, c = moments.residual(mean.b)
     end = finish(c0, c, sums.n, sums.n - 1.0 - moments.rank, log_a, theta, on_bound, m)
-    cov = moments.regress(math.log(end[0]), end[1])[1] * end[2] / sums.n
+    cov = mean.inverse * end[2] / sums.n
     return WindowFit(end[0], end[1], end[3], end[4], end[5], end[6:9], moments.mean,
-                     moments.basis @ b, moments.basis @ cov @ moments.basis.T, trend,
+                     moments.basis @ mean.b, moments.basis @ cov @ moments.basis.T, trend,
                      end[0] < still_fit.FASTEST, c0)
-
-
-def _drifts(sums: Sums, log_a: float, theta: float) -> bool:
-    """Whether time explains the voltage beyond what the load does."""
-    full = Moments.of(sums, True)
-    b, cov = full.regress(log_a, theta)
-    c0, c = full.residual(b)
-    q = still_fit.innovation(c0, c.tolist(), log_a, theta)
-    time = full.basis[-1]
-    return float(time @ b) ** 2 > TREND_SCORE ** 2 * float(time @ cov @ time) * q / sums.n
 
 
 def _functions() -> tuple[Callable[..., tuple[float, float, bool]],

@@ -1,0 +1,88 @@
+"""Dense linear algebra and a plain Kalman filter: what the fast likelihoods must agree with."""
+
+import math
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+
+def block_autocovariances(a, m, count):
+    """
+    Return autocovariances of OU block means at lags 0..count-1, by double sums.
+
+    The sums over both samples are taken over their distance; in units of
+    sigma^2 D.
+    """
+    distance = np.arange(1 - m, m)
+    weight = (m - np.abs(distance)) / m ** 2
+    lags = np.arange(count)[:, None]
+    return 0.5 / a * (weight * np.exp(-a * np.abs(lags + distance / m))).sum(axis=1)
+
+
+def ou_covariance(t, alpha, sigma, noise_var):
+    """Return the covariance matrix of an OU in white noise at stamps t."""
+    distance = np.abs(np.subtract.outer(t, t))
+    return sigma ** 2 / (2.0 * alpha) * np.exp(-alpha * distance) + noise_var * np.eye(t.size)
+
+
+def restricted(cov, y, x):
+    """
+    Return the restricted log-likelihood, profiled over scale, and more.
+
+    Parameters
+    ----------
+    cov : ndarray, shape (n, n)
+        Covariance up to a factor.
+    y : ndarray, shape (n,)
+        Data.
+    x : ndarray, shape (n, p)
+        Regressors.
+
+    Returns
+    -------
+    value : float
+        Log-likelihood of the contrasts, nats.
+    scale : float
+        The factor.
+    beta, beta_cov : ndarray
+        Coefficients and covariance.
+
+    """
+    factor = cho_factor(cov, lower=True)
+    log_det = 2.0 * np.log(factor[0].diagonal()).sum()
+    gram = x.T @ cho_solve(factor, x)
+    beta = np.linalg.solve(gram, x.T @ cho_solve(factor, y))
+    rest = y - x @ beta
+    free = y.size - x.shape[1]
+    scale = float(rest @ cho_solve(factor, rest)) / free
+    value = -0.5 * (free * math.log(2.0 * math.pi * scale) + free + log_det
+                    + np.linalg.slogdet(gram)[1])
+    return value, scale, beta, np.linalg.inv(gram) * scale
+
+
+def fisher(covariance, at, steps):
+    """Return tr(K^-1 dK_i K^-1 dK_j) / 2 for covariance(p), by central differences."""
+    inverse = np.linalg.inv(covariance(at))
+    parts = []
+    for i, step in enumerate(steps):
+        shift = np.zeros(len(at))
+        shift[i] = step
+        parts.append(inverse @ (covariance(at + shift) - covariance(at - shift)) / (2.0 * step))
+    return np.array([[0.5 * np.sum(p * q.T) for q in parts] for p in parts])
+
+
+def kalman_log_likelihood(t, y, alpha, sigma, noise_var, level):
+    """Return the log-likelihood of an OU in white noise about a known level, one by one."""
+    stationary = sigma ** 2 / (2.0 * alpha)
+    state, variance, total = 0.0, stationary, 0.0
+    for j in range(t.size):
+        if j:
+            phi = math.exp(-alpha * (t[j] - t[j - 1]))
+            state *= phi
+            variance = phi * phi * variance + stationary * (1.0 - phi * phi)
+        spread = variance + noise_var
+        error = y[j] - level - state
+        total -= 0.5 * (math.log(2.0 * math.pi * spread) + error * error / spread)
+        state += variance / spread * error
+        variance -= variance * variance / spread
+    return total
