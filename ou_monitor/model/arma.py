@@ -104,27 +104,26 @@ def noise_share(a: float, theta: float, m: int) -> float:
     """
     phi = math.exp(-a)
     gamma0, gamma1 = block_autocovariance(a, m)
-    kappa = theta / (1.0 + theta * theta)
-    return gamma1 * (1.0 - 2.0 * kappa * phi) / (phi - kappa * (1.0 + phi * phi)) - gamma0
+    total = gamma1 * (1.0 + theta * theta - 2.0 * phi * theta) / (
+        (phi - theta) * (1.0 - phi * theta))
+    return total - gamma0
 
 
 def innovation_variance(a: float, theta: float, m: int) -> float:
     """Return the one-step innovation variance in units of sigma^2 D; arguments as above."""
     phi = math.exp(-a)
-    gamma0, gamma1 = block_autocovariance(a, m)
-    total = gamma0 + noise_share(a, theta, m)
-    return (total * (1.0 + phi * phi) - 2.0 * phi * gamma1) / (1.0 + theta * theta)
+    _, gamma1 = block_autocovariance(a, m)
+    return gamma1 * -math.expm1(-2.0 * a) / ((phi - theta) * (1.0 - phi * theta))
 
 
 def log_covariance(a: float, theta: float, m: int, n: int) -> tuple[float, float, float]:
     """
     Return the variances of ln(alpha), ln(sigma) and ln(Var_inf) from n blocks.
 
-    The information of an ARMA(1,1) in (phi, theta, ln q) is n times
-    [[1/(1-phi^2), -1/(1-phi theta)], [., 1/(1-theta^2)]] and n/2 (Box &
-    Jenkins, Time Series Analysis, 7.2.6); the delta method carries it to the
-    logarithms, with derivatives in the logit of theta and the logarithm of a
-    taken numerically.
+    The covariance of (phi, theta) is (1 - phi theta)/(phi - theta)^2 / n times
+    [[(1-phi^2)(1-phi theta), (1-phi^2)(1-theta^2)], [., (1-theta^2)(1-phi
+    theta)]], and that of ln q is 2/n (Box & Jenkins, Time Series Analysis,
+    7.2.6); the delta method carries it to the logarithms.
 
     Parameters
     ----------
@@ -140,17 +139,17 @@ def log_covariance(a: float, theta: float, m: int, n: int) -> tuple[float, float
 
     """
     phi = math.exp(-a)
-    i_pp = 1.0 / -math.expm1(-2.0 * a)
-    i_tt = 1.0 / (1.0 - theta * theta)
-    i_pt = -1.0 / (1.0 - phi * theta)
-    det = i_pp * i_tt - i_pt * i_pt
-    v_phi, v_theta, v_cross = i_tt / det / n, i_pp / det / n, -i_pt / det / n
+    one, other = -math.expm1(-2.0 * a), 1.0 - theta * theta
+    cross, apart = 1.0 - phi * theta, phi - theta
+    common = cross / (apart * apart * n)
+    v_phi, v_theta, v_cross = (common * one * cross, common * other * cross,
+                               common * one * other)
     # ln sigma^2 = ln q - ln q~(a, theta): derivatives of ln q~.
-    step_a, step_t = 1e-4 * a, 1e-4 * min(1.0 - theta, phi - theta, 0.5)
-    d_a = (math.log(innovation_variance(a + step_a, theta, m))
-           - math.log(innovation_variance(a - step_a, theta, m))) / (2.0 * step_a)
-    d_t = (math.log(innovation_variance(a, theta + step_t, m))
-           - math.log(innovation_variance(a, theta - step_t, m))) / (2.0 * step_t)
+    d_t = 1.0 / apart + phi / cross
+    d_a = 2.0 * phi * phi / one + phi / apart - phi * theta / cross - 1.0 / a - 1.0 / m
+    if m > 1:
+        r = math.exp(-a / m)
+        d_a += 2.0 * phi / -math.expm1(-a) - 2.0 * r / (m * -math.expm1(-a / m))
     # a = -ln phi.
     s_phi, s_theta = d_a / phi, -d_t
     a_phi = -1.0 / (phi * a)

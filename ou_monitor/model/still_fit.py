@@ -14,7 +14,7 @@ import math
 
 from ou_monitor.model.arma import (
     innovation_variance, log_covariance, noise_free_theta, noise_share)
-from ou_monitor.model.quasi_fit import information, innovation, minimise
+from ou_monitor.model.quasi_fit import information, innovation, minimise, objective
 
 # ln(a) settles to this when something else is fitted along with it; the error
 # left in it is the square.
@@ -61,6 +61,15 @@ def search(c0: float, c: Sequence[float], free: float, log_a: float, theta: floa
 
     """
     theta = min(theta, 0.9 * math.exp(-math.exp(log_a)))
+    if not objective(c0, c, free, log_a, theta, 0.0, 0.0)[0] < math.inf:
+        # Sums over a few pairs need not be a covariance: start where they are one.
+        best = math.inf
+        for i in range(6):
+            for k in range(4):
+                a = 0.01 * 4.0 ** i
+                value = objective(c0, c, free, math.log(a), 0.3 * k * math.exp(-a), 0.0, 0.0)[0]
+                if value < best:
+                    best, log_a, theta = value, math.log(a), 0.3 * k * math.exp(-a)
     floor = 0.0
     slope = 0.0
     on_bound = False
@@ -100,12 +109,14 @@ def finish(c0: float, c: Sequence[float], n: int, free: float, log_a: float, the
 
     """
     floor = noise_free_theta(math.exp(log_a), m)
-    i_aa, i_at, i_tt = information(log_a, theta)
-    spread = math.sqrt(i_aa / (i_aa * i_tt - i_at * i_at) / n)
+    phi = math.exp(-math.exp(log_a))
+    i_aa, i_at, _ = information(log_a, theta)
+    # Standard error of theta, alpha being free (see `arma.log_covariance`).
+    spread = (1.0 - phi * theta) / (phi - theta) * math.sqrt((1.0 - theta * theta) / n)
     score = 0.0
     if not on_bound:
         score = max(theta - floor, 0.0) / spread
-    if score > 0.0:
+    if score > 0.0 and innovation(c0, c, log_a, theta) > 0.0:
         pull = min(PULL * math.exp(-score * score / 8.0), score) * spread
         theta -= pull
         log_a += i_at / i_aa * pull

@@ -120,7 +120,7 @@ def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None) -> 
     if abs(end[9]) > TREND_SCORE:
         return _fit_moving(sums, m, (math.log(end[0]), end[1]), trend=True)
     return WindowFit(end[0], end[1], end[3], end[4], end[5], end[6:9], level, _EMPTY, _NO_COV,
-                     False, end[0] < still_fit.FASTEST, c0)
+                     False, _found(end), c0)
 
 
 _EMPTY = np.empty(0)
@@ -129,6 +129,11 @@ _NO_COV = np.empty((0, 0))
 
 def _correlated(c0: float, c: FloatArray, n: int) -> bool:
     return c0 > 0.0 and float(c[0]) > _CORRELATED * c0 / math.sqrt(n)
+
+
+def _found(end: tuple[float, ...]) -> bool:
+    """Whether a relaxation was found: within reach of the rate, and of positive variance."""
+    return end[0] < still_fit.FASTEST and end[3] > 0.0
 
 
 def _uncorrelated(level: FloatArray, beta: FloatArray, trend: bool, c0: float) -> WindowFit:
@@ -171,7 +176,7 @@ def _fit_moving(sums: Sums, m: int, start: tuple[float, float] | None, trend: bo
     cov = mean.inverse * end[2] / sums.n
     return WindowFit(end[0], end[1], end[3], end[4], end[5], end[6:9], moments.mean,
                      moments.basis @ mean.b, moments.basis @ cov @ moments.basis.T, trend,
-                     end[0] < still_fit.FASTEST, c0)
+                     _found(end), c0)
 
 
 def _functions() -> tuple[Callable[..., tuple[float, float, bool]],

@@ -115,4 +115,7 @@ def test_edges_are_told():
     # Drift makes it certain: a line is no OU.
     walk = np.cumsum(rng.standard_normal(400)) + 0.5 * np.arange(400)
     assert fit_exact(t, walk, x).edge == -1
-    assert fit_exact(t, made(1, n=400)[1], x).edge == 0
+    # Signs that alternate are what a fast OU fits least badly.
+    swing = rng.standard_normal(400) * 0.1 + (-1.0) ** np.arange(400)
+    assert fit_exact(t, swing, x).edge == 1
+    assert fit_exact(t, simulate(t, 30.0, 0.5, rng), x).edge == 0

@@ -1,0 +1,195 @@
+"""The quasi-likelihood from autocovariances: its gradient, its dense twin, its minimiser."""
+
+import math
+
+from dense import block_autocovariances, fisher, restricted
+import numpy as np
+from ou_monitor.model import arma, quasi_fit
+from ou_monitor.model.exact_fit import fit_exact
+from ou_monitor.model.ou import simulate
+import pytest
+from scipy.linalg import toeplitz
+from scipy.optimize import minimize
+
+LAGS = 24
+
+
+def variogram(y):
+    """Return c0 and c_k = c0 - D_k / 2 over all pairs, as the sliding sums have them."""
+    c0 = float(y.var())
+    return c0, [c0 - float(np.mean((y[k:] - y[:-k]) ** 2)) / 2.0 for k in range(1, LAGS + 1)]
+
+
+def made(seed, n, a=0.1, share=0.3):
+    """Return OU plus white noise with sigma^2 D = 1."""
+    rng = np.random.default_rng(seed)
+    return simulate(np.arange(float(n)), a, 1.0, rng) + math.sqrt(share) * rng.standard_normal(n)
+
+
+def arma_covariance(log_a, theta, n):
+    """Return the covariance of an ARMA(1,1) of unit innovation variance."""
+    phi = math.exp(-math.exp(log_a))
+    column = np.empty(n)
+    column[0] = (1.0 + theta ** 2 - 2.0 * phi * theta) / (1.0 - phi * phi)
+    column[1:] = (phi * column[0] - theta) * phi ** np.arange(n - 1)
+    return toeplitz(column)
+
+
+@pytest.mark.parametrize('log_a, theta', [
+    (-2.3, 0.3), (-5.0, 0.7), (-0.5, -0.25), (0.7, -0.2), (-2.3, 0.0), (-7.0, 0.95)])
+def test_gradient(log_a, theta):
+    """Central differences at steps of 1e-5 are good to 1e-9 of the curvature, some 1e3."""
+    c0, c = variogram(made(1, 500))
+    tilts = (0.7, -0.4)
+
+    def value(x, y):
+        return quasi_fit.objective(c0, c, 497.0, x, y, *tilts)[0]
+
+    h, k = 1e-5, 1e-5 * (1.0 - theta)
+    _, by_a, by_t = quasi_fit.objective(c0, c, 497.0, log_a, theta, *tilts)
+    scale = 1.0 + abs(by_a) + abs(by_t)
+    assert by_a == pytest.approx(
+        (value(log_a + h, theta) - value(log_a - h, theta)) / (2 * h), abs=1e-6 * scale)
+    assert by_t == pytest.approx(
+        (value(log_a, theta + k) - value(log_a, theta - k)) / (2 * k), abs=2e-6 * scale)
+
+
+def test_impossible_parameters_are_infinite():
+    """A quadratic form that comes out negative cannot be a likelihood."""
+    value, by_a, by_t = quasi_fit.objective(1.0, [2.0, 2.0], 10.0, -3.0, 0.0, 0.0, 0.0)
+    assert (value, by_a, by_t) == (math.inf, 0.0, 0.0)
+
+
+def test_determinant_is_that_of_dense_matrices():
+    """
+    With equal quadratic forms what is left of value is half log|K| + half log|X'K^-1X|.
+
+    c0 = 1 and c = the model's own autocovariances make the form free * q; the
+    ends have died out at n = 800 (a n = 40, theta^n = 0), and 1'K^-1 1 is
+    n f(0) + O(1), so the difference between two parameters is met to O(1/(n a)).
+    """
+    n = 800
+    ones = np.ones(n)
+    left = []
+    for log_a, theta in ((-2.3, 0.3), (-1.0, -0.2), (-3.0, 0.6), (-1.5, 0.0)):
+        cov = arma_covariance(log_a, theta, n)
+        c = cov[0, 1:200].tolist()
+        value = quasi_fit.objective(cov[0, 0], c, n - 1.0, log_a, theta, 0.0, 0.0)[0]
+        assert quasi_fit.innovation(cov[0, 0], c, log_a, theta) == pytest.approx(1.0, rel=1e-9)
+        half = 0.5 * (np.linalg.slogdet(cov)[1]
+                      + math.log(ones @ np.linalg.solve(cov, ones)))
+        left.append((value - half, math.exp(log_a)))
+    for value, a in left:
+        assert value == pytest.approx(-0.5 * math.log(n), abs=1.5 / (n * a))
+
+
+def test_differences_of_dense_likelihoods():
+    """
+    Between two parameters near the optimum, one quasi-likelihood is the other's twin.
+
+    What is left comes from the ends: differences of parameters of one standard
+    error, n^(-1/2), change it by O(n^(-1/2)).  Four times the data must halve it.
+    """
+    def apart(n, seed):
+        y = made(seed, n)
+        c0, c = variogram(y)
+        a, theta = math.log(0.1), arma.theta_at(0.1, 1, 0.3)
+        step = math.sqrt(2.0 / (0.1 * n))
+        values = []
+        for x in (a - step, a + step):
+            dense = -restricted(arma_covariance(x, theta, n), y, np.ones((n, 1)))[0]
+            values.append(quasi_fit.objective(c0, c, n - 1.0, x, theta, 0.0, 0.0)[0] - dense)
+        return values[1] - values[0]
+
+    small = np.sqrt(np.mean([apart(150, seed) ** 2 for seed in range(24)]))
+    large = np.sqrt(np.mean([apart(600, seed) ** 2 for seed in range(24)]))
+    # One standard error is half a nat: the ends are worth less than a fifth of that.
+    assert large < 0.1 and large < 0.7 * small
+
+
+def optimum(y, m=1):
+    """Return the minimiser from a poor start."""
+    c0, c = variogram(y)
+    return quasi_fit.minimise(c0, c, y.size - 1.0, -1.0, 0.1, 0.0, 0.0, -20.0, 2.0, 0.0, 0.0)
+
+
+def test_optimum_is_that_of_the_exact_likelihood():
+    """To O(1/n) in ln(alpha), where the standard error is O(n^(-1/2)): 4 n, a quarter."""
+    def apart(n):
+        differences = []
+        for seed in range(24):
+            y = made(seed, n, a=0.2, share=0.3)
+            exact = fit_exact(np.arange(float(n)), y, np.ones((n, 1)))
+            log_a, theta, _, _, _ = optimum(y)
+            own = (arma.theta_at(exact.alpha, 1, exact.noise_var / exact.sigma ** 2))
+            differences.append((log_a - math.log(exact.alpha), theta - own))
+        return np.sqrt(np.mean(np.square(differences), axis=0))
+
+    small, large = apart(500), apart(2000)
+    information = quasi_fit.information(math.log(0.2), arma.theta_at(0.2, 1, 0.3))
+    i_aa, i_at, i_tt = information
+    det = i_aa * i_tt - i_at ** 2
+    se = np.sqrt(np.array([i_tt, i_aa]) / det / 2000)
+    assert (large < 0.2 * se).all()
+    # Between a half (a bias of the order of the error) and a quarter.
+    assert (large < 0.4 * small).all()
+
+
+@pytest.mark.parametrize('seed', range(12))
+@pytest.mark.parametrize('a, share, floor, slope', [
+    (0.05, 0.3, 0.0, 0.0), (0.05, 0.0, 0.0, 0.0), (0.3, 1.0, 0.0, 0.0), (0.1, 0.0, -0.2, 0.05),
+    (0.02, 5.0, 0.0, 0.0)])
+def test_minimiser_is_scipys(seed, a, share, floor, slope):
+    """Bounded search by scipy from several starts finds no lower value."""
+    y = made(seed, 800, a, share)
+    c0, c = variogram(y)
+    start = math.log(0.4)
+    log_a, theta, value, on_bound, steps = quasi_fit.minimise(
+        c0, c, 799.0, start, 0.2, floor, slope, -20.0, 2.0, 0.0, 0.0)
+    assert steps < quasi_fit.MAX_STEPS
+    again, by_a, by_t = quasi_fit.objective(c0, c, 799.0, log_a, theta, 0.0, 0.0)
+    assert value == again
+    least = floor + slope * (log_a - start)
+    assert theta >= least - 1e-12 and on_bound == (abs(theta - least) < 1e-12)
+
+    def cost(p):
+        # theta = bound + what is above it, below phi.
+        low = floor + slope * (p[0] - start)
+        phi = math.exp(-math.exp(p[0]))
+        if not low < phi:
+            return math.inf
+        at = low + (phi - low) * (1.0 - 1e-9) * math.sin(p[1]) ** 2
+        return quasi_fit.objective(c0, c, 799.0, p[0], at, 0.0, 0.0)[0]
+
+    best = min(minimize(cost, (x, z), method='Nelder-Mead',
+                        options={'xatol': 1e-7, 'fatol': 1e-10}).fun
+               for x in (-4.0, -2.0) for z in (0.3, 1.0))
+    # Settled to 1e-6 of ln(a): the value is flat to the square of that.
+    assert value <= best + 1e-8
+    if on_bound:
+        assert by_t >= -1e-6
+        assert by_a + slope * by_t == pytest.approx(0.0, abs=1e-2)
+    else:
+        assert (by_a, by_t) == pytest.approx((0.0, 0.0), abs=1e-2)
+
+
+def test_information_is_that_of_dense_matrices():
+    """Differences of 2n and n are free of the ends; steps of 1e-4 leave 1e-6."""
+    at = np.array([math.log(0.3), 0.4])
+    steps = (1e-4, 1e-4)
+    per_sample = (fisher(lambda p: arma_covariance(*p, 240), at, steps)
+                  - fisher(lambda p: arma_covariance(*p, 120), at, steps)) / 120
+    expected = (per_sample[0, 0], per_sample[0, 1], per_sample[1, 1])
+    assert quasi_fit.information(*at) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize('m', [1, 4])
+def test_exact_autocovariances_give_the_truth(m):
+    """Many samples whose autocovariances are the model's: the optimum is the model."""
+    a, share, lags = 0.1, 0.3, 60
+    gamma = block_autocovariances(a, m, lags + 1)
+    log_a, theta, _, on_bound, _ = quasi_fit.minimise(
+        gamma[0] + share, gamma[1:].tolist(), 1e9, -1.0, 0.0,
+        arma.noise_free_theta(a, m), 0.0, -20.0, 2.0, 0.0, 0.0)
+    assert not on_bound
+    assert (math.exp(log_a), theta) == pytest.approx((a, arma.theta_at(a, m, share)), rel=1e-6)
