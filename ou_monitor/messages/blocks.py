@@ -25,9 +25,9 @@ from ou_monitor.records import FloatArray
 # clock that is wrong by 100 ppm is followed 1 ms behind.
 FOLLOW = 10.0  # s
 
-# A difference beyond this, and beyond two blocks, is a real gap: schedulers
-# of companion computers delay by several ms, hardly by 20.
-GAP_LEAST = 0.020  # s
+# A difference beyond this, and beyond two blocks, is a real gap: a busy
+# companion computer holds blocks back by some 100 ms and then sends them all.
+GAP_LEAST = 0.25  # s
 
 
 class BlockClock:

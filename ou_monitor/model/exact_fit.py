@@ -93,11 +93,11 @@ class _Likelihood:
         kw[:-1] += off[:, None] * w[1:]
         gram = self.table.T @ kw
         xx, xy = gram[:self.p, :self.p], gram[:self.p, self.p]
-        inverse = np.linalg.inv(xx)
+        inverse = np.linalg.pinv(xx, hermitian=True)
         beta = inverse @ xy
         free = self.n - self.p
         scale = max(float(gram[self.p, self.p] - xy @ beta) / free, np.finfo(float).tiny)
-        value = 0.5 * (free * math.log(scale) + log_det - math.log(np.linalg.det(inverse))
+        value = 0.5 * (free * math.log(scale) + log_det + float(np.linalg.slogdet(xx)[1])
                        + free * (1.0 + math.log(2.0 * math.pi)))
         return value, scale, beta, inverse * scale
 

@@ -175,7 +175,7 @@ def check(t, y, before, low, high):  # type: ignore[no-untyped-def]
 
 def build() -> Kernels:
     """Compile all kernels now; raises what Numba raises."""
-    import numba
+    import numba  # type: ignore[import-not-found,unused-ignore]
 
     compile_one = numba.njit(cache=True, nogil=True)
     names: dict[str, Any] = {}
@@ -199,9 +199,9 @@ def build() -> Kernels:
     kernels.search(1.0, c, 97.0, -3.0, 0.1, 1, 0.0, 0.0)
     kernels.finish(1.0, c, 100, 97.0, -3.0, 0.1, False, 1)
     edges = np.array([0, 4])
-    for c in (1, 5):
-        width = 1 + 2 * c + c * c + 2 * (1 + c + c * c)
-        kernels.slot_sums(np.zeros((c, 6)), np.zeros(4, dtype=np.int64), edges, 2,
+    for size in (1, 5):
+        width = 1 + 2 * size + size * size + 2 * (1 + size + size * size)
+        kernels.slot_sums(np.zeros((size, 6)), np.zeros(4, dtype=np.int64), edges, 2,
                           np.zeros((1, width)))
     kernels.check(np.zeros(2), np.zeros(2), 0.0, 1.0, 2.0)
     return kernels

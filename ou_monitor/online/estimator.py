@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -44,7 +45,6 @@ _DITHER = 0.7
 # The quality of the input is looked at this many times per window.
 _LOOKS = 4
 _DOUBLE = np.dtype(np.float64)
-_ONE = (float, int, type(None))
 
 
 class SlidingEstimator:
@@ -124,34 +124,37 @@ class SlidingEstimator:
 
         """
         self._cached = None
-        put = self._intake.put
         # What the fast sources send, with as few steps as can be.
-        if type(t) is float and type(voltage) is float and type(throttle) in _ONE:
-            if not self._intake.put_one(t, voltage, throttle):  # type: ignore[arg-type]
+        stamps: Any = t
+        volts: Any = voltage
+        if isinstance(stamps, float) and isinstance(volts, float) and (
+                throttle is None or isinstance(throttle, (float, int))):
+            if not self._intake.put_one(stamps, volts, throttle):
                 self._work_off()
-                self._intake.put_one(t, voltage, throttle)  # type: ignore[arg-type]
+                self._intake.put_one(stamps, volts, throttle)
             return
-        if not (type(t) is np.ndarray is type(voltage) and t.dtype is _DOUBLE
-                and voltage.dtype is _DOUBLE and t.ndim == 1):
-            t, voltage = as_column(t), as_column(voltage)
-        if t.shape != voltage.shape or t.ndim != 1:
+        if not (isinstance(stamps, np.ndarray) and isinstance(volts, np.ndarray)
+                and stamps.dtype == _DOUBLE == volts.dtype and stamps.ndim):
+            stamps, volts = as_column(stamps), as_column(volts)
+        if stamps.shape != volts.shape or stamps.ndim != 1:
             raise ValueError(
-                f't and voltage must have one shape (n,): got {t.shape} and {voltage.shape}')
+                f't and voltage must have one shape (n,): got {stamps.shape} and {volts.shape}')
         load: FloatArray | float | None = None
         if throttle is not None:
             load = np.asarray(throttle, dtype=np.float64)
             if load.ndim == 0:
                 load = float(load)
-            elif load.shape != t.shape:
+            elif load.shape != stamps.shape:
                 raise ValueError(
-                    f'throttle must be one number or have the shape of t, {t.shape}: got '
+                    f'throttle must be one number or have the shape of t, {stamps.shape}: got '
                     f'{load.shape}')
-        if put(t, voltage, load):
+        put = self._intake.put
+        if put(stamps, volts, load):
             return
-        for begin in range(0, t.size, BATCH):
+        for begin in range(0, stamps.size, BATCH):
             part = slice(begin, begin + BATCH)
             self._work_off()
-            put(t[part], voltage[part], load[part] if isinstance(load, np.ndarray) else load)
+            put(stamps[part], volts[part], load[part] if isinstance(load, np.ndarray) else load)
 
     def estimate(self) -> Estimate:
         """Return the estimate for the window that ends at the newest sample."""
@@ -167,16 +170,16 @@ class SlidingEstimator:
         for batch in self._intake.work_off(self._window, self._thinner.step):
             if batch.restart:
                 self._forget()
-            y = batch.y
-            self._tail = y[-TAIL:].copy() if y.size >= TAIL else np.concatenate(
-                [self._tail, y])[-TAIL:]
-            *kept, restart = self._thinner.take(batch)
+            raw = batch.y
+            self._tail = raw[-TAIL:].copy() if raw.size >= TAIL else np.concatenate(
+                [self._tail, raw])[-TAIL:]
+            t, y, u, breaks, restart = self._thinner.take(batch)
             if restart:
                 # Block means of another size do not go with the old ones.
                 self._intake.count(resets=1)
                 self._finest.clear()
                 self._start = None
-            self._finest.add(*kept)
+            self._finest.add(t, y, u, breaks)
 
     def _forget(self) -> None:
         self._thinner.forget()
@@ -237,8 +240,9 @@ class SlidingEstimator:
         moves = series.moves and series.known
         sums = self._finest.sums.total()
         if quality.held > 1 and self._thinner.m == 1:
-            columns = fresh_columns(series.all_columns(), quality.held)
-            return fit_irregular(columns[:, -MOST:], moves), NAN
+            columns = fresh_columns(series.all_columns(), quality.held)[:, -MOST:]
+            if columns.shape[1] >= MIN_SAMPLES:
+                return fit_irregular(columns, moves), NAN
         if self._thinner.m == 1 and series.size <= MOST and (
                 sums.pairs[-1] < _EVEN * (sums.n - LAGS)):
             return fit_irregular(series.all_columns(), moves), NAN

@@ -15,16 +15,14 @@ import numpy as np
 from ou_monitor.model import arma
 from ou_monitor.model.exact_fit import ExactFit, fit_exact
 from ou_monitor.online.fitted import Fitted, Outcome
+from ou_monitor.online.load import independent
 from ou_monitor.online.quality import fresh_samples
 from ou_monitor.online.series import FAST, SLOW, T, U, Y
+from ou_monitor.online.window_fit import TREND_SCORE
 from ou_monitor.records import FloatArray
 
 # Samples up to which the exact likelihood is used (some 50 ms).
 MOST = 4096
-# Directions of the load that vary less than this share of the largest.
-_UNSEEN = 1e-5
-# As in window_fit: a trend must be this many standard errors large.
-_TREND_SCORE = 4.0
 
 
 def fresh_columns(columns: FloatArray, held: int) -> FloatArray:
@@ -60,7 +58,7 @@ def fit_irregular(columns: FloatArray, moves: bool) -> Fitted:
     with_time, wide, wide_level = _fit(t, y, np.concatenate([load, [time]]))
     slope = float((wide @ with_time.beta[1:])[-1])
     spread = float((wide @ with_time.beta_cov[1:, 1:] @ wide.T)[-1, -1])
-    if slope * slope > _TREND_SCORE ** 2 * spread:
+    if slope * slope > TREND_SCORE ** 2 * spread:
         fit, basis, level, trend = with_time, wide, wide_level, True
     beta = basis @ fit.beta[1:]
     cov = basis @ fit.beta_cov[1:, 1:] @ basis.T
@@ -79,13 +77,8 @@ def fit_irregular(columns: FloatArray, moves: bool) -> Fitted:
 def _fit(t: FloatArray, y: FloatArray, load: FloatArray
          ) -> tuple[ExactFit, FloatArray, FloatArray]:
     """Fit with independent combinations of the load, centred."""
-    mean = load.mean(axis=1) if load.size else np.empty(0)
+    mean = load.mean(axis=1)
     centred = load - mean[:, None]
-    basis = np.empty((load.shape[0], 0))
-    if load.size:
-        scale = np.sqrt(np.maximum((centred ** 2).mean(axis=1), 1e-300))
-        values, vectors = np.linalg.eigh(
-            centred @ centred.T / t.size / (scale[:, None] * scale))
-        basis = (vectors / scale[:, None])[:, values > _UNSEEN * values[-1]]
+    basis = independent(centred @ centred.T / t.size)
     regressors = np.column_stack([np.ones(t.size), centred.T @ basis])
     return fit_exact(t, y, regressors), basis, mean

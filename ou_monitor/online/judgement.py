@@ -11,7 +11,9 @@ the other, so one correction serves both: 1.5/T, which leaves each high by
 
 from __future__ import annotations
 
+from dataclasses import replace
 import math
+from typing import Any
 
 from ou_monitor.online.fitted import Fitted, Outcome
 from ou_monitor.online.load import load_at, slope_at
@@ -153,7 +155,5 @@ def _level(fit: Fitted, throttle: float, moves: bool) -> tuple[float, float]:
     return float(fit.level[0] + shift), slope_at(throttle, fit.beta)
 
 
-def _with(base: Estimate, status: Status, flags: list[Flag], **values: float) -> Estimate:
-    fields = {name: getattr(base, name) for name in (
-        't', 'voltage', 'throttle', 'n', 'duration', 'rate', 'counters')}
-    return Estimate(**fields, **values, status=status, flags=tuple(flags))
+def _with(base: Estimate, status: Status, flags: list[Flag], **values: Any) -> Estimate:
+    return replace(base, status=status, flags=tuple(flags), **values)

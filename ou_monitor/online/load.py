@@ -96,9 +96,9 @@ class Moments:
         """Choose the regressors: the load, and time if wanted."""
         size = self.mean.size
         used = slice(1, size if trend else size - 1)
-        independent = _independent(self._raw[0, used, used])
-        self.basis = np.zeros((size - 1, independent.shape[1]))
-        self.basis[:independent.shape[0]] = independent
+        found = independent(self._raw[0, used, used])
+        self.basis = np.zeros((size - 1, found.shape[1]))
+        self.basis[:found.shape[0]] = found
         turn = np.zeros((size, 1 + self.rank))
         turn[0, 0] = 1.0
         turn[1:, 1:] = self.basis
@@ -154,7 +154,7 @@ def _weights(log_a: FloatArray, theta: FloatArray, count: int) -> FloatArray:
     return weights / (1.0 - theta * theta)[:, None]
 
 
-def _independent(cov: FloatArray) -> FloatArray:
+def independent(cov: FloatArray) -> FloatArray:
     """Return the independent, unit-variance combinations (columns) of variables that vary."""
     used = np.flatnonzero(cov.diagonal() > _STILL)
     if not used.size:

@@ -12,8 +12,11 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from ou_monitor.records import FloatArray
+
+BoolArray = npt.NDArray[np.bool_]
 
 # Raw samples looked at.
 TAIL = 1024
@@ -99,7 +102,7 @@ def lattice(sizes: FloatArray) -> float:
     return unit if bool((np.abs(ordered - multiples * unit) < 0.02 * unit).all()) else 0.0
 
 
-def _refresh(tie: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> int:
+def _refresh(tie: BoolArray) -> int:
     """
     Return samples per refresh: 1 unless changes avoid following each other.
 
@@ -120,7 +123,7 @@ def _refresh(tie: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> int:
     return max(1, int(np.median(gaps)))
 
 
-def fresh_samples(y: FloatArray, held: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def fresh_samples(y: FloatArray, held: int) -> BoolArray:
     """
     Return which samples are refreshes of a source that repeats its last value.
 
@@ -133,7 +136,8 @@ def fresh_samples(y: FloatArray, held: int) -> np.ndarray[tuple[int], np.dtype[n
     place = np.arange(y.size) - np.repeat(starts, np.diff(np.append(starts, y.size)))
     lengths = np.repeat(np.diff(np.append(starts, y.size)), np.diff(np.append(starts, y.size)))
     # The last refresh of a run must leave it at least half a refresh long.
-    return (place % held == 0) & ((place == 0) | (lengths - place > held // 2))
+    late = (place == 0) | (lengths - place > held // 2)
+    return np.asarray((place % held == 0) & late, dtype=np.bool_)
 
 
 def _piles_up(y: FloatArray, held: int) -> bool:

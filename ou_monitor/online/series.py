@@ -52,9 +52,17 @@ def lagged(t: FloatArray, u: FloatArray, tau: float, before: tuple[float, float,
     Returns
     -------
     ndarray, shape (n,)
-        Lagged throttle.
+        Lagged throttle; NaN where the throttle is, which is taken to have held
+        its last value meanwhile.
 
     """
+    unknown = np.isnan(u)
+    if unknown.any() and not unknown.all():
+        place = np.maximum.accumulate(np.where(unknown, -1, np.arange(u.size)))
+        filled = u[np.where(place < 0, np.flatnonzero(~unknown)[0], place)]
+        out = lagged(t, filled, tau, before).copy()
+        out[unknown] = math.nan
+        return out
     t0, u0, state = before
     if math.isnan(state):
         t0, u0, state = float(t[0]), float(u[0]), float(u[0])
@@ -147,8 +155,10 @@ class Series:
     def column(self, which: int) -> FloatArray:
         """Return one column of the window (a view)."""
         if which < U:
-            return self._main[which, self._head:self._tail]
-        return self.load(self.first, self.end)[which - U]
+            column: FloatArray = self.columns(self.first, self.end)[which]
+        else:
+            column = self.load(self.first, self.end)[which - U]
+        return column
 
     def throttle(self, begin: int, end: int) -> FloatArray | None:
         """Return the throttle of samples begin..end-1 (a view); None when never known."""

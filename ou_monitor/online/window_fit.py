@@ -119,7 +119,7 @@ def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None) -> 
                                   pairs.tolist(), log_a, theta, m)
     if abs(end[9]) > TREND_SCORE:
         return _fit_moving(sums, m, (math.log(end[0]), end[1]), trend=True)
-    return WindowFit(end[0], end[1], end[3], end[4], end[5], end[6:9], level, _EMPTY, _NO_COV,
+    return WindowFit(end[0], end[1], end[3], end[4], end[5], (end[6], end[7], end[8]), level, _EMPTY, _NO_COV,
                      False, _found(end), c0)
 
 
@@ -174,8 +174,8 @@ def _fit_moving(sums: Sums, m: int, start: tuple[float, float] | None, trend: bo
     c0, c = moments.residual(mean.b)
     end = finish(c0, c, sums.n, sums.n - 1.0 - moments.rank, log_a, theta, on_bound, m)
     cov = mean.inverse * end[2] / sums.n
-    return WindowFit(end[0], end[1], end[3], end[4], end[5], end[6:9], moments.mean,
-                     moments.basis @ mean.b, moments.basis @ cov @ moments.basis.T, trend,
+    return WindowFit(end[0], end[1], end[3], end[4], end[5], (end[6], end[7], end[8]),
+                     moments.mean, moments.basis @ mean.b, moments.basis @ cov @ moments.basis.T, trend,
                      _found(end), c0)
 
 

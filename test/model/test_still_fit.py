@@ -65,8 +65,9 @@ def test_pull_is_a_tenth_of_a_standard_error_and_fades():
                                False, 1)
         moved[score] = score - end[1] / se
         assert end[5] == pytest.approx(score, rel=0.05)
+        i_aa, i_at, _ = quasi_fit.information(math.log(a), score * se)
         assert math.log(end[0] / a) == pytest.approx(
-            i_at / i_aa * moved[score] * se, rel=0.1, abs=1e-9)
+            i_at / i_aa * moved[score] * se, rel=0.01, abs=1e-9)
     # Half or twice the pull lies outside; the spread differs by some percent from se.
     assert 0.06 < moved[1.0] < 0.13
     assert moved[0.01] == pytest.approx(0.01, abs=1e-6)
@@ -86,7 +87,7 @@ def test_trend_score_is_that_of_generalised_least_squares(seed, slope):
     """
     The slope over its error, with the dense covariance of the noise.
 
-    The ends weigh 1/(n a) = 1 % of a score, more while the slope is small.
+    n a = 100 relaxations: the two at the ends shift a score by some 2/sqrt(100).
     """
     rng = np.random.default_rng(seed)
     n, a, share = 1000, 0.1, 0.3
@@ -108,7 +109,7 @@ def test_trend_score_is_that_of_generalised_least_squares(seed, slope):
     got = still_fit.trend_score(c0, c, n, place, [float((y[k:] - y[:-k]).sum()) for k in lags],
                                 [float(n - k) for k in lags], math.log(a),
                                 arma.theta_at(a, 1, share))
-    assert got == pytest.approx(expected, rel=0.05, abs=0.1)
+    assert got == pytest.approx(expected, rel=0.05, abs=0.3)
 
 
 def test_guess_sees_the_noise():
