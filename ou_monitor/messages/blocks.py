@@ -8,7 +8,7 @@ were taken by a quartz at a steady rate.  So the time line runs at the stated
 rate and only leans slowly towards the stamps.
 
 Limits first: a constant delay of arrival stays in the time line; one lost
-block (within `max(2 blocks, 20 ms)`) cannot be told from jitter, is not
+block (within `max(2 blocks, 0.25 s)`) cannot be told from jitter, is not
 counted as a gap, and is made up slowly.
 """
 
@@ -43,7 +43,7 @@ class BlockClock:
     ----------
     gaps : int
         Times the time line was started anew because a stamp was further than
-        max(2 blocks, 20 ms) from where it was expected.
+        max(2 blocks, 0.25 s) from where it was expected.
 
     Raises
     ------
