@@ -14,10 +14,9 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from ou_monitor.records import FloatArray
 from scipy.linalg.lapack import dpttrf, dpttrs
 from scipy.optimize import minimize
-
-from ou_monitor.records import FloatArray
 
 # Search range of the noise share nu / mean step: ten thousand times the
 # diffusion of one step hides any OU.
@@ -140,6 +139,7 @@ def fit_exact(t: FloatArray, y: FloatArray, regressors: FloatArray) -> ExactFit:
         share, (value, scale, beta, cov) = 0.0, clean
     beta = beta.copy()
     beta[0] += likelihood.shift
-    edge = -1 if log_alpha < low + 1e-3 else 1 if log_alpha > high - 1e-3 else 0
+    # The likelihood is flat there: within 5 % of the end is at the end.
+    edge = -1 if log_alpha < low + 0.05 else 1 if log_alpha > high - 0.05 else 0
     return ExactFit(math.exp(log_alpha), math.sqrt(scale), share * scale * likelihood.step,
                     beta, cov, -value, edge)

@@ -96,5 +96,5 @@ def from_window(fit: WindowFit, step: float, m: int, n: int, reference: float) -
                       math.nan)
     return Fitted(
         Outcome.FOUND, fit.a / step, math.sqrt(fit.scale / step),
-        fit.noise_share * fit.scale * m, fit.noise_score, fit.log_var, fit.variance, level, fit.beta,
-        fit.beta_cov, fit.trend, n, fit.a)
+        fit.noise_share * fit.scale * m, fit.noise_score, fit.log_var, fit.variance, level,
+        fit.beta, fit.beta_cov, fit.trend, n, fit.a)

@@ -130,4 +130,5 @@ class Resolution:
             count += whole
             self._taken = begin + (stop if high == edges[-1] else high)
         joined = np.concatenate(parts, axis=1)
-        self.add(joined[0], joined[1], joined[2] if throttle is not None else None, np.array([b for b in breaks if b < count], dtype=np.int64))
+        self.add(joined[0], joined[1], None if throttle is None else joined[2],
+                 np.array([b for b in breaks if b < count], dtype=np.int64))

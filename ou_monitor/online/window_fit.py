@@ -119,8 +119,8 @@ def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None) -> 
                                   pairs.tolist(), log_a, theta, m)
     if abs(end[9]) > TREND_SCORE:
         return _fit_moving(sums, m, (math.log(end[0]), end[1]), trend=True)
-    return WindowFit(end[0], end[1], end[3], end[4], end[5], (end[6], end[7], end[8]), level, _EMPTY, _NO_COV,
-                     False, _found(end), c0)
+    return WindowFit(end[0], end[1], end[3], end[4], end[5], (end[6], end[7], end[8]),
+                     level, _EMPTY, _NO_COV, False, _found(end), c0)
 
 
 _EMPTY = np.empty(0)
@@ -175,8 +175,8 @@ def _fit_moving(sums: Sums, m: int, start: tuple[float, float] | None, trend: bo
     end = finish(c0, c, sums.n, sums.n - 1.0 - moments.rank, log_a, theta, on_bound, m)
     cov = mean.inverse * end[2] / sums.n
     return WindowFit(end[0], end[1], end[3], end[4], end[5], (end[6], end[7], end[8]),
-                     moments.mean, moments.basis @ mean.b, moments.basis @ cov @ moments.basis.T, trend,
-                     _found(end), c0)
+                     moments.mean, moments.basis @ mean.b,
+                     moments.basis @ cov @ moments.basis.T, trend, _found(end), c0)
 
 
 def _functions() -> tuple[Callable[..., tuple[float, float, bool]],
