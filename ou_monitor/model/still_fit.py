@@ -24,6 +24,9 @@ STEADY = 1e-3
 FASTEST = 4.6
 LOW = math.log(1e-9)
 HIGH = math.log(2.0 * FASTEST)
+# Relaxations in the window below which a minimum is not trusted before others
+# have been looked for.
+DOUBTFUL = 25.0
 # Pull of theta towards "no measurement noise" where the data cannot tell, in
 # standard errors, fading within two of them: a clamped estimate is high by 0.4
 # on average when there is no noise.  A larger pull costs more at 5 mV than it
@@ -36,6 +39,26 @@ def guess(c0: float, c: Sequence[float]) -> tuple[float, float]:
     noise = min(max(0.0, 2.0 * (c0 - c[0]) - (c0 - c[1])), 0.9 * c0)
     phi = min(max(c[0] / (c0 - noise), 0.02), 1.0 - 1e-6)
     return math.log(-math.log(phi)), 0.1 * phi
+
+
+def _descend(c0: float, c: Sequence[float], free: float, log_a: float, theta: float, m: int,
+             tilt_a: float, tilt_t: float) -> tuple[float, float, bool, float]:
+    """Minimise from one start, the bound on theta following ln a; return the value, too."""
+    floor = 0.0
+    slope = 0.0
+    on_bound = False
+    value = math.inf
+    for _ in range(4):
+        if m > 1:
+            a = math.exp(log_a)
+            floor = noise_free_theta(a, m)
+            slope = (noise_free_theta(1.001 * a, m) - floor) / math.log(1.001)
+        before = log_a
+        log_a, theta, value, on_bound, _ = minimise(
+            c0, c, free, log_a, theta, floor, slope, LOW, HIGH, tilt_a, tilt_t)
+        if m == 1 or not on_bound or abs(log_a - before) < STEADY:
+            break
+    return log_a, theta, on_bound, value
 
 
 def search(c0: float, c: Sequence[float], free: float, log_a: float, theta: float, m: int,
@@ -70,19 +93,16 @@ def search(c0: float, c: Sequence[float], free: float, log_a: float, theta: floa
                 value = objective(c0, c, free, math.log(a), 0.3 * k * math.exp(-a), 0.0, 0.0)[0]
                 if value < best:
                     best, log_a, theta = value, math.log(a), 0.3 * k * math.exp(-a)
-    floor = 0.0
-    slope = 0.0
-    on_bound = False
-    for _ in range(4):
-        if m > 1:
-            a = math.exp(log_a)
-            floor = noise_free_theta(a, m)
-            slope = (noise_free_theta(1.001 * a, m) - floor) / math.log(1.001)
-        before = log_a
-        log_a, theta, _, on_bound, _ = minimise(
-            c0, c, free, log_a, theta, floor, slope, LOW, HIGH, tilt_a, tilt_t)
-        if m == 1 or not on_bound or abs(log_a - before) < STEADY:
-            break
+    log_a, theta, on_bound, value = _descend(c0, c, free, log_a, theta, m, tilt_a, tilt_t)
+    if math.exp(log_a) * free < DOUBTFUL:
+        # A valley at alpha -> 0 catches searches that start badly in strong noise.
+        for i in range(4):
+            a = DOUBTFUL / free * (0.5 * free / DOUBTFUL) ** (0.2 + 0.2 * i)
+            for k in range(2):
+                other = _descend(c0, c, free, math.log(a), (0.5 + 0.4 * k) * math.exp(-a), m,
+                                 tilt_a, tilt_t)
+                if other[3] < value:
+                    log_a, theta, on_bound, value = other
     return log_a, theta, on_bound
 
 

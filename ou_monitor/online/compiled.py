@@ -32,7 +32,7 @@ _SCALAR = (
         'innovation_variance', 'log_covariance')),
     *((quasi_fit, name) for name in ('objective', 'innovation', 'information', 'minimise')),
     *((still_fit, name) for name in (
-        'guess', 'search', 'finish', 'trend_score', 'fit_still')))
+        'guess', '_descend', 'search', 'finish', 'trend_score', 'fit_still')))
 
 
 @dataclass(frozen=True)

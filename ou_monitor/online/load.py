@@ -88,8 +88,6 @@ class Moments:
         raw[:, c, :c] = raw[:, :c, c]
         raw[:, c, c] = (1.0 - 1.0 / (n * n)) / 12.0 - 0.5 * k * k
         self._raw = raw
-        self._turn = np.zeros((c + 1, 1))
-        self._turn[0, 0] = 1.0
         self.use_time(trend)
 
     def use_time(self, trend: bool) -> None:
@@ -133,9 +131,10 @@ class Moments:
         weights = _weights(np.array([log_a]), np.array([theta]), self._raw.shape[0])
         gram = (weights @ self._raw.reshape(self._raw.shape[0], -1)).reshape(
             self._raw.shape[1:])
-        turn = np.zeros((self.mean.size, 2 + self.rank))
+        load = independent(self._raw[0, 1:-1, 1:-1])
+        turn = np.zeros((self.mean.size, 2 + load.shape[1]))
         turn[0, 0] = turn[-1, 1] = 1.0
-        turn[1:, 2:] = self.basis
+        turn[1:-1, 2:] = load
         gram = turn.T @ gram @ turn
         inverse = np.linalg.inv(gram[1:, 1:])
         b = inverse @ gram[1:, 0]

@@ -24,6 +24,11 @@ from ou_monitor.records import FloatArray
 # A trend is taken into the model from this many standard errors on: by chance
 # once in 16 000 windows.
 TREND_SCORE = 4.0
+# A few relaxations look like a trend more often: the score asked for grows by
+# 1 + 6/x, x = alpha T.
+_FEW = 6.0
+# From this score on a trend is looked into (by chance once in 22 windows).
+_SUSPECT = 2.0
 # Neighbouring samples correlated by less than this many standard errors are
 # not correlated.
 _CORRELATED = 2.0
@@ -56,6 +61,8 @@ class WindowFit:
         Their covariance, V^2.
     trend : bool
         Whether a trend was needed.
+    trend_score : float
+        Trend over its standard error.
     correlated : bool
         Whether neighbouring samples are correlated at all; if not, a to
         log_var are NaN.
@@ -74,6 +81,7 @@ class WindowFit:
     beta: FloatArray
     beta_cov: FloatArray
     trend: bool
+    trend_score: float
     correlated: bool
     variance: float
 
@@ -98,7 +106,22 @@ def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None) -> 
 
     """
     if sums.first.size > 1:
-        return _fit_moving(sums, m, start, trend=False)
+        fit = _fit_moving(sums, m, start, trend=False)
+    else:
+        fit = _fit_still(sums, m, start)
+    if fit.correlated and (abs(fit.trend_score) > _SUSPECT
+                           or fit.a * sums.n < still_fit.DOUBTFUL):
+        # To a rail without restoring force any drift is chance: so the drift is
+        # judged by the fit that knows it.
+        drifting = _fit_moving(sums, m, None, trend=True)
+        if drifting.correlated and abs(drifting.trend_score) > TREND_SCORE * (
+                1.0 + _FEW / (drifting.a * sums.n)):
+            return drifting
+    return fit
+
+
+def _fit_still(sums: Sums, m: int, start: tuple[float, float] | None) -> WindowFit:
+    """Fit a window whose mean is a constant."""
     n = sums.n
     mean = float(sums.first[0]) / n
     c0 = float(sums.second[0, 0]) / n - mean * mean
@@ -117,10 +140,8 @@ def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None) -> 
     else:
         end = still_fit.fit_still(c0, c.tolist(), n, place, sums.change[:, 0].tolist(),
                                   pairs.tolist(), log_a, theta, m)
-    if abs(end[9]) > TREND_SCORE:
-        return _fit_moving(sums, m, (math.log(end[0]), end[1]), trend=True)
     return WindowFit(end[0], end[1], end[3], end[4], end[5], (end[6], end[7], end[8]),
-                     level, _EMPTY, _NO_COV, False, _found(end), c0)
+                     level, _EMPTY, _NO_COV, False, end[9], _found(end), c0)
 
 
 _EMPTY = np.empty(0)
@@ -139,7 +160,7 @@ def _found(end: tuple[float, ...]) -> bool:
 def _uncorrelated(level: FloatArray, beta: FloatArray, trend: bool, c0: float) -> WindowFit:
     nan = math.nan
     return WindowFit(nan, nan, nan, nan, nan, (nan, nan, nan), level, beta,
-                     np.full((beta.size, beta.size), nan), trend, False, c0)
+                     np.full((beta.size, beta.size), nan), trend, nan, False, c0)
 
 
 def _fit_moving(sums: Sums, m: int, start: tuple[float, float] | None, trend: bool
@@ -164,19 +185,15 @@ def _fit_moving(sums: Sums, m: int, start: tuple[float, float] | None, trend: bo
             abs(log_a - before[0]), abs(theta - before[1])) < still_fit.STEADY
         at = log_a, theta
         mean = moments.regress(log_a, theta)
-        if not settled:
-            continue
-        if trend or abs(moments.trend_score(log_a, theta)) < TREND_SCORE:
+        if settled:
             break
-        trend = True
-        moments.use_time(True)
-        mean = moments.regress(log_a, theta)
     c0, c = moments.residual(mean.b)
     end = finish(c0, c, sums.n, sums.n - 1.0 - moments.rank, log_a, theta, on_bound, m)
     cov = mean.inverse * end[2] / sums.n
     return WindowFit(end[0], end[1], end[3], end[4], end[5], (end[6], end[7], end[8]),
                      moments.mean, moments.basis @ mean.b,
-                     moments.basis @ cov @ moments.basis.T, trend, _found(end), c0)
+                     moments.basis @ cov @ moments.basis.T, trend,
+                     moments.trend_score(log_a, theta), _found(end), c0)
 
 
 def _functions() -> tuple[Callable[..., tuple[float, float, bool]],

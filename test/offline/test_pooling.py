@@ -58,7 +58,8 @@ def test_pooling_does_not_favour_what_came_out_high():
     made = recording(3, levels=((0.1, 0.3),), seconds=40.0)
     pooled, scatter = pool([fit_stretch(made, k, k + 1000) for k in range(0, 40000, 1000)])
     assert abs(math.log(pooled.alpha / ALPHA)) < 4.0 * math.sqrt(2.0 / (ALPHA * 40.0))
-    assert pooled.alpha_se == pytest.approx(math.sqrt(2.0 / (ALPHA * 40.0)), rel=0.25)
+    # The noise being unknown costs 8 %, the short segments 4 %.
+    assert pooled.alpha_se == pytest.approx(1.12 * math.sqrt(2.0 / (ALPHA * 40.0)), rel=0.15)
     # sqrt(chi2 / 39): 1 +- 0.11.
     assert scatter < 1.5
 

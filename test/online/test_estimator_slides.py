@@ -1,0 +1,209 @@
+"""The window slides: blocks or singles, hours, other lengths, bounded memory."""
+
+import tracemalloc
+
+from hypothesis import given, settings, strategies as st
+from made_windows import DT, estimate, paths, stamps
+import numpy as np
+from ou_monitor import SlidingEstimator
+from ou_monitor.records import Counters, Status
+import pytest
+
+NAMES = ('alpha', 'sigma', 'var_inf', 'u0', 'alpha_se', 'sigma_se', 'var_inf_se', 'u0_se', 'sag')
+Y = paths(np.random.default_rng(51), 1, 6000)[0]
+T = stamps(6000)
+U = 0.2 + 0.5 * (np.floor(T / 0.7) % 2)
+
+
+def numbers(e):
+    """Return what a fit decides."""
+    return [getattr(e, name) for name in NAMES]
+
+
+@pytest.mark.parametrize('moving', [False, True])
+@pytest.mark.parametrize('block', [1, 7, 100, 1000, 6000])
+def test_blocks_of_any_size_agree(block, moving):
+    """
+    Sums are of the same terms in another order: 1e-12, and the search settles to 1e-6.
+
+    It starts the same way in each (no estimate came before), so 1e-9 is left.
+    """
+    whole, parts = SlidingEstimator(2.0), SlidingEstimator(2.0)
+    y = Y - 0.6 * U if moving else Y
+    whole.push(T, y, U if moving else None)
+    for begin in range(0, 6000, block):
+        part = slice(begin, begin + block)
+        if block == 1:
+            parts.push(float(T[begin]), float(y[begin]), float(U[begin]) if moving else None)
+        else:
+            parts.push(T[part], y[part], U[part] if moving else None)
+    a, b = whole.estimate(), parts.estimate()
+    assert numbers(a) == pytest.approx(numbers(b), rel=1e-9, nan_ok=True)
+    assert (a.n, a.duration, a.status, a.flags) == (b.n, b.duration, b.status, b.flags)
+
+
+@pytest.mark.parametrize('moving', [False, True])
+def test_estimates_on_the_way_change_nothing(moving):
+    """
+    With 60 estimates on the way sums are taken in pieces, and searches start warm.
+
+    Each search stops where a step is below 1e-6 (1e-3 while the mean is fitted
+    along, which leaves its square).
+    """
+    once, often = SlidingEstimator(2.0), SlidingEstimator(2.0)
+    y = Y - 0.6 * U if moving else Y
+    once.push(T, y, U if moving else None)
+    for begin in range(0, 6000, 97):
+        part = slice(begin, begin + 97)
+        often.push(T[part], y[part], U[part] if moving else None)
+        often.estimate()
+    a, b = once.estimate(), often.estimate()
+    assert numbers(a) == pytest.approx(numbers(b), rel=1e-4 if moving else 1e-5, nan_ok=True)
+    assert (a.n, a.duration, a.status, a.flags) == (b.n, b.duration, b.status, b.flags)
+
+
+def test_sliding_is_the_fit_of_what_is_left():
+    """An estimator that has seen 4 s before is one that has seen the window alone."""
+    slid = SlidingEstimator(2.0)
+    for begin in range(0, 6000, 250):
+        slid.push(T[begin:begin + 250], Y[begin:begin + 250])
+        slid.estimate()
+    e = slid.estimate()
+    # The window is resolved to a fortieth of itself.
+    assert 2000 - 50 <= e.n <= 2000 + 1 and e.duration == pytest.approx(DT * (e.n - 1))
+    alone = estimate(T[6000 - e.n:], Y[6000 - e.n:], window=2.1)
+    # Pairs that reach back behind the window are what a window that has slid knows more.
+    assert numbers(e)[:3] == pytest.approx(numbers(alone)[:3], rel=0.02)
+
+
+@pytest.mark.parametrize('seconds', [1.0, 2.0, 5.0])
+def test_resolution_of_the_window(seconds):
+    """Over many lengths of the past the window is within a fortieth of what was asked."""
+    estimator = SlidingEstimator(seconds)
+    for begin in range(0, 6000, 13):
+        estimator.push(T[begin:begin + 13], Y[begin:begin + 13])
+        e = estimator.estimate()
+        if T[begin] > seconds + 0.1:
+            assert seconds * (1.0 - 1.0 / 40.0) - 2 * DT <= e.duration <= seconds + DT
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.floats(0.01, 100.0), st.floats(-100.0, 100.0), st.floats(0.1, 10.0), st.booleans())
+def test_units_and_shifts(scale, shift, slower, moving):
+    """
+    Other volts, another level, another origin and unit of time.
+
+    Doubles at a level of 100 V leave 1e-12 of sums of squares, the search its
+    1e-6 (see above); stamps in other units move the edges of slots by nothing.
+    """
+    n = 1500
+    t, y = T[:n], Y[:n]
+    u = None
+    if moving:
+        # Lags are in seconds, so only voltage may be scaled while throttle moves.
+        slower, u = 1.0, U[:n]
+        y = y - 0.6 * u
+    one = estimate(t, y, u, window=2.0)
+    two = estimate(slower * t, shift + scale * y, u, window=2.0 * slower)
+    assert (two.status, two.n) == (one.status, one.n)
+    tight = 2e-4 if moving else 1e-5
+    assert two.alpha * slower == pytest.approx(one.alpha, rel=tight)
+    assert two.sigma * slower ** 0.5 == pytest.approx(scale * one.sigma, rel=tight)
+    assert two.var_inf == pytest.approx(scale ** 2 * one.var_inf, rel=tight)
+    assert two.u0 == pytest.approx(shift + scale * one.u0, abs=1e-4 * scale)
+    assert two.noise_std == pytest.approx(scale * one.noise_std, abs=1e-4 * scale)
+    assert (two.alpha_se, two.sigma_se, two.var_inf_se) == pytest.approx(
+        (one.alpha_se, one.sigma_se, one.var_inf_se), rel=1e-3)
+
+
+def test_window_change_keeps_samples():
+    """Shorter: the newest stay. Longer: nothing is lost, and the past is not invented."""
+    estimator = SlidingEstimator(4.0)
+    estimator.push(T, Y)
+    assert estimator.estimate().n == pytest.approx(4000, abs=101)
+    estimator.window = 1.0
+    e = estimator.estimate()
+    assert e.n == pytest.approx(1000, abs=26) and e.t == T[-1]
+    assert e.alpha == pytest.approx(
+        estimate(T[-e.n:], Y[-e.n:], window=1.1).alpha, rel=0.05)
+    estimator.window = 3.0
+    assert estimator.estimate().n == e.n
+    assert estimator.estimate().counters == Counters(pushed=6000, used=6000)
+    more = T[-1] + DT * np.arange(1, 1001)
+    estimator.push(more, Y[:1000])
+    assert estimator.estimate().n == e.n + 1000
+    assert estimator.estimate().counters.resets == 0
+
+
+def test_no_drift_and_bounded_memory():
+    """
+    Ten million samples at a level of 12 V, then against an estimator that is new.
+
+    Nothing is ever subtracted, so the sums are those of the window alone, to the
+    rounding of some thousand terms; only the voltage that moments are taken
+    against (the first ever seen) differs.  Memory is what the window needs.
+    """
+    rng = np.random.default_rng(52)
+    y = 12.0 + 0.05 * paths(rng, 1, 10_000)[0]
+    t = stamps(10_000)
+    old = SlidingEstimator(2.0)
+    blocks = 1000
+    peak = 0
+    for block in range(blocks):
+        old.push(block * 10.0 + t, y)
+        if block % 20 == 0:
+            old.estimate()
+        if block == 20:
+            tracemalloc.start()
+            old.estimate()
+            begin = tracemalloc.get_traced_memory()[0]
+    end, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # A window of 2000 samples takes 0.1 MB, a batch of 32768 at most 1 MB a column.
+    assert end - begin < 2e6 and peak < 3e7
+    e = old.estimate()
+    assert e.counters == Counters(pushed=10_000 * blocks, used=10_000 * blocks)
+    new = SlidingEstimator(2.0)
+    new.push((blocks - 1) * 10.0 + t, y)
+    # The same slots; new searches start elsewhere: 1e-6, once more from the same start.
+    fresh = new.estimate()
+    assert (e.n, e.status) == (fresh.n, fresh.status)
+    assert numbers(e)[:5] == pytest.approx(numbers(fresh)[:5], rel=1e-5)
+
+
+def test_sums_do_not_drift():
+    """The sums themselves, to 1e-9 of the smallest of them (a spread at lag 1)."""
+    rng = np.random.default_rng(53)
+    y = 12.0 + paths(rng, 1, 4000)[0]
+    t = stamps(4000)
+    old, new = SlidingEstimator(2.0), SlidingEstimator(2.0)
+    for block in range(300):
+        old.push(block * 4.0 + t, y)
+        if block % 3 == 0:
+            old.estimate()
+    new.push(299 * 4.0 + t, y)
+    a, b = old._finest, new._finest
+    old.estimate(), new.estimate()
+    one, two = a.sums.total(), b.sums.total()
+    assert one.n == two.n
+    assert one.spread == pytest.approx(two.spread, rel=1e-9)
+    assert one.change == pytest.approx(two.change, abs=1e-9)
+
+    def variance(sums):
+        return sums.second[0, 0] / sums.n - (sums.first[0] / sums.n) ** 2
+
+    assert variance(one) == pytest.approx(variance(two), rel=1e-9)
+
+
+def test_a_million_single_pushes_of_blocks_keep_status():
+    """Every estimate on the way over 100 s is usable: nothing degrades."""
+    rng = np.random.default_rng(54)
+    y = paths(rng, 1, 100_000)[0]
+    estimator = SlidingEstimator(2.0)
+    found = []
+    for begin in range(0, 100_000, 1000):
+        estimator.push(stamps(1000) + begin * DT, y[begin:begin + 1000])
+        found.append(estimator.estimate())
+    assert {e.status for e in found[2:]} == {Status.OK}
+    # 50 windows of 2 s: 14 %/sqrt(50) = 2 %.
+    assert np.mean([e.alpha for e in found[2:]]) == pytest.approx(63.0, rel=0.08)

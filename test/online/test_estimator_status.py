@@ -1,0 +1,226 @@
+"""Each status and each flag: a case that raises it, and the clean case that does not."""
+
+import math
+
+from made_windows import ALPHA, DT, estimate, LEVEL, paths, stamps
+import numpy as np
+from ou_monitor import SlidingEstimator
+from ou_monitor.model.ou import simulate
+from ou_monitor.records import Flag, Status
+import pytest
+from scipy.signal import lfilter
+
+N = 2000
+T = stamps(N)
+NUMBERS = ('alpha', 'sigma', 'var_inf')
+
+
+def clean(seed=1, n=N, dt=DT):
+    """Return one clean window."""
+    return paths(np.random.default_rng(seed), 1, n, dt)[0]
+
+
+def lowpassed(corner):
+    """Return a clean window through a first-order low-pass, Hz."""
+    fine = 20
+    k = 1.0 - math.exp(-2.0 * math.pi * corner * DT / fine)
+    y = paths(np.random.default_rng(2), 1, N * fine, DT / fine)[0]
+    return LEVEL + lfilter([k], [1.0, k - 1.0], y - LEVEL)[::fine]
+
+
+def steps():
+    """Return a throttle that moves."""
+    return 0.2 + 0.5 * (np.floor(T / 0.3) % 2)
+
+
+FLAGGED = {
+    Flag.QUANTIZED: [lambda: (T, 0.05 * np.round(clean() / 0.05)),
+                     lambda: (T, 0.1 * np.round(clean() / 0.1)),
+                     lambda: (T, 0.03 * np.round(clean() / 0.03))],
+    Flag.HELD_SAMPLES: [lambda: (T, np.repeat(clean(1, 500, 4 * DT), 4)),
+                        lambda: (T, np.repeat(clean(1, 1000, 2 * DT), 2))],
+    Flag.SATURATED: [lambda: (T, np.minimum(clean(), LEVEL + 0.05)),
+                     lambda: (T, np.maximum(clean(), LEVEL - 0.05))],
+    Flag.LOWPASS_UPSTREAM: [lambda: (T, lowpassed(100.0)), lambda: (T, lowpassed(200.0))],
+    Flag.NO_EXCITATION: [lambda: (T, clean(), np.full(N, 0.3)),
+                         lambda: (T, clean(), 0.3 + 0.002 * np.sign(np.sin(40.0 * T)))],
+    Flag.TREND: [lambda: (T, clean() + 0.5 * T), lambda: (T, clean() - 0.2 * T),
+                 lambda: (T, clean() + 0.5 * T - 0.6 * steps(), steps())],
+    Flag.SLOW_RATE: [lambda: (stamps(N, 0.025), clean(1, N, 0.025))],
+    Flag.IRREGULAR: [lambda: (np.append(T, 1.0), np.append(clean(), 5.0)),
+                     lambda: (T, np.where(np.arange(N) == 7, np.nan, clean()))],
+}
+
+
+@pytest.mark.parametrize('flag, number', [
+    (flag, i) for flag, cases in FLAGGED.items() for i in range(len(cases))])
+def test_flag_is_raised(flag, number):
+    """By its own case, and with a sentence."""
+    e = estimate(*FLAGGED[flag][number]())
+    assert flag in e.flags
+    assert len(flag.value.split()) > 5
+
+
+def test_every_flag_has_a_case():
+    assert set(FLAGGED) == set(Flag)
+
+
+@pytest.mark.parametrize('case', [
+    lambda seed: (T, clean(seed)),
+    lambda seed: (T, clean(seed) - 0.6 * steps(), steps()),
+    lambda seed: (T, 12.5e-3 * np.round(clean(seed) / 12.5e-3), steps()),
+    lambda seed: (T, clean(seed) + 5e-3 * np.random.default_rng(seed).standard_normal(N)),
+    lambda seed: (T, clean(seed).astype(np.float32))])
+def test_clean_input_has_no_flags(case):
+    """
+    Ten windows of each.
+
+    A trend is taken for one in 16 000, a low-pass for fewer: 50 windows are not enough for chance.
+    """
+    assert {flag for seed in range(10) for flag in estimate(*case(100 + seed)).flags} == set()
+
+
+def test_low_pass_above_the_sampling_rate_is_none():
+    """A corner at 2 kHz leaves samples of 1 kHz as they are, to 5 %."""
+    assert Flag.LOWPASS_UPSTREAM not in estimate(T, lowpassed(2000.0)).flags
+
+
+def white(seed=3):
+    """Return white noise of 10 mV."""
+    return LEVEL + 0.01 * np.random.default_rng(seed).standard_normal(N)
+
+
+STATUS = {
+    Status.OK: lambda: (T, clean()),
+    Status.SHORT_WINDOW: lambda: (stamps(240), clean(1, 240)),
+    Status.NO_DATA: lambda: ([], []),
+    Status.TOO_FEW_SAMPLES: lambda: (stamps(12), clean(1, 12)),
+    Status.CONSTANT: lambda: (T, np.full(N, 5.0)),
+    Status.UNBOUND: lambda: (T, np.cumsum(np.random.default_rng(4).standard_normal(N))),
+    Status.NO_RELAXATION: lambda: (T, white()),
+}
+
+
+@pytest.mark.parametrize('status', STATUS, ids=lambda s: s.name)
+def test_status(status):
+    """Each with its sentence, and numbers only where they may be acted on."""
+    t, y = STATUS[status]()
+    estimator = SlidingEstimator(2.1)
+    estimator.push(t, y)
+    e = estimator.estimate()
+    assert e.status is status
+    assert len(status.value.split()) >= 3
+    assert e.usable == (status in (Status.OK, Status.SHORT_WINDOW))
+    if not e.usable:
+        assert math.isnan(e.alpha) and math.isnan(e.var_inf) and math.isnan(e.alpha_se)
+    assert e.counters.pushed == len(t)
+
+
+def test_short_windows_say_so():
+    """
+    Three relaxation times: alpha is refused in most windows, never called good.
+
+    (A path of three relaxation times may well look like one of eight.)
+    """
+    rng = np.random.default_rng(5)
+    n = round(3 / ALPHA / DT)
+    found = [estimate(stamps(n), y) for y in paths(rng, 200, n)]
+    names = [e.status for e in found]
+    assert Status.OK not in names
+    told = np.mean([e.usable for e in found])
+    assert 0.1 < told < 0.5
+    assert names.count(Status.TOO_SHORT) > 30 and names.count(Status.UNBOUND) > 30
+    assert all(math.isfinite(e.sigma) for e in found if e.status is Status.TOO_SHORT)
+
+
+@pytest.mark.parametrize('relaxations, status', [
+    (4.0, Status.TOO_SHORT), (7.0, Status.SHORT_WINDOW), (22.0, Status.SHORT_WINDOW),
+    (32.0, Status.OK)])
+def test_limits_of_short_and_good_windows(relaxations, status):
+    """
+    5 and 25 relaxations, as found: windows built to be found with a given number.
+
+    Of 200 paths those are looked at whose alpha T came out near the number.
+    """
+    rng = np.random.default_rng(6)
+    n = round(relaxations / ALPHA / DT)
+    seen = 0
+    for y in paths(rng, 200, n):
+        e = estimate(stamps(n), y)
+        if e.usable:
+            found = e.alpha * e.duration
+            assert found >= 5.0
+            assert (e.status is Status.OK) == (found >= 25.0)
+            seen += e.status is status
+        else:
+            seen += e.status is status
+    assert seen > 30
+
+
+def test_white_and_alternating_input_is_a_finding():
+    """
+    An AR(1) coefficient that is zero or negative is "no relaxation", not a number.
+
+    Of 200 windows of white noise one in fifty may look like something else.
+    """
+    rng = np.random.default_rng(7)
+    found = [estimate(T, 0.01 * rng.standard_normal(N)) for _ in range(200)]
+    assert np.mean([e.status is Status.NO_RELAXATION for e in found]) > 0.95
+    assert not any(e.usable for e in found)
+    for factor in (-0.9, -0.3):
+        y = lfilter([1.0], [1.0, -factor], rng.standard_normal(N))
+        e = estimate(T, y)
+        assert e.status is Status.NO_RELAXATION and math.isnan(e.sigma)
+    alternating = estimate(T, 5.0 + 0.1 * (-1.0) ** np.arange(N))
+    assert alternating.status is Status.NO_RELAXATION
+
+
+def test_noise_that_hides_alpha_is_said():
+    """
+    Noise of ten standard deviations of the OU: no number that may be acted on.
+
+    What looks like an OU in 2000 samples of nearly white noise must not be
+    published with a confidence it has not: 1 of 100 is allowed.
+    """
+    rng = np.random.default_rng(8)
+    found = [estimate(T, y + 0.56 * rng.standard_normal(N)) for y in paths(rng, 100, N)]
+    assert sum(e.usable for e in found) <= 1
+    assert {e.status for e in found} <= {Status.NO_RELAXATION, Status.BURIED, Status.UNBOUND,
+                                         Status.OK, Status.TOO_SHORT}
+
+
+def test_ramp_alone_is_not_an_ou():
+    """No restoring force, or no relaxation: never a number."""
+    for noise in (0.0, 0.01):
+        e = estimate(T, 5.0 - 0.1 * T + noise * np.random.default_rng(9).standard_normal(N))
+        assert not e.usable and math.isnan(e.alpha)
+
+
+def test_throttle_unknown_is_not_still():
+    """Neither sag nor "no excitation" is said of what is not known."""
+    e = estimate(T, clean())
+    assert math.isnan(e.sag) and math.isnan(e.throttle) and Flag.NO_EXCITATION not in e.flags
+    e = estimate(T, clean(), np.full(N, 0.25))
+    assert math.isnan(e.sag) and e.throttle == 0.25
+
+
+def test_throttle_known_late_or_with_holes():
+    """Where throttle is not known throughout, there is an estimate all the same."""
+    throttle = steps()
+    throttle[:700] = np.nan
+    assert estimate(T, clean() - 0.3 * steps() * 0.0, throttle).usable
+    throttle = steps()
+    throttle[500:510] = np.nan
+    e = estimate(T, clean(), throttle)
+    assert e.usable and e.throttle == throttle[-1]
+
+
+def test_step_and_level_are_told_at_the_present_throttle():
+    """U0 is the level *now*: a quarter volt below that at rest, to three errors."""
+    rng = np.random.default_rng(10)
+    throttle = steps()
+    y = LEVEL - 0.5 * throttle + simulate(T, ALPHA, 0.1, rng)
+    e = estimate(T, y, throttle)
+    assert e.u0 == pytest.approx(LEVEL - 0.5 * throttle[-1], abs=3.0 * e.u0_se)
+    assert e.u0_se < 0.01 and e.throttle == throttle[-1]
+    assert e.sag == pytest.approx(-0.5, abs=0.2)
