@@ -101,7 +101,8 @@ def search(c0: float, c: Sequence[float], free: float, log_a: float, theta: floa
             for k in range(2):
                 other = _descend(c0, c, free, math.log(a), (0.5 + 0.4 * k) * math.exp(-a), m,
                                  tilt_a, tilt_t)
-                if other[3] < value:
+                # Sums over lags say little of the slow end: never leave for there.
+                if other[3] < value and other[0] > log_a:
                     log_a, theta, on_bound, value = other
     return log_a, theta, on_bound
 

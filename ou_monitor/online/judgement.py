@@ -26,7 +26,7 @@ _HIGH_BY = 1.5
 # which it is told to a quarter (doc/estimation.md).
 MIN_RELAXATIONS = 5.0
 GOOD_RELAXATIONS = 25.0
-# Standard error of ln(alpha) beyond which alpha is not known to a factor.
+# Standard error of ln(alpha), before it is widened, beyond which alpha is not known to a factor.
 _BURIED = 1.0
 # In short windows ln(alpha) has wider tails than its information says: its
 # standard error grows by 1 + 1.5/x + 70/x^2, x = alpha T, which brings the
@@ -119,7 +119,7 @@ def judge(fit: Fitted, base: Estimate, quality: Quality, throttle_std: float,
     if fit.outcome is Outcome.UNBOUND or relaxations < MIN_RELAXATIONS:
         unbound = relaxations < 0.5
         return _with(base, Status.UNBOUND if unbound else Status.TOO_SHORT, flags, **known)
-    if se[0] > _BURIED:
+    if fit.log_var[0] > _BURIED ** 2:
         return _with(base, Status.BURIED, flags, **known)
     alpha = fit.alpha - _HIGH_BY / duration
     var_inf = fit.sigma ** 2 / (2.0 * alpha)
