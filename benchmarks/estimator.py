@@ -31,6 +31,8 @@ import data  # noqa: E402
 import tables  # noqa: E402
 
 SEED = 20260131
+# A Markdown file that has these two lines keeps what is outside them.
+_BEGIN, _END = '<!-- benchmark begins -->', '<!-- benchmark ends -->'
 _PACKAGES = ('numpy', 'scipy', 'numba', 'statsmodels', 'celerite2', 'pymle-diffusion', 'pandas')
 
 
@@ -118,6 +120,17 @@ def report(results: dict[str, Any]) -> str:
     return '\n'.join(parts)
 
 
+def put_tables(path: Path, text: str) -> None:
+    """Write the tables, between the marks where the file has them."""
+    if path.exists():
+        old = path.read_text()
+        head, mark, rest = old.partition(_BEGIN)
+        _, end, tail = rest.partition(_END)
+        if mark and end:
+            text = f'{head}{mark}\n{text}\n{end}{tail}'
+    path.write_text(text)
+
+
 def main() -> int:
     """Parse arguments, measure, write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
@@ -129,7 +142,7 @@ def main() -> int:
     parser.add_argument('--parts', default='awts',
                         help='a: accuracy, w: short windows, t: throttle steps, s: speed')
     parser.add_argument('--json', type=Path, help='write all numbers here')
-    parser.add_argument('--markdown', type=Path, help='write the tables here')
+    parser.add_argument('--markdown', type=Path, help='write the tables here, between its marks if it has them')
     given = parser.parse_args()
     windows = min(given.windows, 20) if given.quick else given.windows
     slow = given.slow_windows or max(windows // 5, min(windows, 5))
@@ -140,7 +153,7 @@ def main() -> int:
     if given.json:
         given.json.write_text(json.dumps(results, indent=1) + '\n')
     if given.markdown:
-        given.markdown.write_text(text)
+        put_tables(given.markdown, text)
     else:
         print(text)
     return 0

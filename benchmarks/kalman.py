@@ -30,7 +30,8 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     if importlib.util.find_spec('numba') is None:
         return function
     import numba
-    return numba.njit(function)
+    compiled: Callable[..., Any] = numba.njit(function)
+    return compiled
 
 
 @_compiled
@@ -64,7 +65,7 @@ def _filtered(y: Array, a: float, noise: float) -> tuple[float, float, float]:
 def _deviance(y: Array, log_a: float, noise: float) -> float:
     """Return minus twice the restricted log-likelihood with the scale profiled out."""
     form, log_det, by_level = _filtered(y, math.exp(log_a), noise)
-    return (y.size - 1) * math.log(form) + log_det + math.log(by_level)
+    return float((y.size - 1) * math.log(form) + log_det + math.log(by_level))
 
 
 def _log_errors(y: Array, log_a: float, log_scale: float, noise: float) -> Array:
@@ -76,8 +77,8 @@ def _log_errors(y: Array, log_a: float, log_scale: float, noise: float) -> Array
     """
     def value(p: Array) -> float:
         form, log_det, by_level = _filtered(y, math.exp(p[0]), p[2])
-        return 0.5 * ((y.size - 1) * p[1] + form * math.exp(-p[1]) + log_det
-                      + math.log(by_level))
+        return float(0.5 * ((y.size - 1) * p[1] + form * math.exp(-p[1]) + log_det
+                            + math.log(by_level)))
 
     at = np.array([log_a, log_scale, noise])
     steps = np.array([1e-2, 1e-3, 3e-3 * max(noise, 0.1)])

@@ -4,12 +4,15 @@ What a user would pick instead: each method as `fit(y, dt) -> Fit`.
 Standard errors are the method's own (its covariance, by the delta method to
 the logarithms, so that all intervals have one form).  celerite2 gives a
 likelihood and no errors: it gets a numerical Hessian, which is not timed.
+statsmodels' state-space methods get standardised data, as a careful user would
+give them: on volts their optimisers stop early.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 import contextlib
+from dataclasses import replace
 import importlib.util
 import io
 import math
@@ -44,6 +47,11 @@ def _delta(p: Array, covariance: Array, logs: Callable[[Array], Array], status: 
     return Fit(alpha, sigma, var_inf, tuple(errors.tolist()), status)
 
 
+def _scaled(fit: Fit, scale: float) -> Fit:
+    """Return a fit of standardised data in volts."""
+    return replace(fit, sigma=fit.sigma * scale, var_inf=fit.var_inf * scale ** 2)
+
+
 def autoreg(y: Array, dt: float) -> Fit:
     """Return the fit of statsmodels AutoReg(1), carried to continuous time exactly."""
     from statsmodels.tsa.ar_model import AutoReg
@@ -65,7 +73,7 @@ def arma(y: Array, dt: float) -> Fit:
     from statsmodels.tsa.arima.model import ARIMA
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')
-        found = ARIMA(y, order=(1, 0, 1), trend='c').fit()
+        found = ARIMA((y - y.mean()) / y.std(), order=(1, 0, 1), trend='c').fit()
         covariance = np.asarray(found.cov_params())[1:, 1:]
 
     def logs(p: Array) -> Array:
@@ -76,7 +84,7 @@ def arma(y: Array, dt: float) -> Fit:
         return np.array([np.log(-log_phi / dt), 0.5 * np.log(-2.0 * log_phi / dt * var_inf),
                          np.log(var_inf)])
 
-    return _delta(np.asarray(found.params)[1:], covariance, logs)
+    return _scaled(_delta(np.asarray(found.params)[1:], covariance, logs), float(y.std()))
 
 
 def components(y: Array, dt: float) -> Fit:
@@ -84,9 +92,10 @@ def components(y: Array, dt: float) -> Fit:
     from statsmodels.tsa.statespace.structural import UnobservedComponents
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')
-        model = UnobservedComponents(y, level='fixed intercept', irregular=True,
-                                     autoregressive=1)
-        found = model.fit(disp=False)
+        # level as a string ('fixed intercept') would switch `irregular` off.
+        model = UnobservedComponents((y - y.mean()) / y.std(), level=True,
+                                     stochastic_level=False, irregular=True, autoregressive=1)
+        found = model.fit(disp=False, maxiter=200)
         covariance = np.asarray(found.cov_params())
     names = list(model.param_names)
     order = [names.index('sigma2.ar'), names.index('ar.L1')]
@@ -97,7 +106,8 @@ def components(y: Array, dt: float) -> Fit:
         return np.array([np.log(-log_phi / dt), 0.5 * np.log(-2.0 * log_phi / dt * var_inf),
                          np.log(var_inf)])
 
-    return _delta(np.asarray(found.params)[order], covariance[np.ix_(order, order)], logs)
+    return _scaled(_delta(np.asarray(found.params)[order], covariance[np.ix_(order, order)],
+                          logs), float(y.std()))
 
 
 def celerite(y: Array, dt: float) -> tuple[Fit, Callable[[], Fit]]:
@@ -143,7 +153,7 @@ def celerite(y: Array, dt: float) -> tuple[Fit, Callable[[], Fit]]:
             # No jitter: nothing changes along its logarithm.
             hessian[2, :] = hessian[:, 2] = 0.0
             hessian[2, 2] = 1.0
-        return _delta(found.x, np.linalg.pinv(hessian), logs)
+        return _delta(found.x, np.asarray(np.linalg.pinv(hessian), dtype=np.float64), logs)
 
     return _delta(found.x, np.zeros((4, 4)), logs), with_errors
 

@@ -6,7 +6,9 @@ from collections import Counter
 from dataclasses import dataclass, field
 import math
 
+from data import Array
 import numpy as np
+import numpy.typing as npt
 
 NAMES = ('alpha', 'sigma', 'var_inf')
 # Two-sided 95 % point of the normal distribution.
@@ -59,12 +61,12 @@ class Fits:
     fits: list[Fit] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
 
-    def relative(self, truth: dict[str, float]) -> np.ndarray:
+    def relative(self, truth: dict[str, float]) -> Array:
         """Return relative errors, shape (windows, 3)."""
         values = np.array([[f.alpha, f.sigma, f.var_inf] for f in self.fits])
-        return values / np.array([truth[name] for name in NAMES]) - 1.0
+        return np.asarray(values / np.array([truth[name] for name in NAMES]) - 1.0)
 
-    def summary(self, truth: dict[str, float], only: np.ndarray | None = None
+    def summary(self, truth: dict[str, float], only: npt.NDArray[np.bool_] | None = None
                 ) -> dict[str, object]:
         """
         Return bias, its Monte Carlo error, RMSE, coverage, time and outcomes.
@@ -110,7 +112,7 @@ class Fits:
         return out
 
 
-def rmse_ratio(one: np.ndarray, other: np.ndarray, paired: bool) -> tuple[float, float]:
+def rmse_ratio(one: Array, other: Array, paired: bool) -> tuple[float, float]:
     """
     Return the ratio of two root mean squares and its bootstrap error.
 

@@ -18,7 +18,11 @@ from typing import Any
 
 BLOCKS = (1, 10, 100, 1000, 10000)
 STEPS = {'1 kHz': 1e-3, '1 MHz': 1e-6}
-REPEATS = 5
+REPEATS = 7
+# Samples pushed in each repeat; 12 MB in three columns, so that the blocks come
+# from the cache, as blocks that have just arrived do.
+SAMPLES = {1: 60_000, 10: 300_000}
+MOST = 500_000
 # Windows for the latency, s, and the samples pushed before each estimate.
 WINDOWS = (2.0, 20.0, 200.0)
 BETWEEN = 100
@@ -60,12 +64,19 @@ def main(quick: bool) -> None:
         return t, y, moving
 
     def throughput(dt: float, block: int) -> dict[str, float]:
-        n = {1: 60_000, 10: 300_000}.get(block, 2_000_000) // scale // block * block
+        n = SAMPLES.get(block, MOST) // scale // block * block
         t, y, moving = supply(n, dt)
         still = np.full(n, data.LOW)
         cuts = [slice(i, i + block) for i in range(0, n, block)]
         ts, ys = [t[c] for c in cuts], [y[c] for c in cuts]
         rows: dict[str, float] = {}
+        pairs = list(zip(ts, ys))
+
+        def bare() -> None:
+            put = SlidingEstimator(2.0).push
+            for a, b in pairs:
+                put(a, b)
+        rows['push_bare'] = n / best(bare)
         for name, u in (('push', still), ('push_moving', moving)):
             pushes = list(zip(ts, ys, [u[c] for c in cuts]))
 

@@ -91,17 +91,21 @@ def load(results: dict[str, Any]) -> str:
                   *(f'{t} ratio' for t in _TITLES.values()), 'told'], rows)
 
 
+_PUSHES = (
+    ('push_scalar', 'push(float, float, float)'),
+    ('push_bare', 'push(t, voltage)'),
+    ('push', 'push(t, voltage, throttle)'),
+    ('push_moving', 'the same, throttle moving'),
+    ('sustained', 'push(t, voltage, throttle) and a fit at 20 Hz'),
+)
+
+
 def throughput(results: dict[str, Any]) -> str:
     """Return millions of samples a second, and ratios to the limits."""
     rows = []
     for rate, blocks in results.items():
         for block, r in blocks.items():
-            entries = [('push', 'push')]
-            if 'push_scalar' in r:
-                entries.insert(0, ('push_scalar', 'push(float, float, float)'))
-            entries += [('push_moving', 'push, throttle moving'),
-                        ('sustained', 'push, and a fit at 20 Hz')]
-            for key, name in entries:
+            for key, name in _PUSHES:
                 if key not in r:
                     continue
                 rows.append([rate, block, name, *(

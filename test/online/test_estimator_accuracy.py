@@ -134,8 +134,9 @@ def test_short_windows_keep_honest_errors():
         assert len(found) > 500
         share = covered(found)
         assert 0.91 < share[0] < 0.985 and 0.93 < share[1] and 0.86 < share[2]
-        # The width itself: sqrt(2/(alpha T)) (1 + 2.5/(alpha T)), for most windows.
-        expected = math.sqrt(2.0 / relaxations) * (1.0 + 2.5 / relaxations)
+        # The width itself: sqrt(2/x) (1 + 1.5/x + 70/x^2) with x = alpha T, for most.
+        expected = math.sqrt(2.0 / relaxations) * (
+            1.0 + 1.5 / relaxations + 70.0 / relaxations ** 2)
         assert np.median([e.alpha_se for e in found]) == pytest.approx(expected, rel=0.12)
 
 
