@@ -19,7 +19,7 @@ setup(
         (SHARE + '/msg_config', glob('msg_config/*.yaml')),
     ],
     install_requires=['numpy', 'scipy', 'PyYAML', 'mcap', 'mcap-ros2-support'],
-    extras_require={'test': ['pytest', 'hypothesis', 'rosbags']},
+    extras_require={'fast': ['numba'], 'test': ['pytest', 'hypothesis', 'rosbags']},
     python_requires='>=3.11',
     # The message descriptions are read as files beside the package.
     zip_safe=False,
