@@ -78,6 +78,7 @@ class SlidingEstimator:
         self._looked = -math.inf
         self._start: tuple[float, float] | None = None
         self._cached: Estimate | None = None
+        self._last: Estimate | None = None
         kernels()
 
     @property
@@ -91,7 +92,7 @@ class SlidingEstimator:
         self._work_off()
         self._window = _positive('window', value, 's')
         self._finest.set_window(self._window)
-        self._cached = None
+        self._cached = self._last = None
 
     def reset(self) -> None:
         """Clear the window; the counters go on."""
@@ -99,7 +100,7 @@ class SlidingEstimator:
         self._intake.forget()
         self._intake.count(resets=1)
         self._forget()
-        self._cached = None
+        self._cached = self._last = None
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
              throttle: npt.ArrayLike | None = None) -> None:
@@ -127,16 +128,16 @@ class SlidingEstimator:
         # What the fast sources send, with as few steps as can be.
         stamps: Any = t
         volts: Any = voltage
-        if isinstance(stamps, float) and isinstance(volts, float) and (
-                throttle is None or isinstance(throttle, (float, int))):
-            if not self._intake.put_one(stamps, volts, throttle):
-                self._work_off()
-                self._intake.put_one(stamps, volts, throttle)
-            return
-        if not (isinstance(stamps, np.ndarray) and isinstance(volts, np.ndarray)
-                and stamps.dtype == _DOUBLE == volts.dtype and stamps.ndim):
+        if not (type(stamps) is np.ndarray is type(volts) and stamps.dtype is _DOUBLE
+                is volts.dtype and stamps.ndim == 1 == volts.ndim):
+            if isinstance(stamps, float) and isinstance(volts, float) and (
+                    throttle is None or isinstance(throttle, (float, int))):
+                if not self._intake.put_one(stamps, volts, throttle):
+                    self._work_off()
+                    self._intake.put_one(stamps, volts, throttle)
+                return
             stamps, volts = as_column(stamps), as_column(volts)
-        if stamps.shape != volts.shape or stamps.ndim != 1:
+        if len(stamps) != len(volts) or stamps.ndim != 1 or volts.ndim != 1:
             raise ValueError(
                 f't and voltage must have one shape (n,): got {stamps.shape} and {volts.shape}')
         load: FloatArray | float | None = None
@@ -159,8 +160,15 @@ class SlidingEstimator:
     def estimate(self) -> Estimate:
         """Return the estimate for the window that ends at the newest sample."""
         if self._cached is None:
+            used = self._intake.counters.used
             self._work_off()
-            self._cached = self._estimate()
+            counters = self._intake.counters
+            if self._last is not None and counters.used == used == self._last.counters.used:
+                # Nothing new in the window: the same numbers, not merely close ones.
+                self._last = replace(self._last, counters=counters)
+            else:
+                self._last = self._estimate()
+            self._cached = self._last
         return self._cached
 
     def _work_off(self) -> None:

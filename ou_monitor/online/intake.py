@@ -78,7 +78,7 @@ class Intake:
     def put(self, t: FloatArray, y: FloatArray, u: FloatArray | float | None) -> bool:
         """Copy samples into the buffer; return False, and do nothing, without room."""
         begin = self._fill
-        end = begin + t.size
+        end = begin + len(t)
         if end > BATCH:
             return False
         self._t[begin:end] = t
@@ -151,12 +151,15 @@ class Intake:
             t, y, u = t[good], y[good], None if u is None else u[good]
         if not t.size:
             return []
-        shortest = longest = float(t[0]) - self.newest
+        first = float(t[0]) - self.newest
+        shortest = longest = first
         if t.size > 1:
             steps = t[1:] - t[:-1]
-            shortest = min(shortest, float(steps.min()))
-            longest = max(longest, float(steps.max()))
-        if shortest > 0.0 and (longest <= window or longest == math.inf):
+            shortest = min(first, float(steps.min()))
+            # The first sample of all follows nothing: no pause lies before it.
+            longest = float(steps.max())
+            longest = longest if first == math.inf else max(longest, first)
+        if shortest > 0.0 and (longest <= window or first == longest == math.inf):
             self._accept(t)
             return [Batch(t, y, u, shortest, longest, restart=False)]
         return self._untangle(t, y, u, window)
@@ -199,7 +202,7 @@ class Intake:
             self.count(resets=1)
         order = np.argsort(t, kind='stable')
         t, y, u = t[order], y[order], None if u is None else u[order]
-        keep = np.diff(t, prepend=self.newest) > 0.0
+        keep = (np.diff(t, prepend=self.newest) > 0.0) & (t > self.newest)
         self.count(late=t.size - int(keep.sum()))
         t, y, u = t[keep], y[keep], None if u is None else u[keep]
         if not t.size:

@@ -27,7 +27,10 @@ _HIGH_BY = 1.5
 MIN_RELAXATIONS = 5.0
 GOOD_RELAXATIONS = 25.0
 # Standard error of ln(alpha), before it is widened, beyond which alpha is not known to a factor.
-_BURIED = 1.0
+_BURIED = 0.5
+# ... provided that noise, and not the length of the window, is the cause: the
+# error is this many times that without noise.
+_BURIED_BY = 2.0
 # In short windows ln(alpha) has wider tails than its information says: its
 # standard error grows by 1 + 1.5/x + 70/x^2, x = alpha T, which brings the
 # coverage of 95 % intervals to 94 % at x = 12 (and 88 % at x = 5, where windows
@@ -119,8 +122,11 @@ def judge(fit: Fitted, base: Estimate, quality: Quality, throttle_std: float,
     if fit.outcome is Outcome.UNBOUND or relaxations < MIN_RELAXATIONS:
         unbound = relaxations < 0.5
         return _with(base, Status.UNBOUND if unbound else Status.TOO_SHORT, flags, **known)
-    if fit.log_var[0] > _BURIED ** 2:
+    floor = 2.0 / max(relaxations, MIN_RELAXATIONS)
+    if fit.log_var[0] > max(_BURIED ** 2, _BURIED_BY ** 2 * floor):
         return _with(base, Status.BURIED, flags, **known)
+    # A short window often looks longer than it is: one standard error is granted.
+    surely = relaxations * math.exp(-se[0])
     alpha = fit.alpha - _HIGH_BY / duration
     var_inf = fit.sigma ** 2 / (2.0 * alpha)
     # The mean of an OU over a long window has variance 2 Var_inf / (alpha T).
@@ -129,7 +135,7 @@ def judge(fit: Fitted, base: Estimate, quality: Quality, throttle_std: float,
         x = load_at(base.throttle) - fit.level[1:5]
         level_var += float(x @ fit.beta_cov[:4, :4] @ x)
     return _with(
-        base, Status.OK if relaxations >= GOOD_RELAXATIONS else Status.SHORT_WINDOW, flags,
+        base, Status.OK if surely >= GOOD_RELAXATIONS else Status.SHORT_WINDOW, flags,
         alpha=alpha, alpha_se=se[0], var_inf=var_inf, var_inf_se=se[2],
         u0_se=math.sqrt(max(level_var, 0.0)), **known)
 

@@ -25,6 +25,9 @@ _ENOUGH = 64
 # A lattice needs this many different steps, all whole multiples of one, and
 # at most this many codes: fewer distinct steps are chance, more are a fine ADC.
 _FEWEST_STEPS = 3
+# Share of samples that change, of those next to each other, below which the
+# ADC is coarse.
+_TIED = 0.9
 # Share of samples at the extreme from which the ADC range counts as left, and
 # how many times more often than the code beside it.
 _CLIPPED_SHARE = 0.01
@@ -79,11 +82,13 @@ def examine(y: FloatArray) -> Quality:
     sizes = np.abs(steps[changes])
     held = _refresh(steps == 0.0)
     fresh = sizes if held > 1 else steps
-    return Quality(lattice(sizes), held, _piles_up(y, held),
+    # Where many neighbours are equal, a few different steps are a lattice, too.
+    tied = held == 1 and changes.size < _TIED * steps.size
+    return Quality(lattice(sizes, 1 if tied else _FEWEST_STEPS), held, _piles_up(y, held),
                    float(np.sqrt(np.mean(fresh * fresh))))
 
 
-def lattice(sizes: FloatArray) -> float:
+def lattice(sizes: FloatArray, fewest: int = _FEWEST_STEPS) -> float:
     """
     Return the common step of increments, V; 0 when there is none.
 
@@ -96,7 +101,7 @@ def lattice(sizes: FloatArray) -> float:
     near = ordered[ordered < 1.001 * least]
     unit = float(near.mean())
     multiples = np.rint(ordered / unit)
-    if multiples[-1] > 1000.0 or np.unique(multiples).size < _FEWEST_STEPS:
+    if multiples[-1] > 1000.0 or np.unique(multiples).size < fewest:
         return 0.0
     unit = float((ordered @ multiples) / (multiples @ multiples))
     return unit if bool((np.abs(ordered - multiples * unit) < 0.02 * unit).all()) else 0.0

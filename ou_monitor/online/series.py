@@ -31,7 +31,7 @@ _SPAN = 300.0
 # A lagged throttle this near to the throttle has settled.
 _SETTLED = 1e-7
 # After this long without a change of throttle all lags have settled, s.
-_MEMORY = 16.0 * LOAD_LAGS[1]
+LOOK_BACK = 16.0 * LOAD_LAGS[1]
 
 
 def lagged(t: FloatArray, u: FloatArray, tau: float, before: tuple[float, float, float]
@@ -127,7 +127,7 @@ class Series:
     @property
     def moves(self) -> bool:
         """Whether throttle, or its lag, moved in the window."""
-        return self.size > 0 and float(self._main[T, self._head]) <= self._moved_at + _MEMORY
+        return self.size > 0 and float(self._main[T, self._head]) <= self._moved_at + LOOK_BACK
 
     @property
     def known(self) -> bool:
@@ -276,7 +276,7 @@ class Series:
             stamps = self._main[T, start:self._head]
             at = min(self._head, self._run.size - 1)
             keep = max(keep, stamps.size - int(np.searchsorted(
-                stamps, self._main[T, at] - _MEMORY)))
+                stamps, self._main[T, at] - LOOK_BACK)))
         self._behind = min(self._behind, keep)
 
     def clear(self) -> None:

@@ -31,7 +31,7 @@ _FEW = 6.0
 _SUSPECT = 2.0
 # Neighbouring samples correlated by less than this many standard errors are
 # not correlated.
-_CORRELATED = 2.0
+_CORRELATED = 4.0
 # ln(alpha D) of noise that is as good as white.
 _WHITE = 3.0
 
