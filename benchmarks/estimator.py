@@ -142,7 +142,8 @@ def main() -> int:
     parser.add_argument('--parts', default='awts',
                         help='a: accuracy, w: short windows, t: throttle steps, s: speed')
     parser.add_argument('--json', type=Path, help='write all numbers here')
-    parser.add_argument('--markdown', type=Path, help='write the tables here, between its marks if it has them')
+    parser.add_argument('--markdown', type=Path,
+                        help='write the tables here, between its marks if it has them')
     given = parser.parse_args()
     windows = min(given.windows, 20) if given.quick else given.windows
     slow = given.slow_windows or max(windows // 5, min(windows, 5))

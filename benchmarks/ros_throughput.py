@@ -41,12 +41,13 @@ class Trial:
     def __init__(self, arguments: list[str], kind: Any) -> None:
         from diagnostic_msgs.msg import DiagnosticArray
         import rclpy
-        from rclpy.qos import qos_profile_sensor_data
+        from rclpy.qos import QoSProfile, ReliabilityPolicy
         self.process = subprocess.Popen(
             [sys.executable, '-m', 'ou_monitor.nodes.estimator', '--ros-args', *arguments],
             env={**os.environ, 'PYTHONPATH': f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"})
         self.node = rclpy.create_node('load')
-        self.output = self.node.create_publisher(kind, 'voltage', qos_profile_sensor_data)
+        self.output = self.node.create_publisher(
+            kind, 'voltage', QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT))
         self.fields: dict[str, str] = {}
         self.node.create_subscription(DiagnosticArray, '/ou_estimator/state', self._hear, 10)
         self._rclpy = rclpy
@@ -58,24 +59,35 @@ class Trial:
         """Send at a rate for a while; return CPU share, loss and the last estimate."""
         while not self.output.get_subscription_count():
             self._rclpy.spin_once(self.node, timeout_sec=0.05)
-        count, started, cpu, wall = 0, time.monotonic(), 0.0, 0.0
+        self._send(0, int(SETTLE * rate), rate, make)
+        before = self._taken(int(SETTLE * rate))
+        cpu, wall = cpu_seconds(self.process.pid), time.monotonic()
+        first = int(SETTLE * rate)
         total = int((SETTLE + seconds) * rate)
-        while count < total:
-            due = min(int((time.monotonic() - started) * rate), total)
+        self._send(first, total, rate, make)
+        cpu = (cpu_seconds(self.process.pid) - cpu) / (time.monotonic() - wall)
+        taken = self._taken(total)
+        return {'messages_per_s': rate, 'sent': total - first, 'taken': taken - before,
+                'lost_while_starting': first - before, 'cpu_share': cpu,
+                **{key: float(self.fields.get(key, 'nan'))
+                   for key in ('pushed', 'used', 'alpha', 'sigma', 'noise_std')}}
+
+    def _send(self, first: int, last: int, rate: float, make: Callable[[int], Any]) -> None:
+        """Send messages first..last-1 at a rate."""
+        count, started = first, time.monotonic()
+        while count < last:
+            due = min(first + int((time.monotonic() - started) * rate), last)
             for number in range(count, due):
                 self.output.publish(make(number))
             count = max(count, due)
-            if not wall and count > SETTLE * rate:
-                cpu, wall = cpu_seconds(self.process.pid), time.monotonic()
             self._rclpy.spin_once(self.node, timeout_sec=0.0002)
-        cpu = (cpu_seconds(self.process.pid) - cpu) / (time.monotonic() - wall)
-        end = time.monotonic() + 3.0
-        while time.monotonic() < end and int(self.fields.get('messages', 0)) < total:
+
+    def _taken(self, expected: int) -> int:
+        """Return what the node has taken once no more is on its way."""
+        end = time.monotonic() + 2.0
+        while time.monotonic() < end and int(self.fields.get('messages', 0)) < expected:
             self._rclpy.spin_once(self.node, timeout_sec=0.05)
-        return {'messages_per_s': rate, 'sent': total,
-                'taken': int(self.fields.get('messages', 0)), 'cpu_share': cpu,
-                **{key: float(self.fields.get(key, 'nan'))
-                   for key in ('pushed', 'used', 'alpha', 'sigma', 'noise_std')}}
+        return int(self.fields.get('messages', 0))
 
     def close(self) -> None:
         """End the node that this trial started."""

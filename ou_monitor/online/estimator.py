@@ -284,7 +284,8 @@ class SlidingEstimator:
         if series.even:
             return float(t[-1] - t[0]) / (t.size - 1)
         runs = series.runs(series.first, series.end)
-        return float(np.diff(t)[runs[1:] > 0].mean())
+        even = np.diff(t)[runs[1:] > 0]
+        return float(even.mean()) if even.size else self._thinner.step
 
 
 def _smoothness(variogram: FloatArray, a: float, m: int) -> float:
@@ -294,6 +295,8 @@ def _smoothness(variogram: FloatArray, a: float, m: int) -> float:
     From E(z_j - z_{j-1})^2 and E(z_j - z_{j-2})^2: their correlation is
     D_2 / (2 D_1) - 1.
     """
+    if not variogram[0] > 0.0:
+        return NAN
     gamma0, gamma1 = arma.block_autocovariance(a, m)
     of_ou = (gamma0 - gamma1 * math.exp(-a)) / (2.0 * (gamma0 - gamma1)) - 1.0
     return float(variogram[1] / (2.0 * variogram[0])) - 1.0 - of_ou

@@ -108,7 +108,12 @@ def test_late_samples_after_an_estimate_are_dropped_and_counted():
     estimator.push(T[-5:], Y[-5:])
     after = estimator.estimate()
     assert after.counters == Counters(pushed=N + 5, used=N, late=5)
-    assert after.alpha == before.alpha
+    assert after.alpha == pytest.approx(before.alpha, rel=1e-6)
+    # None of several late samples, and none among good ones, gets through.
+    t = [T[-1] + DT, T[-3], T[-2], T[-1] + 2 * DT]
+    estimator.push(t, [5.0] * 4)
+    e = estimator.estimate()
+    assert (e.counters.used, e.counters.late, e.t) == (N + 2, 7, t[-1])
 
 
 @pytest.mark.parametrize('shift', [-100.0, 100.0])

@@ -1,0 +1,107 @@
+"""Findings about raw samples: lattices, repeats, piles at an extreme."""
+
+from hypothesis import given, settings, strategies as st
+from made_windows import DT, paths
+import numpy as np
+from ou_monitor.online.quality import examine, fresh_samples, Quality
+import pytest
+
+
+def path(seed=1, n=1024, dt=DT):
+    return paths(np.random.default_rng(seed), 1, n, dt)[0]
+
+
+@pytest.mark.parametrize('kind', [np.float64, np.float32])
+@pytest.mark.parametrize('step', [1e-3, 5e-3, 12.5e-3, 0.03, 0.05, 0.1])
+def test_step_of_the_adc(step, kind):
+    """
+    From a twentieth to five times the increment (20 mV), in either precision.
+
+    Float32 rounds a 5 V value to 0.2 uV, 2e-4 of the finest step here.
+    """
+    y = (step * np.round(path() / step)).astype(kind).astype(np.float64)
+    assert examine(y).step == pytest.approx(step, rel=2e-3)
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(0, 1000), st.floats(1e-3, 0.08))
+def test_step_scales(seed, step):
+    """Any step, any path."""
+    y = step * np.round(path(seed) / step)
+    assert examine(y).step == pytest.approx(step, rel=1e-6)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_no_lattice_no_finding(seed):
+    """Neither in doubles nor in float32, whose own lattice is finer than a thousandth."""
+    for kind in (np.float64, np.float32):
+        quality = examine(path(seed).astype(kind).astype(np.float64))
+        assert (quality.step, quality.held, quality.saturated) == (0.0, 1, False)
+
+
+def test_rms_increment():
+    """Of an OU: sigma sqrt(dt) (1 - alpha dt / 4) = 19.7 mV; 1023 increments give 2 %."""
+    assert examine(path()).rms_increment == pytest.approx(0.0197, rel=0.07)
+    # Of fresh samples, where the source repeats: sqrt(4) times, less relaxation.
+    assert examine(np.repeat(path(2, 256, 4 * DT), 4)).rms_increment == pytest.approx(
+        0.0376, rel=0.15)
+
+
+@pytest.mark.parametrize('held', [2, 3, 4, 8])
+def test_repeats(held):
+    """Also of a coarse ADC, where a refresh may repeat the value by chance."""
+    y = np.repeat(path(3, 1024 // held, held * DT), held)
+    assert examine(y).held == held
+    assert examine(0.02 * np.round(y / 0.02)).held == held
+
+
+@pytest.mark.parametrize('step', [12.5e-3, 0.03, 0.06])
+def test_ties_of_a_coarse_adc_are_no_repeats(step):
+    for seed in range(20):
+        assert examine(step * np.round(path(seed) / step)).held == 1
+
+
+def test_repeats_are_where_they_were():
+    """Refreshes are kept, also those that happen to equal the one before."""
+    source = np.array([1.0, 2.0, 2.0, 3.0, 1.0, 1.0, 1.0, 5.0])
+    fresh = fresh_samples(np.repeat(source, 4), 4)
+    assert np.flatnonzero(fresh).tolist() == [4 * k for k in range(8)]
+    # Two and three in turn: one refresh each.
+    y = np.repeat([1.0, 2.0, 3.0, 4.0], [2, 3, 2, 3])
+    assert np.flatnonzero(fresh_samples(y, 2)).tolist() == [0, 2, 5, 7]
+    assert np.flatnonzero(fresh_samples(y, 3)).tolist() == [0, 2, 5, 7]
+
+
+@pytest.mark.parametrize('side', [-1, 1])
+def test_saturation(side):
+    """Clipped at one standard deviation, or at 1.7: 16 or 4 % of samples at the end."""
+    for level in (0.056, 0.095):
+        assert examine(5.0 + side * np.minimum(side * (path(4) - 5.0), level)).saturated
+    assert not examine(5.0 + side * np.minimum(side * (path(4) - 5.0), 0.4)).saturated
+
+
+def test_saturation_needs_a_hundredth_of_the_samples():
+    """Ten equal values at the top of 1024 are at the limit; four or thirty are clear."""
+    y = path(5)
+    order = np.argsort(y)
+    for many, expected in ((4, False), (40, True)):
+        z = y.copy()
+        z[order[-many:]] = y[order[-many]]
+        assert examine(z).saturated == expected
+
+
+def test_the_extreme_code_of_a_coarse_adc_is_not_saturation():
+    for seed in range(20):
+        assert not examine(0.03 * np.round(path(seed) / 0.03)).saturated
+
+
+@pytest.mark.parametrize('y', [
+    np.empty(0), np.ones(5), path(1, 63), np.full(1024, 5.0), np.r_[np.zeros(500), np.ones(500)]])
+def test_too_little_to_tell(y):
+    """Below 64 samples, or without changes, nothing is said."""
+    assert repr(examine(y)) == repr(Quality())
+
+
+def test_from_sixty_four_samples_on():
+    y = 0.0125 * np.round(path(6) / 0.0125)
+    assert examine(y[:64]).step == pytest.approx(0.0125) and examine(y[:63]).step == 0.0
