@@ -113,7 +113,7 @@ def _refresh(tie: BoolArray) -> int:
 
     A coarse ADC makes ties too, but they cluster; a logger that repeats makes
     a change *less* likely right after a change.  Counts are compared with
-    independence at five standard deviations.
+    independence at 3.5 standard deviations.
     """
     n, ties = tie.size, int(tie.sum())
     share = 1.0 - ties / n
@@ -121,7 +121,7 @@ def _refresh(tie: BoolArray) -> int:
         return 1
     follow = int((~tie[1:] & ~tie[:-1]).sum())
     expected = share * share * (n - 1)
-    if follow > 0.25 * expected or expected - follow < 5.0 * math.sqrt(expected):
+    if follow > 0.25 * expected or expected - follow < 3.5 * math.sqrt(expected):
         return 1
     gaps = np.diff(np.flatnonzero(~tie))
     # Refreshes that happen to repeat a value double a gap: the usual gap counts.

@@ -12,7 +12,7 @@ from made_windows import (
     ALPHA, covered, DT, errors, estimate, NAMES, paths, SIGMA, stamps, TRUTH, VAR_INF)
 import numpy as np
 from ou_monitor.model.exact_fit import fit_exact
-from ou_monitor.records import Status
+from ou_monitor.records import Flag, Status
 import pytest
 
 N = 2000
@@ -37,6 +37,8 @@ def test_bias_and_coverage(sensor):
     rng = np.random.default_rng(11)
     found = [estimate(T, y) for y in SENSORS[sensor](paths(rng, 500, N), rng)]
     assert {e.status for e in found} == {Status.OK}
+    # By chance a trend in one of 16 000; a threshold of half of that, in 25 of 500.
+    assert sum(Flag.TREND in e.flags for e in found) <= 2
     error = errors(found)
     spread = error.std(axis=0) / math.sqrt(len(found))
     assert (spread < [0.01, 0.003, 0.01]).all(), 'the test has lost its power'

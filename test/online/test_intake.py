@@ -137,6 +137,16 @@ def test_a_new_rate_is_learnt_when_steps_are_off(factor, learnt):
     assert thinner.step == pytest.approx(factor * DT if learnt else DT)
 
 
+@pytest.mark.parametrize('factor, learnt', [(1.2, False), (1.45, True)])
+def test_a_slightly_other_rate_is_the_same(factor, learnt):
+    """A gap makes the rate looked at; below 1.3 times the usual step it is kept."""
+    thinner = Thinner(1e4)
+    intake = Intake()
+    thinner.take(batches(np.arange(100) * DT, intake=intake)[0][0])
+    thinner.take(batches(0.2 + np.arange(300) * DT * factor, intake=intake)[0][0])
+    assert thinner.step == pytest.approx(factor * DT if learnt else DT)
+
+
 def test_a_lone_gap_does_not_change_the_rate():
     thinner = Thinner(1e4)
     intake = Intake()

@@ -128,6 +128,22 @@ def test_compiled_sums_are_those_of_numpy(variables, monkeypatch):
         assert getattr(one, name) == pytest.approx(getattr(two, name), rel=1e-9, abs=1e-10)
 
 
+def test_coarser_samples_are_means_of_four():
+    """Also when they come in pieces; what does not fill a block waits."""
+    rng = np.random.default_rng(5)
+    n = 1001
+    t, y = np.arange(n) * DT, rng.standard_normal(n)
+    resolution = Resolution(5.0)
+    for begin, end in ((0, 333), (333, 334), (334, n)):
+        resolution.add(t[begin:end], y[begin:end], None,
+                       np.array([0] if not begin else [], dtype=np.int64))
+        coarse = resolution.coarser()
+    expected = np.stack([t, y])[:, :1000].reshape(2, 250, 4).mean(axis=2)
+    assert coarse.series.columns(0, 250) == pytest.approx(expected, abs=1e-12)
+    assert coarse.series.size == 250 and coarse.series.even
+    check(coarse.sums.total(), loops(*expected, [], coarse.sums.reference))
+
+
 def test_lags_and_slots_are_enough():
     """
     What they are there for: theta^24 < 5 % up to theta = 0.88; a window to 2.5 %.

@@ -121,4 +121,5 @@ def test_clear_goes_on_counting():
     assert (series.size, series.first, series.end, series.behind) == (0, 10, 10, 0)
     assert math.isnan(series.last(Y)) and math.isnan(series.last(U))
     series.append(np.arange(3.0), np.ones(3), None, START)
-    assert series.column(Y).tolist() == [1.0, 1.0, 1.0] and series.runs(10, 13).tolist() == [0, 1, 2]
+    assert series.column(Y).tolist() == [1.0, 1.0, 1.0]
+    assert series.runs(10, 13).tolist() == [0, 1, 2]
