@@ -162,12 +162,12 @@ def test_white_and_alternating_input_is_a_finding():
     """
     An AR(1) coefficient that is zero or negative is "no relaxation", not a number.
 
-    Of 500 windows of white noise one in a hundred may look like something else.
+    Neighbours count as correlated from four standard errors on: never in 500
+    windows, where half of that would be exceeded in a dozen.
     """
     rng = np.random.default_rng(7)
     found = [estimate(T, 0.01 * rng.standard_normal(N)) for _ in range(500)]
-    assert np.mean([e.status is Status.NO_RELAXATION for e in found]) > 0.95
-    assert sum(e.usable for e in found) <= 5
+    assert {e.status for e in found} == {Status.NO_RELAXATION}
     for factor in (-0.9, -0.3):
         y = lfilter([1.0], [1.0, -factor], rng.standard_normal(N))
         e = estimate(T, y)

@@ -3,7 +3,7 @@
 from hypothesis import given, settings, strategies as st
 from made_windows import DT, paths
 import numpy as np
-from ou_monitor.online.quality import examine, fresh_samples, Quality
+from ou_monitor.online.quality import examine, fresh_samples, lattice, Quality
 import pytest
 
 
@@ -81,13 +81,28 @@ def test_saturation(side):
 
 
 def test_saturation_needs_a_hundredth_of_the_samples():
-    """Ten equal values at the top of 1024 are at the limit; four or thirty are clear."""
-    y = path(5)
+    """Of 2048 samples 20 is one in a hundred; and three times as many as the next value."""
+    y = path(5, 2048)
     order = np.argsort(y)
-    for many, expected in ((4, False), (40, True)):
+    for many, expected in ((15, False), (25, True)):
         z = y.copy()
         z[order[-many:]] = y[order[-many]]
         assert examine(z).saturated == expected
+
+
+@pytest.mark.parametrize('top, beside, expected', [(50, 20, False), (50, 14, True)])
+def test_saturation_is_three_times_the_next_value(top, beside, expected):
+    """The outermost codes of an ADC are rarer than those beside them, never so common."""
+    y = np.sort(path(5))
+    y[-top:] = 6.0
+    y[-top - beside:-top] = 5.9
+    assert examine(np.random.default_rng(1).permutation(y)).saturated == expected
+
+
+@pytest.mark.parametrize('multiples, told', [((1, 2), False), ((1, 2, 5), True)])
+def test_lattice_needs_three_different_steps(multiples, told):
+    """Two sizes of step may be chance, three multiples of one are not."""
+    assert (lattice(0.01 * np.array(multiples)) > 0.0) == told
 
 
 def test_the_extreme_code_of_a_coarse_adc_is_not_saturation():
