@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass, field
-import math
 from pathlib import Path
 import shutil
 import sys
@@ -25,41 +24,14 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from ou_monitor.model.ou import simulate  # noqa: E402, I100
+from ou_monitor.offline.presets import (  # noqa: E402
+    ALPHA, FLIGHT_NOISE, FLIGHT_SAG, SIGMA, TRANSIENT_SAG, U0)
+from ou_monitor.offline.profiles import FLIGHT, PROFILES  # noqa: E402
 from ou_monitor.recordings.write import TYPES, write_recording  # noqa: E402
 from ou_monitor.records import FloatArray, Recording  # noqa: E402
 
-# The paper's rail, V, and relaxation rate, 1/s (Table 2).
-U0 = 5.0
-ALPHA = 63.0
-
-# Display step of the oscilloscope behind Table 1: every Vrms is a multiple, V.
-STEP = 9.375e-3
-
-# Noise intensity by throttle, V/sqrt(s).  10 % and 40 % are Table 2; 5 % follows
-# from its Vrms of 9.38 mV (Table 1); motors off reads "~0": half a step at most.
-SIGMA_IDLE = 4.7e-3 * math.sqrt(2.0 * ALPHA)
-SIGMA = {0.0: SIGMA_IDLE, 0.05: 9.38e-3 * math.sqrt(2.0 * ALPHA), 0.10: 0.3156, 0.40: 0.632}
-
 # 2024-01-01T00:00:00Z: a fixed start, for a bag must not depend on the day.
 START_NS = 1_704_067_200 * 1_000_000_000
-
-# Figure 5: deviation right after 20 % throttle is released, V.
-TRANSIENT_SAG = 0.368
-
-# The flight: sag at full throttle, V, and the sensor's white noise, V.
-FLIGHT_SAG = 0.3
-FLIGHT_NOISE = 2e-3
-
-# Throttle of the flight, as (time s, throttle) joined by straight lines: arm,
-# take-off, hover, two climbs and descents, landing.
-FLIGHT = (
-    (0.0, 0.0), (2.0, 0.0), (2.2, 0.05), (4.0, 0.05), (4.6, 0.55), (6.0, 0.55), (6.4, 0.40),
-    (12.0, 0.40), (12.4, 0.65), (16.0, 0.65), (16.4, 0.40), (19.0, 0.40), (19.4, 0.25),
-    (23.0, 0.25), (23.4, 0.40), (26.0, 0.40), (26.3, 0.75), (28.5, 0.75), (28.9, 0.30),
-    (32.0, 0.30), (32.4, 0.40), (34.0, 0.40), (36.5, 0.20), (37.0, 0.05), (37.5, 0.0),
-    (40.0, 0.0))
-# A receiver updates the throttle at this rate, Hz.
-STICK_RATE = 50.0
 
 
 @dataclass(frozen=True)
@@ -119,9 +91,7 @@ def flight_sigma(throttle: npt.ArrayLike) -> FloatArray:
 def flight(duration: float = 40.0, rate: float = 1000.0, seed: int = 40) -> Bag:
     """Return a flight: sag in proportion to throttle, sigma by throttle, sensor noise."""
     t = grid(duration, rate)
-    # The stick holds between two updates; half a step guards against rounding.
-    held = np.floor(t * STICK_RATE + 0.5 * STICK_RATE / rate) / STICK_RATE
-    throttle = np.interp(held, [s for s, _ in FLIGHT], [p for _, p in FLIGHT])
+    throttle = PROFILES['flight'][0](t)
     # What a bag can hold is what the truth is made from.
     throttle = throttle.astype(np.float32).astype(np.float64)
     rng = np.random.default_rng(seed)

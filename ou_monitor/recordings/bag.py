@@ -24,7 +24,8 @@ from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag_target import BagTarget
-from ou_monitor.recordings.mcap_file import in_time_order, McapFile, RawMessage
+from ou_monitor.recordings.mcap_file import (
+    in_time_order, McapFile, RawMessage, SAMPLE_RATE)
 from ou_monitor.recordings.rosbag2_metadata import (
     find_files, parse_qos, qos_profile, TopicInfo)
 from ou_monitor.recordings.schemas import SCHEMAS, TYPE_HASHES
@@ -88,6 +89,9 @@ class BagReader:
         Topic -> message type.
     info : dict of str to TopicInfo
         Topic -> type, number of messages, QoS.
+    sample_rates : dict of str to float
+        Topic -> rate of the samples within its blocks, Hz, where the bag
+        states it (those written here do).
     start_ns, end_ns : int
         Log times of the first and last message, ns.
     message_count : int
@@ -114,9 +118,12 @@ class BagReader:
                    for file in self._files if file.damage is not None]
         self.damage = '; '.join(([missing] if missing else []) + damages) or None
         self.info: dict[str, TopicInfo] = {}
+        self.sample_rates: dict[str, float] = {}
         self._schemas: dict[str, Schema] = {}
         for file in self._files:
             for key, topic in file.topics.items():
+                if topic.sample_rate is not None:
+                    self.sample_rates[topic.name] = topic.sample_rate
                 known = self.info.get(topic.name)
                 if known is None:
                     reliability, durability, depth = parse_qos(qos.get(topic.name) or topic.qos)
@@ -271,6 +278,7 @@ class BagWriter:
     def add_topic(
         self, name: str, type: str, *,  # noqa: A002
         schema: str | None = None, reliability: str = 'reliable',
+        sample_rate: float | None = None,
     ) -> str:
         """
         Announce a topic.
@@ -285,6 +293,9 @@ class BagWriter:
             Its ros2msg definition; needed for types not in `schemas.SCHEMAS`.
         reliability : {'reliable', 'best_effort'}
             QoS to be offered at playback.
+        sample_rate : float, optional
+            Rate of the samples within a block, Hz; kept in the channel's
+            metadata, where `BagReader` finds it.
 
         Returns
         -------
@@ -308,10 +319,12 @@ class BagWriter:
             self._definitions[type] = text
         info = TopicInfo(topic, type, 0, reliability)
         self._topics[topic] = info
+        metadata = {'offered_qos_profiles': yaml.safe_dump(qos_profile(info), sort_keys=False),
+                    'topic_type_hash': TYPE_HASHES.get(type, '')}
+        if sample_rate is not None:
+            metadata[SAMPLE_RATE] = repr(float(sample_rate))
         self._channels[topic] = self._writer.register_channel(
-            topic, 'cdr', self._schemas[type], {
-                'offered_qos_profiles': yaml.safe_dump(qos_profile(info), sort_keys=False),
-                'topic_type_hash': TYPE_HASHES.get(type, '')})
+            topic, 'cdr', self._schemas[type], metadata)
         self._counts[topic] = 0
         return topic
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+import math
 from operator import itemgetter
 import os
 from pathlib import Path
@@ -50,6 +51,19 @@ class Codec(Protocol):
         """Return the summary section, or None."""
 
 
+# Where a channel's metadata holds the rate of the samples within a block, Hz.
+SAMPLE_RATE = 'sample_rate_hz'
+
+
+def _rate(text: str | None) -> float | None:
+    """Return a stated rate, Hz; None when there is none that makes sense."""
+    try:
+        rate = float(text or '')
+    except ValueError:
+        return None
+    return rate if 0.0 < rate < math.inf else None
+
+
 @dataclass(frozen=True)
 class TopicRecord:
     """A channel of one file: what its messages are."""
@@ -58,6 +72,7 @@ class TopicRecord:
     type: str  # noqa: A003
     schema: Any
     qos: str
+    sample_rate: float | None
 
 
 class McapFile:
@@ -246,7 +261,8 @@ class McapFile:
                 f"'{channel.message_encoding}', schema '{encoding}').")
             return
         self.topics[channel.id] = TopicRecord(
-            channel.topic, schema.name, schema, channel.metadata.get('offered_qos_profiles', ''))
+            channel.topic, schema.name, schema, channel.metadata.get('offered_qos_profiles', ''),
+            _rate(channel.metadata.get(SAMPLE_RATE)))
 
     def read(self, span: Span, wanted: set[str]) -> list[RawMessage]:
         """Return the messages of a span in file order."""

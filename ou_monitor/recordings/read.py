@@ -8,6 +8,7 @@ for a clock that counts from 1970 resolves 0.24 us; more than that is not kept.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -141,7 +142,12 @@ def _read_bag(
     notes = [*bag.notes, *choice.notes]
     if bag.damage is not None:
         notes.append(f'The bag is damaged; what it still holds was read: {bag.damage}.')
-    t, voltage = _series(bag, choice.voltage, 'voltage', notes)
+    spec = choice.voltage
+    stated = bag.sample_rates.get(spec.topic)
+    if spec.sample_rate is not None and stated is not None:
+        # The bag knows better than a config that is made for many.
+        spec = replace(spec, sample_rate=stated)
+    t, voltage = _series(bag, spec, 'voltage', notes)
     throttle = np.full(t.shape, np.nan)
     source = {
         'file': bag.path.name, 'format': 'mcap', 'msg_config': choice.config.name,
@@ -155,7 +161,7 @@ def _read_bag(
         order = np.argsort(stamps, kind='stable')
         # Stamps within a block are worked out, and may be a rounding short of a
         # throttle that was meant to hold for that sample.
-        rate = choice.voltage.sample_rate
+        rate = spec.sample_rate
         slack = 0.0 if rate is None else 0.1 / rate
         throttle = hold_last(stamps[order], values[order], t + slack)
     return tidy(t, voltage, throttle, bag.path.name, source, notes)

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import heapq
+import math
 from pathlib import Path
+from types import TracebackType
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +18,7 @@ import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings import cdr
 from ou_monitor.recordings.bag import BagWriter
-from ou_monitor.records import Recording
+from ou_monitor.records import FloatArray, Recording
 
 # What `type` may be -> message type of the voltage.
 TYPES = {
@@ -24,8 +26,8 @@ TYPES = {
     'adc_block': cdr.FLOAT32_ARRAY,
 }
 
-# Messages encoded at once; bounds memory.
-SLICE = 16384
+# Samples encoded at once; bounds memory.
+SLICE = 1024
 
 # An unchanged throttle is repeated this often, so that a subscriber that comes
 # late, or a bag played from the middle, knows it soon.
@@ -80,72 +82,173 @@ def write_recording(
         type.
 
     """
-    if type not in TYPES:
-        raise InputError(f"no bag type '{type}': {nearest(type, TYPES)}")
     if rec.n == 0:
         raise InputError(f"'{rec.name}' holds no sample: there is nothing to write")
-    notes: list[str] = []
-    stamps = np.rint(rec.t * 1e9).astype(np.int64) + start_ns
-    if stamps[0] < 0:
-        notes.append(f'Stamps were moved by {-stamps[0] * 1e-9:.9f} s: a bag cannot hold '
-                     'negative ones.')
-        stamps = stamps - stamps[0]
-    if type == 'battery_state' and stamps[-1] > LAST_HEADER_NS:
-        raise InputError(f"'{rec.name}' has stamps after 2^31 s, which a header cannot hold: use "
-                         'another type')
-    if type == 'adc_block':
-        _check_uniform(rec, stamps, sample_rate)
-    with BagWriter(path) as bag:
-        topics = {VOLTAGE: bag.add_topic('voltage', TYPES[type])}
-        streams = [_voltage(stamps, rec, type, block)]
-        if rec.has_throttle:
-            topics[THROTTLE] = bag.add_topic('throttle', cdr.FLOAT32)
-            streams.append(_throttle(stamps, rec))
-        last = 0
+    with RecordingWriter(path, type=type, start_ns=start_ns, sample_rate=sample_rate,
+                         block=block) as writer:
+        for first in range(0, rec.n, SLICE):
+            part = slice(first, first + SLICE)
+            writer.write(Recording(rec.t[part], rec.voltage[part], rec.throttle[part], rec.name))
+            if progress is not None:
+                progress(min(1.0, (first + SLICE) / rec.n))
+    return writer.notes
+
+
+class RecordingWriter:
+    """
+    Writes a recording that comes in pieces; memory does not grow with them.
+
+    A context manager; what was written is removed when its block fails.
+
+    Parameters
+    ----------
+    path, type, start_ns, sample_rate, block :
+        As in `write_recording`.
+
+    Attributes
+    ----------
+    topics : dict of str to str
+        Topic -> message type, as written so far.
+    notes : tuple of str
+        What was changed on the way, one sentence each.
+
+    Raises
+    ------
+    InputError
+        As `write_recording`.
+
+    """
+
+    def __init__(self, path: str | Path, *, type: str = 'battery_state',  # noqa: A002
+                 start_ns: int = 0, sample_rate: float = 10000.0, block: int = 100) -> None:
+        if type not in TYPES:
+            raise InputError(f"no bag type '{type}': {nearest(type, TYPES)}")
+        if type == 'adc_block' and not sample_rate > 0.0:
+            raise InputError(f'sample_rate must be above 0 Hz, got {sample_rate}')
+        self._type, self._block, self._rate = type, block, sample_rate
+        self._shift = start_ns
+        self._first: int | None = None
+        self._written = 0
+        self._throttle = math.nan
+        self._period = -1
+        self._rest: tuple[npt.NDArray[np.int64], FloatArray] = (
+            np.empty(0, dtype=np.int64), np.empty(0))
+        self.notes: tuple[str, ...] = ()
+        self.topics: dict[str, str] = {}
+        self._bag = BagWriter(path)
+        self._names = {VOLTAGE: self._add('voltage', TYPES[type], sample_rate
+                                          if type == 'adc_block' else None)}
+
+    def _add(self, name: str, kind: str, sample_rate: float | None = None) -> str:
+        topic = self._bag.add_topic(name, kind, sample_rate=sample_rate)
+        self.topics[topic] = kind
+        return topic
+
+    def write(self, piece: Recording) -> None:
+        """
+        Write the next samples.
+
+        Parameters
+        ----------
+        piece : Recording
+            Stamps go on from the piece before.
+
+        Raises
+        ------
+        InputError
+            When the piece does not fit the type, or the disk refuses.
+
+        """
+        if not piece.n:
+            return
+        stamps = np.rint(piece.t * 1e9).astype(np.int64) + self._shift
+        if self._first is None:
+            if stamps[0] < 0:
+                self.notes += (f'Stamps were moved by {-stamps[0] * 1e-9:.9f} s: a bag cannot '
+                               'hold negative ones.',)
+                self._shift -= int(stamps[0])
+                stamps = stamps - stamps[0]
+            self._first = int(stamps[0])
+        if self._type == 'battery_state' and stamps[-1] > LAST_HEADER_NS:
+            raise InputError(f"'{piece.name}' has stamps after 2^31 s, which a header cannot "
+                             'hold: use another type')
+        if self._type == 'adc_block':
+            _check_uniform(piece, stamps - self._first, self._written, self._rate)
+        if THROTTLE not in self._names and piece.has_throttle:
+            self._names[THROTTLE] = self._add('throttle', cdr.FLOAT32)
+        self._written += piece.n
+        self._send(self._voltage(stamps, piece.voltage), self._throttles(stamps, piece.throttle))
+
+    def _send(self, *streams: Iterator[Timed]) -> None:
         for t, topic, data in heapq.merge(*streams):
-            bag.write(topics[topic], t, data)
-            if progress is not None and t - last > 100_000_000:
-                last = t
-                progress((t - int(stamps[0])) / max(1, int(stamps[-1] - stamps[0])))
-    return tuple(notes)
+            self._bag.write(self._names[topic], t, data)
 
+    def close(self) -> None:
+        """
+        Finish the bag.
 
-def _voltage(
-    stamps: npt.NDArray[np.int64], rec: Recording, type: str, block: int,  # noqa: A002
-) -> Iterator[Timed]:
-    if type == 'adc_block':
-        for first in range(0, rec.n, block):
-            samples = rec.voltage[first:first + block]
-            yield int(stamps[first + samples.size - 1]), VOLTAGE, cdr.encode_block(samples)
-        return
-    for first in range(0, rec.n, SLICE):
-        part = slice(first, first + SLICE)
-        if type == 'battery_state':
-            messages = cdr.encode_battery(stamps[part], rec.voltage[part])
+        Raises
+        ------
+        InputError
+            When the disk refuses.
+
+        """
+        stamps, samples = self._rest
+        if samples.size:
+            self._bag.write(self._names[VOLTAGE], int(stamps[-1]), cdr.encode_block(samples))
+            self._rest = stamps[:0], samples[:0]
+        self._bag.close()
+
+    def __enter__(self) -> RecordingWriter:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Finish the bag, or remove it when the block failed."""
+        if kind is None:
+            self.close()
+        self._bag.__exit__(kind, error, trace)
+
+    def _voltage(self, stamps: npt.NDArray[np.int64], voltage: FloatArray) -> Iterator[Timed]:
+        if self._type == 'adc_block':
+            stamps = np.concatenate((self._rest[0], stamps))
+            voltage = np.concatenate((self._rest[1], voltage))
+            whole = stamps.size - stamps.size % self._block
+            self._rest = stamps[whole:], voltage[whole:]
+            for first in range(0, whole, self._block):
+                last = first + self._block
+                yield int(stamps[last - 1]), VOLTAGE, cdr.encode_block(voltage[first:last])
+            return
+        if self._type == 'battery_state':
+            messages = cdr.encode_battery(stamps, voltage)
         else:
-            messages = cdr.encode_scalars(TYPES[type], rec.voltage[part])
-        for t, message in zip(stamps[part].tolist(), messages, strict=True):
+            messages = cdr.encode_scalars(TYPES[self._type], voltage)
+        for t, message in zip(stamps.tolist(), messages, strict=True):
             yield t, VOLTAGE, message
 
+    def _throttles(self, stamps: npt.NDArray[np.int64], throttle: FloatArray) -> Iterator[Timed]:
+        known = np.isfinite(throttle)
+        times, values = stamps[known], throttle[known].astype(np.float32)
+        if not values.size:
+            return
+        changed = np.diff(values, prepend=np.float32(self._throttle)) != 0.0
+        # One sample a period is sent whatever it says.
+        periods = times // THROTTLE_PERIOD_NS
+        changed |= np.diff(periods, prepend=self._period) > 0
+        self._throttle, self._period = float(values[-1]), int(periods[-1])
+        for t, message in zip(times[changed].tolist(),
+                              cdr.encode_scalars(cdr.FLOAT32, values[changed]), strict=True):
+            yield t, THROTTLE, message
 
-def _throttle(stamps: npt.NDArray[np.int64], rec: Recording) -> Iterator[Timed]:
-    known = np.isfinite(rec.throttle)
-    times, values = stamps[known], rec.throttle[known].astype(np.float32)
-    changed = np.ones(values.size, dtype=bool)
-    changed[1:] = values[1:] != values[:-1]
-    # One sample a period is sent whatever it says.
-    changed[1:] |= np.diff(times // THROTTLE_PERIOD_NS) > 0
-    for t, message in zip(times[changed].tolist(),
-                          cdr.encode_scalars(cdr.FLOAT32, values[changed]), strict=True):
-        yield t, THROTTLE, message
 
-
-def _check_uniform(rec: Recording, stamps: npt.NDArray[np.int64], sample_rate: float) -> None:
+def _check_uniform(rec: Recording, since_first: npt.NDArray[np.int64], before: int,
+                   sample_rate: float) -> None:
     """Refuse what blocks without stamps cannot hold: any spacing but the stated one."""
-    if not sample_rate > 0.0:
-        raise InputError(f'sample_rate must be above 0 Hz, got {sample_rate}')
-    grid = np.arange(rec.n) * (1e9 / sample_rate)
-    worst = np.abs((stamps - stamps[0]) - grid).max()
+    grid = (before + np.arange(rec.n)) * (1e9 / sample_rate)
+    worst = np.abs(since_first - grid).max()
     if worst > 0.5e9 / sample_rate:
         raise InputError(
             f"'{rec.name}' is not sampled at a steady {sample_rate:g} Hz, as blocks of samples "

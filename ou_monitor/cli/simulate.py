@@ -1,0 +1,149 @@
+"""`ou-monitor simulate`: a recording from a model."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import Any
+
+from ou_monitor.cli import output
+from ou_monitor.errors import InputError, nearest
+
+TYPES = ('battery_state', 'float32', 'float64', 'adc_block')
+# From this rate on samples travel in blocks unless told otherwise, Hz.
+_BLOCKS_FROM = 5000.0
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command to the parser.
+
+    Parameters
+    ----------
+    subparsers : argparse subparsers
+        Where to add it.
+
+    """
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        'simulate', help='a recording from a model',
+        description='Draw a recording from a model of a supply, exact in law at any rate. '
+                    '--list shows the presets and the throttle profiles.')
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument('--preset', metavar='NAME',
+                        help="what to simulate (default 'flight'; --list shows all)")
+    source.add_argument('--model', metavar='FILE.yaml', type=Path,
+                        help='model file, as discover writes it')
+    parser.add_argument('--duration', metavar='S', type=float, help='length, s')
+    parser.add_argument('--rate', metavar='HZ', type=float, help='samples per second')
+    parser.add_argument('--seed', metavar='N', type=int, default=1,
+                        help='same seed, same recording (default %(default)s)')
+    parser.add_argument(
+        '--throttle', metavar='PROFILE',
+        help='name of a profile, a number 0..1, points T:U,T:U,..., or a CSV file with time_s '
+             'and throttle')
+    parser.add_argument('--output', metavar='PATH', type=Path,
+                        help='NAME.mcap for one file, NAME for a rosbag2 folder')
+    parser.add_argument(
+        '--type', choices=TYPES,
+        help='message of the voltage (default battery_state, adc_block from 5 kHz on)')
+    parser.add_argument('--save-model', metavar='FILE.yaml', type=Path,
+                        help='write the model that was simulated')
+    parser.add_argument('--list', action='store_true', help='list presets and profiles')
+    parser.add_argument('--json', metavar='FILE',
+                        help='write what was simulated (- is standard output)')
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    Simulate.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        As parsed.
+
+    Returns
+    -------
+    int
+        Exit status, 0.
+
+    Raises
+    ------
+    InputError
+        When an option makes no sense or a file cannot be read or written.
+
+    """
+    from ou_monitor.offline.presets import PRESETS
+    from ou_monitor.offline.profiles import PROFILES, read_profile
+    from ou_monitor.recordings.model_file import as_yaml, ModelFile, read_model
+
+    if args.list:
+        print(output.table(['Preset', 'Throttle', 'Rate, Hz', 'Length, s', 'What it is'], [
+            [name, p.throttle, f'{p.rate:g}', f'{p.duration:g}', p.text]
+            for name, p in PRESETS.items()], left=[0, 1, 4]))
+        print(output.table(['Throttle profile', 'What it is'],
+                           [[name, text] for name, (_, text) in PROFILES.items()], left=[0, 1]))
+        return 0
+    output.check_writable(args.json)
+    output.check_writable(None if args.save_model is None else str(args.save_model))
+    name = args.preset or 'flight'
+    if name not in PRESETS:
+        raise InputError(f"no preset '{name}': {nearest(name, PRESETS)}")
+    preset = PRESETS[name]
+    if args.model is not None:
+        file, name = read_model(args.model), args.model.stem
+    else:
+        file = ModelFile(preset.model, provenance={'preset': name})
+    rate = _positive('--rate', preset.rate if args.rate is None else args.rate, 'Hz')
+    duration = _positive('--duration', preset.duration if args.duration is None
+                         else args.duration, 's')
+    if not 1.0 <= duration * rate <= 1e12:
+        raise InputError(f'{duration:g} s at {rate:g} Hz are {duration * rate:.3g} samples: 1 to '
+                         '1e12 can be made')
+    if args.seed < 0:
+        raise InputError(f'--seed must be 0 or more, got {args.seed}')
+    throttle = preset.throttle if args.throttle is None else args.throttle
+    profile = read_profile(throttle)
+    kind = args.type or ('adc_block' if rate >= _BLOCKS_FROM else 'battery_state')
+    if args.output is None:
+        if args.save_model is None:
+            raise InputError('--output PATH.mcap is needed: where the recording goes')
+        output.write_text(as_yaml(file), args.save_model)
+        return 0
+    written = _write(args, file.model, profile, duration, rate, kind, name)
+    if args.save_model is not None:
+        output.write_text(as_yaml(file), args.save_model)
+    if args.json is not None:
+        output.write_json({
+            'output': str(args.output), 'duration_s': duration, 'rate_hz': rate,
+            'seed': args.seed, 'throttle': throttle, **written,
+            'model': [{'term': term.NAME, 'params': term.values()}
+                      for term in file.model.terms]}, args.json)
+    if args.json != output.STDOUT:
+        print(f"{args.output}: {written['n']} samples of '{name}', {duration:g} s at {rate:g} Hz, "
+              f"{', '.join(term.NAME for term in file.model.terms)}; seed {args.seed}")
+    return 0
+
+
+def _write(args: argparse.Namespace, model: Any, profile: Any, duration: float, rate: float,
+           kind: str, name: str) -> dict[str, Any]:
+    from ou_monitor.offline.simulation import simulated
+    from ou_monitor.recordings.write import RecordingWriter
+
+    total, done = round(duration * rate), 0
+    with RecordingWriter(args.output, type=kind, sample_rate=rate) as writer, \
+            output.Progress('simulating') as progress:
+        for piece in simulated(model, profile, duration=duration, rate=rate, seed=args.seed,
+                               name=name):
+            writer.write(piece)
+            done += piece.n
+            progress(done / total)
+    return {'n': done, 'topics': writer.topics}
+
+
+def _positive(name: str, value: float, unit: str) -> float:
+    if not (math.isfinite(value) and value > 0.0):
+        raise InputError(f'{name} must be a positive number of {unit}, got {value:g}')
+    return value

@@ -1,0 +1,219 @@
+"""
+A supply as a sum of terms, and its simulation.
+
+Limits: between samples the parameters of a step hold still (throttle, a
+wandering sigma); what is exact in law and what is not is said by each term.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.term import Effect, Stretch, Term
+from ou_monitor.records import FloatArray
+
+# Terms of which a model can have several.
+SEVERAL = frozenset({'tone', 'throttle_tone', 'second_relaxation', 'resonance', 'load_transient',
+                     'jumps', 'glitches', 'regime_switching', 'ac_coupling'})
+
+# Samples made at once by `SupplyModel.simulate`: bounds memory beside the result.
+STRETCH = 65536
+
+# Steps that differ by less than this share differ by the rounding of stamps.
+_ROUNDING = 1e-6
+
+
+@dataclass(frozen=True)
+class SupplyModel:
+    """
+    Terms that add up to a supply.
+
+    Attributes
+    ----------
+    terms : tuple of Term
+        The first is the `ou`, the only one of its kind.
+
+    Raises
+    ------
+    ValueError
+        When the first term is not the `ou`, or a term that can be there once
+        is there twice.
+
+    """
+
+    terms: tuple[Term, ...]
+
+    def __post_init__(self) -> None:
+        """Check the composition."""
+        names = [term.NAME for term in self.terms]
+        if not names or names[0] != 'ou':
+            raise ValueError("the first term of a model must be 'ou', got "
+                             + (f"'{names[0]}'" if names else 'no term at all'))
+        for name in names:
+            if names.count(name) > 1 and name not in SEVERAL:
+                raise ValueError(f"a model can have one term '{name}', got {names.count(name)}")
+
+    @property
+    def ou(self) -> OU:
+        """Return the first term."""
+        first = self.terms[0]
+        if not isinstance(first, OU):
+            raise ValueError("the first term of a model must be 'ou'")
+        return first
+
+    @property
+    def needs_throttle(self) -> tuple[str, ...]:
+        """Return the names of the terms that need throttle."""
+        return tuple(term.NAME for term in self.terms if term.NEEDS_THROTTLE)
+
+    def simulate(self, t: npt.ArrayLike, rng: np.random.Generator,
+                 throttle: npt.ArrayLike | None = None) -> FloatArray:
+        """
+        Draw a recording.
+
+        Parameters
+        ----------
+        t : array_like, shape (n,)
+            Stamps, s, rising.
+        rng : numpy.random.Generator
+            Source of randomness.
+        throttle : array_like, shape (n,), optional
+            0..1, held from the stamp before to its own stamp; one number
+            stands for all.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            What is logged, V.
+
+        Raises
+        ------
+        ValueError
+            As `Simulation.advance`.
+
+        """
+        stamps = np.asarray(t, dtype=np.float64)
+        load = None if throttle is None else np.broadcast_to(
+            np.asarray(throttle, dtype=np.float64), stamps.shape)
+        run = Simulation(self, rng)
+        voltage = np.empty(stamps.size)
+        for begin in range(0, stamps.size, STRETCH):
+            part = slice(begin, begin + STRETCH)
+            voltage[part] = run.advance(stamps[part], None if load is None else load[part])
+        return voltage
+
+
+class Simulation:
+    """
+    A simulation that goes on from stretch to stretch.
+
+    The same seed gives the same samples, to rounding, whatever the stretches.
+
+    Parameters
+    ----------
+    model : SupplyModel
+        What is simulated.
+    rng : numpy.random.Generator
+        Source of randomness; each term gets a child of it.
+
+    """
+
+    def __init__(self, model: SupplyModel, rng: np.random.Generator) -> None:
+        self._model = model
+        self._effects = _in_order(model.terms, rng)
+        self._origin = math.nan
+        self._last = -math.inf
+
+    def advance(self, t: npt.ArrayLike, throttle: npt.ArrayLike | None = None) -> FloatArray:
+        """
+        Draw the next samples.
+
+        Parameters
+        ----------
+        t : array_like, shape (n,)
+            Stamps, s, rising, after those drawn before.
+        throttle : array_like, shape (n,), optional
+            0..1.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            What is logged, V.
+
+        Raises
+        ------
+        ValueError
+            When stamps do not rise, shapes differ, or a term needs throttle
+            that is not given or not finite.
+
+        """
+        stamps = np.asarray(t, dtype=np.float64)
+        if stamps.ndim != 1:
+            raise ValueError(f't must have shape (n,), got {stamps.shape}')
+        if not stamps.size:
+            return np.empty(0)
+        step = np.diff(stamps, prepend=self._last)
+        if not (np.isfinite(stamps).all() and (step > 0.0).all()):
+            raise ValueError('stamps must be finite and rise, s')
+        later = step[1:]
+        if later.size and np.ptp(later) <= _ROUNDING * later[0]:
+            later[:] = (stamps[-1] - stamps[0]) / later.size
+        if math.isnan(self._origin):
+            self._origin = float(stamps[0])
+        s = self._stretch(stamps, step, self._load(throttle, stamps))
+        for effect in self._effects:
+            effect(s)
+        self._last = float(stamps[-1])
+        return s.voltage
+
+    def _load(self, throttle: npt.ArrayLike | None, stamps: FloatArray) -> FloatArray:
+        """Return throttle for all samples; NaN where no term asks for it."""
+        needs = self._model.needs_throttle
+        if throttle is None:
+            if needs:
+                raise ValueError(f"the term '{needs[0]}' needs throttle, and none is given")
+            return np.full(stamps.size, math.nan)
+        load = np.asarray(throttle, dtype=np.float64)
+        if load.shape != stamps.shape:
+            raise ValueError(f'throttle must have the shape of t, {stamps.shape}, got '
+                             f'{load.shape}')
+        if needs and not np.isfinite(load).all():
+            raise ValueError(f"the term '{needs[0]}' needs throttle at every sample: some is not "
+                             'finite')
+        return load
+
+    def _stretch(self, stamps: FloatArray, step: FloatArray, throttle: FloatArray) -> Stretch:
+        ou, n = self._model.ou, stamps.size
+        return Stretch(
+            t=stamps, at=stamps, step=step, throttle=throttle, origin=self._origin,
+            alpha=np.full(n, ou.alpha), sigma=np.full(n, ou.sigma), power=np.ones(n),
+            push=np.zeros(n), bend=(0.0, 0.0), x=np.zeros(n), level=np.full(n, ou.u0),
+            voltage=np.zeros(n))
+
+
+def _in_order(terms: Sequence[Term], rng: np.random.Generator) -> list[Effect]:
+    """Return the effects of all terms in the order of their stages."""
+    # A term's draws depend on its name and on how many of that name came before
+    # it, so that adding another term leaves them as they were.
+    seeds = rng.integers(0, 2**63, size=2).tolist()
+    counts: dict[str, int] = {}
+    pairs = []
+    for term in terms:
+        nth = counts[term.NAME] = counts.get(term.NAME, 0) + 1
+        own = np.random.default_rng([*seeds, nth, *term.NAME.encode()])
+        pairs.append((term.STAGE, term.start(own)))
+    effects = [effect for stage, effect in sorted(pairs, key=lambda pair: pair[0])]
+    at = sum(term.STAGE <= term.STAGE.LEVEL for term in terms)
+    effects.insert(at, _join)
+    return effects
+
+
+def _join(s: Stretch) -> None:
+    """Put the rail together, before any instrument sees it."""
+    s.voltage = s.x + s.level

@@ -1,0 +1,103 @@
+"""The instrument's AC coupling: then the fitted alpha may be the instrument's corner."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import ClassVar
+
+import numpy as np
+
+from ou_monitor.model.terms.recursion import first_order
+from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.records import FloatArray
+
+# Rates nearer to each other than this are taken apart by it: the closed forms
+# below divide by their difference.
+_APART = 1e-4
+
+
+@dataclass(frozen=True)
+class ACCoupling(Term):
+    """
+    High-pass the rail with a first-order corner.
+
+    What is logged is U - l with dl = rate (U - l) dt, rate = 2 pi corner.  For
+    the OU the law of l between samples is exact, given the samples; all other
+    terms count as straight lines between samples.
+    """
+
+    NAME: ClassVar[str] = 'ac_coupling'
+    FAMILY: ClassVar[str] = 'instrument'
+    STAGE: ClassVar[Stage] = Stage.INSTRUMENT
+
+    corner: float = parameter('Hz', 'where the high-pass is down by 3 dB', 0.0, above=True)
+
+    def start(self, rng: np.random.Generator) -> Effect:
+        """Begin a simulation."""
+        low = x_before = level_before = math.nan
+        rate = 2.0 * math.pi * self.corner
+
+        def effect(s: Stretch) -> None:
+            nonlocal low, x_before, level_before
+            level = s.voltage - s.x
+            draws = rng.standard_normal(s.t.size)
+            alpha, step = s.alpha.copy(), s.step.copy()
+            first = math.isnan(low)
+            if first:
+                # In the stationary law, given x; the level has long been there.
+                of_x = rate / (rate + alpha[0])
+                spread = s.sigma[0] ** 2 / (2.0 * alpha[0]) * s.power[0] * of_x * (1.0 - of_x)
+                low = float(level[0] + of_x * s.x[0] + math.sqrt(spread) * draws[0])
+                x_before, level_before, step[0] = float(s.x[0]), float(level[0]), 0.0
+            start, end, spread = bridge(alpha, rate, step)
+            decay = np.exp(-rate * step)
+            x_old = np.concatenate(([x_before], s.x[:-1]))
+            level_old = np.concatenate(([level_before], level[:-1]))
+            e = start * x_old + end * s.x + s.sigma * np.sqrt(spread * s.power) * draws
+            # A straight line from level_old to level.
+            mean = np.where(step > 0.0, -np.expm1(-rate * step) / np.where(
+                step > 0.0, rate * step, 1.0), 1.0)
+            e += (mean - decay) * level_old + (1.0 - mean) * level
+            if first:
+                e[0], decay[0] = low, 0.0
+            path = first_order(decay, e, low)
+            low, x_before, level_before = float(path[-1]), float(s.x[-1]), float(level[-1])
+            s.voltage -= path
+
+        return effect
+
+
+def bridge(alpha: FloatArray, rate: float, step: FloatArray
+           ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """
+    Return the law of what an OU adds to its low-pass in a step, given both ends.
+
+    l_k = exp(-rate step) l_{k-1} + start x_{k-1} + end x_k + sigma sqrt(spread) z.
+
+    Parameters
+    ----------
+    alpha : ndarray, shape (n,)
+        Rate of the OU, 1/s.
+    rate : float
+        Rate of the low-pass, 1/s.
+    step : ndarray, shape (n,)
+        Steps, s.
+
+    Returns
+    -------
+    start, end, spread : ndarray, shape (n,)
+        Coefficients, and a variance per unit sigma^2, s.
+
+    """
+    a = np.where(np.abs(alpha / rate - 1.0) < _APART, rate * (1.0 + _APART), alpha)
+    share = rate / (rate - a)
+    xx = -np.expm1(-2.0 * a * step) / (2.0 * a)
+    both = -np.expm1(-(a + rate) * step) / (a + rate)
+    ll = -np.expm1(-2.0 * rate * step) / (2.0 * rate)
+    xl = share * (xx - both)
+    end = np.divide(xl, xx, out=np.zeros_like(xx), where=xx > 0.0)
+    phi = np.exp(-a * step)
+    start = share * (phi - np.exp(-rate * step)) - end * phi
+    spread = share * share * (xx - 2.0 * both + ll) - end * xl
+    return start, end, np.maximum(spread, 0.0)

@@ -1,0 +1,58 @@
+"""The mean answers changes of throttle: lag, inrush, slow polarisation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import ClassVar
+
+import numpy as np
+
+from ou_monitor.model.terms.recursion import first_order
+from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+
+
+@dataclass(frozen=True)
+class LoadTransient(Term):
+    """
+    Add gain * (throttle - its low-pass of time constant tau), after a delay.
+
+    A step of throttle shows as gain * exp(-t/tau).  gain of the sign of the sag
+    (> 0 when the voltage falls) delays the sag: with gain equal to the sag it is
+    low-passed.  gain < 0 deepens the fall at first (inrush).
+    """
+
+    NAME: ClassVar[str] = 'load_transient'
+    FAMILY: ClassVar[str] = 'load'
+    STAGE: ClassVar[Stage] = Stage.LEVEL
+    NEEDS_THROTTLE: ClassVar[bool] = True
+
+    gain: float = parameter('V', 'answer to a step of full throttle, at once')
+    tau: float = parameter('s', 'time in which it dies out', 0.0, above=True)
+    delay: float = parameter('s', 'time until the answer begins', 0.0)
+
+    def start(self, rng: np.random.Generator) -> Effect:
+        """Begin a simulation."""
+        slow = math.nan
+        times = np.empty(0)
+        values = np.empty(0)
+
+        def effect(s: Stretch) -> None:
+            nonlocal slow, times, values
+            throttle = s.throttle
+            if self.delay > 0.0:
+                # What was set `delay` ago; before the first sample, what it had.
+                times = np.concatenate((times, s.at))
+                values = np.concatenate((values, throttle))
+                then = np.searchsorted(times, s.at - self.delay, side='right') - 1
+                throttle = values[np.maximum(then, 0)]
+                keep = max(int(then[-1]), 0)
+                times, values = times[keep:], values[keep:]
+            if math.isnan(slow):
+                slow = float(throttle[0])
+            phi = np.exp(-s.step / self.tau)
+            low = first_order(phi, (1.0 - phi) * throttle, slow)
+            slow = float(low[-1])
+            s.level += self.gain * (throttle - low)
+
+        return effect

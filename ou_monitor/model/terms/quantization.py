@@ -1,0 +1,28 @@
+"""Steps of the ADC, or of the oscilloscope."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+
+
+@dataclass(frozen=True)
+class Quantization(Term):
+    """Round to whole steps, counted from 0 V."""
+
+    NAME: ClassVar[str] = 'quantization'
+    FAMILY: ClassVar[str] = 'sensor'
+    STAGE: ClassVar[Stage] = Stage.CODE
+
+    step: float = parameter('V', 'one code', 0.0, above=True)
+
+    def start(self, rng: np.random.Generator) -> Effect:
+        """Begin a simulation."""
+        def effect(s: Stretch) -> None:
+            s.voltage = self.step * np.rint(s.voltage / self.step)
+
+        return effect

@@ -1,0 +1,56 @@
+"""Recordings from a model, piece by piece: memory does not grow with their length."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ou_monitor.errors import InputError
+from ou_monitor.model.supply import Simulation, STRETCH, SupplyModel
+from ou_monitor.offline.profiles import Profile
+from ou_monitor.records import Recording
+
+
+def simulated(model: SupplyModel, profile: Profile, *, duration: float, rate: float, seed: int,
+              name: str = 'simulated') -> Iterator[Recording]:
+    """
+    Yield a recording in pieces.
+
+    Parameters
+    ----------
+    model : SupplyModel
+        What is simulated.
+    profile : callable
+        Stamps, s, to throttle.
+    duration : float
+        Length, s; stamps run from 0 to duration - 1/rate.
+    rate : float
+        Samples per second, Hz.
+    seed : int
+        Same seed, same samples.
+    name : str
+        Of the recording.
+
+    Yields
+    ------
+    Recording
+        At most 65536 samples.
+
+    Raises
+    ------
+    InputError
+        When the model cannot be simulated (its voltage runs away).
+
+    """
+    total = round(duration * rate)
+    run = Simulation(model, np.random.default_rng(seed))
+    for first in range(0, total, STRETCH):
+        t = np.arange(first, min(first + STRETCH, total)) / rate
+        # As a bag can hold it, so that the truth is what the bag says.
+        throttle = profile(t).astype(np.float32).astype(np.float64)
+        try:
+            voltage = run.advance(t, throttle)
+        except ValueError as error:
+            raise InputError(str(error)) from error
+        yield Recording(t, voltage, throttle, name)

@@ -1,0 +1,193 @@
+"""
+Model files: the terms of a supply as YAML.
+
+`model:` is a list of terms, each `{term: NAME, params: {...}, se: {...}}`, the
+first being `ou`; `provenance:` tells where it comes from.  Written by
+`discover`, read by `simulate` and by the estimator node.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+import math
+from pathlib import Path
+from typing import Any
+
+from ou_monitor.errors import InputError, nearest
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.term import Term
+import yaml
+
+_KEYS = ('model', 'provenance')
+_TERM_KEYS = ('term', 'params', 'se')
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """
+    What a model file holds.
+
+    Attributes
+    ----------
+    model : SupplyModel
+        The terms.
+    se : tuple of dict
+        Standard errors by parameter, one dict a term, empty where not known;
+        in the unit of the parameter.
+    provenance : dict
+        Recording, commit, date, held-out score; free text.
+
+    """
+
+    model: SupplyModel
+    se: tuple[dict[str, Any], ...] = ()
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+
+def read_model(path: str | Path) -> ModelFile:
+    """
+    Read a model file.
+
+    Parameters
+    ----------
+    path : str or path
+        YAML.
+
+    Returns
+    -------
+    ModelFile
+        Checked.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, or names an unknown term, misses or exceeds
+        the parameters of a term, or holds a value out of range.
+
+    """
+    path = Path(path)
+    try:
+        data = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except OSError as error:
+        raise InputError(f'cannot read the model file {path}: {error.strerror}') from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(f'{path} is not YAML: {error}') from error
+    return parse_model(data, str(path))
+
+
+def parse_model(data: Any, where: str) -> ModelFile:
+    """
+    Return the model that parsed YAML describes.
+
+    Parameters
+    ----------
+    data : object
+        What the YAML parser returned.
+    where : str
+        Its source, for messages.
+
+    Returns
+    -------
+    ModelFile
+        Checked.
+
+    Raises
+    ------
+    InputError
+        As `read_model`.
+
+    """
+    if not isinstance(data, dict) or 'model' not in data:
+        raise InputError(f"{where}: a model file needs 'model:', a list of terms")
+    for key in data:
+        if key not in _KEYS:
+            raise InputError(f"{where}: unknown entry '{key}': {nearest(str(key), _KEYS)}")
+    entries = data['model']
+    if not isinstance(entries, list):
+        raise InputError(f"{where}: 'model' must be a list of terms, got "
+                         f'{type(entries).__name__}')
+    terms = [_term(entry, f'{where}, term {k}') for k, entry in enumerate(entries, start=1)]
+    try:
+        model = SupplyModel(tuple(term for term, _ in terms))
+    except ValueError as error:
+        raise InputError(f'{where}: {error}') from error
+    provenance = data.get('provenance') or {}
+    if not isinstance(provenance, dict):
+        raise InputError(f"{where}: 'provenance' must be a mapping")
+    return ModelFile(model, tuple(se for _, se in terms), provenance)
+
+
+def _term(entry: Any, where: str) -> tuple[Term, dict[str, Any]]:
+    if not isinstance(entry, dict) or 'term' not in entry:
+        raise InputError(f"{where}: a term needs 'term: NAME' and 'params:'")
+    name = str(entry['term'])
+    terms = catalogue()
+    if name not in terms:
+        raise InputError(f"{where}: unknown term '{name}': {nearest(name, terms)}")
+    for key in entry:
+        if key not in _TERM_KEYS:
+            raise InputError(f"{where} ('{name}'): unknown entry '{key}': "
+                             f'{nearest(str(key), _TERM_KEYS)}')
+    params, se = entry.get('params') or {}, entry.get('se') or {}
+    for what, values in (('params', params), ('se', se)):
+        if not isinstance(values, dict):
+            raise InputError(f"{where} ('{name}'): '{what}' must be a mapping of names to numbers")
+    for key in se:
+        if key not in terms[name].parameters():
+            raise InputError(f"{where} ('{name}'): 'se' names '{key}', which is no parameter: "
+                             f'{nearest(str(key), terms[name].parameters())}')
+    try:
+        return terms[name].read(params), {k: _error(v) for k, v in se.items()}
+    except ValueError as error:
+        raise InputError(f'{where}: {error}') from error
+
+
+def _error(value: Any) -> Any:
+    """Return a standard error, or a list of them; null means unknown."""
+    if isinstance(value, list):
+        return [_error(v) for v in value]
+    if value is None:
+        return math.nan
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f'a standard error must be a number, got {value!r}')
+    return float(value)
+
+
+def as_yaml(file: ModelFile) -> str:
+    """
+    Return the text of a model file; `parse_model` gives the same model back.
+
+    Parameters
+    ----------
+    file : ModelFile
+        What to write.
+
+    Returns
+    -------
+    str
+        YAML.
+
+    """
+    entries = []
+    for k, term in enumerate(file.model.terms):
+        entry: dict[str, Any] = {'term': term.NAME, 'params': _plain(term.values())}
+        se = file.se[k] if k < len(file.se) else {}
+        if se:
+            entry['se'] = _plain(se)
+        entries.append(entry)
+    data: dict[str, Any] = {'model': entries}
+    if file.provenance:
+        data['provenance'] = dict(file.provenance)
+    text: str = yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
+    return text
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    def one(value: Any) -> Any:
+        if isinstance(value, (list, tuple)):
+            return [one(v) for v in value]
+        return float(value) if math.isfinite(value) else None
+
+    return {name: one(value) for name, value in values.items()}
