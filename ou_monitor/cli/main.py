@@ -18,6 +18,7 @@ from ou_monitor.errors import InputError, nearest
 COMMANDS = {
     'analyze': 'ou_monitor.cli.analyze',
     'convert': 'ou_monitor.cli.convert',
+    'design': 'ou_monitor.cli.design',
     'simulate': 'ou_monitor.cli.simulate',
 }
 

@@ -1,0 +1,203 @@
+"""`ou-monitor design`: which capacitance brings the brown-out risk under X at throttle Y."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+import math
+from textwrap import fill
+from typing import Any, TYPE_CHECKING
+
+from ou_monitor.cli.quantities import component, quantity, read_network, value_of
+from ou_monitor.errors import InputError
+
+if TYPE_CHECKING:
+    from ou_monitor.model.network.components import PowerNetwork
+    from ou_monitor.offline.design import Design
+
+_COLUMNS = 100
+# One row of the printed table for this many rows of the calculation.
+_EVERY = 10
+# Options that are numbers, and their units.
+_OPTIONS = {'risk': '', 'throttle': '', 'horizon': 's', 'capacitance_min': 'F',
+            'capacitance_max': 'F'}
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        From ``ArgumentParser.add_subparsers``.
+
+    """
+    parser = subparsers.add_parser(
+        'design', allow_abbrev=False,
+        help='which capacitance brings the brown-out risk under X at throttle Y',
+        description='Compute alpha, sigma, Var_inf and the brown-out risk of a rail from the '
+                    'components of its power network, over bulk capacitances, and the least one '
+                    'that meets a risk.',
+        epilog='Values are in SI units, or with prefix and unit: 470uF, 40mOhm, 24kHz.')
+    parser.add_argument('--risk', metavar='X', required=True,
+                        help='probability of a brown-out allowed within the horizon, 0..1')
+    parser.add_argument('--throttle', metavar='Y', required=True, help='throttle, 0..1')
+    parser.add_argument('--rail', choices=('bus', 'regulated'), default='bus',
+                        help='the battery bus at the ESCs, or the regulated rail '
+                             '(default: %(default)s)')
+    parser.add_argument('--voltage', metavar='V',
+                        help='brown-out level, V (default: 3.3 V a cell on the bus; 4.5 V on a '
+                             'regulated rail of 5 V, 2.88 V on one of 3.3 V)')
+    parser.add_argument('--horizon', metavar='S', default='5', help='horizon, s (default: 5)')
+    parser.add_argument('--capacitance-min', metavar='F', default='10uF',
+                        help='least capacitance to look at (default: %(default)s)')
+    parser.add_argument('--capacitance-max', metavar='F', default='22mF',
+                        help='most capacitance to look at (default: %(default)s)')
+    parser.add_argument('--esr-fixed', action='store_true',
+                        help='keep the ESR (default: ESR falls as 1/C, as of more capacitors of '
+                             'one series in parallel)')
+    parser.add_argument('--set', metavar='NAME=VALUE', action='append', default=[],
+                        help='a component, such as bulk_capacitance=1000uF; may be repeated '
+                             '(see --list)')
+    parser.add_argument('--network', metavar='FILE.yaml',
+                        help='components as a YAML mapping of name to value; --set goes first')
+    parser.add_argument('--list', action=_List, help='list the components and their defaults')
+    parser.add_argument('--json', metavar='FILE',
+                        help="write the result as JSON ('-': to standard output, alone)")
+    parser.set_defaults(run=run)
+
+
+class _List(argparse.Action):
+    """Print the components with defaults and units, and leave."""
+
+    def __init__(self, option_strings: list[str], dest: str, **options: Any) -> None:
+        """Take no value."""
+        super().__init__(option_strings, dest, nargs=0, **options)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        """Print and leave with status 0."""
+        from ou_monitor.cli.output import table
+        from ou_monitor.model.network.components import PowerNetwork, UNITS
+
+        network = PowerNetwork()
+        rows = [[name, _shown(value, network), UNITS.get(name, '')]
+                for name, value in asdict(network).items()]
+        print(table(['component', 'default', 'unit'], rows, left=[0, 2]))
+        parser.exit()
+
+
+def _shown(value: object, network: PowerNetwork) -> str:
+    if value is None:
+        return f'{network.line_feedthrough:.4g}'
+    return str(value).lower() if isinstance(value, bool) else f'{value:g}'
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    Run the command.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Parsed arguments.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    Raises
+    ------
+    InputError
+        When an argument or the network cannot be used.
+
+    """
+    from ou_monitor.cli import output
+
+    numbers = {name: quantity(f'--{name.replace("_", "-")}', getattr(args, name), unit)
+               for name, unit in _OPTIONS.items()}
+    if numbers['throttle'] > 1.0:
+        raise InputError(f"--throttle: '{args.throttle}' is not between 0 and 1; write 40 % as "
+                         '0.4')
+    values = {} if args.network is None else read_network(args.network)
+    for word in args.set:
+        name, separator, text = word.partition('=')
+        if not separator:
+            raise InputError(f"--set: '{word}' is not NAME=VALUE, such as bulk_esr=20mOhm")
+        name = component(name.strip(), '--set')
+        values[name] = value_of(f'--set {name}', name, text)
+    output.check_writable(args.json)
+
+    from ou_monitor.model.network.components import PowerNetwork
+    from ou_monitor.offline.design import default_voltage, design
+    from ou_monitor.offline.design_words import as_data
+
+    try:
+        network = PowerNetwork(**values)
+        voltage, source = (
+            default_voltage(network, args.rail) if args.voltage is None
+            else (quantity('--voltage', args.voltage, 'V'), 'given'))
+        result = design(
+            network, numbers['throttle'], voltage=voltage, horizon=numbers['horizon'],
+            risk=numbers['risk'], rail=args.rail, esr_follows=not args.esr_fixed,
+            capacitances=(numbers['capacitance_min'], numbers['capacitance_max']))
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    if args.json is not None:
+        output.write_json(as_data(result, source), args.json)
+    if args.json != output.STDOUT:
+        print(render(result, source))
+    return 0
+
+
+def render(result: Design, source: str) -> str:
+    """
+    Return the table and the answer for a terminal 100 columns wide.
+
+    Parameters
+    ----------
+    result : Design
+        Result.
+    source : str
+        Where the brown-out level comes from.
+
+    Returns
+    -------
+    str
+        Plain text.
+
+    """
+    from ou_monitor.cli.output import table
+    from ou_monitor.offline.design_words import answer, effect, probability, remarks
+    from ou_monitor.offline.words import number
+
+    present = result.present
+    chosen = [(present, 'present')]
+    if result.least is not None:
+        chosen.append((result.least, 'least that meets it'))
+    for row in result.rows[::_EVERY]:
+        if not any(math.isclose(row.capacitance, r.capacitance, rel_tol=0.01) for r, _ in chosen):
+            chosen.append((row, '' if row.stable else 'unstable'))
+    cells = [[number(1e6 * r.capacitance), number(1e3 * r.esr), number(r.alpha),
+              number(1e6 * r.tau), number(r.sigma), number(r.var_inf), _time(r.mean_time),
+              probability(r.risk_ou), probability(r.risk_crossing), mark]
+             for r, mark in sorted(chosen, key=lambda item: item[0].capacitance)]
+    name = 'battery bus' if result.rail == 'bus' else 'regulated rail'
+    head = (f'{name} at throttle {result.throttle:g}: mean {present.mean:.4g} V (sag of the bus '
+            f'{present.sag:.3g} V), brown-out at {result.voltage:g} V ({source}), risk allowed '
+            f'{result.target:g} within {result.horizon:g} s')
+    lines = [
+        fill(head, _COLUMNS), '',
+        table(['C uF', 'ESR mOhm', 'alpha 1/s', 'tau us', 'sigma V/sqrt(s)', 'Var_inf V^2',
+               'mean time', 'risk OU', 'crossing', ''], cells, left=[9]), '']
+    for text in (answer(result), effect(result), *remarks(result)):
+        if text:
+            lines.append(fill(text, _COLUMNS))
+    return '\n'.join(lines)
+
+
+def _time(value: float) -> str:
+    from ou_monitor.offline.words import number
+
+    return 'never' if value > 1e100 else f'{number(value)} s'

@@ -1,0 +1,1 @@
+"""A power network from its components: battery, capacitor, filter, regulator, ESCs."""

@@ -1,0 +1,152 @@
+"""`ou-monitor design`: question in, table, sentence and JSON out; bad input one line."""
+
+import json
+import re
+
+from ou_monitor.cli.main import main
+from ou_monitor.cli.quantities import quantity
+from ou_monitor.errors import InputError
+from ou_monitor.model.network.components import PowerNetwork
+import pytest
+
+QUESTION = ['design', '--risk', '1e-3', '--throttle', '0.4']
+
+
+def said(capsys, *more):
+    """Return what a run that succeeds prints."""
+    assert main([*QUESTION, *more]) == 0
+    out, err = capsys.readouterr()
+    assert err == ''
+    return out
+
+
+def told(capsys, *more):
+    """Return the JSON of a run; NaN and Infinity are errors."""
+    def refuse(word):
+        raise ValueError(f'{word} is not JSON')
+
+    return json.loads(said(capsys, '--json', '-', *more), parse_constant=refuse)
+
+
+def test_answer_table_and_effect(capsys):
+    """The table has both ends, the present capacitor and the answer, in order of capacitance."""
+    out = said(capsys)
+    assert '2305 uF is the least that brings the risk under 0.001.' in out
+    words = ' '.join(out.split())
+    assert ('From 470 uF to 2305 uF: alpha falls from 30391 to 9406 1/s, Var_inf falls from 0.161 '
+            'to 0.0341 V^2') in words
+    rows = [line.split() for line in out.splitlines() if re.match(r' *[\d.]+ +[\d.]+ ', line)]
+    sizes = [float(row[0]) for row in rows]
+    assert sizes == sorted(sizes) and (sizes[0], sizes[-1]) == (10.0, 22000.0)
+    assert [row[0] for row in rows if row[-1] == 'present'] == ['470']
+    assert [row[0] for row in rows if row[-1] == 'it'] == ['2305']
+    assert all(len(line) <= 120 for line in out.splitlines())
+
+
+def test_json_and_table_agree(capsys, tmp_path):
+    """JSON alone on standard output; the same in a file, beside the table."""
+    data = told(capsys)
+    assert data['verdict'] == 'found' and data['brownout_voltage'] == pytest.approx(19.8)
+    assert data['least']['risk'] == pytest.approx(1e-3, rel=1e-6)
+    assert data['least']['alpha'] < data['present']['alpha']
+    assert data['network']['bulk_capacitance'] == 470e-6 and data['lc_corner_hz'] is None
+    file = tmp_path / 'design.json'
+    assert data['answer'] in said(capsys, '--json', str(file))
+    assert json.loads(file.read_text(encoding='utf-8')) == data
+
+
+def test_components_by_file_and_option(capsys, tmp_path):
+    """An option goes before the file, the file before the default."""
+    file = tmp_path / 'frame.yaml'
+    file.write_text('cells: 4\nbattery_voltage: 14.8\nbulk_capacitance: 1000uF\nbulk_esr: 2e-2\n'
+                    'constant_power: false\n', encoding='utf-8')
+    network = told(capsys, '--network', str(file), '--set', 'bulk_esr=15mOhm')['network']
+    assert (network['cells'], network['battery_voltage']) == (4, 14.8)
+    assert network['bulk_capacitance'] == pytest.approx(1e-3)
+    assert network['bulk_esr'] == pytest.approx(0.015) and network['constant_power'] is False
+    assert network['current_max'] == PowerNetwork().current_max
+
+
+def test_rails_levels_and_esr(capsys):
+    """Each rail has its own level; the ESR may be kept."""
+    assert told(capsys, '--rail', 'regulated')['brownout_voltage'] == 4.5
+    given = told(capsys, '--voltage', '18.5', '--horizon', '60s', '--esr-fixed')
+    assert (given['brownout_voltage'], given['horizon_s']) == (18.5, 60.0)
+    assert {row['esr'] for row in given['rows']} == {0.03}
+    narrow = told(capsys, '--capacitance-min', '100uF', '--capacitance-max', '1mF')
+    assert narrow['verdict'] == 'out_of_range' and narrow['least'] is None
+    assert [narrow['rows'][k]['capacitance'] for k in (0, -1)] == pytest.approx([1e-4, 1e-3])
+
+
+def test_filter_and_sag_in_words(capsys):
+    """The corner and resonance of a filter; a sag below the level."""
+    assert 'LC filter: corner 5033 Hz' in said(
+        capsys, '--rail', 'regulated', '--set', 'filter_inductance=10uH')
+    assert 'No capacitor helps' in said(capsys, '--set', 'current_max=400')
+    assert 'No more is needed' in said(capsys, '--set', 'current_max=10')
+
+
+def test_list(capsys):
+    """Every component with its default and unit."""
+    assert main(['design', '--list']) == 0
+    out = capsys.readouterr().out
+    assert re.search(r'^bulk_capacitance +0.00047  F$', out, re.MULTILINE)
+    assert re.search(r'^line_gain +0.2252$', out, re.MULTILINE)
+    assert len(out.splitlines()) == 2 + len(PowerNetwork.__dataclass_fields__)
+
+
+@pytest.mark.parametrize('more, words', [
+    (['--throttle', '40'], 'write 40 % as 0.4'), (['--throttle', '40%'], 'not a number'),
+    (['--throttle', '-0.1'], 'throttle'), (['--throttle', 'nan'], 'not a number'),
+    (['--risk', '1'], 'between 0 and 1'), (['--risk', '-1'], 'between 0 and 1'),
+    (['--risk', '1e999'], 'not a number'), (['--horizon', '0'], 'horizon must be positive'),
+    (['--horizon', '5V'], 'must be in s'), (['--voltage', 'low'], 'not a number'),
+    (['--capacitance-min', '1F'], 'must be below the most'),
+    (['--set', 'bulk_esr'], 'NAME=VALUE'), (['--set', 'bulk_capacitence=1'], 'bulk_capacitance'),
+    (['--set', 'bulk_capacitance=0'], 'bulk_capacitance must be positive and finite, got 0.0 F'),
+    (['--set', 'bulk_esr=-1mOhm'], 'bulk_esr must be zero or positive'),
+    (['--set', 'bulk_esr=20mV'], 'must be in Ohm'), (['--set', 'cells=6V'], 'no unit'),
+    (['--set', 'cells=5.5'], 'whole number'), (['--set', 'constant_power=2'], 'true nor false'),
+    (['--set', 'current_max=5000'], 'battery cannot give the load'),
+    (['--set', 'regulator_voltage=9', '--rail', 'regulated'], 'no default brown-out voltage'),
+    (['--set', 'filter_inductance=100uH', '--set', 'filter_resistance=1m', '--set',
+      'filter_capacitance=1uF', '--set', 'filter_esr=0'], 'unstable'),
+    (['--rail', 'motor'], 'invalid choice'), (['--network', 'none.yaml'], 'no file'),
+    (['--json', 'no/such/folder.json'], 'does not exist'),
+])
+def test_bad_input_is_one_line(more, words, capsys):
+    """Status 2, one line that names what to mend, nothing on standard output."""
+    assert main([*QUESTION, *more]) == 2
+    out, err = capsys.readouterr()
+    assert out == '' and err.count('\n') == 1 and words in err
+
+
+@pytest.mark.parametrize('text, words', [
+    (b'[1, 2]', 'mapping'), (b'', 'mapping'), (b'cells: [', 'not readable YAML'),
+    (b'\xff\xfe\x00', 'not readable YAML'), (b'celles: 4', "did you mean 'cells'"),
+    (b'cells: [4]', 'not a number'), (b'cells: true', 'not a number'), (b'1: 2', 'unknown'),
+    (b'line_gain: null', 'not a number'), (b'cells: .inf', 'not a number'),
+    (b'bulk_esr: 2 V', 'must be in Ohm'), (b'[' * 5000, 'not readable YAML')])
+def test_bad_network_files_are_one_line(text, words, capsys, tmp_path):
+    """As of any other input; the line names the file."""
+    file = tmp_path / 'frame.yaml'
+    file.write_bytes(text)
+    assert main([*QUESTION, '--network', str(file)]) == 2
+    out, err = capsys.readouterr()
+    assert out == '' and err.count('\n') == 1 and words in err and 'frame.yaml' in err
+
+
+@pytest.mark.parametrize('text, unit, value', [
+    ('470uF', 'F', 470e-6), ('470 µF', 'F', 470e-6), ('470u', 'F', 470e-6), ('1e-3', 'F', 1e-3),
+    ('24kHz', 'Hz', 24e3), ('40mOhm', 'Ohm', 0.04), ('40 mohm', 'Ohm', 0.04), ('2Ω', 'Ohm', 2.0),
+    ('33 1/s', '1/s', 33.0), ('.5', '', 0.5), (7, 'V', 7.0), ('-3V', 'V', -3.0)])
+def test_quantities(text, unit, value):
+    """Prefix and unit as users write them."""
+    assert quantity('x', text, unit) == pytest.approx(value, rel=1e-14)
+
+
+@pytest.mark.parametrize('text', ['', 'uF', '1e', '1..2', 'inf', 'nan', '1xF', '1 2', True, None])
+def test_what_is_no_quantity(text):
+    """Refused, with where it stands."""
+    with pytest.raises(InputError, match='^here: '):
+        quantity('here', text, 'F')
