@@ -82,7 +82,9 @@ class Flag(enum.Enum):
 @dataclass(frozen=True)
 class Counters:
     """
-    What became of every sample pushed so far; the parts add up to `pushed`.
+    What became of every sample pushed so far.
+
+    `used`, `non_finite`, `late` and `held` add up to `pushed`.
 
     Attributes
     ----------
@@ -95,7 +97,9 @@ class Counters:
     late : int
         Stamps at or before one already used, dropped.
     held : int
-        Repeats of the last value by the logger, dropped.
+        Repeats of the last value by a logger that is faster than its source,
+        dropped.  Repeats in the window when that is found out are counted
+        then; those that left it before stay in `used`.
     resets : int
         Times the window was cleared (gap, or a clock that jumped back).
 

@@ -20,9 +20,11 @@ import math
 MAX_STEPS = 60
 # No step moves alpha by more than a factor exp(1.5).
 _LONGEST = 1.5
-# Settled: ln(alpha) and theta (relative to its distance from 1) move less; what
-# is left is the square of it.
-_SETTLED = 1e-6
+# Settled: ln(alpha) and theta (relative to its distance from 1) move less, and
+# `polish` takes over: values tell no finer steps apart than some 1e-7, gradients do.
+_SETTLED = 1e-3
+# Steps of the differences that give the curvature there.
+_NEAR = 1e-5
 
 
 def objective(c0: float, c: Sequence[float], free: float, log_a: float, theta: float,
@@ -97,14 +99,71 @@ def information(log_a: float, theta: float) -> tuple[float, float, float]:
             1.0 / (1.0 - theta * theta))
 
 
+def polish(c0: float, c: Sequence[float], free: float, log_a: float, theta: float,
+           value: float, g_a: float, g_t: float, on_bound: bool, floor: float, slope: float,
+           low: float, high: float, tilt_a: float, tilt_t: float) -> tuple[float, float, float]:
+    """
+    Bring a point beside the minimum to it, by the gradient alone.
+
+    Two steps of Newton with one curvature, from differences of the gradient; a
+    step counts if the gradient falls in the metric of the curvature.
+
+    Parameters
+    ----------
+    c0, c, free, log_a, theta, tilt_a, tilt_t :
+        As in `objective`.
+    value, g_a, g_t : float
+        Its result there.
+    on_bound : bool
+        Whether theta stays on its bound; else it must not fall below.
+    floor, slope : float
+        The bound: floor + slope ln a.
+    low, high : float
+        Range of ln a.
+
+    Returns
+    -------
+    log_a, theta, value : float
+        The minimiser, to rounding, and the value there.
+
+    """
+    turn = slope if on_bound else 0.0
+    step = _NEAR * (1.0 - theta)
+    _, n_a, n_t = objective(c0, c, free, log_a + _NEAR, theta + turn * _NEAR, tilt_a, tilt_t)
+    aa, at, tt = (n_a - g_a) / _NEAR, (n_t - g_t) / _NEAR, 0.0
+    if on_bound:
+        along = aa + slope * at
+        h_aa = 1.0 / along if along > 0.0 else 0.0
+        h_at, h_tt = slope * h_aa, slope * slope * h_aa
+    else:
+        _, n_a, n_t = objective(c0, c, free, log_a, theta - step, tilt_a, tilt_t)
+        at, tt = 0.5 * (at + (g_a - n_a) / step), (g_t - n_t) / step
+        det = aa * tt - at * at
+        convex = aa > 0.0 and det > 0.0
+        h_aa, h_at, h_tt = (tt / det, -at / det, aa / det) if convex else (0.0, 0.0, 0.0)
+    for _ in range(2):
+        d_a, d_t = -(h_aa * g_a + h_at * g_t), -(h_at * g_a + h_tt * g_t)
+        new_a, new_t = log_a + d_a, theta + d_t
+        far = -(d_a * g_a + d_t * g_t)
+        if not (far > 0.0 and low <= new_a <= high and new_t < math.exp(-math.exp(new_a))
+                and (on_bound or new_t >= floor + slope * new_a)):
+            break
+        new_value, n_a, n_t = objective(c0, c, free, new_a, new_t, tilt_a, tilt_t)
+        if not (new_value < math.inf and h_aa * n_a * n_a + 2.0 * h_at * n_a * n_t
+                + h_tt * n_t * n_t < far):
+            break
+        log_a, theta, value, g_a, g_t = new_a, new_t, new_value, n_a, n_t
+    return log_a, theta, value
+
+
 def minimise(c0: float, c: Sequence[float], free: float, log_a: float, theta: float,
              floor: float, slope: float, low: float, high: float, tilt_a: float, tilt_t: float,
              ) -> tuple[float, float, float, bool, int]:
     """
     Minimise `objective` over ln a and theta >= floor + slope (ln a - start).
 
-    Quasi-Newton (BFGS) from the expected information, with step halving; on
-    the bound (no measurement noise) the search goes along it.
+    Quasi-Newton (BFGS) from the expected information, with step halving, then
+    `polish`; on the bound (no measurement noise) the search goes along it.
 
     Parameters
     ----------
@@ -206,4 +265,6 @@ def minimise(c0: float, c: Sequence[float], free: float, log_a: float, theta: fl
         value, g_a, g_t = new_value, n_a, n_t
         if not fresh and abs(s_a) < _SETTLED and abs(s_t) < _SETTLED * (1.0 - theta):
             break
+    log_a, theta, value = polish(c0, c, free, log_a, theta, value, g_a, g_t, on_bound,
+                                 floor - slope * start, slope, low, high, tilt_a, tilt_t)
     return log_a, theta, value, on_bound, steps

@@ -84,7 +84,8 @@ def search(c0: float, c: Sequence[float], free: float, log_a: float, theta: floa
 
     """
     theta = min(theta, 0.9 * math.exp(-math.exp(log_a)))
-    if not objective(c0, c, free, log_a, theta, 0.0, 0.0)[0] < math.inf:
+    log_a, theta, on_bound, value = _descend(c0, c, free, log_a, theta, m, tilt_a, tilt_t)
+    if not value < math.inf:
         # Sums over a few pairs need not be a covariance: start where they are one.
         best = math.inf
         for i in range(6):
@@ -93,7 +94,7 @@ def search(c0: float, c: Sequence[float], free: float, log_a: float, theta: floa
                 value = objective(c0, c, free, math.log(a), 0.3 * k * math.exp(-a), 0.0, 0.0)[0]
                 if value < best:
                     best, log_a, theta = value, math.log(a), 0.3 * k * math.exp(-a)
-    log_a, theta, on_bound, value = _descend(c0, c, free, log_a, theta, m, tilt_a, tilt_t)
+        log_a, theta, on_bound, value = _descend(c0, c, free, log_a, theta, m, tilt_a, tilt_t)
     if math.exp(log_a) * free < DOUBTFUL:
         # A valley at alpha -> 0 catches searches that start badly in strong noise.
         for i in range(4):

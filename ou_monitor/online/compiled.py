@@ -13,10 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+import hashlib
 import importlib.util
 import logging
 import math
 import os
+from pathlib import Path
 import threading
 import types
 from typing import Any
@@ -24,13 +26,15 @@ from typing import Any
 import numpy as np
 
 from ou_monitor.model import arma, quasi_fit, still_fit
+from ou_monitor.records import FloatArray
 
 # Compiled from their own text, each after those it calls.
 _SCALAR = (
     *((arma, name) for name in (
         'block_autocovariance', 'theta_at', 'noise_free_theta', 'noise_share',
         'innovation_variance', 'log_covariance')),
-    *((quasi_fit, name) for name in ('objective', 'innovation', 'information', 'minimise')),
+    *((quasi_fit, name) for name in (
+        'objective', 'innovation', 'information', 'polish', 'minimise')),
     *((still_fit, name) for name in (
         'guess', '_descend', 'search', 'finish', 'trend_score', 'fit_still')))
 
@@ -48,8 +52,8 @@ class Kernels:
     ----------
     fit_still, search, finish : callable
         Those of `still_fit`, for arrays of autocovariances.
-    slot_sums : callable
-        Sums over one slot, see `slot_sums`.
+    take_slots, add_slots : callable
+        Sums over slots, see `take_slots` and `add_slots`.
     check : callable
         Whether samples are finite and evenly spaced, see `check`.
 
@@ -58,7 +62,8 @@ class Kernels:
     fit_still: Callable[..., tuple[float, ...]]
     search: Callable[..., tuple[float, float, bool]]
     finish: Callable[..., tuple[float, ...]]
-    slot_sums: Callable[..., None]
+    take_slots: Callable[..., int]
+    add_slots: Callable[..., FloatArray]
     check: Callable[..., bool]
 
 
@@ -126,8 +131,9 @@ def slot_sums(z, runs, edges, lags, rows):  # type: ignore[no-untyped-def]
                 one_back = z[p, lags + begin - k:lags + end - k]
                 change = 0.0
                 if whole:
-                    for j in range(end - begin):
-                        change += one[j] - one_back[j]
+                    # What enters at one end and leaves at the other.
+                    for j in range(k):
+                        change += z[p, lags + end - 1 - j] - z[p, lags + begin - 1 - j]
                 else:
                     for j in range(end - begin):
                         if runs[begin + j] >= k:
@@ -146,6 +152,94 @@ def slot_sums(z, runs, edges, lags, rows):  # type: ignore[no-untyped-def]
                                 spread += (one[j] - one_back[j]) * (two[j] - two_back[j])
                     row[base + p * c + q] = spread
                     row[base + q * c + p] = spread
+
+
+def take_slots(z, runs, t, origin, slot, last, number, lags, rows, begins, head, tail):  # type: ignore[no-untyped-def]  # noqa: E501
+    """
+    Sum new samples into the rows of `LagSums`.
+
+    Parameters
+    ----------
+    z, runs, lags :
+        As in `slot_sums`.
+    t : ndarray, shape (n,)
+        Stamps, s.
+    origin, slot : float
+        Where slots begin, and their length, s.
+    last : float
+        The slot of the last row; NaN for none.
+    number : int
+        Number of the first of the samples.
+    rows : ndarray, shape (room, width)
+        Rows head..tail are in use; new ones follow.
+    begins : ndarray of int, shape (room,)
+        Numbers of the first samples of the rows.
+    head, tail : int
+        The rows in use.
+
+    Returns
+    -------
+    int
+        The new tail.
+
+    """
+    c = z.shape[0]
+    edges = np.empty(2, dtype=np.int64)
+    open_row = rows[:1]
+    begin = 0
+    while begin < t.size:
+        own = math.floor((t[begin] - origin) / slot + 1e-6)
+        end = begin + 1
+        while end < t.size and math.floor((t[end] - origin) / slot + 1e-6) == own:
+            end += 1
+        edges[0] = begin
+        edges[1] = end
+        if begin == 0 and head < tail and own == last:
+            open_row = np.empty((1, rows.shape[1]))
+            slot_sums(z, runs, edges, lags, open_row)  # type: ignore[no-untyped-call]
+            offset = number - begins[tail - 1]
+            for p in range(c):
+                open_row[0, 1 + c + p] += offset * open_row[0, 1 + p]
+            for i in range(rows.shape[1]):
+                rows[tail - 1, i] += open_row[0, i]
+        else:
+            row = rows[tail:tail + 1]
+            slot_sums(z, runs, edges, lags, row)  # type: ignore[no-untyped-call]
+            begins[tail] = number + begin
+            tail += 1
+        begin = end
+    return tail
+
+
+def add_slots(rows, begins, first, c):  # type: ignore[no-untyped-def]
+    """
+    Return the sums over slots.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (s, width)
+        Of `LagSums`.
+    begins : ndarray of int, shape (s,)
+        Numbers of their first samples.
+    first : int
+        Number of the first sample of the window.
+    c : int
+        Variables.
+
+    Returns
+    -------
+    ndarray, shape (width,)
+        Sums, the places counted from `first`.
+
+    """
+    total = np.zeros(rows.shape[1])
+    for i in range(rows.shape[0]):
+        offset = float(begins[i] - first)
+        for j in range(rows.shape[1]):
+            total[j] += rows[i, j]
+        for p in range(c):
+            total[1 + c + p] += offset * rows[i, 1 + p]
+    return total
 
 
 def check(t, y, before, low, high):  # type: ignore[no-untyped-def]
@@ -181,18 +275,26 @@ def build() -> Kernels:
     import numba  # type: ignore[import-not-found,unused-ignore]
 
     compile_one = numba.njit(cache=True, nogil=True)
+    # Numba's cache looks at the file of a function, not at those of what it calls.
+    text = b''.join(Path(str(module.__file__)).read_bytes()
+                    for module in (arma, quasi_fit, still_fit))
+    mark = hashlib.sha256(text).hexdigest()[:12]
     names: dict[str, Any] = {}
     for module, name in _SCALAR:
         plain = getattr(module, name)
         own = types.FunctionType(plain.__code__, {**plain.__globals__, **names}, name,
                                  plain.__defaults__)
         own.__module__ = plain.__module__
+        own.__qualname__ = f'{name}_{mark}'
         names[name] = compile_one(own)
     # Sums may be reordered, which lets them run several at a time; NaN and
     # infinity keep their meaning.
-    sums = numba.njit(cache=True, nogil=True, fastmath={'reassoc', 'contract', 'nsz'})(slot_sums)
-    kernels = Kernels(names['fit_still'], names['search'], names['finish'], sums,
-                      compile_one(check))
+    sums = numba.njit(cache=True, nogil=True, fastmath={'reassoc', 'contract', 'nsz'})
+    own = types.FunctionType(take_slots.__code__, {**globals(), 'slot_sums': sums(slot_sums)},
+                             'take_slots')
+    own.__module__ = __name__
+    kernels = Kernels(names['fit_still'], names['search'], names['finish'], sums(own),
+                      compile_one(add_slots), compile_one(check))
     # One call each with the types that are used, so that no caller waits.
     c = np.array([0.9, 0.8])
     pairs = np.full(2, 99.0)
@@ -201,11 +303,13 @@ def build() -> Kernels:
     kernels.fit_still(1.0, c, 100, 0.0, np.zeros((2, 5))[:, 0], pairs, -3.0, 0.1, 1)
     kernels.search(1.0, c, 97.0, -3.0, 0.1, 1, 0.0, 0.0)
     kernels.finish(1.0, c, 100, 97.0, -3.0, 0.1, False, 1)
-    edges = np.array([0, 4])
     for size in (1, 5):
-        width = 1 + 2 * size + size * size + 2 * (1 + size + size * size)
-        kernels.slot_sums(np.zeros((size, 6)), np.zeros(4, dtype=np.int64), edges, 2,
-                          np.zeros((1, width)))
+        rows = np.zeros((2, 1 + 2 * size + size * size + 2 * (1 + size + size * size)))
+        begins = np.zeros(2, dtype=np.int64)
+        stamps = np.zeros((2, 4))[0]
+        kernels.take_slots(np.zeros((size, 6)), np.zeros(4, dtype=np.int8), stamps, 0.0, 1.0,
+                           math.nan, 0, 2, rows, begins, 0, 0)
+        kernels.add_slots(rows[:1], begins[:1], 0, size)
     kernels.check(np.zeros(2), np.zeros(2), 0.0, 1.0, 2.0)
     return kernels
 

@@ -21,12 +21,14 @@ from ou_monitor.model import arma
 from ou_monitor.online import judgement
 from ou_monitor.online.compiled import kernels
 from ou_monitor.online.fitted import Fitted, from_window
-from ou_monitor.online.intake import as_column, BATCH, Intake, Thinner
-from ou_monitor.online.irregular import fit_irregular, fresh_columns, MOST
+from ou_monitor.online.intake import as_column, BATCH, Batch, Intake, Thinner
+from ou_monitor.online.irregular import fit_irregular, MOST
+from ou_monitor.online.lagsums import Sums
 from ou_monitor.online.quality import examine, Quality, TAIL
+from ou_monitor.online.repeats import refresh_period, Repeats, whole
 from ou_monitor.online.resolution import FACTOR, FEWEST, LAGS, Resolution
-from ou_monitor.online.series import T, U, Y
-from ou_monitor.online.window_fit import fit_window
+from ou_monitor.online.series import T, U
+from ou_monitor.online.window_fit import fit_window, TREND_SCORE
 from ou_monitor.records import Estimate, FloatArray, NAN, Status
 
 # Samples from which a fit is tried.
@@ -42,8 +44,14 @@ _JITTER = 0.1
 # An ADC step is white noise only where the OU crosses several codes within a
 # step: D >= (0.7 step / sigma)^2 (doc/estimation.md).
 _DITHER = 0.7
+# A diffusion of one step below this share of the variance is rounding of the sums.
+_EXACT = 1e-14
+# Increments that vary by less than this share of their mean square are one: a ramp.
+_RAMP = 1e-9
 # The quality of the input is looked at this many times per window.
 _LOOKS = 4
+# Where repeats are looked for: a third of the samples repeat at two a refresh, or more.
+_TIED = 0.25
 _DOUBLE = np.dtype(np.float64)
 
 
@@ -70,7 +78,9 @@ class SlidingEstimator:
     def __init__(self, window: float = 2.0, *, fastest: float = 1.0e4) -> None:
         self._window = _positive('window', window, 's')
         self._intake = Intake()
-        self._thinner = Thinner(_positive('fastest', fastest, 'Hz'))
+        self._fastest = _positive('fastest', fastest, 'Hz')
+        self._thinner = Thinner(self._fastest)
+        self._repeats = Repeats()
         self._finest = Resolution(self._window)
         self._tail = np.empty(0)
         self._quality = Quality()
@@ -141,7 +151,10 @@ class SlidingEstimator:
             raise ValueError(
                 f't and voltage must have one shape (n,): got {stamps.shape} and {volts.shape}')
         load: FloatArray | float | None = None
-        if throttle is not None:
+        if type(throttle) is np.ndarray and throttle.dtype is _DOUBLE and (
+                throttle.shape == stamps.shape):
+            load = throttle
+        elif throttle is not None:
             load = np.asarray(throttle, dtype=np.float64)
             if load.ndim == 0:
                 load = float(load)
@@ -160,12 +173,11 @@ class SlidingEstimator:
     def estimate(self) -> Estimate:
         """Return the estimate for the window that ends at the newest sample."""
         if self._cached is None:
-            used = self._intake.counters.used
+            used = self._intake.used
             self._work_off()
-            counters = self._intake.counters
-            if self._last is not None and counters.used == used == self._last.counters.used:
+            if self._last is not None and self._intake.used == used == self._last.counters.used:
                 # Nothing new in the window: the same numbers, not merely close ones.
-                self._last = replace(self._last, counters=counters)
+                self._last = judgement.recount(self._last, self._intake.counters)
             else:
                 self._last = self._estimate()
             self._cached = self._last
@@ -181,6 +193,20 @@ class SlidingEstimator:
             raw = batch.y
             self._tail = raw[-TAIL:].copy() if raw.size >= TAIL else np.concatenate(
                 [self._tail, raw])[-TAIL:]
+            if self._looked == -math.inf and self._tail.size >= TAIL and (
+                    self._repeats.period == 1.0) and _ties(self._tail) > _TIED:
+                # Before the first estimate: where the source is thinned it would be too late.
+                self._refresh(refresh_period(self._tail))
+            self._add(batch)
+
+    def _add(self, batch: Batch | None) -> None:
+        """Add samples to the window, less repeats of a source known to repeat."""
+        if batch is not None and self._repeats.period > 1.0:
+            size = batch.t.size
+            batch = self._repeats.drop(batch)
+            dropped = size - (0 if batch is None else batch.t.size)
+            self._intake.count(held=dropped, used=-dropped)
+        if batch is not None:
             t, y, u, breaks, restart = self._thinner.take(batch)
             if restart:
                 # Block means of another size do not go with the old ones.
@@ -189,8 +215,25 @@ class SlidingEstimator:
                 self._start = None
             self._finest.add(t, y, u, breaks)
 
+    def _refresh(self, period: float) -> None:
+        """Take the window again, less repeats, when a source is found to repeat its last value."""
+        before, self._repeats.period = self._repeats.period, period
+        if period == 1.0:
+            self._repeats.forget()
+        if before > 1.0 or period == 1.0:
+            return
+        again = whole(self._finest.series.all_columns()) if self._thinner.m == 1 else None
+        if again is None and self._finest.series.size:
+            # Means of repeats and refreshes cannot be told apart.
+            self._intake.count(resets=1)
+        self._finest.clear()
+        self._thinner = Thinner(self._fastest)
+        self._start = None
+        self._add(again)
+
     def _forget(self) -> None:
         self._thinner.forget()
+        self._repeats.forget()
         self._finest.clear()
         self._tail = np.empty(0)
         self._looked = -math.inf
@@ -199,7 +242,9 @@ class SlidingEstimator:
     def _look(self, t: float) -> Quality:
         """Examine the raw samples, now and then."""
         if not 0.0 <= t - self._looked < self._window / _LOOKS:
-            self._quality = examine(self._tail)
+            self._quality = examine(self._tail, self._repeats.period)
+            if self._quality.held != self._repeats.period:
+                self._refresh(self._quality.held)
             steps = np.diff(self._finest.series.column(T)[-TAIL:])
             self._jitter = float(np.std(steps)) if steps.size else 0.0
             self._looked = t
@@ -208,30 +253,32 @@ class SlidingEstimator:
     def _estimate(self) -> Estimate:
         """Fit the window."""
         series, intake = self._finest.series, self._intake
+        quality = self._look(intake.newest) if series.size else self._quality
+        counters = intake.counters
         if not series.size:
             n, since = self._thinner.waiting, self._thinner.waits_since
             if not n:
-                return Estimate(counters=intake.counters)
+                return Estimate(counters=counters)
             duration = intake.newest - since
             return Estimate(t=intake.newest, voltage=float(self._tail[-1]), n=n,
                             duration=duration, rate=(n - 1) / duration if duration else NAN,
-                            counters=intake.counters, status=Status.TOO_FEW_SAMPLES)
-        y, t = series.column(Y), series.column(T)
+                            counters=counters, status=Status.TOO_FEW_SAMPLES,
+                            flags=tuple(judgement.input_flags(counters, quality, NAN)))
+        t, y = series.columns(series.first, series.end)
         duration = float(t[-1] - t[0])
         m, n = self._thinner.m, series.size
         base = Estimate(
             t=intake.newest, voltage=float(self._tail[-1]), throttle=series.last(U),
-            n=n * m, duration=duration, counters=intake.counters,
-            rate=(n - 1) * m / duration if duration > 0.0 else NAN, u0=float(y.mean()))
-        quality = self._look(intake.newest)
+            n=n * m, duration=duration, counters=counters,
+            rate=(n - 1) * m / duration if duration > 0.0 else NAN)
         status = None
         if n < MIN_SAMPLES:
             status = Status.TOO_FEW_SAMPLES
         elif y[0] == y[-1] and not np.ptp(y) > 0.0:
             status = Status.CONSTANT
         if status is not None:
-            return replace(base, status=status, flags=tuple(
-                judgement.input_flags(intake.counters, quality, NAN)))
+            return replace(base, status=status, u0=float(y.mean()), flags=tuple(
+                judgement.input_flags(counters, quality, NAN)))
         fit, smoothness = self._fit(quality)
         return judgement.judge(fit, base, quality, self._throttle_std(), smoothness)
 
@@ -247,10 +294,6 @@ class SlidingEstimator:
         series = self._finest.series
         moves = series.moves and series.known
         sums = self._finest.sums.total()
-        if quality.held > 1 and self._thinner.m == 1:
-            columns = fresh_columns(series.all_columns(), quality.held)[:, -MOST:]
-            if columns.shape[1] >= MIN_SAMPLES:
-                return fit_irregular(columns, moves), NAN
         if self._thinner.m == 1 and series.size <= MOST and (
                 sums.pairs[-1] < _EVEN * (sums.n - LAGS)):
             return fit_irregular(series.all_columns(), moves), NAN
@@ -258,10 +301,12 @@ class SlidingEstimator:
         step = self._step(series.column(T))
         fit = fit_window(sums, m, self._start)
         self._start = (math.log(fit.a), fit.theta) if fit.correlated else None
-        smoothness = NAN
+        smoothness, drifts = NAN, False
         if fit.correlated:
-            smoothness = _smoothness(sums.spread[:, 0, 0] / np.maximum(sums.pairs, 1.0),
-                                     fit.a, m)
+            smoothness, drifts = _smoothness(sums, fit.a, m), _drifts(sums)
+            if fit.scale < _EXACT * float(sums.second[0, 0]) / sums.n:
+                # Load and trend leave nothing but rounding.
+                fit = replace(fit, correlated=False)
             if m == 1 and series.size <= MOST and self._jitter * fit.a / step > _JITTER:
                 return fit_irregular(series.all_columns(), moves), NAN
         # Coarser where noise, or an ADC step, hides what the lags can hold.
@@ -276,7 +321,8 @@ class SlidingEstimator:
             if not coarse.correlated:
                 break
             fit = coarse
-        return from_window(fit, step, m, sums.n, resolution.sums.reference), smoothness
+        found = from_window(fit, step, m, sums.n, resolution.sums.reference)
+        return replace(found, trend=True) if drifts else found, smoothness
 
     def _step(self, t: FloatArray) -> float:
         """Return the mean step between evenly spaced samples, s."""
@@ -288,18 +334,49 @@ class SlidingEstimator:
         return float(even.mean()) if even.size else self._thinner.step
 
 
-def _smoothness(variogram: FloatArray, a: float, m: int) -> float:
+def _smoothness(sums: Sums, a: float, m: int) -> float:
     """
-    Return how much more neighbouring increments are correlated than in an OU.
+    Return how much more neighbouring increments are correlated than in an OU; NaN on a ramp.
 
-    From E(z_j - z_{j-1})^2 and E(z_j - z_{j-2})^2: their correlation is
-    D_2 / (2 D_1) - 1.
+    From D_1 = E(z_j - z_{j-1})^2 and D_2 = E(z_j - z_{j-2})^2, less the means
+    squared, their correlation is D_2 / (2 D_1) - 1.
     """
-    if not variogram[0] > 0.0:
+    (raw, one), (_, two) = (_increments(sums, lag) for lag in (1, 2))
+    if not one > _RAMP * raw:
         return NAN
     gamma0, gamma1 = arma.block_autocovariance(a, m)
     of_ou = (gamma0 - gamma1 * math.exp(-a)) / (2.0 * (gamma0 - gamma1)) - 1.0
-    return float(variogram[1] / (2.0 * variogram[0])) - 1.0 - of_ou
+    return two / (2.0 * one) - 1.0 - of_ou
+
+
+def _drifts(sums: Sums) -> bool:
+    """
+    Whether the voltage drifts faster than even a random walk of its increments would.
+
+    What the fit of a window that does not come back cannot tell: to it every
+    drift may be chance.  The increments over the longest lag stand for those
+    that go on in one direction for a while.
+    """
+    pairs = float(sums.pairs[-1])
+    # While throttle moves, it explains what it can.
+    if pairs < _EVEN * sums.n or sums.first.size > 1:
+        return False
+    lag = sums.pairs.size
+    variance = max(_increments(sums, 1)[1], _increments(sums, lag)[1] / lag)
+    net = float(sums.change[0, 0]) / math.sqrt(float(sums.pairs[0]))
+    return net * net > TREND_SCORE ** 2 * variance
+
+
+def _increments(sums: Sums, lag: int) -> tuple[float, float]:
+    """Return mean square and variance, V^2, of increments over a lag."""
+    pairs = max(float(sums.pairs[lag - 1]), 1.0)
+    square = float(sums.spread[lag - 1, 0, 0]) / pairs
+    return square, square - (float(sums.change[lag - 1, 0]) / pairs) ** 2
+
+
+def _ties(y: FloatArray) -> float:
+    """Return the share of samples that are equal to the one before."""
+    return float(np.count_nonzero(y[1:] == y[:-1])) / y.size
 
 
 def _positive(name: str, value: float, unit: str) -> float:

@@ -18,7 +18,7 @@ class Outcome(enum.Enum):
     UNBOUND = 'no restoring force visible'
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class Fitted:
     """
     Parameters before correction for the length of the window.

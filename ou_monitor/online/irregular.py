@@ -2,8 +2,8 @@
 The fit for windows whose stamps are not evenly spaced.
 
 Exact likelihood at the stamps as they are (model/exact_fit.py); dearer than
-the sums over lags, so only for windows that need it: irregular sources,
-windows with many holes, and loggers that repeat their last value.
+the sums over lags, so only for windows that need it: irregular sources, and
+windows with many holes.
 """
 
 from __future__ import annotations
@@ -16,18 +16,12 @@ from ou_monitor.model import arma
 from ou_monitor.model.exact_fit import ExactFit, fit_exact
 from ou_monitor.online.fitted import Fitted, Outcome
 from ou_monitor.online.load import independent
-from ou_monitor.online.quality import fresh_samples
 from ou_monitor.online.series import FAST, SLOW, T, U, Y
 from ou_monitor.online.window_fit import TREND_SCORE
 from ou_monitor.records import FloatArray
 
 # Samples up to which the exact likelihood is used (some 50 ms).
 MOST = 4096
-
-
-def fresh_columns(columns: FloatArray, held: int) -> FloatArray:
-    """Return the columns without the repeats of a source that holds its last value."""
-    return columns[:, fresh_samples(columns[Y], held)] if held > 1 else columns
 
 
 def fit_irregular(columns: FloatArray, moves: bool) -> Fitted:

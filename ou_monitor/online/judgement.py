@@ -11,7 +11,6 @@ the other, so one correction serves both: 1.5/T, which leaves each high by
 
 from __future__ import annotations
 
-from dataclasses import replace
 import math
 from typing import Any
 
@@ -156,6 +155,14 @@ def input_flags(counters: Counters, quality: Quality, throttle_std: float) -> li
     return flags
 
 
+def recount(estimate: Estimate, counters: Counters) -> Estimate:
+    """Return the same estimate with newer counters, and the flag that goes with them."""
+    flags = estimate.flags
+    if (counters.late or counters.non_finite) and Flag.IRREGULAR not in flags:
+        flags = (*flags, Flag.IRREGULAR)
+    return Estimate(**{**vars(estimate), 'counters': counters, 'flags': flags})
+
+
 def _level(fit: Fitted, throttle: float, moves: bool) -> tuple[float, float]:
     """Return the mean at the present throttle, V, and its slope, V per unit throttle."""
     if not moves or math.isnan(throttle):
@@ -165,4 +172,5 @@ def _level(fit: Fitted, throttle: float, moves: bool) -> tuple[float, float]:
 
 
 def _with(base: Estimate, status: Status, flags: list[Flag], **values: Any) -> Estimate:
-    return replace(base, status=status, flags=tuple(flags), **values)
+    # What `replace` does, without its looking at every field.
+    return Estimate(**{**vars(base), 'status': status, 'flags': tuple(flags), **values})

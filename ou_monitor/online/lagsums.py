@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from ou_monitor.online.compiled import kernels
 from ou_monitor.online.series import Series, T, Y
@@ -22,9 +23,11 @@ from ou_monitor.records import FloatArray
 
 # Variables while throttle moves: voltage, throttle, its square, its two lags.
 LOAD_VARIABLES = 5
+# Rows made at first.
+_ROOM = 128
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class Sums:
     """
     Sums over the samples of a window, for c variables and K lags.
@@ -85,8 +88,10 @@ class LagSums:
         c, lags = variables, self._lags
         sizes = [1, c, c, c * c, lags, lags * c, lags * c * c]
         self._ends = np.cumsum(sizes).tolist()
-        self._begins: list[int] = []
-        self._rows = np.empty((0, self._ends[-1]))
+        # Rows head..tail of the slots, the numbers of their first samples beside them.
+        self._rows = np.empty((_ROOM, self._ends[-1]))
+        self._begins = np.empty(_ROOM, dtype=np.int64)
+        self._head = self._tail = 0
         self._summed = self._series.first
         self._open = math.nan
         self._reference: float | None = None
@@ -100,6 +105,10 @@ class LagSums:
     def slots_of(self, t: FloatArray) -> FloatArray:
         """Return the slot of each stamp; edges are met to 1e-6, as stamps are sums of steps."""
         return np.floor((t - self.origin) / self._slot + 1e-6)
+
+    def slot_of(self, t: float) -> int:
+        """Return the slot of one stamp, as `slots_of` does."""
+        return math.floor((t - self.origin) / self._slot + 1e-6)
 
     @property
     def throttle_std(self) -> float:
@@ -117,12 +126,8 @@ class LagSums:
             self.restart(self._slot, variables)
         if self._reference is None and series.size:
             self._reference = float(series.column(Y)[0])
-        gone = 0
-        while gone < len(self._begins) and self._begins[gone] < series.first:
-            gone += 1
-        if gone:
-            del self._begins[:gone]
-            self._rows = self._rows[gone:]
+        while self._head < self._tail and self._begins[self._head] < series.first:
+            self._head += 1
         self._summed = max(self._summed, series.first)
         if self._summed < series.end:
             self._take()
@@ -131,85 +136,125 @@ class LagSums:
 
     def _take(self) -> None:
         """Sum what is new; the first part of it may go on in the slot that is open."""
-        series, begin = self._series, self._summed
-        slots = self.slots_of(series.columns(begin, series.end)[T])
-        cuts = (np.flatnonzero(slots[1:] != slots[:-1]) + 1 + begin).tolist()
-        edges = [begin, *cuts, series.end]
-        rows = self._sum(edges)
-        begins = edges[:-1]
-        if self._begins and slots[0] == self._open:
-            offset = begin - self._begins[-1]
-            first, place = slice(1, self._ends[1]), slice(self._ends[1], self._ends[2])
-            rows[0, place] += offset * rows[0, first]
-            self._rows[-1] += rows[0]
-            rows, begins = rows[1:], begins[1:]
-        self._rows = np.concatenate([self._rows, rows])
-        self._begins += begins
-        self._summed, self._open = series.end, float(slots[-1])
-
-    def _sum(self, edges: list[int]) -> FloatArray:
-        """Return one row per slot between the edges."""
-        series, lags = self._series, self._lags
-        begin, end = edges[0], edges[-1]
+        series, lags, begin, end = self._series, self._lags, self._summed, self._series.end
+        t = series.columns(begin, end)[T]
+        self._make_room(min(end - begin, int((float(t[-1]) - float(t[0])) / self._slot) + 2))
         back = min(lags, begin - series.first + series.behind)
-        y = series.columns(begin - back, end)[Y] - self.reference
-        if self._c == 1:
-            z = y[None, :]
-        else:
-            load = series.load(begin - back, end)
-            u, fast, slow = np.where(np.isfinite(load), load, 0.0)
-            z = np.stack([y, u, u * u, fast, slow])
+        z = self._variables(begin - back, end)
         runs = series.runs(begin, end)
         if back < lags:
-            runs = np.minimum(runs, back + np.arange(end - begin))
+            runs = np.minimum(runs, back + np.arange(end - begin)).astype(np.int8)
             z = np.concatenate([np.zeros((self._c, lags - back)), z], axis=1)
-        fast_sums = kernels()
-        if fast_sums is not None:
-            rows = np.empty((len(edges) - 1, self._ends[-1]))
-            fast_sums.slot_sums(z, runs.astype(np.int64), np.array(edges) - begin, lags, rows)
-            return rows
+        fast = kernels()
+        if fast is not None:
+            self._tail = fast.take_slots(z, runs, t, self.origin, self._slot, self._open, begin,
+                                         lags, self._rows, self._begins, self._head, self._tail)
+        else:
+            self._take_plain(z, runs, t, begin)
+        self._summed, self._open = end, float(self.slot_of(float(t[-1])))
+
+    def _make_room(self, more: int) -> None:
+        """Move the rows to the front, of a larger store if need be."""
+        if self._tail + more <= len(self._begins):
+            return
+        kept = slice(self._head, self._tail)
+        rows, begins = self._rows[kept].copy(), self._begins[kept].copy()
+        if len(begins) + more > len(self._begins):
+            size = 2 * (len(begins) + more)
+            self._rows = np.empty((size, self._ends[-1]))
+            self._begins = np.empty(size, dtype=np.int64)
+        self._head, self._tail = 0, len(begins)
+        self._rows[:self._tail], self._begins[:self._tail] = rows, begins
+
+    def _variables(self, begin: int, end: int) -> FloatArray:
+        """Return the variables of samples begin..end-1, shape (c, end - begin)."""
+        y: FloatArray = self._series.columns(begin, end)[Y] - self.reference
+        if self._c == 1:
+            return y.reshape(1, -1)
+        z = np.empty((self._c, end - begin))
+        load = self._series.load(begin, end)
+        z[0] = y
+        z[1] = load[0]
+        z[3:] = load[1:]
+        unknown = np.isnan(load)
+        if unknown.any():
+            # Samples before the window, which pairs reach back to.
+            z[1] = np.where(unknown[0], 0.0, load[0])
+            z[3:] = np.where(unknown[1:], 0.0, load[1:])
+        np.multiply(z[1], z[1], out=z[2])
+        return z
+
+    def _take_plain(self, z: FloatArray, runs: npt.NDArray[np.int8], t: FloatArray, begin: int
+                    ) -> None:
+        """Do what the kernel `take_slots` does."""
+        slots = self.slots_of(t)
+        cuts = np.flatnonzero(slots[1:] != slots[:-1]) + 1
+        edges = [0, *cuts.tolist(), t.size]
+        rows = self._sum(z, runs, edges)
+        skip = 0
+        if self._head < self._tail and slots[0] == self._open:
+            offset = begin - int(self._begins[self._tail - 1])
+            first, place = slice(1, self._ends[1]), slice(self._ends[1], self._ends[2])
+            rows[0, place] += offset * rows[0, first]
+            self._rows[self._tail - 1] += rows[0]
+            skip = 1
+        tail = self._tail + len(rows) - skip
+        self._rows[self._tail:tail] = rows[skip:]
+        self._begins[self._tail:tail] = np.array(edges[skip:-1]) + begin
+        self._tail = tail
+
+    def _sum(self, z: FloatArray, runs: npt.NDArray[np.int8], edges: list[int]) -> FloatArray:
+        """Return one row per slot between the edges."""
+        lags, size = self._lags, edges[-1]
         own = z[:, lags:]
-        windows = np.lib.stride_tricks.sliding_window_view(z, end - begin, axis=1)
-        difference = own[:, None, :] - windows[:, lags - 1::-1, :]
-        whole = bool(runs.min() >= lags)
-        cuts = np.array(edges[:-1]) - begin
-        sizes = np.diff(np.array(edges))
+        # Differences by lag, variable and sample.
+        wide, narrow = z.strides
+        back: FloatArray = np.ndarray((lags, self._c, size), np.float64, z, (lags - 1) * narrow,
+                                      (-narrow, wide, narrow))
+        difference = own - back
+        cuts, sizes = np.array(edges[:-1]), np.array(edges[1:])
+        sizes -= cuts
         rows = np.empty((cuts.size, self._ends[-1]))
         rows[:, 0] = sizes
         _, at_first, at_place, at_second, at_pairs, at_change, _ = self._ends
-        if whole:
+        if int(runs.min()) >= lags:
             rows[:, at_second:at_pairs] = sizes[:, None]
+            # The sum of a difference is what enters at one end and leaves at the other.
+            ends = z[:, lags - 1 + np.array(edges)[:, None] - np.arange(lags)].cumsum(axis=2)
+            change = (ends[:, 1:] - ends[:, :-1]).transpose(1, 2, 0)
         else:
             valid = runs >= np.arange(1, lags + 1)[:, None]
-            difference *= valid
+            difference *= valid[:, None, :]
             rows[:, at_second:at_pairs] = np.add.reduceat(valid, cuts, axis=1, dtype=float).T
+            change = np.add.reduceat(difference, cuts, axis=2).transpose(2, 0, 1)
+        rows[:, at_pairs:at_change] = change.reshape(cuts.size, -1)
+        number = np.arange(size) - np.repeat(cuts, sizes)
+        moments = np.concatenate([own, own * number, *(own * one for one in own)])
+        rows[:, 1:at_second] = np.add.reduceat(moments, cuts, axis=1).T
         if self._c == 1:
-            y, change = own[0], difference[0]
-            number = np.arange(y.size) - np.repeat(cuts, sizes)
-            moments = np.add.reduceat(np.stack([y, y * number, y * y]), cuts, axis=1)
-            rows[:, 1:4] = moments.T
-            rows[:, at_pairs:at_change] = np.add.reduceat(change, cuts, axis=1).T
-            change *= change
-            rows[:, at_change:] = np.add.reduceat(change, cuts, axis=1).T
+            difference *= difference
+            rows[:, at_change:] = np.add.reduceat(difference[:, 0], cuts, axis=1).T
             return rows
-        for row, cut, size in zip(rows, cuts.tolist(), sizes.tolist()):
-            part = own[:, cut:cut + size]
-            by_lag = difference[:, :, cut:cut + size].transpose(1, 0, 2)
-            row[1:at_first] = part.sum(axis=1)
-            row[at_first:at_place] = part @ np.arange(size, dtype=np.float64)
-            row[at_place:at_second] = (part @ part.T).ravel()
-            row[at_pairs:at_change] = by_lag.sum(axis=2).ravel()
-            row[at_change:] = (by_lag @ by_lag.transpose(0, 2, 1)).ravel()
+        for row, low, high in zip(rows, edges[:-1], edges[1:]):
+            part = difference[:, :, low:high]
+            row[at_change:] = (part @ part.transpose(0, 2, 1)).ravel()
         return rows
 
     def _added(self) -> Sums:
-        rows, c, lags = self._rows, self._c, self._lags
+        c, lags = self._c, self._lags
         _, at_first, at_place, at_second, at_pairs, at_change, _ = self._ends
-        total = rows.sum(axis=0)
-        offsets = np.array(self._begins, dtype=np.float64) - self._series.first
+        kept = slice(self._head, self._tail)
+        fast = kernels()
+        if fast is not None:
+            total = fast.add_slots(self._rows[kept], self._begins[kept], self._series.first, c)
+        else:
+            rows = self._rows[kept]
+            total = np.add.reduce(rows, axis=0)
+            offsets = self._begins[kept] - float(self._series.first)
+            total[at_first:at_place] += offsets @ rows[:, 1:at_first]
         return Sums(
             n=int(total[0]), first=total[1:at_first],
-            place=total[at_first:at_place] + offsets @ rows[:, 1:at_first],
+            place=total[at_first:at_place],
             second=total[at_place:at_second].reshape(c, c),
             pairs=total[at_second:at_pairs],
             change=total[at_pairs:at_change].reshape(lags, c),

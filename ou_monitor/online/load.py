@@ -15,36 +15,41 @@ import numpy as np
 
 from ou_monitor.online.lagsums import Sums
 from ou_monitor.records import FloatArray
+from scipy.linalg.lapack import dposv, dsyev
 
 # Directions of the load that vary less than this share of the largest are
 # left out: the window does not show them.
 _UNSEEN = 1e-5
 # A load variable of less variance than this (full scale squared) is constant.
 _STILL = 1e-12
-# Steps of the differences that give the gradient of a log-determinant.
-_STEP = 1e-3
+# Exponents of theta, as many as lags could be; parts of vectors.
+_COUNT = np.arange(256.0)
+_ONE, _NO_TIME = np.ones(1), np.zeros(1)
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class Regression:
     """
     The mean, fitted at one choice of noise.
 
     Attributes
     ----------
-    b : ndarray, shape (r,)
-        Coefficients of the regressors, V.
-    inverse : ndarray, shape (r, r)
+    beta : ndarray, shape (c,)
+        Coefficients of load and time, V per unit.
+    cov : ndarray, shape (c, c)
         Their covariance per unit innovation variance, times n.
     tilt : tuple of float
         Gradient of half the log-determinant of their information in ln a and
         theta (see `quasi_fit.objective`).
+    gram : ndarray, shape (c + 1, c + 1)
+        Products x' K^-1 z over n of voltage, load and time.
 
     """
 
-    b: FloatArray
-    inverse: FloatArray
+    beta: FloatArray
+    cov: FloatArray
     tilt: tuple[float, float]
+    gram: FloatArray
 
 
 class Moments:
@@ -64,7 +69,7 @@ class Moments:
         Samples.
     mean : ndarray, shape (c,)
         Means of voltage (less its reference), load, and time (0).
-    basis : ndarray, shape (c - 1, r)
+    basis : ndarray, shape (c, r)
         Load and time coefficients of each of the r regressors, which are
         independent combinations of them; the last row is time.
 
@@ -74,96 +79,118 @@ class Moments:
         n, c, lags = sums.n, sums.first.size, sums.pairs.size
         self.n = n
         mean = sums.first / n
-        self.mean = np.append(mean, 0.0)
-        pairs = np.maximum(sums.pairs, 1.0)
+        self.mean = np.concatenate([mean, _NO_TIME])
+        halves = 0.5 / np.maximum(sums.pairs, 1.0)
         # Lag 0, then lags 1..K; time, counted from the middle in windows, comes last.
         raw = np.empty((lags + 1, c + 1, c + 1))
-        zero = sums.second / n - mean[:, None] * mean
+        zero = sums.second / n
+        zero -= mean[:, None] * mean
         raw[0, :c, :c] = zero
-        raw[1:, :c, :c] = zero - sums.spread / (2.0 * pairs)[:, None, None]
-        with_time = (sums.place / n - 0.5 * (n - 1) * mean) / n
+        np.multiply(sums.spread, -halves[:, None, None], out=raw[1:, :c, :c])
+        raw[1:, :c, :c] += zero
         k = np.arange(lags + 1.0) / n
-        raw[:, :c, c] = with_time
-        raw[1:, :c, c] -= sums.change * (k[1:] / (2.0 * pairs))[:, None]
+        raw[:, :c, c] = (sums.place - 0.5 * (n - 1) * sums.first) / n / n
+        raw[1:, :c, c] -= sums.change * (k[1:] * halves)[:, None]
         raw[:, c, :c] = raw[:, :c, c]
         raw[:, c, c] = (1.0 - 1.0 / (n * n)) / 12.0 - 0.5 * k * k
         self._raw = raw
-        self.use_time(trend)
-
-    def use_time(self, trend: bool) -> None:
-        """Choose the regressors: the load, and time if wanted."""
-        size = self.mean.size
-        used = slice(1, size if trend else size - 1)
-        found = independent(self._raw[0, used, used])
-        self.basis = np.zeros((size - 1, found.shape[1]))
-        self.basis[:found.shape[0]] = found
-        turn = np.zeros((size, 1 + self.rank))
-        turn[0, 0] = 1.0
-        turn[1:, 1:] = self.basis
-        self._at = turn.T @ self._raw @ turn
-        self._flat = self._at.reshape(self._at.shape[0], -1)
+        self._flat = raw.reshape(lags + 1, -1)
+        # Powers of theta, their derivatives, and lag 0 apart.
+        self._powers = np.zeros((3, lags + 1))
+        self._powers[0, 0] = 1.0
+        load = independent(zero[1:, 1:])
+        self._load = np.zeros((c, load.shape[1]))
+        self._load[:-1] = load
+        self.basis = independent(raw[0, 1:, 1:]) if trend else self._load
 
     @property
     def rank(self) -> int:
         """Return the number of regressors."""
         return int(self.basis.shape[1])
 
-    def residual(self, b: FloatArray) -> tuple[float, FloatArray]:
-        """Return autocovariances, V^2, of the voltage less b times regressors: lag 0, 1..K."""
-        w = np.concatenate(([1.0], -b))
-        c = (self._at @ w) @ w
+    def residual(self, beta: FloatArray) -> tuple[float, FloatArray]:
+        """Return autocovariances, V^2, of the voltage less its mean: lag 0, lags 1..K."""
+        w = np.concatenate([_ONE, -beta])
+        c = (self._raw @ w) @ w
         return float(c[0]), c[1:]
 
     def regress(self, log_a: float, theta: float) -> Regression:
         """Fit the mean by generalised least squares with the noise of (ln a, theta)."""
-        step = _STEP * (1.0 - theta)
-        gram = (_weights(np.array([log_a, log_a - _STEP, log_a]),
-                         np.array([theta, theta, theta - step]), self._at.shape[0])
-                @ self._flat).reshape(3, *self._at.shape[1:])
-        inner = gram[:, 1:, 1:]
-        inverse = np.linalg.inv(inner[0])
-        half = 0.5 * np.linalg.slogdet(inner)[1]
-        return Regression(inverse @ gram[0, 1:, 0], inverse,
-                          (float(half[0] - half[1]) / _STEP, float(half[0] - half[2]) / step))
+        gram, by_log_a, by_theta = (self._weights(log_a, theta) @ self._flat).reshape(
+            3, *self._raw.shape[1:])
+        basis = self.basis
+        inner = gram[1:, 1:]
+        cov = basis @ _inverse(basis.T @ inner @ basis) @ basis.T
+        # The gradient of half a log-determinant is half the trace of inverse times change.
+        return Regression(cov @ gram[1:, 0], cov,
+                          (0.5 * float(np.vdot(cov, by_log_a[1:, 1:])),
+                           0.5 * float(np.vdot(cov, by_theta[1:, 1:]))), gram)
 
-    def trend_score(self, log_a: float, theta: float) -> float:
-        """Return a trend beyond the load, over its standard error; theta as in `regress`."""
-        weights = _weights(np.array([log_a]), np.array([theta]), self._raw.shape[0])
-        gram = (weights @ self._raw.reshape(self._raw.shape[0], -1)).reshape(
-            self._raw.shape[1:])
-        load = independent(self._raw[0, 1:-1, 1:-1])
-        turn = np.zeros((self.mean.size, 2 + load.shape[1]))
-        turn[0, 0] = turn[-1, 1] = 1.0
-        turn[1:-1, 2:] = load
-        gram = turn.T @ gram @ turn
-        inverse = np.linalg.inv(gram[1:, 1:])
-        b = inverse @ gram[1:, 0]
-        rest = float(gram[0, 0] - gram[0, 1:] @ b)
-        spread = float(inverse[0, 0]) * max(rest, 0.0) / self.n
-        return float(b[0]) / math.sqrt(spread) if spread > 0.0 else 0.0
+    def trend_score(self, mean: Regression) -> float:
+        """Return a trend beyond the load, over its standard error, with the noise of `mean`."""
+        gram = mean.gram
+        cov = mean.cov
+        if self.basis is not self._load:
+            load = self._load
+            cov = load @ _inverse(load.T @ gram[1:, 1:] @ load) @ load.T
+        # What the load does not explain of the trend and of the voltage.
+        x, y = gram[1:, -1], gram[1:, 0]
+        explained = cov @ x
+        xx = float(gram[-1, -1] - explained @ x)
+        xy = float(gram[-1, 0] - explained @ y)
+        yy = float(gram[0, 0] - y @ cov @ y)
+        if not xx > 0.0:
+            return 0.0
+        spread = max(yy - xy * xy / xx, 0.0) * xx / self.n
+        return xy / math.sqrt(spread) if spread > 0.0 else 0.0
+
+    def _weights(self, log_a: float, theta: float) -> FloatArray:
+        """Return what each lag counts in x' K^-1 z, and the derivatives by ln a and theta."""
+        phi = math.exp(-math.exp(log_a))
+        by = -math.exp(log_a) * phi
+        one, cross, apart = 1.0 - theta * theta, 1.0 - phi * theta, theta - phi
+        lead, tail = 1.0 + phi * phi - 2.0 * phi * theta, 2.0 * cross * apart
+        more = 2.0 * theta / one
+        powers = self._powers
+        k = _COUNT[:powers.shape[1] - 1]
+        powers[1, 1:] = theta ** k
+        np.multiply(k[1:], powers[1, 1:-1], out=powers[2, 2:])
+        turn = np.array([
+            [lead, tail, 0.0],
+            [-2.0 * by * apart, -2.0 * by * (theta * apart + cross), 0.0],
+            [more * lead - 2.0 * phi, more * tail + 2.0 * (cross - phi * apart), tail]])
+        turn /= one
+        weights: FloatArray = turn @ powers
+        return weights
 
 
-def _weights(log_a: FloatArray, theta: FloatArray, count: int) -> FloatArray:
-    """Return what each lag counts in x' K^-1 z, shape (points, count), lag 0 first."""
-    phi = np.exp(-np.exp(log_a))
-    weights = np.empty((theta.size, count))
-    weights[:, 0] = 1.0 + phi * phi - 2.0 * phi * theta
-    tail = 2.0 * (1.0 - phi * theta) * (theta - phi)
-    weights[:, 1:] = tail[:, None] * theta[:, None] ** np.arange(count - 1)
-    return weights / (1.0 - theta * theta)[:, None]
+def _inverse(inner: FloatArray) -> FloatArray:
+    """Return the inverse of a symmetric matrix; LAPACK's own call, as these are small."""
+    if not inner.size:
+        return inner
+    _, inverse, bad = dposv(inner, np.eye(len(inner)))
+    # Sums over few pairs need not be positive.
+    return np.asarray(np.linalg.inv(inner) if bad else inverse, dtype=np.float64)
 
 
 def independent(cov: FloatArray) -> FloatArray:
     """Return the independent, unit-variance combinations (columns) of variables that vary."""
-    used = np.flatnonzero(cov.diagonal() > _STILL)
-    if not used.size:
-        return np.empty((cov.shape[0], 0))
-    scale = np.sqrt(cov.diagonal()[used])
-    values, vectors = np.linalg.eigh(cov[np.ix_(used, used)] / (scale[:, None] * scale))
-    seen = values > _UNSEEN * values[-1]
-    basis = np.zeros((cov.shape[0], int(seen.sum())))
-    basis[used] = vectors[:, seen] / scale[:, None]
-    return basis
+    variances = cov.diagonal()
+    varies = variances > _STILL
+    if not varies.all():
+        used = varies.nonzero()[0]
+        basis = np.zeros((cov.shape[0], used.size))
+        if used.size:
+            own = independent(cov[used[:, None], used])
+            basis = basis[:, :own.shape[1]]
+            basis[used] = own
+        return basis
+    if not variances.size:
+        return np.empty((0, 0))
+    scale = np.sqrt(variances)
+    values, vectors, _ = dsyev(cov / (scale[:, None] * scale))
+    found: FloatArray = vectors[:, values > _UNSEEN * values[-1]] / scale[:, None]
+    return found
 
 
 def load_at(throttle: float) -> FloatArray:

@@ -12,11 +12,9 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from ou_monitor.online.repeats import refresh_period
 from ou_monitor.records import FloatArray
-
-BoolArray = npt.NDArray[np.bool_]
 
 # Raw samples looked at.
 TAIL = 1024
@@ -43,7 +41,7 @@ class Quality:
     ----------
     step : float
         ADC step, V; 0 when the values lie on no lattice.
-    held : int
+    held : float
         Samples per refresh of a source that repeats its last value; 1: none.
     saturated : bool
         Whether samples pile up at an extreme.
@@ -53,12 +51,12 @@ class Quality:
     """
 
     step: float = 0.0
-    held: int = 1
+    held: float = 1.0
     saturated: bool = False
     rms_increment: float = math.nan
 
 
-def examine(y: FloatArray) -> Quality:
+def examine(y: FloatArray, known: float = 1.0) -> Quality:
     """
     Return what the raw samples show.
 
@@ -66,6 +64,8 @@ def examine(y: FloatArray) -> Quality:
     ----------
     y : ndarray, shape (n,)
         Voltages in order, V, finite.
+    known : float
+        Samples per refresh as found before; 1: none (see `refresh_period`).
 
     Returns
     -------
@@ -74,16 +74,16 @@ def examine(y: FloatArray) -> Quality:
 
     """
     if y.size < _ENOUGH:
-        return Quality()
+        return Quality(held=known)
     steps = np.diff(y)
     changes = np.flatnonzero(steps)
     if changes.size < _FEWEST_STEPS:
-        return Quality()
+        return Quality(held=known)
     sizes = np.abs(steps[changes])
-    held = _refresh(steps == 0.0)
-    fresh = sizes if held > 1 else steps
+    held = refresh_period(y, known)
+    fresh = sizes if held > 1.0 else steps
     # Where many neighbours are equal, a few different steps are a lattice, too.
-    tied = held == 1 and changes.size < _TIED * steps.size
+    tied = held == 1.0 and changes.size < _TIED * steps.size
     return Quality(lattice(sizes, 1 if tied else _FEWEST_STEPS), held, _piles_up(y, held),
                    float(np.sqrt(np.mean(fresh * fresh))))
 
@@ -107,45 +107,7 @@ def lattice(sizes: FloatArray, fewest: int = _FEWEST_STEPS) -> float:
     return unit if bool((np.abs(ordered - multiples * unit) < 0.02 * unit).all()) else 0.0
 
 
-def _refresh(tie: BoolArray) -> int:
-    """
-    Return samples per refresh: 1 unless changes avoid following each other.
-
-    A coarse ADC makes ties too, but they cluster; a logger that repeats makes
-    a change *less* likely right after a change.  Counts are compared with
-    independence at 3.5 standard deviations.
-    """
-    n, ties = tie.size, int(tie.sum())
-    share = 1.0 - ties / n
-    if share > 0.9 or share == 0.0:
-        return 1
-    follow = int((~tie[1:] & ~tie[:-1]).sum())
-    expected = share * share * (n - 1)
-    if follow > 0.25 * expected or expected - follow < 3.5 * math.sqrt(expected):
-        return 1
-    gaps = np.diff(np.flatnonzero(~tie))
-    # Refreshes that happen to repeat a value double a gap: the usual gap counts.
-    return max(1, int(np.median(gaps)))
-
-
-def fresh_samples(y: FloatArray, held: int) -> BoolArray:
-    """
-    Return which samples are refreshes of a source that repeats its last value.
-
-    A long run holds refreshes that happened to give the same value: they are
-    put at their usual distance, so that dropping repeats does not select
-    changes.
-    """
-    change = np.concatenate(([True], y[1:] != y[:-1]))
-    starts = np.flatnonzero(change)
-    place = np.arange(y.size) - np.repeat(starts, np.diff(np.append(starts, y.size)))
-    lengths = np.repeat(np.diff(np.append(starts, y.size)), np.diff(np.append(starts, y.size)))
-    # The last refresh of a run must leave it at least half a refresh long.
-    late = (place == 0) | (lengths - place > held // 2)
-    return np.asarray((place % held == 0) & late, dtype=np.bool_)
-
-
-def _piles_up(y: FloatArray, held: int) -> bool:
+def _piles_up(y: FloatArray, held: float) -> bool:
     """Whether one extreme is far more common than the value next to it."""
     values, counts = np.unique(y, return_counts=True)
     if values.size < _FEWEST_STEPS:

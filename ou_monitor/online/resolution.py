@@ -78,16 +78,16 @@ class Resolution:
         if not self.series.size:
             return
         slot = self._window / SLOTS
-        origin, slots_of = self.sums.origin, self.sums.slots_of
+        origin, slot_of = self.sums.origin, self.sums.slot_of
         oldest = math.ceil((self.series.last(T) - origin - self._window) / slot - 1e-6)
         stamps = self.series.column(T)
-        if slots_of(stamps[:1])[0] >= oldest:
+        if slot_of(float(stamps[0])) >= oldest:
             return
-        begin = int(np.searchsorted(stamps, origin + oldest * slot))
+        begin = int(stamps.searchsorted(origin + oldest * slot))
         # Where the edge was met only nearly, the sums decide which side it is.
-        while begin > 0 and slots_of(stamps[begin - 1:begin])[0] >= oldest:
+        while begin > 0 and slot_of(float(stamps[begin - 1])) >= oldest:
             begin -= 1
-        while slots_of(stamps[begin:begin + 1])[0] < oldest:
+        while slot_of(float(stamps[begin])) < oldest:
             begin += 1
         self.series.drop_before(self.series.first + begin)
 

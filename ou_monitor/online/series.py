@@ -57,7 +57,7 @@ def lagged(t: FloatArray, u: FloatArray, tau: float, before: tuple[float, float,
 
     """
     unknown = np.isnan(u)
-    if unknown.any() and not unknown.all():
+    if 0 < np.count_nonzero(unknown) < u.size:
         place = np.maximum.accumulate(np.where(unknown, -1, np.arange(u.size)))
         filled = u[np.where(place < 0, np.flatnonzero(~unknown)[0], place)]
         out = lagged(t, filled, tau, before).copy()
@@ -66,18 +66,24 @@ def lagged(t: FloatArray, u: FloatArray, tau: float, before: tuple[float, float,
     t0, u0, state = before
     if math.isnan(state):
         t0, u0, state = float(t[0]), float(u[0]), float(u[0])
-    if state == u0 and (u == u0).all():
+    if state == u0 and not np.count_nonzero(u != u0):
         return u
     out = np.empty_like(u)
-    held = np.concatenate(([u0], u[:-1]))
     begin = 0
     while begin < t.size:
-        end = max(int(np.searchsorted(t, t0 + _SPAN * tau)), begin + 1)
-        elapsed = np.minimum((t[begin:end] - t0) / tau, 2.0 * _SPAN)
-        weight = np.exp(elapsed)
-        gain = np.diff(weight, prepend=1.0)
-        out[begin:end] = (state + np.cumsum(held[begin:end] * gain)) / weight
-        t0, state = float(t[end - 1]), float(out[end - 1])
+        end = t.size
+        if float(t[-1]) - t0 > _SPAN * tau:
+            end = max(int(np.searchsorted(t, t0 + _SPAN * tau)), begin + 1)
+        weight = np.exp(np.minimum((t[begin:end] - t0) / tau, 2.0 * _SPAN))
+        gain = weight.copy()
+        gain[0] -= 1.0
+        gain[1:] -= weight[:-1]
+        gain[0] *= u0
+        gain[1:] *= u[begin:end - 1]
+        np.add.accumulate(gain, out=gain)
+        gain += state
+        np.divide(gain, weight, out=out[begin:end])
+        t0, u0, state = float(t[end - 1]), float(u[end - 1]), float(out[end - 1])
         begin = end
     near = np.abs(out - u) < _SETTLED
     out[near] = u[near]
@@ -231,10 +237,13 @@ class Series:
     def _take_throttle(self, t: FloatArray, u: FloatArray, at: slice, had: bool) -> None:
         """Store the throttle, and note where it was unknown and where it last moved."""
         if self._load is None:
-            self._load = np.full((3, self._run.size), math.nan)
+            self._load = np.empty((3, self._run.size))
+            self._load[:, :self._tail] = math.nan
             self._lagged_to = self.end
         before = float(self._load[0, self._tail - 1]) if had else math.nan
         self._load[0, at] = u
+        if before == u[0] and not np.count_nonzero(u != before):
+            return
         change = u[1:] != u[:-1]
         if math.isnan(float(u.sum())):
             unknown = np.isnan(u)
@@ -254,14 +263,17 @@ class Series:
             return
         at = slice(begin + shift, end + shift)
         t, u = self._main[T, at], load[0, at]
-        for row, tau in ((1, LOAD_LAGS[0]), (2, LOAD_LAGS[1])):
-            before = (math.nan,) * 3
-            if begin > self.first - self._behind:
-                last = at.start - 1
-                before = (float(self._main[T, last]), float(load[0, last]),
-                          float(load[row, last]))
-            load[row, at] = lagged(t, u, tau, before)
         self._lagged_to = end
+        before = [math.nan] * 4
+        if begin > self.first - self._behind:
+            last = at.start - 1
+            before = [float(self._main[T, last]), *load[:, last].tolist()]
+        t0, u0 = before[:2]
+        if before == [t0, u0, u0, u0] and not np.count_nonzero(u != u0):
+            load[1:, at] = u0
+            return
+        for row, tau in enumerate(LOAD_LAGS, 1):
+            load[row, at] = lagged(t, u, tau, (t0, u0, before[row + 1]))
 
     def drop_before(self, number: int) -> None:
         """Forget the samples numbered below `number`."""
@@ -269,14 +281,15 @@ class Series:
         self._head += count
         self.first += count
         self._behind += count
+
+    def _trim(self) -> None:
+        """Let go of what neither pairs nor lags reach back to."""
         keep = self._reach
-        if self._load is not None and self._head:
+        if self._load is not None and self.size:
             # The lags remember longer than the pairs do.
-            start = self._head - self._behind
-            stamps = self._main[T, start:self._head]
-            at = min(self._head, self._run.size - 1)
+            stamps = self._main[T, self._head - self._behind:self._head]
             keep = max(keep, stamps.size - int(np.searchsorted(
-                stamps, self._main[T, at] - LOOK_BACK)))
+                stamps, self._main[T, self._head] - LOOK_BACK)))
         self._behind = min(self._behind, keep)
 
     def clear(self) -> None:
@@ -290,16 +303,17 @@ class Series:
     def _make_room(self, n: int) -> None:
         if self._tail + n <= self._run.size:
             return
+        self._trim()
         begin = self._head - self._behind
         kept = self._tail - begin
-        wanted = 2 * (kept + n) + 256
+        wanted = 2 * kept + n + 256
         main, run, load = self._main, self._run, self._load
         if wanted > run.size or 4 * wanted < run.size:
-            # Half as much again as is needed to move each sample but once.
+            # Half as much again, so that each sample moves but once or so.
             size = wanted + wanted // 2
             main, run = np.empty((2, size)), np.empty(size, dtype=np.int8)
-            load = None if load is None else np.full((3, size), math.nan)
-        # Never overlaps: what is kept is less than half, and lies in the other half.
+            load = None if load is None else np.empty((3, size))
+        # Never overlaps: what is kept begins behind where it goes, as n did not fit.
         main[:, :kept] = self._main[:, begin:self._tail]
         run[:kept] = self._run[begin:self._tail]
         if load is not None and self._load is not None:

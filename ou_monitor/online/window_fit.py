@@ -36,7 +36,7 @@ _CORRELATED = 4.0
 _WHITE = 3.0
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class WindowFit:
     """
     What the sums of a window say.
@@ -55,8 +55,8 @@ class WindowFit:
         Variances of ln(alpha), ln(sigma), ln(Var_inf).
     level : ndarray, shape (c,)
         Means of voltage (less its reference) and load variables.
-    beta : ndarray, shape (c - 1,)
-        Coefficients of the load, V per unit; of time last when `trend`.
+    beta : ndarray, shape (c,) or none
+        Coefficients of the load, V per unit, and of time (0 without `trend`).
     beta_cov : ndarray
         Their covariance, V^2.
     trend : bool
@@ -173,9 +173,9 @@ def _fit_moving(sums: Sums, m: int, start: tuple[float, float] | None, trend: bo
     mean = moments.regress(*(at or (_WHITE, 0.0)))
     on_bound = False
     for _ in range(8):
-        c0, c = moments.residual(mean.b)
+        c0, c = moments.residual(mean.beta)
         if not _correlated(c0, c, sums.n):
-            return _uncorrelated(moments.mean, moments.basis @ mean.b, trend, c0)
+            return _uncorrelated(moments.mean, mean.beta, trend, c0)
         log_a, theta = at or still_fit.guess(c0, c.tolist())
         tilt = mean.tilt if at else (0.0, 0.0)
         before = log_a, theta
@@ -187,13 +187,11 @@ def _fit_moving(sums: Sums, m: int, start: tuple[float, float] | None, trend: bo
         mean = moments.regress(log_a, theta)
         if settled:
             break
-    c0, c = moments.residual(mean.b)
+    c0, c = moments.residual(mean.beta)
     end = finish(c0, c, sums.n, sums.n - 1.0 - moments.rank, log_a, theta, on_bound, m)
-    cov = mean.inverse * end[2] / sums.n
     return WindowFit(end[0], end[1], end[3], end[4], end[5], (end[6], end[7], end[8]),
-                     moments.mean, moments.basis @ mean.b,
-                     moments.basis @ cov @ moments.basis.T, trend,
-                     moments.trend_score(log_a, theta), _found(end), c0)
+                     moments.mean, mean.beta, mean.cov * (end[2] / sums.n), trend,
+                     moments.trend_score(mean), _found(end), c0)
 
 
 def _functions() -> tuple[Callable[..., tuple[float, float, bool]],

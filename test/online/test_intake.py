@@ -1,5 +1,6 @@
 """From pushes to clean batches, and from fast sources to block means."""
 
+import copy
 import math
 
 import numpy as np
@@ -45,6 +46,36 @@ def test_throttle_does_not_leak_into_the_next_batch():
     assert u[0] == 0.1 and math.isnan(u[1])
     got, _ = batches([0.4], intake=intake)
     assert got[0].u is None or np.isnan(got[0].u).all()
+
+
+def test_any_array_of_doubles_is_copied():
+    """Strided, reversed, read-only, unaligned, repeated and empty ones."""
+    plain = np.arange(1.0, 5.0)
+    records = np.zeros(4, dtype=[('pad', 'i1'), ('y', 'f8')])
+    records['y'] = plain
+    fixed = plain.copy()
+    fixed.setflags(write=False)
+    for y in (np.repeat(plain, 3)[::3], plain[::-1].copy()[::-1], fixed, records['y']):
+        intake = Intake()
+        assert intake.put(np.empty(0), np.empty(0), np.empty(0))
+        assert intake.put(0.1 * plain, y, y)
+        assert intake.put(0.1 * plain + 1.0, np.broadcast_to(2.0, 4), np.broadcast_to(0.5, 4))
+        batch = intake.work_off(2.0, math.nan)[0]
+        assert batch.y.tolist() == [1.0, 2.0, 3.0, 4.0, 2.0, 2.0, 2.0, 2.0]
+        assert batch.u.tolist() == [1.0, 2.0, 3.0, 4.0, 0.5, 0.5, 0.5, 0.5]
+
+
+def test_a_copy_has_buffers_of_its_own():
+    """Both go on from what had been pushed, apart."""
+    intake = Intake()
+    intake.put(np.array([0.1]), np.array([1.0]), None)
+    other = copy.deepcopy(intake)
+    intake.put(np.array([0.2]), np.array([2.0]), None)
+    other.put(np.array([0.3]), np.array([3.0]), 0.5)
+    assert intake.work_off(1.0, math.nan)[0].y.tolist() == [1.0, 2.0]
+    batch = other.work_off(1.0, math.nan)[0]
+    assert batch.y.tolist() == [1.0, 3.0] and batch.t.tolist() == [0.1, 0.3]
+    assert math.isnan(batch.u[0]) and batch.u[1] == 0.5
 
 
 @pytest.mark.parametrize('t, parts, resets, late', [

@@ -3,7 +3,7 @@
 from hypothesis import given, settings, strategies as st
 from made_windows import DT, paths
 import numpy as np
-from ou_monitor.online.quality import examine, fresh_samples, lattice, Quality
+from ou_monitor.online.quality import examine, lattice, Quality
 import pytest
 
 
@@ -55,21 +55,11 @@ def test_repeats(held):
     assert examine(0.02 * np.round(y / 0.02)).held == held
 
 
-@pytest.mark.parametrize('step', [12.5e-3, 0.03, 0.06])
-def test_ties_of_a_coarse_adc_are_no_repeats(step):
-    for seed in range(20):
-        assert examine(step * np.round(path(seed) / step)).held == 1
-
-
-def test_repeats_are_where_they_were():
-    """Refreshes are kept, also those that happen to equal the one before."""
-    source = np.array([1.0, 2.0, 2.0, 3.0, 1.0, 1.0, 1.0, 5.0])
-    fresh = fresh_samples(np.repeat(source, 4), 4)
-    assert np.flatnonzero(fresh).tolist() == [4 * k for k in range(8)]
-    # Two and three in turn: one refresh each.
-    y = np.repeat([1.0, 2.0, 3.0, 4.0], [2, 3, 2, 3])
-    assert np.flatnonzero(fresh_samples(y, 2)).tolist() == [0, 2, 5, 7]
-    assert np.flatnonzero(fresh_samples(y, 3)).tolist() == [0, 2, 5, 7]
+def test_a_period_known_is_kept_where_nothing_is_told():
+    """Of 20 samples, or of a constant, the period found before stands."""
+    for y in (path(1, 20), np.full(1024, 5.0)):
+        assert examine(y, 8.0).held == 8.0
+    assert examine(path(1), 8.0).held == 1.0
 
 
 @pytest.mark.parametrize('side', [-1, 1])

@@ -1,0 +1,94 @@
+"""Ramps are trends, not a low-pass; what is nothing but a ramp gives no numbers."""
+
+import math
+
+from made_windows import DT, estimate, LEVEL, paths, stamps
+import numpy as np
+from ou_monitor import SlidingEstimator
+from ou_monitor.records import Flag, Status
+import pytest
+
+N = 2000
+T = stamps(N)
+
+
+@pytest.mark.parametrize('n', [100, 200, 500, 1000, 2000, 6000])
+@pytest.mark.parametrize('kind', [np.float64, np.float32])
+@pytest.mark.parametrize('noise', [0.0, 1e-5])
+def test_a_ramp_is_a_trend(n, kind, noise):
+    """From the first hundred samples on; noiseless increments are all equal, not smooth."""
+    y = LEVEL - 0.1 * stamps(n) + noise * np.random.default_rng(1).standard_normal(n)
+    e = estimate(stamps(n), y.astype(kind).astype(np.float64))
+    assert Flag.TREND in e.flags and Flag.LOWPASS_UPSTREAM not in e.flags
+    assert not e.usable and math.isnan(e.alpha) and math.isnan(e.var_inf)
+
+
+def test_a_ramp_that_slides_through():
+    """In every report, while the window fills and after."""
+    estimator = SlidingEstimator(1.0)
+    for begin in range(0, 4000, 100):
+        t = (begin + np.arange(100)) * DT
+        estimator.push(t, LEVEL - 0.1 * t)
+        e = estimator.estimate()
+        assert e.flags == (Flag.TREND,) and not e.usable
+
+
+def test_a_random_walk_does_not_drift():
+    """
+    Its net change is chance: more than four standard deviations in 1 of 16 000.
+
+    Two of 400 would be a chance of 3e-4.  Where a trend and a restoring force are found
+    together, that is the fit's doing, and not looked at here.
+    """
+    rng = np.random.default_rng(2)
+    for n in (60, 200, 2000):
+        walks = LEVEL + np.cumsum(0.01 * rng.standard_normal((400, n)), axis=1)
+        found = [estimate(stamps(n), y) for y in walks]
+        told = [e for e in found if e.status is Status.UNBOUND and Flag.TREND in e.flags]
+        assert len(told) <= 1
+        # The same with a drift of six standard deviations of the walk.
+        drift = 6.0 * 0.01 / math.sqrt(n) * np.arange(n)
+        found = [estimate(stamps(n), y + drift) for y in walks[:100]]
+        # 6 - 4 = 2 standard deviations: 97 %, less what is judged by other means.
+        assert sum(Flag.TREND in e.flags for e in found) >= 80
+
+
+def test_windows_that_hold_a_few_relaxations_do_not_drift():
+    """Three to ten: an OU comes back, so its net change is less than that of a walk."""
+    rng = np.random.default_rng(3)
+    for n in (50, 100, 160):
+        found = [estimate(stamps(n), y) for y in paths(rng, 300, n)]
+        assert sum(e.status in (Status.UNBOUND, Status.TOO_SHORT) for e in found) > 10
+        assert not any(Flag.TREND in e.flags for e in found if e.status is Status.UNBOUND)
+
+
+@pytest.mark.parametrize('load', [lambda t: 0.2 + 0.05 * t, lambda t: 0.2 + 0.4 * (t > 1.0)])
+def test_what_throttle_explains_to_the_last_digit(load):
+    """Nothing is left that relaxes: no alpha of rounding errors, and no trend either."""
+    e = estimate(T, LEVEL - 0.6 * load(T), load(T))
+    assert not e.usable and math.isnan(e.alpha) and math.isnan(e.var_inf)
+    assert e.status in (Status.NO_RELAXATION, Status.UNBOUND)
+    assert Flag.TREND not in e.flags
+
+
+def test_tiny_noise_on_a_large_voltage_is_measured():
+    """An OU of 1 uV on 5 V is one: a million times less than usual is not rounding."""
+    y = LEVEL + 1e-6 * (paths(np.random.default_rng(4), 1, N)[0] - LEVEL)
+    e = estimate(T, y)
+    assert e.status is Status.OK and e.sigma == pytest.approx(0.632e-6, rel=0.1)
+
+
+def test_what_is_dropped_is_said_though_the_numbers_stand():
+    """A late sample after an estimate changes counters and flag, nothing else."""
+    estimator = SlidingEstimator(2.1)
+    estimator.push(T, paths(np.random.default_rng(5), 1, N)[0])
+    before = estimator.estimate()
+    estimator.push(1.0, 5.0)
+    after = estimator.estimate()
+    assert before.flags == () and after.flags == (Flag.IRREGULAR,)
+    assert (after.counters.late, after.alpha) == (1, before.alpha)
+    # Samples that wait for the rate are said to wait, with what was dropped.
+    waits = SlidingEstimator(2.0)
+    waits.push(T[:4], [5.0, math.nan, 5.1, 5.2])
+    assert waits.estimate().status is Status.TOO_FEW_SAMPLES
+    assert waits.estimate().flags == (Flag.IRREGULAR,)
