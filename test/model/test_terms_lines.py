@@ -1,0 +1,141 @@
+"""Lines and 1/f noise: frequency, amplitude, width, spectrum."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.signal import welch
+from term_examples import agrees, clusters, has_covariance, still, term
+
+
+@pytest.mark.parametrize('frequency, damping, std', [(120.0, 40.0, 0.03), (5.0, 90.0, 0.1)])
+def test_resonance(frequency, damping, std):
+    """Covariance std^2 exp(-damping lag) cos(2 pi frequency lag), uneven stamps."""
+    offsets = np.array([0.0, 0.1, 0.9, 1.3]) / frequency
+    groups = clusters(still(term('resonance', frequency=frequency, damping=damping, std=std)),
+                      offsets, 12.0 / damping + 1.5 / frequency, 60_000, 1)
+    has_covariance(groups, offsets, lambda lag: std ** 2 * math.exp(-damping * lag) * math.cos(
+        2.0 * math.pi * frequency * lag))
+
+
+def test_resonance_at_even_stamps():
+    """
+    Lags of a run at 1 kHz, also of half and whole periods.
+
+    A sample covariance at lag k has the variance (1/n) sum_j (c_j^2 + c_{j+k} c_{j-k}).
+    """
+    n, dt = 400_000, 1e-3
+    x = still(term('resonance', frequency=50.0, damping=20.0, std=0.05)).simulate(
+        np.arange(n) * dt, np.random.default_rng(2))
+
+    def cov(j):
+        lag = np.abs(j) * dt
+        return 0.0025 * np.exp(-20.0 * lag) * np.cos(2.0 * math.pi * 50.0 * lag)
+
+    j = np.arange(-600, 601)
+    for k in (0, 5, 10, 20, 40):
+        error = math.sqrt(np.sum(cov(j) ** 2 + cov(j + k) * cov(j - k)) / n)
+        agrees(np.mean(x[k:] * x[:n - k]), cov(k), error, 0.1 if k in (0, 10, 20) else math.inf)
+
+
+@pytest.mark.parametrize('start', [0.0, 1.7e9])
+def test_pure_tone(start):
+    """Amplitude sin(2 pi frequency t + phase), t from the first sample."""
+    t = np.arange(5000) / 8192.0
+    found = still(term('tone', amplitude=0.2, frequency=123.4, phase=0.7, linewidth=0.0)).simulate(
+        start + t, np.random.default_rng(0))
+    # A clock of 1.7e9 s counts in steps of 0.24 us: exact in binary here.
+    np.testing.assert_allclose(found, 0.2 * np.sin(2.0 * math.pi * 123.4 * t + 0.7), rtol=0,
+                               atol=1e-10)
+
+
+def test_wide_tone():
+    """
+    Covariance A^2/2 cos(2 pi f lag) exp(-pi width lag): a Lorentzian, full width at half height.
+
+    Its Fourier transform ~ 1/(1 + (2 (f - f0)/width)^2).
+    """
+    amplitude, frequency, width = 0.2, 40.0, 3.0
+    offsets = np.array([0.0, 0.004, 0.05, 0.15])
+    groups = clusters(still(term('tone', amplitude=amplitude, frequency=frequency, phase=0.7,
+                                 linewidth=width)), offsets, 1.7321, 60_000, 3)
+    has_covariance(groups, offsets, lambda lag: 0.5 * amplitude ** 2 * math.exp(
+        -math.pi * width * lag) * math.cos(2.0 * math.pi * frequency * lag))
+    # The amplitude does not wander.
+    assert np.abs(groups).max() <= amplitude and np.abs(groups).max() > 0.999 * amplitude
+
+
+def test_width_of_the_line():
+    """
+    Half of the power of a tone lies within its full width at half height.
+
+    Re-sampled power of 1000 s: some 3000 coherence times; the share of power
+    within +-width/2 of a Lorentzian is 1/2, found to about 1/sqrt(3000) = 2 %.
+    """
+    width, n, dt = 3.0, 250_000, 4e-3
+    x = still(term('tone', amplitude=1.0, frequency=50.0, phase=0.0, linewidth=width)).simulate(
+        np.arange(n) * dt, np.random.default_rng(4))
+    power = np.abs(np.fft.rfft(x)) ** 2
+    off = np.abs(np.fft.rfftfreq(n, dt) - 50.0)
+    share = power[off < 0.5 * width].sum() / power.sum()
+    agrees(share, 2.0 / math.pi * math.atan(1.0), 0.5 / math.sqrt(3000.0), 0.12)
+
+
+def test_throttle_tone_at_constant_throttle():
+    """Frequency idle + slope throttle."""
+    t = np.arange(3000) / 1000.0
+    found = still(term('throttle_tone', amplitude=0.1, idle=20.0, slope=300.0, phase=0.3)).simulate(
+        t, np.random.default_rng(0), 0.25)
+    np.testing.assert_allclose(found, 0.1 * np.sin(2.0 * math.pi * 95.0 * t + 0.3), rtol=0,
+                               atol=1e-10)
+
+
+def test_throttle_tone_has_no_jump_of_phase():
+    """Throttle holds to its stamp: phase is the integral, in closed form for a step at 1 s."""
+    t = np.arange(2001) / 1000.0
+    found = still(term('throttle_tone', amplitude=0.1, idle=20.0, slope=300.0, phase=0.0)).simulate(
+        t, np.random.default_rng(0), np.where(t <= 1.0, 0.1, 0.3))
+    turns = np.where(t <= 1.0, 50.0 * t, 50.0 + 110.0 * (t - 1.0))
+    np.testing.assert_allclose(found, 0.1 * np.sin(2.0 * math.pi * turns), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize('low, high', [(10.0, 100.0), (0.5, 200.0), (1e-3, 1e4), (3.0, 5.0)])
+def test_flicker_poles_make_one_over_f(low, high):
+    """
+    The one-sided PSD of the sum is amplitude^2/f within 2 %, at the ends as between.
+
+    An OU of variance v and rate a has the one-sided PSD 4 v a / (a^2 + (2 pi f)^2):
+    its integral over f > 0 is v.
+    """
+    noise = term('flicker_noise', amplitude=0.3, low=low, high=high)
+    poles, std = np.broadcast_arrays(noise.poles(), noise.pole_std())
+    f = np.geomspace(low, high, 400)
+    psd = np.sum(4.0 * std ** 2 * poles / (poles ** 2 + (2.0 * math.pi * f[:, None]) ** 2), axis=1)
+    assert np.abs(psd * f / 0.3 ** 2 - 1.0).max() < 0.02
+    # Flat below and steeper above, as stated.
+    f = np.array([1e-3 * low, 1e-2 * low, 1e2 * high, 1e3 * high])
+    psd = np.sum(4.0 * std ** 2 * poles / (poles ** 2 + (2.0 * math.pi * f[:, None]) ** 2), axis=1)
+    assert psd[0] == pytest.approx(psd[1], rel=0.05)
+    assert psd[3] == pytest.approx(psd[2] * 1e-2, rel=0.05)
+
+
+def test_flicker_samples_have_that_spectrum():
+    """
+    Octaves of a run at 4 kHz against amplitude^2/f between 10 and 80 Hz.
+
+    Half-overlapped Hann segments of n_seg samples out of n average about
+    1.9 n/n_seg periodograms' worth of 0.95 each; neighbouring bins share
+    information, 1.5 bins of noise bandwidth: the relative error of a mean over
+    m bins is sqrt(1.5 n_seg / (1.8 m n)).  What aliases from above 3.9 kHz adds
+    (80/4000)^2 at most.
+    """
+    n, rate, seg = 2 ** 20, 4000.0, 2 ** 14
+    x = still(term('flicker_noise', amplitude=0.3, low=10.0, high=80.0)).simulate(
+        np.arange(n) / rate, np.random.default_rng(5))
+    f, psd = welch(x, rate, 'hann', seg, detrend=False)
+    for low in (10.0, 20.0, 40.0):
+        band = (f >= low) & (f < 2.0 * low)
+        error = math.sqrt(1.5 * seg / (1.8 * band.sum() * n))
+        # 2 % of the stated law, and the statistics.
+        assert 6.0 * error < 0.15
+        assert abs(np.mean(psd[band] * f[band]) / 0.09 - 1.0) < 0.02 + 4.0 * error

@@ -1,0 +1,97 @@
+"""What throttle and time do to the level: closed forms, without noise."""
+
+import math
+
+import numpy as np
+import pytest
+from term_examples import still, term
+
+DT = 1e-3
+T = np.arange(400) * DT
+
+
+def level(*terms, throttle=None, t=T):
+    """Return what the terms add to the level, V."""
+    return still(*terms).simulate(t, np.random.default_rng(0), throttle)
+
+
+def step_at(k, low=0.0, high=1.0):
+    """Return a throttle that is `high` from sample k on."""
+    return np.where(np.arange(T.size) < k, low, high)
+
+
+def test_sag():
+    """-(linear u + square u^2), at once."""
+    throttle = np.random.default_rng(1).random(T.size)
+    np.testing.assert_allclose(
+        level(term('load_sag', linear=0.3, square=0.07), throttle=throttle),
+        -0.3 * throttle - 0.07 * throttle ** 2, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize('gain, tau', [(0.4, 0.03), (-0.2, 0.005), (0.1, 2.0)])
+def test_transient_of_a_step(gain, tau):
+    """
+    A step from 20 to 70 % shows as 0.5 gain exp(-t/tau) and nothing before.
+
+    Throttle holds from the stamp before to its own, so t counts from the stamp
+    before the first sample of the new throttle.
+    """
+    found = level(term('load_transient', gain=gain, tau=tau, delay=0.0),
+                  throttle=step_at(100, 0.2, 0.7))
+    since = T - T[99]
+    np.testing.assert_allclose(
+        found, np.where(since > 0.0, 0.5 * gain * np.exp(-since / tau), 0.0), rtol=0, atol=1e-13)
+
+
+def test_transient_of_uneven_stamps():
+    """The same closed form, whatever the spacing."""
+    t = np.cumsum(np.random.default_rng(3).exponential(DT, 400))
+    found = level(term('load_transient', gain=0.4, tau=0.03, delay=0.0), throttle=step_at(100),
+                  t=t)
+    since = t - t[99]
+    np.testing.assert_allclose(
+        found, np.where(since > 0.0, 0.4 * np.exp(-since / 0.03), 0.0), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize('delay, later', [(0.02, 20), (0.001, 1), (0.1, 100), (0.0205, 21)])
+@pytest.mark.parametrize('start', [0.0, 0.3, 1000.1])
+def test_transient_comes_after_its_delay(delay, later, start):
+    """
+    The answer is that without delay, later by the samples that the delay lasts.
+
+    A delay of half a sample more shows one sample later.  Whole samples are
+    whole whatever the rounding of the stamps.
+    """
+    t = start + np.arange(400) / 1000.0
+    throttle = step_at(100) * 0.5 + 0.1
+    prompt = level(term('load_transient', gain=0.4, tau=0.03, delay=0.0), throttle=throttle, t=t)
+    late = level(term('load_transient', gain=0.4, tau=0.03, delay=delay), throttle=throttle, t=t)
+    np.testing.assert_allclose(late[later:], prompt[:-later], rtol=0, atol=1e-9)
+    assert not late[:100 + later].any() and late[100 + later] != 0.0
+
+
+def test_lag():
+    """A sag and a transient of the same size are a low-passed sag."""
+    throttle = step_at(100, 0.0, 0.2)
+    found = level(term('load_sag', linear=0.5, square=0.0),
+                  term('load_transient', gain=0.5, tau=0.02, delay=0.0), throttle=throttle)
+    since = T - T[99]
+    np.testing.assert_allclose(
+        found, np.where(since > 0.0, -0.1 * -np.expm1(-since / 0.02), 0.0), rtol=0, atol=1e-13)
+
+
+def test_inrush():
+    """A negative gain deepens the fall at first: here half as much again, gone after 8 tau."""
+    throttle = step_at(100)
+    found = level(term('load_sag', linear=0.4, square=0.0),
+                  term('load_transient', gain=-0.2, tau=0.01, delay=0.0), throttle=throttle)
+    assert found[100] == pytest.approx(-0.4 - 0.2 * math.exp(-0.1), abs=1e-12)
+    assert found.min() == found[100] and found[180] == pytest.approx(-0.4, abs=1e-4)
+
+
+@pytest.mark.parametrize('start', [0.0, 1.7e9])
+def test_drift(start):
+    """Rate t + curvature t^2 from the first sample, whatever clock the stamps are of."""
+    found = level(term('drift', rate=-0.5, curvature=0.3), t=start + T)
+    np.testing.assert_allclose(found, -0.5 * T + 0.3 * T ** 2, rtol=0,
+                               atol=1e-12 if start == 0.0 else 1e-6)
