@@ -13,6 +13,8 @@ from ou_monitor.errors import InputError, nearest
 TYPES = ('battery_state', 'float32', 'float64', 'adc_block')
 # From this rate on samples travel in blocks unless told otherwise, Hz.
 _BLOCKS_FROM = 5000.0
+# Above it stamps would fall together, Hz.
+_RATE_MOST = 1e9
 
 
 def add_parser(subparsers: Any) -> None:
@@ -88,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     output.check_writable(args.json)
     output.check_writable(None if args.save_model is None else str(args.save_model))
-    name = args.preset or 'flight'
+    name = 'flight' if args.preset is None else args.preset
     if name not in PRESETS:
         raise InputError(f"no preset '{name}': {nearest(name, PRESETS)}")
     preset = PRESETS[name]
@@ -102,6 +104,9 @@ def run(args: argparse.Namespace) -> int:
     if not 1.0 <= duration * rate <= 1e12:
         raise InputError(f'{duration:g} s at {rate:g} Hz are {duration * rate:.3g} samples: 1 to '
                          '1e12 can be made')
+    if rate > _RATE_MOST:
+        raise InputError(f'--rate must be at most {_RATE_MOST:g} Hz, as bags count in ns; got '
+                         f'{rate:g}')
     if args.seed < 0:
         raise InputError(f'--seed must be 0 or more, got {args.seed}')
     throttle = preset.throttle if args.throttle is None else args.throttle
@@ -110,6 +115,8 @@ def run(args: argparse.Namespace) -> int:
     if args.output is None:
         if args.save_model is None:
             raise InputError('--output PATH.mcap is needed: where the recording goes')
+        if args.json is not None:
+            raise InputError('--json says what was simulated: it needs --output PATH.mcap')
         output.write_text(as_yaml(file), args.save_model)
         return 0
     written = _write(args, file.model, profile, duration, rate, kind, name)

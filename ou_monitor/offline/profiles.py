@@ -168,11 +168,14 @@ def _check_throttle(value: float, where: str) -> None:
 
 def _from_csv(path: Path) -> Profile:
     try:
+        if not path.read_text(encoding='utf-8').strip():
+            raise InputError(f'{path} is empty: expected the columns time_s and throttle')
         table: Any = np.genfromtxt(path, delimiter=',', names=True, dtype=np.float64, ndmin=1)
     except OSError as error:
-        raise InputError(f'cannot read the throttle profile {path}: {error}') from error
+        raise InputError(f'cannot read the throttle profile {path}: {error.strerror}') from error
     except ValueError as error:
-        raise InputError(f'{path} is not a CSV of numbers: {error}') from error
+        raise InputError(f'{path} is not a CSV of numbers: '
+                         f"{' '.join(str(error).split())}") from error
     names = table.dtype.names or ()
     if 'time_s' not in names or 'throttle' not in names:
         raise InputError(f'{path} needs the columns time_s and throttle, it has: '

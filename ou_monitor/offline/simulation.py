@@ -11,6 +11,9 @@ from ou_monitor.model.supply import Simulation, STRETCH, SupplyModel
 from ou_monitor.offline.profiles import Profile
 from ou_monitor.records import Recording
 
+# Far beyond any supply, V, and within what messages hold.
+LARGEST = 1e9
+
 
 def simulated(model: SupplyModel, profile: Profile, *, duration: float, rate: float, seed: int,
               name: str = 'simulated') -> Iterator[Recording]:
@@ -40,7 +43,7 @@ def simulated(model: SupplyModel, profile: Profile, *, duration: float, rate: fl
     Raises
     ------
     InputError
-        When the model cannot be simulated (its voltage runs away).
+        When the model cannot be simulated (its voltage runs away or is beyond `LARGEST`).
 
     """
     total = round(duration * rate)
@@ -50,7 +53,11 @@ def simulated(model: SupplyModel, profile: Profile, *, duration: float, rate: fl
         # As a bag can hold it, so that the truth is what the bag says.
         throttle = profile(t).astype(np.float32).astype(np.float64)
         try:
-            voltage = run.advance(t, throttle)
+            with np.errstate(over='ignore', invalid='ignore'):
+                voltage = run.advance(t, throttle)
         except ValueError as error:
             raise InputError(str(error)) from error
+        if not (np.abs(voltage) <= LARGEST).all():
+            raise InputError(
+                f'the model gives voltages beyond {LARGEST:g} V: check its parameters')
         yield Recording(t, voltage, throttle, name)

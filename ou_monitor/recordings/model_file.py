@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 import math
 from pathlib import Path
+import re
 from typing import Any
 
 from ou_monitor.errors import InputError, nearest
@@ -22,6 +23,7 @@ import yaml
 
 _KEYS = ('model', 'provenance')
 _TERM_KEYS = ('term', 'params', 'se')
+_EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d{1,3}')
 
 
 @dataclass(frozen=True)
@@ -72,8 +74,11 @@ def read_model(path: str | Path) -> ModelFile:
         data = yaml.safe_load(path.read_text(encoding='utf-8'))
     except OSError as error:
         raise InputError(f'cannot read the model file {path}: {error.strerror}') from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f'{path} is not YAML: {error}') from error
+    except (ValueError, yaml.YAMLError) as error:
+        # Also a date that the calendar does not have is a ValueError.
+        raise InputError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    except RecursionError:
+        raise InputError(f'{path} is nested too deeply for a model file') from None
     return parse_model(data, str(path))
 
 
@@ -139,19 +144,29 @@ def _term(entry: Any, where: str) -> tuple[Term, dict[str, Any]]:
             raise InputError(f"{where} ('{name}'): 'se' names '{key}', which is no parameter: "
                              f'{nearest(str(key), terms[name].parameters())}')
     try:
-        return terms[name].read(params), {k: _error(v) for k, v in se.items()}
+        return (terms[name].read({k: _numbers(v) for k, v in params.items()}),
+                {k: _error(f'{name}.{k}', _numbers(v)) for k, v in se.items()})
     except ValueError as error:
         raise InputError(f'{where}: {error}') from error
 
 
-def _error(value: Any) -> Any:
+def _numbers(value: Any) -> Any:
+    """Return a value with 1e-3 as a number: to YAML 1.1 it is text, as it has no point."""
+    if isinstance(value, list):
+        return [_numbers(v) for v in value]
+    return float(value) if isinstance(value, str) and _EXPONENT.fullmatch(value) else value
+
+
+def _error(name: str, value: Any) -> Any:
     """Return a standard error, or a list of them; null means unknown."""
     if isinstance(value, list):
-        return [_error(v) for v in value]
+        return [_error(name, v) for v in value]
     if value is None:
         return math.nan
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f'a standard error must be a number, got {value!r}')
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not (
+            0.0 <= value < math.inf):
+        raise ValueError(f'the standard error of {name} must be null or a number, at least 0, '
+                         f'got {value!r}')
     return float(value)
 
 

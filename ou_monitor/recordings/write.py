@@ -209,7 +209,11 @@ class RecordingWriter:
     ) -> None:
         """Finish the bag, or remove it when the block failed."""
         if kind is None:
-            self.close()
+            try:
+                self.close()
+            except BaseException as failure:
+                self._bag.__exit__(type(failure), failure, failure.__traceback__)
+                raise
         self._bag.__exit__(kind, error, trace)
 
     def _voltage(self, stamps: npt.NDArray[np.int64], voltage: FloatArray) -> Iterator[Timed]:

@@ -127,7 +127,7 @@ def test_the_caller_keeps_his_arrays():
 
 
 def test_throttle_that_nobody_asks_for_may_be_unknown():
-    """NaN is fine without a term of throttle, and changes nothing."""
+    """Unknown (NaN) is fine without a term of throttle, and changes nothing."""
     np.testing.assert_array_equal(
         supply().simulate(T, np.random.default_rng(1), math.nan),
         supply().simulate(T, np.random.default_rng(1)))

@@ -24,7 +24,7 @@ def covariance(alpha, rate, lag, var=VAR):
 
 
 def test_the_closed_form():
-    """It is that of the linear system (x, l): dx = -alpha x dt + sigma dW, dl = rate (x - l) dt."""
+    """It is that of the linear system dx = -alpha x dt + sigma dW, dl = rate (x - l) dt."""
     for rate in (5.0, 62.0, 63.0, 300.0):
         a = np.array([[-ALPHA, 0.0], [rate, -rate]])
         p = solve_continuous_lyapunov(a, -np.diag([SIGMA ** 2, 0.0]))

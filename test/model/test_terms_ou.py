@@ -127,7 +127,7 @@ def test_volatility():
 
 
 @pytest.mark.parametrize('square, cube, sigma', [
-    (0.0, 4000.0, 2.0), (300.0, 3000.0, 2.0), (-300.0, 3000.0, 2.0)])
+    (0.0, 4000.0, 2.0), (300.0, 3000.0, 2.0), (-300.0, 3000.0, 2.0), (0.0, 1e6, 2.0)])
 def test_nonlinear_restoring_has_the_density_of_its_potential(square, cube, sigma):
     """
     Density ~ exp(-2 V/sigma^2), V the integral of alpha x + square x^2 + cube x^3.
@@ -139,16 +139,18 @@ def test_nonlinear_restoring_has_the_density_of_its_potential(square, cube, sigm
         return math.exp(-(ALPHA * x * x + square * x ** 3 / 1.5 + 0.5 * cube * x ** 4)
                         / sigma ** 2)
 
-    norm = quad(weight, -2.0, 2.0, epsabs=1e-13)[0]
-    moment = [quad(lambda x, p=p: x ** p * weight(x), -2.0, 2.0, epsabs=1e-13)[0] / norm
+    far = 2.0 if cube < 1e5 else 0.4
+    norm = quad(weight, -far, far, epsabs=1e-13)[0]
+    moment = [quad(lambda x, p=p: x ** p * weight(x), -far, far, epsabs=1e-13)[0] / norm
               for p in range(5)]
-    n = 12_000
+    # A cube of 1e6 relaxes 15 times faster, and so takes parts that much shorter.
+    n, apart = (12_000, 4.0 / ALPHA) if cube < 1e5 else (8_000, 0.4 / ALPHA)
     model = supply(term('nonlinear_restoring', square=square, cube=cube), sigma=sigma, u0=0.0)
-    x = model.simulate(np.arange(n) * 4.0 / ALPHA, np.random.default_rng(9))
+    x = model.simulate(np.arange(n) * apart, np.random.default_rng(9))
     for p in (1, 2, 4):
         error = float((x ** p).std()) / math.sqrt(0.9 * n)
         # The mean is 0 without the square, and then needs no power.
-        power = math.inf if p == 1 else 0.10 if p == 2 else 0.2
+        power = math.inf if p == 1 else 0.12 if p == 2 else 0.22
         agrees((x ** p).mean(), moment[p], error, power)
     if square:
         assert abs(moment[1]) > 8.0 * x.std() / math.sqrt(n)
@@ -156,28 +158,29 @@ def test_nonlinear_restoring_has_the_density_of_its_potential(square, cube, sigm
     assert moment[2] < 0.85 * sigma ** 2 / (2.0 * ALPHA)
 
 
-def decay_error(dt, cube=6000.0):
+def decay_error(dt, square=0.0, cube=6000.0):
     """Return the error of the decay after a jump, over 32 ms, at steps dt, V."""
-    model = supply(term('nonlinear_restoring', square=0.0, cube=cube),
+    model = supply(term('nonlinear_restoring', square=square, cube=cube),
                    term('jumps', rate=3.0, mean=0.3, std=0.0), sigma=0.0, u0=0.0)
     t = np.arange(int(round(3.0 / dt))) * dt
     x = model.simulate(t, np.random.default_rng(11))
     k = int(np.flatnonzero(x)[0])
     later = k + int(round(0.032 / dt))
-    # dx/dt = -alpha x - cube x^3: 1/x^2 obeys a linear equation.
-    ratio = cube / ALPHA
-    end = (math.exp(2.0 * ALPHA * 0.032) * (1.0 / x[k] ** 2 + ratio) - ratio) ** -0.5
-    assert not np.any(np.diff(x[k:later + 1]) > 0.0) and end < 0.2 * x[k]
+    # dx/dt = -alpha x - b x^(p + 1): 1/x^p obeys a linear equation.  Either force alone.
+    ratio, p = (square / ALPHA, 1) if square else (cube / ALPHA, 2)
+    end = (math.exp(p * ALPHA * 0.032) * (x[k] ** -p + ratio) - ratio) ** (-1.0 / p)
+    assert not np.any(np.diff(x[k:later + 1]) > 0.0) and end < 0.3 * x[k]
     return abs(x[later] - end) / x[k]
 
 
-def test_nonlinear_restoring_is_of_second_order():
+@pytest.mark.parametrize('square, cube', [(0.0, 6000.0), (700.0, 1e-6), (-90.0, 1e-6)])
+def test_nonlinear_restoring_is_of_second_order(square, cube):
     """
     Without noise the closed form is met, four times nearer at half the step.
 
     Order 1 would give 2; the bound is 3, and steps are well below the cut.
     """
-    errors = [decay_error(dt) for dt in (4e-4, 2e-4, 1e-4)]
+    errors = [decay_error(dt, square, cube) for dt in (4e-4, 2e-4, 1e-4)]
     assert errors[0] < 1e-5
     assert 3.0 < errors[0] / errors[1] < 5.5 and 3.0 < errors[1] / errors[2] < 5.5
 

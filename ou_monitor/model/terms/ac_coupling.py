@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 import math
 from typing import ClassVar
 
 import numpy as np
 
 from ou_monitor.model.terms.recursion import first_order
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray
 
 # Rates nearer to each other than this are taken apart by it: the closed forms
@@ -30,6 +31,9 @@ class ACCoupling(Term):
     NAME: ClassVar[str] = 'ac_coupling'
     FAMILY: ClassVar[str] = 'instrument'
     STAGE: ClassVar[Stage] = Stage.INSTRUMENT
+    ROLE: ClassVar[Role] = Role.BLOCK
+    FREE: ClassVar[tuple[str, ...]] = ('corner',)
+    SIGNS: ClassVar[tuple[str, ...]] = ('band',)
 
     corner: float = parameter('Hz', 'where the high-pass is down by 3 dB', 0.0, above=True)
 
@@ -66,6 +70,22 @@ class ACCoupling(Term):
             s.voltage -= path
 
         return effect
+
+    @classmethod
+    def candidates(cls, view: View) -> Sequence[Term]:
+        """Return corners around that of the fitted relaxation."""
+        rate = -math.log(float(np.median(view.phi[1:]))) * view.rate / (2.0 * math.pi)
+        return [cls(rate), cls(0.25 * rate)]
+
+    def pass_through(self, columns: FloatArray, s: Stretch) -> FloatArray:
+        """Return columns of the mean as the instrument shows them."""
+        made = np.empty_like(columns)
+        for k in range(columns.shape[1]):
+            seen = replace(s, x=np.zeros(s.t.size), sigma=np.zeros(s.t.size),
+                           voltage=columns[:, k].copy())
+            self.start(np.random.default_rng(0))(seen)
+            made[:, k] = seen.voltage
+        return made
 
 
 def bridge(alpha: FloatArray, rate: float, step: FloatArray

@@ -8,7 +8,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.hidden_chain import forward
+from ou_monitor.model.terms.laws import (
+    climb, curvature_se, log_normal, mixture_cdf, normal_scores)
+from ou_monitor.model.terms.term import (
+    Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
+from ou_monitor.records import FloatArray
 
 
 @dataclass(frozen=True)
@@ -23,6 +28,8 @@ class ClockJitter(Term):
     NAME: ClassVar[str] = 'clock_jitter'
     FAMILY: ClassVar[str] = 'sensor'
     STAGE: ClassVar[Stage] = Stage.CLOCK
+    ROLE: ClassVar[Role] = Role.LAW
+    SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis', 'clustering')
 
     std: float = parameter('s', 'standard deviation of the error of a stamp', 0.0)
 
@@ -37,11 +44,47 @@ class ClockJitter(Term):
             # The step to come is not known at the end of a stretch: that behind bounds both.
             bound = np.where(np.isfinite(gap), 0.45 * gap, 0.0)
             error = self.std * rng.standard_normal(s.t.size)
-            s.at = s.t + np.clip(error, -bound, bound)
-            s.step = np.diff(s.at, prepend=last)
             # Uneven stamps: the sample before may have gone past this one.
-            s.step = np.maximum(s.step, 0.0)
-            s.at = np.maximum.accumulate(s.at)
+            s.at = np.maximum(np.maximum.accumulate(s.t + np.clip(error, -bound, bound)), last)
+            s.step = np.diff(s.at, prepend=last)
             last, stamp = float(s.at[-1]), float(s.t[-1])
 
         return effect
+
+    @classmethod
+    def fit_law(cls, view: View) -> LawFit | None:
+        """Fit hidden errors of the stamps: a step that is longer has more noise in it."""
+        step = 1.0 / view.rate
+        z = view.z[view.train]
+
+        def value(x: FloatArray) -> float:
+            if not -4.0 < x[0] < -0.8:
+                return -math.inf
+            return float(_errors(z, x)[1].sum())
+
+        x, _ = climb(value, [math.log(0.2), 0.0], most=40)
+        before, density, std, law = _errors(view.z, x)
+        weight = (before[:, :, None] * law[None, None, :]).reshape(view.z.size, -1)
+        wide = np.broadcast_to(std.reshape(-1), weight.shape)
+        scores = normal_scores(mixture_cdf(view.z, weight, np.zeros_like(weight), wide))
+        error = math.exp(x[0]) * step
+        return LawFit(cls(error), {'std': error * float(curvature_se(value, x)[0])}, scores,
+                      density - log_normal(view.z), 2)
+
+
+# Levels of the error of a stamp.
+_LEVELS = 7
+
+
+def _errors(z: FloatArray, x: FloatArray
+            ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the law of the error before, densities, scales of each pair, and the prior."""
+    nodes = np.linspace(-2.4, 2.4, _LEVELS)
+    law = np.exp(-0.5 * nodes * nodes)
+    law /= law.sum()
+    error = math.exp(x[0]) * nodes
+    var = math.exp(2.0 * x[1]) * np.maximum(1.0 + error[None, :] - error[:, None], 0.05)
+    transition = np.broadcast_to(law, (_LEVELS, _LEVELS))
+    log_density = log_normal(z[:, None, None], 0.0, var[None])
+    before, density = forward(log_density, transition, law)
+    return before, density, np.sqrt(var), law

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
 
 
 @dataclass(frozen=True)
@@ -17,6 +18,9 @@ class Drift(Term):
     NAME: ClassVar[str] = 'drift'
     FAMILY: ClassVar[str] = 'slow'
     STAGE: ClassVar[Stage] = Stage.LEVEL
+    ROLE: ClassVar[Role] = Role.MEAN
+    LINEAR: ClassVar[tuple[str, ...]] = ('rate', 'curvature')
+    SIGNS: ClassVar[tuple[str, ...]] = ('time', 'band 0')
 
     rate: float = parameter('V/s', 'slope at the first sample')
     curvature: float = parameter('V/s^2', 'coefficient of t^2')
@@ -28,3 +32,8 @@ class Drift(Term):
             s.level += (self.rate + self.curvature * t) * t
 
         return effect
+
+    @classmethod
+    def candidates(cls, view: View) -> Sequence[Term]:
+        """Return the one there is: it is linear."""
+        return (cls(0.0, 0.0),)

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.terms.laws import climb, curvature_se, log_normal, normal_scores
+from ou_monitor.model.terms.term import (
+    Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
+from ou_monitor.records import FloatArray
+from scipy.special import gammaln, stdtr
 
 
 @dataclass(frozen=True)
@@ -22,6 +27,8 @@ class HeavyTails(Term):
     NAME: ClassVar[str] = 'heavy_tails'
     FAMILY: ClassVar[str] = 'events'
     STAGE: ClassVar[Stage] = Stage.DRIVE
+    ROLE: ClassVar[Role] = Role.LAW
+    SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis', 'tails')
 
     dof: float = parameter('', 'degrees of freedom', 2.0, above=True)
 
@@ -31,3 +38,32 @@ class HeavyTails(Term):
             s.power *= (self.dof - 2.0) / (2.0 * rng.standard_gamma(0.5 * self.dof, s.t.size))
 
         return effect
+
+    @classmethod
+    def fit_law(cls, view: View) -> LawFit | None:
+        """Fit a scaled Student-t to the scores, the scale free."""
+        z = view.z[view.train]
+
+        def value(x: FloatArray) -> float:
+            return float(_log_t(z, math.exp(x[0]), math.exp(x[1])).sum())
+
+        x, _ = climb(value, [math.log(5.0), 0.0])
+        dof, scale = math.exp(x[0]), math.exp(x[1])
+        if dof <= 2.01 or dof > 200.0:
+            return None
+        gain = _log_t(view.z, dof, scale) - log_normal(view.z)
+        unit = scale * math.sqrt((dof - 2.0) / dof)
+        scores = np.where(view.z < 0.0, normal_scores(stdtr(dof, view.z / unit)),
+                          -normal_scores(stdtr(dof, -view.z / unit)))
+        return LawFit(cls(dof), {'dof': dof * float(curvature_se(value, x)[0])}, scores, gain, 2)
+
+
+def _log_t(z: FloatArray, dof: float, scale: float) -> FloatArray:
+    """Return the log density of a Student-t of standard deviation `scale`."""
+    if dof <= 2.0:
+        return np.full(z.size, -math.inf)
+    unit = scale * math.sqrt((dof - 2.0) / dof)
+    head = gammaln(0.5 * (dof + 1.0)) - gammaln(0.5 * dof) - 0.5 * math.log(dof * math.pi)
+    result: FloatArray = head - math.log(unit) - 0.5 * (dof + 1.0) * np.log1p(
+        (z / unit) ** 2 / dof)
+    return result

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term
 
 
 @dataclass(frozen=True)
@@ -17,6 +17,7 @@ class HeldSamples(Term):
     NAME: ClassVar[str] = 'held_samples'
     FAMILY: ClassVar[str] = 'sensor'
     STAGE: ClassVar[Stage] = Stage.LOGGER
+    ROLE: ClassVar[Role] = Role.EXACT
 
     rate: float = parameter('Hz', 'rate at which the source has new values', 0.0, above=True)
 
@@ -28,7 +29,8 @@ class HeldSamples(Term):
         def effect(s: Stretch) -> None:
             nonlocal last, turn
             # A hair more, so that a stamp at the very turn does not miss it by rounding.
-            turns = np.floor((s.t - s.origin) * self.rate + 1e-6)
+            hair = 1e-6 + 2.0 * self.rate * np.spacing(np.abs(s.t))
+            turns = np.floor((s.t - s.origin) * self.rate + hair)
             fresh = np.diff(turns, prepend=turn) > 0.0
             at = np.maximum.accumulate(np.where(fresh, np.arange(s.t.size), -1))
             s.voltage = np.where(at >= 0, s.voltage[np.maximum(at, 0)], last)

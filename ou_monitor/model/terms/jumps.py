@@ -8,7 +8,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.terms.laws import log_normal, normal_scores
+from ou_monitor.model.terms.term import (
+    Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
+from ou_monitor.records import FloatArray
+from scipy.special import ndtr
+
+
+# Events drawn for one stretch at most: bounds time and memory.
+_MOST = 5_000_000
 
 
 @dataclass(frozen=True)
@@ -18,6 +26,8 @@ class Jumps(Term):
     NAME: ClassVar[str] = 'jumps'
     FAMILY: ClassVar[str] = 'events'
     STAGE: ClassVar[Stage] = Stage.DRIVE
+    ROLE: ClassVar[Role] = Role.LAW
+    SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis', 'tails', 'skewness')
 
     rate: float = parameter('1/s', 'jumps per second', 0.0)
     mean: float = parameter('V', 'mean size')
@@ -34,6 +44,9 @@ class Jumps(Term):
                 return
             if math.isnan(next_at):
                 next_at = float(s.at[0]) + waits.standard_exponential() / self.rate
+            if self.rate * (s.at[-1] - next_at) > _MOST:
+                raise ValueError(f'{self.NAME}.rate of {self.rate:g} 1/s: more than {_MOST} jumps '
+                                 'in one stretch of samples; so many are noise')
             times = []
             while next_at <= s.at[-1]:
                 times.append(next_at)
@@ -47,3 +60,64 @@ class Jumps(Term):
             np.add.at(s.push, k, size * np.exp(-s.alpha[k] * (s.at[k] - when)))
 
         return effect
+
+    @classmethod
+    def fit_law(cls, view: View) -> LawFit | None:
+        """Fit a mixture to the scores: most are N(0, 1), some have a jump in them."""
+        z, var = view.z, view.variance
+        found = _mixture(z[view.train], var[view.train])
+        if found is None:
+            return None
+        share, mean, spread, unit = found
+        log_calm, log_jump = _parts(z, var, share, mean, spread, unit)
+        both = np.logaddexp(log_calm, log_jump)
+        jumped = np.exp(log_jump - both)
+        s = np.sqrt(var)
+        wide = np.sqrt(unit * unit + spread * spread / var)
+        scores = normal_scores((1.0 - share) * ndtr(z / unit)
+                               + share * ndtr((z - mean / s) / wide))
+        step = 1.0 / view.rate
+        push = np.where(jumped > 0.5, spread * spread + mean * mean, 0.0)
+        n = view.train.stop * share
+        term = cls(share / step, mean, spread)
+        se = {'rate': term.rate / math.sqrt(max(n, 1.0)), 'mean': spread / math.sqrt(max(n, 1.0)),
+              'std': spread / math.sqrt(2.0 * max(n, 1.0))}
+        return LawFit(term, se, scores, both - log_normal(z), 4, push=push)
+
+
+def _parts(z: FloatArray, var: FloatArray, share: float, mean: float, spread: float, unit: float
+           ) -> tuple[FloatArray, FloatArray]:
+    """Return the log densities, weights included, without and with a jump."""
+    calm = math.log1p(-share) + log_normal(z, 0.0, unit * unit)
+    jump = math.log(share) + log_normal(z, mean / np.sqrt(var),
+                                        unit * unit + spread * spread / var)
+    return calm, jump
+
+
+def _mixture(z: FloatArray, var: FloatArray) -> tuple[float, float, float, float] | None:
+    """Return share, mean and spread (V) of the jumps and the scale of the rest, by EM."""
+    s = np.sqrt(var)
+    big = np.abs(z) > 4.0
+    if big.sum() < 3:
+        return None
+    share = float(big.mean())
+    mean, spread, unit = float((z * s)[big].mean()), float((z * s)[big].std() + s.mean()), 1.0
+    for _ in range(60):
+        calm, jump = _parts(z, var, share, mean, spread, unit)
+        weight = np.exp(jump - np.logaddexp(calm, jump))
+        total = float(weight.sum())
+        if total < 2.0:
+            return None
+        before = share
+        share = min(total / z.size, 0.5)
+        # What of a score is jump, by its prior and that of the noise in it.
+        part = spread * spread / (spread * spread + unit * unit * var)
+        size = mean + part * (z * s - mean)
+        mean = float((weight * size).sum()) / total
+        spread = math.sqrt(max(float((weight * ((size - mean) ** 2
+                                                + part * unit * unit * var)).sum()) / total,
+                               1e-12 * float(var.mean())))
+        unit = math.sqrt(float(((1.0 - weight) * z * z).sum()) / (z.size - total))
+        if abs(share - before) < 1e-4 * share:
+            break
+    return share, mean, spread, unit

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,9 @@ class LoadDependentAlpha(Term):
     FAMILY: ClassVar[str] = 'restoring'
     STAGE: ClassVar[Stage] = Stage.DRIVE
     NEEDS_THROTTLE: ClassVar[bool] = True
+    ROLE: ClassVar[Role] = Role.DRIVE
+    FREE: ClassVar[tuple[str, ...]] = ('slope',)
+    SIGNS: ClassVar[tuple[str, ...]] = ('state throttle',)
 
     slope: float = parameter('', 'ln of the factor at full throttle')
 
@@ -27,3 +31,16 @@ class LoadDependentAlpha(Term):
             s.alpha *= np.exp(self.slope * s.throttle)
 
         return effect
+
+    def moved(self, name: str, by: float) -> LoadDependentAlpha:
+        """Return the term with its slope moved."""
+        return replace(self, slope=self.slope + by)
+
+    def per_coordinate(self, name: str) -> float:
+        """Return 1: the slope is that of a logarithm already."""
+        return 1.0
+
+    @classmethod
+    def candidates(cls, view: View) -> Sequence[Term]:
+        """Return the constant rate."""
+        return () if view.throttle is None else (cls(0.0),)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,9 @@ class LoadSag(Term):
     FAMILY: ClassVar[str] = 'load'
     STAGE: ClassVar[Stage] = Stage.LEVEL
     NEEDS_THROTTLE: ClassVar[bool] = True
+    ROLE: ClassVar[Role] = Role.MEAN
+    LINEAR: ClassVar[tuple[str, ...]] = ('linear', 'square')
+    SIGNS: ClassVar[tuple[str, ...]] = ('throttle',)
 
     linear: float = parameter('V', 'fall at full throttle, linear part')
     square: float = parameter('V', 'fall at full throttle, square part')
@@ -28,3 +32,8 @@ class LoadSag(Term):
             s.level -= (self.linear + self.square * s.throttle) * s.throttle
 
         return effect
+
+    @classmethod
+    def candidates(cls, view: View) -> Sequence[Term]:
+        """Return the one there is: it is linear."""
+        return (cls(0.0, 0.0),)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from typing import ClassVar
@@ -9,7 +10,10 @@ from typing import ClassVar
 import numpy as np
 
 from ou_monitor.model.terms.recursion import first_order
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
+
+# Stamps nearer than this are one, s: bags count in ns.
+_HAIR = 1e-9
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,10 @@ class LoadTransient(Term):
     FAMILY: ClassVar[str] = 'load'
     STAGE: ClassVar[Stage] = Stage.LEVEL
     NEEDS_THROTTLE: ClassVar[bool] = True
+    ROLE: ClassVar[Role] = Role.MEAN
+    LINEAR: ClassVar[tuple[str, ...]] = ('gain',)
+    SIGNS: ClassVar[tuple[str, ...]] = ('throttle',)
+    SEARCH: ClassVar[float] = 3.4
 
     gain: float = parameter('V', 'answer to a step of full throttle, at once')
     tau: float = parameter('s', 'time in which it dies out', 0.0, above=True)
@@ -44,7 +52,9 @@ class LoadTransient(Term):
                 # What was set `delay` ago; before the first sample, what it had.
                 times = np.concatenate((times, s.at))
                 values = np.concatenate((values, throttle))
-                then = np.searchsorted(times, s.at - self.delay, side='right') - 1
+                # A hair later, so that a delay of whole steps does not miss by rounding.
+                hair = _HAIR + 2.0 * np.spacing(np.abs(s.at))
+                then = np.searchsorted(times, s.at - self.delay + hair, side='right') - 1
                 throttle = values[np.maximum(then, 0)]
                 keep = max(int(then[-1]), 0)
                 times, values = times[keep:], values[keep:]
@@ -56,3 +66,13 @@ class LoadTransient(Term):
             s.level += self.gain * (throttle - low)
 
         return effect
+
+    @classmethod
+    def candidates(cls, view: View) -> Sequence[Term]:
+        """Return time constants from two steps to a quarter of the recording, and delays."""
+        step = 1.0 / view.rate
+        longest = 0.25 * float(view.at[-1])
+        if longest <= 2.0 * step:
+            return ()
+        count = max(2, math.ceil(2.0 * math.log2(longest / (2.0 * step))))
+        return [cls(0.0, float(tau), 0.0) for tau in np.geomspace(2.0 * step, longest, count)]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+import math
 from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
 
 
 @dataclass(frozen=True)
@@ -17,6 +19,9 @@ class MeasurementNoise(Term):
     NAME: ClassVar[str] = 'measurement_noise'
     FAMILY: ClassVar[str] = 'sensor'
     STAGE: ClassVar[Stage] = Stage.SENSOR
+    ROLE: ClassVar[Role] = Role.NOISE
+    FREE: ClassVar[tuple[str, ...]] = ('std',)
+    SIGNS: ClassVar[tuple[str, ...]] = ('autocorrelation', 'band')
 
     std: float = parameter('V', 'standard deviation', 0.0)
 
@@ -26,3 +31,13 @@ class MeasurementNoise(Term):
             s.voltage += self.std * rng.standard_normal(s.t.size)
 
         return effect
+
+    @classmethod
+    def candidates(cls, view: View) -> Sequence[Term]:
+        """Return a share of the one-step error."""
+        error = math.sqrt(float(np.median(view.variance)))
+        return [cls(0.1 * error), cls(0.4 * error)]
+
+    def variance(self) -> float:
+        """Return the variance that this term adds to each measurement, V^2."""
+        return self.std * self.std

@@ -13,8 +13,10 @@ from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
 from ou_monitor.records import FloatArray
 
 # With a force that is not linear, a step is cut into parts of at most this
-# many relaxation times; the error of the law is of second order in it.
+# many relaxation times, of the whole force at a usual deviation; the error of the
+# law is of second order in it.  More parts than that are refused.
 _PART = 0.05
+_PARTS_MOST = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,7 @@ class OU(Term):
 
     NAME: ClassVar[str] = 'ou'
     STAGE: ClassVar[Stage] = Stage.STATE
+    FREE: ClassVar[tuple[str, ...]] = ('alpha', 'sigma')
 
     alpha: float = parameter('1/s', 'relaxation rate', 0.0, above=True)
     sigma: float = parameter('V/sqrt(s)', 'noise intensity', 0.0)
@@ -61,19 +64,41 @@ def _bent(s: Stretch, kicks: FloatArray, before: float, rng: np.random.Generator
         alpha, step = float(s.alpha[k]), float(s.step[k])
         # Stationary from some relaxations before the first sample on.
         span = min(step, 20.0 / alpha)
-        parts = max(1, math.ceil(alpha * span / _PART))
+        wanted = (alpha + _stiffness(s, k)) * span / _PART
+        if not wanted < _PARTS_MOST:
+            raise ValueError('nonlinear_restoring: the voltage runs away, or the force is far too '
+                             f'strong for a step of {span:g} s')
+        parts = max(1, math.ceil(wanted))
         h = span / parts
         phi = math.exp(-alpha * h)
         spread = float(s.sigma[k]) * math.sqrt(
             -math.expm1(-2.0 * alpha * h) / (2.0 * alpha) * float(s.power[k]))
         draws = [float(kicks[k])] if parts == 1 else rng.standard_normal(parts).tolist()
+        by_square, by_cube = 0.5 * h * square, h * cube
         for draw in draws:
-            before -= 0.5 * h * (square + cube * before) * before * before
+            # Half a part of -cube x^3 (its exact flow) and of -square x^2 (midpoint
+            # rule), the exact law of the linear force, and back: symmetric, of order 2.
+            before /= math.sqrt(1.0 + by_cube * before * before)
+            middle = before - 0.5 * by_square * before * before
+            before -= by_square * middle * middle
             before = phi * before + spread * draw
-            before -= 0.5 * h * (square + cube * before) * before * before
-            if not -1e6 < before < 1e6:
+            middle = before - 0.5 * by_square * before * before
+            before -= by_square * middle * middle
+            before /= math.sqrt(1.0 + by_cube * before * before)
+            if not (-1e6 < before < 1e6 and -0.5 < by_square * before < 0.5):
                 raise ValueError('nonlinear_restoring: the voltage runs away; the force must '
-                                 'pull back at large deviations (cube > 0 when square is not 0)')
+                                 'pull back where x^2 is stronger than alpha x (a larger cube)')
         before += float(s.push[k])
         x[k] = before
     return x
+
+
+def _stiffness(s: Stretch, k: int) -> float:
+    """Return what the bend adds to the rate at one standard deviation, 1/s."""
+    square, cube = s.bend
+    sigma = float(s.sigma[k])
+    var = sigma * sigma / (2.0 * float(s.alpha[k]))
+    if cube > 0.0:
+        # Of a cube alone it is 0.48 sigma / sqrt(cube).
+        var = min(var, 0.48 * sigma / math.sqrt(cube))
+    return abs(square) * math.sqrt(var) + cube * var

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term
 
 
 @dataclass(frozen=True)
@@ -17,6 +17,7 @@ class Quantization(Term):
     NAME: ClassVar[str] = 'quantization'
     FAMILY: ClassVar[str] = 'sensor'
     STAGE: ClassVar[Stage] = Stage.CODE
+    ROLE: ClassVar[Role] = Role.NOISE
 
     step: float = parameter('V', 'one code', 0.0, above=True)
 
@@ -26,3 +27,7 @@ class Quantization(Term):
             s.voltage = self.step * np.rint(s.voltage / self.step)
 
         return effect
+
+    def variance(self) -> float:
+        """Return the variance of rounding to whole steps, V^2."""
+        return self.step * self.step / 12.0

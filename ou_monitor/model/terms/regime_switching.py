@@ -8,7 +8,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.hidden_chain import forward
+from ou_monitor.model.terms.laws import (
+    climb, curvature_se, log_normal, mixture_cdf, normal_scores)
+from ou_monitor.model.terms.term import (
+    Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
+from ou_monitor.records import FloatArray
+
+
+# Events drawn for one stretch at most: bounds time and memory.
+_MOST = 5_000_000
 
 
 @dataclass(frozen=True)
@@ -23,6 +32,8 @@ class RegimeSwitching(Term):
     NAME: ClassVar[str] = 'regime_switching'
     FAMILY: ClassVar[str] = 'switching'
     STAGE: ClassVar[Stage] = Stage.DRIVE
+    ROLE: ClassVar[Role] = Role.LAW
+    SIGNS: ClassVar[tuple[str, ...]] = ('clustering', 'kurtosis', 'band')
 
     rate_up: float = parameter('1/s', 'rate of going into the second state', 0.0, above=True)
     rate_down: float = parameter('1/s', 'rate of leaving it', 0.0, above=True)
@@ -41,6 +52,10 @@ class RegimeSwitching(Term):
                 up = bool(rng.random() * (self.rate_up + self.rate_down) < self.rate_up)
                 next_at = float(s.at[0]) + waits.standard_exponential() / (
                     self.rate_down if up else self.rate_up)
+            changes = 2.0 / (1.0 / self.rate_up + 1.0 / self.rate_down)
+            if changes * (s.at[-1] - next_at) > _MOST:
+                raise ValueError(f'{self.NAME}: {changes:g} changes a second are more than '
+                                 f'{_MOST} in one stretch of samples; so many are noise')
             times = []
             states = [up]
             while next_at <= s.at[-1]:
@@ -67,3 +82,68 @@ class RegimeSwitching(Term):
             s.power *= np.maximum(factor, 0.0)
 
         return effect
+
+    @classmethod
+    def fit_law(cls, view: View) -> LawFit | None:
+        """Fit a hidden chain of two states that share a level and a scale."""
+        best: tuple[float, FloatArray] | None = None
+        z, phi = view.z[view.train], view.phi[view.train]
+        spread = math.sqrt(float(np.mean(view.residual[view.train] ** 2)))
+        unit = math.sqrt(float(np.median(view.variance)))
+        step = 1.0 / view.rate
+
+        def value(x: FloatArray, most: int = 1 << 40) -> float:
+            if max(abs(x[0]), abs(x[1])) > 12.0 or abs(x[3]) > 3.0 or abs(x[4]) > 2.0:
+                return -math.inf
+            return float(_chain(z[:most], phi[:most], step, x)[1].sum())
+
+        # Coordinates: ln rates, level in innovations, ln sigma ratio, ln scale.
+        for dwell in (0.1, 1.0):
+            for level, ratio in ((0.0, 0.7), (spread / unit, 0.0)):
+                rate = -math.log(dwell)
+                x, top = climb(lambda p: value(p, _SHORT),
+                               [rate, rate, level, ratio, -0.3 * ratio], most=60)
+                if best is None or top > best[0]:
+                    best = top, x
+        if best is None:
+            return None
+        x, _ = climb(value, best[1], size=0.2, most=120)
+        before, density, mean, std = _chain(view.z, view.phi, step, x)
+        weight = before[:, :, None] * _transition(x, step)
+        scores = normal_scores(mixture_cdf(view.z, weight.reshape(-1, 4),
+                                           mean.reshape(-1, 4), std.reshape(-1, 4)))
+        term = cls(math.exp(x[0]), math.exp(x[1]), float(x[2]) * unit, math.exp(x[3]))
+        e = curvature_se(value, x)
+        se = {'rate_up': term.rate_up * float(e[0]), 'rate_down': term.rate_down * float(e[1]),
+              'level': unit * float(e[2]), 'sigma_ratio': term.sigma_ratio * float(e[3])}
+        after = np.append(before[1:, 1], before[-1, 1])
+        offset = None if abs(x[2]) < _NO_LEVEL else term.level * (after - after.mean())
+        return LawFit(term, se, scores, density - log_normal(view.z), 5, offset=offset)
+
+
+# Samples on which starts are tried.
+_SHORT = 12000
+# A level of fewer innovations than this is none.
+_NO_LEVEL = 0.2
+
+
+def _transition(x: FloatArray, step: float) -> FloatArray:
+    up, down = math.exp(x[0]), math.exp(x[1])
+    total = up + down
+    move = -math.expm1(-total * step) / total
+    return np.array([[1.0 - up * move, up * move], [down * move, 1.0 - down * move]])
+
+
+def _chain(z: FloatArray, phi: FloatArray, step: float, x: FloatArray
+           ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the law of the state before each sample, densities, and what each pair expects."""
+    state = np.array([0.0, 1.0])
+    # The level enters the innovations where it changes, and a little while it is on.
+    mean = x[2] * (state[None, None, :] - phi[:, None, None] * state[None, :, None])
+    share = math.exp(x[1]) / (math.exp(x[0]) + math.exp(x[1]))
+    centre = x[2] * (1.0 - share) * (1.0 - phi)
+    mean = mean - centre[:, None, None]
+    std = np.broadcast_to(math.exp(x[4]) * np.exp(x[3] * state)[None, None, :], mean.shape)
+    log_density = log_normal(z[:, None, None], mean, std * std)
+    before, density = forward(log_density, _transition(x, step), np.array([share, 1.0 - share]))
+    return before, density, mean, std

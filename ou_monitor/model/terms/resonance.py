@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from typing import ClassVar
 
 import numpy as np
 
+from ou_monitor.model.terms.lines import broad_peaks
 from ou_monitor.model.terms.recursion import first_order
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.records import FloatArray
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,10 @@ class Resonance(Term):
     NAME: ClassVar[str] = 'resonance'
     FAMILY: ClassVar[str] = 'line'
     STAGE: ClassVar[Stage] = Stage.LEVEL
+    ROLE: ClassVar[Role] = Role.BLOCK
+    FREE: ClassVar[tuple[str, ...]] = ('frequency', 'damping', 'std')
+    SIGNS: ClassVar[tuple[str, ...]] = ('line', 'band')
+    SEARCH: ClassVar[float] = 5.0
 
     frequency: float = parameter('Hz', 'of the ringing', 0.0, above=True)
     damping: float = parameter('1/s', 'rate at which ringing dies out', 0.0, above=True)
@@ -50,3 +57,22 @@ class Resonance(Term):
             s.level += (still * turn).real
 
         return effect
+
+    @classmethod
+    def candidates(cls, view: View) -> Sequence[Term]:
+        """Return the broad peaks of what is left over."""
+        spread = float(np.sqrt(np.median(view.variance)))
+        return [cls(frequency, width, 0.5 * spread)
+                for frequency, width in broad_peaks(view.z[view.train], view.rate)]
+
+    def block(self, s: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return its two states, which turn."""
+        turn = 2.0 * math.pi * self.frequency * np.where(np.isfinite(s.step), s.step, 0.0)
+        shrink = np.exp(-self.damping * s.step)
+        f = np.empty((s.t.size, 2, 2))
+        f[:, 0, 0] = f[:, 1, 1] = shrink * np.cos(turn)
+        f[:, 1, 0] = shrink * np.sin(turn)
+        f[:, 0, 1] = -f[:, 1, 0]
+        q = np.zeros_like(f)
+        q[:, 0, 0] = q[:, 1, 1] = self.std**2 * -np.expm1(-2.0 * self.damping * s.step)
+        return f, q, np.array([1.0, 0.0])

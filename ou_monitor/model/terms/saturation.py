@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term
 
 
 @dataclass(frozen=True)
@@ -17,6 +17,7 @@ class Saturation(Term):
     NAME: ClassVar[str] = 'saturation'
     FAMILY: ClassVar[str] = 'sensor'
     STAGE: ClassVar[Stage] = Stage.CLIP
+    ROLE: ClassVar[Role] = Role.EXACT
 
     low: float = parameter('V', 'lowest reading')
     high: float = parameter('V', 'highest reading')

@@ -9,8 +9,8 @@ depend on the stretches it is made in, nor one term's draws on another's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 import enum
 import math
 from typing import Any, ClassVar, Self
@@ -88,6 +88,105 @@ class Stretch:
 Effect = Callable[[Stretch], None]
 
 
+class Role(enum.Enum):
+    """How a term enters a likelihood."""
+
+    # Known without a model: a property of the codes and stamps themselves.
+    EXACT = enum.auto()
+    # A sum of known columns, each times a coefficient.
+    MEAN = enum.auto()
+    # Changes alpha or sigma by what is measured.
+    DRIVE = enum.auto()
+    # Further states of the linear system.
+    BLOCK = enum.auto()
+    # White noise of the measurement.
+    NOISE = enum.auto()
+    # Another law of the one-step innovations.
+    LAW = enum.auto()
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """
+    What a candidate may look at before it is fitted.
+
+    Attributes
+    ----------
+    z : ndarray, shape (n,)
+        Normal scores of the one-step innovations under the model so far.
+    variance : ndarray, shape (n,)
+        Predictive variance of each sample, V^2.
+    phi : ndarray, shape (n,)
+        Coefficient of the OU in the step before each sample.
+    state : ndarray, shape (n,)
+        Deviation of the sample before from its mean, V; 0 at the first.
+    residual : ndarray, shape (n,)
+        Voltage less its mean, V.
+    at : ndarray, shape (n,)
+        Time since the first sample, s.
+    step : ndarray, shape (n,)
+        Time since the sample before, s.
+    throttle : ndarray, shape (n,), or None
+        0..1.
+    train : slice
+        The part that parameters are fitted on.
+
+    """
+
+    z: FloatArray
+    variance: FloatArray
+    phi: FloatArray
+    state: FloatArray
+    residual: FloatArray
+    at: FloatArray
+    step: FloatArray
+    throttle: FloatArray | None
+    train: slice
+
+    @property
+    def rate(self) -> float:
+        """Return the usual rate, Hz."""
+        return 1.0 / float(np.median(self.step[1:]))
+
+
+@dataclass(frozen=True, eq=False)
+class LawFit:
+    """
+    A law of the innovations, fitted.
+
+    Attributes
+    ----------
+    term : Term
+        With its parameters.
+    se : dict of str to float
+        Their standard errors, where known.
+    z : ndarray, shape (n,)
+        Normal scores under the law: independent N(0, 1) when it is right.
+    gain : ndarray, shape (n,)
+        Log predictive density of each sample over that of N(0, 1) for
+        `View.z`, nats.
+    free : int
+        Parameters fitted.
+    push : ndarray, shape (n,), or None
+        Variance that events add to the state, V^2.
+    error : ndarray, shape (n,), or None
+        Variance that events add to the measurement, V^2.
+    offset : ndarray, shape (n,), or None
+        What the law believes to be added to the level, V: the Gaussian part
+        is fitted to what is left without it.
+
+    """
+
+    term: Term
+    se: dict[str, float]
+    z: FloatArray
+    gain: FloatArray
+    free: int
+    push: FloatArray | None = None
+    error: FloatArray | None = None
+    offset: FloatArray | None = None
+
+
 def parameter(unit: str, text: str, low: float = -math.inf, high: float = math.inf, *,
               above: bool = False) -> Any:
     """
@@ -132,6 +231,19 @@ class Term:
         When it acts.
     NEEDS_THROTTLE : bool
         Whether it says nothing without throttle.
+    ROLE : Role
+        How it enters a likelihood.
+    LINEAR : tuple of str
+        Parameters that multiply known columns (`Role.MEAN`).
+    FREE : tuple of str
+        Positive parameters found by maximum likelihood, on a log scale
+        (`Role.DRIVE`, `BLOCK`, `NOISE`).
+    SIGNS : tuple of str
+        Statistics that ask for this term, by the beginning of their names.
+    SEARCH : float
+        Penalty for what is searched beside the free parameters, nats.
+    MEANING : str
+        One sentence for the report.
 
     Raises
     ------
@@ -144,6 +256,12 @@ class Term:
     FAMILY: ClassVar[str] = ''
     STAGE: ClassVar[Stage] = Stage.LEVEL
     NEEDS_THROTTLE: ClassVar[bool] = False
+    ROLE: ClassVar[Role] = Role.MEAN
+    LINEAR: ClassVar[tuple[str, ...]] = ()
+    FREE: ClassVar[tuple[str, ...]] = ()
+    SIGNS: ClassVar[tuple[str, ...]] = ()
+    SEARCH: ClassVar[float] = 0.0
+    MEANING: ClassVar[str] = ''
 
     def __post_init__(self) -> None:
         """Check every parameter against its declaration."""
@@ -179,6 +297,110 @@ class Term:
 
         """
         raise NotImplementedError
+
+    @classmethod
+    def candidates(cls, view: View) -> Sequence[Term]:
+        """
+        Return starting points for a fit to what the model so far leaves over.
+
+        Parameters
+        ----------
+        view : View
+            What is left over.
+
+        Returns
+        -------
+        sequence of Term
+            Best first; empty where there is nothing to start from.
+
+        """
+        return ()
+
+    def columns(self, s: Stretch) -> FloatArray:
+        """
+        Return what the linear parameters multiply.
+
+        Parameters
+        ----------
+        s : Stretch
+            All samples; not changed.
+
+        Returns
+        -------
+        ndarray, shape (n, p)
+            One column for each of `LINEAR`, V per unit.
+
+        """
+        made = []
+        rng = np.random.default_rng(0)
+        for name in self.LINEAR:
+            unit = replace(self, **{other: float(other == name) for other in self.LINEAR})
+            level = replace(s, level=np.zeros(s.t.size))
+            unit.start(rng)(level)
+            made.append(level.level)
+        return np.stack(made, axis=1) if made else np.empty((s.t.size, 0))
+
+    def linear_values(self) -> list[float]:
+        """Return the coefficients of the columns."""
+        return [float(getattr(self, name)) for name in self.LINEAR]
+
+    def with_linear(self, beta: Sequence[float]) -> Self:
+        """Return the term with the coefficients of its columns."""
+        return replace(self, **dict(zip(self.LINEAR, map(float, beta), strict=True)))
+
+    def free(self) -> tuple[str, ...]:
+        """Return the names of the coordinates found by maximum likelihood."""
+        return self.FREE
+
+    def moved(self, name: str, by: float) -> Self:
+        """Return the term with one coordinate moved; the default moves the logarithm."""
+        return replace(self, **{name: getattr(self, name) * math.exp(by)})
+
+    def per_coordinate(self, name: str) -> float:
+        """Return the derivative of a parameter with respect to its coordinate."""
+        return float(getattr(self, name))
+
+    def block(self, s: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """
+        Return the states that this term adds (`Role.BLOCK`).
+
+        Parameters
+        ----------
+        s : Stretch
+            All samples.
+
+        Returns
+        -------
+        f, q : ndarray, shape (n, d, d)
+            Transition into each sample and covariance of what is added, V^2;
+            at the first sample the stationary covariance.
+        h : ndarray, shape (d,)
+            What of it is seen.
+
+        """
+        raise NotImplementedError
+
+    def variance(self) -> float:
+        """Return the variance that this term adds to each measurement, V^2 (`Role.NOISE`)."""
+        return 0.0
+
+    @classmethod
+    def fit_law(cls, view: View) -> LawFit | None:
+        """
+        Fit another law to the normal scores (`Role.LAW`).
+
+        Parameters
+        ----------
+        view : View
+            What the model so far leaves over.
+
+        Returns
+        -------
+        LawFit or None
+            None where this law cannot be fitted.
+
+        """
+        return None
 
     @classmethod
     def parameters(cls) -> tuple[str, ...]:
@@ -234,9 +456,14 @@ def _listed(names: Any) -> str:
 def _number(term: str, name: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
         raise ValueError(f'{term}.{name} must be a number, got {value!r}')
-    if not math.isfinite(value):
-        raise ValueError(f'{term}.{name} must be finite, got {value}')
-    return float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        raise ValueError(f'{term}.{name} must be finite, got an integer of '
+                         f'{int(value).bit_length()} bits') from None
+    if not math.isfinite(number):
+        raise ValueError(f'{term}.{name} must be finite, got {number}')
+    return number
 
 
 def _check_range(term: str, name: str, value: float, rule: Mapping[str, Any]) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 import math
 from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.terms.lines import lines_at
+from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.records import FloatArray
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,10 @@ class Tone(Term):
     NAME: ClassVar[str] = 'tone'
     FAMILY: ClassVar[str] = 'line'
     STAGE: ClassVar[Stage] = Stage.LEVEL
+    ROLE: ClassVar[Role] = Role.MEAN
+    LINEAR: ClassVar[tuple[str, ...]] = ('amplitude', 'phase')
+    SIGNS: ClassVar[tuple[str, ...]] = ('line',)
+    SEARCH: ClassVar[float] = 10.0
 
     amplitude: float = parameter('V', 'peak', 0.0)
     frequency: float = parameter('Hz', 'frequency', 0.0, above=True)
@@ -45,3 +52,26 @@ class Tone(Term):
             s.level += self.amplitude * np.sin(phase)
 
         return effect
+
+    @classmethod
+    def candidates(cls, view: View) -> Sequence[Term]:
+        """Return the strongest lines of what is left over."""
+        return [cls(0.0, f, 0.0, 0.0) for f in lines_at(view)]
+
+    def columns(self, s: Stretch) -> FloatArray:
+        """Return the line in phase and in quadrature."""
+        made = []
+        for phase in (0.0, 0.5 * math.pi):
+            level = replace(s, level=np.zeros(s.t.size))
+            unit = replace(self, amplitude=1.0, phase=phase, linewidth=0.0)
+            unit.start(np.random.default_rng(0))(level)
+            made.append(level.level)
+        return np.stack(made, axis=1)
+
+    def linear_values(self) -> list[float]:
+        """Return the coefficients of the columns."""
+        return [self.amplitude * math.cos(self.phase), self.amplitude * math.sin(self.phase)]
+
+    def with_linear(self, beta: Sequence[float]) -> Tone:
+        """Return the line with these coefficients."""
+        return replace(self, amplitude=math.hypot(*beta), phase=math.atan2(beta[1], beta[0]))

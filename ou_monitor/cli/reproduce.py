@@ -1,0 +1,116 @@
+"""`ou-monitor reproduce`: every number of the paper, recomputed, with a verdict."""
+
+from __future__ import annotations
+
+import argparse
+from textwrap import fill
+from typing import Any, TYPE_CHECKING
+
+from ou_monitor.cli import output
+from ou_monitor.errors import InputError
+
+if TYPE_CHECKING:
+    from ou_monitor.offline.reproduce.reproduce import Reproduction
+
+# Lines are broken to be read at this width.
+_COLUMNS = 100
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        From ``ArgumentParser.add_subparsers``.
+
+    """
+    parser = subparsers.add_parser(
+        'reproduce', allow_abbrev=False,
+        help='recompute every number of the paper, verdict per row',
+        description='Recompute every number of the paper: printed value, recomputed value, and '
+                    'whether it agrees, differs by rounding, or does not hold.')
+    parser.add_argument('--seed', metavar='N', type=int, default=1,
+                        help='same seed, same simulations (default: %(default)s)')
+    parser.add_argument('--json', metavar='FILE',
+                        help="write the result as JSON ('-': to standard output, alone)")
+    parser.add_argument('--report', metavar='FILE.html',
+                        help='write a self-contained HTML page')
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    Reproduce.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        As parsed.
+
+    Returns
+    -------
+    int
+        Exit status, 0; that a number of the paper does not hold is a result.
+
+    Raises
+    ------
+    InputError
+        When an option makes no sense or a file cannot be written.
+
+    """
+    if args.seed < 0:
+        raise InputError(f'--seed must be 0 or more, got {args.seed}')
+    if args.report == output.STDOUT:
+        raise InputError("--report needs a file: '-' is not supported")
+    output.check_writable(args.json)
+    output.check_writable(args.report)
+
+    from ou_monitor.offline.reproduce.reproduce import reproduce
+    from ou_monitor.offline.reproduce.words import as_data
+
+    with output.Progress('recomputing') as progress:
+        result = reproduce(args.seed, progress)
+    if args.report is not None:
+        from ou_monitor.offline.report.reproduction_page import reproduction_page
+        output.write_text(
+            reproduction_page(result, f'ou-monitor reproduce --seed {args.seed}'), args.report)
+    if args.json is not None:
+        output.write_json(as_data(result), args.json)
+    if args.json != output.STDOUT:
+        print(render(result))
+        if args.report is not None:
+            print(f'\nReport: {args.report}')
+    return 0
+
+
+def render(result: Reproduction) -> str:
+    """
+    Return the rows and points for a terminal 100 columns wide.
+
+    Parameters
+    ----------
+    result : Reproduction
+        Rows and points.
+
+    Returns
+    -------
+    str
+        Plain text.
+
+    """
+    from ou_monitor.offline.reproduce.points import tally
+    from ou_monitor.offline.reproduce.words import headline, recomputed
+
+    lines = [fill(headline(result), _COLUMNS)]
+    rows = [[row.where if k == 0 or row.where != found[k - 1].where else '',
+             row.quantity + (f', {row.unit}' if row.unit else ''), row.printed.text,
+             recomputed(row), row.verdict.value]
+            for _, found in result.parts() for k, row in enumerate(found)]
+    lines += ['', output.table(['where', 'quantity', 'printed', 'recomputed', 'verdict'],
+                               rows, left=[0, 1, 4])]
+    for point in result.points:
+        lines += ['', f'{point.number}. {point.title} ({tally(point.rows)})',
+                  fill(point.text, _COLUMNS, initial_indent='   ', subsequent_indent='   ')]
+    return '\n'.join(lines)

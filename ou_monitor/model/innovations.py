@@ -1,0 +1,215 @@
+"""
+One-step innovations of a linear Gaussian state-space model, in library code.
+
+x_k = F_k x_{k-1} + w_k, y_k = H x_k + v_k with F_k, Var w_k = Q_k and Var v_k =
+R_k changing from step to step.  The joint precision of all states is block
+tridiagonal; its banded Cholesky factor, in the order of time, is the
+information form of the Kalman filter (Rue & Held, Gaussian Markov Random
+Fields, 2005), so no Python loop runs over the samples.
+
+Where nothing changes any more the gain settles: it is found on the first
+samples and the rest is a constant filter.
+
+Limits: Q_k must be regular and R_k above 0 (a millionth of Q_k stands for "no
+measurement noise"); the states are few, for the cost grows with their square.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from ou_monitor.records import FloatArray
+from scipy.linalg.lapack import dpbtrf, dtbtrs
+from scipy.signal import lfilter
+
+
+@dataclass(frozen=True)
+class StateSpace:
+    """
+    A model over n samples with d states.
+
+    Attributes
+    ----------
+    f : ndarray, shape (n, d, d)
+        Transition into each sample; that into the first one is not used.
+    q : ndarray, shape (n, d, d)
+        Covariance of what the noise adds in that step, V^2; for the first
+        sample that of the state itself.
+    h : ndarray, shape (d,)
+        What is observed.
+    r : ndarray, shape (n,)
+        Variance of the measurement noise, V^2, > 0.
+
+    """
+
+    f: FloatArray
+    q: FloatArray
+    h: FloatArray
+    r: FloatArray
+
+
+class Filter:
+    """
+    Gains and predictive variances of a model; filters any number of series.
+
+    Parameters
+    ----------
+    model : StateSpace
+        The model, of all samples or of the first ones.
+    n : int, optional
+        Samples; beyond those of `model` it is taken as constant and settled.
+
+    Attributes
+    ----------
+    variance : ndarray, shape (n,)
+        Variance of the one-step innovations, V^2.
+
+    Raises
+    ------
+    ValueError
+        When the precision is not positive definite: a covariance is singular
+        or not finite.
+
+    """
+
+    def __init__(self, model: StateSpace, n: int | None = None) -> None:
+        self._n = model.f.shape[0] if n is None else n
+        self.variance: FloatArray = self._solve(model)
+        if self._n > model.f.shape[0]:
+            # The last gain does not know that a step follows; the one before does.
+            self._steady = _Steady(self._loop[-2], self._gain[-2], self._look[-2])
+            more = np.full(self._n - model.f.shape[0] + 1, self.variance[-2])
+            self.variance = np.concatenate((self.variance[:-1], more))
+
+    def _solve(self, model: StateSpace) -> FloatArray:
+        """Find the gains, sample by sample; return the variances."""
+        f, h = model.f, model.h
+        n, d = f.shape[0], f.shape[1]
+        weight = _inverse(model.q)
+        forward = _times(weight, f)
+        # What the step into the next sample says of this one.
+        back = np.zeros_like(f)
+        back[:-1] = _times(f[1:].transpose(0, 2, 1), forward[1:])
+        diagonal = weight + back + np.multiply.outer(1.0 / model.r, np.outer(h, h))
+        factor, info = dpbtrf(_band(diagonal, -forward[1:]), lower=1, overwrite_ab=1)
+        if info != 0:
+            raise ValueError('the covariance of the model is singular or not finite')
+        pivot = _pivots(factor, n, d)
+        # Filtered covariance, then the gain, then the closed loop.
+        p = _inverse(pivot - back)
+        self._gain = p @ h / model.r[:, None]
+        self._loop = f - self._gain[:, :, None] * (h @ f)[:, None, :]
+        self._loop[0] = 0.0
+        self._look = h @ f
+        self._look[0] = 0.0
+        ahead = np.empty_like(p)
+        ahead[0] = model.q[0]
+        ahead[1:] = _times(_times(f[1:], p[:-1]), f[1:].transpose(0, 2, 1)) + model.q[1:]
+        self._band_of_loop = _band(np.broadcast_to(np.eye(d), f.shape), -self._loop[1:])
+        variance: FloatArray = (ahead @ h) @ h + model.r
+        return variance
+
+    def innovations(self, y: FloatArray) -> FloatArray:
+        """
+        Return one-step innovations.
+
+        Parameters
+        ----------
+        y : ndarray, shape (n,) or (n, p)
+            Series; the filter is linear, so regressors pass as the data do.
+
+        Returns
+        -------
+        ndarray
+            Of the shape of `y`, in its unit.
+
+        """
+        columns = y[:, None] if y.ndim == 1 else y
+        length = self._gain.shape[0]
+        if length == self._n:
+            e = self._through(columns)
+        else:
+            e = np.empty_like(columns, dtype=np.float64)
+            e[:length], state = self._states(columns[:length])
+            # The gain at the last sample solved is not that of one inside.
+            e[length - 1:] = self._steady.innovations(columns[length - 1:], state[-2])
+        return e[:, 0] if y.ndim == 1 else e
+
+    def _through(self, columns: FloatArray) -> FloatArray:
+        return self._states(columns)[0]
+
+    def _states(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return innovations and filtered states of the samples solved."""
+        n, p = columns.shape
+        d = self._gain.shape[1]
+        right = (self._gain[:, :, None] * columns[:, None, :]).reshape(n * d, p)
+        state = dtbtrs(self._band_of_loop, right, uplo='L', diag='U')[0].reshape(n, d, p)
+        e = columns.astype(np.float64)
+        e[1:] -= (self._look[1:, :, None] * state[:-1]).sum(axis=1)
+        return e, state
+
+
+class _Steady:
+    """A filter whose gain has settled, run mode by mode."""
+
+    def __init__(self, loop: FloatArray, gain: FloatArray, look: FloatArray) -> None:
+        self._roots, vectors = np.linalg.eig(loop)
+        self._into = np.linalg.inv(vectors)
+        self._drive = self._into @ gain
+        self._seen = look @ vectors
+
+    def innovations(self, columns: FloatArray, state: FloatArray) -> FloatArray:
+        """Return innovations from a filtered state of shape (d, p) on."""
+        e = columns.astype(np.float64)
+        modes = self._into @ state
+        for root, drive, seen, before in zip(self._roots, self._drive, self._seen, modes):
+            if abs(seen * drive) == 0.0:
+                continue
+            kept, _ = lfilter([drive], [1.0, -root], columns, axis=0, zi=root * before[None, :])
+            e[0] -= (seen * before).real
+            e[1:] -= (seen * kept[:-1]).real
+        return e
+
+
+def _times(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Multiply stacks of small matrices."""
+    product: FloatArray = a * b if a.shape[1] == 1 else a @ b
+    return product
+
+
+def _inverse(a: FloatArray) -> FloatArray:
+    """Invert a stack of small matrices."""
+    d = a.shape[1]
+    if d == 1:
+        return 1.0 / a
+    if d == 2:
+        result = np.empty_like(a)
+        scale = 1.0 / (a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0])
+        result[:, 0, 0], result[:, 1, 1] = a[:, 1, 1] * scale, a[:, 0, 0] * scale
+        result[:, 0, 1], result[:, 1, 0] = -a[:, 0, 1] * scale, -a[:, 1, 0] * scale
+        return result
+    inverse: FloatArray = np.asarray(np.linalg.inv(a), dtype=np.float64)
+    return inverse
+
+
+def _band(diagonal: FloatArray, below: FloatArray) -> FloatArray:
+    """Return a block bidiagonal or symmetric block tridiagonal matrix, lower band storage."""
+    n, d = diagonal.shape[0], diagonal.shape[1]
+    band = np.zeros((2 * d, n, d))
+    for j in range(d):
+        for i in range(j, d):
+            band[i - j, :, j] = diagonal[:, i, j]
+        for i in range(d):
+            band[d + i - j, :-1, j] = below[:, i, j]
+    return band.reshape(2 * d, n * d)
+
+
+def _pivots(factor: FloatArray, n: int, d: int) -> FloatArray:
+    """Return the pivot blocks L_kk L_kk' of a banded Cholesky factor."""
+    lower = np.zeros((n, d, d))
+    rows = factor.reshape(factor.shape[0], n, d)
+    for j in range(d):
+        for i in range(j, d):
+            lower[:, i, j] = rows[i - j, :, j]
+    return _times(lower, lower.transpose(0, 2, 1))

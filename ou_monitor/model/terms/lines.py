@@ -1,0 +1,196 @@
+"""Where spectral lines stand in normal scores: sharp, broad, or following throttle."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from ou_monitor.model.terms.term import View
+from ou_monitor.records import FloatArray
+from scipy.signal import welch
+
+# Lines looked into.
+_MOST = 3
+
+
+def lines_at(view: View) -> list[float]:
+    """
+    Return the frequencies of the strongest sharp lines.
+
+    Parameters
+    ----------
+    view : View
+        Scores, on a grid that is even but for gaps.
+
+    Returns
+    -------
+    list of float
+        Hz, strongest first, refined to a small part of a bin.
+
+    """
+    z = view.z[view.train]
+    if z.size < 32:
+        return []
+    power = np.abs(np.fft.rfft(z, 2 * z.size)) ** 2
+    power[:4] = 0.0
+    found: list[float] = []
+    for _ in range(_MOST):
+        at = int(np.argmax(power))
+        # A parabola through the logarithm of the peak.
+        shift = 0.0
+        if 0 < at < power.size - 1 and power[at - 1] > 0.0 < power[at + 1]:
+            a, b, c = np.log(power[at - 1:at + 2])
+            shift = 0.5 * (a - c) / (a - 2.0 * b + c) if a - 2.0 * b + c < 0.0 else 0.0
+        found.append((at + shift) * view.rate / (2.0 * z.size))
+        power[max(at - 8, 0):at + 9] = 0.0
+    return found
+
+
+def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
+    """
+    Return the broad peaks of scores.
+
+    Parameters
+    ----------
+    z : ndarray, shape (n,)
+        Scores.
+    rate : float
+        Samples per second, Hz.
+
+    Returns
+    -------
+    list of (float, float)
+        Frequency, Hz, and half width, 1/s, at several resolutions.
+
+    """
+    found = []
+    for length in (256, 1024, 4096):
+        if z.size < 4 * length:
+            continue
+        frequency, density = welch(z, rate, nperseg=length)
+        # The lowest bins are those of slow noise, not of ringing.
+        density[:3] = 0.0
+        at = int(np.argmax(density))
+        found.append((float(frequency[at]), 4.0 * math.pi * rate / length))
+    return found
+
+
+def order_lines(view: View) -> list[tuple[float, float]]:
+    """
+    Return the lines whose frequency follows throttle.
+
+    The power of short stretches is added up along frequency = idle + slope *
+    throttle for many idles and slopes (a Hough transform); the best are
+    refined by adding up amplitudes over longer stretches.
+
+    Parameters
+    ----------
+    view : View
+        Scores and throttle.
+
+    Returns
+    -------
+    list of (float, float)
+        Idle frequency and slope, Hz, best first.
+
+    """
+    if view.throttle is None:
+        return []
+    z, u = view.z[view.train], view.throttle[view.train]
+    best = _hough(z, u, view.rate)
+    return [_refined(z, u, view.rate, idle, slope, view.rate / (2.0 * _length(view.rate)))
+            for _, idle, slope in best[:_MOST]]
+
+
+def order_power(z: FloatArray, u: FloatArray, rate: float) -> tuple[float, float]:
+    """
+    Return the power of the strongest line that follows throttle.
+
+    Parameters
+    ----------
+    z, u : ndarray, shape (n,)
+        Scores and throttle.
+    rate : float
+        Samples per second, Hz.
+
+    Returns
+    -------
+    power : float
+        Such that its exponential is the chance of one trial to be beaten.
+    trials : float
+        Lines looked at; 0 where there is nothing to look at.
+
+    """
+    best = _hough(z, u, rate)
+    if not best:
+        return 0.0, 0.0
+    count = z.size // _length(rate)
+    # A mean of `count` exponentials, about; its tail by the Cramer bound.
+    mean = best[0][0]
+    rise = count * _EFFECTIVE * (mean - 1.0 - math.log(max(mean, 1e-9)))
+    return rise, 2.0 * _length(rate) * len(best)
+
+
+# Share of stretches that count as independent: a window of Hann, zero-padded once.
+_EFFECTIVE = 1.0
+
+
+def _length(rate: float) -> int:
+    """Return the samples in a stretch of a quarter of a second."""
+    return int(1 << max(5, round(math.log2(max(32.0, 0.25 * rate)))))
+
+
+def _hough(z: FloatArray, u: FloatArray, rate: float) -> list[tuple[float, float, float]]:
+    """Return mean power, idle and slope of the best idle for each slope, best first."""
+    length = _length(rate)
+    count = z.size // length
+    if count < 8 or np.ptp(u) < 0.02:
+        return []
+    shape = z[:count * length].reshape(count, length)
+    power = np.abs(np.fft.rfft(shape * np.hanning(length), 2 * length, axis=1)) ** 2
+    power /= power.mean()
+    load = u[:count * length].reshape(count, length).mean(axis=1)
+    width = rate / (2.0 * length)
+    bins = power.shape[1] - 1
+    idles = np.arange(bins)
+    best: list[tuple[float, float, float]] = []
+    reach = 0.6 * 0.5 * rate
+    flat = power.ravel()
+    row = np.arange(count)[:, None] * power.shape[1]
+    for slope in np.arange(-reach, reach, 2.0 * width / np.ptp(load)):
+        shift = np.rint(slope * load / width).astype(np.int64)
+        # Beyond the Nyquist frequency a line comes back.
+        at = np.abs((idles[None, :] + shift[:, None] + bins) % (2 * bins) - bins)
+        total = flat[row + at].mean(axis=0)
+        k = int(np.argmax(total))
+        best.append((float(total[k]), float(idles[k] * width), float(slope)))
+    best.sort(reverse=True)
+    return best
+
+
+def _refined(z: FloatArray, u: FloatArray, rate: float, idle: float, slope: float, width: float
+             ) -> tuple[float, float]:
+    """Climb to the top of the coherent power, stretches growing to the whole."""
+    turns = np.cumsum(u - u.mean()) / rate
+    idle += slope * float(u.mean())
+    at = np.arange(z.size) / rate
+    length = max(64, int(rate / width))
+    while True:
+        pieces = max(1, z.size // length)
+        size = z.size // pieces
+        reach = 1.5 / (length / rate)
+        spread = max(float(np.ptp(turns[:size])), 1e-3)
+        slopes = slope + np.linspace(-1.0, 1.0, 9) * min(1.0 / spread, 4.0 * width / 0.02)
+        idles = idle + np.linspace(-1.0, 1.0, 9) * reach
+        top = -1.0
+        for s in slopes:
+            warped = z * np.exp(-2j * math.pi * s * turns)
+            for f in idles:
+                wave = (warped * np.exp(-2j * math.pi * f * at))[:pieces * size]
+                value = float((np.abs(wave.reshape(pieces, size).sum(axis=1)) ** 2).sum()) / size
+                if value > top:
+                    top, idle_best, slope_best = value, float(f), float(s)
+        idle, slope = idle_best, slope_best
+        if pieces == 1:
+            return idle - slope * float(u.mean()), slope
+        length *= 4

@@ -1,0 +1,1 @@
+"""What a simulation gets wrong: integrity -> fit -> criticise -> name -> extend -> gain."""

@@ -1,0 +1,143 @@
+"""
+A whole model, fitted: the Gaussian part, then laws of its innovations in turn.
+
+Each law turns normal scores into better ones and tells the ratio of densities,
+so laws compose; events that a law finds go back into the Gaussian part as
+extra variance, and both are fitted again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from ou_monitor.model.terms.term import LawFit, Role, Term, View
+from ou_monitor.offline.discover.battery import Scene
+from ou_monitor.offline.discover.data import Samples
+from ou_monitor.offline.discover.structure import Events, fit_gaussian, GaussianFit
+from ou_monitor.records import FloatArray
+
+# Rounds between events and the Gaussian part.
+_ROUNDS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Composite:
+    """
+    A fitted model.
+
+    Attributes
+    ----------
+    terms : tuple of Term
+        All, laws included, with parameters.
+    se : tuple of dict
+        Standard errors, a dict a term.
+    gaussian : GaussianFit
+        Its Gaussian part.
+    z : ndarray, shape (n,)
+        Normal scores of the one-step predictions.
+    density : ndarray, shape (n,)
+        Log predictive density of each sample, nats.
+    free : int
+        Free parameters.
+    search : float
+        Penalty for what was searched beside them, nats.
+
+    """
+
+    terms: tuple[Term, ...]
+    se: tuple[dict[str, float], ...]
+    gaussian: GaussianFit
+    z: FloatArray
+    density: FloatArray
+    free: int
+    search: float
+
+    def score(self, samples: Samples) -> float:
+        """Return evidence, nats: of the part fitted, less its price, and of the part kept."""
+        n = samples.train.stop
+        return float(self.density[samples.train].sum() + self.density[samples.test].sum()
+                     - 0.5 * self.free * math.log(n) - self.search)
+
+    def has(self, name: str) -> bool:
+        """Whether a term of that name is in."""
+        return any(term.NAME == name for term in self.terms)
+
+
+def fit_composite(samples: Samples, terms: Sequence[Term], part: slice) -> Composite | None:
+    """
+    Fit a model.
+
+    Parameters
+    ----------
+    samples : Samples
+        The recording.
+    terms : sequence of Term
+        Start; laws in the order in which they are applied.
+    part : slice
+        What the fit may see.
+
+    Returns
+    -------
+    Composite or None
+        None where a law cannot be fitted.
+
+    """
+    structural = [term for term in terms if term.ROLE is not Role.LAW]
+    laws = [type(term) for term in terms if term.ROLE is Role.LAW]
+    events: Events | None = None
+    offset: FloatArray | None = None
+    fits: list[LawFit] = []
+    for turn in range(1 + _ROUNDS):
+        gaussian = fit_gaussian(samples, structural, part, events, offset)
+        z, density = gaussian.z, gaussian.density
+        fits = []
+        push, error, moved = np.zeros(samples.n), np.zeros(samples.n), np.zeros(samples.n)
+        for law in laws:
+            fit = law.fit_law(view_of(samples, gaussian, z, part))
+            if fit is None:
+                return None
+            fits.append(fit)
+            z, density = fit.z, density + fit.gain
+            push += 0.0 if fit.push is None else fit.push
+            error += 0.0 if fit.error is None else fit.error
+            moved += 0.0 if fit.offset is None else fit.offset
+        if _same(events, offset, push, error, moved, gaussian) or turn == _ROUNDS:
+            break
+        if push.any() or error.any() or events is not None:
+            events = Events(push, error)
+        offset = moved if moved.any() else None
+        structural = list(gaussian.terms)
+    fitted = (*gaussian.terms, *(fit.term for fit in fits))
+    free = sum(len(term.free()) + len(term.LINEAR) for term in gaussian.terms) + 1
+    return Composite(fitted, (*gaussian.se, *(fit.se for fit in fits)), gaussian, z, density,
+                     free + sum(fit.free for fit in fits), sum(term.SEARCH for term in fitted))
+
+
+def _same(events: Events | None, offset: FloatArray | None, push: FloatArray, error: FloatArray,
+          moved: FloatArray, gaussian: GaussianFit) -> bool:
+    """Return whether the laws have found again what the Gaussian part was fitted with."""
+    before = (np.zeros(1), np.zeros(1)) if events is None else (events.push, events.error)
+    if ((push > 0.0) != (before[0] > 0.0)).any() or ((error > 0.0) != (before[1] > 0.0)).any():
+        return False
+    change = moved - (0.0 if offset is None else offset)
+    return float(np.mean(change**2)) < 0.01 * float(np.median(gaussian.variance))
+
+
+def view_of(samples: Samples, gaussian: GaussianFit, z: FloatArray, part: slice) -> View:
+    """Return what a law or a candidate may look at."""
+    residual = samples.voltage - gaussian.mean
+    return View(z=z, variance=gaussian.variance, phi=gaussian.phi,
+                state=np.concatenate(([0.0], residual[:-1])), residual=residual,
+                at=samples.t - samples.t[0], step=samples.step, throttle=samples.throttle,
+                train=part)
+
+
+def scene_of(samples: Samples, composite: Composite) -> Scene:
+    """Return what the scores of a model are held against."""
+    residual = samples.voltage - composite.gaussian.mean
+    return Scene(np.concatenate(([0.0], residual[:-1])), samples.t - samples.t[0],
+                 samples.throttle, 1.0 / float(np.median(samples.step[1:])))

@@ -1,0 +1,72 @@
+"""The samples that a discovery works on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ou_monitor.model.terms.term import Stretch
+from ou_monitor.records import FloatArray
+
+# Share of the samples that models are fitted on; the rest is kept to score them.
+TRAIN = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """
+    Clean samples in order.
+
+    Attributes
+    ----------
+    t, voltage : ndarray, shape (n,)
+        Stamps, s, rising, and V.
+    throttle : ndarray, shape (n,), or None
+        0..1; None when it says nothing (unknown, or constant).
+
+    """
+
+    t: FloatArray
+    voltage: FloatArray
+    throttle: FloatArray | None
+
+    @property
+    def n(self) -> int:
+        """Return the number of samples."""
+        return int(self.t.size)
+
+    @property
+    def train(self) -> slice:
+        """Return the part for fitting."""
+        return slice(0, round(TRAIN * self.n))
+
+    @property
+    def test(self) -> slice:
+        """Return the part for scoring."""
+        return slice(round(TRAIN * self.n), self.n)
+
+    @property
+    def step(self) -> FloatArray:
+        """Return the time before each sample, s; infinite before the first."""
+        step = np.diff(self.t, prepend=-np.inf)
+        usual = float(np.median(step[1:]))
+        near = np.abs(step - usual) < 1e-3 * usual
+        step[near] = usual
+        return step
+
+    @property
+    def even(self) -> bool:
+        """Return whether all steps are alike."""
+        step = self.step[1:]
+        return bool((step == step[0]).all()) if step.size else True
+
+    def stretch(self, alpha: float, sigma: float) -> Stretch:
+        """Return the samples as terms take them, with nothing on them yet."""
+        n = self.n
+        return Stretch(
+            t=self.t, at=self.t, step=self.step,
+            throttle=np.full(n, np.nan) if self.throttle is None else self.throttle,
+            origin=float(self.t[0]), alpha=np.full(n, alpha), sigma=np.full(n, sigma),
+            power=np.ones(n), push=np.zeros(n), bend=(0.0, 0.0), x=np.zeros(n),
+            level=np.zeros(n), voltage=np.zeros(n))

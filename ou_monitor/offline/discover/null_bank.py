@@ -1,0 +1,98 @@
+"""
+How the statistics spread when nothing is wrong, by simulation.
+
+Recordings of the fitted baseline, with the stamps and the throttle of the data,
+go through the same fit and the same statistics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from ou_monitor.offline.discover.battery import Scene, statistics
+from ou_monitor.records import FloatArray
+from scipy.signal import lfilter
+from scipy.special import ndtr
+
+# Recordings simulated.
+SIZE = 24
+# The spread found by so few is drawn towards 1, which theory gives, as by this
+# many more.
+_PRIOR = 24.0
+
+
+@dataclass(frozen=True)
+class NullBank:
+    """
+    Means and spreads of the statistics under the baseline.
+
+    Attributes
+    ----------
+    mean, std : dict of str to float
+        By statistic.
+
+    """
+
+    mean: dict[str, float]
+    std: dict[str, float]
+
+    def standardised(self, values: dict[str, float]) -> dict[str, float]:
+        """Return statistics as they would be N(0, 1) under the baseline."""
+        return {name: (value - self.mean.get(name, 0.0)) / self.std.get(name, 1.0)
+                for name, value in values.items()}
+
+
+def simulate_bank(scene: Scene, phi: float, rng: np.random.Generator, size: int = SIZE
+                  ) -> NullBank:
+    """
+    Simulate the bank.
+
+    Parameters
+    ----------
+    scene : Scene
+        Stamps and throttle of the data.
+    phi : float
+        Coefficient of the fitted baseline.
+    rng : numpy.random.Generator
+        Source of randomness.
+    size : int
+        Recordings.
+
+    Returns
+    -------
+    NullBank
+        Means and spreads.
+
+    """
+    found: dict[str, list[float]] = {}
+    n = scene.at.size
+    for _ in range(size):
+        y = lfilter([1.0], [1.0, -phi], rng.standard_normal(n))
+        z, state = refit(y)
+        made = Scene(state, scene.at, scene.throttle, scene.rate)
+        for name, value in statistics(z, made).items():
+            found.setdefault(name, []).append(value)
+    mean, std = {}, {}
+    for name, values in found.items():
+        v = np.array(values)
+        weight = size / (size + _PRIOR)
+        mean[name] = weight * float(v.mean())
+        std[name] = math.sqrt(weight * float(v.var(ddof=1)) + 1.0 - weight)
+    return NullBank(mean, std)
+
+
+def refit(y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the scores and the states of a series after the fit of the baseline to it."""
+    before = np.concatenate(([y[0]], y[:-1]))
+    a, b = before - before.mean(), y - y.mean()
+    phi = float(a @ b) / float(a @ a)
+    e = b - phi * a
+    return e / e.std(), np.concatenate(([0.0], b[:-1]))
+
+
+def family_chance(largest: float, count: int) -> float:
+    """Return the chance that the largest of `count` standard scores is at least so large."""
+    one = 2.0 * float(ndtr(-abs(largest)))
+    return -math.expm1(count * math.log1p(-min(one, 1.0 - 1e-16)))

@@ -1,0 +1,310 @@
+"""
+The Gaussian part of a model: mean, poles, intensities, noise; fitted together.
+
+A model is a list of terms.  Those of `Role.MEAN` are columns of a regression,
+`DRIVE` changes alpha and sigma along the recording, `BLOCK` adds states and
+`NOISE` white errors; `LAW` terms are left to `laws`.  Events found by a law
+enter as extra variance at their samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+
+from ou_monitor.model.innovations import Filter, StateSpace
+from ou_monitor.model.terms.ac_coupling import ACCoupling, bridge
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.term import Role, Stretch, Term
+from ou_monitor.offline.discover.data import Samples
+from ou_monitor.records import FloatArray
+
+# Measurement noise that stands for none, as a share of what a step adds.
+NO_NOISE = 1e-6
+# Steps of the numerical scores, in the logarithm of a parameter.
+_STEP = 1e-4
+_ROUNDS = 12
+# Samples in which the gain of a constant model has settled: the predictive
+# variance is then within some 1e-5 of its limit.
+_SETTLES = 2048
+# Settled: a step gains less than this, nats.
+_SETTLED = 0.02
+_RNG = np.random.default_rng(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Events:
+    """
+    Variance that events add, V^2.
+
+    Attributes
+    ----------
+    push, error : ndarray, shape (n,)
+        To the state, and to the measurement.
+
+    """
+
+    push: FloatArray
+    error: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianFit:
+    """
+    A fitted Gaussian model.
+
+    Attributes
+    ----------
+    terms : tuple of Term
+        With their parameters; the first is the `ou`.
+    se : tuple of dict
+        Standard errors by parameter, a dict a term.
+    mean : ndarray, shape (n,)
+        Of the voltage, V.
+    innovation, variance : ndarray, shape (n,)
+        One-step errors, V, and their predictive variances, V^2, events not
+        counted at their own sample.
+    density : ndarray, shape (n,)
+        Log predictive density of each sample, nats.
+    phi : ndarray, shape (n,)
+        Coefficient of the OU in each step.
+
+    """
+
+    terms: tuple[Term, ...]
+    se: tuple[dict[str, float], ...]
+    mean: FloatArray
+    innovation: FloatArray
+    variance: FloatArray
+    density: FloatArray
+    phi: FloatArray
+
+    @property
+    def z(self) -> FloatArray:
+        """Return the standardised innovations."""
+        return self.innovation / np.sqrt(self.variance)
+
+
+def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
+                 events: Events | None = None, offset: FloatArray | None = None) -> GaussianFit:
+    """
+    Fit the Gaussian part by maximum likelihood on a part of the recording.
+
+    Parameters
+    ----------
+    samples : Samples
+        The recording.
+    terms : sequence of Term
+        Start: the `ou` first; `LAW` and `EXACT` terms pass through.
+    part : slice
+        What the fit may see.
+    events : Events, optional
+        Extra variances at single samples.
+    offset : ndarray, shape (n,), optional
+        Taken from the voltage for the fit, V; not for the evaluation.
+
+    Returns
+    -------
+    GaussianFit
+        Evaluated on all samples.
+
+    """
+    voltage = samples.voltage if offset is None else samples.voltage - offset
+    seen = Samples(samples.t[part], voltage[part],
+                   None if samples.throttle is None else samples.throttle[part])
+    inside = None if events is None else Events(events.push[part], events.error[part])
+    start = tuple(terms)
+    found = _maximise(seen, start, inside)
+    terms, se = found
+    return evaluate(samples, terms, events, se)
+
+
+def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = None,
+             se: Sequence[dict[str, float]] = ()) -> GaussianFit:
+    """
+    Return what a model with given parameters says of a recording.
+
+    Parameters
+    ----------
+    samples : Samples
+        The recording.
+    terms : sequence of Term
+        All parameters as they are.
+    events : Events, optional
+        Extra variances at single samples.
+    se : sequence of dict
+        Handed on.
+
+    Returns
+    -------
+    GaussianFit
+        Nothing is fitted.
+
+    """
+    s, space = _space(samples, terms, events)
+    run = Filter(space, samples.n)
+    columns = _columns(terms, s)
+    beta = np.concatenate([_linear(term) for term in terms])
+    mean = columns @ beta
+    e = run.innovations(samples.voltage - mean)
+    variance = run.variance if events is None else run.variance - events.push - events.error
+    density = -0.5 * (np.log(2.0 * math.pi * variance) + e * e / variance)
+    return GaussianFit(tuple(terms), tuple(se), mean, e, variance, density,
+                       np.exp(-s.alpha * s.step))
+
+
+def _linear(term: Term) -> FloatArray:
+    """Return the coefficients of a term's columns."""
+    if isinstance(term, OU):
+        return np.array([term.u0])
+    return np.asarray(term.linear_values(), dtype=np.float64)
+
+
+def _columns(terms: Sequence[Term], s: Stretch) -> FloatArray:
+    """Return all columns of the mean, through the instrument."""
+    parts = [np.ones((s.t.size, 1))]
+    parts += [term.columns(s) for term in terms if term.ROLE is Role.MEAN and term.NAME != 'ou']
+    columns = np.concatenate(parts, axis=1)
+    for term in terms:
+        if isinstance(term, ACCoupling):
+            columns = term.pass_through(columns, s)
+    return columns
+
+
+def _space(samples: Samples, terms: Sequence[Term], events: Events | None
+           ) -> tuple[Stretch, StateSpace]:
+    """Return the stretch with alpha and sigma along it, and the state space."""
+    ou = terms[0]
+    assert isinstance(ou, OU)
+    s = samples.stretch(ou.alpha, ou.sigma)
+    for term in terms:
+        if term.ROLE is Role.DRIVE:
+            term.start(_RNG)(s)
+    whole = s
+    if events is None and samples.n > _SETTLES and samples.even and not any(
+            term.ROLE is Role.DRIVE for term in terms):
+        s = _first(s, _SETTLES)
+    n = s.t.size
+    phi = np.exp(-s.alpha * s.step)
+    q = s.sigma * s.sigma * -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
+    floor = NO_NOISE * q[1:].mean()
+    blocks = [(phi[:, None, None], q[:, None, None], np.ones(1))]
+    for term in terms:
+        if isinstance(term, ACCoupling):
+            blocks[0] = _coupled(term, s, phi, q)
+    if events is not None:
+        blocks[0][1][:, 0, 0] += events.push
+    blocks += [term.block(s) for term in terms
+               if term.ROLE is Role.BLOCK and not isinstance(term, ACCoupling)]
+    d = sum(h.size for _, _, h in blocks)
+    f_all, q_all, h_all = np.zeros((n, d, d)), np.zeros((n, d, d)), np.zeros(d)
+    at = 0
+    for f, cov, h in blocks:
+        to = at + h.size
+        f_all[:, at:to, at:to], q_all[:, at:to, at:to], h_all[at:to] = f, cov, h
+        at = to
+    r = np.full(n, floor + sum(term.variance() for term in terms))
+    if events is not None:
+        r += events.error
+    return whole, StateSpace(f_all, q_all, h_all, r)
+
+
+def _first(s: Stretch, n: int) -> Stretch:
+    """Return the first samples of a stretch."""
+    return replace(s, **{name: getattr(s, name)[:n] for name in (
+        't', 'at', 'step', 'throttle', 'alpha', 'sigma', 'power', 'push', 'x', 'level',
+        'voltage')})
+
+
+def _coupled(term: ACCoupling, s: Stretch, phi: FloatArray, q: FloatArray
+             ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the OU and its low-pass, which the instrument subtracts."""
+    rate = 2.0 * math.pi * term.corner
+    step = s.step.copy()
+    step[0] = 1.0
+    start, end, spread = bridge(s.alpha, rate, step)
+    f, cov = np.zeros((s.t.size, 2, 2)), np.zeros((s.t.size, 2, 2))
+    f[:, 0, 0], f[:, 1, 1] = phi, np.exp(-rate * s.step)
+    f[:, 1, 0] = start + end * phi
+    cov[:, 0, 0], cov[:, 0, 1] = q, end * q
+    cov[:, 1, 1] = end * end * q + s.sigma * s.sigma * spread
+    share = rate / (rate + s.alpha[0])
+    cov[0] = q[0] * np.array([[1.0, share], [share, share]])
+    cov[:, 1, 0] = cov[:, 0, 1]
+    return f, cov, np.array([1.0, -1.0])
+
+
+def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None
+              ) -> tuple[tuple[Term, ...], tuple[dict[str, float], ...]]:
+    """Fit by scoring: the outer product of numerical scores stands for the information."""
+    free = [(k, name) for k, term in enumerate(terms) for name in _free(term)]
+    terms = _regress(samples, terms, events)
+    base = evaluate(samples, terms, events)
+    value, damping, inverse = float(base.density.sum()), 0.0, np.zeros((0, 0))
+    for _ in range(_ROUNDS):
+        scores = np.empty((samples.n, len(free)))
+        for j, (k, name) in enumerate(free):
+            moved = _moved(terms, k, name, _STEP)
+            scores[:, j] = (evaluate(samples, moved, events).density - base.density) / _STEP
+        information = scores.T @ scores
+        gradient = scores.sum(axis=0)
+        scale = np.sqrt(information.diagonal()) + 1e-12
+        better = None
+        for _ in range(6):
+            ridge = (damping + 1e-9) * np.eye(len(free))
+            step = np.linalg.solve(information / np.outer(scale, scale) + ridge,
+                                   gradient / scale) / scale
+            step = np.clip(step, -1.5, 1.5)
+            trial = terms
+            for (k, name), by in zip(free, step.tolist(), strict=True):
+                trial = _moved(trial, k, name, by)
+            trial = _regress(samples, trial, events)
+            new = evaluate(samples, trial, events)
+            if float(new.density.sum()) > value - 1e-9 * abs(value):
+                better = new
+                break
+            damping = max(10.0 * damping, 0.1)
+        if better is None:
+            break
+        gain = float(better.density.sum()) - value
+        terms, base, value = better.terms, better, float(better.density.sum())
+        damping *= 0.3
+        if gain < _SETTLED:
+            break
+    inverse = np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+    se: list[dict[str, float]] = [{} for _ in terms]
+    for j, (k, name) in enumerate(free):
+        se[k][name] = math.sqrt(max(inverse[j, j], 0.0)) * abs(terms[k].per_coordinate(name))
+    return terms, tuple(se)
+
+
+def _free(term: Term) -> tuple[str, ...]:
+    return term.free()
+
+
+def _moved(terms: tuple[Term, ...], k: int, name: str, by: float) -> tuple[Term, ...]:
+    changed = terms[k].moved(name, by)
+    return (*terms[:k], changed, *terms[k + 1:])
+
+
+def _regress(samples: Samples, terms: tuple[Term, ...], events: Events | None
+             ) -> tuple[Term, ...]:
+    """Fit the coefficients of the mean by generalised least squares."""
+    s, space = _space(samples, terms, events)
+    run = Filter(space, samples.n)
+    columns = _columns(terms, s)
+    weight = 1.0 / np.sqrt(run.variance)
+    through = run.innovations(np.column_stack((samples.voltage, columns))) * weight[:, None]
+    beta = np.linalg.lstsq(through[:, 1:], through[:, 0], rcond=1e-10)[0]
+    ou = terms[0]
+    assert isinstance(ou, OU)
+    result: list[Term] = [replace(ou, u0=float(beta[0]))]
+    at = 1
+    for term in terms[1:]:
+        size = len(term.LINEAR) if term.ROLE is Role.MEAN else 0
+        result.append(term.with_linear(beta[at:at + size].tolist()) if size else term)
+        at += size
+    return tuple(result)

@@ -1,0 +1,293 @@
+"""`ou-monitor simulate` as a user has it: bags, presets, models, seeds, bad options, Ctrl-C."""
+
+import json
+import math
+import os
+from pathlib import Path
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+from ou_monitor.cli.main import main
+from ou_monitor.errors import InputError
+from ou_monitor.offline.presets import PRESETS
+from ou_monitor.recordings.bag import BagReader
+from ou_monitor.recordings.model_file import read_model
+from ou_monitor.recordings.read import read_recording
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+MODEL = """model:
+- term: ou
+  params: {alpha: 40.0, sigma: 0.5, u0: 12.0}
+- term: load_sag
+  params: {linear: 1.0, square: 0.0}
+"""
+
+
+def simulate(*argv):
+    """Run the command; it must succeed."""
+    assert main(['simulate', *(str(word) for word in argv)]) == 0
+
+
+def failure(capsys, *argv):
+    """Run a command that must fail; return its one line."""
+    assert main(['simulate', *(str(word) for word in argv)]) == 2
+    out, err = capsys.readouterr()
+    assert out == '' and re.fullmatch(r'ou-monitor( simulate)?: [^\n]+\n', err), out + err
+    return err
+
+
+@pytest.mark.parametrize('name', ['a.mcap', 'folder'])
+def test_a_bag_that_analyze_takes(tmp_path, name, capsys):
+    """One file, or a rosbag2 folder: stamps, throttle, and the law of the preset."""
+    path = tmp_path / name
+    simulate('--preset', 'load_40', '--duration', 20, '--output', path)
+    assert path.is_dir() == (name == 'folder')
+    assert sorted(p.name for p in tmp_path.rglob('*') if p.is_file()) == (
+        ['folder_0.mcap', 'metadata.yaml'] if name == 'folder' else ['a.mcap'])
+    out, err = capsys.readouterr()
+    assert err == '' and out.count('\n') == 1
+    assert all(word in out for word in (str(path), '20000 samples', "'load_40'", 'seed 1'))
+    rec = read_recording(path)
+    np.testing.assert_allclose(rec.t, np.arange(20_000) / 1000.0, rtol=0, atol=1.1e-9)
+    assert np.all(rec.throttle == np.float32(0.4)) and rec.notes == ()
+    # sqrt(2/(alpha T)) = 4 % of the variance.
+    assert abs(np.var(rec.voltage) / 3.17e-3 - 1.0) < 4.0 * math.sqrt(2.0 / 1260.0)
+    assert main(['analyze', str(path), '--json', '-']) == 0
+    (level,) = json.loads(capsys.readouterr().out)['levels']
+    # 20 000 innovations: sigma to 0.5 %, 0.7 % with alpha unknown.
+    assert abs(level['sigma'] / 0.632 - 1.0) < 4.0 * 0.007
+
+
+def test_default_is_a_flight(tmp_path, capsys):
+    """Without a word: 120 s at 1 kHz in battery messages, named in the list too."""
+    simulate('--duration', 5, '--output', tmp_path / 'f.mcap', '--json', '-')
+    data = json.loads(capsys.readouterr().out)
+    assert (data['n'], data['rate_hz'], data['throttle']) == (5000, 1000.0, 'flight')
+    assert data['topics'] == {'/voltage': 'sensor_msgs/msg/BatteryState',
+                              '/throttle': 'std_msgs/msg/Float32'}
+    assert PRESETS['flight'].duration == 120.0
+
+
+def test_list(capsys):
+    """Every preset and every profile, within a terminal; nothing is written."""
+    simulate('--list')
+    out = capsys.readouterr().out
+    words = out.split()
+    assert all(name in words for name in (*PRESETS, 'hover', 'loads', 'Hz'))
+    assert all(len(line) <= 110 for line in out.splitlines())
+
+
+def test_json_file(tmp_path, capsys):
+    """What was made, with the parameters of every term."""
+    target = tmp_path / 'a.json'
+    simulate('--preset', 'load_10', '--duration', 2, '--rate', 500, '--seed', 7, '--throttle',
+             '0.3', '--output', tmp_path / 'a.mcap', '--json', target)
+    assert json.loads(target.read_text()) == {
+        'output': str(tmp_path / 'a.mcap'), 'duration_s': 2.0, 'rate_hz': 500.0, 'seed': 7,
+        'throttle': '0.3', 'n': 1000, 'topics': {'/voltage': 'sensor_msgs/msg/BatteryState',
+                                                 '/throttle': 'std_msgs/msg/Float32'},
+        'model': [{'term': 'ou', 'params': {'alpha': 63.0, 'sigma': 0.3156, 'u0': 5.0}}]}
+    assert 'a.mcap' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('name', ['a', 'a.mcap'])
+def test_the_same_seed_gives_the_same_bytes(tmp_path, name):
+    """All files of a bag, byte for byte; another seed, other samples."""
+    files = []
+    for folder, seed in (('one', 3), ('two', 3), ('three', 4)):
+        (tmp_path / folder).mkdir()
+        simulate('--preset', 'flight_full', '--duration', 3, '--seed', seed, '--output',
+                 tmp_path / folder / name)
+        files.append({p.name: p.read_bytes() for p in (tmp_path / folder).rglob('*')
+                      if p.is_file()})
+    assert files[0] == files[1] != files[2]
+    assert set(files[0]) == set(files[2])
+
+
+def test_a_saved_model_gives_the_same_samples(tmp_path):
+    """--save-model and then --model: every sample, with the same seed and throttle."""
+    for preset in ('flight_full', 'transient'):
+        saved = tmp_path / f'{preset}.yaml'
+        simulate('--preset', preset, '--duration', 8, '--seed', 5, '--output',
+                 tmp_path / f'{preset}.mcap', '--save-model', saved)
+        file = read_model(saved)
+        assert file.model == PRESETS[preset].model and file.provenance == {'preset': preset}
+        simulate('--model', saved, '--duration', 8, '--seed', 5, '--throttle',
+                 PRESETS[preset].throttle, '--output', tmp_path / f'{preset}_2.mcap')
+        one, two = (read_recording(tmp_path / f'{preset}{end}.mcap') for end in ('', '_2'))
+        np.testing.assert_array_equal(one.voltage, two.voltage)
+        np.testing.assert_array_equal(one.throttle, two.throttle)
+
+
+def test_a_model_can_be_saved_without_a_recording(tmp_path, capsys):
+    """A start for one's own."""
+    simulate('--preset', 'loads', '--save-model', tmp_path / 'm.yaml')
+    assert read_model(tmp_path / 'm.yaml').model == PRESETS['loads'].model
+    assert [p.name for p in tmp_path.iterdir()] == ['m.yaml']
+    assert capsys.readouterr().err == ''
+
+
+def test_a_model_file_of_ones_own(tmp_path):
+    """Mean, sag and variance are those of the file; throttle by points."""
+    (tmp_path / 'own.yaml').write_text(MODEL)
+    simulate('--model', tmp_path / 'own.yaml', '--duration', 40, '--throttle', '0:0,20:0,20:0.5',
+             '--output', tmp_path / 'a.mcap', '--type', 'float64')
+    rec = read_recording(tmp_path / 'a.mcap')
+    std = 0.5 / math.sqrt(80.0)
+    for half, level in ((rec.voltage[:20_000], 12.0), (rec.voltage[20_000:], 11.5)):
+        # A mean over T = 20 s, 800 relaxations.
+        assert abs(half.mean() - level) < 4.0 * std * math.sqrt(2.0 / 800.0)
+        assert abs(half.var() / std ** 2 - 1.0) < 4.0 * math.sqrt(2.0 / 800.0)
+    assert rec.throttle[19_999] == 0.0 and rec.throttle[20_000] == 0.5
+
+
+@pytest.mark.parametrize('kind, topic', [
+    ('battery_state', 'sensor_msgs/msg/BatteryState'), ('float32', 'std_msgs/msg/Float32'),
+    ('float64', 'std_msgs/msg/Float64'), ('adc_block', 'std_msgs/msg/Float32MultiArray')])
+def test_types_hold_the_same_samples(tmp_path, kind, topic):
+    """The message is another, the samples are those of float64 to 0.5 uV."""
+    for name in (kind, 'float64'):
+        if not (tmp_path / f'{name}.mcap').exists():
+            simulate('--duration', 1.234, '--type', name, '--output', tmp_path / f'{name}.mcap')
+    rec, exact = (read_recording(tmp_path / f'{name}.mcap') for name in (kind, 'float64'))
+    assert BagReader(tmp_path / f'{kind}.mcap').topics['/voltage'] == topic
+    np.testing.assert_allclose(rec.t, exact.t, rtol=0, atol=1.1e-9)
+    np.testing.assert_allclose(rec.voltage, exact.voltage, rtol=0, atol=0.5e-6)
+    np.testing.assert_array_equal(rec.throttle, exact.throttle)
+
+
+@pytest.mark.parametrize('rate, duration', [(20_000, 2.0), (1_000_000, 0.1), (44_100, 0.50003)])
+def test_blocks_say_their_own_rate(tmp_path, rate, duration):
+    """From 5 kHz on samples travel in blocks, and read back at their rate, to the last one."""
+    path = tmp_path / 'a.mcap'
+    simulate('--preset', 'load_40', '--duration', duration, '--rate', rate, '--output', path)
+    reader = BagReader(path)
+    assert reader.topics['/voltage'] == 'std_msgs/msg/Float32MultiArray'
+    assert reader.sample_rates == {'/voltage': float(rate)}
+    rec = read_recording(path)
+    n = round(rate * duration)
+    assert rec.n == n
+    # Stamps of blocks are whole ns.
+    np.testing.assert_allclose(rec.t, np.arange(n) / rate, rtol=0, atol=2e-9)
+    steps = np.diff(rec.voltage)
+    # Var of a step is sigma^2 dt: to sqrt(2/n).
+    assert abs(steps.var() / (0.632 ** 2 / rate) - 1.0) < 4.0 * math.sqrt(2.0 / n) + 63.0 / rate
+
+
+def test_throttle_of_blocks(tmp_path):
+    """A step within a block is at its sample."""
+    path = tmp_path / 'a.mcap'
+    simulate('--preset', 'loads', '--duration', 0.1, '--rate', 20_000, '--throttle',
+             '0:0.1,0.05125:0.1,0.05125:0.4', '--output', path)
+    throttle = read_recording(path).throttle
+    np.testing.assert_array_equal(
+        throttle, np.where(np.arange(2000) < 1025, np.float32(0.1), np.float32(0.4)))
+
+
+@pytest.mark.parametrize('options, words', [
+    (['--preset', 'lod_10'], "'load_10'"), (['--preset', ''], "''"),
+    (['--duration', '0'], '--duration'), (['--duration', '-1'], '--duration'),
+    (['--duration', 'nan'], '--duration'), (['--duration', 'inf'], '--duration'),
+    (['--duration', 'x'], '--duration'), (['--rate', '0'], '--rate'),
+    (['--rate', 'nan'], '--rate'), (['--rate', '-5'], '--rate'),
+    (['--rate', '1e-3', '--duration', '10'], '0.01 samples'),
+    (['--rate', '1e9', '--duration', '1e9'], '1e+18 samples'),
+    (['--rate', '2e9', '--duration', '1e-6'], '--rate must be at most 1e+09 Hz'),
+    (['--rate', '1e10', '--duration', '1e-6', '--type', 'float32'], '--rate'),
+    (['--seed', '-1'], '--seed'), (['--seed', '1.5'], '--seed'), (['--throttle', '2'], '0..1'),
+    (['--throttle', 'flihgt'], "'flight'"), (['--throttle', 'none.csv'], 'none.csv'),
+    (['--type', 'float16'], 'float16'), (['--model', 'none.yaml'], 'none.yaml'),
+    (['--preset', 'idle', '--model', 'm.yaml'], '--preset'), (['--sed', '1'], '--seed'),
+    (['extra'], 'extra'), (['--json', '/nowhere/a.json'], '/nowhere'),
+    (['--save-model', '/nowhere/m.yaml'], '/nowhere'), (['--save-model', '/'], 'folder'),
+])
+def test_bad_options_leave_nothing(tmp_path, options, words, capsys):
+    """One line with the option or the value, status 2, and no file."""
+    assert words in failure(capsys, '--output', tmp_path / 'a.mcap', *options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_output_is_needed(tmp_path, monkeypatch, capsys):
+    """Without it there is nowhere to go, nor anything to tell."""
+    monkeypatch.chdir(tmp_path)
+    assert '--output' in failure(capsys, '--preset', 'idle')
+    assert '--json' in failure(capsys, '--save-model', 'm.yaml', '--json', '-')
+
+
+@pytest.mark.parametrize('name', ['a.mcap', 'a'])
+def test_nothing_is_overwritten(tmp_path, name, capsys):
+    """An existing file or folder is refused and keeps its content."""
+    path = tmp_path / name
+    simulate('--preset', 'idle', '--duration', 1, '--output', path)
+    before = {p: p.read_bytes() for p in tmp_path.rglob('*') if p.is_file()}
+    capsys.readouterr()
+    assert 'exists already' in failure(capsys, '--preset', 'idle', '--duration', '2', '--output',
+                                       path)
+    assert {p: p.read_bytes() for p in tmp_path.rglob('*') if p.is_file()} == before
+    assert 'no folder' in failure(capsys, '--output', tmp_path / 'none' / 'b.mcap')
+
+
+@pytest.mark.parametrize('name', ['a.mcap', 'a'])
+@pytest.mark.parametrize('model, words', [
+    (MODEL.replace('load_sag', 'load_sack'), "'load_sag'"),
+    (MODEL.replace('sigma: 0.5', 'sigma: 1e+100'), 'beyond'),
+    (MODEL.replace('sigma: 0.5', 'sigma: 1000.0').replace(
+        'load_sag\n  params: {linear: 1.0, square: 0.0}',
+        'nonlinear_restoring\n  params: {square: 1.0e+6, cube: 0.001}'), 'runs away'),
+    (MODEL.replace('load_sag\n  params: {linear: 1.0, square: 0.0}',
+                   'jumps\n  params: {rate: 1e12, mean: 0, std: 1}'), 'jumps.rate'),
+])
+def test_an_error_half_way_leaves_nothing(tmp_path, name, model, words, capsys):
+    """A model that cannot be read, or whose simulation fails when the bag is open."""
+    (tmp_path / 'm.yaml').write_text(model)
+    assert words in failure(capsys, '--model', tmp_path / 'm.yaml', '--duration', 100,
+                            '--output', tmp_path / name)
+    assert [p.name for p in tmp_path.iterdir()] == ['m.yaml']
+
+
+@pytest.mark.parametrize('name', ['a.mcap', 'a'])
+def test_ctrl_c(tmp_path, name):
+    """
+    Interrupted while it writes: status 130, no traceback, no bag.
+
+    An hour at 20 kHz lasts far longer than the test; the signal goes out once
+    the bag has grown.
+    """
+    path = tmp_path / name
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'ou_monitor.cli.main', 'simulate', '--duration', '3600', '--rate',
+         '20000', '--output', str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True, env={**os.environ, 'PYTHONPATH': str(ROOT)})
+    try:
+        end = time.monotonic() + 60.0
+        while sum(p.stat().st_size for p in tmp_path.rglob('*.mcap')) < 100_000:
+            assert process.poll() is None and time.monotonic() < end, process.stderr.read()
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert (process.returncode, out, err) == (130, '', '')
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_writer_leaves_nothing_when_finishing_fails(tmp_path, monkeypatch):
+    """A disk that is full at the last block: no bag is left that looks like one."""
+    from ou_monitor.recordings.bag import BagWriter
+    from ou_monitor.recordings.write import RecordingWriter
+    from ou_monitor.records import Recording
+
+    def full(*_):
+        raise InputError('disk full')
+
+    t = np.arange(150) / 1e4
+    with pytest.raises(InputError, match='disk full'):
+        with RecordingWriter(tmp_path / 'a.mcap', type='adc_block', sample_rate=1e4) as writer:
+            writer.write(Recording(t, t + 5.0, t * 0.0))
+            monkeypatch.setattr(BagWriter, 'write', full)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,187 @@
+"""Model files: round trips, and one line for everything that can be wrong."""
+
+import datetime
+import math
+
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.recordings.model_file import as_yaml, ModelFile, parse_model, read_model
+import pytest
+import yaml
+
+OU = {'term': 'ou', 'params': {'alpha': 63.0, 'sigma': 0.3156, 'u0': 5.0}}
+SAG = {'term': 'load_sag', 'params': {'linear': 0.3, 'square': 0.0}}
+KNOTS = {'term': 'load_dependent_sigma',
+         'params': {'throttle': [0.1, 0.4], 'log_factor': [0.0, 0.7]}}
+
+
+def model(*names_and_params):
+    """Return a model of terms of the catalogue."""
+    return SupplyModel(tuple(catalogue()[n](**p) for n, p in names_and_params))
+
+
+def failure(data, where='m.yaml'):
+    """Return the message of a model that must be refused: one line that names the file."""
+    with pytest.raises(InputError) as caught:
+        parse_model(data, where)
+    text = str(caught.value)
+    assert text.startswith(where) and '\n' not in text
+    return text
+
+
+def test_round_trip(tmp_path):
+    """Every digit of parameters, errors and provenance, through a file."""
+    rng = np.random.default_rng(1)
+    third, tiny = 1.0 / 3.0, 1.234567890123456e-17
+    supply = model(('ou', {'alpha': 63.0 + third, 'sigma': tiny, 'u0': -5.0}),
+                   ('load_dependent_sigma', {'throttle': [0.1, third, 0.9],
+                                             'log_factor': rng.standard_normal(3).tolist()}),
+                   ('tone', {'amplitude': 1e-9, 'frequency': 1e9, 'phase': -third,
+                             'linewidth': 0.0}),
+                   ('tone', {'amplitude': 1.0, 'frequency': 2.0, 'phase': 0.0,
+                             'linewidth': third}))
+    file = ModelFile(supply, ({'alpha': third, 'sigma': 1e-30}, {'log_factor': [0.1, 0.2, third]},
+                              {}, {'phase': 0.5}),
+                     {'recording': 'flight <ü>: 1', 'commit': 'abc', 'heldout_score': -third,
+                      'date': datetime.date(2026, 11, 21), 'n': 5})
+    path = tmp_path / 'm.yaml'
+    path.write_text(as_yaml(file), encoding='utf-8')
+    assert read_model(path) == file and read_model(str(path)) == file
+    assert as_yaml(read_model(path)) == as_yaml(file)
+
+
+@pytest.mark.parametrize('name', sorted(set(catalogue()) - {'ou'}))
+def test_every_term_goes_through_a_file(name):
+    """With a number for every parameter that all ranges allow."""
+    cls = catalogue()[name]
+    params = {key: [0.25, 0.5] if key in ('throttle', 'log_factor')
+              else 0.5 + 2.0 * k + 2.0 * (key == 'dof')
+              for k, key in enumerate(cls.parameters())}
+    if name == 'glitches':
+        params['probability'] = 0.5
+    file = ModelFile(model(('ou', OU['params']), (name, params)), ({}, {}))
+    back = parse_model(yaml.safe_load(as_yaml(file)), 'x')
+    assert back == file and back.model.terms[1].values() == params
+
+
+def test_the_text_is_that_of_the_contract():
+    """`model:` a list of term, params, se; `provenance:`; empty parts are left out."""
+    file = ModelFile(model(('ou', OU['params']), ('load_sag', SAG['params'])),
+                     ({'alpha': 0.5}, {}), {'commit': 'abc'})
+    assert yaml.safe_load(as_yaml(file)) == {
+        'model': [{**OU, 'se': {'alpha': 0.5}}, SAG], 'provenance': {'commit': 'abc'}}
+    assert yaml.safe_load(as_yaml(ModelFile(file.model))) == {'model': [OU, SAG]}
+
+
+def test_standard_errors():
+    """Not known is null in the file and NaN when read; whole numbers are numbers."""
+    file = parse_model({'model': [{**OU, 'se': {'alpha': None, 'u0': 1}},
+                                  {**KNOTS, 'se': {'log_factor': [None, 0.5]}}]}, 'x')
+    assert math.isnan(file.se[0]['alpha']) and file.se[0]['u0'] == 1.0
+    assert math.isnan(file.se[1]['log_factor'][0]) and file.se[1]['log_factor'][1] == 0.5
+    again = yaml.safe_load(as_yaml(file))['model']
+    assert again[0]['se'] == {'alpha': None, 'u0': 1.0}
+    assert again[1]['se'] == {'log_factor': [None, 0.5]}
+
+
+@pytest.mark.parametrize('entry, words', [
+    ({**OU, 'se': {'alfa': 1.0}}, ["'alfa'", "'alpha'"]), ({**OU, 'se': [1.0]}, ["'se'", "'ou'"]),
+    ({**OU, 'se': {'alpha': 'x'}}, ["'x'", 'standard error', 'ou']),
+    ({**OU, 'se': {'alpha': True}}, ['True', 'standard error']),
+    ({**OU, 'se': {'alpha': [1.0, 'y']}}, ["'y'"]),
+    ({**OU, 'se': {'alpha': -0.1}}, ['standard error of ou.alpha', '-0.1']),
+    ({**OU, 'se': {'alpha': math.inf}}, ['standard error of ou.alpha', 'inf']),
+])
+def test_bad_standard_errors(entry, words):
+    """One line with the file, the term and what is wrong."""
+    text = failure({'model': [entry]})
+    assert 'term 1' in text and all(word in text for word in words), text
+
+
+def test_numbers_with_an_exponent_need_no_point(tmp_path):
+    """1e-3 is a number to people and to YAML 1.2; other text is not."""
+    path = tmp_path / 'm.yaml'
+    path.write_text('model:\n- term: ou\n  params: {alpha: 6.3e1, sigma: 3E-1, u0: -5e+0}\n'
+                    '- term: load_dependent_sigma\n'
+                    '  params: {throttle: [0, 1], log_factor: [1e-1, 2]}\n')
+    first, second = read_model(path).model.terms
+    assert first.values() == {'alpha': 63.0, 'sigma': 0.3, 'u0': -5.0}
+    assert second.values() == {'throttle': [0.0, 1.0], 'log_factor': [0.1, 2.0]}
+    for text in ('1e', 'e5', '1e999', '0x1p3', 'nan'):
+        assert 'ou.u0' in failure({'model': [{'term': 'ou', 'params': {
+            **OU['params'], 'u0': text}}]})
+
+
+@pytest.mark.parametrize('entry, words', [
+    ('load_sag', ['term: NAME']), (None, ['term: NAME']), ({'params': {}}, ['term: NAME']),
+    ({'term': 'load_sak', 'params': {}}, ["'load_sak'", "'load_sag'"]),
+    ({'term': None, 'params': {}}, ['unknown term']), ({'term': [1], 'params': {}}, ['unknown']),
+    ({'term': 'Load_sag', 'params': {}}, ["'load_sag'"]),
+    ({**SAG, 'parms': {}}, ["'parms'", "'params'", 'load_sag']),
+    ({'term': 'load_sag'}, ["'load_sag'", "'linear'", "'square'"]),
+    ({'term': 'load_sag', 'params': None}, ["lacks 'linear'"]),
+    ({'term': 'load_sag', 'params': {'linear': 0.1}}, ["'load_sag'", "lacks 'square'"]),
+    ({'term': 'load_sag', 'params': {'linear': 0.1, 'square': 0.0, 'cube': 1.0}},
+     ["no parameter 'cube'", "'linear', 'square'"]),
+    ({'term': 'load_sag', 'params': {1: 0.1, 'linear': 0.1, 'square': 0.0}}, ["'1'"]),
+    ({'term': 'load_sag', 'params': [0.1, 0.2]}, ["'params'", 'mapping']),
+    ({'term': 'load_sag', 'params': {'linear': 'x', 'square': 0.0}}, ['load_sag.linear', "'x'"]),
+    ({'term': 'load_sag', 'params': {'linear': None, 'square': 0.0}}, ['load_sag.linear']),
+    ({'term': 'load_sag', 'params': {'linear': math.nan, 'square': 0.0}}, ['finite']),
+    ({'term': 'load_sag', 'params': {'linear': 10 ** 400, 'square': 0.0}}, ['load_sag.linear']),
+    ({'term': 'jumps', 'params': {'rate': -2.0, 'mean': 0.0, 'std': 0.1}},
+     ['jumps.rate', '1/s', '-2']),
+    ({'term': 'load_dependent_sigma', 'params': {'throttle': 0.1, 'log_factor': [0.0]}},
+     ['load_dependent_sigma.throttle', 'list']),
+])
+def test_bad_terms(entry, words):
+    """File, which of the terms, its name, the parameter, and the nearest valid word."""
+    text = failure({'model': [OU, entry]})
+    assert 'term 2' in text and all(word in text for word in words), text
+
+
+@pytest.mark.parametrize('data, words', [
+    (None, "needs 'model:'"), ([], "needs 'model:'"), ('text', "needs 'model:'"), (5, "'model:'"),
+    ({}, "needs 'model:'"), ({'modell': [OU]}, "needs 'model:'"),
+    ({'model': [OU], 'provenence': {}}, "'provenance'"), ({'model': [OU], 3: 1}, "entry '3'"),
+    ({'model': None}, 'list of terms'), ({'model': OU}, 'list of terms'),
+    ({'model': 'ou'}, 'list of terms'), ({'model': []}, "'ou', got no term at all"),
+    ({'model': [SAG]}, "'ou', got 'load_sag'"), ({'model': [SAG, OU]}, "'ou', got 'load_sag'"),
+    ({'model': [OU, OU]}, "one term 'ou', got 2"),
+    ({'model': [OU, SAG, SAG]}, "one term 'load_sag', got 2"),
+    ({'model': [OU], 'provenance': ['x']}, "'provenance'"),
+    ({'model': [OU], 'provenance': 'x'}, "'provenance'"),
+])
+def test_bad_files(data, words):
+    """Also what is missing, misspelt, out of order or there twice."""
+    assert words in failure(data)
+
+
+@pytest.mark.parametrize('content, words', [
+    (b'', "needs 'model:'"), (b'\n# only a comment\n', "needs 'model:'"),
+    (b'model: [\n  b: }\n', 'is not YAML'), (b'model:\n\t- term: ou\n', 'is not YAML'),
+    (bytes(range(256)) * 8, 'is not YAML'), (b'\x00\x01\x02', 'is not YAML'),
+    (b'model: !!python/object/apply:os.getcwd []\n', 'is not YAML'),
+    (b'model: []\nprovenance: {date: 2026-99-99}\n', 'is not YAML'),
+    (b'[' * 20_000, 'nested'), (b'a: 1\n---\nb: 2\n', 'is not YAML'),
+    (b'model: &a [*a]\n', 'term: NAME'),
+], ids=['empty', 'comment', 'syntax', 'tab', 'binary', 'nul', 'python', 'date', 'deep', 'two',
+        'loop'])
+def test_files_that_are_none(tmp_path, content, words):
+    """One line that names the file, whatever its bytes."""
+    path = tmp_path / 'bad.yaml'
+    path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_model(path)
+    text = str(caught.value)
+    assert str(path) in text and words in text and '\n' not in text
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    """Missing, and a folder."""
+    for path in (tmp_path / 'none.yaml', tmp_path):
+        with pytest.raises(InputError, match='cannot read the model file') as caught:
+            read_model(path)
+        assert str(path) in str(caught.value)
