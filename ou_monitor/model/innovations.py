@@ -150,18 +150,30 @@ class Filter:
         return e, state
 
 
+# Modes nearer to each other than this (condition of the eigenvectors) are not
+# taken apart.
+_APART = 1e10
+# Samples filtered at once where they are not.
+_CHUNK = 4096
+
+
 class _Steady:
-    """A filter whose gain has settled, run mode by mode."""
+    """A filter whose gain has settled, run mode by mode where the modes are distinct."""
 
     def __init__(self, loop: FloatArray, gain: FloatArray, look: FloatArray) -> None:
+        self._loop, self._gain, self._look = loop, gain, look
         self._roots, vectors = np.linalg.eig(loop)
-        self._into = np.linalg.inv(vectors)
-        self._drive = self._into @ gain
-        self._seen = look @ vectors
+        self._modal = bool(np.linalg.cond(vectors) < _APART)
+        if self._modal:
+            self._into = np.linalg.inv(vectors)
+            self._drive = self._into @ gain
+            self._seen = look @ vectors
 
     def innovations(self, columns: FloatArray, state: FloatArray) -> FloatArray:
         """Return innovations from a filtered state of shape (d, p) on."""
         e = columns.astype(np.float64)
+        if not self._modal:
+            return self._in_chunks(e, state)
         modes = self._into @ state
         for root, drive, seen, before in zip(self._roots, self._drive, self._seen, modes):
             if abs(seen * drive) == 0.0:
@@ -169,6 +181,22 @@ class _Steady:
             kept, _ = lfilter([drive], [1.0, -root], columns, axis=0, zi=root * before[None, :])
             e[0] -= (seen * before).real
             e[1:] -= (seen * kept[:-1]).real
+        return e
+
+    def _in_chunks(self, e: FloatArray, state: FloatArray) -> FloatArray:
+        d = self._gain.size
+        for begin in range(0, e.shape[0], _CHUNK):
+            part = e[begin:begin + _CHUNK].copy()
+            m = part.shape[0]
+            right = self._gain[None, :, None] * part[:, None, :]
+            right[0] += self._loop @ state
+            loops = np.broadcast_to(self._loop, (m, d, d))
+            band = _band(np.broadcast_to(np.eye(d), (m, d, d)), -loops[1:])
+            states = dtbtrs(band, right.reshape(m * d, -1), uplo='L', diag='U')[0].reshape(
+                m, d, -1)
+            before = np.concatenate((state[None], states[:-1]))
+            e[begin:begin + m] -= np.einsum('d,mdp->mp', self._look, before)
+            state = states[-1]
         return e
 
 

@@ -36,6 +36,7 @@ class ACCoupling(Term):
     SIGNS: ClassVar[tuple[str, ...]] = ('band',)
 
     corner: float = parameter('Hz', 'where the high-pass is down by 3 dB', 0.0, above=True)
+    offset: float = parameter('V', 'level about which the instrument shows what it sees')
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
@@ -67,7 +68,7 @@ class ACCoupling(Term):
                 e[0], decay[0] = low, 0.0
             path = first_order(decay, e, low)
             low, x_before, level_before = float(path[-1]), float(s.x[-1]), float(level[-1])
-            s.voltage -= path
+            s.voltage -= path - self.offset
 
         return effect
 
@@ -75,7 +76,11 @@ class ACCoupling(Term):
     def candidates(cls, view: View) -> Sequence[Term]:
         """Return corners around that of the fitted relaxation."""
         rate = -math.log(float(np.median(view.phi[1:]))) * view.rate / (2.0 * math.pi)
-        return [cls(rate), cls(0.25 * rate)]
+        return [cls(rate, 0.0), cls(0.25 * rate, 0.0)]
+
+    def beside(self, ou: Term) -> Term:
+        """Return a slow `ou`: the relaxation seen may be all the instrument's."""
+        return replace(ou, alpha=0.3 * math.pi * self.corner)
 
     def pass_through(self, columns: FloatArray, s: Stretch) -> FloatArray:
         """Return columns of the mean as the instrument shows them."""
@@ -83,7 +88,7 @@ class ACCoupling(Term):
         for k in range(columns.shape[1]):
             seen = replace(s, x=np.zeros(s.t.size), sigma=np.zeros(s.t.size),
                            voltage=columns[:, k].copy())
-            self.start(np.random.default_rng(0))(seen)
+            replace(self, offset=0.0).start(np.random.default_rng(0))(seen)
             made[:, k] = seen.voltage
         return made
 

@@ -31,7 +31,7 @@ class FlickerNoise(Term):
     FAMILY: ClassVar[str] = 'slow'
     STAGE: ClassVar[Stage] = Stage.LEVEL
     ROLE: ClassVar[Role] = Role.BLOCK
-    FREE: ClassVar[tuple[str, ...]] = ('amplitude',)
+    FREE: ClassVar[tuple[str, ...]] = ('amplitude', 'high')
     SIGNS: ClassVar[tuple[str, ...]] = ('band', 'autocorrelation')
 
     amplitude: float = parameter('V', 'square root of f times the PSD', 0.0)

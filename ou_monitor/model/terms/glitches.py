@@ -47,8 +47,11 @@ class Glitches(Term):
         """
         # The bad ones widen what the fit so far takes for noise: a scale that
         # does not see them.
-        unit = float(np.median(np.abs(view.z))) / 0.6745
-        seen = replace(view, z=view.z / unit, variance=view.variance * unit * unit)
+        # Judged by what a filter sees that knows of no error: a sample once left
+        # out no longer disturbs the next.
+        plain = (view.residual - view.phi * view.state) / np.sqrt(view.variance)
+        unit = float(np.median(np.abs(plain))) / 0.6745
+        seen = replace(view, z=plain / unit, variance=view.variance * unit * unit)
         share, spread = 1e-3, 6.0 * math.sqrt(float(np.median(seen.variance)))
         for _ in range(3):
             bad = bad_samples(seen, share, spread)

@@ -46,6 +46,39 @@ def lines_at(view: View) -> list[float]:
     return found
 
 
+def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float
+             ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """
+    Return two states that turn, die out and are driven, as `Term.block`.
+
+    Parameters
+    ----------
+    turn : ndarray, shape (n,)
+        Angle of each step, rad.
+    damping : float
+        Rate at which they die out, 1/s.
+    step : ndarray, shape (n,)
+        Steps, s; infinite before the first sample.
+    std : float
+        Standard deviation of either, V.
+
+    Returns
+    -------
+    f, q : ndarray, shape (n, 2, 2)
+        Transition and covariance of what is added, V^2.
+    h : ndarray, shape (2,)
+        What is seen: the first.
+
+    """
+    shrink = np.exp(-damping * step)
+    f, q = np.empty((step.size, 2, 2)), np.zeros((step.size, 2, 2))
+    f[:, 0, 0] = f[:, 1, 1] = shrink * np.cos(turn)
+    f[:, 1, 0] = shrink * np.sin(turn)
+    f[:, 0, 1] = -f[:, 1, 0]
+    q[:, 0, 0] = q[:, 1, 1] = std * std * -np.expm1(-2.0 * damping * step)
+    return f, q, np.array([1.0, 0.0])
+
+
 def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
     """
     Return the broad peaks of scores.

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.recursion import first_order
+from ou_monitor.model.terms.recursion import first_order, steady
 from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
 from ou_monitor.records import FloatArray
 
@@ -45,15 +45,40 @@ class OU(Term):
             nonlocal before
             kicks = rng.standard_normal(s.t.size)
             if s.bend == (0.0, 0.0):
-                phi = np.exp(-s.alpha * s.step)
-                var = -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
-                e = s.sigma * np.sqrt(var * s.power) * kicks + s.push
-                s.x = first_order(phi, e, before)
+                phi, std = _law(s)
+                kicks *= std
+                if not (steady(s.push) and s.push[0] == 0.0):
+                    kicks += s.push
+                s.x = first_order(phi, kicks, before)
             else:
                 s.x = _bent(s, kicks, before, parts)
             before = float(s.x[-1])
 
         return effect
+
+
+def _law(s: Stretch) -> tuple[FloatArray, FloatArray]:
+    """Return what is left of the state after each step, and the deviation of what is added, V."""
+    n = s.step.size
+    # Of equal steps at one alpha two will do: the first, which may come after
+    # a gap or be the first of all, and any other.
+    some = slice(2) if steady(s.step[1:]) and steady(s.alpha[1:]) else slice(n)
+    alpha, step = s.alpha[some], s.step[some]
+    phi = _over(n, np.exp(-alpha * step))
+    std = _over(n, np.sqrt(-np.expm1(-2.0 * alpha * step) / (2.0 * alpha)))
+    std *= s.sigma
+    if not (steady(s.power) and s.power[0] == 1.0):
+        std *= np.sqrt(s.power)
+    return phi, std
+
+
+def _over(n: int, values: FloatArray) -> FloatArray:
+    """Return n values, the last one repeated as often as it takes."""
+    if values.size == n:
+        return values
+    filled = np.full(n, values[-1])
+    filled[:values.size] = values
+    return filled
 
 
 def _bent(s: Stretch, kicks: FloatArray, before: float, rng: np.random.Generator) -> FloatArray:

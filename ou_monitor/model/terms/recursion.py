@@ -28,14 +28,36 @@ def first_order(phi: FloatArray, e: FloatArray, before: float) -> FloatArray:
     n = e.size
     if not n:
         return np.empty(0)
-    if n > 1 and np.all(phi[1:] == phi[1]):
-        first = phi[0] * before + e[0]
-        rest = lfilter([1.0], [1.0, -phi[1]], e[1:], zi=[phi[1] * first])[0]
-        return np.concatenate(([first], rest))
-    # A lower bidiagonal system with a unit diagonal.
-    band = np.ones((2, n))
-    band[1, :-1] = -phi[1:]
-    right = e.copy()
+    if steady(phi[1:]):
+        x: FloatArray = lfilter([1.0], [1.0, -phi[-1]], e, zi=[phi[0] * before])[0]
+        return x
+    # A lower bidiagonal system with a unit diagonal, laid out as LAPACK has it:
+    # otherwise it is copied line by line.
+    band = np.empty((2, n), order='F')
+    band[0] = 1.0
+    np.negative(phi[1:], out=band[1, :-1])
+    band[1, -1] = 0.0
+    right = np.array(e[:, None], order='F')
     right[0] += phi[0] * before
-    x: FloatArray = dtbtrs(band, right[:, None], uplo='L', diag='U')[0][:, 0]
-    return x
+    solved: FloatArray = dtbtrs(band, right, uplo='L', diag='U', overwrite_b=True)[0][:, 0]
+    return solved
+
+
+def steady(values: FloatArray) -> bool:
+    """
+    Tell whether all values are the same.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n,)
+        Any numbers; one number seen n times (`numpy.broadcast_to`) costs nothing.
+
+    Returns
+    -------
+    bool
+        True also where there is none.
+
+    """
+    # The last one first: what varies mostly differs there.
+    return not values.size or values.strides == (0,) or bool(
+        values[0] == values[-1] and (values == values[0]).all())

@@ -91,14 +91,17 @@ class RegimeSwitching(Term):
         spread = math.sqrt(float(np.mean(view.residual[view.train] ** 2)))
         unit = math.sqrt(float(np.median(view.variance)))
         step = 1.0 / view.rate
+        # States that last a few samples only are glitches, or another law.
+        fastest = math.log(min(_FASTEST, view.rate / 20.0))
 
         def value(x: FloatArray, most: int = 1 << 40) -> float:
-            if max(abs(x[0]), abs(x[1])) > 12.0 or abs(x[3]) > 3.0 or abs(x[4]) > 2.0:
+            if max(x[0], x[1]) > fastest or min(x[0], x[1]) < -12.0 or abs(x[3]) > 3.0 or (
+                    abs(x[4]) > 2.0):
                 return -math.inf
             return float(_chain(z[:most], phi[:most], step, x)[1].sum())
 
         # Coordinates: ln rates, level in innovations, ln sigma ratio, ln scale.
-        for dwell in (0.1, 1.0):
+        for dwell in (5.0 * math.exp(-fastest), 50.0 * math.exp(-fastest)):
             for level, ratio in ((0.0, 0.7), (spread / unit, 0.0)):
                 rate = -math.log(dwell)
                 x, top = climb(lambda p: value(p, _SHORT),
@@ -123,6 +126,8 @@ class RegimeSwitching(Term):
 
 # Samples on which starts are tried.
 _SHORT = 12000
+# Largest rate of switching, 1/s.
+_FASTEST = 30.0
 # A level of fewer innovations than this is none.
 _NO_LEVEL = 0.2
 

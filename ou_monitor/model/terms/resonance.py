@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.lines import broad_peaks
+from ou_monitor.model.terms.lines import broad_peaks, rotation
 from ou_monitor.model.terms.recursion import first_order
 from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray
@@ -68,11 +68,9 @@ class Resonance(Term):
     def block(self, s: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return its two states, which turn."""
         turn = 2.0 * math.pi * self.frequency * np.where(np.isfinite(s.step), s.step, 0.0)
-        shrink = np.exp(-self.damping * s.step)
-        f = np.empty((s.t.size, 2, 2))
-        f[:, 0, 0] = f[:, 1, 1] = shrink * np.cos(turn)
-        f[:, 1, 0] = shrink * np.sin(turn)
-        f[:, 0, 1] = -f[:, 1, 0]
-        q = np.zeros_like(f)
-        q[:, 0, 0] = q[:, 1, 1] = self.std**2 * -np.expm1(-2.0 * self.damping * s.step)
-        return f, q, np.array([1.0, 0.0])
+        return rotation(turn, self.damping, s.step, self.std)
+
+    @property
+    def rings(self) -> bool:
+        """Whether it turns at all before it dies out."""
+        return self.damping < 2.0 * math.pi * self.frequency

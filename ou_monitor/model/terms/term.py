@@ -316,6 +316,10 @@ class Term:
         """
         return ()
 
+    def beside(self, ou: Term) -> Term:
+        """Return the `ou` that a fit with this term starts from; the default leaves it."""
+        return ou
+
     def columns(self, s: Stretch) -> FloatArray:
         """
         Return what the linear parameters multiply.

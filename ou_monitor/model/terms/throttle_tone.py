@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.lines import order_lines
+from ou_monitor.model.terms.lines import order_lines, rotation
 from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray
 
 
 @dataclass(frozen=True)
 class ThrottleTone(Term):
-    """Add amplitude * sin(phase), the phase running at idle + slope * throttle."""
+    """
+    Add amplitude * sin(phase), the phase running at idle + slope * throttle.
+
+    The phase also wanders, which widens the line to `linewidth` (full width at
+    half of its height).
+    """
 
     NAME: ClassVar[str] = 'throttle_tone'
     FAMILY: ClassVar[str] = 'line'
     STAGE: ClassVar[Stage] = Stage.LEVEL
     NEEDS_THROTTLE: ClassVar[bool] = True
-    ROLE: ClassVar[Role] = Role.MEAN
-    LINEAR: ClassVar[tuple[str, ...]] = ('amplitude', 'phase')
+    ROLE: ClassVar[Role] = Role.BLOCK
+    FREE: ClassVar[tuple[str, ...]] = ('amplitude', 'linewidth')
     SIGNS: ClassVar[tuple[str, ...]] = ('order', 'line')
     SEARCH: ClassVar[float] = 9.0
 
@@ -31,38 +36,46 @@ class ThrottleTone(Term):
     idle: float = parameter('Hz', 'frequency at zero throttle, below 0 where it folds back')
     slope: float = parameter('Hz', 'what full throttle adds to it')
     phase: float = parameter('rad', 'phase at the first sample')
+    linewidth: float = parameter('Hz', 'width of the line; 0: it follows throttle alone', 0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        turns = 0.0
+        turns = wander = 0.0
 
         def effect(s: Stretch) -> None:
-            nonlocal turns
+            nonlocal turns, wander
             step = np.where(np.isfinite(s.step), s.step, 0.0)
             run = turns + np.cumsum((self.idle + self.slope * s.throttle) * step)
             turns = float(run[-1]) % 1.0
-            s.level += self.amplitude * np.sin(2.0 * math.pi * run + self.phase)
+            phase = 2.0 * math.pi * run + self.phase
+            if self.linewidth > 0.0:
+                walk = wander + np.cumsum(np.sqrt(2.0 * math.pi * self.linewidth * step)
+                                          * rng.standard_normal(s.t.size))
+                wander = float(walk[-1])
+                phase += walk
+            s.level += self.amplitude * np.sin(phase)
 
         return effect
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the strongest lines of what is left over."""
-        return [cls(0.0, idle, slope, 0.0) for idle, slope in order_lines(view)]
+        """Return the strongest lines of what is left over that throttle moves at all."""
+        if view.throttle is None:
+            return ()
+        spread = math.sqrt(float(np.median(view.variance)))
+        moving = _MOVES / float(view.at[-1]) / max(float(np.ptp(view.throttle)), 1e-6)
+        return [cls(0.3 * spread, idle, slope, 0.0, 0.05)
+                for idle, slope in order_lines(view) if abs(slope) > moving]
 
-    def columns(self, s: Stretch) -> FloatArray:
-        """Return the line in phase and in quadrature."""
-        made = []
-        for phase in (0.0, 0.5 * math.pi):
-            level = replace(s, level=np.zeros(s.t.size))
-            replace(self, amplitude=1.0, phase=phase).start(np.random.default_rng(0))(level)
-            made.append(level.level)
-        return np.stack(made, axis=1)
+    def block(self, s: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return its two states, which turn as throttle says."""
+        step = np.where(np.isfinite(s.step), s.step, 0.0)
+        turn = 2.0 * math.pi * (self.idle + self.slope * s.throttle) * step
+        damping = math.pi * max(self.linewidth, _NARROWEST)
+        return rotation(turn, damping, s.step, self.amplitude / math.sqrt(2.0))
 
-    def linear_values(self) -> list[float]:
-        """Return the coefficients of the columns."""
-        return [self.amplitude * math.cos(self.phase), self.amplitude * math.sin(self.phase)]
 
-    def with_linear(self, beta: Sequence[float]) -> ThrottleTone:
-        """Return the line with these coefficients."""
-        return replace(self, amplitude=math.hypot(*beta), phase=math.atan2(beta[1], beta[0]))
+# Lines that throttle moves by fewer than this many widths of a bin are tones.
+_MOVES = 30.0
+# A line narrower than this would be no noise at all, Hz.
+_NARROWEST = 1e-4

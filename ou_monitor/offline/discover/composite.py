@@ -45,6 +45,10 @@ class Composite:
         Free parameters.
     search : float
         Penalty for what was searched beside them, nats.
+    events : Events, optional
+        What the laws found, as the Gaussian part was fitted with it.
+    offset : ndarray, shape (n,), optional
+        Likewise, V.
 
     """
 
@@ -55,6 +59,8 @@ class Composite:
     density: FloatArray
     free: int
     search: float
+    events: Events | None = None
+    offset: FloatArray | None = None
 
     def score(self, samples: Samples) -> float:
         """Return evidence, nats: of the part fitted, less its price, and of the part kept."""
@@ -67,7 +73,8 @@ class Composite:
         return any(term.NAME == name for term in self.terms)
 
 
-def fit_composite(samples: Samples, terms: Sequence[Term], part: slice) -> Composite | None:
+def fit_composite(samples: Samples, terms: Sequence[Term], part: slice,
+                  known: Composite | None = None) -> Composite | None:
     """
     Fit a model.
 
@@ -79,6 +86,8 @@ def fit_composite(samples: Samples, terms: Sequence[Term], part: slice) -> Compo
         Start; laws in the order in which they are applied.
     part : slice
         What the fit may see.
+    known : Composite, optional
+        A model with the same laws, whose events are taken as they are.
 
     Returns
     -------
@@ -88,10 +97,11 @@ def fit_composite(samples: Samples, terms: Sequence[Term], part: slice) -> Compo
     """
     structural = [term for term in terms if term.ROLE is not Role.LAW]
     laws = [type(term) for term in terms if term.ROLE is Role.LAW]
-    events: Events | None = None
-    offset: FloatArray | None = None
+    events = None if known is None else known.events
+    offset = None if known is None else known.offset
     fits: list[LawFit] = []
-    for turn in range(1 + _ROUNDS):
+    last = _ROUNDS if known is None else 0
+    for turn in range(1 + last):
         gaussian = fit_gaussian(samples, structural, part, events, offset)
         z, density = gaussian.z, gaussian.density
         fits = []
@@ -105,7 +115,7 @@ def fit_composite(samples: Samples, terms: Sequence[Term], part: slice) -> Compo
             push += 0.0 if fit.push is None else fit.push
             error += 0.0 if fit.error is None else fit.error
             moved += 0.0 if fit.offset is None else fit.offset
-        if _same(events, offset, push, error, moved, gaussian) or turn == _ROUNDS:
+        if _same(events, offset, push, error, moved, gaussian) or turn == last:
             break
         if push.any() or error.any() or events is not None:
             events = Events(push, error)
@@ -114,7 +124,8 @@ def fit_composite(samples: Samples, terms: Sequence[Term], part: slice) -> Compo
     fitted = (*gaussian.terms, *(fit.term for fit in fits))
     free = sum(len(term.free()) + len(term.LINEAR) for term in gaussian.terms) + 1
     return Composite(fitted, (*gaussian.se, *(fit.se for fit in fits)), gaussian, z, density,
-                     free + sum(fit.free for fit in fits), sum(term.SEARCH for term in fitted))
+                     free + sum(fit.free for fit in fits), sum(term.SEARCH for term in fitted),
+                     events, offset)
 
 
 def _same(events: Events | None, offset: FloatArray | None, push: FloatArray, error: FloatArray,

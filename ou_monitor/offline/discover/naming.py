@@ -105,9 +105,9 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
             progress(turn / MOST)
         values = criticise(samples, search.composite, bank)
         trials, good = [], []
-        for measured in (True, False):
+        for tier in range(_TIERS):
             # Measured inputs first: what is latent can imitate them, and costs more.
-            trials += _trials(samples, search, values, given, measured)
+            trials += _trials(samples, search, values, given, tier)
             good = [trial for trial in trials if trial.evidence > ACCEPT]
             if good:
                 break
@@ -128,7 +128,7 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
 
 
 def _trials(samples: Samples, search: Search, values: dict[str, float], given: Sequence[str],
-            measured: bool) -> list[Trial]:
+            tier: int) -> list[Trial]:
     """Return the candidates that something asks for, fitted."""
     asked = [name for name, value in values.items() if abs(value) > ASK]
     composite = search.composite
@@ -138,7 +138,7 @@ def _trials(samples: Samples, search: Search, values: dict[str, float], given: S
     for name, kind in catalogue().items():
         if name in ('ou', *given) or kind.ROLE is Role.EXACT or not kind.SIGNS:
             continue
-        if _is_measured(kind) is not measured:
+        if _tier(kind, values) != tier:
             continue
         if composite.has(name) and name not in SEVERAL:
             continue
@@ -165,7 +165,8 @@ def _best_start(samples: Samples, composite: Composite, kind: type[Term], view: 
     for start in starts[:_FULL] if kind.ROLE is Role.MEAN else starts:
         structural = [term for term in terms if term.ROLE is not Role.LAW]
         laws = [term for term in terms if term.ROLE is Role.LAW]
-        made = fit_composite(samples, [*structural, start, *laws], samples.train)
+        structural[0] = start.beside(structural[0])
+        made = fit_composite(samples, [*structural, start, *laws], samples.train, composite)
         if made is not None and (best is None or made.score(samples) > best.score(samples)):
             best = made
     return best
@@ -195,8 +196,21 @@ def _screened(samples: Samples, starts: list[Term], view: View) -> list[Term]:
     return sorted(starts, key=lambda term: -explained(term))
 
 
-def _is_measured(kind: type[Term]) -> bool:
-    return kind.FAMILY == 'load' or kind.NEEDS_THROTTLE or kind.NAME == 'drift'
+_TIERS = 3
+
+
+def _tier(kind: type[Term], values: dict[str, float]) -> int:
+    """Return when a kind has its turn: measured inputs, clear outliers, the rest."""
+    if kind.FAMILY != 'line' and (kind.NEEDS_THROTTLE or kind.NAME == 'drift'):
+        return 0
+    shape = max((abs(value) for name, value in values.items()
+                 if name.startswith(_SHAPE)), default=0.0)
+    # No Gaussian term makes outliers: where there are many, laws are tried alone.
+    return 1 if kind.ROLE is Role.LAW and shape > _CLEAR_SHAPE else 2
+
+
+_SHAPE = ('kurtosis', 'tails')
+_CLEAR_SHAPE = 25.0
 
 
 def _prune(samples: Samples, search: Search) -> None:
@@ -205,7 +219,8 @@ def _prune(samples: Samples, search: Search) -> None:
     for name in search.accepted[:-1]:
         index = next(k for k, term in enumerate(search.composite.terms) if term.NAME == name)
         kept = [term for k, term in enumerate(search.composite.terms) if k != index]
-        less = fit_composite(samples, kept, samples.train)
+        same = search.composite if search.composite.terms[index].ROLE is not Role.LAW else None
+        less = fit_composite(samples, kept, samples.train, same)
         if less is not None and full - less.score(samples) < TIE:
             search.log.append(f'{name} is not needed any more')
             search.composite = less

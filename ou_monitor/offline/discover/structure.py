@@ -123,7 +123,7 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
 
 
 def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = None,
-             se: Sequence[dict[str, float]] = ()) -> GaussianFit:
+             se: Sequence[dict[str, float]] = (), inside: bool = False) -> GaussianFit:
     """
     Return what a model with given parameters says of a recording.
 
@@ -137,6 +137,8 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
         Extra variances at single samples.
     se : sequence of dict
         Handed on.
+    inside : bool
+        Whether events count as known at their own samples, too.
 
     Returns
     -------
@@ -150,7 +152,10 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
     beta = np.concatenate([_linear(term) for term in terms])
     mean = columns @ beta
     e = run.innovations(samples.voltage - mean)
-    variance = run.variance if events is None else run.variance - events.push - events.error
+    # An event is the law's to expect, at its own sample: not so while it is fitted around.
+    variance = run.variance
+    if events is not None and not inside:
+        variance = variance - events.push - events.error
     density = -0.5 * (np.log(2.0 * math.pi * variance) + e * e / variance)
     return GaussianFit(tuple(terms), tuple(se), mean, e, variance, density,
                        np.exp(-s.alpha * s.step))
@@ -170,7 +175,8 @@ def _columns(terms: Sequence[Term], s: Stretch) -> FloatArray:
     columns = np.concatenate(parts, axis=1)
     for term in terms:
         if isinstance(term, ACCoupling):
-            columns = term.pass_through(columns, s)
+            # What the instrument shows has a level of its own.
+            columns[:, 1:] = term.pass_through(columns[:, 1:], s)
     return columns
 
 
@@ -185,7 +191,8 @@ def _space(samples: Samples, terms: Sequence[Term], events: Events | None
             term.start(_RNG)(s)
     whole = s
     if events is None and samples.n > _SETTLES and samples.even and not any(
-            term.ROLE is Role.DRIVE for term in terms):
+            term.ROLE is Role.DRIVE or (term.ROLE is Role.BLOCK and term.NEEDS_THROTTLE)
+            for term in terms):
         s = _first(s, _SETTLES)
     n = s.t.size
     phi = np.exp(-s.alpha * s.step)
@@ -242,13 +249,13 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None
     """Fit by scoring: the outer product of numerical scores stands for the information."""
     free = [(k, name) for k, term in enumerate(terms) for name in _free(term)]
     terms = _regress(samples, terms, events)
-    base = evaluate(samples, terms, events)
+    base = evaluate(samples, terms, events, inside=True)
     value, damping, inverse = float(base.density.sum()), 0.0, np.zeros((0, 0))
     for _ in range(_ROUNDS):
         scores = np.empty((samples.n, len(free)))
         for j, (k, name) in enumerate(free):
             moved = _moved(terms, k, name, _STEP)
-            scores[:, j] = (evaluate(samples, moved, events).density - base.density) / _STEP
+            scores[:, j] = (evaluate(samples, moved, events, inside=True).density - base.density) / _STEP
         information = scores.T @ scores
         gradient = scores.sum(axis=0)
         scale = np.sqrt(information.diagonal()) + 1e-12
@@ -262,7 +269,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None
             for (k, name), by in zip(free, step.tolist(), strict=True):
                 trial = _moved(trial, k, name, by)
             trial = _regress(samples, trial, events)
-            new = evaluate(samples, trial, events)
+            new = evaluate(samples, trial, events, inside=True)
             if float(new.density.sum()) > value - 1e-9 * abs(value):
                 better = new
                 break
@@ -304,6 +311,8 @@ def _regress(samples: Samples, terms: tuple[Term, ...], events: Events | None
     result: list[Term] = [replace(ou, u0=float(beta[0]))]
     at = 1
     for term in terms[1:]:
+        if isinstance(term, ACCoupling):
+            term = replace(term, offset=float(beta[0]))
         size = len(term.LINEAR) if term.ROLE is Role.MEAN else 0
         result.append(term.with_linear(beta[at:at + size].tolist()) if size else term)
         at += size
