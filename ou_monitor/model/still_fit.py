@@ -16,6 +16,9 @@ from ou_monitor.model.arma import (
     innovation_variance, log_covariance, noise_free_theta, noise_share)
 from ou_monitor.model.quasi_fit import information, innovation, minimise, objective
 
+# Neighbouring samples correlated by less than this many standard errors are
+# not correlated.
+CORRELATED = 4.0
 # ln(a) settles to this when something else is fitted along with it; the error
 # left in it is the square.
 STEADY = 1e-3
@@ -223,3 +226,42 @@ def fit_still(c0: float, c: Sequence[float], n: int, place: float, change: Seque
     score = trend_score(c0, c, n, place, change, pairs, log_a, theta)
     end = finish(c0, c, n, n - 1.0, log_a, theta, on_bound, m)
     return (end[0], end[1], end[2], end[3], end[4], end[5], end[6], end[7], end[8], score)
+
+
+def fit_sums(sums: Sequence[float], lags: int, log_a: float, theta: float, m: int
+             ) -> tuple[float, float, float, float, float, float, float, float, float, float,
+                        float, float]:
+    """
+    Fit a window whose mean is a constant, from its sums over lags.
+
+    Parameters
+    ----------
+    sums : sequence of float, length 4 + 3 K
+        Samples; their sum, V; sum of sample times number; sum of squares; then
+        for each lag pairs, sum of differences, sum of squared differences.
+    lags : int
+        K.
+    log_a, theta, m :
+        As in `fit_still`.
+
+    Returns
+    -------
+    tuple of float
+        Mean, V; variance about it, V^2; then what `fit_still` returns, NaN
+        where neighbouring samples are not correlated.
+
+    """
+    n = int(sums[0])
+    mean = sums[1] / n
+    c0 = sums[3] / n - mean * mean
+    # Lags without pairs count as uncorrelated.
+    pairs = [max(sums[4 + k], 1.0) for k in range(lags)]
+    change = [sums[4 + lags + k] for k in range(lags)]
+    c = [c0 - 0.5 * sums[4 + 2 * lags + k] / pairs[k] for k in range(lags)]
+    if not (c0 > 0.0 and c[0] > CORRELATED * c0 / math.sqrt(n)):
+        none = math.nan
+        return mean, c0, none, none, none, none, none, none, none, none, none, none
+    place = (sums[2] - 0.5 * (n - 1) * sums[1]) / n / n
+    end = fit_still(c0, c, n, place, change, pairs, log_a, theta, m)
+    return (mean, c0, end[0], end[1], end[2], end[3], end[4], end[5], end[6], end[7], end[8],
+            end[9])

@@ -36,7 +36,7 @@ _SCALAR = (
     *((quasi_fit, name) for name in (
         'objective', 'innovation', 'information', 'polish', 'minimise')),
     *((still_fit, name) for name in (
-        'guess', '_descend', 'search', 'finish', 'trend_score', 'fit_still')))
+        'guess', '_descend', 'search', 'finish', 'trend_score', 'fit_still', 'fit_sums')))
 
 
 # The largest finite double: NaN and infinity are not below it.
@@ -50,20 +50,21 @@ class Kernels:
 
     Attributes
     ----------
-    fit_still, search, finish : callable
-        Those of `still_fit`, for arrays of autocovariances.
-    take_slots, add_slots : callable
-        Sums over slots, see `take_slots` and `add_slots`.
+    fit_sums, search, finish : callable
+        Those of `still_fit`, for arrays.
+    take_slots, add_slots, slide : callable
+        Sums over slots, see the functions of these names.
     check : callable
         Whether samples are finite and evenly spaced, see `check`.
 
     """
 
-    fit_still: Callable[..., tuple[float, ...]]
+    fit_sums: Callable[..., tuple[float, ...]]
     search: Callable[..., tuple[float, float, bool]]
     finish: Callable[..., tuple[float, ...]]
     take_slots: Callable[..., int]
     add_slots: Callable[..., FloatArray]
+    slide: Callable[..., tuple[int, int, FloatArray]]
     check: Callable[..., bool]
 
 
@@ -242,6 +243,49 @@ def add_slots(rows, begins, first, c):  # type: ignore[no-untyped-def]
     return total
 
 
+def slide(main, run, at, end, back, reference, origin, slot, last, number, lags, rows, begins, head, tail, first):  # type: ignore[no-untyped-def]  # noqa: E501
+    """
+    Bring the sums of the voltage alone up to date, and add them.
+
+    Parameters
+    ----------
+    main : ndarray, shape (2, room)
+        Stamps and voltages of a `Series`.
+    run : ndarray of int, shape (room,)
+        Equal steps behind each sample.
+    at, end : int
+        Where in them the new samples are.
+    back : int
+        Samples before them that pairs may reach back to, at most `lags`.
+    reference : float
+        Voltage that moments are taken against, V.
+    origin, slot, last, number, lags, rows, begins, head, tail :
+        As in `take_slots`.
+    first : int
+        Number of the first sample of the window.
+
+    Returns
+    -------
+    head, tail : int
+        The rows in use.
+    total : ndarray, shape (width,)
+        As from `add_slots`.
+
+    """
+    while head < tail and begins[head] < first:
+        head += 1
+    if at < end:
+        z = np.zeros((1, lags + end - at))
+        for j in range(back + end - at):
+            z[0, lags - back + j] = main[1, at - back + j] - reference
+        runs = run[at:end].copy()
+        for j in range(min(lags - back, end - at)):
+            runs[j] = min(runs[j], back + j)
+        tail = take_slots(z, runs, main[0, at:end], origin, slot, last, number,  # type: ignore[no-untyped-call]  # noqa: E501
+                          lags, rows, begins, head, tail)
+    return head, tail, add_slots(rows[head:tail], begins[head:tail], first, 1)  # type: ignore[no-untyped-call]  # noqa: E501
+
+
 def check(t, y, before, low, high):  # type: ignore[no-untyped-def]
     """
     Return whether samples are finite and evenly spaced.
@@ -293,14 +337,17 @@ def build() -> Kernels:
     own = types.FunctionType(take_slots.__code__, {**globals(), 'slot_sums': sums(slot_sums)},
                              'take_slots')
     own.__module__ = __name__
-    kernels = Kernels(names['fit_still'], names['search'], names['finish'], sums(own),
-                      compile_one(add_slots), compile_one(check))
+    take = sums(own)
+    add = compile_one(add_slots)
+    own = types.FunctionType(slide.__code__, {**globals(), 'take_slots': take, 'add_slots': add},
+                             'slide')
+    own.__module__ = __name__
+    kernels = Kernels(names['fit_sums'], names['search'], names['finish'], take, add,
+                      compile_one(own), compile_one(check))
     # One call each with the types that are used, so that no caller waits.
     c = np.array([0.9, 0.8])
-    pairs = np.full(2, 99.0)
-    kernels.fit_still(1.0, c, 100, 0.0, np.zeros(2), pairs, math.nan, math.nan, 1)
-    # Rows of the sums are views with gaps between them.
-    kernels.fit_still(1.0, c, 100, 0.0, np.zeros((2, 5))[:, 0], pairs, -3.0, 0.1, 1)
+    kernels.fit_sums(np.array([100.0, 0.0, 0.0, 100.0, 99.0, 98.0, 0.0, 0.0, 19.8, 39.2]), 2,
+                     math.nan, math.nan, 1)
     kernels.search(1.0, c, 97.0, -3.0, 0.1, 1, 0.0, 0.0)
     kernels.finish(1.0, c, 100, 97.0, -3.0, 0.1, False, 1)
     for size in (1, 5):
@@ -310,6 +357,8 @@ def build() -> Kernels:
         kernels.take_slots(np.zeros((size, 6)), np.zeros(4, dtype=np.int8), stamps, 0.0, 1.0,
                            math.nan, 0, 2, rows, begins, 0, 0)
         kernels.add_slots(rows[:1], begins[:1], 0, size)
+    kernels.slide(np.zeros((2, 8)), np.zeros(8, dtype=np.int8), 2, 6, 2, 0.0, 0.0, 1.0, math.nan,
+                  0, 2, np.zeros((2, 10)), begins, 0, 0, 0)
     kernels.check(np.zeros(2), np.zeros(2), 0.0, 1.0, 2.0)
     return kernels
 

@@ -27,7 +27,7 @@ from ou_monitor.online.lagsums import Sums
 from ou_monitor.online.quality import examine, Quality, TAIL
 from ou_monitor.online.repeats import refresh_period, Repeats, whole
 from ou_monitor.online.resolution import FACTOR, FEWEST, LAGS, Resolution
-from ou_monitor.online.series import T, U
+from ou_monitor.online.series import T, U, Y
 from ou_monitor.online.window_fit import fit_window, TREND_SCORE
 from ou_monitor.records import Estimate, FloatArray, NAN, Status
 
@@ -53,6 +53,7 @@ _LOOKS = 4
 # Where repeats are looked for: a third of the samples repeat at two a refresh, or more.
 _TIED = 0.25
 _DOUBLE = np.dtype(np.float64)
+_NOTHING = Estimate()
 
 
 class SlidingEstimator:
@@ -256,30 +257,32 @@ class SlidingEstimator:
         quality = self._look(intake.newest) if series.size else self._quality
         counters = intake.counters
         if not series.size:
-            n, since = self._thinner.waiting, self._thinner.waits_since
+            waiting = self._thinner.waiting(intake.newest - self._window)
+            n = waiting.size
             if not n:
                 return Estimate(counters=counters)
-            duration = intake.newest - since
+            duration = intake.newest - waiting.item(0)
             return Estimate(t=intake.newest, voltage=float(self._tail[-1]), n=n,
                             duration=duration, rate=(n - 1) / duration if duration else NAN,
                             counters=counters, status=Status.TOO_FEW_SAMPLES,
                             flags=tuple(judgement.input_flags(counters, quality, NAN)))
-        t, y = series.columns(series.first, series.end)
-        duration = float(t[-1] - t[0])
-        m, n = self._thinner.m, series.size
-        base = Estimate(
-            t=intake.newest, voltage=float(self._tail[-1]), throttle=series.last(U),
+        main, _, at, end = series.store(series.first)
+        duration = main.item(T, end - 1) - main.item(T, at)
+        m, n = self._thinner.m, end - at
+        base = judgement.made(
+            _NOTHING, t=intake.newest, voltage=self._tail.item(-1), throttle=series.last(U),
             n=n * m, duration=duration, counters=counters,
             rate=(n - 1) * m / duration if duration > 0.0 else NAN)
         status = None
         if n < MIN_SAMPLES:
             status = Status.TOO_FEW_SAMPLES
-        elif y[0] == y[-1] and not np.ptp(y) > 0.0:
+        elif main.item(Y, at) == main.item(Y, end - 1) and not np.ptp(main[Y, at:end]) > 0.0:
             status = Status.CONSTANT
         if status is not None:
-            return replace(base, status=status, u0=float(y.mean()), flags=tuple(
-                judgement.input_flags(counters, quality, NAN)))
-        fit, smoothness = self._fit(quality)
+            return judgement.made(
+                base, status=status, u0=float(main[Y, at:end].mean()),
+                flags=tuple(judgement.input_flags(counters, quality, NAN)))
+        fit, smoothness = self._fit(quality, duration)
         return judgement.judge(fit, base, quality, self._throttle_std(), smoothness)
 
     def _throttle_std(self) -> float:
@@ -289,7 +292,7 @@ class SlidingEstimator:
             return NAN
         return self._finest.sums.throttle_std if series.moves else 0.0
 
-    def _fit(self, quality: Quality) -> tuple[Fitted, float]:
+    def _fit(self, quality: Quality, duration: float) -> tuple[Fitted, float]:
         """Return the fit, and how much smoother than it neighbouring increments are."""
         series = self._finest.series
         moves = series.moves and series.known
@@ -298,12 +301,15 @@ class SlidingEstimator:
                 sums.pairs[-1] < _EVEN * (sums.n - LAGS)):
             return fit_irregular(series.all_columns(), moves), NAN
         resolution, m = self._finest, self._thinner.m
-        step = self._step(series.column(T))
+        step = duration / (series.size - 1) if series.even else self._step(series.column(T))
         fit = fit_window(sums, m, self._start)
         self._start = (math.log(fit.a), fit.theta) if fit.correlated else None
         smoothness, drifts = NAN, False
         if fit.correlated:
-            smoothness, drifts = _smoothness(sums, fit.a, m), _drifts(sums)
+            raw, one = _increments(sums, 1)
+            if one > _RAMP * raw:
+                smoothness = _smoothness(_increments(sums, 2)[1] / one, fit.a, m)
+            drifts = _drifts(sums, one)
             if fit.scale < _EXACT * float(sums.second[0, 0]) / sums.n:
                 # Load and trend leave nothing but rounding.
                 fit = replace(fit, correlated=False)
@@ -327,29 +333,24 @@ class SlidingEstimator:
     def _step(self, t: FloatArray) -> float:
         """Return the mean step between evenly spaced samples, s."""
         series = self._finest.series
-        if series.even:
-            return float(t[-1] - t[0]) / (t.size - 1)
         runs = series.runs(series.first, series.end)
         even = np.diff(t)[runs[1:] > 0]
         return float(even.mean()) if even.size else self._thinner.step
 
 
-def _smoothness(sums: Sums, a: float, m: int) -> float:
+def _smoothness(ratio: float, a: float, m: int) -> float:
     """
-    Return how much more neighbouring increments are correlated than in an OU; NaN on a ramp.
+    Return how much more neighbouring increments are correlated than in an OU.
 
     From D_1 = E(z_j - z_{j-1})^2 and D_2 = E(z_j - z_{j-2})^2, less the means
-    squared, their correlation is D_2 / (2 D_1) - 1.
+    squared, their correlation is D_2 / (2 D_1) - 1; the ratio is D_2 / D_1.
     """
-    (raw, one), (_, two) = (_increments(sums, lag) for lag in (1, 2))
-    if not one > _RAMP * raw:
-        return NAN
     gamma0, gamma1 = arma.block_autocovariance(a, m)
     of_ou = (gamma0 - gamma1 * math.exp(-a)) / (2.0 * (gamma0 - gamma1)) - 1.0
-    return two / (2.0 * one) - 1.0 - of_ou
+    return 0.5 * ratio - 1.0 - of_ou
 
 
-def _drifts(sums: Sums) -> bool:
+def _drifts(sums: Sums, one: float) -> bool:
     """
     Whether the voltage drifts faster than even a random walk of its increments would.
 
@@ -357,21 +358,20 @@ def _drifts(sums: Sums) -> bool:
     drift may be chance.  The increments over the longest lag stand for those
     that go on in one direction for a while.
     """
-    pairs = float(sums.pairs[-1])
+    pairs = sums.pairs.item(-1)
     # While throttle moves, it explains what it can.
     if pairs < _EVEN * sums.n or sums.first.size > 1:
         return False
     lag = sums.pairs.size
-    variance = max(_increments(sums, 1)[1], _increments(sums, lag)[1] / lag)
-    net = float(sums.change[0, 0]) / math.sqrt(float(sums.pairs[0]))
-    return net * net > TREND_SCORE ** 2 * variance
+    variance = max(one, _increments(sums, lag)[1] / lag)
+    return sums.change.item(0, 0) ** 2 / sums.pairs.item(0) > TREND_SCORE ** 2 * variance
 
 
 def _increments(sums: Sums, lag: int) -> tuple[float, float]:
     """Return mean square and variance, V^2, of increments over a lag."""
-    pairs = max(float(sums.pairs[lag - 1]), 1.0)
-    square = float(sums.spread[lag - 1, 0, 0]) / pairs
-    return square, square - (float(sums.change[lag - 1, 0]) / pairs) ** 2
+    pairs = max(sums.pairs.item(lag - 1), 1.0)
+    square = sums.spread.item(lag - 1, 0, 0) / pairs
+    return square, square - (sums.change.item(lag - 1, 0) / pairs) ** 2
 
 
 def _ties(y: FloatArray) -> float:

@@ -275,15 +275,10 @@ class Thinner:
         self._last = -math.inf
         self._continues = False
 
-    @property
-    def waiting(self) -> int:
-        """Return the number of samples that wait for the rate, or for a whole block."""
-        return int(self._rest.shape[1])
-
-    @property
-    def waits_since(self) -> float:
-        """Return the stamp of the first sample that waits, s; NaN for none."""
-        return float(self._rest[0, 0]) if self._rest.shape[1] else NAN
+    def waiting(self, since: float) -> FloatArray:
+        """Return the stamps, not before `since`, that wait for the rate or for a whole block."""
+        stamps: FloatArray = self._rest[0]
+        return stamps[stamps >= since]
 
     def take(self, batch: Batch
              ) -> tuple[FloatArray, FloatArray, FloatArray | None, IntArray, bool]:

@@ -160,7 +160,7 @@ def recount(estimate: Estimate, counters: Counters) -> Estimate:
     flags = estimate.flags
     if (counters.late or counters.non_finite) and Flag.IRREGULAR not in flags:
         flags = (*flags, Flag.IRREGULAR)
-    return Estimate(**{**vars(estimate), 'counters': counters, 'flags': flags})
+    return made(estimate, counters=counters, flags=flags)
 
 
 def _level(fit: Fitted, throttle: float, moves: bool) -> tuple[float, float]:
@@ -172,5 +172,12 @@ def _level(fit: Fitted, throttle: float, moves: bool) -> tuple[float, float]:
 
 
 def _with(base: Estimate, status: Status, flags: list[Flag], **values: Any) -> Estimate:
-    # What `replace` does, without its looking at every field.
-    return Estimate(**{**vars(base), 'status': status, 'flags': tuple(flags), **values})
+    return made(base, status=status, flags=tuple(flags), **values)
+
+
+def made(base: Estimate, **values: Any) -> Estimate:
+    """Return a copy with some values changed, for a quarter of what `replace` takes."""
+    copy = object.__new__(Estimate)
+    # Frozen records set each field through a call; these are all known to be fields.
+    copy.__dict__.update(base.__dict__, **values)
+    return copy

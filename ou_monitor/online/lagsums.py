@@ -17,7 +17,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from ou_monitor.online.compiled import kernels
+from ou_monitor.online.compiled import Kernels, kernels
 from ou_monitor.online.series import Series, T, Y
 from ou_monitor.records import FloatArray
 
@@ -34,6 +34,8 @@ class Sums:
 
     Attributes
     ----------
+    row : ndarray
+        All that follows, in one row.
     n : int
         Samples.
     first : ndarray, shape (c,)
@@ -51,6 +53,7 @@ class Sums:
 
     """
 
+    row: FloatArray
     n: int
     first: FloatArray
     place: FloatArray
@@ -95,7 +98,7 @@ class LagSums:
         self._summed = self._series.first
         self._open = math.nan
         self._reference: float | None = None
-        self._last = Sums(0, *(np.zeros(0) for _ in range(6)))
+        self._last = Sums(np.zeros(1), 0, *(np.zeros(0) for _ in range(6)))
 
     @property
     def reference(self) -> float:
@@ -126,13 +129,34 @@ class LagSums:
             self.restart(self._slot, variables)
         if self._reference is None and series.size:
             self._reference = float(series.column(Y)[0])
+        self._summed = max(self._summed, series.first)
+        fast = kernels()
+        if fast is not None and self._c == 1:
+            self._last = self._parts(self._slide(fast))
+            return self._last
         while self._head < self._tail and self._begins[self._head] < series.first:
             self._head += 1
-        self._summed = max(self._summed, series.first)
         if self._summed < series.end:
             self._take()
-        self._last = self._added()
+        self._last = self._parts(self._added())
         return self._last
+
+    def _slide(self, fast: Kernels) -> FloatArray:
+        """Take what is new, and add, in one compiled call."""
+        series, begin = self._series, self._summed
+        main, run, at, end = series.store(begin)
+        if at < end:
+            newest = main.item(T, end - 1)
+            self._make_room(min(end - at, int((newest - main.item(T, at)) / self._slot) + 2))
+        else:
+            newest = math.nan
+        back = min(self._lags, begin - series.first + series.behind)
+        self._head, self._tail, row = fast.slide(
+            main, run, at, end, back, self.reference, self.origin, self._slot, self._open, begin,
+            self._lags, self._rows, self._begins, self._head, self._tail, series.first)
+        if at < end:
+            self._summed, self._open = series.end, float(self.slot_of(newest))
+        return row
 
     def _take(self) -> None:
         """Sum what is new; the first part of it may go on in the slot that is open."""
@@ -240,20 +264,26 @@ class LagSums:
             row[at_change:] = (part @ part.transpose(0, 2, 1)).ravel()
         return rows
 
-    def _added(self) -> Sums:
-        c, lags = self._c, self._lags
-        _, at_first, at_place, at_second, at_pairs, at_change, _ = self._ends
+    def _added(self) -> FloatArray:
+        """Return the sum over the slots, in one row."""
+        _, at_first, at_place, *_ = self._ends
         kept = slice(self._head, self._tail)
         fast = kernels()
         if fast is not None:
-            total = fast.add_slots(self._rows[kept], self._begins[kept], self._series.first, c)
-        else:
-            rows = self._rows[kept]
-            total = np.add.reduce(rows, axis=0)
-            offsets = self._begins[kept] - float(self._series.first)
-            total[at_first:at_place] += offsets @ rows[:, 1:at_first]
+            return fast.add_slots(self._rows[kept], self._begins[kept], self._series.first,
+                                  self._c)
+        rows = self._rows[kept]
+        total: FloatArray = np.add.reduce(rows, axis=0)
+        offsets = self._begins[kept] - float(self._series.first)
+        total[at_first:at_place] += offsets @ rows[:, 1:at_first]
+        return total
+
+    def _parts(self, total: FloatArray) -> Sums:
+        """Return views of the parts of a row."""
+        c, lags = self._c, self._lags
+        _, at_first, at_place, at_second, at_pairs, at_change, _ = self._ends
         return Sums(
-            n=int(total[0]), first=total[1:at_first],
+            row=total, n=int(total[0]), first=total[1:at_first],
             place=total[at_first:at_place],
             second=total[at_place:at_second].reshape(c, c),
             pairs=total[at_second:at_pairs],

@@ -25,6 +25,7 @@ _STILL = 1e-12
 # Exponents of theta, as many as lags could be; parts of vectors.
 _COUNT = np.arange(256.0)
 _ONE, _NO_TIME = np.ones(1), np.zeros(1)
+_IDENTITIES = [np.eye(size) for size in range(8)]
 
 
 @dataclass(slots=True)
@@ -168,7 +169,7 @@ def _inverse(inner: FloatArray) -> FloatArray:
     """Return the inverse of a symmetric matrix; LAPACK's own call, as these are small."""
     if not inner.size:
         return inner
-    _, inverse, bad = dposv(inner, np.eye(len(inner)))
+    _, inverse, bad = dposv(inner, _IDENTITIES[len(inner)])
     # Sums over few pairs need not be positive.
     return np.asarray(np.linalg.inv(inner) if bad else inverse, dtype=np.float64)
 

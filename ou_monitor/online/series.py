@@ -133,7 +133,8 @@ class Series:
     @property
     def moves(self) -> bool:
         """Whether throttle, or its lag, moved in the window."""
-        return self.size > 0 and float(self._main[T, self._head]) <= self._moved_at + LOOK_BACK
+        return (self._tail > self._head
+                and self._main.item(T, self._head) <= self._moved_at + LOOK_BACK)
 
     @property
     def known(self) -> bool:
@@ -149,6 +150,10 @@ class Series:
         """Return stamps and voltage (2, end - begin) of samples begin..end-1 (a view)."""
         shift = self._head - self.first
         return self._main[:, begin + shift:end + shift]
+
+    def store(self, begin: int) -> tuple[FloatArray, npt.NDArray[np.int8], int, int]:
+        """Return stamps and voltage, runs, and where in them sample `begin` and the end are."""
+        return self._main, self._run, begin + self._head - self.first, self._tail
 
     def load(self, begin: int, end: int) -> FloatArray:
         """Return throttle and its lags (3, end - begin); NaN where unknown."""
@@ -188,12 +193,12 @@ class Series:
         if not self.size:
             return math.nan
         if which < U:
-            return float(self._main[which, self._tail - 1])
+            return self._main.item(which, self._tail - 1)
         if self._load is None:
             return math.nan
         if which > U:
             self._lag()
-        return float(self._load[which - U, self._tail - 1])
+        return self._load.item(which - U, self._tail - 1)
 
     def append(self, t: FloatArray, y: FloatArray, u: FloatArray | None, breaks: IntArray
                ) -> None:
@@ -226,7 +231,8 @@ class Series:
         run = self._run[at]
         run[:] = self._reach
         first = min(n, max(self._reach - before, 0))
-        run[:first] = np.arange(before + 1, before + 1 + first)
+        if first:
+            run[:first] = np.arange(before + 1, before + 1 + first)
         for position in breaks.tolist():
             first = min(n - position, self._reach)
             run[position:] = self._reach

@@ -22,18 +22,16 @@ from ou_monitor.online.load import Moments
 from ou_monitor.records import FloatArray
 
 # A trend is taken into the model from this many standard errors on: by chance
-# once in 16 000 windows.
+# once in 16 000 long windows.
 TREND_SCORE = 4.0
 # A few relaxations look like a trend more often: the score asked for grows by
-# 1 + 6/x, x = alpha T.
+# 1 + 6/x, x = alpha T.  That leaves 1 % of windows of 4 to 13 relaxations, and
+# 5 % of random walks, in which 16 relaxations about a trend are seen; with twice
+# as much a drift of 8 standard deviations over 25 relaxations would be missed
+# in every fifth window rather than in every twelfth.
 _FEW = 6.0
 # From this score on a trend is looked into (by chance once in 22 windows).
 _SUSPECT = 2.0
-# Neighbouring samples correlated by less than this many standard errors are
-# not correlated.
-_CORRELATED = 4.0
-# ln(alpha D) of noise that is as good as white.
-_WHITE = 3.0
 
 
 @dataclass(slots=True)
@@ -122,26 +120,17 @@ def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None) -> 
 
 def _fit_still(sums: Sums, m: int, start: tuple[float, float] | None) -> WindowFit:
     """Fit a window whose mean is a constant."""
-    n = sums.n
-    mean = float(sums.first[0]) / n
-    c0 = float(sums.second[0, 0]) / n - mean * mean
-    pairs = sums.pairs
-    if not pairs[-1] > 0.0:
-        pairs = np.maximum(pairs, 1.0)
-    c = c0 - sums.spread[:, 0, 0] / (2.0 * pairs)
-    level = np.array([mean])
-    if not _correlated(c0, c, n):
-        return _uncorrelated(level, _EMPTY, False, c0)
-    place = (float(sums.place[0]) - 0.5 * (n - 1) * float(sums.first[0])) / n / n
     log_a, theta = start or (math.nan, math.nan)
     fast = kernels()
     if fast is not None:
-        end = fast.fit_still(c0, c, n, place, sums.change[:, 0], pairs, log_a, theta, m)
+        end = fast.fit_sums(sums.row, sums.pairs.size, log_a, theta, m)
     else:
-        end = still_fit.fit_still(c0, c.tolist(), n, place, sums.change[:, 0].tolist(),
-                                  pairs.tolist(), log_a, theta, m)
-    return WindowFit(end[0], end[1], end[3], end[4], end[5], (end[6], end[7], end[8]),
-                     level, _EMPTY, _NO_COV, False, end[9], _found(end), c0)
+        end = still_fit.fit_sums(sums.row.tolist(), sums.pairs.size, log_a, theta, m)
+    level, c0 = np.array(end[:1]), end[1]
+    if end[2] != end[2]:
+        return _uncorrelated(level, _EMPTY, False, c0)
+    return WindowFit(end[2], end[3], end[5], end[6], end[7], (end[8], end[9], end[10]), level,
+                     _EMPTY, _NO_COV, False, end[11], _found(end[2:]), c0)
 
 
 _EMPTY = np.empty(0)
@@ -149,7 +138,7 @@ _NO_COV = np.empty((0, 0))
 
 
 def _correlated(c0: float, c: FloatArray, n: int) -> bool:
-    return c0 > 0.0 and float(c[0]) > _CORRELATED * c0 / math.sqrt(n)
+    return c0 > 0.0 and float(c[0]) > still_fit.CORRELATED * c0 / math.sqrt(n)
 
 
 def _found(end: tuple[float, ...]) -> bool:
@@ -169,8 +158,8 @@ def _fit_moving(sums: Sums, m: int, start: tuple[float, float] | None, trend: bo
     search, finish = _functions()
     moments = Moments(sums, trend)
     at = start
-    # Without a start: ordinary least squares, as for white noise.
-    mean = moments.regress(*(at or (_WHITE, 0.0)))
+    # Without a start: ordinary least squares, as the fastest OU is as good as white.
+    mean = moments.regress(*(at or (still_fit.HIGH, 0.0)))
     on_bound = False
     for _ in range(8):
         c0, c = moments.residual(mean.beta)

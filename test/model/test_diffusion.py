@@ -384,7 +384,8 @@ def test_sigma_of_the_rail_follows_from_the_switching():
     (lambda: TELEGRAPH.autocovariance([-1.0]), 'lags must not be negative'),
     (lambda: esc_chain(0.0, 0.5), 'frequency must be positive'),
     (lambda: esc_chain(24e3, 1.0), 'duty must lie between 0 and 1, got 1.0'),
-    (lambda: esc_chain(24e3, 0.5, 0), 'phases must be 1 or more'),
+    (lambda: esc_chain(24e3, 0.5, 0), 'phases must be a whole number, 1 or more, got 0'),
+    (lambda: esc_chain(24e3, 0.5, 1.5), 'phases must be a whole number, 1 or more, got 1.5'),
     (lambda: diffusion_limit(SYSTEM, 0.0), 'factor must be positive'),
     (lambda: diffusion_limit(SYSTEM).simulate(
         [0.0], [0.0, 0.0], np.random.default_rng(0), max_step=0.0), 'max_step must be positive'),

@@ -134,3 +134,10 @@ def test_a_coefficient_out_of_range_later_is_named_with_its_time():
     model = MatrixModel(5.0, 4.0, 3.0, lambda t: 1.0 - t)
     with pytest.raises(ValueError, match=r'alpha_p must be positive, got .* at t = [12]'):
         model.solve([0.0, 2.0], U0)
+
+
+@pytest.mark.parametrize('option', ['rtol', 'max_step'])
+@pytest.mark.parametrize('value', [0.0, -1.0, math.nan])
+def test_options_that_are_not_positive_are_refused(option, value):
+    with pytest.raises(ValueError, match=f'{option} must be positive'):
+        MatrixModel(5.0, 4.0, 3.0, lambda t: 63.0).solve([0.0, 1.0], U0, **{option: value})

@@ -193,6 +193,8 @@ def test_monte_carlo_decides_for_the_factor_two(method):
 @pytest.mark.parametrize('call, message', [
     (lambda rng: FIVE.sample_path(0.0, rng), 'duration must be positive'),
     (lambda rng: FIVE.sample_path(1.0, rng, start=5), 'start must be a state 0..4, got 5'),
+    (lambda rng: FIVE.sample_path(1.0, rng, start=1.5), 'start must be a state 0..4, got 1.5'),
+    (lambda rng: Generator(np.array([[-1j, 1j], [1j, -1j]])), 'rates must be real'),
     (lambda rng: FIVE.stream(1.0, rng, block=0), 'block must be 1 or more'),
     (lambda rng: FIVE.sample_many([1.0, 0.0], 3, rng), 'must not decrease'),
     (lambda rng: FIVE.sample_many([0.0, 1.0], 0, rng), 'paths must be 1 or more'),

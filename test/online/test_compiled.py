@@ -145,11 +145,14 @@ def test_loops_are_the_text_of_the_kernel():
 def test_scalar_fit_is_the_same_text():
     """Compiled from their own source; to 1e-12, as only the order of a sum may differ."""
     fast = compiled.kernels(wait=True)
-    fit = fast.fit_still if fast else still_fit.fit_still
     c = 0.01 * 0.94 ** np.arange(1, 25)
-    flat, pairs = np.zeros(24), np.full(24, 1976.0)
+    pairs = np.full(24, 1976.0)
+    row = np.concatenate([[2000.0, 3.0, 3100.0, 22.0], pairs, np.full(24, 0.01),
+                          2.0 * pairs * (0.011 - c)])
     for m in (1, 10):
-        one = still_fit.fit_still(0.011, c.tolist(), 2000, 1e-4, flat.tolist(), pairs.tolist(),
-                                  math.nan, math.nan, m)
-        two = fit(0.011, c, 2000, 1e-4, flat, pairs, math.nan, math.nan, m)
-        assert tuple(two) == pytest.approx(one, rel=1e-9)
+        for start in ((math.nan, math.nan), (-2.5, 0.2)):
+            one = still_fit.fit_sums(row.tolist(), 24, *start, m)
+            two = fast.fit_sums(row, 24, *start, m) if fast else still_fit.fit_sums(
+                row, 24, *start, m)
+            assert tuple(two) == pytest.approx(one, rel=1e-9)
+            assert one[1] == pytest.approx(0.011, rel=1e-3) and one[2] > 0.0

@@ -110,9 +110,9 @@ def test_rate_needs_eight_samples():
     thinner = Thinner(1e4)
     t = np.arange(12) * DT
     kept = taken(thinner, t[:7])
-    assert kept[0].size == 0 and thinner.waiting == 7 and thinner.waits_since == 0.0
+    assert kept[0].size == 0 and thinner.waiting(-1.0).size == 7
     kept = taken(thinner, t[7:8])
-    assert kept[0].tolist() == t[:8].tolist() and thinner.waiting == 0
+    assert kept[0].tolist() == t[:8].tolist() and thinner.waiting(-1.0).size == 0
     assert thinner.m == 1 and thinner.step == pytest.approx(DT)
 
 

@@ -38,7 +38,7 @@ def test_a_random_walk_does_not_drift():
     Its net change is chance: more than four standard deviations in 1 of 16 000.
 
     Two of 400 would be a chance of 3e-4.  Where a trend and a restoring force are found
-    together, that is the fit's doing, and not looked at here.
+    together, that is the fit's doing, and looked at in test_estimator_limits.
     """
     rng = np.random.default_rng(2)
     for n in (60, 200, 2000):
