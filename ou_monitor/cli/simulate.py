@@ -15,6 +15,8 @@ TYPES = ('battery_state', 'float32', 'float64', 'adc_block')
 _BLOCKS_FROM = 5000.0
 # Above it stamps would fall together, Hz.
 _RATE_MOST = 1e9
+# After it stamps would not fit into a bag, s.
+_DURATION_MOST = 9e9
 
 
 def add_parser(subparsers: Any) -> None:
@@ -104,6 +106,9 @@ def run(args: argparse.Namespace) -> int:
     if not 1.0 <= duration * rate <= 1e12:
         raise InputError(f'{duration:g} s at {rate:g} Hz are {duration * rate:.3g} samples: 1 to '
                          '1e12 can be made')
+    if duration > _DURATION_MOST:
+        raise InputError(f'--duration must be at most {_DURATION_MOST:g} s, as bags count in ns; '
+                         f'got {duration:g}')
     if rate > _RATE_MOST:
         raise InputError(f'--rate must be at most {_RATE_MOST:g} Hz, as bags count in ns; got '
                          f'{rate:g}')

@@ -93,7 +93,7 @@ class Filter:
         back[:-1] = _times(f[1:].transpose(0, 2, 1), forward[1:])
         diagonal = weight + back + np.multiply.outer(1.0 / model.r, np.outer(h, h))
         factor, info = dpbtrf(_band(diagonal, -forward[1:]), lower=1, overwrite_ab=1)
-        if info != 0:
+        if info != 0 or not np.isfinite(factor[0]).all():
             raise ValueError('the covariance of the model is singular or not finite')
         pivot = _pivots(factor, n, d)
         # Filtered covariance, then the gain, then the closed loop.

@@ -267,11 +267,15 @@ class MatrixModel:
         Raises
         ------
         ValueError
-            When a coefficient is out of range or the solution overflows.
+            When a coefficient or an option is out of range, or the solution
+            overflows.
 
         """
         times = check_times(t)
         state = check_state(u0, 3)
+        for name, value in (('rtol', rtol), ('max_step', max_step)):
+            if value is not None and not value > 0.0:
+                raise ValueError(f'{name} must be positive, got {value}')
         with np.errstate(all='ignore'):
             path = (self._closed_form(times - times[0], state) if self.is_constant
                     else self._integrate(times, state, rtol, max_step))

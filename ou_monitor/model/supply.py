@@ -15,15 +15,21 @@ import numpy as np
 import numpy.typing as npt
 
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.term import Effect, Stretch, Term
+from ou_monitor.model.terms.term import Effect, Stage, Stretch, Term
 from ou_monitor.records import FloatArray
 
 # Terms of which a model can have several.
 SEVERAL = frozenset({'tone', 'throttle_tone', 'second_relaxation', 'resonance', 'load_transient',
                      'jumps', 'glitches', 'regime_switching', 'ac_coupling'})
 
-# Samples made at once by `SupplyModel.simulate`: bounds memory beside the result.
-STRETCH = 65536
+# Samples made at once by `SupplyModel.simulate`: bounds memory beside the result,
+# and what the terms touch stays in the processor's caches.
+STRETCH = 15_000
+
+# An array of that many, made and dropped, has the GNU allocator keep the memory of
+# stretches for the next ones.  Else it returns and fetches it page by page, which
+# can cost more than the arithmetic.
+_KEPT = 2**18
 
 # Steps that differ by less than this share differ by the rounding of stamps.
 _ROUNDING = 1e-6
@@ -126,7 +132,11 @@ class Simulation:
 
     def __init__(self, model: SupplyModel, rng: np.random.Generator) -> None:
         self._model = model
+        np.empty(_KEPT)
         self._effects = _in_order(model.terms, rng)
+        # Only then does a term change alpha, sigma, power or push: else they are
+        # one number each, seen n times.
+        self._driven = any(term.STAGE is Stage.DRIVE for term in model.terms)
         self._origin = math.nan
         self._last = -math.inf
 
@@ -178,7 +188,7 @@ class Simulation:
         if throttle is None:
             if needs:
                 raise ValueError(f"the term '{needs[0]}' needs throttle, and none is given")
-            return np.full(stamps.size, math.nan)
+            return np.broadcast_to(math.nan, stamps.size)
         load = np.asarray(throttle, dtype=np.float64)
         if load.shape != stamps.shape:
             raise ValueError(f'throttle must have the shape of t, {stamps.shape}, got '
@@ -190,11 +200,14 @@ class Simulation:
 
     def _stretch(self, stamps: FloatArray, step: FloatArray, throttle: FloatArray) -> Stretch:
         ou, n = self._model.ou, stamps.size
+
+        def of(value: float) -> FloatArray:
+            return np.full(n, value) if self._driven else np.broadcast_to(value, n)
+
         return Stretch(
             t=stamps, at=stamps, step=step, throttle=throttle, origin=self._origin,
-            alpha=np.full(n, ou.alpha), sigma=np.full(n, ou.sigma), power=np.ones(n),
-            push=np.zeros(n), bend=(0.0, 0.0), x=np.zeros(n), level=np.full(n, ou.u0),
-            voltage=np.zeros(n))
+            alpha=of(ou.alpha), sigma=of(ou.sigma), power=of(1.0), push=of(0.0), bend=(0.0, 0.0),
+            x=np.broadcast_to(0.0, n), level=np.full(n, ou.u0), voltage=np.broadcast_to(0.0, n))
 
 
 def _in_order(terms: Sequence[Term], rng: np.random.Generator) -> list[Effect]:

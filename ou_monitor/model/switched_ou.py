@@ -259,7 +259,7 @@ def esc_chain(
         raise ValueError(f'frequency must be positive and finite, got {frequency} Hz')
     if not 0.0 < duty < 1.0:
         raise ValueError(f'duty must lie between 0 and 1, got {duty}: else nothing switches')
-    if phases < 1:
-        raise ValueError(f'phases must be 1 or more, got {phases}')
+    if not isinstance(phases, (int, np.integer)) or phases < 1:
+        raise ValueError(f'phases must be a whole number, 1 or more, got {phases}')
     on = np.arange(2 * phases) < phases
     return Generator.cycle(phases * frequency / np.where(on, duty, 1.0 - duty)), on

@@ -48,6 +48,8 @@ class Generator:
             absorbing or transient states, or the separate classes.
 
         """
+        if np.iscomplexobj(self.q):
+            raise ValueError('rates must be real, 1/s')
         q = np.array(self.q, dtype=np.float64)
         check_rates(q)
         np.fill_diagonal(q, 0.0)
@@ -239,7 +241,7 @@ class Generator:
             raise ValueError(f'paths must be 1 or more, got {paths}')
         if start is None:
             return np.asarray(rng.choice(self.size, paths, p=self.stationary), dtype=np.intp)
-        if not 0 <= start < self.size:
+        if not isinstance(start, (int, np.integer)) or not 0 <= start < self.size:
             raise ValueError(f'start must be a state 0..{self.size - 1}, got {start}')
         return np.full(paths, start, dtype=np.intp)
 

@@ -65,16 +65,12 @@ def through(points: Sequence[tuple[float, float]], period: float | None = None,
     values = np.array([u for _, u in points], dtype=np.float64)
 
     def profile(t: FloatArray) -> FloatArray:
-        at = t if period is None else t % period
+        # Several times as fast as t % period, and as exact as needed: one rounding.
+        at = t if period is None else t - np.floor(t / period) * period
         if stick_rate is not None:
             # A hair more, so that a stamp at the very update is not before it.
             at = np.floor(at * stick_rate + 1e-6) / stick_rate
-        right = np.clip(np.searchsorted(times, at, side='right'), 1, times.size - 1)
-        left = right - 1
-        span = times[right] - times[left]
-        share = np.clip(np.divide(at - times[left], span, out=np.ones_like(at),
-                                  where=span > 0.0), 0.0, 1.0)
-        found: FloatArray = values[left] + share * (values[right] - values[left])
+        found: FloatArray = np.interp(at, times, values)
         return found
 
     return profile
@@ -131,8 +127,8 @@ def read_profile(text: str) -> Profile:
     except ValueError:
         if ':' not in text:
             raise InputError(
-                f"no throttle profile '{text}': {nearest(text, PROFILES)}; or give a number 0..1, "
-                'points T:U,T:U,... or a CSV file') from None
+                f"no throttle profile '{text}': {nearest(text, PROFILES)} (or give a number 0..1, "
+                'points T:U,T:U,... or a CSV file)') from None
         return through(_checked(_points(text), f"throttle '{text}'"))
     _check_throttle(number, f"throttle '{text}'")
     return constant(number)
@@ -163,7 +159,7 @@ def _checked(points: list[tuple[float, float]], where: str) -> list[tuple[float,
 
 def _check_throttle(value: float, where: str) -> None:
     if not 0.0 <= value <= 1.0:
-        raise InputError(f'{where}: throttle must be 0..1, got {value:g}')
+        raise InputError(f'{where}: throttle must be a number 0..1, got {value:g}')
 
 
 def _from_csv(path: Path) -> Profile:

@@ -38,7 +38,7 @@ def simulated(model: SupplyModel, profile: Profile, *, duration: float, rate: fl
     Yields
     ------
     Recording
-        At most 65536 samples.
+        At most `STRETCH` samples.
 
     Raises
     ------

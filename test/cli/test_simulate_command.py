@@ -199,6 +199,7 @@ def test_throttle_of_blocks(tmp_path):
     (['--rate', '1e9', '--duration', '1e9'], '1e+18 samples'),
     (['--rate', '2e9', '--duration', '1e-6'], '--rate must be at most 1e+09 Hz'),
     (['--rate', '1e10', '--duration', '1e-6', '--type', 'float32'], '--rate'),
+    (['--rate', '1e-7', '--duration', '1e11', '--type', 'float64'], '--duration must be at most'),
     (['--seed', '-1'], '--seed'), (['--seed', '1.5'], '--seed'), (['--throttle', '2'], '0..1'),
     (['--throttle', 'flihgt'], "'flight'"), (['--throttle', 'none.csv'], 'none.csv'),
     (['--type', 'float16'], 'float16'), (['--model', 'none.yaml'], 'none.yaml'),

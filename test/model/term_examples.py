@@ -25,8 +25,9 @@ EXAMPLES = {
     'second_relaxation': {'alpha': 4.0, 'sigma': 0.1},
     'resonance': {'frequency': 120.0, 'damping': 40.0, 'std': 0.03},
     'tone': {'amplitude': 0.05, 'frequency': 50.0, 'phase': 0.4, 'linewidth': 2.0},
-    'throttle_tone': {'amplitude': 0.05, 'idle': 20.0, 'slope': 300.0, 'phase': 0.1},
-    'ac_coupling': {'corner': 7.0},
+    'throttle_tone': {
+        'amplitude': 0.05, 'idle': 20.0, 'slope': 300.0, 'phase': 0.1, 'linewidth': 0.0},
+    'ac_coupling': {'corner': 7.0, 'offset': 0.5},
     'jumps': {'rate': 30.0, 'mean': -0.05, 'std': 0.02},
     'heavy_tails': {'dof': 5.0},
     'glitches': {'probability': 0.05, 'std': 0.3},

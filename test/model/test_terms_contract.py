@@ -57,7 +57,8 @@ NEUTRAL = {
     'second_relaxation': {'alpha': 4.0, 'sigma': 0.0},
     'resonance': {'frequency': 120.0, 'damping': 40.0, 'std': 0.0},
     'tone': {'amplitude': 0.0, 'frequency': 50.0, 'phase': 0.4, 'linewidth': 2.0},
-    'throttle_tone': {'amplitude': 0.0, 'idle': 20.0, 'slope': 300.0, 'phase': 0.1},
+    'throttle_tone': {
+        'amplitude': 0.0, 'idle': 20.0, 'slope': 300.0, 'phase': 0.1, 'linewidth': 0.0},
     'jumps': {'rate': 0.0, 'mean': 1.0, 'std': 1.0},
     'glitches': {'probability': 0.0, 'std': 0.3},
     'regime_switching': {'rate_up': 20.0, 'rate_down': 50.0, 'level': 0.0, 'sigma_ratio': 1.0},
@@ -204,7 +205,8 @@ def test_limits_of_those_without_a_neutral_value():
     """A corner far below takes away the level alone; many degrees of freedom are normal."""
     t = stamps()
     plain = supply().simulate(t, np.random.default_rng(4))
-    coupled = supply(term('ac_coupling', corner=1e-9)).simulate(t, np.random.default_rng(4))
+    coupled = supply(term('ac_coupling', corner=1e-9, offset=0.0)).simulate(
+        t, np.random.default_rng(4))
     np.testing.assert_allclose(coupled, plain - 5.0, rtol=0, atol=1e-4)
     # The factor on the variance scatters by sqrt(2/dof) = 1.4e-5.
     tails = supply(term('heavy_tails', dof=1e10)).simulate(t, np.random.default_rng(4))

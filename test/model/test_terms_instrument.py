@@ -44,7 +44,8 @@ def test_covariance_at_any_spacing(corner):
     rate = 2.0 * math.pi * corner
     offsets = np.array([0.0, 0.3, 1.3, 3.3]) / math.sqrt(ALPHA * rate)
     gap = 15.0 / min(ALPHA, rate)
-    groups = clusters(supply(term('ac_coupling', corner=corner)), offsets, gap, 90_000, 1)
+    groups = clusters(supply(term('ac_coupling', corner=corner, offset=0.0)), offsets, gap,
+                      90_000, 1)
     assert abs(groups.mean()) < 4.0 * math.sqrt(VAR / 90_000)
     has_covariance(groups, offsets, lambda lag: covariance(ALPHA, rate, lag))
 
@@ -59,7 +60,7 @@ def test_covariance_at_even_stamps(corner, dt):
     """
     rate = 2.0 * math.pi * corner
     n = 1_000_000 if dt < 1e-3 else 100_000
-    x = supply(term('ac_coupling', corner=corner)).simulate(
+    x = supply(term('ac_coupling', corner=corner, offset=0.0)).simulate(
         np.arange(n) * dt, np.random.default_rng(2))
     span = math.ceil(12.0 / (rate * dt))
     c = np.array([covariance(ALPHA, rate, j * dt) for j in range(2 * span)])
@@ -72,7 +73,7 @@ def test_covariance_at_even_stamps(corner, dt):
 
 def test_first_sample_is_stationary():
     """Over 5000 starts the first sample has the variance of all others; so has the tenth."""
-    model = supply(term('ac_coupling', corner=5.0))
+    model = supply(term('ac_coupling', corner=5.0, offset=0.0))
     rng = np.random.default_rng(3)
     first = np.array([model.simulate([0.0, 0.02], rng) for _ in range(5_000)])
     truth = covariance(ALPHA, 10.0 * math.pi, 0.0)
@@ -94,7 +95,7 @@ def test_step_response(corner):
     rate = 2.0 * math.pi * corner
     throttle = np.where(np.arange(3000) < k, 0.1, 0.6)
     found = still(term('load_sag', linear=-1.0, square=0.0),
-                  term('ac_coupling', corner=corner)).simulate(
+                  term('ac_coupling', corner=corner, offset=0.0)).simulate(
         np.arange(3000) * dt, np.random.default_rng(0), throttle)
     since = (np.arange(3000) - k) * dt
     ramp = -math.expm1(-rate * dt) / (rate * dt)
@@ -105,7 +106,7 @@ def test_step_response(corner):
 def test_what_comes_after_the_instrument_is_not_coupled():
     """Noise of the ADC and its offset codes are added after the high-pass."""
     t = np.arange(2000) / 1000.0
-    ac = term('ac_coupling', corner=10.0)
+    ac = term('ac_coupling', corner=10.0, offset=0.0)
     noise = term('measurement_noise', std=0.05)
     together = supply(ac, noise).simulate(t, np.random.default_rng(5))
     alone = supply(ac).simulate(t, np.random.default_rng(5))
@@ -123,7 +124,7 @@ def test_coupling_takes_a_slow_second_pole_away():
     n, dt, corner = 400_000, 5e-4, 10.0
     rate = 2.0 * math.pi * corner
     model = still(term('second_relaxation', alpha=3.0, sigma=1.0),
-                  term('ac_coupling', corner=corner))
+                  term('ac_coupling', corner=corner, offset=0.0))
     x = model.simulate(np.arange(n) * dt, np.random.default_rng(6))
     truth = covariance(3.0, rate, 0.0, 1.0 / 6.0)
     c = np.array([covariance(3.0, rate, j * dt, 1.0 / 6.0) for j in range(8000)])
@@ -133,6 +134,6 @@ def test_coupling_takes_a_slow_second_pole_away():
 
 def test_level_is_lost():
     """What an AC-coupled instrument logs has no mean, whatever the rail's."""
-    x = supply(term('ac_coupling', corner=10.0), u0=U0 + 7.0).simulate(
+    x = supply(term('ac_coupling', corner=10.0, offset=0.0), u0=U0 + 7.0).simulate(
         np.arange(50_000) * 1e-2, np.random.default_rng(7))
     assert abs(x.mean()) < 4.0 * math.sqrt(VAR / 50_000)

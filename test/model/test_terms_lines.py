@@ -84,7 +84,7 @@ def test_width_of_the_line():
 def test_throttle_tone_at_constant_throttle():
     """Frequency idle + slope throttle."""
     t = np.arange(3000) / 1000.0
-    tone = term('throttle_tone', amplitude=0.1, idle=20.0, slope=300.0, phase=0.3)
+    tone = term('throttle_tone', amplitude=0.1, idle=20.0, slope=300.0, phase=0.3, linewidth=0.0)
     found = still(tone).simulate(
         t, np.random.default_rng(0), 0.25)
     np.testing.assert_allclose(found, 0.1 * np.sin(2.0 * math.pi * 95.0 * t + 0.3), rtol=0,
@@ -94,7 +94,7 @@ def test_throttle_tone_at_constant_throttle():
 def test_throttle_tone_has_no_jump_of_phase():
     """Throttle holds to its stamp: phase is the integral, in closed form for a step at 1 s."""
     t = np.arange(2001) / 1000.0
-    tone = term('throttle_tone', amplitude=0.1, idle=20.0, slope=300.0, phase=0.0)
+    tone = term('throttle_tone', amplitude=0.1, idle=20.0, slope=300.0, phase=0.0, linewidth=0.0)
     found = still(tone).simulate(
         t, np.random.default_rng(0), np.where(t <= 1.0, 0.1, 0.3))
     turns = np.where(t <= 1.0, 50.0 * t, 50.0 + 110.0 * (t - 1.0))

@@ -119,7 +119,7 @@ def test_bad_profiles(text, words):
     (b'', 'empty'), (b'\n\n', 'empty'), (b'time_s,throttle\n', 'no row'),
     (b'time_s,thrust\n0,0\n', 'it has: time_s, thrust'),
     (b'0,0.1\n1,0.2\n', 'time_s and throttle'),
-    (b'time_s,throttle\n0,0.1\n1,x\n', 'throttle must be 0..1'),
+    (b'time_s,throttle\n0,0.1\n1,x\n', 'throttle must be a number 0..1'),
     (b'time_s,throttle\n0,0.1\nx,0.1\n', 'times'),
     (b'time_s,throttle\n0,0.1\n1,40\n', 'got 40'),
     (b'time_s,throttle\n1,0.1\n0,0.1\n', 'must not fall'),

@@ -17,7 +17,8 @@ def test_pieces():
     """Together they have the stamps k/rate, none longer than a stretch."""
     pieces = list(simulated(SAGGING, read_profile('loads'), duration=3.0, rate=50_000.0, seed=1,
                             name='made'))
-    assert [piece.n for piece in pieces] == [STRETCH, STRETCH, 150_000 - 2 * STRETCH]
+    assert sum(piece.n for piece in pieces) == 150_000
+    assert max(piece.n for piece in pieces) == STRETCH
     assert {piece.name for piece in pieces} == {'made'}
     np.testing.assert_array_equal(np.concatenate([piece.t for piece in pieces]),
                                   np.arange(150_000) / 50_000.0)

@@ -75,7 +75,8 @@ def test_clean_input_has_no_flags(case):
     """
     Ten windows of each.
 
-    In 126 relaxations a trend is taken for one in 16 000, a low-pass for fewer: 50 windows are not enough for chance.
+    In 126 relaxations a trend is seen by chance in one of 16 000, a low-pass in
+    fewer: 50 windows are not enough for that.
     """
     assert {flag for seed in range(10) for flag in estimate(*case(100 + seed)).flags} == set()
 

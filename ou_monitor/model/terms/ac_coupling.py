@@ -80,7 +80,7 @@ class ACCoupling(Term):
 
     def beside(self, ou: Term) -> Term:
         """Return a slow `ou`: the relaxation seen may be all the instrument's."""
-        return replace(ou, alpha=0.3 * math.pi * self.corner)
+        return ou.read({**ou.values(), 'alpha': 0.3 * math.pi * self.corner})
 
     def pass_through(self, columns: FloatArray, s: Stretch) -> FloatArray:
         """Return columns of the mean as the instrument shows them."""

@@ -7,6 +7,7 @@ import math
 from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
 from ou_monitor.model.terms.recursion import first_order, steady
 from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
@@ -17,6 +18,8 @@ from ou_monitor.records import FloatArray
 # law is of second order in it.  More parts than that are refused.
 _PART = 0.05
 _PARTS_MOST = 1_000_000
+# Parts whose random numbers are held at once.
+_DRAWS = 100_000
 
 
 @dataclass(frozen=True)
@@ -84,46 +87,63 @@ def _over(n: int, values: FloatArray) -> FloatArray:
 def _bent(s: Stretch, kicks: FloatArray, before: float, rng: np.random.Generator) -> FloatArray:
     """Return the state under a force that is not linear; steps that are cut draw from rng."""
     square, cube = s.bend
+    # Stationary from some relaxations before the first sample on.
+    span = np.minimum(s.step, 20.0 / s.alpha)
+    wanted = (s.alpha + _stiffness(s)) * span / _PART
+    if not (wanted < _PARTS_MOST).all():
+        raise ValueError('nonlinear_restoring: the voltage runs away, or the force is far too '
+                         f'strong for a step of {float(span[np.argmax(wanted)]):g} s')
+    parts = np.maximum(1, np.ceil(wanted)).astype(np.int64)
+    h = span / parts
+    phi = np.exp(-s.alpha * h)
+    spread = s.sigma * np.sqrt(-np.expm1(-2.0 * s.alpha * h) / (2.0 * s.alpha) * s.power)
     x = np.empty(s.t.size)
-    for k in range(s.t.size):
-        alpha, step = float(s.alpha[k]), float(s.step[k])
-        # Stationary from some relaxations before the first sample on.
-        span = min(step, 20.0 / alpha)
-        wanted = (alpha + _stiffness(s, k)) * span / _PART
-        if not wanted < _PARTS_MOST:
-            raise ValueError('nonlinear_restoring: the voltage runs away, or the force is far too '
-                             f'strong for a step of {span:g} s')
-        parts = max(1, math.ceil(wanted))
-        h = span / parts
-        phi = math.exp(-alpha * h)
-        spread = float(s.sigma[k]) * math.sqrt(
-            -math.expm1(-2.0 * alpha * h) / (2.0 * alpha) * float(s.power[k]))
-        draws = [float(kicks[k])] if parts == 1 else rng.standard_normal(parts).tolist()
-        by_square, by_cube = 0.5 * h * square, h * cube
-        for draw in draws:
-            # Half a part of -cube x^3 (its exact flow) and of -square x^2 (midpoint
-            # rule), the exact law of the linear force, and back: symmetric, of order 2.
-            before /= math.sqrt(1.0 + by_cube * before * before)
-            middle = before - 0.5 * by_square * before * before
-            before -= by_square * middle * middle
-            before = phi * before + spread * draw
-            middle = before - 0.5 * by_square * before * before
-            before -= by_square * middle * middle
-            before /= math.sqrt(1.0 + by_cube * before * before)
-            if not (-1e6 < before < 1e6 and -0.5 < by_square * before < 0.5):
-                raise ValueError('nonlinear_restoring: the voltage runs away; the force must '
-                                 'pull back where x^2 is stronger than alpha x (a larger cube)')
-        before += float(s.push[k])
-        x[k] = before
+    # Some samples at a time: what they draw is bounded, and is in order.
+    for some in _bundles(parts):
+        cut = parts[some]
+        draws = np.empty(int(cut.sum()))
+        whole = np.repeat(cut == 1, cut)
+        draws[whole] = kicks[some][cut == 1]
+        draws[~whole] = rng.standard_normal(draws.size - int(np.count_nonzero(whole)))
+        draws *= np.repeat(spread[some], cut)
+        path = []
+        feed = iter(draws.tolist())
+        for count, a, step, push in zip(cut.tolist(), phi[some].tolist(), h[some].tolist(),
+                                        s.push[some].tolist(), strict=True):
+            by_square, by_cube = 0.5 * step * square, step * cube
+            for _ in range(count):
+                # Half a part of -cube x^3 (its exact flow) and of -square x^2 (midpoint
+                # rule), the exact law of the linear force, and back: symmetric, of order 2.
+                before /= math.sqrt(1.0 + by_cube * before * before)
+                middle = before - 0.5 * by_square * before * before
+                before -= by_square * middle * middle
+                before = a * before + next(feed)
+                middle = before - 0.5 * by_square * before * before
+                before -= by_square * middle * middle
+                before /= math.sqrt(1.0 + by_cube * before * before)
+                if not (-1e6 < before < 1e6 and -0.5 < by_square * before < 0.5):
+                    raise ValueError('nonlinear_restoring: the voltage runs away; the force must '
+                                     'pull back where x^2 is stronger than alpha x (a larger '
+                                     'cube)')
+            before += push
+            path.append(before)
+        x[some] = path
     return x
 
 
-def _stiffness(s: Stretch, k: int) -> float:
-    """Return what the bend adds to the rate at one standard deviation, 1/s."""
+def _bundles(parts: npt.NDArray[np.int64]) -> list[slice]:
+    """Return slices of samples that have about `_DRAWS` parts together, or one sample of more."""
+    bundle = np.cumsum(parts) // _DRAWS
+    edges = [0, *(np.flatnonzero(np.diff(bundle)) + 1).tolist(), parts.size]
+    return [slice(first, last) for first, last in zip(edges, edges[1:])]
+
+
+def _stiffness(s: Stretch) -> FloatArray:
+    """Return what the bend adds to the rate at one standard deviation, 1/s, shape (n,)."""
     square, cube = s.bend
-    sigma = float(s.sigma[k])
-    var = sigma * sigma / (2.0 * float(s.alpha[k]))
+    var = s.sigma * s.sigma / (2.0 * s.alpha)
     if cube > 0.0:
         # Of a cube alone it is 0.48 sigma / sqrt(cube).
-        var = min(var, 0.48 * sigma / math.sqrt(cube))
-    return abs(square) * math.sqrt(var) + cube * var
+        var = np.minimum(var, 0.48 * s.sigma / math.sqrt(cube))
+    stiffness: FloatArray = abs(square) * np.sqrt(var) + cube * var
+    return stiffness

@@ -74,7 +74,8 @@ class Composite:
 
 
 def fit_composite(samples: Samples, terms: Sequence[Term], part: slice,
-                  known: Composite | None = None) -> Composite | None:
+                  known: Composite | None = None, *, whole_mean: bool = True
+                  ) -> Composite | None:
     """
     Fit a model.
 
@@ -88,6 +89,9 @@ def fit_composite(samples: Samples, terms: Sequence[Term], part: slice,
         What the fit may see.
     known : Composite, optional
         A model with the same laws, whose events are taken as they are.
+    whole_mean : bool
+        Whether the coefficients of the mean may see everything (to name a
+        cause), or only the part (to measure a gain).
 
     Returns
     -------
@@ -102,7 +106,7 @@ def fit_composite(samples: Samples, terms: Sequence[Term], part: slice,
     fits: list[LawFit] = []
     last = _ROUNDS if known is None else 0
     for turn in range(1 + last):
-        gaussian = fit_gaussian(samples, structural, part, events, offset)
+        gaussian = fit_gaussian(samples, structural, part, events, offset, whole_mean)
         z, density = gaussian.z, gaussian.density
         fits = []
         push, error, moved = np.zeros(samples.n), np.zeros(samples.n), np.zeros(samples.n)

@@ -22,6 +22,7 @@ from ou_monitor.offline.discover.battery import statistics
 from ou_monitor.offline.discover.composite import Composite, fit_composite, scene_of, view_of
 from ou_monitor.offline.discover.data import Samples
 from ou_monitor.offline.discover.null_bank import NullBank
+from ou_monitor.offline.discover.structure import evaluate
 from ou_monitor.records import FloatArray
 
 # Evidence from which a cause is accepted, nats.
@@ -30,10 +31,12 @@ ACCEPT = 6.0
 TIE = 3.0
 # A statistic this far off asks for the terms that it is a sign of.
 ASK = 2.6
+# The same for terms that take seconds to fit.
+ASK_DEAR = 3.2
 # Causes accepted at most.
 MOST = 7
-# Starting points that are fitted in full.
-_FULL = 2
+# Starting points that are fitted in full, and samples that tell which.
+_FULL, _GLANCE = 2, 8000
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +133,8 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
 def _trials(samples: Samples, search: Search, values: dict[str, float], given: Sequence[str],
             tier: int) -> list[Trial]:
     """Return the candidates that something asks for, fitted."""
-    asked = [name for name, value in values.items() if abs(value) > ASK]
+    asked = {dear: [name for name, value in values.items() if abs(value) > limit]
+             for dear, limit in ((False, ASK), (True, ASK_DEAR))}
     composite = search.composite
     view = view_of(samples, composite.gaussian, composite.z, samples.train)
     before = composite.score(samples)
@@ -144,7 +148,8 @@ def _trials(samples: Samples, search: Search, values: dict[str, float], given: S
             continue
         if kind.NEEDS_THROTTLE and samples.throttle is None:
             continue
-        if not any(word.startswith(sign) for word in asked for sign in kind.SIGNS):
+        if not any(word.startswith(sign) for word in asked[kind.ROLE is Role.BLOCK]
+                   for sign in kind.SIGNS):
             continue
         best = _best_start(samples, composite, kind, view)
         if best is not None:
@@ -161,8 +166,10 @@ def _best_start(samples: Samples, composite: Composite, kind: type[Term], view: 
     starts = list(kind.candidates(view))
     if kind.ROLE is Role.MEAN and len(starts) > _FULL:
         starts = _screened(samples, starts, view)
+    if kind.ROLE is Role.BLOCK and len(starts) > 1:
+        starts = _likely(samples, composite, starts)
     best: Composite | None = None
-    for start in starts[:_FULL] if kind.ROLE is Role.MEAN else starts:
+    for start in starts[:_FULL]:
         structural = [term for term in terms if term.ROLE is not Role.LAW]
         laws = [term for term in terms if term.ROLE is Role.LAW]
         structural[0] = start.beside(structural[0])
@@ -170,6 +177,20 @@ def _best_start(samples: Samples, composite: Composite, kind: type[Term], view: 
         if made is not None and (best is None or made.score(samples) > best.score(samples)):
             best = made
     return best
+
+
+def _likely(samples: Samples, composite: Composite, starts: list[Term]) -> list[Term]:
+    """Return starts in the order of their likelihood as they are, on a part."""
+    part = slice(0, min(samples.train.stop, _GLANCE))
+    few = Samples(samples.t[part], samples.voltage[part],
+                  None if samples.throttle is None else samples.throttle[part])
+    structural = [term for term in composite.terms if term.ROLE is not Role.LAW]
+
+    def value(start: Term) -> float:
+        terms = [start.beside(structural[0]), *structural[1:], start]
+        return float(evaluate(few, terms).density.sum())
+
+    return sorted(starts, key=lambda start: -value(start))
 
 
 def _blank(kind: type[Term]) -> Term:

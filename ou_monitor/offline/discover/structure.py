@@ -26,7 +26,11 @@ from ou_monitor.records import FloatArray
 NO_NOISE = 1e-6
 # Steps of the numerical scores, in the logarithm of a parameter.
 _STEP = 1e-4
-_ROUNDS = 12
+_ROUNDS, _LAST_ROUNDS = 12, 2
+# Samples times further states that are too dear to begin with.
+_DEAR = 30000
+# With more states than this the part has to do.
+_MANY = 4
 # Samples in which the gain of a constant model has settled: the predictive
 # variance is then within some 1e-5 of its limit.
 _SETTLES = 2048
@@ -89,7 +93,8 @@ class GaussianFit:
 
 
 def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
-                 events: Events | None = None, offset: FloatArray | None = None) -> GaussianFit:
+                 events: Events | None = None, offset: FloatArray | None = None,
+                 whole_mean: bool = False) -> GaussianFit:
     """
     Fit the Gaussian part by maximum likelihood on a part of the recording.
 
@@ -105,6 +110,9 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
         Extra variances at single samples.
     offset : ndarray, shape (n,), optional
         Taken from the voltage for the fit, V; not for the evaluation.
+    whole_mean : bool
+        Whether the coefficients of the mean may see everything: a trend fitted
+        to the first part runs away in the second.
 
     Returns
     -------
@@ -117,8 +125,9 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
                    None if samples.throttle is None else samples.throttle[part])
     inside = None if events is None else Events(events.push[part], events.error[part])
     start = tuple(terms)
-    found = _maximise(seen, start, inside)
-    terms, se = found
+    terms, se = _maximise(seen, start, inside)
+    if whole_mean and seen.n < samples.n:
+        terms = _regress(Samples(samples.t, voltage, samples.throttle), terms, events)
     return evaluate(samples, terms, events, se)
 
 
@@ -247,15 +256,30 @@ def _coupled(term: ACCoupling, s: Stretch, phi: FloatArray, q: FloatArray
 def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None
               ) -> tuple[tuple[Term, ...], tuple[dict[str, float], ...]]:
     """Fit by scoring: the outer product of numerical scores stands for the information."""
+    rounds = _ROUNDS
+    states = _space(samples, terms, events)[1].f.shape
+    if states[0] * (states[1] - 1) > _DEAR:
+        # Far from the top a part of the samples shows the way.
+        part = slice(0, max(_DEAR // (2 * states[1]), 2000))
+        terms, se_part = _maximise(
+            Samples(samples.t[part], samples.voltage[part],
+                    None if samples.throttle is None else samples.throttle[part]), terms,
+            None if events is None else Events(events.push[part], events.error[part]))
+        if states[1] > _MANY:
+            shrink = math.sqrt(part.stop / samples.n)
+            return _regress(samples, terms, events), tuple(
+                {name: value * shrink for name, value in errors.items()} for errors in se_part)
+        rounds = _LAST_ROUNDS
     free = [(k, name) for k, term in enumerate(terms) for name in _free(term)]
     terms = _regress(samples, terms, events)
     base = evaluate(samples, terms, events, inside=True)
     value, damping, inverse = float(base.density.sum()), 0.0, np.zeros((0, 0))
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         scores = np.empty((samples.n, len(free)))
         for j, (k, name) in enumerate(free):
             moved = _moved(terms, k, name, _STEP)
-            scores[:, j] = (evaluate(samples, moved, events, inside=True).density - base.density) / _STEP
+            there = evaluate(samples, moved, events, inside=True)
+            scores[:, j] = (there.density - base.density) / _STEP
         information = scores.T @ scores
         gradient = scores.sum(axis=0)
         scale = np.sqrt(information.diagonal()) + 1e-12

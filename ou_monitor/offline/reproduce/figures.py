@@ -138,7 +138,7 @@ def _spectrum(state: paper.LoadState, rng: np.random.Generator) -> Spectrum:
     t = np.arange(round(_SPECTRUM * paper.SAMPLING_HZ)) / paper.SAMPLING_HZ
     ou = OU(paper.ALPHA.value, sigma_of(state), 0.0)
     plain = _density(simulate(t, ou.alpha, ou.sigma, rng))
-    coupled = _density(SupplyModel((ou, ACCoupling(CORNER_HZ))).simulate(t, rng))
+    coupled = _density(SupplyModel((ou, ACCoupling(CORNER_HZ, 0.0))).simulate(t, rng))
     return Spectrum(state, plain[0], plain[1], coupled[1])
 
 

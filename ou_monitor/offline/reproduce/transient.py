@@ -242,7 +242,8 @@ def simulate_seen(rng: np.random.Generator, draws: int) -> FloatArray:
         model = SupplyModel((
             OU(rail, noise * math.sqrt(2.0 * rail), 0.0),
             LoadSag(sag / paper.TRANSIENT_LOAD, 0.0),
-            LoadTransient(sag / paper.TRANSIENT_LOAD, 1.0 / rail, 0.0), ACCoupling(CORNER_HZ)))
+            LoadTransient(sag / paper.TRANSIENT_LOAD, 1.0 / rail, 0.0),
+            ACCoupling(CORNER_HZ, 0.0)))
         peak = _HOLD + math.log(rail / w) / (rail - w)
         at = np.round((peak + used) * _RATE).astype(np.intp)
         for k in range(draws):
