@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ou_monitor.errors import InputError
+    from ou_monitor.offline.discover.run import discover
     from ou_monitor.online.estimator import SlidingEstimator
     from ou_monitor.online.lowpass import AdaptiveLowPass
     from ou_monitor.online.risk import brownout_probability
@@ -30,12 +31,13 @@ _HOMES = {
     'SlidingEstimator': 'ou_monitor.online.estimator',
     'Status': 'ou_monitor.records',
     'brownout_probability': 'ou_monitor.online.risk',
+    'discover': 'ou_monitor.offline.discover.run',
     'read_recording': 'ou_monitor.recordings.read',
 }
 
 __all__ = [
     'AdaptiveLowPass', 'Estimate', 'Flag', 'InputError', 'Recording', 'SlidingEstimator',
-    'Status', '__version__', 'brownout_probability', 'read_recording',
+    'Status', '__version__', 'brownout_probability', 'discover', 'read_recording',
 ]
 
 

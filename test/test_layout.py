@@ -17,7 +17,7 @@ LEVEL = {
     'offline': 5, 'nodes': 6, 'cli': 6,
 }
 # What users reach as `from ou_monitor import ...`: above all but the programs.
-FACADE_LEVEL = 5
+FACADE_LEVEL = 5.5
 PLOTTING = {'matplotlib', 'plotly', 'seaborn', 'bokeh', 'PIL'}
 MCAP = {'mcap', 'mcap_ros2', 'rosbags', 'rosbag2_py'}
 CORE = {'numpy', 'scipy'}

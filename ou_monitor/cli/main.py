@@ -19,6 +19,7 @@ COMMANDS = {
     'analyze': 'ou_monitor.cli.analyze',
     'convert': 'ou_monitor.cli.convert',
     'design': 'ou_monitor.cli.design',
+    'discover': 'ou_monitor.cli.discover',
     'reproduce': 'ou_monitor.cli.reproduce',
     'simulate': 'ou_monitor.cli.simulate',
 }

@@ -74,7 +74,7 @@ class Composite:
 
 
 def fit_composite(samples: Samples, terms: Sequence[Term], part: slice,
-                  known: Composite | None = None, *, whole_mean: bool = True
+                  known: Composite | None = None, *, whole_mean: bool = False
                   ) -> Composite | None:
     """
     Fit a model.

@@ -102,7 +102,7 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
         The model and its causes.
 
     """
-    search = Search(baseline)
+    search = Search(_fitted(samples, baseline.terms, baseline) or baseline)
     for turn in range(MOST):
         if progress is not None:
             progress(turn / MOST)
@@ -162,7 +162,7 @@ def _best_start(samples: Samples, composite: Composite, kind: type[Term], view: 
     """Return the best fit with one more term of a kind."""
     terms = composite.terms
     if kind.ROLE is Role.LAW:
-        return fit_composite(samples, [*terms, _blank(kind)], samples.train)
+        return _fitted(samples, [*terms, _blank(kind)], None)
     starts = list(kind.candidates(view))
     if kind.ROLE is Role.MEAN and len(starts) > _FULL:
         starts = _screened(samples, starts, view)
@@ -173,10 +173,20 @@ def _best_start(samples: Samples, composite: Composite, kind: type[Term], view: 
         structural = [term for term in terms if term.ROLE is not Role.LAW]
         laws = [term for term in terms if term.ROLE is Role.LAW]
         structural[0] = start.beside(structural[0])
-        made = fit_composite(samples, [*structural, start, *laws], samples.train, composite)
+        made = _fitted(samples, [*structural, start, *laws], composite)
         if made is not None and (best is None or made.score(samples) > best.score(samples)):
             best = made
     return best
+
+
+def _fitted(samples: Samples, terms: Sequence[Term], known: Composite | None
+            ) -> Composite | None:
+    """Return a fit to the first part, its mean to everything; None where it cannot be fitted."""
+    try:
+        return fit_composite(samples, terms, samples.train, known, whole_mean=True)
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+        # Parameters have left what a term allows, or numbers can hold.
+        return None
 
 
 def _likely(samples: Samples, composite: Composite, starts: list[Term]) -> list[Term]:
@@ -241,7 +251,7 @@ def _prune(samples: Samples, search: Search) -> None:
         index = next(k for k, term in enumerate(search.composite.terms) if term.NAME == name)
         kept = [term for k, term in enumerate(search.composite.terms) if k != index]
         same = search.composite if search.composite.terms[index].ROLE is not Role.LAW else None
-        less = fit_composite(samples, kept, samples.train, same)
+        less = _fitted(samples, kept, same)
         if less is not None and full - less.score(samples) < TIE:
             search.log.append(f'{name} is not needed any more')
             search.composite = less

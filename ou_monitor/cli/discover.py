@@ -1,0 +1,222 @@
+"""`ou-monitor discover RECORDING`: what the simulation gets wrong, why, and what it is worth."""
+
+from __future__ import annotations
+
+import argparse
+from datetime import datetime, timezone
+import math
+import shlex
+from textwrap import fill
+from typing import Any, TYPE_CHECKING
+
+from ou_monitor import __version__
+from ou_monitor.cli import output
+from ou_monitor.errors import InputError
+
+if TYPE_CHECKING:
+    from ou_monitor.offline.discover.finding import Finding
+
+# Lines are broken to be read at this width.
+_COLUMNS = 100
+# Statistics and notes shown at most; all of them are in the report.
+_SHOWN = 8
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        From ``ArgumentParser.add_subparsers``.
+
+    """
+    parser = subparsers.add_parser(
+        'discover', allow_abbrev=False,
+        help='criticise the simulation, name the cause, extend, measure the gain',
+        description='Fit and simulate the plain OU, tell what it gets wrong, name the cause, '
+                    'extend the model, and measure the gain on samples not used for the fit.')
+    parser.add_argument(
+        'recording', metavar='RECORDING',
+        help='.mcap file, rosbag2 folder, or CSV with columns time_s, voltage_v[, throttle]')
+    parser.add_argument('--seed', metavar='N', type=int, default=0,
+                        help='same seed, same result (default: %(default)s)')
+    parser.add_argument('--msg-config', metavar='NAME',
+                        help='msg_config that says which topic and field is the voltage')
+    parser.add_argument('--voltage-topic', metavar='TOPIC', help='topic of the voltage')
+    parser.add_argument('--throttle-topic', metavar='TOPIC', help='topic of the throttle')
+    parser.add_argument('--partial', action='store_true',
+                        help='use what a truncated file still holds')
+    parser.add_argument('--json', metavar='FILE',
+                        help="write the result as JSON ('-': to standard output, alone)")
+    parser.add_argument('--save-model', metavar='FILE.yaml',
+                        help='write the extended model, for simulate --model and the estimator')
+    parser.add_argument('--report', metavar='FILE.html',
+                        help='write a self-contained HTML page')
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    Run the command.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        As parsed.
+
+    Returns
+    -------
+    int
+        Exit status, 0; that nothing or too little was found is a result.
+
+    Raises
+    ------
+    InputError
+        When an option, the recording or an output cannot be used.
+
+    """
+    if args.seed < 0:
+        raise InputError(f'--seed must be 0 or more, got {args.seed}')
+    for option, target in (('--report', args.report), ('--save-model', args.save_model)):
+        if target == output.STDOUT:
+            raise InputError(f"{option} needs a file: '-' is not supported")
+        output.check_writable(target)
+    output.check_writable(args.json)
+
+    from ou_monitor.offline.discover.run import discover
+    from ou_monitor.recordings.read import read_recording
+
+    recording = read_recording(
+        args.recording, msg_config=args.msg_config, voltage_topic=args.voltage_topic,
+        throttle_topic=args.throttle_topic, partial=args.partial)
+    with output.Progress('discovering') as progress:
+        finding = discover(recording, seed=args.seed, progress=progress)
+    if args.report is not None:
+        from ou_monitor.offline.report.discovery_page import discovery_page
+        with output.Progress('drawing') as progress:
+            text = discovery_page(finding, command_line(args), progress)
+        output.write_text(text, args.report)
+    if args.save_model is not None:
+        output.write_text(model_text(finding), args.save_model)
+    if args.json is not None:
+        output.write_json(finding.as_data(), args.json)
+    if args.json != output.STDOUT:
+        print(render(finding))
+        for name, target in (('Report', args.report), ('Model', args.save_model)):
+            if target is not None:
+                print(f'\n{name}: {target}')
+    return 0
+
+
+def command_line(args: argparse.Namespace) -> str:
+    """
+    Return the command that repeats this discovery.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Parsed arguments.
+
+    Returns
+    -------
+    str
+        Quoted for a shell; without the outputs.
+
+    """
+    words = ['ou-monitor', 'discover', args.recording, '--seed', str(args.seed)]
+    for name in ('msg_config', 'voltage_topic', 'throttle_topic'):
+        value = getattr(args, name)
+        if value is not None:
+            words += ['--' + name.replace('_', '-'), str(value)]
+    return shlex.join(words + (['--partial'] if args.partial else []))
+
+
+def model_text(finding: Finding) -> str:
+    """
+    Return the extended model as the text of a model file.
+
+    Parameters
+    ----------
+    finding : Finding
+        Result.
+
+    Returns
+    -------
+    str
+        YAML.
+
+    Raises
+    ------
+    InputError
+        When there is no model.
+
+    """
+    from ou_monitor.recordings.model_file import as_yaml, ModelFile
+
+    if finding.model is None:
+        raise InputError(f"no model to save: '{finding.recording}' was not fitted. "
+                         f'{finding.sentence}')
+
+    def known(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    provenance = {
+        'recording': finding.recording, 'date': datetime.now(timezone.utc).date().isoformat(),
+        'ou_monitor': __version__, 'verdict': finding.verdict.value,
+        'heldout_score': known(finding.score), 'gain': known(finding.gain),
+        'gain_se': known(finding.gain_se), 'seed': finding.seed}
+    return as_yaml(ModelFile(finding.model, tuple(dict(se) for se in finding.se), provenance))
+
+
+def render(finding: Finding) -> str:
+    """
+    Return the finding for a terminal 100 columns wide.
+
+    Parameters
+    ----------
+    finding : Finding
+        Result.
+
+    Returns
+    -------
+    str
+        Plain text.
+
+    """
+    from ou_monitor.offline.discover.words import (
+        crossing_words, parameters, plain_model_words, plain_words)
+    from ou_monitor.offline.words import number
+
+    used = '' if finding.samples is None or finding.samples.n == finding.n else (
+        f', {finding.samples.n} used')
+    lines = [f'{finding.recording}: {finding.n} samples in {number(finding.duration, 4)} s{used}',
+             '', fill(finding.sentence, _COLUMNS)]
+    if finding.causes:
+        rows = [[cause.name, cause.term.FAMILY,
+                 f'{number(1e3 * cause.gain)} +- {number(1e3 * cause.gain_se, 2)}',
+                 'exact' if cause.exact else f'{cause.p_value:.2g}',
+                 ', '.join(cause.alternatives) or '-'] for cause in finding.causes]
+        lines += ['', output.table(['cause', 'family', 'gain mnat/sample', 'p', 'not told from'],
+                                   rows, left=[0, 1, 4]), '']
+        lines += [_item(f'{cause.name}: {parameters(cause.term, cause.se)}')
+                  for cause in finding.causes]
+    if finding.baseline is not None:
+        lines += ['', fill(f'Plain OU: {plain_model_words(finding.baseline)}.', _COLUMNS)]
+        felt = crossing_words(finding)
+        lines += [fill(felt, _COLUMNS)] if felt else []
+    left = finding.remaining
+    if left:
+        lines += ['', 'What is left:', *[
+            _item(f'{c.statistic}: {number(c.after)} (band {number(c.low)} to {number(c.high)}), '
+                  f'{plain_words(c.statistic)}') for c in left[:_SHOWN]]]
+        if len(left) > _SHOWN:
+            lines.append(_item(f'and {len(left) - _SHOWN} more'))
+    if finding.notes:
+        lines += ['', *[_item(note) for note in finding.notes]]
+    return '\n'.join(lines)
+
+
+def _item(text: str) -> str:
+    return fill(text, _COLUMNS, initial_indent='- ', subsequent_indent='  ')

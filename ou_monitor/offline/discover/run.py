@@ -1,0 +1,277 @@
+"""A recording -> what the simulation gets wrong, why, and what it is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.term import Role, Term
+from ou_monitor.offline.discover.composite import Composite, fit_composite, scene_of
+from ou_monitor.offline.discover.data import Samples
+from ou_monitor.offline.discover.errors import standard_errors
+from ou_monitor.offline.discover.finding import Cause, Criticism, Finding, Verdict
+from ou_monitor.offline.discover.gain import crossing_rates, mean_difference, without, worth
+from ou_monitor.offline.discover.integrity import examine, Integrity
+from ou_monitor.offline.discover.naming import criticise, name_causes, Search
+from ou_monitor.offline.discover.null_bank import family_chance, simulate_bank
+from ou_monitor.offline.discover.structure import evaluate, fit_gaussian
+from ou_monitor.offline.discover.verdict import judge, NOTHING, withdrawn
+from ou_monitor.offline.discover.words import (
+    coupling_found, coupling_note, explain, no_relaxation_note, verdict_sentence)
+from ou_monitor.recordings.read import read_recording
+from ou_monitor.records import FloatArray, Recording
+from scipy.special import ndtri
+
+Progress = Callable[[float], None]
+
+# Steps of more relaxation times than this leave no relaxation to be seen.
+_BLIND = 1.0
+# Relaxation times in a recording from which its rate is one, and no trend.
+_RELAXES = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Named:
+    """What the search left: a model, its causes, and statistics before and after."""
+
+    model: Composite
+    names: tuple[str, ...]
+    rivals: Mapping[str, list[str]]
+    dropped: tuple[str, ...]
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+    failure: str
+
+
+def discover(recording: Recording | str | Path, *, seed: int = 0,
+             progress: Progress | None = None) -> Finding:
+    """
+    Criticise the simulation of a recording, name the cause, extend, measure the gain.
+
+    Parameters
+    ----------
+    recording : Recording or path
+        What to look at; a path is read as `read_recording` does.
+    seed : int
+        Same seed, same result.
+    progress : callable, optional
+        Called with the share done, 0..1.
+
+    Returns
+    -------
+    Finding
+        With `as_data` for JSON.
+
+    Raises
+    ------
+    InputError
+        When a path cannot be read.
+
+    """
+    if not isinstance(recording, Recording):
+        recording = read_recording(recording)
+    tell: Progress = progress or (lambda share: None)
+    state = examine(recording, lambda share: tell(0.05 * share))
+    samples = state.samples
+    if samples is None:
+        return _insufficient(recording, state, state.reason, seed)
+    rng = np.random.default_rng(seed)
+    try:
+        plain, plain_density, start = _baseline(samples, state)
+    except (ValueError, np.linalg.LinAlgError):
+        return _insufficient(recording, state, 'No OU can be fitted to it.', seed)
+    tell(0.1)
+    named = _named(samples, start, rng, state.exact, lambda share: tell(0.1 + 0.6 * share))
+    tell(0.7)
+    causes = _causes(samples, state, named, start, plain_density,
+                     lambda share: tell(0.7 + 0.15 * share))
+    whole, se = _refitted(samples, named.model)
+    tell(0.9)
+    test = _kept(samples, state)
+    gain, gain_se = mean_difference(named.model.density[test], plain_density[test])
+    verdict = judge(named.after, len(causes), len(named.dropped))
+    criticism = _criticism(named.before, named.after)
+    left = sorted((c for c in criticism if c.is_off), key=lambda c: -abs(c.after))
+    # The rest is in the model that was fitted.
+    undone = tuple(t for t in state.exact if t.NAME != 'quantization')
+    crossing = crossing_rates(samples, (plain,), named.model.terms, rng)
+    tell(1.0)
+    return Finding(
+        recording=recording.name, n=recording.n, duration=recording.duration, verdict=verdict,
+        sentence=verdict_sentence(verdict, causes, left, gain, gain_se, named.dropped),
+        baseline=plain, baseline_score=float(plain_density[test].mean()), criticism=criticism,
+        causes=causes, model=SupplyModel((*whole.terms, *undone)),
+        se=(*se, *({} for _ in undone)), score=float(named.model.density[test].mean()),
+        gain=gain, gain_se=gain_se, crossing=crossing, notes=_notes(state, named, samples),
+        samples=samples, simulated=SupplyModel(whole.terms), seed=seed)
+
+
+def _insufficient(recording: Recording, state: Integrity, reason: str, seed: int) -> Finding:
+    return Finding(
+        recording=recording.name, n=recording.n,
+        duration=recording.duration if math.isfinite(recording.duration) else math.nan,
+        verdict=Verdict.INSUFFICIENT_DATA, sentence=f'Nothing can be said of it. {reason}',
+        notes=state.notes, seed=seed)
+
+
+def _kept(samples: Samples, state: Integrity) -> npt.NDArray[np.bool_]:
+    """Return which samples are scored: those of the part kept that were measured."""
+    kept = np.zeros(samples.n, dtype=np.bool_)
+    kept[samples.test] = True
+    return kept if state.drawn is None else kept & ~state.drawn
+
+
+def _guess(samples: Samples) -> OU:
+    """Return a start for the fit: from the correlation of neighbours."""
+    v = samples.voltage[samples.train]
+    c = v - v.mean()
+    power = float(c @ c)
+    keep = min(max(float(c[1:] @ c[:-1]) / power, 0.05), 0.9999)
+    alpha = -math.log(keep) / float(np.median(samples.step[1:]))
+    return OU(alpha, math.sqrt(power / c.size * 2.0 * alpha), float(v.mean()))
+
+
+def _baseline(samples: Samples, state: Integrity) -> tuple[OU, FloatArray, Composite]:
+    """
+    Return the plain OU, its density of each sample, and where the search starts.
+
+    The plain OU is fitted to the samples as logged, repeats and wrong stamps
+    included; the search starts with what is known without a model.
+
+    """
+    guess = _guess(samples)
+    clean = fit_composite(samples, [guess], samples.train)
+    assert clean is not None
+    plain, density = clean.terms[0], clean.density
+    if state.raw is not None:
+        plain = fit_gaussian(state.raw, [_guess(state.raw)], state.raw.train).terms[0]
+        density = evaluate(samples, [plain]).density
+    assert isinstance(plain, OU)
+    steps = [term for term in state.exact if term.ROLE is Role.NOISE]
+    start = fit_composite(samples, [clean.terms[0], *steps], samples.train) if steps else clean
+    assert start is not None
+    return plain, density, start
+
+
+def _named(samples: Samples, start: Composite, rng: np.random.Generator,
+           exact: tuple[Term, ...], progress: Progress) -> _Named:
+    """Search for causes; withdraw those that claim what they do not explain."""
+    phi = float(np.median(start.gaussian.phi[1:]))
+    bank = simulate_bank(scene_of(samples, start), phi, rng)
+    progress(0.1)
+    before = criticise(samples, start, bank)
+    try:
+        search = name_causes(samples, start, bank, given=[term.NAME for term in exact],
+                             progress=lambda share: progress(0.1 + 0.9 * share))
+        failure = ''
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+        # A fit outside of what numbers can hold; the criticism still stands.
+        search, failure = Search(start), f'The search for causes broke off: {error}.'
+    model, names = search.composite, list(search.accepted)
+    if names:
+        # Named with a mean that saw everything; measured with one that did not.
+        model = fit_composite(samples, model.terms, samples.train) or model
+    after = criticise(samples, model, bank) if names else before
+    kinds = [catalogue()[name] for name in names]
+    away = withdrawn(before, after, kinds)
+    dropped = tuple(names[k] for k in away)
+    for k in sorted(away, reverse=True):
+        less = without(samples, model, position(model, names, k))
+        if less is not None:
+            model = less
+        del names[k]
+    if away:
+        after = criticise(samples, model, bank)
+    return _Named(model, tuple(names), search.rivals, dropped, before, after, failure)
+
+
+def position(model: Composite, names: list[str] | tuple[str, ...], k: int) -> int:
+    """Return where in the model the k-th cause is: the n-th of its kind is the n-th."""
+    nth = list(names[:k]).count(names[k])
+    return [i for i, term in enumerate(model.terms) if term.NAME == names[k]][nth]
+
+
+def _causes(samples: Samples, state: Integrity, named: _Named, start: Composite,
+            plain_density: FloatArray, progress: Progress) -> tuple[Cause, ...]:
+    """
+    Return all causes: exact findings first, then those of the search.
+
+    The gain of a cause is what the model loses without it, fitted again; that
+    of repeats, rails and wrong stamps, which are undone in the samples, is what
+    the OU fitted to the samples as logged loses on those left, all together.
+
+    """
+    found: list[Cause] = []
+    se = standard_errors(samples, named.model, samples.train)
+    test = _kept(samples, state)
+    for term in state.exact:
+        if term.ROLE is Role.NOISE:
+            index = next(i for i, t in enumerate(named.model.terms) if t.NAME == term.NAME)
+            less = without(samples, named.model, index)
+            gain, error = (math.nan, math.nan) if less is None else mean_difference(
+                named.model.density[test], less.density[test])
+        else:
+            clean = evaluate(samples, fit_gaussian(
+                samples, [start.terms[0]], samples.train).terms)
+            gain, error = mean_difference(clean.density[test], plain_density[test])
+        found.append(Cause(term, {}, gain, error, 0.0, (),
+                           explain(term, {}, gain, error, (), True), True))
+    alone = len(named.names) == 1
+    for k, name in enumerate(named.names):
+        index = position(named.model, named.names, k)
+        term = named.model.terms[index]
+        less = start if alone else without(samples, named.model, index)
+        gain, error, chance = (math.nan,) * 3 if less is None else worth(
+            samples, named.model, less)
+        rivals = tuple(dict.fromkeys(named.rivals.get(name, ())))
+        found.append(Cause(term, se[index], gain, error, chance, rivals,
+                           explain(term, se[index], gain, error, rivals, False), False))
+        progress((k + 1) / len(named.names))
+    return tuple(found)
+
+
+def _refitted(samples: Samples, model: Composite) -> tuple[Composite, tuple[dict[str, Any], ...]]:
+    """Return the model fitted on everything, and its standard errors."""
+    whole = slice(0, samples.n)
+    again = fit_composite(samples, model.terms, whole)
+    if again is None or not math.isfinite(float(again.density.sum())):
+        return model, standard_errors(samples, model, samples.train)
+    return again, standard_errors(samples, again, whole)
+
+
+def _criticism(before: Mapping[str, float], after: Mapping[str, float]) -> tuple[Criticism, ...]:
+    """Return all statistics with the band that a right model leaves with chance `NOTHING`."""
+    count = len(before)
+    one = -math.expm1(math.log1p(-NOTHING) / count)
+    edge = -float(ndtri(0.5 * one))
+    return tuple(Criticism(
+        name, value, after.get(name, math.nan), -edge, edge, family_chance(value, count),
+        family_chance(after[name], count) if name in after else math.nan)
+        for name, value in before.items())
+
+
+def _notes(state: Integrity, named: _Named, samples: Samples) -> tuple[str, ...]:
+    """Return what to know: the way in, what was withdrawn, what cannot be decided."""
+    notes = [*state.notes, *([named.failure] if named.failure else [])]
+    for name in dict.fromkeys(named.dropped):
+        notes.append(f"'{name}' fitted, but left what it should explain: withdrawn.")
+    duration = float(samples.t[-1] - samples.t[0])
+    ou = named.model.terms[0]
+    assert isinstance(ou, OU)
+    coupled = named.model.has('ac_coupling')
+    step = float(np.median(samples.step[1:]))
+    if coupled:
+        notes.append(coupling_found(duration))
+    elif ou.alpha * step > _BLIND:
+        notes.append(no_relaxation_note(ou.alpha, step))
+    elif ou.alpha * duration > _RELAXES:
+        notes.append(coupling_note(ou.alpha, duration))
+    return tuple(notes)
