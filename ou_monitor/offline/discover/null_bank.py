@@ -11,7 +11,11 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from ou_monitor.model.supply import SupplyModel
 from ou_monitor.offline.discover.battery import Scene, statistics
+from ou_monitor.offline.discover.composite import Composite
+from ou_monitor.offline.discover.data import Samples
+from ou_monitor.offline.discover.structure import evaluate
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
 from scipy.special import ndtr
@@ -66,19 +70,61 @@ def simulate_bank(scene: Scene, phi: float, rng: np.random.Generator, size: int 
         Means and spreads.
 
     """
-    found: dict[str, list[float]] = {}
+    rows = []
     n = scene.at.size
     for _ in range(size):
         y = lfilter([1.0], [1.0, -phi], rng.standard_normal(n))
         z, state = refit(y)
         made = Scene(state, scene.at, scene.throttle, scene.rate)
-        for name, value in statistics(z, made).items():
-            found.setdefault(name, []).append(value)
+        rows.append(statistics(z, made))
+    return _summary(rows)
+
+
+def simulate_bank_of(samples: Samples, composite: Composite, rng: np.random.Generator,
+                     size: int = SIZE) -> NullBank:
+    """
+    Simulate the bank of a model that is more than the `ou`.
+
+    A step of the ADC that is as large as the noise leaves errors that are
+    neither normal nor independent, however right the model is.
+
+    Parameters
+    ----------
+    samples : Samples
+        Stamps and throttle of the data.
+    composite : Composite
+        The fitted model.
+    rng : numpy.random.Generator
+        Source of randomness.
+    size : int
+        Recordings.
+
+    Returns
+    -------
+    NullBank
+        Means and spreads.
+
+    """
+    model, rows = SupplyModel(composite.terms), []
+    for _ in range(size):
+        y = model.simulate(samples.t, rng, samples.throttle)
+        made = Samples(samples.t, y, samples.throttle)
+        fit = evaluate(made, composite.terms)
+        state = np.concatenate(([0.0], (y - fit.mean)[:-1]))
+        rows.append(statistics(fit.z, Scene(state, samples.t - samples.t[0], samples.throttle,
+                                            1.0 / float(np.median(samples.step[1:])))))
+    return _summary(rows)
+
+
+def _summary(rows: list[dict[str, float]]) -> NullBank:
+    """Return means and spreads, the spreads drawn towards 1."""
+    weight = len(rows) / (len(rows) + _PRIOR)
     mean, std = {}, {}
-    for name, values in found.items():
-        v = np.array(values)
-        weight = size / (size + _PRIOR)
-        mean[name] = weight * float(v.mean())
+    for name in rows[0]:
+        v = np.array([row[name] for row in rows if name in row])
+        # What is far from normal has a mean of its own, known as well as may be.
+        strange = abs(float(v.mean())) > 4.0 * float(v.std()) / math.sqrt(v.size) + 1.0
+        mean[name] = (1.0 if strange else weight) * float(v.mean())
         std[name] = math.sqrt(weight * float(v.var(ddof=1)) + 1.0 - weight)
     return NullBank(mean, std)
 

@@ -21,7 +21,7 @@ from ou_monitor.offline.discover.finding import Cause, Criticism, Finding, Verdi
 from ou_monitor.offline.discover.gain import crossing_rates, mean_difference, without, worth
 from ou_monitor.offline.discover.integrity import examine, Integrity
 from ou_monitor.offline.discover.naming import criticise, name_causes, Search
-from ou_monitor.offline.discover.null_bank import family_chance, simulate_bank
+from ou_monitor.offline.discover.null_bank import family_chance, simulate_bank, simulate_bank_of
 from ou_monitor.offline.discover.structure import evaluate, fit_gaussian
 from ou_monitor.offline.discover.verdict import judge, NOTHING, withdrawn
 from ou_monitor.offline.discover.words import (
@@ -165,7 +165,10 @@ def _named(samples: Samples, start: Composite, rng: np.random.Generator,
            exact: tuple[Term, ...], progress: Progress) -> _Named:
     """Search for causes; withdraw those that claim what they do not explain."""
     phi = float(np.median(start.gaussian.phi[1:]))
-    bank = simulate_bank(scene_of(samples, start), phi, rng)
+    if len(start.terms) > 1:
+        bank = simulate_bank_of(samples, start, rng)
+    else:
+        bank = simulate_bank(scene_of(samples, start), phi, rng)
     progress(0.1)
     before = criticise(samples, start, bank)
     try:
