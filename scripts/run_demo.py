@@ -266,10 +266,16 @@ def options() -> argparse.Namespace:
     return parser.parse_args()
 
 
+def interrupt(*_: object) -> None:
+    """End the demo as Ctrl-C does."""
+    raise KeyboardInterrupt
+
+
 def main() -> int:
     """Run the demo; return the exit status."""
     chosen = options()
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    # Not by way of SIGINT, which a shell may have told all its children to ignore.
+    signal.signal(signal.SIGTERM, interrupt)
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     try:
         if not Path(chosen.bag).exists():
