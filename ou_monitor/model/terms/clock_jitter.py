@@ -56,6 +56,10 @@ class ClockJitter(Term):
         """Fit hidden errors of the stamps: a step that is longer has more noise in it."""
         step = 1.0 / view.rate
         z = view.z[view.train]
+        if float(np.mean(z**4)) > _MOST_KURTOSIS:
+            # Errors of half a step at the most leave less.
+            return None
+        z = z[:_SHORT]
 
         def value(x: FloatArray) -> float:
             if not -4.0 < x[0] < -0.8:
@@ -72,6 +76,8 @@ class ClockJitter(Term):
                       density - log_normal(view.z), 2)
 
 
+# Samples that the error is fitted on, and the largest fourth moment it can leave.
+_SHORT, _MOST_KURTOSIS = 15000, 6.0
 # Levels of the error of a stamp.
 _LEVELS = 7
 

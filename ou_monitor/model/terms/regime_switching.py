@@ -105,12 +105,12 @@ class RegimeSwitching(Term):
             for level, ratio in ((0.0, 0.7), (spread / unit, 0.0)):
                 rate = -math.log(dwell)
                 x, top = climb(lambda p: value(p, _SHORT),
-                               [rate, rate, level, ratio, -0.3 * ratio], most=60)
+                               [rate, rate, level, ratio, -0.3 * ratio], most=50)
                 if best is None or top > best[0]:
                     best = top, x
         if best is None:
             return None
-        x, _ = climb(value, best[1], size=0.2, most=120)
+        x, _ = climb(lambda p: value(p, _LONG), best[1], size=0.2, most=80)
         before, density, mean, std = _chain(view.z, view.phi, step, x)
         weight = before[:, :, None] * _transition(x, step)
         scores = normal_scores(mixture_cdf(view.z, weight.reshape(-1, 4),
@@ -124,8 +124,8 @@ class RegimeSwitching(Term):
         return LawFit(term, se, scores, density - log_normal(view.z), 5, offset=offset)
 
 
-# Samples on which starts are tried.
-_SHORT = 12000
+# Samples on which starts are tried, and on which the best is fitted.
+_SHORT, _LONG = 8000, 30000
 # Largest rate of switching, 1/s.
 _FASTEST = 30.0
 # A level of fewer innovations than this is none.

@@ -127,6 +127,11 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
         search.composite = best.composite
         search.accepted.append(best.name)
         _prune(samples, search)
+        if _tier(catalogue()[best.name], values) > 0 and not _helped(
+                values, criticise(samples, search.composite, bank)):
+            # What is wrong here is not in the catalogue: more terms would only dress it up.
+            search.log.append(f'{best.name} leaves most of what is wrong: no further causes')
+            break
     return search
 
 
@@ -228,6 +233,18 @@ def _screened(samples: Samples, starts: list[Term], view: View) -> list[Term]:
 
 
 _TIERS = 3
+# Share of the misfit that a latent cause must take away for the search to go on,
+# and misfit (squares of statistics that are off) that is too little to ask so.
+_SHARE, _LITTLE = 0.5, 100.0
+
+
+def _helped(before: dict[str, float], after: dict[str, float]) -> bool:
+    """Return whether statistics that are off have come nearer."""
+    def misfit(values: dict[str, float]) -> float:
+        return sum(value**2 for value in values.values() if abs(value) > 4.0)
+
+    left = misfit(after)
+    return left < _LITTLE or left < (1.0 - _SHARE) * misfit(before)
 
 
 def _tier(kind: type[Term], values: dict[str, float]) -> int:
