@@ -33,8 +33,8 @@ TIE = 3.0
 ASK = 2.6
 # The same for terms that take seconds to fit.
 ASK_DEAR = 3.2
-# Causes accepted at most.
-MOST = 7
+# Causes accepted at most, and of these what no input was measured for.
+MOST, MOST_LATENT = 8, 3
 # Starting points that are fitted in full, and samples that tell which.
 _FULL, _GLANCE = 2, 8000
 
@@ -108,7 +108,8 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
             progress(turn / MOST)
         values = criticise(samples, search.composite, bank)
         trials, good = [], []
-        for tier in range(_TIERS):
+        latent = sum(_tier(catalogue()[name], values) > 0 for name in search.accepted)
+        for tier in range(_TIERS if latent < MOST_LATENT else 1):
             # Measured inputs first: what is latent can imitate them, and costs more.
             trials += _trials(samples, search, values, given, tier)
             good = [trial for trial in trials if trial.evidence > ACCEPT]
