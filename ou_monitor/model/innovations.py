@@ -77,37 +77,41 @@ class Filter:
         self._n = model.f.shape[0] if n is None else n
         self.variance: FloatArray = self._solve(model)
         if self._n > model.f.shape[0]:
-            # The last gain does not know that a step follows; the one before does.
-            self._steady = _Steady(self._loop[-2], self._gain[-2], self._look[-2])
+            self._steady = _Steady(self._last_loop, self._gain[-2], self._look[-2])
             more = np.full(self._n - model.f.shape[0] + 1, self.variance[-2])
             self.variance = np.concatenate((self.variance[:-1], more))
 
     def _solve(self, model: StateSpace) -> FloatArray:
         """Find the gains, sample by sample; return the variances."""
-        f, h = model.f, model.h
-        n, d = f.shape[0], f.shape[1]
-        weight = _inverse(model.q)
+        h = model.h
+        n, d = model.f.shape[0], model.f.shape[1]
+        # One array for each element of the matrices, along the samples: no small
+        # matrices are touched one by one.
+        f, q = _elements(model.f), _elements(model.q)
+        weight = _inverse(q)
         forward = _times(weight, f)
         # What the step into the next sample says of this one.
         back = np.zeros_like(f)
-        back[:-1] = _times(f[1:].transpose(0, 2, 1), forward[1:])
-        diagonal = weight + back + np.multiply.outer(1.0 / model.r, np.outer(h, h))
-        factor, info = dpbtrf(_band(diagonal, -forward[1:]), lower=1, overwrite_ab=1)
+        back[..., :-1] = _times(f.transpose(1, 0, 2)[..., 1:], forward[..., 1:])
+        diagonal = weight + back + np.outer(h, h)[:, :, None] / model.r
+        factor, info = dpbtrf(_band(diagonal, -forward[..., 1:]), lower=1, overwrite_ab=1)
         if info != 0 or not np.isfinite(factor[0]).all():
             raise ValueError('the covariance of the model is singular or not finite')
-        pivot = _pivots(factor, n, d)
         # Filtered covariance, then the gain, then the closed loop.
-        p = _inverse(pivot - back)
-        self._gain = p @ h / model.r[:, None]
-        self._loop = f - self._gain[:, :, None] * (h @ f)[:, None, :]
-        self._loop[0] = 0.0
-        self._look = h @ f
-        self._look[0] = 0.0
-        ahead = np.empty_like(p)
-        ahead[0] = model.q[0]
-        ahead[1:] = _times(_times(f[1:], p[:-1]), f[1:].transpose(0, 2, 1)) + model.q[1:]
-        self._band_of_loop = _band(np.broadcast_to(np.eye(d), f.shape), -self._loop[1:])
-        variance: FloatArray = (ahead @ h) @ h + model.r
+        p = _inverse(_pivots(factor, n, d) - back)
+        gain = np.einsum('ijn,j->in', p, h) / model.r
+        look = np.einsum('i,ijn->jn', h, f)
+        loop = f - gain[:, None] * look[None]
+        loop[..., 0] = look[:, 0] = 0.0
+        self._band_of_loop = _band(_one(d, n), -loop[..., 1:])
+        self._gain = np.ascontiguousarray(gain.T)
+        self._look = np.ascontiguousarray(look.T)
+        # The last gain does not know that a step follows; the one before does.
+        self._last_loop = loop[..., -2].copy() if n > 1 else np.zeros((d, d))
+        ahead = model.r.copy()
+        ahead += np.einsum('i,ijn,j->n', h, q, h)
+        ahead[1:] += np.einsum('in,ijn,jn->n', look[:, 1:], p[..., :-1], look[:, 1:])
+        variance: FloatArray = ahead
         return variance
 
     def innovations(self, y: FloatArray) -> FloatArray:
@@ -176,8 +180,12 @@ class _Steady:
             return self._in_chunks(e, state)
         modes = self._into @ state
         for root, drive, seen, before in zip(self._roots, self._drive, self._seen, modes):
-            if abs(seen * drive) == 0.0:
+            if abs(seen * drive) == 0.0 or root.imag < 0.0:
                 continue
+            if root.imag == 0.0:
+                root, drive, before = root.real, drive.real, before.real
+            # The conjugate of a mode that turns adds the same again.
+            seen = 2.0 * seen if root.imag > 0.0 else seen.real
             kept, _ = lfilter([drive], [1.0, -root], columns, axis=0, zi=root * before[None, :])
             e[0] -= (seen * before).real
             e[1:] -= (seen * kept[:-1]).real
@@ -190,8 +198,8 @@ class _Steady:
             m = part.shape[0]
             right = self._gain[None, :, None] * part[:, None, :]
             right[0] += self._loop @ state
-            loops = np.broadcast_to(self._loop, (m, d, d))
-            band = _band(np.broadcast_to(np.eye(d), (m, d, d)), -loops[1:])
+            loops = np.broadcast_to(self._loop[:, :, None], (d, d, m - 1))
+            band = _band(_one(d, m), -loops)
             states = dtbtrs(band, right.reshape(m * d, -1), uplo='L', diag='U')[0].reshape(
                 m, d, -1)
             before = np.concatenate((state[None], states[:-1]))
@@ -200,44 +208,63 @@ class _Steady:
         return e
 
 
+def _elements(a: FloatArray) -> FloatArray:
+    """Return a stack of matrices, shape (n, d, d), as shape (d, d, n)."""
+    return np.ascontiguousarray(a.transpose(1, 2, 0))
+
+
+def _one(d: int, n: int) -> FloatArray:
+    """Return n unit matrices, shape (d, d, n)."""
+    one: FloatArray = np.broadcast_to(np.eye(d)[:, :, None], (d, d, n))
+    return one
+
+
 def _times(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Multiply stacks of small matrices."""
-    product: FloatArray = a * b if a.shape[1] == 1 else a @ b
+    """Multiply matrices of shape (d, d, n)."""
+    d = a.shape[0]
+    product = a[:, 0, None] * b[None, 0]
+    for k in range(1, d):
+        product += a[:, k, None] * b[None, k]
     return product
 
 
 def _inverse(a: FloatArray) -> FloatArray:
-    """Invert a stack of small matrices."""
-    d = a.shape[1]
+    """Invert positive definite matrices, shape (d, d, n), by their Cholesky factors; else NaN."""
+    d = a.shape[0]
     if d == 1:
         return 1.0 / a
-    if d == 2:
-        result = np.empty_like(a)
-        scale = 1.0 / (a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0])
-        result[:, 0, 0], result[:, 1, 1] = a[:, 1, 1] * scale, a[:, 0, 0] * scale
-        result[:, 0, 1], result[:, 1, 0] = -a[:, 0, 1] * scale, -a[:, 1, 0] * scale
-        return result
-    inverse: FloatArray = np.asarray(np.linalg.inv(a), dtype=np.float64)
-    return inverse
+    # Lower factor, and its inverse by forward substitution.
+    low, up = np.zeros_like(a), np.zeros_like(a)
+    with np.errstate(invalid='ignore', divide='ignore'):
+        for j in range(d):
+            pivot = a[j, j] - (low[j, :j] ** 2).sum(axis=0)
+            up[j, j] = 1.0 / np.sqrt(pivot)
+            low[j, j] = pivot * up[j, j]
+            for i in range(j + 1, d):
+                low[i, j] = (a[i, j] - (low[i, :j] * low[j, :j]).sum(axis=0)) * up[j, j]
+            for i in range(j):
+                up[j, i] = -(low[j, i:j] * up[i:j, i]).sum(axis=0) * up[j, j]
+    return _times(up.transpose(1, 0, 2), up)
 
 
 def _band(diagonal: FloatArray, below: FloatArray) -> FloatArray:
     """Return a block bidiagonal or symmetric block tridiagonal matrix, lower band storage."""
-    n, d = diagonal.shape[0], diagonal.shape[1]
-    band = np.zeros((2 * d, n, d))
+    d, n = diagonal.shape[0], diagonal.shape[2]
+    # As LAPACK wants it: all rows of one column beside each other.
+    band = np.zeros((n, d, 2 * d))
     for j in range(d):
         for i in range(j, d):
-            band[i - j, :, j] = diagonal[:, i, j]
+            band[:, j, i - j] = diagonal[i, j]
         for i in range(d):
-            band[d + i - j, :-1, j] = below[:, i, j]
-    return band.reshape(2 * d, n * d)
+            band[:-1, j, d + i - j] = below[i, j]
+    return band.reshape(n * d, 2 * d).T
 
 
 def _pivots(factor: FloatArray, n: int, d: int) -> FloatArray:
-    """Return the pivot blocks L_kk L_kk' of a banded Cholesky factor."""
-    lower = np.zeros((n, d, d))
-    rows = factor.reshape(factor.shape[0], n, d)
+    """Return the pivot blocks L_kk L_kk' of a banded Cholesky factor, shape (d, d, n)."""
+    lower = np.zeros((d, d, n))
+    rows = factor.T.reshape(n, d, -1)
     for j in range(d):
         for i in range(j, d):
-            lower[:, i, j] = rows[i - j, :, j]
-    return _times(lower, lower.transpose(0, 2, 1))
+            lower[i, j] = rows[:, j, i - j]
+    return _times(lower, lower.transpose(1, 0, 2))

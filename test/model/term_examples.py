@@ -23,7 +23,7 @@ EXAMPLES = {
     'held_samples': {'rate': 270.0},
     'saturation': {'low': 4.9, 'high': 5.1},
     'second_relaxation': {'alpha': 4.0, 'sigma': 0.1},
-    'resonance': {'frequency': 120.0, 'damping': 40.0, 'std': 0.03},
+    'resonance': {'frequency': 120.0, 'damping': 40.0, 'std': 0.03, 'tilt': -0.5},
     'tone': {'amplitude': 0.05, 'frequency': 50.0, 'phase': 0.4, 'linewidth': 2.0},
     'throttle_tone': {
         'amplitude': 0.05, 'idle': 20.0, 'slope': 300.0, 'phase': 0.1, 'linewidth': 0.0},
@@ -31,7 +31,8 @@ EXAMPLES = {
     'jumps': {'rate': 30.0, 'mean': -0.05, 'std': 0.02},
     'heavy_tails': {'dof': 5.0},
     'glitches': {'probability': 0.05, 'std': 0.3},
-    'regime_switching': {'rate_up': 20.0, 'rate_down': 50.0, 'level': -0.1, 'sigma_ratio': 2.0},
+    'regime_switching': {'rate_up': 20.0, 'rate_down': 50.0, 'level': -0.1, 'sigma_ratio': 2.0,
+                         'at_once': 0.5, 'states': 3.0},
     'volatility': {'std': 0.4, 'rate': 5.0},
     'nonlinear_restoring': {'square': 100.0, 'cube': 3000.0},
     'flicker_noise': {'amplitude': 0.02, 'low': 0.5, 'high': 200.0},

@@ -55,13 +55,16 @@ NEUTRAL = {
     'measurement_noise': {'std': 0.0}, 'quantization': {'step': 1e-12},
     'held_samples': {'rate': 1000.0}, 'saturation': {'low': -100.0, 'high': 100.0},
     'second_relaxation': {'alpha': 4.0, 'sigma': 0.0},
-    'resonance': {'frequency': 120.0, 'damping': 40.0, 'std': 0.0},
+    'resonance': {'frequency': 120.0, 'damping': 40.0, 'std': 0.0,
+                  'tilt': 0.0},
     'tone': {'amplitude': 0.0, 'frequency': 50.0, 'phase': 0.4, 'linewidth': 2.0},
     'throttle_tone': {
         'amplitude': 0.0, 'idle': 20.0, 'slope': 300.0, 'phase': 0.1, 'linewidth': 0.0},
     'jumps': {'rate': 0.0, 'mean': 1.0, 'std': 1.0},
     'glitches': {'probability': 0.0, 'std': 0.3},
-    'regime_switching': {'rate_up': 20.0, 'rate_down': 50.0, 'level': 0.0, 'sigma_ratio': 1.0},
+    'regime_switching': {'rate_up': 20.0, 'rate_down': 50.0, 'level': 0.0, 'sigma_ratio': 1.0,
+                         'at_once': 1.0,
+                         'states': 2.0},
     'volatility': {'std': 0.0, 'rate': 5.0}, 'nonlinear_restoring': {'square': 0.0, 'cube': 0.0},
     'flicker_noise': {'amplitude': 0.0, 'low': 0.5, 'high': 200.0}, 'clock_jitter': {'std': 0.0},
 }

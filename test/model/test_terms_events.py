@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy.stats import kstest, t as student
-from term_examples import agrees, ALPHA, SIGMA, still, supply, term
+from term_examples import agrees, ALPHA, clusters, SIGMA, still, supply, term
 
 VAR = SIGMA ** 2 / (2.0 * ALPHA)
 
@@ -115,7 +115,8 @@ def test_switching_of_the_level():
     Sampled every 100 ms, 8 relaxations of the chain; 8 and 25 ms give the lags.
     """
     n, level = 60_000, 0.3
-    state = term('regime_switching', rate_up=UP, rate_down=DOWN, level=level, sigma_ratio=1.0)
+    state = term('regime_switching', rate_up=UP, rate_down=DOWN, level=level, sigma_ratio=1.0,
+                 at_once=1.0, states=2.0)
     t = (np.arange(n)[:, None] * 0.125 + np.array([0.0, 0.008, 0.025])).ravel()
     x = still(state).simulate(t, np.random.default_rng(6)).reshape(n, 3)
     assert set(np.unique(x)) == {0.0, level}
@@ -130,13 +131,48 @@ def test_rates_of_switching():
     """Stays in either state are exponential with the stated rates, seen at 20 kHz."""
     dt = 5e-5
     x = still(term('regime_switching', rate_up=UP, rate_down=DOWN, level=1.0,
-                   sigma_ratio=1.0)).simulate(np.arange(2_000_000) * dt, np.random.default_rng(7))
+                   sigma_ratio=1.0, at_once=1.0, states=2.0)).simulate(
+                       np.arange(2_000_000) * dt, np.random.default_rng(7))
     at = np.flatnonzero(np.diff(x))
     stays, state = np.diff(at) * dt, x[at[:-1] + 1]
     for value, rate in ((0.0, UP), (1.0, DOWN)):
         own = stays[state == value]
         agrees(own.mean(), 1.0 / rate, 1.0 / rate / math.sqrt(own.size), 0.2)
         assert kstest(own, 'expon', (0.0, 1.0 / rate)).pvalue > 1e-4
+
+
+def test_a_level_that_comes_at_the_rate_alpha():
+    """
+    A telegraph behind a low-pass: variance level^2 p (1 - p) alpha/(alpha + up + down).
+
+    Whatever the steps: groups of samples 1 and 30 ms apart, independent of each other.
+    """
+    level = 0.3
+    slow = term('regime_switching', rate_up=UP, rate_down=DOWN, level=level, sigma_ratio=1.0,
+                at_once=0.0, states=2.0)
+    x = clusters(still(slow), np.array([0.0, 0.001, 0.031]), 0.5, 60_000, 3)
+    truth = level ** 2 * SHARE * (1.0 - SHARE) * ALPHA / (ALPHA + UP + DOWN)
+    for k in (1, 2):
+        square = (x[:, k] - SHARE * level) ** 2
+        agrees(square.mean(), truth, square.std() / math.sqrt(x.shape[0]))
+    agrees(x[:, 2].mean(), SHARE * level, math.sqrt(truth / x.shape[0]))
+
+
+def test_three_states():
+    """
+    Shares of the states, by detailed balance of up and down; each adds its level once.
+
+    With q = up/down: 0 is left at 2 up, 1 at up + down, 2 at 2 down.
+    """
+    up, down, count = 20.0, 30.0, 60_000
+    three = term('regime_switching', rate_up=up, rate_down=down, level=0.5, sigma_ratio=1.0,
+                 at_once=1.0, states=3.0)
+    x = clusters(still(three), np.array([0.0]), 0.5, count, 4)[:, 0]
+    # Flow into each state is flow out of it.
+    flow = np.array([[-2.0 * up, down, down], [up, -up - down, down], [1.0, 1.0, 1.0]])
+    for k, share in enumerate(np.linalg.solve(flow, [0.0, 0.0, 1.0])):
+        agrees(np.mean(x == 0.5 * k), share, math.sqrt(share * (1.0 - share) / count))
+    assert set(np.unique(x)) == {0.0, 0.5, 1.0}
 
 
 @pytest.mark.parametrize('dt', [1e-3, 0.02, 0.06])
@@ -151,7 +187,7 @@ def test_switching_of_sigma_within_a_step(dt):
     """
     n, ratio = 200_000, 3.0
     x = supply(term('regime_switching', rate_up=UP, rate_down=DOWN, level=100.0,
-                    sigma_ratio=ratio), u0=0.0).simulate(
+                    sigma_ratio=ratio, at_once=1.0, states=2.0), u0=0.0).simulate(
         np.arange(n) * dt, np.random.default_rng(8))
     state = (x > 50.0).astype(float)
     x = x - 100.0 * state
@@ -169,7 +205,8 @@ def test_switching_of_sigma_within_a_step(dt):
 def test_switching_of_sigma_alone_leaves_the_level():
     """No level: a mean as without, and the variance of the mixture."""
     n = 200_000
-    x = supply(term('regime_switching', rate_up=UP, rate_down=DOWN, level=0.0, sigma_ratio=2.0),
+    x = supply(term('regime_switching', rate_up=UP, rate_down=DOWN, level=0.0, sigma_ratio=2.0,
+                    at_once=1.0, states=2.0),
                u0=0.0).simulate(np.arange(n) * 0.1, np.random.default_rng(9))
     truth = VAR * (1.0 + 3.0 * SHARE)
     agrees(np.mean(x * x), truth, float((x * x).std()) / math.sqrt(n), 0.03)
@@ -178,7 +215,8 @@ def test_switching_of_sigma_alone_leaves_the_level():
 
 @pytest.mark.parametrize('wild, words', [
     (jumps(rate=1e12), 'jumps.rate of 1e'),
-    (term('regime_switching', rate_up=1e12, rate_down=1e11, level=0.1, sigma_ratio=1.0),
+    (term('regime_switching', rate_up=1e12, rate_down=1e11, level=0.1, sigma_ratio=1.0,
+          at_once=1.0, states=2.0),
      'regime_switching: 1.8')])
 def test_more_events_than_can_be_drawn_are_refused(wild, words):
     """At once, with the rate; nothing hangs."""

@@ -8,14 +8,18 @@ from scipy.signal import welch
 from term_examples import agrees, clusters, has_covariance, still, term
 
 
-@pytest.mark.parametrize('frequency, damping, std', [(120.0, 40.0, 0.03), (5.0, 90.0, 0.1)])
-def test_resonance(frequency, damping, std):
-    """Covariance std^2 exp(-damping lag) cos(2 pi frequency lag), uneven stamps."""
+@pytest.mark.parametrize('frequency, damping, std, tilt', [
+    (120.0, 40.0, 0.03, 0.0), (5.0, 90.0, 0.1, 0.0), (20.0, 60.0, 0.05, -1.0),
+    (20.0, 60.0, 0.05, 1.0), (60.0, 120.0, 0.05, 0.5)])
+def test_resonance(frequency, damping, std, tilt):
+    """Covariance std^2 exp(-damping lag) (cos + tilt damping/w sin), uneven stamps."""
     offsets = np.array([0.0, 0.1, 0.9, 1.3]) / frequency
-    groups = clusters(still(term('resonance', frequency=frequency, damping=damping, std=std)),
-                      offsets, 12.0 / damping + 1.5 / frequency, 60_000, 1)
-    has_covariance(groups, offsets, lambda lag: std ** 2 * math.exp(-damping * lag) * math.cos(
-        2.0 * math.pi * frequency * lag))
+    groups = clusters(still(term('resonance', frequency=frequency, damping=damping, std=std,
+                                 tilt=tilt)), offsets, 12.0 / damping + 1.5 / frequency,
+                      60_000, 1)
+    turn = 2.0 * math.pi * frequency
+    has_covariance(groups, offsets, lambda lag: std ** 2 * math.exp(-damping * lag) * (
+        math.cos(turn * lag) + tilt * damping / turn * math.sin(turn * lag)))
 
 
 def test_resonance_at_even_stamps():
@@ -25,7 +29,7 @@ def test_resonance_at_even_stamps():
     A sample covariance at lag k has the variance (1/n) sum_j (c_j^2 + c_{j+k} c_{j-k}).
     """
     n, dt = 400_000, 1e-3
-    x = still(term('resonance', frequency=50.0, damping=20.0, std=0.05)).simulate(
+    x = still(term('resonance', frequency=50.0, damping=20.0, std=0.05, tilt=0.0)).simulate(
         np.arange(n) * dt, np.random.default_rng(2))
 
     def cov(j):

@@ -9,7 +9,7 @@ from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.tone import Tone
 from ou_monitor.offline.discover.finding import Cause, Criticism, CrossingRate, Finding, Verdict
-from ou_monitor.offline.discover.verdict import judge, largest_chance, untouched, withdrawn
+from ou_monitor.offline.discover.verdict import failing, judge, largest_chance, withdrawn
 from ou_monitor.offline.discover.words import (
     coupling_note, explain, parameters, plain_words, verdict_sentence, with_error)
 import pytest
@@ -95,14 +95,24 @@ def test_the_chance_counts_all_statistics():
     assert largest_chance({**values, 'x': 3.0}) == pytest.approx(1 - (1 - 2.6998e-3)**51, rel=1e-3)
 
 
-def test_only_latent_causes_with_a_share_in_what_is_left_are_withdrawn():
-    """Little reduced, failing before: jumps go; sag stays; what was reduced is touched."""
+def test_latent_causes_are_withdrawn_where_something_still_fails():
+    """One statistic of 6 beside a worst of 100 fails: jumps and noise go; sag stays."""
     kinds = [catalogue()[name] for name in ('load_sag', 'jumps', 'measurement_noise')]
-    before = {'throttle': 30.0, 'kurtosis': 40.0, 'autocorrelation lag 1': 50.0, 'time': 1.0}
-    after = {'throttle': 29.0, 'kurtosis': 38.0, 'autocorrelation lag 1': 6.0, 'time': 8.0}
-    assert untouched(before, after) == ['throttle', 'kurtosis']
-    assert withdrawn(before, after, kinds) == [1]
-    assert withdrawn(before, {**after, 'kurtosis': 1.0}, kinds) == []
+    before = {'throttle': 30.0, 'kurtosis': 100.0, 'time': 1.0}
+    assert failing(before, {'throttle': 4.7, 'kurtosis': 7.1, 'time': -4.9}) == [
+        'kurtosis', 'time']
+    assert withdrawn(before, {'throttle': 2.0, 'kurtosis': 7.1, 'time': 0.0}, kinds) == [1]
+    assert withdrawn({**before, 'band 7': 0.0}, {'band 7': 6.0}, kinds) == [1, 2]
+    assert withdrawn(before, {'throttle': 4.7, 'kurtosis': 2.0, 'time': 0.0}, kinds) == []
+
+
+def test_what_is_left_may_be_a_small_share_of_what_was():
+    """7 % of itself, or a fiftieth of the worst, is form left over; more is not."""
+    kinds = [catalogue()['jumps']]
+    before = {'band 7': 200.0, 'line': 0.0, 'tails': 400.0}
+    assert withdrawn(before, {'band 7': 13.9, 'line': 7.9, 'tails': 0.0}, kinds) == []
+    assert withdrawn(before, {'band 7': 14.1, 'line': 0.0, 'tails': 0.0}, kinds) == [0]
+    assert withdrawn(before, {'band 7': 0.0, 'line': 8.1, 'tails': 0.0}, kinds) == [0]
 
 
 @pytest.mark.parametrize('name', [name for name in catalogue() if name != 'ou'])
@@ -112,8 +122,7 @@ def test_every_cause_has_its_words(name):
     values = dict.fromkeys(kind.parameters(), 0.7)
     values.update({'low': 0.1} if 'low' in values else {})
     values.update({p: [0.7] for p in ('throttle', 'log_factor') if p in values})
-    if 'dof' in values:
-        values['dof'] = 5.0
+    values.update({p: v for p, v in (('dof', 5.0), ('states', 2.0)) if p in values})
     text = explain(kind.read(values), {}, 0.01, 0.001, ['drift'], False)
     assert len(text) > 120 and 'what would' in text and '(for drift)' in text
     assert all(f'{p} = ' in text for p in kind.parameters())

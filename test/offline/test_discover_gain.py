@@ -94,7 +94,7 @@ def test_errors_of_the_mean_are_its_scatter():
     found, stated = [], []
     for seed in range(40):
         samples = made(seed, 2000, 0.4)
-        model = fit_composite(samples, [OU(63.0, 0.3, 5.0), LoadSag(0.4, 0.0)],
+        model = fit_composite(samples, [OU(63.0, 0.3, 5.0), LoadSag(0.4, 0.01)],
                               slice(0, samples.n))
         se = standard_errors(samples, model, slice(0, samples.n))
         found.append([model.terms[0].u0, model.terms[1].linear, model.terms[1].square])

@@ -69,7 +69,7 @@ def test_a_sag_is_found_measured_and_worth_its_gain(sag):
     assert sag.verdict is Verdict.EXPLAINED and names(sag) == ['load_sag']
     (cause,) = sag.causes
     fall = cause.term.linear + cause.term.square
-    assert abs(fall - 0.5) < 4.0 * math.hypot(cause.se['linear'], cause.se['square'])
+    assert abs(fall - 0.5) < 4.0 * math.hypot(*cause.se.values())
     assert cause.measurable and cause.p_value < 1e-6
     assert cause.gain == pytest.approx(sag.gain) and sag.score > sag.baseline_score
     ou = sag.model.ou

@@ -33,7 +33,8 @@ class ACCoupling(Term):
     STAGE: ClassVar[Stage] = Stage.INSTRUMENT
     ROLE: ClassVar[Role] = Role.BLOCK
     FREE: ClassVar[tuple[str, ...]] = ('corner',)
-    SIGNS: ClassVar[tuple[str, ...]] = ('band',)
+    DEAR: ClassVar[bool] = True
+    SIGNS: ClassVar[tuple[str, ...]] = ('-band',)
 
     corner: float = parameter('Hz', 'where the high-pass is down by 3 dB', 0.0, above=True)
     offset: float = parameter('V', 'level about which the instrument shows what it sees')
@@ -75,7 +76,7 @@ class ACCoupling(Term):
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
         """Return corners around that of the fitted relaxation."""
-        rate = -math.log(float(np.median(view.phi[1:]))) * view.rate / (2.0 * math.pi)
+        rate = -math.log(max(float(np.median(view.phi[1:])), 1e-300)) * view.rate / (2.0 * math.pi)
         return [cls(rate, 0.0), cls(0.25 * rate, 0.0)]
 
     def beside(self, ou: Term) -> Term:

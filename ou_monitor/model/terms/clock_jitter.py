@@ -54,10 +54,23 @@ class ClockJitter(Term):
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Fit hidden errors of the stamps: a step that is longer has more noise in it."""
+        return cls._climbed(view, [math.log(0.2), 0.0], 40)
+
+    @classmethod
+    def refit_law(cls, view: View, near: Term) -> LawFit | None:
+        """Fit again, from where it was."""
+        assert isinstance(near, ClockJitter)
+        return cls._climbed(view, [math.log(min(max(near.std * view.rate, 0.02), 0.44)), 0.0], 20)
+
+    @classmethod
+    def _climbed(cls, view: View, start: list[float], most: int) -> LawFit | None:
+        """Return the fit near a start."""
         step = 1.0 / view.rate
         z = view.z[view.train]
-        if float(np.mean(z**4)) > _MOST_KURTOSIS:
-            # Errors of half a step at the most leave less.
+        square = z * z
+        if float(np.mean(square**2)) > _MOST_KURTOSIS or _together(square) > _MOST_TOGETHER:
+            # Errors of half a step at the most leave less; and a step that was too
+            # long makes the next too short.
             return None
         z = z[:_SHORT]
 
@@ -66,7 +79,7 @@ class ClockJitter(Term):
                 return -math.inf
             return float(_errors(z, x)[1].sum())
 
-        x, _ = climb(value, [math.log(0.2), 0.0], most=40)
+        x, _ = climb(value, start, most=most)
         before, density, std, law = _errors(view.z, x)
         weight = (before[:, :, None] * law[None, None, :]).reshape(view.z.size, -1)
         wide = np.broadcast_to(std.reshape(-1), weight.shape)
@@ -76,8 +89,15 @@ class ClockJitter(Term):
                       density - log_normal(view.z), 2)
 
 
-# Samples that the error is fitted on, and the largest fourth moment it can leave.
-_SHORT, _MOST_KURTOSIS = 15000, 6.0
+def _together(square: FloatArray) -> float:
+    """Return the correlation of neighbouring squares, as a normal score."""
+    c = square - square.mean()
+    return math.sqrt(c.size) * float(c[1:] @ c[:-1]) / float(c @ c)
+
+
+# Samples that the error is fitted on, the largest fourth moment it can leave, and
+# the largest correlation of neighbouring squares: it makes that negative.
+_SHORT, _MOST_KURTOSIS, _MOST_TOGETHER = 15000, 6.0, 4.0
 # Levels of the error of a stamp.
 _LEVELS = 7
 

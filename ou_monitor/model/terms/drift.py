@@ -8,12 +8,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.term import (
+    Effect, NEXT_TO_ZERO, parameter, Role, Stage, Stretch, Term, View)
 
 
 @dataclass(frozen=True)
 class Drift(Term):
-    """Add rate * t + curvature * t^2, t counted from the first sample."""
+    """
+    Add rate * t + curvature * t^2, t counted from the first sample.
+
+    A curvature of exactly 0 stands for a straight line, in a fit too.
+    """
 
     NAME: ClassVar[str] = 'drift'
     FAMILY: ClassVar[str] = 'slow'
@@ -25,6 +30,11 @@ class Drift(Term):
     rate: float = parameter('V/s', 'slope at the first sample')
     curvature: float = parameter('V/s^2', 'coefficient of t^2')
 
+    def check(self) -> None:
+        """Leave the curvature out of a fit where it is 0."""
+        if self.curvature == 0.0:
+            object.__setattr__(self, 'LINEAR', ('rate',))
+
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
         def effect(s: Stretch) -> None:
@@ -35,5 +45,5 @@ class Drift(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the one there is: it is linear."""
-        return (cls(0.0, 0.0),)
+        """Return a straight line and a parabola."""
+        return cls(0.0, 0.0), cls(0.0, NEXT_TO_ZERO)

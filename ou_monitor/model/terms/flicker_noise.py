@@ -9,12 +9,18 @@ from typing import ClassVar
 
 import numpy as np
 
+from ou_monitor.model.terms.ac_coupling import bridge
 from ou_monitor.model.terms.recursion import first_order
 from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray
 
 # Octaves from pole to pole: 1/f within 0.2 %, and within 6 %.
 _FINE, _COARSE = 0.5, 3.0
+# The upper end, the last poles and the corner of the low-pass: at the end the
+# low-pass has taken 1.5 %, and where the poles end most of the rest.
+_LADDER, _CORNER = 4.5, 8.0
+# Corner over lower end below which it is one relaxation, or two.
+_LEAST = 30.0
 
 
 @dataclass(frozen=True)
@@ -22,9 +28,10 @@ class FlickerNoise(Term):
     """
     Add noise of PSD amplitude^2 / f between two frequencies.
 
-    A sum of OUs, two to the octave, which follows 1/f within 2 % between the
-    frequencies, the ends included (one-sided PSD), and is flat below and steeper
-    above.
+    A sum of OUs, two to the octave, behind a first-order low-pass at 8 * high.  It
+    follows 1/f within 2 % between the frequencies, the ends included (one-sided
+    PSD), is flat below, and falls as 1/f^3, then 1/f^4, from the corner on, as noise
+    behind a circuit of that bandwidth does.  Exact in law at any spacing.
     """
 
     NAME: ClassVar[str] = 'flicker_noise'
@@ -32,11 +39,13 @@ class FlickerNoise(Term):
     STAGE: ClassVar[Stage] = Stage.LEVEL
     ROLE: ClassVar[Role] = Role.BLOCK
     FREE: ClassVar[tuple[str, ...]] = ('amplitude', 'high')
+    DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('band', 'autocorrelation')
 
     amplitude: float = parameter('V', 'square root of f times the PSD', 0.0)
     low: float = parameter('Hz', 'lower end', 0.0, above=True)
-    high: float = parameter('Hz', 'upper end', 0.0, above=True)
+    high: float = parameter('Hz', 'upper end; 1/8 of the corner of the low-pass', 0.0,
+                            above=True)
 
     def check(self) -> None:
         """Check that the ends leave room."""
@@ -45,48 +54,96 @@ class FlickerNoise(Term):
                              f'{self.high:g} Hz')
 
     def poles(self) -> FloatArray:
-        """Return the relaxation rates, 1/s."""
-        return _sum(self.low, self.high, _FINE)[0]
+        """Return the relaxation rates before the low-pass, 1/s."""
+        return _sum(self.low, _LADDER * self.high, _FINE)[0]
 
     def pole_std(self) -> FloatArray:
         """Return the standard deviation of each of the OUs, V."""
-        return self.amplitude * np.sqrt(_sum(self.low, self.high, _FINE)[1])
+        return self.amplitude * np.sqrt(_sum(self.low, _LADDER * self.high, _FINE)[1])
+
+    @property
+    def corner(self) -> float:
+        """Return the rate of the low-pass, 1/s."""
+        return 2.0 * math.pi * _CORNER * self.high
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        poles, std = self.poles(), self.pole_std()
-        sources = rng.spawn(poles.size)
-        before = np.zeros(poles.size)
+        poles, std, rate = self.poles(), self.pole_std(), self.corner
+        *sources, last = rng.spawn(poles.size + 1)
+        before, low = np.zeros(poles.size), math.nan
 
         def effect(s: Stretch) -> None:
+            nonlocal low
+            first = math.isnan(low)
+            step = s.step.copy()
+            if first:
+                # What was long ago is forgotten; the low-pass is drawn apart.
+                step[0] = 0.0
+            driven, spread = np.zeros(s.t.size), np.zeros(s.t.size)
+            of_first = 0.0
             for k, pole in enumerate(poles):
                 phi = np.exp(-pole * s.step)
                 e = std[k] * np.sqrt(-np.expm1(-2.0 * pole * s.step))
                 x = first_order(phi, e * sources[k].standard_normal(s.t.size), before[k])
+                of_old, of_new, left = _bridge(float(pole), rate, step)
+                driven += of_old * np.concatenate(([before[k]], x[:-1])) + of_new * x
+                spread += 2.0 * pole * std[k] ** 2 * left
                 before[k] = x[-1]
-                s.level += x
+                share = rate / (rate + pole)
+                if first:
+                    of_first += share * x[0]
+                    spread[0] += std[k] ** 2 * share * (1.0 - share)
+            if first:
+                driven[0] = of_first
+            driven += np.sqrt(spread) * last.standard_normal(s.t.size)
+            seen = first_order(np.exp(-rate * s.step), driven, 0.0 if first else low)
+            low = float(seen[-1])
+            s.level += seen
 
         return effect
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
         """Return noise over all frequencies of the recording, of a third of its variance."""
-        low, high = 1.0 / float(view.at[-1]), 0.5 * view.rate
-        if high < 4.0 * low:
+        low, high = 1.0 / float(view.at[-1]), 0.2 * view.rate / _CORNER
+        if _CORNER * high < _LEAST * low:
             return ()
         spread = float(np.std(view.residual))
-        return (cls(spread * math.sqrt(0.3 / math.log(high / low)), low, high),)
+        return (cls(spread * math.sqrt(0.3 / math.log(_CORNER * high / low)), low, high),)
+
+    def holds(self, view: View) -> bool:
+        """Return whether 1/f goes on for so long that it is not a relaxation."""
+        return bool(_CORNER * self.high > _LEAST * self.low)
 
     def block(self, s: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return one state a pole; for a fit one pole in three octaves is enough."""
-        poles, variances = _sum(self.low, self.high, _COARSE)
-        count = poles.size
-        f = np.zeros((s.t.size, count, count))
+        """Return one state a pole, and the low-pass; for a fit few poles are enough."""
+        poles, variances = _sum(self.low, _LADDER * self.high, _COARSE)
+        variances = self.amplitude ** 2 * variances
+        # Most recordings have but a few different steps.
+        step, which = np.unique(s.step, return_inverse=True)
+        rate, last, seen = self.corner, poles.size, np.isfinite(step)
+        f = np.zeros((step.size, last + 1, last + 1))
         q = np.zeros_like(f)
-        for k, pole in enumerate(poles):
-            f[:, k, k] = np.exp(-pole * s.step)
-            q[:, k, k] = -self.amplitude ** 2 * variances[k] * np.expm1(-2.0 * pole * s.step)
-        return f, q, np.ones(count)
+        f[:, last, last] = np.exp(-rate * step)
+        share = rate / (rate + poles)
+        for k, (pole, variance, of_long) in enumerate(zip(poles, variances, share, strict=True)):
+            phi = np.exp(-pole * step)
+            added = variance * -np.expm1(-2.0 * pole * step)
+            of_old, of_new, left = _bridge(pole, rate, np.where(seen, step, 0.0))
+            f[:, k, k], q[:, k, k] = phi, added
+            f[:, last, k] = of_old + of_new * phi
+            q[:, k, last] = q[:, last, k] = np.where(seen, of_new * added, of_long * variance)
+            q[:, last, last] += np.where(
+                seen, of_new * of_new * added + 2.0 * pole * variance * left, of_long * variance)
+        return f[which], q[which], np.eye(last + 1)[last]
+
+
+def _bridge(pole: float, rate: float, step: FloatArray
+            ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return `bridge` for one pole; most steps are alike."""
+    some, which = np.unique(step, return_inverse=True)
+    old, new, left = bridge(np.full(some.size, pole), rate, some)
+    return old[which], new[which], left[which]
 
 
 def _sum(low: float, high: float, octaves: float) -> tuple[FloatArray, FloatArray]:

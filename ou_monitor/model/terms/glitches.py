@@ -7,10 +7,12 @@ import math
 from typing import ClassVar
 
 import numpy as np
-
+import numpy.typing as npt
+from ou_monitor.model.hidden_chain import forward
 from ou_monitor.model.terms.laws import log_normal, normal_scores
 from ou_monitor.model.terms.term import (
     Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
+from ou_monitor.records import FloatArray
 from scipy.special import ndtr
 
 
@@ -52,39 +54,92 @@ class Glitches(Term):
         plain = (view.residual - view.phi * view.state) / np.sqrt(view.variance)
         unit = float(np.median(np.abs(plain))) / 0.6745
         seen = replace(view, z=plain / unit, variance=view.variance * unit * unit)
-        share, spread = 1e-3, 6.0 * math.sqrt(float(np.median(seen.variance)))
+        floor = float(np.median(seen.variance))
+        share, spread = 1e-3, 6.0 * math.sqrt(floor)
+        lengths = np.array([1.0, share, share * share])
         for _ in range(3):
-            bad = bad_samples(seen, share, spread)
+            bad = bad_samples(seen, share, spread, lengths)
             count = int(bad[view.train].sum())
             if count < 3:
                 return None
             error = view.z[bad] * np.sqrt(view.variance[bad])
-            floor = float(np.median(seen.variance))
             spread = math.sqrt(max(float(np.mean(error**2)) - floor, floor))
-            share = float(bad.mean())
-        term = cls(min(share, 1.0), spread)
-        wide = np.sqrt(1.0 + spread * spread / view.variance)
-        calm = math.log1p(-share) + log_normal(view.z)
-        hit = math.log(share) + log_normal(view.z, 0.0, wide * wide)
-        both = np.logaddexp(calm, hit)
-        scores = normal_scores((1.0 - share) * ndtr(view.z) + share * ndtr(view.z / wide))
-        se = {'probability': share / math.sqrt(count), 'std': spread / math.sqrt(2.0 * count)}
+            found = _lengths(bad[view.train])
+            runs = int(found.sum())
+            share = runs / view.z[view.train].size
+            lengths = (found + 0.1) / (runs + 0.3)
+        term = cls(min(count / view.z[view.train].size, 1.0), spread)
+        scores, gain, free = _scored(view, bad, share, spread, lengths)
+        se = {'probability': term.probability / math.sqrt(count),
+              'std': spread / math.sqrt(2.0 * count)}
         # Once an error is taken out, the samples after it are scored anew.
-        return LawFit(term, se, scores, both - log_normal(view.z), 2,
-                      error=np.where(bad, 1e4 * spread * spread, 0.0))
+        return LawFit(term, se, scores, gain, free,
+                      error=np.where(bad, spread * spread, 0.0))
 
 
-def bad_samples(view: View, share: float, spread: float) -> np.ndarray:
+def _scored(view: View, bad: npt.NDArray[np.bool_], share: float, spread: float,
+            lengths: FloatArray) -> tuple[FloatArray, FloatArray, int]:
+    """Return normal scores, gains in log density, and how many parameters they took."""
+    # Good, and the first, second and third sample of a run, whose errors are alike.
+    e = view.z * np.sqrt(view.variance)
+    keep, rest = _alike(e, bad, view.train, spread)
+    wide = np.sqrt(1.0 + spread * spread / view.variance)
+    again = np.sqrt(1.0 + rest * rest / view.variance)
+    mean = keep * np.concatenate(([0.0], e[:-1])) / np.sqrt(view.variance)
+    calm, hit = log_normal(view.z), log_normal(view.z, 0.0, wide * wide)
+    more = log_normal(view.z, mean, again * again)
+    # What each step of the chain expects: nothing, an error, the same error again.
+    which = np.array([[0, 1, 0, 0], [0, 0, 2, 0], [0, 0, 0, 2], [0, 0, 0, 0]])
+    go = 1.0 - lengths[0], lengths[2] / (lengths[1] + lengths[2])
+    transition = np.array([[1.0 - share, share, 0.0, 0.0], [1.0 - go[0], 0.0, go[0], 0.0],
+                           [1.0 - go[1], 0.0, 0.0, go[1]], [1.0, 0.0, 0.0, 0.0]])
+    before, both = forward(np.stack((calm, hit, more), axis=1)[:, which], transition,
+                           np.array([1.0, 0.0, 0.0, 0.0]))
+    chance = np.stack([before @ (transition * (which == k)).sum(axis=1) for k in range(3)])
+    scores = normal_scores(chance[0] * ndtr(view.z) + chance[1] * ndtr(view.z / wide)
+                           + chance[2] * ndtr((view.z - mean) / again))
+    return scores, both - calm, 2 if keep == 0.0 else 6
+
+
+def _alike(e: FloatArray, bad: npt.NDArray[np.bool_], train: slice, spread: float
+           ) -> tuple[float, float]:
+    """Return how much of an error the next one of its run keeps, and what it adds, V."""
+    e, bad = e[train], bad[train]
+    second = np.flatnonzero(bad[1:] & bad[:-1]) + 1
+    if second.size < _PAIRS:
+        return 0.0, spread
+    keep = float(e[second] @ e[second - 1]) / float(e[second - 1] @ e[second - 1])
+    return keep, float(np.std(e[second] - keep * e[second - 1]))
+
+
+# Pairs of bad samples from which it can be said whether errors repeat.
+_PAIRS = 8
+
+
+def _lengths(bad: npt.NDArray[np.bool_]) -> FloatArray:
+    """Return how many runs there are of one, of two, and of three or more."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], bad, [False]))))
+    widths = np.minimum(edges[1::2] - edges[::2], 3)
+    return np.bincount(widths, minlength=4)[1:].astype(np.float64)
+
+
+def bad_samples(view: View, share: float, spread: float, lengths: FloatArray
+                ) -> npt.NDArray[np.bool_]:
     """
     Return which samples are off while the rail went on.
+
+    Of all sets of runs of up to three samples, with a good sample between any
+    two, that which explains most.
 
     Parameters
     ----------
     view : View
         Scores and coefficients.
     share, spread : float
-        Share of samples that are bad, and the standard deviation of their
-        errors, V.
+        Share of samples at which a run of bad ones begins, and the standard
+        deviation of their errors, V.
+    lengths : ndarray, shape (3,)
+        Chances that a run is of one, of two, of three.
 
     Returns
     -------
@@ -93,27 +148,45 @@ def bad_samples(view: View, share: float, spread: float) -> np.ndarray:
 
     """
     z, phi, n = view.z, view.phi, view.z.size
-    bad = np.zeros(n, dtype=bool)
-    each = -math.log(share) + 0.5 * math.log1p(spread * spread / float(np.median(view.variance)))
-    for k in np.flatnonzero(np.abs(z) > 2.5).tolist():
-        if k == 0 or bad[k] or (k > 1 and bad[k - 1]):
-            continue
-        best, chosen = 0.0, 0
-        for width in (1, 2, 3):
-            end = k + width
-            if end >= n:
-                break
-            # Innovations k..end with the samples k..end-1 out: one remains, the
-            # way from k-1 to end in width + 1 steps.
-            run, weight = 0.0, 0.0
-            for j in range(width + 1):
-                power = float(np.prod(phi[k + j + 1:end + 1]))
-                run += power * float(z[k + j])
-                weight += power * power
-            before = float((z[k:end + 1] ** 2).sum())
-            # Each sample taken out has cost its own share of prior and size.
-            gain = 0.5 * (before - run * run / weight) - each * width
-            if gain > best:
-                best, chosen = gain, width
-        bad[k:k + chosen] = True
+    size = 0.5 * math.log1p(spread * spread / float(np.median(view.variance)))
+    begins, ends, gains = [], [], []
+    for width in (1, 2, 3):
+        first = np.arange(1, n - width)
+        # Innovations k..k+width with the samples k..k+width-1 out: one remains,
+        # the way from k-1 to k+width in width + 1 steps.
+        run, weight, power = z[first + width].copy(), np.ones(first.size), np.ones(first.size)
+        before = run**2
+        for j in range(width - 1, -1, -1):
+            power = power * phi[first + j + 1]
+            run += power * z[first + j]
+            weight += power * power
+            before += z[first + j] ** 2
+        price = width * size - math.log(share * lengths[width - 1])
+        gain = 0.5 * (before - run * run / weight) - price
+        good = np.flatnonzero(gain > 0.0)
+        begins.append(first[good])
+        ends.append(first[good] + width)
+        gains.append(gain[good])
+    return _best_runs(np.concatenate(begins), np.concatenate(ends), np.concatenate(gains), n)
+
+
+def _best_runs(begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64], gain: FloatArray, n: int
+               ) -> npt.NDArray[np.bool_]:
+    """Return the samples of the runs that gain most together (weighted interval scheduling)."""
+    order = np.argsort(end, kind='stable')
+    begin, end = begin[order], end[order]
+    # A run needs the innovations up to its end; how many runs end before each begins.
+    clear = np.searchsorted(end, begin, side='left').tolist()
+    best, taken = [0.0], []
+    for value, k in zip(gain[order].tolist(), clear, strict=True):
+        taken.append(best[k] + value > best[-1])
+        best.append(max(best[k] + value, best[-1]))
+    bad = np.zeros(n, dtype=np.bool_)
+    at = len(taken)
+    while at > 0:
+        if taken[at - 1]:
+            bad[begin[at - 1]:end[at - 1]] = True
+            at = clear[at - 1]
+        else:
+            at -= 1
     return bad

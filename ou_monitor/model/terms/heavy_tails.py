@@ -55,7 +55,8 @@ class HeavyTails(Term):
         unit = scale * math.sqrt((dof - 2.0) / dof)
         scores = np.where(view.z < 0.0, normal_scores(stdtr(dof, view.z / unit)),
                           -normal_scores(stdtr(dof, -view.z / unit)))
-        return LawFit(cls(dof), {'dof': dof * float(curvature_se(value, x)[0])}, scores, gain, 2)
+        return LawFit(cls(dof), {'dof': dof * float(curvature_se(value, x)[0])}, scores, gain, 2,
+                      power=unit * unit * (dof + (view.z / unit) ** 2) / (dof + 1.0))
 
 
 def _log_t(z: FloatArray, dof: float, scale: float) -> FloatArray:

@@ -17,6 +17,8 @@ from scipy.special import ndtr
 
 # Events drawn for one stretch at most: bounds time and memory.
 _MOST = 5_000_000
+# Share of samples with a jump in them from which jumps cannot be told apart.
+_OFTEN = 0.05
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,9 @@ class Jumps(Term):
         if found is None:
             return None
         share, mean, spread, unit = found
+        if share > _OFTEN:
+            # So many are no events: the noise itself is of another law.
+            return None
         log_calm, log_jump = _parts(z, var, share, mean, spread, unit)
         both = np.logaddexp(log_calm, log_jump)
         jumped = np.exp(log_jump - both)

@@ -28,7 +28,9 @@ def lines_at(view: View) -> list[float]:
         Hz, strongest first, refined to a small part of a bin.
 
     """
-    z = view.z[view.train]
+    # All of them: a line may have begun late, and its frequency is no parameter of
+    # a likelihood, but pays for its search.
+    z = view.z
     if z.size < 32:
         return []
     power = np.abs(np.fft.rfft(z, 2 * z.size)) ** 2
@@ -46,10 +48,13 @@ def lines_at(view: View) -> list[float]:
     return found
 
 
-def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float
-             ) -> tuple[FloatArray, FloatArray, FloatArray]:
+def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
+             lag: float = 0.0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """
     Return two states that turn, die out and are driven, as `Term.block`.
+
+    The first has the autocovariance std^2 exp(-damping t) (cos + lag sin) of the
+    angle turned in t.
 
     Parameters
     ----------
@@ -60,7 +65,9 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float
     step : ndarray, shape (n,)
         Steps, s; infinite before the first sample.
     std : float
-        Standard deviation of either, V.
+        Standard deviation of the first, V.
+    lag : float
+        Share of the sine; of the size of damping over angular frequency at most.
 
     Returns
     -------
@@ -75,7 +82,11 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float
     f[:, 0, 0] = f[:, 1, 1] = shrink * np.cos(turn)
     f[:, 1, 0] = shrink * np.sin(turn)
     f[:, 0, 1] = -f[:, 1, 0]
-    q[:, 0, 0] = q[:, 1, 1] = std * std * -np.expm1(-2.0 * damping * step)
+    if lag == 0.0:
+        q[:, 0, 0] = q[:, 1, 1] = std * std * -np.expm1(-2.0 * damping * step)
+    else:
+        own = np.array([[1.0, -lag], [-lag, 1.0 + 2.0 * lag * lag]])
+        q[:] = std * std * (own - f @ own @ f.transpose(0, 2, 1))
     return f, q, np.array([1.0, 0.0])
 
 
@@ -160,12 +171,14 @@ def order_power(z: FloatArray, u: FloatArray, rate: float) -> tuple[float, float
     count = z.size // _length(rate)
     # A mean of `count` exponentials, about; its tail by the Cramer bound.
     mean = best[0][0]
-    rise = count * _EFFECTIVE * (mean - 1.0 - math.log(max(mean, 1e-9)))
-    return rise, 2.0 * _length(rate) * len(best)
+    rise = count * (mean - 1.0 - math.log(max(mean, 1e-9)))
+    return rise, _INDEPENDENT * 2.0 * _length(rate) * len(best)
 
 
-# Share of stretches that count as independent: a window of Hann, zero-padded once.
-_EFFECTIVE = 1.0
+# Share of the lines looked at that are as good as independent: neighbours share
+# most of their bins.  Found by simulation: of 120 flights of white noise 5 % were
+# to exceed the 95 % point, and 1 did.
+_INDEPENDENT = 0.02
 
 
 def _length(rate: float) -> int:
@@ -181,7 +194,8 @@ def _hough(z: FloatArray, u: FloatArray, rate: float) -> list[tuple[float, float
         return []
     shape = z[:count * length].reshape(count, length)
     power = np.abs(np.fft.rfft(shape * np.hanning(length), 2 * length, axis=1)) ** 2
-    power /= power.mean()
+    # What every stretch has at a frequency does not follow throttle.
+    power = (power / power.mean(axis=0)).astype(np.float32)
     load = u[:count * length].reshape(count, length).mean(axis=1)
     width = rate / (2.0 * length)
     bins = power.shape[1] - 1
@@ -189,12 +203,13 @@ def _hough(z: FloatArray, u: FloatArray, rate: float) -> list[tuple[float, float
     best: list[tuple[float, float, float]] = []
     reach = 0.6 * 0.5 * rate
     flat = power.ravel()
-    row = np.arange(count)[:, None] * power.shape[1]
+    row = (np.arange(count) * power.shape[1])[:, None]
+    fold = np.abs((np.arange(4 * bins) + bins) % (2 * bins) - bins)
     for slope in np.arange(-reach, reach, 2.0 * width / np.ptp(load)):
         shift = np.rint(slope * load / width).astype(np.int64)
         # Beyond the Nyquist frequency a line comes back.
-        at = np.abs((idles[None, :] + shift[:, None] + bins) % (2 * bins) - bins)
-        total = flat[row + at].mean(axis=0)
+        at = fold[idles[None, :] + (shift % (2 * bins))[:, None]]
+        total = flat.take(row + at).mean(axis=0)
         k = int(np.argmax(total))
         best.append((float(total[k]), float(idles[k] * width), float(slope)))
     best.sort(reverse=True)

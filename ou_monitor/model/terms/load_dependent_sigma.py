@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+import math
 from typing import ClassVar
 
 import numpy as np
 
 from ou_monitor.model.terms.term import Effect, parameters, Role, Stage, Stretch, Term, View
+from ou_monitor.records import FloatArray
 
 
 @dataclass(frozen=True)
@@ -61,13 +63,48 @@ class LoadDependentSigma(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return knots over the range of the throttle, level."""
+        """Return the likelier two of: a straight line, a step, knots by share and by range."""
         if view.throttle is None:
             return ()
-        knots = np.unique(np.round(np.quantile(view.throttle[view.train],
-                                               [0.01, 0.25, 0.5, 0.75, 0.99]), 4))
-        keep = [float(knots[0])]
-        for knot in knots[1:]:
-            if knot - keep[-1] > 0.02:
-                keep.append(float(knot))
-        return (cls(tuple(keep), (0.0,) * len(keep)),) if len(keep) > 1 else ()
+        u = view.throttle[view.train]
+        square = view.z[view.train] ** 2
+        low, high = np.quantile(u, [0.01, 0.99])
+        if high - low < _APART:
+            return ()
+        inner = np.quantile(u, np.linspace(0.05, 0.95, 91))
+        forms = [np.array([low, high]), np.quantile(u, [0.01, 0.25, 0.5, 0.75, 0.99]),
+                 np.linspace(low, high, 9),
+                 *(np.array([at - _EDGE, at + _EDGE]) for at in np.unique(inner))]
+        made = [_to_squares(square, u, _spaced(knots)) for knots in forms]
+        price = 0.5 * math.log(u.size)
+        made.sort(key=lambda pair: pair[1] - price * len(pair[0][0]), reverse=True)
+        return [cls(knots, factors) for (knots, factors), _ in made[:2]]
+
+
+# Knots nearer than this are one, and half the width of a step, in throttle.
+_APART, _EDGE = 0.02, 0.002
+
+
+def _spaced(knots: FloatArray) -> FloatArray:
+    """Return knots that are apart; of a step both."""
+    if knots.size == 2:
+        return knots
+    keep = [float(knots[0])]
+    for knot in knots[1:].tolist():
+        if knot - keep[-1] > _APART:
+            keep.append(knot)
+    return np.array(keep)
+
+
+def _to_squares(square: FloatArray, u: FloatArray, knots: FloatArray
+                ) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], float]:
+    """Return knots with factors that fit squares of scores, and the log-likelihood of these."""
+    near = np.eye(knots.size)
+    factors = []
+    for k in range(knots.size):
+        weight = np.interp(u, knots, near[k])
+        factors.append(0.5 * math.log(max(float(weight @ square), 1e-9)
+                                      / max(float(weight.sum()), 1e-9)))
+    log = np.interp(u, knots, factors)
+    value = float((-log - 0.5 * square * np.exp(-2.0 * log)).sum())
+    return (tuple(knots.tolist()), tuple(f - factors[0] for f in factors)), value

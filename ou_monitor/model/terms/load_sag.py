@@ -8,12 +8,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.term import (
+    Effect, NEXT_TO_ZERO, parameter, Role, Stage, Stretch, Term, View)
 
 
 @dataclass(frozen=True)
 class LoadSag(Term):
-    """Subtract linear * throttle + square * throttle^2 from the level."""
+    """
+    Subtract linear * throttle + square * throttle^2 from the level.
+
+    A square of exactly 0 stands for a straight line, in a fit too.
+    """
 
     NAME: ClassVar[str] = 'load_sag'
     FAMILY: ClassVar[str] = 'load'
@@ -26,6 +31,11 @@ class LoadSag(Term):
     linear: float = parameter('V', 'fall at full throttle, linear part')
     square: float = parameter('V', 'fall at full throttle, square part')
 
+    def check(self) -> None:
+        """Leave the square out of a fit where it is 0."""
+        if self.square == 0.0:
+            object.__setattr__(self, 'LINEAR', ('linear',))
+
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
         def effect(s: Stretch) -> None:
@@ -35,5 +45,5 @@ class LoadSag(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the one there is: it is linear."""
-        return (cls(0.0, 0.0),)
+        """Return a straight line and a parabola."""
+        return cls(0.0, 0.0), cls(0.0, NEXT_TO_ZERO)

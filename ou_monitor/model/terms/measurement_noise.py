@@ -21,7 +21,7 @@ class MeasurementNoise(Term):
     STAGE: ClassVar[Stage] = Stage.SENSOR
     ROLE: ClassVar[Role] = Role.NOISE
     FREE: ClassVar[tuple[str, ...]] = ('std',)
-    SIGNS: ClassVar[tuple[str, ...]] = ('autocorrelation', 'band')
+    SIGNS: ClassVar[tuple[str, ...]] = ('-autocorrelation', '+band')
 
     std: float = parameter('V', 'standard deviation', 0.0)
 

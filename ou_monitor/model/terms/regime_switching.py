@@ -11,9 +11,11 @@ import numpy as np
 from ou_monitor.model.hidden_chain import forward
 from ou_monitor.model.terms.laws import (
     climb, curvature_se, log_normal, mixture_cdf, normal_scores)
+from ou_monitor.model.terms.recursion import first_order
 from ou_monitor.model.terms.term import (
     Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
 from ou_monitor.records import FloatArray
+from scipy.linalg import expm
 
 
 # Events drawn for one stretch at most: bounds time and memory.
@@ -23,8 +25,9 @@ _MOST = 5_000_000
 @dataclass(frozen=True)
 class RegimeSwitching(Term):
     """
-    Switch between two states; in the second, add a level and multiply sigma.
+    Switch between two or three states; each adds a level and multiplies sigma once more.
 
+    From any state to any higher one at `rate_up`, to any lower one at `rate_down`.
     Exact in law: the instants of switching are drawn, and sigma is integrated over
     the part of a step that it holds for.
     """
@@ -33,52 +36,67 @@ class RegimeSwitching(Term):
     FAMILY: ClassVar[str] = 'switching'
     STAGE: ClassVar[Stage] = Stage.DRIVE
     ROLE: ClassVar[Role] = Role.LAW
-    SIGNS: ClassVar[tuple[str, ...]] = ('clustering', 'kurtosis', 'band')
+    DEAR: ClassVar[bool] = True
+    SIGNS: ClassVar[tuple[str, ...]] = (
+        '+clustering', '+kurtosis', '+band 0', '+band 1', '+band 2', '+band 3')
 
-    rate_up: float = parameter('1/s', 'rate of going into the second state', 0.0, above=True)
-    rate_down: float = parameter('1/s', 'rate of leaving it', 0.0, above=True)
-    level: float = parameter('V', 'what the second state adds to the level')
-    sigma_ratio: float = parameter('', 'sigma in the second state / in the first', 0.0)
+    rate_up: float = parameter('1/s', 'rate of going to each higher state', 0.0, above=True)
+    rate_down: float = parameter('1/s', 'rate of going to each lower state', 0.0, above=True)
+    level: float = parameter('V', 'what each further state adds to the level')
+    sigma_ratio: float = parameter('', 'sigma in a state / in the one below', 0.0)
+    at_once: float = parameter(
+        '', 'share of the level that comes at once; the rest at the rate alpha', 0.0, 1.0)
+    states: float = parameter('', 'number of states, 2 or 3', 2.0, 3.0)
+
+    def check(self) -> None:
+        """Check that states can be counted."""
+        if self.states not in (2.0, 3.0):
+            raise ValueError(f'{self.NAME}.states must be 2 or 3, got {self.states:g}')
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        waits = rng
-        up = False
+        count = int(self.states)
+        rates = _rates(self.rate_up, self.rate_down, count)
+        leave = rates.sum(axis=1)
+        now_in = 0
         next_at = math.nan
 
         def effect(s: Stretch) -> None:
-            nonlocal up, next_at
+            nonlocal now_in, next_at
             if math.isnan(next_at):
-                up = bool(rng.random() * (self.rate_up + self.rate_down) < self.rate_up)
-                next_at = float(s.at[0]) + waits.standard_exponential() / (
-                    self.rate_down if up else self.rate_up)
-            changes = 2.0 / (1.0 / self.rate_up + 1.0 / self.rate_down)
+                now_in = _pick(rng, _stationary(rates))
+                next_at = float(s.at[0]) + rng.standard_exponential() / leave[now_in]
+            changes = float(_stationary(rates) @ leave)
             if changes * (s.at[-1] - next_at) > _MOST:
                 raise ValueError(f'{self.NAME}: {changes:g} changes a second are more than '
                                  f'{_MOST} in one stretch of samples; so many are noise')
             times = []
-            states = [up]
+            states = [now_in]
             while next_at <= s.at[-1]:
-                up = not up
+                now_in = 1 - now_in if count == 2 else _pick(rng, rates[now_in])
                 times.append(next_at)
-                states.append(up)
-                next_at += waits.standard_exponential() / (self.rate_down if up else self.rate_up)
+                states.append(now_in)
+                next_at += rng.standard_exponential() / leave[now_in]
             when = np.array(times)
             seen = np.array(states, dtype=np.float64)
             # The state at each sample, and at the begin of each step.
             now = seen[np.searchsorted(when, s.at, side='right')]
             before = np.concatenate(([seen[0]], now[:-1]))
-            s.level += self.level * now
-            more = self.sigma_ratio * self.sigma_ratio - 1.0
-            if more == 0.0:
-                return
-            factor = 1.0 + more * before
+            s.level += self.at_once * self.level * now
             # What is left of a change within a step: the share of the step's
-            # noise that comes after it.
+            # pull, and of its noise, that comes after it.
             k = np.searchsorted(s.at, when)
+            slow = (1.0 - self.at_once) * self.level
+            if slow != 0.0:
+                push = before * -np.expm1(-s.alpha * s.step)
+                np.add.at(push, k, -np.expm1(-s.alpha[k] * (s.at[k] - when)) * np.diff(seen))
+                s.push += slow * push
+            if self.sigma_ratio == 1.0:
+                return
+            factor = self.sigma_ratio ** (2.0 * before)
             share = np.expm1(-2.0 * s.alpha[k] * (s.at[k] - when)) / np.expm1(
                 -2.0 * s.alpha[k] * s.step[k])
-            np.add.at(factor, k, more * share * np.diff(seen))
+            np.add.at(factor, k, share * np.diff(self.sigma_ratio ** (2.0 * seen)))
             s.power *= np.maximum(factor, 0.0)
 
         return effect
@@ -86,69 +104,158 @@ class RegimeSwitching(Term):
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Fit a hidden chain of two states that share a level and a scale."""
-        best: tuple[float, FloatArray] | None = None
+        best: tuple[float, FloatArray, float] | None = None
         z, phi = view.z[view.train], view.phi[view.train]
         spread = math.sqrt(float(np.mean(view.residual[view.train] ** 2)))
         unit = math.sqrt(float(np.median(view.variance)))
         step = 1.0 / view.rate
-        # States that last a few samples only are glitches, or another law.
-        fastest = math.log(min(_FASTEST, view.rate / 20.0))
+        z, phi = z[:_SHORT], phi[:_SHORT]
 
-        def value(x: FloatArray, most: int = 1 << 40) -> float:
-            if max(x[0], x[1]) > fastest or min(x[0], x[1]) < -12.0 or abs(x[3]) > 3.0 or (
-                    abs(x[4]) > 2.0):
+        def value(x: FloatArray) -> float:
+            if not _inside(x, view):
                 return -math.inf
-            return float(_chain(z[:most], phi[:most], step, x)[1].sum())
+            return float(_chain(z, phi, step, x, once)[1].sum())
 
         # Coordinates: ln rates, level in innovations, ln sigma ratio, ln scale.
-        for dwell in (5.0 * math.exp(-fastest), 50.0 * math.exp(-fastest)):
-            for level, ratio in ((0.0, 0.7), (spread / unit, 0.0)):
+        shortest = math.exp(-_fastest(view))
+        for dwell in (5.0 * shortest, 50.0 * shortest):
+            for level, ratio, once in ((0.0, 0.7, 1.0), (spread / unit, 0.0, 1.0),
+                                       (spread / unit, 0.0, 0.0)):
                 rate = -math.log(dwell)
-                x, top = climb(lambda p: value(p, _SHORT),
-                               [rate, rate, level, ratio, -0.3 * ratio], most=50)
+                x, top = climb(value, [rate, rate, level, ratio, -0.3 * ratio], most=40)
                 if best is None or top > best[0]:
-                    best = top, x
+                    best = top, x, once
         if best is None:
             return None
-        x, _ = climb(lambda p: value(p, _LONG), best[1], size=0.2, most=80)
-        before, density, mean, std = _chain(view.z, view.phi, step, x)
-        weight = before[:, :, None] * _transition(x, step)
-        scores = normal_scores(mixture_cdf(view.z, weight.reshape(-1, 4),
-                                           mean.reshape(-1, 4), std.reshape(-1, 4)))
-        term = cls(math.exp(x[0]), math.exp(x[1]), float(x[2]) * unit, math.exp(x[3]))
+        two = cls._finished(view, best[1], best[2], 80)
+        if two is None:
+            return None
+        # Three states: of sigma, or of the level, whichever the two differ in.
+        x = np.array([0.0, 0.0, 0.0, 0.7, -0.7])
+        if two.power is None:
+            x = np.array(best[1]) * [1.0, 1.0, 0.6, 0.0, 1.0]
+        three = cls._finished(view, x, best[2], 90, 3)
+        part = slice(0, min(view.train.stop, _LONG))
+        if three is not None and float((three.gain - two.gain)[part].sum()) > _THIRD:
+            return three
+        return two
+
+    @classmethod
+    def refit_law(cls, view: View, near: Term) -> LawFit | None:
+        """Fit again, from where it was."""
+        assert isinstance(near, RegimeSwitching)
+        unit = math.sqrt(float(np.median(view.variance)))
+        ratio = math.log(max(near.sigma_ratio, 1e-2))
+        states = int(near.states)
+        law = _stationary(_rates(near.rate_up, near.rate_down, states))
+        # Such that the mean square is that of the scores.
+        square = float(law @ np.exp(2.0 * ratio * np.arange(states)))
+        scale = 0.5 * math.log(float(np.mean(view.z[view.train] ** 2)) / square)
+        return cls._finished(view, np.array([
+            math.log(near.rate_up), math.log(near.rate_down), near.level / unit, ratio,
+            scale]), near.at_once, 40, states)
+
+    @classmethod
+    def _finished(cls, view: View, start: FloatArray, at_once: float, most: int,
+                  states: int = 2) -> LawFit | None:
+        """Return the fit near a start."""
+        z, phi = view.z[view.train][:_LONG], view.phi[view.train][:_LONG]
+        step, unit = 1.0 / view.rate, math.sqrt(float(np.median(view.variance)))
+
+        def value(x: FloatArray) -> float:
+            if not _inside(x, view):
+                return -math.inf
+            return float(_chain(z, phi, step, x, at_once, states)[1].sum())
+
+        x, top = climb(value, start, size=0.2, most=most)
+        if top == -math.inf:
+            return None
+        before, density, mean, std = _chain(view.z, view.phi, step, x, at_once, states)
+        weight = before[:, :, None] * _transition(x, step, states)
+        pairs = states * states
+        scores = normal_scores(mixture_cdf(view.z, weight.reshape(-1, pairs),
+                                           mean.reshape(-1, pairs), std.reshape(-1, pairs)))
+        term = cls(math.exp(x[0]), math.exp(x[1]), float(x[2]) * unit, math.exp(x[3]),
+                   at_once, float(states))
         e = curvature_se(value, x)
         se = {'rate_up': term.rate_up * float(e[0]), 'rate_down': term.rate_down * float(e[1]),
               'level': unit * float(e[2]), 'sigma_ratio': term.sigma_ratio * float(e[3])}
-        after = np.append(before[1:, 1], before[-1, 1])
-        offset = None if abs(x[2]) < _NO_LEVEL else term.level * (after - after.mean())
-        return LawFit(term, se, scores, density - log_normal(view.z), 5, offset=offset)
+        number = before @ np.arange(states)
+        after = np.append(number[1:], number[-1])
+        moved = term.level * (after - after.mean())
+        if at_once == 0.0:
+            moved = first_order(view.phi, (1.0 - view.phi) * moved, 0.0)
+        offset = None if abs(x[2]) < _NO_LEVEL else moved
+        # As known at each sample.
+        known = np.concatenate((before[1:], before[-1:]))
+        power = 1.0 / (known @ np.exp(-2.0 * (x[4] + x[3] * np.arange(states))))
+        return LawFit(term, se, scores, density - log_normal(view.z), 5,
+                      power=None if abs(x[3]) < _NO_RATIO else power, offset=offset)
 
 
 # Samples on which starts are tried, and on which the best is fitted.
 _SHORT, _LONG = 8000, 30000
 # Largest rate of switching, 1/s.
 _FASTEST = 30.0
+# Evidence from which there are three states, nats.
+_THIRD = 10.0
 # A level of fewer innovations than this is none.
 _NO_LEVEL = 0.2
+# A ratio of which the logarithm is less than this is 1.
+_NO_RATIO = 0.05
 
 
-def _transition(x: FloatArray, step: float) -> FloatArray:
-    up, down = math.exp(x[0]), math.exp(x[1])
-    total = up + down
-    move = -math.expm1(-total * step) / total
-    return np.array([[1.0 - up * move, up * move], [down * move, 1.0 - down * move]])
+def _fastest(view: View) -> float:
+    """Return the logarithm of the largest rate: states of a few samples are another law."""
+    return math.log(min(_FASTEST, view.rate / 20.0))
 
 
-def _chain(z: FloatArray, phi: FloatArray, step: float, x: FloatArray
-           ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _inside(x: FloatArray, view: View) -> bool:
+    """Return whether coordinates are in their range."""
+    return bool(max(x[0], x[1]) <= _fastest(view) and min(x[0], x[1]) >= -12.0
+                and abs(x[3]) <= 3.0 and abs(x[4]) <= 2.0)
+
+
+def _rates(up: float, down: float, states: int) -> FloatArray:
+    """Return the rates from each state to each other, 1/s; 0 on the diagonal."""
+    ones = np.ones((states, states))
+    return up * np.triu(ones, 1) + down * np.tril(ones, -1)
+
+
+def _stationary(rates: FloatArray) -> FloatArray:
+    """Return the stationary law of a chain."""
+    flow = np.vstack(((rates - np.diag(rates.sum(axis=1))).T / rates.max(),
+                      np.ones(rates.shape[0])))
+    law: FloatArray = np.linalg.lstsq(flow, np.eye(rates.shape[0] + 1)[-1], rcond=None)[0]
+    return law
+
+
+def _pick(rng: np.random.Generator, weight: FloatArray) -> int:
+    """Draw a number with the given weights."""
+    total = np.cumsum(weight)
+    return min(int(np.searchsorted(total, rng.random() * total[-1], side='right')),
+               weight.size - 1)
+
+
+def _transition(x: FloatArray, step: float, states: int) -> FloatArray:
+    rates = _rates(math.exp(x[0]), math.exp(x[1]), states)
+    moved: FloatArray = expm((rates - np.diag(rates.sum(axis=1))) * step)
+    return moved
+
+
+def _chain(z: FloatArray, phi: FloatArray, step: float, x: FloatArray, at_once: float,
+           states: int = 2) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the law of the state before each sample, densities, and what each pair expects."""
-    state = np.array([0.0, 1.0])
-    # The level enters the innovations where it changes, and a little while it is on.
-    mean = x[2] * (state[None, None, :] - phi[:, None, None] * state[None, :, None])
-    share = math.exp(x[1]) / (math.exp(x[0]) + math.exp(x[1]))
-    centre = x[2] * (1.0 - share) * (1.0 - phi)
+    state = np.arange(states, dtype=np.float64)
+    # The level enters the innovations where it changes, and a little while it is on;
+    # where it comes at the rate alpha, only the latter.
+    pull = 1.0 - phi[:, None, None]
+    mean = x[2] * (pull * state[None, :, None]
+                   + at_once * (state[None, None, :] - state[None, :, None]))
+    law = _stationary(_rates(math.exp(x[0]), math.exp(x[1]), states))
+    centre = x[2] * float(law @ state) * (1.0 - phi)
     mean = mean - centre[:, None, None]
     std = np.broadcast_to(math.exp(x[4]) * np.exp(x[3] * state)[None, None, :], mean.shape)
     log_density = log_normal(z[:, None, None], mean, std * std)
-    before, density = forward(log_density, _transition(x, step), np.array([share, 1.0 - share]))
+    before, density = forward(log_density, _transition(x, step, states), law)
     return before, density, mean, std

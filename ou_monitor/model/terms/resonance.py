@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import ClassVar
 
@@ -12,16 +12,19 @@ import numpy as np
 from ou_monitor.model.terms.lines import broad_peaks, rotation
 from ou_monitor.model.terms.recursion import first_order
 from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.tone import WIDEST
 from ou_monitor.records import FloatArray
 
 
 @dataclass(frozen=True)
 class Resonance(Term):
     """
-    Add the real part of a complex OU: noise with a rounded spectral line.
+    Add noise with a rounded spectral line.
 
-    Autocovariance std^2 exp(-damping |tau|) cos(2 pi frequency tau), exact in law at
-    any spacing.
+    Autocovariance std^2 exp(-damping |tau|) (cos(w |tau|) + tilt damping/w sin(w |tau|)),
+    w = 2 pi frequency; exact in law at any spacing.  tilt = 0 is the real part of a
+    complex OU, 1 the voltage of the capacitor of an LC filter (all of it below the
+    line), -1 that across its choke (none at 0 Hz).
     """
 
     NAME: ClassVar[str] = 'resonance'
@@ -29,12 +32,29 @@ class Resonance(Term):
     STAGE: ClassVar[Stage] = Stage.LEVEL
     ROLE: ClassVar[Role] = Role.BLOCK
     FREE: ClassVar[tuple[str, ...]] = ('frequency', 'damping', 'std')
-    SIGNS: ClassVar[tuple[str, ...]] = ('line', 'band')
+    DEAR: ClassVar[bool] = True
+    SIGNS: ClassVar[tuple[str, ...]] = ('line', '+band')
     SEARCH: ClassVar[float] = 5.0
 
     frequency: float = parameter('Hz', 'of the ringing', 0.0, above=True)
     damping: float = parameter('1/s', 'rate at which ringing dies out', 0.0, above=True)
     std: float = parameter('V', 'standard deviation', 0.0)
+    tilt: float = parameter('', 'slope of the spectrum: 1 low-pass, -1 band-pass', -1.0, 1.0)
+
+    def check(self) -> None:
+        """Fit the tilt where it is not 0."""
+        if self.tilt != 0.0:
+            object.__setattr__(self, 'FREE', ('frequency', 'damping', 'std', 'tilt'))
+
+    def moved(self, name: str, by: float) -> Resonance:
+        """Return the term with one coordinate moved: the tilt itself, logarithms else."""
+        if name != 'tilt':
+            return super().moved(name, by)
+        return replace(self, tilt=min(max(self.tilt + by, -_STEEPEST), _STEEPEST))
+
+    def per_coordinate(self, name: str) -> float:
+        """Return the derivative of a parameter with respect to its coordinate."""
+        return 1.0 if name == 'tilt' else super().per_coordinate(name)
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
@@ -44,8 +64,11 @@ class Resonance(Term):
             nonlocal before
             n = s.t.size
             pairs = rng.standard_normal((n, 2))
-            kicks = (pairs[:, 0] + 1j * pairs[:, 1]) * self.std * np.sqrt(
-                -np.expm1(-2.0 * self.damping * s.step))
+            q = self.block(s)[1]
+            low = np.sqrt(np.maximum(q[:, 0, 0], 0.0))
+            across = np.divide(q[:, 0, 1], low, out=np.zeros(n), where=low > 0.0)
+            rest = np.sqrt(np.maximum(q[:, 1, 1] - across * across, 0.0))
+            kicks = low * pairs[:, 0] + 1j * (across * pairs[:, 0] + rest * pairs[:, 1])
             # In a frame that turns along, it is an OU with a real rate.
             turn = np.exp(2j * math.pi * self.frequency * ((s.at - s.origin) % (
                 1.0 / self.frequency)))
@@ -62,15 +85,20 @@ class Resonance(Term):
     def candidates(cls, view: View) -> Sequence[Term]:
         """Return the broad peaks of what is left over."""
         spread = float(np.sqrt(np.median(view.variance)))
-        return [cls(frequency, width, 0.5 * spread)
-                for frequency, width in broad_peaks(view.z[view.train], view.rate)]
+        return [cls(frequency, width, 0.5 * spread, tilt)
+                for frequency, width in broad_peaks(view.z[view.train], view.rate)
+                for tilt in (0.0, -_STEEP, _STEEP)]
 
     def block(self, s: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return its two states, which turn."""
         turn = 2.0 * math.pi * self.frequency * np.where(np.isfinite(s.step), s.step, 0.0)
-        return rotation(turn, self.damping, s.step, self.std)
+        return rotation(turn, self.damping, s.step, self.std,
+                        self.tilt * self.damping / (2.0 * math.pi * self.frequency))
 
-    @property
-    def rings(self) -> bool:
-        """Whether it turns at all before it dies out."""
-        return self.damping < 2.0 * math.pi * self.frequency
+    def holds(self, view: View) -> bool:
+        """Return whether it turns before it dies out, and dies out sooner than a line does."""
+        return math.pi * WIDEST < self.damping < 2.0 * math.pi * self.frequency
+
+
+# Tilt to begin with, and at most: at 1 a step would add no noise in one direction.
+_STEEP, _STEEPEST = 0.9, 0.99

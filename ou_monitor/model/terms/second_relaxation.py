@@ -23,6 +23,7 @@ class SecondRelaxation(Term):
     STAGE: ClassVar[Stage] = Stage.LEVEL
     ROLE: ClassVar[Role] = Role.BLOCK
     FREE: ClassVar[tuple[str, ...]] = ('alpha', 'sigma')
+    DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('band', 'autocorrelation')
 
     alpha: float = parameter('1/s', 'its relaxation rate', 0.0, above=True)
@@ -45,7 +46,7 @@ class SecondRelaxation(Term):
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
         """Return poles slower and faster than that of the ou, of less variance."""
-        rate = -math.log(float(np.median(view.phi[1:]))) * view.rate
+        rate = -math.log(max(float(np.median(view.phi[1:])), 1e-300)) * view.rate
         spread = float(np.std(view.residual))
         slowest = 3.0 / float(view.at[-1])
         found = [cls(a, 0.5 * spread * math.sqrt(2.0 * a))

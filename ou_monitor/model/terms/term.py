@@ -87,6 +87,9 @@ class Stretch:
 
 Effect = Callable[[Stretch], None]
 
+# A coefficient to start from that is not left out as 0 is.
+NEXT_TO_ZERO = 1e-12
+
 
 class Role(enum.Enum):
     """How a term enters a likelihood."""
@@ -171,6 +174,9 @@ class LawFit:
         Variance that events add to the state, V^2.
     error : ndarray, shape (n,), or None
         Variance that events add to the measurement, V^2.
+    power : ndarray, shape (n,), or None
+        Factor on the variance of what the noise adds in the step before each
+        sample, as the law believes it was: the inverse of the mean precision.
     offset : ndarray, shape (n,), or None
         What the law believes to be added to the level, V: the Gaussian part
         is fitted to what is left without it.
@@ -184,6 +190,7 @@ class LawFit:
     free: int
     push: FloatArray | None = None
     error: FloatArray | None = None
+    power: FloatArray | None = None
     offset: FloatArray | None = None
 
 
@@ -239,9 +246,12 @@ class Term:
         Positive parameters found by maximum likelihood, on a log scale
         (`Role.DRIVE`, `BLOCK`, `NOISE`).
     SIGNS : tuple of str
-        Statistics that ask for this term, by the beginning of their names.
+        Statistics that ask for this term, by the beginning of their names,
+        after + or - where only one direction does.
     SEARCH : float
         Penalty for what is searched beside the free parameters, nats.
+    DEAR : bool
+        Whether a fit takes seconds, so that cheaper terms are tried first.
     MEANING : str
         One sentence for the report.
 
@@ -261,6 +271,7 @@ class Term:
     FREE: ClassVar[tuple[str, ...]] = ()
     SIGNS: ClassVar[tuple[str, ...]] = ()
     SEARCH: ClassVar[float] = 0.0
+    DEAR: ClassVar[bool] = False
     MEANING: ClassVar[str] = ''
 
     def __post_init__(self) -> None:
@@ -315,6 +326,10 @@ class Term:
 
         """
         return ()
+
+    def holds(self, view: View) -> bool:
+        """Return whether fitted parameters still mean what the name says; the default: yes."""
+        return True
 
     def beside(self, ou: Term) -> Term:
         """Return the `ou` that a fit with this term starts from; the default leaves it."""
@@ -405,6 +420,11 @@ class Term:
 
         """
         return None
+
+    @classmethod
+    def refit_law(cls, view: View, near: Term) -> LawFit | None:
+        """Fit the law again where `near` fits nearly the same scores; the default starts anew."""
+        return cls.fit_law(view)
 
     @classmethod
     def parameters(cls) -> tuple[str, ...]:

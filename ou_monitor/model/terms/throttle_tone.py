@@ -29,6 +29,7 @@ class ThrottleTone(Term):
     NEEDS_THROTTLE: ClassVar[bool] = True
     ROLE: ClassVar[Role] = Role.BLOCK
     FREE: ClassVar[tuple[str, ...]] = ('amplitude', 'linewidth')
+    DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('order', 'line')
     SEARCH: ClassVar[float] = 9.0
 
@@ -67,6 +68,11 @@ class ThrottleTone(Term):
         return [cls(0.3 * spread, idle, slope, 0.0, 0.05)
                 for idle, slope in order_lines(view) if abs(slope) > moving]
 
+    def holds(self, view: View) -> bool:
+        """Return whether throttle moves the line by more than it is wide."""
+        return view.throttle is not None and (
+            abs(self.slope) * float(view.throttle[view.train].std()) > _MORE * self.linewidth)
+
     def block(self, s: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return its two states, which turn as throttle says."""
         step = np.where(np.isfinite(s.step), s.step, 0.0)
@@ -77,5 +83,7 @@ class ThrottleTone(Term):
 
 # Lines that throttle moves by fewer than this many widths of a bin are tones.
 _MOVES = 30.0
+# What throttle moves it by, of a standard deviation, in widths of the line.
+_MORE = 2.0
 # A line narrower than this would be no noise at all, Hz.
 _NARROWEST = 1e-4

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.lines import lines_at
+from ou_monitor.model.terms.lines import lines_at, rotation
 from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray
 
@@ -36,6 +36,13 @@ class Tone(Term):
     phase: float = parameter('rad', 'phase at the first sample')
     linewidth: float = parameter('Hz', 'width of the line; 0: a pure tone', 0.0)
 
+    def check(self) -> None:
+        """Take a line that wanders as two states, not as known columns."""
+        if self.linewidth > 0.0:
+            object.__setattr__(self, 'ROLE', Role.BLOCK)
+            object.__setattr__(self, 'LINEAR', ())
+            object.__setattr__(self, 'FREE', ('amplitude', 'frequency', 'linewidth'))
+
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
         wander = 0.0
@@ -55,8 +62,19 @@ class Tone(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the strongest lines of what is left over."""
-        return [cls(0.0, f, 0.0, 0.0) for f in lines_at(view)]
+        """Return the strongest lines of what is left over, and the first of them wandering."""
+        found = [cls(0.0, f, 0.0, 0.0) for f in lines_at(view)]
+        spread = math.sqrt(float(np.median(view.variance)))
+        return [*found, *(cls(0.3 * spread, line.frequency, 0.0, _WANDERS) for line in found[:1])]
+
+    def holds(self, view: View) -> bool:
+        """Return whether it is a line, not ringing."""
+        return self.linewidth < min(WIDEST, _SHARP * self.frequency)
+
+    def block(self, s: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the two states of a line that wanders, which turn."""
+        turn = 2.0 * math.pi * self.frequency * np.where(np.isfinite(s.step), s.step, 0.0)
+        return rotation(turn, math.pi * self.linewidth, s.step, self.amplitude / math.sqrt(2.0))
 
     def columns(self, s: Stretch) -> FloatArray:
         """Return the line in phase and in quadrature."""
@@ -75,3 +93,9 @@ class Tone(Term):
     def with_linear(self, beta: Sequence[float]) -> Tone:
         """Return the line with these coefficients."""
         return replace(self, amplitude=math.hypot(*beta), phase=math.atan2(beta[1], beta[0]))
+
+
+# Linewidth to start from, Hz, and that from which a line is ringing that dies out.
+_WANDERS, WIDEST = 0.3, 2.0
+# Width of the widest line, in frequencies.
+_SHARP = 0.05

@@ -24,6 +24,7 @@ class Volatility(Term):
     FAMILY: ClassVar[str] = 'intensity'
     STAGE: ClassVar[Stage] = Stage.DRIVE
     ROLE: ClassVar[Role] = Role.LAW
+    DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('clustering', 'kurtosis')
 
     std: float = parameter('', 'standard deviation of ln sigma', 0.0)
@@ -46,28 +47,75 @@ class Volatility(Term):
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Fit a log-variance that wanders, taken as constant over short stretches."""
-        z, step = view.z, 1.0 / view.rate
-        size = max(1, z.size // _STRETCHES)
-        squares = np.add.reduceat(z * z, np.arange(0, z.size, size))
-        sizes = np.diff(np.append(np.arange(0, z.size, size), z.size)).astype(np.float64)
+        return cls._climbed(view, _start(view), 60)
+
+    @classmethod
+    def refit_law(cls, view: View, near: Term) -> LawFit | None:
+        """Fit again, from where it was."""
+        assert isinstance(near, Volatility)
+        return cls._climbed(view, np.array([
+            math.log(max(near.std, 1e-3)), math.log(near.rate), _start(view)[2]]), 30)
+
+    @classmethod
+    def _climbed(cls, view: View, start: FloatArray, most: int) -> LawFit | None:
+        """Return the fit near a start."""
+        size, squares, sizes = _stretches(view)
+        span = size / view.rate
         trained = view.train.stop // size
 
         def value(x: FloatArray) -> float:
             if not (-4.0 < x[0] < 1.0 and -7.0 < x[1] < 5.0):
                 return -math.inf
-            return float(_grid(squares[:trained], sizes[:trained], size * step, x)[1].sum())
+            return float(_grid(squares[:trained], sizes[:trained], span, x)[1].sum())
 
-        x, _ = max((climb(value, [math.log(0.3), math.log(rate), 0.0], most=20)
-                    for rate in (0.1, 1.0)), key=lambda pair: pair[1])
-        x, _ = climb(value, x, size=0.2, most=50)
-        before, density, levels = _grid(squares, sizes, size * step, x)
-        scores = _scores(z, before, levels, size)[:z.size]
-        base = -0.5 * squares
-        gain = np.repeat((density - base) / sizes, size)[:z.size]
+        x, top = climb(value, start, size=0.25, most=most)
+        if top == -math.inf:
+            return None
+        before, density, levels = _grid(squares, sizes, span, x)
+        scores = _scores(view.z, before, levels, size)[:view.z.size]
+        gain = np.repeat((density + 0.5 * squares) / sizes, size)[:view.z.size]
         e = curvature_se(value, x)
         term = cls(math.exp(x[0]), math.exp(x[1]))
+        # As known at the end of each stretch.
+        log = np.log(np.maximum(before, 1e-300)) - sizes[:, None] * levels - 0.5 * squares[
+            :, None] * np.exp(-2.0 * levels)
+        weight = np.exp(log - log.max(axis=1)[:, None])
+        power = weight.sum(axis=1) / (weight @ np.exp(-2.0 * levels))
         return LawFit(term, {'std': term.std * float(e[0]), 'rate': term.rate * float(e[1])},
-                      scores, gain, 3)
+                      scores, gain, 3, power=np.repeat(power, size)[:view.z.size])
+
+
+def _stretches(view: View) -> tuple[int, FloatArray, FloatArray]:
+    """Return samples in a stretch, the sums of squares, and what each stretch really has."""
+    n = view.z.size
+    size = max(1, n // _STRETCHES)
+    begin = np.arange(0, n, size)
+    return size, np.add.reduceat(view.z * view.z, begin), np.diff(
+        np.append(begin, n)).astype(np.float64)
+
+
+def _start(view: View) -> FloatArray:
+    """
+    Return std, rate and mean of ln sigma, as `_grid` has them, by moments.
+
+    The logarithm of the mean of m squares is 2 ln sigma and an error that does
+    not depend on its neighbours; so the covariances at two lags tell variance
+    and rate.
+    """
+    size, squares, sizes = _stretches(view)
+    log = 0.5 * np.log(np.maximum(squares / sizes, 1e-12))[:max(view.train.stop // size, 2)]
+    c = log - log.mean()
+
+    def covariance(lag: int) -> float:
+        return float(np.mean(c[lag:] * c[:-lag]))
+
+    near = max(covariance(1), 1e-3)
+    # Where a good part of it is gone: there the rate is told best.
+    lags = [1 << k for k in range(1, 11) if 1 << k < c.size // 4]
+    far = next((lag for lag in lags if covariance(lag) < 0.6 * near), lags[-1] if lags else 0)
+    fall = math.log(near / max(covariance(far), 0.05 * near)) if far else 1.0
+    rate = max(fall, 0.02) / (max(far - 1, 1) * size / view.rate)
+    return np.array([0.5 * math.log(near), min(math.log(rate), 4.0), float(log.mean())])
 
 
 def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) -> FloatArray:
@@ -84,15 +132,18 @@ def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) ->
     return normal_scores(chance.ravel())
 
 
-# Stretches that a recording is cut into, and levels of ln sigma.
+# Stretches that a recording is cut into, levels of ln sigma and how many standard
+# deviations they reach (it may go beyond all that the fit has seen), products between
+# two scalings: few, for a stretch can be unlikely at all levels but one.
 _STRETCHES = 1500
-_LEVELS = 31
+_LEVELS, _REACH = 41, 4.0
+_EVERY = 4
 
 
 def _grid(squares: FloatArray, sizes: FloatArray, span: float, x: FloatArray
           ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the law of the level before each stretch, its log density, and the levels."""
-    nodes = np.linspace(-2.8, 2.8, _LEVELS)
+    nodes = np.linspace(-_REACH, _REACH, _LEVELS)
     levels = x[2] + math.exp(x[0]) * nodes
     keep = math.exp(-math.exp(x[1]) * span)
     kernel = np.exp(-0.5 * (nodes[None, :] - keep * nodes[:, None]) ** 2
@@ -104,11 +155,10 @@ def _grid(squares: FloatArray, sizes: FloatArray, span: float, x: FloatArray
     top = log_density.max(axis=1)
     weight = np.exp(log_density - top[:, None])
     before = np.empty((squares.size, _LEVELS))
-    density = np.empty(squares.size)
-    for k in range(squares.size):
+    for k, row in enumerate(weight):
         before[k] = law
-        law = law * weight[k]
-        total = law.sum()
-        density[k] = total
-        law = (law / total) @ kernel
-    return before, np.log(density) + top, levels
+        law = (law * row) @ kernel
+        if k % _EVERY == 0:
+            law /= law.sum()
+    before /= before.sum(axis=1, keepdims=True)
+    return before, np.log((before * weight).sum(axis=1)) + top, levels

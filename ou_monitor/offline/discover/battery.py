@@ -49,7 +49,7 @@ class Scene:
     rate: float
 
 
-def statistics(z: FloatArray, scene: Scene) -> dict[str, float]:
+def statistics(z: FloatArray, scene: Scene, *, lines: bool = True) -> dict[str, float]:
     """
     Return all statistics.
 
@@ -59,6 +59,8 @@ def statistics(z: FloatArray, scene: Scene) -> dict[str, float]:
         Normal scores.
     scene : Scene
         What they are held against.
+    lines : bool
+        Whether to look for lines that follow throttle.
 
     Returns
     -------
@@ -66,20 +68,47 @@ def statistics(z: FloatArray, scene: Scene) -> dict[str, float]:
         Name to value, about N(0, 1) when the model is right.
 
     """
-    return dict(_all(z, scene))
+    return dict(_all(z, scene, lines))
 
 
-def _all(z: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
+def is_sign(sign: str, name: str, value: float) -> bool:
+    """
+    Return whether a statistic is what a sign means.
+
+    Parameters
+    ----------
+    sign : str
+        Beginning of a name, after + or - where one direction counts only.
+    name : str
+        Of the statistic.
+    value : float
+        Of the statistic.
+
+    Returns
+    -------
+    bool
+        Whatever the size of the value.
+
+    """
+    if sign[0] in '+-':
+        return name.startswith(sign[1:]) and (value > 0.0) == (sign[0] == '+')
+    return name.startswith(sign)
+
+
+def _all(z: FloatArray, scene: Scene, lines: bool) -> Iterator[tuple[str, float]]:
     # The scores of a far outlier must not rule all that is not about outliers.
     w = np.clip(z, -5.0, 5.0)
     square = np.minimum(z * z, 25.0) - 1.0
     square -= square.mean()
     yield from _correlations(w)
     yield from _spectrum(w, scene)
+    if lines and scene.throttle is not None:
+        yield 'order line', _order(w, scene)
     yield from _moments(z)
     yield from _clustering(square, scene)
     yield from _inputs(w, square, scene)
     yield from _state(w, square, scene)
+    yield from _beyond_second_order(w, scene)
 
 
 def _score(a: FloatArray, b: FloatArray) -> float:
@@ -116,8 +145,6 @@ def _spectrum(w: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
             yield f'band {k}, {_hertz(a, n, scene)} to {_hertz(b, n, scene)} Hz', value
     # The highest of many exponentials: its chance, as a normal score.
     yield 'line', _gumbel(float(power[3:].max()), power.size - 3)
-    if scene.throttle is not None:
-        yield 'order line', _order(w, scene)
 
 
 def _hertz(bin_: int, n: int, scene: Scene) -> str:
@@ -215,6 +242,37 @@ def _state(w: FloatArray, square: FloatArray, scene: Scene) -> Iterator[tuple[st
     if scene.throttle is not None:
         u = scene.throttle - scene.throttle.mean()
         yield 'state throttle', _score(w, x * u - float((x * x * u).mean()) * x)
+
+
+# Samples in a stretch whose spectrum is looked at, and lags of products of three.
+_STRETCHES, _TRIPLES = (32, 128, 512), 10
+
+
+def _beyond_second_order(w: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
+    """Yield what a spectrum does not show: power that comes and goes, and products of three."""
+    n = w.size
+    for length in _STRETCHES:
+        count = n // length
+        if count < 16:
+            break
+        rows = w[:count * length].reshape(count, length) * np.hanning(length)
+        power = np.abs(np.fft.rfft(rows, axis=1)[:, 1:-1]) ** 2
+        power /= power.mean(axis=0)
+        # Exponentials: mean square 2, of variance 20.
+        value = (float((power * power).mean()) - 2.0) * math.sqrt(power.size / 20.0)
+        yield f'bursts within {length / scene.rate:.2g} s', value
+    if n > 4 * _TRIPLES:
+        # Hinich, J. Nonparametr. Stat. 6 (1996) 205.
+        c = (w - w.mean()) / float(w.std())
+        total, count = 0.0, 0
+        for j in range(1, _TRIPLES):
+            pair = c[j:] * c[:-j]
+            for k in range(j + 1, _TRIPLES + 1):
+                third = float(pair[k - j:] @ c[:n - k])
+                total += third * third / (n - k)
+                count += 1
+        yield 'products of three', ((total / count) ** (1.0 / 3.0) - 1.0 + 2.0 / (9.0 * count)
+                                    ) * math.sqrt(9.0 * count / 2.0)
 
 
 def _mean_score(a: FloatArray) -> float:

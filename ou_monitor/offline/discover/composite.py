@@ -9,7 +9,7 @@ extra variance, and both are fitted again.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -22,6 +22,10 @@ from ou_monitor.records import FloatArray
 
 # Rounds between events and the Gaussian part.
 _ROUNDS = 3
+# Factors on the noise at most and at least, and how alike they are when they count
+# as found again: the mean of their logarithms.
+_POWERS = 1e-3, 1e3
+_ALIKE = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +78,8 @@ class Composite:
 
 
 def fit_composite(samples: Samples, terms: Sequence[Term], part: slice,
-                  known: Composite | None = None, *, whole_mean: bool = False
-                  ) -> Composite | None:
+                  known: Composite | None = None, *, whole_mean: bool = False,
+                  rough: bool = False) -> Composite | None:
     """
     Fit a model.
 
@@ -88,10 +92,13 @@ def fit_composite(samples: Samples, terms: Sequence[Term], part: slice,
     part : slice
         What the fit may see.
     known : Composite, optional
-        A model with the same laws, whose events are taken as they are.
+        A model to begin with; of one with the same laws the events are taken
+        as they are.
     whole_mean : bool
         Whether the coefficients of the mean may see everything (to name a
         cause), or only the part (to measure a gain).
+    rough : bool
+        Whether some thousand samples will do where all of them take long.
 
     Returns
     -------
@@ -100,29 +107,34 @@ def fit_composite(samples: Samples, terms: Sequence[Term], part: slice,
 
     """
     structural = [term for term in terms if term.ROLE is not Role.LAW]
-    laws = [type(term) for term in terms if term.ROLE is Role.LAW]
+    laws = [term for term in terms if term.ROLE is Role.LAW]
     events = None if known is None else known.events
     offset = None if known is None else known.offset
     fits: list[LawFit] = []
-    last = _ROUNDS if known is None else 0
+    last = 0 if known is not None and _kinds(known.terms) == _kinds(terms) else _ROUNDS
     for turn in range(1 + last):
-        gaussian = fit_gaussian(samples, structural, part, events, offset, whole_mean)
+        gaussian = fit_gaussian(samples, structural, part, events, offset, whole_mean, rough)
         z, density = gaussian.z, gaussian.density
         fits = []
         push, error, moved = np.zeros(samples.n), np.zeros(samples.n), np.zeros(samples.n)
-        for law in laws:
-            fit = law.fit_law(view_of(samples, gaussian, z, part))
+        power = np.ones(samples.n)
+        for k, law in enumerate(laws):
+            view = replace(view_of(samples, gaussian, z, part), variance=gaussian.variance * power)
+            fit = law.refit_law(view, law) if vars(law) else law.fit_law(view)
             if fit is None:
                 return None
+            laws[k] = fit.term
             fits.append(fit)
             z, density = fit.z, density + fit.gain
             push += 0.0 if fit.push is None else fit.push
             error += 0.0 if fit.error is None else fit.error
             moved += 0.0 if fit.offset is None else fit.offset
-        if _same(events, offset, push, error, moved, gaussian) or turn == last:
+            power *= 1.0 if fit.power is None else np.clip(fit.power, *_POWERS)
+        found = Events(push, error, power)
+        if _same(events, offset, found, moved, gaussian) or turn == last:
             break
-        if push.any() or error.any() or events is not None:
-            events = Events(push, error)
+        if push.any() or error.any() or events is not None or (power != 1.0).any():
+            events = found
         offset = moved if moved.any() else None
         structural = list(gaussian.terms)
     fitted = (*gaussian.terms, *(fit.term for fit in fits))
@@ -132,11 +144,19 @@ def fit_composite(samples: Samples, terms: Sequence[Term], part: slice,
                      events, offset)
 
 
-def _same(events: Events | None, offset: FloatArray | None, push: FloatArray, error: FloatArray,
-          moved: FloatArray, gaussian: GaussianFit) -> bool:
+def _kinds(terms: Sequence[Term]) -> list[str]:
+    """Return the names of the laws."""
+    return [term.NAME for term in terms if term.ROLE is Role.LAW]
+
+
+def _same(events: Events | None, offset: FloatArray | None, found: Events, moved: FloatArray,
+          gaussian: GaussianFit) -> bool:
     """Return whether the laws have found again what the Gaussian part was fitted with."""
-    before = (np.zeros(1), np.zeros(1)) if events is None else (events.push, events.error)
-    if ((push > 0.0) != (before[0] > 0.0)).any() or ((error > 0.0) != (before[1] > 0.0)).any():
+    before = events or Events(np.zeros(1), np.zeros(1), np.ones(1))
+    if ((found.push > 0.0) != (before.push > 0.0)).any() or (
+            (found.error > 0.0) != (before.error > 0.0)).any():
+        return False
+    if float(np.mean(np.abs(np.log(found.power / before.power)))) > _ALIKE:
         return False
     change = moved - (0.0 if offset is None else offset)
     return float(np.mean(change**2)) < 0.01 * float(np.median(gaussian.variance))

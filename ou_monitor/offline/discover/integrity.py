@@ -23,6 +23,7 @@ from ou_monitor.model.terms.term import Term
 from ou_monitor.offline.discover.clipped import redraw
 from ou_monitor.offline.discover.data import Samples
 from ou_monitor.offline.discover.lattice import find_rails, find_step
+from ou_monitor.offline.discover.squeezed import find_knee
 from ou_monitor.offline.discover.stamps import judge_stamps, on_grid
 from ou_monitor.offline.discover.thinning import choose_samples
 from ou_monitor.online.intake import Batch
@@ -119,10 +120,15 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     noise = _innovation_std(v)
     step = find_step(v)
     low, high = find_rails(v, step, noise)
+    soft = 'readings squeezed near the end of the range'
+    if not math.isfinite(low) and not math.isfinite(high):
+        low, high = _knees(v, noise)
+    else:
+        soft = 'samples at the end of the range'
     if math.isfinite(low) or math.isfinite(high):
         drawn = (v <= low) | (v >= high)
         exact.append(_saturation(v, low, high))
-        notes.append(f'{int(drawn.sum())} samples at the end of the range were drawn anew from '
+        notes.append(f'{int(drawn.sum())} {soft} were drawn anew from '
                      'what an OU does beyond it, given their neighbours.')
         v = redraw(v, low, high, step, np.random.default_rng(0))
     _judge_step(step, _innovation_std(v), exact, notes)
@@ -244,6 +250,12 @@ def _judge_step(step: float, noise: float, exact: list[Term], notes: list[str]) 
     else:
         notes.append(f'The ADC counts in steps of {1e3 * step:.3g} mV, small beside the noise '
                      'between samples.')
+
+
+def _knees(v: FloatArray, noise: float) -> tuple[float, float]:
+    """Return the limits beyond which readings are squeezed; infinite where there is none."""
+    bottom, top = find_knee(v, noise, -1.0), find_knee(v, noise, 1.0)
+    return -math.inf if bottom is None else bottom, math.inf if top is None else top
 
 
 def _saturation(v: FloatArray, low: float, high: float) -> Term:

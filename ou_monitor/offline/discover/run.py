@@ -178,22 +178,19 @@ def _named(samples: Samples, start: Composite, rng: np.random.Generator,
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         # A fit outside of what numbers can hold; the criticism still stands.
         search, failure = Search(start), f'The search for causes broke off: {error}.'
-    model, names = search.composite, list(search.accepted)
-    if names:
+    after = criticise(samples, search.composite, bank) if search.accepted else before
+    kinds = [catalogue()[name] for name in search.accepted]
+    dropped = tuple(search.accepted[k] for k in withdrawn(before, after, kinds))
+    if dropped:
+        # They may have stood in the way of what was measured.
+        search = name_causes(samples, start, bank, given=[term.NAME for term in exact],
+                             latent=False)
+        after = criticise(samples, search.composite, bank)
+    model = search.composite
+    if search.accepted:
         # Named with a mean that saw everything; measured with one that did not.
-        model = fit_composite(samples, model.terms, samples.train) or model
-    after = criticise(samples, model, bank) if names else before
-    kinds = [catalogue()[name] for name in names]
-    away = withdrawn(before, after, kinds)
-    dropped = tuple(names[k] for k in away)
-    for k in sorted(away, reverse=True):
-        less = without(samples, model, position(model, names, k))
-        if less is not None:
-            model = less
-        del names[k]
-    if away:
-        after = criticise(samples, model, bank)
-    return _Named(model, tuple(names), search.rivals, dropped, before, after, failure)
+        model = fit_composite(samples, model.terms, samples.train, model) or model
+    return _Named(model, tuple(search.accepted), search.rivals, dropped, before, after, failure)
 
 
 def position(model: Composite, names: list[str] | tuple[str, ...], k: int) -> int:

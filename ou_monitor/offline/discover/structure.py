@@ -33,26 +33,33 @@ _DEAR = 30000
 _MANY = 4
 # Samples in which the gain of a constant model has settled: the predictive
 # variance is then within some 1e-5 of its limit.
-_SETTLES = 2048
+_SETTLES = 1024
 # Settled: a step gains less than this, nats.
-_SETTLED = 0.02
+_SETTLED, _NEARLY = 0.02, 0.5
 _RNG = np.random.default_rng(0)
 
 
 @dataclass(frozen=True, eq=False)
 class Events:
     """
-    Variance that events add, V^2.
+    Variance that events add, V^2, and by what the noise is more or less.
 
     Attributes
     ----------
     push, error : ndarray, shape (n,)
         To the state, and to the measurement.
+    power : ndarray, shape (n,)
+        Factor on what the noise of the `ou` adds to the state.
 
     """
 
     push: FloatArray
     error: FloatArray
+    power: FloatArray
+
+    def part(self, part: slice) -> Events:
+        """Return a part."""
+        return Events(self.push[part], self.error[part], self.power[part])
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +101,7 @@ class GaussianFit:
 
 def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
                  events: Events | None = None, offset: FloatArray | None = None,
-                 whole_mean: bool = False) -> GaussianFit:
+                 whole_mean: bool = False, rough: bool = False) -> GaussianFit:
     """
     Fit the Gaussian part by maximum likelihood on a part of the recording.
 
@@ -113,6 +120,8 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
     whole_mean : bool
         Whether the coefficients of the mean may see everything: a trend fitted
         to the first part runs away in the second.
+    rough : bool
+        Whether some thousand samples will do where all of them take long.
 
     Returns
     -------
@@ -123,9 +132,9 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
     voltage = samples.voltage if offset is None else samples.voltage - offset
     seen = Samples(samples.t[part], voltage[part],
                    None if samples.throttle is None else samples.throttle[part])
-    inside = None if events is None else Events(events.push[part], events.error[part])
+    inside = None if events is None else events.part(part)
     start = tuple(terms)
-    terms, se = _maximise(seen, start, inside)
+    terms, se = _maximise(seen, start, inside, rough)
     if whole_mean and seen.n < samples.n:
         terms = _regress(Samples(samples.t, voltage, samples.throttle), terms, events)
     return evaluate(samples, terms, events, se)
@@ -155,7 +164,7 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
         Nothing is fitted.
 
     """
-    s, space = _space(samples, terms, events)
+    s, space, own = _space(samples, terms, events)
     run = Filter(space, samples.n)
     columns = _columns(terms, s)
     beta = np.concatenate([_linear(term) for term in terms])
@@ -163,18 +172,22 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
     e = run.innovations(samples.voltage - mean)
     # An event is the law's to expect, at its own sample: not so while it is fitted around.
     variance = run.variance
-    if events is not None and not inside:
-        variance = variance - events.push - events.error
-    density = -0.5 * (np.log(2.0 * math.pi * variance) + e * e / variance)
-    return GaussianFit(tuple(terms), tuple(se), mean, e, variance, density,
+    if not inside:
+        variance = variance - own
+    return GaussianFit(tuple(terms), tuple(se), mean, e, variance, _log_density(e, variance),
                        np.exp(-s.alpha * s.step))
+
+
+def _log_density(e: FloatArray, variance: FloatArray) -> FloatArray:
+    density: FloatArray = -0.5 * (np.log(2.0 * math.pi * variance) + e * e / variance)
+    return density
 
 
 def _linear(term: Term) -> FloatArray:
     """Return the coefficients of a term's columns."""
     if isinstance(term, OU):
         return np.array([term.u0])
-    return np.asarray(term.linear_values(), dtype=np.float64)
+    return np.array(term.linear_values() if term.ROLE is Role.MEAN else [], dtype=np.float64)
 
 
 def _columns(terms: Sequence[Term], s: Stretch) -> FloatArray:
@@ -190,8 +203,8 @@ def _columns(terms: Sequence[Term], s: Stretch) -> FloatArray:
 
 
 def _space(samples: Samples, terms: Sequence[Term], events: Events | None
-           ) -> tuple[Stretch, StateSpace]:
-    """Return the stretch with alpha and sigma along it, and the state space."""
+           ) -> tuple[Stretch, StateSpace, FloatArray | float]:
+    """Return the stretch, the state space, and what events add to each variance predicted."""
     ou = terms[0]
     assert isinstance(ou, OU)
     s = samples.stretch(ou.alpha, ou.sigma)
@@ -211,8 +224,13 @@ def _space(samples: Samples, terms: Sequence[Term], events: Events | None
     for term in terms:
         if isinstance(term, ACCoupling):
             blocks[0] = _coupled(term, s, phi, q)
+    own: FloatArray | float = 0.0
     if events is not None:
-        blocks[0][1][:, 0, 0] += events.push
+        f, cov, h = blocks[0]
+        more = (events.power - 1.0)[:, None, None] * cov
+        more[:, 0, 0] += events.push
+        blocks[0] = f, cov + more, h
+        own = (more @ h) @ h + events.error
     blocks += [term.block(s) for term in terms
                if term.ROLE is Role.BLOCK and not isinstance(term, ACCoupling)]
     d = sum(h.size for _, _, h in blocks)
@@ -225,7 +243,7 @@ def _space(samples: Samples, terms: Sequence[Term], events: Events | None
     r = np.full(n, floor + sum(term.variance() for term in terms))
     if events is not None:
         r += events.error
-    return whole, StateSpace(f_all, q_all, h_all, r)
+    return whole, StateSpace(f_all, q_all, h_all, r), own
 
 
 def _first(s: Stretch, n: int) -> Stretch:
@@ -253,26 +271,26 @@ def _coupled(term: ACCoupling, s: Stretch, phi: FloatArray, q: FloatArray
     return f, cov, np.array([1.0, -1.0])
 
 
-def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None
-              ) -> tuple[tuple[Term, ...], tuple[dict[str, float], ...]]:
+def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
+              rough: bool = False) -> tuple[tuple[Term, ...], tuple[dict[str, float], ...]]:
     """Fit by scoring: the outer product of numerical scores stands for the information."""
     rounds = _ROUNDS
     states = _space(samples, terms, events)[1].f.shape
     if states[0] * (states[1] - 1) > _DEAR:
         # Far from the top a part of the samples shows the way.
-        part = slice(0, max(_DEAR // (2 * states[1]), 2000))
+        part = _telling(samples, max(_DEAR // (2 * states[1]), 2000))
         terms, se_part = _maximise(
             Samples(samples.t[part], samples.voltage[part],
                     None if samples.throttle is None else samples.throttle[part]), terms,
-            None if events is None else Events(events.push[part], events.error[part]))
-        if states[1] > _MANY:
-            shrink = math.sqrt(part.stop / samples.n)
+            None if events is None else events.part(part))
+        if rough or states[1] > _MANY:
+            shrink = math.sqrt((part.stop - part.start) / samples.n)
             return _regress(samples, terms, events), tuple(
                 {name: value * shrink for name, value in errors.items()} for errors in se_part)
         rounds = _LAST_ROUNDS
-    free = [(k, name) for k, term in enumerate(terms) for name in _free(term)]
-    terms = _regress(samples, terms, events)
-    base = evaluate(samples, terms, events, inside=True)
+    free = [(k, name) for k, term in enumerate(terms) for name in term.free()]
+    base = _with_mean(samples, terms, events)
+    terms = base.terms
     value, damping, inverse = float(base.density.sum()), 0.0, np.zeros((0, 0))
     for _ in range(rounds):
         scores = np.empty((samples.n, len(free)))
@@ -292,8 +310,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None
             trial = terms
             for (k, name), by in zip(free, step.tolist(), strict=True):
                 trial = _moved(trial, k, name, by)
-            trial = _regress(samples, trial, events)
-            new = evaluate(samples, trial, events, inside=True)
+            new = _with_mean(samples, trial, events)
             if float(new.density.sum()) > value - 1e-9 * abs(value):
                 better = new
                 break
@@ -303,7 +320,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None
         gain = float(better.density.sum()) - value
         terms, base, value = better.terms, better, float(better.density.sum())
         damping *= 0.3
-        if gain < _SETTLED:
+        if gain < (_NEARLY if rough else _SETTLED):
             break
     inverse = np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale)
     se: list[dict[str, float]] = [{} for _ in terms]
@@ -312,8 +329,14 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None
     return terms, tuple(se)
 
 
-def _free(term: Term) -> tuple[str, ...]:
-    return term.free()
+def _telling(samples: Samples, size: int) -> slice:
+    """Return the stretch of a size in which throttle moves most; the first without throttle."""
+    if samples.throttle is None or size >= samples.n:
+        return slice(0, min(size, samples.n))
+    first = np.arange(0, samples.n - size + 1, max(size // 4, 1))
+    moves = [float(samples.throttle[k:k + size].std()) for k in first.tolist()]
+    begin = int(first[int(np.argmax(moves))])
+    return slice(begin, begin + size)
 
 
 def _moved(terms: tuple[Term, ...], k: int, name: str, by: float) -> tuple[Term, ...]:
@@ -323,8 +346,13 @@ def _moved(terms: tuple[Term, ...], k: int, name: str, by: float) -> tuple[Term,
 
 def _regress(samples: Samples, terms: tuple[Term, ...], events: Events | None
              ) -> tuple[Term, ...]:
-    """Fit the coefficients of the mean by generalised least squares."""
-    s, space = _space(samples, terms, events)
+    """Fit the coefficients of the mean."""
+    return _with_mean(samples, terms, events).terms
+
+
+def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None) -> GaussianFit:
+    """Fit the coefficients of the mean by generalised least squares; events count as known."""
+    s, space, _ = _space(samples, terms, events)
     run = Filter(space, samples.n)
     columns = _columns(terms, s)
     weight = 1.0 / np.sqrt(run.variance)
@@ -340,4 +368,6 @@ def _regress(samples: Samples, terms: tuple[Term, ...], events: Events | None
         size = len(term.LINEAR) if term.ROLE is Role.MEAN else 0
         result.append(term.with_linear(beta[at:at + size].tolist()) if size else term)
         at += size
-    return tuple(result)
+    e = (through[:, 0] - through[:, 1:] @ beta) / weight
+    return GaussianFit(tuple(result), (), columns @ beta, e, run.variance,
+                       _log_density(e, run.variance), np.exp(-s.alpha * s.step))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from ou_monitor.model.terms.term import Term
+from ou_monitor.model.terms.term import Role, Term
+from ou_monitor.offline.discover.battery import is_sign
 from ou_monitor.offline.discover.finding import Verdict
 from ou_monitor.offline.discover.null_bank import family_chance
 
@@ -12,10 +13,9 @@ from ou_monitor.offline.discover.null_bank import family_chance
 NOTHING = 0.01
 # Chance above which a model with causes passes; the causes were chosen to please.
 PASSES = 0.001
-# A statistic this far off fails.
-FAILS = 5.0
-# Share by which the causes must reduce a failing statistic to have touched it.
-TOUCHED = 0.7
+# A statistic fails that is this far off, and by more than these shares of what it,
+# and the worst of all, was before there were any causes.
+FAILS, OWN_SHARE, SHARE = 4.8, 0.07, 0.02
 
 
 def largest_chance(values: Mapping[str, float]) -> float:
@@ -24,11 +24,11 @@ def largest_chance(values: Mapping[str, float]) -> float:
     return family_chance(largest, max(len(values), 1))
 
 
-def untouched(before: Mapping[str, float], after: Mapping[str, float]) -> list[str]:
-    """Return statistics that failed before the causes and still do, little reduced."""
+def failing(before: Mapping[str, float], after: Mapping[str, float]) -> list[str]:
+    """Return the statistics that the causes should have mended and did not."""
+    worst = max((abs(value) for value in before.values()), default=0.0)
     return [name for name, value in after.items()
-            if abs(value) > FAILS and abs(before.get(name, 0.0)) > FAILS
-            and abs(value) > (1.0 - TOUCHED) * abs(before[name])]
+            if abs(value) > max(FAILS, OWN_SHARE * abs(before.get(name, 0.0)), SHARE * worst)]
 
 
 def is_latent(kind: type[Term]) -> bool:
@@ -51,13 +51,20 @@ def withdrawn(before: Mapping[str, float], after: Mapping[str, float],
     Returns
     -------
     list of int
-        Positions in `accepted`: latent causes that an untouched statistic is a
-        sign of.
+        Positions in `accepted`: where a statistic fails, all latent causes.
+        What nobody measured can imitate a part of almost anything; it is named
+        only where it explains the whole.  White noise, which no sensor is
+        without, has to explain only what it is asked for.
 
     """
-    left = untouched(before, after)
-    return [k for k, kind in enumerate(accepted) if is_latent(kind)
-            and any(name.startswith(sign) for name in left for sign in kind.SIGNS)]
+    left = failing(before, after)
+
+    def fails(kind: type[Term]) -> bool:
+        if kind.ROLE is not Role.NOISE:
+            return bool(left)
+        return any(is_sign(sign, name, after[name]) for name in left for sign in kind.SIGNS)
+
+    return [k for k, kind in enumerate(accepted) if is_latent(kind) and fails(kind)]
 
 
 def judge(after: Mapping[str, float], causes: int, dropped: int) -> Verdict:

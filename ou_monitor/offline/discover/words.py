@@ -126,6 +126,8 @@ _PLAIN = ((
     ('state throttle', 'the relaxation depends on throttle'),
     ('state', 'the relaxation is not proportional to the deviation'),
     ('irreversibility', 'it looks different backwards in time'),
+    ('bursts', 'power at some frequencies comes and goes'),
+    ('products of three', 'neighbouring errors depend on each other in a way no spectrum shows'),
     ('pairs', 'large errors are followed by related ones'))
 
 

@@ -1,0 +1,71 @@
+"""
+Where an input is squeezed rather than cut: a protection diode before the ADC.
+
+Beyond a knee the reading rises as a logarithm.  Undone, it is an OU again: the
+knee and the scale are those under which an AR(1) finds the readings likeliest,
+the density of the transformed samples counted.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ou_monitor.records import FloatArray
+
+# Shares of the samples beyond the knee, and scales in standard deviations of the
+# innovations.  A larger scale is no limit but a bent characteristic.
+_SHARES = (0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.1)
+_SCALES = (0.05, 0.1, 0.15, 0.2, 0.3)
+# Evidence from which it is found, nats.
+_FOUND = 50.0
+# Beyond so many scales a reading says nothing of what was there.
+_FAR = 8.0
+
+
+def find_knee(voltage: FloatArray, noise: float, side: float) -> float | None:
+    """
+    Return where readings begin to be squeezed.
+
+    Parameters
+    ----------
+    voltage : ndarray, shape (n,)
+        V.
+    noise : float
+        Standard deviation of the innovations, V.
+    side : float
+        1 for the top of the range, -1 for the bottom.
+
+    Returns
+    -------
+    float or None
+        V; None where nothing is squeezed.
+
+    """
+    x = side * voltage
+    plain = _likelihood(x)
+    best, found = plain + _FOUND, None
+    for share in _SHARES:
+        knee = float(np.quantile(x, 1.0 - share))
+        over = np.maximum(x - knee, 0.0)
+        for scale in _SCALES:
+            far = over / (scale * noise)
+            if float(far.max()) > 1e3:
+                continue
+            part = np.minimum(far, _FAR)
+            # Beyond, on along the tangent.
+            stretched = np.expm1(part) + (far - part) * math.exp(_FAR)
+            value = float(part.sum()) + _likelihood(
+                np.minimum(x, knee) + scale * noise * stretched)
+            if value > best:
+                best, found = value, side * knee
+    return found
+
+
+def _likelihood(x: FloatArray) -> float:
+    """Return the log-likelihood of an AR(1), but for a constant, nats."""
+    a, b = x[:-1] - x[:-1].mean(), x[1:] - x[1:].mean()
+    e = b - float(a @ b) / float(a @ a) * a
+    count = int(e.size)
+    return -0.5 * count * math.log(float(e @ e) / count)

@@ -1,0 +1,203 @@
+"""
+Effects hidden blind, each to be found: the fast part of `benchmarks/discover.py`.
+
+Rail, flight, strength and noise are drawn from a base seed, which the names of
+the tests carry; OU_MONITOR_BLIND_SEED sets another.  Recordings are shorter
+than the minute for which levels are required, and effects stronger by as much
+as makes amplitude squared times duration the same.
+
+Removing the module of any cause makes its test below fail: what is not in the
+catalogue is never named.
+"""
+
+from collections.abc import Mapping
+from functools import cache
+import math
+import os
+import sys
+
+from blind_scores import confusion, hide, Outcome, outcome
+from hidden_effects import causes, labels, pairs, unknowns
+import numpy as np
+from ou_monitor import discover
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.term import Role
+from ou_monitor.records import Recording
+import pytest
+from scipy.stats import binom
+
+BASE = int(os.environ.get('OU_MONITOR_BLIND_SEED', '20260131'))
+SEED = f'seed {BASE}'
+MINUTE, DURATION, RATE = 60.0, 20.0, 1000.0
+# The generator limits how far a force can bend: no strength makes up for a short recording.
+WHOLE = ('nonlinear_restoring',)
+# A count is too low, or too high, when the required level gives it so rarely.
+RARE = 0.01
+TRIES = 3
+
+
+def drawn(kind: str, effect: str, number: int) -> tuple[Recording, object]:
+    """Return a recording and what is hidden in it."""
+    duration = MINUTE if effect in WHOLE else DURATION
+    hidden = hide(kind, effect, BASE, number, duration=duration, rate=RATE,
+                  strength=math.sqrt(MINUTE / duration))
+    return Recording(hidden.t, hidden.voltage, hidden.throttle, 'blind'), hidden
+
+
+def seen(kind: str, effect: str, number: int = 0) -> Outcome:
+    """Return what `discover` makes of a recording; once for all tests."""
+    return _seen(kind, effect, number)
+
+
+@cache
+def _seen(kind: str, effect: str, number: int) -> Outcome:
+    recording, hidden = drawn(kind, effect, number)
+    finding = discover(recording)
+    return outcome(hidden, finding.verdict.value, finding.causes)
+
+
+def chosen(what: list, count: int, word: int) -> list:
+    """Return some, drawn without replacement."""
+    rng = np.random.default_rng([BASE, word])
+    return [what[k] for k in rng.choice(len(what), count, replace=False)]
+
+
+def least(count: int, share: float) -> int:
+    """Return the lowest number of `count` that is no rarity where `share` is required."""
+    return int(binom.ppf(RARE, count, share))
+
+
+def told(outcomes: list[Outcome]) -> str:
+    """Return what was said of each, for the message of a failure."""
+    return f'{SEED}: ' + '; '.join(
+        f"{one.effect}: {one.verdict}, {dict(one.named) or 'nothing'}" for one in outcomes)
+
+
+@pytest.mark.parametrize('cause', causes(), ids=lambda cause: f'{cause}, {SEED}')
+def test_each_cause_is_named(cause):
+    """
+    In one of three recordings at least; most need the first only.
+
+    At the required nine in ten, a cause is missed three times once in 1000; one
+    of the 22 so, by an unlucky base seed, once in 46.  A cause without its module is
+    never named; one that is named in half of recordings fails once in 8.
+    """
+    tried = []
+    for number in range(TRIES):
+        tried.append(seen('single', cause, number))
+        if cause in tried[-1].named:
+            return
+    pytest.fail(told(tried))
+
+
+def test_most_causes_are_named_alone_or_in_the_set():
+    """
+    Required: 90 % alone and 95 % in the set; of 22, 16 and 18 at least.
+
+    Fewer have chances of 0.4 % each at those levels, and of 84 % and 97 % at 60 %.
+    """
+    found = [seen('single', cause) for cause in causes()]
+    for truth, row in confusion(found).items():
+        print(f'{truth:>22}:', ', '.join(
+            f'{name} {count}' for name, count in row.items() if name != 'of'))
+    alone, in_set = sum(one.alone for one in found), sum(one.in_set for one in found)
+    print(f'{SEED}: {alone} of {len(found)} alone, {in_set} in the set')
+    assert alone >= least(len(found), 0.90), told([one for one in found if not one.alone])
+    assert in_set >= least(len(found), 0.95), told([one for one in found if not one.in_set])
+
+
+def test_nothing_is_found_where_nothing_is_hidden():
+    """
+    Alarms in 5 % at most; of eight, two at most.
+
+    Three or more have a chance of 0.6 % at 5 %, and of 86 % where half are alarms.
+    """
+    found = [seen('none', '', number) for number in range(8)]
+    most = len(found) - least(len(found), 0.95)
+    assert sum(one.alarm for one in found) <= most, told(found)
+
+
+def test_two_at_once_are_both_named():
+    """
+    Required: 80 %; of five pairs, two at least.
+
+    Fewer have a chance of 0.7 % at that level, and of 53 % at 30 %.
+    """
+    found = [seen('pair', '+'.join(pair)) for pair in chosen(list(pairs()), 5, 1)]
+    assert sum(one.all_named for one in found) >= least(len(found), 0.80), told(found)
+
+
+def test_what_is_not_in_the_catalogue_is_not_dressed_up():
+    """
+    Required: said to be unexplained, wholly or partly, with no wrong name, in 90 %; 3 of 5.
+
+    Fewer have a chance of 0.9 % at that level, and of 84 % at 30 %.
+    """
+    found = [seen('unknown', name) for name in chosen(list(unknowns()), 5, 2)]
+    good = [one.left_open and not one.misnamed for one in found]
+    assert sum(good) >= least(len(found), 0.90), told(
+        [one for one, right in zip(found, good) if not right])
+
+
+def searched() -> list[str]:
+    """Return the causes that are found by the search of the catalogue, not by looking."""
+    kinds = catalogue()
+    return [cause for cause in causes() if cause in kinds and kinds[cause].SIGNS
+            and kinds[cause].ROLE is not Role.EXACT and cause != 'clock_jitter']
+
+
+@pytest.mark.parametrize('cause', chosen(searched(), 3, 3),
+                         ids=lambda cause: f'{cause}, {SEED}')
+def test_a_cause_out_of_the_catalogue_is_found_no_more(cause, monkeypatch):
+    """What names a cause is its entry: with it found, without it not, nor as a rival."""
+    number = next((k for k in range(TRIES) if cause in seen('single', cause, k).named), None)
+    assert number is not None, f'{cause} was not named with its entry either'
+    every = catalogue
+    less: Mapping = {name: kind for name, kind in every().items() if name != cause}
+    for name, module in list(sys.modules.items()):
+        if name.startswith('ou_monitor.') and getattr(module, 'catalogue', None) is every:
+            monkeypatch.setattr(module, 'catalogue', lambda: less)
+    recording, hidden = drawn('single', cause, number)
+    finding = discover(recording)
+    without = outcome(hidden, finding.verdict.value, finding.causes)
+    assert without.verdict and cause not in without.reported, told([without])
+
+
+SAG, NOISE = 'load_sag', 'measurement_noise'
+
+
+@pytest.mark.parametrize('accepted, named, alone, in_set, all_named, family', [
+    ([[SAG]], {SAG: ()}, True, True, True, True),
+    ([[SAG]], {}, False, False, False, False),
+    # In the set of a neighbour: reported, not named; the families are those of the names.
+    ([[SAG]], {'load_transient': (SAG,)}, False, True, False, True),
+    ([['tone']], {'drift': ('tone',)}, False, True, False, False),
+    # Named, and something false beside it.
+    ([[SAG]], {SAG: (), 'tone': ()}, False, False, True, False),
+    # A false name is not excused by an alternative that is named already.
+    ([[SAG]], {SAG: (), 'tone': (SAG,)}, False, False, True, False),
+    ([[SAG, 'tone']], {'drift': (SAG, 'tone')}, False, True, False, False),
+    ([[SAG, NOISE]], {SAG: (), 'tone': (NOISE,)}, False, True, False, False),
+    ([[SAG, NOISE]], {SAG: (), NOISE: ()}, True, True, True, True),
+    ([[SAG, NOISE]], {SAG: ()}, False, False, False, False),
+    # Any list that is accepted will do.
+    ([['tone'], ['resonance']], {'resonance': ()}, True, True, True, True),
+])
+def test_scores(accepted, named, alone, in_set, all_named, family):
+    """What counts as right, as in the set, as named, and as of the family."""
+    one = Outcome('single', 'x', tuple(map(tuple, accepted)), (), 'explained', named)
+    assert (one.alone, one.in_set, one.all_named, one.family) == (
+        alone, in_set, all_named, family)
+    failed = Outcome('single', 'x', one.accepted, (), '', {})
+    assert not (failed.alone or failed.in_set or failed.covered or failed.family)
+    assert failed.alarm and not failed.left_open
+    assert set(named) <= set(labels)
+
+
+@pytest.mark.parametrize('named, wrong', [
+    ({}, False), ({'jumps': ()}, False), ({'tone': ()}, True), ({'tone': ('jumps',)}, False),
+    ({'jumps': (), 'tone': ()}, True)])
+def test_a_name_near_the_unknown_is_not_wrong(named, wrong):
+    """Only names of its part are; the verdict is counted apart."""
+    one = Outcome('unknown', 'unknown/x', ((),), ('jumps',), 'partly_explained', named)
+    assert one.misnamed is wrong and one.left_open
