@@ -64,6 +64,8 @@ class Filter:
     ----------
     variance : ndarray, shape (n,)
         Variance of the one-step innovations, V^2.
+    shape : (int, int)
+        Samples whose gains were found one by one, and states.
 
     Raises
     ------
@@ -75,6 +77,7 @@ class Filter:
 
     def __init__(self, model: StateSpace, n: int | None = None) -> None:
         self._n = model.f.shape[0] if n is None else n
+        self.shape = (model.f.shape[0], model.f.shape[1])
         self.variance: FloatArray = self._solve(model)
         if self._n > model.f.shape[0]:
             self._steady = _Steady(self._last_loop, self._gain[-2], self._look[-2])

@@ -12,7 +12,7 @@ from ou_monitor.offline.discover.composite import fit_composite
 from ou_monitor.offline.discover.data import Samples
 from ou_monitor.offline.discover.errors import standard_errors
 from ou_monitor.offline.discover.gain import (
-    BLOCKS, crossing_level, crossing_rates, crossings, mean_difference, without, worth)
+    BLOCKS, crossing_level, crossing_rates, crossings, mean_difference, mean_score, without, worth)
 import pytest
 from scipy.signal import lfilter
 
@@ -47,10 +47,15 @@ def test_the_error_of_a_mean_knows_correlation(keep):
     assert abs(np.mean(means)) < 4.0 * np.std(means) / math.sqrt(300)
 
 
-def test_too_few_samples_have_no_error():
-    """Fewer than blocks: the mean, and NaN."""
+def test_too_few_samples_have_no_gain():
+    """Fewer than blocks: unknown; as many as blocks: known."""
     mean, error = mean_difference(np.ones(BLOCKS - 1), np.zeros(BLOCKS - 1))
-    assert mean == 1.0 and math.isnan(error)
+    assert math.isnan(mean) and math.isnan(error)
+    mean, error = mean_difference(np.ones(BLOCKS), np.zeros(BLOCKS))
+    assert mean == 1.0 and error == 0.0
+    scored = np.arange(40) < BLOCKS
+    assert mean_score(np.where(scored, 2.0, 9.0), scored) == 2.0
+    assert math.isnan(mean_score(np.ones(40), np.arange(40) < BLOCKS - 1))
 
 
 def test_a_true_cause_gains_what_theory_says():

@@ -196,3 +196,20 @@ def test_a_clean_bench_stays_quiet():
     """mm_bench_5: white and clean, nothing to find."""
     found = discover(Path(os.environ['OU_MONITOR_REALDATA']) / 'mm_bench_5.csv')
     assert found.verdict is Verdict.NO_EFFECT
+
+
+@pytest.mark.skipif('OU_MONITOR_REALDATA' not in os.environ, reason='no real recordings')
+@pytest.mark.parametrize('name', ['mm_bench_1', 'mm_bench_3'])
+def test_a_motor_that_starts_late_gains_nothing_absurd(name):
+    """What the first part did not see is left out: gains are known within errors, or unknown."""
+    found = discover(Path(os.environ['OU_MONITOR_REALDATA']) / f'{name}.csv')
+    for worth in (found, *found.causes):
+        assert math.isnan(worth.gain) == math.isnan(worth.gain_se)
+        assert math.isnan(worth.gain) or worth.gain > -3.0 * worth.gain_se - 0.05
+    known = found.samples.throttle[found.samples.train]
+    still = float(known.max() - known.min()) < 0.01
+    assert still == (name == 'mm_bench_3')
+    if still:
+        # A motor that stops in the last part only.
+        assert any('the first 60 % never had' in note for note in found.notes)
+        assert all(math.isnan(cause.gain) for cause in found.causes if cause.term.NEEDS_THROTTLE)

@@ -13,7 +13,7 @@ from scipy.signal import welch
 _MOST = 3
 
 
-def lines_at(view: View) -> list[float]:
+def lines_at(view: View, most: int = _MOST) -> list[float]:
     """
     Return the frequencies of the strongest sharp lines.
 
@@ -21,6 +21,8 @@ def lines_at(view: View) -> list[float]:
     ----------
     view : View
         Scores, on a grid that is even but for gaps.
+    most : int
+        Lines at most.
 
     Returns
     -------
@@ -28,22 +30,43 @@ def lines_at(view: View) -> list[float]:
         Hz, strongest first, refined to a small part of a bin.
 
     """
+    return [frequency for frequency, _ in lines_with_height(view, most)]
+
+
+def lines_with_height(view: View, most: int) -> list[tuple[float, float]]:
+    """
+    Return the frequencies of the strongest sharp lines and what each is worth.
+
+    Parameters
+    ----------
+    view : View
+        Scores, on a grid that is even but for gaps.
+    most : int
+        Lines at most.
+
+    Returns
+    -------
+    list of (float, float)
+        Hz, and the gain in log-likelihood of a line there beside white noise,
+        nats; strongest first.
+
+    """
     # All of them: a line may have begun late, and its frequency is no parameter of
     # a likelihood, but pays for its search.
     z = view.z
     if z.size < 32:
         return []
-    power = np.abs(np.fft.rfft(z, 2 * z.size)) ** 2
+    power = np.abs(np.fft.rfft(z, 2 * z.size)) ** 2 / z.size
     power[:4] = 0.0
-    found: list[float] = []
-    for _ in range(_MOST):
+    found: list[tuple[float, float]] = []
+    for _ in range(most):
         at = int(np.argmax(power))
         # A parabola through the logarithm of the peak.
         shift = 0.0
         if 0 < at < power.size - 1 and power[at - 1] > 0.0 < power[at + 1]:
             a, b, c = np.log(power[at - 1:at + 2])
             shift = 0.5 * (a - c) / (a - 2.0 * b + c) if a - 2.0 * b + c < 0.0 else 0.0
-        found.append((at + shift) * view.rate / (2.0 * z.size))
+        found.append(((at + shift) * view.rate / (2.0 * z.size), float(power[at])))
         power[max(at - 8, 0):at + 9] = 0.0
     return found
 
@@ -108,7 +131,7 @@ def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
 
     """
     found = []
-    for length in (256, 1024, 4096):
+    for length in (64, 256, 1024, 4096):
         if z.size < 4 * length:
             continue
         frequency, density = welch(z, rate, nperseg=length)

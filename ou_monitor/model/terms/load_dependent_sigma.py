@@ -37,6 +37,9 @@ class LoadDependentSigma(Term):
             raise ValueError(
                 f'{self.NAME}: throttle and log_factor need the same number of values, got '
                 f'{len(self.throttle)} and {len(self.log_factor)}')
+        if len(self.throttle) == 2 and self.throttle[1] - self.throttle[0] < 3.0 * _EDGE:
+            # Where it steps was searched for.
+            object.__setattr__(self, 'SEARCH', _STEP_PRICE)
         if any(b <= a for a, b in zip(self.throttle, self.throttle[1:])):
             raise ValueError(f'{self.NAME}.throttle must rise, got {list(self.throttle)}')
 
@@ -73,14 +76,25 @@ class LoadDependentSigma(Term):
             return ()
         inner = np.quantile(u, np.linspace(0.05, 0.95, 91))
         forms = [np.array([low, high]), np.quantile(u, [0.01, 0.25, 0.5, 0.75, 0.99]),
-                 np.linspace(low, high, 9),
+                 *(np.linspace(low, high, count) for count in (3, 5, 9)),
                  *(np.array([at - _EDGE, at + _EDGE]) for at in np.unique(inner))]
         made = [_to_squares(square, u, _spaced(knots)) for knots in forms]
         price = 0.5 * math.log(u.size)
-        made.sort(key=lambda pair: pair[1] - price * len(pair[0][0]), reverse=True)
+        made.sort(key=lambda pair: pair[1] - price * len(pair[0][0]) - (
+            _STEP_PRICE if pair[0][0][-1] - pair[0][0][0] < 3.0 * _EDGE else 0.0), reverse=True)
         return [cls(knots, factors) for (knots, factors), _ in made[:2]]
 
+    @classmethod
+    def simplest(cls, view: View) -> Sequence[Term]:
+        """Return a straight line."""
+        if view.throttle is None:
+            return ()
+        low, high = np.quantile(view.throttle[view.train], [0.01, 0.99]).tolist()
+        return (cls((low, high), (0.0, 0.5)),) if high - low > _APART else ()
 
+
+# What the search for the edge of a step costs, nats: ln of the edges tried.
+_STEP_PRICE = 4.5
 # Knots nearer than this are one, and half the width of a step, in throttle.
 _APART, _EDGE = 0.02, 0.002
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 from typing import ClassVar
 
 import numpy as np
@@ -45,10 +46,19 @@ class NonlinearRestoring(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Regress the innovations on square and cube of the deviation before them."""
+        """Regress the innovations on square, cube, or both, of the deviation before them."""
+        found = [fit for powers in ((2,), (3,), (2, 3))
+                 if (fit := cls._regressed(view, powers)) is not None]
+        price = 0.5 * math.log(view.train.stop)
+        return max(found, default=None,
+                   key=lambda fit: float(fit.gain[view.train].sum()) - price * fit.free)
+
+    @classmethod
+    def _regressed(cls, view: View, powers: tuple[int, ...]) -> LawFit | None:
+        """Return the fit with some powers; the linear force is fitted again with them."""
         span = np.where(np.isfinite(view.step), view.step, 0.0)
         s, x = np.sqrt(view.variance), view.state
-        columns = np.stack((x, -x * x, -x**3), axis=1) * (span / s)[:, None]
+        columns = np.stack((x, *(-x**power for power in powers)), axis=1) * (span / s)[:, None]
         columns -= columns[view.train].mean(axis=0)
         inside = columns[view.train]
         gram = inside.T @ inside
@@ -57,14 +67,22 @@ class NonlinearRestoring(Term):
             return None
         inverse = np.linalg.pinv(gram / np.outer(scale, scale)) / np.outer(scale, scale)
         b = inverse @ (inside.T @ view.z[view.train])
+        by = dict(zip(powers, b[1:].tolist(), strict=True))
+        error = dict(zip(powers, np.sqrt(np.maximum(inverse.diagonal()[1:], 0.0)).tolist(),
+                         strict=True))
+        square, cube = by.get(2, 0.0), by.get(3, 0.0)
         # A steeper force also leaves less noise at the end of a step.
-        part = 1.0 - np.clip((2.0 * b[1] * x + 3.0 * b[2] * x * x) * span, -0.5, 0.5)
+        part = 1.0 - np.clip((2.0 * square * x + 3.0 * cube * x * x) * span, -0.5, 0.5)
         part /= float(np.mean(part[view.train]))
         scores = (view.z - columns @ b) / np.sqrt(part)
         gain = log_normal(scores) - 0.5 * np.log(part) - log_normal(view.z)
-        se = np.sqrt(np.maximum(inverse.diagonal(), 0.0))
         # A force that would push away at large deviations is held just short of it.
-        cube = max(float(b[2]), 0.0)
-        square = float(b[1]) if cube > 0.0 else 0.0
-        return LawFit(cls(square, cube), {'square': float(se[1]), 'cube': float(se[2])}, scores,
-                      gain, 3)
+        alpha = -math.log(max(float(np.median(view.phi[1:])), 1e-300)) * view.rate
+        cube = max(cube, _HOLDS * square * square / alpha)
+        return LawFit(cls(square, cube), {'square': error.get(2, math.nan),
+                                          'cube': error.get(3, math.nan)}, scores, gain,
+                      len(powers))
+
+
+# Cube at least, in square^2/alpha: from 1/4 on the force has one zero only.
+_HOLDS = 0.26

@@ -101,6 +101,12 @@ class RegimeSwitching(Term):
 
         return effect
 
+    def holds(self, view: View) -> bool:
+        """Return whether so many changes are expected that they are a law, not a few steps."""
+        rates = _rates(self.rate_up, self.rate_down, int(self.states))
+        span = float(view.at[view.train.stop - 1] - view.at[0])
+        return float(_stationary(rates) @ rates.sum(axis=1)) * span >= _CHANGES
+
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Fit a hidden chain of two states that share a level and a scale."""
@@ -131,14 +137,16 @@ class RegimeSwitching(Term):
         if two is None:
             return None
         # Three states: of sigma, or of the level, whichever the two differ in.
-        x = np.array([0.0, 0.0, 0.0, 0.7, -0.7])
+        starts = [np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]
         if two.power is None:
-            x = np.array(best[1]) * [1.0, 1.0, 0.6, 0.0, 1.0]
-        three = cls._finished(view, x, best[2], 90, 3)
-        part = slice(0, min(view.train.stop, _LONG))
-        if three is not None and float((three.gain - two.gain)[part].sum()) > _THIRD:
-            return three
-        return two
+            starts = [np.array(best[1]) * [1.0, 1.0, 0.6, 0.0, 1.0]]
+        part, found = slice(0, min(view.train.stop, _LONG)), two
+        for start in starts:
+            three = cls._finished(view, start, best[2], 70, 3)
+            ahead = _THIRD if found is two else 0.0
+            if three is not None and float((three.gain - found.gain)[part].sum()) > ahead:
+                found = three
+        return found
 
     @classmethod
     def refit_law(cls, view: View, near: Term) -> LawFit | None:
@@ -197,6 +205,8 @@ class RegimeSwitching(Term):
 _SHORT, _LONG = 8000, 30000
 # Largest rate of switching, 1/s.
 _FASTEST = 30.0
+# Changes in the part fitted, at least.
+_CHANGES = 8.0
 # Evidence from which there are three states, nats.
 _THIRD = 10.0
 # A level of fewer innovations than this is none.

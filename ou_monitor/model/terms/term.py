@@ -327,6 +327,11 @@ class Term:
         """
         return ()
 
+    @classmethod
+    def simplest(cls, view: View) -> Sequence[Term]:
+        """Return starting points with the fewest parameters; the default are the candidates."""
+        return cls.candidates(view) if cls.ROLE is not Role.LAW else ()
+
     def holds(self, view: View) -> bool:
         """Return whether fitted parameters still mean what the name says; the default: yes."""
         return True

@@ -2,31 +2,49 @@
 What a model is worth on samples that it has not seen.
 
 Scores are log densities of one-step predictions.  They differ from sample to
-sample by what neighbours share, so errors come from means of blocks.
+sample by what neighbours share, so errors come from means of blocks.  Scored
+are samples at throttle that the part fitted has been through: what a model
+says of others is extrapolated, and says nothing of what it is worth.
+
+The gain is stated as that of the true model, of which the fitted one loses
+what its parameters are off.  Its error covers both: what the samples scored
+happen to be, and that loss.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from functools import cached_property
 import math
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.term import Term
 from ou_monitor.offline.discover.composite import Composite, fit_composite
 from ou_monitor.offline.discover.data import Samples
+from ou_monitor.offline.discover.errors import Estimation, estimations
 from ou_monitor.offline.discover.finding import CrossingRate
+from ou_monitor.offline.discover.words import unmeasured_words
 from ou_monitor.records import FloatArray, NAN
 from scipy.special import ndtr
 from scipy.stats import chi2
 
 # Blocks of the samples kept; the fewest with which a spread is estimated well.
 BLOCKS = 24
+# Mean loss by errors of parameters, nats per sample, from which the part fitted does not
+# determine them: predictions are then as far off by them as by the noise.
+_UNKNOWN = 0.5
 # Level of the crossings: standard deviations below the mean, lowered in steps
 # until both the part fitted and the part kept cross it so often.
 _DEEP, _STEP, _SHALLOW, _OFTEN = 2.5, 0.25, 0.5, 5
 # Simulations of each model.
 _DRAWS = 8
+
+
+def mean_score(density: FloatArray, scored: npt.NDArray[np.bool_]) -> float:
+    """Return the mean log density of the samples scored, nats; NaN for fewer than `BLOCKS`."""
+    return float(density[scored].mean()) if int(scored.sum()) >= BLOCKS else NAN
 
 
 def mean_difference(new: FloatArray, old: FloatArray) -> tuple[float, float]:
@@ -43,14 +61,14 @@ def mean_difference(new: FloatArray, old: FloatArray) -> tuple[float, float]:
     mean, se : float
         nats per sample.  The error is that of means of `BLOCKS` blocks, one
         lag of their correlation included (Newey & West, Econometrica 55
-        (1987) 703); NaN with fewer samples than blocks.
+        (1987) 703); both are NaN with fewer samples than blocks.
 
     """
     difference = np.asarray(new, dtype=np.float64) - np.asarray(old, dtype=np.float64)
-    mean = float(difference.mean()) if difference.size else NAN
     size = difference.size // BLOCKS
     if size < 1:
-        return mean, NAN
+        return NAN, NAN
+    mean = float(difference.mean())
     blocks = difference[:size * BLOCKS].reshape(BLOCKS, size).mean(axis=1)
     c = blocks - blocks.mean()
     own = float(c @ c) / (BLOCKS - 1)
@@ -59,13 +77,90 @@ def mean_difference(new: FloatArray, old: FloatArray) -> tuple[float, float]:
     return mean, math.sqrt((own + shared) / BLOCKS)
 
 
-def without(samples: Samples, model: Composite, index: int) -> Composite | None:
-    """Return the model fitted again without one of its terms."""
-    kept = [term for k, term in enumerate(model.terms) if k != index]
-    return fit_composite(samples, kept, samples.train)
+def without(samples: Samples, model: Composite, *indices: int) -> Composite | None:
+    """Return the model fitted again without some of its terms; None where it cannot be."""
+    kept = [term for k, term in enumerate(model.terms) if k not in indices]
+    try:
+        return fit_composite(samples, kept, samples.train)
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+        # Parameters have left what a term allows, or numbers can hold.
+        return None
 
 
-def worth(samples: Samples, full: Composite, less: Composite) -> tuple[float, float, float]:
+class Scale:
+    """
+    What the gain of a model and of its terms is measured on.
+
+    Parameters
+    ----------
+    samples : Samples
+        The recording.
+    model : Composite
+        Fitted on its first part.
+    scored : ndarray of bool, shape (n,), optional
+        Samples that count; those of `seen` where not given.
+
+    """
+
+    def __init__(self, samples: Samples, model: Composite,
+                 scored: npt.NDArray[np.bool_] | None = None) -> None:
+        self._samples, self._model = samples, model
+        self.scored = samples.seen if scored is None else scored
+
+    @property
+    def estimation(self) -> Estimation:
+        """Return what the samples scored ask of the parameters."""
+        return self._estimations[0]
+
+    @cached_property
+    def _estimations(self) -> list[Estimation]:
+        """Return what errors of parameters cost on the samples scored, and on all kept."""
+        kept = np.zeros(self._samples.n, dtype=np.bool_)
+        kept[self._samples.test] = True
+        return estimations(self._samples, self._model, self.scored, kept)
+
+    def why_unknown(self, terms: Collection[int] | None = None) -> str:
+        """
+        Return why a gain cannot be measured, for people; empty where it can.
+
+        Parameters
+        ----------
+        terms : collection of int, optional
+            Positions of the terms whose gain it is; all where not given.
+
+        """
+        model, count = self._model, int(self.scored.sum())
+        if count < BLOCKS:
+            kept = self._samples.n - self._samples.test.start
+            unseen = int(self._samples.seen.sum()) < BLOCKS <= kept
+            return unmeasured_words(BLOCKS, count, unseen)
+        if self._estimations[1].loss(terms)[0] <= _UNKNOWN:
+            return ''
+        owners = range(len(model.terms)) if terms is None else terms
+        return unmeasured_words(BLOCKS, count, any(
+            model.terms[k].NEEDS_THROTTLE for k in owners))
+
+    def gain(self, new: FloatArray, old: FloatArray, terms: Collection[int] | None = None
+             ) -> tuple[float, float]:
+        """
+        Return a gain and its standard error, nats per sample; NaN where it cannot be measured.
+
+        Parameters
+        ----------
+        new, old : ndarray, shape (n,)
+            Log densities of all samples, with and without the terms.
+        terms : collection of int, optional
+            Positions of the terms whose gain it is; all where not given.
+
+        """
+        if self.why_unknown(terms):
+            return NAN, NAN
+        gain, error = mean_difference(new[self.scored], old[self.scored])
+        return gain, math.hypot(error, self.estimation.loss(terms)[1])
+
+
+def worth(samples: Samples, full: Composite, less: Composite, scale: Scale | None = None,
+          terms: Collection[int] | None = None) -> tuple[float, float, float]:
     """
     Return what the larger of two models gains.
 
@@ -75,19 +170,24 @@ def worth(samples: Samples, full: Composite, less: Composite) -> tuple[float, fl
         What both were fitted on the first part of.
     full, less : Composite
         With and without a cause.
+    scale : Scale, optional
+        Of the larger one.
+    terms : collection of int, optional
+        Positions of the cause in the larger one; all where not given.
 
     Returns
     -------
     gain, gain_se : float
-        On the part kept, nats per sample.
+        On the samples scored, nats per sample; NaN where it cannot be measured.
     p_value : float
         The smaller of two, doubled: of the likelihood ratio on the part fitted
         (chi-squared with as many degrees of freedom as there are more
         parameters, times what was searched) and of gain / gain_se (normal).
 
     """
-    test, train = samples.test, samples.train
-    gain, error = mean_difference(full.density[test], less.density[test])
+    scale = Scale(samples, full) if scale is None else scale
+    gain, error = scale.gain(full.density, less.density, terms)
+    train = samples.train
     ratio = 2.0 * float((full.density[train] - less.density[train]).sum())
     tail = float(chi2.logsf(max(ratio, 0.0), max(full.free - less.free, 1)))
     fitted = math.exp(min(tail + full.search - less.search, 0.0))
@@ -95,20 +195,25 @@ def worth(samples: Samples, full: Composite, less: Composite) -> tuple[float, fl
     return gain, error, min(1.0, 2.0 * min(fitted, kept))
 
 
-def crossings(t: FloatArray, voltage: FloatArray, level: float) -> float:
-    """Return downward crossings of a level per minute."""
-    span = float(t[-1] - t[0])
-    return 60.0 * _falls(voltage, level) / span if span > 0.0 else NAN
+def crossings(t: FloatArray, voltage: FloatArray, level: float,
+              scored: npt.NDArray[np.bool_] | None = None) -> float:
+    """Return downward crossings of a level per minute, between neighbours that are scored."""
+    pairs = np.ones(t.size - 1, dtype=np.bool_) if scored is None else scored[1:] & scored[:-1]
+    span = float(np.diff(t)[pairs].sum())
+    return 60.0 * _falls(voltage, level, pairs) / span if span > 0.0 else NAN
 
 
-def crossing_level(samples: Samples) -> float:
+def crossing_level(samples: Samples, scored: npt.NDArray[np.bool_] | None = None) -> float:
     """Return a level that is crossed now and then in both parts, V."""
     v = samples.voltage
+    fitted, kept = np.zeros((2, samples.n), dtype=np.bool_)
+    fitted[samples.train] = True
+    kept[samples.test] = True
+    parts = [part[1:] & part[:-1] for part in (fitted, kept if scored is None else scored)]
     mean, spread = float(v.mean()), float(v.std())
     depth = _DEEP
     while depth > _SHALLOW and min(
-            _falls(v[part], mean - depth * spread)
-            for part in (samples.train, samples.test)) < _OFTEN:
+            _falls(v, mean - depth * spread, pairs) for pairs in parts) < _OFTEN:
         depth -= _STEP
     level = mean - depth * spread
     below, above = v[v < level], v[v >= level]
@@ -116,12 +221,13 @@ def crossing_level(samples: Samples) -> float:
     return 0.5 * float(below.max() + above.min()) if below.size and above.size else level
 
 
-def _falls(v: FloatArray, level: float) -> int:
-    return int(((v[:-1] >= level) & (v[1:] < level)).sum())
+def _falls(v: FloatArray, level: float, pairs: npt.NDArray[np.bool_]) -> int:
+    return int(((v[:-1] >= level) & (v[1:] < level) & pairs).sum())
 
 
 def crossing_rates(samples: Samples, baseline: Sequence[Term], extended: Sequence[Term],
-                   rng: np.random.Generator) -> CrossingRate:
+                   rng: np.random.Generator, scored: npt.NDArray[np.bool_] | None = None
+                   ) -> CrossingRate:
     """
     Compare how often a level is crossed, in the data and in simulations.
 
@@ -130,30 +236,36 @@ def crossing_rates(samples: Samples, baseline: Sequence[Term], extended: Sequenc
     samples : Samples
         The recording; its last part is compared.
     baseline, extended : sequence of Term
-        Models fitted on its first part.
+        Models fitted on its first part; none at all stands for unknown.
     rng : numpy.random.Generator
         Source of randomness.
+    scored : ndarray of bool, shape (n,), optional
+        Samples that are compared; those of `seen` where not given.
 
     Returns
     -------
     CrossingRate
-        NaN for a model that cannot be simulated.
+        NaN for a model that is unknown or cannot be simulated, and for all
+        where fewer than `BLOCKS` samples are compared.
 
     """
-    level, part = crossing_level(samples), samples.test
-    t = samples.t[part]
+    scored = samples.seen if scored is None else scored
+    if int(scored.sum()) < BLOCKS:
+        return CrossingRate()
+    level, t = crossing_level(samples, scored), samples.t
     rates = []
     for terms in (baseline, extended):
         try:
             model = SupplyModel(tuple(terms))
             # Drift and tones count from the first sample of all.
-            found = [crossings(t, model.simulate(samples.t, rng, samples.throttle)[part], level)
+            found = [crossings(t, model.simulate(t, rng, samples.throttle), level, scored)
                      for _ in range(_DRAWS)]
         except ValueError:
             found = [NAN, NAN]
         rates.append((float(np.mean(found)), float(np.std(found, ddof=1)) / math.sqrt(len(found))))
-    v, span = samples.voltage[part], float(t[-1] - t[0])
-    # As if crossings came independently of each other.
-    error = 60.0 * math.sqrt(_falls(v, level)) / span if span > 0.0 else NAN
-    return CrossingRate(level, crossings(t, v, level), rates[0][0], rates[1][0], error,
-                        rates[0][1], rates[1][1])
+    observed = crossings(t, samples.voltage, level, scored)
+    # As if crossings came independently of each other; none at all is as uncertain as one.
+    minutes = float(np.diff(t)[scored[1:] & scored[:-1]].sum()) / 60.0
+    error = math.sqrt(max(observed * minutes, 1.0)) / minutes if minutes > 0.0 else NAN
+    return CrossingRate(level, observed, rates[0][0], rates[1][0], error, rates[0][1],
+                        rates[1][1])

@@ -18,24 +18,31 @@ from ou_monitor.offline.discover.composite import Composite, fit_composite, scen
 from ou_monitor.offline.discover.data import Samples
 from ou_monitor.offline.discover.errors import standard_errors
 from ou_monitor.offline.discover.finding import Cause, Criticism, Finding, Verdict
-from ou_monitor.offline.discover.gain import crossing_rates, mean_difference, without, worth
+from ou_monitor.offline.discover.gain import (
+    crossing_rates, mean_difference, mean_score, Scale, without, worth)
 from ou_monitor.offline.discover.integrity import examine, Integrity
-from ou_monitor.offline.discover.naming import criticise, name_causes, Search
+from ou_monitor.offline.discover.naming import name_causes, Search
 from ou_monitor.offline.discover.null_bank import family_chance, simulate_bank, simulate_bank_of
 from ou_monitor.offline.discover.structure import evaluate, fit_gaussian
+from ou_monitor.offline.discover.trials import criticise
 from ou_monitor.offline.discover.verdict import judge, NOTHING, withdrawn
 from ou_monitor.offline.discover.words import (
-    coupling_found, coupling_note, explain, no_relaxation_note, verdict_sentence)
+    coupling_found, coupling_note, explain, left_out_note, no_relaxation_note, verdict_sentence)
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import FloatArray, Recording
 from scipy.special import ndtri
 
 Progress = Callable[[float], None]
 
+# What to say where the search was cut short.
+STOPPED = ('The search for causes was cut short where the next ones would have taken long; there '
+           'may be more than are named.')
 # Steps of more relaxation times than this leave no relaxation to be seen.
 _BLIND = 1.0
 # Relaxation times in a recording from which its rate is one, and no trend.
 _RELAXES = 20.0
+# Causes of one kind from which their gain is measured together.
+_MANY = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,30 +93,34 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
     rng = np.random.default_rng(seed)
     try:
         plain, plain_density, start = _baseline(samples, state)
-    except (ValueError, np.linalg.LinAlgError):
-        return _insufficient(recording, state, 'No OU can be fitted to it.', seed)
-    tell(0.1)
-    named = _named(samples, start, rng, state.exact, lambda share: tell(0.1 + 0.6 * share))
+        tell(0.1)
+        named = _named(samples, start, rng, state.exact, lambda share: tell(0.1 + 0.6 * share))
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+        return _insufficient(recording, state, 'No OU can be fitted to it and simulated: hardly '
+                             'any of its samples differ, or some are far beyond all others.',
+                             seed)
     tell(0.7)
-    causes = _causes(samples, state, named, start, plain_density,
-                     lambda share: tell(0.7 + 0.15 * share))
     whole, se = _refitted(samples, named.model)
-    tell(0.9)
-    test = _kept(samples, state)
-    gain, gain_se = mean_difference(named.model.density[test], plain_density[test])
+    tell(0.75)
+    scored = _kept(samples, state)
+    scale = Scale(samples, named.model, scored)
+    causes = _causes(samples, state, named, whole, se, start, plain_density, scale,
+                     lambda share: tell(0.75 + 0.2 * share))
+    gain, gain_se = scale.gain(named.model.density, plain_density)
+    why = scale.why_unknown()
     verdict = judge(named.after, len(causes), len(named.dropped))
     criticism = _criticism(named.before, named.after)
     left = sorted((c for c in criticism if c.is_off), key=lambda c: -abs(c.after))
     # The rest is in the model that was fitted.
     undone = tuple(t for t in state.exact if t.NAME != 'quantization')
-    crossing = crossing_rates(samples, (plain,), named.model.terms, rng)
+    crossing = crossing_rates(samples, (plain,), () if why else named.model.terms, rng)
     tell(1.0)
     return Finding(
         recording=recording.name, n=recording.n, duration=recording.duration, verdict=verdict,
-        sentence=verdict_sentence(verdict, causes, left, gain, gain_se, named.dropped),
-        baseline=plain, baseline_score=float(plain_density[test].mean()), criticism=criticism,
+        sentence=verdict_sentence(verdict, causes, left, gain, gain_se, named.dropped, why),
+        baseline=plain, baseline_score=mean_score(plain_density, scored), criticism=criticism,
         causes=causes, model=SupplyModel((*whole.terms, *undone)),
-        se=(*se, *({} for _ in undone)), score=float(named.model.density[test].mean()),
+        se=(*se, *({} for _ in undone)), score=mean_score(named.model.density, scored),
         gain=gain, gain_se=gain_se, crossing=crossing, notes=_notes(state, named, samples),
         samples=samples, simulated=SupplyModel(whole.terms), seed=seed)
 
@@ -123,9 +134,8 @@ def _insufficient(recording: Recording, state: Integrity, reason: str, seed: int
 
 
 def _kept(samples: Samples, state: Integrity) -> npt.NDArray[np.bool_]:
-    """Return which samples are scored: those of the part kept that were measured."""
-    kept = np.zeros(samples.n, dtype=np.bool_)
-    kept[samples.test] = True
+    """Return which samples are scored: those that `seen` tells and that were measured."""
+    kept = samples.seen
     return kept if state.drawn is None else kept & ~state.drawn
 
 
@@ -174,7 +184,7 @@ def _named(samples: Samples, start: Composite, rng: np.random.Generator,
     try:
         search = name_causes(samples, start, bank, given=[term.NAME for term in exact],
                              progress=lambda share: progress(0.1 + 0.9 * share))
-        failure = ''
+        failure = STOPPED if search.stopped else ''
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         # A fit outside of what numbers can hold; the criticism still stands.
         search, failure = Search(start), f'The search for causes broke off: {error}.'
@@ -199,41 +209,53 @@ def position(model: Composite, names: list[str] | tuple[str, ...], k: int) -> in
     return [i for i, term in enumerate(model.terms) if term.NAME == names[k]][nth]
 
 
-def _causes(samples: Samples, state: Integrity, named: _Named, start: Composite,
-            plain_density: FloatArray, progress: Progress) -> tuple[Cause, ...]:
+def _causes(samples: Samples, state: Integrity, named: _Named, whole: Composite,
+            se: tuple[dict[str, Any], ...], start: Composite, plain_density: FloatArray,
+            scale: Scale, progress: Progress) -> tuple[Cause, ...]:
     """
     Return all causes: exact findings first, then those of the search.
 
-    The gain of a cause is what the model loses without it, fitted again; that
-    of repeats, rails and wrong stamps, which are undone in the samples, is what
-    the OU fitted to the samples as logged loses on those left, all together.
+    The gain of a cause is what the model loses without it, fitted again; causes
+    of one kind, where there are many (the harmonics of a line), are left out
+    together, and each has the gain of all.  That of repeats, rails and wrong
+    stamps, which are undone in the samples, is what the OU fitted to the
+    samples as logged loses on those left, all together.  Parameters are those
+    fitted to everything.
 
     """
     found: list[Cause] = []
-    se = standard_errors(samples, named.model, samples.train)
-    test = _kept(samples, state)
     for term in state.exact:
+        why = ''
         if term.ROLE is Role.NOISE:
             index = next(i for i, t in enumerate(named.model.terms) if t.NAME == term.NAME)
             less = without(samples, named.model, index)
-            gain, error = (math.nan, math.nan) if less is None else mean_difference(
-                named.model.density[test], less.density[test])
+            gain, error = (math.nan, math.nan) if less is None else scale.gain(
+                named.model.density, less.density, (index,))
+            why = scale.why_unknown((index,))
         else:
             clean = evaluate(samples, fit_gaussian(
                 samples, [start.terms[0]], samples.train).terms)
-            gain, error = mean_difference(clean.density[test], plain_density[test])
+            gain, error = mean_difference(clean.density[scale.scored],
+                                          plain_density[scale.scored])
         found.append(Cause(term, {}, gain, error, 0.0, (),
-                           explain(term, {}, gain, error, (), True), True))
-    alone = len(named.names) == 1
+                           explain(term, {}, gain, error, (), True, why), True))
+    groups: dict[tuple[int, ...], tuple[float, float, float]] = {}
     for k, name in enumerate(named.names):
         index = position(named.model, named.names, k)
-        term = named.model.terms[index]
-        less = start if alone else without(samples, named.model, index)
-        gain, error, chance = (math.nan,) * 3 if less is None else worth(
-            samples, named.model, less)
+        many = named.names.count(name) >= _MANY
+        group = tuple(position(named.model, named.names, j) for j, other in enumerate(named.names)
+                      if other == name) if many else (index,)
+        if group not in groups:
+            less = start if len(group) == len(named.names) else without(
+                samples, named.model, *group)
+            groups[group] = (math.nan,) * 3 if less is None else worth(
+                samples, named.model, less, scale, group)
+        gain, error, chance = groups[group]
         rivals = tuple(dict.fromkeys(named.rivals.get(name, ())))
-        found.append(Cause(term, se[index], gain, error, chance, rivals,
-                           explain(term, se[index], gain, error, rivals, False), False))
+        term = whole.terms[index]
+        found.append(Cause(term, se[index], gain, error, chance, rivals, explain(
+            term, se[index], gain, error, rivals, False, scale.why_unknown(group), len(group)),
+            False))
         progress((k + 1) / len(named.names))
     return tuple(found)
 
@@ -241,7 +263,10 @@ def _causes(samples: Samples, state: Integrity, named: _Named, start: Composite,
 def _refitted(samples: Samples, model: Composite) -> tuple[Composite, tuple[dict[str, Any], ...]]:
     """Return the model fitted on everything, and its standard errors."""
     whole = slice(0, samples.n)
-    again = fit_composite(samples, model.terms, whole)
+    try:
+        again = fit_composite(samples, model.terms, whole)
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+        again = None
     if again is None or not math.isfinite(float(again.density.sum())):
         return model, standard_errors(samples, model, samples.train)
     return again, standard_errors(samples, again, whole)
@@ -263,6 +288,10 @@ def _notes(state: Integrity, named: _Named, samples: Samples) -> tuple[str, ...]
     notes = [*state.notes, *([named.failure] if named.failure else [])]
     for name in dict.fromkeys(named.dropped):
         notes.append(f"'{name}' fitted, but left what it should explain: withdrawn.")
+    scored = int(samples.seen.sum())
+    out = samples.n - samples.train.stop - scored
+    if out:
+        notes.append(left_out_note(out, scored))
     duration = float(samples.t[-1] - samples.t[0])
     ou = named.model.terms[0]
     assert isinstance(ou, OU)

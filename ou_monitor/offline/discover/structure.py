@@ -26,7 +26,9 @@ from ou_monitor.records import FloatArray
 NO_NOISE = 1e-6
 # Steps of the numerical scores, in the logarithm of a parameter.
 _STEP = 1e-4
-_ROUNDS, _LAST_ROUNDS = 12, 2
+_ROUNDS, _FEW_ROUNDS, _LAST_ROUNDS = 12, 6, 2
+# Columns up to which least squares are solved without the normal equations.
+_NARROW = 8
 # Samples times further states that are too dear to begin with.
 _DEAR = 30000
 # With more states than this the part has to do.
@@ -130,13 +132,12 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
 
     """
     voltage = samples.voltage if offset is None else samples.voltage - offset
-    seen = Samples(samples.t[part], voltage[part],
-                   None if samples.throttle is None else samples.throttle[part])
+    seen = samples.part(part, voltage)
     inside = None if events is None else events.part(part)
     start = tuple(terms)
     terms, se = _maximise(seen, start, inside, rough)
     if whole_mean and seen.n < samples.n:
-        terms = _regress(Samples(samples.t, voltage, samples.throttle), terms, events)
+        terms = _regress(samples.part(slice(None), voltage), terms, events)
     return evaluate(samples, terms, events, se)
 
 
@@ -164,16 +165,13 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
         Nothing is fitted.
 
     """
-    s, space, own = _space(samples, terms, events)
-    run = Filter(space, samples.n)
-    columns = _columns(terms, s)
+    s, run, plain, full = _filter(samples, terms, events)
+    columns = _columns(samples, terms, s)
     beta = np.concatenate([_linear(term) for term in terms])
     mean = columns @ beta
     e = run.innovations(samples.voltage - mean)
     # An event is the law's to expect, at its own sample: not so while it is fitted around.
-    variance = run.variance
-    if not inside:
-        variance = variance - own
+    variance = full if inside else plain
     return GaussianFit(tuple(terms), tuple(se), mean, e, variance, _log_density(e, variance),
                        np.exp(-s.alpha * s.step))
 
@@ -190,16 +188,38 @@ def _linear(term: Term) -> FloatArray:
     return np.array(term.linear_values() if term.ROLE is Role.MEAN else [], dtype=np.float64)
 
 
-def _columns(terms: Sequence[Term], s: Stretch) -> FloatArray:
+def _columns(samples: Samples, terms: Sequence[Term], s: Stretch) -> FloatArray:
     """Return all columns of the mean, through the instrument."""
     parts = [np.ones((s.t.size, 1))]
-    parts += [term.columns(s) for term in terms if term.ROLE is Role.MEAN and term.NAME != 'ou']
+    for term in terms:
+        if term.ROLE is Role.MEAN and term.NAME != 'ou':
+            # Its coefficients apart, a term has the same columns again and again.
+            unit = term.with_linear([1.0] * len(term.LINEAR))
+            if unit not in samples.columns:
+                samples.columns[unit] = term.columns(s)
+            parts.append(samples.columns[unit])
     columns = np.concatenate(parts, axis=1)
     for term in terms:
         if isinstance(term, ACCoupling):
             # What the instrument shows has a level of its own.
             columns[:, 1:] = term.pass_through(columns[:, 1:], s)
     return columns
+
+
+def _filter(samples: Samples, terms: Sequence[Term], events: Events | None
+            ) -> tuple[Stretch, Filter, FloatArray, FloatArray]:
+    """Return the stretch, its filter, and variances: events at their own sample not in, and in."""
+    many = sum(term.ROLE is Role.BLOCK for term in terms) > 0
+    if events is not None and many and not events.push.any() and not events.error.any():
+        # Where only the intensity changes, the gains of several states hardly do: a
+        # filter that is settled saves most of the time.
+        s, space, _ = _space(samples, terms, None)
+        run = Filter(space, samples.n)
+        q = s.sigma * s.sigma * -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
+        return s, run, run.variance, run.variance + (events.power - 1.0) * q
+    s, space, own = _space(samples, terms, events)
+    run = Filter(space, samples.n)
+    return s, run, run.variance - own, run.variance
 
 
 def _space(samples: Samples, terms: Sequence[Term], events: Events | None
@@ -240,6 +260,8 @@ def _space(samples: Samples, terms: Sequence[Term], events: Events | None
         to = at + h.size
         f_all[:, at:to, at:to], q_all[:, at:to, at:to], h_all[at:to] = f, cov, h
         at = to
+    # Measured: some 0.1 us a sample, and as the square of the states.
+    samples.work[0] += 1e-7 * n * d * d + 2e-8 * samples.n * d
     r = np.full(n, floor + sum(term.variance() for term in terms))
     if events is not None:
         r += events.error
@@ -272,23 +294,26 @@ def _coupled(term: ACCoupling, s: Stretch, phi: FloatArray, q: FloatArray
 
 
 def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
-              rough: bool = False) -> tuple[tuple[Term, ...], tuple[dict[str, float], ...]]:
+              rough: bool = False, only: Sequence[int] | None = None
+              ) -> tuple[tuple[Term, ...], tuple[dict[str, float], ...]]:
     """Fit by scoring: the outer product of numerical scores stands for the information."""
-    rounds = _ROUNDS
-    states = _space(samples, terms, events)[1].f.shape
-    if states[0] * (states[1] - 1) > _DEAR:
+    rounds = _FEW_ROUNDS if rough else _ROUNDS
+    states = _filter(samples, terms, events)[1].shape
+    few = max(_DEAR // (2 * states[1]), 2000)
+    if states[0] * (states[1] - 1) > _DEAR and few < samples.n:
         # Far from the top a part of the samples shows the way.
-        part = _telling(samples, max(_DEAR // (2 * states[1]), 2000))
+        part = _telling(samples, few)
+        # What was fitted to all samples before is known better than a part can tell.
         terms, se_part = _maximise(
-            Samples(samples.t[part], samples.voltage[part],
-                    None if samples.throttle is None else samples.throttle[part]), terms,
-            None if events is None else events.part(part))
+            samples.part(part), terms, None if events is None else events.part(part),
+            only=(0, len(terms) - 1) if rough else None)
         if rough or states[1] > _MANY:
             shrink = math.sqrt((part.stop - part.start) / samples.n)
             return _regress(samples, terms, events), tuple(
                 {name: value * shrink for name, value in errors.items()} for errors in se_part)
         rounds = _LAST_ROUNDS
-    free = [(k, name) for k, term in enumerate(terms) for name in term.free()]
+    free = [(k, name) for k, term in enumerate(terms) for name in term.free()
+            if only is None or k in only]
     base = _with_mean(samples, terms, events)
     terms = base.terms
     value, damping, inverse = float(base.density.sum()), 0.0, np.zeros((0, 0))
@@ -329,10 +354,25 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
     return terms, tuple(se)
 
 
+def _solved(columns: FloatArray, y: FloatArray) -> FloatArray:
+    """Return least squares; coefficients that nothing determines come out as small as may be."""
+    if columns.shape[1] <= _NARROW:
+        few: FloatArray = np.asarray(np.linalg.lstsq(columns, y, rcond=1e-10)[0])
+        return few
+    # Of many columns, lines mostly and so nearly at right angles, the normal equations.
+    scale = np.sqrt(np.einsum('ij,ij->j', columns, columns))
+    scale[scale == 0.0] = 1.0
+    gram = columns.T @ columns / np.outer(scale, scale)
+    inverse = np.asarray(np.linalg.pinv(gram, rcond=1e-12, hermitian=True), dtype=np.float64)
+    many: FloatArray = inverse @ (
+        columns.T @ y / scale) / scale
+    return many
+
+
 def _telling(samples: Samples, size: int) -> slice:
     """Return the stretch of a size in which throttle moves most; the first without throttle."""
-    if samples.throttle is None or size >= samples.n:
-        return slice(0, min(size, samples.n))
+    if samples.throttle is None:
+        return slice(0, size)
     first = np.arange(0, samples.n - size + 1, max(size // 4, 1))
     moves = [float(samples.throttle[k:k + size].std()) for k in first.tolist()]
     begin = int(first[int(np.argmax(moves))])
@@ -352,12 +392,14 @@ def _regress(samples: Samples, terms: tuple[Term, ...], events: Events | None
 
 def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None) -> GaussianFit:
     """Fit the coefficients of the mean by generalised least squares; events count as known."""
-    s, space, _ = _space(samples, terms, events)
-    run = Filter(space, samples.n)
-    columns = _columns(terms, s)
-    weight = 1.0 / np.sqrt(run.variance)
+    s, run, _, variance = _filter(samples, terms, events)
+    columns = _columns(samples, terms, s)
+    if not (variance > 0.0).all():
+        raise ArithmeticError('variances that are not above 0')
+    weight = 1.0 / np.sqrt(variance)
     through = run.innovations(np.column_stack((samples.voltage, columns))) * weight[:, None]
-    beta = np.linalg.lstsq(through[:, 1:], through[:, 0], rcond=1e-10)[0]
+    beta = _solved(through[:, 1:], through[:, 0])
+    samples.work[0] += 1e-8 * samples.n * beta.size
     ou = terms[0]
     assert isinstance(ou, OU)
     result: list[Term] = [replace(ou, u0=float(beta[0]))]
@@ -369,5 +411,5 @@ def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None)
         result.append(term.with_linear(beta[at:at + size].tolist()) if size else term)
         at += size
     e = (through[:, 0] - through[:, 1:] @ beta) / weight
-    return GaussianFit(tuple(result), (), columns @ beta, e, run.variance,
-                       _log_density(e, run.variance), np.exp(-s.alpha * s.step))
+    return GaussianFit(tuple(result), (), columns @ beta, e, variance,
+                       _log_density(e, variance), np.exp(-s.alpha * s.step))

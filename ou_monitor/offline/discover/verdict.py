@@ -16,6 +16,8 @@ PASSES = 0.001
 # A statistic fails that is this far off, and by more than these shares of what it,
 # and the worst of all, was before there were any causes.
 FAILS, OWN_SHARE, SHARE = 4.8, 0.07, 0.02
+# Share of its own signs that noise or a line may leave.
+_SIGNS_SHARE = 0.3
 
 
 def largest_chance(values: Mapping[str, float]) -> float:
@@ -54,15 +56,23 @@ def withdrawn(before: Mapping[str, float], after: Mapping[str, float],
         Positions in `accepted`: where a statistic fails, all latent causes.
         What nobody measured can imitate a part of almost anything; it is named
         only where it explains the whole.  White noise, which no sensor is
-        without, has to explain only what it is asked for.
+        without, and lines, which are there whatever else is, have to explain
+        only what they are asked for.
 
     """
-    left = failing(before, after)
+    measured = [kind for kind in accepted if not is_latent(kind)]
+    # What a measured cause is asked for and leaves is its form, which is not complete.
+    left = [name for name in failing(before, after)
+            if not any(is_sign(sign, name, after[name]) for kind in measured
+                       for sign in kind.SIGNS)]
 
     def fails(kind: type[Term]) -> bool:
-        if kind.ROLE is not Role.NOISE:
+        if kind.ROLE is not Role.NOISE and kind.FAMILY != 'line':
             return bool(left)
-        return any(is_sign(sign, name, after[name]) for name in left for sign in kind.SIGNS)
+        own = max((abs(value) for name, value in before.items() for sign in kind.SIGNS
+                   if is_sign(sign, name, value)), default=0.0)
+        return any(is_sign(sign, name, after[name]) and abs(after[name]) > _SIGNS_SHARE * own
+                   for name in left for sign in kind.SIGNS)
 
     return [k for k, kind in enumerate(accepted) if is_latent(kind) and fails(kind)]
 

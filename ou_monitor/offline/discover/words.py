@@ -180,7 +180,7 @@ def _unit(term: Term, name: str) -> str:
 
 
 def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
-            alternatives: Sequence[str], exact: bool) -> str:
+            alternatives: Sequence[str], exact: bool, why: str = '', together: int = 1) -> str:
     """
     Return what a cause is, its estimate, its gain and what to do, for people.
 
@@ -196,6 +196,10 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
         Causes that cannot be told from it.
     exact : bool
         Whether it was found without a model.
+    why : str
+        Why the gain is not known, where it is not.
+    together : int
+        Terms of the kind of which the gain is, all together.
 
     Returns
     -------
@@ -207,7 +211,9 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
     parts = [what, f'Estimate: {parameters(term, se)}.']
     if exact:
         parts.append('Seen in the samples themselves, without a model.')
-    parts.append(gain_words(gain, gain_se))
+    parts.append(gain_words(gain, gain_se, why))
+    if together > 1 and math.isfinite(gain):
+        parts.append(f'That is the gain of all {together} terms {term.NAME} together.')
     if alternatives:
         separate = [f'{_CAUSES[name][2]} (for {name})' for name in (term.NAME, *alternatives)
                     if name in _CAUSES]
@@ -217,14 +223,50 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
     return ' '.join(part for part in parts if part)
 
 
-def gain_words(gain: float, gain_se: float) -> str:
+def gain_words(gain: float, gain_se: float, why: str = '') -> str:
     """Return the gain in a sentence; one that is not distinguishable from zero is none."""
     if not math.isfinite(gain):
-        return 'Its gain cannot be measured here.'
+        return 'Its gain cannot be measured on this recording' + (f': {why}' if why else '.')
     size = f'{number(1e3 * gain)} +- {number(1e3 * gain_se, 2)} mnat per sample'
     if gain > 1.96 * gain_se:
         return f'Gain on samples not used for the fit: {size}.'
     return f'No measurable gain on samples not used for the fit ({size}).'
+
+
+def left_out_note(count: int, scored: int) -> str:
+    """Return that samples at throttle which the part fitted has not seen are not scored."""
+    return (f'{count} samples of the last 40 % are at throttle that the first 60 % never had: a '
+            f'model fitted there says nothing of them. Only the other {scored} are scored.')
+
+
+def unmeasured_words(fewest: int, scored: int, throttle: bool) -> str:
+    """
+    Return why a gain cannot be measured, and what recording would measure it.
+
+    Parameters
+    ----------
+    fewest : int
+        Samples that have to be scored, at least.
+    scored : int
+        Samples that are.
+    throttle : bool
+        Whether it is for throttle that the first part did not see.
+
+    Returns
+    -------
+    str
+        The end of a sentence, and one more.
+
+    """
+    few = f'{scored} samples are left to score it on, fewer than {fewest}'
+    if throttle:
+        return (f'{few if scored < fewest else "models are fitted on the first 60 % for this"}, '
+                'and throttle there does not go through what the rest holds. One that goes '
+                'through all of its throttle in both parts would measure it.')
+    if scored < fewest:
+        return f'{few}. A longer one would measure it.'
+    return ('the first 60 %, on which models are fitted for this, do not determine it. A longer '
+            'one would measure it.')
 
 
 def coupling_note(alpha: float, duration: float) -> str:
@@ -275,7 +317,8 @@ def remaining_words(left: Sequence[Criticism]) -> str:
 
 
 def verdict_sentence(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism],
-                     gain: float, gain_se: float, dropped: Sequence[str] = ()) -> str:
+                     gain: float, gain_se: float, dropped: Sequence[str] = (),
+                     why: str = '') -> str:
     """
     Return the verdict in a sentence or two.
 
@@ -291,6 +334,8 @@ def verdict_sentence(verdict: Verdict, causes: Sequence[Cause], left: Sequence[C
         Of the extended model, nats per sample.
     dropped : sequence of str
         Causes that fitted but did not explain.
+    why : str
+        Why the gain is not known, where it is not.
 
     Returns
     -------
@@ -311,10 +356,10 @@ def verdict_sentence(verdict: Verdict, causes: Sequence[Cause], left: Sequence[C
                 f'{remaining_words(left)}.{tried}')
     if verdict is Verdict.EXPLAINED:
         return (f'What the plain OU gets wrong is explained by {listed(names)}. '
-                + gain_words(gain, gain_se))
+                + gain_words(gain, gain_se, why))
     rest = f': {remaining_words(left)}' if left else ''
     return (f'{listed(names)} explain{"s" if len(names) == 1 else ""} a part of what the plain OU '
-            f'gets wrong; something else is left{rest}.{tried} ' + gain_words(gain, gain_se))
+            f'gets wrong; something else is left{rest}.{tried} ' + gain_words(gain, gain_se, why))
 
 
 def _counted(names: Sequence[str]) -> list[str]:
