@@ -75,4 +75,12 @@ class LoadTransient(Term):
         if longest <= 2.0 * step:
             return ()
         count = max(2, math.ceil(2.0 * math.log2(longest / (2.0 * step))))
-        return [cls(0.0, float(tau), 0.0) for tau in np.geomspace(2.0 * step, longest, count)]
+        lags = [cls(0.0, float(tau), 0.0) for tau in np.geomspace(2.0 * step, longest, count)]
+        # Late by whole steps, and for good: a delay.
+        latest = max(_LATEST, 4.0 * step)
+        late = np.unique(np.rint(np.geomspace(step, latest, _DELAYS) / step)) * step
+        return [*lags, *(cls(0.0, longest, float(delay)) for delay in late)]
+
+
+# Delays tried, and the longest of them, s.
+_DELAYS, _LATEST = 12, 0.1

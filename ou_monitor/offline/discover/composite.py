@@ -69,7 +69,7 @@ class Composite:
     def score(self, samples: Samples) -> float:
         """Return evidence, nats: of the part fitted, less its price, and of the part kept."""
         n = samples.train.stop
-        return float(self.density[samples.train].sum() + self.density[samples.seen].sum()
+        return float(self.density[samples.train].sum() + self.density[samples.test].sum()
                      - 0.5 * self.free * math.log(n) - self.search)
 
     def has(self, name: str) -> bool:

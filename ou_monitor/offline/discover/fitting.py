@@ -7,6 +7,7 @@ Most starts are told from each other on some thousand samples.
 from __future__ import annotations
 
 from collections.abc import Sequence
+import math
 
 import numpy as np
 
@@ -76,7 +77,10 @@ def _likely(samples: Samples, composite: Composite, starts: list[Term]) -> list[
 
     def value(start: Term) -> float:
         terms = [start.beside(structural[0]), *structural[1:], start]
-        return float(evaluate(few, terms).density.sum())
+        try:
+            return float(evaluate(few, terms).density.sum())
+        except (ValueError, ArithmeticError):
+            return -math.inf
 
     return sorted(starts, key=lambda start: -value(start))
 

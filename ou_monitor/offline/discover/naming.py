@@ -20,11 +20,11 @@ from ou_monitor.model.terms.tone import Tone
 from ou_monitor.offline.discover.battery import is_sign
 from ou_monitor.offline.discover.composite import Composite, view_of
 from ou_monitor.offline.discover.data import Samples
-from ou_monitor.offline.discover.fitting import fitted, joined
+from ou_monitor.offline.discover.fitting import best_start, fitted, joined
 from ou_monitor.offline.discover.gain import BLOCKS, mean_difference
 from ou_monitor.offline.discover.null_bank import NullBank
 from ou_monitor.offline.discover.trials import (
-    AGAIN, criticise, is_measured, MOST_WORK, refined, ROUGH, tier_of, TIERS, trials_of)
+    AGAIN, criticise, is_measured, MOST_WORK, refined, ROUGH, tier_of, TIERS, Trial, trials_of)
 
 # Evidence from which a cause is accepted, nats; the same for a mean that answers to what
 # was measured, which every flight has some of.
@@ -128,6 +128,7 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
                                       if t is not best))
         search.composite = best.composite
         search.accepted.append(best.name)
+        _other_means(samples, search, trials)
         after = criticise(samples, search.composite, bank)
         if best.name == 'tone':
             after = _more_lines(samples, search, after, bank)
@@ -164,6 +165,25 @@ def _throughout(new: Composite, old: Composite) -> bool:
     mean, error = mean_difference(new.density, old.density)
     gains = [float(part.sum()) for part in np.array_split(new.density - old.density, BLOCKS)]
     return not mean <= _STEADY * error or sum(gain > 0.0 for gain in gains) >= _MOSTLY * BLOCKS
+
+
+def _other_means(samples: Samples, search: Search, trials: Sequence[Trial]) -> None:
+    """Accept what else in the mean answers to what was measured, before alpha takes its place."""
+    last = search.accepted[-1]
+    for trial in trials:
+        kind = catalogue()[trial.name]
+        if trial.name == last or kind.ROLE is not Role.MEAN or not is_measured(kind) or (
+                trial.evidence < ACCEPT_MEAN or not is_measured(catalogue()[last])):
+            continue
+        composite = search.composite
+        view = view_of(samples, composite.gaussian, composite.z, samples.train)
+        made = best_start(samples, composite, kind, view)
+        gain = -math.inf if made is None else made.score(samples) - composite.score(samples)
+        if made is not None and gain > ACCEPT_MEAN:
+            search.log.append(f'{trial.name}: {gain:.1f} nats beside it')
+            search.composite = made
+            search.accepted.append(trial.name)
+            search.rivals.setdefault(trial.name, [])
 
 
 def _more_lines(samples: Samples, search: Search, values: dict[str, float], bank: NullBank
