@@ -79,6 +79,9 @@ def run(args: argparse.Namespace) -> int:
     """
     from ou_monitor.cli import output
 
+    output.check_paths(
+        {'RECORDING': args.recording, '--msg-config': args.msg_config},
+        {'--json': args.json, '--report': args.report})
     levels = _levels(args.levels)
     window = _number('--window', args.window)
     horizon = _number('--brownout-horizon', args.brownout_horizon)
@@ -111,9 +114,9 @@ def run(args: argparse.Namespace) -> int:
     if args.json is not None:
         output.write_json(as_data(analysis), args.json)
     if args.json != output.STDOUT:
-        print(render(analysis))
+        output.say(render(analysis))
         if args.report is not None:
-            print(f'\nReport: {args.report}')
+            output.say(f'\nReport: {args.report}')
     return 0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from ou_monitor.cli import output
@@ -32,9 +31,9 @@ def add_parser(subparsers: Any) -> None:
         'convert', help='a log becomes an MCAP bag',
         description='Convert a log to a bag with the topics /voltage and /throttle.',
         epilog='Read today: ' + '; '.join(FORMATS.values()) + '.')
-    parser.add_argument('log', metavar='LOG', type=Path, help='what to read')
+    parser.add_argument('log', metavar='LOG', type=output.path_argument, help='what to read')
     parser.add_argument(
-        'out', metavar='OUT', type=Path,
+        'out', metavar='OUT', type=output.path_argument,
         help='what to write: NAME.mcap for one file, NAME for a rosbag2 folder')
     parser.add_argument(
         '--type', choices=TYPES, default='battery_state',
@@ -73,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
             + '; '.join(f'{key} ({words})' for key, words in FORMATS.items()))
     if args.out.suffix.lower() in LOG_ENDINGS:
         raise InputError(f"OUT '{args.out}' must end in .mcap, or be the name of a folder")
+    output.check_paths({'LOG': args.log}, {'OUT': args.out, '--json': args.json})
     output.check_writable(args.json)
 
     from ou_monitor.recordings.read import read_recording
@@ -90,8 +90,8 @@ def run(args: argparse.Namespace) -> int:
             'log': str(args.log), 'out': str(args.out), 'n': recording.n,
             'duration_s': recording.duration, 'topics': topics, 'notes': list(notes)}, args.json)
     if args.json != output.STDOUT:
-        print(f'{args.out}: {recording.n} samples, {recording.duration:.3f} s, '
-              + ', '.join(f'{topic} ({kind})' for topic, kind in topics.items()))
+        output.say(f'{args.out}: {recording.n} samples, {recording.duration:.3f} s, '
+                   + ', '.join(f'{topic} ({kind})' for topic, kind in topics.items()))
         for note in notes:
-            print(f'note: {note}')
+            output.say(f'note: {note}')
     return 0

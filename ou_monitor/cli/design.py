@@ -77,13 +77,13 @@ class _List(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         """Print and leave with status 0."""
-        from ou_monitor.cli.output import table
+        from ou_monitor.cli.output import say, table
         from ou_monitor.model.network.components import PowerNetwork, UNITS
 
         network = PowerNetwork()
         rows = [[name, _shown(value, network), UNITS.get(name, '')]
                 for name, value in asdict(network).items()]
-        print(table(['component', 'default', 'unit'], rows, left=[0, 2]))
+        say(table(['component', 'default', 'unit'], rows, left=[0, 2]))
         parser.exit()
 
 
@@ -115,6 +115,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from ou_monitor.cli import output
 
+    output.check_paths({'--network': args.network}, {'--json': args.json})
     numbers = {name: quantity(f'--{name.replace("_", "-")}', getattr(args, name), unit)
                for name, unit in _OPTIONS.items()}
     if numbers['throttle'] > 1.0:
@@ -147,7 +148,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json is not None:
         output.write_json(as_data(result, source), args.json)
     if args.json != output.STDOUT:
-        print(render(result, source))
+        output.say(render(result, source))
     return 0
 
 

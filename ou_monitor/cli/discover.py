@@ -74,11 +74,15 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        When an option, the recording or an output cannot be used.
+        When an option, the recording or an output cannot be used, and when
+        there is no model to save; report and JSON are written all the same.
 
     """
     if args.seed < 0:
         raise InputError(f'--seed must be 0 or more, got {args.seed}')
+    output.check_paths(
+        {'RECORDING': args.recording, '--msg-config': args.msg_config},
+        {'--json': args.json, '--save-model': args.save_model, '--report': args.report})
     for option, target in (('--report', args.report), ('--save-model', args.save_model)):
         if target == output.STDOUT:
             raise InputError(f"{option} needs a file: '-' is not supported")
@@ -98,15 +102,16 @@ def run(args: argparse.Namespace) -> int:
         with output.Progress('drawing') as progress:
             text = discovery_page(finding, command_line(args), progress)
         output.write_text(text, args.report)
-    if args.save_model is not None:
-        output.write_text(model_text(finding), args.save_model)
     if args.json is not None:
         output.write_json(finding.as_data(), args.json)
+    if args.save_model is not None:
+        # Last: that there is none must not keep the others from being written.
+        output.write_text(model_text(finding), args.save_model)
     if args.json != output.STDOUT:
-        print(render(finding))
+        output.say(render(finding))
         for name, target in (('Report', args.report), ('Model', args.save_model)):
             if target is not None:
-                print(f'\n{name}: {target}')
+                output.say(f'\n{name}: {target}')
     return 0
 
 
@@ -185,8 +190,9 @@ def render(finding: Finding) -> str:
         Plain text.
 
     """
+    from ou_monitor.offline.discover.cause_rows import cause_rows
     from ou_monitor.offline.discover.words import (
-        crossing_words, parameters, plain_model_words, plain_words)
+        crossing_words, plain_model_words, plain_words)
     from ou_monitor.offline.words import number
 
     used = '' if finding.samples is None or finding.samples.n == finding.n else (
@@ -194,14 +200,16 @@ def render(finding: Finding) -> str:
     lines = [f'{finding.recording}: {finding.n} samples in {number(finding.duration, 4)} s{used}',
              '', fill(finding.sentence, _COLUMNS)]
     if finding.causes:
-        rows = [[cause.name, cause.term.FAMILY,
-                 f'{number(1e3 * cause.gain)} +- {number(1e3 * cause.gain_se, 2)}',
-                 'exact' if cause.exact else f'{cause.p_value:.2g}',
-                 ', '.join(cause.alternatives) or '-'] for cause in finding.causes]
+        found = cause_rows(finding.causes)
+        rows = [[row.label, row.family, row.gain, row.chance, ', '.join(row.alternatives) or '-']
+                for row in found]
         lines += ['', output.table(['cause', 'family', 'gain mnat/sample', 'p', 'not told from'],
                                    rows, left=[0, 1, 4]), '']
-        lines += [_item(f'{cause.name}: {parameters(cause.term, cause.se)}')
-                  for cause in finding.causes]
+        for row in found:
+            lines += [_item(f'{row.name}: {estimate}') for estimate in row.estimates]
+        for remark in dict.fromkeys(row.remark for row in found if row.remark):
+            lines.append(_item(f'Gain {remark}: ' + ', '.join(
+                f'{row.label} ({row.gain})' for row in found if row.remark == remark)))
     if finding.baseline is not None:
         lines += ['', fill(f'Plain OU: {plain_model_words(finding.baseline)}.', _COLUMNS)]
         felt = crossing_words(finding)

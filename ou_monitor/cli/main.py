@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from importlib import import_module
-import os
 import sys
 from typing import NoReturn
 
@@ -108,9 +107,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if argv is None else argv)
     where = PROGRAM
     try:
-        args = _parse(given)
-        where = f'{PROGRAM} {args.command}'
-        return int(args.run(args))
+        try:
+            args = _parse(given)
+            where = f'{PROGRAM} {args.command}'
+            return int(args.run(args))
+        except SystemExit as stop:
+            # From argparse: --help, --version and bad arguments.  What it printed
+            # is still in the buffer, and an error of writing it can still be told.
+            from ou_monitor.cli.output import say
+
+            say('', end='')
+            return stop.code if isinstance(stop.code, int) else 0
     except InputError as error:
         # One line, whatever a file name or a library's message may hold.
         print(f"{where}: {' '.join(str(error).split())}", file=sys.stderr)
@@ -118,13 +125,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:
+        from ou_monitor.cli.output import abandon_stdout
+
         # The reader (head, less) has gone.  Nothing more may be written, also
         # not by the flush at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        abandon_stdout()
         return 0
-    except SystemExit as stop:
-        # From argparse: --help, --version and bad arguments.
-        return stop.code if isinstance(stop.code, int) else 0
 
 
 if __name__ == '__main__':

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 import enum
 import json
 import math
+import os
 from pathlib import Path
 import shutil
 import sys
@@ -17,6 +20,8 @@ import numpy as np
 from ou_monitor.errors import InputError
 
 STDOUT = '-'
+# What a rosbag2 folder is made of, beside its metadata.yaml: storage files, compressed or not.
+_STORAGE = ('.mcap', '.db3', '.zst', '.zstd', '.lz4')
 
 
 def plain(value: Any) -> Any:
@@ -64,15 +69,51 @@ def write_json(data: Mapping[str, Any], target: str) -> None:
     Raises
     ------
     InputError
-        When the file cannot be written.
+        When it cannot be written.
 
     """
-    text = json.dumps(plain(data), indent=2, allow_nan=False, ensure_ascii=False) + '\n'
+    text = json.dumps(plain(data), indent=2, allow_nan=False, ensure_ascii=False)
     if target == STDOUT:
-        sys.stdout.write(text)
-        sys.stdout.flush()
+        say(text)
     else:
-        write_text(text, target)
+        write_text(text + '\n', target)
+
+
+def say(text: str, end: str = '\n') -> None:
+    """
+    Write to standard output, at once.
+
+    Parameters
+    ----------
+    text : str
+        What to write.
+    end : str
+        What follows it.
+
+    Raises
+    ------
+    InputError
+        When standard output cannot be written, such as on a full disk.
+    BrokenPipeError
+        When its reader has gone, which is no error of the user.
+
+    """
+    try:
+        sys.stdout.write(text + end)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        abandon_stdout()
+        raise InputError(
+            f'cannot write to standard output: {error.strerror or error}') from error
+
+
+def abandon_stdout() -> None:
+    """Send what is left in the buffer nowhere, so that the flush at exit cannot fail."""
+    # A standard output that is no file, as in a test, has nothing to abandon.
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def write_text(text: str, target: str | Path) -> None:
@@ -96,6 +137,87 @@ def write_text(text: str, target: str | Path) -> None:
         Path(target).write_text(text, encoding='utf-8')
     except OSError as error:
         raise InputError(f"cannot write '{target}': {error.strerror or error}") from error
+
+
+def path_argument(text: str) -> Path:
+    """
+    Return a path given as an argument; an empty one would be the current folder.
+
+    Parameters
+    ----------
+    text : str
+        As typed.
+
+    Returns
+    -------
+    pathlib.Path
+        The path.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        When it is empty.
+
+    """
+    if not text:
+        raise argparse.ArgumentTypeError('the path is empty')
+    return Path(text)
+
+
+def check_paths(inputs: Mapping[str, str | Path | None],
+                outputs: Mapping[str, str | Path | None]) -> None:
+    """
+    Refuse paths that are empty, and outputs that would overwrite an input or each other.
+
+    Parameters
+    ----------
+    inputs : mapping of str to str or Path or None
+        What is read, by argument; None where left out.
+    outputs : mapping of str to str or Path or None
+        What is written, by option; None where left out, ``-`` passes.
+
+    Raises
+    ------
+    InputError
+        Names both arguments.
+
+    """
+    for name, given in (*inputs.items(), *outputs.items()):
+        if given is not None and not str(given):
+            raise InputError(f'{name}: the path is empty')
+    written = [(name, Path(target)) for name, target in outputs.items()
+               if target is not None and str(target) != STDOUT and not _is_device(Path(target))]
+    for k, (name, target) in enumerate(written):
+        for source, given in inputs.items():
+            if given is not None and _overwrites(target, Path(given)):
+                raise InputError(f"{name} '{target}' would overwrite {source} '{given}', which "
+                                 'is read: give another name')
+        for other, earlier in written[:k]:
+            if _same(target, earlier):
+                raise InputError(f"{other} and {name} are both '{target}': give each its own "
+                                 'name')
+
+
+def _is_device(path: Path) -> bool:
+    """Return whether it is such as /dev/null, where nothing is overwritten."""
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
+def _same(first: Path, second: Path) -> bool:
+    """Return whether two paths are one file, by whatever links."""
+    if first.resolve() == second.resolve():
+        return True
+    return first.exists() and second.exists() and first.samefile(second)
+
+
+def _overwrites(target: Path, source: Path) -> bool:
+    """Return whether writing the target harms the source: a file, or a bag's folder."""
+    if _same(target, source):
+        return True
+    if not source.is_dir() or source.resolve() not in target.resolve().parents:
+        return False
+    name = target.resolve().name.lower()
+    return name == 'metadata.yaml' or name.endswith(_STORAGE)
 
 
 def check_writable(target: str | None) -> None:

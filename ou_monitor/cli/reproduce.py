@@ -64,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f'--seed must be 0 or more, got {args.seed}')
     if args.report == output.STDOUT:
         raise InputError("--report needs a file: '-' is not supported")
+    output.check_paths({}, {'--json': args.json, '--report': args.report})
     output.check_writable(args.json)
     output.check_writable(args.report)
 
@@ -79,9 +80,9 @@ def run(args: argparse.Namespace) -> int:
     if args.json is not None:
         output.write_json(as_data(result), args.json)
     if args.json != output.STDOUT:
-        print(render(result))
+        output.say(render(result))
         if args.report is not None:
-            print(f'\nReport: {args.report}')
+            output.say(f'\nReport: {args.report}')
     return 0
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-from pathlib import Path
 from typing import Any
 
 from ou_monitor.cli import output
@@ -36,7 +35,7 @@ def add_parser(subparsers: Any) -> None:
     source = parser.add_mutually_exclusive_group()
     source.add_argument('--preset', metavar='NAME',
                         help="what to simulate (default 'flight'; --list shows all)")
-    source.add_argument('--model', metavar='FILE.yaml', type=Path,
+    source.add_argument('--model', metavar='FILE.yaml', type=output.path_argument,
                         help='model file, as discover writes it')
     parser.add_argument('--duration', metavar='S', type=float, help='length, s')
     parser.add_argument('--rate', metavar='HZ', type=float, help='samples per second')
@@ -46,12 +45,12 @@ def add_parser(subparsers: Any) -> None:
         '--throttle', metavar='PROFILE',
         help='name of a profile, a number 0..1, points T:U,T:U,..., or a CSV file with time_s '
              'and throttle')
-    parser.add_argument('--output', metavar='PATH', type=Path,
+    parser.add_argument('--output', metavar='PATH', type=output.path_argument,
                         help='NAME.mcap for one file, NAME for a rosbag2 folder')
     parser.add_argument(
         '--type', choices=TYPES,
         help='message of the voltage (default battery_state, adc_block from 5 kHz on)')
-    parser.add_argument('--save-model', metavar='FILE.yaml', type=Path,
+    parser.add_argument('--save-model', metavar='FILE.yaml', type=output.path_argument,
                         help='write the model that was simulated')
     parser.add_argument('--list', action='store_true', help='list presets and profiles')
     parser.add_argument('--json', metavar='FILE',
@@ -84,12 +83,18 @@ def run(args: argparse.Namespace) -> int:
     from ou_monitor.recordings.model_file import as_yaml, ModelFile, read_model
 
     if args.list:
-        print(output.table(['Preset', 'Throttle', 'Rate, Hz', 'Length, s', 'What it is'], [
+        output.say(output.table(['Preset', 'Throttle', 'Rate, Hz', 'Length, s', 'What it is'], [
             [name, p.throttle, f'{p.rate:g}', f'{p.duration:g}', p.text]
             for name, p in PRESETS.items()], left=[0, 1, 4]))
-        print(output.table(['Throttle profile', 'What it is'],
-                           [[name, text] for name, (_, text) in PROFILES.items()], left=[0, 1]))
+        output.say(output.table(
+            ['Throttle profile', 'What it is'],
+            [[name, text] for name, (_, text) in PROFILES.items()], left=[0, 1]))
         return 0
+    # A profile by name or number is no file, and no output is taken for one.
+    table = args.throttle if str(args.throttle).lower().endswith('.csv') else None
+    output.check_paths(
+        {'--model': args.model, '--throttle': table},
+        {'--output': args.output, '--save-model': args.save_model, '--json': args.json})
     output.check_writable(args.json)
     output.check_writable(None if args.save_model is None else str(args.save_model))
     name = 'flight' if args.preset is None else args.preset
@@ -134,8 +139,9 @@ def run(args: argparse.Namespace) -> int:
             'model': [{'term': term.NAME, 'params': term.values()}
                       for term in file.model.terms]}, args.json)
     if args.json != output.STDOUT:
-        print(f"{args.output}: {written['n']} samples of '{name}', {duration:g} s at {rate:g} Hz, "
-              f"{', '.join(term.NAME for term in file.model.terms)}; seed {args.seed}")
+        output.say(
+            f"{args.output}: {written['n']} samples of '{name}', {duration:g} s at {rate:g} Hz, "
+            f"{', '.join(term.NAME for term in file.model.terms)}; seed {args.seed}")
     return 0
 
 

@@ -97,11 +97,17 @@ class Filter:
         back = np.zeros_like(f)
         back[..., :-1] = _times(f.transpose(1, 0, 2)[..., 1:], forward[..., 1:])
         diagonal = weight + back + np.outer(h, h)[:, :, None] / model.r
-        factor, info = dpbtrf(_band(diagonal, -forward[..., 1:]), lower=1, overwrite_ab=1)
+        band = _band(diagonal, -forward[..., 1:])
+        del weight, forward, diagonal
+        factor, info = dpbtrf(band, lower=1, overwrite_ab=1)
+        del band
         if info != 0 or not np.isfinite(factor[0]).all():
             raise ValueError('the covariance of the model is singular or not finite')
         # Filtered covariance, then the gain, then the closed loop.
-        p = _inverse(_pivots(factor, n, d) - back)
+        p = _pivots(factor, n, d)
+        p -= back
+        del factor, back
+        p = _inverse(p)
         gain = np.einsum('ijn,j->in', p, h) / model.r
         look = np.einsum('i,ijn->jn', h, f)
         loop = f - gain[:, None] * look[None]

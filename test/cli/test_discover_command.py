@@ -5,10 +5,17 @@ import re
 from xml.etree import ElementTree
 
 import numpy as np
+from ou_monitor.cli.discover import render
 from ou_monitor.cli.main import main
 from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.drift import Drift
 from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.tone import Tone
+from ou_monitor.offline.discover.data import Samples
+from ou_monitor.offline.discover.finding import Cause, Finding, Verdict
+from ou_monitor.offline.discover.words import explain, parameters
+from ou_monitor.offline.report.discovery_page import discovery_page
 from ou_monitor.recordings.model_file import read_model
 import pytest
 
@@ -94,6 +101,72 @@ def test_too_short_is_a_result(tmp_path, capsys):
     assert 'at least' in capsys.readouterr().out
     err = failure(capsys, 'discover', path, '--save-model', tmp_path / 'm.yaml')
     assert 'no model' in err and not (tmp_path / 'm.yaml').exists()
+
+
+def test_too_short_still_writes_all_but_the_model(tmp_path, capsys):
+    """Report and JSON tell the verdict; the one line, that there is no model."""
+    path, data, page = (tmp_path / name for name in ('short.csv', 'd.json', 'r.html'))
+    write(path, np.array([0.0, 0.1]), np.array([5.0, 5.1]))
+    words = ['discover', path, '--save-model', tmp_path / 'm.yaml', '--report', page, '--json']
+    assert 'no model' in failure(capsys, *words, data)
+    assert strict(data.read_text())['verdict'] == 'insufficient_data'
+    assert 'at least' in page.read_text() and not (tmp_path / 'm.yaml').exists()
+    assert main([str(word) for word in words] + ['-']) == 2
+    out, err = capsys.readouterr()
+    assert strict(out)['verdict'] == 'insufficient_data' and err.count('\n') == 1
+
+
+def tables(html):
+    """Return the rows of the first table of a page, as text."""
+    tree = ElementTree.fromstring(html.replace('<!DOCTYPE html>\n', ''))
+    return [[' '.join(cell.itertext()) for cell in row]
+            for row in next(tree.iter('table')).iter('tr')]
+
+
+def made(*causes):
+    """Return a finding of causes: term, gain, its error, p."""
+    terms = tuple(term for term, *_ in causes)
+    samples = Samples(np.arange(400) / 100.0, 5.0 + 0.01 * np.sin(np.arange(400.0) ** 2), None)
+    model = SupplyModel((OU(60.0, 0.3, 5.0), *terms))
+    return Finding(
+        'x', 400, 4.0, Verdict.EXPLAINED, 's', baseline=OU(60.0, 0.3, 5.0), baseline_score=2.0,
+        causes=tuple(Cause(term, {}, gain, se, p, (), explain(
+            term, {}, gain, se, (), False, '', len(causes)), False)
+            for term, gain, se, p in causes),
+        model=model, se=({},) * len(model.terms), samples=samples,
+        simulated=SupplyModel((OU(60.0, 0.3, 5.0),)))
+
+
+def test_what_is_not_known_is_said_and_what_is_worse_too():
+    """No nan, no '- +- -'; unknown is not 'none'; significantly negative is 'worse'."""
+    nan = float('nan')
+    finding = made((LoadSag(0.6, 0.0), nan, nan, nan), (Tone(0.01, 9.0, 0.0, 0.0), -0.01, 0.002,
+                                                        1e-9),
+                   (Drift(0.1, 0.0), 0.001, 0.002, 0.5))
+    text, html = render(finding), discovery_page(finding)
+    for shown in (text, html):
+        assert not re.search(r'\bnan\b|- \+- -|\u2013 \u00b1 \u2013', shown)
+        assert shown.count('worse on the part kept') == 1
+        assert 'Worse on the part kept' in html
+    rows = {row[0]: row for row in tables(html)}
+    assert rows['load_sag'][2:4] == ['not known', 'not known']
+    assert 'worse' in rows['tone'][2] and 'not distinguishable from none' in rows['drift'][2]
+    assert re.search(r'load_sag +load +not known +not known', text)
+    assert 'of means of blocks and of the errors of the parameters' in html
+
+
+def test_terms_that_share_a_gain_are_one_row():
+    """Once, with their number, the parameters of each, one paragraph; others stay apart."""
+    tones = [Tone(0.01, frequency, 0.0, 0.0) for frequency in (11.0, 23.0, 31.0)]
+    finding = made(*[(tone, 0.02, 0.002, 1e-9) for tone in tones],
+                   (Tone(0.01, 41.0, 0.0, 0.0), 0.03, 0.002, 1e-9))
+    text, html = render(finding), discovery_page(finding)
+    assert [row[0] for row in tables(html)[1:]] == ['tone x3', 'tone']
+    assert text.count('20.0 +- 2.0') == 1 and text.count('tone x3') == 1
+    for tone in tones:
+        assert parameters(tone, {}) in ' '.join(text.split())
+        assert html.split('Parameters of the')[0].count(parameters(tone, {})) == 1
+    assert len(finding.as_data()['causes']) == 4
 
 
 @pytest.mark.parametrize('words, part', [

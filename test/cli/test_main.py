@@ -1,5 +1,7 @@
 """`ou-monitor`: which command, which exit status, one line on standard error."""
 
+import os
+import re
 import subprocess
 import sys
 
@@ -124,3 +126,51 @@ def test_module_runs_as_a_program():
     done = subprocess.run([sys.executable, '-m', 'ou_monitor.cli.main', 'bogus'],
                           capture_output=True, text=True, timeout=60)
     assert done.returncode == 2 and done.stderr.count('\n') == 1
+
+
+@pytest.mark.skipif(not os.path.exists('/dev/full'), reason='needs /dev/full')
+@pytest.mark.parametrize('argv', [
+    ['discover', 'CSV'], ['discover', 'CSV', '--json', '-'], ['analyze', 'CSV'],
+    ['convert', 'CSV', 'OUT.mcap'], ['simulate', '--duration', '1', '--output', 'OUT.mcap'],
+    ['simulate', '--list'], ['design', '--list'],
+    ['design', '--risk', '0.1', '--throttle', '0.4'], ['--help'], ['analyze', '--help'],
+    ['--version']])
+def test_a_full_standard_output_is_one_line(argv, tmp_path):
+    """Status 2 and the reason: no traceback, and no complaint of the flush at exit."""
+    csv = tmp_path / 'in.csv'
+    csv.write_text('time_s,voltage_v\n' + ''.join(
+        f'{k / 100},{5.0 + 0.01 * (k * k % 7)}\n' for k in range(50)))
+    words = [str(csv) if word == 'CSV' else
+             str(tmp_path / word) if word == 'OUT.mcap' else word for word in argv]
+    with open('/dev/full', 'w') as full:
+        done = subprocess.run([sys.executable, '-m', 'ou_monitor.cli.main', *words], stdout=full,
+                              stderr=subprocess.PIPE, text=True, timeout=120)
+    assert done.returncode == 2
+    assert re.fullmatch(
+        r'ou-monitor[^\n]*: cannot write to standard output: [^\n]+\n', done.stderr)
+
+
+@pytest.mark.parametrize('argv', [
+    ['discover', 'IN', '--report', 'IN'], ['discover', 'IN', '--json', 'IN'],
+    ['discover', 'IN', '--save-model', 'IN'], ['analyze', 'IN', '--report', 'IN'],
+    ['analyze', 'IN', '--json', 'IN'], ['convert', 'IN', 'NEW.mcap', '--json', 'IN'],
+    ['design', '--risk', '0.1', '--throttle', '0.4', '--network', 'IN', '--json', 'IN'],
+    ['simulate', '--throttle', 'IN', '--output', 'NEW.mcap', '--json', 'IN'],
+    ['simulate', '--model', 'IN', '--save-model', 'IN'],
+    ['discover', 'IN', '--report', 'NEW', '--json', 'NEW'],
+    ['discover', 'IN', '--report', 'NEW', '--save-model', 'NEW'],
+    ['analyze', 'IN', '--report', 'NEW', '--json', 'NEW'],
+    ['reproduce', '--report', 'NEW', '--json', 'NEW'],
+    ['convert', 'IN', 'NEW.mcap', '--json', 'NEW.mcap'],
+    ['simulate', '--output', 'NEW.mcap', '--json', 'NEW.mcap'],
+    ['discover', ''], ['analyze', ''], ['convert', '', 'NEW.mcap'], ['simulate', '--output', ''],
+    ['discover', 'IN', '--report', '']])
+def test_no_command_overwrites_its_input_or_its_output(argv, tmp_path, capsys):
+    """One line; the input is as it was, and nothing was written."""
+    source = tmp_path / 'in.csv'
+    source.write_text('time_s,voltage_v\n0,5\n0.1,5.1\n')
+    names = {'IN': source, 'NEW': tmp_path / 'new', 'NEW.mcap': tmp_path / 'new.mcap'}
+    err = failure(capsys, *[str(names.get(word, word)) for word in argv])
+    assert 'overwrite' in err or 'are both' in err or 'path is empty' in err
+    assert source.read_text() == 'time_s,voltage_v\n0,5\n0.1,5.1\n'
+    assert list(tmp_path.iterdir()) == [source]

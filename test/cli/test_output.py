@@ -1,5 +1,6 @@
 """Tables, strict JSON, files and progress of the commands."""
 
+import argparse
 import enum
 import io
 import json
@@ -81,3 +82,41 @@ def test_progress_draws_and_wipes_on_a_terminal(monkeypatch):
             assert 'work [####' in terminal.getvalue() and '100%' in terminal.getvalue()
             raise KeyboardInterrupt
     assert terminal.getvalue().endswith('\r\x1b[K')
+
+
+def test_paths_that_collide_or_are_empty_are_named(tmp_path):
+    """By name, by another spelling, by a link; two outputs; but not two devices."""
+    source = tmp_path / 'in.csv'
+    source.write_text('x')
+    (tmp_path / 'soft.csv').symlink_to(source)
+    (tmp_path / 'hard.csv').hardlink_to(source)
+    for target in (source, tmp_path / '..' / tmp_path.name / 'in.csv', tmp_path / 'soft.csv',
+                   tmp_path / 'hard.csv'):
+        with pytest.raises(InputError, match='--json .* would overwrite RECORDING'):
+            output.check_paths({'RECORDING': str(source)}, {'--json': str(target)})
+    new = str(tmp_path / 'new')
+    with pytest.raises(InputError, match='--json and --report are both'):
+        output.check_paths({}, {'--json': new, '--report': new})
+    for inputs, outputs in (({'RECORDING': ''}, {}), ({}, {'--json': ''})):
+        with pytest.raises(InputError, match='(RECORDING|--json): the path is empty'):
+            output.check_paths(inputs, outputs)
+    output.check_paths({'RECORDING': str(source), '--model': None},
+                       {'--json': '-', '--report': new, '--save-model': None})
+    output.check_paths({}, {'--json': '/dev/null', '--report': '/dev/null'})
+    with pytest.raises(argparse.ArgumentTypeError, match='empty'):
+        output.path_argument('')
+
+
+@pytest.mark.parametrize('name, part', [
+    ('metadata.yaml', True), ('bag_0.mcap', True), ('bag_1.db3', True), ('bag_0.mcap.zstd', True),
+    ('report.html', False), ('result.json', False)])
+def test_what_a_bag_is_made_of_is_not_overwritten(tmp_path, name, part):
+    """Its metadata and storage files are refused; a report may lie beside them."""
+    bag = tmp_path / 'bag'
+    bag.mkdir()
+    (bag / name).write_text('x')
+    if part:
+        with pytest.raises(InputError, match='would overwrite RECORDING'):
+            output.check_paths({'RECORDING': str(bag)}, {'--report': str(bag / name)})
+    else:
+        output.check_paths({'RECORDING': str(bag)}, {'--report': str(bag / name)})

@@ -51,7 +51,7 @@ def test_json_is_that_of_the_contract():
     assert {'name': 'load_sag', 'family': 'load', 'gain': 0.015, 'gain_se': 0.002,
             'p_value': 1e-9, 'params': {'linear': 0.5, 'square': 0.0},
             'alternatives': ['load_transient'], 'explanation': 'It sags.'}.items() <= cause.items()
-    assert cause['units'] == {'linear': 'V', 'square': 'V'}
+    assert cause['units'] == {'linear': 'V', 'square': 'V'} and cause['exact'] is False
     extended = data['extended']
     assert list(extended['params']) == ['ou', 'load_sag', 'tone', 'tone 2']
     assert (extended['heldout_score'], extended['gain'], extended['gain_se']) == (
@@ -77,6 +77,8 @@ def test_a_gain_is_measurable_from_two_errors_on():
     assert cause.measurable
     assert 'No measurable gain' in explain(cause.term, {}, 0.003, 0.002, (), False)
     assert 'Gain on samples' in explain(cause.term, {}, 0.015, 0.002, (), False)
+    worse = explain(cause.term, {}, -0.015, 0.002, (), False)
+    assert 'Worse on the part kept' in worse and 'No measurable gain' not in worse
 
 
 @pytest.mark.parametrize('after, causes, dropped, verdict', [

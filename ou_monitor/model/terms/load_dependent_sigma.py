@@ -66,23 +66,32 @@ class LoadDependentSigma(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the likelier two of: a straight line, a step, knots by share and by range."""
+        """Return the likelier two of: a straight line, steps, and as many knots as it takes."""
         if view.throttle is None:
             return ()
         u = view.throttle[view.train]
-        square = view.z[view.train] ** 2
         low, high = np.quantile(u, [0.01, 0.99])
         if high - low < _APART:
             return ()
-        inner = np.quantile(u, np.linspace(0.05, 0.95, 91))
-        forms = [np.array([low, high]), np.quantile(u, [0.01, 0.25, 0.5, 0.75, 0.99]),
-                 *(np.linspace(low, high, count) for count in (3, 5, 9)),
-                 *(np.array([at - _EDGE, at + _EDGE]) for at in np.unique(inner))]
-        made = [_to_squares(square, u, _spaced(knots)) for knots in forms]
+        bins = _binned(view.z[view.train] ** 2, u, low, high)
         price = 0.5 * math.log(u.size)
-        made.sort(key=lambda pair: pair[1] - price * len(pair[0][0]) - (
-            _STEP_PRICE if pair[0][0][-1] - pair[0][0][0] < 3.0 * _EDGE else 0.0), reverse=True)
-        return [cls(knots, factors) for (knots, factors), _ in made[:2]]
+        made = []
+        inner = np.unique(np.quantile(u, np.linspace(0.05, 0.95, 91)))
+        for knots in (np.array([low, high]), _greedy(bins, low, high, price + _KNOT_PRICE),
+                      *(np.array([at - _EDGE, at + _EDGE]) for at in inner)):
+            factors, misfit = _to_bins(bins, knots)
+            found = _STEP_PRICE if knots[-1] - knots[0] < 3.0 * _EDGE else (
+                _KNOT_PRICE * (knots.size - 2))
+            made.append((misfit + price * knots.size + found, knots, factors))
+        made.sort(key=lambda form: form[0])
+        return [cls(tuple(knots.tolist()), tuple((factors - factors[0]).tolist()))
+                for _, knots, factors in made[:2]]
+
+    def relative(self, view: View) -> View:
+        """Return scores as they are without this term, for candidates in its place."""
+        assert view.throttle is not None
+        factor = np.exp(np.interp(view.throttle, self.throttle, self.log_factor))
+        return replace(view, z=view.z * factor)
 
     @classmethod
     def simplest(cls, view: View) -> Sequence[Term]:
@@ -95,30 +104,50 @@ class LoadDependentSigma(Term):
 
 # What the search for the edge of a step costs, nats: ln of the edges tried.
 _STEP_PRICE = 4.5
+# The same for a knot; bins of throttle, scores in one at least, and knots at most.
+_KNOT_PRICE = 3.5
+_BINS, _IN_BIN, _MOST_KNOTS = 40, 20, 9
 # Knots nearer than this are one, and half the width of a step, in throttle.
 _APART, _EDGE = 0.02, 0.002
 
 
-def _spaced(knots: FloatArray) -> FloatArray:
-    """Return knots that are apart; of a step both."""
-    if knots.size == 2:
-        return knots
-    keep = [float(knots[0])]
-    for knot in knots[1:].tolist():
-        if knot - keep[-1] > _APART:
-            keep.append(knot)
-    return np.array(keep)
+Bins = tuple[FloatArray, FloatArray, FloatArray]
 
 
-def _to_squares(square: FloatArray, u: FloatArray, knots: FloatArray
-                ) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], float]:
-    """Return knots with factors that fit squares of scores, and the log-likelihood of these."""
-    near = np.eye(knots.size)
-    factors = []
-    for k in range(knots.size):
-        weight = np.interp(u, knots, near[k])
-        factors.append(0.5 * math.log(max(float(weight @ square), 1e-9)
-                                      / max(float(weight.sum()), 1e-9)))
-    log = np.interp(u, knots, factors)
-    value = float((-log - 0.5 * square * np.exp(-2.0 * log)).sum())
-    return (tuple(knots.tolist()), tuple(f - factors[0] for f in factors)), value
+def _binned(square: FloatArray, u: FloatArray, low: float, high: float) -> Bins:
+    """Return throttle, ln of the deviation of the scores, and samples, of bins that have some."""
+    edges = np.linspace(low, high, _BINS + 1)
+    where = np.clip(np.searchsorted(edges, u, side='right') - 1, 0, _BINS - 1)
+    count = np.bincount(where, minlength=_BINS).astype(np.float64)
+    some = count >= _IN_BIN
+    centre = np.bincount(where, u, _BINS)[some] / count[some]
+    power = np.bincount(where, square, _BINS)[some] / count[some]
+    return centre, 0.5 * np.log(np.maximum(power, 1e-12)), count[some]
+
+
+def _to_bins(bins: Bins, knots: FloatArray) -> tuple[FloatArray, float]:
+    """Return factors at the knots that fit the bins, and what is left, nats."""
+    centre, log, count = bins
+    # The logarithm of a deviation found from n scores has a variance of 1/(2 n).
+    weight = np.sqrt(2.0 * count)
+    hats = np.stack([np.interp(centre, knots, row) for row in np.eye(knots.size)], axis=1)
+    factors: FloatArray = np.asarray(
+        np.linalg.lstsq(hats * weight[:, None], log * weight, rcond=1e-6)[0], dtype=np.float64)
+    left = (log - hats @ factors) * weight
+    return factors, 0.5 * float(left @ left)
+
+
+def _greedy(bins: Bins, low: float, high: float, price: float) -> FloatArray:
+    """Return knots: the ends, and one after the other where it helps most, while it pays."""
+    knots = np.array([low, high])
+    misfit = _to_bins(bins, knots)[1]
+    while knots.size < _MOST_KNOTS:
+        tried = [np.sort(np.append(knots, at)) for at in bins[0].tolist()
+                 if float(np.abs(knots - at).min()) > _APART]
+        if not tried:
+            break
+        value, best = min(((_to_bins(bins, more)[1], k) for k, more in enumerate(tried)))
+        if misfit - value < price:
+            break
+        knots, misfit = tried[best], value
+    return knots

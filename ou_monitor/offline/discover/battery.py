@@ -22,6 +22,8 @@ from scipy.special import ndtri
 _LAGS = ((1, 1), (2, 2), (3, 5), (6, 15), (16, 50))
 # Spectral bands: edges in shares of the Nyquist frequency, from the slowest on.
 _BANDS = 8
+# Scores up to this are small.
+_SMALL = 2.5
 _CLUSTERS = (0.02, 0.1, 0.5, 2.5, 8.0)
 
 
@@ -101,6 +103,7 @@ def _all(z: FloatArray, scene: Scene, lines: bool) -> Iterator[tuple[str, float]
     square = np.minimum(z * z, 25.0) - 1.0
     square -= square.mean()
     yield from _correlations(w)
+    yield from _among_small(w)
     yield from _spectrum(w, scene)
     if lines and scene.throttle is not None:
         yield 'order line', _order(w, scene)
@@ -128,6 +131,13 @@ def _correlations(w: FloatArray) -> Iterator[tuple[str, float]]:
         r = sum(float(c[k:] @ c[:-k]) for k in range(low, high + 1)) / power
         name = f'autocorrelation lag {low}' + ('' if low == high else f' to {high}')
         yield name, math.sqrt(n / (high - low + 1.0)) * r
+
+
+def _among_small(w: FloatArray) -> Iterator[tuple[str, float]]:
+    """Yield the correlation of neighbours that are both small: outliers have no part in it."""
+    small = (np.abs(w[1:]) < _SMALL) & (np.abs(w[:-1]) < _SMALL)
+    if int(small.sum()) > 30:
+        yield 'small errors lag 1', _score(w[1:][small], w[:-1][small])
 
 
 def _spectrum(w: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:

@@ -231,7 +231,7 @@ class Finding:
             'discrepancies': [_discrepancy(c, c.before, c.p_before) for c in self.discrepancies],
             'causes': [{
                 'name': cause.name, 'family': cause.term.FAMILY, 'gain': cause.gain,
-                'gain_se': cause.gain_se, 'p_value': cause.p_value,
+                'gain_se': cause.gain_se, 'p_value': cause.p_value, 'exact': cause.exact,
                 'params': cause.term.values(), 'se': dict(cause.se),
                 'units': _units(type(cause.term)), 'alternatives': list(cause.alternatives),
                 'explanation': cause.explanation} for cause in self.causes],

@@ -15,6 +15,7 @@ import numpy as np
 
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.lines import lines_with_height
+from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.model.terms.tone import Tone
 from ou_monitor.offline.discover.battery import is_sign
@@ -24,7 +25,8 @@ from ou_monitor.offline.discover.fitting import best_start, fitted, joined
 from ou_monitor.offline.discover.gain import BLOCKS, mean_difference
 from ou_monitor.offline.discover.null_bank import NullBank
 from ou_monitor.offline.discover.trials import (
-    AGAIN, criticise, is_measured, MOST_WORK, refined, ROUGH, tier_of, TIERS, Trial, trials_of)
+    AGAIN, anything, criticise, is_measured, MOST_WORK, refined, ROUGH, tier_of, TIERS, Trial,
+    trials_of)
 
 # Evidence from which a cause is accepted, nats; the same for a mean that answers to what
 # was measured, which every flight has some of.
@@ -101,7 +103,7 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
     """
     search = Search(fitted(samples, baseline.terms, baseline) or baseline)
     values = criticise(samples, search.composite, bank)
-    only = ''
+    only, reformed = '', False
     for turn in range(MOST):
         if progress is not None:
             progress(turn / MOST)
@@ -115,6 +117,11 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
                          or _throughout(trial.composite, search.composite))]
             if good:
                 break
+            if tier == 0 and not reformed and anything(values):
+                # Before anything latent mends what the form of a measured cause leaves.
+                reformed = True
+                if _reform(samples, search):
+                    values = criticise(samples, search.composite, bank)
         if not good:
             break
         trials = refined(samples, search.composite, trials)
@@ -219,10 +226,32 @@ def _helped(before: dict[str, float], after: dict[str, float],
     return left < _LITTLE or left < (1.0 - _SHARE) * misfit(before)
 
 
+def _reform(samples: Samples, search: Search) -> bool:
+    """Look for better knots of sigma(throttle) beside all else; return whether there are any."""
+    composite = search.composite
+    index = next((k for k, term in enumerate(composite.terms)
+                  if isinstance(term, LoadDependentSigma)), None)
+    if index is None:
+        return False
+    term = composite.terms[index]
+    assert isinstance(term, LoadDependentSigma)
+    view = view_of(samples, composite.gaussian, composite.gaussian.z, samples.train)
+    for start in term.candidates(term.relative(view)):
+        terms = [*composite.terms[:index], start, *composite.terms[index + 1:]]
+        made = fitted(samples, terms, composite)
+        if made is not None and made.score(samples) > search.composite.score(samples) + TIE:
+            search.composite = made
+    return search.composite is not composite
+
+
 def _prune(samples: Samples, search: Search) -> None:
     """Take out causes that are not needed beside those accepted since."""
     full = search.composite.score(samples)
+    last = catalogue()[search.accepted[-1]]
     for name in search.accepted[:-1]:
+        if last.ROLE is Role.LAW and is_measured(catalogue()[name]):
+            # Another law of the noise is no reason to doubt what answers to an input.
+            continue
         index = next(k for k, term in enumerate(search.composite.terms) if term.NAME == name)
         kept = [term for k, term in enumerate(search.composite.terms) if k != index]
         same = search.composite if search.composite.terms[index].ROLE is not Role.LAW else None

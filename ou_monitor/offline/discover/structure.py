@@ -33,6 +33,8 @@ _NARROW = 8
 _DEAR = 30000
 # With more states than this the part has to do.
 _MANY = 4
+# Blocks of one state.
+_SINGLE = ('second_relaxation', 'ac_coupling')
 # Samples in which the gain of a constant model has settled: the predictive
 # variance is then within some 1e-5 of its limit.
 _SETTLES = 1024
@@ -209,17 +211,22 @@ def _columns(samples: Samples, terms: Sequence[Term], s: Stretch) -> FloatArray:
 def _filter(samples: Samples, terms: Sequence[Term], events: Events | None
             ) -> tuple[Stretch, Filter, FloatArray, FloatArray]:
     """Return the stretch, its filter, and variances: events at their own sample not in, and in."""
-    many = sum(term.ROLE is Role.BLOCK for term in terms) > 0
-    if events is not None and many and not events.push.any() and not events.error.any():
-        # Where only the intensity changes, the gains of several states hardly do: a
-        # filter that is settled saves most of the time.
+    if events is not None and _states(terms) >= _MANY and not events.error.any():
+        # Where noise or pushes enter the state and nothing hides them, the gains of
+        # several states hardly change: a filter that is settled saves most of the time.
         s, space, _ = _space(samples, terms, None)
         run = Filter(space, samples.n)
         q = s.sigma * s.sigma * -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
-        return s, run, run.variance, run.variance + (events.power - 1.0) * q
+        return s, run, run.variance, run.variance + (events.power - 1.0) * q + events.push
     s, space, own = _space(samples, terms, events)
     run = Filter(space, samples.n)
     return s, run, run.variance - own, run.variance
+
+
+def _states(terms: Sequence[Term]) -> int:
+    """Return about how many states a model has: flicker noise is many, other blocks one or two."""
+    return 1 + sum(_MANY if term.NAME == 'flicker_noise' else 1 if term.NAME in _SINGLE else 2
+                   for term in terms if term.ROLE is Role.BLOCK)
 
 
 def _space(samples: Samples, terms: Sequence[Term], events: Events | None
@@ -254,7 +261,9 @@ def _space(samples: Samples, terms: Sequence[Term], events: Events | None
     blocks += [term.block(s) for term in terms
                if term.ROLE is Role.BLOCK and not isinstance(term, ACCoupling)]
     d = sum(h.size for _, _, h in blocks)
-    f_all, q_all, h_all = np.zeros((n, d, d)), np.zeros((n, d, d)), np.zeros(d)
+    # Element by element along the samples, as the filter takes them.
+    f_all, q_all = (np.zeros((d, d, n)).transpose(2, 0, 1) for _ in range(2))
+    h_all = np.zeros(d)
     at = 0
     for f, cov, h in blocks:
         to = at + h.size

@@ -39,6 +39,8 @@ MOST_WORK = 10.0
 TIERS = 3
 _SHAPE = ('kurtosis', 'tails')
 _CLEAR_SHAPE = 25.0
+# Correlation of small neighbours, as a score, from which on it is white noise.
+_WHITE = -8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,13 +166,17 @@ def _settled(trial: Trial, kind: type[Term]) -> bool:
 
 def tier_of(kind: type[Term], values: dict[str, float]) -> int:
     """Return when a kind has its turn: measured inputs, clear outliers, the rest."""
-    if is_measured(kind) or kind.ROLE is Role.NOISE:
-        # White noise is in every sensor, and hides what is slow and weak.
+    if is_measured(kind):
         return 0
     shape = max((abs(value) for name, value in values.items()
                  if name.startswith(_SHAPE)), default=0.0)
-    # No Gaussian term makes outliers: where there are many, laws are tried alone.
-    return 1 if kind.ROLE is Role.LAW and shape > _CLEAR_SHAPE else 2
+    # No Gaussian term makes outliers: where there are many, laws come before.
+    outliers = shape > _CLEAR_SHAPE
+    if kind.ROLE is Role.NOISE:
+        # White noise is in every sensor, and hides what is slow and weak; but bad samples
+        # look like some, if not among small errors.
+        return int(outliers and values.get('small errors lag 1', 0.0) > _WHITE)
+    return 1 if kind.ROLE is Role.LAW and outliers else 2
 
 
 def is_measured(kind: type[Term]) -> bool:

@@ -18,6 +18,8 @@ PASSES = 0.001
 FAILS, OWN_SHARE, SHARE = 4.8, 0.07, 0.02
 # Share of its own signs that noise or a line may leave.
 _SIGNS_SHARE = 0.3
+# Share of clustering that the form of sigma(throttle) may leave.
+_FORM_SHARE = 0.15
 
 
 def largest_chance(values: Mapping[str, float]) -> float:
@@ -65,6 +67,9 @@ def withdrawn(before: Mapping[str, float], after: Mapping[str, float],
     left = [name for name in failing(before, after)
             if not any(is_sign(sign, name, after[name]) for kind in measured
                        for sign in kind.SIGNS)]
+    if any(kind.FAMILY == 'intensity' for kind in measured):
+        left = [name for name in left if not name.startswith(('clustering', 'variance'))
+                or abs(after[name]) > _FORM_SHARE * abs(before.get(name, 0.0))]
 
     def fails(kind: type[Term]) -> bool:
         if kind.ROLE is not Role.NOISE and kind.FAMILY != 'line':

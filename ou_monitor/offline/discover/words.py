@@ -126,6 +126,7 @@ _PLAIN = ((
     ('state throttle', 'the relaxation depends on throttle'),
     ('state', 'the relaxation is not proportional to the deviation'),
     ('irreversibility', 'it looks different backwards in time'),
+    ('small errors', 'neighbouring small errors are correlated'),
     ('bursts', 'power at some frequencies comes and goes'),
     ('products of three', 'neighbouring errors depend on each other in a way no spectrum shows'),
     ('pairs', 'large errors are followed by related ones'))
@@ -230,6 +231,8 @@ def gain_words(gain: float, gain_se: float, why: str = '') -> str:
     size = f'{number(1e3 * gain)} +- {number(1e3 * gain_se, 2)} mnat per sample'
     if gain > 1.96 * gain_se:
         return f'Gain on samples not used for the fit: {size}.'
+    if gain < -1.96 * gain_se:
+        return f'Worse on the part kept, which was not used for the fit: {size}.'
     return f'No measurable gain on samples not used for the fit ({size}).'
 
 

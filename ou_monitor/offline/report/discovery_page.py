@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 from ou_monitor.model.supply import SupplyModel
+from ou_monitor.offline.discover.cause_rows import cause_rows, gain_remark, NOT_KNOWN
 from ou_monitor.offline.discover.finding import Criticism, Finding
 from ou_monitor.offline.discover.words import (
     crossing_words, plain_model_words, plain_words, with_error)
@@ -66,39 +67,55 @@ def _typeset(text: str) -> str:
 
 
 def _value(value: float, digits: int = 3) -> str:
-    return (number(value, digits).replace('-', '\u2212') if math.isfinite(value) else _UNKNOWN)
+    return number(value, digits).replace('-', '\u2212') if math.isfinite(value) else NOT_KNOWN
+
+
+def _with_error(value: float, error: float) -> str:
+    if not math.isfinite(value):
+        return NOT_KNOWN
+    return _value(value) + (f' \u00b1 {_value(error, 2)}' if math.isfinite(error) else '')
+
+
+def _minus(text: str) -> str:
+    """Return a number that stands at the front with a true minus."""
+    return '\u2212' + text[1:] if text.startswith('-') else text
+
+
+def _total_gain(finding: Finding) -> str:
+    remark = gain_remark(finding.gain, finding.gain_se) if finding.causes else ''
+    return (f'gain {_with_error(finding.gain, finding.gain_se)}'
+            + (f'\n{remark}' if remark else ''))
 
 
 def _causes(finding: Finding) -> list[str]:
     if not finding.causes:
         return [page.paragraph('None was named.')]
-    rows = [[cause.name, cause.term.FAMILY,
-             f'{_value(1e3 * cause.gain)} \u00b1 {_value(1e3 * cause.gain_se, 2)}'
-             + ('' if cause.measurable else '\nnot distinguishable from none'),
-             'exact' if cause.exact else f'{cause.p_value:.2g}',
-             ', '.join(cause.alternatives) or _UNKNOWN] for cause in finding.causes]
+    found = cause_rows(finding.causes)
+    rows = [[row.label, row.family,
+             _minus(_typeset(row.gain)) + (f'\n{row.remark}' if row.remark else ''),
+             row.chance, ', '.join(row.alternatives) or _UNKNOWN] for row in found]
     return [
         page.table(['Cause', 'Family', 'Gain, mnat per sample', 'p', 'Not told from'], rows,
                    left=[0, 1, 4]),
-        page.bullets([_typeset(f'{cause.name}: {cause.explanation}')
-                      for cause in finding.causes]),
+        page.bullets([_typeset(f'{row.label}: {row.explanation}') for row in found]),
         page.paragraph(
             'Gain: what the held-out score loses when the cause is left out and all else is '
-            'fitted again, with the standard error of means of blocks. p: of the likelihood '
-            'ratio on the part fitted, searching counted, or of the gain, doubled. Exact '
-            'findings are seen in the samples themselves; the gain of those undone in them is '
-            'shared.', soft=True)]
+            'fitted again, with the standard error of means of blocks and of the errors of the '
+            'parameters. p: of the likelihood ratio on the part fitted, searching counted, or of '
+            'the gain, doubled. Exact findings are seen in the samples themselves; the gain of '
+            'those undone in them is shared. Terms of one kind that share a gain are one row.',
+            soft=True)]
 
 
 def _worth(finding: Finding) -> list[str]:
     c = finding.crossing
     rows = [['Score on the last 40 %, nats per sample', _value(finding.baseline_score, 4),
-             _value(finding.score, 4),
-             f'gain {_value(finding.gain)} \u00b1 {_value(finding.gain_se, 2)}'],
-            [f'Falls through {_value(c.level, 4)} V per minute',
-             f'{_value(c.baseline)} \u00b1 {_value(c.baseline_se, 2)}',
-             f'{_value(c.extended)} \u00b1 {_value(c.extended_se, 2)}',
-             f'{_value(c.observed)} \u00b1 {_value(c.observed_se, 2)} observed']]
+             _value(finding.score, 4), _total_gain(finding)]]
+    if math.isfinite(c.level):
+        rows.append([
+            f'Falls through {_value(c.level, 4)} V per minute',
+            _with_error(c.baseline, c.baseline_se), _with_error(c.extended, c.extended_se),
+            f'{_with_error(c.observed, c.observed_se)}, observed'])
     assert finding.baseline is not None
     return [page.table(['', 'Plain OU', 'Extended', ''], rows, left=[0]),
             page.paragraph(_typeset(crossing_words(finding))),
@@ -133,8 +150,9 @@ def _pictures(finding: Finding) -> list[str]:
                          for k, name in enumerate(('plain OU', 'extended model'))])
              for picture in made]
     return [*drawn, page.paragraph(
-        'Line: the data. Band: the range of 40 simulations with the stamps and the throttle of '
-        'the data; about one point in twenty of a right model lies outside.', soft=True)]
+        'Line or dots: the data. Band or bars: the range of 40 simulations with the stamps and '
+        'the throttle of the data; about one point in twenty of a right model lies outside.',
+        soft=True)]
 
 
 def _plot(picture: Picture, k: int, name: str) -> Plot:
@@ -151,7 +169,13 @@ def _plot(picture: Picture, k: int, name: str) -> Plot:
     # Both plots of a pair have one axis.
     ends = [np.where(e > 0.0, np.maximum(e, floor), np.nan) for e in ends] if picture.log_y \
         else ends
-    plot.limits(y=span(ends, picture.log_y))
+    bottom, top = span(ends, picture.log_y)
+    plot.limits(y=(bottom, top))
+    if picture.points:
+        # Room for the markers at both ends, and for the legend above them.
+        plot.limits(span([picture.x], pad=0.12), (bottom, top + 0.35 * (top - bottom)))
+        plot.bars(picture.x, low, high, 'simulated', k)
+        return plot.markers(picture.x, data, 'data', 7)
     plot.band(picture.x, low, high, 'simulated', k)
     return plot.line(picture.x, data, 'data', 7, 'thick')
 
@@ -160,7 +184,8 @@ def _left(finding: Finding) -> list[str]:
     if not finding.remaining:
         return [page.paragraph('Nothing: no statistic of the extended model lies outside the '
                                'band.')]
-    rows = [[c.statistic, _value(c.before), _value(c.after), f'{c.p_after:.2g}',
+    rows = [[c.statistic, _value(c.before), _value(c.after),
+             f'{c.p_after:.2g}' if math.isfinite(c.p_after) else NOT_KNOWN,
              plain_words(c.statistic)] for c in finding.remaining]
     return [page.table(['Statistic', 'Plain OU', 'Extended', 'p', 'In words'], rows,
                        left=[0, 4])]

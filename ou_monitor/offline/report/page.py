@@ -57,7 +57,7 @@ def _stylesheet() -> str:
 
     series = ''.join(
         f'svg .line.s{k} {{ stroke: var(--c{k}); }} '
-        f'svg .band.s{k}, svg .shade.s{k} {{ fill: var(--c{k}); }}\n'
+        f'svg .band.s{k}, svg .shade.s{k}, svg .dot.s{k} {{ fill: var(--c{k}); }}\n'
         for k in range(len(_LIGHT)))
     return _STYLE.replace('LIGHT', names(_LIGHT)).replace('DARK', names(_DARK)) + series
 

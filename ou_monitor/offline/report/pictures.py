@@ -13,10 +13,12 @@ from ou_monitor.records import FloatArray
 # Simulations of each model: their range leaves out about one point in twenty.
 DRAWS = 40
 _BINS, _LEVELS, _LAGS, _BANDS = 60, 10, 40, 60
+# Up to so many distinct throttles each is a bin of its own.
+_DISTINCT = 12
 
 Curve = Callable[[FloatArray], FloatArray]
-# Title and labels, x, the curve, and which axes are logarithmic.
-_Curve = tuple[tuple[str, str, str], FloatArray, Curve, tuple[bool, bool]]
+# Title and labels, x, the curve, which axes are logarithmic, and whether it is separate points.
+_Curve = tuple[tuple[str, str, str], FloatArray, Curve, tuple[bool, bool, bool]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +36,8 @@ class Picture:
         Lowest and highest of the simulations, for each model.
     log_x, log_y : bool
         Axes.
+    points : bool
+        Separate values, between which there is nothing to draw a line through.
 
     """
 
@@ -45,6 +49,7 @@ class Picture:
     bands: tuple[tuple[FloatArray, FloatArray], ...]
     log_x: bool = False
     log_y: bool = False
+    points: bool = False
 
 
 def pictures(samples: Samples, models: Sequence[SupplyModel], rng: np.random.Generator,
@@ -91,7 +96,7 @@ def pictures(samples: Samples, models: Sequence[SupplyModel], rng: np.random.Gen
 
 
 def _curves(samples: Samples) -> list[_Curve]:
-    """Return title and labels, x, the curve as a function of the voltage, and log axes."""
+    """Return title and labels, x, the curve as a function of the voltage, and how to draw it."""
     v, n = samples.voltage, samples.n
     step = float(np.median(samples.step[1:]))
     even = samples.even
@@ -133,20 +138,23 @@ def _curves(samples: Samples) -> list[_Curve]:
     values = _bins(v)
     changes = _bins(np.diff(v))
     found: list[_Curve] = [
-        (('Spectrum', 'frequency, Hz', 'PSD, V\u00b2/Hz'), centres, spectrum, (True, True)),
-        (('Autocorrelation', 'lag, s', 'correlation'), lags * step, correlation, (True, False)),
+        (('Spectrum', 'frequency, Hz', 'PSD, V\u00b2/Hz'), centres, spectrum,
+         (True, True, False)),
+        (('Autocorrelation', 'lag, s', 'correlation'), lags * step, correlation,
+         (True, False, False)),
         (('Distribution of the voltage', 'voltage, V', 'density, 1/V'), _middle(values),
-         lambda y: _density(y, values), (False, True)),
+         lambda y: _density(y, values), (False, True, False)),
         (('Distribution of the increments', 'change from sample to sample, mV',
           'density, 1/V'), 1e3 * _middle(changes),
-         lambda y: _density(np.diff(y), changes), (False, True)),
+         lambda y: _density(np.diff(y), changes), (False, True, False)),
     ]
     u = samples.throttle
     if u is not None:
-        levels = np.unique(np.quantile(u, np.linspace(0.0, 1.0, _LEVELS + 1)))
-        which = np.clip(np.searchsorted(levels, u, side='right') - 1, 0, levels.size - 2)
-        count = np.bincount(which, minlength=levels.size - 1).astype(np.float64)
-        at = np.bincount(which, u, minlength=levels.size - 1) / np.maximum(count, 1.0)
+        which, bins = _by_throttle(u)
+        count = np.bincount(which, minlength=bins).astype(np.float64)
+        at = np.bincount(which, u, minlength=bins) / np.maximum(count, 1.0)
+        # Few levels are separate: a line would say something of what lies between.
+        few = bins <= _DISTINCT and np.unique(u).size == bins or bins < 3
 
         def mean(y: FloatArray) -> FloatArray:
             return _averages(y, which, count)
@@ -156,10 +164,20 @@ def _curves(samples: Samples) -> list[_Curve]:
             return 1e3 * np.sqrt(_averages(d * d, which, count))
 
         found += [
-            (('Mean voltage by throttle', 'throttle, %', 'V'), 100.0 * at, mean, (False, False)),
+            (('Mean voltage by throttle', 'throttle, %', 'V'), 100.0 * at, mean,
+             (False, False, few)),
             (('Size of increments by throttle', 'throttle, %', 'rms, mV'), 100.0 * at, spread,
-             (False, False))]
+             (False, False, few))]
     return found
+
+
+def _by_throttle(u: FloatArray) -> tuple[np.ndarray, int]:
+    """Return the bin of each sample, and how many: one a distinct value when these are few."""
+    values, which = np.unique(u, return_inverse=True)
+    if values.size <= _DISTINCT:
+        return which, values.size
+    edges = np.unique(np.quantile(u, np.linspace(0.0, 1.0, _LEVELS + 1)))
+    return np.clip(np.searchsorted(edges, u, side='right') - 1, 0, edges.size - 2), edges.size - 1
 
 
 def _averages(y: FloatArray, which: np.ndarray, count: FloatArray) -> FloatArray:

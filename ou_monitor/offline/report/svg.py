@@ -21,6 +21,8 @@ SERIES = 8
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 30, 42
 # Width of a letter of the 12-pixel sans serif, generously.
 _LETTER = 7.0
+# Half the width of the cap of a bar, pixels.
+_CAP = 7.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +125,20 @@ class Plot:
             f's{colour % SERIES}', 'band'))
         return self
 
+    def markers(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0) -> Plot:
+        """Add a dot at each point; none where it is NaN."""
+        self._curves.append(_Curve(np.asarray(x, float), np.asarray(y, float), None, label,
+                                   f's{colour % SERIES}', 'markers'))
+        return self
+
+    def bars(self, x: FloatArray, low: FloatArray, high: FloatArray, label: str = '',
+             colour: int = 0) -> Plot:
+        """Add a bar from `low` to `high` at each point, with caps; none where one is NaN."""
+        self._curves.append(_Curve(
+            np.asarray(x, float), np.asarray(low, float), np.asarray(high, float), label,
+            f's{colour % SERIES}', 'bars'))
+        return self
+
     def shade(self, start: float, stop: float, colour: int = 0, label: str = '') -> Plot:
         """Shade a stretch of the x axis; its label is drawn where there is room."""
         self._spans.append((start, stop, f's{colour % SERIES}', label))
@@ -172,8 +188,8 @@ class Plot:
             if label and b - a > _LETTER * len(label) + 8.0:
                 parts.append(f'<text class="note" text-anchor="middle" '
                              f'x="{0.5 * (a + b):.1f}" y="{_TOP + 13}">{escape(label)}</text>')
-        # Bands lie behind lines.
-        for curve in sorted(self._curves, key=lambda c: c.kind != 'band'):
+        # Bands and bars lie behind lines and dots.
+        for curve in sorted(self._curves, key=lambda c: c.kind not in ('band', 'bars')):
             parts.append(self._draw(curve, x, y))
         parts.append('</svg>')
         for where, label in self._marks:
@@ -209,6 +225,16 @@ class Plot:
         return parts
 
     def _draw(self, curve: _Curve, x: Scale, y: Scale) -> str:
+        if curve.kind == 'markers':
+            return ''.join(
+                f'<circle class="dot {curve.style}" cx="{a:.1f}" cy="{b:.1f}" r="4"/>'
+                for a, b in _pixels(x(curve.x), y(curve.y)))
+        if curve.kind == 'bars' and curve.high is not None:
+            ends = _pixels(x(curve.x), y(curve.y), y(curve.high))
+            path = ''.join(
+                f'M{a - _CAP:.1f},{b:.1f}H{a + _CAP:.1f}M{a:.1f},{b:.1f}V{c:.1f}'
+                f'M{a - _CAP:.1f},{c:.1f}H{a + _CAP:.1f}' for a, b, c in ends)
+            return f'<path class="line thick {curve.style}" d="{path}"/>'
         if curve.high is not None:
             pieces = []
             px, low, high = x(curve.x), y(curve.y), y(curve.high)
@@ -241,9 +267,18 @@ class Plot:
 def _legend_entry(curve: _Curve, x: float, y: int) -> str:
     swatch = (f'<rect class="band {curve.style}" x="{x:.0f}" y="{y - 9}" width="18" height="10"/>'
               if curve.kind == 'band' else
+              f'<circle class="dot {curve.style}" cx="{x + 9:.0f}" cy="{y - 4}" r="4"/>'
+              if curve.kind == 'markers' else
               f'<path class="line thick {curve.style}" '
               f'd="M{x:.0f},{y - 4}L{x + 18:.0f},{y - 4}"/>')
     return f'{swatch}<text class="legend" x="{x + 22:.0f}" y="{y}">{escape(curve.label)}</text>'
+
+
+def _pixels(*columns: FloatArray) -> list[list[float]]:
+    """Return the rows without NaN, within what a renderer can draw."""
+    rows = np.clip(np.column_stack(columns), -1e4, 1e4)
+    found: list[list[float]] = rows[np.isfinite(rows).all(axis=1)].tolist()
+    return found
 
 
 def _stretches(good: np.ndarray) -> list[slice]:
