@@ -57,7 +57,8 @@ class LoadDependentSigma(Term):
     def moved(self, name: str, by: float) -> LoadDependentSigma:
         """Return the term with one knot moved."""
         at = int(name.split()[1])
-        factors = tuple(f + by * (k == at) for k, f in enumerate(self.log_factor))
+        factors = tuple(min(max(f + by, -_MOST), _MOST) if k == at else f
+                        for k, f in enumerate(self.log_factor))
         return replace(self, log_factor=factors)
 
     def per_coordinate(self, name: str) -> float:
@@ -107,6 +108,9 @@ _STEP_PRICE = 4.5
 # The same for a knot; bins of throttle, scores in one at least, and knots at most.
 _KNOT_PRICE = 3.5
 _BINS, _IN_BIN, _MOST_KNOTS = 40, 20, 9
+# Logarithms of factors that a fit stays within: where white noise hides the rail, nothing
+# else holds them.
+_MOST = 4.0
 # Knots nearer than this are one, and half the width of a step, in throttle.
 _APART, _EDGE = 0.02, 0.002
 
