@@ -33,7 +33,7 @@ class Resonance(Term):
     ROLE: ClassVar[Role] = Role.BLOCK
     FREE: ClassVar[tuple[str, ...]] = ('frequency', 'damping', 'std')
     DEAR: ClassVar[bool] = True
-    SIGNS: ClassVar[tuple[str, ...]] = ('line', '+band')
+    SIGNS: ClassVar[tuple[str, ...]] = ('line', '+band', 'autocorrelation')
     SEARCH: ClassVar[float] = 5.0
 
     frequency: float = parameter('Hz', 'of the ringing', 0.0, above=True)

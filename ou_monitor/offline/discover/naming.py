@@ -36,7 +36,7 @@ TIE = 3.0
 # Evidence from which a measured cause stays when others have come, nats.
 NEEDED = 0.0
 # Gain in its standard errors from which it is not by chance of a few stretches.
-_STEADY, _RAGGED = 2.3, 8.0
+_STEADY, _RAGGED = 4.0, 8.0
 # Share of the stretches that gain, from which a gain is throughout: by chance once in 100.
 _MOSTLY = 0.75
 # Causes accepted at most, of these what no input was measured for, and lines that

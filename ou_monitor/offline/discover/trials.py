@@ -161,7 +161,8 @@ def _settled(trial: Trial, kind: type[Term]) -> bool:
     """Return whether a trial leaves nothing that a dear kind of another family could explain."""
     return (kind.DEAR and trial.left is not None and not asks(kind, trial.left)
             and not anything(trial.left)
-            and catalogue()[trial.name].FAMILY != kind.FAMILY)
+            and catalogue()[trial.name].FAMILY != kind.FAMILY
+            and not any({trial.name, kind.NAME} <= group for group in _ALIKE))
 
 
 def tier_of(kind: type[Term], values: dict[str, float]) -> int:

@@ -16,8 +16,9 @@ PASSES = 0.001
 # A statistic fails that is this far off, and by more than these shares of what it,
 # and the worst of all, was before there were any causes.
 FAILS, OWN_SHARE, SHARE = 4.8, 0.07, 0.02
-# Share of its own signs that noise or a line may leave.
-_SIGNS_SHARE = 0.3
+# Share of its own signs that noise, a line or the instrument (which may have two
+# corners) may leave, by family.
+_SIGNS_SHARE = {'sensor': 0.3, 'line': 0.3, 'instrument': 0.75}
 # Share of clustering that the form of sigma(throttle) may leave.
 _FORM_SHARE = 0.15
 
@@ -58,8 +59,8 @@ def withdrawn(before: Mapping[str, float], after: Mapping[str, float],
         Positions in `accepted`: where a statistic fails, all latent causes.
         What nobody measured can imitate a part of almost anything; it is named
         only where it explains the whole.  White noise, which no sensor is
-        without, and lines, which are there whatever else is, have to explain
-        only what they are asked for.
+        without, and lines and the coupling of the instrument, which are there
+        whatever else is, have to explain only what they are asked for.
 
     """
     measured = [kind for kind in accepted if not is_latent(kind)]
@@ -72,11 +73,12 @@ def withdrawn(before: Mapping[str, float], after: Mapping[str, float],
                 or abs(after[name]) > _FORM_SHARE * abs(before.get(name, 0.0))]
 
     def fails(kind: type[Term]) -> bool:
-        if kind.ROLE is not Role.NOISE and kind.FAMILY != 'line':
+        if kind.ROLE is not Role.NOISE and kind.FAMILY not in ('line', 'instrument'):
             return bool(left)
+        share = _SIGNS_SHARE[kind.FAMILY]
         own = max((abs(value) for name, value in before.items() for sign in kind.SIGNS
                    if is_sign(sign, name, value)), default=0.0)
-        return any(is_sign(sign, name, after[name]) and abs(after[name]) > _SIGNS_SHARE * own
+        return any(is_sign(sign, name, after[name]) and abs(after[name]) > share * own
                    for name in left for sign in kind.SIGNS)
 
     return [k for k, kind in enumerate(accepted) if is_latent(kind) and fails(kind)]
