@@ -14,6 +14,7 @@ from ou_monitor.model.terms.term import (
     Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
 from ou_monitor.records import FloatArray
 from scipy.special import ndtr
+from scipy.stats import binom
 
 
 @dataclass(frozen=True)
@@ -132,25 +133,43 @@ def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) ->
     return normal_scores(chance.ravel())
 
 
-# Stretches that a recording is cut into, levels of ln sigma and how many standard
-# deviations they reach (it may go beyond all that the fit has seen), products between
-# two scalings: few, for a stretch can be unlikely at all levels but one.
+# Stretches that a recording is cut into, levels of ln sigma (they reach 8 standard
+# deviations: it may go beyond all that the fit has seen), products between two
+# scalings: few, for a stretch can be unlikely at all levels but one.
 _STRETCHES = 1500
-_LEVELS, _REACH = 41, 4.0
+_LEVELS = 65
 _EVERY = 4
+
+
+def _rouwenhorst(keep: float) -> FloatArray:
+    """
+    Return the chances to go from level to level, shape (levels, levels).
+
+    Conditional mean and variance are those of the OU however slow it is, where
+    steps are much smaller than from one level to the next (Rouwenhorst 1995;
+    Kopecky & Suen, Rev. Econ. Dyn. 13 (2010) 701).
+
+    """
+    stay, go = 0.5 * (1.0 + keep), 0.5 * (1.0 - keep)
+    chances = np.array([[stay, go], [go, stay]])
+    for n in range(3, _LEVELS + 1):
+        larger = np.zeros((n, n))
+        larger[:-1, :-1] += stay * chances
+        larger[:-1, 1:] += go * chances
+        larger[1:, :-1] += go * chances
+        larger[1:, 1:] += stay * chances
+        larger[1:-1] /= 2.0
+        chances = larger
+    return chances
 
 
 def _grid(squares: FloatArray, sizes: FloatArray, span: float, x: FloatArray
           ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the law of the level before each stretch, its log density, and the levels."""
-    nodes = np.linspace(-_REACH, _REACH, _LEVELS)
-    levels = x[2] + math.exp(x[0]) * nodes
-    keep = math.exp(-math.exp(x[1]) * span)
-    kernel = np.exp(-0.5 * (nodes[None, :] - keep * nodes[:, None]) ** 2
-                    / max(1.0 - keep * keep, (0.5 * (nodes[1] - nodes[0])) ** 2))
-    kernel /= kernel.sum(axis=1, keepdims=True)
-    law = np.exp(-0.5 * nodes * nodes)
-    law /= law.sum()
+    reach = math.sqrt(_LEVELS - 1.0)
+    levels = x[2] + math.exp(x[0]) * np.linspace(-reach, reach, _LEVELS)
+    kernel = _rouwenhorst(math.exp(-math.exp(x[1]) * span))
+    law = binom.pmf(np.arange(_LEVELS), _LEVELS - 1, 0.5)
     log_density = -sizes[:, None] * levels - 0.5 * squares[:, None] * np.exp(-2.0 * levels)
     top = log_density.max(axis=1)
     weight = np.exp(log_density - top[:, None])

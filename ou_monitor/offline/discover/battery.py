@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 from ou_monitor.model.terms.lines import order_power
+from ou_monitor.offline.discover.battery_history import after_large, score
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
 from scipy.special import ndtri
@@ -42,6 +43,12 @@ class Scene:
         0..1.
     rate : float
         Samples per second, Hz.
+    keep : float
+        What the state keeps from one sample to the next.
+    large : ndarray, shape (n,), or None
+        Where large errors begin, as `large_ones` returns them.
+    paths : tuple of (str, ndarray of shape (n,))
+        As `throttle_paths` yields them.
 
     """
 
@@ -49,6 +56,9 @@ class Scene:
     at: FloatArray
     throttle: FloatArray | None
     rate: float
+    keep: float
+    large: FloatArray | None = None
+    paths: tuple[tuple[str, FloatArray], ...] = ()
 
 
 def statistics(z: FloatArray, scene: Scene, *, lines: bool = True) -> dict[str, float]:
@@ -111,14 +121,11 @@ def _all(z: FloatArray, scene: Scene, lines: bool) -> Iterator[tuple[str, float]
     yield from _clustering(square, scene)
     yield from _inputs(w, square, scene)
     yield from _state(w, square, scene)
+    for name, path in scene.paths:
+        yield name, score(w, path)
+    if scene.large is not None:
+        yield from after_large(w, square, scene.large)
     yield from _beyond_second_order(w, scene)
-
-
-def _score(a: FloatArray, b: FloatArray) -> float:
-    """Return the correlation of two series, as a normal score."""
-    a, b = a - a.mean(), b - b.mean()
-    norm = math.sqrt(float(a @ a) * float(b @ b))
-    return math.sqrt(a.size) * float(a @ b) / norm if norm > 0.0 else 0.0
 
 
 def _correlations(w: FloatArray) -> Iterator[tuple[str, float]]:
@@ -137,7 +144,7 @@ def _among_small(w: FloatArray) -> Iterator[tuple[str, float]]:
     """Yield the correlation of neighbours that are both small: outliers have no part in it."""
     small = (np.abs(w[1:]) < _SMALL) & (np.abs(w[:-1]) < _SMALL)
     if int(small.sum()) > 30:
-        yield 'small errors lag 1', _score(w[1:][small], w[:-1][small])
+        yield 'small errors lag 1', score(w[1:][small], w[:-1][small])
 
 
 def _spectrum(w: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
@@ -193,8 +200,8 @@ def _moments(z: FloatArray) -> Iterator[tuple[str, float]]:
 
 def _clustering(square: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
     n = square.size
-    yield 'clustering next sample', _score(square[1:], square[:-1])
-    yield 'clustering few samples', _score(
+    yield 'clustering next sample', score(square[1:], square[:-1])
+    yield 'clustering few samples', score(
         square[10:], lfilter(np.ones(9), [1.0], square)[9:-1] if n > 20 else square[10:])
     for span in _CLUSTERS:
         m = round(span * scene.rate)
@@ -202,7 +209,7 @@ def _clustering(square: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]
         if m < 4 or count < 12:
             continue
         mean = square[:count * m].reshape(count, m).mean(axis=1)
-        yield f'clustering {span:g} s', _score(mean[1:], mean[:-1])
+        yield f'clustering {span:g} s', score(mean[1:], mean[:-1])
         spread = float(mean.var()) * m / max(float(square.var()), 1e-12)
         value = (spread ** (1.0 / 3.0) - 1.0 + 2.0 / (9.0 * count)) * math.sqrt(9.0 * count / 2.0)
         yield f'clustering spread {span:g} s', value
@@ -210,39 +217,39 @@ def _clustering(square: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]
 
 def _inputs(w: FloatArray, square: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
     t = np.linspace(-1.0, 1.0, w.size)
-    yield 'time', _score(w, t)
-    yield 'time squared', _score(w, t * t)
-    yield 'variance time', _score(square, t)
+    yield 'time', score(w, t)
+    yield 'time squared', score(w, t * t)
+    yield 'variance time', score(square, t)
     u = scene.throttle
     if u is None:
         return
-    yield 'throttle', _score(w, u)
+    yield 'throttle', score(w, u)
     centre = u - u.mean()
     slope = float((centre * centre * centre).mean()) / max(float((centre * centre).mean()), 1e-12)
-    yield 'throttle squared', _score(w, centre * centre - slope * centre)
+    yield 'throttle squared', score(w, centre * centre - slope * centre)
     change = np.diff(u, prepend=u[0])
     for span in (0.002, 0.01, 0.05, 0.3, 2.0, 12.0):
         tau = span * scene.rate
         if 0.5 <= tau < 0.25 * w.size:
             keep = math.exp(-1.0 / tau)
             recent = lfilter([1.0], [1.0, -keep], change)
-            yield f'throttle change over {span:g} s', _score(w, recent)
+            yield f'throttle change over {span:g} s', score(w, recent)
             if span in (0.05, 2.0):
-                yield f'throttle direction over {span:g} s', _score(w, np.abs(recent))
-    yield 'variance throttle', _score(square, u)
-    yield 'variance throttle squared', _score(square, centre * centre - slope * centre)
+                yield f'throttle direction over {span:g} s', score(w, np.abs(recent))
+    yield 'variance throttle', score(square, u)
+    yield 'variance throttle squared', score(square, centre * centre - slope * centre)
     keep = math.exp(-1.0 / max(0.05 * scene.rate, 1.0))
-    yield 'variance change of throttle', _score(
+    yield 'variance change of throttle', score(
         square, lfilter([1.0], [1.0, -keep], np.abs(change)))
 
 
 def _state(w: FloatArray, square: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
     x = scene.state / max(float(scene.state.std()), 1e-12)
     x = np.clip(x, -4.0, 4.0)
-    yield 'state squared', _score(w, x * x - float((x**3).mean()) * x)
-    yield 'state cubed', _score(w, x**3 - float((x**4).mean()) * x)
-    yield 'variance state', _score(square, x)
-    yield 'variance state squared', _score(square, x * x)
+    yield 'state squared', score(w, x * x - float((x**3).mean()) * x)
+    yield 'state cubed', score(w, x**3 - float((x**4).mean()) * x)
+    yield 'variance state', score(square, x)
+    yield 'variance state squared', score(square, x * x)
     yield 'irreversibility', _mean_score(
         w[1:] * (w[:-1] ** 2 - 1.0) - w[:-1] * (w[1:] ** 2 - 1.0))
     large = np.flatnonzero(np.abs(w[:-1]) > 3.0)
@@ -251,7 +258,7 @@ def _state(w: FloatArray, square: FloatArray, scene: Scene) -> Iterator[tuple[st
         max(float((w[large] ** 2).sum()), 9.0))
     if scene.throttle is not None:
         u = scene.throttle - scene.throttle.mean()
-        yield 'state throttle', _score(w, x * u - float((x * x * u).mean()) * x)
+        yield 'state throttle', score(w, x * u - float((x * x * u).mean()) * x)
 
 
 # Samples in a stretch whose spectrum is looked at, and lags of products of three.

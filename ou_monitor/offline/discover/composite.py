@@ -16,6 +16,7 @@ import numpy as np
 
 from ou_monitor.model.terms.term import LawFit, Role, Term, View
 from ou_monitor.offline.discover.battery import Scene
+from ou_monitor.offline.discover.battery_history import large_ones, throttle_paths
 from ou_monitor.offline.discover.data import Samples
 from ou_monitor.offline.discover.structure import Events, fit_gaussian, GaussianFit
 from ou_monitor.records import FloatArray
@@ -173,6 +174,11 @@ def view_of(samples: Samples, gaussian: GaussianFit, z: FloatArray, part: slice)
 
 def scene_of(samples: Samples, composite: Composite) -> Scene:
     """Return what the scores of a model are held against."""
-    residual = samples.voltage - composite.gaussian.mean
+    gaussian, events = composite.gaussian, composite.events
+    residual = samples.voltage - gaussian.mean
+    found = None if events is None else (events.push > 0.0) | (events.error > 0.0)
+    keep = float(np.median(gaussian.phi[1:]))
+    paths = () if samples.throttle is None else tuple(throttle_paths(samples.throttle, keep))
     return Scene(np.concatenate(([0.0], residual[:-1])), samples.t - samples.t[0],
-                 samples.throttle, 1.0 / float(np.median(samples.step[1:])))
+                 samples.throttle, 1.0 / float(np.median(samples.step[1:])), keep,
+                 large_ones(gaussian.z, found), paths)

@@ -62,6 +62,8 @@ class Search:
         For each cause, those that did as well in its round.
     log : list of str
         What was tried and what came of it, one line each.
+    removed : list of str
+        Causes taken out again: others that came later do what they did.
     stopped : bool
         Whether the search ended because it took too long.
 
@@ -71,6 +73,7 @@ class Search:
     accepted: list[str] = field(default_factory=list)
     rivals: dict[str, list[str]] = field(default_factory=dict)
     log: list[str] = field(default_factory=list)
+    removed: list[str] = field(default_factory=list)
     stopped: bool = False
 
 
@@ -269,6 +272,7 @@ def _prune(samples: Samples, search: Search) -> None:
             search.log.append(f'{name} is not needed any more: {full - less.score(samples):.1f}')
             search.composite = less
             search.accepted.remove(name)
+            search.removed.append(name)
             full = less.score(samples)
 
 

@@ -2,19 +2,19 @@
 How the statistics spread when nothing is wrong, by simulation.
 
 Recordings of the fitted baseline, with the stamps and the throttle of the data,
-go through the same fit and the same statistics, but for the lines that follow
-throttle: their chances are exact enough, and they take longest.
+go through the same fit and the same statistics, but for what theory tells well
+enough: lines that follow throttle, which take longest, and what comes after large errors.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.offline.discover.battery import Scene, statistics
-from ou_monitor.offline.discover.composite import Composite
+from ou_monitor.offline.discover.composite import Composite, scene_of
 from ou_monitor.offline.discover.data import Samples
 from ou_monitor.offline.discover.structure import evaluate
 from ou_monitor.records import FloatArray
@@ -76,7 +76,7 @@ def simulate_bank(scene: Scene, phi: float, rng: np.random.Generator, size: int 
     for _ in range(size):
         y = lfilter([1.0], [1.0, -phi], rng.standard_normal(n))
         z, state = refit(y)
-        made = Scene(state, scene.at, scene.throttle, scene.rate)
+        made = replace(scene, state=state, large=None)
         rows.append(statistics(z, made, lines=False))
     return _summary(rows)
 
@@ -106,15 +106,13 @@ def simulate_bank_of(samples: Samples, composite: Composite, rng: np.random.Gene
         Means and spreads.
 
     """
-    model, rows = SupplyModel(composite.terms), []
+    model, rows, scene = SupplyModel(composite.terms), [], scene_of(samples, composite)
     for _ in range(size):
         y = model.simulate(samples.t, rng, samples.throttle)
         made = Samples(samples.t, y, samples.throttle)
         fit = evaluate(made, composite.terms)
         state = np.concatenate(([0.0], (y - fit.mean)[:-1]))
-        rows.append(statistics(fit.z, Scene(state, samples.t - samples.t[0], samples.throttle,
-                                            1.0 / float(np.median(samples.step[1:]))),
-                               lines=False))
+        rows.append(statistics(fit.z, replace(scene, state=state, large=None), lines=False))
     return _summary(rows)
 
 

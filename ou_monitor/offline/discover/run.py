@@ -47,9 +47,16 @@ _MANY = 4
 
 @dataclass(frozen=True, eq=False)
 class _Named:
-    """What the search left: a model, its causes, and statistics before and after."""
+    """
+    What the search left: a model, its causes, and statistics before and after.
+
+    `model` was fitted on the first part, `whole` on `part`: everything where that could be done.
+
+    """
 
     model: Composite
+    whole: Composite
+    part: slice
     names: tuple[str, ...]
     rivals: Mapping[str, list[str]]
     dropped: tuple[str, ...]
@@ -100,7 +107,8 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
                              'any of its samples differ, or some are far beyond all others.',
                              seed)
     tell(0.7)
-    whole, se = _refitted(samples, named.model)
+    whole = named.whole
+    se = standard_errors(samples, whole, named.part)
     tell(0.75)
     scored = _kept(samples, state)
     scale = Scale(samples, named.model, scored)
@@ -188,19 +196,26 @@ def _named(samples: Samples, start: Composite, rng: np.random.Generator,
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         # A fit outside of what numbers can hold; the criticism still stands.
         search, failure = Search(start), f'The search for causes broke off: {error}.'
-    after = criticise(samples, search.composite, bank) if search.accepted else before
+    # What happens once, in the part kept, is no fault of the form of a cause.
+    whole = _whole(samples, search.composite)
+    after = criticise(samples, whole, bank) if search.accepted else before
     kinds = [catalogue()[name] for name in search.accepted]
     dropped = tuple(search.accepted[k] for k in withdrawn(before, after, kinds))
     if dropped:
-        # They may have stood in the way of what was measured.
-        search = name_causes(samples, start, bank, given=[term.NAME for term in exact],
-                             latent=False)
-        after = criticise(samples, search.composite, bank)
+        # They may have stood in the way of what was measured; a trend that they did better
+        # than is none.
+        slow = [name for name in search.removed if catalogue()[name].FAMILY == 'slow']
+        search = name_causes(samples, start, bank, latent=False,
+                             given=[*(term.NAME for term in exact), *slow])
+        whole = _whole(samples, search.composite)
+        after = criticise(samples, whole, bank)
+    part = samples.train if whole is search.composite else slice(0, samples.n)
     model = search.composite
     if search.accepted:
         # Named with a mean that saw everything; measured with one that did not.
         model = fit_composite(samples, model.terms, samples.train, model) or model
-    return _Named(model, tuple(search.accepted), search.rivals, dropped, before, after, failure)
+    return _Named(model, whole, part, tuple(search.accepted), search.rivals, dropped, before, after,
+                  failure)
 
 
 def position(model: Composite, names: list[str] | tuple[str, ...], k: int) -> int:
@@ -260,16 +275,13 @@ def _causes(samples: Samples, state: Integrity, named: _Named, whole: Composite,
     return tuple(found)
 
 
-def _refitted(samples: Samples, model: Composite) -> tuple[Composite, tuple[dict[str, Any], ...]]:
-    """Return the model fitted on everything, and its standard errors."""
-    whole = slice(0, samples.n)
+def _whole(samples: Samples, model: Composite) -> Composite:
+    """Return a model fitted on everything; as it is where that cannot be done."""
     try:
-        again = fit_composite(samples, model.terms, whole)
+        again = fit_composite(samples, model.terms, slice(0, samples.n))
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
-        again = None
-    if again is None or not math.isfinite(float(again.density.sum())):
-        return model, standard_errors(samples, model, samples.train)
-    return again, standard_errors(samples, again, whole)
+        return model
+    return again if again is not None and math.isfinite(float(again.density.sum())) else model
 
 
 def _criticism(before: Mapping[str, float], after: Mapping[str, float]) -> tuple[Criticism, ...]:

@@ -75,6 +75,9 @@ def withdrawn(before: Mapping[str, float], after: Mapping[str, float],
     def fails(kind: type[Term]) -> bool:
         if kind.ROLE is not Role.NOISE and kind.FAMILY not in ('line', 'instrument'):
             return bool(left)
+        if kind.FAMILY == 'line' and any(name.startswith('bursts') for name in left):
+            # A line does not come and go.
+            return True
         share = _SIGNS_SHARE[kind.FAMILY]
         own = max((abs(value) for name, value in before.items() for sign in kind.SIGNS
                    if is_sign(sign, name, value)), default=0.0)
