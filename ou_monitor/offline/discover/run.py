@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 import math
 from pathlib import Path
@@ -18,14 +18,16 @@ from ou_monitor.offline.discover.composite import Composite, fit_composite, scen
 from ou_monitor.offline.discover.data import Samples
 from ou_monitor.offline.discover.errors import standard_errors
 from ou_monitor.offline.discover.finding import Cause, Criticism, Finding, Verdict
+from ou_monitor.offline.discover.fitting import joined
 from ou_monitor.offline.discover.gain import (
     crossing_rates, mean_difference, mean_score, Scale, without, worth)
 from ou_monitor.offline.discover.integrity import examine, Integrity
-from ou_monitor.offline.discover.naming import name_causes, Search
-from ou_monitor.offline.discover.null_bank import family_chance, simulate_bank, simulate_bank_of
+from ou_monitor.offline.discover.naming import ACCEPT, name_causes, Search
+from ou_monitor.offline.discover.null_bank import (
+    family_chance, NullBank, simulate_bank, simulate_bank_of)
 from ou_monitor.offline.discover.structure import evaluate, fit_gaussian
 from ou_monitor.offline.discover.trials import criticise
-from ou_monitor.offline.discover.verdict import judge, NOTHING, withdrawn
+from ou_monitor.offline.discover.verdict import is_latent, judge, NOTHING, withdrawn
 from ou_monitor.offline.discover.words import (
     coupling_found, coupling_note, explain, left_out_note, no_relaxation_note, verdict_sentence)
 from ou_monitor.recordings.read import read_recording
@@ -190,17 +192,38 @@ def _named(samples: Samples, start: Composite, rng: np.random.Generator,
         search, failure = Search(start), f'The search for causes broke off: {error}.'
     after = criticise(samples, search.composite, bank) if search.accepted else before
     kinds = [catalogue()[name] for name in search.accepted]
-    dropped = tuple(search.accepted[k] for k in withdrawn(before, after, kinds))
+    out = withdrawn(before, after, kinds)
+    dropped = tuple(search.accepted[k] for k in out)
     if dropped:
+        stays = [search.composite.terms[position(search.composite, search.accepted, k)]
+                 for k, kind in enumerate(kinds) if k not in out and is_latent(kind)]
         # They may have stood in the way of what was measured.
         search = name_causes(samples, start, bank, given=[term.NAME for term in exact],
                              latent=False)
-        after = criticise(samples, search.composite, bank)
+        after = _kept_beside(samples, search, stays, before, bank)
     model = search.composite
     if search.accepted:
         # Named with a mean that saw everything; measured with one that did not.
         model = fit_composite(samples, model.terms, samples.train, model) or model
     return _Named(model, tuple(search.accepted), search.rivals, dropped, before, after, failure)
+
+
+def _kept_beside(samples: Samples, search: Search, stays: Sequence[Term],
+                 before: Mapping[str, float], bank: NullBank) -> dict[str, float]:
+    """Put latent causes that were not withdrawn beside the measured ones; return what is left."""
+    after = criticise(samples, search.composite, bank)
+    for term in stays:
+        made = joined(samples, search.composite, [term], rough=False)
+        if made is None or made.score(samples) - search.composite.score(samples) < ACCEPT:
+            continue
+        left = criticise(samples, made, bank)
+        names = [*search.accepted, term.NAME]
+        if withdrawn(before, left, [catalogue()[name] for name in names]):
+            continue
+        search.composite, after = made, left
+        search.accepted.append(term.NAME)
+        search.rivals.setdefault(term.NAME, [])
+    return after
 
 
 def position(model: Composite, names: list[str] | tuple[str, ...], k: int) -> int:
