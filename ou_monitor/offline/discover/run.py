@@ -39,6 +39,8 @@ Progress = Callable[[float], None]
 # What to say where the search was cut short.
 STOPPED = ('The search for causes was cut short where the next ones would have taken long; there '
            'may be more than are named.')
+# Why the gain of a line is not known that was found in all samples, of which some are used.
+FAST = 'the samples that are used are too few to show a line so fast.'
 # Steps of more relaxation times than this leave no relaxation to be seen.
 _BLIND = 1.0
 # Relaxation times in a recording from which its rate is one, and no trend.
@@ -183,8 +185,10 @@ def _named(samples: Samples, start: Composite, rng: np.random.Generator,
         bank = simulate_bank(scene_of(samples, start), phi, rng)
     progress(0.1)
     before = criticise(samples, start, bank)
+    # Beside lines that were taken out there may be slower ones.
+    given = [term.NAME for term in exact if term.FAMILY != 'line']
     try:
-        search = name_causes(samples, start, bank, given=[term.NAME for term in exact],
+        search = name_causes(samples, start, bank, given=given,
                              progress=lambda share: progress(0.1 + 0.9 * share))
         failure = STOPPED if search.stopped else ''
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
@@ -198,8 +202,7 @@ def _named(samples: Samples, start: Composite, rng: np.random.Generator,
         stays = [search.composite.terms[position(search.composite, search.accepted, k)]
                  for k, kind in enumerate(kinds) if k not in out and is_latent(kind)]
         # They may have stood in the way of what was measured.
-        search = name_causes(samples, start, bank, given=[term.NAME for term in exact],
-                             latent=False)
+        search = name_causes(samples, start, bank, given=given, latent=False)
         after = _kept_beside(samples, search, stays, before, bank)
     model = search.composite
     if search.accepted:
@@ -255,6 +258,8 @@ def _causes(samples: Samples, state: Integrity, named: _Named, whole: Composite,
             gain, error = (math.nan, math.nan) if less is None else scale.gain(
                 named.model.density, less.density, (index,))
             why = scale.why_unknown((index,))
+        elif term.FAMILY == 'line':
+            gain, error, why = math.nan, math.nan, FAST
         else:
             clean = evaluate(samples, fit_gaussian(
                 samples, [start.terms[0]], samples.train).terms)
