@@ -77,14 +77,14 @@ def log_likelihood(log_density: FloatArray, transition: FloatArray, start: Float
     Returns
     -------
     float
-        Log density of all samples.
+        Log density of all samples; -inf where they cannot be.
 
     """
     k = transition.shape[0]
-    log = log_density.transpose(1, 2, 0)
+    log: FloatArray = log_density.transpose(1, 2, 0)
     top = _largest(log)
     total = float(top.sum())
-    m = np.empty(log.shape)
+    m: FloatArray = np.empty(log.shape)
     for i, j in np.ndindex(k, k):
         np.exp(log[i, j] - top, out=m[i, j])
         m[i, j] *= transition[i, j]
@@ -102,12 +102,13 @@ def log_likelihood(log_density: FloatArray, transition: FloatArray, start: Float
             scale = m.sum(axis=(0, 1))
             m /= scale
             total += float(np.log(scale).sum())
-    return total + math.log(float((start / start.sum() @ m[:, :, 0]).sum()))
+    left_over = float((start / start.sum() @ m[:, :, 0]).sum())
+    return total + math.log(left_over) if left_over > 0.0 else -math.inf
 
 
 def _largest(log: FloatArray) -> FloatArray:
     """Return the largest element of each matrix, shape (k, k, n)."""
-    top = log[0, 0].copy()
+    top: FloatArray = log[0, 0].copy()
     for i, j in np.ndindex(log.shape[:2]):
         np.maximum(top, log[i, j], out=top)
     return top
@@ -116,7 +117,7 @@ def _largest(log: FloatArray) -> FloatArray:
 def _in_blocks(log_density: FloatArray, transition: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the scale of each sample, and scaled products, shape (size, k, k, blocks)."""
     n, k, _ = log_density.shape
-    log = log_density.transpose(1, 2, 0)
+    log: FloatArray = log_density.transpose(1, 2, 0)
     size = max(1, round(_SHORT * math.sqrt(n)))
     blocks = -(-n // size)
     top = _largest(log)
