@@ -15,9 +15,11 @@ import numpy as np
 
 from ou_monitor.records import FloatArray
 
-# Products between two scalings: far from the smallest number, for the largest
-# density of each sample is scaled to 1.
-_EVERY = 8
+# Products, and levels of products of two, between two scalings: far from the smallest
+# number, for the largest density of each sample is scaled to 1.
+_EVERY, _LEVELS = 8, 3
+# Samples in a block, in roots of their number: a turn over blocks is the dearer one.
+_SHORT = 0.4
 
 
 def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
@@ -28,7 +30,8 @@ def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
     Parameters
     ----------
     log_density : ndarray, shape (n, k, k)
-        Log density of each sample given the states before and at it.
+        Log density of each sample given the states before and at it; a
+        transposed array of shape (k, k, n) saves a copy.
     transition : ndarray, shape (k, k)
         Probabilities; rows add up to 1.
     start : ndarray, shape (k,)
@@ -43,25 +46,9 @@ def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
 
     """
     n, k, _ = log_density.shape
-    size = max(1, math.isqrt(n))
-    blocks = -(-n // size)
-    top = log_density.reshape(n, -1).max(axis=1)
-    m = np.exp(log_density - top[:, None, None]) * transition
-    # The last block is filled up with samples that say nothing.
-    padded = np.broadcast_to(transition, (blocks * size, k, k)).copy()
-    padded[:n] = m
-    padded = np.ascontiguousarray(padded.reshape(blocks, size, k, k).transpose(1, 2, 3, 0))
-    whole = padded[0]
-    for j in range(1, size):
-        whole = (whole[:, :, None] * padded[j][None]).sum(axis=1)
-        if j % _EVERY == 0:
-            whole = whole / whole.sum(axis=(0, 1))
-    first = np.empty((blocks, k))
-    law = start / start.sum()
-    for b in range(blocks):
-        first[b] = law
-        law = law @ whole[:, :, b]
-        law = law / law.sum()
+    top, padded = _in_blocks(log_density, transition)
+    size, blocks = padded.shape[0], padded.shape[3]
+    first = _through(padded, start)
     before = np.empty((size, k, blocks))
     norm = np.empty((size, blocks))
     now = first.T
@@ -72,3 +59,90 @@ def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
         now = now / norm[j]
     return (before.transpose(2, 0, 1).reshape(-1, k)[:n],
             np.log(norm.T.reshape(-1)[:n]) + top)
+
+
+def log_likelihood(log_density: FloatArray, transition: FloatArray, start: FloatArray) -> float:
+    """
+    Return the sum of the evidence of `forward`, at a small part of its cost.
+
+    Parameters
+    ----------
+    log_density : ndarray, shape (n, k, k)
+        As `forward`.
+    transition : ndarray, shape (k, k)
+        As `forward`.
+    start : ndarray, shape (k,)
+        As `forward`.
+
+    Returns
+    -------
+    float
+        Log density of all samples; -inf where they cannot be.
+
+    """
+    k = transition.shape[0]
+    log: FloatArray = log_density.transpose(1, 2, 0)
+    top = _largest(log)
+    total = float(top.sum())
+    m: FloatArray = np.empty(log.shape)
+    for i, j in np.ndindex(k, k):
+        np.exp(log[i, j] - top, out=m[i, j])
+        m[i, j] *= transition[i, j]
+    # Neighbours in pairs, and these in pairs again.
+    level = 0
+    while m.shape[2] > 1:
+        if m.shape[2] % 2:
+            m = np.concatenate((m, np.eye(k)[:, :, None]), axis=2)
+        left, right = m[:, :, ::2], m[:, :, 1::2]
+        m = left[:, 0, None] * right[None, 0]
+        for j in range(1, k):
+            m += left[:, j, None] * right[None, j]
+        level += 1
+        if level % _LEVELS == 0 or m.shape[2] == 1:
+            scale = m.sum(axis=(0, 1))
+            m /= scale
+            total += float(np.log(scale).sum())
+    left_over = float((start / start.sum() @ m[:, :, 0]).sum())
+    return total + math.log(left_over) if left_over > 0.0 else -math.inf
+
+
+def _largest(log: FloatArray) -> FloatArray:
+    """Return the largest element of each matrix, shape (k, k, n)."""
+    top: FloatArray = log[0, 0].copy()
+    for i, j in np.ndindex(log.shape[:2]):
+        np.maximum(top, log[i, j], out=top)
+    return top
+
+
+def _in_blocks(log_density: FloatArray, transition: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the scale of each sample, and scaled products, shape (size, k, k, blocks)."""
+    n, k, _ = log_density.shape
+    log: FloatArray = log_density.transpose(1, 2, 0)
+    size = max(1, round(_SHORT * math.sqrt(n)))
+    blocks = -(-n // size)
+    top = _largest(log)
+    padded = np.empty((size, k, k, blocks))
+    # The last block is filled up with samples that say nothing.
+    row = np.zeros(blocks * size)
+    for i, j in np.ndindex(k, k):
+        np.exp(log[i, j] - top, out=row[:n])
+        row[n:] = 1.0
+        np.multiply(row.reshape(blocks, size).T, transition[i, j], out=padded[:, i, j])
+    return top, padded
+
+
+def _through(padded: FloatArray, start: FloatArray) -> FloatArray:
+    """Return the law before each block."""
+    size, k, _, blocks = padded.shape
+    whole = padded[0]
+    for j in range(1, size):
+        whole = (whole[:, :, None] * padded[j][None]).sum(axis=1)
+        if j % _EVERY == 0:
+            whole = whole / whole.sum(axis=(0, 1))
+    first = np.empty((blocks, k))
+    law = start / start.sum()
+    for b, product in enumerate(np.ascontiguousarray(whole.transpose(2, 0, 1))):
+        first[b] = law
+        law = law @ product
+        law = law / law.sum()
+    return first

@@ -19,6 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.records import FloatArray
 from scipy.linalg.lapack import dpbtrf, dtbtrs
 from scipy.signal import lfilter
@@ -89,14 +90,18 @@ class Filter:
         h = model.h
         n, d = model.f.shape[0], model.f.shape[1]
         # One array for each element of the matrices, along the samples: no small
-        # matrices are touched one by one.
+        # matrices are touched one by one.  Blocks leave most of them zero.
         f, q = _elements(model.f), _elements(model.q)
+        turns = _pattern(f)
         weight = _inverse(q)
-        forward = _times(weight, f)
+        known = _pattern(weight)
+        forward = _times(weight, f, known, turns)
         # What the step into the next sample says of this one.
         back = np.zeros_like(f)
-        back[..., :-1] = _times(f.transpose(1, 0, 2)[..., 1:], forward[..., 1:])
-        diagonal = weight + back + np.outer(h, h)[:, :, None] / model.r
+        _symmetric(f[..., 1:], forward[..., 1:], turns, known @ turns, back[..., :-1])
+        diagonal = weight + back
+        for i, j in np.argwhere(np.outer(h, h) != 0.0).tolist():
+            diagonal[i, j] += h[i] * h[j] / model.r
         band = _band(diagonal, -forward[..., 1:])
         del weight, forward, diagonal
         factor, info = dpbtrf(band, lower=1, overwrite_ab=1)
@@ -108,8 +113,8 @@ class Filter:
         p -= back
         del factor, back
         p = _inverse(p)
-        gain = np.einsum('ijn,j->in', p, h) / model.r
-        look = np.einsum('i,ijn->jn', h, f)
+        gain = _seen(h, p) / model.r
+        look = _seen(h, f)
         loop = f - gain[:, None] * look[None]
         loop[..., 0] = look[:, 0] = 0.0
         self._band_of_loop = _band(_one(d, n), -loop[..., 1:])
@@ -118,8 +123,10 @@ class Filter:
         # The last gain does not know that a step follows; the one before does.
         self._last_loop = loop[..., -2].copy() if n > 1 else np.zeros((d, d))
         ahead = model.r.copy()
-        ahead += np.einsum('i,ijn,j->n', h, q, h)
-        ahead[1:] += np.einsum('in,ijn,jn->n', look[:, 1:], p[..., :-1], look[:, 1:])
+        ahead += h @ _seen(h, q)
+        for i in range(d):
+            for j in range(i + 1):
+                ahead[1:] += (1.0 + (i > j)) * p[i, j, :-1] * look[i, 1:] * look[j, 1:]
         variance: FloatArray = ahead
         return variance
 
@@ -228,13 +235,39 @@ def _one(d: int, n: int) -> FloatArray:
     return one
 
 
-def _times(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Multiply matrices of shape (d, d, n)."""
-    d = a.shape[0]
-    product = a[:, 0, None] * b[None, 0]
-    for k in range(1, d):
-        product += a[:, k, None] * b[None, k]
+Pattern = npt.NDArray[np.bool_]
+
+
+def _pattern(a: FloatArray) -> Pattern:
+    """Return which elements of matrices of shape (d, d, n) are not zero all along."""
+    return np.asarray(a.any(axis=2))
+
+
+def _seen(h: FloatArray, a: FloatArray) -> FloatArray:
+    """Return the rows of matrices, shape (d, d, n), added up with weights."""
+    total = np.zeros(a.shape[1:])
+    for k in np.flatnonzero(h).tolist():
+        total += a[k] if h[k] == 1.0 else h[k] * a[k]
+    return total
+
+
+def _times(a: FloatArray, b: FloatArray, left: Pattern, right: Pattern) -> FloatArray:
+    """Multiply matrices of shape (d, d, n) of which some elements are zero."""
+    product = np.zeros_like(a)
+    for i, k in np.argwhere(left).tolist():
+        for j in np.flatnonzero(right[k]).tolist():
+            product[i, j] += a[i, k] * b[k, j]
     return product
+
+
+def _symmetric(a: FloatArray, b: FloatArray, left: Pattern, right: Pattern, out: FloatArray
+               ) -> None:
+    """Put the product of the transpose of a with b, which is symmetric, into zeros."""
+    for k, i in np.argwhere(left).tolist():
+        for j in np.flatnonzero(right[k, :i + 1]).tolist():
+            out[i, j] += a[k, i] * b[k, j]
+    for i, j in np.argwhere(np.tri(out.shape[0], k=-1)).tolist():
+        out[j, i] = out[i, j]
 
 
 def _inverse(a: FloatArray) -> FloatArray:
@@ -242,38 +275,73 @@ def _inverse(a: FloatArray) -> FloatArray:
     d = a.shape[0]
     if d == 1:
         return 1.0 / a
+    some = _pattern(a)
     # Lower factor, and its inverse by forward substitution.
-    low, up = np.zeros_like(a), np.zeros_like(a)
+    low: dict[tuple[int, int], FloatArray] = {}
+    up: dict[tuple[int, int], FloatArray] = {}
     with np.errstate(invalid='ignore', divide='ignore'):
         for j in range(d):
-            pivot = a[j, j] - (low[j, :j] ** 2).sum(axis=0)
+            pivot = a[j, j].copy()
+            for k in range(j):
+                if (j, k) in low:
+                    pivot -= low[j, k] ** 2
             up[j, j] = 1.0 / np.sqrt(pivot)
             low[j, j] = pivot * up[j, j]
             for i in range(j + 1, d):
-                low[i, j] = (a[i, j] - (low[i, :j] * low[j, :j]).sum(axis=0)) * up[j, j]
+                both = [k for k in range(j) if (i, k) in low and (j, k) in low]
+                if some[i, j] or both:
+                    rest = a[i, j].copy()
+                    for k in both:
+                        rest -= low[i, k] * low[j, k]
+                    rest *= up[j, j]
+                    low[i, j] = rest
             for i in range(j):
-                up[j, i] = -(low[j, i:j] * up[i:j, i]).sum(axis=0) * up[j, j]
-    return _times(up.transpose(1, 0, 2), up)
+                terms = [low[j, k] * up[k, i] for k in range(i, j)
+                         if (j, k) in low and (k, i) in up]
+                if terms:
+                    up[j, i] = -sum(terms[1:], start=terms[0]) * up[j, j]
+    result = np.zeros_like(a)
+    for (k, i), value in up.items():
+        for j in range(i + 1):
+            if (k, j) in up:
+                result[i, j] += value * up[k, j]
+    for i, j in np.argwhere(np.tri(d, k=-1)).tolist():
+        result[j, i] = result[i, j]
+    return result
+
+
+# Samples whose matrices stay in the fast memory.
+_AT_ONCE = 1024
 
 
 def _band(diagonal: FloatArray, below: FloatArray) -> FloatArray:
     """Return a block bidiagonal or symmetric block tridiagonal matrix, lower band storage."""
     d, n = diagonal.shape[0], diagonal.shape[2]
-    # As LAPACK wants it: all rows of one column beside each other.
+    # As LAPACK wants it: all rows of one column beside each other; written stretch by
+    # stretch, or each element would go through all the memory.
     band = np.zeros((n, d, 2 * d))
-    for j in range(d):
-        for i in range(j, d):
-            band[:, j, i - j] = diagonal[i, j]
-        for i in range(d):
-            band[:-1, j, d + i - j] = below[i, j]
+    inside = [(i, j) for j in range(d) for i in range(j, d)]
+    across = np.argwhere(_pattern(below)).tolist()
+    for begin in range(0, n, _AT_ONCE):
+        part = slice(begin, begin + _AT_ONCE)
+        rows = band[part]
+        for i, j in inside:
+            rows[:, j, i - j] = diagonal[i, j, part]
+        rows = band[begin:min(begin + _AT_ONCE, n - 1)]
+        for i, j in across:
+            rows[:, j, d + i - j] = below[i, j, part]
     return band.reshape(n * d, 2 * d).T
 
 
 def _pivots(factor: FloatArray, n: int, d: int) -> FloatArray:
     """Return the pivot blocks L_kk L_kk' of a banded Cholesky factor, shape (d, d, n)."""
-    lower = np.zeros((d, d, n))
     rows = factor.T.reshape(n, d, -1)
-    for j in range(d):
-        for i in range(j, d):
-            lower[i, j] = rows[:, j, i - j]
-    return _times(lower, lower.transpose(1, 0, 2))
+    lower = {(i, j): np.ascontiguousarray(rows[:, j, i - j])
+             for i in range(d) for j in range(i + 1)}
+    pivots = np.empty((d, d, n))
+    for i, j in lower:
+        pivots[i, j] = lower[i, 0] * lower[j, 0]
+        for k in range(1, j + 1):
+            pivots[i, j] += lower[i, k] * lower[j, k]
+        pivots[j, i] = pivots[i, j]
+    return pivots

@@ -1,7 +1,7 @@
 """Hidden chains in blocks, against the recursion sample by sample."""
 
 import numpy as np
-from ou_monitor.model.hidden_chain import forward
+from ou_monitor.model.hidden_chain import forward, log_likelihood
 import pytest
 
 
@@ -20,6 +20,7 @@ def test_as_the_recursion(states, n):
         law = law @ (transition * np.exp(density[k]))
         assert evidence[k] == pytest.approx(np.log(law.sum()), abs=1e-10)
         law = law / law.sum()
+    assert log_likelihood(density, transition, start) == pytest.approx(evidence.sum(), abs=1e-9)
 
 
 def test_densities_far_apart():
@@ -32,3 +33,5 @@ def test_densities_far_apart():
     assert np.isfinite(before).all() and np.isfinite(evidence).all()
     # Every step must change the state.
     np.testing.assert_allclose(evidence[1:], np.log(0.1), atol=1e-9)
+    total = log_likelihood(density, transition, np.array([0.5, 0.5]))
+    assert total == pytest.approx(evidence.sum(), rel=1e-12)

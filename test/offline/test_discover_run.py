@@ -199,6 +199,15 @@ def test_a_clean_bench_stays_quiet():
 
 
 @pytest.mark.skipif('OU_MONITOR_REALDATA' not in os.environ, reason='no real recordings')
+def test_the_line_of_a_motor_is_named():
+    """mm_bench_3: a line that wanders from 236 to 246 Hz in 0.7 s, most of the variance."""
+    found = discover(Path(os.environ['OU_MONITOR_REALDATA']) / 'mm_bench_3.csv')
+    (line,) = [cause for cause in found.causes if cause.term.FAMILY == 'line']
+    assert 232.0 < line.term.frequency < 250.0
+    assert line.gain > 5.0 * line.gain_se
+
+
+@pytest.mark.skipif('OU_MONITOR_REALDATA' not in os.environ, reason='no real recordings')
 @pytest.mark.parametrize('name', ['mm_bench_1', 'mm_bench_3'])
 def test_a_motor_that_starts_late_gains_nothing_absurd(name):
     """What the first part did not see is left out: gains are known within errors, or unknown."""

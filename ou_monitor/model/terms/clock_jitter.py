@@ -111,6 +111,6 @@ def _errors(z: FloatArray, x: FloatArray
     error = math.exp(x[0]) * nodes
     var = math.exp(2.0 * x[1]) * np.maximum(1.0 + error[None, :] - error[:, None], 0.05)
     transition = np.broadcast_to(law, (_LEVELS, _LEVELS))
-    log_density = log_normal(z[:, None, None], 0.0, var[None])
-    before, density = forward(log_density, transition, law)
+    log_density = log_normal(z, 0.0, var[:, :, None])
+    before, density = forward(log_density.transpose(2, 0, 1), transition, law)
     return before, density, np.sqrt(var), law

@@ -93,7 +93,7 @@ def _scored(view: View, bad: npt.NDArray[np.bool_], share: float, spread: float,
     go = 1.0 - lengths[0], lengths[2] / (lengths[1] + lengths[2])
     transition = np.array([[1.0 - share, share, 0.0, 0.0], [1.0 - go[0], 0.0, go[0], 0.0],
                            [1.0 - go[1], 0.0, 0.0, go[1]], [1.0, 0.0, 0.0, 0.0]])
-    before, both = forward(np.stack((calm, hit, more), axis=1)[:, which], transition,
+    before, both = forward(np.stack((calm, hit, more))[which].transpose(2, 0, 1), transition,
                            np.array([1.0, 0.0, 0.0, 0.0]))
     chance = np.stack([before @ (transition * (which == k)).sum(axis=1) for k in range(3)])
     scores = normal_scores(chance[0] * ndtr(view.z) + chance[1] * ndtr(view.z / wide)

@@ -8,14 +8,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.hidden_chain import forward
-from ou_monitor.model.terms.laws import (
-    climb, curvature_se, log_normal, mixture_cdf, normal_scores)
+from ou_monitor.model.hidden_chain import forward, log_likelihood
+from ou_monitor.model.terms.laws import climb, curvature_se, log_normal, normal_scores
 from ou_monitor.model.terms.recursion import first_order
 from ou_monitor.model.terms.term import (
     Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
 from ou_monitor.records import FloatArray
 from scipy.linalg import expm
+from scipy.special import ndtr
 
 
 # Events drawn for one stretch at most: bounds time and memory.
@@ -120,7 +120,7 @@ class RegimeSwitching(Term):
         def value(x: FloatArray) -> float:
             if not _inside(x, view):
                 return -math.inf
-            return float(_chain(z, phi, step, x, once)[1].sum())
+            return log_likelihood(*_chain(z, phi, step, x, once)[0])
 
         # Coordinates: ln rates, level in innovations, ln sigma ratio, ln scale.
         shortest = math.exp(-_fastest(view))
@@ -173,16 +173,17 @@ class RegimeSwitching(Term):
         def value(x: FloatArray) -> float:
             if not _inside(x, view):
                 return -math.inf
-            return float(_chain(z, phi, step, x, at_once, states)[1].sum())
+            return log_likelihood(*_chain(z, phi, step, x, at_once, states)[0])
 
         x, top = climb(value, start, size=0.2, most=most)
         if top == -math.inf:
             return None
-        before, density, mean, std = _chain(view.z, view.phi, step, x, at_once, states)
-        weight = before[:, :, None] * _transition(x, step, states)
-        pairs = states * states
-        scores = normal_scores(mixture_cdf(view.z, weight.reshape(-1, pairs),
-                                           mean.reshape(-1, pairs), std.reshape(-1, pairs)))
+        chain, mean, std = _chain(view.z, view.phi, step, x, at_once, states)
+        before, density = forward(*chain)
+        chance = np.zeros(view.z.size)
+        for i, j in np.ndindex(states, states):
+            chance += before[:, i] * chain[1][i, j] * ndtr((view.z - mean[i, j]) / std[j])
+        scores = normal_scores(chance)
         term = cls(math.exp(x[0]), math.exp(x[1]), float(x[2]) * unit, math.exp(x[3]),
                    at_once, float(states))
         e = curvature_se(value, x)
@@ -254,18 +255,23 @@ def _transition(x: FloatArray, step: float, states: int) -> FloatArray:
 
 
 def _chain(z: FloatArray, phi: FloatArray, step: float, x: FloatArray, at_once: float,
-           states: int = 2) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the law of the state before each sample, densities, and what each pair expects."""
+           states: int = 2) -> tuple[tuple[FloatArray, FloatArray, FloatArray],
+                                     FloatArray, FloatArray]:
+    """
+    Return what a filter takes, and what each pair of states expects.
+
+    The mean of each pair, shape (states, states, n), and the deviation of each
+    state.
+    """
     state = np.arange(states, dtype=np.float64)
+    transition = _transition(x, step, states)
+    law = _stationary(_rates(math.exp(x[0]), math.exp(x[1]), states))
+    std = np.exp(x[4] + x[3] * state)
     # The level enters the innovations where it changes, and a little while it is on;
     # where it comes at the rate alpha, only the latter.
-    pull = 1.0 - phi[:, None, None]
-    mean = x[2] * (pull * state[None, :, None]
-                   + at_once * (state[None, None, :] - state[None, :, None]))
-    law = _stationary(_rates(math.exp(x[0]), math.exp(x[1]), states))
-    centre = x[2] * float(law @ state) * (1.0 - phi)
-    mean = mean - centre[:, None, None]
-    std = np.broadcast_to(math.exp(x[4]) * np.exp(x[3] * state)[None, None, :], mean.shape)
-    log_density = log_normal(z[:, None, None], mean, std * std)
-    before, density = forward(log_density, _transition(x, step, states), law)
-    return before, density, mean, std
+    pull = x[2] * (1.0 - phi)
+    mean, log = np.empty((states, states, z.size)), np.empty((states, states, z.size))
+    for i, j in np.ndindex(states, states):
+        mean[i, j] = pull * (i - float(law @ state)) + x[2] * at_once * (j - i)
+        log[i, j] = log_normal(z, mean[i, j], float(std[j]) ** 2)
+    return (log.transpose(2, 0, 1), transition, law), mean, std

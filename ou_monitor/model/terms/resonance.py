@@ -9,10 +9,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.lines import broad_peaks, rotation
+from ou_monitor.model.terms.lines import broad_peaks, keeps_its_height, rotation
 from ou_monitor.model.terms.recursion import first_order
 from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
-from ou_monitor.model.terms.tone import WIDEST
+from ou_monitor.model.terms.tone import SHARP, WIDEST
 from ou_monitor.records import FloatArray
 
 
@@ -97,7 +97,10 @@ class Resonance(Term):
 
     def holds(self, view: View) -> bool:
         """Return whether it turns before it dies out, and dies out sooner than a line does."""
-        return math.pi * WIDEST < self.damping < 2.0 * math.pi * self.frequency
+        width = self.damping / math.pi
+        return WIDEST < width < 2.0 * self.frequency and not (
+            width < SHARP * self.frequency
+            and keeps_its_height(view, self.frequency, width))
 
 
 # Tilt to begin with, and at most: at 1 a step would add no noise in one direction.

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ou_monitor.model.terms.lines import lines_at, rotation
+from ou_monitor.model.terms.lines import keeps_its_height, lines_at, rotation
 from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray
 
@@ -69,7 +69,9 @@ class Tone(Term):
 
     def holds(self, view: View) -> bool:
         """Return whether it is a line, not ringing."""
-        return self.linewidth < min(WIDEST, _SHARP * self.frequency)
+        return self.linewidth < SHARP * self.frequency and (
+            self.linewidth < WIDEST
+            or keeps_its_height(view, self.frequency, self.linewidth))
 
     def block(self, s: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the two states of a line that wanders, which turn."""
@@ -95,7 +97,8 @@ class Tone(Term):
         return replace(self, amplitude=math.hypot(*beta), phase=math.atan2(beta[1], beta[0]))
 
 
-# Linewidth to start from, Hz, and that from which a line is ringing that dies out.
+# Linewidth to start from, Hz, and that from which a line is ringing that dies out, if it
+# does not keep its height.
 _WANDERS, WIDEST = 0.3, 2.0
 # Width of the widest line, in frequencies.
-_SHARP = 0.05
+SHARP = 0.05

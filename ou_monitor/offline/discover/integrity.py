@@ -22,10 +22,11 @@ from ou_monitor.model.terms.saturation import Saturation
 from ou_monitor.model.terms.term import Term
 from ou_monitor.offline.discover.clipped import redraw
 from ou_monitor.offline.discover.data import Samples
+from ou_monitor.offline.discover.fast_lines import lines_lost, without_lines
 from ou_monitor.offline.discover.lattice import find_rails, find_step
 from ou_monitor.offline.discover.squeezed import find_knee
 from ou_monitor.offline.discover.stamps import judge_stamps, on_grid
-from ou_monitor.offline.discover.thinning import choose_samples
+from ou_monitor.offline.discover.thinning import choose_samples, events_between
 from ou_monitor.online.intake import Batch
 from ou_monitor.online.repeats import refresh_period, Repeats
 from ou_monitor.records import FloatArray, Recording
@@ -106,15 +107,26 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     logged = (t, v, u)
     t, v, u, period = _without_repeats(t, v, u)
     if period > 1.0:
-        rate = (v.size - 1) / float(t[-1] - t[0])
-        exact.append(HeldSamples(rate))
-        notes.append(f'The logger repeats its last value: the source refreshes at {rate:.4g} Hz; '
+        fresh = (v.size - 1) / float(t[-1] - t[0])
+        exact.append(HeldSamples(fresh))
+        notes.append(f'The logger repeats its last value: the source refreshes at {fresh:.4g} Hz; '
                      f'{logged[0].size - v.size} repeats were dropped.')
     tell(0.4)
-    which, note = choose_samples(v, (v.size - 1) / float(t[-1] - t[0]))
+    rate = (v.size - 1) / float(t[-1] - t[0])
+    which, note = choose_samples(v, rate)
     if note:
         notes.append(note)
+    lines = lines_lost(t, v, which)
+    for line in lines:
+        notes.append(f'The line at {line.frequency:.6g} Hz was found in all samples and taken '
+                     'out of those used, which are too few to show it.')
+    between = events_between(v, u, rate, which)
+    origin = float(t[which.start])
+    events = (t[between], without_lines(t[between], v[between], origin, lines),
+              None if u is None else u[between])
     t, v, u = t[which], v[which], None if u is None else u[which]
+    v = without_lines(t, v, origin, lines)
+    exact += lines
     tell(0.6)
     drawn = None
     noise = _innovation_std(v)
@@ -136,7 +148,12 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     notes += stamps.notes
     if stamps.error > 0.0:
         exact.append(ClockJitter(stamps.error))
-    samples = Samples(stamps.t, v, _useful(u, notes))
+    useful = _useful(u, notes)
+    samples = Samples(stamps.t, v, useful)
+    if between.size and drawn is None and stamps.error == 0.0:
+        samples = _joined(samples, *events)
+        notes.append(f'{between.size} samples about changes that stand out between neighbours '
+                     'were kept, too.')
     tell(1.0)
     return Integrity(samples, tuple(exact), tuple(notes), raw=_as_logged(*logged, exact),
                      drawn=drawn)
@@ -225,6 +242,13 @@ def _refreshed(t: FloatArray, period: float) -> FloatArray:
     grid = on_grid(t, np.maximum(1.0, np.rint(np.diff(t) / usual)))
     # The logger is late by up to one of its own steps, 1/period of those here.
     return grid if float(np.abs(t - grid).max()) < 1.5 * usual / period else t
+
+
+def _joined(samples: Samples, t: FloatArray, v: FloatArray, u: FloatArray | None) -> Samples:
+    """Return samples with more between them."""
+    at = np.searchsorted(samples.t, t)
+    more = None if samples.throttle is None or u is None else np.insert(samples.throttle, at, u)
+    return Samples(np.insert(samples.t, at, t), np.insert(samples.voltage, at, v), more)
 
 
 def _innovation_std(v: FloatArray) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 import math
 from pathlib import Path
@@ -18,14 +18,16 @@ from ou_monitor.offline.discover.composite import Composite, fit_composite, scen
 from ou_monitor.offline.discover.data import Samples
 from ou_monitor.offline.discover.errors import standard_errors
 from ou_monitor.offline.discover.finding import Cause, Criticism, Finding, Verdict
+from ou_monitor.offline.discover.fitting import joined
 from ou_monitor.offline.discover.gain import (
     crossing_rates, mean_difference, mean_score, Scale, without, worth)
 from ou_monitor.offline.discover.integrity import examine, Integrity
-from ou_monitor.offline.discover.naming import name_causes, Search
-from ou_monitor.offline.discover.null_bank import family_chance, simulate_bank, simulate_bank_of
+from ou_monitor.offline.discover.naming import ACCEPT, name_causes, Search
+from ou_monitor.offline.discover.null_bank import (
+    family_chance, NullBank, simulate_bank, simulate_bank_of)
 from ou_monitor.offline.discover.structure import evaluate, fit_gaussian
 from ou_monitor.offline.discover.trials import criticise
-from ou_monitor.offline.discover.verdict import judge, NOTHING, withdrawn
+from ou_monitor.offline.discover.verdict import is_latent, judge, NOTHING, withdrawn
 from ou_monitor.offline.discover.words import (
     coupling_found, coupling_note, explain, left_out_note, no_relaxation_note, verdict_sentence)
 from ou_monitor.recordings.read import read_recording
@@ -37,6 +39,8 @@ Progress = Callable[[float], None]
 # What to say where the search was cut short.
 STOPPED = ('The search for causes was cut short where the next ones would have taken long; there '
            'may be more than are named.')
+# Why the gain of a line is not known that was found in all samples, of which some are used.
+FAST = 'the samples that are used are too few to show a line so fast.'
 # Steps of more relaxation times than this leave no relaxation to be seen.
 _BLIND = 1.0
 # Relaxation times in a recording from which its rate is one, and no trend.
@@ -189,8 +193,10 @@ def _named(samples: Samples, start: Composite, rng: np.random.Generator,
         bank = simulate_bank(scene_of(samples, start), phi, rng)
     progress(0.1)
     before = criticise(samples, start, bank)
+    # Beside lines that were taken out there may be slower ones.
+    given = [term.NAME for term in exact if term.FAMILY != 'line']
     try:
-        search = name_causes(samples, start, bank, given=[term.NAME for term in exact],
+        search = name_causes(samples, start, bank, given=given,
                              progress=lambda share: progress(0.1 + 0.9 * share))
         failure = STOPPED if search.stopped else ''
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
@@ -200,15 +206,16 @@ def _named(samples: Samples, start: Composite, rng: np.random.Generator,
     whole = _whole(samples, search.composite)
     after = criticise(samples, whole, bank) if search.accepted else before
     kinds = [catalogue()[name] for name in search.accepted]
-    dropped = tuple(search.accepted[k] for k in withdrawn(before, after, kinds))
+    out = withdrawn(before, after, kinds)
+    dropped = tuple(search.accepted[k] for k in out)
     if dropped:
+        stays = [search.composite.terms[position(search.composite, search.accepted, k)]
+                 for k, kind in enumerate(kinds) if k not in out and is_latent(kind)]
         # They may have stood in the way of what was measured; a trend that they did better
         # than is none.
         slow = [name for name in search.removed if catalogue()[name].FAMILY == 'slow']
-        search = name_causes(samples, start, bank, latent=False,
-                             given=[*(term.NAME for term in exact), *slow])
-        whole = _whole(samples, search.composite)
-        after = criticise(samples, whole, bank)
+        search = name_causes(samples, start, bank, latent=False, given=[*given, *slow])
+        whole, after = _kept_beside(samples, search, stays, before, bank)
     part = samples.train if whole is search.composite else slice(0, samples.n)
     model = search.composite
     if search.accepted:
@@ -216,6 +223,25 @@ def _named(samples: Samples, start: Composite, rng: np.random.Generator,
         model = fit_composite(samples, model.terms, samples.train, model) or model
     return _Named(model, whole, part, tuple(search.accepted), search.rivals, dropped, before, after,
                   failure)
+
+
+def _kept_beside(samples: Samples, search: Search, stays: Sequence[Term],
+                 before: Mapping[str, float], bank: NullBank) -> dict[str, float]:
+    """Put latent causes that were not withdrawn beside the measured ones; return what is left."""
+    after = criticise(samples, search.composite, bank)
+    for term in stays:
+        made = joined(samples, search.composite, [term], rough=False)
+        if made is None or made.score(samples) - search.composite.score(samples) < ACCEPT:
+            continue
+        again = _whole(samples, made)
+        left = criticise(samples, again, bank)
+        names = [*search.accepted, term.NAME]
+        if withdrawn(before, left, [catalogue()[name] for name in names]):
+            continue
+        search.composite, whole, after = made, again, left
+        search.accepted.append(term.NAME)
+        search.rivals.setdefault(term.NAME, [])
+    return whole, after
 
 
 def position(model: Composite, names: list[str] | tuple[str, ...], k: int) -> int:
@@ -247,6 +273,8 @@ def _causes(samples: Samples, state: Integrity, named: _Named, whole: Composite,
             gain, error = (math.nan, math.nan) if less is None else scale.gain(
                 named.model.density, less.density, (index,))
             why = scale.why_unknown((index,))
+        elif term.FAMILY == 'line':
+            gain, error, why = math.nan, math.nan, FAST
         else:
             clean = evaluate(samples, fit_gaussian(
                 samples, [start.terms[0]], samples.train).terms)

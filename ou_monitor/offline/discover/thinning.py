@@ -11,8 +11,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from ou_monitor.records import FloatArray
+from scipy.special import ndtri
 
 # Samples that are fitted at most.
 MOST = 80_000
@@ -23,6 +25,14 @@ _STEP = 0.3
 _RATIO = math.exp(_STEP) / (1.0 + math.exp(-_STEP))
 # Values looked at for it.
 _LOOK = 1_000_000
+# Samples whose changes share a scale; chance that noise makes any change pass for an
+# event, and by what more they must be larger, for the scale is an estimate.
+_SHARE, _CHANCE, _MORE = 1024, 0.02, 1.05
+# Throttle that moves more than this in a sample steps, and for how long after it a change
+# is the load's, s.
+_STEPS, _SOON = 0.01, 0.02
+# Events that are few; of more the samples used have enough.
+_FEW = 300
 
 
 def choose_samples(voltage: FloatArray, rate: float) -> tuple[slice, str]:
@@ -59,6 +69,58 @@ def choose_samples(voltage: FloatArray, rate: float) -> tuple[slice, str]:
     return slice(first, first + size, widest), (
         f'{n} samples: {what} of the {size / rate:.4g} s in the middle ({rate / widest:.4g} Hz), '
         'for the rail relaxes too fast for fewer; what is slower than that stretch is not seen.')
+
+
+def events_between(voltage: FloatArray, throttle: FloatArray | None, rate: float, which: slice
+                   ) -> npt.NDArray[np.int64]:
+    """
+    Return samples to keep beside those used: about changes that only neighbours show.
+
+    A jump that stands out between two samples drowns in what the noise adds on the way
+    to the k-th one.
+
+    Parameters
+    ----------
+    voltage : ndarray, shape (n,)
+        V.
+    throttle : ndarray, shape (n,), or None
+        0..1: what comes soon after it has stepped is the load, which stays to be seen.
+    rate : float
+        Samples per second, Hz.
+    which : slice
+        What is used.
+
+    Returns
+    -------
+    ndarray of int
+        Places that are not in `which`, rising; empty where there are no events, or many.
+
+    """
+    first, stop, k = which.start, min(which.stop, voltage.size), which.step or 1
+    none = np.zeros(0, dtype=np.int64)
+    change = np.diff(voltage[first:stop])
+    blocks = change.size // _SHARE
+    if k == 1 or blocks < 1:
+        return none
+    size = np.abs(change[:blocks * _SHARE]).reshape(blocks, _SHARE)
+    scale = np.median(size, axis=1) / 0.6745
+    if not (scale > 0.0).all():
+        # Codes so coarse that most do not change.
+        return none
+    limit = -_MORE * float(ndtri(0.5 * _CHANCE / change.size))
+    row, column = np.nonzero(size > limit * scale[:, None])
+    at = first + row * _SHARE + column
+    if throttle is not None:
+        stepped = np.flatnonzero(np.abs(np.diff(throttle[first:stop])) > _STEPS) + first
+        last = np.searchsorted(stepped, at, side='right') - 1
+        since = np.where(last < 0, np.inf, at - stepped[last] if stepped.size else 0)
+        at = at[since > _SOON * rate]
+    if not 0 < at.size <= _FEW:
+        return none
+    # Before it and after it, and the next, by which a bad sample is told from a jump.
+    near: npt.NDArray[np.int64] = np.unique(np.concatenate((at, at + 1, at + 2)))
+    kept: npt.NDArray[np.int64] = near[(near < stop) & ((near - first) % k != 0)]
+    return kept
 
 
 def _nth(k: int) -> str:
