@@ -226,9 +226,11 @@ def _named(samples: Samples, start: Composite, rng: np.random.Generator,
 
 
 def _kept_beside(samples: Samples, search: Search, stays: Sequence[Term],
-                 before: Mapping[str, float], bank: NullBank) -> dict[str, float]:
+                 before: Mapping[str, float], bank: NullBank
+                 ) -> tuple[Composite, dict[str, float]]:
     """Put latent causes that were not withdrawn beside the measured ones; return what is left."""
-    after = criticise(samples, search.composite, bank)
+    whole = _whole(samples, search.composite)
+    after = criticise(samples, whole, bank)
     for term in stays:
         made = joined(samples, search.composite, [term], rough=False)
         if made is None or made.score(samples) - search.composite.score(samples) < ACCEPT:
