@@ -19,7 +19,8 @@ from ou_monitor.offline.discover.data import Samples
 from ou_monitor.offline.discover.errors import standard_errors
 from ou_monitor.offline.discover.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.offline.discover.gain import (
-    crossing_rates, mean_difference, mean_score, Scale, without, worth)
+    crossing_rates, mean_difference, mean_score, Scale, told, without, worth)
+from ou_monitor.offline.discover.gain_words import NO_OTHER, VAGUE
 from ou_monitor.offline.discover.integrity import examine, Integrity
 from ou_monitor.offline.discover.naming import name_causes, Search
 from ou_monitor.offline.discover.null_bank import family_chance, simulate_bank, simulate_bank_of
@@ -107,17 +108,19 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
     causes = _causes(samples, state, named, whole, se, start, plain_density, scale,
                      lambda share: tell(0.75 + 0.2 * share))
     gain, gain_se = scale.gain(named.model.density, plain_density)
-    why = scale.why_unknown()
+    unknown = scale.why_unknown()
+    why = unknown or ('' if math.isfinite(gain) else VAGUE)
     verdict = judge(named.after, len(causes), len(named.dropped))
     criticism = _criticism(named.before, named.after)
     left = sorted((c for c in criticism if c.is_off), key=lambda c: -abs(c.after))
     # The rest is in the model that was fitted.
     undone = tuple(t for t in state.exact if t.NAME != 'quantization')
-    crossing = crossing_rates(samples, (plain,), () if why else named.model.terms, rng)
+    crossing = crossing_rates(samples, (plain,), () if unknown else named.model.terms, rng)
     tell(1.0)
     return Finding(
         recording=recording.name, n=recording.n, duration=recording.duration, verdict=verdict,
-        sentence=verdict_sentence(verdict, causes, left, gain, gain_se, named.dropped, why),
+        sentence=verdict_sentence(verdict, causes, left, gain, gain_se, named.dropped, why,
+                                  _unseen(samples)),
         baseline=plain, baseline_score=mean_score(plain_density, scored), criticism=criticism,
         causes=causes, model=SupplyModel((*whole.terms, *undone)),
         se=(*se, *({} for _ in undone)), score=mean_score(named.model.density, scored),
@@ -137,6 +140,12 @@ def _kept(samples: Samples, state: Integrity) -> npt.NDArray[np.bool_]:
     """Return which samples are scored: those that `seen` tells and that were measured."""
     kept = samples.seen
     return kept if state.drawn is None else kept & ~state.drawn
+
+
+def _unseen(samples: Samples) -> int:
+    """Return the number of samples kept at throttle that the part fitted never had."""
+    count: int = samples.n - samples.train.stop - int(samples.seen.sum())
+    return count
 
 
 def _guess(samples: Samples) -> OU:
@@ -161,7 +170,7 @@ def _baseline(samples: Samples, state: Integrity) -> tuple[OU, FloatArray, Compo
     clean = fit_composite(samples, [guess], samples.train)
     assert clean is not None
     plain, density = clean.terms[0], clean.density
-    if state.raw is not None:
+    if state.raw is not None and np.ptp(state.raw.voltage[state.raw.train]) > 0.0:
         plain = fit_gaussian(state.raw, [_guess(state.raw)], state.raw.train).terms[0]
         density = evaluate(samples, [plain]).density
     assert isinstance(plain, OU)
@@ -231,15 +240,16 @@ def _causes(samples: Samples, state: Integrity, named: _Named, whole: Composite,
             less = without(samples, named.model, index)
             gain, error = (math.nan, math.nan) if less is None else scale.gain(
                 named.model.density, less.density, (index,))
-            why = scale.why_unknown((index,))
+            why = _why_unknown(gain, less, scale, (index,))
         else:
             clean = evaluate(samples, fit_gaussian(
                 samples, [start.terms[0]], samples.train).terms)
-            gain, error = mean_difference(clean.density[scale.scored],
-                                          plain_density[scale.scored])
+            gain, error = told(*mean_difference(
+                clean.density[scale.scored], plain_density[scale.scored]))
+            why = '' if math.isfinite(gain) else VAGUE
         found.append(Cause(term, {}, gain, error, 0.0, (),
                            explain(term, {}, gain, error, (), True, why), True))
-    groups: dict[tuple[int, ...], tuple[float, float, float]] = {}
+    groups: dict[tuple[int, ...], tuple[float, float, float, str]] = {}
     for k, name in enumerate(named.names):
         index = position(named.model, named.names, k)
         many = named.names.count(name) >= _MANY
@@ -248,16 +258,24 @@ def _causes(samples: Samples, state: Integrity, named: _Named, whole: Composite,
         if group not in groups:
             less = start if len(group) == len(named.names) else without(
                 samples, named.model, *group)
-            groups[group] = (math.nan,) * 3 if less is None else worth(
+            gain, error, chance = (math.nan,) * 3 if less is None else worth(
                 samples, named.model, less, scale, group)
-        gain, error, chance = groups[group]
+            groups[group] = gain, error, chance, _why_unknown(gain, less, scale, group)
+        gain, error, chance, why = groups[group]
         rivals = tuple(dict.fromkeys(named.rivals.get(name, ())))
         term = whole.terms[index]
         found.append(Cause(term, se[index], gain, error, chance, rivals, explain(
-            term, se[index], gain, error, rivals, False, scale.why_unknown(group), len(group)),
-            False))
+            term, se[index], gain, error, rivals, False, why, len(group), chance), False))
         progress((k + 1) / len(named.names))
     return tuple(found)
+
+
+def _why_unknown(gain: float, less: Composite | None, scale: Scale, group: tuple[int, ...]
+                 ) -> str:
+    """Return why the gain of a group of terms is not known; empty where it is."""
+    if math.isfinite(gain):
+        return ''
+    return scale.why_unknown(group) or (NO_OTHER if less is None else VAGUE)
 
 
 def _refitted(samples: Samples, model: Composite) -> tuple[Composite, tuple[dict[str, Any], ...]]:
@@ -288,10 +306,9 @@ def _notes(state: Integrity, named: _Named, samples: Samples) -> tuple[str, ...]
     notes = [*state.notes, *([named.failure] if named.failure else [])]
     for name in dict.fromkeys(named.dropped):
         notes.append(f"'{name}' fitted, but left what it should explain: withdrawn.")
-    scored = int(samples.seen.sum())
-    out = samples.n - samples.train.stop - scored
+    out = _unseen(samples)
     if out:
-        notes.append(left_out_note(out, scored))
+        notes.append(left_out_note(out, int(samples.seen.sum())))
     duration = float(samples.t[-1] - samples.t[0])
     ou = named.model.terms[0]
     assert isinstance(ou, OU)
