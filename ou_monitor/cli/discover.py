@@ -89,13 +89,17 @@ def run(args: argparse.Namespace) -> int:
         output.check_writable(target)
     output.check_writable(args.json)
 
+    import numpy as np
+
     from ou_monitor.offline.discover.run import discover
     from ou_monitor.recordings.read import read_recording
 
     recording = read_recording(
         args.recording, msg_config=args.msg_config, voltage_topic=args.voltage_topic,
         throttle_topic=args.throttle_topic, partial=args.partial)
-    with output.Progress('discovering') as progress:
+    # What overflows on the way ends as not finite, which the search refuses: a user has no
+    # use for the source line of it.
+    with output.Progress('discovering') as progress, np.errstate(all='ignore'):
         finding = discover(recording, seed=args.seed, progress=progress)
     if args.report is not None:
         from ou_monitor.offline.report.discovery_page import discovery_page

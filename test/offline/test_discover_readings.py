@@ -28,7 +28,7 @@ def with_bad(what):
     """Return a rail with some samples that are none, and where they are."""
     v, at = rail(), {
         'last': [N - 1], 'first': [0], 'middle': [3000], 'in the part kept': [5000],
-        'two': [700, 5000], 'codes': CODES, 'codes at the end': range(N - 300, N),
+        'two': [700, 5000], 'off at first': range(3000), 'codes': CODES, 'codes at the end': range(N - 300, N),
         'minus one': CODES, 'supply off': range(2000, 2150)}[what]
     bad = np.zeros(N, bool)
     bad[list(at)] = True
@@ -38,7 +38,7 @@ def with_bad(what):
 
 
 ALL = ('last', 'first', 'middle', 'in the part kept', 'two', 'codes', 'codes at the end',
-       'minus one', 'supply off')
+       'minus one', 'supply off', 'off at first')
 
 
 @pytest.mark.parametrize('what', ALL)
@@ -137,6 +137,8 @@ def test_throttle_of_no_known_unit_and_wild_values_are_not_used():
     notes = []
     assert usable(Recording(T, rail(), 65535.0 * u, 'counts'), notes)[2] is None
     assert 'no unit that is known' in ' '.join(notes)
+    said = discover(Recording(T, rail(), 65535.0 * u, 'counts')).notes
+    assert any('Throttle is not usable: load_dependent_alpha' in note for note in said)
     notes = []
     wild = np.where(np.arange(N) == 70, 1e30, u)
     assert usable(Recording(T, rail(), wild, 'wild'), notes)[2][70] == u[69]

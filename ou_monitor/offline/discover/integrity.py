@@ -137,7 +137,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     notes += stamps.notes
     if stamps.error > 0.0:
         exact.append(ClockJitter(stamps.error))
-    samples = Samples(stamps.t, v, _useful(u, notes))
+    samples = Samples(stamps.t, v, _useful(u, recording.has_throttle, notes))
     tell(1.0)
     return Integrity(samples, tuple(exact), tuple(notes), raw=_as_logged(*logged, exact),
                      drawn=drawn)
@@ -243,12 +243,12 @@ def _saturation(v: FloatArray, low: float, high: float) -> Term:
         high=high if math.isfinite(high) else float(v.max()) + far)
 
 
-def _useful(u: FloatArray | None, notes: list[str]) -> FloatArray | None:
+def _useful(u: FloatArray | None, recorded: bool, notes: list[str]) -> FloatArray | None:
     """Return throttle where it moves; say what cannot be tested where it does not."""
     if u is not None and float(u.max() - u.min()) >= MOVES:
         return u
     names = [name for name, kind in catalogue().items() if kind.NEEDS_THROTTLE]
-    why = 'not recorded' if u is None else 'constant'
+    why = 'constant' if u is not None else 'not usable' if recorded else 'not recorded'
     notes.append(f'Throttle is {why}: {", ".join(names)} cannot be tested.')
     return None
 

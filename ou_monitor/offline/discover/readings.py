@@ -18,6 +18,8 @@ _FAR, _GAP = 50.0, 5.0
 # single bad samples that are left out at most, and one more for each so many samples.
 _CODE, _MOST_CODES = 3, 0.2
 _SINGLES, _EACH = 3, 100_000
+# Others from which a value of a larger share can be far.
+_OTHERS = 100
 # Values looked at for the spread.
 _LOOK = 200_000
 # Constant but for so many samples, or this share of them, says nothing.
@@ -108,6 +110,11 @@ def find_bad(v: FloatArray) -> npt.NDArray[np.bool_]:
     some = v[::max(1, v.size // _LOOK)]
     if some.size < 2:
         return bad
+    off = _resting(some)
+    if off is not None:
+        bad = v == off
+        bad[~bad] = find_bad(v[~bad])
+        return bad
     low, middle, high = _quantiles(some, 0.2, 0.5, 0.8)
     if low == high:
         low, high = _quantiles(some, 0.05, 0.95)
@@ -135,6 +142,20 @@ def find_bad(v: FloatArray) -> npt.NDArray[np.bool_]:
     return bad
 
 
+def _resting(v: FloatArray) -> float | None:
+    """Return the value of a large share of the samples that is far from all others, if any."""
+    values, count = np.unique(v, return_counts=True)
+    value = float(values[count.argmax()])
+    others = v[v != value]
+    if int(count.max()) <= _MOST_CODES * v.size or others.size < _OTHERS:
+        return None
+    low, middle, high = _quantiles(others, 0.2, 0.5, 0.8)
+    away = np.abs(others - middle)
+    near = away[away <= _FAR * (high - low) / 1.683]
+    reach = max(_FAR * (high - low) / 1.683, _GAP * float(near.max()))
+    return value if high > low and abs(value - middle) > reach else None
+
+
 def _quantiles(v: FloatArray, *shares: float) -> list[float]:
     """Return values of the sample itself: a mean of two of them might overflow."""
     at = [round(share * (v.size - 1)) for share in shares]
@@ -147,7 +168,7 @@ def _bad_notes(t: FloatArray, v: FloatArray, bad: npt.NDArray[np.bool_]) -> list
     rest = f'while all others lie within {_range(v[~bad])} V'
     values, count = np.unique(v[bad], return_counts=True)
     notes = [f'{many} samples read exactly {_short(value)} V, {rest}: taken as a code for no '
-             'reading, and left out. If the supply was there, this recording needs to be cut.'
+             'reading, or as the supply being off, and left out.'
              for value, many in zip(values.tolist(), count.tolist()) if many >= _CODE]
     single = np.flatnonzero(bad & np.isin(v, values[count < _CODE]))
     if single.size:
