@@ -28,7 +28,8 @@ def with_bad(what):
     """Return a rail with some samples that are none, and where they are."""
     v, at = rail(), {
         'last': [N - 1], 'first': [0], 'middle': [3000], 'in the part kept': [5000],
-        'two': [700, 5000], 'off at first': range(3000), 'codes': CODES, 'codes at the end': range(N - 300, N),
+        'two': [700, 5000], 'off at first': range(3000), 'codes': CODES,
+        'codes at the end': range(N - 300, N),
         'minus one': CODES, 'supply off': range(2000, 2150)}[what]
     bad = np.zeros(N, bool)
     bad[list(at)] = True

@@ -31,7 +31,7 @@ class CauseRow:
     gain : str
         mnat per sample with its standard error, or that it is not known.
     remark : str
-        What to make of the gain; empty when it is a gain, or not known.
+        What to make of the gain, and why the cause is named; empty when it is one.
     chance : str
         p, ``exact``, or that it is not known.
     alternatives : tuple of str
@@ -103,13 +103,13 @@ def gain_remark(gain: float, gain_se: float) -> str:
 
 def _remark(cause: Cause) -> str:
     """Return what to make of the gain of a cause, and why it is named all the same."""
-    remark = gain_remark(cause.gain, cause.gain_se)
-    if cause.exact or not remark and math.isfinite(cause.gain):
+    remark = gain_remark(cause.gain, cause.gain_se) if math.isfinite(cause.gain) else (
+        'not measurable here')
+    if cause.exact or not remark:
         return remark
-    named = '' if not math.isfinite(cause.p_value) else (
-        'named by the search on the whole recording' if cause.p_value > _CHANCE
-        else 'named for what it explains in the first 60 %')
-    return '; '.join(part for part in (remark, named) if part)
+    first = math.isfinite(cause.p_value) and cause.p_value <= _CHANCE
+    return remark + ('; named for what it explains in the first 60 %' if first
+                     else '; named by the search on the whole recording')
 
 
 def _chance(cause: Cause) -> str:

@@ -112,7 +112,7 @@ def find_bad(v: FloatArray) -> npt.NDArray[np.bool_]:
         return bad
     off = _resting(some)
     if off is not None:
-        bad = v == off
+        bad[v == off] = True
         bad[~bad] = find_bad(v[~bad])
         return bad
     low, middle, high = _quantiles(some, 0.2, 0.5, 0.8)

@@ -109,6 +109,9 @@ _CAUSES: Mapping[str, tuple[str, str, str]] = {
         'stamps by the clock of the ADC recorded beside the others'),
 }
 
+# An estimate whose error is so many times as large is none.
+_UNDETERMINED = 1e4
+
 _PLAIN = ((
     'autocorrelation', 'neighbouring prediction errors are correlated'),
     ('band', 'the spectrum has too much or too little power in some band'),
@@ -171,6 +174,8 @@ def with_error(value: Any, error: Any) -> str:
         errors = error if isinstance(error, list) else [None] * len(value)
         return '[' + ', '.join(with_error(v, e) for v, e in zip(value, errors)) + ']'
     if isinstance(error, float) and math.isfinite(error) and error > 0.0:
+        if abs(value) * _UNDETERMINED < error and value != 0.0:
+            return f'{number(value, 2)} (not determined)'
         digits = min(max(2 + math.floor(math.log10(max(abs(value) / error, 1.0))), 2), 6)
         return f'{number(value, digits)} +- {number(error, 2)}'
     return number(value, 4)
@@ -317,8 +322,9 @@ def verdict_sentence(verdict: Verdict, causes: Sequence[Cause], left: Sequence[C
              if dropped else '')
     if left and unseen:
         tried += (f' {unseen} samples of the last 40 % are at throttle that the first 60 %, on '
-                  'which models are fitted, never had: what is left may be no more than that; a '
-                  'recording that goes through all of its throttle in both parts would tell.')
+                  'which models are fitted, never had: what is left may be no more than that'
+                  + ('.' if why else '; a recording that goes through all of its throttle in '
+                     'both parts would tell.'))
     if verdict is Verdict.NO_EFFECT:
         return ('The plain OU simulates this recording: nothing is wrong with it that this length '
                 'could show.')
