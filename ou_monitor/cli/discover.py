@@ -89,13 +89,17 @@ def run(args: argparse.Namespace) -> int:
         output.check_writable(target)
     output.check_writable(args.json)
 
+    import numpy as np
+
     from ou_monitor.offline.discover.run import discover
     from ou_monitor.recordings.read import read_recording
 
     recording = read_recording(
         args.recording, msg_config=args.msg_config, voltage_topic=args.voltage_topic,
         throttle_topic=args.throttle_topic, partial=args.partial)
-    with output.Progress('discovering') as progress:
+    # What overflows on the way ends as not finite, which the search refuses: a user has no
+    # use for the source line of it.
+    with output.Progress('discovering') as progress, np.errstate(all='ignore'):
         finding = discover(recording, seed=args.seed, progress=progress)
     if args.report is not None:
         from ou_monitor.offline.report.discovery_page import discovery_page
@@ -191,6 +195,7 @@ def render(finding: Finding) -> str:
 
     """
     from ou_monitor.offline.discover.cause_rows import cause_rows
+    from ou_monitor.offline.discover.gain_words import MNAT, overlap_words
     from ou_monitor.offline.discover.words import (
         crossing_words, plain_model_words, plain_words)
     from ou_monitor.offline.words import number
@@ -207,11 +212,14 @@ def render(finding: Finding) -> str:
                                    rows, left=[0, 1, 4]), '']
         for row in found:
             lines += [_item(f'{row.name}: {estimate}') for estimate in row.estimates]
+        overlap = overlap_words(finding.causes, finding.gain)
+        lines += [_item(MNAT), *([_item(overlap)] if overlap else [])]
         for remark in dict.fromkeys(row.remark for row in found if row.remark):
             lines.append(_item(f'Gain {remark}: ' + ', '.join(
                 f'{row.label} ({row.gain})' for row in found if row.remark == remark)))
     if finding.baseline is not None:
-        lines += ['', fill(f'Plain OU: {plain_model_words(finding.baseline)}.', _COLUMNS)]
+        lines += ['', fill('Plain OU, fitted on the first 60 %: '
+                           f'{plain_model_words(finding.baseline)}.', _COLUMNS)]
         felt = crossing_words(finding)
         lines += [fill(felt, _COLUMNS)] if felt else []
     left = finding.remaining

@@ -12,6 +12,8 @@ from ou_monitor.errors import InputError, nearest
 TYPES = ('battery_state', 'float32', 'float64', 'adc_block')
 # From this rate on samples travel in blocks unless told otherwise, Hz.
 _BLOCKS_FROM = 5000.0
+# Endings of files that are no bag: a folder of such a name would surprise.
+_NO_BAG = ('.bag', '.bin', '.csv', '.db3', '.json', '.txt', '.ulg', '.yaml', '.yml')
 # Above it stamps would fall together, Hz.
 _RATE_MOST = 1e9
 # After it stamps would not fit into a bag, s.
@@ -95,6 +97,9 @@ def run(args: argparse.Namespace) -> int:
     output.check_paths(
         {'--model': args.model, '--throttle': table},
         {'--output': args.output, '--save-model': args.save_model, '--json': args.json})
+    if args.output is not None and args.output.suffix.lower() in _NO_BAG:
+        raise InputError(f"--output '{args.output}': {args.output.suffix} is not written; give "
+                         'NAME.mcap for one file, or NAME for a rosbag2 folder')
     output.check_writable(args.json)
     output.check_writable(None if args.save_model is None else str(args.save_model))
     name = 'flight' if args.preset is None else args.preset

@@ -20,6 +20,8 @@ from ou_monitor.records import FloatArray
 _EVERY, _LEVELS = 8, 3
 # Samples in a block, in roots of their number: a turn over blocks is the dearer one.
 _SHORT = 0.4
+# Probability that counts as none: a sample out of reach of all states that are possible.
+_NONE = 1e-300
 
 
 def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
@@ -42,7 +44,8 @@ def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
     before : ndarray, shape (n, k)
         Law of the state before each sample, given all samples before.
     evidence : ndarray, shape (n,)
-        Log predictive density of each sample.
+        Log predictive density of each sample; at least that of the likeliest
+        state less 691, where that state cannot be reached.
 
     """
     n, k, _ = log_density.shape
@@ -55,8 +58,8 @@ def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
     for j in range(size):
         before[j] = now
         now = (now[:, None] * padded[j]).sum(axis=0)
-        norm[j] = now.sum(axis=0)
-        now = now / norm[j]
+        norm[j] = np.maximum(now.sum(axis=0), _NONE)
+        now = _law(now, start)
     return (before.transpose(2, 0, 1).reshape(-1, k)[:n],
             np.log(norm.T.reshape(-1)[:n]) + top)
 
@@ -100,6 +103,8 @@ def log_likelihood(log_density: FloatArray, transition: FloatArray, start: Float
         level += 1
         if level % _LEVELS == 0 or m.shape[2] == 1:
             scale = m.sum(axis=(0, 1))
+            if not scale.all():
+                return -math.inf
             m /= scale
             total += float(np.log(scale).sum())
     left_over = float((start / start.sum() @ m[:, :, 0]).sum())
@@ -138,11 +143,19 @@ def _through(padded: FloatArray, start: FloatArray) -> FloatArray:
     for j in range(1, size):
         whole = (whole[:, :, None] * padded[j][None]).sum(axis=1)
         if j % _EVERY == 0:
-            whole = whole / whole.sum(axis=(0, 1))
+            total = whole.sum(axis=(0, 1))
+            whole = whole / np.where(total > 0.0, total, 1.0)
     first = np.empty((blocks, k))
     law = start / start.sum()
     for b, product in enumerate(np.ascontiguousarray(whole.transpose(2, 0, 1))):
         first[b] = law
-        law = law @ product
-        law = law / law.sum()
+        law = _law((law @ product)[:, None], start)[:, 0]
     return first
+
+
+def _law(weight: FloatArray, start: FloatArray) -> FloatArray:
+    """Return weights, shape (k, blocks), as laws; as the first where all are too small."""
+    total = weight.sum(axis=0)
+    fresh = (start / start.sum())[:, None]
+    law: FloatArray = np.where(total >= _NONE, weight / np.maximum(total, _NONE), fresh)
+    return law

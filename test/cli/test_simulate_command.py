@@ -294,3 +294,13 @@ def test_the_writer_leaves_nothing_when_finishing_fails(tmp_path, monkeypatch):
             writer.write(Recording(t, t + 5.0, t * 0.0))
             monkeypatch.setattr(BagWriter, 'write', full)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('name', ['a.csv', 'a.CSV', 'a.db3', 'a.json'])
+def test_a_bag_is_not_named_like_another_file(name, tmp_path, capsys):
+    """One line that says what can be written; no folder of that name."""
+    assert main(['simulate', '--preset', 'idle', '--duration', '1', '--output',
+                 str(tmp_path / name)]) == 2
+    out, err = capsys.readouterr()
+    assert out == '' and err.count('\n') == 1 and '.mcap' in err and name in err
+    assert list(tmp_path.iterdir()) == []

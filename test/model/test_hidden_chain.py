@@ -1,5 +1,7 @@
 """Hidden chains in blocks, against the recursion sample by sample."""
 
+import warnings
+
 import numpy as np
 from ou_monitor.model.hidden_chain import forward, log_likelihood
 import pytest
@@ -35,3 +37,17 @@ def test_densities_far_apart():
     np.testing.assert_allclose(evidence[1:], np.log(0.1), atol=1e-9)
     total = log_likelihood(density, transition, np.array([0.5, 0.5]))
     assert total == pytest.approx(evidence.sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize('at', [0, 30, 999])
+def test_a_sample_out_of_reach_of_all_states_is_finite(at):
+    """One that only a state explains which cannot be: no warning, and laws after it."""
+    density = np.zeros((1000, 2, 2))
+    density[at] = [[-1e18, -1e18], [0.0, 0.0]]
+    transition = np.array([[1.0, 0.0], [0.0, 1.0]])
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        before, evidence = forward(density, transition, np.array([1.0, 0.0]))
+    assert np.isfinite(before).all() and np.isfinite(evidence).all()
+    np.testing.assert_allclose(before.sum(axis=1), 1.0)
+    assert evidence[at] < -600.0 and np.delete(evidence, at) == pytest.approx(0.0)

@@ -1,5 +1,6 @@
 """Records, verdicts and words: the JSON of the contract, strict, and each rule."""
 
+from dataclasses import replace
 import json
 import math
 
@@ -9,6 +10,7 @@ from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.tone import Tone
 from ou_monitor.offline.discover.finding import Cause, Criticism, CrossingRate, Finding, Verdict
+from ou_monitor.offline.discover.gain_words import overlap_words, why_named
 from ou_monitor.offline.discover.verdict import failing, judge, largest_chance, withdrawn
 from ou_monitor.offline.discover.words import (
     coupling_note, explain, parameters, plain_words, verdict_sentence, with_error)
@@ -138,6 +140,8 @@ def test_numbers_have_errors_and_units():
     assert with_error(0.49096, 0.03225) == '0.491 +- 0.032'
     assert with_error([0.0, 1.5], [math.nan, 0.1]) == '[0, 1.50 +- 0.10]'
     assert with_error(2.0, math.nan) == '2.000'
+    assert with_error([4.0], [6.6e6]) == '[4.0 (not determined)]'
+    assert with_error(1e-4, 0.02) == '1.0e-4 +- 0.020'
     assert parameters(OU(60.0, 0.3, 5.0), {'alpha': 2.0}).startswith('alpha = 60.0 +- 2.0 1/s; ')
 
 
@@ -152,3 +156,32 @@ def test_sentences():
     assert plain_words('order line') != plain_words('line')
     # 0.24 alpha T = 6 nats.
     assert 'above 0.250 1/s' in coupling_note(63.0, 100.0)
+
+
+def test_why_a_cause_without_a_gain_is_named():
+    """By its p: the first part, or the search on everything; nothing where the gain says it."""
+    assert why_named(0.02, 0.005, 1e-9) == '' and why_named(math.nan, math.nan, math.nan) == ''
+    assert 'first 60 % (p = 1e-09)' in why_named(0.001, 0.005, 1e-9)
+    for gain, error in ((0.001, 0.005), (math.nan, math.nan)):
+        assert 'whole recording' in why_named(gain, error, 1.0)
+    term = finding().causes[0].term
+    assert 'p = 1)' in explain(term, {}, 0.001, 0.005, [], False, chance=1.0)
+    assert 'p = ' not in explain(term, {}, 0.001, 0.005, [], True, chance=0.0)
+
+
+def test_gains_that_overlap_are_told():
+    """Where one is larger than that of the whole by more than its error; by name."""
+    cause = replace(finding().causes[0], gain=0.7, gain_se=0.1)
+    assert 'Without load_sag' in overlap_words([cause], 0.2)
+    assert overlap_words([cause], 0.6) == '' and overlap_words([], math.nan) == ''
+    vague = replace(cause, gain=math.nan, gain_se=math.nan)
+    assert overlap_words([vague], 0.2) == ''
+
+
+def test_what_is_left_may_be_throttle_never_seen():
+    """The sentence says so, and which recording would tell."""
+    cause = finding().causes[0]
+    text = verdict_sentence(Verdict.PARTLY_EXPLAINED, [cause], [WORSE], 0.015, 0.002, unseen=900)
+    assert '900 samples of the last 40 %' in text
+    assert 'last 40 %' not in verdict_sentence(
+        Verdict.EXPLAINED, [cause], [], 0.015, 0.002, unseen=900)

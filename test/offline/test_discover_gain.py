@@ -12,7 +12,8 @@ from ou_monitor.offline.discover.composite import fit_composite
 from ou_monitor.offline.discover.data import Samples
 from ou_monitor.offline.discover.errors import standard_errors
 from ou_monitor.offline.discover.gain import (
-    BLOCKS, crossing_level, crossing_rates, crossings, mean_difference, mean_score, without, worth)
+    BLOCKS, crossing_level, crossing_rates, crossings, mean_difference, mean_score, told, without,
+    worth)
 import pytest
 from scipy.signal import lfilter
 
@@ -145,3 +146,11 @@ def test_a_model_that_cannot_be_simulated_has_no_rate():
     rates = crossing_rates(samples, (OU(ALPHA, SIGMA, 5.0),),
                            (OU(ALPHA, SIGMA, 5.0), LoadSag(0.5, 0.0)), np.random.default_rng(0))
     assert math.isnan(rates.extended) and math.isfinite(rates.baseline)
+
+
+@pytest.mark.parametrize('gain, error, known', [
+    (0.00072, 0.797, False), (-1e-4, 50.0, False), (0.00072, 0.05, True), (4.0, 4.0, True),
+    (0.1, 0.02, True)])
+def test_an_error_that_leaves_nothing_known_is_no_gain(gain, error, known):
+    """Ten times as large as the gain, and large beside any; small ones are just none."""
+    assert told(gain, error) == (gain, error) if known else all(map(math.isnan, told(gain, error)))

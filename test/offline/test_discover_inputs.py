@@ -119,7 +119,7 @@ def short(what):
 
 SHORT = {'two': '2 usable samples; at least 100', '99': '99 usable samples',
          'constant': 'does not change at all', 'all NaN': '0 usable samples',
-         'one stamp': '1 usable samples'}
+         'one stamp': '1 usable sample;'}
 
 
 @pytest.mark.parametrize('what', sorted(SHORT))

@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import ou_monitor
 from ou_monitor import discover
+from ou_monitor.cli.discover import render
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.drift import Drift
@@ -222,3 +223,28 @@ def test_a_motor_that_starts_late_gains_nothing_absurd(name):
         # A motor that stops in the last part only.
         assert any('the first 60 % never had' in note for note in found.notes)
         assert all(math.isnan(cause.gain) for cause in found.causes if cause.term.NEEDS_THROTTLE)
+
+
+def test_the_page_of_a_plain_rail_keeps_the_plain_model():
+    """No extended model is shown where nothing was added: one picture each, and it is said so."""
+    found = discover(made(seed=2, n=5000))
+    assert found.verdict is Verdict.NO_EFFECT
+    root = parsed(discovery_page(found))
+    text = ' '.join(''.join(root.itertext()).split())
+    assert 'The plain OU is kept' in text and 'xtended' not in text
+    assert len(root.findall('.//figure/svg')) == 1 + 6
+    assert 'xtended' not in render(found)
+
+
+@pytest.mark.parametrize('code, count', [(0.011, 60), (0.0007, 400), (0.05, 7)])
+def test_bins_hold_as_many_codes_each(code, count):
+    """Else the distribution of a coarse ADC would show a comb that is not in the data."""
+    from ou_monitor.offline.report.pictures import _bins
+    codes = 4.9 + code * np.arange(count)
+    edges = _bins(codes, code)
+    held = np.histogram(codes, edges)[0]
+    inner = held[held > 0][:-1]
+    assert held.sum() == count and inner.size and (inner == inner[0]).all()
+    # Without the step they do not.
+    comb = np.histogram(codes, _bins(codes))[0]
+    assert np.ptp(comb[np.flatnonzero(comb)[0]:np.flatnonzero(comb)[-1]]) > 0

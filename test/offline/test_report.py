@@ -162,3 +162,14 @@ def test_report_of_a_recording_that_tells_nothing(made):
     html = analysis_page(analyze(made))
     parsed(html)
     assert not re.search(r'[ ",]nan\b', html)
+
+
+@pytest.mark.parametrize('title', ['short', 'a title that leaves no room beside it'])
+def test_a_legend_covers_no_curve(title):
+    """Beside the title or in a row below it: its entries end above the axes."""
+    x = np.linspace(0.0, 1.0, 9)
+    plot = Plot(title, 'x', 'y', width=300)
+    tree = ElementTree.fromstring(plot.line(x, x, 'data').band(x, x, x + 1.0, 'simulated').svg())
+    axes = next(part for part in tree if part.tag == 'svg')
+    entries = [part for part in tree if part.get('class') == 'legend']
+    assert len(entries) == 2 and all(float(e.get('y')) < float(axes.get('y')) for e in entries)

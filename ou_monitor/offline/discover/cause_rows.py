@@ -11,6 +11,8 @@ from ou_monitor.offline.discover.words import parameters
 from ou_monitor.offline.words import number
 
 NOT_KNOWN = 'not known'
+# Chance from which a cause cannot be told from none by the part fitted.
+_CHANCE = 0.05
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class CauseRow:
     gain : str
         mnat per sample with its standard error, or that it is not known.
     remark : str
-        What to make of the gain; empty when it is a gain, or not known.
+        What to make of the gain, and why the cause is named; empty when it is one.
     chance : str
         p, ``exact``, or that it is not known.
     alternatives : tuple of str
@@ -75,7 +77,7 @@ def cause_rows(causes: Sequence[Cause]) -> list[CauseRow]:
     return [CauseRow(
         group[0].name, group[0].name if len(group) == 1 else f'{group[0].name} x{len(group)}',
         group[0].term.FAMILY, gain_text(group[0].gain, group[0].gain_se),
-        gain_remark(group[0].gain, group[0].gain_se), _chance(group[0]),
+        _remark(group[0]), _chance(group[0]),
         tuple(dict.fromkeys(name for cause in group for name in cause.alternatives)),
         tuple(parameters(cause.term, cause.se) for cause in group),
         _explanation(group)) for group in groups.values()]
@@ -97,6 +99,17 @@ def gain_remark(gain: float, gain_se: float) -> str:
     if gain < -1.96 * gain_se:
         return 'worse on the part kept'
     return 'not distinguishable from none'
+
+
+def _remark(cause: Cause) -> str:
+    """Return what to make of the gain of a cause, and why it is named all the same."""
+    remark = gain_remark(cause.gain, cause.gain_se) if math.isfinite(cause.gain) else (
+        'not measurable here')
+    if cause.exact or not remark:
+        return remark
+    first = math.isfinite(cause.p_value) and cause.p_value <= _CHANCE
+    return remark + ('; named for what it explains in the first 60 %' if first
+                     else '; named by the search on the whole recording')
 
 
 def _chance(cause: Cause) -> str:

@@ -25,7 +25,7 @@ from ou_monitor.offline.discover.composite import Composite, fit_composite
 from ou_monitor.offline.discover.data import Samples
 from ou_monitor.offline.discover.errors import Estimation, estimations
 from ou_monitor.offline.discover.finding import CrossingRate
-from ou_monitor.offline.discover.words import unmeasured_words
+from ou_monitor.offline.discover.gain_words import unmeasured_words
 from ou_monitor.records import FloatArray, NAN
 from scipy.special import ndtr
 from scipy.stats import chi2
@@ -35,6 +35,8 @@ BLOCKS = 24
 # Mean loss by errors of parameters, nats per sample, from which the part fitted does not
 # determine them: predictions are then as far off by them as by the noise.
 _UNKNOWN = 0.5
+# A gain whose error is so many times as large, and so many nats per sample, is not measured.
+_VAGUE, _WIDE = 10.0, 0.1
 # Level of the crossings: standard deviations below the mean, lowered in steps
 # until both the part fitted and the part kept cross it so often.
 _DEEP, _STEP, _SHALLOW, _OFTEN = 2.5, 0.25, 0.5, 5
@@ -75,6 +77,11 @@ def mean_difference(new: FloatArray, old: FloatArray) -> tuple[float, float]:
     # Half the weight of a full lag; negative correlation is not trusted.
     shared = max(float(c[1:] @ c[:-1]) / (BLOCKS - 1), 0.0)
     return mean, math.sqrt((own + shared) / BLOCKS)
+
+
+def told(gain: float, error: float) -> tuple[float, float]:
+    """Return a gain and its error; NaN for both where the error says that nothing is known."""
+    return (NAN, NAN) if error > max(_VAGUE * abs(gain), _WIDE) else (gain, error)
 
 
 def without(samples: Samples, model: Composite, *indices: int) -> Composite | None:
@@ -145,6 +152,9 @@ class Scale:
         """
         Return a gain and its standard error, nats per sample; NaN where it cannot be measured.
 
+        That is where `why_unknown` says why, and where the error is both ten
+        times as large as the gain and large beside any gain there is.
+
         Parameters
         ----------
         new, old : ndarray, shape (n,)
@@ -156,7 +166,7 @@ class Scale:
         if self.why_unknown(terms):
             return NAN, NAN
         gain, error = mean_difference(new[self.scored], old[self.scored])
-        return gain, math.hypot(error, self.estimation.loss(terms)[1])
+        return told(gain, math.hypot(error, self.estimation.loss(terms)[1]))
 
 
 def worth(samples: Samples, full: Composite, less: Composite, scale: Scale | None = None,

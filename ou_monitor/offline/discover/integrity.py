@@ -24,6 +24,7 @@ from ou_monitor.offline.discover.clipped import redraw
 from ou_monitor.offline.discover.data import Samples
 from ou_monitor.offline.discover.fast_lines import lines_lost, without_lines
 from ou_monitor.offline.discover.lattice import find_rails, find_step
+from ou_monitor.offline.discover.readings import counted, usable, why_nothing
 from ou_monitor.offline.discover.squeezed import find_knee
 from ou_monitor.offline.discover.stamps import judge_stamps, on_grid
 from ou_monitor.offline.discover.thinning import choose_samples, events_between
@@ -95,13 +96,13 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     """
     tell = progress or (lambda share: None)
     notes = list(recording.notes)
-    t, v, u = _finite(recording, notes)
+    t, v, u = usable(recording, notes)
     if v.size < LEAST:
-        return Integrity(None, (), tuple(notes), f'It holds {v.size} usable samples; at least '
-                         f'{LEAST} are needed.')
-    if float(v.min()) == float(v.max()):
-        return Integrity(None, (), tuple(notes), 'The voltage does not change at all: the sensor '
-                         'is stuck, or its step is larger than the noise.')
+        return Integrity(None, (), tuple(notes), f'It holds {counted(v.size, "usable sample")}; '
+                         f'at least {LEAST} are needed.')
+    reason = why_nothing(v)
+    if reason:
+        return Integrity(None, (), tuple(notes), reason)
     tell(0.2)
     exact: list[Term] = []
     logged = (t, v, u)
@@ -148,7 +149,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     notes += stamps.notes
     if stamps.error > 0.0:
         exact.append(ClockJitter(stamps.error))
-    useful = _useful(u, notes)
+    useful = _useful(u, recording.has_throttle, notes)
     samples = Samples(stamps.t, v, useful)
     if between.size and drawn is None and stamps.error == 0.0:
         samples = _joined(samples, *events)
@@ -157,32 +158,6 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     tell(1.0)
     return Integrity(samples, tuple(exact), tuple(notes), raw=_as_logged(*logged, exact),
                      drawn=drawn)
-
-
-def _finite(recording: Recording, notes: list[str]
-            ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Return finite samples in order, and throttle with its holes filled."""
-    t, v = recording.t, recording.voltage
-    u: FloatArray | None = recording.throttle if recording.has_throttle else None
-    good = np.isfinite(t) & np.isfinite(v)
-    if not good.all():
-        notes.append(f'{int(good.size - good.sum())} samples dropped: not a finite number.')
-        t, v, u = t[good], v[good], None if u is None else u[good]
-    # Not by differences: they would take as much memory as the stamps.
-    rising = t[1:] > t[:-1]
-    if not rising.all():
-        order = np.argsort(t, kind='stable')
-        order = order[np.concatenate(([True], np.diff(t[order]) > 0.0))]
-        notes.append(f'{int((~rising).sum())} stamps did not rise: sorted; {t.size - order.size} '
-                     'dropped, whose stamp was there before.')
-        t, v, u = t[order], v[order], None if u is None else u[order]
-    if u is not None and not np.isfinite(u).all():
-        known = np.flatnonzero(np.isfinite(u))
-        at = np.searchsorted(known, np.arange(u.size), side='right') - 1
-        notes.append(f'Throttle is unknown at {u.size - known.size} samples: held from the sample '
-                     'before.')
-        u = u[known[np.maximum(at, 0)]]
-    return t, v, u
 
 
 def _without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
@@ -278,6 +253,8 @@ def _judge_step(step: float, noise: float, exact: list[Term], notes: list[str]) 
 
 def _knees(v: FloatArray, noise: float) -> tuple[float, float]:
     """Return the limits beyond which readings are squeezed; infinite where there is none."""
+    if not noise > 0.0:
+        return -math.inf, math.inf
     bottom, top = find_knee(v, noise, -1.0), find_knee(v, noise, 1.0)
     return -math.inf if bottom is None else bottom, math.inf if top is None else top
 
@@ -290,12 +267,12 @@ def _saturation(v: FloatArray, low: float, high: float) -> Term:
         high=high if math.isfinite(high) else float(v.max()) + far)
 
 
-def _useful(u: FloatArray | None, notes: list[str]) -> FloatArray | None:
+def _useful(u: FloatArray | None, recorded: bool, notes: list[str]) -> FloatArray | None:
     """Return throttle where it moves; say what cannot be tested where it does not."""
     if u is not None and float(u.max() - u.min()) >= MOVES:
         return u
     names = [name for name, kind in catalogue().items() if kind.NEEDS_THROTTLE]
-    why = 'not recorded' if u is None else 'constant'
+    why = 'constant' if u is not None else 'not usable' if recorded else 'not recorded'
     notes.append(f'Throttle is {why}: {", ".join(names)} cannot be tested.')
     return None
 

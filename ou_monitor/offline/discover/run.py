@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 import math
 from pathlib import Path
 from typing import Any
@@ -11,23 +10,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.term import Role, Term
-from ou_monitor.offline.discover.composite import Composite, fit_composite, scene_of
+from ou_monitor.model.terms.term import Role
+from ou_monitor.offline.discover.composite import Composite, fit_composite
 from ou_monitor.offline.discover.data import Samples
 from ou_monitor.offline.discover.errors import standard_errors
 from ou_monitor.offline.discover.finding import Cause, Criticism, Finding, Verdict
-from ou_monitor.offline.discover.fitting import joined
 from ou_monitor.offline.discover.gain import (
-    crossing_rates, mean_difference, mean_score, Scale, without, worth)
+    crossing_rates, mean_difference, mean_score, Scale, told, without, worth)
+from ou_monitor.offline.discover.gain_words import NO_OTHER, VAGUE
 from ou_monitor.offline.discover.integrity import examine, Integrity
-from ou_monitor.offline.discover.naming import ACCEPT, name_causes, Search
-from ou_monitor.offline.discover.null_bank import (
-    family_chance, NullBank, simulate_bank, simulate_bank_of)
+from ou_monitor.offline.discover.null_bank import family_chance
+from ou_monitor.offline.discover.second_criticism import Named, named_causes, position
 from ou_monitor.offline.discover.structure import evaluate, fit_gaussian
-from ou_monitor.offline.discover.trials import criticise
-from ou_monitor.offline.discover.verdict import is_latent, judge, NOTHING, withdrawn
+from ou_monitor.offline.discover.verdict import judge, NOTHING
 from ou_monitor.offline.discover.words import (
     coupling_found, coupling_note, explain, left_out_note, no_relaxation_note, verdict_sentence)
 from ou_monitor.recordings.read import read_recording
@@ -36,9 +32,6 @@ from scipy.special import ndtri
 
 Progress = Callable[[float], None]
 
-# What to say where the search was cut short.
-STOPPED = ('The search for causes was cut short where the next ones would have taken long; there '
-           'may be more than are named.')
 # Why the gain of a line is not known that was found in all samples, of which some are used.
 FAST = 'the samples that are used are too few to show a line so fast.'
 # Steps of more relaxation times than this leave no relaxation to be seen.
@@ -47,26 +40,6 @@ _BLIND = 1.0
 _RELAXES = 20.0
 # Causes of one kind from which their gain is measured together.
 _MANY = 4
-
-
-@dataclass(frozen=True, eq=False)
-class _Named:
-    """
-    What the search left: a model, its causes, and statistics before and after.
-
-    `model` was fitted on the first part, `whole` on `part`: everything where that could be done.
-
-    """
-
-    model: Composite
-    whole: Composite
-    part: slice
-    names: tuple[str, ...]
-    rivals: Mapping[str, list[str]]
-    dropped: tuple[str, ...]
-    before: Mapping[str, float]
-    after: Mapping[str, float]
-    failure: str
 
 
 def discover(recording: Recording | str | Path, *, seed: int = 0,
@@ -105,7 +78,8 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
     try:
         plain, plain_density, start = _baseline(samples, state)
         tell(0.1)
-        named = _named(samples, start, rng, state.exact, lambda share: tell(0.1 + 0.6 * share))
+        named = named_causes(samples, start, rng, state.exact,
+                             lambda share: tell(0.1 + 0.6 * share))
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return _insufficient(recording, state, 'No OU can be fitted to it and simulated: hardly '
                              'any of its samples differ, or some are far beyond all others.',
@@ -119,17 +93,19 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
     causes = _causes(samples, state, named, whole, se, start, plain_density, scale,
                      lambda share: tell(0.75 + 0.2 * share))
     gain, gain_se = scale.gain(named.model.density, plain_density)
-    why = scale.why_unknown()
+    unknown = scale.why_unknown()
+    why = unknown or ('' if math.isfinite(gain) else VAGUE)
     verdict = judge(named.after, len(causes), len(named.dropped))
     criticism = _criticism(named.before, named.after)
     left = sorted((c for c in criticism if c.is_off), key=lambda c: -abs(c.after))
     # The rest is in the model that was fitted.
     undone = tuple(t for t in state.exact if t.NAME != 'quantization')
-    crossing = crossing_rates(samples, (plain,), () if why else named.model.terms, rng)
+    crossing = crossing_rates(samples, (plain,), () if unknown else named.model.terms, rng)
     tell(1.0)
     return Finding(
         recording=recording.name, n=recording.n, duration=recording.duration, verdict=verdict,
-        sentence=verdict_sentence(verdict, causes, left, gain, gain_se, named.dropped, why),
+        sentence=verdict_sentence(verdict, causes, left, gain, gain_se, named.dropped, why,
+                                  _unseen(samples)),
         baseline=plain, baseline_score=mean_score(plain_density, scored), criticism=criticism,
         causes=causes, model=SupplyModel((*whole.terms, *undone)),
         se=(*se, *({} for _ in undone)), score=mean_score(named.model.density, scored),
@@ -149,6 +125,12 @@ def _kept(samples: Samples, state: Integrity) -> npt.NDArray[np.bool_]:
     """Return which samples are scored: those that `seen` tells and that were measured."""
     kept = samples.seen
     return kept if state.drawn is None else kept & ~state.drawn
+
+
+def _unseen(samples: Samples) -> int:
+    """Return the number of samples kept at throttle that the part fitted never had."""
+    count: int = samples.n - samples.train.stop - int(samples.seen.sum())
+    return count
 
 
 def _guess(samples: Samples) -> OU:
@@ -173,7 +155,7 @@ def _baseline(samples: Samples, state: Integrity) -> tuple[OU, FloatArray, Compo
     clean = fit_composite(samples, [guess], samples.train)
     assert clean is not None
     plain, density = clean.terms[0], clean.density
-    if state.raw is not None:
+    if state.raw is not None and np.ptp(state.raw.voltage[state.raw.train]) > 0.0:
         plain = fit_gaussian(state.raw, [_guess(state.raw)], state.raw.train).terms[0]
         density = evaluate(samples, [plain]).density
     assert isinstance(plain, OU)
@@ -183,76 +165,7 @@ def _baseline(samples: Samples, state: Integrity) -> tuple[OU, FloatArray, Compo
     return plain, density, start
 
 
-def _named(samples: Samples, start: Composite, rng: np.random.Generator,
-           exact: tuple[Term, ...], progress: Progress) -> _Named:
-    """Search for causes; withdraw those that claim what they do not explain."""
-    phi = float(np.median(start.gaussian.phi[1:]))
-    if len(start.terms) > 1:
-        bank = simulate_bank_of(samples, start, rng)
-    else:
-        bank = simulate_bank(scene_of(samples, start), phi, rng)
-    progress(0.1)
-    before = criticise(samples, start, bank)
-    # Beside lines that were taken out there may be slower ones.
-    given = [term.NAME for term in exact if term.FAMILY != 'line']
-    try:
-        search = name_causes(samples, start, bank, given=given,
-                             progress=lambda share: progress(0.1 + 0.9 * share))
-        failure = STOPPED if search.stopped else ''
-    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
-        # A fit outside of what numbers can hold; the criticism still stands.
-        search, failure = Search(start), f'The search for causes broke off: {error}.'
-    # What happens once, in the part kept, is no fault of the form of a cause.
-    whole = _whole(samples, search.composite)
-    after = criticise(samples, whole, bank) if search.accepted else before
-    kinds = [catalogue()[name] for name in search.accepted]
-    out = withdrawn(before, after, kinds)
-    dropped = tuple(search.accepted[k] for k in out)
-    if dropped:
-        stays = [search.composite.terms[position(search.composite, search.accepted, k)]
-                 for k, kind in enumerate(kinds) if k not in out and is_latent(kind)]
-        # They may have stood in the way of what was measured; a trend that they did better
-        # than is none.
-        slow = [name for name in search.removed if catalogue()[name].FAMILY == 'slow']
-        search = name_causes(samples, start, bank, latent=False, given=[*given, *slow])
-        whole, after = _kept_beside(samples, search, stays, before, bank)
-    part = samples.train if whole is search.composite else slice(0, samples.n)
-    model = search.composite
-    if search.accepted:
-        # Named with a mean that saw everything; measured with one that did not.
-        model = fit_composite(samples, model.terms, samples.train, model) or model
-    return _Named(model, whole, part, tuple(search.accepted), search.rivals, dropped, before, after,
-                  failure)
-
-
-def _kept_beside(samples: Samples, search: Search, stays: Sequence[Term],
-                 before: Mapping[str, float], bank: NullBank
-                 ) -> tuple[Composite, dict[str, float]]:
-    """Put latent causes that were not withdrawn beside the measured ones; return what is left."""
-    whole = _whole(samples, search.composite)
-    after = criticise(samples, whole, bank)
-    for term in stays:
-        made = joined(samples, search.composite, [term], rough=False)
-        if made is None or made.score(samples) - search.composite.score(samples) < ACCEPT:
-            continue
-        again = _whole(samples, made)
-        left = criticise(samples, again, bank)
-        names = [*search.accepted, term.NAME]
-        if withdrawn(before, left, [catalogue()[name] for name in names]):
-            continue
-        search.composite, whole, after = made, again, left
-        search.accepted.append(term.NAME)
-        search.rivals.setdefault(term.NAME, [])
-    return whole, after
-
-
-def position(model: Composite, names: list[str] | tuple[str, ...], k: int) -> int:
-    """Return where in the model the k-th cause is: the n-th of its kind is the n-th."""
-    nth = list(names[:k]).count(names[k])
-    return [i for i, term in enumerate(model.terms) if term.NAME == names[k]][nth]
-
-
-def _causes(samples: Samples, state: Integrity, named: _Named, whole: Composite,
+def _causes(samples: Samples, state: Integrity, named: Named, whole: Composite,
             se: tuple[dict[str, Any], ...], start: Composite, plain_density: FloatArray,
             scale: Scale, progress: Progress) -> tuple[Cause, ...]:
     """
@@ -274,17 +187,18 @@ def _causes(samples: Samples, state: Integrity, named: _Named, whole: Composite,
             less = without(samples, named.model, index)
             gain, error = (math.nan, math.nan) if less is None else scale.gain(
                 named.model.density, less.density, (index,))
-            why = scale.why_unknown((index,))
+            why = _why_unknown(gain, less, scale, (index,))
         elif term.FAMILY == 'line':
             gain, error, why = math.nan, math.nan, FAST
         else:
             clean = evaluate(samples, fit_gaussian(
                 samples, [start.terms[0]], samples.train).terms)
-            gain, error = mean_difference(clean.density[scale.scored],
-                                          plain_density[scale.scored])
+            gain, error = told(*mean_difference(
+                clean.density[scale.scored], plain_density[scale.scored]))
+            why = '' if math.isfinite(gain) else VAGUE
         found.append(Cause(term, {}, gain, error, 0.0, (),
                            explain(term, {}, gain, error, (), True, why), True))
-    groups: dict[tuple[int, ...], tuple[float, float, float]] = {}
+    groups: dict[tuple[int, ...], tuple[float, float, float, str]] = {}
     for k, name in enumerate(named.names):
         index = position(named.model, named.names, k)
         many = named.names.count(name) >= _MANY
@@ -293,25 +207,24 @@ def _causes(samples: Samples, state: Integrity, named: _Named, whole: Composite,
         if group not in groups:
             less = start if len(group) == len(named.names) else without(
                 samples, named.model, *group)
-            groups[group] = (math.nan,) * 3 if less is None else worth(
+            gain, error, chance = (math.nan,) * 3 if less is None else worth(
                 samples, named.model, less, scale, group)
-        gain, error, chance = groups[group]
+            groups[group] = gain, error, chance, _why_unknown(gain, less, scale, group)
+        gain, error, chance, why = groups[group]
         rivals = tuple(dict.fromkeys(named.rivals.get(name, ())))
         term = whole.terms[index]
         found.append(Cause(term, se[index], gain, error, chance, rivals, explain(
-            term, se[index], gain, error, rivals, False, scale.why_unknown(group), len(group)),
-            False))
+            term, se[index], gain, error, rivals, False, why, len(group), chance), False))
         progress((k + 1) / len(named.names))
     return tuple(found)
 
 
-def _whole(samples: Samples, model: Composite) -> Composite:
-    """Return a model fitted on everything; as it is where that cannot be done."""
-    try:
-        again = fit_composite(samples, model.terms, slice(0, samples.n))
-    except (ValueError, ArithmeticError, np.linalg.LinAlgError):
-        return model
-    return again if again is not None and math.isfinite(float(again.density.sum())) else model
+def _why_unknown(gain: float, less: Composite | None, scale: Scale, group: tuple[int, ...]
+                 ) -> str:
+    """Return why the gain of a group of terms is not known; empty where it is."""
+    if math.isfinite(gain):
+        return ''
+    return scale.why_unknown(group) or (NO_OTHER if less is None else VAGUE)
 
 
 def _criticism(before: Mapping[str, float], after: Mapping[str, float]) -> tuple[Criticism, ...]:
@@ -325,15 +238,14 @@ def _criticism(before: Mapping[str, float], after: Mapping[str, float]) -> tuple
         for name, value in before.items())
 
 
-def _notes(state: Integrity, named: _Named, samples: Samples) -> tuple[str, ...]:
+def _notes(state: Integrity, named: Named, samples: Samples) -> tuple[str, ...]:
     """Return what to know: the way in, what was withdrawn, what cannot be decided."""
     notes = [*state.notes, *([named.failure] if named.failure else [])]
     for name in dict.fromkeys(named.dropped):
         notes.append(f"'{name}' fitted, but left what it should explain: withdrawn.")
-    scored = int(samples.seen.sum())
-    out = samples.n - samples.train.stop - scored
+    out = _unseen(samples)
     if out:
-        notes.append(left_out_note(out, scored))
+        notes.append(left_out_note(out, int(samples.seen.sum())))
     duration = float(samples.t[-1] - samples.t[0])
     ou = named.model.terms[0]
     assert isinstance(ou, OU)

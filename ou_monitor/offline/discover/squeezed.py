@@ -25,6 +25,8 @@ _FOUND = 50.0
 _FEWEST, _AS_NOISY, _PARTS = 30, 0.6, 10
 # Beyond so many scales a reading says nothing of what was there.
 _FAR = 8.0
+# Sums of squares that are none; far from it, their inverse is still a number.
+_TINY = 1e-280
 
 
 def find_knee(voltage: FloatArray, noise: float, side: float) -> float | None:
@@ -87,6 +89,6 @@ def _is_limit(x: FloatArray, knee: float) -> bool:
 def _likelihood(x: FloatArray) -> float:
     """Return the log-likelihood of an AR(1), but for a constant, nats."""
     a, b = x[:-1] - x[:-1].mean(), x[1:] - x[1:].mean()
-    e = b - float(a @ b) / float(a @ a) * a
+    e = b - float(a @ b) / max(float(a @ a), _TINY) * a
     count = int(e.size)
-    return -0.5 * count * math.log(float(e @ e) / count)
+    return -0.5 * count * math.log(max(float(e @ e), _TINY) / count)

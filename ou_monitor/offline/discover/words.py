@@ -9,6 +9,7 @@ from typing import Any
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Term
 from ou_monitor.offline.discover.finding import Cause, Criticism, Finding, Verdict
+from ou_monitor.offline.discover.gain_words import gain_words, why_named
 from ou_monitor.offline.words import number
 
 # What it is; what to do about it; which recording shows it apart from others.
@@ -108,6 +109,9 @@ _CAUSES: Mapping[str, tuple[str, str, str]] = {
         'stamps by the clock of the ADC recorded beside the others'),
 }
 
+# An estimate whose error is so many times as large is none.
+_UNDETERMINED = 1e4
+
 _PLAIN = ((
     'autocorrelation', 'neighbouring prediction errors are correlated'),
     ('band', 'the spectrum has too much or too little power in some band'),
@@ -174,6 +178,8 @@ def with_error(value: Any, error: Any) -> str:
         errors = error if isinstance(error, list) else [None] * len(value)
         return '[' + ', '.join(with_error(v, e) for v, e in zip(value, errors)) + ']'
     if isinstance(error, float) and math.isfinite(error) and error > 0.0:
+        if abs(value) * _UNDETERMINED < error and value != 0.0:
+            return f'{number(value, 2)} (not determined)'
         digits = min(max(2 + math.floor(math.log10(max(abs(value) / error, 1.0))), 2), 6)
         return f'{number(value, digits)} +- {number(error, 2)}'
     return number(value, 4)
@@ -185,7 +191,8 @@ def _unit(term: Term, name: str) -> str:
 
 
 def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
-            alternatives: Sequence[str], exact: bool, why: str = '', together: int = 1) -> str:
+            alternatives: Sequence[str], exact: bool, why: str = '', together: int = 1,
+            chance: float = math.nan) -> str:
     """
     Return what a cause is, its estimate, its gain and what to do, for people.
 
@@ -205,6 +212,8 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
         Why the gain is not known, where it is not.
     together : int
         Terms of the kind of which the gain is, all together.
+    chance : float
+        Its p; NaN where not known.
 
     Returns
     -------
@@ -219,6 +228,8 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
     parts.append(gain_words(gain, gain_se, why))
     if together > 1 and math.isfinite(gain):
         parts.append(f'That is the gain of all {together} terms {term.NAME} together.')
+    if not exact:
+        parts.append(why_named(gain, gain_se, chance))
     if alternatives:
         separate = [f'{_CAUSES[name][2]} (for {name})' for name in (term.NAME, *alternatives)
                     if name in _CAUSES]
@@ -228,52 +239,10 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
     return ' '.join(part for part in parts if part)
 
 
-def gain_words(gain: float, gain_se: float, why: str = '') -> str:
-    """Return the gain in a sentence; one that is not distinguishable from zero is none."""
-    if not math.isfinite(gain):
-        return 'Its gain cannot be measured on this recording' + (f': {why}' if why else '.')
-    size = f'{number(1e3 * gain)} +- {number(1e3 * gain_se, 2)} mnat per sample'
-    if gain > 1.96 * gain_se:
-        return f'Gain on samples not used for the fit: {size}.'
-    if gain < -1.96 * gain_se:
-        return f'Worse on the part kept, which was not used for the fit: {size}.'
-    return f'No measurable gain on samples not used for the fit ({size}).'
-
-
 def left_out_note(count: int, scored: int) -> str:
     """Return that samples at throttle which the part fitted has not seen are not scored."""
     return (f'{count} samples of the last 40 % are at throttle that the first 60 % never had: a '
             f'model fitted there says nothing of them. Only the other {scored} are scored.')
-
-
-def unmeasured_words(fewest: int, scored: int, throttle: bool) -> str:
-    """
-    Return why a gain cannot be measured, and what recording would measure it.
-
-    Parameters
-    ----------
-    fewest : int
-        Samples that have to be scored, at least.
-    scored : int
-        Samples that are.
-    throttle : bool
-        Whether it is for throttle that the first part did not see.
-
-    Returns
-    -------
-    str
-        The end of a sentence, and one more.
-
-    """
-    few = f'{scored} samples are left to score it on, fewer than {fewest}'
-    if throttle:
-        return (f'{few if scored < fewest else "models are fitted on the first 60 % for this"}, '
-                'and throttle there does not go through what the rest holds. One that goes '
-                'through all of its throttle in both parts would measure it.')
-    if scored < fewest:
-        return f'{few}. A longer one would measure it.'
-    return ('the first 60 %, on which models are fitted for this, do not determine it. A longer '
-            'one would measure it.')
 
 
 def coupling_note(alpha: float, duration: float) -> str:
@@ -308,7 +277,7 @@ def no_relaxation_note(alpha: float, step: float) -> str:
     """Return what it means that samples are farther apart than the rail remembers."""
     return (f'Samples {number(1e3 * step)} ms apart are nearly uncorrelated: the rail is faster '
             f'than the sampling, or the noise is that of the sensor, and alpha = {number(alpha)} '
-            '1/s is only a lower bound.')
+            '1/s, fitted on the first 60 %, is only a lower bound.')
 
 
 def coupling_found(duration: float) -> str:
@@ -325,7 +294,7 @@ def remaining_words(left: Sequence[Criticism]) -> str:
 
 def verdict_sentence(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism],
                      gain: float, gain_se: float, dropped: Sequence[str] = (),
-                     why: str = '') -> str:
+                     why: str = '', unseen: int = 0) -> str:
     """
     Return the verdict in a sentence or two.
 
@@ -343,6 +312,8 @@ def verdict_sentence(verdict: Verdict, causes: Sequence[Cause], left: Sequence[C
         Causes that fitted but did not explain.
     why : str
         Why the gain is not known, where it is not.
+    unseen : int
+        Samples kept at throttle that the part fitted never had.
 
     Returns
     -------
@@ -353,6 +324,11 @@ def verdict_sentence(verdict: Verdict, causes: Sequence[Cause], left: Sequence[C
     names = _counted([cause.name for cause in causes])
     tried = (f' The nearest entries of the catalogue ({listed(list(dropped))}) fit in part only.'
              if dropped else '')
+    if left and unseen:
+        tried += (f' {unseen} samples of the last 40 % are at throttle that the first 60 %, on '
+                  'which models are fitted, never had: what is left may be no more than that'
+                  + ('.' if why else '; a recording that goes through all of its throttle in '
+                     'both parts would tell.'))
     if verdict is Verdict.NO_EFFECT:
         return ('The plain OU simulates this recording: nothing is wrong with it that this length '
                 'could show.')
@@ -381,7 +357,7 @@ def crossing_words(finding: Finding) -> str:
     if not math.isfinite(c.observed):
         return ''
     extended = (f', the extended model {number(c.extended)} +- {number(c.extended_se, 2)}'
-                if math.isfinite(c.extended) else '')
+                if finding.causes and math.isfinite(c.extended) else '')
     return (f'The voltage fell through {number(c.level, 4)} V '
             f'{number(c.observed)} +- {number(c.observed_se, 2)} times a minute; the plain OU '
             f'says {number(c.baseline)} +- {number(c.baseline_se, 2)}{extended}.')

@@ -10,6 +10,7 @@ import numpy as np
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.offline.discover.cause_rows import cause_rows, gain_remark, NOT_KNOWN
 from ou_monitor.offline.discover.finding import Criticism, Finding
+from ou_monitor.offline.discover.gain_words import MNAT, overlap_words
 from ou_monitor.offline.discover.words import (
     crossing_words, plain_model_words, plain_words, with_error)
 from ou_monitor.offline.report import page
@@ -51,11 +52,14 @@ def discovery_page(finding: Finding, command: str = '',
     sections = [page.headline(_typeset(finding.sentence))]
     if finding.baseline is not None:
         sections += [page.section('Causes', *_causes(finding)),
-                     page.section('What it is worth', *_worth(finding)),
-                     page.section('Statistics before and after', *_statistics(finding)),
+                     page.section('What it is worth' if finding.causes else 'What it predicts',
+                                  *_worth(finding)),
+                     page.section(
+                         'Statistics before and after' if finding.causes else 'Statistics',
+                         *_statistics(finding)),
                      page.section('Data beside simulations', *_pictures(finding)),
                      page.section('What is left', *_left(finding)),
-                     page.section('Parameters of the extended model', *_parameters(finding))]
+                     page.section('Parameters', *_parameters(finding))]
     tell(1.0)
     sections.append(page.section('Where it comes from', *_origin(finding, command)))
     return page.page(f'What the simulation gets wrong: {finding.recording or "recording"}',
@@ -91,12 +95,14 @@ def _causes(finding: Finding) -> list[str]:
     if not finding.causes:
         return [page.paragraph('None was named.')]
     found = cause_rows(finding.causes)
+    overlap = overlap_words(finding.causes, finding.gain)
     rows = [[row.label, row.family,
              _minus(_typeset(row.gain)) + (f'\n{row.remark}' if row.remark else ''),
              row.chance, ', '.join(row.alternatives) or _UNKNOWN] for row in found]
     return [
         page.table(['Cause', 'Family', 'Gain, mnat per sample', 'p', 'Not told from'], rows,
                    left=[0, 1, 4]),
+        *([page.paragraph(overlap)] if overlap else []),
         page.bullets([_typeset(f'{row.label}: {row.explanation}') for row in found]),
         page.paragraph(
             'Gain: what the held-out score loses when the cause is left out and all else is '
@@ -104,7 +110,8 @@ def _causes(finding: Finding) -> list[str]:
             'parameters. p: of the likelihood ratio on the part fitted, searching counted, or of '
             'the gain, doubled. Exact findings are seen in the samples themselves; the gain of '
             'those undone in them is shared. Terms of one kind that share a gain are one row.',
-            soft=True)]
+            soft=True),
+        page.paragraph(MNAT, soft=True)]
 
 
 def _worth(finding: Finding) -> list[str]:
@@ -116,10 +123,15 @@ def _worth(finding: Finding) -> list[str]:
             f'Falls through {_value(c.level, 4)} V per minute',
             _with_error(c.baseline, c.baseline_se), _with_error(c.extended, c.extended_se),
             f'{_with_error(c.observed, c.observed_se)}, observed'])
+    head = ['', 'Plain OU', 'Extended', '']
+    if not finding.causes:
+        # Nothing was added to the plain OU: there is nothing to compare it with.
+        head, rows = ['', 'Plain OU', ''], [
+            [row[0], row[1], row[3] if 'observed' in row[3] else ''] for row in rows]
     assert finding.baseline is not None
-    return [page.table(['', 'Plain OU', 'Extended', ''], rows, left=[0]),
+    return [page.table(head, rows, left=[0]),
             page.paragraph(_typeset(crossing_words(finding))),
-            page.paragraph(f'Plain OU, fitted on the first 60 %: '
+            page.paragraph(f'Plain OU, fitted on the first 60 % with nothing else in the model: '
                            f'{plain_model_words(finding.baseline)}.', soft=True)]
 
 
@@ -132,11 +144,11 @@ def _shown(finding: Finding) -> list[Criticism]:
 def _statistics(finding: Finding) -> list[str]:
     rows = [(c.statistic, c.low, c.high, c.before, c.after) for c in _shown(finding)]
     text = (f'{len(finding.discrepancies)} of {len(finding.criticism)} statistics of the '
-            f'one-step errors lie outside the band for the plain OU, {len(finding.remaining)} for '
-            'the extended model. ')
+            'one-step errors lie outside the band for the plain OU'
+            + (f', {len(finding.remaining)} for the extended model. ' if finding.causes else '. '))
+    dots = 'Hollow: plain OU. Full: extended model' if finding.causes else 'Dot: plain OU'
     return [page.figure(
-        dot_rows('Hollow: plain OU. Full: extended model. Band: what simulations produce',
-                 'standard scores', rows),
+        dot_rows(f'{dots}. Band: what simulations produce', 'standard scores', rows),
         text + 'The band is that of simulations through the same fit: a right model leaves it '
         'with any of its statistics in one recording of a hundred.')]
 
@@ -144,12 +156,13 @@ def _statistics(finding: Finding) -> list[str]:
 def _pictures(finding: Finding) -> list[str]:
     samples, baseline, extended = finding.samples, finding.baseline, finding.simulated
     assert samples is not None and baseline is not None and extended is not None
-    made = pictures(samples, [SupplyModel((baseline,)), extended],
+    plain = SupplyModel((baseline,))
+    named = ('plain OU', 'extended model') if finding.causes else ('plain OU',)
+    made = pictures(samples, [plain, extended] if finding.causes else [plain],
                     np.random.default_rng(finding.seed))
-    drawn = [page.pair(*[page.figure(_plot(picture, k, name).svg())
-                         for k, name in enumerate(('plain OU', 'extended model'))])
-             for picture in made]
-    return [*drawn, page.paragraph(
+    drawn = [page.figure(_plot(picture, k, name).svg())
+             for picture in made for k, name in enumerate(named)]
+    return [*[page.pair(*drawn[k:k + 2]) for k in range(0, len(drawn), 2)], page.paragraph(
         'Line or dots: the data. Band or bars: the range of 40 simulations with the stamps and '
         'the throttle of the data; about one point in twenty of a right model lies outside.',
         soft=True)]
@@ -158,7 +171,7 @@ def _pictures(finding: Finding) -> list[str]:
 def _plot(picture: Picture, k: int, name: str) -> Plot:
     low, high = picture.bands[k]
     plot = Plot(f'{picture.title}: {name}', picture.x_label, picture.y_label, width=450,
-                height=250, log_x=picture.log_x, log_y=picture.log_y)
+                height=250, log_x=picture.log_x, log_y=picture.log_y, legend_row=True)
     data = picture.data
     if picture.log_y:
         # A bin without samples has no place on a logarithmic axis.
@@ -172,8 +185,8 @@ def _plot(picture: Picture, k: int, name: str) -> Plot:
     bottom, top = span(ends, picture.log_y)
     plot.limits(y=(bottom, top))
     if picture.points:
-        # Room for the markers at both ends, and for the legend above them.
-        plot.limits(span([picture.x], pad=0.12), (bottom, top + 0.35 * (top - bottom)))
+        # Room for the markers at both ends.
+        plot.limits(span([picture.x], pad=0.12), (bottom, top))
         plot.bars(picture.x, low, high, 'simulated', k)
         return plot.markers(picture.x, data, 'data', 7)
     plot.band(picture.x, low, high, 'simulated', k)
@@ -182,13 +195,13 @@ def _plot(picture: Picture, k: int, name: str) -> Plot:
 
 def _left(finding: Finding) -> list[str]:
     if not finding.remaining:
-        return [page.paragraph('Nothing: no statistic of the extended model lies outside the '
-                               'band.')]
-    rows = [[c.statistic, _value(c.before), _value(c.after),
+        which = 'extended model' if finding.causes else 'plain OU'
+        return [page.paragraph(f'Nothing: no statistic of the {which} lies outside the band.')]
+    rows = [[c.statistic, _value(c.before), *([_value(c.after)] if finding.causes else []),
              f'{c.p_after:.2g}' if math.isfinite(c.p_after) else NOT_KNOWN,
              plain_words(c.statistic)] for c in finding.remaining]
-    return [page.table(['Statistic', 'Plain OU', 'Extended', 'p', 'In words'], rows,
-                       left=[0, 4])]
+    head = ['Statistic', 'Plain OU', *(['Extended'] if finding.causes else []), 'p', 'In words']
+    return [page.table(head, rows, left=[0, len(head) - 1])]
 
 
 def _parameters(finding: Finding) -> list[str]:
@@ -201,9 +214,15 @@ def _parameters(finding: Finding) -> list[str]:
             rows.append([term.NAME, spec.name,
                          _typeset(with_error(value, se.get(spec.name))),
                          spec.metadata['unit'] or _UNKNOWN, spec.metadata['text']])
-    return [page.table(['Term', 'Parameter', 'Estimate \u00b1 standard error', 'Unit',
-                        'What it is'], rows, left=[0, 1, 4]),
-            page.paragraph('Fitted on the whole recording.', soft=True)]
+    about = ('Extended model: all terms fitted together on the whole recording. Its alpha and '
+             'sigma are what is left of the relaxation and the noise beside all causes; those of '
+             'the plain OU above, fitted on the first 60 %, hold the causes as well.'
+             if finding.causes else
+             'The plain OU is kept, as no cause was named: the same model as above, fitted on the '
+             'whole recording instead of its first 60 %, so that its numbers differ a little.')
+    return [page.paragraph(about),
+            page.table(['Term', 'Parameter', 'Estimate \u00b1 standard error', 'Unit',
+                        'What it is'], rows, left=[0, 1, 4])]
 
 
 def _origin(finding: Finding, command: str) -> list[str]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.offline.discover.data import Samples
+from ou_monitor.offline.discover.lattice import find_step
 from ou_monitor.records import FloatArray
 
 # Simulations of each model: their range leaves out about one point in twenty.
@@ -135,8 +137,10 @@ def _curves(samples: Samples) -> list[_Curve]:
         r: FloatArray = np.fft.irfft(spectrum_)[lags] / max(float(c @ c), 1e-300)
         return r
 
-    values = _bins(v)
-    changes = _bins(np.diff(v))
+    # Bins that hold different numbers of codes would show a comb.
+    code = find_step(v)
+    values = _bins(v, code)
+    changes = _bins(np.diff(v), code)
     found: list[_Curve] = [
         (('Spectrum', 'frequency, Hz', 'PSD, V\u00b2/Hz'), centres, spectrum,
          (True, True, False)),
@@ -185,11 +189,17 @@ def _averages(y: FloatArray, which: np.ndarray, count: FloatArray) -> FloatArray
     return np.where(count >= 5.0, total / np.maximum(count, 1.0), np.nan)
 
 
-def _bins(y: FloatArray) -> FloatArray:
-    """Return edges with room for the tails."""
+def _bins(y: FloatArray, code: float = 0.0) -> FloatArray:
+    """Return edges with room for the tails; half-way between codes, each bin of as many."""
     low, high = float(y.min()), float(y.max())
     room = 0.15 * (high - low) or 1e-6
-    return np.linspace(low - room, high + room, _BINS + 1)
+    if not code > 0.0:
+        return np.linspace(low - room, high + room, _BINS + 1)
+    width = code * max(1, round((high - low + 2.0 * room) / (_BINS * code)))
+    beside = math.ceil(room / width)
+    count = 2 * beside + math.ceil((high - low + code) / width)
+    edges: FloatArray = width * np.arange(count + 1, dtype=np.float64)
+    return edges + (low - 0.5 * code - width * beside)
 
 
 def _middle(edges: FloatArray) -> FloatArray:

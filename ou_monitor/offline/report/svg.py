@@ -23,6 +23,8 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 30, 42
 _LETTER = 7.0
 # Half the width of the cap of a bar, pixels.
 _CAP = 7.0
+# Height of a legend in a row of its own, pixels.
+_LEGEND = 18
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,19 +52,22 @@ class Plot:
     log_x, log_y : bool
         Logarithmic axes.
     legend_low : bool
-        A legend that does not fit beside the title goes to the lower left of
-        the axes instead of the upper right.
+        A legend that fits neither beside the title nor below it goes to the
+        lower left of the axes instead of the upper right.
+    legend_row : bool
+        The legend has a row of its own below the title in any case, as of plots
+        side by side that should have axes of one size.
 
     """
 
     def __init__(self, title: str, x_label: str, y_label: str, *, width: int = 860,
                  height: int = 240, log_x: bool = False, log_y: bool = False,
-                 legend_low: bool = False) -> None:
+                 legend_low: bool = False, legend_row: bool = False) -> None:
         self.title = title
         self._x_label, self._y_label = x_label, y_label
         self._width, self._height = width, height
         self._log_x, self._log_y = log_x, log_y
-        self._legend_low = legend_low
+        self._legend_low, self._legend_row = legend_low, legend_row
         self._curves: list[_Curve] = []
         self._spans: list[tuple[float, float, str, str]] = []
         self._marks: list[tuple[float, str]] = []
@@ -171,23 +176,25 @@ class Plot:
         x_low, x_high = self._x_range or span([c.x for c in self._curves], self._log_x, pad=0.0)
         y_low, y_high = self._y_range or span(ends, self._log_y)
         x = Scale(x_low, x_high, _LEFT, right, self._log_x)
-        y = Scale(y_low, y_high, bottom, _TOP, self._log_y)
+        y = Scale(y_low, y_high, bottom, self._top, self._log_y)
         # A nested drawing clips what leaves the axes, and needs no id.
-        inner = f'{_LEFT} {_TOP} {right - _LEFT} {bottom - _TOP}'
+        inner = f'{_LEFT} {self._top} {right - _LEFT} {bottom - self._top}'
         parts = [
             f'<svg viewBox="0 0 {self._width} {self._height}" role="img" '
             f'aria-label="{escape(self.title, quote=True)}">',
             f'<text class="title" x="{_LEFT}" y="16">{escape(self.title)}</text>',
             *self._axes(x, y, right, bottom),
-            f'<svg x="{_LEFT}" y="{_TOP}" width="{right - _LEFT}" height="{bottom - _TOP}" '
+            f'<svg x="{_LEFT}" y="{self._top}" width="{right - _LEFT}" '
+            f'height="{bottom - self._top}" '
             f'viewBox="{inner}">']
         for start, stop, style, label in self._spans:
             a, b = np.clip(x(np.array([start, stop])), _LEFT, right)
-            parts.append(f'<rect class="shade {style}" x="{a:.1f}" y="{_TOP}" '
-                         f'width="{max(b - a, 0.5):.1f}" height="{bottom - _TOP}"/>')
+            parts.append(f'<rect class="shade {style}" x="{a:.1f}" y="{self._top}" '
+                         f'width="{max(b - a, 0.5):.1f}" height="{bottom - self._top}"/>')
             if label and b - a > _LETTER * len(label) + 8.0:
                 parts.append(f'<text class="note" text-anchor="middle" '
-                             f'x="{0.5 * (a + b):.1f}" y="{_TOP + 13}">{escape(label)}</text>')
+                             f'x="{0.5 * (a + b):.1f}" y="{self._top + 13}">'
+                             f'{escape(label)}</text>')
         # Bands and bars lie behind lines and dots.
         for curve in sorted(self._curves, key=lambda c: c.kind not in ('band', 'bars')):
             parts.append(self._draw(curve, x, y))
@@ -195,10 +202,30 @@ class Plot:
         for where, label in self._marks:
             pixel = float(x(where))
             if _LEFT <= pixel <= right:
-                parts.append(f'<line class="mark" x1="{pixel:.1f}" y1="{_TOP}" '
+                parts.append(f'<line class="mark" x1="{pixel:.1f}" y1="{self._top}" '
                              f'x2="{pixel:.1f}" y2="{bottom}"/><text class="note" '
-                             f'x="{pixel + 4:.1f}" y="{_TOP + 12}">{escape(label)}</text>')
+                             f'x="{pixel + 4:.1f}" y="{self._top + 12}">{escape(label)}</text>')
         return '\n'.join([*parts, *self._legend(right, bottom), '</svg>'])
+
+    @property
+    def _named(self) -> list[_Curve]:
+        """Return the curves of the legend."""
+        return [c for c in self._curves if c.label]
+
+    @property
+    def _legend_place(self) -> str:
+        """Return where the legend fits without covering a curve, ``corner`` where nowhere."""
+        size = sum(_LETTER * len(c.label) + 34.0 for c in self._named)
+        right = self._width - _RIGHT
+        beside = _LEFT + 1.15 * _LETTER * len(self.title) + size < right
+        if beside and not self._legend_row:
+            return 'title'
+        return 'row' if _LEFT + size < right else 'corner'
+
+    @property
+    def _top(self) -> int:
+        """Return where the axes begin, pixels."""
+        return _TOP + (_LEGEND if self._named and self._legend_place == 'row' else 0)
 
     def _axes(self, x: Scale, y: Scale, right: int, bottom: int) -> list[str]:
         parts = []
@@ -208,7 +235,7 @@ class Plot:
                 step = abs(value) if uneven else ticks[1] - ticks[0]
                 text, pixel = escape(tick_text(value, step or 1.0)), float(scale(value))
                 if across:
-                    parts.append(f'<line class="grid" x1="{pixel:.1f}" y1="{_TOP}" '
+                    parts.append(f'<line class="grid" x1="{pixel:.1f}" y1="{self._top}" '
                                  f'x2="{pixel:.1f}" y2="{bottom}"/><text class="tick" '
                                  f'text-anchor="middle" x="{pixel:.1f}" y="{bottom + 16}">'
                                  f'{text}</text>')
@@ -217,7 +244,7 @@ class Plot:
                                  f'x2="{right}" y2="{pixel:.1f}"/><text class="tick" '
                                  f'text-anchor="end" x="{_LEFT - 6}" y="{pixel + 4:.1f}">'
                                  f'{text}</text>')
-        middle = 0.5 * (_TOP + bottom)
+        middle = 0.5 * (self._top + bottom)
         parts.append(f'<text class="label" text-anchor="middle" x="{0.5 * (_LEFT + right):.0f}" '
                      f'y="{self._height - 6}">{escape(self._x_label)}</text>')
         parts.append(f'<text class="label" text-anchor="middle" transform="translate(14 '
@@ -249,16 +276,18 @@ class Plot:
         return f'<path class="line {curve.style}" d="{"".join(pieces)}"/>'
 
     def _legend(self, right: int, bottom: int) -> list[str]:
-        """Return the legend: beside the title, or in a corner of the axes."""
-        named = [c for c in self._curves if c.label]
+        """Return the legend: beside the title, in a row below it, or in a corner of the axes."""
+        named, place = self._named, self._legend_place
         if not named:
             return []
         widths = [_LETTER * len(c.label) + 34.0 for c in named]
-        if _LEFT + 1.15 * _LETTER * len(self.title) + sum(widths) < right:
+        if place != 'corner':
             starts = right - np.cumsum(widths[::-1])[::-1]
-            return [_legend_entry(c, float(x), 16) for c, x in zip(named, starts)]
+            return [_legend_entry(c, float(x), 16 + (_LEGEND if place == 'row' else 0))
+                    for c, x in zip(named, starts)]
         width, height = max(widths), 16 * len(named) + 8
-        left, top = (_LEFT + 2.0, bottom - height) if self._legend_low else (right - width, _TOP)
+        left, top = ((_LEFT + 2.0, bottom - height) if self._legend_low
+                     else (right - width, self._top))
         return [f'<rect class="panel" x="{left:.0f}" y="{top + 1}" width="{width:.0f}" '
                 f'height="{height}"/>',
                 *[_legend_entry(c, left + 4.0, top + 16 + 16 * k) for k, c in enumerate(named)]]
