@@ -30,6 +30,8 @@ _DENSITY = 1.25
 _MOST = 112
 # Samples are taken together while the path moves by less than this part of the noise.
 _SLIGHT = 0.35
+# Noise of less than this part of what a step adds is none.
+_NO_NOISE = 1e-4
 # Time, in relaxation times, after which where it began is forgotten.
 _FORGOTTEN = 25.0
 # -zeta(1/2) / sqrt(2 pi): how far a random walk oversteps, in steps.
@@ -78,6 +80,8 @@ def sampled_passage_probability(start: float, barrier: float, step: float, count
         return 0.0
     if math.isinf(barrier) or math.isinf(start):
         return 1.0 if barrier == -math.inf or start == math.inf > barrier else 0.0
+    if noise < _NO_NOISE * math.sqrt(-math.expm1(-2.0 * step)):
+        noise = 0.0
     grid = _panels(start, barrier, step, count, noise)
     if grid.count <= _MOST:
         return _doubled(start, barrier, step, int(count), noise, grid, 1.0)
