@@ -221,10 +221,10 @@ def _build() -> PassageTable:
     b = _B_SCALE * np.sinh(_U)
     # The steps err by the square of their length: the leading error is taken out.
     table = (4.0 * _solve(b, _FINE_W, _FINE_S) - _solve(b, _FINE_W, _FINE_S // 2)) / 3.0
-    return PassageTable(_spline(table), _spline(_log_rate(b)))
+    return PassageTable(spline(table), spline(_log_rate(b)))
 
 
-def _spline(table: FloatArray) -> FloatArray:
+def spline(table: FloatArray) -> FloatArray:
     """Return the coefficients of cubic splines along all axes, with nodes added at the ends."""
     for axis in range(table.ndim):
         for _ in range(_PAD):
