@@ -70,9 +70,9 @@ class Squares:
             # Samples were lost, maybe: only pairs that are k steps apart.
             lag = t[k:] - t[:-k]
             usual = float(np.median(lag))
-            even = np.abs(lag - usual) < 0.5 * usual / k
-            later, earlier = later[even], earlier[even]
-            step = float(lag[even].mean()) if later.size else usual
+            regular = np.abs(lag - usual) < 0.5 * usual / k
+            later, earlier = later[regular], earlier[regular]
+            step = float(lag[regular].mean()) if later.size else usual
         m = later.size
         if m - k < _SQUARES:
             return

@@ -151,6 +151,11 @@ class LearnedCurves:
         return self._throttle_known
 
     @property
+    def scatter(self) -> tuple[float, float]:
+        """Return mean squared misses of level and intensity against what was expected; 1 is right."""
+        return self._level.scatter, self._intensity.scatter
+
+    @property
     def extent(self) -> tuple[float, float]:
         """Return the lowest and the highest throttle with data, to 0.01; NaN without any."""
         at = np.flatnonzero((self._level.flown() > 1.0) & (self._intensity.flown() > 1.0))

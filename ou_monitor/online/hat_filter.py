@@ -96,6 +96,11 @@ class HatFilter:
         return self._prior is not None
 
     @property
+    def scatter(self) -> float:
+        """Mean square of the last fifty or so misses, in standard deviations; about 1 is right."""
+        return self._scatter if self.started else math.nan
+
+    @property
     def forgetting(self) -> float:
         """Time in which the shape changes by `CurvePrior.change`, s."""
         return self._forgetting
