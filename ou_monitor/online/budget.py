@@ -107,9 +107,8 @@ def throttle_budget(estimate: Estimate, curves: LearnedCurves, *, voltage: float
     """
     Return the highest throttle up to which the risk stays within the limit.
 
-    Between 0 and the lowest throttle flown the risk counts with the errors of the prior only
-    where the lowest one flown is above the limit; a rail that holds under load is taken to hold
-    under less.
+    A rail that holds at the lowest throttle flown is taken to hold below it.  Where it does not,
+    the budget lies below, and is known as far as the prior is good enough for that.
 
     Parameters
     ----------
@@ -220,7 +219,8 @@ def risk_at(throttle: float, estimate: Estimate, curves: LearnedCurves, *,
     up, down = changes.max(axis=0).clip(min=0.0), changes.min(axis=0).clip(max=0.0)
     high = odds.item(0) + math.sqrt(float(up @ up))
     low = odds.item(0) - math.sqrt(float(down @ down))
-    return ThrottleRisk(throttle, found.item(0), _from_odds(low), _from_odds(high), known)
+    risk = min(max(found.item(0), 0.0), 1.0)
+    return ThrottleRisk(throttle, risk, _from_odds(low), _from_odds(high), known)
 
 
 def _risks(throttles: FloatArray, e: Estimate, curves: LearnedCurves,
@@ -230,8 +230,10 @@ def _risks(throttles: FloatArray, e: Estimate, curves: LearnedCurves,
     log_sigma, log_sigma_se = curves.sigma_curve(throttles)
     log_alpha = np.full(throttles.shape, math.log(e.alpha))
     alpha_se = np.full(throttles.shape, e.alpha_se if math.isfinite(e.alpha_se) else 0.0)
-    return np.array(probability(level, level_se, log_sigma, log_sigma_se, log_alpha, alpha_se),
-                    dtype=np.float64)
+    # A quadrature may round to just above 1; NaN stays.
+    return np.clip(np.asarray(
+        probability(level, level_se, log_sigma, log_sigma_se, log_alpha, alpha_se),
+        dtype=np.float64), 0.0, 1.0)
 
 
 def _end(risks: FloatArray, known: npt.NDArray[np.bool_], lowest: float, highest: float,

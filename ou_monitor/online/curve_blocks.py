@@ -14,7 +14,7 @@ import numpy as np
 from ou_monitor.records import Estimate, FloatArray
 
 # Throttles closer than this are one.
-STEADY = 0.02
+STEADY = 0.03
 # Relative variance of sigma^2 at which its logarithm is taken, and up to which it may be.
 _SHARP = 0.1
 _BLUNT = 0.35
@@ -50,13 +50,14 @@ class Squares:
     def __init__(self) -> None:
         self._sum = self._weight = self._throttle = self._time = 0.0
 
-    def add(self, t: FloatArray, v: FloatArray, throttle: float, dt: float, e: Estimate) -> None:
+    def add(self, t: FloatArray, v: FloatArray, throttle: float, dt: float, e: Estimate,
+            even: bool) -> None:
         """
         Add a block, as an estimate of sigma^2 with its relative variance.
 
         Innovations over k steps, e_j = v_j - phi^k v_{j-k} less their mean, have variance
         g + N: g = sigma^2 (1 - phi^2k) / (2 alpha), N = noise^2 (1 + phi^2k).  k is 1 unless
-        noise would hide sigma.
+        noise would hide sigma.  `even` when no sample is missing between the stamps.
         """
         n, noise = t.size, e.noise_std ** 2
         k = 1
@@ -64,14 +65,14 @@ class Squares:
             k = max(1, min(math.ceil(2.0 * noise / (e.sigma ** 2 * dt)), n // 4,
                            int(1.0 / (e.alpha * dt))))
         later, earlier = v[k:], v[:-k]
-        lag = t[k:] - t[:-k]
         step = k * dt
-        if lag.max() - step > 0.5 * dt or step - lag.min() > 0.5 * dt:
-            # Samples were lost: only pairs that are k steps apart.
+        if not even:
+            # Samples were lost, maybe: only pairs that are k steps apart.
+            lag = t[k:] - t[:-k]
             usual = float(np.median(lag))
-            even = np.abs(lag - usual) < 0.5 * usual / k
-            later, earlier = later[even], earlier[even]
-            step = float(lag[even].mean()) if later.size else usual
+            regular = np.abs(lag - usual) < 0.5 * usual / k
+            later, earlier = later[regular], earlier[regular]
+            step = float(lag[regular].mean()) if later.size else usual
         m = later.size
         if m - k < _SQUARES:
             return

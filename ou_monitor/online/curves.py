@@ -33,6 +33,8 @@ _POOL = 0.25
 # and the spread of throttle within a block beyond which it is.
 _UNSETTLED = 0.05
 _SPREAD = 0.125
+# Throttle further outside 0..1 than this is in another unit, or broken.
+_OUTSIDE = 0.05
 # After a pause the rail is given this many relaxation times.
 _SETTLE = 5.0
 # A pause without samples, s, and steps, that starts the blocks afresh.
@@ -41,8 +43,12 @@ _PAUSE_STEPS = 10.0
 # A step back in time, s, that is a clock set back; what time has gone by then is not known.
 _BACK = 1.0
 _UNKNOWN_TIME = 60.0
+# Relaxation times in a block from which powers would lose digits or overflow.
+_FAST = 100.0
 # Samples that wait at most, when their stamps stand still.
 _MOST = 65536
+# The curves are told for at most so long after the last observation, s.
+_AHEAD = 10.0
 # Longest time that is believed to have gone by between two samples, s.
 _LONGEST = 3600.0
 
@@ -105,11 +111,12 @@ class LearnedCurves:
         """Forget everything learned, as for another supply."""
         self._level = HatFilter(self._nodes, self._level.forgetting)
         self._intensity = HatFilter(self._nodes, self._intensity.forgetting)
-        self._pending: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+        self._pending: list[tuple[FloatArray, ...]] = []
         self._waiting = 0
         self._begin = NAN
         self._newest = -math.inf
         self._clock = NAN
+        self._scale = NAN
         self._estimate: Estimate | None = None
         self._usable = False
         self._throttle_known = False
@@ -144,6 +151,11 @@ class LearnedCurves:
         return self._throttle_known
 
     @property
+    def scatter(self) -> tuple[float, float]:
+        """Return mean squared misses of level and intensity against what was expected; 1 is right."""
+        return self._level.scatter, self._intensity.scatter
+
+    @property
     def extent(self) -> tuple[float, float]:
         """Return the lowest and the highest throttle with data, to 0.01; NaN without any."""
         at = np.flatnonzero((self._level.flown() > 1.0) & (self._intensity.flown() > 1.0))
@@ -161,7 +173,7 @@ class LearnedCurves:
         t, voltage : float or array_like, shape (n,)
             Stamps, s, and voltages, V; those not finite are left out.
         throttle : float or array_like, shape (n,), or None
-            Throttle 0..1; samples without (NaN, None) are left out.
+            Throttle 0..1; samples without (NaN, None), or far outside, are left out.
         estimate : Estimate
             The newest.  While it is not usable, the level is learned with the last one that
             was, and the intensity is not.
@@ -177,8 +189,7 @@ class LearnedCurves:
             self._estimate = estimate
         if throttle is None:
             return
-        stamps, volts = _column(t), _column(voltage)
-        load = _column(throttle)
+        stamps, volts, load = _column(t), _column(voltage), _column(throttle)
         if load.size == 1 != stamps.size:
             load = np.full(stamps.shape, load.item(0))
         if not stamps.shape == volts.shape == load.shape or stamps.ndim != 1:
@@ -216,12 +227,15 @@ class LearnedCurves:
 
     def level_curve(self, throttles: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return levels and their standard errors, V, at throttles of shape (k,)."""
-        ahead = min(self._newest - self._clock, _POOL) if self._level.started else 0.0
-        return self._level.curve(throttles, ahead)
+        return self._level.curve(throttles, self._ahead())
 
     def sigma_curve(self, throttles: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return ln(sigma) and its standard errors at throttles of shape (k,)."""
-        return self._intensity.curve(throttles)
+        return self._intensity.curve(throttles, self._ahead())
+
+    def _ahead(self) -> float:
+        """Return the time, s, since the last observation."""
+        return min(self._newest - self._clock, _AHEAD) if self._level.started else 0.0
 
     def seen_curve(self, throttles: FloatArray) -> npt.NDArray[np.bool_]:
         """Return `seen` at throttles of shape (k,); False where throttle is NaN."""
@@ -237,7 +251,7 @@ class LearnedCurves:
             t, v, u = parts[0]
         else:
             t, v, u = (np.concatenate(columns) for columns in zip(*parts))
-        if not math.isfinite(float(t.sum() + v.sum() + u.sum())):
+        if not math.isfinite(float(v @ u)) or not math.isfinite(float(t @ u)):
             self._throttle_known = self._throttle_known or bool(np.isfinite(u).any())
             good = np.isfinite(t) & np.isfinite(v) & np.isfinite(u)
             t, v, u = t[good], v[good], u[good]
@@ -247,15 +261,18 @@ class LearnedCurves:
         steps = t[1:] - t[:-1]
         mean = (t.item(-1) - t.item(0)) / max(t.size - 1, 1)
         pause = max(_PAUSE, _PAUSE_STEPS * mean) if mean > 0.0 else _PAUSE
-        if not steps.size or (steps.min() > 0.0 and steps.max() <= pause):
-            self._run(t, v, u, pause)
-            return
+        if steps.size:
+            shortest, longest = float(steps.min()), float(steps.max())
+            if shortest > 0.0 and longest <= pause:
+                self._run(t, v, u, pause, shortest > 0.5 * mean and longest < 1.5 * mean)
+                return
         cuts = np.flatnonzero((steps > pause) | (steps <= 0.0)) + 1
         for part in np.split(np.arange(t.size), cuts):
-            self._run(t[part], v[part], u[part], pause)
+            self._run(t[part], v[part], u[part], pause, False)
 
-    def _run(self, t: FloatArray, v: FloatArray, u: FloatArray, pause: float) -> None:
-        """Take samples whose stamps rise without a pause."""
+    def _run(self, t: FloatArray, v: FloatArray, u: FloatArray, pause: float,
+             even: bool) -> None:
+        """Take samples whose stamps rise without a pause; `even` when none were lost."""
         if t.item(0) <= self._newest:
             if self._newest - t.item(-1) > _BACK:
                 # The clock was set back.
@@ -274,20 +291,19 @@ class LearnedCurves:
         if e is not None and Flag.HELD_SAMPLES in e.flags and t.size > 1:
             fresh = np.append(True, v[1:] != v[:-1])
             t, v, u = t[fresh], v[fresh], u[fresh]
+            even = False
         n = t.size
         self._newest = t.item(-1)
         pieces = max(1, min(int((self._newest - t.item(0)) / _BLOCK), n // _FEWEST))
         if e is None or n < 2:
             self._followed = NAN
             return
-        if pieces == 1:
-            self._block(t, v, u, e)
-            return
         edges = [n * k // pieces for k in range(pieces + 1)]
         for begin, end in zip(edges, edges[1:]):
-            self._block(t[begin:end], v[begin:end], u[begin:end], e)
+            self._block(t[begin:end], v[begin:end], u[begin:end], e, even)
 
-    def _block(self, t: FloatArray, v: FloatArray, u: FloatArray, e: Estimate) -> None:
+    def _block(self, t: FloatArray, v: FloatArray, u: FloatArray, e: Estimate,
+               even: bool) -> None:
         """Take one block: what throttle did, the mean, and the squares of innovations."""
         n = t.size
         span = t.item(-1) - t.item(0)
@@ -298,21 +314,22 @@ class LearnedCurves:
             self._followed = u.item(0)
             self._settled = t.item(0) + _SETTLE / e.alpha
         # The rail follows throttle with its own relaxation time.
-        before = self._followed
+        before, given = self._followed, low
         if low == high:
             decay = -math.expm1(-a * n) / (a * n)
             mean_u = low + (before - low) * decay
             apart = abs(before - low) * decay
             self._followed = low + (before - low) * math.exp(-a * n)
         else:
-            phi = math.exp(-a)
-            follow, _ = lfilter([1.0 - phi], [1.0, -phi], u, zi=[phi * before])
+            follow = _follow(u, before, a)
             mean_u, self._followed = float(follow.mean()), follow.item(-1)
-            apart = float(np.abs(u - follow).mean())
-        if apart > _UNSETTLED or high - low > _SPREAD or t.item(0) < self._settled:
+            apart, given = float(np.abs(u - follow).mean()), float(u.mean())
+        if (apart > _UNSETTLED or high - low > _SPREAD or t.item(0) < self._settled
+                or low < -_OUTSIDE or high > 1.0 + _OUTSIDE):
             self._close()
             return
-        mean_u = min(max(mean_u, 0.0), 1.0)
+        # The intensity follows at once.
+        mean_u, given = min(max(mean_u, 0.0), 1.0), min(max(given, 0.0), 1.0)
         pool = self._pool
         if pool.n and (abs(mean_u - pool.throttle) > STEADY
                        or t.item(-1) - pool.begin > 1.5 * _POOL):
@@ -320,7 +337,7 @@ class LearnedCurves:
             pool = self._pool
         pool.add(n, t.item(0), t.item(-1), dt, float(v.mean()), mean_u, apart)
         if self._usable:
-            self._squares.add(t, v, mean_u, dt, e)
+            self._squares.add(t, v, given, dt, e, even)
         if pool.end - pool.begin >= _POOL - 0.5 * _BLOCK:
             self._close()
 
@@ -341,13 +358,8 @@ class LearnedCurves:
                 self._intensity.start(value, _INTENSITY)
             self._intensity.correct(throttle, value, variance)
         if not self._level.started:
-            v = abs(pool.voltage)
-            scale = v if v > 0.0 else 1.0
-            self._level.start(pool.voltage, CurvePrior(*(
-                scale * getattr(_LEVEL, name)
-                for name in ('common', 'slope', 'bend', 'change', 'walk', 'drift')),
-                drift_time=_LEVEL.drift_time))
-            self._scale = scale
+            self._scale = abs(pool.voltage) or 1.0
+            self._level.start(pool.voltage, _LEVEL.scaled(self._scale))
         sigma = (math.exp(self._intensity.value(pool.throttle)) if self._intensity.started
                  else e.sigma)
         # Variance of the mean of n samples of an OU, as it adds up over many blocks.
@@ -361,6 +373,21 @@ class LearnedCurves:
     def _elapse(self, dt: float) -> None:
         self._level.predict(dt)
         self._intensity.predict(dt)
+
+
+def _follow(u: FloatArray, before: float, a: float) -> FloatArray:
+    """Return throttle as the rail has followed it at each sample, at a rate a per sample."""
+    phi = math.exp(-a)
+    if a * u.size > _FAST:
+        follow, _ = lfilter([1.0 - phi], [1.0, -phi], u, zi=[phi * before])
+        return np.asarray(follow)
+    # Closed form: for short blocks cheaper than the recursion.
+    growth = np.exp(a * np.arange(1.0, u.size + 1.0))
+    total = (u * growth).cumsum()
+    total *= 1.0 - phi
+    total += before
+    total /= growth
+    return total
 
 
 def _column(values: Any) -> FloatArray:

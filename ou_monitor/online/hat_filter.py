@@ -55,6 +55,12 @@ class CurvePrior:
     drift: float = 0.0
     drift_time: float = 30.0
 
+    def scaled(self, unit: float) -> CurvePrior:
+        """Return the same for a curve in units smaller by a factor."""
+        return CurvePrior(unit * self.common, unit * self.slope, unit * self.bend,
+                          unit * self.change, unit * self.walk, unit * self.drift,
+                          self.drift_time)
+
 
 class HatFilter:
     """
@@ -88,6 +94,11 @@ class HatFilter:
     def started(self) -> bool:
         """Whether anything has been observed."""
         return self._prior is not None
+
+    @property
+    def scatter(self) -> float:
+        """Mean square of the last fifty or so misses, in standard deviations; about 1 is right."""
+        return self._scatter if self.started else math.nan
 
     @property
     def forgetting(self) -> float:
@@ -184,7 +195,7 @@ class HatFilter:
         place = throttle * (self.nodes - 1)
         i = min(int(place), self.nodes - 2)
         right = place - i
-        return (1.0 - right) * self._x.item(i) + right * self._x.item(i + 1)
+        return float((1.0 - right) * self._x.item(i) + right * self._x.item(i + 1))
 
     def curve(self, throttles: FloatArray, ahead: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """
@@ -195,7 +206,8 @@ class HatFilter:
         throttles : ndarray, shape (k,)
             Throttles; outside 0..1 the end of the range is meant.
         ahead : float
-            Time since the last observation, s, over which the drift goes on.
+            Time since the last observation, s, over which the drift goes on; short against
+            its correlation time.
 
         Returns
         -------
@@ -203,13 +215,17 @@ class HatFilter:
             Values and standard errors; NaN before any observation, or where throttle is NaN.
 
         """
-        if not self.started:
+        prior = self._prior
+        if prior is None:
             unknown = np.full(throttles.shape, math.nan)
             return unknown, unknown.copy()
         n = self.nodes
         place = np.clip(throttles, 0.0, 1.0) * (n - 1)
         weights = np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(n)))
-        variance = ((weights @ self._p[:n, :n]) * weights).sum(axis=1)
+        drift = ahead * self._p[:n, n]
+        at_end = (self._p[:n, :n] + drift) + drift[:, None] + ahead * (
+            self._rate[:n, :n] + ahead * self._p.item(n, n))
+        variance = ((weights @ at_end) * weights).sum(axis=1)
         values = weights @ self._x[:n] + ahead * self._x[n]
         widen = math.sqrt(max(1.0, self._scatter))
         return values, widen * np.sqrt(np.maximum(variance, 0.0))
