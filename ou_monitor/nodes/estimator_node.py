@@ -199,7 +199,7 @@ class EstimatorNode(MonitorNode):
         level, summary = report.level, report.summary
         problem = self._problems.get('voltage')
         limit = self._monitor.settings.stale_after
-        silent = report.stale
+        silent = report.level is Level.STALE
         if level is Level.ERROR:
             # A flag that is set comes before what is wrong with the input.
             summary = f'{summary} {problem}' if problem else summary
@@ -234,7 +234,7 @@ class EstimatorNode(MonitorNode):
         for key, output in self._outputs.items():
             # What is stale is no longer known.
             output.publish(Float64(
-                data=math.nan if report.stale else values[key]))
+                data=math.nan if report.level is Level.STALE else values[key]))
         if report.brownout is not None:
             self._brownout.publish(Bool(data=report.brownout))
         self._state.publish(self._message('state', report, level, summary, report.estimate.t))

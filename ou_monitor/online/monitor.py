@@ -56,8 +56,6 @@ class MonitorReport:
         One line for the pilot.
     age : float
         Time since the last voltage arrived, s; inf when none ever did.
-    stale : bool
-        Whether there is no voltage to go by: numbers are those of the past.
 
     """
 
@@ -68,7 +66,6 @@ class MonitorReport:
     level: Level
     summary: str
     age: float
-    stale: bool
 
     @property
     def brownout(self) -> bool | None:
@@ -191,7 +188,7 @@ class SupplyMonitor:
         budget = NAN if stale else self._budget(e)
         flag = self._flag.update(e.t + silent if now is None else now, risk, fresh=not stale)
         level, summary = self._judge(e, risk, flag, self._silence(age, e) if stale else '')
-        return MonitorReport(e, risk, budget, flag, level, summary, silent, stale)
+        return MonitorReport(e, risk, budget, flag, level, summary, silent)
 
     def _risk(self, e: Estimate) -> float:
         """Return the probability of a brown-out within the horizon; NaN when not known."""
@@ -216,10 +213,12 @@ class SupplyMonitor:
     def _judge(self, e: Estimate, risk: float, flag: FlagState,
                silence: str) -> tuple[Level, str]:
         """Return the level of the diagnostics and the line for the pilot."""
-        if flag.level is FlagLevel.CRITICAL:
-            return Level.ERROR, (silence + ' ' if silence else '') + self._of_risk(e, risk, flag)
+        critical = flag.level is FlagLevel.CRITICAL
         if silence:
-            return Level.STALE, silence
+            still = f' The brown-out flag is still set: {flag.reason}.' if critical else ''
+            return Level.STALE, silence + still
+        if critical:
+            return Level.ERROR, self._of_risk(e, risk, flag)
         if flag.level is FlagLevel.WARN and flag.brownout is not None:
             return Level.WARN, self._of_risk(e, risk, flag)
         if not e.usable:
