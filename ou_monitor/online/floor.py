@@ -101,8 +101,7 @@ class FloorWatch:
         low = (count > 1) & (2 * count > ends + 1 - begin)
         self._low = bool(low[-1])
         self._was_low = self._was_low or bool(low.any())
-        keep = max(min(int(begin[-1]), t.size - _FEWEST), 0)
-        self._t, self._v = t[keep:], v[keep:]
+        self._t, self._v = t[begin[-1]:], v[begin[-1]:]
 
     def take(self) -> bool:
         """Return whether the voltage is at or below the floor, or was since the last call."""

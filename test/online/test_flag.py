@@ -103,6 +103,13 @@ def test_clear_does_not_hide_a_risk_that_is_there():
     check(line(flag, [0.5], start=1.0), 'c')
 
 
+def test_clear_begins_the_delay_anew():
+    flag = made(brownout_latch=True, brownout_delay=2.0)
+    check(line(flag, [0.5, 0.5, 0.5]), 'u u c')
+    assert flag.clear()
+    check(line(flag, [0.5, 0.5, 0.5], start=3.0), 'u u c')
+
+
 def test_latch_switched_off_ends_it_and_on_begins_it():
     """Hysteresis and hold go on as they are."""
     flag = made(brownout_latch=True)
@@ -210,6 +217,16 @@ def test_floor_overrules_a_small_risk_and_waits_for_no_delay():
     flag = made(brownout_delay=10.0)
     flag.push([0.0, 0.01, 0.02], [4.2] * 3)
     assert flag.update(0.0, 0.0).level is CRITICAL
+
+
+def test_floor_can_be_changed():
+    flag = made()
+    flag.configure(MonitorSettings(brownout_floor=3.0, brownout_hold=0.0))
+    flag.push([0.0, 0.01, 0.02], [4.2] * 3)
+    check([flag.update(0.0, NAN)], 'u')
+    flag.configure(MonitorSettings(brownout_floor=4.2, brownout_hold=0.0))
+    flag.push([0.03, 0.04, 0.05], [4.2] * 3)
+    check([flag.update(1.0, NAN)], 'c')
 
 
 def test_floor_of_stale_data_does_not_decide():

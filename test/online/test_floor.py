@@ -46,6 +46,13 @@ def test_it_trips_within_half_of_its_time(rate, needed):
         assert floor.take() is trips, count
 
 
+def test_a_sample_as_old_as_the_time_is_outside():
+    """Five samples lie within 1.25 s of a step of 0.25 s: three low ones are enough."""
+    floor = watch(brownout_floor_time=1.25)
+    push(floor, [5.0] * 20 + [4.0] * 3, rate=4.0)
+    assert floor.take()
+
+
 def test_a_dip_between_two_reports_is_not_lost():
     """15 ms at 1 kHz within 50 ms: told once, and over."""
     floor = watch()

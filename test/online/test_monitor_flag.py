@@ -69,6 +69,8 @@ def test_a_parameter_change_keeps_the_flag():
     feed.monitor.configure(MonitorSettings(brownout_hold=60.0, brownout_voltage=4.0, window=1.5))
     report = feed.feed(5.0)
     assert report.brownout is True and report.flag.age == pytest.approx(2.0)
+    feed.monitor.configure(MonitorSettings(brownout_hold=0.0, window=1.5))
+    assert feed.monitor.report(0.0).brownout is False
 
 
 def test_a_reset_keeps_the_flag_and_forgets_the_samples():
@@ -82,6 +84,22 @@ def test_a_reset_keeps_the_flag_and_forgets_the_samples():
     feed.t = -1000.0
     assert feed.feed(5.0, 3.0).risk < 0.005
     assert feed.feed(5.0, 3.0).brownout is False
+
+
+def test_a_reset_forgets_what_the_floor_has_seen():
+    """One bad sample before and one after are two lone ones."""
+    monitor = SupplyMonitor()
+    monitor.push(0.0, 4.2)
+    monitor.reset('the clock jumped')
+    monitor.push([0.001, 0.002], [4.2, 5.0])
+    assert monitor.report(0.0).brownout is None
+
+
+def test_floor_of_a_silent_source_does_not_decide():
+    monitor = SupplyMonitor(MonitorSettings(brownout_hold=0.0))
+    monitor.push([0.0, 0.001, 0.002], [4.2] * 3)
+    assert monitor.report(0.9).brownout is True
+    assert monitor.report(1.1).brownout is None
 
 
 def test_floor_without_an_estimate():
