@@ -13,7 +13,7 @@ from std_msgs.msg import Bool, Float64
 from std_srvs.srv import Trigger
 
 WARN, ERROR, STALE = b'\x01', b'\x02', b'\x03'
-DT = 0.002
+DT, DT_NS = 0.002, 2_000_000
 MODEL = """\
 model:
 - term: ou
@@ -36,15 +36,14 @@ class Rig:
             'estimator', '--ros-args', '-r', f'__ns:=/{namespace}', *arguments)
         self.output = self.probe.publisher(f'/{namespace}/voltage', BatteryState, 1000)
         wait_until(lambda: self.output.get_subscription_count() and self.states, what='its input')
-        self.t = 1000.0
+        self.ns = 1000 * 10**9
 
     def feed(self, voltages):
         """Send stamped samples; do not flood best effort."""
         for k, voltage in enumerate(voltages):
-            self.t += DT
-            whole = math.floor(self.t)
+            self.ns += DT_NS
             message = BatteryState(voltage=voltage)
-            message.header.stamp = Time(sec=whole, nanosec=round((self.t - whole) * 1e9) % 10**9)
+            message.header.stamp = Time(sec=self.ns // 10**9, nanosec=self.ns % 10**9)
             self.output.publish(message)
             if k % 20 == 19:
                 time.sleep(0.002)
