@@ -12,7 +12,7 @@ from sensor_msgs.msg import BatteryState
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import Trigger
 
-WARN, ERROR, STALE = b'\x01', b'\x02', b'\x03'
+ERROR, STALE = b'\x02', b'\x03'
 DT, DT_NS = 0.002, 2_000_000
 MODEL = """\
 model:
@@ -67,7 +67,7 @@ class Rig:
                                  GetParameters.Request(names=[name]))
         return answer.values[0]
 
-    def set(self, name, value):
+    def give(self, name, value):
         """Set a parameter that must be taken."""
         result = self.probe.set_parameter(self.node, name, value)
         assert result.successful, result.reason
@@ -103,8 +103,8 @@ def test_floor_latch_and_service(rig):
 
     50 ms below the floor, of which best effort may lose some.
     """
-    rig.set('brownout.latch', True)
-    rig.set('brownout.hold', 0.0)
+    rig.give('brownout.latch', True)
+    rig.give('brownout.hold', 0.0)
     rig.feed(ou_path(500, DT, seed=1))
     wait_until(lambda: False in [m.data for m in rig.flags], what='a flag that says false')
     rig.feed([4.2] * 25 + ou_path(25, DT, seed=2))
@@ -130,13 +130,13 @@ def test_floor_latch_and_service(rig):
 
 def test_latch_off_clears(rig):
     """And neither it nor any other parameter clears the window."""
-    rig.set('brownout.latch', True)
+    rig.give('brownout.latch', True)
     rig.feed(ou_path(300, DT, seed=4) + [4.2] * 100)
     rig.wait_level('CRITICAL')
     rig.feed(ou_path(1500, DT, seed=5))
     wait_until(lambda: 'latched' in rig.field('brownout_reason'), what='the latch')
     resets, pushed = rig.field('resets'), int(rig.field('pushed'))
-    rig.set('brownout.latch', False)
+    rig.give('brownout.latch', False)
     wait_until(lambda: rig.field('brownout_level') != 'CRITICAL', what='the end of the latch')
     assert rig.field('resets') == resets and int(rig.field('pushed')) >= pushed
 
@@ -165,18 +165,18 @@ def test_model_file(rig, shared_world):
     good.write_text(MODEL)
     bad.write_text(MODEL.replace('measurement_noise', 'measurment_noise'))
     resets = rig.field('resets')
-    rig.set('model_file', str(good))
+    rig.give('model_file', str(good))
     wait_until(lambda: rig.field('model_terms') == 'ou,measurement_noise', what='the terms')
     result = rig.probe.set_parameter(rig.node, 'model_file', str(bad))
     assert not result.successful and "did you mean 'measurement_noise'" in result.reason
     assert rig.get('model_file').string_value == str(good)
     # The file in use may go away: other parameters can still be set.
     good.unlink()
-    rig.set('brownout.warn', 0.02)
+    rig.give('brownout.warn', 0.02)
     states = len(rig.states)
     wait_until(lambda: len(rig.states) > states + 2)
     assert rig.field('model_terms') == 'ou,measurement_noise'
-    rig.set('model_file', '')
+    rig.give('model_file', '')
     wait_until(lambda: rig.field('model_terms') == '', what='no terms')
     assert rig.field('resets') == resets
 
