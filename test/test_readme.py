@@ -71,6 +71,23 @@ def test_executables_exist():
         assert option in shown.stdout
 
 
+def test_brownout_parameters_are_listed():
+    """Each with its default; none is named that does not exist."""
+    from ou_monitor.online.settings import ESTIMATOR_PARAMETERS
+    defaults = {p.name: p.default for p in ESTIMATOR_PARAMETERS}
+    assert set(re.findall(r'`(brownout\.\w+)`', README)) <= set(defaults)
+    rows = dict(re.findall(r'^\| (`(?:brownout\.|model_file)[^|]*) \| ([^|]*) \|', README,
+                           re.MULTILINE))
+    listed = {}
+    for names, values in rows.items():
+        for name, value in zip(names.split(', '), (values + ', ').split(', ')):
+            listed[name.strip('`')] = value.strip().split(' ')[0]
+    wanted = {name: default for name, default in defaults.items()
+              if name.startswith('brownout.') or name == 'model_file'}
+    assert listed == {name: f'{v:g}' if isinstance(v, float) else str(v).lower() or 'none'
+                      for name, v in wanted.items()}
+
+
 def test_python_example_runs():
     """The example runs and its intervals hold the values it was made with."""
     (code,) = blocks('python')

@@ -3,11 +3,13 @@ The node of `estimator`.
 
 Inputs: voltage and throttle, as a msg_config says (`voltage`, `throttle` by
 default), best effort.  Outputs at `publish_rate` of real time, reliable:
-`~/alpha`, `~/sigma`, `~/var_inf`, `~/brownout_risk` (std_msgs/Float64, NaN
-when not known), `~/brownout` (std_msgs/Bool, published only while it is
-known, so that it is never silently false), `~/state` (DiagnosticArray, every
-field of one estimate, stamped with the estimate's newest sample), and
-`/diagnostics` at 1 Hz.
+`~/alpha`, `~/sigma`, `~/var_inf`, `~/brownout_risk`, `~/throttle_budget`
+(std_msgs/Float64, NaN when not known), `~/brownout` (std_msgs/Bool, published
+only while it is known, so that it is never silently false), `~/state`
+(DiagnosticArray, every field of one estimate, stamped with the estimate's
+newest sample), and `/diagnostics` at 1 Hz.  Service `~/clear_brownout`
+(std_srvs/Trigger): drops a flag that is latched or held.  Hold, delay and
+latch count real time, under `use_sim_time` too.
 
 Limits: one voltage; an estimate older than `stale_after` is not published as
 a number, though `~/state` still shows its fields.
@@ -24,24 +26,28 @@ from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.diagnostics import diagnostic
 from ou_monitor.nodes.inputs import INPUT_QOS, Silence, Stamper, types_on
+from ou_monitor.nodes.model_choice import ModelChoice
 from ou_monitor.nodes.sample_stream import SampleStream
 from ou_monitor.nodes.send_clock import SendClock
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
 from ou_monitor.online.monitor import Level, MonitorReport, SupplyMonitor
 from ou_monitor.online.settings import ESTIMATOR_PARAMETERS, monitor_settings
 from std_msgs.msg import Bool, Float64
+from std_srvs.srv import Trigger
 
 # How often the samples collected go to the monitor, s, whatever `publish_rate` is: bounds memory.
 FLUSH = 0.05
-OUTPUTS = ('alpha', 'sigma', 'var_inf', 'brownout_risk')
+OUTPUTS = ('alpha', 'sigma', 'var_inf', 'brownout_risk', 'throttle_budget')
 
 
 class EstimatorNode(MonitorNode):
     """Sliding OU estimate of one supply, as a node."""
 
     def __init__(self, name: str) -> None:
+        self._models = ModelChoice()
         super().__init__(name, (*ESTIMATOR_PARAMETERS, PUBLISH_RATE), SOURCE_PARAMETERS)
-        self._monitor = SupplyMonitor(monitor_settings(_of_monitor(self.values())))
+        settings = monitor_settings(_of_monitor(self.values()))
+        self._monitor = SupplyMonitor(settings, self._models.use(settings.model_file))
         self._stream = SampleStream(self._monitor)
         self._arrived = Silence(self.steady_now)
         self._usable = Silence(self.steady_now)
@@ -52,6 +58,7 @@ class EstimatorNode(MonitorNode):
         self._brownout = self.create_publisher(Bool, '~/brownout', 10)
         self._state = self.create_publisher(DiagnosticArray, '~/state', 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self.create_service(Trigger, '~/clear_brownout', self.guarded(self._clear))
         self._stamper = Stamper(self, self._jumped)
         self._send_clock = SendClock() if self.get_parameter('smooth_stamps').value else None
         self._sources = self._find_sources()
@@ -62,12 +69,14 @@ class EstimatorNode(MonitorNode):
 
     def check(self, values: Mapping[str, Any]) -> None:
         """Raise `ValueError` when the parameters contradict each other."""
-        monitor_settings(_of_monitor(values))
+        self._models.check(monitor_settings(_of_monitor(values)).model_file)
 
     def apply(self, values: Mapping[str, Any]) -> None:
         """Bring checked parameters into force; no sample in the window is lost."""
         super().apply(values)
-        self._monitor.configure(monitor_settings(_of_monitor(values)))
+        settings = monitor_settings(_of_monitor(values))
+        self._monitor.configure(settings)
+        self._monitor.set_model(self._models.use(settings.model_file))
 
     # -- where the input comes from
 
@@ -175,17 +184,26 @@ class EstimatorNode(MonitorNode):
     def _jumped(self, reason: str) -> None:
         self._stream.reset(reason)
 
+    def _clear(self, request: Any, response: Any) -> Any:
+        done = self._monitor.clear_brownout()
+        response.success, response.message = bool(done), done or (
+            'Nothing to clear: the brown-out flag is not CRITICAL.')
+        return response
+
     # -- reports out
 
     def _report(self) -> tuple[MonitorReport, Level, str]:
         """Return the monitor's report, with what only the node can know put first."""
         self._stream.flush()
-        report = self._monitor.report(self._usable.age)
+        report = self._monitor.report(self._usable.age, self.steady_now())
         level, summary = report.level, report.summary
         problem = self._problems.get('voltage')
         limit = self._monitor.settings.stale_after
         silent = report.level is Level.STALE
-        if problem:
+        if level is Level.ERROR:
+            # A flag that is set comes before what is wrong with the input.
+            summary = f'{summary} {problem}' if problem else summary
+        elif problem:
             level, summary = (Level.ERROR if silent else Level.WARN), problem
         elif 'voltage' not in self._opened:
             topic = self.resolve_topic_name(self._sources['voltage'].topic)
@@ -211,7 +229,8 @@ class EstimatorNode(MonitorNode):
     def _publish(self) -> None:
         report, level, summary = self._report()
         values = {'alpha': report.estimate.alpha, 'sigma': report.estimate.sigma,
-                  'var_inf': report.estimate.var_inf, 'brownout_risk': report.risk}
+                  'var_inf': report.estimate.var_inf, 'brownout_risk': report.risk,
+                  'throttle_budget': report.budget}
         for key, output in self._outputs.items():
             # What is stale is no longer known.
             output.publish(Float64(
@@ -233,7 +252,8 @@ class EstimatorNode(MonitorNode):
                   'messages': str(self._stream.messages),
                   'smoothed_rate': repr(self._send_clock.rate if self._send_clock else math.nan),
                   'throttle_age': repr(math.inf if throttle_age is None else throttle_age),
-                  'throttle_problem': self._problems.get('throttle', '')}
+                  'throttle_problem': self._problems.get('throttle', ''),
+                  'model_terms': self._models.terms}
         return diagnostic(f'{self.get_fully_qualified_name()[1:]}: {part}', level, summary,
                           fields, stamp, hardware_id=self.resolve_topic_name(source.topic))
 

@@ -13,7 +13,9 @@ import math
 
 import numpy.typing as npt
 
+from ou_monitor.model.supply import SupplyModel
 from ou_monitor.online.estimator import SlidingEstimator
+from ou_monitor.online.flag import BrownoutFlag, FlagLevel, FlagState
 from ou_monitor.online.risk import brownout_probability
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, Flag, NAN, Status
@@ -43,8 +45,11 @@ class MonitorReport:
         Newest estimate.
     risk : float
         Probability of a brown-out within the horizon; NaN when not known.
-    brownout : bool or None
-        The flag; None when not known.
+    budget : float
+        Highest throttle, 0..1, that keeps the risk under
+        `brownout.budget_limit`; NaN when not known.
+    flag : FlagState
+        The brown-out flag, and why.
     level : Level
         Level for the diagnostics.
     summary : str
@@ -56,10 +61,16 @@ class MonitorReport:
 
     estimate: Estimate
     risk: float
-    brownout: bool | None
+    budget: float
+    flag: FlagState
     level: Level
     summary: str
     age: float
+
+    @property
+    def brownout(self) -> bool | None:
+        """Return the flag; None when not known."""
+        return self.flag.brownout
 
     @property
     def fields(self) -> dict[str, str]:
@@ -71,6 +82,10 @@ class MonitorReport:
                 'u0', 'u0_se', 'noise_std', 'sag', 'voltage', 'throttle', 'n', 'duration', 'rate')}
         values['brownout_risk'] = self.risk
         values['brownout'] = 'unknown' if self.brownout is None else str(self.brownout).lower()
+        values['brownout_level'] = self.flag.level.name
+        values['brownout_level_age'] = self.flag.age
+        values['brownout_reason'] = self.flag.reason
+        values['throttle_budget'] = self.budget
         values['age'] = self.age
         values['status'] = e.status.name
         values['status_text'] = e.status.value
@@ -88,12 +103,17 @@ class SupplyMonitor:
     ----------
     settings : MonitorSettings, optional
         Settings; the defaults when left out.
+    model : SupplyModel, optional
+        Terms of the supply, as `discover` found them; none when left out.
 
     """
 
-    def __init__(self, settings: MonitorSettings | None = None) -> None:
+    def __init__(self, settings: MonitorSettings | None = None,
+                 model: SupplyModel | None = None) -> None:
         self._settings = settings or MonitorSettings()
         self._estimator = SlidingEstimator(self._settings.window)
+        self._flag = BrownoutFlag(self._settings)
+        self._model = model
         self._reset_reason = ''
 
     @property
@@ -106,18 +126,44 @@ class SupplyMonitor:
         if settings.window != self._settings.window:
             self._estimator.window = settings.window
         self._settings = settings
+        self._flag.configure(settings)
+
+    @property
+    def model(self) -> SupplyModel | None:
+        """Return the terms of the supply in force."""
+        return self._model
+
+    def set_model(self, model: SupplyModel | None) -> None:
+        """Change the terms of the supply; window and flag stay."""
+        self._model = model
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
              throttle: npt.ArrayLike | None = None) -> None:
         """Add samples; see `SlidingEstimator.push`."""
         self._estimator.push(t, voltage, throttle)
+        self._flag.push(t, voltage)
+
+    def clear_brownout(self) -> str:
+        """
+        Drop a CRITICAL that is latched or held; the next report judges anew.
+
+        Returns
+        -------
+        str
+            What was cleared; empty when there was nothing.
+
+        """
+        old = self._flag.state
+        return (f'CRITICAL of {old.age:.1f} s is cleared; the flag is judged anew.'
+                if self._flag.clear() else '')
 
     def reset(self, reason: str) -> None:
-        """Clear the window, and remember why for the next reports."""
+        """Clear the window, and remember why for the next reports; the flag stays held."""
         self._estimator.reset()
+        self._flag.new_time_line()
         self._reset_reason = reason
 
-    def report(self, age: float | None) -> MonitorReport:
+    def report(self, age: float | None, now: float | None = None) -> MonitorReport:
         """
         Return what is known now.
 
@@ -125,6 +171,9 @@ class SupplyMonitor:
         ----------
         age : float or None
             Time since the last voltage arrived, s; None when none ever did.
+        now : float, optional
+            The clock by which the flag counts hold and delay, s; when left
+            out the stamp of the newest sample plus `age`.
 
         Returns
         -------
@@ -133,14 +182,22 @@ class SupplyMonitor:
 
         """
         e = self._estimator.estimate()
-        s = self._settings
         silent = math.inf if age is None else max(age, 0.0)
-        if age is None or silent > s.stale_after or e.status is Status.NO_DATA:
-            return MonitorReport(e, NAN, None, Level.STALE, self._silence(age, e), silent)
-        risk = brownout_probability(e, s.brownout_voltage, s.brownout_horizon, e.voltage)
-        brownout = None if math.isnan(risk) else risk >= s.brownout_critical
-        level, summary = self._judge(e, risk)
-        return MonitorReport(e, risk, brownout, level, summary, silent)
+        stale = silent > self._settings.stale_after or e.status is Status.NO_DATA
+        risk = NAN if stale else self._risk(e)
+        budget = NAN if stale else self._budget(e)
+        flag = self._flag.update(e.t + silent if now is None else now, risk, fresh=not stale)
+        level, summary = self._judge(e, risk, flag, self._silence(age, e) if stale else '')
+        return MonitorReport(e, risk, budget, flag, level, summary, silent)
+
+    def _risk(self, e: Estimate) -> float:
+        """Return the probability of a brown-out within the horizon; NaN when not known."""
+        s = self._settings
+        return brownout_probability(e, s.brownout_voltage, s.brownout_horizon, e.voltage)
+
+    def _budget(self, e: Estimate) -> float:
+        """Return the throttle budget; with no curve learned it is not known."""
+        return NAN
 
     def _silence(self, age: float | None, e: Estimate) -> str:
         if age is not None and age > self._settings.stale_after:
@@ -153,21 +210,32 @@ class SupplyMonitor:
             return f'The window was cleared ({self._reset_reason}) and is filling again.'
         return Status.NO_DATA.value
 
-    def _judge(self, e: Estimate, risk: float) -> tuple[Level, str]:
-        s = self._settings
-        if risk >= s.brownout_critical:
-            return Level.ERROR, (
-                f'Brown-out risk {risk:.2g} within {s.brownout_horizon:g} s of '
-                f'{s.brownout_voltage:g} V (critical from {s.brownout_critical:g}); supply now '
-                f'{e.voltage:.3f} V.')
+    def _judge(self, e: Estimate, risk: float, flag: FlagState,
+               silence: str) -> tuple[Level, str]:
+        """Return the level of the diagnostics and the line for the pilot."""
+        critical = flag.level is FlagLevel.CRITICAL
+        if silence:
+            still = f' The brown-out flag is still set: {flag.reason}.' if critical else ''
+            return Level.STALE, silence + still
+        if critical:
+            return Level.ERROR, self._of_risk(e, risk, flag)
+        if flag.level is FlagLevel.WARN and flag.brownout is not None:
+            return Level.WARN, self._of_risk(e, risk, flag)
         if not e.usable:
             rate = f' Input: {e.n} samples at {e.rate:.3g} Hz.' if e.rate > 0.0 else ''
             return Level.WARN, e.status.value + rate
-        if risk >= s.brownout_warn:
-            return Level.WARN, (
-                f'Brown-out risk {risk:.2g} within {s.brownout_horizon:g} s of '
-                f'{s.brownout_voltage:g} V.')
-        doubts = [flag.value for flag in e.flags if flag in _DOUBTFUL]
+        if flag.level is not FlagLevel.OK:
+            return Level.WARN, self._of_risk(e, risk, flag)
+        doubts = [caution.value for caution in e.flags if caution in _DOUBTFUL]
         if doubts:
             return Level.WARN, ' '.join(doubts)
         return Level.OK, e.status.value
+
+    def _of_risk(self, e: Estimate, risk: float, flag: FlagState) -> str:
+        s = self._settings
+        load = f' at throttle {e.throttle:.2f}' if math.isfinite(e.throttle) else ''
+        known = 'unknown' if math.isnan(risk) else f'{risk:.2g}'
+        supply = f'; supply now {e.voltage:.3f} V' if math.isfinite(e.voltage) else ''
+        return (f'Brown-out risk {known} within {s.brownout_horizon:g} s of '
+                f'{s.brownout_voltage:g} V (critical from {s.brownout_critical:g}){load}{supply}; '
+                f'{flag.level.name} for {flag.age:.1f} s: {flag.reason}.')

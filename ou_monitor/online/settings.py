@@ -44,6 +44,10 @@ class Parameter:
     choices: tuple[str, ...] = ()
 
 
+# Where the floor is when only brownout.voltage is given, V below it: the step from the 4.5 V at
+# which PX4 calls a 5 V rail low to the 4.3 V below which ArduPilot does not arm.
+FLOOR_BELOW = 0.2
+
 ESTIMATOR_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('window', 2.0, 'Length of the sliding window, s.', 0.05, 3600.0),
     Parameter('stale_after', 1.0, 'Silence after which the input counts as stale, s.',
@@ -56,6 +60,34 @@ ESTIMATOR_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('brownout.warn', 0.01, 'Risk from which the diagnostics warn, 0..1.', 0.0, 1.0),
     Parameter('brownout.critical', 0.1, 'Risk from which the brown-out flag is set, 0..1.',
               0.0, 1.0),
+    Parameter('brownout.leave', 0.5,
+              'A level is left when the risk falls below this share of what it is entered at, '
+              '0.001..1, less than 1 (default: half, our choice).', 0.001, 1.0),
+    Parameter('brownout.hold', 2.0,
+              'Time for which WARN and CRITICAL stay at least, and outlast an unknown risk, s '
+              '(default: the length of the default window, after which a dip is forgotten).',
+              0.0, 3600.0),
+    Parameter('brownout.delay', 0.0,
+              'Time for which a risk must last before its level is entered, s (default: none; '
+              'ArduPilot waits 10 s before a voltage failsafe).', 0.0, 3600.0),
+    Parameter('brownout.latch', False,
+              'Whether CRITICAL stays until ~/clear_brownout is called or this is switched off '
+              '(default: no; PX4 latches its battery warning while armed).'),
+    Parameter('brownout.floor', -1.0,
+              'Voltage at or below which the flag is CRITICAL whatever the model says, V; 0: off; '
+              'negative: 0.2 V below brownout.voltage (with the default of that 4.3 V, the '
+              'BRD_VBUS_MIN of ArduPilot for a 5 V rail).', -1.0, 1000.0),
+    Parameter('brownout.floor_time', 0.02,
+              'Time over which the median of the voltage is held against the floor, s, three '
+              'samples at least (default: shorter than the 40 ms dips of real inrush, longer than '
+              'a bad sample).', 0.0, 10.0),
+    Parameter('brownout.watch', 'continuous',
+              'Whether the risk is that of the voltage at all times or only at its samples.',
+              choices=('continuous', 'sampled')),
+    Parameter('brownout.budget_limit', 0.0,
+              'Risk that the throttle budget keeps under, 0..1; 0: brownout.warn.', 0.0, 1.0),
+    Parameter('model_file', '',
+              'Model file of the supply (discover --save-model); empty: none.'),
 )
 
 FILTER_PARAMETERS: tuple[Parameter, ...] = (
@@ -85,6 +117,15 @@ class MonitorSettings:
     brownout_horizon: float = 5.0
     brownout_warn: float = 0.01
     brownout_critical: float = 0.1
+    brownout_leave: float = 0.5
+    brownout_hold: float = 2.0
+    brownout_delay: float = 0.0
+    brownout_latch: bool = False
+    brownout_floor: float = -1.0
+    brownout_floor_time: float = 0.02
+    brownout_watch: str = 'continuous'
+    brownout_budget_limit: float = 0.0
+    model_file: str = ''
 
     def __post_init__(self) -> None:
         """Refuse values out of range and contradictions."""
@@ -93,6 +134,31 @@ class MonitorSettings:
             raise ValueError(
                 f'brownout.warn ({self.brownout_warn}) must be less than brownout.critical '
                 f'({self.brownout_critical})')
+        if not self.brownout_leave < 1.0:
+            raise ValueError(
+                f'brownout.leave ({self.brownout_leave}) must be less than 1: a level is left at '
+                'brownout.leave times the risk at which it is entered')
+        if self.brownout_floor > self.brownout_voltage:
+            raise ValueError(
+                f'brownout.floor ({self.brownout_floor} V) must not exceed brownout.voltage '
+                f'({self.brownout_voltage} V): lower it, or set 0 (off) or -1 (0.2 V below)')
+        if self.brownout_budget_limit > self.brownout_critical:
+            raise ValueError(
+                f'brownout.budget_limit ({self.brownout_budget_limit}) must not exceed '
+                f'brownout.critical ({self.brownout_critical}): the throttle that it allows would '
+                'set the flag')
+
+    @property
+    def floor(self) -> float:
+        """Return the voltage floor in force, V; 0: off."""
+        if self.brownout_floor < 0.0:
+            return max(self.brownout_voltage - FLOOR_BELOW, 0.0)
+        return self.brownout_floor
+
+    @property
+    def budget_limit(self) -> float:
+        """Return the risk that the throttle budget keeps under, 0..1."""
+        return self.brownout_budget_limit or self.brownout_warn
 
 
 @dataclass(frozen=True)
@@ -193,7 +259,11 @@ def _check(table: tuple[Parameter, ...], settings: object) -> None:
                 raise ValueError(
                     f"{parameter.name}: unknown '{value}': "
                     f'{nearest(str(value), parameter.choices)}')
-        elif isinstance(parameter.default, (int, float)):
+        elif isinstance(parameter.default, (bool, str)):
+            if not isinstance(value, type(parameter.default)):
+                word = 'true or false' if isinstance(parameter.default, bool) else 'text'
+                raise ValueError(f'{parameter.name} must be {word}, got {value!r}')
+        else:
             whole = isinstance(parameter.default, int)
             if not _is_number(value) or (whole and value != int(value)):
                 raise ValueError(

@@ -140,10 +140,15 @@ def test_risk_and_flag(states, run):
     risks = [float(f['brownout_risk']) for _, f in states]
     assert all(0.0 < risk <= 1.0 for risk in risks)
     known = [m for m in run['brownout_risk'] if not math.isnan(m.data)]
-    # Critical from 0.1: the flags are those of the risks, one for one (the stop may cut one).
+    # Critical from 0.1: a flag for each risk (the stop may cut one), set where the risk is, and
+    # held for longer, also beyond the last voltage.
     flags = [m.data for m in run['brownout']]
-    assert flags[:len(known) - 1] == [m.data >= 0.1 for m in known][:len(flags)][:len(known) - 1]
-    assert abs(len(flags) - len(known)) <= 1
+    assert len(flags) >= len(known) - 1
+    told = [values_of(m.status[0]) for m in run['state']]
+    assert all((f['brownout'] == 'true') == (f['brownout_level'] == 'CRITICAL') for f in told)
+    assert all(f['brownout'] != 'false' for f in told if f['brownout_risk'] == 'nan')
+    assert all(f['brownout'] == 'true' for f in told if float(f['brownout_risk']) >= 0.1)
+    assert set(flags) <= {f['brownout'] == 'true' for f in told if f['brownout'] != 'unknown'}
 
 
 def test_what_is_not_known_is_nan(run):

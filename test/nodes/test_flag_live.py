@@ -1,0 +1,194 @@
+"""The flag of a real estimator: floor, latch and its service, parameters, model file."""
+
+import math
+import time
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from live import ou_path, values_of, wait_until
+import pytest
+from rcl_interfaces.srv import GetParameters
+from sensor_msgs.msg import BatteryState
+from std_msgs.msg import Bool, Float64
+from std_srvs.srv import Trigger
+
+ERROR, STALE = b'\x02', b'\x03'
+DT, DT_NS = 0.002, 2_000_000
+MODEL = """\
+model:
+- term: ou
+  params: {alpha: 63.0, sigma: 0.3, u0: 5.0}
+- term: measurement_noise
+  params: {std: 0.002}
+"""
+
+
+class Rig:
+    """An estimator in a namespace, fed with stamped messages."""
+
+    def __init__(self, world, namespace, *arguments):
+        self.probe = world.probe()
+        self.node = f'/{namespace}/ou_estimator'
+        self.states = self.probe.listen(f'{self.node}/state', DiagnosticArray)
+        self.flags = self.probe.listen(f'{self.node}/brownout', Bool)
+        self.budgets = self.probe.listen(f'{self.node}/throttle_budget', Float64)
+        self.process = world.start(
+            'estimator', '--ros-args', '-r', f'__ns:=/{namespace}', *arguments)
+        self.output = self.probe.publisher(f'/{namespace}/voltage', BatteryState, 1000)
+        wait_until(lambda: self.output.get_subscription_count() and self.states, what='its input')
+        self.ns = 1000 * 10**9
+
+    def feed(self, voltages):
+        """Send stamped samples; do not flood best effort."""
+        for k, voltage in enumerate(voltages):
+            self.ns += DT_NS
+            message = BatteryState(voltage=voltage)
+            message.header.stamp = Time(sec=self.ns // 10**9, nanosec=self.ns % 10**9)
+            self.output.publish(message)
+            if k % 20 == 19:
+                time.sleep(0.002)
+
+    @property
+    def status(self):
+        """Return the newest status."""
+        return self.states[-1].status[0]
+
+    def field(self, name):
+        """Return a field of the newest state."""
+        return values_of(self.status)[name]
+
+    def wait_level(self, level):
+        """Wait until the flag has a level."""
+        wait_until(lambda: self.field('brownout_level') == level, what=f'the level {level}')
+
+    def get(self, name):
+        """Return a parameter as the node has it."""
+        answer = self.probe.call(GetParameters, f'{self.node}/get_parameters',
+                                 GetParameters.Request(names=[name]))
+        return answer.values[0]
+
+    def give(self, name, value):
+        """Set a parameter that must be taken."""
+        result = self.probe.set_parameter(self.node, name, value)
+        assert result.successful, result.reason
+
+    def clear(self):
+        """Call the service."""
+        return self.probe.call(Trigger, f'{self.node}/clear_brownout', Trigger.Request())
+
+
+@pytest.fixture(scope='module')
+def rig(shared_world):
+    """Give one estimator."""
+    return Rig(shared_world, 'flag')
+
+
+def test_silent_while_unknown(rig):
+    """Three samples make no estimate: no flag is published, neither true nor false."""
+    rig.feed([5.0, 5.01, 4.99])
+    wait_until(lambda: int(rig.field('pushed')) >= 1)
+    states = len(rig.states)
+    wait_until(lambda: len(rig.states) > states + 3)
+    assert rig.flags == [] and rig.field('brownout') == 'unknown'
+    assert rig.field('brownout_level') == 'UNKNOWN'
+    assert rig.budgets and all(math.isnan(m.data) for m in rig.budgets)
+    assert rig.field('throttle_budget') == 'nan'
+    answer = rig.clear()
+    assert not answer.success and 'Nothing to clear' in answer.message
+
+
+def test_floor_latch_and_service(rig):
+    """
+    A dip that no estimate sees: set by the floor, latched, cleared by the service.
+
+    50 ms below the floor, of which best effort may lose some.
+    """
+    rig.give('brownout.latch', True)
+    rig.give('brownout.hold', 0.0)
+    rig.feed(ou_path(500, DT, seed=1))
+    wait_until(lambda: False in [m.data for m in rig.flags], what='a flag that says false')
+    rig.feed([4.2] * 25 + ou_path(25, DT, seed=2))
+    rig.wait_level('CRITICAL')
+    wait_until(lambda: rig.flags[-1].data, what='the flag')
+    # A window later the dip is forgotten, the latch is not.
+    rig.feed(ou_path(1500, DT, seed=3))
+    wait_until(lambda: 'latched' in rig.field('brownout_reason'), what='the latch')
+    assert rig.status.level in (ERROR, STALE) and rig.flags[-1].data
+    # Nor does silence end it.
+    wait_until(lambda: rig.status.level == STALE, what='STALE')
+    states = len(rig.states)
+    wait_until(lambda: len(rig.states) > states + 3)
+    assert rig.field('brownout_level') == 'CRITICAL'
+    answer = rig.clear()
+    assert answer.success and 'CRITICAL of' in answer.message
+    rig.wait_level('UNKNOWN')
+    flags = len(rig.flags)
+    states = len(rig.states)
+    wait_until(lambda: len(rig.states) > states + 3)
+    assert len(rig.flags) <= flags + 1 and rig.field('brownout') == 'unknown'
+
+
+def test_latch_off_clears(rig):
+    """And neither it nor any other parameter clears the window."""
+    rig.give('brownout.latch', True)
+    rig.feed(ou_path(300, DT, seed=4) + [4.2] * 100)
+    rig.wait_level('CRITICAL')
+    rig.feed(ou_path(1500, DT, seed=5))
+    wait_until(lambda: 'latched' in rig.field('brownout_reason'), what='the latch')
+    resets, pushed = rig.field('resets'), int(rig.field('pushed'))
+    rig.give('brownout.latch', False)
+    wait_until(lambda: rig.field('brownout_level') != 'CRITICAL', what='the end of the latch')
+    assert rig.field('resets') == resets and int(rig.field('pushed')) >= pushed
+
+
+@pytest.mark.parametrize('name, value, words', [
+    ('brownout.floor', 4.6, 'must not exceed brownout.voltage'),
+    ('brownout.leave', 1.0, 'must be less than 1'),
+    ('brownout.budget_limit', 0.5, 'must not exceed brownout.critical'),
+    ('brownout.critical', 0.005, 'must be less than brownout.critical'),
+    ('brownout.watch', 'both', 'brownout.watch'),
+    ('brownout.horizon', 0.0, 'out of range'),
+    ('brownout.latch', 1.5, 'Wrong parameter type'),
+    ('model_file', '/no/such/model.yaml', 'cannot read the model file'),
+])
+def test_contradictions_are_refused_at_run_time(rig, name, value, words):
+    """With the reason; the old value stays."""
+    before = rig.get(name)
+    result = rig.probe.set_parameter(rig.node, name, value)
+    assert not result.successful and words in result.reason and '\n' not in result.reason
+    assert rig.get(name) == before
+
+
+def test_model_file(rig, shared_world):
+    """Read when it is set; a bad one is refused with its line and the old one stays."""
+    good, bad = shared_world.folder / 'good.yaml', shared_world.folder / 'bad.yaml'
+    good.write_text(MODEL)
+    bad.write_text(MODEL.replace('measurement_noise', 'measurment_noise'))
+    resets = rig.field('resets')
+    rig.give('model_file', str(good))
+    wait_until(lambda: rig.field('model_terms') == 'ou,measurement_noise', what='the terms')
+    result = rig.probe.set_parameter(rig.node, 'model_file', str(bad))
+    assert not result.successful and "did you mean 'measurement_noise'" in result.reason
+    assert rig.get('model_file').string_value == str(good)
+    # The file in use may go away: other parameters can still be set.
+    good.unlink()
+    rig.give('brownout.warn', 0.02)
+    states = len(rig.states)
+    wait_until(lambda: len(rig.states) > states + 2)
+    assert rig.field('model_terms') == 'ou,measurement_noise'
+    rig.give('model_file', '')
+    wait_until(lambda: rig.field('model_terms') == '', what='no terms')
+    assert rig.field('resets') == resets
+
+
+@pytest.mark.parametrize('arguments, words', [
+    (['-p', 'brownout.floor:=4.8'], 'must not exceed brownout.voltage'),
+    (['-p', 'brownout.leave:=1.0'], 'must be less than 1'),
+    (['-p', 'model_file:=/no/such/model.yaml'], 'cannot read the model file'),
+])
+def test_contradictions_are_refused_at_the_start(world, arguments, words):
+    """One line at FATAL, status 2."""
+    process = world.start('estimator', '--ros-args', *arguments)
+    assert process.wait() == 2
+    (line,) = [line for line in process.err.splitlines() if 'FATAL' in line]
+    assert words in line
