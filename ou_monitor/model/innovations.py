@@ -86,48 +86,46 @@ class Filter:
             self.variance = np.concatenate((self.variance[:-1], more))
 
     def _solve(self, model: StateSpace) -> FloatArray:
-        """Find the gains, sample by sample; return the variances."""
+        """Find the gains, stretch by stretch; return the variances."""
         h = model.h
         n, d = model.f.shape[0], model.f.shape[1]
-        # One array for each element of the matrices, along the samples: no small
-        # matrices are touched one by one.  Blocks leave most of them zero.
-        f, q = _elements(model.f), _elements(model.q)
-        turns = _pattern(f)
-        weight = _inverse(q)
-        known = _pattern(weight)
-        forward = _times(weight, f, known, turns)
-        # What the step into the next sample says of this one.
-        back = np.zeros_like(f)
-        _symmetric(f[..., 1:], forward[..., 1:], turns, known @ turns, back[..., :-1])
-        diagonal = weight + back
-        for i, j in np.argwhere(np.outer(h, h) != 0.0).tolist():
-            diagonal[i, j] += h[i] * h[j] / model.r
-        band = _band(diagonal, -forward[..., 1:])
-        del weight, forward, diagonal
-        factor, info = dpbtrf(band, lower=1, overwrite_ab=1)
-        del band
-        if info != 0 or not np.isfinite(factor[0]).all():
-            raise ValueError('the covariance of the model is singular or not finite')
-        # Filtered covariance, then the gain, then the closed loop.
-        p = _pivots(factor, n, d)
-        p -= back
-        del factor, back
-        p = _inverse(p)
-        gain = _seen(h, p) / model.r
-        look = _seen(h, f)
-        loop = f - gain[:, None] * look[None]
-        loop[..., 0] = look[:, 0] = 0.0
-        self._band_of_loop = _band(_one(d, n), -loop[..., 1:])
-        self._gain = np.ascontiguousarray(gain.T)
-        self._look = np.ascontiguousarray(look.T)
-        # The last gain does not know that a step follows; the one before does.
-        self._last_loop = loop[..., -2].copy() if n > 1 else np.zeros((d, d))
-        ahead = model.r.copy()
-        ahead += h @ _seen(h, q)
-        for i in range(d):
-            for j in range(i + 1):
-                ahead[1:] += (1.0 + (i > j)) * p[i, j, :-1] * look[i, 1:] * look[j, 1:]
-        variance: FloatArray = ahead
+        self._gain, self._look = np.empty((n, d)), np.empty((n, d))
+        self._last_loop = np.zeros((d, d))
+        band = np.zeros((n, d, 2 * d))
+        band[:, :, 0] = 1.0
+        variance: FloatArray = model.r.copy()
+        known: FloatArray | None = None
+        count = max(1, round(n * d * d / _ELEMENTS))
+        edges = [n * k // count for k in range(count + 1)]
+        for begin, end in zip(edges[:-1], edges[1:]):
+            # One array for each element of the matrices, along the samples: no small
+            # matrices are touched one by one.  Blocks leave most of them zero.
+            f, q = _elements(model.f[begin:end]), _elements(model.q[begin:end])
+            r = model.r[begin:end]
+            variance[begin:end] += h @ _seen(h, q)
+            look = _seen(h, f)
+            if known is None:
+                look[:, 0] = f[..., 0] = 0.0
+            else:
+                variance[begin] += look[:, 0] @ known @ look[:, 0]
+                # What is known of the last sample before, carried one step on.
+                q[..., 0] += f[..., 0] @ known @ f[..., 0].T
+            p = _filtered(f, q, h, r)
+            for i in range(d):
+                for j in range(i + 1):
+                    variance[begin + 1:end] += (1.0 + (i > j)) * p[i, j, :-1] * (
+                        look[i, 1:] * look[j, 1:])
+            known = p[..., -1].copy()
+            gain = _seen(h, p) / r
+            loop = f - gain[:, None] * look[None]
+            self._gain[begin:end], self._look[begin:end] = gain.T, look.T
+            first = max(begin, 1)
+            for i, j in np.argwhere(_pattern(loop)).tolist():
+                band[first - 1:end - 1, j, d + i - j] = -loop[i, j, first - begin:]
+            if end - begin > 1:
+                # The last gain does not know that a step follows; the one before does.
+                self._last_loop = loop[..., -2].copy()
+        self._band_of_loop = band.reshape(n * d, 2 * d).T
         return variance
 
     def innovations(self, y: FloatArray) -> FloatArray:
@@ -308,6 +306,35 @@ def _inverse(a: FloatArray) -> FloatArray:
     for i, j in np.argwhere(np.tri(d, k=-1)).tolist():
         result[j, i] = result[i, j]
     return result
+
+
+# Elements of matrices that are worked on at once, about: bounds memory.
+_ELEMENTS = 2e6
+
+
+def _filtered(f: FloatArray, q: FloatArray, h: FloatArray, r: FloatArray) -> FloatArray:
+    """Return filtered covariances, shape (d, d, n); q of the first sample is its prior."""
+    d, n = f.shape[0], f.shape[2]
+    turns = _pattern(f)
+    weight = _inverse(q)
+    known = _pattern(weight)
+    forward = _times(weight, f, known, turns)
+    # What the step into the next sample says of this one.
+    back = np.zeros_like(f)
+    _symmetric(f[..., 1:], forward[..., 1:], turns, known @ turns, back[..., :-1])
+    diagonal = weight + back
+    for i, j in np.argwhere(np.outer(h, h) != 0.0).tolist():
+        diagonal[i, j] += h[i] * h[j] / r
+    band = _band(diagonal, -forward[..., 1:])
+    del weight, forward, diagonal
+    factor, info = dpbtrf(band, lower=1, overwrite_ab=1)
+    del band
+    if info != 0 or not np.isfinite(factor[0]).all():
+        raise ValueError('the covariance of the model is singular or not finite')
+    p = _pivots(factor, n, d)
+    p -= back
+    del factor, back
+    return _inverse(p)
 
 
 # Samples whose matrices stay in the fast memory.

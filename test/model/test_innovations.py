@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from ou_monitor.model import innovations
 from ou_monitor.model.innovations import Filter, StateSpace
 import pytest
 
@@ -85,3 +86,15 @@ def test_singular_is_refused():
         q[20] *= bad
         with pytest.raises(ValueError, match='singular or not finite'):
             Filter(StateSpace(good.f, q, good.h, good.r))
+
+
+@pytest.mark.parametrize('pieces', [2, 7, 200])
+def test_in_pieces_as_at_once(monkeypatch, pieces):
+    """Many states are worked on stretch by stretch; what is known is carried on."""
+    model = relaxations(400, [63.0, 8.0, 0.5], 0.1, uneven=True)
+    y = np.random.default_rng(4).standard_normal(400)
+    monkeypatch.setattr(innovations, '_ELEMENTS', 400 * 9 / pieces)
+    run = Filter(model)
+    e, variance = kalman(model, y)
+    np.testing.assert_allclose(run.innovations(y), e, rtol=0.0, atol=1e-7)
+    np.testing.assert_allclose(run.variance, variance, rtol=1e-8)

@@ -33,6 +33,8 @@ from ou_monitor.offline.discover.trials import (
 ACCEPT, ACCEPT_MEAN = 6.0, 3.0
 # Causes within this of the best cannot be told from it here, nats.
 TIE = 3.0
+# Share of the largest evidence that drift needs beside it.
+_FORM = 0.02
 # Evidence from which a measured cause stays when others have come, nats.
 NEEDED = 0.0
 # Gain in its standard errors from which it is not by chance of a few stretches.
@@ -64,6 +66,8 @@ class Search:
         What was tried and what came of it, one line each.
     removed : list of str
         Causes taken out again: others that came later do what they did.
+    largest : float
+        Largest evidence of an accepted cause, nats.
     stopped : bool
         Whether the search ended because it took too long.
 
@@ -74,6 +78,7 @@ class Search:
     rivals: dict[str, list[str]] = field(default_factory=dict)
     log: list[str] = field(default_factory=list)
     removed: list[str] = field(default_factory=list)
+    largest: float = 0.0
     stopped: bool = False
 
 
@@ -115,7 +120,7 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
         for tier in range(TIERS if latent and len(hidden) < MOST_LATENT else 1):
             # Measured inputs first: what is latent can imitate them, and costs more.
             trials += trials_of(samples, search.composite, values, given, tier, bank, only)
-            good = [trial for trial in trials if trial.evidence > _least(trial.name)
+            good = [trial for trial in trials if trial.evidence > _least(trial.name, search)
                     and (not (is_measured(catalogue()[trial.name]) and _ragged(values))
                          or _throughout(trial.composite, search.composite))]
             if good:
@@ -138,6 +143,7 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
                                       if t is not best))
         search.composite = best.composite
         search.accepted.append(best.name)
+        search.largest = max(search.largest, best.evidence)
         _other_means(samples, search, trials)
         after = criticise(samples, search.composite, bank)
         if best.name == 'tone':
@@ -158,9 +164,12 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
     return search
 
 
-def _least(name: str) -> float:
+def _least(name: str, search: Search) -> float:
     """Return the evidence from which a cause is accepted."""
     kind = catalogue()[name]
+    if name == 'drift':
+        # Time mends a little of whatever the form of a larger effect leaves.
+        return max(ACCEPT, _FORM * search.largest)
     return ACCEPT_MEAN if is_measured(kind) and kind.ROLE is Role.MEAN else ACCEPT
 
 
@@ -183,13 +192,13 @@ def _other_means(samples: Samples, search: Search, trials: Sequence[Trial]) -> N
     for trial in trials:
         kind = catalogue()[trial.name]
         if trial.name == last or kind.ROLE is not Role.MEAN or not is_measured(kind) or (
-                trial.evidence < ACCEPT_MEAN or not is_measured(catalogue()[last])):
+                trial.evidence < _least(trial.name, search) or not is_measured(catalogue()[last])):
             continue
         composite = search.composite
         view = view_of(samples, composite.gaussian, composite.z, samples.train)
         made = best_start(samples, composite, kind, view)
         gain = -math.inf if made is None else made.score(samples) - composite.score(samples)
-        if made is not None and gain > ACCEPT_MEAN:
+        if made is not None and gain > _least(trial.name, search):
             search.log.append(f'{trial.name}: {gain:.1f} nats beside it')
             search.composite = made
             search.accepted.append(trial.name)
