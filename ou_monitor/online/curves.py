@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from ou_monitor.online.curve_blocks import Pool, Squares, STEADY
 from ou_monitor.online.hat_filter import BINS, CurvePrior, HatFilter
+from ou_monitor.online.wander import Wander
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN
 from scipy.signal import lfilter
 
@@ -124,6 +125,7 @@ class LearnedCurves:
         self._settled = -math.inf
         self._pool = Pool()
         self._squares = Squares()
+        self._wander = Wander()
 
     @property
     def forgetting(self) -> float:
@@ -220,6 +222,11 @@ class LearnedCurves:
         """Return ln(sigma), of sigma in V/sqrt(s), at a throttle."""
         values, errors = self.sigma_curve(np.array([throttle]))
         return CurvePoint(values.item(), errors.item())
+
+    @property
+    def wander(self) -> Wander:
+        """Return how ln(sigma) goes beside the curve: where it is now, and how fast it walks."""
+        return self._wander
 
     def seen(self, throttle: float) -> bool:
         """Whether data within half the distance of two nodes weigh more than the prior."""
@@ -356,6 +363,7 @@ class LearnedCurves:
             throttle, value, variance = found
             if not self._intensity.started:
                 self._intensity.start(value, _INTENSITY)
+            self._wander.correct(value - self._intensity.value(throttle), variance)
             self._intensity.correct(throttle, value, variance)
         if not self._level.started:
             self._scale = abs(pool.voltage) or 1.0
@@ -373,6 +381,7 @@ class LearnedCurves:
     def _elapse(self, dt: float) -> None:
         self._level.predict(dt)
         self._intensity.predict(dt)
+        self._wander.elapse(dt)
 
 
 def _follow(u: FloatArray, before: float, a: float) -> FloatArray:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.online.estimator import SlidingEstimator
 from ou_monitor.online.flag import BrownoutFlag, FlagLevel, FlagState
-from ou_monitor.online.risk import brownout_probability
+from ou_monitor.online.outlook import Outlook
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, Flag, NAN, Status
 
@@ -48,6 +48,8 @@ class MonitorReport:
     budget : float
         Highest throttle, 0..1, that keeps the risk under
         `brownout.budget_limit`; NaN when not known.
+    budget_reason : str
+        What ends the budget, or why it is not known.
     flag : FlagState
         The brown-out flag, and why.
     level : Level
@@ -62,6 +64,7 @@ class MonitorReport:
     estimate: Estimate
     risk: float
     budget: float
+    budget_reason: str
     flag: FlagState
     level: Level
     summary: str
@@ -86,6 +89,7 @@ class MonitorReport:
         values['brownout_level_age'] = self.flag.age
         values['brownout_reason'] = self.flag.reason
         values['throttle_budget'] = self.budget
+        values['throttle_budget_reason'] = self.budget_reason
         values['age'] = self.age
         values['status'] = e.status.name
         values['status_text'] = e.status.value
@@ -113,6 +117,8 @@ class SupplyMonitor:
         self._settings = settings or MonitorSettings()
         self._estimator = SlidingEstimator(self._settings.window)
         self._flag = BrownoutFlag(self._settings)
+        self._outlook = Outlook()
+        self._newest = Estimate()
         self._model = model
         self._reset_reason = ''
 
@@ -142,6 +148,7 @@ class SupplyMonitor:
         """Add samples; see `SlidingEstimator.push`."""
         self._estimator.push(t, voltage, throttle)
         self._flag.push(t, voltage)
+        self._outlook.push(t, voltage, throttle, self._newest)
 
     def clear_brownout(self) -> str:
         """
@@ -161,6 +168,7 @@ class SupplyMonitor:
         """Clear the window, and remember why for the next reports; the flag stays held."""
         self._estimator.reset()
         self._flag.new_time_line()
+        self._outlook.new_time_line()
         self._reset_reason = reason
 
     def report(self, age: float | None, now: float | None = None) -> MonitorReport:
@@ -181,23 +189,15 @@ class SupplyMonitor:
             The report.
 
         """
-        e = self._estimator.estimate()
+        e = self._newest = self._estimator.estimate()
         silent = math.inf if age is None else max(age, 0.0)
         stale = silent > self._settings.stale_after or e.status is Status.NO_DATA
-        risk = NAN if stale else self._risk(e)
-        budget = NAN if stale else self._budget(e)
+        risk = NAN if stale else self._outlook.risk(e, self._settings)
+        budget = None if stale else self._outlook.budget(e, self._settings)
         flag = self._flag.update(e.t + silent if now is None else now, risk, fresh=not stale)
         level, summary = self._judge(e, risk, flag, self._silence(age, e) if stale else '')
-        return MonitorReport(e, risk, budget, flag, level, summary, silent)
-
-    def _risk(self, e: Estimate) -> float:
-        """Return the probability of a brown-out within the horizon; NaN when not known."""
-        s = self._settings
-        return brownout_probability(e, s.brownout_voltage, s.brownout_horizon, e.voltage)
-
-    def _budget(self, e: Estimate) -> float:
-        """Return the throttle budget; with no curve learned it is not known."""
-        return NAN
+        return MonitorReport(e, risk, NAN if budget is None else budget.throttle,
+                             '' if budget is None else budget.reason, flag, level, summary, silent)
 
     def _silence(self, age: float | None, e: Estimate) -> str:
         if age is not None and age > self._settings.stale_after:

@@ -1,0 +1,211 @@
+"""
+How the brown-out risk compares with what happens, and with the alarms that fly.
+
+    python benchmarks/risk.py calibration --table doc/risk.md --figure doc/risk_reliability.svg
+    python benchmarks/risk.py alarms --table doc/risk.md --figure doc/risk_alarms.svg
+    python benchmarks/risk.py cost --table doc/risk.md
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from datetime import date
+import math
+from pathlib import Path
+import sys
+import time
+
+import numpy as np
+from ou_monitor import brownout_probability
+from ou_monitor.offline.report.svg import Plot
+from ou_monitor.records import Estimate, Status
+from risk_alarms import METHODS, Score, score, settings, timelines
+from risk_flights import fly
+from risk_scores import brier, Horizon, predict, reliability
+from tables import number, table
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+SEED = 20261121
+# Flights simulated at once: bounds memory.
+_BATCH = 100
+# Predictions within this factor of what is observed are called calibrated.
+_FACTOR = 1.5
+
+
+def _told(what: str, of: int) -> Callable[[], None]:
+    """Return what to call after each of so many steps: tells how far it is."""
+    done, begin = [0], time.monotonic()
+
+    def tell() -> None:
+        done[0] += 1
+        if done[0] % 20 == 0 or done[0] == of:
+            rest = (time.monotonic() - begin) / done[0] * (of - done[0])
+            print(f'{what}: {done[0]}/{of}, about {rest:.0f} s left', file=sys.stderr)
+    return tell
+
+
+def calibration(given: argparse.Namespace) -> tuple[str, str]:
+    """Return a table and a reliability diagram."""
+    found: list[Horizon] = []
+    tell = _told('flights', given.flights)
+    for begin in range(0, given.flights, _BATCH):
+        rng = np.random.default_rng([given.seed, begin])
+        count = min(_BATCH, given.flights - begin)
+        flights = fly(rng, count, given.seconds)
+        levels = flights.level - flights.spread * rng.uniform(1.5, 6.0, count)
+        found += predict(flights, levels, given.horizon, given.horizon, tell)
+    steady = [h for h in found if h.steady]
+    parts = [_reliability_table(
+        f'Throttle stays as it is within the horizon: {len(steady)} horizons of '
+        f'{given.horizon:g} s, {sum(h.happened for h in steady)} brown-outs', steady)]
+    parts.append(_reliability_table(
+        f'Throttle may change within the horizon: {len(found)} horizons, '
+        f'{sum(h.happened for h in found)} brown-outs', found))
+    return '\n\n'.join(parts), _reliability_figure(steady)
+
+
+def _columns(found: Sequence[Horizon], method: str) -> tuple[np.ndarray, np.ndarray]:
+    return (np.array([h.predicted[method] for h in found]),
+            np.array([h.happened for h in found], dtype=float))
+
+
+def _reliability_table(title: str, found: Sequence[Horizon]) -> str:
+    methods = list(found[0].predicted)
+    base = float(np.mean([h.happened for h in found]))
+    rows = []
+    for method in methods:
+        predicted, happened = _columns(found, method)
+        score_ = brier(predicted, happened)
+        rows.append([method, f'{score_:.4f}', f'{1.0 - score_ / (base * (1.0 - base)):.3f}'])
+    text = [f'**{title}**', '', table(['method', 'Brier score', 'skill'], rows), '']
+    for method in methods[:1]:
+        rows = []
+        for b in reliability(*_columns(found, method)):
+            low, high = b.interval
+            ratio = b.observed / b.predicted
+            inside = low <= b.predicted * _FACTOR and high >= b.predicted / _FACTOR
+            rows.append([f'{b.low:g}..{b.high:g}', str(b.count), number(b.predicted, '.3g'),
+                         number(b.observed, '.3g'), f'{low:.2g}..{high:.2g}',
+                         f'{ratio:.2f}', 'yes' if 1 / _FACTOR <= ratio <= _FACTOR
+                         else 'not refuted' if inside else 'no'])
+        text += [f'{method[0].upper()}{method[1:]}:', '', table(
+            ['predicted', 'horizons', 'mean', 'observed', '95 % interval', 'observed / predicted',
+             f'within {_FACTOR:g}'], rows)]
+    return '\n'.join(text)
+
+
+def _reliability_figure(found: Sequence[Horizon]) -> str:
+    plot = Plot('Predicted and observed probability of a brown-out', 'predicted', 'observed',
+                width=620, height=460, log_x=True, log_y=True)
+    line = np.geomspace(1e-4, 1.0, 50)
+    plot.line(line, line, 'as predicted', 7, 'dash')
+    plot.band(line, line / _FACTOR, np.minimum(line * _FACTOR, 1.0), f'within {_FACTOR:g}', 7)
+    for colour, method in enumerate(found[0].predicted):
+        bins = [b for b in reliability(*_columns(found, method)) if b.hits]
+        x = np.array([b.predicted for b in bins])
+        plot.line(x, np.array([b.observed for b in bins]), method, colour, 'thick')
+        if colour == 0:
+            for b in bins:
+                low, high = b.interval
+                plot.line(np.array([b.predicted] * 2), np.array([max(low, 1e-5), high]), '', 0)
+    return plot.svg()
+
+
+def alarms(given: argparse.Namespace) -> tuple[str, str]:
+    """Return a table of alarms at equal misses, and curves of both."""
+    lines = []
+    tell = _told('flights', given.flights)
+    for begin in range(0, given.flights, _BATCH):
+        rng = np.random.default_rng([given.seed, 1, begin])
+        count = min(_BATCH, given.flights - begin)
+        flights = fly(rng, count, given.seconds)
+        levels = flights.level - flights.spread * rng.uniform(3.5, 9.0, count)
+        lines += timelines(flights, levels, given.horizon, tell)
+    outs = sum(math.isfinite(line.brownout) for line in lines)
+    plot = Plot('Alarms for nothing against brown-outs missed', 'brown-outs missed (share)',
+                'false alarms per hour', width=620, height=460, log_y=True)
+    rows = []
+    for colour, method in enumerate(METHODS):
+        scores = [score(lines, method, s) for s in settings(lines, method)]
+        if method == METHODS[0]:
+            fixed = [score(lines, method, s) for s in (0.01, 0.1)]
+            rows += [[f'{method}, from {s.setting:g}', f'{s.missed:.2f}',
+                      number(s.false_per_hour, '.3g'), number(s.lead, '.2g')] for s in fixed]
+        plot.line(np.array([s.missed for s in scores]),
+                  np.array([max(s.false_per_hour, 0.05) for s in scores]), method, colour, 'thick')
+        for missed in (0.1, 0.3):
+            best = _at(scores, missed)
+            rows.append([f'{method}, {missed:.0%} missed at most', f'{best.missed:.2f}',
+                         number(best.false_per_hour, '.3g'), number(best.lead, '.2g')]
+                        if best else [f'{method}, {missed:.0%} missed at most', '-', '-', '-'])
+    hours = sum(line.t[-1] - line.t[0] for line in lines if line.t.size) / 3600.0
+    text = (f'**{len(lines)} flights, {hours:.1f} hours, {outs} brown-outs; an alarm counts that '
+            'is on half a second before**\n\n' + table(
+                ['alarm', 'missed', 'false alarms per hour', 'median lead, s'], rows))
+    return text, plot.svg()
+
+
+def _at(scores: Sequence[Score], missed: float) -> Score | None:
+    """Return the setting with the fewest false alarms that misses no more than a share."""
+    good = [s for s in scores if s.missed <= missed]
+    return min(good, key=lambda s: s.false_per_hour) if good else None
+
+
+def cost(given: argparse.Namespace) -> tuple[str, str]:
+    """Return the time of an evaluation, beside a bare comparison and an estimate."""
+    e = Estimate(t=0.0, alpha=63.0, sigma=0.632, var_inf=0.632**2 / 126.0, u0=5.0, alpha_se=0.15,
+                 sigma_se=0.02, var_inf_se=0.15, u0_se=0.005, noise_std=0.005, rate=1000.0,
+                 n=2000, duration=2.0, status=Status.OK)
+    rows = []
+    for watch in ('continuous', 'sampled'):
+        brownout_probability(e, 4.8, 5.0, 4.95, watch=watch)
+        took = []
+        for k in range(given.flights):
+            begin = time.perf_counter()
+            brownout_probability(e, 4.7 + 0.0001 * k, 5.0, 4.95, watch=watch)
+            took.append(time.perf_counter() - begin)
+        p50, p99 = np.quantile(took, [0.5, 0.99]) * 1e3
+        rows.append([watch, f'{p50:.3f}', f'{p99:.3f}'])
+    return table(['path', 'p50, ms', 'p99, ms'], rows), ''
+
+
+def _write(given: argparse.Namespace, text: str, drawing: str) -> None:
+    stamp = f'{date.today().isoformat()}, seed {given.seed}.'
+    if given.table:
+        begin, end = f'<!-- {given.part} begins -->', f'<!-- {given.part} ends -->'
+        old = given.table.read_text(encoding='utf-8')
+        if begin not in old or end not in old:
+            raise SystemExit(f'{given.table} has no lines "{begin}" and "{end}"')
+        head, rest = old.split(begin, 1)
+        given.table.write_text(f'{head}{begin}\n{stamp}\n\n{text}\n{end}{rest.split(end, 1)[1]}',
+                               encoding='utf-8')
+    else:
+        print(text)
+    if given.figure and drawing:
+        given.figure.write_text(drawing, encoding='utf-8')
+
+
+def main() -> int:
+    """Parse arguments, measure, write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parts = parser.add_subparsers(dest='part', required=True)
+    for name, action, flights, seconds in (('calibration', calibration, 2000, 24.0),
+                                           ('alarms', alarms, 300, 60.0),
+                                           ('cost', cost, 2000, 0.0)):
+        part = parts.add_parser(name, help=action.__doc__)
+        part.set_defaults(action=action)
+        part.add_argument('--flights', type=int, default=flights)
+        part.add_argument('--seconds', type=float, default=seconds, help='of each flight')
+        part.add_argument('--horizon', type=float, default=2.0, help='s')
+        part.add_argument('--seed', type=int, default=SEED)
+        part.add_argument('--table', type=Path)
+        part.add_argument('--figure', type=Path)
+    given = parser.parse_args()
+    _write(given, *given.action(given))
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,143 @@
+"""What is predicted of flights, and what then happened."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from ou_monitor import brownout_probability, SlidingEstimator
+from ou_monitor.records import Estimate
+from risk_flights import Flights, RATE
+from scipy.special import ndtr
+from scipy.stats import beta
+
+# Seconds before the first prediction, and between looks.
+WARM, WINDOW = 3.0, 2.0
+# Edges of the bins of predicted probability.
+EDGES = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """
+    One prediction, and what happened.
+
+    Attributes
+    ----------
+    flight : int
+        Number of the flight.
+    t : float
+        When it was made, s.
+    predicted : dict of str to float
+        Probability by method.
+    happened : bool
+        Whether the path went below the level within the horizon.
+    steady : bool
+        Whether throttle did not change within the horizon.
+
+    """
+
+    flight: int
+    t: float
+    predicted: dict[str, float]
+    happened: bool
+    steady: bool
+
+
+def stationary(e: Estimate, level: float) -> float:
+    """Return the paper's P(|U - U0| > delta): the share of time, both sides."""
+    return 2.0 * float(ndtr(-(e.u0 - level) / math.sqrt(e.var_inf)))
+
+
+def certain(e: Estimate, level: float, horizon: float) -> float:
+    """Return the first-passage risk as if the estimate had no errors."""
+    from dataclasses import replace
+    known = replace(e, alpha_se=0.0, sigma_se=0.0, var_inf_se=0.0, u0_se=0.0)
+    return brownout_probability(known, level, horizon, e.voltage)
+
+
+def predict(flights: Flights, levels: np.ndarray, horizon: float, every: float,
+            progress: Callable[[], None]) -> Iterator[Horizon]:
+    """
+    Predict, every so often, over horizons that do not overlap.
+
+    Parameters
+    ----------
+    flights : Flights
+        What is flown.
+    levels : ndarray, shape (flights,)
+        Brown-out voltage of each, V.
+    horizon : float
+        Time ahead, s.
+    every : float
+        From one prediction to the next, s; at least the horizon.
+    progress : callable
+        Called after each flight.
+
+    Yields
+    ------
+    Horizon
+        Where the estimate is usable and the rail not already below.
+
+    """
+    count, ahead = flights.t.size, round(horizon * RATE)
+    for f, level in enumerate(levels.tolist()):
+        estimator, done = SlidingEstimator(WINDOW), 0
+        v, u = flights.voltage[f].astype(np.float64), flights.throttle[f]
+        for at in range(round(WARM * RATE), count - ahead, round(every * RATE)):
+            for begin in range(done, at, 50):
+                part = slice(begin, min(begin + 50, at))
+                estimator.push(flights.t[part], v[part], u[part])
+            done = at
+            e = estimator.estimate()
+            if not e.usable or v[at - 1] <= level or flights.path[f, at - 1] <= level:
+                continue
+            yield Horizon(f, float(flights.t[at - 1]), {
+                'first passage, errors averaged': brownout_probability(
+                    e, level, horizon, e.voltage),
+                'first passage, errors ignored': certain(e, level, horizon),
+                'stationary, as the paper': stationary(e, level),
+            }, bool(flights.low[f, at:at + ahead].min() < level),
+                bool((u[at:at + ahead] == u[at - 1]).all()))
+        progress()
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Predictions that are alike: how many, their mean, and how often it happened."""
+
+    low: float
+    high: float
+    count: int
+    predicted: float
+    hits: int
+
+    @property
+    def observed(self) -> float:
+        """Return the share that happened."""
+        return self.hits / self.count
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Return the 95 % interval of the share (Clopper & Pearson 1934)."""
+        k, n = self.hits, self.count
+        return (float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0,
+                float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0)
+
+
+def reliability(predicted: np.ndarray, happened: np.ndarray) -> list[Bin]:
+    """Return the reliability diagram."""
+    bins = []
+    for low, high in zip(EDGES[:-1], EDGES[1:]):
+        inside = (predicted >= low) & (predicted < (high if high < 1.0 else 2.0))
+        if inside.any():
+            bins.append(Bin(low, high, int(inside.sum()), float(predicted[inside].mean()),
+                            int(happened[inside].sum())))
+    return bins
+
+
+def brier(predicted: np.ndarray, happened: np.ndarray) -> float:
+    """Return the Brier score: mean square of probability less outcome."""
+    return float(np.mean((predicted - happened) ** 2))

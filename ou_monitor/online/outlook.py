@@ -1,0 +1,127 @@
+"""
+What lies ahead of the supply: the risk at the present throttle, and the throttle that is left.
+
+The window knows the supply of the last seconds; the curves learned in flight know
+the intensity of the present throttle, which after a step is not that of the
+window; and how fast the intensity has been seen to wander tells what may become of
+it within the horizon.
+
+Limits: throttle stays as it is; a throttle not flown before has the error of the
+curves' prior; the terms of a model file count as `ExtendedPassage` says.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.online.budget import throttle_budget, ThrottleBudget
+from ou_monitor.online.curves import LearnedCurves
+from ou_monitor.online.risk import as_sampled, risk_of, Supply
+from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.records import Estimate, FloatArray, NAN
+
+# Share of the walk of ln sigma within the horizon that counts: the risk is of all of it,
+# not of its end, but the largest sigma counts most.
+_SHARE = 0.8
+# Largest error of ln sigma that is averaged over: beyond it sigma is unknown.
+_LARGEST = 1.0
+# Newest voltages of which the middle one is where the supply is now: one bad sample is
+# no brown-out.
+_NEWEST = 3
+
+
+class Outlook:
+    """Risk and throttle budget of one supply."""
+
+    def __init__(self) -> None:
+        self._curves = LearnedCurves()
+        self._newest = np.empty(0)
+
+    @property
+    def curves(self) -> LearnedCurves:
+        """Return what has been learned in flight."""
+        return self._curves
+
+    def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike, throttle: npt.ArrayLike | None,
+             estimate: Estimate) -> None:
+        """Learn from samples, given the newest estimate; see `LearnedCurves.update`."""
+        volts = np.atleast_1d(np.asarray(voltage, dtype=np.float64))[-64:]
+        last = np.concatenate((self._newest, volts[np.isfinite(volts)]))
+        self._newest = last[-_NEWEST:]
+        self._curves.update(t, voltage, throttle, estimate)
+
+    def new_time_line(self) -> None:
+        """Forget where the supply was last; what throttle does to it stays learned."""
+        self._newest = np.empty(0)
+
+    @property
+    def voltage(self) -> float:
+        """Where the supply is now, V: the middle one of the last three samples."""
+        return float(np.median(self._newest)) if self._newest.size else NAN
+
+    def supply(self, e: Estimate, horizon: float) -> Supply:
+        """
+        Return what is known of the supply at the present throttle.
+
+        Parameters
+        ----------
+        e : Estimate
+            Usable.
+        horizon : float
+            Time ahead for which it is to hold, s.
+
+        Returns
+        -------
+        Supply
+            One.
+
+        """
+        plain = Supply.of(e)
+        if math.isnan(e.throttle):
+            return plain
+        sigma, level = self._curves.sigma_at(e.throttle), self._curves.level_at(e.throttle)
+        if not (math.isfinite(sigma.value) and math.isfinite(level.value)):
+            return plain
+        u0, u0_se = plain.u0, plain.u0_se
+        if level.se < float(np.asarray(u0_se)):
+            u0, u0_se = level.value, level.se
+        ln_sigma, error = self._ahead(np.array([sigma.value]), np.array([sigma.se]), horizon)
+        return Supply(u0, u0_se, plain.ln_alpha, plain.ln_alpha_se, ln_sigma.item(), error.item())
+
+    def _ahead(self, ln_sigma: FloatArray, error: FloatArray, horizon: float
+               ) -> tuple[FloatArray, FloatArray]:
+        """Return ln sigma with what it wanders, and the error of that within the horizon."""
+        wander = self._curves.wander
+        variance = error**2 + wander.variance + _SHARE * wander.speed * horizon
+        return ln_sigma + wander.value, np.minimum(np.sqrt(variance), _LARGEST)
+
+    def risk(self, e: Estimate, settings: MonitorSettings) -> float:
+        """Return the probability of a brown-out within the horizon; NaN when not known."""
+        s, now = settings, self.voltage
+        if now <= s.brownout_voltage:
+            return 1.0
+        if not e.usable:
+            return NAN
+        here = None if math.isnan(now) else now
+        supply = self.supply(e, s.brownout_horizon)
+        risk = float(risk_of(supply, s.brownout_voltage, s.brownout_horizon, here, e.noise_std))
+        if s.brownout_watch == 'continuous':
+            return risk
+        return as_sampled(e, supply, s.brownout_voltage, s.brownout_horizon, here, risk)
+
+    def budget(self, e: Estimate, settings: MonitorSettings) -> ThrottleBudget:
+        """Return the throttle budget; its throttle is NaN when not known."""
+        s = settings
+
+        def probability(u0: FloatArray, u0_se: FloatArray, ln_sigma: FloatArray,
+                        ln_sigma_se: FloatArray, ln_alpha: FloatArray, ln_alpha_se: FloatArray
+                        ) -> FloatArray:
+            ln_sigma, ln_sigma_se = self._ahead(ln_sigma, ln_sigma_se, s.brownout_horizon)
+            return risk_of(Supply(u0, u0_se, ln_alpha, ln_alpha_se, ln_sigma, ln_sigma_se),
+                           s.brownout_voltage, s.brownout_horizon, coarse=True)
+
+        return throttle_budget(e, self._curves, voltage=s.brownout_voltage,
+                               horizon=s.brownout_horizon, limit=s.budget_limit,
+                               probability=probability)
