@@ -129,13 +129,16 @@ def alarms(given: argparse.Namespace) -> tuple[str, str]:
     rows = []
     for colour, method in enumerate(METHODS):
         scores = [score(lines, method, s) for s in settings(lines, method)]
-        if method == METHODS[0]:
-            fixed = [score(lines, method, s) for s in (0.01, 0.1)]
-            rows += [[f'{method}, from {s.setting:g}', f'{s.missed:.2f}',
-                      number(s.false_per_hour, '.3g'), number(s.lead, '.2g')] for s in fixed]
+        if method == METHODS[2]:
+            flag = score(lines, method, 0.5)
+            rows.append([method, f'{flag.missed:.2f}', number(flag.false_per_hour, '.3g'),
+                         number(flag.lead, '.2g')])
+            plot.line(np.array([flag.missed - 0.01, flag.missed + 0.01]),
+                      np.array([flag.false_per_hour] * 2), method, colour, 'thick')
+            continue
         plot.line(np.array([s.missed for s in scores]),
                   np.array([max(s.false_per_hour, 0.05) for s in scores]), method, colour, 'thick')
-        for missed in (0.1, 0.3):
+        for missed in (0.1, 0.2, 0.3):
             best = _at(scores, missed)
             rows.append([f'{method}, {missed:.0%} missed at most', f'{best.missed:.2f}',
                          number(best.false_per_hour, '.3g'), number(best.lead, '.2g')]

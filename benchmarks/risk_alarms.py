@@ -7,13 +7,16 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor import brownout_probability, SlidingEstimator
+from ou_monitor.online.flag import FlagLevel
+from ou_monitor.online.monitor import SupplyMonitor
 from risk_flights import Flights, RATE
-from risk_scores import stationary, WARM, WINDOW
+from risk_scores import monitor_settings, stationary, WARM
 
 # Seconds between looks; an alarm is in time that is on at a look from `AFTER` to `LEAD`
 # before the brown-out, s, and one is for nothing that no brown-out follows within `AFTER`.
 LOOK, LEAD, AFTER = 0.1, 0.5, 5.0
+# Looks that are taken together: what lasts is told from a dip.
+_STEADY = 5
 # Continuous time below a threshold before ArduPilot acts (BATT_LOW_TIMER), s.
 TIMER = 10.0
 
@@ -47,30 +50,32 @@ def timelines(flights: Flights, levels: np.ndarray, horizon: float,
     for f, level in enumerate(levels.tolist()):
         below = np.flatnonzero(flights.low[f] < level)
         end = int(below[0]) if below.size else flights.t.size
-        estimator = SlidingEstimator(WINDOW)
+        monitor, risks = SupplyMonitor(monitor_settings(level, horizon)), [math.nan] * _STEADY
         v, u = flights.voltage[f].astype(np.float64), flights.throttle[f]
         t, rows = [], []
         for at in range(step, end, step):
             part = slice(at - step, at)
-            estimator.push(flights.t[part], v[part], u[part])
+            monitor.push(flights.t[part], v[part], u[part])
+            report = monitor.report(0.0)
+            e = report.estimate
+            risks = [*risks[1:], report.risk]
             if at < WARM * RATE:
                 continue
-            e = estimator.estimate()
-            risk = brownout_probability(e, level, horizon, e.voltage)
             paper = stationary(e, level) if e.usable else math.nan
             t.append(flights.t[at - 1])
             # How low the last look went, and how high the last ten seconds.
-            rows.append((risk, paper, level - v[part].min(),
+            rows.append((report.risk, min(risks), float(report.flag.level is FlagLevel.CRITICAL), paper, level - v[part].min(),
                          level - v[max(0, at - round(TIMER * RATE)):at].max()
                          if at >= TIMER * RATE else -math.inf))
-        table = np.array(rows).reshape(-1, 4).T
+        table = np.array(rows).reshape(-1, len(METHODS)).T
         made.append(Timeline(np.array(t), dict(zip(METHODS, table)),
                              float(flights.t[end]) if below.size else math.inf))
         progress()
     return made
 
 
-METHODS = ('first passage', 'stationary, as the paper', 'threshold on the voltage',
+METHODS = ('published risk', 'published risk, lowest of 0.5 s', 'flag, as set by default',
+           'stationary, as the paper', 'threshold on the voltage',
            'threshold with a timer of 10 s')
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from ou_monitor import brownout_probability, SlidingEstimator
+from ou_monitor import brownout_probability
+from ou_monitor.online.monitor import SupplyMonitor
+from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate
 from risk_flights import Flights, RATE
 from scipy.special import ndtr
@@ -15,6 +17,9 @@ from scipy.stats import beta
 
 # Seconds before the first prediction, and between looks.
 WARM, WINDOW = 3.0, 2.0
+# Samples from one report of the monitor to the next.
+STEP = 50
+PUBLISHED = 'published risk'
 # Edges of the bins of predicted probability.
 EDGES = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 
@@ -46,6 +51,12 @@ class Horizon:
     steady: bool
 
 
+def monitor_settings(level: float, horizon: float) -> MonitorSettings:
+    """Return the defaults but for the level, the horizon and a floor that would answer for it."""
+    return MonitorSettings(window=WINDOW, brownout_voltage=level, brownout_horizon=horizon,
+                           brownout_floor=0.0)
+
+
 def stationary(e: Estimate, level: float) -> float:
     """Return the paper's P(|U - U0| > delta): the share of time, both sides."""
     return 2.0 * float(ndtr(-(e.u0 - level) / math.sqrt(e.var_inf)))
@@ -53,7 +64,6 @@ def stationary(e: Estimate, level: float) -> float:
 
 def certain(e: Estimate, level: float, horizon: float) -> float:
     """Return the first-passage risk as if the estimate had no errors."""
-    from dataclasses import replace
     known = replace(e, alpha_se=0.0, sigma_se=0.0, var_inf_se=0.0, u0_se=0.0)
     return brownout_probability(known, level, horizon, e.voltage)
 
@@ -84,20 +94,21 @@ def predict(flights: Flights, levels: np.ndarray, horizon: float, every: float,
     """
     count, ahead = flights.t.size, round(horizon * RATE)
     for f, level in enumerate(levels.tolist()):
-        estimator, done = SlidingEstimator(WINDOW), 0
+        monitor = SupplyMonitor(monitor_settings(level, horizon))
         v, u = flights.voltage[f].astype(np.float64), flights.throttle[f]
-        for at in range(round(WARM * RATE), count - ahead, round(every * RATE)):
-            for begin in range(done, at, 50):
-                part = slice(begin, min(begin + 50, at))
-                estimator.push(flights.t[part], v[part], u[part])
-            done = at
-            e = estimator.estimate()
-            if not e.usable or v[at - 1] <= level or flights.path[f, at - 1] <= level:
+        for at in range(STEP, count - ahead, STEP):
+            part = slice(at - STEP, at)
+            monitor.push(flights.t[part], v[part], u[part])
+            report = monitor.report(0.0)
+            e = report.estimate
+            if at < WARM * RATE or at % round(every * RATE) or not e.usable or (
+                    v[at - 1] <= level or flights.path[f, at - 1] <= level):
                 continue
             yield Horizon(f, float(flights.t[at - 1]), {
-                'first passage, errors averaged': brownout_probability(
+                PUBLISHED: report.risk,
+                'window alone, errors averaged': brownout_probability(
                     e, level, horizon, e.voltage),
-                'first passage, errors ignored': certain(e, level, horizon),
+                'window alone, errors ignored': certain(e, level, horizon),
                 'stationary, as the paper': stationary(e, level),
             }, bool(flights.low[f, at:at + ahead].min() < level),
                 bool((u[at:at + ahead] == u[at - 1]).all()))
