@@ -23,8 +23,7 @@ from ou_monitor.records import Estimate, Flag, FloatArray, NAN
 from scipy.signal import lfilter
 
 # Samples are looked at in blocks of this length, s, and of this many samples or more.
-_BLOCK = 0.05
-_FEWEST = 32
+_BLOCK, _FEWEST = 0.05, 32
 # A slow source is not waited for longer than this, s.
 _PATIENCE = 0.5
 # Blocks are pooled into one observation over this time, s.
@@ -37,9 +36,8 @@ _SPREAD = 0.125
 _OUTSIDE = 0.05
 # After a pause the rail is given this many relaxation times.
 _SETTLE = 5.0
-# A pause without samples, s, and steps, that starts the blocks afresh.
-_PAUSE = 0.25
-_PAUSE_STEPS = 10.0
+# A pause without samples, s, and in steps, that starts the blocks afresh.
+_PAUSE, _PAUSE_STEPS = 0.25, 10.0
 # A step back in time, s, that is a clock set back; what time has gone by then is not known.
 _BACK = 1.0
 _UNKNOWN_TIME = 60.0
@@ -152,7 +150,7 @@ class LearnedCurves:
 
     @property
     def scatter(self) -> tuple[float, float]:
-        """Return mean squared misses of level and intensity against what was expected; 1 is right."""
+        """Return `HatFilter.scatter` of level and intensity: 1 when the errors are right."""
         return self._level.scatter, self._intensity.scatter
 
     @property
@@ -185,8 +183,7 @@ class LearnedCurves:
 
         """
         self._usable = estimate.usable
-        if self._usable:
-            self._estimate = estimate
+        self._estimate = estimate if self._usable else self._estimate
         if throttle is None:
             return
         stamps, volts, load = _column(t), _column(voltage), _column(throttle)
@@ -197,8 +194,7 @@ class LearnedCurves:
                              f'{stamps.shape}, {volts.shape} and {load.shape}')
         if not stamps.size:
             return
-        if not self._pending:
-            self._begin = stamps.item(0)
+        self._begin = self._begin if self._pending else stamps.item(0)
         self._pending.append((stamps, volts, load))
         self._waiting += stamps.size
         span = abs(stamps.item(-1) - self._begin)
@@ -254,9 +250,9 @@ class LearnedCurves:
         if not math.isfinite(float(v @ u)) or not math.isfinite(float(t @ u)):
             self._throttle_known = self._throttle_known or bool(np.isfinite(u).any())
             good = np.isfinite(t) & np.isfinite(v) & np.isfinite(u)
-            t, v, u = t[good], v[good], u[good]
-            if not t.size:
+            if not good.any():
                 return
+            t, v, u = t[good], v[good], u[good]
         self._throttle_known = True
         steps = t[1:] - t[:-1]
         mean = (t.item(-1) - t.item(0)) / max(t.size - 1, 1)
@@ -281,10 +277,10 @@ class LearnedCurves:
                 self._clock = t.item(0)
                 self._followed = NAN
             else:
+                if self._newest >= t.item(-1):
+                    return
                 late = int(np.searchsorted(t, self._newest, 'right'))
                 t, v, u = t[late:], v[late:], u[late:]
-                if not t.size:
-                    return
         elif t.item(0) - self._newest > pause:
             self._followed = NAN
         e = self._estimate
@@ -294,10 +290,10 @@ class LearnedCurves:
             even = False
         n = t.size
         self._newest = t.item(-1)
-        pieces = max(1, min(int((self._newest - t.item(0)) / _BLOCK), n // _FEWEST))
         if e is None or n < 2:
             self._followed = NAN
             return
+        pieces = max(1, min(int((self._newest - t.item(0)) / _BLOCK), n // _FEWEST))
         edges = [n * k // pieces for k in range(pieces + 1)]
         for begin, end in zip(edges, edges[1:]):
             self._block(t[begin:end], v[begin:end], u[begin:end], e, even)
