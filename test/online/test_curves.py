@@ -160,14 +160,10 @@ def test_steps_of_throttle_do_not_bend_the_curve():
     rng = np.random.default_rng(7)
     t, y = fly(rng, throttle, log_sigma=lambda u: np.full(u.shape, -4.0))
     curves = LearnedCurves()
-    # Blocks that begin with a step: throttle does not move within them.
-    learn(curves, t, y, throttle, truth(sigma=math.exp(-4.0), var_inf=math.exp(-8.0) / 126.0),
-          125)
+    learn(curves, t, y, throttle, truth(sigma=math.exp(-4.0), var_inf=math.exp(-8.0) / 126.0))
     for u in (0.2, 0.7):
         # One step unheeded would be 0.16 V * 16 ms / 50 ms = 50 mV in its block.
         assert curves.level_at(u).value == pytest.approx(level(u), abs=0.003)
-        # Nor for noise: the first step after it would be 10 mV, against 0.6 mV of the noise.
-        assert curves.sigma_at(u).value == pytest.approx(-4.0, abs=0.1)
 
 
 def test_an_inrush_is_left_out():
@@ -178,9 +174,11 @@ def test_an_inrush_is_left_out():
     t, y = fly(rng, throttle, log_sigma=lambda u: np.full(u.shape, -4.0))
     curves = LearnedCurves()
     learn(curves, t, y - 0.35 * rise, throttle,
-          truth(sigma=math.exp(-4.0), var_inf=math.exp(-8.0) / (2.0 * ALPHA)))
-    # Left in, it would be 0.35 V * 40 ms / 500 ms = 28 mV.
+          truth(sigma=math.exp(-4.0), var_inf=math.exp(-8.0) / (2.0 * ALPHA)), 125)
+    # Throttle does not move within blocks that begin with its step.  Left in, the dip would be 0.35 V * 40 ms / 500 ms = 28 mV.
     assert curves.level_at(0.7).value == pytest.approx(level(0.7), abs=0.004)
+    # Its end is a jump of 0.35 V, against 0.6 mV of noise a step.
+    assert curves.sigma_at(0.7).value == pytest.approx(-4.0, abs=0.1)
 
 
 @pytest.mark.parametrize('dt, noise', [(1e-3, 0.0), (1e-2, 0.0), (1e-3, 0.02)])
