@@ -22,6 +22,11 @@ _BLUNT = 0.35
 _SQUARES = 8
 
 
+def noise_variance(e: Estimate) -> float:
+    """Return the variance of the white noise of a sample, V^2; 0 when unknown."""
+    return e.noise_std ** 2 if e.noise_std > 0.0 else 0.0
+
+
 class Pool:
     """Means of blocks at one throttle."""
 
@@ -59,10 +64,10 @@ class Squares:
         g + N: g = sigma^2 (1 - phi^2k) / (2 alpha), N = noise^2 (1 + phi^2k).  k is 1 unless
         noise would hide sigma.  `even` when no sample is missing between the stamps.
         """
-        n, noise = t.size, e.noise_std ** 2
+        n, noise = t.size, noise_variance(e)
         k = 1
         if noise > 0.0:
-            k = max(1, min(math.ceil(2.0 * noise / (e.sigma ** 2 * dt)), n // 4,
+            k = max(1, min(math.ceil(min(2.0 * noise / (e.sigma ** 2 * dt), n)), n // 4,
                            int(1.0 / (e.alpha * dt))))
         later, earlier = v[k:], v[:-k]
         step = k * dt

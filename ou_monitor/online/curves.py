@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ou_monitor.online.curve_blocks import Pool, Squares, STEADY
+from ou_monitor.online.curve_blocks import noise_variance, Pool, Squares, STEADY
 from ou_monitor.online.hat_filter import BINS, CurvePrior, HatFilter
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN
 from scipy.signal import lfilter
@@ -182,7 +182,7 @@ class LearnedCurves:
             When the shapes differ.
 
         """
-        self._usable = estimate.usable
+        self._usable = estimate.usable and min(estimate.alpha, estimate.sigma) > 0.0
         self._estimate = estimate if self._usable else self._estimate
         if throttle is None:
             return
@@ -361,7 +361,7 @@ class LearnedCurves:
         # Variance of the mean of n samples of an OU, as it adds up over many blocks.
         dt = pool.time / pool.n
         variance = (sigma * sigma / (2.0 * e.alpha * math.tanh(0.5 * e.alpha * dt))
-                    + e.noise_std ** 2) / pool.n
+                    + noise_variance(e)) / pool.n
         # The lag itself is known no better than to a factor.
         variance += (_LEVEL.slope * self._scale * pool.apart) ** 2
         self._level.correct(pool.throttle, pool.voltage, variance)

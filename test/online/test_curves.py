@@ -175,7 +175,8 @@ def test_an_inrush_is_left_out():
     curves = LearnedCurves()
     learn(curves, t, y - 0.35 * rise, throttle,
           truth(sigma=math.exp(-4.0), var_inf=math.exp(-8.0) / (2.0 * ALPHA)), 125)
-    # Throttle does not move within blocks that begin with its step.  Left in, the dip would be 0.35 V * 40 ms / 500 ms = 28 mV.
+    # Throttle does not move within blocks that begin with its step.  Left in, the dip would be
+    # 0.35 V * 40 ms / 500 ms = 28 mV.
     assert curves.level_at(0.7).value == pytest.approx(level(0.7), abs=0.004)
     # Its end is a jump of 0.35 V, against 0.6 mV of noise a step.
     assert curves.sigma_at(0.7).value == pytest.approx(-4.0, abs=0.1)
@@ -361,6 +362,22 @@ def test_shorter_forgetting_forgets_faster():
         learn(curves, t, y, throttle, truth())
         errors.append(curves.sigma_at(0.7).se)
     assert errors[0] > 1.5 * errors[1] > 2.0 * errors[2]
+
+
+def test_what_is_old_is_no_longer_seen():
+    """Data weigh less with time: after hours elsewhere nothing is known of 0.7, or claimed."""
+    throttle = np.full(8000, 0.3)
+    throttle[2000:4000] = 0.7
+    rng = np.random.default_rng(21)
+    t, y = fly(rng, throttle)
+    curves = LearnedCurves(forgetting=20.0, shape_forgetting=60.0)
+    learn(curves, t, y, throttle, truth())
+    assert curves.seen(0.7) and curves.extent[1] == pytest.approx(0.7)
+    # Longer than the largest number that weights are counted in.
+    for hour in range(1, 8):
+        learn(curves, t[:2000] + 3600.0 * hour, y[:2000], throttle[:2000], truth())
+    assert curves.seen(0.3) and not curves.seen(0.7)
+    assert curves.extent == pytest.approx((0.3, 0.3))
 
 
 @pytest.mark.parametrize('bad', [
