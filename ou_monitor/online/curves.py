@@ -36,11 +36,12 @@ _SPREAD = 0.125
 _OUTSIDE = 0.05
 # After a pause the rail is given this many relaxation times.
 _SETTLE = 5.0
+# Sigma at one throttle against that of the whole window: at most so different.
+_RANGE = 30.0
 # A pause without samples, s, and in steps, that starts the blocks afresh.
 _PAUSE, _PAUSE_STEPS = 0.25, 10.0
 # A step back in time, s, that is a clock set back; what time has gone by then is not known.
-_BACK = 1.0
-_UNKNOWN_TIME = 60.0
+_BACK, _UNKNOWN_TIME = 1.0, 60.0
 # Relaxation times in a block from which powers would lose digits or overflow.
 _FAST = 100.0
 # Samples that wait at most, when their stamps stand still.
@@ -110,16 +111,13 @@ class LearnedCurves:
         self._level = HatFilter(self._nodes, self._level.forgetting)
         self._intensity = HatFilter(self._nodes, self._intensity.forgetting)
         self._pending: list[tuple[FloatArray, ...]] = []
-        self._waiting = 0
-        self._begin = NAN
+        self._waiting, self._begin = 0, NAN
         self._newest = -math.inf
-        self._clock = NAN
-        self._scale = NAN
+        self._clock = self._scale = NAN
         self._estimate: Estimate | None = None
         self._usable = False
         self._throttle_known = False
-        self._followed = NAN
-        self._settled = -math.inf
+        self._followed, self._settled = NAN, -math.inf
         self._pool = Pool()
         self._squares = Squares()
 
@@ -249,7 +247,7 @@ class LearnedCurves:
             t, v, u = (np.concatenate(columns) for columns in zip(*parts))
         if not math.isfinite(float(v @ u)) or not math.isfinite(float(t @ u)):
             self._throttle_known = self._throttle_known or bool(np.isfinite(u).any())
-            good = np.isfinite(t) & np.isfinite(v) & np.isfinite(u)
+            good = np.isfinite(t + v + u)
             if not good.any():
                 return
             t, v, u = t[good], v[good], u[good]
@@ -333,7 +331,10 @@ class LearnedCurves:
             pool = self._pool
         pool.add(n, t.item(0), t.item(-1), dt, float(v.mean()), mean_u, apart)
         if self._usable:
-            self._squares.add(t, v, given, dt, e, even)
+            log_sigma, far = self._intensity.value(given), math.log(_RANGE * e.sigma)
+            sigma = e.sigma if math.isnan(log_sigma) else math.exp(
+                min(max(log_sigma, far - 2.0 * math.log(_RANGE)), far))
+            self._squares.add(t, v, given, dt, e, even, sigma)
         if pool.end - pool.begin >= _POOL - 0.5 * _BLOCK:
             self._close()
 
