@@ -22,6 +22,11 @@ _BLUNT = 0.35
 _SQUARES = 8
 
 
+def noise_variance(e: Estimate) -> float:
+    """Return the variance of the white noise of a sample, V^2; 0 when unknown."""
+    return e.noise_std ** 2 if e.noise_std > 0.0 else 0.0
+
+
 class Pool:
     """Means of blocks at one throttle."""
 
@@ -49,20 +54,21 @@ class Squares:
 
     def __init__(self) -> None:
         self._sum = self._weight = self._throttle = self._time = 0.0
+        self._worse = 1.0
 
     def add(self, t: FloatArray, v: FloatArray, throttle: float, dt: float, e: Estimate,
-            even: bool) -> None:
+            even: bool, sigma: float) -> None:
         """
-        Add a block, as an estimate of sigma^2 with its relative variance.
+        Add a block, as an estimate of sigma^2 with its relative variance; `sigma` is expected.
 
         Innovations over k steps, e_j = v_j - phi^k v_{j-k} less their mean, have variance
         g + N: g = sigma^2 (1 - phi^2k) / (2 alpha), N = noise^2 (1 + phi^2k).  k is 1 unless
         noise would hide sigma.  `even` when no sample is missing between the stamps.
         """
-        n, noise = t.size, e.noise_std ** 2
+        n, noise = t.size, noise_variance(e)
         k = 1
         if noise > 0.0:
-            k = max(1, min(math.ceil(2.0 * noise / (e.sigma ** 2 * dt)), n // 4,
+            k = max(1, min(math.ceil(min(2.0 * noise / (sigma ** 2 * dt), n)), n // 4,
                            int(1.0 / (e.alpha * dt))))
         later, earlier = v[k:], v[:-k]
         step = k * dt
@@ -84,7 +90,7 @@ class Squares:
         # The mean of overlapping innovations takes k squares of g with it.
         g = (float(parts @ parts) - total * total / m - m * hidden
              + noise * (1.0 - phi) ** 2) / (m - k)
-        expected = e.sigma ** 2 * per_sigma2
+        expected = sigma ** 2 * per_sigma2
         share = expected / (expected + hidden)
         alike = 1.0 + share ** 2 * (k - 1) * (2 * k - 1) / (3.0 * k) + (
             2.0 * ((1.0 - share) * phi / (1.0 + phi * phi)) ** 2)
@@ -93,6 +99,9 @@ class Squares:
         self._throttle += weight * throttle
         self._weight += weight
         self._time += n * dt
+        # Noise that is wrong, or was not found, weighs more where sigma is less than in the
+        # window as a whole.
+        self._worse = max(self._worse, (e.sigma / sigma) ** 2)
 
     def take(self, e: Estimate, throttle: float) -> tuple[float, float, float] | None:
         """
@@ -109,11 +118,12 @@ class Squares:
         away = abs(at - throttle) > STEADY
         if relative > _SHARP and not away:
             return None
-        mean, time = self._sum / self._weight, self._time
+        mean, time, worse = self._sum / self._weight, self._time, self._worse
+        self._worse = 1.0
         self._sum = self._weight = self._throttle = self._time = 0.0
         if relative > _BLUNT or mean <= 0.0:
             return None
         variance = 0.25 * relative
         if e.sigma_se > 0.0 and time > 0.0:
-            variance = max(variance, e.sigma_se ** 2 * e.duration / time)
+            variance = max(variance, (worse * e.sigma_se) ** 2 * e.duration / time)
         return at, 0.5 * (math.log(mean) + 0.5 * relative), variance

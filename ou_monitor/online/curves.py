@@ -17,15 +17,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ou_monitor.online.curve_blocks import Pool, Squares, STEADY
+from ou_monitor.online.curve_blocks import noise_variance, Pool, Squares, STEADY
 from ou_monitor.online.hat_filter import BINS, CurvePrior, HatFilter
 from ou_monitor.online.wander import Wander
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN
 from scipy.signal import lfilter
 
 # Samples are looked at in blocks of this length, s, and of this many samples or more.
-_BLOCK = 0.05
-_FEWEST = 32
+_BLOCK, _FEWEST = 0.05, 32
 # A slow source is not waited for longer than this, s.
 _PATIENCE = 0.5
 # Blocks are pooled into one observation over this time, s.
@@ -38,12 +37,12 @@ _SPREAD = 0.125
 _OUTSIDE = 0.05
 # After a pause the rail is given this many relaxation times.
 _SETTLE = 5.0
-# A pause without samples, s, and steps, that starts the blocks afresh.
-_PAUSE = 0.25
-_PAUSE_STEPS = 10.0
+# Sigma at one throttle against that of the whole window: at most so different.
+_RANGE = 30.0
+# A pause without samples, s, and in steps, that starts the blocks afresh.
+_PAUSE, _PAUSE_STEPS = 0.25, 10.0
 # A step back in time, s, that is a clock set back; what time has gone by then is not known.
-_BACK = 1.0
-_UNKNOWN_TIME = 60.0
+_BACK, _UNKNOWN_TIME = 1.0, 60.0
 # Relaxation times in a block from which powers would lose digits or overflow.
 _FAST = 100.0
 # Samples that wait at most, when their stamps stand still.
@@ -113,16 +112,13 @@ class LearnedCurves:
         self._level = HatFilter(self._nodes, self._level.forgetting)
         self._intensity = HatFilter(self._nodes, self._intensity.forgetting)
         self._pending: list[tuple[FloatArray, ...]] = []
-        self._waiting = 0
-        self._begin = NAN
+        self._waiting, self._begin = 0, NAN
         self._newest = -math.inf
-        self._clock = NAN
-        self._scale = NAN
+        self._clock = self._scale = NAN
         self._estimate: Estimate | None = None
         self._usable = False
         self._throttle_known = False
-        self._followed = NAN
-        self._settled = -math.inf
+        self._followed, self._settled = NAN, -math.inf
         self._pool = Pool()
         self._squares = Squares()
         self._wander = Wander()
@@ -154,7 +150,7 @@ class LearnedCurves:
 
     @property
     def scatter(self) -> tuple[float, float]:
-        """Return mean squared misses of level and intensity against what was expected; 1 is right."""
+        """Return `HatFilter.scatter` of level and intensity: 1 when the errors are right."""
         return self._level.scatter, self._intensity.scatter
 
     @property
@@ -186,9 +182,8 @@ class LearnedCurves:
             When the shapes differ.
 
         """
-        self._usable = estimate.usable
-        if self._usable:
-            self._estimate = estimate
+        self._usable = estimate.usable and min(estimate.alpha, estimate.sigma) > 0.0
+        self._estimate = estimate if self._usable else self._estimate
         if throttle is None:
             return
         stamps, volts, load = _column(t), _column(voltage), _column(throttle)
@@ -199,8 +194,7 @@ class LearnedCurves:
                              f'{stamps.shape}, {volts.shape} and {load.shape}')
         if not stamps.size:
             return
-        if not self._pending:
-            self._begin = stamps.item(0)
+        self._begin = self._begin if self._pending else stamps.item(0)
         self._pending.append((stamps, volts, load))
         self._waiting += stamps.size
         span = abs(stamps.item(-1) - self._begin)
@@ -260,10 +254,10 @@ class LearnedCurves:
             t, v, u = (np.concatenate(columns) for columns in zip(*parts))
         if not math.isfinite(float(v @ u)) or not math.isfinite(float(t @ u)):
             self._throttle_known = self._throttle_known or bool(np.isfinite(u).any())
-            good = np.isfinite(t) & np.isfinite(v) & np.isfinite(u)
-            t, v, u = t[good], v[good], u[good]
-            if not t.size:
+            good = np.isfinite(t + v + u)
+            if not good.any():
                 return
+            t, v, u = t[good], v[good], u[good]
         self._throttle_known = True
         steps = t[1:] - t[:-1]
         mean = (t.item(-1) - t.item(0)) / max(t.size - 1, 1)
@@ -288,10 +282,10 @@ class LearnedCurves:
                 self._clock = t.item(0)
                 self._followed = NAN
             else:
+                if self._newest >= t.item(-1):
+                    return
                 late = int(np.searchsorted(t, self._newest, 'right'))
                 t, v, u = t[late:], v[late:], u[late:]
-                if not t.size:
-                    return
         elif t.item(0) - self._newest > pause:
             self._followed = NAN
         e = self._estimate
@@ -301,10 +295,10 @@ class LearnedCurves:
             even = False
         n = t.size
         self._newest = t.item(-1)
-        pieces = max(1, min(int((self._newest - t.item(0)) / _BLOCK), n // _FEWEST))
         if e is None or n < 2:
             self._followed = NAN
             return
+        pieces = max(1, min(int((self._newest - t.item(0)) / _BLOCK), n // _FEWEST))
         edges = [n * k // pieces for k in range(pieces + 1)]
         for begin, end in zip(edges, edges[1:]):
             self._block(t[begin:end], v[begin:end], u[begin:end], e, even)
@@ -344,7 +338,10 @@ class LearnedCurves:
             pool = self._pool
         pool.add(n, t.item(0), t.item(-1), dt, float(v.mean()), mean_u, apart)
         if self._usable:
-            self._squares.add(t, v, given, dt, e, even)
+            log_sigma, far = self._intensity.value(given), math.log(_RANGE * e.sigma)
+            sigma = e.sigma if math.isnan(log_sigma) else math.exp(
+                min(max(log_sigma, far - 2.0 * math.log(_RANGE)), far))
+            self._squares.add(t, v, given, dt, e, even, sigma)
         if pool.end - pool.begin >= _POOL - 0.5 * _BLOCK:
             self._close()
 
@@ -373,7 +370,7 @@ class LearnedCurves:
         # Variance of the mean of n samples of an OU, as it adds up over many blocks.
         dt = pool.time / pool.n
         variance = (sigma * sigma / (2.0 * e.alpha * math.tanh(0.5 * e.alpha * dt))
-                    + e.noise_std ** 2) / pool.n
+                    + noise_variance(e)) / pool.n
         # The lag itself is known no better than to a factor.
         variance += (_LEVEL.slope * self._scale * pool.apart) ** 2
         self._level.correct(pool.throttle, pool.voltage, variance)

@@ -19,6 +19,8 @@ from ou_monitor.records import FloatArray
 BINS = 51
 # Observations further out than this many standard deviations count as that far.
 _OUTLIER = 5.0
+# Weights are brought back to today's unit beyond this.
+_LARGE = 1e100
 # Share of one observation in the running scatter.
 _SHARE = 0.02
 # Distance in throttle over which slow changes of the curve go together.
@@ -84,7 +86,9 @@ class HatFilter:
         self._p = np.zeros((nodes + 1, nodes + 1))
         self._prior: CurvePrior | None = None
         self._rate = np.zeros_like(self._p)
+        # Sums of 1 / variance; instead of the old ones fading, the unit of the new ones grows.
         self._weight = np.zeros(BINS)
+        self._unit = 1.0
         self._needed = math.inf
         self._scatter = 1.0
         reach = round(0.5 * (BINS - 1) / (nodes - 1))
@@ -124,6 +128,7 @@ class HatFilter:
                            + prior.bend ** 2 * np.minimum.outer(at, at))
         self._p[n, n] = prior.drift ** 2
         self._weight[:] = 0.0
+        self._unit = 1.0
         spacing = 1.0 / (n - 1)
         self._needed = 1.0 / (prior.bend ** 2 * spacing + (prior.slope * spacing) ** 2)
         self._scatter = 1.0
@@ -148,7 +153,14 @@ class HatFilter:
             return
         p = self._p
         p += self._rate * dt
-        self._weight *= math.exp(-dt / self._forgetting)
+        faded = dt / self._forgetting
+        if faded > 100.0:
+            self._weight[:] = 0.0
+        elif self._unit > _LARGE:
+            self._weight /= self._unit * math.exp(faded)
+            self._unit = 1.0
+        else:
+            self._unit *= math.exp(faded)
         if prior.drift == 0.0:
             return
         # The drift is an OU of its own: exact moments of its integral over dt.
@@ -188,7 +200,7 @@ class HatFilter:
         x += gain * (miss / total)
         gain *= 1.0 / math.sqrt(total)
         p -= gain[:, None] * gain
-        self._weight[int(throttle * (BINS - 1) + 0.5)] += 1.0 / variance
+        self._weight[int(throttle * (BINS - 1) + 0.5)] += self._unit / variance
 
     def value(self, throttle: float) -> float:
         """Return the curve at one throttle 0..1; NaN before any observation."""
@@ -241,8 +253,8 @@ class HatFilter:
             two nodes; above 1 the data weigh more.
 
         """
-        return np.convolve(self._weight, self._near, 'same') / self._needed
+        return np.convolve(self.flown(), self._near, 'same')
 
     def flown(self) -> FloatArray:
         """Return the ratio of `seen` for the data at each throttle of the bins alone."""
-        return self._weight / self._needed
+        return self._weight / (self._unit * self._needed)

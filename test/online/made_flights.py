@@ -61,6 +61,44 @@ def wandering(rng, duration, low=0.1, high=0.8, dt=DT):
     return np.clip(base + work, 0.0, 1.0)
 
 
+class DrawnSupply:
+    """A supply drawn from what the curves believe before a flight; it wanders as they expect."""
+
+    def __init__(self, rng, n):
+        nodes = np.linspace(0.0, 1.0, 9)
+        alike = np.linalg.cholesky(np.exp(-np.abs(np.subtract.outer(nodes, nodes)) / 0.5))
+        steps, t = 200, np.linspace(0.0, n * DT, 201)
+        self.t, self.every, self.nodes = t, np.arange(n) * DT, nodes
+
+        def shape(slope, bend, change, forgetting):
+            walk = np.concatenate([[0.0], rng.standard_normal(8).cumsum() * bend / math.sqrt(8.0)])
+            kicks = (rng.standard_normal((steps, 9)) @ alike.T) * change * math.sqrt(
+                t[1] / forgetting)
+            path = np.vstack([np.zeros(9), kicks.cumsum(axis=0)])
+            return slope * rng.standard_normal() * (nodes - 0.5) + walk + path
+
+        self.level = 5.0 + shape(0.75, 0.25, 0.05, 1800.0)
+        drift, keep = 0.01 * rng.standard_normal(), math.exp(-t[1] / 30.0)
+        for k in range(steps):
+            step = drift * t[1] + 0.002 * math.sqrt(t[1]) * rng.standard_normal()
+            self.level[k + 1:] += step
+            drift = keep * drift + 0.01 * math.sqrt(1.0 - keep * keep) * rng.standard_normal()
+        self.log_sigma = math.log(0.5) + shape(2.0, 1.0, 0.2, 300.0)
+
+    def along(self, table, throttle):
+        """Return a curve at the throttle and the time of each sample."""
+        k = np.minimum((self.every / self.t[1]).astype(int), self.t.size - 2)
+        early = self.every / self.t[1] - k
+        i = np.minimum((throttle * 8).astype(int), 7)
+        right = throttle * 8 - i
+        return sum(w_t * (table[k_t, i] * (1.0 - right) + table[k_t, i + 1] * right)
+                   for k_t, w_t in ((k, 1.0 - early), (k + 1, early)))
+
+    def last(self, table, throttle):
+        """Return a curve at the end, at throttles of shape (k,)."""
+        return np.interp(throttle, self.nodes, table[-1])
+
+
 def truth(u=0.4, **more):
     """Return the estimate that a perfect estimator would give at throttle u, 2 s at 1 kHz."""
     sigma = math.exp(log_sigma(u))

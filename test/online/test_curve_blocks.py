@@ -21,7 +21,8 @@ def draws(n, dt, noise, *, lost=0.0, **more):
         kept = begin + np.flatnonzero(rng.random(n) >= lost)
         squares = Squares()
         step = (t[kept[-1]] - t[kept[0]]) / (kept.size - 1)
-        squares.add(t[kept], y[kept], THROTTLE, step, estimate, not lost)
+        squares.add(t[kept], y[kept], THROTTLE, step, estimate, not lost,
+                    estimate.sigma)
         found.append(squares.take(estimate, THROTTLE))
     return np.array([(value - log_sigma(THROTTLE), variance)
                      for _, value, variance in filter(None, found)])
@@ -51,9 +52,13 @@ def test_the_estimate_says_how_well_at_best():
     t, y = fly(rng, np.full(250, THROTTLE))
     squares = Squares()
     estimate = truth(THROTTLE, sigma_se=0.1, duration=2.0)
-    squares.add(t, y, THROTTLE, 1e-3, estimate, True)
+    squares.add(t, y, THROTTLE, 1e-3, estimate, True, estimate.sigma)
     _, _, variance = squares.take(estimate, THROTTLE)
     assert variance == pytest.approx(0.1 ** 2 * 2.0 / 0.25)
+    # At a throttle with half the sigma of the window an error of the noise counts four times.
+    squares.add(t, y, THROTTLE, 1e-3, estimate, True, 0.5 * estimate.sigma)
+    _, _, variance = squares.take(estimate, THROTTLE)
+    assert variance == pytest.approx((4.0 * 0.1) ** 2 * 2.0 / 0.25)
 
 
 def test_too_little_waits_or_is_dropped():
@@ -62,11 +67,11 @@ def test_too_little_waits_or_is_dropped():
     t, y = fly(rng, np.full(40, THROTTLE))
     estimate, squares = truth(THROTTLE), Squares()
     assert squares.take(estimate, THROTTLE) is None
-    squares.add(t[:12], y[:12], THROTTLE, 1e-3, estimate, True)
+    squares.add(t[:12], y[:12], THROTTLE, 1e-3, estimate, True, estimate.sigma)
     assert squares.take(estimate, THROTTLE) is None
-    squares.add(t[12:], y[12:], THROTTLE, 1e-3, estimate, True)
+    squares.add(t[12:], y[12:], THROTTLE, 1e-3, estimate, True, estimate.sigma)
     assert squares.take(estimate, THROTTLE) is not None
-    squares.add(t[:5], y[:5], THROTTLE, 1e-3, estimate, True)
+    squares.add(t[:5], y[:5], THROTTLE, 1e-3, estimate, True, estimate.sigma)
     assert squares.take(estimate, 0.9) is None
 
 

@@ -2,7 +2,8 @@
 
 import math
 
-from made_flights import ALPHA, DT, fly, holds, learn, level, log_sigma, truth, wandering
+from made_flights import (
+    ALPHA, DrawnSupply, DT, fly, holds, learn, level, log_sigma, truth, wandering)
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.online.curves import LearnedCurves
@@ -29,44 +30,6 @@ def flown(seed=0, throttle=None, duration=20.0, estimate=None, **more):
     return curves
 
 
-class DrawnSupply:
-    """A supply drawn from what the curves believe before a flight; it wanders as they expect."""
-
-    def __init__(self, rng, n):
-        nodes = np.linspace(0.0, 1.0, 9)
-        alike = np.linalg.cholesky(np.exp(-np.abs(np.subtract.outer(nodes, nodes)) / 0.5))
-        steps, t = 200, np.linspace(0.0, n * DT, 201)
-        self.t, self.every, self.nodes = t, np.arange(n) * DT, nodes
-
-        def shape(slope, bend, change, forgetting):
-            walk = np.concatenate([[0.0], rng.standard_normal(8).cumsum() * bend / math.sqrt(8.0)])
-            kicks = (rng.standard_normal((steps, 9)) @ alike.T) * change * math.sqrt(
-                t[1] / forgetting)
-            path = np.vstack([np.zeros(9), kicks.cumsum(axis=0)])
-            return slope * rng.standard_normal() * (nodes - 0.5) + walk + path
-
-        self.level = 5.0 + shape(0.75, 0.25, 0.05, 1800.0)
-        drift, keep = 0.01 * rng.standard_normal(), math.exp(-t[1] / 30.0)
-        for k in range(steps):
-            step = drift * t[1] + 0.002 * math.sqrt(t[1]) * rng.standard_normal()
-            self.level[k + 1:] += step
-            drift = keep * drift + 0.01 * math.sqrt(1.0 - keep * keep) * rng.standard_normal()
-        self.log_sigma = math.log(0.5) + shape(2.0, 1.0, 0.2, 300.0)
-
-    def along(self, table, throttle):
-        """Return a curve at the throttle and the time of each sample."""
-        k = np.minimum((self.every / self.t[1]).astype(int), self.t.size - 2)
-        early = self.every / self.t[1] - k
-        i = np.minimum((throttle * 8).astype(int), 7)
-        right = throttle * 8 - i
-        return sum(w_t * (table[k_t, i] * (1.0 - right) + table[k_t, i + 1] * right)
-                   for k_t, w_t in ((k, 1.0 - early), (k + 1, early)))
-
-    def last(self, table):
-        """Return a curve at the end, at the throttles of the test."""
-        return np.interp(AT, self.nodes, table[-1])
-
-
 @pytest.mark.parametrize('profile', [holds, wandering])
 def test_the_standard_errors_are_honest(profile):
     """
@@ -86,8 +49,8 @@ def test_the_standard_errors_are_honest(profile):
         learn(curves, t, y, throttle, truth(sigma_se=0.0))
         v, v_se = curves.level_curve(AT)
         s, s_se = curves.sigma_curve(AT)
-        z.append([(v - supply.last(supply.level)) / v_se,
-                  (s - supply.last(supply.log_sigma)) / s_se])
+        z.append([(v - supply.last(supply.level, AT)) / v_se,
+                  (s - supply.last(supply.log_sigma, AT)) / s_se])
     z = np.array(z)
     share = np.mean(np.abs(z) < 1.96, axis=(0, 2))
     assert np.all(share > 0.95 - 3.0 * math.sqrt(0.95 * 0.05 / 40.0)), share
@@ -204,16 +167,19 @@ def test_steps_of_throttle_do_not_bend_the_curve():
 
 
 def test_an_inrush_is_left_out():
-    """A dip of twice the sag for 40 ms after each rise, as racers show: the steady sag is found."""
+    """A dip of twice the sag for 40 ms after each rise, as in racers: the steady sag is found."""
     throttle = np.where(np.arange(60000) % 1000 < 500, 0.2, 0.7)
     rng = np.random.default_rng(18)
     rise = (np.arange(60000) % 1000 >= 500) & (np.arange(60000) % 1000 < 540)
     t, y = fly(rng, throttle, log_sigma=lambda u: np.full(u.shape, -4.0))
     curves = LearnedCurves()
     learn(curves, t, y - 0.35 * rise, throttle,
-          truth(sigma=math.exp(-4.0), var_inf=math.exp(-8.0) / (2.0 * ALPHA)))
-    # Left in, it would be 0.35 V * 40 ms / 500 ms = 28 mV.
+          truth(sigma=math.exp(-4.0), var_inf=math.exp(-8.0) / (2.0 * ALPHA)), 125)
+    # Throttle does not move within blocks that begin with its step.  Left in, the dip would be
+    # 0.35 V * 40 ms / 500 ms = 28 mV.
     assert curves.level_at(0.7).value == pytest.approx(level(0.7), abs=0.004)
+    # Its end is a jump of 0.35 V, against 0.6 mV of noise a step.
+    assert curves.sigma_at(0.7).value == pytest.approx(-4.0, abs=0.1)
 
 
 @pytest.mark.parametrize('dt, noise', [(1e-3, 0.0), (1e-2, 0.0), (1e-3, 0.02)])
@@ -396,6 +362,22 @@ def test_shorter_forgetting_forgets_faster():
         learn(curves, t, y, throttle, truth())
         errors.append(curves.sigma_at(0.7).se)
     assert errors[0] > 1.5 * errors[1] > 2.0 * errors[2]
+
+
+def test_what_is_old_is_no_longer_seen():
+    """Data weigh less with time: after hours elsewhere nothing is known of 0.7, or claimed."""
+    throttle = np.full(8000, 0.3)
+    throttle[2000:4000] = 0.7
+    rng = np.random.default_rng(21)
+    t, y = fly(rng, throttle)
+    curves = LearnedCurves(forgetting=20.0, shape_forgetting=60.0)
+    learn(curves, t, y, throttle, truth())
+    assert curves.seen(0.7) and curves.extent[1] == pytest.approx(0.7)
+    # Longer than the largest number that weights are counted in.
+    for hour in range(1, 8):
+        learn(curves, t[:2000] + 3600.0 * hour, y[:2000], throttle[:2000], truth())
+    assert curves.seen(0.3) and not curves.seen(0.7)
+    assert curves.extent == pytest.approx((0.3, 0.3))
 
 
 @pytest.mark.parametrize('bad', [
