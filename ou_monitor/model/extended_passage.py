@@ -136,10 +136,16 @@ class ExtendedPassage:
         corner = (math.floor(math.log(alpha) / _STEP),
                   round(math.log(sigma / math.sqrt(2.0 * alpha)) / _STEP) if self._in_volts else 0)
         with self._lock:
-            if self._cell is not None and self._cell.corner == corner:
+            if self._cell is not None and self._near(self._cell, alpha, sigma):
                 return
             self._cell = _Cell(corner, tuple(
                 self._table((corner[0] + i, corner[1] + j)) for i, j in self._corners))
+
+    def _near(self, cell: _Cell, alpha: float, sigma: float) -> bool:
+        """Return whether the tables of a cell are good for these parameters."""
+        i = math.log(alpha) / _STEP - cell.corner[0]
+        j = math.log(sigma / math.sqrt(2.0 * alpha)) / _STEP - cell.corner[1]
+        return abs(i - 0.5) <= 1.0 and (abs(j) <= 1.0 or not self._in_volts)
 
     def _table(self, key: Key) -> EventTable:
         """Return the table at a pair of parameters, made now or before."""

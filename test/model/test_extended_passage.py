@@ -223,6 +223,26 @@ def test_between_and_beside_the_tables(jumping):
                                    other.probability(U0, level, horizon, **at), rtol=0.03)
 
 
+def test_fast_regimes_are_one_noise():
+    """Of two intensities that change 60 times in a relaxation time the mean square counts."""
+    made = passage(term('regime_switching', rate_up=60.0, rate_down=60.0, level=0.0,
+                        sigma_ratio=2.0, at_once=0.0, states=2.0))
+    for b, horizon in ((1.5, 0.3), (2.5, 2.0), (3.0, 20.0)):
+        p = made.probability(U0, U0 - b * math.sqrt(2.5) * SD, horizon, **LIVE)
+        assert p == pytest.approx(float(passage_probability(0.0, b, horizon * ALPHA)), rel=0.1)
+
+
+def test_the_same_tables_near_by(jumping):
+    """What is near is answered from the tables there are, to the last bit."""
+    before = jumping.probability(U0, 11.5, 1.0, **LIVE)
+    jumping.prepare(ALPHA * 1.03, SIGMA * 1.03)
+    assert jumping.probability(U0, 11.5, 1.0, **LIVE) == before
+    jumping.prepare(ALPHA * 2.0, SIGMA * 2.0)
+    assert math.isnan(jumping.probability(U0, 11.5, 1.0, **LIVE))
+    jumping.prepare(ALPHA, SIGMA)
+    assert jumping.probability(U0, 11.5, 1.0, **LIVE) == before
+
+
 def test_beyond_the_longest_span(jumping):
     """Passages then come at a steady rate: survival falls by the same factor."""
     left = np.log1p(-jumping.probability(U0, 11.2, [30.0, 45.0, 60.0, 75.0], **LIVE))
