@@ -50,6 +50,8 @@ class MonitorReport:
         `brownout.budget_limit`; NaN when not known.
     budget_reason : str
         What ends the budget, or why it is not known.
+    left_out : tuple of str
+        Terms of the model file that move the supply and that the risk does not know of.
     flag : FlagState
         The brown-out flag, and why.
     level : Level
@@ -65,6 +67,7 @@ class MonitorReport:
     risk: float
     budget: float
     budget_reason: str
+    left_out: tuple[str, ...]
     flag: FlagState
     level: Level
     summary: str
@@ -89,6 +92,7 @@ class MonitorReport:
         values['brownout_level_age'] = self.flag.age
         values['brownout_reason'] = self.flag.reason
         values['throttle_budget'] = self.budget
+        values['model_left_out'] = ','.join(self.left_out)
         values['throttle_budget_reason'] = self.budget_reason
         values['age'] = self.age
         values['status'] = e.status.name
@@ -109,15 +113,19 @@ class SupplyMonitor:
         Settings; the defaults when left out.
     model : SupplyModel, optional
         Terms of the supply, as `discover` found them; none when left out.
+    background : bool
+        Whether tables for these terms are made in a thread, so that reports never wait;
+        until they are there the risk is unknown.
 
     """
 
     def __init__(self, settings: MonitorSettings | None = None,
-                 model: SupplyModel | None = None) -> None:
+                 model: SupplyModel | None = None, *, background: bool = True) -> None:
         self._settings = settings or MonitorSettings()
         self._estimator = SlidingEstimator(self._settings.window)
         self._flag = BrownoutFlag(self._settings)
-        self._outlook = Outlook()
+        self._outlook = Outlook(background=background)
+        self._outlook.set_model(model)
         self._newest = Estimate()
         self._model = model
         self._reset_reason = ''
@@ -142,6 +150,7 @@ class SupplyMonitor:
     def set_model(self, model: SupplyModel | None) -> None:
         """Change the terms of the supply; window and flag stay."""
         self._model = model
+        self._outlook.set_model(model)
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
              throttle: npt.ArrayLike | None = None) -> None:
@@ -194,10 +203,12 @@ class SupplyMonitor:
         stale = silent > self._settings.stale_after or e.status is Status.NO_DATA
         risk = NAN if stale else self._outlook.risk(e, self._settings)
         budget = None if stale else self._outlook.budget(e, self._settings)
+        events = self._outlook.events
         flag = self._flag.update(e.t + silent if now is None else now, risk, fresh=not stale)
         level, summary = self._judge(e, risk, flag, self._silence(age, e) if stale else '')
         return MonitorReport(e, risk, NAN if budget is None else budget.throttle,
-                             '' if budget is None else budget.reason, flag, level, summary, silent)
+                             '' if budget is None else budget.reason,
+                             () if events is None else events.left_out, flag, level, summary, silent)
 
     def _silence(self, age: float | None, e: Estimate) -> str:
         if age is not None and age > self._settings.stale_after:
