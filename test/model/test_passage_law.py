@@ -8,11 +8,11 @@ import numpy as np
 from ou_monitor.model.passage import mean_first_passage
 from ou_monitor.model.passage_law import passage_probability, prepare, stationary_exceedance
 import pytest
-from scipy.integrate import trapezoid
+from scipy.integrate import quad, trapezoid
 from scipy.special import log_ndtr, ndtr, pbdv
 
 # What the table is allowed to be off by, relative to P.
-TABLE = 3e-3
+TABLE = 1e-3
 
 
 def constant_pull(gap, barrier, span):
@@ -44,14 +44,33 @@ def test_mean_time_is_that_of_siegert(start, barrier):
     assert trapezoid((1.0 - p) * s, log) == pytest.approx(mean, rel=TABLE)
 
 
+def log_cylinder(p, z):
+    """
+    Return ln D_-p(z) for p > 0, from its integral (DLMF 12.5.1).
+
+    For p > 1; scipy's pbdv, good for small p, is off by 0.3 % at p = 60 here and there.
+    """
+    if p <= 1.0:
+        return math.log(pbdv(-p, z)[0])
+
+    def log(t):
+        return (p - 1.0) * math.log(t) - 0.5 * t * t - z * t
+
+    top = 0.5 * (-z + math.sqrt(z * z + 4.0 * (p - 1.0)))
+    wide = 12.0 / math.sqrt(1.0 + (p - 1.0) / top ** 2)
+    total, _ = quad(lambda t: math.exp(log(t) - log(top)), max(1e-9, top - wide), top + wide,
+                    epsrel=1e-12, limit=200)
+    return math.log(total) + log(top) - 0.25 * z * z - math.lgamma(p)
+
+
 @pytest.mark.parametrize('barrier', [-2.5, -1.0, 0.0, 1.0, 2.0, 3.5, 5.0])
 @pytest.mark.parametrize('gap', [0.1, 1.0, 3.0])
 @pytest.mark.parametrize('p', [0.03, 1.0, 8.0, 60.0])
 def test_laplace_transform(barrier, gap, p):
     """E exp(-p T) = exp((x^2 - b^2)/4) D_-p(-x) / D_-p(-b); as small as 1e-14."""
     x = barrier - gap
-    expected = (math.exp((x * x - barrier * barrier) / 4.0) * pbdv(-p, -x)[0]
-                / pbdv(-p, -barrier)[0])
+    expected = math.exp((x * x - barrier * barrier) / 4.0 + log_cylinder(p, -x)
+                        - log_cylinder(p, -barrier))
     log = np.linspace(math.log(1e-8 / p), math.log(60.0 / p), 5000)
     s = np.exp(log)
     got = trapezoid(p * np.exp(-p * s) * passage_probability(x, barrier, s) * s, log)
@@ -153,15 +172,15 @@ spans = st.floats(-4.0 * math.log(10.0), 5.0 * math.log(10.0)).map(math.exp)
 @settings(max_examples=300, deadline=None)
 @given(levels, levels, levels, spans, spans)
 def test_monotone(x, b, c, s, r):
-    """More time, a start nearer, a barrier nearer: no less likely, to the table's accuracy."""
+    """More time, a start nearer, a barrier nearer: no less likely, to the accuracy of the table."""
     near, far = min(b, c), max(b, c)
     short, long = min(s, r), max(s, r)
     p = passage_probability([x, x, x], [near, far, near], [short, short, long])
     assert ((p >= 0.0) & (p <= 1.0)).all()
-    slack = 1.0 + TABLE
-    assert p[1] <= p[0] * slack + 1e-300 and p[0] <= p[2] * slack + 1e-300
+    slack = 1.0 + 2.0 * TABLE
+    assert p[1] <= p[0] * slack + 1e-13 and p[0] <= p[2] * slack + 1e-13
     q = passage_probability([near, far], x, s)
-    assert q[0] <= q[1] * slack + 1e-300
+    assert q[0] <= q[1] * slack + 1e-13
 
 
 def test_ends():
