@@ -90,8 +90,8 @@ class Outlook:
 
     @property
     def voltage(self) -> float:
-        """Where the supply is now, V: the middle one of the last three samples."""
-        return float(np.median(self._newest)) if self._newest.size else NAN
+        """Where the supply is now, V: the middle one of the last three samples; NaN of one."""
+        return float(np.median(self._newest)) if self._newest.size > 1 else NAN
 
     def supply(self, e: Estimate, horizon: float) -> Supply:
         """

@@ -103,9 +103,9 @@ def test_floor_of_a_silent_source_does_not_decide():
 
 
 def test_floor_without_an_estimate():
-    """Three samples: no fit yet, and the risk knows only the newest one."""
+    """Five samples: no fit yet, and the risk knows only the newest ones."""
     monitor = SupplyMonitor()
-    monitor.push([0.0, 0.001, 0.002, 0.003], [4.2, 4.2, 4.2, 4.6])
+    monitor.push([0.0, 0.001, 0.002, 0.003, 0.004], [4.2, 4.2, 4.2, 4.6, 4.6])
     report = monitor.report(0.0)
     assert math.isnan(report.risk) and not report.estimate.usable
     assert report.level is Level.ERROR and report.brownout is True
