@@ -54,7 +54,7 @@ def calibration(given: argparse.Namespace) -> tuple[str, str]:
         rng = np.random.default_rng([given.seed, begin])
         count = min(_BATCH, given.flights - begin)
         flights = fly(rng, count, given.seconds)
-        levels = flights.level - flights.spread * rng.uniform(1.5, 6.0, count)
+        levels = flights.level - flights.spread * rng.uniform(2.5, 7.0, count)
         found += predict(flights, levels, given.horizon, given.horizon, tell)
     steady = [h for h in found if h.steady]
     parts = [_reliability_table(

@@ -17,8 +17,8 @@ from scipy.stats import beta
 
 # Seconds before the first prediction, and between looks.
 WARM, WINDOW = 3.0, 2.0
-# Samples from one report of the monitor to the next.
-STEP = 50
+# Samples from one report of the monitor to the next: a slow companion computer.
+STEP = 250
 PUBLISHED = 'published risk'
 # Edges of the bins of predicted probability.
 EDGES = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
