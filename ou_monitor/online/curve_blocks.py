@@ -124,6 +124,8 @@ class Squares:
         if relative > _BLUNT or mean <= 0.0:
             return None
         variance = 0.25 * relative
+        # What was expected may be wrong, as at a throttle not flown before.
+        worse = max(worse, e.sigma ** 2 / mean)
         if e.sigma_se > 0.0 and time > 0.0:
             variance = max(variance, (worse * e.sigma_se) ** 2 * e.duration / time)
         return at, 0.5 * (math.log(mean) + 0.5 * relative), variance

@@ -360,7 +360,9 @@ class LearnedCurves:
             throttle, value, variance = found
             if not self._intensity.started:
                 self._intensity.start(value, _INTENSITY)
-            self._wander.correct(value - self._intensity.value(throttle), variance)
+            expected, error = self.sigma_at(throttle)
+            # What the curve itself does not know says nothing of all throttles together.
+            self._wander.correct(value - expected, variance + error * error)
             self._intensity.correct(throttle, value, variance)
         if not self._level.started:
             self._scale = abs(pool.voltage) or 1.0

@@ -143,6 +143,11 @@ class SupplyMonitor:
         self._flag.configure(settings)
 
     @property
+    def outlook(self) -> Outlook:
+        """Return what lies ahead: learned curves, risk and budget."""
+        return self._outlook
+
+    @property
     def model(self) -> SupplyModel | None:
         """Return the terms of the supply in force."""
         return self._model
