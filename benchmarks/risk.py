@@ -194,7 +194,7 @@ def main() -> int:
     """Parse arguments, measure, write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parts = parser.add_subparsers(dest='part', required=True)
-    for name, action, flights, seconds in (('calibration', calibration, 2000, 24.0),
+    for name, action, flights, seconds in (('calibration', calibration, 2500, 24.0),
                                            ('alarms', alarms, 300, 60.0),
                                            ('cost', cost, 2000, 0.0)):
         part = parts.add_parser(name, help=action.__doc__)
