@@ -28,7 +28,8 @@ sys.path[:0] = [str(_ROOT), str(_ROOT / 'test' / 'offline')]
 from discover_limits import (  # noqa: E402
     CAUSES, DURATIONS, figure, limits_table, Point, Search)
 import discover_runs as runs  # noqa: E402
-from discover_tables import heat_map, put, report  # noqa: E402
+from discover_tables import heat_map, report  # noqa: E402
+from drawing import put  # noqa: E402
 from hidden_effects import causes, KINDS, pairs, unknowns, variants  # noqa: E402
 import numpy as np  # noqa: E402
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from blind_scores import from_data
 from discover_runs import key_of, Results, Task
-from discover_tables import drawing
+from drawing import drawing
 import numpy as np
 from ou_monitor.offline.report.svg import Plot
 from ou_monitor.records import FloatArray

@@ -10,28 +10,37 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from datetime import date
+import json
 import math
 from pathlib import Path
 import sys
 import time
 
-import numpy as np
-from ou_monitor import brownout_probability
-from ou_monitor.offline.report.svg import Plot
-from ou_monitor.records import Estimate, Status
-from risk_alarms import METHODS, Score, score, settings, timelines
-from risk_flights import fly
-from risk_scores import brier, Horizon, predict, reliability
-from tables import number, table
-
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from drawing import drawing, put  # noqa: E402
+import numpy as np  # noqa: E402
+from ou_monitor import brownout_probability  # noqa: E402
+from ou_monitor.offline.report.svg import Plot  # noqa: E402
+from ou_monitor.records import Estimate, Status  # noqa: E402
+from risk_alarms import METHODS, Score, score, settings, timelines  # noqa: E402
+from risk_flights import fly  # noqa: E402
+from risk_scores import brier, Horizon, predict, reliability  # noqa: E402
+from tables import number, table  # noqa: E402
 
 SEED = 20261121
 # Flights simulated at once: bounds memory.
 _BATCH = 100
 # Predictions within this factor of what is observed are called calibrated.
 _FACTOR = 1.5
+# Names that fit into a legend.
+_SHORT = {'published risk': 'published', 'published risk, lowest of 0.5 s': 'lowest of 0.5 s',
+          'window alone, errors averaged': 'window alone',
+          'window alone, errors ignored': 'and without errors',
+          'stationary, as the paper': 'paper', 'threshold on the voltage': 'threshold',
+          'threshold with a timer of 10 s': 'with timer'}
 
 
 def _told(what: str, of: int) -> Callable[[], None]:
@@ -49,6 +58,9 @@ def _told(what: str, of: int) -> Callable[[], None]:
 def calibration(given: argparse.Namespace) -> tuple[str, str]:
     """Return a table and a reliability diagram."""
     found: list[Horizon] = []
+    if given.lines and given.lines.exists():
+        found = [Horizon(**json.loads(line)) for line in given.lines.read_text().splitlines()]
+        return _calibration(found, given.horizon)
     tell = _told('flights', given.flights)
     for begin in range(0, given.flights, _BATCH):
         rng = np.random.default_rng([given.seed, begin])
@@ -56,10 +68,16 @@ def calibration(given: argparse.Namespace) -> tuple[str, str]:
         flights = fly(rng, count, given.seconds)
         levels = flights.level - flights.spread * rng.uniform(2.5, 7.0, count)
         found += predict(flights, levels, given.horizon, given.horizon, tell)
+    if given.lines:
+        given.lines.write_text(''.join(json.dumps(asdict(h)) + '\n' for h in found))
+    return _calibration(found, given.horizon)
+
+
+def _calibration(found: Sequence[Horizon], horizon: float) -> tuple[str, str]:
     steady = [h for h in found if h.steady]
     parts = [_reliability_table(
         f'Throttle stays as it is within the horizon: {len(steady)} horizons of '
-        f'{given.horizon:g} s, {sum(h.happened for h in steady)} brown-outs', steady)]
+        f'{horizon:g} s, {sum(h.happened for h in steady)} brown-outs', steady)]
     parts.append(_reliability_table(
         f'Throttle may change within the horizon: {len(found)} horizons, '
         f'{sum(h.happened for h in found)} brown-outs', found))
@@ -98,19 +116,20 @@ def _reliability_table(title: str, found: Sequence[Horizon]) -> str:
 
 def _reliability_figure(found: Sequence[Horizon]) -> str:
     plot = Plot('Predicted and observed probability of a brown-out', 'predicted', 'observed',
-                width=620, height=460, log_x=True, log_y=True)
+                width=900, height=480, log_x=True, log_y=True, legend_row=True)
     line = np.geomspace(1e-4, 1.0, 50)
-    plot.line(line, line, 'as predicted', 7, 'dash')
+    plot.line(line, line, '', 7, 'dash')
     plot.band(line, line / _FACTOR, np.minimum(line * _FACTOR, 1.0), f'within {_FACTOR:g}', 7)
     for colour, method in enumerate(found[0].predicted):
         bins = [b for b in reliability(*_columns(found, method)) if b.hits]
         x = np.array([b.predicted for b in bins])
-        plot.line(x, np.array([b.observed for b in bins]), method, colour, 'thick')
+        plot.line(x, np.array([b.observed for b in bins]), _SHORT.get(method, method), colour,
+                  'thick')
         if colour == 0:
             for b in bins:
                 low, high = b.interval
                 plot.line(np.array([b.predicted] * 2), np.array([max(low, 1e-5), high]), '', 0)
-    return plot.svg()
+    return _document(plot, 'reliability')
 
 
 def alarms(given: argparse.Namespace) -> tuple[str, str]:
@@ -125,7 +144,7 @@ def alarms(given: argparse.Namespace) -> tuple[str, str]:
         lines += timelines(flights, levels, given.horizon, tell)
     outs = sum(math.isfinite(line.brownout) for line in lines)
     plot = Plot('Alarms for nothing against brown-outs missed', 'brown-outs missed (share)',
-                'false alarms per hour', width=620, height=460, log_y=True)
+                'false alarms per hour', width=900, height=480, log_y=True, legend_row=True)
     rows = []
     for colour, method in enumerate(METHODS):
         scores = [score(lines, method, s) for s in settings(lines, method)]
@@ -134,10 +153,11 @@ def alarms(given: argparse.Namespace) -> tuple[str, str]:
             rows.append([method, f'{flag.missed:.2f}', number(flag.false_per_hour, '.3g'),
                          number(flag.lead, '.2g')])
             plot.line(np.array([flag.missed - 0.01, flag.missed + 0.01]),
-                      np.array([flag.false_per_hour] * 2), method, colour, 'thick')
+                      np.array([flag.false_per_hour] * 2), 'flag', colour, 'thick')
             continue
         plot.line(np.array([s.missed for s in scores]),
-                  np.array([max(s.false_per_hour, 0.05) for s in scores]), method, colour, 'thick')
+                  np.array([max(s.false_per_hour, 0.05) for s in scores]),
+                  _SHORT.get(method, method), colour, 'thick')
         for missed in (0.1, 0.2, 0.3):
             best = _at(scores, missed)
             rows.append([f'{method}, {missed:.0%} missed at most', f'{best.missed:.2f}',
@@ -147,7 +167,11 @@ def alarms(given: argparse.Namespace) -> tuple[str, str]:
     text = (f'**{len(lines)} flights, {hours:.1f} hours, {outs} brown-outs; an alarm counts that '
             'is on half a second before**\n\n' + table(
                 ['alarm', 'missed', 'false alarms per hour', 'median lead, s'], rows))
-    return text, plot.svg()
+    return text, _document(plot, 'alarms')
+
+
+def _document(plot: Plot, title: str) -> str:
+    return drawing([plot.svg()], 900, 480, title)
 
 
 def _at(scores: Sequence[Score], missed: float) -> Score | None:
@@ -175,15 +199,8 @@ def cost(given: argparse.Namespace) -> tuple[str, str]:
 
 
 def _write(given: argparse.Namespace, text: str, drawing: str) -> None:
-    stamp = f'{date.today().isoformat()}, seed {given.seed}.'
     if given.table:
-        begin, end = f'<!-- {given.part} begins -->', f'<!-- {given.part} ends -->'
-        old = given.table.read_text(encoding='utf-8')
-        if begin not in old or end not in old:
-            raise SystemExit(f'{given.table} has no lines "{begin}" and "{end}"')
-        head, rest = old.split(begin, 1)
-        given.table.write_text(f'{head}{begin}\n{stamp}\n\n{text}\n{end}{rest.split(end, 1)[1]}',
-                               encoding='utf-8')
+        put(given.table, f'{date.today().isoformat()}, seed {given.seed}.\n\n{text}', given.part)
     else:
         print(text)
     if given.figure and drawing:
@@ -205,6 +222,8 @@ def main() -> int:
         part.add_argument('--seed', type=int, default=SEED)
         part.add_argument('--table', type=Path)
         part.add_argument('--figure', type=Path)
+    parts.choices['calibration'].add_argument(
+        '--lines', type=Path, help='results as JSON lines: written, or read where it exists')
     given = parser.parse_args()
     _write(given, *given.action(given))
     return 0

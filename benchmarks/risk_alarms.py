@@ -64,7 +64,9 @@ def timelines(flights: Flights, levels: np.ndarray, horizon: float,
             paper = stationary(e, level) if e.usable else math.nan
             t.append(flights.t[at - 1])
             # How low the last look went, and how high the last ten seconds.
-            rows.append((report.risk, min(risks), float(report.flag.level is FlagLevel.CRITICAL), paper, level - v[part].min(),
+            rows.append((report.risk, min(risks),
+                         float(report.flag.level is FlagLevel.CRITICAL), paper,
+                         level - v[part].min(),
                          level - v[max(0, at - round(TIMER * RATE)):at].max()
                          if at >= TIMER * RATE else -math.inf))
         table = np.array(rows).reshape(-1, len(METHODS)).T
@@ -138,5 +140,6 @@ def settings(lines: Sequence[Timeline], method: str, count: int = 60) -> np.ndar
     values = values[np.isfinite(values)]
     if not values.size:
         return np.array([math.inf])
-    share = np.concatenate((np.geomspace(1e-5, 0.1, count // 2), np.linspace(0.12, 1.0, count // 2)))
+    share = np.concatenate((np.geomspace(1e-5, 0.1, count // 2),
+                            np.linspace(0.12, 1.0, count // 2)))
     return np.unique(np.quantile(values, 1.0 - share))
