@@ -136,6 +136,11 @@ class RegimeSwitching(Term):
         two = cls._finished(view, best[1], best[2], 80)
         if two is None:
             return None
+        if two.power is None:
+            slow, ahead, states = _slow_levels(view)
+            if slow is not None and ahead > max(float(two.gain[view.train].sum()), _SLOW_AHEAD):
+                # The relaxation seen is that of both; that of the noise alone comes with the fit.
+                return cls._finished(view, slow, 0.0, 1, states) or two
         # Three states: of sigma, or of the level, whichever the two differ in.
         starts = [np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]
         if two.power is None:
@@ -202,6 +207,69 @@ class RegimeSwitching(Term):
                       power=None if abs(x[3]) < _NO_RATIO else power, offset=offset)
 
 
+def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
+    """
+    Return a start for levels that last much longer than the noise, and its evidence.
+
+    Means over half a relaxation time are levels and a first-order noise, of which
+    the correlation is fitted with them: that of the samples is of both together.
+
+    Returns
+    -------
+    start : ndarray or None
+        Coordinates as in `fit_law`.
+    evidence : float
+        Gain in log-likelihood over the noise alone, nats.
+    states : int
+        Levels, 2 or 3.
+
+    """
+    r = view.residual[view.train]
+    a = -math.log(min(max(float(np.median(view.phi[view.train])), 1e-6), 1.0 - 1e-6))
+    size = max(1, round(0.5 / a))
+    count = r.size // size
+    if count < 100:
+        return None, 0.0, 2
+    mean = r[:count * size].reshape(count, size).mean(axis=1)
+    spread = float(mean.std())
+    if not spread > 0.0:
+        return None, 0.0, 2
+    mean = (mean - mean.mean()) / spread
+    step = size / view.rate
+
+    def value(x: FloatArray, states: int) -> float:
+        if max(x[0], x[1]) > _fastest(view) or min(x[0], x[1]) < -6.0 or abs(x[4]) > 4.0:
+            return -math.inf
+        law = _stationary(_rates(math.exp(x[0]), math.exp(x[1]), states))
+        keep, state = math.tanh(x[3]), np.arange(states)
+        level = x[2] * (state - law @ state)
+        log = np.empty((states, states, count - 1))
+        for i, j in np.ndindex(states, states):
+            e = mean[1:] - level[j] - keep * (mean[:-1] - level[i])
+            log[i, j] = log_normal(e, 0.0, math.exp(2.0 * x[4]))
+        return log_likelihood(log.transpose(2, 0, 1), _transition(x, step, states), law)
+
+    # Without a level the rates say nothing: correlation and scale alone.
+    rest = mean[1:] - (keep := float(mean[1:] @ mean[:-1]) / count) * mean[:-1]
+    least = float(log_normal(rest, 0.0, float(rest.var())).sum())
+    best: tuple[float, FloatArray, int] | None = None
+    for states, level in ((2, 1.7), (3, 1.2)):
+        for dwell in (0.5, 2.0):
+            rate = -math.log(dwell * (states - 1))
+            x, top = climb(lambda x: value(x, states), [rate, rate, level, 0.5 * keep, -0.5],
+                           most=120)
+            top -= _THIRD * (states - 2)
+            if best is None or top > best[0]:
+                best = top, x, states
+    if best is None:
+        return None, 0.0, 2
+    unit = math.sqrt(float(np.median(view.variance)))
+    x = best[1]
+    return np.array([x[0], x[1], x[2] * spread / unit, 0.0, 0.0]), best[0] - least, best[2]
+
+
+# Evidence from which slow levels are tried, nats.
+_SLOW_AHEAD = 8.0
 # Samples on which starts are tried, and on which the best is fitted.
 _SHORT, _LONG = 8000, 30000
 # Largest rate of switching, 1/s.

@@ -261,8 +261,10 @@ def _prune(samples: Samples, search: Search) -> None:
     full = search.composite.score(samples)
     last = catalogue()[search.accepted[-1]]
     for name in search.accepted[:-1]:
-        if last.ROLE is Role.LAW and is_measured(catalogue()[name]):
-            # Another law of the noise is no reason to doubt what answers to an input.
+        kind = catalogue()[name]
+        if last.ROLE is Role.LAW and is_measured(kind) and kind.FAMILY != last.FAMILY:
+            # Another law of the noise is no reason to doubt what answers to an input, unless
+            # it is the intensity that wanders: by chance with throttle.
             continue
         index = next(k for k, term in enumerate(search.composite.terms) if term.NAME == name)
         kept = [term for k, term in enumerate(search.composite.terms) if k != index]

@@ -19,9 +19,9 @@ FAILS, OWN_SHARE, SHARE = 4.8, 0.07, 0.02
 # Share of its own signs that noise, a line or the instrument (which may have two
 # corners) may leave, by family; a broad line could be the spectrum of anything.
 _SIGNS_SHARE = {'sensor': 0.3, 'line': 0.3, 'resonance': 0.1, 'instrument': 0.75}
-# A line does not come and go, and what rings under noise does not make three neighbours
-# depend on each other, as harmonics do.
-_NO_LINE = {'resonance': ('bursts', 'products of three'), 'tone': ('bursts',)}
+# What rings under noise does not come and go, and does not make three neighbours depend on
+# each other.
+_NO_RINGING = ('bursts', 'products of three')
 # Share of clustering that the form of sigma(throttle) may leave.
 _FORM_SHARE = 0.15
 
@@ -78,7 +78,7 @@ def withdrawn(before: Mapping[str, float], after: Mapping[str, float],
     def fails(kind: type[Term]) -> bool:
         if kind.ROLE is not Role.NOISE and kind.FAMILY not in ('line', 'instrument'):
             return bool(left)
-        if kind.NAME in _NO_LINE and any(name.startswith(_NO_LINE[kind.NAME]) for name in left):
+        if kind.NAME == 'resonance' and any(name.startswith(_NO_RINGING) for name in left):
             return True
         share = _SIGNS_SHARE['resonance' if kind.NAME == 'resonance' else kind.FAMILY]
         own = max((abs(value) for name, value in before.items() for sign in kind.SIGNS
