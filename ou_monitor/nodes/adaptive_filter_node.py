@@ -214,6 +214,10 @@ class AdaptiveFilterNode(MonitorNode):
             return Level.WARN, (
                 f'The cutoff goes to the fallback, {s.fallback:g} Hz, because '
                 f'{self._unknown(supply)}.')
+        if self.low_pass.cutoff < s.lowest:
+            return Level.WARN, (
+                f'The messages on {self._topic} come too slowly: the cutoff is 0.45 of their '
+                f'rate, {self.low_pass.cutoff:.4g} Hz, below fmin ({s.lowest:.4g} Hz).')
         shadow = 'Shadow, the signal passes unfiltered: ' if s.shadow else ''
         of = f'throttle {supply.throttle:.2f}' if s.law == 'throttle' else (
             f'sigma {supply.sigma:.4g} V/sqrt(s)')

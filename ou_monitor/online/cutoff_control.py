@@ -15,10 +15,11 @@ from ou_monitor.online.settings import FilterSettings
 LN2 = math.log(2.0)
 # Highest cutoff as a share of the sample rate (Betaflight allows 0.475).
 OF_RATE = 0.45
-# Samples over which the sample rate is averaged, and the most that one interval counts of the
-# average: a gap is no sample rate.
+# Samples over which the sample rate is averaged; how far an interval may be from the mean before
+# it is odd; and how many odd ones in a row are a new rate.
 _MEMORY = 100
-_LONGEST = 3.0
+_ODD = 5.0
+_NEW = 5
 
 
 class Bound(enum.Enum):
@@ -37,7 +38,11 @@ class Bound(enum.Enum):
 
 class SampleInterval:
     """
-    Mean time between samples, s: over some 100 samples, a gap counted as three at most.
+    Mean time between samples, s, over some 100 of them.
+
+    An interval of more than five means is a gap and left out, unless gaps are
+    a third of all; five in a row that are five times off are a new rate, which
+    starts the mean anew.
 
     Attributes
     ----------
@@ -46,21 +51,35 @@ class SampleInterval:
 
     """
 
-    __slots__ = ('_n', 'mean')
+    __slots__ = ('_long', '_n', '_short', 'mean')
 
     def __init__(self) -> None:
         self.mean = 0.0
-        self._n = 0
+        self._n = self._short = self._long = 0
 
     def add(self, dt: float) -> float:
         """Take an interval above 0, s; return the mean."""
-        if not self._n:
-            self.mean, self._n = dt, 1
-            return dt
+        if dt > _ODD * self.mean:
+            self._short, self._long = 0, self._long + 2
+            if self._n and self._long < 2 * _NEW:
+                return self.mean
+            return self._restart(dt)
+        if self.mean > _ODD * dt:
+            self._short += 1
+            if self._short >= _NEW:
+                return self._restart(dt)
+        else:
+            # Two normal intervals make up for a gap.
+            self._short, self._long = 0, max(self._long - 1, 0)
         if self._n < _MEMORY:
             self._n += 1
-        self.mean += (min(dt, _LONGEST * self.mean) - self.mean) / self._n
+        self.mean += (dt - self.mean) / self._n
         return self.mean
+
+    def _restart(self, dt: float) -> float:
+        self.mean, self._n = dt, 1
+        self._short = self._long = 0
+        return dt
 
 
 def time_constant(settings: FilterSettings, error: float) -> float:

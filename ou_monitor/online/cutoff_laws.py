@@ -42,7 +42,8 @@ def wanted_cutoff(settings: FilterSettings, sigma: float, alpha: float, throttle
     sigma : float
         Noise intensity of the supply, V/sqrt(s).
     alpha : float
-        Relaxation rate of the supply, 1/s; NaN: the parameter `alpha`.
+        Relaxation rate of the supply, 1/s; the parameter `alpha` stands for NaN
+        and for what that parameter may not be.
     throttle : float
         Throttle, 0..1.
     interval : float
@@ -59,7 +60,7 @@ def wanted_cutoff(settings: FilterSettings, sigma: float, alpha: float, throttle
         return throttle_law(settings, throttle)
     if not (math.isfinite(sigma) and sigma >= 0.0):
         return NAN
-    rate = alpha if math.isfinite(alpha) and alpha > 0.0 else settings.alpha
+    rate = alpha if 1e-6 <= alpha <= 1e9 else settings.alpha
     wanted = LAWS[settings.law](settings, sigma, rate, interval)
     return min(max(wanted, settings.lowest), settings.fmax)
 
@@ -200,9 +201,11 @@ def cutoff_for_noise(mode: str, order: int, rms: float, intensity: float,
         Cutoff, Hz; infinite where even the unfiltered noise is less.
 
     """
-    if intensity <= 0.0:
+    if intensity <= 1e-12 * rms:
         return math.inf
     v = (rms / intensity) ** 2
+    if v == 0.0:
+        return 0.0
     if mode == 'lowpass':
         q = 2.0 * alpha * v
         if q >= 1.0:

@@ -29,8 +29,8 @@ from ou_monitor.records import FloatArray
 
 NAN = math.nan
 _TWO_PI = 2.0 * math.pi
-# Signals beyond this overflow in the filter.
-_LARGEST = 1e150
+# Signals and stamps beyond this, and steps below it, overflow in the filter.
+_LARGEST, _LATEST, _SHORTEST = 1e150, 1e18, 1e-12
 # A step of so many mean intervals is counted as a gap, once the mean stands on so many samples.
 _GAP, _KNOWN = 5.0, 10
 
@@ -47,9 +47,9 @@ class FilterCounters:
     samples : int
         Samples used.
     non_finite : int
-        Samples that were NaN, infinite or beyond 1e150, or whose stamp was.
+        Samples that were NaN, infinite or beyond 1e150, or whose stamp was or lay beyond 1e18 s.
     repeated : int
-        Samples with the stamp of the one before.
+        Samples with the stamp of the one before, or less than 1 ps later.
     back : int
         Samples with an earlier stamp; time goes on from there.
     gaps : int
@@ -210,7 +210,7 @@ class AdaptiveLowPass:
 
     def _step(self, t: float, x: float, sigma: float, sigma_se: float, alpha: float,
               throttle: float) -> float:
-        if not (abs(x) < _LARGEST and math.isfinite(t)):
+        if not (abs(x) < _LARGEST and abs(t) < _LATEST):
             self.counters.non_finite += 1
             return self._out
         error = sigma_se / sigma if sigma > 0.0 and sigma_se >= 0.0 else NAN
@@ -222,7 +222,7 @@ class AdaptiveLowPass:
             self._t, self._x = t, x
             return self._out
         dt = t - self._t
-        if not dt > 0.0:
+        if dt < _SHORTEST:
             self._stay(t, x, dt)
             return self._out
         self.counters.samples += 1

@@ -29,8 +29,8 @@ def chain(shared_world):
     estimator = shared_world.start('estimator')
     low_pass = shared_world.start(
         'adaptive_filter', '--ros-args', '-r', 'sigma:=ou_estimator/sigma',
-        '-r', 'state:=ou_estimator/state', '-r', 'input:=voltage', '-p', f'sigma_ref:={SIGMA_REF}', '-p', 'fmin:=2.0',
-        '-p', 'smoothing:=0.05')
+        '-r', 'state:=ou_estimator/state', '-r', 'input:=voltage',
+        '-p', f'sigma_ref:={SIGMA_REF}', '-p', 'fmin:=2.0', '-p', 'smoothing:=0.05')
     # Both must be there: replay starts with its first subscriber, which is this probe.
     wait_until(lambda: heard['sigma'] and heard['cutoff'] and statuses(heard), what='both nodes')
     heard['fallback'] = heard['cutoff'][0].data

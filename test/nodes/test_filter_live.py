@@ -219,6 +219,22 @@ def test_shadow_lets_the_signal_pass(rig):
     assert rig.probe.set_parameter(NODE, 'shadow', False).successful
 
 
+def test_a_slow_input_warns(rig):
+    """At 10 Hz 0.45 of the rate is below fmin."""
+    def told():
+        for _ in range(50):
+            rig.send((0.0, 0.0, 0.0), dt=0.1)
+            time.sleep(0.001)
+        rig.sigma.publish(Float64(data=0.6))
+        return 'come too slowly: the cutoff is 0.45 of their rate, 4.5 Hz' in rig.status.message
+    wait_until(told, what='WARN')
+    assert rig.status.level == b'\x01'
+    # The sample rate is averaged over 100 samples: back to what the other tests use.
+    for _ in range(2000):
+        rig.send((0.0, 0.0, 0.0))
+        time.sleep(0.0005)
+
+
 def test_stale_sigma_falls_back_and_warns(rig):
     """An old sigma is no sigma."""
     cutoff_becomes(rig, 37.5, 0.6)

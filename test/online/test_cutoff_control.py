@@ -144,15 +144,29 @@ def test_configure_keeps_the_cutoff_within_the_new_limits():
 
 
 def test_the_sample_interval_is_not_taken_in_by_gaps():
-    """1 kHz with a gap of half a second in it; and a rate that changes is followed."""
+    """1 kHz with a gap of half a second in it; pairs of messages; rates that change."""
     interval = SampleInterval()
     for _ in range(200):
         interval.add(1e-3)
     interval.add(0.5)
-    assert interval.mean == pytest.approx(1.02e-3)
+    assert interval.mean == pytest.approx(1e-3)
     for _ in range(1000):
         interval.add(4e-3)
     assert interval.mean == pytest.approx(4e-3, rel=0.01)
+    for dt in (0.1,) * 5:
+        interval.add(dt)
+    assert interval.mean == 0.1
+    for dt in (1e-6, 2e-3) * 300:
+        interval.add(dt)
+    assert interval.mean == pytest.approx(1e-3, rel=0.02)
+
+
+def test_a_first_stamp_far_away_is_soon_forgotten():
+    """From 0 to the wall clock in one step: six samples later the rate is known."""
+    interval = SampleInterval()
+    for dt in (1.7e9, *(1e-3,) * 5):
+        interval.add(dt)
+    assert interval.mean == 1e-3
 
 
 @settings(max_examples=200, deadline=None)

@@ -2,6 +2,7 @@
 
 import math
 
+from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.online.cutoff_laws import (
     cutoff_for_noise, LAWS, least_error, relative_cutoff, squared_error, supply_noise,
@@ -259,3 +260,24 @@ def test_more_noise_never_raises_the_cutoff(law, more, order):
     assert all(s.fmin <= fc <= s.fmax for fc in cutoffs)
     assert all(b <= a * (1.0 + 1e-3) for a, b in zip(cutoffs, cutoffs[1:]))
     assert cutoffs[0] == pytest.approx(s.fmax) and cutoffs[-1] == pytest.approx(s.fmin)
+
+
+ANY = st.floats(allow_nan=True, allow_infinity=True)
+SETTINGS = [FilterSettings(**{'mode': mode, 'order': order, **more}) for mode, more in (
+    *((mode, more) for mode in ('lowpass', 'derivative') for more in (
+        {}, {'law': 'threshold'}, {'law': 'throttle'}, {'coupling': 2.0},
+        {'coupling': 1e9, 'noise_wanted': 1e-9}, {'coupling': 1e-9, 'noise_wanted': 1e12})),
+    *(('lowpass', {'law': 'wiener', **more}) for more in (
+        {'n0': 1e-300}, {'n0': 1e12}, {'signal_bandwidth': 1e-3, 'signal_rms': 1e12, 'n0': 1e-9},
+        {'signal_bandwidth': 1e6, 'signal_rms': 1e-9, 'coupling': 1e9}))) for order in (1, 2)]
+
+
+@settings(max_examples=1000, deadline=None)
+@given(s=st.sampled_from(SETTINGS), sigma=ANY, alpha=ANY, throttle=ANY,
+       interval=st.one_of(st.just(0.0), st.floats(1e-9, 1e6)))
+def test_any_number_gives_a_cutoff_within_the_limits_or_nan(s, sigma, alpha, throttle, interval):
+    """Numbers from a topic may be anything; nothing overflows, and NaN is for the unknown."""
+    got = wanted_cutoff(s, sigma, alpha, throttle, interval)
+    known = (math.isfinite(throttle) if s.law == 'throttle' else
+             math.isfinite(sigma) and sigma >= 0.0)
+    assert s.fmin <= got <= s.fmax if known else math.isnan(got)

@@ -152,6 +152,22 @@ def test_bounded_and_finite_whatever_comes(order, shadow, samples):
     assert c.samples + c.non_finite + c.repeated + c.back == len(samples)
 
 
+@settings(max_examples=200, deadline=None)
+@given(mode=st.sampled_from(['lowpass', 'derivative']), order=st.sampled_from([1, 2]),
+       samples=st.lists(st.tuples(*[st.floats(allow_nan=True, allow_infinity=True)] * 3),
+                        min_size=1, max_size=40))
+def test_no_number_can_break_it(mode, order, samples):
+    """Any floats at all, subnormal steps included; afterwards it works as ever."""
+    f = AdaptiveLowPass(mode=mode, order=order)
+    for t, x, sigma in samples:
+        assert not math.isinf(f.filter(t, x, sigma))
+    t = -2e17 + np.arange(0.0, 640.0 * 3000, 640.0)
+    y = f.filter(t, 3.0 + 2.0 * (t - t[0]), 0.1)
+    # Steps of 640 s are long for any cutoff that 0.45 of the sample rate allows.
+    assert y[-1] == pytest.approx(2.0 if mode == 'derivative' else 3.0 + 2.0 * (t[-1] - t[0]),
+                                  rel=1e-2)
+
+
 def test_nan_input_does_not_move_the_filter():
     f = AdaptiveLowPass()
     assert math.isnan(f.filter(0.0, NAN, 0.1))
