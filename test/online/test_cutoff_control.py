@@ -129,9 +129,9 @@ def test_dead_band_holds_and_then_follows():
 
 
 def test_after_the_fallback_the_dead_band_does_not_hold():
-    """A sigma that has come back is followed, however near it is."""
+    """A sigma that has come back is followed, however near it is; then the band is there again."""
     made = control(dead_band=0.5, fallback=75.0)
-    assert line(made, [100.0, NAN, 80.0]) == [100.0, 75.0, 80.0]
+    assert line(made, [100.0, NAN, 80.0, 85.0]) == [100.0, 75.0, 80.0, 80.0]
 
 
 def test_configure_keeps_the_cutoff_within_the_new_limits():
