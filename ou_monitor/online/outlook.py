@@ -16,6 +16,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.model.passage_law import prepare
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.measurement_noise import MeasurementNoise
 from ou_monitor.online.budget import throttle_budget, ThrottleBudget
@@ -47,6 +48,8 @@ class Outlook:
     """
 
     def __init__(self, *, background: bool = True) -> None:
+        # A third of a second, once: not while samples are coming.
+        prepare()
         self._curves = LearnedCurves()
         self._newest = np.empty(0)
         # Whether no throttle has come yet: all samples are then of one.

@@ -5,6 +5,7 @@ import math
 import time
 
 import numpy as np
+from ou_monitor.model import passage_law
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.jumps import Jumps
 from ou_monitor.model.terms.load_sag import LoadSag
@@ -131,3 +132,13 @@ def test_sampled_sees_less_than_the_path():
     reports = [flown(SupplyMonitor(replace(settings, brownout_watch=watch)), [(0.5, 3.0)])
                for watch in ('continuous', 'sampled')]
     assert 0.2 * reports[0].risk < reports[1].risk < 0.9 * reports[0].risk
+
+
+def test_the_table_is_made_before_samples_come(monkeypatch):
+    """A node that built it at its first report would lose what arrives meanwhile."""
+    monitor = SupplyMonitor(SETTINGS)
+
+    def build():
+        raise AssertionError('built while samples are coming')
+    monkeypatch.setattr(passage_law, '_build', build)
+    assert flown(monitor, [(0.2, 2.0)]).risk < 1e-6
