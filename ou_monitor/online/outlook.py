@@ -130,7 +130,7 @@ class Outlook:
                ) -> tuple[FloatArray, FloatArray]:
         """Return ln sigma with what it wanders, and the error of that within the horizon."""
         wander = self._curves.wander
-        variance = error**2 + wander.variance + _SHARE * wander.speed * horizon
+        variance = error**2 + wander.variance + _SHARE * wander.fast_speed * horizon
         return ln_sigma + wander.value, np.minimum(np.sqrt(variance), _LARGEST)
 
     def risk(self, e: Estimate, settings: MonitorSettings) -> float:

@@ -37,6 +37,8 @@ class Wander:
         Where it is by all that has been seen, and how well that is known.
     speed : float
         Variance that it gains per second, as far as is known.
+    fast_speed : float
+        The same, the faster of what may be counted more.
 
     """
 
@@ -93,3 +95,9 @@ class Wander:
     def speed(self) -> float:
         """Return the variance that it gains per second."""
         return float(self._weight @ _SPEEDS)
+
+    @property
+    def fast_speed(self) -> float:
+        """Return the same where the faster count by their speed, as tails feel them."""
+        speed = self.speed
+        return float(self._weight @ _SPEEDS**2) / speed if speed > 0.0 else 0.0
