@@ -1,58 +1,67 @@
 """
-A low-pass whose cutoff follows sigma and may move with every sample.
+A low-pass, or filtered derivative, whose cutoff follows the noise of the supply.
 
-State form: the continuous filter is solved exactly over each step with the
-input held, so any dt is right, and the states (output, scaled slope) do not
-jump when the cutoff moves.  The sum of their squares never grows by itself at
-any sequence of cutoffs, so no modulation can make the filter unstable.
+sigma -> law (`cutoff_laws`) -> wanted cutoff -> limits, smoothing, slew
+(`cutoff_control`) -> cutoff in force -> filter (`filter_state`) -> output.
 
-Limits: two laws (`threshold`, `constant_noise`); white noise whose intensity
-is proportional to sigma is assumed by `constant_noise`.
+The derivative is the same low-pass with the slope of the input for its input:
+no term of it jumps when the cutoff moves, and it is the exact response to an
+input that is linear between samples.
+
+Limits: the cutoff is constant within a step; sampling folds what lies above
+half the sample rate down before any filter sees it.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 import math
 
 import numpy as np
 import numpy.typing as npt
 
+from ou_monitor.online.cutoff_control import Bound, CutoffControl, SampleInterval
+from ou_monitor.online.cutoff_laws import wanted_cutoff
+from ou_monitor.online.filter_state import LowPassState
+from ou_monitor.online.lag import delay, phase_lag
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray
 
-_ROOT2 = math.sqrt(2.0)
+NAN = math.nan
+_TWO_PI = 2.0 * math.pi
+# Signals beyond this overflow in the filter.
+_LARGEST = 1e150
+# A step of so many mean intervals is counted as a gap, once the mean stands on so many samples.
+_GAP, _KNOWN = 5.0, 10
+
+_Maybe = npt.ArrayLike | None
 
 
-def cutoff_from_sigma(settings: FilterSettings, sigma: float) -> float:
+@dataclass
+class FilterCounters:
     """
-    Return the cutoff, Hz, that the law asks for at `sigma`.
+    Samples that came, and those that were not used.
 
-    `threshold` (the paper's section 6): fmax up to `sigma_ref`, fmin above.
-    `constant_noise`: white noise through a low-pass of either order has an
-    rms proportional to sigma sqrt(fc), so fc = fmax (sigma_ref / sigma)^2
-    holds it at its value for sigma_ref.
-
-    Parameters
+    Attributes
     ----------
-    settings : FilterSettings
-        Law and limits.
-    sigma : float
-        Noise intensity, V/sqrt(s); NaN, infinite or negative: the fallback.
-
-    Returns
-    -------
-    float
-        Cutoff within fmin..fmax, Hz.
+    samples : int
+        Samples used.
+    non_finite : int
+        Samples that were NaN, infinite or beyond 1e150, or whose stamp was.
+    repeated : int
+        Samples with the stamp of the one before.
+    back : int
+        Samples with an earlier stamp; time goes on from there.
+    gaps : int
+        Steps of more than five mean intervals.
 
     """
-    if not (math.isfinite(sigma) and sigma >= 0.0):
-        return settings.fallback
-    if settings.law == 'threshold':
-        return settings.fmax if sigma <= settings.sigma_ref else settings.fmin
-    if sigma <= settings.sigma_ref:
-        return settings.fmax
-    wanted = settings.fmax * (settings.sigma_ref / sigma) ** 2
-    return max(wanted, settings.fmin)
+
+    samples: int = 0
+    non_finite: int = 0
+    repeated: int = 0
+    back: int = 0
+    gaps: int = 0
 
 
 class AdaptiveLowPass:
@@ -62,22 +71,28 @@ class AdaptiveLowPass:
     Parameters
     ----------
     **options
-        Fields of `FilterSettings`: order (1 or 2), law, fmin, fmax (Hz),
-        sigma_ref (V/sqrt(s)), fallback (Hz), smoothing (s).
+        Fields of `FilterSettings`, as the parameters of the node.
 
     Raises
     ------
     ValueError
-        For an option that is unknown or out of range.
+        For an option that is unknown or out of range, or that contradicts
+        another.
 
     """
 
     def __init__(self, **options: object) -> None:
         self._settings = FilterSettings.from_options(options)
-        self._cutoff = self._settings.fallback
+        self._control = CutoffControl(self._settings)
+        self._state = LowPassState()
+        self._interval = SampleInterval()
+        self.counters = FilterCounters()
         self._t: float | None = None
-        self._y = 0.0
-        self._slope = 0.0
+        self._x = 0.0
+        self._raw = self._offset = 0.0
+        self._out = NAN
+        self._asked: tuple[float, ...] | None = None
+        self._wanted = NAN
 
     @property
     def settings(self) -> FilterSettings:
@@ -86,33 +101,84 @@ class AdaptiveLowPass:
 
     @property
     def cutoff(self) -> float:
-        """Cutoff now, Hz."""
-        return self._cutoff
+        """Cutoff in force, Hz; of a shadow, the one that would be."""
+        return self._control.cutoff
+
+    @property
+    def wanted(self) -> float:
+        """Cutoff that the law wants, within fmin..fmax, Hz; NaN when it does not know."""
+        return self._control.wanted
+
+    @property
+    def bound(self) -> Bound:
+        """What decides the cutoff in force."""
+        return self._control.bound
+
+    @property
+    def phase_lag(self) -> float:
+        """Lag of the cutoff in force at `lag_frequency`, degrees."""
+        s = self._settings
+        return phase_lag(s.order, self.cutoff, s.lag_frequency)
+
+    @property
+    def delay(self) -> float:
+        """Phase delay of the cutoff in force at `lag_frequency`, s."""
+        return delay(self.phase_lag, self._settings.lag_frequency)
 
     def configure(self, **options: object) -> None:
-        """Change options; the output does not move, the cutoff follows."""
-        self._settings = FilterSettings.from_options(options, base=self._settings)
-        self._cutoff = min(max(self._cutoff, self._settings.fmin), self._settings.fmax)
+        """
+        Change options; the output does not move, the cutoff follows.
+
+        Where `shadow` is switched, the output goes from the one to the other
+        within the time constant of the filter.
+
+        Raises
+        ------
+        ValueError
+            For an option that cannot be used (the old ones stay), or another
+            mode: its output has another unit, which takes a new filter.
+
+        """
+        settings = FilterSettings.from_options(options, base=self._settings)
+        if settings.mode != self._settings.mode and self._t is not None:
+            raise ValueError(
+                f"mode cannot change from '{self._settings.mode}' to '{settings.mode}' while "
+                'filtering: the output would change its unit; make a new filter')
+        self._settings = settings
+        self._control.configure(settings)
+        self._asked = None
+        if self._t is not None:
+            self._offset = self._out - self._source()
 
     def filter(self, t: npt.ArrayLike, x: npt.ArrayLike,  # noqa: A003
-               sigma: npt.ArrayLike) -> FloatArray | float:
+               sigma: npt.ArrayLike, *, sigma_se: _Maybe = None, alpha: _Maybe = None,
+               throttle: _Maybe = None) -> FloatArray | float:
         """
         Filter samples.
 
         Parameters
         ----------
         t : float or array_like, shape (n,)
-            Stamps, s.  A step back or a repeat is taken as dt = 0: the output
-            stays.
+            Stamps, s.  At a repeat or a step back the output stays; both are
+            counted, and time goes on from an earlier stamp.
         x : float or array_like, shape (n,)
-            Signal, any unit.  NaN and infinite samples do not move the filter.
+            Signal, any unit.  NaN and infinite samples are counted and do not
+            move the output.
         sigma : float or array_like, shape (n,)
             Noise intensity, V/sqrt(s); NaN means unknown (fallback cutoff).
+        sigma_se : float or array_like, shape (n,), optional
+            Standard error of sigma, V/sqrt(s): a certain sigma moves the
+            cutoff faster.
+        alpha : float or array_like, shape (n,), optional
+            Relaxation rate of the supply, 1/s; NaN or left out: the parameter.
+        throttle : float or array_like, shape (n,), optional
+            Throttle, 0..1, for the law of that name.
 
         Returns
         -------
         float or ndarray, shape (n,)
-            Filtered signal, like `x`; NaN until the first finite sample.
+            Filtered signal, or its derivative in unit/s (0 at the first
+            sample); NaN until the first finite sample.
 
         Raises
         ------
@@ -124,44 +190,80 @@ class AdaptiveLowPass:
         if stamps.shape != signal.shape or stamps.ndim > 1:
             raise ValueError(
                 f't and x must have one shape: got {stamps.shape} and {signal.shape}')
+        others = [np.asarray(NAN if one is None else one, dtype=np.float64)
+                  for one in (sigma, sigma_se, alpha, throttle)]
+        for name, one in zip(('sigma', 'sigma_se', 'alpha', 'throttle'), others, strict=True):
+            if one.shape not in ((), stamps.shape):
+                raise ValueError(
+                    f'{name} must be one number or of the shape of t, {stamps.shape}: got '
+                    f'{one.shape}')
         if stamps.ndim == 0:
-            return self._step(float(stamps), float(signal), float(np.asarray(sigma)))
-        intensity = np.broadcast_to(np.asarray(sigma, dtype=np.float64), stamps.shape)
+            return self._step(float(stamps), float(signal), *map(float, others))
+        wide = [np.broadcast_to(one, stamps.shape).tolist() for one in others]
         return np.array([self._step(*one) for one in
-                         zip(stamps.tolist(), signal.tolist(), intensity.tolist())])
+                         zip(stamps.tolist(), signal.tolist(), *wide, strict=True)])
 
-    def _step(self, t: float, x: float, sigma: float) -> float:
-        if not math.isfinite(x) or not math.isfinite(t):
-            return self._y if self._t is not None else math.nan
+    def step(self, t: float, x: float, sigma: float, sigma_se: float = NAN,
+             alpha: float = NAN, throttle: float = NAN) -> float:
+        """Filter one sample; as `filter`, NaN for what is not known (the node's short way)."""
+        return self._step(t, x, sigma, sigma_se, alpha, throttle)
+
+    def _step(self, t: float, x: float, sigma: float, sigma_se: float, alpha: float,
+              throttle: float) -> float:
+        if not (abs(x) < _LARGEST and math.isfinite(t)):
+            self.counters.non_finite += 1
+            return self._out
+        error = sigma_se / sigma if sigma > 0.0 and sigma_se >= 0.0 else NAN
+        derivative = self._settings.mode == 'derivative'
         if self._t is None:
-            self._t, self._y, self._slope = t, x, 0.0
-            self._cutoff = cutoff_from_sigma(self._settings, sigma)
-            return x
-        dt = max(t - self._t, 0.0)
-        self._t = t
-        self._follow(cutoff_from_sigma(self._settings, sigma), dt)
-        if dt > 0.0:
-            self._advance(2.0 * math.pi * self._limited(dt) * dt, x)
-        return self._y
+            self.counters.samples += 1
+            self._control.update(self._ask(sigma, alpha, throttle, 0.0), error, 0.0, 0.0)
+            self._state.y = self._raw = self._out = 0.0 if derivative else x
+            self._t, self._x = t, x
+            return self._out
+        dt = t - self._t
+        if not dt > 0.0:
+            self._stay(t, x, dt)
+            return self._out
+        self.counters.samples += 1
+        if dt > _GAP * self._interval.mean and self.counters.samples > _KNOWN:
+            self.counters.gaps += 1
+        interval = self._interval.add(dt)
+        cutoff = self._control.update(
+            self._ask(sigma, alpha, throttle, interval), error, dt, interval)
+        angle = _TWO_PI * cutoff * dt
+        start, end = self._x, x
+        if derivative:
+            start = end = (x - self._x) / dt
+        self._t, self._x, self._raw = t, x, end
+        self._state.advance(self._settings.order, angle, start, end)
+        self._out = self._source()
+        if self._offset:
+            self._offset *= math.exp(-angle)
+            self._out += self._offset
+        return self._out
 
-    def _follow(self, target: float, dt: float) -> None:
-        """Move the cutoff towards its target, first order in ln(f)."""
-        share = -math.expm1(-dt / self._settings.smoothing) if self._settings.smoothing else 1.0
-        self._cutoff *= (target / self._cutoff) ** share
+    def _stay(self, t: float, x: float, dt: float) -> None:
+        """Take a sample that has no time of its own."""
+        if dt < 0.0:
+            # The slope from here to the next sample is of the new time line.
+            self._t, self._x = t, x
+            self.counters.back += 1
+        else:
+            self.counters.repeated += 1
 
-    def _limited(self, dt: float) -> float:
-        """Keep the cutoff in force under 0.45 of the sample rate."""
-        return min(self._cutoff, 0.45 / dt)
+    def _source(self) -> float:
+        """Return what comes out when no switch of `shadow` is being smoothed over."""
+        return self._raw if self._settings.shadow else self._state.y
 
-    def _advance(self, angle: float, x: float) -> None:
-        """Solve the filter over one step of `angle` = 2 pi fc dt, input held at x."""
-        if self._settings.order == 1:
-            self._y += -math.expm1(-angle) * (x - self._y)
-            self._slope = 0.0
-            return
-        # Butterworth, poles at fc exp(+-3i pi/4): closed form of the 2 x 2 exponential.
-        a = angle / _ROOT2
-        decay, sin, cos = math.exp(-a), math.sin(a), math.cos(a)
-        off, slope = self._y - x, self._slope
-        self._y = x + decay * ((cos + sin) * off + _ROOT2 * sin * slope)
-        self._slope = decay * (-_ROOT2 * sin * off + (cos - sin) * slope)
+    def _ask(self, sigma: float, alpha: float, throttle: float, interval: float) -> float:
+        """Return what the law wants; asked again only when something it reads has changed."""
+        # NaN never equals itself; the derivative of order 1 is the one that reads the interval,
+        # which is not known at the first sample.
+        s = self._settings
+        rate = interval if s.order == 1 and s.mode == 'derivative' else interval > 0.0
+        asked = (*(one if one == one else math.inf for one in (sigma, alpha, throttle)), rate)
+        if asked != self._asked:
+            self._wanted = wanted_cutoff(s, sigma, alpha, throttle, interval)
+            self._asked = asked
+        return self._wanted

@@ -14,6 +14,7 @@ import math
 from typing import Any
 
 from ou_monitor.errors import nearest
+from ou_monitor.online.lag import cutoff_for_lag, most_lag
 
 
 @dataclass(frozen=True)
@@ -90,18 +91,56 @@ ESTIMATOR_PARAMETERS: tuple[Parameter, ...] = (
               'Model file of the supply (discover --save-model); empty: none.'),
 )
 
+LAWS = ('constant_noise', 'threshold', 'throttle', 'wiener')
+
 FILTER_PARAMETERS: tuple[Parameter, ...] = (
+    Parameter('mode', 'lowpass',
+              'What comes out: the signal, or its derivative in unit/s (for a D term).',
+              choices=('lowpass', 'derivative')),
     Parameter('order', 2, 'Order of the low-pass: 1, or 2 (Butterworth).', 1, 2),
-    Parameter('law', 'constant_noise', 'Law from sigma to cutoff.',
-              choices=('threshold', 'constant_noise')),
+    Parameter('law', 'constant_noise', 'Law from sigma to cutoff.', choices=LAWS),
     Parameter('fmin', 20.0, 'Lowest cutoff, Hz: the limit of the lag, so a safety limit.',
               0.001, 1.0e6),
     Parameter('fmax', 150.0, 'Highest cutoff, Hz.', 0.001, 1.0e6),
-    Parameter('sigma_ref', 0.3, 'Sigma up to which the cutoff stays at fmax, V/sqrt(s).',
-              1.0e-9, 1.0e6),
+    Parameter('max_lag', 0.0,
+              'Most lag at lag_frequency, degrees: takes the place of fmin; 0: fmin as given.',
+              0.0, 179.0),
+    Parameter('lag_frequency', 10.0, 'Where the lag is computed and limited, Hz.', 0.001, 1.0e6),
+    Parameter('sigma_ref', 0.3,
+              'Sigma up to which the cutoff stays at fmax, V/sqrt(s) (threshold, and '
+              'constant_noise without coupling).', 1.0e-9, 1.0e6),
+    Parameter('coupling', 0.0, 'Supply noise in the signal, unit of the signal per V; 0: not '
+              'known, constant_noise is relative to sigma_ref.', 0.0, 1.0e9),
+    Parameter('noise_wanted', 0.0,
+              'Rms of the output noise that constant_noise holds, unit of the output; needs '
+              'coupling.', 0.0, 1.0e12),
+    Parameter('n0', 0.0,
+              'White noise of the measurement for wiener, unit^2/Hz, two-sided: variance of a '
+              'sample over sample rate.', 0.0, 1.0e12),
+    Parameter('alpha', 63.0,
+              "Relaxation rate of the supply while the estimator's is not known, 1/s.",
+              1.0e-6, 1.0e9),
+    Parameter('signal_bandwidth', 0.0,
+              'Bandwidth of the true signal for wiener, Hz; 0: the signal is the voltage itself.',
+              0.0, 1.0e6),
+    Parameter('signal_rms', 0.0, 'Rms of the true signal for wiener, unit of the signal.',
+              0.0, 1.0e12),
+    Parameter('expo', 5.0, 'Curvature of the throttle law, 0..10.', 0.0, 10.0),
+    Parameter('smoothing', 0.2,
+              'Time constant of the cutoff (in its logarithm), s, at a relative error of sigma '
+              'of smoothing_error.', 0.0, 3600.0),
+    Parameter('smoothing_error', 0.1,
+              'Relative error of sigma for which smoothing is meant; a better sigma moves the '
+              'cutoff faster in proportion.', 0.001, 10.0),
+    Parameter('smoothing_range', 4.0,
+              'Most that the time constant is divided or multiplied by for the error of sigma; '
+              '1: never.', 1.0, 100.0),
+    Parameter('slew', 4.0, 'Most that the cutoff moves, octaves/s; 0: no limit.', 0.0, 1.0e6),
+    Parameter('dead_band', 0.1, 'Change of the wanted cutoff that is not followed, octaves.',
+              0.0, 10.0),
     Parameter('fallback', 75.0, 'Cutoff when sigma is stale or unknown, Hz.', 0.001, 1.0e6),
-    Parameter('smoothing', 0.2, 'Time constant of the cutoff (in its logarithm), s.',
-              0.0, 3600.0),
+    Parameter('shadow', False,
+              'Whether the cutoff is only computed and published, the signal passing unfiltered.'),
     Parameter('stale_after', 1.0, 'Age of sigma after which the fallback is used, s.',
               0.01, 3600.0),
 )
@@ -165,24 +204,84 @@ class MonitorSettings:
 class FilterSettings:
     """Settings of `AdaptiveLowPass`; see `FILTER_PARAMETERS` for units."""
 
+    mode: str = 'lowpass'
     order: int = 2
     law: str = 'constant_noise'
     fmin: float = 20.0
     fmax: float = 150.0
+    max_lag: float = 0.0
+    lag_frequency: float = 10.0
     sigma_ref: float = 0.3
-    fallback: float = 75.0
+    coupling: float = 0.0
+    noise_wanted: float = 0.0
+    n0: float = 0.0
+    alpha: float = 63.0
+    signal_bandwidth: float = 0.0
+    signal_rms: float = 0.0
+    expo: float = 5.0
     smoothing: float = 0.2
+    smoothing_error: float = 0.1
+    smoothing_range: float = 4.0
+    slew: float = 4.0
+    dead_band: float = 0.1
+    fallback: float = 75.0
+    shadow: bool = False
     stale_after: float = 1.0
 
     def __post_init__(self) -> None:
         """Refuse values out of range and contradictions."""
         _check(FILTER_PARAMETERS, self)
-        if not self.fmin < self.fmax:
+        self._check_limits()
+        self._check_law()
+
+    def _check_limits(self) -> None:
+        if self.max_lag:
+            if self.max_lag >= most_lag(self.order):
+                raise ValueError(
+                    f'max_lag ({self.max_lag:g} degrees) must be less than '
+                    f'{most_lag(self.order):g}, which order {self.order} never reaches; 0: none')
+            if not self.lowest < self.fmax:
+                raise ValueError(
+                    f'max_lag ({self.max_lag:g} degrees at {self.lag_frequency:g} Hz) needs a '
+                    f'cutoff of {self.lowest:.4g} Hz at least, which is not less than fmax '
+                    f'({self.fmax} Hz): allow more lag or raise fmax')
+        elif not self.fmin < self.fmax:
             raise ValueError(f'fmin ({self.fmin} Hz) must be less than fmax ({self.fmax} Hz)')
-        if not self.fmin <= self.fallback <= self.fmax:
+        if not self.lowest <= self.fallback <= self.fmax:
+            why = f' (fmin by max_lag {self.max_lag:g} degrees)' if self.max_lag else ''
             raise ValueError(
                 f'fallback ({self.fallback} Hz) must lie within fmin..fmax '
-                f'({self.fmin}..{self.fmax} Hz)')
+                f'({self.lowest:.6g}..{self.fmax} Hz){why}')
+
+    def _check_law(self) -> None:
+        if self.law == 'constant_noise' and (self.coupling > 0.0) != (self.noise_wanted > 0.0):
+            given, missing = (('coupling', 'noise_wanted') if self.coupling else
+                              ('noise_wanted', 'coupling'))
+            raise ValueError(
+                f'law constant_noise with {given} needs {missing} too (above 0); with neither it '
+                'is relative to sigma_ref')
+        if self.law != 'wiener':
+            return
+        if self.mode == 'derivative':
+            raise ValueError(
+                'law wiener cannot be used in mode derivative: the derivative of the signal that '
+                'it assumes has no finite variance; use constant_noise')
+        if self.signal_bandwidth:
+            if not (self.signal_rms > 0.0 and (self.coupling > 0.0 or self.n0 > 0.0)):
+                raise ValueError(
+                    'law wiener with signal_bandwidth needs signal_rms and the noise: coupling, '
+                    'n0 or both (above 0)')
+        elif not self.n0 > 0.0:
+            raise ValueError(
+                'law wiener needs n0 (the white noise of the measurement, above 0), or '
+                'signal_bandwidth, signal_rms and coupling')
+
+    @property
+    def lowest(self) -> float:
+        """Return the lowest cutoff, Hz: fmin, or what max_lag makes of it."""
+        if self.max_lag:
+            return cutoff_for_lag(self.order, self.max_lag, self.lag_frequency)
+        return self.fmin
 
     @classmethod
     def from_options(cls, options: Mapping[str, object],
@@ -206,9 +305,15 @@ class FilterSettings:
         values: dict[str, Any] = dict(options)
         old = base or cls()
         if 'fallback' not in values:
-            low, high = values.get('fmin', old.fmin), values.get('fmax', old.fmax)
-            if _is_number(low) and _is_number(high) and low < high:
-                values['fallback'] = min(max(old.fallback, low), high)
+            try:
+                lowest = replace(old, **{**values, 'fallback': values.get('fmax', old.fmax)}
+                                 ).lowest
+            except (TypeError, ValueError):
+                # Told below, with the fallback as it was.
+                lowest = math.nan
+            if math.isfinite(lowest):
+                values['fallback'] = min(max(old.fallback, lowest),
+                                         values.get('fmax', old.fmax))
         return replace(base, **values) if base else cls(**values)
 
 

@@ -1,0 +1,305 @@
+r"""
+Laws from sigma to the cutoff that is wanted, each derived where it is.
+
+With w = 2 pi fc, the supply U an Ornstein-Uhlenbeck process of intensity
+sigma and rate alpha, and `coupling` times its deviation in the signal, the
+output variance is (coupling sigma)^2 V(w), by the integral of
+|H(iw)|^2 / (alpha^2 + w^2) over the frequencies:
+
+    low-pass, order 1     V = w / (2 alpha (w + alpha))
+    low-pass, order 2     V = w (sqrt2 w + alpha) / (2 sqrt2 alpha (w^2 + sqrt2 w alpha + alpha^2))
+    derivative, order 1   V = w^2 / (2 (w + alpha))
+    derivative, order 2   V = w^3 / (2 sqrt2 (w^2 + sqrt2 w alpha + alpha^2))
+
+All grow with w, so that a wanted variance has one cutoff.
+
+Limits: stationary laws of a cutoff that stays; noise above half the sample
+rate, which folds down, is not in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import math
+
+from ou_monitor.online.settings import FilterSettings
+
+TWO_PI = 2.0 * math.pi
+_ROOT2 = math.sqrt(2.0)
+_ROOT8 = 2.0 * _ROOT2
+NAN = math.nan
+
+
+def wanted_cutoff(settings: FilterSettings, sigma: float, alpha: float, throttle: float,
+                  interval: float) -> float:
+    """
+    Return the cutoff that the law in force asks for.
+
+    Parameters
+    ----------
+    settings : FilterSettings
+        Law and its parameters.
+    sigma : float
+        Noise intensity of the supply, V/sqrt(s).
+    alpha : float
+        Relaxation rate of the supply, 1/s; NaN: the parameter `alpha`.
+    throttle : float
+        Throttle, 0..1.
+    interval : float
+        Time between samples, s.
+
+    Returns
+    -------
+    float
+        Cutoff, Hz, within the limits of the settings; NaN where what the law
+        needs is not known (NaN, infinite or negative).
+
+    """
+    if settings.law == 'throttle':
+        return throttle_law(settings, throttle)
+    if not (math.isfinite(sigma) and sigma >= 0.0):
+        return NAN
+    rate = alpha if math.isfinite(alpha) and alpha > 0.0 else settings.alpha
+    wanted = LAWS[settings.law](settings, sigma, rate, interval)
+    return min(max(wanted, settings.lowest), settings.fmax)
+
+
+def threshold_law(settings: FilterSettings, sigma: float, alpha: float,
+                  interval: float) -> float:
+    """Return fmax up to `sigma_ref` and the lowest cutoff above it (the paper, section 6)."""
+    return settings.fmax if sigma <= settings.sigma_ref else settings.lowest
+
+
+def constant_noise_law(settings: FilterSettings, sigma: float, alpha: float,
+                       interval: float) -> float:
+    """
+    Return the cutoff at which the rms of the output noise is the wanted one.
+
+    With `coupling`: the noise is the supply's own, and `cutoff_for_noise`
+    solves coupling sigma sqrt(V) = noise_wanted.
+
+    Without: white noise of a variance proportional to sigma^2, held at its
+    value for `sigma_ref` and fmax; see `relative_cutoff`.
+    """
+    if settings.coupling:
+        return cutoff_for_noise(settings.mode, settings.order,
+                                settings.noise_wanted, settings.coupling * sigma, alpha)
+    if sigma <= settings.sigma_ref:
+        return settings.fmax
+    return relative_cutoff(settings.mode, settings.order, settings.fmax,
+                           sigma / settings.sigma_ref, interval)
+
+
+def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
+    r"""
+    Return the cutoff that makes `times` as much white noise come out as at fmax once did.
+
+    White noise of two-sided density N through a low-pass has the variance
+    N w / 2 (order 1) or N w / (2 sqrt 2) (order 2): rms ~ sqrt(fc), so
+    fc = fmax / times^2 for both.
+
+    Derivative, order 2: N int w'^2 |H|^2 dw' / 2 pi = N w^3 / (2 sqrt 2), so
+    rms ~ fc^(3/2) and fc = fmax / times^(2/3).
+
+    Derivative, order 1: the same integral is infinite; what makes it finite is
+    the sample rate.  Independent samples of variance v, linear between, give
+    d_k = q d_(k-1) + (1 - q) (x_k - x_(k-1)) / dt with q = exp(-w dt), whose
+    variance is 2 v (1 - q)^2 / (dt^2 (1 + q)): for w dt << 1, v w^2.  With
+    g = 1 - q the wanted K = g^2 / (2 - g) gives g = (sqrt(K^2 + 8 K) - K) / 2.
+
+    Parameters
+    ----------
+    mode : {'lowpass', 'derivative'}
+        What comes out.
+    order : {1, 2}
+        Order.
+    fmax : float
+        Cutoff at `times` = 1, Hz.
+    times : float
+        Sigma over sigma_ref, above 0.
+    interval : float
+        Time between samples, s (used by the derivative of order 1 alone).
+
+    Returns
+    -------
+    float
+        Cutoff, Hz.
+
+    """
+    if mode == 'lowpass':
+        return fmax / (times * times)
+    if order == 2:
+        return float(fmax * times ** (-2.0 / 3.0))
+    if not interval > 0.0:
+        return fmax / times
+    g = -math.expm1(-TWO_PI * fmax * interval)
+    k = g * g / (2.0 - g) / (times * times)
+    g = 0.5 * (math.sqrt(k * k + 8.0 * k) - k)
+    return -math.log1p(-g) / (TWO_PI * interval)
+
+
+def cutoff_for_noise(mode: str, order: int, rms: float, intensity: float,
+                     alpha: float) -> float:
+    """
+    Return the cutoff at which the supply's noise comes out with a wanted rms.
+
+    Solves intensity^2 V(w) = rms^2 (V: head of this module): linear or
+    quadratic in w, a cubic for the derivative of order 2 (one positive root,
+    by Newton's iteration from above, where the cubic is convex).
+
+    Parameters
+    ----------
+    mode : {'lowpass', 'derivative'}
+        What comes out.
+    order : {1, 2}
+        Order.
+    rms : float
+        Wanted, unit of the output.
+    intensity : float
+        coupling sigma, unit of the signal / sqrt(s).
+    alpha : float
+        Relaxation rate of the supply, 1/s.
+
+    Returns
+    -------
+    float
+        Cutoff, Hz; infinite where even the unfiltered noise is less.
+
+    """
+    if intensity <= 0.0:
+        return math.inf
+    v = (rms / intensity) ** 2
+    if mode == 'lowpass':
+        q = 2.0 * alpha * v
+        if q >= 1.0:
+            return math.inf
+        if order == 1:
+            return alpha * q / (1.0 - q) / TWO_PI
+        # sqrt2 (1 - q) u^2 + (1 - 2 q) u - sqrt2 q = 0 with u = w / alpha.
+        b, root = 1.0 - 2.0 * q, math.sqrt(1.0 + 4.0 * q - 4.0 * q * q)
+        u = 4.0 * q / (_ROOT2 * (b + root)) if b > 0.0 else (root - b) / (_ROOT8 * (1.0 - q))
+        return alpha * u / TWO_PI
+    if order == 1:
+        return 0.5 * (2.0 * v + math.sqrt(4.0 * v * v + 8.0 * v * alpha)) / TWO_PI
+    q = _ROOT8 * v
+    w = q + math.sqrt(_ROOT2 * q * alpha) + math.cbrt(q * alpha * alpha)
+    for _ in range(60):
+        off = w ** 3 - q * (w * w + _ROOT2 * w * alpha + alpha * alpha)
+        step = off / (3.0 * w * w - q * (2.0 * w + _ROOT2 * alpha))
+        w -= step
+        if abs(step) <= 1e-12 * w:
+            break
+    return w / TWO_PI
+
+
+def wiener_law(settings: FilterSettings, sigma: float, alpha: float, interval: float) -> float:
+    """
+    Return the cutoff of least mean square error.
+
+    Without `signal_bandwidth` the signal is the voltage itself, in white noise
+    of density n0.  The Kalman-Bucy filter of an OU process has one pole: from
+    its Riccati equation 0 = sigma^2 - 2 alpha P - P^2 / n0 it lies at
+    alpha + P / n0 = sqrt(alpha^2 + sigma^2 / n0), the law for order 1.  A
+    second-order Butterworth has the error 3 sigma^2 / (2 sqrt2 w)
+    + n0 w / (2 sqrt2) for w >> alpha, least at w = sqrt(3) sigma / sqrt(n0): the
+    law for order 2 is sqrt(alpha^2 + 3 sigma^2 / n0).  The filter of this
+    package has gain 1 where Kalman's has less, so that for sigma^2 / n0 near
+    alpha^2 and below it is not the optimum; `squared_error` has the errors.
+
+    With `signal_bandwidth`: see `squared_error`, whose least value is searched
+    over the logarithm of the cutoff.
+    """
+    if settings.signal_bandwidth:
+        return least_error(settings, sigma, alpha)
+    factor = 1.0 if settings.order == 1 else 3.0
+    return math.sqrt(alpha * alpha + factor * sigma * sigma / settings.n0) / TWO_PI
+
+
+def squared_error(order: int, w: float, signal: tuple[float, float],
+                  noise: tuple[float, float], n0: float) -> float:
+    """
+    Return the mean square error of a low-pass with a cutoff of `w`.
+
+    What of the signal is lost: an OU of intensity a and rate b through 1 - H.
+    Order 1: a^2 / (2 (w + b)); order 2: a^2 (3 w + sqrt2 b)
+    / (2 sqrt2 (w^2 + sqrt2 w b + b^2)).  What comes through of the supply's
+    noise: V of this module; of white noise: n0 w / 2 or n0 w / (2 sqrt2).
+
+    Parameters
+    ----------
+    order : {1, 2}
+        Order.
+    w : float
+        2 pi fc, 1/s.
+    signal : tuple of float
+        Intensity, unit/sqrt(s), and rate, 1/s, of the true signal.
+    noise : tuple of float
+        The same of the supply's noise in it.
+    n0 : float
+        Density of the white noise in it, two-sided, unit^2/Hz.
+
+    Returns
+    -------
+    float
+        Error, unit^2.
+
+    """
+    a, b = signal
+    c, d = noise
+    if order == 1:
+        return (0.5 * a * a / (w + b) + 0.5 * c * c * w / (d * (w + d)) + 0.5 * n0 * w)
+    lost = a * a * (3.0 * w + _ROOT2 * b) / (w * w + _ROOT2 * w * b + b * b)
+    through = c * c * w * (_ROOT2 * w + d) / (d * (w * w + _ROOT2 * w * d + d * d))
+    return (lost + through + n0 * w) / _ROOT8
+
+
+def least_error(settings: FilterSettings, sigma: float, alpha: float) -> float:
+    """
+    Return the cutoff of the least `squared_error` within the limits, Hz.
+
+    The signal is an OU of rms `signal_rms` and rate 2 pi signal_bandwidth: the
+    error may have two valleys (let the noise pass, or cut it), so a grid of an
+    eighth of an octave comes before the section search.
+    """
+    rate = TWO_PI * settings.signal_bandwidth
+    signal = (settings.signal_rms * math.sqrt(2.0 * rate), rate)
+    noise = (settings.coupling * sigma, alpha)
+
+    def error(level: float) -> float:
+        return squared_error(settings.order, TWO_PI * math.exp(level), signal, noise, settings.n0)
+
+    low, high = math.log(settings.lowest), math.log(settings.fmax)
+    n = max(2, math.ceil((high - low) / (math.log(2.0) / 8.0)))
+    width = (high - low) / n
+    best = min((low + k * width for k in range(n + 1)), key=error)
+    left, right = max(best - width, low), min(best + width, high)
+    golden = 0.5 * (math.sqrt(5.0) - 1.0)
+    while right - left > 1e-4:
+        inner, outer = right - golden * (right - left), left + golden * (right - left)
+        if error(inner) <= error(outer):
+            right = outer
+        else:
+            left = inner
+    # The ends of the range count too: the search only comes near them.
+    return math.exp(min((0.5 * (left + right), low, high), key=error))
+
+
+def throttle_law(settings: FilterSettings, throttle: float) -> float:
+    """
+    Return Betaflight's curve: fmin + (fmax - fmin) (t + e t (1 - t)), e = expo / 10.
+
+    It rises with throttle, for less delay where control is fast, and knows
+    nothing of sigma: the peer that the other laws are held against.
+    """
+    if not math.isfinite(throttle):
+        return NAN
+    t = min(max(throttle, 0.0), 1.0)
+    share = t + 0.1 * settings.expo * t * (1.0 - t)
+    return settings.lowest + (settings.fmax - settings.lowest) * min(share, 1.0)
+
+
+LAWS: dict[str, Callable[[FilterSettings, float, float, float], float]] = {
+    'constant_noise': constant_noise_law,
+    'threshold': threshold_law,
+    'wiener': wiener_law,
+}

@@ -1,0 +1,87 @@
+"""
+Phase lag of the low-passes, and the cutoff that keeps a lag.
+
+Of the continuous filters, with r = f / fc: order 1 lags by atan r, the
+second-order Butterworth by atan2(sqrt(2) r, 1 - r^2).  The filter of this
+package takes its input as linear between samples, which has no phase of its
+own, so that these are its lags too (of a derivative: behind the true one).
+"""
+
+from __future__ import annotations
+
+import math
+
+_ROOT2 = math.sqrt(2.0)
+
+
+def phase_lag(order: int, cutoff: float, frequency: float) -> float:
+    """
+    Return the phase lag of a low-pass.
+
+    Parameters
+    ----------
+    order : {1, 2}
+        Order.
+    cutoff : float
+        Cutoff (-3 dB), Hz.
+    frequency : float
+        Where the lag is taken, Hz.
+
+    Returns
+    -------
+    float
+        Lag, degrees: 0..90 for order 1, 0..180 for order 2.
+
+    """
+    ratio = frequency / cutoff
+    if order == 1:
+        return math.degrees(math.atan(ratio))
+    return math.degrees(math.atan2(_ROOT2 * ratio, 1.0 - ratio * ratio))
+
+
+def delay(lag: float, frequency: float) -> float:
+    """Return the phase delay, s, of a `lag` in degrees at `frequency`, Hz."""
+    return lag / (360.0 * frequency)
+
+
+def most_lag(order: int) -> float:
+    """Return the lag, degrees, that a low-pass never reaches."""
+    return 90.0 * order
+
+
+def cutoff_for_lag(order: int, lag: float, frequency: float) -> float:
+    """
+    Return the cutoff whose lag at `frequency` is `lag`: the inverse of `phase_lag`.
+
+    Order 1: fc = f / tan(lag).  Order 2: with c = cot(lag), r^2 + sqrt(2) c r
+    - 1 = 0, so fc = f / r = f (c + sqrt(c^2 + 2)) / sqrt(2).
+
+    Parameters
+    ----------
+    order : {1, 2}
+        Order.
+    lag : float
+        Lag, degrees, above 0 and below `most_lag(order)`.
+    frequency : float
+        Where the lag is taken, Hz.
+
+    Returns
+    -------
+    float
+        Cutoff, Hz.
+
+    Raises
+    ------
+    ValueError
+        For a lag that the order cannot have.
+
+    """
+    if not 0.0 < lag < most_lag(order):
+        raise ValueError(
+            f'a low-pass of order {order} lags by more than 0 and less than '
+            f'{most_lag(order):g} degrees, got {lag:g}')
+    angle = math.radians(lag)
+    cot = math.cos(angle) / math.sin(angle)
+    if order == 1:
+        return frequency * cot
+    return frequency * (cot + math.hypot(cot, _ROOT2)) / _ROOT2
