@@ -241,7 +241,8 @@ def _segments(grid: Grid, length: int, low: float, high: float,
     """Return bins, Hz, and coefficients of each series, shape (segments, bins)."""
     window = np.hanning(length + 1)[:-1]
     frequency = np.fft.rfftfreq(length, 1.0 / grid.rate)
-    bins = (frequency >= low) & (frequency <= high)
+    # Rates come from stamps and are not round to the last bit.
+    bins = (frequency >= low * (1.0 - 1e-6)) & (frequency <= high * (1.0 + 1e-6))
     if bins.sum() < 2:
         raise InputError(f'the band {low:g}..{high:g} Hz holds {int(bins.sum())} frequencies of '
                          f'segments of {length / grid.rate:.2g} s: widen it')
@@ -257,7 +258,7 @@ def _segments(grid: Grid, length: int, low: float, high: float,
             for out, column in zip(found, columns):
                 part = column[start:start + length]
                 out.append(np.fft.rfft(window * (part - part.mean()))[bins])
-    band: FloatArray = frequency[bins]
+    band = np.asarray(frequency[bins], dtype=np.float64)
     return band, [np.array(out, dtype=np.complex128).reshape(-1, int(bins.sum()))
                              for out in found]
 

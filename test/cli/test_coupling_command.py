@@ -112,9 +112,9 @@ def test_none_is_said_with_the_limit(table, capsys):
 
 def test_seen_is_said_in_words(table, capsys):
     """Gain, interval, lag."""
-    assert main(['coupling', str(table), '--signal', 'gyro_x', '--band', '12,60']) == 0
+    assert main(['coupling', str(table), '--signal', 'gyro_x', '--band', '10,60']) == 0
     text = capsys.readouterr().out
-    assert 'Coupling is seen' in text and 'per V' in text and '12..60 Hz' in text
+    assert 'Coupling is seen' in text and 'per V' in text and '10..60 Hz' in text
 
 
 @pytest.mark.parametrize('options, words', [
