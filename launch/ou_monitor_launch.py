@@ -33,5 +33,6 @@ def generate_launch_description():
                               description='Whether time comes from /clock.'),
         Node(executable='estimator', name='ou_estimator', **common),
         Node(executable='adaptive_filter', name='ou_adaptive_filter',
-             remappings=[('sigma', 'ou_estimator/sigma')], **common),
+             remappings=[('sigma', 'ou_estimator/sigma'),
+                         ('state', 'ou_estimator/state')], **common),
     ])

@@ -1,13 +1,17 @@
 """
 The node of `adaptive_filter`.
 
-Inputs (relative names): `sigma` (std_msgs/Float64), `input` (a type of
-`filter_channels.CHANNELS`).  Outputs: `~/output` (type and stamp of the
-input), `~/cutoff` (std_msgs/Float64, Hz) at `publish_rate`, `/diagnostics`.
+Inputs (relative names): `input` (a type of `filter_channels.CHANNELS`, or any
+installed type with `input.field`), `sigma` (std_msgs/Float64), and `state`
+(the estimator's `~/state`, DiagnosticArray), which is used while it is
+published: error of sigma, alpha, throttle, and whether the estimate is usable.
+Outputs: `~/output` (type and stamp of the input), `~/cutoff` (Hz) and `~/lag`
+(ms, phase delay at `lag_frequency`) as std_msgs/Float64 at `publish_rate`,
+`/diagnostics` at 1 Hz.
 
 Limits: of an IMU the angular velocity is filtered and of a BatteryState the
-voltage, the rest passes through;
-a message with a non-finite signal is counted and not passed on.
+voltage, unless `input.field` names another; the rest passes through; a message
+with a non-finite signal is counted and not passed on.
 """
 
 from __future__ import annotations
@@ -17,86 +21,103 @@ import math
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from ou_monitor.errors import InputError, nearest
+from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.diagnostics import diagnostic
-from ou_monitor.nodes.filter_channels import CHANNELS, Channels
+from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of
 from ou_monitor.nodes.inputs import INPUT_QOS, Silence, Stamper, types_on
 from ou_monitor.nodes.message_types import message_class
-from ou_monitor.online.lowpass import AdaptiveLowPass
+from ou_monitor.nodes.supply_input import Supply, SupplyInput
+from ou_monitor.online.cutoff_control import Bound
+from ou_monitor.online.lowpass import AdaptiveLowPass, FilterCounters
 from ou_monitor.online.monitor import Level
 from ou_monitor.online.settings import FILTER_PARAMETERS, filter_settings, Parameter
 from std_msgs.msg import Float64
 
-FIXED = (Parameter('input_type', 'auto', 'Type of `input`; auto: that of its publisher.',
-                   choices=('auto', *CHANNELS)),)
+AUTO = 'auto'
+# The mode gives the output its unit, so it is not for changing in flight.
+_MODE = next(p for p in FILTER_PARAMETERS if p.name == 'mode')
+RUN_TIME = tuple(p for p in FILTER_PARAMETERS if p is not _MODE)
+FIXED = (
+    Parameter('input.type', AUTO, 'Message type of `input`; auto: that of its publisher.'),
+    Parameter('input.field', '',
+              'Field path of the signal; empty: data, voltage of a battery, angular velocity of '
+              'an IMU.'),
+    _MODE)
 
 
 class AdaptiveFilterNode(MonitorNode):
     """Low-pass with a cutoff driven by sigma, as a node."""
 
     def __init__(self, name: str) -> None:
-        super().__init__(name, (*FILTER_PARAMETERS, PUBLISH_RATE), FIXED)
+        super().__init__(name, (*RUN_TIME, PUBLISH_RATE), FIXED)
         self._channels: Channels | None = None
         self._filters: list[AdaptiveLowPass] = []
-        self._sigma = math.nan
-        self._sigma_silence = Silence(self.steady_now)
+        # Stands for them until there are any, and for what they would say.
+        self._idle = AdaptiveLowPass(**self._of_filter(self.values()))
+        self._supply = SupplyInput(self.steady_now, (
+            self.resolve_topic_name('sigma'), self.resolve_topic_name('state')))
         self._input_silence = Silence(self.steady_now)
         self._dropped = self._passed = 0
         self._found: list[str] = []
-        self._type = self.get_parameter('input_type').value
+        self._type, self._field = (self.get_parameter(f'input.{key}').value
+                                   for key in ('type', 'field'))
         self._topic = self.resolve_topic_name('input')
         self._stamper = Stamper(self, self._jumped)
         self._cutoff_output = self.create_publisher(Float64, '~/cutoff', 10)
+        self._lag_output = self.create_publisher(Float64, '~/lag', 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self.create_subscription(Float64, 'sigma', self.guarded(self._take_sigma), INPUT_QOS)
-        if self._type != 'auto':
+        self.create_subscription(Float64, 'sigma', self.guarded(
+            lambda message: self._supply.take_sigma(message.data)), INPUT_QOS)
+        self.create_subscription(DiagnosticArray, 'state', self.guarded(
+            self._supply.take_state), INPUT_QOS)
+        if self._type != AUTO:
             self._open(self._type)
         self.every(0.2, self._watch)
         self.every(1.0, self._diagnose)
-        self.publish_every(self._publish_cutoff)
+        self.publish_every(self._publish)
 
     def check(self, values: Mapping[str, Any]) -> None:
         """Raise `ValueError` when the parameters contradict each other."""
-        filter_settings(_of_filter(values))
-        kind = self.get_parameter('input_type').value
-        if kind not in ('auto', *CHANNELS):
-            raise ValueError(f"input_type: cannot filter '{kind}': {nearest(kind, CHANNELS)}")
+        filter_settings(self._of_filter(values))
 
     def apply(self, values: Mapping[str, Any]) -> None:
         """Bring checked parameters into force; the output does not move."""
         super().apply(values)
-        for channel in self._filters:
-            channel.configure(**_of_filter(values))
+        for channel in (self._idle, *self._filters):
+            channel.configure(**self._of_filter(values))
 
     @property
-    def sigma(self) -> float:
-        """Sigma, V/sqrt(s); NaN when it is stale or not known."""
-        age = self._sigma_silence.age
-        stale = age is None or age > self.get_parameter('stale_after').value
-        return math.nan if stale else self._sigma
+    def low_pass(self) -> AdaptiveLowPass:
+        """Filter of the first signal: all have one cutoff."""
+        return self._filters[0] if self._filters else self._idle
+
+    def _of_filter(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the parameters that belong to the filter itself."""
+        own = {name: value for name, value in values.items() if name != PUBLISH_RATE.name}
+        return {**own, _MODE.name: self.get_parameter(_MODE.name).value}
+
+    # -- messages in
 
     def _watch(self) -> None:
         """Subscribe as soon as a publisher shows the type."""
         self._stamper.follow()
         if self._channels is None:
             self._found = types_on(self, self._topic)
-            known = [kind for kind in self._found if kind in CHANNELS]
+            known = [kind for kind in self._found if self._field or kind in CHANNELS]
             if known:
                 self._open(known[0])
 
     def _open(self, kind: str) -> None:
+        channels = channels_of(kind, self._field)
         message = message_class(kind)
-        self._type, self._channels = kind, CHANNELS[kind]
-        self._filters = [AdaptiveLowPass(**_of_filter(self.values()))
-                         for _ in self._channels.names]
+        self._type, self._channels = kind, channels
+        self._filters = [AdaptiveLowPass(**self._of_filter(self.values()))
+                         for _ in channels.names]
         self._output = self.create_publisher(message, '~/output', 10)
         self.create_subscription(message, 'input', self.with_info(self._take_input), INPUT_QOS)
-        self.get_logger().info(f'filtering {self._topic} ({kind})')
-
-    def _take_sigma(self, message: Float64) -> None:
-        self._sigma_silence.heard()
-        self._sigma = message.data if message.data >= 0.0 else math.nan
+        self.get_logger().info(
+            f"filtering {self._topic} ({kind}, {', '.join(channels.names)})")
 
     def _take_input(self, message: Any, info: Any) -> None:
         self._input_silence.heard()
@@ -104,63 +125,99 @@ class AdaptiveFilterNode(MonitorNode):
             raise InputError('a message came before its type was known')
         values = self._channels.take(message)
         stamp = self._stamper.time_of(message, info)
-        if not all(map(math.isfinite, (stamp, *values))):
+        if not values or not all(map(math.isfinite, (stamp, *values))):
             self._dropped += 1
             return
-        sigma = self.sigma
+        supply = self._known()
         self._channels.put(message, [
-            float(channel.filter(stamp, value, sigma))
+            channel.step(stamp, value, supply.sigma, supply.sigma_se, supply.alpha,
+                         supply.throttle)
             for channel, value in zip(self._filters, values, strict=True)])
         self._output.publish(message)
         self._passed += 1
+
+    def _known(self) -> Supply:
+        return self._supply.now(self.low_pass.settings.stale_after)
 
     def _jumped(self, reason: str) -> None:
         """Do nothing: to the filter a step back is a step of no length, its output stays."""
         self.get_logger().info(f'{reason}: the filter goes on from its output')
 
-    def _publish_cutoff(self) -> None:
-        self._cutoff_output.publish(Float64(data=self.cutoff))
+    # -- what is said
 
-    @property
-    def cutoff(self) -> float:
-        """Cutoff in force, Hz."""
-        if self._filters:
-            return self._filters[0].cutoff
-        return float(self.get_parameter('fallback').value)
+    def _publish(self) -> None:
+        self._cutoff_output.publish(Float64(data=self.low_pass.cutoff))
+        self._lag_output.publish(Float64(data=1e3 * self.low_pass.delay))
 
     def _diagnose(self) -> None:
-        level, summary = self._judge()
-        fields = {
-            'input_type': self._type, 'cutoff': repr(self.cutoff), 'sigma': repr(self.sigma),
-            'passed': str(self._passed), 'dropped': str(self._dropped),
-            'sigma_age': repr(self._sigma_silence.age), 'input_age':
-            repr(self._input_silence.age)}
+        supply, low_pass = self._known(), self.low_pass
+        settings = low_pass.settings
+        level, summary = self._judge(supply)
+        counters: FilterCounters = low_pass.counters
+        values: dict[str, object] = {
+            'input_type': self._type, 'law': settings.law, 'mode': settings.mode,
+            'order': settings.order, 'shadow': settings.shadow,
+            'cutoff': low_pass.cutoff, 'cutoff_wanted': low_pass.wanted,
+            'decided_by': self._decided_by(supply), 'lag': low_pass.phase_lag,
+            'delay': low_pass.delay, 'lag_frequency': settings.lag_frequency,
+            'sigma': supply.sigma, 'sigma_se': supply.sigma_se, 'alpha': supply.alpha,
+            'throttle': supply.throttle, 'passed': self._passed, 'dropped': self._dropped,
+            'repeated': counters.repeated, 'back': counters.back, 'gaps': counters.gaps,
+            'sigma_age': self._supply.age, 'state_age': self._supply.state_age,
+            'input_age': self._input_silence.age}
+        fields = {key: repr(value) if isinstance(value, float) else str(value)
+                  for key, value in values.items()}
         self._diagnostics.publish(diagnostic(
             f'{self.get_fully_qualified_name()[1:]}: adaptive low-pass', level, summary, fields,
             self.stamp_now(), hardware_id=self._topic))
 
-    def _judge(self) -> tuple[Level, str]:
-        limit = self.get_parameter('stale_after').value
+    def _decided_by(self, supply: Supply) -> str:
+        """Say in words what decides the cutoff now."""
+        low_pass = self.low_pass
+        s, bound = low_pass.settings, low_pass.bound
+        if not self._passed:
+            return f'nothing yet: no message was filtered, it starts at {s.fallback:g} Hz'
+        if bound is Bound.FALLBACK:
+            return f'the fallback, because {self._unknown(supply)}'
+        if bound is Bound.LAG:
+            return (f'fmin, {s.lowest:.4g} Hz by max_lag ({s.max_lag:g} degrees at '
+                    f'{s.lag_frequency:g} Hz)')
+        if bound in (Bound.SLEW, Bound.SMOOTHING):
+            aim = (f'the {low_pass.wanted:.4g} Hz wanted' if math.isfinite(low_pass.wanted) else
+                   f'the fallback, because {self._unknown(supply)}')
+            return f'{bound.value}, on the way to {aim}'
+        return bound.value
+
+    def _unknown(self, supply: Supply) -> str:
+        """Say why what the law needs is not known."""
+        s = self.low_pass.settings
+        if s.law == 'throttle':
+            return self._supply.why_no_throttle(s.stale_after)
+        return supply.why or 'sigma was not known at the last message'
+
+    def _judge(self, supply: Supply) -> tuple[Level, str]:
+        s = self.low_pass.settings
         age = self._input_silence.age
         if self._channels is None and self._found:
             return Level.WARN, (
                 f"Cannot filter {self._topic} of type {', '.join(self._found)}: "
-                f"{', '.join(CHANNELS)} only.")
+                f"{', '.join(CHANNELS)} only, or name its signal with input.field.")
         if self._channels is None:
             return Level.STALE, f'Waiting for a publisher on {self._topic}.'
-        if age is None or age > limit:
+        if age is None or age > s.stale_after:
             return Level.STALE, f'No message on {self._topic}' + (
                 ' yet.' if age is None else f' for {age:.1f} s.')
         if self._stamper.waiting and not self._passed:
             return Level.WARN, 'use_sim_time is set, but nothing comes on /clock.'
-        if math.isnan(self.sigma):
-            topic = self.resolve_topic_name('sigma')
+        missing = math.isnan(supply.throttle if s.law == 'throttle' else supply.sigma)
+        if missing:
             return Level.WARN, (
-                f'Sigma on {topic} is missing, stale or unknown: the cutoff goes to the '
-                f"fallback, {self.get_parameter('fallback').value:g} Hz.")
-        return Level.OK, f'Cutoff {self.cutoff:.4g} Hz at sigma {self.sigma:.4g} V/sqrt(s).'
-
-
-def _of_filter(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters that belong to the filter itself."""
-    return {name: value for name, value in values.items() if name != PUBLISH_RATE.name}
+                f'The cutoff goes to the fallback, {s.fallback:g} Hz, because '
+                f'{self._unknown(supply)}.')
+        shadow = 'Shadow, the signal passes unfiltered: ' if s.shadow else ''
+        of = f'throttle {supply.throttle:.2f}' if s.law == 'throttle' else (
+            f'sigma {supply.sigma:.4g} V/sqrt(s)')
+        return Level.OK, (
+            f'{shadow}Cutoff {self.low_pass.cutoff:.4g} Hz by law {s.law} at {of}; decided by '
+            f'{self._decided_by(supply)}; lag {self.low_pass.phase_lag:.3g} degrees '
+            f'({1e3 * self.low_pass.delay:.3g} ms) at {s.lag_frequency:g} Hz.')

@@ -122,7 +122,7 @@ class CutoffControl:
 
     @property
     def bound(self) -> Bound:
-        """What decides the cutoff in force."""
+        """Return what decides the cutoff in force."""
         s = self._settings
         if self._cutoff < self._moving:
             return Bound.RATE

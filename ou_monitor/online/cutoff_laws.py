@@ -76,14 +76,17 @@ def constant_noise_law(settings: FilterSettings, sigma: float, alpha: float,
     Return the cutoff at which the rms of the output noise is the wanted one.
 
     With `coupling`: the noise is the supply's own, and `cutoff_for_noise`
-    solves coupling sigma sqrt(V) = noise_wanted.
+    solves coupling sigma sqrt(V) = noise_wanted (when that is not given: what
+    comes out at `sigma_ref` and fmax).
 
     Without: white noise of a variance proportional to sigma^2, held at its
     value for `sigma_ref` and fmax; see `relative_cutoff`.
     """
     if settings.coupling:
-        return cutoff_for_noise(settings.mode, settings.order,
-                                settings.noise_wanted, settings.coupling * sigma, alpha)
+        wanted = settings.noise_wanted or settings.coupling * settings.sigma_ref * math.sqrt(
+            supply_noise(settings.mode, settings.order, settings.fmax, alpha))
+        return cutoff_for_noise(settings.mode, settings.order, wanted,
+                                settings.coupling * sigma, alpha)
     if sigma <= settings.sigma_ref:
         return settings.fmax
     return relative_cutoff(settings.mode, settings.order, settings.fmax,
@@ -136,6 +139,37 @@ def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: 
     k = g * g / (2.0 - g) / (times * times)
     g = 0.5 * (math.sqrt(k * k + 8.0 * k) - k)
     return -math.log1p(-g) / (TWO_PI * interval)
+
+
+def supply_noise(mode: str, order: int, cutoff: float, alpha: float) -> float:
+    """
+    Return V of the head of this module: output variance over (coupling sigma)^2.
+
+    Parameters
+    ----------
+    mode : {'lowpass', 'derivative'}
+        What comes out.
+    order : {1, 2}
+        Order.
+    cutoff : float
+        Cutoff, Hz.
+    alpha : float
+        Relaxation rate of the supply, 1/s.
+
+    Returns
+    -------
+    float
+        Variance, s for a low-pass and 1/s for a derivative.
+
+    """
+    w = TWO_PI * cutoff
+    if order == 1:
+        return (0.5 * w / (alpha * (w + alpha)) if mode == 'lowpass' else
+                0.5 * w * w / (w + alpha))
+    spread = _ROOT8 * (w * w + _ROOT2 * w * alpha + alpha * alpha)
+    if mode == 'lowpass':
+        return w * (_ROOT2 * w + alpha) / (alpha * spread)
+    return w ** 3 / spread
 
 
 def cutoff_for_noise(mode: str, order: int, rms: float, intensity: float,

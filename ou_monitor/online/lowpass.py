@@ -111,7 +111,7 @@ class AdaptiveLowPass:
 
     @property
     def bound(self) -> Bound:
-        """What decides the cutoff in force."""
+        """Return what decides the cutoff in force."""
         return self._control.bound
 
     @property

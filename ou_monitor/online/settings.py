@@ -108,12 +108,12 @@ FILTER_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('lag_frequency', 10.0, 'Where the lag is computed and limited, Hz.', 0.001, 1.0e6),
     Parameter('sigma_ref', 0.3,
               'Sigma up to which the cutoff stays at fmax, V/sqrt(s) (threshold, and '
-              'constant_noise without coupling).', 1.0e-9, 1.0e6),
+              'constant_noise without noise_wanted).', 1.0e-9, 1.0e6),
     Parameter('coupling', 0.0, 'Supply noise in the signal, unit of the signal per V; 0: not '
               'known, constant_noise is relative to sigma_ref.', 0.0, 1.0e9),
     Parameter('noise_wanted', 0.0,
-              'Rms of the output noise that constant_noise holds, unit of the output; needs '
-              'coupling.', 0.0, 1.0e12),
+              'Rms of the output noise that constant_noise holds, unit of the output, with '
+              'coupling; 0: what sigma_ref makes at fmax.', 0.0, 1.0e12),
     Parameter('n0', 0.0,
               'White noise of the measurement for wiener, unit^2/Hz, two-sided: variance of a '
               'sample over sample rate.', 0.0, 1.0e12),
@@ -254,12 +254,10 @@ class FilterSettings:
                 f'({self.lowest:.6g}..{self.fmax} Hz){why}')
 
     def _check_law(self) -> None:
-        if self.law == 'constant_noise' and (self.coupling > 0.0) != (self.noise_wanted > 0.0):
-            given, missing = (('coupling', 'noise_wanted') if self.coupling else
-                              ('noise_wanted', 'coupling'))
+        if self.law == 'constant_noise' and self.noise_wanted and not self.coupling:
             raise ValueError(
-                f'law constant_noise with {given} needs {missing} too (above 0); with neither it '
-                'is relative to sigma_ref')
+                f'noise_wanted ({self.noise_wanted:g}) needs coupling (above 0): without it '
+                'the noise in the signal is known only relative to sigma_ref')
         if self.law != 'wiener':
             return
         if self.mode == 'derivative':

@@ -6,16 +6,16 @@ import sys
 from types import ModuleType
 
 from live import ROOT
-from ou_monitor.nodes.adaptive_filter_node import FIXED
+from ou_monitor.nodes.adaptive_filter_node import FIXED, RUN_TIME
 from ou_monitor.nodes.base import PUBLISH_RATE
 from ou_monitor.nodes.sources import SOURCE_PARAMETERS
-from ou_monitor.online.settings import ESTIMATOR_PARAMETERS, FILTER_PARAMETERS
+from ou_monitor.online.settings import ESTIMATOR_PARAMETERS
 import pytest
 import yaml
 
 DECLARED = {
     'ou_estimator': (*ESTIMATOR_PARAMETERS, PUBLISH_RATE, *SOURCE_PARAMETERS),
-    'ou_adaptive_filter': (*FILTER_PARAMETERS, PUBLISH_RATE, *FIXED),
+    'ou_adaptive_filter': (*RUN_TIME, PUBLISH_RATE, *FIXED),
 }
 FILE = ROOT / 'config' / 'ou_monitor.yaml'
 LAUNCH = ROOT / 'launch' / 'ou_monitor_launch.py'
@@ -102,7 +102,8 @@ def test_launch_nodes(described):
         file, extra = node.kwargs['parameters']
         assert file.args == ('params_file',)
         assert extra['use_sim_time'].args == ('use_sim_time',)
-    assert nodes[1].kwargs['remappings'] == [('sigma', 'ou_estimator/sigma')]
+    assert nodes[1].kwargs['remappings'] == [
+        ('sigma', 'ou_estimator/sigma'), ('state', 'ou_estimator/state')]
 
 
 def test_the_file_is_taken_in_any_namespace(world):

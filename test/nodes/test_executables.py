@@ -60,7 +60,13 @@ def test_a_signal_at_any_moment_of_the_start(world, number):
     ('estimator', ['--params-file', 'no_such.yaml'], 'cannot read the ROS arguments'),
     ('adaptive_filter', ['-p', 'law:=constant_nose'], "did you mean 'constant_noise'?"),
     ('adaptive_filter', ['-p', 'fmin:=200.0'], 'fmin'),
-    ('adaptive_filter', ['-p', 'input_type:=std_msgs/msg/String'], 'cannot filter'),
+    ('adaptive_filter', ['-p', 'input.type:=std_msgs/msg/String'], 'cannot filter'),
+    ('adaptive_filter', ['-p', 'input.type:=sensor_msgs/msg/Temperature', '-p',
+                         'input.field:=temprature'], "did you mean 'temperature'?"),
+    ('adaptive_filter', ['-p', 'input.type:=std_msgs/msg/Int32', '-p', 'input.field:=data'],
+     'name a float field'),
+    ('adaptive_filter', ['-p', 'law:=wiener'], 'law wiener needs n0'),
+    ('adaptive_filter', ['-p', 'max_lag:=5.0'], 'allow more lag or raise fmax'),
     ('adaptive_filter', ['-r', '__node:=9 lives'], 'cannot read the ROS arguments'),
 ], ids=lambda value: '' if isinstance(value, list) else value[:24])
 def test_what_is_refused(world, name, arguments, words):
