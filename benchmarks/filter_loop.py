@@ -20,6 +20,7 @@ _ABOVE = 0.72
 _BARE = {'smoothing': 0.0, 'slew': 0.0, 'dead_band': 0.0}
 CASES: dict[str, dict[str, object]] = {
     'constant_noise, defaults': {},
+    'constant_noise, defaults, sigma ~ load^3': {'steepness': 3.0},
     'constant_noise, nothing held': {'filter': {**_BARE}},
     'constant_noise, nothing held, sigma ~ load^3': {
         'filter': {**_BARE, 'fmin': 5.0}, 'steepness': 3.0},
@@ -30,7 +31,7 @@ CASES: dict[str, dict[str, object]] = {
 }
 
 
-def scan(seconds: float, seed: int, tell: Callable[[], None]) -> dict[str, list[Verdict]]:
+def scan(seconds: float, seed: int, tell: Callable[[str], None]) -> dict[str, list[Verdict]]:
     """Return verdicts of each case at each coupling."""
     found: dict[str, list[Verdict]] = {}
     for name, options in CASES.items():
@@ -38,11 +39,11 @@ def scan(seconds: float, seed: int, tell: Callable[[], None]) -> dict[str, list[
         for coupling in COUPLINGS:
             found[name].append(judge(Loop(coupling=coupling, **options),  # type: ignore[arg-type]
                                      seconds, seed))
-            tell()
+        tell(name)
     return found
 
 
-def render(found: dict[str, list[Verdict]]) -> tuple[str, str]:
+def render(found: dict[str, list[Verdict]]) -> tuple[str, Plot]:
     """Return a table and a figure."""
     rows = []
     plot = Plot('Swing of the cutoff against coupling of the supply into the gyro',
@@ -66,7 +67,7 @@ def render(found: dict[str, list[Verdict]]) -> tuple[str, str]:
             '**Loop gain from which the linear theory hunts, window 2 s**\n\n' + table(
                 ['smoothing, s', *(f'{s:g}' for s in _SMOOTHINGS)],
                 [['gain', *(_gain(s) for s in _SMOOTHINGS)]]))
-    return text, plot.svg()
+    return text, plot
 
 
 _SMOOTHINGS = (0.0, 0.05, 0.2, 0.5, 1.0, 4.0)

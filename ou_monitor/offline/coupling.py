@@ -259,8 +259,7 @@ def _segments(grid: Grid, length: int, low: float, high: float,
                 part = column[start:start + length]
                 out.append(np.fft.rfft(window * (part - part.mean()))[bins])
     band = np.asarray(frequency[bins], dtype=np.float64)
-    return band, [np.array(out, dtype=np.complex128).reshape(-1, int(bins.sum()))
-                             for out in found]
+    return band, [np.array(out, dtype=np.complex128).reshape(-1, band.size) for out in found]
 
 
 def _without(y: ComplexArray, causes: list[ComplexArray]) -> ComplexArray:

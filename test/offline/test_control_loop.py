@@ -62,7 +62,7 @@ def test_same_seed_same_flight():
 
 @pytest.mark.parametrize('smoothing', [0.2, 0.5, 2.0])
 def test_critical_gain_is_where_a_linear_loop_grows(smoothing):
-    """x' = (-gain mean(x over the window) - x) / smoothing: it decays below, grows above."""
+    """Of x' = (-gain mean(x over the window) - x) / smoothing: it decays below, grows above."""
     window, dt = 2.0, 0.005
     critical = critical_gain(window, smoothing)
     size = {}
