@@ -216,7 +216,8 @@ def watch(bag: str, seconds: float, logs: Path) -> Listener:
         with Children(logs) as children:
             children.start('estimator')
             children.start('adaptive_filter', '--ros-args', '-r', f'input:={topic}',
-                           '-r', 'sigma:=/ou_estimator/sigma')
+                           '-r', 'sigma:=/ou_estimator/sigma',
+                           '-r', 'state:=/ou_estimator/state')
             listener = Listener(node)
             listener.hear_filter(kind)
             deadline = time.monotonic() + START_TIMEOUT

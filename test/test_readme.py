@@ -88,6 +88,46 @@ def test_brownout_parameters_are_listed():
                       for name, v in wanted.items()}
 
 
+def test_filter_parameters_are_listed():
+    """Each with its default, in the section of the filter."""
+    from ou_monitor.online.settings import FILTER_PARAMETERS
+    section = README.split('## Adaptive low-pass')[1].split('## ')[0]
+    listed = {}
+    for names, values in re.findall(r'^\| ((?:`[\w.]+`(?:, )?)+) \| ([^|]*) \|', section.split(
+            '| parameter |')[1], re.MULTILINE):
+        for name, value in zip(names.split(', '), values.split(', '), strict=True):
+            listed[name.strip('`')] = value.strip()
+    assert listed == {'input.type': 'auto', 'input.field': 'none', **{
+        p.name: f'{p.default:g}' if isinstance(p.default, float) else str(p.default).lower()
+        for p in FILTER_PARAMETERS}}
+
+
+def test_filter_laws_are_listed():
+    """Every law has a row, and there are no others."""
+    from ou_monitor.online.settings import LAWS
+    section = README.split('| law | cutoff |')[1].split('\n\n')[0]
+    assert set(re.findall(r'^\| `(\w+)` \|', section, re.MULTILINE)) == set(LAWS)
+
+
+def test_filter_numbers_are_those_of_the_laws():
+    """Noise taken off between 150 and 20 Hz, lags, and what the pole of Kalman loses."""
+    import math
+
+    from ou_monitor.online.cutoff_laws import squared_error, supply_noise
+    from ou_monitor.online.lag import cutoff_for_lag
+    off = {mode: 1.0 - math.sqrt(supply_noise(mode, 2, 20.0, 63.0)
+                                 / supply_noise(mode, 2, 150.0, 63.0))
+           for mode in ('lowpass', 'derivative')}
+    # 15 % for order 2 and 16 % for order 1; 73 % and 69 % of the derivative.
+    assert off == {'lowpass': pytest.approx(0.15, abs=0.01),
+                   'derivative': pytest.approx(0.7, abs=0.04)}
+    assert [round(cutoff_for_lag(2, lag, 10.0), 1) for lag in (45.0, 20.0)] == [19.3, 41.3]
+    for ratio, loss in ((5.0, 2.0), (2.0, 16.0)):
+        pole, best = math.hypot(1.0, ratio), ratio - 1.0
+        errors = [squared_error(1, w, (ratio, 1.0), (0.0, 1.0), 1.0) for w in (pole, best)]
+        assert 100.0 * (errors[0] / errors[1] - 1.0) == pytest.approx(loss, abs=0.5)
+
+
 def test_python_example_runs():
     """The example runs and its intervals hold the values it was made with."""
     (code,) = blocks('python')

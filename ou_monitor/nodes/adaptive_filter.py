@@ -1,7 +1,8 @@
-"""
+r"""
 Executable `adaptive_filter`: a low-pass whose cutoff follows sigma.
 
-ros2 run ou_monitor adaptive_filter --ros-args -r sigma:=ou_estimator/sigma -r input:=/imu
+ros2 run ou_monitor adaptive_filter --ros-args -r input:=/imu -r sigma:=ou_estimator/sigma \
+    -r state:=ou_estimator/state
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ class LowPassState:
         if order == 1:
             lost = math.expm1(-angle)
             self.slope = 0.0
-            self.y = end + (1.0 + lost) * off + rise * lost / angle
+            self.y += lost * off + rise * (1.0 + lost / angle)
             return self.y
         # Poles at w exp(+-3i pi/4): closed form of the 2 x 2 exponential, and of its integral
         # over the ramp; written in what is small for a short step, so that nothing cancels.
@@ -75,6 +75,6 @@ class LowPassState:
         c = math.expm1(-p) * math.cos(p) - 2.0 * math.sin(0.5 * p) ** 2
         s = decay * sin
         slope = self.slope
-        self.y = end + (1.0 + c + s) * off + _ROOT2 * s * slope + rise * c / p
-        self.slope = (1.0 + c - s) * slope - _ROOT2 * s * off - rise * (c + s) / angle
+        self.y += (c + s) * off + _ROOT2 * s * slope + rise * (1.0 + c / p)
+        self.slope += (c - s) * slope - _ROOT2 * s * off - rise * (c + s) / angle
         return self.y

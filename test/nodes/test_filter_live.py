@@ -1,10 +1,11 @@
-"""The real adaptive filter: IMU, bad values, stale sigma, parameters."""
+"""The real adaptive filter: IMU, bad values, stale sigma, state, parameters."""
 
 import math
 import time
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from live import diagnosis, seconds, values_of, wait_until
+from ou_monitor.online.lag import phase_lag
 import pytest
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64
@@ -20,11 +21,15 @@ class Rig:
         self.probe = world.probe()
         self.output = self.probe.listen(f'{NODE}/output', Imu)
         self.cutoff = self.probe.listen(f'{NODE}/cutoff', Float64)
+        self.lag = self.probe.listen(f'{NODE}/lag', Float64)
         self.diagnostics = self.probe.listen('/diagnostics', DiagnosticArray)
         self.sigma = self.probe.publisher('/sigma', Float64)
+        self.state = self.probe.publisher('/state', DiagnosticArray)
         self.input = self.probe.publisher('/input', Imu)
-        self.process = world.start('adaptive_filter', '--ros-args', '-p', 'smoothing:=0.0')
+        self.process = world.start('adaptive_filter', '--ros-args', '-p', 'smoothing:=0.0',
+                                   '-p', 'slew:=0.0')
         wait_until(lambda: self.sigma.get_subscription_count()
+                   and self.state.get_subscription_count()
                    and self.input.get_subscription_count(), what='subscriptions')
         # Both ends must know of each other before the first message.
         wait_until(lambda: self.probe.node.count_publishers(f'{NODE}/output'))
@@ -85,8 +90,15 @@ def test_imu_keeps_type_stamp_and_the_rest(rig):
         1.0, -2.0, 3.0)
 
 
+def ramp_response(t, fc):
+    """Return the answer of a second-order Butterworth to max(t, 0)."""
+    w = 2.0 * math.pi * fc
+    a, t = w / math.sqrt(2.0), max(t, 0.0)
+    return t - math.sqrt(2.0) / w * (1.0 - math.exp(-a * t) * math.cos(a * t))
+
+
 def test_a_step_is_answered_like_a_butterworth(rig):
-    """Without sigma the cutoff is the fallback, 75 Hz: the exact step response of order 2."""
+    """Without sigma the cutoff is the fallback, 75 Hz: the exact answer of order 2."""
     for _ in range(400):
         rig.send((0.0, 0.0, 0.0))
         time.sleep(0.0005)
@@ -95,16 +107,16 @@ def test_a_step_is_answered_like_a_butterworth(rig):
         rig.send((1.0, 0.0, 0.0))
         time.sleep(0.002)
     wait_until(lambda: seconds(rig.output[-1].header.stamp) > rig.stamp - 0.003, what='the end')
-    # The input is held over the interval before its stamp, so the step begins at the last zero
-    # that arrived; times are told from stamps, for best effort may lose a message.
+    # The input is linear between samples, so the step is a ramp from the last zero that arrived
+    # to the first one; times are told from stamps, for best effort may lose a message.
     stamps = [seconds(m.header.stamp) for m in rig.output]
     begin = max(stamp for stamp in stamps if stamp < step + 1e-6)
-    answers = [(stamp - begin, m.angular_velocity) for stamp, m in zip(stamps, rig.output)
+    answers = [(stamp, m.angular_velocity) for stamp, m in zip(stamps, rig.output)
                if stamp > begin + 1e-6]
     assert len(answers) > 20
-    a = 2.0 * math.pi * 75.0 / math.sqrt(2.0)
+    end = answers[0][0]
     for t, rate in answers:
-        wanted = 1.0 - math.exp(-a * t) * (math.cos(a * t) + math.sin(a * t))
+        wanted = (ramp_response(t - begin, 75.0) - ramp_response(t - end, 75.0)) / (end - begin)
         # Stamps are rounded to ns and the slope is below 300 1/s.
         assert rate.x == pytest.approx(wanted, abs=1e-4)
         assert rate.y == pytest.approx(0.0, abs=1e-4)
@@ -115,6 +127,96 @@ def test_a_step_is_answered_like_a_butterworth(rig):
 def test_cutoff_law(rig, sigma, cutoff):
     """The law fmax (sigma_ref / sigma)^2 within fmin..fmax; unknown: the fallback."""
     cutoff_becomes(rig, cutoff, sigma)
+
+
+def test_the_lag_is_published(rig):
+    """That of the cutoff in force at 10 Hz, as phase delay in ms."""
+    cutoff_becomes(rig, 37.5, 0.6)
+    lag = phase_lag(2, 37.5, 10.0)
+    wait_until(lambda: rig.lag[-1].data == pytest.approx(lag / 3.6), what=f'{rig.lag[-1:]}')
+
+    def told():
+        drive(rig, 0.6, 0.1)
+        return float(values_of(rig.status)['lag']) == pytest.approx(lag)
+    wait_until(told, what='lag on /diagnostics')
+    assert 'by law constant_noise at sigma 0.6' in rig.status.message
+    assert f'{lag:.3g} degrees ({lag / 3.6:.3g} ms) at 10 Hz' in rig.status.message
+
+
+def test_the_bound_is_told_in_words(rig):
+    """The limits, and fmin that follows from a lag."""
+    def told(words, sigma):
+        def there():
+            drive(rig, sigma, 0.1)
+            return rig.status.level == b'\x00' and words in values_of(rig.status)['decided_by']
+        wait_until(there, what=f'{words}: {rig.status.message}')
+    told('fmax', 0.1)
+    assert rig.probe.set_parameter(NODE, 'slew', 4.0).successful
+    told('the slew limit, on the way to the 20 Hz wanted', 100.0)
+    assert rig.probe.set_parameter(NODE, 'slew', 0.0).successful
+    told('fmin', 100.0)
+    assert rig.probe.set_parameter(NODE, 'max_lag', 45.0).successful
+    cutoff_becomes(rig, 19.3185, 100.0)
+    told('fmin, 19.32 Hz by max_lag (45 degrees at 10 Hz)', 100.0)
+    assert rig.probe.set_parameter(NODE, 'max_lag', 0.0).successful
+
+
+def state_of(**values):
+    """Return a state as the estimator publishes it."""
+    return DiagnosticArray(status=[DiagnosticStatus(values=[
+        KeyValue(key=key, value=str(value)) for key, value in values.items()])])
+
+
+def test_the_state_of_the_estimator_is_used_while_it_is_published(rig):
+    """Throttle for the law of that name; an unusable estimate is no sigma; then it is silent."""
+    good = {'sigma': 0.6, 'sigma_se': 0.03, 'alpha': 60.0, 'throttle': 0.5, 'status': 'OK'}
+
+    def with_state(cutoff, **change):
+        def there():
+            rig.state.publish(state_of(**{**good, **change}))
+            drive(rig, 0.6, 0.1)
+            return rig.cutoff[-1].data == pytest.approx(cutoff, rel=1e-6)
+        wait_until(there, what=f'{cutoff} Hz; is {rig.cutoff[-1:]}')
+
+    def told(key, value, **change):
+        def there():
+            rig.state.publish(state_of(**{**good, **change}))
+            drive(rig, 0.6, 0.1)
+            return value in (values_of(rig.status)[key] if key else rig.status.message)
+        wait_until(there, what=value)
+    with_state(37.5)
+    told('sigma_se', '0.03')
+    with_state(75.0, status='QUANTIZED_HEAVILY')
+    told('', 'because the estimator says QUANTIZED_HEAVILY', status='QUANTIZED_HEAVILY')
+    assert rig.probe.set_parameter(NODE, 'law', 'throttle').successful
+    with_state(20.0 + 130.0 * 0.625)
+    told('', 'by law throttle at throttle 0.50')
+    # Without it this law knows nothing, whatever sigma says.
+    cutoff_becomes(rig, 75.0, 0.6)
+
+    def silent():
+        drive(rig, 0.6, 0.1)
+        return '/state has been silent for' in rig.status.message
+    wait_until(silent, what='silence of the state')
+    assert rig.probe.set_parameter(NODE, 'law', 'constant_noise').successful
+    cutoff_becomes(rig, 37.5, 0.6)
+
+
+def test_shadow_lets_the_signal_pass(rig):
+    """The cutoff is published all the same, and the diagnostics say so."""
+    assert rig.probe.set_parameter(NODE, 'shadow', True).successful
+    drive(rig, 0.6, 0.5)
+    before = len(rig.output)
+    rig.send((2.0, 0.0, 0.0))
+    wait_until(lambda: len(rig.output) > before)
+    assert rig.output[-1].angular_velocity.x == pytest.approx(2.0, abs=1e-6)
+    cutoff_becomes(rig, 150.0, 0.1)
+
+    def told():
+        drive(rig, 0.1, 0.1)
+        return rig.status.message.startswith('Shadow, the signal passes unfiltered: Cutoff')
+    wait_until(told, what='shadow in the diagnostics')
+    assert rig.probe.set_parameter(NODE, 'shadow', False).successful
 
 
 def test_stale_sigma_falls_back_and_warns(rig):
@@ -130,7 +232,7 @@ def test_stale_sigma_falls_back_and_warns(rig):
         rig.send((0.0, 0.0, 0.0))
         return rig.status and rig.status.level == b'\x01'
     wait_until(warned, what='warning')
-    assert 'Sigma on /sigma is missing' in rig.status.message
+    assert 'goes to the fallback, 75 Hz, because sigma on /sigma is stale' in rig.status.message
 
 
 def test_bad_samples_are_counted_and_not_passed_on(rig):
@@ -145,6 +247,27 @@ def test_bad_samples_are_counted_and_not_passed_on(rig):
         return values_of(rig.status)['dropped'] == '2'
     wait_until(counted, what='2 dropped')
     assert all(math.isfinite(m.angular_velocity.y) for m in rig.output)
+
+
+def test_time_back_is_counted_and_holds_the_output(rig):
+    """A repeat and a step back of 10 s: both come out, with the output as it was."""
+    for _ in range(300):
+        rig.send((0.7, 0.0, 0.0))
+        time.sleep(0.0005)
+    wait_until(lambda: rig.output[-1].angular_velocity.x == pytest.approx(0.7, abs=1e-6))
+    n = len(rig.output)
+    rig.send((5.0, 0.0, 0.0), dt=0.0)
+    rig.send((6.0, 0.0, 0.0), dt=-10.0)
+    wait_until(lambda: len(rig.output) >= n + 2)
+    assert [m.angular_velocity.x for m in rig.output[n:]] == pytest.approx([0.7, 0.7], abs=1e-6)
+
+    def counted():
+        rig.send((0.7, 0.0, 0.0))
+        values = values_of(rig.status)
+        return values['repeated'] == '1' and values['back'] == '1'
+    wait_until(counted, what='1 repeated, 1 back')
+    # The tests after this one tell messages by their stamps.
+    rig.stamp += 20.0
 
 
 def test_parameter_change_does_not_move_the_output(rig):
@@ -164,8 +287,12 @@ def test_parameter_change_does_not_move_the_output(rig):
     assert len(after) >= 3 and after == pytest.approx([0.7] * len(after), abs=1e-9)
     refused = rig.probe.set_parameter(NODE, 'fmin', 300.0)
     assert not refused.successful and 'fmin' in refused.reason
-    refused = rig.probe.set_parameter(NODE, 'order', 3)
-    assert not refused.successful
+    for name, value, words in (
+            ('order', 3, ''), ('law', 'wiener', 'needs n0'), ('law', 'treshold', 'threshold'),
+            ('max_lag', 2.0, 'allow more lag or raise fmax'), ('noise_wanted', 1.0, 'coupling'),
+            ('mode', 'derivative', 'read-only')):
+        refused = rig.probe.set_parameter(NODE, name, value)
+        assert not refused.successful and words in refused.reason
 
 
 def test_silence_is_stale(rig):

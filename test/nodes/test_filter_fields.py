@@ -1,0 +1,117 @@
+"""Any field of any installed type through the real filter; and the two modules beside it."""
+
+import math
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseWithCovariance
+from live import wait_until
+from ou_monitor.errors import InputError
+from ou_monitor.nodes.filter_channels import CHANNELS, channels_of
+from ou_monitor.nodes.supply_input import SupplyInput
+import pytest
+from sensor_msgs.msg import Imu, JointState, Temperature
+
+
+@pytest.mark.parametrize('message, field', [
+    (Temperature(), 'variance'), (Imu(), 'linear_acceleration.z'),
+    (JointState(velocity=[1.0, 2.0]), 'velocity[1]'), (PoseWithCovariance(), 'covariance[7]')])
+def test_one_field_is_taken_and_put_back(message, field):
+    """Scalars, nested ones, elements of arrays of any and of fixed length; nothing else moves."""
+    package = type(message).__module__.split('.')[0]
+    channel = channels_of(f'{package}/msg/{type(message).__name__}', field)
+    assert channel.names == (field,)
+    before = str(message)
+    channel.put(message, (3.25,))
+    assert list(channel.take(message)) == [3.25]
+    assert str(message) != before
+
+
+def test_an_array_that_is_too_short_gives_nothing():
+    channel = channels_of('sensor_msgs/msg/JointState', 'velocity[1]')
+    assert len(channel.take(JointState(velocity=[1.0]))) == 0
+
+
+@pytest.mark.parametrize('kind, field, words', [
+    ('std_msgs/msg/String', '', 'without input.field'),
+    ('std_msgs/msg/String', 'data', 'not a number'),
+    ('std_msgs/msg/Int32', 'data', 'name a float field'),
+    ('std_msgs/msg/Float64', 'dat', "did you mean 'data'"),
+    ('std_msgs/msg/Float32MultiArray', 'data', 'is an array'),
+    ('std_msgs/msg/Float64', 'da ta', 'not of the form'),
+    ('no_such_msgs/msg/Rail', 'data', 'not installed')])
+def test_what_cannot_be_filtered_is_refused_in_a_line(kind, field, words):
+    with pytest.raises(InputError, match=words) as caught:
+        channels_of(kind, field)
+    assert '\n' not in str(caught.value)
+
+
+def test_known_types_need_no_field():
+    assert channels_of('sensor_msgs/msg/Imu', '') is CHANNELS['sensor_msgs/msg/Imu']
+
+
+class Clock:
+    """A clock set by hand."""
+
+    now = 0.0
+
+    def __call__(self):
+        """Return the time, s."""
+        return self.now
+
+
+def state_of(**values):
+    """Return a state as the estimator publishes it."""
+    return DiagnosticArray(status=[DiagnosticStatus(values=[
+        KeyValue(key=key, value=str(value)) for key, value in values.items()])])
+
+
+def test_time_line_of_the_supply():
+    """Nothing, sigma, sigma and state, state silent, unusable, garbage, sigma silent."""
+    clock = Clock()
+    supply = SupplyInput(clock, ('/sigma', '/state'))
+    assert supply.now(1.0).why == 'no message on /sigma' and math.isnan(supply.now(1.0).sigma)
+    supply.take_sigma(0.5)
+    assert supply.now(1.0).sigma == 0.5 and math.isnan(supply.now(1.0).alpha)
+    supply.take_state(state_of(sigma=0.4, sigma_se=0.04, alpha=63.0, throttle=0.3, status='OK'))
+    known = supply.now(1.0)
+    assert known.sigma_se == pytest.approx(0.05)
+    assert (known.alpha, known.throttle, known.why) == (63.0, 0.3, '')
+    supply.take_state(state_of(other=1.0))
+    assert supply.now(1.0) == known
+    clock.now = 0.9
+    supply.take_sigma(0.5)
+    clock.now = 1.5
+    assert math.isnan(supply.now(1.0).alpha) and supply.now(1.0).sigma == 0.5
+    supply.take_state(state_of(sigma='nan', sigma_se='x', status='NO_DATA', throttle=0.2))
+    known = supply.now(1.0)
+    assert math.isnan(known.sigma) and known.why == 'the estimator says NO_DATA'
+    assert known.throttle == 0.2
+    supply.take_state(state_of(sigma=0.5, sigma_se=0.01, status='SHORT_WINDOW'))
+    assert supply.now(1.0).sigma == 0.5
+    clock.now = 2.0
+    assert supply.now(1.0).why == 'sigma on /sigma is stale, 1.1 s old'
+    supply.take_sigma(math.nan)
+    assert 'not a number' in supply.now(1.0).why
+
+
+def test_a_field_of_any_type_is_differentiated_by_the_node(world):
+    """`input.field` alone: the type is the publisher's; a ramp of 2 per s comes out as 2."""
+    probe = world.probe()
+    output = probe.listen('/ou_adaptive_filter/output', Temperature)
+    sender = probe.publisher('/input', Temperature)
+    process = world.start('adaptive_filter', '--ros-args', '-p', 'input.field:=temperature',
+                          '-p', 'mode:=derivative')
+    wait_until(sender.get_subscription_count, what='subscription')
+    wait_until(lambda: probe.node.count_publishers('/ou_adaptive_filter/output'))
+    stamps = iter(range(1, 100_000))
+
+    def settled():
+        for _ in range(20):
+            k = next(stamps)
+            message = Temperature(temperature=0.002 * k, variance=7.0)
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(k * 10**6, 10**9)
+            sender.publish(message)
+        return output and output[-1].temperature == pytest.approx(2.0, abs=1e-6)
+    wait_until(settled, what='a slope of 2 1/s')
+    assert output[-1].variance == 7.0
+    assert process.stop() == 0
