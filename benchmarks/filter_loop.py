@@ -47,8 +47,9 @@ def render(found: dict[str, list[Verdict]]) -> tuple[str, Plot]:
     """Return a table and a figure."""
     rows = []
     plot = Plot('Swing of the cutoff against coupling of the supply into the gyro',
-                'coupling, rad/s per V', 'swing, octaves', width=760, height=380, log_x=True,
-                legend_row=True)
+                'coupling, rad/s per V', 'swing, octaves', width=760, height=380, log_x=True)
+    # Room for the legend above the curves.
+    plot.limits((COUPLINGS[0], COUPLINGS[-1]), (-0.1, 5.0))
     for colour, (name, verdicts) in enumerate(found.items()):
         swings = [v.swing for v in verdicts]
         first = next((k for k, v in enumerate(verdicts) if v.cycle), None)

@@ -24,21 +24,17 @@ from tables import table
 RATE, SETTLE = 1000.0, 3.0
 _ECHO = """
 import rclpy
-import rclpy.executors
 from ou_monitor.nodes.run import make_executor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 rclpy.init()
 node = rclpy.create_node('ou_adaptive_filter')
 out = node.create_publisher(Imu, '~/output', 10)
-node.create_subscription(Imu, 'input', out.publish,
+node.create_subscription(Imu, 'input', lambda message: out.publish(message),
                          QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT))
 executor = make_executor()
 executor.add_node(node)
-try:
-    executor.spin()
-except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
-    pass
+executor.spin()
 """
 
 
@@ -108,7 +104,12 @@ def trial(command: list[str], seconds: float) -> dict[str, float]:
                 'lost': len(sent)}
     finally:
         process.send_signal(signal.SIGINT)
-        process.wait(10.0)
+        try:
+            process.wait(3.0)
+        except subprocess.TimeoutExpired:
+            # The bare node: its executor, left to itself, does not heed the signal.
+            process.kill()
+            process.wait()
         node.destroy_node()
 
 
