@@ -1,11 +1,11 @@
 """
 What the adaptive_filter node costs, and how late its output comes, at 1 kHz.
 
-Run by `filter.py node`.  An Imu message (three channels) goes over DDS to the node, a process of its
-own, and back; output is matched to input by its stamp.  The same way through a
-node that only hands messages on, by `rclpy.spin`, says what a plain node takes
-(ours uses the EventsExecutor, which is faster).  The CPU time is read from
-/proc.
+Run by `filter.py node`.  An Imu message (three channels) goes over DDS to the
+node, a process of its own, and back; output is matched to input by its stamp.
+The same way through a node that only hands messages on, by `rclpy.spin`, says
+what a plain node takes (ours uses the EventsExecutor, which is faster).  The
+CPU time is read from /proc.
 """
 
 from __future__ import annotations
