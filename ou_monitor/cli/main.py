@@ -17,6 +17,7 @@ from ou_monitor.errors import InputError, nearest
 COMMANDS = {
     'analyze': 'ou_monitor.cli.analyze',
     'convert': 'ou_monitor.cli.convert',
+    'coupling': 'ou_monitor.cli.coupling',
     'design': 'ou_monitor.cli.design',
     'discover': 'ou_monitor.cli.discover',
     'reproduce': 'ou_monitor.cli.reproduce',

@@ -9,7 +9,7 @@ or semicolons separate.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 import csv
 from pathlib import Path
 
@@ -46,9 +46,42 @@ def read_csv(path: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
         one), or a cell is not a number (with its line).
 
     """
+    columns = _columns(path, (TIME, VOLTAGE), (THROTTLE,))
+    return columns[0], columns[1], columns[2]
+
+
+def read_column(path: Path, name: str) -> tuple[FloatArray, FloatArray]:
+    """
+    Return the stamps and one column of a CSV as they stand, NaN kept.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        File.
+    name : str
+        Column.
+
+    Returns
+    -------
+    tuple of ndarray, each of shape (n,)
+        Stamps, s, and values.
+
+    Raises
+    ------
+    InputError
+        As `read_csv`.
+
+    """
+    if name == TIME:
+        raise InputError(f"{path}: '{TIME}' is the time, not a signal")
+    columns = _columns(path, (TIME, name), ())
+    return columns[0], columns[1]
+
+
+def _columns(path: Path, needed: Sequence[str], optional: Sequence[str]) -> list[FloatArray]:
     try:
         with path.open(encoding='utf-8-sig', newline='') as file:
-            return _read(path, file)
+            return _read(path, file, needed, optional)
     except OSError as error:
         raise InputError(f'cannot read {path}: {error.strerror}') from error
     except UnicodeDecodeError as error:
@@ -72,7 +105,8 @@ class _Lines:
                 yield line
 
 
-def _read(path: Path, file: Iterator[str]) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _read(path: Path, file: Iterator[str], needed: Sequence[str], optional: Sequence[str],
+          ) -> list[FloatArray]:
     lines = _Lines(file)
     texts = iter(lines)
     first = next(texts, None)
@@ -80,23 +114,22 @@ def _read(path: Path, file: Iterator[str]) -> tuple[FloatArray, FloatArray, Floa
         raise InputError(f'{path} is empty: expected a header with {TIME},{VOLTAGE}[,{THROTTLE}]')
     delimiter = ';' if first.count(';') > first.count(',') else ','
     header = [name.strip() for name in next(csv.reader([first], delimiter=delimiter))]
-    for name in (TIME, VOLTAGE):
+    for name in needed:
         if name not in header:
             raise InputError(
                 f"{path}:{lines.number}: no column '{name}': {_hint(name, header)}")
-    for name in (TIME, VOLTAGE, THROTTLE):
+    for name in (*needed, *optional):
         if header.count(name) > 1:
             raise InputError(f"{path}:{lines.number}: column '{name}' is there twice")
-    names = [name for name in (TIME, VOLTAGE, THROTTLE) if name in header]
+    names = [name for name in (*needed, *optional) if name in header]
     places = [header.index(name) for name in names]
     columns = [array('d') for _ in names]
     for row in csv.reader(texts, delimiter=delimiter):
         for name, place, column in zip(names, places, columns):
             column.append(_cell(row, place, name, path, lines.number))
     arrays = [np.array(column, dtype=np.float64) for column in columns]
-    if THROTTLE not in names:
-        arrays.append(np.full(arrays[0].shape, np.nan))
-    return arrays[0], arrays[1], arrays[2]
+    arrays += [np.full(arrays[0].shape, np.nan) for name in optional if name not in names]
+    return arrays
 
 
 def _cell(row: list[str], place: int, name: str, path: Path, number: int) -> float:

@@ -1,0 +1,205 @@
+"""`ou-monitor coupling RECORDING --signal NAME`: supply noise in a signal."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from textwrap import fill
+from typing import Any, TYPE_CHECKING
+
+from ou_monitor.errors import InputError
+
+if TYPE_CHECKING:
+    from ou_monitor.offline.coupling import Coupling
+
+_COLUMNS = 100
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        From ``ArgumentParser.add_subparsers``.
+
+    """
+    parser = subparsers.add_parser(
+        'coupling', allow_abbrev=False,
+        help='gain from the supply voltage to a signal, such as a gyro axis',
+        description='Estimate how much noise of the supply is in a signal: gain with 95 % '
+                    'interval and lag, or that none was seen and what would have been.')
+    parser.add_argument(
+        'recording', metavar='RECORDING',
+        help='.mcap file, rosbag2 folder, or CSV with columns time_s, voltage_v[, throttle]')
+    parser.add_argument('--signal', metavar='NAME', required=True,
+                        help='TOPIC/FIELD.PATH of a bag (/imu/angular_velocity.x), or a column')
+    parser.add_argument('--band', metavar='LOW,HIGH',
+                        help='frequencies looked at, Hz (default: 5 to a quarter of the slower '
+                             'rate)')
+    parser.add_argument('--level', metavar='P', default='0.05',
+                        help='probability of a false alarm (default: 0.05)')
+    parser.add_argument('--msg-config', metavar='NAME',
+                        help='msg_config that says which topic and field is the voltage')
+    parser.add_argument('--voltage-topic', metavar='TOPIC', help='topic of the voltage')
+    parser.add_argument('--throttle-topic', metavar='TOPIC', help='topic of the throttle')
+    parser.add_argument('--partial', action='store_true',
+                        help='use what a truncated file still holds')
+    parser.add_argument('--json', metavar='FILE',
+                        help="write the result as JSON ('-': to standard output, alone)")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    Run the command.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Parsed arguments.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    Raises
+    ------
+    InputError
+        When an argument or the recording cannot be used.
+
+    """
+    from ou_monitor.cli import output
+
+    output.check_paths({'RECORDING': args.recording, '--msg-config': args.msg_config},
+                       {'--json': args.json})
+    output.check_writable(args.json)
+    band, level = _band(args.band), _level(args.level)
+
+    from ou_monitor.offline.coupling import estimate_coupling
+    from ou_monitor.recordings.read import read_recording
+    from ou_monitor.recordings.read_signal import read_signal
+
+    recording = read_recording(
+        args.recording, msg_config=args.msg_config, voltage_topic=args.voltage_topic,
+        throttle_topic=args.throttle_topic, partial=args.partial)
+    t, values = read_signal(args.recording, args.signal, partial=args.partial)
+    try:
+        found = estimate_coupling(recording.t, recording.voltage, t, values,
+                                  throttle=recording.throttle, band=band, level=level)
+    except InputError as error:
+        raise InputError(f"'{args.recording}', signal '{args.signal}': {error}") from error
+    if args.json is not None:
+        output.write_json(as_data(found, recording.name, args.signal, recording.notes), args.json)
+    if args.json != output.STDOUT:
+        output.say(render(found, recording.name, args.signal, recording.notes))
+    return 0
+
+
+def as_data(found: Coupling, name: str, signal: str, notes: tuple[str, ...]) -> dict[str, Any]:
+    """
+    Return the result for JSON.
+
+    Parameters
+    ----------
+    found : Coupling
+        Result.
+    name, signal : str
+        Recording and signal.
+    notes : tuple of str
+        Of the recording.
+
+    Returns
+    -------
+    dict
+        Units are in the keys; a gain is in signal units per volt.
+
+    """
+    return {
+        'recording': name, 'signal': signal, 'seen': found.seen, 'p_value': found.p_value,
+        'level': found.level, 'gain_per_v': found.gain, 'gain_ci95': found.gain_ci95,
+        'gain_limit_per_v': found.limit, 'lag_s': found.lag, 'lag_se_s': found.lag_se,
+        'share_of_signal': found.noise_share, 'narrow': found.narrow,
+        'signal_leads': found.signal_leads, 'throttle_taken_out': found.partial,
+        'segments': found.segments, 'duration_s': found.grid.duration,
+        'rate_hz': found.grid.rate, 'voltage_rate_hz': found.grid.rates[0],
+        'signal_rate_hz': found.grid.rates[1], 'gaps': found.grid.gaps,
+        'dropped': {'voltage': found.grid.lost[0], 'signal': found.grid.lost[1]},
+        'frequency_hz': found.frequency, 'coherence': found.coherence,
+        'coherence_threshold': found.threshold, 'gain_by_frequency': abs(found.response),
+        'notes': [*notes, *found.notes]}
+
+
+def render(found: Coupling, name: str, signal: str, notes: tuple[str, ...]) -> str:
+    """
+    Return the finding for a terminal 100 columns wide.
+
+    Parameters
+    ----------
+    found : Coupling
+        Result.
+    name, signal : str
+        Recording and signal.
+    notes : tuple of str
+        Of the recording.
+
+    Returns
+    -------
+    str
+        Plain text.
+
+    """
+    grid = found.grid
+    low, high = found.frequency[0], found.frequency[-1]
+    peak = int(found.coherence.argmax())
+    lines = [f'{name}, {signal}: {grid.duration:.4g} s in common, {low:.3g}..{high:.3g} Hz, '
+             f'{found.segments:.0f} segments' + (', throttle taken out' if found.partial else ''),
+             '']
+    if found.seen:
+        a, b = found.gain_ci95
+        lines += [
+            f'Coupling is seen (p = {found.p_value:.2g}, level {found.level:g}).',
+            f'  gain    {found.gain:.4g} per V  [{a:.4g}, {b:.4g}] 95 %',
+            f'  lag     {1e3 * found.lag:.3g} ms of the signal behind the voltage '
+            f'(standard error {1e3 * found.lag_se:.2g} ms)',
+            f'  share   {100.0 * found.noise_share:.3g} % of the signal in this band']
+    else:
+        lines += [
+            f'No coupling seen (p = {found.p_value:.2g}, level {found.level:g}).',
+            f'  limit   a gain of {found.limit:.4g} per V would have been seen with 90 % '
+            'probability']
+    lines.append(f'  largest squared coherence {found.coherence[peak]:.3g} at '
+                 f'{found.frequency[peak]:.3g} Hz, threshold {found.threshold:.3g}')
+    extra = [f'{lost} samples of the {what} dropped.' for lost, what in
+             zip(grid.lost, ('voltage', 'signal')) if lost]
+    if grid.gaps:
+        extra.append(f'{grid.gaps} gap{"s" * (grid.gaps != 1)} left out.')
+    remarks = [*notes, *extra, *found.notes]
+    if remarks:
+        lines += ['', *[fill(text, _COLUMNS, initial_indent='- ', subsequent_indent='  ')
+                        for text in remarks]]
+    return '\n'.join(lines)
+
+
+def _band(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        low, high = (float(word) for word in text.split(','))
+    except ValueError:
+        raise InputError(f"--band: '{text}' is not LOW,HIGH in Hz, such as 10,100") from None
+    if not (0.0 < low < high and math.isfinite(high)):
+        raise InputError(f"--band: '{text}' must be two frequencies, 0 < LOW < HIGH")
+    return low, high
+
+
+def _level(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < 1.0:
+        raise InputError(f"--level: '{text}' is not a probability between 0 and 1")
+    return value

@@ -1,0 +1,91 @@
+"""
+Any scalar of a recording beside its voltage: a field of a topic, or a column.
+
+Limits first: stamps are those of the message's header where it has one, else
+the bag's log times; a voltage with the other kind is off by the delay of the
+transmission.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ou_monitor.errors import InputError, nearest
+from ou_monitor.messages.config import FieldSpec
+from ou_monitor.messages.extract import Extractor
+from ou_monitor.recordings.bag import BagReader
+from ou_monitor.recordings.csv_table import read_column
+from ou_monitor.records import FloatArray
+
+# Types whose only number need not be named.
+_SCALARS = ('std_msgs/msg/Float32', 'std_msgs/msg/Float64')
+
+
+def read_signal(path: str | Path, signal: str, *, partial: bool = False,
+                ) -> tuple[FloatArray, FloatArray]:
+    """
+    Read one scalar over time.
+
+    Parameters
+    ----------
+    path : str or path
+        Recording, as for `read_recording`.
+    signal : str
+        Of a bag TOPIC/FIELD.PATH, such as ``/imu/angular_velocity.x``; of a
+        CSV the name of a column.
+    partial : bool
+        Whether a damaged bag is read as far as it holds.
+
+    Returns
+    -------
+    tuple of ndarray, each of shape (n,)
+        Stamps, s, and values as they stand; NaN are kept.
+
+    Raises
+    ------
+    InputError
+        When there is no such topic, field or column (with the nearest), or it
+        holds no number.
+
+    """
+    path = Path(path)
+    if not signal:
+        raise InputError('the name of the signal is empty: TOPIC/FIELD or a column')
+    if path.suffix.lower() == '.csv' and not path.is_dir():
+        return read_column(path, signal)
+    bag = BagReader(path, partial=partial)
+    topic, field = _split(path, signal, bag.topics)
+    kind = bag.topics[topic]
+    extractor: Extractor | None = None
+    stamps, values = [], []
+    for message in bag.decoded([topic]):
+        if extractor is None:
+            header = hasattr(getattr(message.message, 'header', None), 'stamp')
+            extractor = Extractor(FieldSpec(
+                topic, kind, field, nan='unknown',
+                stamp_field='header.stamp' if header else None))
+        found = extractor.extract(message.message)
+        own = message.log_time_ns // 1_000_000_000 + message.log_time_ns % 1_000_000_000 * 1e-9
+        stamps.append(own if found.stamp is None else found.stamp)
+        values.append(float(found.values[0]) if found.values.size else float('nan'))
+    if not values:
+        raise InputError(f"{path}: topic '{topic}' holds no message")
+    return np.array(stamps), np.array(values)
+
+
+def _split(path: Path, signal: str, topics: Mapping[str, str]) -> tuple[str, str]:
+    """Return the topic and the field that a signal names."""
+    wanted = '/' + signal.lstrip('/')
+    if topics.get(wanted) in _SCALARS:
+        return wanted, 'data'
+    topic, _, field = wanted.rpartition('/')
+    if topic in topics:
+        return topic, field
+    if wanted in topics:
+        raise InputError(f"{path}: topic '{wanted}' is {topics[wanted]}: name the field too, "
+                         f'{wanted}/FIELD')
+    raise InputError(f"{path}: no topic '{topic or wanted}' for the signal '{signal}': "
+                     f'{nearest(topic or wanted, topics)}')
