@@ -213,7 +213,8 @@ class SupplyMonitor:
         level, summary = self._judge(e, risk, flag, self._silence(age, e) if stale else '')
         return MonitorReport(e, risk, NAN if budget is None else budget.throttle,
                              '' if budget is None else budget.reason,
-                             () if events is None else events.left_out, flag, level, summary, silent)
+                             () if events is None else events.left_out, flag, level,
+                             summary, silent)
 
     def _silence(self, age: float | None, e: Estimate) -> str:
         if age is not None and age > self._settings.stale_after:

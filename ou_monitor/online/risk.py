@@ -211,7 +211,8 @@ def _averaged(start: FloatArray, barrier: FloatArray, span: FloatArray, weight: 
     return np.clip(total, 0.0, 1.0)
 
 
-def _nodes(supply: Supply, grid: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _nodes(supply: Supply, grid: FloatArray, weights: FloatArray
+           ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return levels, ln alpha, ln sigma at the nodes (last axis), and their weights."""
     u0, u0_se, ln_alpha, ln_alpha_se, ln_sigma, ln_sigma_se, covariance = (
         np.asarray(value, dtype=np.float64)[..., None] for value in (
