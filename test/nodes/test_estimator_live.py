@@ -37,9 +37,10 @@ class Rig:
         """Send stamped samples, dt apart; do not flood best effort."""
         for k, voltage in enumerate(voltages):
             self.t += dt
-            whole = math.floor(self.t)
+            seconds, nanoseconds = divmod(round(self.t * 1e9), 10**9)
+            self.last = voltage
             message = BatteryState(voltage=voltage)
-            message.header.stamp = Time(sec=whole, nanosec=round((self.t - whole) * 1e9) % 10**9)
+            message.header.stamp = Time(sec=seconds, nanosec=nanoseconds)
             self.output.publish(message)
             if k % 20 == 19:
                 time.sleep(0.002)
@@ -59,7 +60,17 @@ class Rig:
 
     def catch_up(self):
         """Wait until what was sent is in the state, the last few lost ones allowed for."""
-        wait_until(lambda: abs(float(self.field('t')) - self.t) < 0.01, what='the newest sample')
+        for _ in range(8):
+            try:
+                wait_until(self._is_there, 2.5, 'the newest sample')
+                return
+            except pytest.fail.Exception:
+                # Best effort may lose the last ones on a busy machine.
+                self.feed([self.last] * 2)
+        wait_until(self._is_there, what='the newest sample')
+
+    def _is_there(self):
+        return abs(float(self.field('t')) - self.t) < 0.01
         states = len(self.states)
         wait_until(lambda: len(self.states) > states + 2)
 
@@ -100,8 +111,8 @@ def test_one_does_not_hear_the_other(rigs):
 def test_silence(rig):
     """After `stale_after`: STALE, NaN, and no flag that says false."""
     rig.feed(ou_path(500, DT, seed=2))
-    wait_until(lambda: rig.status.level == STALE, what='STALE')
-    assert 'No voltage for' in rig.status.message
+    wait_until(lambda: rig.status.level == STALE and 'No voltage for' in rig.status.message,
+               what='STALE after samples')
     # The estimate goes out before its state, so the newest number is that old at most.
     wait_until(lambda: math.isnan(rig.alpha[-1].data), 2.0)
     time_of_silence = len(rig.flags)
@@ -141,7 +152,8 @@ def test_time_going_back_clears_the_window(rig):
     rig.feed(ou_path(300, DT, seed=6))
     rig.catch_up()
     assert rig.count('resets') == resets + 1
-    assert 250 <= rig.count('n') <= 300
+    # Some more where the last ones were lost.
+    assert 250 <= rig.count('n') <= 316
 
 
 def test_parameter_change_keeps_the_window(rig):
