@@ -103,7 +103,7 @@ def flight(given: argparse.Namespace) -> tuple[str, str]:
         name: getattr(many, name)[most:most + 1] for name in
         ('throttle', 'sigma', 'voltage', 'truth', 'slope', 'measured', 'noise')})
     seen = methods.estimates(flown, given.window)
-    output, cutoff = methods.adaptive(methods.laws(case)['wiener'][0], flown, seen,
+    output, cutoff = methods.adaptive(methods.laws(case)['kalman'][0], flown, seen,
                                       flown.measured)
     fixed = np.geomspace(*case.limits, 41)
     outputs = methods.sweep(flown.measured, fixed[:, None, None], case.order)
@@ -122,7 +122,7 @@ def flight(given: argparse.Namespace) -> tuple[str, str]:
         t[every], flown.sigma[0, every], 'true', 7, 'dash')
     sigmas.line(t[every], seen[0, 0, every], f'estimated, window {given.window:g} s', 1, 'thick')
     cutoffs = plot('Cutoff', 'Hz', log_y=True).line(
-        t[every], cutoff[0, every], 'in force, law wiener', 1, 'thick')
+        t[every], cutoff[0, every], 'that lags as much, law kalman', 1, 'thick')
     cutoffs.line(t[[0, -1]], np.full(2, fixed[best]), 'best fixed in hindsight', 2, 'dash')
     errors = plot('Error against the true body rate, rms of half a second', 'rad/s', 220, True)
     errors.line(t[every], rms(flown.measured[0]), 'unfiltered', 7)

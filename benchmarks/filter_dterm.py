@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import math
 
 import filter_methods as methods
-from filter_signals import Case, Flights, fly, kalman, RATE, SPREAD
+from filter_signals import BODY, Case, Flights, fly, kalman, RATE, SPREAD
 import numpy as np
 from ou_monitor.offline.report.svg import Plot
 from tables import number, table
@@ -21,9 +21,10 @@ from tables import number, table
 CASE = Case('D term of a body rate of two poles at 5 Hz, alpha 600', 'smooth', 600.0, 5.0, 2,
             (20.0, 150.0), coupling=2.0)
 FIXED, CURVE, SWITCH = 'fixed', "Betaflight's curve, f..2 f", 'threshold, f/2..f'
-CONSTANT = 'constant_noise'
+CONSTANT, KALMAN = 'constant_noise', 'kalman'
 # Cutoffs, Hz, and wanted noise, rad/s^2.
 _CUTOFFS, _BASES = np.geomspace(15.0, 200.0, 28), (15.0, 25.0, 40.0, 60.0, 75.0, 90.0)
+_LAGS = (0.0, 30.0, 20.0, 12.0)
 _TOPS, _WANTED = (40.0, 70.0, 110.0, 150.0), (4.0, 7.0, 12.0, 20.0, 30.0)
 
 
@@ -92,6 +93,16 @@ def run(flights: int, seconds: float, seed: int, window: float, tell: Callable[[
         noise, cutoff = methods.adaptive(options, flown, seen, flown.noise)
         keep(name, setting, noise,
              methods.sweep(flown.truth, cutoff[None], 2, True)[0], cutoff)
+    for limit in _LAGS:
+        options = {**base, 'law': 'kalman', 'coupling': CASE.coupling, 'signal_poles': 2,
+                   'signal_bandwidth': CASE.bandwidth, 'signal_rms': BODY, 'fmin': 5.0,
+                   'fmax': 300.0, 'max_lag': limit, 'n0': CASE.white**2 / RATE}
+        setting = f'lag <= {limit:g} degrees' if limit else 'free'
+        tell(f'{KALMAN}, {setting}')
+        # Its gains do not look at the signal, so that noise and signal may be run apart.
+        noise, cutoff = methods.adaptive(options, flown, seen, flown.noise)
+        keep(KALMAN, setting, noise, methods.adaptive(options, flown, seen, flown.truth)[0],
+             cutoff)
     slope = kalman(CASE, flown)[1]
     points.append(Point('Kalman filter that knows sigma', '-', math.nan, math.nan,
                         methods.lag_ms(slope, flown.slope),
@@ -134,7 +145,7 @@ def render(points: list[Point]) -> tuple[str, Plot]:
                      f'{p.low:.0f}..{p.high:.0f}' if math.isfinite(p.low) else '-'])
     plot = Plot('D term: noise of the loudest second in twenty against lag', 'lag, ms',
                 'rms of the noise, rad/s^2', width=760, height=360, log_y=True)
-    for colour, name in enumerate((FIXED, CONSTANT, SWITCH, CURVE)):
+    for colour, name in enumerate((FIXED, CONSTANT, SWITCH, CURVE, KALMAN)):
         found = sorted((p for p in points if p.method == name), key=lambda p: p.lag)
         x = np.array([p.lag for p in found])
         plot.line(x, np.array([p.loud for p in found]), name, colour, 'thick')

@@ -87,6 +87,8 @@ def score(case: Case, flights: Flights, seen: np.ndarray, best: np.ndarray) -> R
             chosen = _least(np.array([methods.error(y, flights.truth) for y, _ in runs]))
             keep(f'{law}, its parameter in hindsight',
                  *(_taken(np.array([run[k] for run in runs]), chosen) for k in range(2)))
+    for name, options in methods.mistaken(case).items():
+        keep(name, *methods.adaptive(options, flights, seen, x))
     # The law alone, without estimator and smoothing: what its form is worth.
     settings = FilterSettings.from_options(methods.laws(case)['wiener'][0])
     grid = np.geomspace(flights.sigma.min(), flights.sigma.max() * 1.0001, 200)
@@ -144,7 +146,7 @@ def errors(flights: int, seconds: float, seed: int, window: float,
 
 
 def windows(flights: int, seconds: float, seed: int, tell: Callable[[str], None]) -> str:
-    """Return how the error of the law `wiener` depends on the estimator's window."""
+    """Return how the error of the law `kalman` depends on the estimator's window."""
     rows = []
     for place, case in enumerate(CASES):
         flown = fly(case, np.random.default_rng([seed, place]), flights, seconds)
@@ -156,7 +158,7 @@ def windows(flights: int, seconds: float, seed: int, tell: Callable[[str], None]
             tell(f'{case.name}, window {window:g} s')
             seen = methods.estimates(flown, window)
             known = float(np.isfinite(seen[0, :, int(methods.SETTLE * RATE):]).mean())
-            output, _ = methods.adaptive(methods.laws(case)['wiener'][0], flown, seen,
+            output, _ = methods.adaptive(methods.laws(case)['kalman'][0], flown, seen,
                                          flown.measured)
             found = methods.error(output, flown.truth)
             rows.append([case.name, f'{window:g}', _ratio(found, best), _ratio(found, fixed),

@@ -18,6 +18,9 @@ COUPLINGS = (0.1, 0.3, 1.0, 1.5, 2.0, 3.0, 4.0)
 # The threshold just above what a quiet hover has: where a law is most tempted.
 _ABOVE = 0.72
 _BARE = {'smoothing': 0.0, 'slew': 0.0, 'dead_band': 0.0}
+# A body rate as quick as the loop makes it; its coupling is that of the loop.
+_KALMAN = {'law': 'kalman', 'signal_bandwidth': 5.0, 'signal_rms': 0.3, 'signal_poles': 2,
+           'n0': 1e-7}
 CASES: dict[str, dict[str, object]] = {
     'constant_noise, defaults': {},
     'constant_noise, defaults, sigma ~ load^3': {'steepness': 3.0},
@@ -26,6 +29,9 @@ CASES: dict[str, dict[str, object]] = {
         'filter': {**_BARE, 'fmin': 5.0}, 'steepness': 3.0},
     'threshold, defaults': {'filter': {'law': 'threshold', 'sigma_ref': _ABOVE}},
     'threshold, nothing held': {'filter': {'law': 'threshold', 'sigma_ref': _ABOVE, **_BARE}},
+    'kalman, lag <= 20 degrees at 10 Hz': {'filter': {**_KALMAN, 'max_lag': 20.0}},
+    'kalman, fmin 5 Hz, sigma ~ load^3': {
+        'filter': {**_KALMAN, 'fmin': 5.0}, 'steepness': 3.0},
     'threshold, slew 0.2 octaves/s': {
         'filter': {'law': 'threshold', 'sigma_ref': _ABOVE, 'slew': 0.2}},
 }
@@ -37,7 +43,11 @@ def scan(seconds: float, seed: int, tell: Callable[[str], None]) -> dict[str, li
     for name, options in CASES.items():
         found[name] = []
         for coupling in COUPLINGS:
-            found[name].append(judge(Loop(coupling=coupling, **options),  # type: ignore[arg-type]
+            given = dict(options)
+            of_filter = given.get('filter', {})
+            if 'kalman' in name:
+                given['filter'] = {**of_filter, 'coupling': coupling}  # type: ignore[dict-item]
+            found[name].append(judge(Loop(coupling=coupling, **given),  # type: ignore[arg-type]
                                      seconds, seed))
         tell(name)
     return found

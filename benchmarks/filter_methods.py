@@ -21,10 +21,10 @@ _ROOT2 = math.sqrt(2.0)
 
 
 def estimates(flights: Flights, window: float) -> np.ndarray:
-    """Return sigma, its error (V/sqrt(s)) and alpha at each sample, shape (3, flights, n)."""
+    """Return sigma, its error, alpha, u0 and its error at each sample, shape (5, flights, n)."""
     count, n = flights.voltage.shape
     block = int(EVERY * RATE)
-    out = np.full((3, count, n), np.nan)
+    out = np.full((5, count, n), np.nan)
     for f in range(count):
         estimator = SlidingEstimator(window=window)
         for at in range(0, n, block):
@@ -35,7 +35,7 @@ def estimates(flights: Flights, window: float) -> np.ndarray:
             if e.usable:
                 # Known from the next sample on.
                 out[:, f, at + block:at + 2 * block] = np.array(
-                    [e.sigma, e.sigma * e.sigma_se, e.alpha])[:, None]
+                    [e.sigma, e.sigma * e.sigma_se, e.alpha, e.u0, e.u0_se])[:, None]
     return out
 
 
@@ -45,8 +45,9 @@ def adaptive(options: Mapping[str, Any], flights: Flights, seen: np.ndarray,
     out, cutoff = np.empty(x.shape), np.empty(x.shape)
     for f in range(x.shape[0]):
         one = AdaptiveLowPass(**options)
-        rows = zip(flights.t.tolist(), x[f].tolist(), *(s[f].tolist() for s in seen),
-                   flights.throttle[f].tolist())
+        sigma, error, alpha, level, level_se = (s[f].tolist() for s in seen)
+        rows = zip(flights.t.tolist(), x[f].tolist(), sigma, error, alpha,
+                   flights.throttle[f].tolist(), level, level_se)
         for k, row in enumerate(rows):
             out[f, k] = one.step(*row)
             cutoff[f, k] = one.cutoff
@@ -159,15 +160,30 @@ def laws(case: Case) -> dict[str, list[dict[str, Any]]]:
     constant = {**base, 'law': 'constant_noise'}
     if case.kind == 'voltage':
         middle = SPREAD * math.sqrt(2.0 * case.alpha)
-        return {'wiener': [wiener], 'constant_noise': [
+        return {'kalman': [{**base, 'law': 'kalman'}], 'wiener': [wiener], 'constant_noise': [
             {**constant, 'sigma_ref': share * middle} for share in (0.5, 0.25, 1.0)]}
-    wiener |= {'signal_rms': BODY, 'coupling': case.coupling}
+    wiener |= {'signal_rms': BODY, 'coupling': case.coupling,
+               'signal_poles': 2 if case.kind == 'smooth' else 1}
     constant |= {'coupling': case.coupling}
     return {
+        'kalman': [{**wiener, 'law': 'kalman', 'signal_bandwidth': case.bandwidth}],
         'wiener': [{**wiener, 'signal_bandwidth': share * case.bandwidth}
                    for share in (1.0, 0.5, 0.25, 0.1, 0.03)],
         'constant_noise': [{**constant, 'noise_wanted': share * BODY}
                            for share in (0.2, 0.1, 0.3, 0.4, 0.6)]}
+
+
+def mistaken(case: Case) -> dict[str, dict[str, Any]]:
+    """Return the options of `kalman` with each of what it is told wrong by a factor of 2."""
+    right = laws(case)['kalman'][0]
+    found = {}
+    for name in ('n0', 'signal_bandwidth', 'signal_rms', 'coupling'):
+        for factor, word in ((0.5, 'half'), (2.0, 'twice')):
+            # The gyro's own noise is next to nothing beside the supply's.
+            if right.get(name) and not (name == 'n0' and case.kind != 'voltage'):
+                found[f'kalman, {name} {word} the true one'] = {
+                    **right, name: factor * right[name]}
+    return found
 
 
 def threshold(case: Case, best: float) -> dict[str, Any]:

@@ -4,7 +4,7 @@ The node of `adaptive_filter`.
 Inputs (relative names): `input` (a type of `filter_channels.CHANNELS`, or any
 installed type with `input.field`), `sigma` (std_msgs/Float64), and `state`
 (the estimator's `~/state`, DiagnosticArray), which is used while it is
-published: error of sigma, alpha, throttle, and whether the estimate is usable.
+published: error of sigma, alpha, throttle, level, and whether the estimate is usable.
 Outputs: `~/output` (type and stamp of the input), `~/cutoff` (Hz) and `~/lag`
 (ms, phase delay at `lag_frequency`) as std_msgs/Float64 at `publish_rate`,
 `/diagnostics` at 1 Hz.
@@ -31,7 +31,8 @@ from ou_monitor.nodes.supply_input import Supply, SupplyInput
 from ou_monitor.online.cutoff_control import Bound
 from ou_monitor.online.lowpass import AdaptiveLowPass, FilterCounters
 from ou_monitor.online.monitor import Level
-from ou_monitor.online.settings import FILTER_PARAMETERS, filter_settings, Parameter
+from ou_monitor.online.settings import (
+    FILTER_PARAMETERS, filter_settings, FilterSettings, Parameter)
 from std_msgs.msg import Float64
 
 AUTO = 'auto'
@@ -49,9 +50,13 @@ FIXED = (
 class AdaptiveFilterNode(MonitorNode):
     """Low-pass with a cutoff driven by sigma, as a node."""
 
+    # Asked by `check` from the beginning on.
+    _channels: Channels | None = None
+    _type = AUTO
+    _topic = ''
+
     def __init__(self, name: str) -> None:
         super().__init__(name, (*RUN_TIME, PUBLISH_RATE), FIXED)
-        self._channels: Channels | None = None
         self._filters: list[AdaptiveLowPass] = []
         # Stands for them until there are any, and for what they would say.
         self._idle = AdaptiveLowPass(**self._of_filter(self.values()))
@@ -78,8 +83,12 @@ class AdaptiveFilterNode(MonitorNode):
         self.publish_every(self._publish)
 
     def check(self, values: Mapping[str, Any]) -> None:
-        """Raise `ValueError` when the parameters contradict each other."""
-        filter_settings(self._of_filter(values))
+        """Raise `ValueError` when the parameters contradict each other or the signal."""
+        settings = filter_settings(self._of_filter(values))
+        if self._channels is not None and _not_a_voltage(self._type, settings):
+            raise ValueError(
+                f'law {settings.law} without signal_bandwidth is for a voltage, and {self._topic} '
+                f'is {self._type}: set signal_bandwidth, signal_rms and coupling first')
 
     def apply(self, values: Mapping[str, Any]) -> None:
         """Bring checked parameters into force; the output does not move."""
@@ -131,7 +140,7 @@ class AdaptiveFilterNode(MonitorNode):
         supply = self._known()
         self._channels.put(message, [
             channel.step(stamp, value, supply.sigma, supply.sigma_se, supply.alpha,
-                         supply.throttle)
+                         supply.throttle, supply.level, supply.level_se)
             for channel, value in zip(self._filters, values, strict=True)])
         self._output.publish(message)
         self._passed += 1
@@ -161,7 +170,8 @@ class AdaptiveFilterNode(MonitorNode):
             'decided_by': self._decided_by(supply), 'lag': low_pass.phase_lag,
             'delay': low_pass.delay, 'lag_frequency': settings.lag_frequency,
             'sigma': supply.sigma, 'sigma_se': supply.sigma_se, 'alpha': supply.alpha,
-            'throttle': supply.throttle, 'passed': self._passed, 'dropped': self._dropped,
+            'throttle': supply.throttle, 'level': supply.level,
+            'passed': self._passed, 'dropped': self._dropped,
             'repeated': counters.repeated, 'back': counters.back, 'gaps': counters.gaps,
             'sigma_age': self._supply.age, 'state_age': self._supply.state_age,
             'input_age': self._input_silence.age}
@@ -209,6 +219,10 @@ class AdaptiveFilterNode(MonitorNode):
                 ' yet.' if age is None else f' for {age:.1f} s.')
         if self._stamper.waiting and not self._passed:
             return Level.WARN, 'use_sim_time is set, but nothing comes on /clock.'
+        if _not_a_voltage(self._type, s):
+            return Level.WARN, (
+                f'Law {s.law} without signal_bandwidth takes {self._topic} of type {self._type} '
+                'for the voltage: set signal_bandwidth, signal_rms and coupling.')
         missing = math.isnan(supply.throttle if s.law == 'throttle' else supply.sigma)
         if missing:
             return Level.WARN, (
@@ -225,3 +239,9 @@ class AdaptiveFilterNode(MonitorNode):
             f'{shadow}Cutoff {self.low_pass.cutoff:.4g} Hz by law {s.law} at {of}; decided by '
             f'{self._decided_by(supply)}; lag {self.low_pass.phase_lag:.3g} degrees '
             f'({1e3 * self.low_pass.delay:.3g} ms) at {s.lag_frequency:g} Hz.')
+
+
+def _not_a_voltage(kind: str, settings: FilterSettings) -> bool:
+    """Tell whether a law that would filter the voltage itself meets a signal that is none."""
+    return (kind == 'sensor_msgs/msg/Imu' and settings.law in ('kalman', 'wiener')
+            and not settings.signal_bandwidth)

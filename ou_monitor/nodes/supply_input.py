@@ -10,6 +10,8 @@ from ou_monitor.nodes.inputs import Silence
 from ou_monitor.records import Status
 
 NAN = math.nan
+# Fields of the state that the filter uses as they are.
+_FIELDS = ('alpha', 'throttle', 'u0', 'u0_se')
 _USABLE = (Status.OK.name, Status.SHORT_WINDOW.name)
 
 
@@ -25,6 +27,8 @@ class Supply(NamedTuple):
         Relaxation rate, 1/s; NaN: not known.
     throttle : float
         Throttle, 0..1; NaN: not known.
+    level, level_se : float
+        Level at the present throttle and its standard error, V; NaN: not known.
     why : str
         Why sigma is not known; empty when it is.
 
@@ -34,6 +38,8 @@ class Supply(NamedTuple):
     sigma_se: float = NAN
     alpha: float = NAN
     throttle: float = NAN
+    level: float = NAN
+    level_se: float = NAN
     why: str = ''
 
 
@@ -55,7 +61,8 @@ class SupplyInput:
         self._sigma = NAN
         self._state: dict[str, str] = {}
         self._heard, self._state_heard = Silence(now), Silence(now)
-        self._error = self._alpha = self._throttle = NAN
+        self._error = NAN
+        self._known = [NAN] * len(_FIELDS)
 
     @property
     def age(self) -> float | None:
@@ -81,19 +88,18 @@ class SupplyInput:
                 self._state = values
                 sigma, error = _number(values, 'sigma'), _number(values, 'sigma_se')
                 self._error = error / sigma if sigma > 0.0 and error >= 0.0 else NAN
-                self._alpha, self._throttle = (_number(values, key)
-                                               for key in ('alpha', 'throttle'))
+                self._known = [_number(values, key) for key in _FIELDS]
                 return
 
     def now(self, stale_after: float) -> Supply:
         """Return what is known, nothing of it older than `stale_after`, s."""
         fresh = _fresh(self._state_heard.age, stale_after)
-        error, alpha, throttle = ((self._error, self._alpha, self._throttle) if fresh
-                                  else (NAN, NAN, NAN))
+        error, (alpha, throttle, level, level_se) = (
+            (self._error, self._known) if fresh else (NAN, [NAN] * len(_FIELDS)))
         why = self._why(fresh, stale_after)
         if why:
             return Supply(throttle=throttle, why=why)
-        return Supply(self._sigma, error * self._sigma, alpha, throttle)
+        return Supply(self._sigma, error * self._sigma, alpha, throttle, level, level_se)
 
     def why_no_throttle(self, stale_after: float) -> str:
         """Say why the throttle is not known."""

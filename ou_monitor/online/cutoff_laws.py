@@ -23,6 +23,8 @@ from collections.abc import Callable
 import math
 
 from ou_monitor.online.settings import FilterSettings
+from ou_monitor.online.white_noise import held_cutoff
+from ou_monitor.online.wiener import least_error, least_sampled_error
 
 TWO_PI = 2.0 * math.pi
 _ROOT2 = math.sqrt(2.0)
@@ -98,18 +100,13 @@ def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: 
     r"""
     Return the cutoff that makes `times` as much white noise come out as at fmax once did.
 
-    White noise of two-sided density N through a low-pass has the variance
+    Of the sampled filter, see `white_noise.held_cutoff`.  Far below the sample
+    rate: white noise of two-sided density N through a low-pass has the variance
     N w / 2 (order 1) or N w / (2 sqrt 2) (order 2): rms ~ sqrt(fc), so
-    fc = fmax / times^2 for both.
-
-    Derivative, order 2: N int w'^2 |H|^2 dw' / 2 pi = N w^3 / (2 sqrt 2), so
-    rms ~ fc^(3/2) and fc = fmax / times^(2/3).
-
-    Derivative, order 1: the same integral is infinite; what makes it finite is
-    the sample rate.  Independent samples of variance v, linear between, give
-    d_k = q d_(k-1) + (1 - q) (x_k - x_(k-1)) / dt with q = exp(-w dt), whose
-    variance is 2 v (1 - q)^2 / (dt^2 (1 + q)): for w dt << 1, v w^2.  With
-    g = 1 - q the wanted K = g^2 / (2 - g) gives g = (sqrt(K^2 + 8 K) - K) / 2.
+    fc = fmax / times^2 for both.  Derivative, order 2: N int w'^2 |H|^2 dw' / 2 pi
+    = N w^3 / (2 sqrt 2), so rms ~ fc^(3/2) and fc = fmax / times^(2/3).
+    Derivative, order 1: the integral is infinite and the sample rate makes it
+    finite; independent samples of variance v give v w^2, so fc = fmax / times.
 
     Parameters
     ----------
@@ -120,9 +117,9 @@ def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: 
     fmax : float
         Cutoff at `times` = 1, Hz.
     times : float
-        Sigma over sigma_ref, above 0.
+        Sigma over sigma_ref, 1 or more.
     interval : float
-        Time between samples, s (used by the derivative of order 1 alone).
+        Time between samples, s; 0: not known, as if sampled without end.
 
     Returns
     -------
@@ -130,16 +127,11 @@ def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: 
         Cutoff, Hz.
 
     """
+    if interval > 0.0 and 1e-6 < TWO_PI * fmax * interval < 1e2 and times < 1e3:
+        return held_cutoff(mode, order, fmax, times, interval)
     if mode == 'lowpass':
         return fmax / (times * times)
-    if order == 2:
-        return float(fmax * times ** (-2.0 / 3.0))
-    if not interval > 0.0:
-        return fmax / times
-    g = -math.expm1(-TWO_PI * fmax * interval)
-    k = g * g / (2.0 - g) / (times * times)
-    g = 0.5 * (math.sqrt(k * k + 8.0 * k) - k)
-    return -math.log1p(-g) / (TWO_PI * interval)
+    return float(fmax * times ** (-2.0 / 3.0)) if order == 2 else fmax / times
 
 
 def supply_noise(mode: str, order: int, cutoff: float, alpha: float) -> float:
@@ -236,89 +228,22 @@ def wiener_law(settings: FilterSettings, sigma: float, alpha: float, interval: f
     Without `signal_bandwidth` the signal is the voltage itself, in white noise
     of density n0.  The Kalman-Bucy filter of an OU process has one pole: from
     its Riccati equation 0 = sigma^2 - 2 alpha P - P^2 / n0 it lies at
-    alpha + P / n0 = sqrt(alpha^2 + sigma^2 / n0), the law for order 1.  A
-    second-order Butterworth has the error 3 sigma^2 / (2 sqrt2 w)
-    + n0 w / (2 sqrt2) for w >> alpha, least at w = sqrt(3) sigma / sqrt(n0): the
-    law for order 2 is sqrt(alpha^2 + 3 sigma^2 / n0).  The filter of this
-    package has gain 1 where Kalman's has less, so that for sigma^2 / n0 near
-    alpha^2 and below it is not the optimum; `squared_error` has the errors.
+    alpha + P / n0 = sqrt(alpha^2 + sigma^2 / n0).  A low-pass of gain 1 has the
+    least error a little off it, and a sampled one further; where the interval
+    is known, order 1 has the least `sampled_error`.  A second-order Butterworth
+    has the error 3 sigma^2 / (2 sqrt2 w) + n0 w / (2 sqrt2) for w >> alpha, least
+    at w = sqrt(3) sigma / sqrt(n0): the law for order 2 is
+    sqrt(alpha^2 + 3 sigma^2 / n0).
 
-    With `signal_bandwidth`: see `squared_error`, whose least value is searched
-    over the logarithm of the cutoff.
+    With `signal_bandwidth`: the least `squared_error`.
     """
-    if settings.signal_bandwidth:
-        return least_error(settings, sigma, alpha)
-    factor = 1.0 if settings.order == 1 else 3.0
-    return math.sqrt(alpha * alpha + factor * sigma * sigma / settings.n0) / TWO_PI
-
-
-def squared_error(order: int, w: float, signal: tuple[float, float],
-                  noise: tuple[float, float], n0: float) -> float:
-    """
-    Return the mean square error of a low-pass with a cutoff of `w`.
-
-    What of the signal is lost: an OU of intensity a and rate b through 1 - H.
-    Order 1: a^2 / (2 (w + b)); order 2: a^2 (3 w + sqrt2 b)
-    / (2 sqrt2 (w^2 + sqrt2 w b + b^2)).  What comes through of the supply's
-    noise: V of this module; of white noise: n0 w / 2 or n0 w / (2 sqrt2).
-
-    Parameters
-    ----------
-    order : {1, 2}
-        Order.
-    w : float
-        2 pi fc, 1/s.
-    signal : tuple of float
-        Intensity, unit/sqrt(s), and rate, 1/s, of the true signal.
-    noise : tuple of float
-        The same of the supply's noise in it.
-    n0 : float
-        Density of the white noise in it, two-sided, unit^2/Hz.
-
-    Returns
-    -------
-    float
-        Error, unit^2.
-
-    """
-    a, b = signal
-    c, d = noise
-    if order == 1:
-        return (0.5 * a * a / (w + b) + 0.5 * c * c * w / (d * (w + d)) + 0.5 * n0 * w)
-    lost = a * a * (3.0 * w + _ROOT2 * b) / (w * w + _ROOT2 * w * b + b * b)
-    through = c * c * w * (_ROOT2 * w + d) / (d * (w * w + _ROOT2 * w * d + d * d))
-    return (lost + through + n0 * w) / _ROOT8
-
-
-def least_error(settings: FilterSettings, sigma: float, alpha: float) -> float:
-    """
-    Return the cutoff of the least `squared_error` within the limits, Hz.
-
-    The signal is an OU of rms `signal_rms` and rate 2 pi signal_bandwidth: the
-    error may have two valleys (let the noise pass, or cut it), so a grid of an
-    eighth of an octave comes before the section search.
-    """
-    rate = TWO_PI * settings.signal_bandwidth
-    signal = (settings.signal_rms * math.sqrt(2.0 * rate), rate)
-    noise = (settings.coupling * sigma, alpha)
-
-    def error(level: float) -> float:
-        return squared_error(settings.order, TWO_PI * math.exp(level), signal, noise, settings.n0)
-
-    low, high = math.log(settings.lowest), math.log(settings.fmax)
-    n = max(2, math.ceil((high - low) / (math.log(2.0) / 8.0)))
-    width = (high - low) / n
-    best = min((low + k * width for k in range(n + 1)), key=error)
-    left, right = max(best - width, low), min(best + width, high)
-    golden = 0.5 * (math.sqrt(5.0) - 1.0)
-    while right - left > 1e-4:
-        inner, outer = right - golden * (right - left), left + golden * (right - left)
-        if error(inner) <= error(outer):
-            right = outer
-        else:
-            left = inner
-    # The ends of the range count too: the search only comes near them.
-    return math.exp(min((0.5 * (left + right), low, high), key=error))
+    s = settings
+    if s.signal_bandwidth:
+        return least_error(s, sigma, alpha)
+    if s.order == 1 and interval > 0.0:
+        return least_sampled_error(s, sigma, alpha, interval)
+    factor = 1.0 if s.order == 1 else 3.0
+    return math.sqrt(alpha * alpha + factor * sigma * sigma / s.n0) / TWO_PI
 
 
 def throttle_law(settings: FilterSettings, throttle: float) -> float:
@@ -335,6 +260,7 @@ def throttle_law(settings: FilterSettings, throttle: float) -> float:
     return settings.lowest + (settings.fmax - settings.lowest) * min(share, 1.0)
 
 
+# The law `kalman` has no cutoff of its own: see `lowpass`.
 LAWS: dict[str, Callable[[FilterSettings, float, float, float], float]] = {
     'constant_noise': constant_noise_law,
     'threshold': threshold_law,

@@ -9,6 +9,7 @@ own, so that these are its lags too (of a derivative: behind the true one).
 
 from __future__ import annotations
 
+import cmath
 import math
 
 _ROOT2 = math.sqrt(2.0)
@@ -85,3 +86,33 @@ def cutoff_for_lag(order: int, lag: float, frequency: float) -> float:
     if order == 1:
         return frequency * cot
     return frequency * (cot + math.hypot(cot, _ROOT2)) / _ROOT2
+
+
+def share_for_lag(response: complex, raw: complex, most: float) -> float:
+    """
+    Return the share of an unfiltered signal that brings a lag down to a limit.
+
+    With the angle of the mixture (1 - m) H + m R turned by the limit p, its
+    imaginary part is that of H e^(ip) and R e^(ip) in the same shares, and 0
+    where the lag is p.
+
+    Parameters
+    ----------
+    response, raw : complex
+        H and R: of the filter and of what is unfiltered, at one frequency.
+    most : float
+        Limit, radians, above 0.
+
+    Returns
+    -------
+    float
+        0 where the lag of `response` is within the limit (more than a half turn
+        counts as a lead); 1 where that of `raw` is not.
+
+    """
+    if -cmath.phase(response) <= most:
+        return 0.0
+    turned, straight = (one * cmath.exp(1j * most) for one in (response, raw))
+    if straight.imag <= 0.0:
+        return 1.0
+    return turned.imag / (turned.imag - straight.imag)

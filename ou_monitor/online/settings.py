@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 import math
+from numbers import Real
 from typing import Any
 
 from ou_monitor.errors import nearest
@@ -91,7 +92,7 @@ ESTIMATOR_PARAMETERS: tuple[Parameter, ...] = (
               'Model file of the supply (discover --save-model); empty: none.'),
 )
 
-LAWS = ('constant_noise', 'threshold', 'throttle', 'wiener')
+LAWS = ('constant_noise', 'kalman', 'threshold', 'throttle', 'wiener')
 
 FILTER_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('mode', 'lowpass',
@@ -115,16 +116,19 @@ FILTER_PARAMETERS: tuple[Parameter, ...] = (
               'Rms of the output noise that constant_noise holds, unit of the output, with '
               'coupling; 0: what sigma_ref makes at fmax.', 0.0, 1.0e12),
     Parameter('n0', 0.0,
-              'White noise of the measurement for wiener, unit^2/Hz, two-sided: variance of a '
-              'sample over sample rate.', 0.0, 1.0e12),
+              'White noise of the measurement for wiener and kalman, unit^2/Hz, two-sided: '
+              'variance of a sample over sample rate.', 0.0, 1.0e12),
     Parameter('alpha', 63.0,
               "Relaxation rate of the supply while the estimator's is not known, 1/s.",
               1.0e-6, 1.0e9),
     Parameter('signal_bandwidth', 0.0,
-              'Bandwidth of the true signal for wiener, Hz; 0: the signal is the voltage itself.',
-              0.0, 1.0e6),
-    Parameter('signal_rms', 0.0, 'Rms of the true signal for wiener, unit of the signal.',
-              0.0, 1.0e12),
+              'Bandwidth of the true signal for wiener and kalman, Hz; 0: the signal is the '
+              'voltage itself.', 0.0, 1.0e6),
+    Parameter('signal_rms', 0.0,
+              'Rms of the true signal for wiener and kalman, unit of the signal.', 0.0, 1.0e12),
+    Parameter('signal_poles', 1,
+              'Poles of the true signal for wiener and kalman: 1 (its spectrum falls with f^2 '
+              'above its bandwidth), or 2 (Butterworth, f^4).', 1, 2),
     Parameter('expo', 5.0, 'Curvature of the throttle law, 0..10.', 0.0, 10.0),
     Parameter('smoothing', 0.2,
               'Time constant of the cutoff (in its logarithm), s, at a relative error of sigma '
@@ -218,6 +222,7 @@ class FilterSettings:
     alpha: float = 63.0
     signal_bandwidth: float = 0.0
     signal_rms: float = 0.0
+    signal_poles: int = 1
     expo: float = 5.0
     smoothing: float = 0.2
     smoothing_error: float = 0.1
@@ -258,20 +263,24 @@ class FilterSettings:
             raise ValueError(
                 f'noise_wanted ({self.noise_wanted:g}) needs coupling (above 0): without it '
                 'the noise in the signal is known only relative to sigma_ref')
-        if self.law != 'wiener':
+        if self.law not in ('kalman', 'wiener'):
             return
-        if self.mode == 'derivative':
+        if self.mode == 'derivative' and self.law == 'wiener':
             raise ValueError(
-                'law wiener cannot be used in mode derivative: the derivative of the signal that '
-                'it assumes has no finite variance; use constant_noise')
+                'law wiener cannot be used in mode derivative: it is the cutoff for the signal '
+                'itself; use constant_noise, or kalman with signal_poles 2')
+        if self.mode == 'derivative' and not (self.signal_bandwidth and self.signal_poles == 2):
+            raise ValueError(
+                'law kalman in mode derivative needs signal_bandwidth and signal_poles 2: the '
+                'derivative of a signal of one pole has no finite variance')
         if self.signal_bandwidth:
             if not (self.signal_rms > 0.0 and (self.coupling > 0.0 or self.n0 > 0.0)):
                 raise ValueError(
-                    'law wiener with signal_bandwidth needs signal_rms and the noise: coupling, '
-                    'n0 or both (above 0)')
+                    f'law {self.law} with signal_bandwidth needs signal_rms and the noise: '
+                    'coupling, n0 or both (above 0)')
         elif not self.n0 > 0.0:
             raise ValueError(
-                'law wiener needs n0 (the white noise of the measurement, above 0), or '
+                f'law {self.law} needs n0 (the white noise of the measurement, above 0), or '
                 'signal_bandwidth, signal_rms and coupling')
 
     @property
@@ -350,8 +359,12 @@ def _by_field(table: tuple[Parameter, ...], values: Mapping[str, object]) -> dic
 
 
 def _is_number(value: object) -> bool:
-    return (isinstance(value, (int, float)) and not isinstance(value, bool)
-            and math.isfinite(value))
+    if isinstance(value, bool):
+        return False
+    try:
+        return isinstance(value, Real) and math.isfinite(value)
+    except OverflowError:
+        return False
 
 
 def _check(table: tuple[Parameter, ...], settings: object) -> None:

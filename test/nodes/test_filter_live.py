@@ -5,6 +5,9 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from live import diagnosis, seconds, values_of, wait_until
+import numpy as np
+from ou_monitor import AdaptiveLowPass
+from ou_monitor.online.cutoff_laws import relative_cutoff
 from ou_monitor.online.lag import phase_lag
 import pytest
 from sensor_msgs.msg import Imu
@@ -12,6 +15,8 @@ from std_msgs.msg import Float64
 
 NODE = '/ou_adaptive_filter'
 NAME = 'ou_adaptive_filter: adaptive low-pass'
+# What constant_noise asks for at twice sigma_ref and 1 kHz; it looks at the rate to 5 %.
+HELD, CLOSE = relative_cutoff('lowpass', 2, 150.0, 2.0, 1e-3), 0.02
 
 
 class Rig:
@@ -74,7 +79,7 @@ def cutoff_becomes(rig, wanted, sigma):
     """Drive until the cutoff is the one wanted."""
     def there():
         drive(rig, sigma, 0.1)
-        return rig.cutoff and rig.cutoff[-1].data == pytest.approx(wanted, rel=1e-6)
+        return rig.cutoff and rig.cutoff[-1].data == pytest.approx(wanted, rel=CLOSE)
     wait_until(there, what=f'{wanted} Hz; is {rig.cutoff[-1:]}')
 
 
@@ -123,7 +128,7 @@ def test_a_step_is_answered_like_a_butterworth(rig):
 
 
 @pytest.mark.parametrize('sigma, cutoff', [
-    (0.1, 150.0), (0.3, 150.0), (0.6, 37.5), (10.0, 20.0), (math.nan, 75.0), (-1.0, 75.0)])
+    (0.1, 150.0), (0.3, 150.0), (0.6, HELD), (10.0, 20.0), (math.nan, 75.0), (-1.0, 75.0)])
 def test_cutoff_law(rig, sigma, cutoff):
     """The law fmax (sigma_ref / sigma)^2 within fmin..fmax; unknown: the fallback."""
     cutoff_becomes(rig, cutoff, sigma)
@@ -131,8 +136,8 @@ def test_cutoff_law(rig, sigma, cutoff):
 
 def test_the_lag_is_published(rig):
     """That of the cutoff in force at 10 Hz, as phase delay in ms."""
-    cutoff_becomes(rig, 37.5, 0.6)
-    lag = phase_lag(2, 37.5, 10.0)
+    cutoff_becomes(rig, HELD, 0.6)
+    lag = phase_lag(2, rig.cutoff[-1].data, 10.0)
     wait_until(lambda: rig.lag[-1].data == pytest.approx(lag / 3.6), what=f'{rig.lag[-1:]}')
 
     def told():
@@ -175,7 +180,7 @@ def test_the_state_of_the_estimator_is_used_while_it_is_published(rig):
         def there():
             rig.state.publish(state_of(**{**good, **change}))
             drive(rig, 0.6, 0.1)
-            return rig.cutoff[-1].data == pytest.approx(cutoff, rel=1e-6)
+            return rig.cutoff[-1].data == pytest.approx(cutoff, rel=CLOSE)
         wait_until(there, what=f'{cutoff} Hz; is {rig.cutoff[-1:]}')
 
     def told(key, value, **change):
@@ -184,7 +189,7 @@ def test_the_state_of_the_estimator_is_used_while_it_is_published(rig):
             drive(rig, 0.6, 0.1)
             return value in (values_of(rig.status)[key] if key else rig.status.message)
         wait_until(there, what=value)
-    with_state(37.5)
+    with_state(HELD)
     told('sigma_se', '0.03')
     with_state(75.0, status='QUANTIZED_HEAVILY')
     told('', 'because the estimator says QUANTIZED_HEAVILY', status='QUANTIZED_HEAVILY')
@@ -199,7 +204,7 @@ def test_the_state_of_the_estimator_is_used_while_it_is_published(rig):
         return '/state has been silent for' in rig.status.message
     wait_until(silent, what='silence of the state')
     assert rig.probe.set_parameter(NODE, 'law', 'constant_noise').successful
-    cutoff_becomes(rig, 37.5, 0.6)
+    cutoff_becomes(rig, HELD, 0.6)
 
 
 def test_shadow_lets_the_signal_pass(rig):
@@ -237,7 +242,7 @@ def test_a_slow_input_warns(rig):
 
 def test_stale_sigma_falls_back_and_warns(rig):
     """An old sigma is no sigma."""
-    cutoff_becomes(rig, 37.5, 0.6)
+    cutoff_becomes(rig, HELD, 0.6)
 
     def fallen_back():
         rig.send((0.0, 0.0, 0.0))
@@ -270,7 +275,8 @@ def test_time_back_is_counted_and_holds_the_output(rig):
     for _ in range(300):
         rig.send((0.7, 0.0, 0.0))
         time.sleep(0.0005)
-    wait_until(lambda: rig.output[-1].angular_velocity.x == pytest.approx(0.7, abs=1e-6))
+    wait_until(lambda: seconds(rig.output[-1].header.stamp) > rig.stamp - 5e-4)
+    assert rig.output[-1].angular_velocity.x == pytest.approx(0.7, abs=1e-6)
     n = len(rig.output)
     rig.send((5.0, 0.0, 0.0), dt=0.0)
     rig.send((6.0, 0.0, 0.0), dt=-10.0)
@@ -301,6 +307,11 @@ def test_parameter_change_does_not_move_the_output(rig):
     after = [m.angular_velocity.x for m in rig.output
              if seconds(m.header.stamp) > settled + 1e-6]
     assert len(after) >= 3 and after == pytest.approx([0.7] * len(after), abs=1e-9)
+    assert rig.probe.set_parameter(NODE, 'n0', 1e-6).successful
+    for law in ('kalman', 'wiener'):
+        refused = rig.probe.set_parameter(NODE, 'law', law)
+        assert not refused.successful and 'is for a voltage' in refused.reason
+    assert rig.probe.set_parameter(NODE, 'n0', 0.0).successful
     refused = rig.probe.set_parameter(NODE, 'fmin', 300.0)
     assert not refused.successful and 'fmin' in refused.reason
     for name, value, words in (
@@ -309,6 +320,33 @@ def test_parameter_change_does_not_move_the_output(rig):
             ('mode', 'derivative', 'read-only')):
         refused = rig.probe.set_parameter(NODE, name, value)
         assert not refused.successful and words in refused.reason
+
+
+def test_the_law_kalman_goes_where_the_offline_filter_goes(rig):
+    """Switched on in flight: the output goes on, then takes the gain of the model at rest."""
+    model = {'n0': 1e-6, 'signal_bandwidth': 5.0, 'signal_rms': 1.0, 'signal_poles': 2,
+             'coupling': 20.0}
+    for name, value in {**model, 'law': 'kalman'}.items():
+        result = rig.probe.set_parameter(NODE, name, value)
+        assert result.successful, result.reason
+    twin = AdaptiveLowPass(law='kalman', **model, fmin=1.0, smoothing=0.0)
+    wanted = twin.filter(np.arange(3000) * 1e-3, np.full(3000, 0.7), 0.6)[-1]
+    assert 0.2 < wanted < 0.65
+    assert rig.probe.set_parameter(NODE, 'fmin', 1.0).successful
+    # The step that comes first goes a third of the way from the low-pass to the other at most.
+    before, count = rig.output[-1].angular_velocity.x, len(rig.output)
+
+    def there():
+        rig.sigma.publish(Float64(data=0.6))
+        for _ in range(20):
+            rig.send((0.7, 0.0, 0.0))
+            time.sleep(0.0005)
+        return rig.output[-1].angular_velocity.x == pytest.approx(wanted, abs=1e-3)
+    wait_until(lambda: there() or len(rig.output) > count)
+    assert abs(rig.output[count].angular_velocity.x - before) < 0.4 * abs(before - wanted)
+    wait_until(there, what=f'an output of {wanted:.4f}')
+    wait_until(lambda: there() and values_of(rig.status).get('law') == 'kalman')
+    assert rig.probe.set_parameter(NODE, 'law', 'constant_noise').successful
 
 
 def test_silence_is_stale(rig):

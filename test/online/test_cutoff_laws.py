@@ -5,11 +5,11 @@ import math
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.online.cutoff_laws import (
-    cutoff_for_noise, LAWS, least_error, relative_cutoff, squared_error, supply_noise,
-    wanted_cutoff)
+    cutoff_for_noise, LAWS, relative_cutoff, supply_noise, wanted_cutoff)
 from ou_monitor.online.filter_state import LowPassState
 from ou_monitor.online.lowpass import AdaptiveLowPass
 from ou_monitor.online.settings import FilterSettings, LAWS as NAMES
+from ou_monitor.online.wiener import least_error, sampled_error, squared_error
 import pytest
 from scipy import integrate, optimize, signal
 
@@ -30,7 +30,7 @@ def through(spectrum):
 
 
 def test_every_law_has_its_function():
-    assert {*LAWS, 'throttle'} == set(NAMES)
+    assert {*LAWS, 'kalman', 'throttle'} == set(NAMES)
 
 
 @pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
@@ -58,28 +58,33 @@ def test_noise_that_is_low_enough_needs_no_filter(order):
     ('lowpass', 1, 2.0), ('lowpass', 2, 2.0), ('derivative', 2, 2.0 / 3.0)])
 def test_white_noise_is_held_by_the_power_of_its_order(mode, order, law):
     """Variance of white noise through |H|^2, by quadrature, at the cutoff for 3 times sigma."""
-    assert relative_cutoff(mode, order, 150.0, 3.0, 1e-3) == pytest.approx(150.0 / 3.0 ** law)
+    assert relative_cutoff(mode, order, 150.0, 3.0, 0.0) == pytest.approx(150.0 / 3.0 ** law)
+    assert relative_cutoff(mode, order, 150.0, 3.0, 1e-6) == pytest.approx(
+        150.0 / 3.0 ** law, rel=5e-3)
     rms = [math.sqrt(through(lambda u, fc=fc: power(order, TWO_PI * fc, mode, u)))
-           for fc in (150.0, relative_cutoff(mode, order, 150.0, 3.0, 1e-3))]
+           for fc in (150.0, relative_cutoff(mode, order, 150.0, 3.0, 0.0))]
     assert 3.0 * rms[1] == pytest.approx(rms[0], rel=1e-6)
 
 
+@pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
+@pytest.mark.parametrize('order', [1, 2])
 @pytest.mark.parametrize('fc', [20.0, 150.0, 400.0])
 @pytest.mark.parametrize('times', [1.5, 4.0])
-def test_first_derivative_is_held_by_the_sample_rate(fc, times):
+def test_white_samples_come_out_alike(mode, order, fc, times):
     """The sum of squares of the sampled impulse response is the variance."""
     dt = 1e-3
 
     def rms(cutoff):
-        state, samples = LowPassState(), []
+        state, samples, before = LowPassState(), [], 0.0
         angle = TWO_PI * cutoff * dt
-        for slope in (1.0 / dt, -1.0 / dt, *np.zeros(3000)):
-            samples.append(state.advance(1, angle, slope, slope))
+        for x in (1.0, *np.zeros(6000)):
+            ends = (before, x) if mode == 'lowpass' else ((x - before) / dt,) * 2
+            samples.append(state.advance(order, angle, *ends))
+            before = x
         return math.sqrt(sum(y * y for y in samples))
-    wanted = relative_cutoff('derivative', 1, fc, times, dt)
-    assert times * rms(wanted) == pytest.approx(rms(fc), rel=1e-6)
-    # Far below the sample rate it is proportional.
-    assert relative_cutoff('derivative', 1, fc, times, 1e-7) == pytest.approx(fc / times, rel=1e-3)
+    wanted = relative_cutoff(mode, order, fc, times, dt)
+    assert wanted < fc
+    assert times * rms(wanted) == pytest.approx(rms(fc), rel=1e-5)
 
 
 @pytest.mark.parametrize('mode, order', [
@@ -146,7 +151,7 @@ def test_wiener_of_order_1_is_the_pole_of_the_kalman_filter():
     r = n0 / dt
     p = linalg.solve_discrete_are([[phi]], [[1.0]], [[q]], [[r]])[0, 0]
     pole = phi * (1.0 - p / (p + r))
-    assert wanted_cutoff(s, sigma, alpha, NAN, dt) == pytest.approx(
+    assert wanted_cutoff(s, sigma, alpha, NAN, 0.0) == pytest.approx(
         -math.log(pole) / dt / TWO_PI, rel=1e-2)
 
 
@@ -158,22 +163,51 @@ def test_wiener_is_least_where_the_supply_is_fast(order):
     best = optimize.minimize_scalar(
         lambda level: squared_error(order, math.exp(level), (sigma, alpha), (0.0, alpha), n0),
         bounds=(1.0, 9.0), method='bounded', options={'xatol': 1e-8}).x
-    assert wanted_cutoff(s, sigma, alpha, NAN, 1e-3) == pytest.approx(
-        math.exp(best) / TWO_PI, rel=0.02)
+    for interval in (0.0, 1e-6):
+        assert wanted_cutoff(s, sigma, alpha, NAN, interval) == pytest.approx(
+            math.exp(best) / TWO_PI, rel=0.02)
 
 
+@pytest.mark.parametrize('fc', [20.0, 150.0, 400.0])
+def test_sampled_error_is_the_integral_over_the_circle(fc):
+    """Of the spectra of an AR(1) process and of white noise, by the trapezoidal rule."""
+    dt, alpha, var, white = 1e-3, 63.0, 0.003, 9e-4
+    z = np.exp(1j * np.linspace(-math.pi, math.pi, 1 << 16, endpoint=False))
+    angle, phi = TWO_PI * fc * dt, math.exp(-alpha * dt)
+    # The exact response to the line between samples: y' = w (x - y) over a step.
+    q = math.exp(-angle)
+    h = ((1.0 - (1.0 - q) / angle) + ((1.0 - q) / angle - q) / z) / (1.0 - q / z)
+    of_signal = var * (1.0 - phi * phi) / np.abs(1.0 - phi / z) ** 2
+    assert sampled_error(TWO_PI * fc, dt, alpha, var, white) == pytest.approx(float(np.mean(
+        np.abs(1.0 - h) ** 2 * of_signal + white * np.abs(h) ** 2)), rel=1e-9)
+
+
+@pytest.mark.parametrize('sigma', [0.05, 0.6, 5.0])
+def test_sampled_wiener_is_the_least(sigma):
+    """Of order 1 at 1 kHz, against a fine grid of the cutoffs within the limits."""
+    alpha, dt, white = 63.0, 1e-3, 9e-4
+    s = FilterSettings(law='wiener', order=1, n0=white * dt, fmin=2.0, fmax=440.0)
+    errors = [sampled_error(TWO_PI * fc, dt, alpha, sigma ** 2 / (2.0 * alpha), white)
+              for fc in (wanted_cutoff(s, sigma, alpha, NAN, dt), *np.geomspace(2.0, 440.0, 2001))]
+    assert errors[0] <= min(errors[1:]) * (1.0 + 1e-6)
+
+
+@pytest.mark.parametrize('poles', [1, 2])
 @pytest.mark.parametrize('order', [1, 2])
-def test_squared_error_is_the_integral_over_the_spectra(order):
+def test_squared_error_is_the_integral_over_the_spectra(order, poles):
     """What is lost of the signal, and what comes through of both noises."""
     w, a, b, c, d, n0 = 120.0, 2.0, 30.0, 0.7, 63.0, 1e-4
 
     def lost(u):
         h = 1.0 / (1j * u / w + 1.0) if order == 1 else 1.0 / (
             (1j * u / w) ** 2 + math.sqrt(2.0) * 1j * u / w + 1.0)
-        return abs(1.0 - h) ** 2 * a * a / (b * b + u * u)
+        one = a * a / (b * b + u * u)
+        two = a * a * 2.0 * math.sqrt(2.0) * b ** 3 / (b ** 4 + u ** 4)
+        return abs(1.0 - h) ** 2 * (one if poles == 1 else two)
     expected = through(lost) + through(
         lambda u: power(order, w, 'lowpass', u) * (c * c / (d * d + u * u) + n0))
-    assert squared_error(order, w, (a, b), (c, d), n0) == pytest.approx(expected, rel=1e-6)
+    assert squared_error(order, w, (a, b), (c, d), n0, poles) == pytest.approx(
+        expected, rel=1e-6)
 
 
 @pytest.mark.parametrize('order', [1, 2])

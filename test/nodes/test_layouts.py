@@ -1,0 +1,140 @@
+"""The layouts of Foxglove and PlotJuggler name only what the nodes publish and take."""
+
+from importlib import import_module
+import json
+import re
+import xml.etree.ElementTree as ElementTree
+
+from ou_monitor.messages.config import list_msg_configs
+from ou_monitor.messages.field_path import parse_field_path
+from project import ROOT
+import pytest
+import rclpy
+
+FOXGLOVE = ROOT / 'layouts' / 'ou_monitor_foxglove.json'
+PLOTJUGGLER = ROOT / 'layouts' / 'ou_monitor_plotjuggler.xml'
+# Foxglove: /topic.field; PlotJuggler: /topic/field.
+SUPPLY = {'alpha', 'sigma', 'var_inf', 'brownout_risk', 'brownout', 'throttle_budget'}
+FILTER = {'cutoff', 'lag'}
+
+
+@pytest.fixture(scope='module')
+def topics() -> dict[str, set[str]]:
+    """Return the topics that the nodes publish, and those that carry their inputs, with types."""
+    found: dict[str, set[str]] = {}
+    rclpy.init(domain_id=61)
+    try:
+        from ou_monitor.nodes.adaptive_filter_node import AdaptiveFilterNode
+        from ou_monitor.nodes.estimator_node import EstimatorNode
+        for kind, name in ((EstimatorNode, 'ou_estimator'),
+                           (AdaptiveFilterNode, 'ou_adaptive_filter')):
+            node = kind(name)
+            for topic, types in node.get_publisher_names_and_types_by_node(name, '/'):
+                found.setdefault(topic, set()).update(types)
+            node.destroy_node()
+    finally:
+        rclpy.shutdown()
+    for config in list_msg_configs().values():
+        for spec in (config.voltage, config.throttle):
+            if spec is not None and spec.topic in ('voltage', 'throttle'):
+                found.setdefault('/' + spec.topic, set()).add(spec.type)
+    return found
+
+
+def foxglove() -> dict:
+    """Return the layout."""
+    return json.loads(FOXGLOVE.read_text(encoding='utf-8'))
+
+
+def foxglove_paths() -> dict[str, str]:
+    """Return topic -> field of every path; an empty field for whole messages."""
+    found = []
+    for panel in foxglove()['configById'].values():
+        found += [path['value'] for path in panel.get('paths', [])]
+        found += [panel[key] for key in ('path', 'topicPath', 'topicToRender') if key in panel]
+    return split(re.fullmatch(r'(/[\w/]+)(?:\.([\w.]+))?', path).groups('') for path in found)
+
+
+def plotjuggler_paths() -> dict[str, str]:
+    """Return topic -> field of every curve."""
+    root = ElementTree.parse(PLOTJUGGLER).getroot()
+    return split(curve.get('name').rsplit('/', 1) for curve in root.iter('curve'))
+
+
+def split(pairs) -> list[tuple[str, str]]:
+    """Return pairs of topic and field, each once."""
+    return sorted({(topic, field) for topic, field in pairs})
+
+
+def has_field(kind: str, field: str) -> bool:
+    """Return whether a message type has a field that can be drawn."""
+    package, _, name = kind.split('/')
+    message = getattr(import_module(f'{package}.msg'), name)()
+    for word in parse_field_path(field):
+        if not hasattr(message, str(word)):
+            return False
+        message = getattr(message, str(word))
+    return isinstance(message, (bool, int, float))
+
+
+@pytest.mark.parametrize('paths', [foxglove_paths, plotjuggler_paths])
+def test_every_path_is_there(paths, topics):
+    """Each topic is published by a node or carries an input, and a type of it has the field."""
+    for topic, field in paths():
+        assert topic in topics, topic
+        if field:
+            assert any(has_field(kind, field) for kind in topics[topic]), (topic, field)
+
+
+@pytest.mark.parametrize('paths', [foxglove_paths, plotjuggler_paths])
+def test_nothing_is_missing(paths):
+    """Voltage, throttle and every number that the nodes publish are drawn."""
+    drawn = {topic for topic, _ in paths()}
+    assert {'/voltage', '/throttle', *(f'/ou_estimator/{name}' for name in SUPPLY),
+            *(f'/ou_adaptive_filter/{name}' for name in FILTER)} <= drawn
+
+
+def test_an_invented_path_is_found(topics):
+    """The checks above can fail."""
+    assert '/ou_estimator/tau' not in topics and '/ou_estimator/alpha' in topics
+    assert not has_field('std_msgs/msg/Float64', 'value')
+    assert not has_field('sensor_msgs/msg/BatteryState', 'header.stamp')
+    assert has_field('sensor_msgs/msg/BatteryState', 'header.stamp.sec')
+
+
+def test_foxglove_panels_are_placed():
+    """Each panel has its place, each place its panel; state and diagnostics are whole messages."""
+    layout = foxglove()
+    leaves = []
+
+    def walk(node) -> None:
+        if isinstance(node, str):
+            leaves.append(node)
+            return
+        assert node['direction'] in ('row', 'column') and 0 < node['splitPercentage'] < 100
+        walk(node['first'])
+        walk(node['second'])
+
+    walk(layout['layout'])
+    assert sorted(leaves) == sorted(layout['configById'])
+    whole = {topic for topic, field in foxglove_paths() if not field}
+    assert whole == {'/ou_estimator/state', '/diagnostics'}
+    (flag,) = (p for key, p in layout['configById'].items() if key.startswith('Indicator!'))
+    assert flag['path'] == '/ou_estimator/brownout.data'
+    # Neither colour of a known flag is that of an unknown one.
+    assert {rule['rawValue'] for rule in flag['rules']} == {'true', 'false'}
+    assert flag['fallbackColor'] not in {rule['color'] for rule in flag['rules']}
+
+
+def test_plotjuggler_subscribes_to_what_it_draws():
+    """The topics of the streaming plug-in are those of the curves; every splitter adds up."""
+    root = ElementTree.parse(PLOTJUGGLER).getroot()
+    (selected,) = root.iter('selected_topics')
+    assert set(selected.get('value').split(';')) == {topic for topic, _ in plotjuggler_paths()}
+    assert root.find('previouslyLoaded_Streamer').get('name') == 'ROS2 Topic Subscriber'
+    for splitter in root.iter('DockSplitter'):
+        sizes = [float(size) for size in splitter.get('sizes').split(';')]
+        assert len(sizes) == int(splitter.get('count')) == len(splitter)
+        assert sum(sizes) == pytest.approx(1.0, abs=1e-5)
+    for tab in root.iter('Tab'):
+        assert int(tab.get('containers')) == len(tab.findall('Container'))
