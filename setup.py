@@ -6,20 +6,29 @@ from setuptools import find_packages, setup
 
 NAME = 'ou_monitor'
 SHARE = 'share/' + NAME
+# What reads the logs of autopilots.  The wheel of orangebox 0.5.0 cannot be installed: pip
+# refuses the entry point in it.
+LOGS = {'ulog': ['pyulog'], 'dataflash': ['pymavlink'], 'blackbox': ['orangebox<0.5']}
 
 setup(
     name=NAME,
     version='0.1.0',
     packages=find_packages(include=[NAME, NAME + '.*']),
+    package_data={NAME + '.offline.report': ['*.css', '*.js']},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + NAME]),
         (SHARE, ['package.xml']),
         (SHARE + '/launch', glob('launch/*_launch.py')),
         (SHARE + '/config', glob('config/*.yaml')),
         (SHARE + '/msg_config', glob('msg_config/*.yaml')),
+        (SHARE + '/layouts', glob('layouts/*')),
     ],
     install_requires=['numpy', 'scipy', 'PyYAML', 'mcap', 'mcap-ros2-support'],
-    extras_require={'fast': ['numba'], 'test': ['pytest', 'hypothesis', 'rosbags']},
+    extras_require={
+        'fast': ['numba'],
+        'fleet': ['dask', 'distributed', 'pyarrow'],
+        'test': ['pytest', 'hypothesis', 'rosbags'],
+        **LOGS, 'logs': [package for packages in LOGS.values() for package in packages]},
     python_requires='>=3.11',
     # The message descriptions are read as files beside the package.
     zip_safe=False,

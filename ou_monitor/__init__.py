@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ou_monitor.online.estimator import SlidingEstimator
     from ou_monitor.online.lowpass import AdaptiveLowPass
     from ou_monitor.online.risk import brownout_probability
-    from ou_monitor.recordings.read import read_recording
+    from ou_monitor.recordings.read import read_pieces, read_recording
     from ou_monitor.records import Estimate, Flag, Recording, Status
 
 __version__ = '0.1.0'
@@ -32,12 +32,14 @@ _HOMES = {
     'Status': 'ou_monitor.records',
     'brownout_probability': 'ou_monitor.online.risk',
     'discover': 'ou_monitor.offline.discover.run',
+    'read_pieces': 'ou_monitor.recordings.read',
     'read_recording': 'ou_monitor.recordings.read',
 }
 
 __all__ = [
     'AdaptiveLowPass', 'Estimate', 'Flag', 'InputError', 'Recording', 'SlidingEstimator',
-    'Status', '__version__', 'brownout_probability', 'discover', 'read_recording',
+    'Status', '__version__', 'brownout_probability', 'discover', 'read_pieces',
+    'read_recording',
 ]
 
 

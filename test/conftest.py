@@ -5,9 +5,43 @@ import pytest
 _ROS = ('nodes/', 'test_package.py', 'test_scripts.py', 'test_readme.py')
 
 
-def pytest_collection_modifyitems(items):
-    """Keep a file together on one worker of pytest-xdist, and all ROS on the same one."""
-    for item in items:
-        path = str(item.path.relative_to(item.config.rootpath / 'test'))
-        group = 'ros' if path.startswith(_ROS) else path
-        item.add_marker(pytest.mark.xdist_group(group))
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """
+    Keep a file together on one worker of pytest-xdist, and all ROS on the same one.
+
+    Groups of xdist itself are ignored from pytest 9.2 on (pytest-xdist issue 1386).
+    """
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        """Hands out files."""
+
+        def _split_scope(self, nodeid):
+            path = nodeid.split('::', 1)[0].removeprefix('test/')
+            return 'ros' if path.startswith(_ROS) else path
+
+    return ByFile(config, log)
+
+
+@pytest.fixture
+def one_process(monkeypatch):
+    """Let `fleet` do its work in this process."""
+    class Here:
+        """Workers that are none."""
+
+        def __init__(self, *_: object) -> None:
+            """Take no notice."""
+
+        def each(self, function, arguments):
+            """Yield as `Workers.each` does."""
+            for k, given in enumerate(arguments):
+                yield k, function(*given), ''
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+    monkeypatch.setattr('ou_monitor.offline.fleet.run.Workers', Here)

@@ -20,7 +20,13 @@ LEVEL = {
 FACADE_LEVEL = 5.5
 PLOTTING = {'matplotlib', 'plotly', 'seaborn', 'bokeh', 'PIL'}
 MCAP = {'mcap', 'mcap_ros2', 'rosbags', 'rosbag2_py'}
+MCAP_MODULES = {'ou_monitor.recordings.bag', 'ou_monitor.recordings.bag_reader'}
+# Parsers of logs: optional, each in one importer.
+PARSERS = {'pyulog': 'ulog', 'pymavlink': 'dataflash', 'orangebox': 'blackbox'}
 CORE = {'numpy', 'scipy'}
+# Extras, each with the one module that may import it.
+EXTRAS = {'dask': 'offline.fleet.cluster', 'distributed': 'offline.fleet.cluster',
+          'pyarrow': 'offline.fleet.table'}
 # What each part may import beyond the standard library; ROS is for nodes alone.
 ALLOWED = {
     'errors': set(), 'records': CORE, 'model': CORE, 'online': CORE,
@@ -95,7 +101,11 @@ def wrong_imports(source: str, module: str) -> list[str]:
             continue
         elif part == 'nodes' and top not in PLOTTING | MCAP:
             continue
-        elif top in MCAP and module == f'{PACKAGE}.recordings.bag':
+        elif top in MCAP and module in MCAP_MODULES:
+            continue
+        elif module == f'{PACKAGE}.recordings.importers.{PARSERS.get(top)}':
+            continue
+        elif top in EXTRAS and module == f'{PACKAGE}.{EXTRAS[top]}':
             continue
         elif top in PLOTTING and module.startswith(f'{PACKAGE}.offline.report'):
             continue
@@ -142,6 +152,10 @@ def test_the_walk_sees_the_house():
     ('ou_monitor.offline.analyze', 'import mcap.reader'),
     ('ou_monitor.offline.analyze', 'if True:\n    import ou_monitor.cli.main'),
     ('ou_monitor.recordings.csv', 'from mcap.reader import make_reader'),
+    ('ou_monitor.recordings.read', 'import pyulog'),
+    ('ou_monitor.recordings.importers.ulog', 'import orangebox'),
+    ('ou_monitor.recordings.importers.log', 'from ou_monitor.offline.analyze import analyze'),
+    ('ou_monitor.offline.fleet.run', 'import dask'),
     ('ou_monitor.nodes.estimator', 'from ou_monitor.cli import main'),
     ('ou_monitor.nodes.estimator', 'import matplotlib'),
     ('ou_monitor.cli.main', 'from ou_monitor.nodes import estimator'),
@@ -162,7 +176,9 @@ def test_a_wrong_import_is_found(module, source):
     ('ou_monitor.model.compiled_kalman', 'import numba'),
     ('ou_monitor.online.risk', 'from ou_monitor.model.passage import x'),
     ('ou_monitor.recordings.bag', 'import mcap.reader\nfrom mcap_ros2.decoder import D'),
+    ('ou_monitor.recordings.importers.ulog', 'from pyulog import ULog'),
     ('ou_monitor.offline.report.page', 'import matplotlib'),
+    ('ou_monitor.offline.fleet.table', 'from pyarrow import parquet'),
     ('ou_monitor.nodes.estimator', 'import rclpy\nfrom ou_monitor.online.monitor import M'),
     ('ou_monitor.__init__', 'from ou_monitor.online.estimator import SlidingEstimator'),
 ])

@@ -88,7 +88,7 @@ def test_colcon_installs_what_ros2_looks_for(installed):
     assert sorted(os.listdir(installed / 'lib' / 'ou_monitor')) == EXECUTABLES
     share = installed / 'share'
     assert (share / 'ament_index/resource_index/packages/ou_monitor').exists()
-    for folder in ('msg_config', 'launch', 'config'):
+    for folder in ('msg_config', 'launch', 'config', 'layouts'):
         expected = {path.name for path in (ROOT / folder).iterdir() if path.is_file()}
         assert expected and set(os.listdir(share / 'ou_monitor' / folder)) == expected
 
@@ -189,10 +189,12 @@ def test_nodes_without_ros_say_so(offline, tmp_path, name):
 
 
 def test_offline_analyze(offline, tmp_path):
-    """The installed command reads a bag of the library."""
+    """The installed command reads a bag of the library; its page has the script of the plots."""
     done = run(offline / 'ou-monitor', 'analyze', ROOT / 'bags' / 'load_10', '--json', '-',
-               cwd=tmp_path)
+               '--report', tmp_path / 'r.html', cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    html = (tmp_path / 'r.html').read_text()
+    assert 'class="plot-data"' in html and 'class LivePlot' in html and '.live-view' in html
 
 
 def test_package_xml_agrees_with_setup_py(tree):

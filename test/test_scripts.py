@@ -212,6 +212,7 @@ def test_demo_shows_estimates_and_leaves_a_report(tmp_path):
     assert str(report) in done.stdout and '<html' in report.read_text(encoding='utf-8').lower()
     rows = [line.split() for line in done.stdout.splitlines() if line[:6].strip()
             .replace('.', '').isdigit()]
-    # One a second; the last ones have numbers in every column but, at most, the risk.
-    assert 5 <= len(rows) <= 10
+    # One a second, less what a busy machine takes to start; the last ones have numbers in every
+    # column but, at most, the risk.
+    assert 3 <= len(rows) <= 10
     assert all(float(cell) > 0.0 for cell in (*rows[-1][2:6], rows[-1][7]))

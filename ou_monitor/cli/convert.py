@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from ou_monitor.cli import output
 from ou_monitor.errors import InputError
 
-# Ending of LOG -> what it is.
-FORMATS = {'.csv': 'CSV with the columns time_s, voltage_v[, throttle]'}
-
 # Endings that OUT cannot have: a folder of that name would mislead.
 LOG_ENDINGS = ('.csv', '.ulg', '.bin', '.bbl', '.bfl', '.log', '.db3', '.bag', '.txt')
 
 TYPES = ('battery_state', 'float32', 'float64', 'adc_block')
+
+READ = ('PX4 ULog (.ulg), ArduPilot dataflash (.bin, .log), Betaflight and INAV blackbox '
+        '(.bbl, .bfl), CSV with the column time_s')
 
 
 def add_parser(subparsers: Any) -> None:
@@ -29,23 +30,63 @@ def add_parser(subparsers: Any) -> None:
     """
     parser: argparse.ArgumentParser = subparsers.add_parser(
         'convert', help='a log becomes an MCAP bag',
-        description='Convert a log to a bag with the topics /voltage and /throttle.',
-        epilog='Read today: ' + '; '.join(FORMATS.values()) + '.')
+        description='Convert a log to a bag with the topics /voltage, /throttle and /current '
+        '(A, positive when the battery is drained). Stamps count from the start of the log, in '
+        'seconds; those of a CSV stay as they are.',
+        epilog=f'Read: {READ}; the first bytes decide, not the ending.')
     parser.add_argument('log', metavar='LOG', type=output.path_argument, help='what to read')
-    parser.add_argument(
+    out = parser.add_argument(
         'out', metavar='OUT', type=output.path_argument,
         help='what to write: NAME.mcap for one file, NAME for a rosbag2 folder')
+    parser.add_argument(
+        '--list', action=_List, nargs=0, const=out, default=False,
+        help='show what could be taken, * what would be, and write nothing (without OUT)')
+    parser.add_argument(
+        '--voltage', metavar='NAME', help='which voltage (default: the battery, if there is one)')
+    parser.add_argument(
+        '--throttle', metavar='NAME',
+        help="which throttle, or 'none' (default: motors, else what is asked of them, else the "
+        'stick)')
+    parser.add_argument(
+        '--current', metavar='NAME',
+        help="which current, or 'none' (default: that of the sensor of the voltage)")
+    parser.add_argument(
+        '--flight', metavar='N', type=_number, help='which flight of a file with several, from 1')
+    held = parser.add_mutually_exclusive_group()
+    held.add_argument(
+        '--drop-held', action='store_true',
+        help='drop voltages that a logger repeats until the ADC is read again')
+    held.add_argument(
+        '--drop-repeats', action='store_true',
+        help='as --drop-held; where no steady refresh is found, drop every repeat')
     parser.add_argument(
         '--type', choices=TYPES, default='battery_state',
         help='message of the voltage (default %(default)s; adc_block needs a steady 10 kHz)')
     parser.add_argument(
-        '--json', metavar='FILE', help='write what was converted (- is standard output)')
+        '--json', metavar='FILE',
+        help='write what was converted, or listed (- is standard output)')
     parser.set_defaults(run=run)
+
+
+class _List(argparse.Action):
+    """Says that no OUT is needed; an optional positional could not follow an option."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
+                 values: Any, option_string: str | None = None) -> None:
+        """Set the flag."""
+        setattr(namespace, self.dest, True)
+        self.const.required = False
+
+
+def _number(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 1 on")
+    return int(text)
 
 
 def run(args: argparse.Namespace) -> int:
     """
-    Convert.
+    Convert, or list.
 
     Parameters
     ----------
@@ -60,38 +101,117 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        When LOG cannot be read or OUT cannot be written.
+        When LOG cannot be read, the choice is not clear, or OUT cannot be
+        written.
 
     """
-    ending = args.log.suffix.lower()
-    if not args.log.exists():
-        raise InputError(f"there is no log '{args.log}': check the path")
-    if ending not in FORMATS:
-        raise InputError(
-            f"'{args.log}' cannot be converted: formats read today: "
-            + '; '.join(f'{key} ({words})' for key, words in FORMATS.items()))
-    if args.out.suffix.lower() in LOG_ENDINGS:
+    if args.list:
+        if args.out is not None:
+            raise InputError(f"--list writes no bag: leave '{args.out}' out")
+    elif args.out.suffix.lower() in LOG_ENDINGS:
         raise InputError(f"OUT '{args.out}' must end in .mcap, or be the name of a folder")
     output.check_paths({'LOG': args.log}, {'OUT': args.out, '--json': args.json})
     output.check_writable(args.json)
+    if args.out is not None:
+        _check_new(args.out)
 
-    from ou_monitor.recordings.read import read_recording
-    from ou_monitor.recordings.write import TYPES as MESSAGES, write_recording
+    from ou_monitor.recordings.importers.formats import import_log
+    from ou_monitor.recordings.importers.log import Request
 
-    recording = read_recording(args.log)
+    names = frozenset(name for name in (args.voltage, args.throttle, args.current)
+                      if name is not None)
+    with output.Progress('reading') as progress:
+        log = import_log(args.log, Request(args.flight, names, args.list, progress))
+    return _list(args, log) if args.list else _convert(args, log)
+
+
+def _check_new(out: Path) -> None:
+    """Refuse an OUT that is there, before a long log is read; writing checks again."""
+    if out.exists() or out.is_symlink():
+        raise InputError(f'{out} exists already: remove it or choose another name')
+    if not out.parent.is_dir():
+        raise InputError(f'cannot write {out}: there is no folder {out.parent}')
+
+
+def _convert(args: argparse.Namespace, log: Any) -> int:
+    from dataclasses import replace
+
+    from ou_monitor.recordings.importers.choose import choose
+    from ou_monitor.recordings.importers.held import drop_held
+    from ou_monitor.recordings.write_log import write_log
+
+    chosen = choose(args.log, log, voltage=args.voltage, throttle=args.throttle,
+                    current=args.current)
+    held: tuple[str, ...] = ()
+    if args.drop_held or args.drop_repeats:
+        voltage, sentence = drop_held(chosen.voltage, every=args.drop_repeats)
+        chosen, held = replace(chosen, voltage=voltage), (sentence,)
+    about = {'log_file': args.log.name, 'log_format': log.format,
+             'log_time': 'as in the file, s' if log.format == 'csv' else
+             's from the start of the log',
+             **{f'log_{key}': value for key, value in log.facts.items()}}
+    if held:
+        about['held_samples'] = held[0]
     with output.Progress('writing') as progress:
-        notes = write_recording(recording, args.out, type=args.type, progress=progress)
-    notes = recording.notes + notes
-    topics = {'/voltage': MESSAGES[args.type]}
-    if recording.has_throttle:
-        topics['/throttle'] = 'std_msgs/msg/Float32'
+        topics, moved = write_log(chosen, args.out, about, kind=args.type, progress=progress)
+    notes = (*log.notes, *chosen.notes, *held, *moved)
+    volts = chosen.voltage
+    duration = float(volts.t[-1] - volts.t[0])
+    series = {topic: getattr(chosen, topic[1:]) for topic in topics}
     if args.json is not None:
         output.write_json({
-            'log': str(args.log), 'out': str(args.out), 'n': recording.n,
-            'duration_s': recording.duration, 'topics': topics, 'notes': list(notes)}, args.json)
-    if args.json != output.STDOUT:
-        output.say(f'{args.out}: {recording.n} samples, {recording.duration:.3f} s, '
-                   + ', '.join(f'{topic} ({kind})' for topic, kind in topics.items()))
-        for note in notes:
-            output.say(f'note: {note}')
+            'log': str(args.log), 'out': str(args.out), 'n': volts.n, 'duration_s': duration,
+            'topics': topics, 'source': {**about, **{
+                topic: {'field': one.name, 'scale': one.scale, 'what': one.words, 'n': one.n}
+                for topic, one in series.items()}}, 'notes': notes}, args.json)
+    if args.json == output.STDOUT:
+        return 0
+    output.say(f'{args.out}: {volts.n} samples, {duration:.3f} s'
+               + (f', {volts.rate:.6g} Hz' if volts.n > 1 else ''))
+    output.say('\n'.join(f'  {topic}: {one.name} ({one.words}), {one.n} samples, '
+                         f'{topics[topic]}' for topic, one in series.items()))
+    for name, value in log.facts.items():
+        output.say(f'  {name}: {value}')
+    for note in notes:
+        output.say(f'note: {note}')
+    return 0
+
+
+def _list(args: argparse.Namespace, log: Any) -> int:
+    import numpy as np
+
+    from ou_monitor.recordings.importers.choose import default
+    from ou_monitor.recordings.importers.log import CURRENT, THROTTLE, UNITS, VOLTAGE
+
+    taken = {quantity: [one.name for one in default(log, quantity)]
+             for quantity in (VOLTAGE, THROTTLE, CURRENT)}
+    rows = []
+    order = (VOLTAGE, THROTTLE, CURRENT)
+    for one in sorted(log.series, key=lambda one: (
+            one.quantity not in order, order.index(one.quantity) if one.quantity in order else 0,
+            one.rank is None, one.rank or 0)):
+        known = one.values[np.isfinite(one.values)]
+        low, high = (float(known.min()), float(known.max())) if known.size else (np.nan, np.nan)
+        rows.append({
+            'quantity': one.quantity, 'name': one.name, 'what': one.words,
+            'default': one.name in taken.get(one.quantity, ()), 'n': one.n,
+            'rate_hz': one.rate, 'min': low, 'max': high, 'unit': UNITS[one.quantity],
+            'repeats': one.repeats, 'scale': one.scale})
+    if args.json is not None:
+        output.write_json({'log': str(args.log), 'format': log.format, 'facts': log.facts,
+                           'series': rows, 'notes': log.notes}, args.json)
+    if args.json == output.STDOUT:
+        return 0
+    output.say(f'{args.log}: {log.format}' + ''.join(
+        f', {name} {value}' for name, value in log.facts.items()))
+    output.say(output.table(
+        ('', 'quantity', 'name', 'samples', 'rate Hz', 'min', 'max', 'unit', 'repeats', 'what'),
+        [('*' if row['default'] else '', row['quantity'], row['name'], str(row['n']),
+          *(f'{row[key]:.4g}' for key in ('rate_hz', 'min', 'max')), row['unit'],
+          f'{row["repeats"]:.0%}', row['what']) for row in rows], left=(0, 1, 2, 7, 9)))
+    for quantity in (VOLTAGE, THROTTLE):
+        if len(taken[quantity]) > 1:
+            output.say(f'Several would be taken as {quantity}: choose with --{quantity} NAME.')
+    for note in log.notes:
+        output.say(f'note: {note}')
     return 0

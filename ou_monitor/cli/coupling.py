@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import argparse
 import math
-from textwrap import fill
 from typing import Any, TYPE_CHECKING
 
+from ou_monitor.cli import output
+from ou_monitor.cli.arguments import (
+    add_part, add_recording, add_topics, part_of_recording, read_given)
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
     from ou_monitor.offline.coupling import Coupling
-
-_COLUMNS = 100
 
 
 def add_parser(subparsers: Any) -> None:
@@ -30,9 +30,8 @@ def add_parser(subparsers: Any) -> None:
         help='gain from the supply voltage to a signal, such as a gyro axis',
         description='Estimate how much noise of the supply is in a signal: gain with 95 % '
                     'interval and lag, or that none was seen and what would have been.')
-    parser.add_argument(
-        'recording', metavar='RECORDING',
-        help='.mcap file, rosbag2 folder, or CSV with columns time_s, voltage_v[, throttle]')
+    add_recording(parser)
+    add_part(parser)
     parser.add_argument('--signal', metavar='NAME', required=True,
                         help='TOPIC/FIELD.PATH of a bag (/imu/angular_velocity.x), or a column')
     parser.add_argument('--band', metavar='LOW,HIGH',
@@ -40,12 +39,7 @@ def add_parser(subparsers: Any) -> None:
                              'rate)')
     parser.add_argument('--level', metavar='P', default='0.05',
                         help='probability of a false alarm (default: 0.05)')
-    parser.add_argument('--msg-config', metavar='NAME',
-                        help='msg_config that says which topic and field is the voltage')
-    parser.add_argument('--voltage-topic', metavar='TOPIC', help='topic of the voltage')
-    parser.add_argument('--throttle-topic', metavar='TOPIC', help='topic of the throttle')
-    parser.add_argument('--partial', action='store_true',
-                        help='use what a truncated file still holds')
+    add_topics(parser)
     parser.add_argument('--json', metavar='FILE',
                         help="write the result as JSON ('-': to standard output, alone)")
     parser.set_defaults(run=run)
@@ -71,21 +65,21 @@ def run(args: argparse.Namespace) -> int:
         When an argument or the recording cannot be used.
 
     """
-    from ou_monitor.cli import output
-
     output.check_paths({'RECORDING': args.recording, '--msg-config': args.msg_config},
                        {'--json': args.json})
     output.check_writable(args.json)
     band, level = _band(args.band), _level(args.level)
+    start, end = part_of_recording(args.start, args.end)
 
     from ou_monitor.offline.coupling import estimate_coupling
-    from ou_monitor.recordings.read import read_recording
     from ou_monitor.recordings.read_signal import read_signal
 
-    recording = read_recording(
-        args.recording, msg_config=args.msg_config, voltage_topic=args.voltage_topic,
-        throttle_topic=args.throttle_topic, partial=args.partial)
+    recording = read_given(args, start, end)
     t, values = read_signal(args.recording, args.signal, partial=args.partial)
+    if start is not None or end is not None:
+        # What lies outside the part has no voltage beside it, and is not counted as dropped.
+        part = (t >= recording.t[0]) & (t <= recording.t[-1])
+        t, values = t[part], values[part]
     try:
         found = estimate_coupling(recording.t, recording.voltage, t, values,
                                   throttle=recording.throttle, band=band, level=level)
@@ -178,8 +172,7 @@ def render(found: Coupling, name: str, signal: str, notes: tuple[str, ...]) -> s
         extra.append(f'{grid.gaps} gap{"s" * (grid.gaps != 1)} left out.')
     remarks = [*notes, *extra, *found.notes]
     if remarks:
-        lines += ['', *[fill(text, _COLUMNS, initial_indent='- ', subsequent_indent='  ')
-                        for text in remarks]]
+        lines += ['', *[output.item(text) for text in remarks]]
     return '\n'.join(lines)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 import math
-from textwrap import fill
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor.cli.quantities import component, quantity, read_network, value_of
@@ -15,7 +14,6 @@ if TYPE_CHECKING:
     from ou_monitor.model.network.components import PowerNetwork
     from ou_monitor.offline.design import Design
 
-_COLUMNS = 100
 # One row of the printed table for this many rows of the calculation.
 _EVERY = 10
 # Options that are numbers, and their units.
@@ -169,7 +167,7 @@ def render(result: Design, source: str) -> str:
         Plain text.
 
     """
-    from ou_monitor.cli.output import table
+    from ou_monitor.cli.output import paragraph, table
     from ou_monitor.offline.design_words import answer, effect, probability, remarks
     from ou_monitor.offline.words import number
 
@@ -189,12 +187,12 @@ def render(result: Design, source: str) -> str:
             f'{present.sag:.3g} V), brown-out at {result.voltage:g} V ({source}), risk allowed '
             f'{result.target:g} within {result.horizon:g} s')
     lines = [
-        fill(head, _COLUMNS), '',
+        paragraph(head), '',
         table(['C uF', 'ESR mOhm', 'alpha 1/s', 'tau us', 'sigma V/sqrt(s)', 'Var_inf V^2',
                'mean time', 'risk OU', 'crossing', ''], cells, left=[9]), '']
     for text in (answer(result), effect(result), *remarks(result)):
         if text:
-            lines.append(fill(text, _COLUMNS))
+            lines.append(paragraph(text))
     return '\n'.join(lines)
 
 

@@ -6,18 +6,17 @@ import argparse
 from datetime import datetime, timezone
 import math
 import shlex
-from textwrap import fill
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor import __version__
 from ou_monitor.cli import output
+from ou_monitor.cli.arguments import (
+    add_part, add_recording, add_topics, part_of_recording, read_given, said_again)
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
     from ou_monitor.offline.discover.finding import Finding
 
-# Lines are broken to be read at this width.
-_COLUMNS = 100
 # Statistics and notes shown at most; all of them are in the report.
 _SHOWN = 8
 
@@ -37,17 +36,11 @@ def add_parser(subparsers: Any) -> None:
         help='criticise the simulation, name the cause, extend, measure the gain',
         description='Fit and simulate the plain OU, tell what it gets wrong, name the cause, '
                     'extend the model, and measure the gain on samples not used for the fit.')
-    parser.add_argument(
-        'recording', metavar='RECORDING',
-        help='.mcap file, rosbag2 folder, or CSV with columns time_s, voltage_v[, throttle]')
+    add_recording(parser)
+    add_part(parser)
     parser.add_argument('--seed', metavar='N', type=int, default=0,
                         help='same seed, same result (default: %(default)s)')
-    parser.add_argument('--msg-config', metavar='NAME',
-                        help='msg_config that says which topic and field is the voltage')
-    parser.add_argument('--voltage-topic', metavar='TOPIC', help='topic of the voltage')
-    parser.add_argument('--throttle-topic', metavar='TOPIC', help='topic of the throttle')
-    parser.add_argument('--partial', action='store_true',
-                        help='use what a truncated file still holds')
+    add_topics(parser)
     parser.add_argument('--json', metavar='FILE',
                         help="write the result as JSON ('-': to standard output, alone)")
     parser.add_argument('--save-model', metavar='FILE.yaml',
@@ -80,6 +73,7 @@ def run(args: argparse.Namespace) -> int:
     """
     if args.seed < 0:
         raise InputError(f'--seed must be 0 or more, got {args.seed}')
+    start, end = part_of_recording(args.start, args.end)
     output.check_paths(
         {'RECORDING': args.recording, '--msg-config': args.msg_config},
         {'--json': args.json, '--save-model': args.save_model, '--report': args.report})
@@ -92,11 +86,8 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from ou_monitor.offline.discover.run import discover
-    from ou_monitor.recordings.read import read_recording
 
-    recording = read_recording(
-        args.recording, msg_config=args.msg_config, voltage_topic=args.voltage_topic,
-        throttle_topic=args.throttle_topic, partial=args.partial)
+    recording = read_given(args, start, end)
     # What overflows on the way ends as not finite, which the search refuses: a user has no
     # use for the source line of it.
     with output.Progress('discovering') as progress, np.errstate(all='ignore'):
@@ -134,12 +125,7 @@ def command_line(args: argparse.Namespace) -> str:
         Quoted for a shell; without the outputs.
 
     """
-    words = ['ou-monitor', 'discover', args.recording, '--seed', str(args.seed)]
-    for name in ('msg_config', 'voltage_topic', 'throttle_topic'):
-        value = getattr(args, name)
-        if value is not None:
-            words += ['--' + name.replace('_', '-'), str(value)]
-    return shlex.join(words + (['--partial'] if args.partial else []))
+    return shlex.join(['ou-monitor', 'discover', args.recording, *said_again(args, 'seed')])
 
 
 def model_text(finding: Finding) -> str:
@@ -203,7 +189,7 @@ def render(finding: Finding) -> str:
     used = '' if finding.samples is None or finding.samples.n == finding.n else (
         f', {finding.samples.n} used')
     lines = [f'{finding.recording}: {finding.n} samples in {number(finding.duration, 4)} s{used}',
-             '', fill(finding.sentence, _COLUMNS)]
+             '', output.paragraph(finding.sentence)]
     if finding.causes:
         found = cause_rows(finding.causes)
         rows = [[row.label, row.family, row.gain, row.chance, ', '.join(row.alternatives) or '-']
@@ -211,28 +197,24 @@ def render(finding: Finding) -> str:
         lines += ['', output.table(['cause', 'family', 'gain mnat/sample', 'p', 'not told from'],
                                    rows, left=[0, 1, 4]), '']
         for row in found:
-            lines += [_item(f'{row.name}: {estimate}') for estimate in row.estimates]
+            lines += [output.item(f'{row.name}: {estimate}') for estimate in row.estimates]
         overlap = overlap_words(finding.causes, finding.gain)
-        lines += [_item(MNAT), *([_item(overlap)] if overlap else [])]
+        lines += [output.item(MNAT), *([output.item(overlap)] if overlap else [])]
         for remark in dict.fromkeys(row.remark for row in found if row.remark):
-            lines.append(_item(f'Gain {remark}: ' + ', '.join(
+            lines.append(output.item(f'Gain {remark}: ' + ', '.join(
                 f'{row.label} ({row.gain})' for row in found if row.remark == remark)))
     if finding.baseline is not None:
-        lines += ['', fill('Plain OU, fitted on the first 60 %: '
-                           f'{plain_model_words(finding.baseline)}.', _COLUMNS)]
+        lines += ['', output.paragraph(
+            f'Plain OU, fitted on the first 60 %: {plain_model_words(finding.baseline)}.')]
         felt = crossing_words(finding)
-        lines += [fill(felt, _COLUMNS)] if felt else []
+        lines += [output.paragraph(felt)] if felt else []
     left = finding.remaining
     if left:
         lines += ['', 'What is left:', *[
-            _item(f'{c.statistic}: {number(c.after)} (band {number(c.low)} to {number(c.high)}), '
-                  f'{plain_words(c.statistic)}') for c in left[:_SHOWN]]]
+            output.item(f'{c.statistic}: {number(c.after)} (band {number(c.low)} to '
+                        f'{number(c.high)}), {plain_words(c.statistic)}') for c in left[:_SHOWN]]]
         if len(left) > _SHOWN:
-            lines.append(_item(f'and {len(left) - _SHOWN} more'))
+            lines.append(output.item(f'and {len(left) - _SHOWN} more'))
     if finding.notes:
-        lines += ['', *[_item(note) for note in finding.notes]]
+        lines += ['', *[output.item(note) for note in finding.notes]]
     return '\n'.join(lines)
-
-
-def _item(text: str) -> str:
-    return fill(text, _COLUMNS, initial_indent='- ', subsequent_indent='  ')

@@ -20,6 +20,7 @@ COMMANDS = {
     'coupling': 'ou_monitor.cli.coupling',
     'design': 'ou_monitor.cli.design',
     'discover': 'ou_monitor.cli.discover',
+    'fleet': 'ou_monitor.cli.fleet',
     'reproduce': 'ou_monitor.cli.reproduce',
     'simulate': 'ou_monitor.cli.simulate',
 }

@@ -12,6 +12,7 @@ import os
 from pathlib import Path
 import shutil
 import sys
+from textwrap import fill
 import time
 from typing import Any
 
@@ -20,6 +21,8 @@ import numpy as np
 from ou_monitor.errors import InputError
 
 STDOUT = '-'
+# Lines are broken to be read at this width.
+COLUMNS = 100
 # What a rosbag2 folder is made of, beside its metadata.yaml: storage files, compressed or not.
 _STORAGE = ('.mcap', '.db3', '.zst', '.zstd', '.lz4')
 
@@ -133,9 +136,17 @@ def write_text(text: str, target: str | Path) -> None:
         When it cannot be written.
 
     """
+    path = Path(target)
+    # What is there stays until the new one is whole; a device or a pipe is written as it is.
+    draft = path if path.exists() and not path.is_file() else path.with_name(
+        f'.{path.name}.{os.getpid()}.draft')
     try:
-        Path(target).write_text(text, encoding='utf-8')
+        draft.write_text(text, encoding='utf-8')
+        if draft is not path:
+            os.replace(draft, path)
     except OSError as error:
+        if draft is not path:
+            draft.unlink(missing_ok=True)
         raise InputError(f"cannot write '{target}': {error.strerror or error}") from error
 
 
@@ -242,6 +253,32 @@ def check_writable(target: str | None) -> None:
         raise InputError(f"cannot write '{target}': it is a folder; name a file in it")
     if not path.parent.is_dir():
         raise InputError(f"cannot write '{target}': the folder '{path.parent}' does not exist")
+
+
+def paragraph(text: str, begin: str = '') -> str:
+    """
+    Break a paragraph into lines; words and paths stay whole.
+
+    Parameters
+    ----------
+    text : str
+        One paragraph.
+    begin : str
+        What its first line begins with; the others are indented as far.
+
+    Returns
+    -------
+    str
+        Lines of `COLUMNS` columns.
+
+    """
+    return fill(text, COLUMNS, initial_indent=begin, subsequent_indent=' ' * len(begin),
+                break_long_words=False, break_on_hyphens=False)
+
+
+def item(text: str) -> str:
+    """Break one entry of a list into lines."""
+    return paragraph(text, '- ')
 
 
 def table(headers: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from textwrap import fill
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor.cli import output
@@ -11,9 +10,6 @@ from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
     from ou_monitor.offline.reproduce.reproduce import Reproduction
-
-# Lines are broken to be read at this width.
-_COLUMNS = 100
 
 
 def add_parser(subparsers: Any) -> None:
@@ -104,7 +100,7 @@ def render(result: Reproduction) -> str:
     from ou_monitor.offline.reproduce.points import tally
     from ou_monitor.offline.reproduce.words import headline, recomputed
 
-    lines = [fill(headline(result), _COLUMNS)]
+    lines = [output.paragraph(headline(result))]
     rows = [[row.where if k == 0 or row.where != found[k - 1].where else '',
              row.quantity + (f', {row.unit}' if row.unit else ''), row.printed.text,
              recomputed(row), row.verdict.value]
@@ -113,5 +109,5 @@ def render(result: Reproduction) -> str:
                                rows, left=[0, 1, 4])]
     for point in result.points:
         lines += ['', f'{point.number}. {point.title} ({tally(point.rows)})',
-                  fill(point.text, _COLUMNS, initial_indent='   ', subsequent_indent='   ')]
+                  output.paragraph(point.text, '   ')]
     return '\n'.join(lines)

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from ou_monitor.records import FloatArray
 
@@ -91,14 +92,65 @@ class BlockClock:
             When the stamp is not finite or `n` is negative.
 
         """
+        start, first, step = self._next(end_stamp, n)
+        if n == 0:
+            return np.empty(0)
+        assert self._anchor is not None
+        return self._anchor + (start + np.arange(first, first + n, dtype=np.float64) * step)
+
+    def stamps_of_many(self, end_stamps: FloatArray, n: npt.NDArray[np.int64]) -> FloatArray:
+        """
+        Return the stamps of the samples of many blocks, as `stamps` would one by one.
+
+        Parameters
+        ----------
+        end_stamps : ndarray, shape (m,)
+            Stamps of the blocks, s.
+        n : ndarray of int, shape (m,)
+            Samples in each.
+
+        Returns
+        -------
+        ndarray, shape (n.sum(),)
+            Stamps, s, one block after another.
+
+        Raises
+        ------
+        ValueError
+            As `stamps`.
+
+        """
+        lines = []
+        for end, count in zip(end_stamps.tolist(), n.tolist()):
+            line = self._next(end, count)
+            lines.append((self._anchor or 0.0, *line))
+        anchor, start, first, step = np.array(lines, dtype=np.float64).reshape(-1, 4).T
+        if n.size and (n == n[0]).all():
+            steps = (first[:, None] + np.arange(int(n[0]))) * step[:, None]
+            steps += start[:, None]
+            steps += anchor[:, None]
+            return steps.reshape(-1)
+        place = np.arange(int(n.sum())) - np.repeat(np.cumsum(n) - n - first, n)
+        return np.repeat(anchor, n) + (np.repeat(start, n) + place * np.repeat(step, n))
+
+    def _next(self, end_stamp: float, n: int) -> tuple[float, int, float]:
+        """
+        Advance the time line by a block.
+
+        Returns
+        -------
+        tuple
+            (start, first, step): sample k of the block is at
+            anchor + start + (first + k) step, s.
+
+        """
         if not math.isfinite(end_stamp):
             raise ValueError(f'the stamp of a block must be finite, got {end_stamp} s')
         if n < 0:
             raise ValueError(f'a block cannot hold {n} samples')
         if n == 0:
-            return np.empty(0)
+            return 0.0, 0, 0.0
         length = n * self._dt
-        steps = np.arange(1, n + 1, dtype=np.float64)
         if self._anchor is not None:
             start = self._elapsed
             error = (end_stamp - self._anchor) - (start + length)
@@ -107,7 +159,7 @@ class BlockClock:
                 # shows where two blocks meet.
                 lean = error * -math.expm1(-length / FOLLOW)
                 self._elapsed = start + length + lean
-                return self._anchor + (start + steps * ((length + lean) / n))
+                return start, 1, (length + lean) / n
             self.gaps += 1
         self._anchor, self._elapsed = end_stamp, 0.0
-        return end_stamp + (steps - n) * self._dt
+        return 0.0, 1 - n, self._dt

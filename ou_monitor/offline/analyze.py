@@ -8,21 +8,39 @@ long as the stretch of constant load.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 import math
 
 import numpy as np
+from ou_monitor.offline.analysis.alpha_test import alpha_constancy, AlphaTest
+from ou_monitor.offline.analysis.by_throttle import by_throttle, ByThrottle
+from ou_monitor.offline.analysis.cause import Cause, judge_cause
+from ou_monitor.offline.analysis.level_sag import level_sags, LevelSag
+from ou_monitor.offline.analysis.level_tests import (
+    adjusted, examine_level, FAMILY_WISE, holm, Shape)
+from ou_monitor.offline.analysis.lines import find_lines, LineSearch
+from ou_monitor.offline.analysis.quality_list import quality_list, QualityItem
+from ou_monitor.offline.analysis.relaxation import fit_relaxation, Relaxation
+from ou_monitor.offline.analysis.settling import unsettled
+from ou_monitor.offline.analysis.steps import find_steps
+from ou_monitor.offline.analysis.whitening import fresh
 from ou_monitor.offline.levels import find_levels, LoadLevel, Segment
-from ou_monitor.offline.pooling import fit_stretch, pool, standardised_increments
-from ou_monitor.offline.process_type import classify, excess_kurtosis, ProcessType
+from ou_monitor.offline.pooling import disagreement, fit_stretch, pool
+from ou_monitor.offline.process_type import classify, ProcessType, Verdict
 from ou_monitor.offline.sliding import slide, Sliding
+from ou_monitor.offline.spectrum import level_spectrum, segment_rate, Spectrum
+from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Recording, Status
 
 Progress = Callable[[float], None]
 
+# Voltages, V, between which the median of a 5 V rail lies.
+RAIL = (4.0, 6.0)
 # Fewer samples than this are not even offered to the estimator.
 _MIN_SEGMENT = 16
+# Intervals widened by more than this factor are spoken of.
+_WIDENED = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,15 +67,24 @@ class LevelResult:
         That deviation, V.
     estimate : Estimate
         OU parameters, pooled over the segments.
-    kurtosis, kurtosis_se : float
-        Excess kurtosis of the standardised increments and its standard error
-        for a Gaussian.
-    kind : ProcessType
-        Kind of process.
-    reason : str
-        Why it is called that, one sentence.
+    shape : Shape
+        Tests of the kind of process, adjusted over all levels.
+    verdict : Verdict
+        Kind of process, and why.
+    sag : LevelSag
+        How far the mean lies below that of the lowest throttle.
+    spectrum : Spectrum
+        PSD, measured and fitted.
+    lines : LineSearch
+        Spectral lines, and what would have been found.
     notes : tuple of str
         What to know before using the numbers.
+    scatter : float
+        How much more its segments differ than their errors allow; those of the pooled estimate
+        are already widened by it.
+    scatter_p : float
+        Probability that segments of one process differ as much, after Holm over all levels; NaN
+        with fewer than two segments.
 
     """
 
@@ -71,11 +98,24 @@ class LevelResult:
     vrms: float
     deviation: FloatArray
     estimate: Estimate
-    kurtosis: float
-    kurtosis_se: float
-    kind: ProcessType
-    reason: str
+    shape: Shape
+    verdict: Verdict = Verdict(ProcessType.UNDETERMINED, 'not judged')
+    sag: LevelSag = LevelSag()
+    spectrum: Spectrum = field(default_factory=Spectrum)
+    lines: LineSearch = field(default_factory=LineSearch)
     notes: tuple[str, ...] = ()
+    scatter: float = 1.0
+    scatter_p: float = NAN
+
+    @property
+    def kind(self) -> ProcessType:
+        """Kind of process."""
+        return self.verdict.kind
+
+    @property
+    def doubted(self) -> bool:
+        """Whether one OU in white noise does not describe it: lines, or another relaxation."""
+        return bool(self.lines.lines) or self.shape['one_relaxation'].rejects
 
     @property
     def crest(self) -> float:
@@ -99,8 +139,20 @@ class Analysis:
         What was analysed.
     levels : tuple of LevelResult
         In order of throttle.
+    relaxations : tuple of Relaxation
+        After falls of throttle (``release``) and rises (``load``).
+    causes : tuple of Cause
+        Of each relaxation: the noise's own time constant, or the instrument.
+    alpha_test : AlphaTest
+        Whether alpha is the same at all levels.
+    by_throttle : ByThrottle
+        Curves and risk over throttle, as the node learns them.
     sliding : Sliding
         What the node would have published.
+    quality : tuple of QualityItem
+        What to know before using the numbers, worst first.
+    brownout_default : bool
+        Whether the voltage of the risk is the node's default, not one that was asked for.
     notes : tuple of str
         What was dropped or left out, one sentence each.
 
@@ -108,12 +160,18 @@ class Analysis:
 
     recording: Recording
     levels: tuple[LevelResult, ...]
+    relaxations: tuple[Relaxation, ...]
+    causes: tuple[Cause, ...]
+    alpha_test: AlphaTest
+    by_throttle: ByThrottle
     sliding: Sliding
+    quality: tuple[QualityItem, ...]
+    brownout_default: bool
     notes: tuple[str, ...]
 
 
 def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
-            window: float = 2.0, brownout_voltage: float = NAN,
+            window: float = 2.0, brownout_voltage: float | None = None,
             brownout_horizon: float = 5.0, progress: Progress | None = None) -> Analysis:
     """
     Analyse a recording load level by load level.
@@ -126,8 +184,9 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
         Throttles 0..1 to use; found from the recording when left out.
     window : float
         Window of the sliding estimate, s.
-    brownout_voltage : float
-        Threshold of the risk, V; NaN leaves the risk unknown.
+    brownout_voltage : float, optional
+        Threshold of the risk, V; NaN leaves the risk unknown.  Left out: the node's default
+        where the supply is a 5 V rail (median within `RAIL`), else NaN.
     brownout_horizon : float
         Horizon of the risk, s.
     progress : callable, optional
@@ -141,31 +200,50 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     Raises
     ------
     ValueError
-        For a level, window or horizon out of range.
+        For a level, window, voltage or horizon out of range.
 
     """
     tell: Progress = progress or (lambda share: None)
+    voltage = _default_voltage(recording) if brownout_voltage is None else brownout_voltage
     found = find_levels(recording.t, recording.throttle, levels)
     results = []
     for k, level in enumerate(found):
-        results.append(_level(recording, level))
+        results.append(_level(recording, level, len(found)))
         tell(0.5 * (k + 1) / len(found))
-    sliding = slide(recording, window, brownout_voltage, brownout_horizon,
+    judged = _judged(recording, results)
+    throttles = [level.throttle for level in judged]
+    estimates = [level.estimate for level in judged]
+    relaxations = _relaxations(recording, judged)
+    settling = unsettled(relaxations, throttles, estimates, [level.time for level in judged])
+    moving = {x for item in settling for x in item.throttles}
+    alpha = alpha_constancy(throttles, estimates, [level.doubted or level.throttle in moving
+                                                   for level in judged])
+    sliding = slide(recording, window, voltage, brownout_horizon,
                     lambda share: tell(0.5 + 0.5 * share))
-    return Analysis(recording, tuple(results), sliding,
-                    recording.notes + _left_out(recording, found))
+    return Analysis(
+        recording, judged, relaxations, tuple(judge_cause(r, alpha) for r in relaxations), alpha,
+        by_throttle(sliding, recording.has_throttle), sliding,
+        quality_list(recording, throttles, estimates, [level.notes for level in judged],
+                     settling),
+        brownout_voltage is None, recording.notes + _left_out(recording, found))
 
 
-def _level(recording: Recording, level: LoadLevel) -> LevelResult:
-    """Return the result of one level."""
+def _default_voltage(recording: Recording) -> float:
+    """Return the node's default, V, for a 5 V rail; NaN for any other supply."""
+    low, high = RAIL
+    middle = float(np.median(recording.voltage)) if recording.n else NAN
+    return MonitorSettings().brownout_voltage if low <= middle <= high else NAN
+
+
+def _level(recording: Recording, level: LoadLevel, levels: int) -> LevelResult:
+    """Return the result of one level, its kind not judged yet."""
     segments = [s for s in level.segments if s.stop - s.start >= _MIN_SEGMENT]
     if not segments:
         segments = [s for s in level.segments if s.stop - s.start >= 2]
     if not segments:
-        return LevelResult(
-            level.throttle, (), 0.0, 0, NAN, NAN, NAN, NAN, np.zeros(0),
-            Estimate(throttle=level.throttle, status=Status.TOO_FEW_SAMPLES), NAN, NAN,
-            ProcessType.UNDETERMINED, 'No samples at this throttle.')
+        nothing = Estimate(throttle=level.throttle, status=Status.TOO_FEW_SAMPLES)
+        return LevelResult(level.throttle, (), 0.0, 0, NAN, NAN, NAN, NAN, np.zeros(0), nothing,
+                           examine_level([], nothing))
     fits = [fit_stretch(recording, s.start, s.stop) for s in segments]
     estimate, scatter = pool(fits)
     # Within a level throttle is meant to stand still.
@@ -173,33 +251,75 @@ def _level(recording: Recording, level: LoadLevel) -> LevelResult:
     estimate = replace(estimate, flags=flags)
     parts = [recording.voltage[s.start:s.stop] for s in segments]
     deviation = np.concatenate([v - v.mean() for v in parts])
-    kurtosis, kurtosis_se = excess_kurtosis(np.concatenate([
-        standardised_increments(recording, s.start, s.stop, e)
-        for s, e in zip(segments, fits)]))
-    kind, reason = classify(estimate, kurtosis, kurtosis_se)
+    rate = segment_rate(recording, segments)
+    memory = math.exp(-estimate.alpha / rate) if estimate.usable and rate > 0.0 else 0.0
     return LevelResult(
         throttle=level.throttle, segments=tuple(segments),
         time=float(sum(recording.t[s.stop - 1] - recording.t[s.start] for s in segments)),
         n=deviation.size, mean=float(np.concatenate(parts).mean()),
         vpp=float(np.ptp(deviation)), peak=float(np.abs(deviation).max()),
         vrms=float(np.sqrt(np.mean(deviation ** 2))), deviation=deviation, estimate=estimate,
-        kurtosis=kurtosis, kurtosis_se=kurtosis_se, kind=kind, reason=reason,
-        notes=_level_notes(fits, estimate, scatter))
+        shape=examine_level([_kept(recording, s, estimate) for s in segments], estimate),
+        spectrum=level_spectrum(recording, segments, estimate),
+        lines=find_lines(parts, rate, levels=levels, memory=memory),
+        notes=_level_notes(fits, estimate), scatter=scatter, scatter_p=disagreement(fits))
 
 
-def _level_notes(fits: list[Estimate], pooled: Estimate, scatter: float) -> tuple[str, ...]:
+def _kept(recording: Recording, segment: Segment, estimate: Estimate
+          ) -> tuple[FloatArray, FloatArray]:
+    """Return stamps and voltages of a segment, repeats of the logger left out."""
+    t = recording.t[segment.start:segment.stop]
+    voltage = recording.voltage[segment.start:segment.stop]
+    keep = fresh(voltage, estimate)
+    return t[keep], voltage[keep]
+
+
+def _judged(recording: Recording, results: Sequence[LevelResult]) -> tuple[LevelResult, ...]:
+    """Name the kind of each level, the tests of all adjusted together; and compare means."""
+    shapes = holm([level.shape for level in results])
+    sags = level_sags(recording, [level.throttle for level in results],
+                      [level.segments for level in results],
+                      [level.estimate for level in results], [level.vrms for level in results])
+    apart = adjusted([level.scatter_p for level in results])
+    return tuple(
+        replace(level, shape=shape, sag=sag, scatter_p=p,
+                notes=level.notes + _scatter_notes(level.scatter, p), verdict=classify(
+                    level.estimate, shape, sum(line.share for line in level.lines.lines)))
+        for level, shape, sag, p in zip(results, shapes, sags, apart))
+
+
+def _relaxations(recording: Recording, levels: Sequence[LevelResult]) -> tuple[Relaxation, ...]:
+    """Fit what follows falls and rises of throttle."""
+    throttles = [level.throttle for level in levels]
+    estimates, rms = [level.estimate for level in levels], [level.vrms for level in levels]
+    steps = find_steps(recording, throttles)
+    falls = [throttles[step.after] < throttles[step.before] for step in steps]
+    return tuple(
+        fit_relaxation(recording, kind, [step for step, down in zip(steps, falls)
+                                         if down == wanted], throttles, estimates, rms)
+        for kind, wanted in (('release', True), ('load', False)))
+
+
+def _scatter_notes(scatter: float, p: float) -> tuple[str, ...]:
+    """Say that the segments differ: that they are not one process, or only what was widened."""
+    if p < FAMILY_WISE:
+        return (f'Its segments differ {scatter:.1f} times more than sampling allows (p = '
+                f'{p:.1g}): the level is not one process; the intervals were widened by that '
+                'factor.',)
+    if scatter > _WIDENED:
+        return (f'The intervals are wider by a factor of {scatter:.1f}, by which its segments '
+                'scatter more than their errors; so much comes by chance.',)
+    return ()
+
+
+def _level_notes(fits: list[Estimate], pooled: Estimate) -> tuple[str, ...]:
     notes = []
     used = sum(e.usable for e in fits)
     if not pooled.usable and len(fits) > 1:
-        longest = max(e.duration for e in fits)
-        notes.append(f'Of its {len(fits)} segments (the longest {longest:.3g} s) most cannot be '
-                     'fitted.')
+        notes.append('Most of its segments are too short to be fitted, or show no relaxation.')
     elif used < len(fits) and len(fits) > 1:
         notes.append(f'{len(fits) - used} of {len(fits)} segments could not be fitted; alpha, '
                      'sigma and Var_inf rest on the others.')
-    if scatter > 1.5:
-        notes.append(f'Its segments differ {scatter:.1f} times more than sampling allows: the '
-                     'level is not one process; the intervals were widened by that factor.')
     return tuple(notes)
 
 

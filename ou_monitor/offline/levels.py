@@ -30,6 +30,9 @@ SETTLE = 0.1
 # found without being asked for.
 MIN_SHARE = 0.02
 MIN_TIME = 0.25
+# And one stretch that can be fitted by itself, s: thirty relaxation times of the
+# paper's rail.  A ramp that lingers here and there is no level where others are.
+MIN_STRETCH = 0.5
 MAX_LEVELS = 10
 # A pause of more than this many median steps breaks a segment.
 GAP_STEPS = 20.0
@@ -83,9 +86,10 @@ def find_levels(t: FloatArray, throttle: FloatArray,
     Returns
     -------
     tuple of LoadLevel
-        In order of throttle.  Without throttle, or when none was held for
-        long, one level, NaN, that holds the whole recording.  A given level
-        that was never flown has no segments.
+        In order of throttle; a throttle that was only passed through, with no
+        stretch of `MIN_STRETCH`, is none where others have one.  Without
+        throttle, or when none was held for long, one level, NaN, that holds the
+        whole recording.  A given level that was never flown has no segments.
 
     Raises
     ------
@@ -97,8 +101,30 @@ def find_levels(t: FloatArray, throttle: FloatArray,
         return ()
     broken = _gaps(t)
     centres = _checked(given) if given is not None else _modes(t, throttle)
-    if not centres:
-        return (LoadLevel(NAN, _runs(np.ones(t.size, dtype=np.bool_), broken)),)
+    while centres:
+        found = _split(t, throttle, centres, broken, given is not None)
+        held = [given is not None or _longest(t, level) >= _least(t) for level in found]
+        if all(held) or not any(held):
+            # Where every stay is short, short stays are all there is to tell from.
+            return found
+        # What was taken for a level may be its neighbours'.
+        centres = [centre for centre, kept in zip(centres, held) if kept]
+    return (LoadLevel(NAN, _runs(np.ones(t.size, dtype=np.bool_), broken)),)
+
+
+def _least(t: FloatArray) -> float:
+    """Return the stretch that a level needs, s; a short recording may be all one level."""
+    return min(MIN_STRETCH, 0.25 * float(t[-1] - t[0]))
+
+
+def _longest(t: FloatArray, level: LoadLevel) -> float:
+    """Return the longest stretch of a level, s; settling left out."""
+    return max((float(t[s.stop - 1] - t[s.start]) for s in level.segments), default=0.0)
+
+
+def _split(t: FloatArray, throttle: FloatArray, centres: list[float], broken: BoolArray,
+           named: bool) -> tuple[LoadLevel, ...]:
+    """Give each sample near a centre to the nearest one."""
     nearest = np.abs(throttle[:, None] - np.asarray(centres)[None, :])
     nearest[~np.isfinite(nearest)] = math.inf
     owner = nearest.argmin(axis=1)
@@ -112,10 +138,30 @@ def find_levels(t: FloatArray, throttle: FloatArray,
         away = ~(np.abs(throttle - centre) <= 2.0 * HALF_WIDTH)
         kept, lost = _settle(t, runs, away, broken)
         mean = centre
-        if given is None and kept:
+        if not named and kept:
             mean = float(np.median(np.concatenate([throttle[s.start:s.stop] for s in kept])))
         found.append(LoadLevel(mean, kept, lost))
     return tuple(found)
+
+
+def runs_at(t: FloatArray, throttle: FloatArray, centre: float) -> tuple[Segment, ...]:
+    """
+    Return the unbroken stretches within `HALF_WIDTH` of a throttle, settling included.
+
+    Parameters
+    ----------
+    t, throttle : ndarray, shape (n,)
+        Stamps, s, and throttle 0..1.
+    centre : float
+        Throttle of the level.
+
+    Returns
+    -------
+    tuple of Segment
+        In order of time.
+
+    """
+    return _runs(np.abs(throttle - centre) <= HALF_WIDTH + 1e-9, _gaps(t))
 
 
 def _checked(given: tuple[float, ...]) -> list[float]:

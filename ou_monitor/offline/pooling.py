@@ -9,6 +9,7 @@ import numpy as np
 
 from ou_monitor.online.estimator import SlidingEstimator
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Recording, Status
+from scipy import stats
 
 # Standard error of ln(alpha) beyond which a segment has no say.
 _MAX_SE = 1.0
@@ -110,6 +111,46 @@ def pool(estimates: Sequence[Estimate]) -> tuple[Estimate, float]:
         rate=float(np.median([e.rate for e in good]))), scatter
 
 
+def disagreement(estimates: Sequence[Estimate]) -> float:
+    """
+    Test whether segments share one set of parameters.
+
+    chi^2 of the logarithms of alpha, sigma and Var_inf about their weighted means, each of the
+    three against its own standard errors; the error of alpha is carried over to the common alpha,
+    for a segment whose alpha came out low shows too small a one.
+
+    Parameters
+    ----------
+    estimates : sequence of Estimate
+        One a segment.
+
+    Returns
+    -------
+    float
+        Probability of such differences by sampling, Bonferroni over the three; NaN with fewer
+        than two segments that tell alpha.
+
+    """
+    good = [e for e in map(_doubted, estimates) if e.usable]
+    if len(good) < 2:
+        return NAN
+    least = 1.0
+    for name in _LOG_NAMES:
+        logs = np.log([getattr(e, name) for e in good])
+        own = np.array([getattr(e, name + '_se') for e in good])
+        alphas = np.log([e.alpha for e in good])
+        se = own
+        for _ in range(20):
+            weight = 1.0 / se ** 2
+            common = float(weight @ alphas / weight.sum())
+            # A relative error goes with 1/sqrt(alpha T) for alpha and Var_inf.
+            se = own * (np.exp(0.5 * (alphas - common)) if name != 'sigma' else 1.0)
+        weight = 1.0 / se ** 2
+        chi2 = float(weight @ (logs - float(weight @ logs / weight.sum())) ** 2)
+        least = min(least, float(stats.chi2.sf(chi2, len(good) - 1)))
+    return min(1.0, len(_LOG_NAMES) * least)
+
+
 def _doubted(e: Estimate) -> Estimate:
     """Return the estimate without its numbers when they say nothing of alpha."""
     if not e.usable or e.alpha_se <= _MAX_SE:
@@ -136,36 +177,3 @@ def _rms(values: Sequence[float]) -> float:
 
 def _mean_se(weight: FloatArray, good: Sequence[Estimate]) -> float:
     return float(np.sqrt(weight ** 2 @ np.array([e.u0_se for e in good]) ** 2))
-
-
-def standardised_increments(recording: Recording, start: int, stop: int,
-                            estimate: Estimate) -> FloatArray:
-    """
-    Return the increments of a stretch over their standard deviation.
-
-    Parameters
-    ----------
-    recording : Recording
-        What to read from.
-    start, stop : int
-        Samples ``start <= k < stop``.
-    estimate : Estimate
-        Of this stretch; gives the standard deviation at each step when usable,
-        else all increments are held to be alike.
-
-    Returns
-    -------
-    ndarray, shape (stop - start - 1,)
-        Dimensionless.
-
-    """
-    steps = np.diff(recording.voltage[start:stop])
-    if estimate.usable:
-        dt = np.diff(recording.t[start:stop])
-        variance = -2.0 * estimate.var_inf * np.expm1(-estimate.alpha * dt)
-        if math.isfinite(estimate.noise_std):
-            variance = variance + 2.0 * estimate.noise_std ** 2
-        scaled: FloatArray = steps / np.sqrt(variance)
-        return scaled
-    rms = float(np.sqrt(np.mean(steps ** 2))) if steps.size else 0.0
-    return steps / rms if rms > 0.0 else steps

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
 
 from ou_monitor.online.estimator import SlidingEstimator
-from ou_monitor.online.risk import brownout_probability
+from ou_monitor.online.outlook import Outlook
+from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
 
 MAX_POINTS = 300
+# The node estimates at least so often, s; here, up to so many times in all.
+_STEP, _MOST = 0.5, 1200
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +35,10 @@ class Sliding:
         Probability of a brown-out within the horizon; NaN when unknown.
     brownout_voltage, brownout_horizon : float
         What the risk is of, V and s.
+    outlook : Outlook
+        What the node has learned by the end: curves over throttle, risk and budget.
+    settings : MonitorSettings
+        Of the node; its voltage is the default where none was asked for.
 
     """
 
@@ -41,6 +48,8 @@ class Sliding:
     risk: FloatArray
     brownout_voltage: float
     brownout_horizon: float
+    outlook: Outlook
+    settings: MonitorSettings
 
     def series(self, name: str) -> FloatArray:
         """
@@ -59,12 +68,17 @@ class Sliding:
         """
         return np.array([getattr(e, name) for e in self.estimates], dtype=np.float64)
 
+    @property
+    def last_usable(self) -> Estimate | None:
+        """Return the newest estimate that may be acted on; None when there is none."""
+        return next((e for e in reversed(self.estimates) if e.usable), None)
+
 
 def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
           brownout_horizon: float = 5.0,
           progress: Callable[[float], None] | None = None) -> Sliding:
     """
-    Run the node's estimator over a recording.
+    Run the node's estimator and its outlook over a recording.
 
     Parameters
     ----------
@@ -87,36 +101,47 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
     Raises
     ------
     ValueError
-        When the window or the horizon is not a positive number.
+        When the window or the horizon is not a positive number, or out of the node's range.
 
     """
     if not (math.isfinite(brownout_horizon) and brownout_horizon > 0.0):
         raise ValueError(f'the horizon must be a positive number of seconds, got '
                          f'{brownout_horizon}')
-    estimator = SlidingEstimator(window=window)
+    asked = math.isfinite(brownout_voltage)
+    settings = MonitorSettings(brownout_horizon=brownout_horizon)
+    if asked:
+        settings = replace(settings, brownout_voltage=brownout_voltage)
+    estimator, outlook = SlidingEstimator(window=window), Outlook(background=False)
     t, voltage, throttle = recording.t, recording.voltage, recording.throttle
     known = recording.has_throttle
     stamps, estimates, risk = [], [], []
     step = max(0.25 * window, recording.duration / MAX_POINTS)
+    # In between, estimates are for the curves alone, which follow the newest.
+    parts = max(1, min(math.ceil(step / _STEP), _MOST // MAX_POINTS))
     first = float(t[0]) if t.size else 0.0
-    count = int(recording.duration / step)
+    count = int(recording.duration / step) * parts
     done = 0
+    newest = Estimate()
     for k in range(1, count + 1):
-        stop = int(np.searchsorted(t, first + k * step, side='right'))
+        stop = int(np.searchsorted(t, first + k * step / parts, side='right'))
         if stop == done:
             continue
-        estimator.push(t[done:stop], voltage[done:stop], throttle[done:stop] if known else None)
+        stick = throttle[done:stop] if known else None
+        estimator.push(t[done:stop], voltage[done:stop], stick)
+        # As in `SupplyMonitor`: samples are learned from with the estimate before them.
+        outlook.push(t[done:stop], voltage[done:stop], stick, newest)
         done = stop
         # Until the first window is full its estimates would only look poor.
-        if t[stop - 1] - first < min(window, 0.5 * recording.duration):
+        filling = t[stop - 1] - first < min(window, 0.5 * recording.duration)
+        newest = estimator.estimate()
+        if filling or k % parts:
             continue
-        e = estimator.estimate()
         stamps.append(float(t[stop - 1]))
-        estimates.append(e)
-        risk.append(brownout_probability(e, brownout_voltage, brownout_horizon,
-                                         float(voltage[stop - 1]))
-                    if math.isfinite(brownout_voltage) else NAN)
+        estimates.append(newest)
+        risk.append(outlook.risk(newest, settings) if asked else NAN)
         if progress is not None:
             progress(k / count)
+    if done < t.size and estimates:
+        outlook.push(t[done:], voltage[done:], throttle[done:] if known else None, newest)
     return Sliding(window, np.array(stamps), tuple(estimates), np.array(risk),
-                   brownout_voltage, brownout_horizon)
+                   brownout_voltage, brownout_horizon, outlook, settings)

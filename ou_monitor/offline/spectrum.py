@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 import math
 
 import numpy as np
-from ou_monitor.offline.analyze import LevelResult
-from ou_monitor.records import FloatArray, Recording
+from ou_monitor.offline.levels import Segment
+from ou_monitor.records import Estimate, FloatArray, Recording
 from scipy.signal import welch
 
 _MIN_LENGTH = 32
@@ -17,9 +19,35 @@ _AVERAGES = 8
 _PER_DECADE = 40
 
 
-def level_spectrum(recording: Recording, level: LevelResult) -> tuple[FloatArray, FloatArray]:
+def _empty() -> FloatArray:
+    return np.zeros(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
     """
-    Return the one-sided PSD of a level (Welch, Hann), averaged over its segments.
+    One-sided power spectral density of a level.
+
+    Attributes
+    ----------
+    frequency : ndarray, shape (k,)
+        Hz, > 0, even on a log axis.
+    density : ndarray, shape (k,)
+        Measured, V^2/Hz.
+    fitted : ndarray, shape (k,)
+        Of the fitted OU in white noise, sampled as the data are, V^2/Hz; NaN without a fit.
+
+    """
+
+    frequency: FloatArray = field(default_factory=_empty)
+    density: FloatArray = field(default_factory=_empty)
+    fitted: FloatArray = field(default_factory=_empty)
+
+
+def level_spectrum(recording: Recording, segments: Sequence[Segment],
+                   estimate: Estimate) -> Spectrum:
+    """
+    Return the PSD of a level (Welch, Hann), averaged over its segments.
 
     Limits: the samples are taken as evenly spaced at their mean rate; where
     they are not, frequencies near the Nyquist frequency are smeared.
@@ -28,26 +56,26 @@ def level_spectrum(recording: Recording, level: LevelResult) -> tuple[FloatArray
     ----------
     recording : Recording
         What the level is of.
-    level : LevelResult
-        Level.
+    segments : sequence of Segment
+        Its stretches.
+    estimate : Estimate
+        Pooled over them; the curve of the fit is of it.
 
     Returns
     -------
-    tuple of ndarray, shape (k,)
-        Frequency, Hz, > 0, and PSD, V^2/Hz; empty when no segment holds 32
-        samples.
+    Spectrum
+        Empty when no segment holds 32 samples.
 
     """
-    longest = max((s.stop - s.start for s in level.segments), default=0)
-    if longest < _MIN_LENGTH or not level.time > 0.0:
-        return np.zeros(0), np.zeros(0)
-    total = sum(s.stop - s.start for s in level.segments)
-    rate = (total - len(level.segments)) / level.time
+    longest = max((s.stop - s.start for s in segments), default=0)
+    rate = segment_rate(recording, segments)
+    if longest < _MIN_LENGTH or not rate > 0.0:
+        return Spectrum()
     length = longest
-    while length > _MIN_LENGTH and _pieces(level, length) < _AVERAGES:
+    while length > _MIN_LENGTH and _pieces(segments, length) < _AVERAGES:
         length = max(_MIN_LENGTH, length * 4 // 5)
     frequency, summed, weight = np.zeros(0), np.zeros(length // 2 + 1), 0
-    for s in level.segments:
+    for s in segments:
         n = s.stop - s.start
         if n >= length:
             frequency, density = welch(recording.voltage[s.start:s.stop], fs=rate,
@@ -55,12 +83,23 @@ def level_spectrum(recording: Recording, level: LevelResult) -> tuple[FloatArray
             summed, weight = summed + n * density, weight + n
     # The first bin above zero is what removing the mean has left; the last,
     # at the Nyquist frequency, is not doubled as the others are.
-    return _even_on_log(frequency[2:-1], summed[2:-1] / weight)
+    frequency, density = _even_on_log(frequency[2:-1], summed[2:-1] / weight)
+    fitted = np.full(frequency.size, math.nan)
+    if estimate.usable:
+        fitted = ou_spectrum(frequency, estimate.alpha, estimate.sigma, rate, estimate.noise_std)
+    return Spectrum(frequency, density, fitted)
 
 
-def _pieces(level: LevelResult, length: int) -> int:
+def segment_rate(recording: Recording, segments: Sequence[Segment]) -> float:
+    """Return the mean rate of the samples within segments, Hz; 0 when there is no time."""
+    steps = sum(s.stop - s.start - 1 for s in segments)
+    time = float(sum(recording.t[s.stop - 1] - recording.t[s.start] for s in segments))
+    return steps / time if time > 0.0 else 0.0
+
+
+def _pieces(segments: Sequence[Segment], length: int) -> int:
     """Return how many half-overlapping pieces of that length the segments hold."""
-    return sum(max(0, 2 * (s.stop - s.start) // length - 1) for s in level.segments)
+    return sum(max(0, 2 * (s.stop - s.start) // length - 1) for s in segments)
 
 
 def _even_on_log(frequency: FloatArray, density: FloatArray) -> tuple[FloatArray, FloatArray]:

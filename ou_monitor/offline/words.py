@@ -1,16 +1,15 @@
-"""An analysis in words and in plain data: headline, status lines, JSON."""
+"""An analysis in words: headline, cautions, sentences of its parts."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
-from ou_monitor.offline.analyze import Analysis, LevelResult
-from ou_monitor.records import Estimate, Status
+import numpy as np
 
-NOISE_UNKNOWN = (
-    'White noise of the sensor is not told from the supply here: where there is some, alpha '
-    'and sigma come out too high (Var_inf does not).')
+from ou_monitor.offline.analysis.quality_list import QualityItem, Severity
+from ou_monitor.offline.analyze import Analysis
+from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.records import Estimate, NAN, Status
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -60,8 +59,7 @@ def headline(analysis: Analysis) -> str:
     good = ([level for level in analysis.levels if level.estimate.status is Status.OK]
             or [level for level in analysis.levels if level.estimate.usable])
     if not good:
-        return ('No load level of this recording can be fitted: see the status of each level '
-                'for the reason.')
+        return 'No load level of this recording can be fitted: the notes on quality say why.'
     low, high = good[0], good[-1]
     if len(good) == 1:
         e = low.estimate
@@ -96,7 +94,7 @@ def _tau(e: Estimate) -> str:
     return f'{number(1e3 / e.alpha)} (95 % {number(1e3 / high)} to {number(1e3 / low)})'
 
 
-def cautions(analysis: Analysis) -> list[str]:
+def cautions(analysis: Analysis, least: Severity = Severity.INFO) -> list[str]:
     """
     Return what to know before using the numbers.
 
@@ -104,29 +102,27 @@ def cautions(analysis: Analysis) -> list[str]:
     ----------
     analysis : Analysis
         Result.
+    least : Severity
+        What matters less is left out.
 
     Returns
     -------
     list of str
-        Sentences (status unless it is good, flags, notes), each led by the
-        levels it is true of.
+        Sentences, worst first, each led by the levels it is true of.
 
     """
-    where: dict[str, list[str]] = {}
-    for level in analysis.levels:
-        status = level.estimate.status
-        for text in [*([] if status is Status.OK else [status.value]),
-                     *[flag.value for flag in level.estimate.flags], *level.notes]:
-            where.setdefault(text, []).append(level.label)
-        # Measured at 20 mV of noise beside 56 mV of OU, 1 kHz: alpha +194 %.
-        if level.estimate.usable and math.isnan(level.estimate.noise_std):
-            where.setdefault(NOISE_UNKNOWN, []).append(level.label)
-    return [f'{", ".join(labels)}: {text}' for text, labels in where.items()]
+    return [caution(item) for item in analysis.quality if item.severity >= least]
 
 
-def as_data(analysis: Analysis) -> dict[str, Any]:
+def caution(item: QualityItem) -> str:
+    """Return one sentence, led by the levels it is true of."""
+    labels = ['all' if math.isnan(x) else f'{100.0 * x:.3g} %' for x in item.throttles]
+    return f'{", ".join(labels)}: {item.text}' if labels else item.text
+
+
+def brownout_sentence(analysis: Analysis) -> str:
     """
-    Return an analysis as plain data; NaN stands for unknown.
+    Return what the risk is of, and the throttle budget.
 
     Parameters
     ----------
@@ -135,63 +131,59 @@ def as_data(analysis: Analysis) -> dict[str, Any]:
 
     Returns
     -------
-    dict
-        Keys ``recording``, ``n``, ``duration_s``, ``rate_hz``, ``source``,
-        ``headline``, ``levels``, ``sliding``, ``notes``.  SI units throughout;
-        ``<name>_se`` is the standard error of the logarithm, except
-        ``u0_se`` (V); ``<name>_ci95`` is ``[low, high]``.
+    str
+        Two sentences.
 
     """
-    recording = analysis.recording
-    sliding = analysis.sliding
-    duration = recording.duration
-    return {
-        'recording': recording.name,
-        'n': recording.n,
-        'duration_s': duration,
-        'rate_hz': (recording.n - 1) / duration if duration > 0.0 else math.nan,
-        'source': dict(recording.source),
-        'headline': headline(analysis),
-        'levels': [_level(level) for level in analysis.levels],
-        'sliding': {
-            'window_s': sliding.window,
-            't': sliding.t,
-            **{name: sliding.series(name) for name in (
-                'alpha', 'alpha_se', 'sigma', 'sigma_se', 'var_inf', 'var_inf_se', 'u0')},
-            'status': [e.status.name for e in sliding.estimates],
-            'brownout_voltage': sliding.brownout_voltage,
-            'brownout_horizon_s': sliding.brownout_horizon,
-            'brownout_risk': sliding.risk,
-        },
-        'notes': list(analysis.notes),
-    }
+    curves = analysis.by_throttle
+    if math.isnan(curves.voltage) and analysis.brownout_default:
+        middle = float(np.median(analysis.recording.voltage)) if analysis.recording.n else NAN
+        return (f"No brown-out risk: the node's default of {MonitorSettings().brownout_voltage:g} "
+                f'V is for a 5 V rail, and this supply is at {number(middle)} V; '
+                '--brownout-voltage sets another.')
+    if math.isnan(curves.voltage):
+        return 'No voltage was given that must not be undershot.'
+    which = ("the node's default for a 5 V rail; --brownout-voltage sets another"
+             if analysis.brownout_default else 'as asked for')
+    text = (f'Brown-out: going below {curves.voltage:g} V ({which}) within '
+            f'{curves.horizon:g} s, with the supply as it was at the end of the recording.')
+    if math.isnan(curves.budget):
+        return f'{text} Throttle budget unknown: {curves.budget_reason}'
+    return (f'{text} Throttle budget for a risk of {curves.limit:g}: '
+            f'{100.0 * curves.budget:.3g} %. {curves.budget_reason}')
 
 
-def _level(level: LevelResult) -> dict[str, Any]:
-    e = level.estimate
-    alpha_low, alpha_high = e.interval('alpha')
-    return {
-        'throttle': level.throttle,
-        'segments': len(level.segments),
-        'time_s': level.time,
-        'n': level.n,
-        'mean': level.mean,
-        'vpp': level.vpp,
-        'peak': level.peak,
-        'vrms': level.vrms,
-        'crest': level.crest,
-        'alpha': e.alpha, 'alpha_se': e.alpha_se, 'alpha_ci95': [alpha_low, alpha_high],
-        'tau': e.tau, 'tau_se': e.alpha_se, 'tau_ci95': [1.0 / alpha_high, 1.0 / alpha_low],
-        'sigma': e.sigma, 'sigma_se': e.sigma_se, 'sigma_ci95': list(e.interval('sigma')),
-        'var_inf': e.var_inf, 'var_inf_se': e.var_inf_se,
-        'var_inf_ci95': list(e.interval('var_inf')),
-        'u0': e.u0, 'u0_se': e.u0_se,
-        'noise_std': e.noise_std,
-        'excess_kurtosis': level.kurtosis, 'excess_kurtosis_se': level.kurtosis_se,
-        'process_type': level.kind.value,
-        'process_reason': level.reason,
-        'status': e.status.name,
-        'status_text': e.status.value,
-        'flags': [{'name': flag.name, 'text': flag.value} for flag in e.flags],
-        'notes': list(level.notes),
-    }
+def relaxation_sentence(analysis: Analysis, k: int) -> str:
+    """
+    Return what follows falls (k = 0) or rises (k = 1) of throttle.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        Result.
+    k : int
+        Number of the relaxation.
+
+    Returns
+    -------
+    str
+        One to three sentences.
+
+    """
+    fit, cause = analysis.relaxations[k], analysis.causes[k]
+    if not fit.seen:
+        return cause.sentence
+    count = len(fit.releases)
+    what = {'release': 'fall', 'load': 'rise'}[fit.kind]
+    return (f'After {count} {what}{"s" if count > 1 else ""} of throttle the voltage relaxes in '
+            f'tau = {number(1e3 * fit.tau)} (95 % {open_end(1e3 * fit.tau_low)} to '
+            f'{open_end(1e3 * fit.tau_high)}) ms. {_led(fit.caveat)}{cause.sentence}')
+
+
+def _led(text: str) -> str:
+    return f'{text} ' if text else ''
+
+
+def open_end(value: float) -> str:
+    """Return one end of an interval; ``open`` where the data leave it so."""
+    return number(value) if 0.0 < value < math.inf else 'open'

@@ -1,33 +1,25 @@
 """
-MCAP bags: the only module that imports mcap.
+MCAP bags: written here by `BagWriter`, read by `BagReader`.
 
-`BagReader` reads an .mcap file or a rosbag2 directory without loading it into
-memory; `BagWriter` writes either.  A bag that is cut off or damaged is refused
-with the byte where the trouble begins, or, when asked, read as far as it holds.
+This module and `bag_reader.py` are the only ones that import mcap; all others
+take both classes from here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-import io
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any
 
-from mcap.data_stream import ReadDataStream
-from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, Schema
-from mcap.stream_reader import get_chunk_data_stream
-from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
-from mcap_ros2.decoder import DecoderFactory
-from ou_monitor.errors import InputError, nearest
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.bag_reader import BagReader, DecodedMessage
 from ou_monitor.recordings.bag_target import BagTarget
-from ou_monitor.recordings.mcap_file import (
-    in_time_order, McapFile, RawMessage, SAMPLE_RATE)
-from ou_monitor.recordings.rosbag2_metadata import (
-    find_files, parse_qos, qos_profile, TopicInfo)
+from ou_monitor.recordings.mcap_file import RawMessage
+from ou_monitor.recordings.mcap_index import ABOUT, ORIGIN, SAMPLE_RATE
+from ou_monitor.recordings.rosbag2_metadata import qos_profile, TopicInfo
 from ou_monitor.recordings.schemas import SCHEMAS, TYPE_HASHES
 import yaml
 
@@ -36,209 +28,6 @@ __all__ = ['BagReader', 'BagWriter', 'DecodedMessage', 'RawMessage', 'TopicInfo'
 # Small chunks: a recording cut off by the brown-out it was made for loses what
 # is in the last one, here about a second at 1 kHz.
 CHUNK_SIZE = 128 * 1024  # bytes
-
-
-class DecodedMessage(NamedTuple):
-    """One message with its fields as attributes."""
-
-    topic: str
-    type: str  # noqa: A003
-    log_time_ns: int
-    message: Any
-
-
-class _LibraryCodec:
-    """Contents of records as the MCAP library reads them."""
-
-    def unpack(self, chunk: bytes) -> bytes:
-        """Return the records in a chunk, its checksum verified."""
-        record = Chunk.read(ReadDataStream(io.BytesIO(chunk)))
-        stream, length = get_chunk_data_stream(record, validate_crc=True)
-        return bytes(stream.read(length))
-
-    def schema(self, content: bytes) -> Schema:
-        """Return a schema."""
-        record: Schema = Schema.read(ReadDataStream(io.BytesIO(content)))
-        return record
-
-    def channel(self, content: bytes) -> Channel:
-        """Return a channel."""
-        record: Channel = Channel.read(ReadDataStream(io.BytesIO(content)))
-        return record
-
-    def summary(self, file: BinaryIO) -> Summary | None:
-        """Return the summary section."""
-        return make_reader(file).get_summary()
-
-
-class BagReader:
-    """
-    Reads a bag: an .mcap file or a rosbag2 directory.
-
-    Parameters
-    ----------
-    path : str or path
-        File or directory.
-    partial : bool
-        Whether a damaged bag is read as far as it holds (`damage` then says
-        what is wrong).
-
-    Attributes
-    ----------
-    topics : dict of str to str
-        Topic -> message type.
-    info : dict of str to TopicInfo
-        Topic -> type, number of messages, QoS.
-    sample_rates : dict of str to float
-        Topic -> rate of the samples within its blocks, Hz, where the bag
-        states it (those written here do).
-    start_ns, end_ns : int
-        Log times of the first and last message, ns.
-    message_count : int
-        Messages of all topics.
-    damage : str or None
-        Where and how the bag is damaged.
-    notes : tuple of str
-        Topics left out, and the like.
-
-    Raises
-    ------
-    InputError
-        When the bag is missing, empty, foreign, holds no messages, or is
-        damaged and not `partial`.
-
-    """
-
-    def __init__(self, path: Path | str, *, partial: bool = False) -> None:
-        """Index the bag; messages are read later."""
-        self.path = Path(path)
-        paths, qos, missing = find_files(self.path, partial)
-        self._files = [McapFile(file, partial, _LibraryCodec()) for file in paths]
-        damages = [f'{file.path.name} is damaged {file.damage}'
-                   for file in self._files if file.damage is not None]
-        self.damage = '; '.join(([missing] if missing else []) + damages) or None
-        self.info: dict[str, TopicInfo] = {}
-        self.sample_rates: dict[str, float] = {}
-        self._schemas: dict[str, Schema] = {}
-        for file in self._files:
-            for key, topic in file.topics.items():
-                if topic.sample_rate is not None:
-                    self.sample_rates[topic.name] = topic.sample_rate
-                known = self.info.get(topic.name)
-                if known is None:
-                    reliability, durability, depth = parse_qos(qos.get(topic.name) or topic.qos)
-                    known = TopicInfo(topic.name, topic.type, 0, reliability, durability, depth)
-                    self._schemas[topic.type] = topic.schema
-                if known.type != topic.type:
-                    raise InputError(f"{self.path}: topic '{topic.name}' has two types, "
-                                     f'{known.type} and {topic.type}')
-                self.info[topic.name] = replace(
-                    known, count=known.count + file.counts.get(key, 0))
-        self.notes = tuple(dict.fromkeys(note for file in self._files for note in file.notes))
-        self.topics = {name: info.type for name, info in self.info.items()}
-        self.message_count = sum(info.count for info in self.info.values())
-        if self.message_count == 0:
-            why = self.damage or ' '.join(self.notes) or (
-                'topics: ' + (', '.join(self.topics) or 'none'))
-            raise InputError(f'{self.path} holds no messages ({why})')
-        held = [file for file in self._files if file.spans]
-        self.start_ns = min(file.start_ns for file in held)
-        self.end_ns = max(file.end_ns for file in held)
-
-    def __enter__(self) -> BagReader:
-        """Return itself; no file stays open between reads."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Do nothing: no file stays open between reads."""
-
-    def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
-        """
-        Yield the messages in the order of their log times.
-
-        Parameters
-        ----------
-        topics : iterable of str, optional
-            Topics wanted; all when left out.
-
-        Yields
-        ------
-        RawMessage
-            Topic, type, log time (ns) and CDR bytes.
-
-        Raises
-        ------
-        InputError
-            For a topic that is not in the bag, or at a broken chunk.
-
-        """
-        yield from in_time_order(self._files, self._wanted(topics))
-
-    def decoded(self, topics: Iterable[str] | None = None) -> Iterator[DecodedMessage]:
-        """
-        Yield the messages with their fields as attributes, in log-time order.
-
-        Parameters
-        ----------
-        topics : iterable of str, optional
-            Topics wanted; all when left out.
-
-        Yields
-        ------
-        DecodedMessage
-            Topic, type, log time (ns) and message object.
-
-        Raises
-        ------
-        InputError
-            As `raw_messages`, and for a message that does not fit its type.
-
-        """
-        decoders: dict[str, Callable[[bytes], Any]] = {}
-        for topic, kind, log_time, data in self.raw_messages(topics):
-            if kind not in decoders:
-                decoders[kind] = self.decoder(kind)
-            yield DecodedMessage(topic, kind, log_time, decoders[kind](data))
-
-    def decoder(self, kind: str) -> Callable[[bytes], Any]:
-        """
-        Return the function from CDR bytes to a message of one type in the bag.
-
-        Parameters
-        ----------
-        kind : str
-            Message type.
-
-        Returns
-        -------
-        callable
-            Raises InputError for bytes that do not fit the type.
-
-        """
-        def complain(error: Exception) -> InputError:
-            return InputError(f'{self.path}: a message of type {kind} cannot be decoded '
-                              f'({type(error).__name__}: {error})')
-        try:
-            decode = DecoderFactory().decoder_for('cdr', self._schemas[kind])
-        except Exception as error:
-            raise complain(error) from error
-        if decode is None:
-            raise InputError(f'{self.path}: type {kind} has no ros2msg definition')
-
-        def checked(data: bytes) -> Any:
-            try:
-                return decode(data)
-            except Exception as error:
-                raise complain(error) from error
-        return checked
-
-    def _wanted(self, topics: Iterable[str] | None) -> set[str]:
-        wanted = set(self.topics if topics is None else topics)
-        for topic in sorted(wanted):
-            if topic not in self.topics:
-                raise InputError(f"{self.path}: no topic '{topic}': "
-                                 f'{nearest(topic, self.topics)}')
-        return wanted
 
 
 class BagWriter:
@@ -252,6 +41,9 @@ class BagWriter:
     ----------
     path : str or path
         Target; must not exist, its folder must.
+    about : mapping of str to str, optional
+        Where the data came from; kept in a metadata record of the file, and
+        in the custom data of metadata.yaml.
 
     Raises
     ------
@@ -260,8 +52,9 @@ class BagWriter:
 
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, *, about: Mapping[str, str] | None = None) -> None:
         """Open the target."""
+        self._about = dict(about or {})
         self.path = Path(path)
         self._target = BagTarget(self.path)
         self._topics: dict[str, TopicInfo] = {}
@@ -274,11 +67,13 @@ class BagWriter:
         self._end_ns = 0
         self._writer = Writer(self._target.file, CHUNK_SIZE, CompressionType.ZSTD)
         self._writer.start(profile='ros2', library='ou_monitor')
+        if self._about:
+            self._writer.add_metadata(ABOUT, self._about)
 
     def add_topic(
         self, name: str, type: str, *,  # noqa: A002
         schema: str | None = None, reliability: str = 'reliable',
-        sample_rate: float | None = None,
+        sample_rate: float | None = None, origin: Mapping[str, str] | None = None,
     ) -> str:
         """
         Announce a topic.
@@ -296,6 +91,9 @@ class BagWriter:
         sample_rate : float, optional
             Rate of the samples within a block, Hz; kept in the channel's
             metadata, where `BagReader` finds it.
+        origin : mapping of str to str, optional
+            Where the values came from; kept there as well, see
+            `BagReader.origins`.
 
         Returns
         -------
@@ -323,6 +121,7 @@ class BagWriter:
                     'topic_type_hash': TYPE_HASHES.get(type, '')}
         if sample_rate is not None:
             metadata[SAMPLE_RATE] = repr(float(sample_rate))
+        metadata |= {ORIGIN + key: value for key, value in (origin or {}).items()}
         self._channels[topic] = self._writer.register_channel(
             topic, 'cdr', self._schemas[type], metadata)
         self._counts[topic] = 0
@@ -392,7 +191,7 @@ class BagWriter:
             finish()
             self._target.finish(
                 [replace(info, count=self._counts[name]) for name, info in self._topics.items()],
-                TYPE_HASHES, self._start_ns or 0, self._end_ns)
+                TYPE_HASHES, self._start_ns or 0, self._end_ns, self._about)
         except OSError as error:
             self._target.remove()
             raise InputError(f'cannot write {self.path}: {error.strerror}') from error

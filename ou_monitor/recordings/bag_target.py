@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 import shutil
 from typing import BinaryIO
@@ -51,15 +52,19 @@ class BagTarget:
 
     def finish(
         self, topics: Iterable[TopicInfo], hashes: dict[str, str], start_ns: int, end_ns: int,
+        custom: Mapping[str, str] | None = None,
     ) -> None:
         """Close the file and, in a directory, write its metadata.yaml."""
         self.file.close()
         if self._folder is not None:
-            write_metadata(self._folder, self._mcap.name, topics, hashes, start_ns, end_ns)
+            write_metadata(self._folder, self._mcap.name, topics, hashes, start_ns, end_ns,
+                           custom)
 
     def remove(self) -> None:
         """Take away what was written; it was made by this object and by no other."""
-        self.file.close()
+        # On a full disk closing fails as well: what is still in the buffer has no place.
+        with suppress(OSError):
+            self.file.close()
         if self._folder is not None:
             shutil.rmtree(self._folder)
         else:

@@ -78,16 +78,75 @@ def read_column(path: Path, name: str) -> tuple[FloatArray, FloatArray]:
     return columns[0], columns[1]
 
 
+def column_names(path: Path, needed: str) -> list[str]:
+    """
+    Return the names of the columns of a CSV.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        File.
+    needed : str
+        A column that must be there.
+
+    Returns
+    -------
+    list of str
+        As in the header, from left to right.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, or the column is missing.
+
+    """
+    try:
+        with path.open(encoding='utf-8-sig', newline='') as file:
+            lines = _Lines(file)
+            return _header(path, lines, next(iter(lines), None), (needed,))[0]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise _unreadable(path, error) from error
+
+
+def read_columns(path: Path, names: Sequence[str]) -> list[FloatArray]:
+    """
+    Return columns of a CSV as they stand, NaN kept.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        File.
+    names : sequence of str
+        Columns; each must be there.
+
+    Returns
+    -------
+    list of ndarray, each of shape (n,)
+        Values.
+
+    Raises
+    ------
+    InputError
+        As `read_csv`.
+
+    """
+    return _columns(path, names, ())
+
+
 def _columns(path: Path, needed: Sequence[str], optional: Sequence[str]) -> list[FloatArray]:
     try:
         with path.open(encoding='utf-8-sig', newline='') as file:
             return _read(path, file, needed, optional)
-    except OSError as error:
-        raise InputError(f'cannot read {path}: {error.strerror}') from error
-    except UnicodeDecodeError as error:
-        raise InputError(f'{path} is not text (byte {error.start} is not UTF-8)') from error
-    except csv.Error as error:
-        raise InputError(f'{path} is not a CSV: {error}') from error
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    if isinstance(error, OSError):
+        return InputError(f'cannot read {path}: {error.strerror}')
+    if isinstance(error, UnicodeDecodeError):
+        return InputError(f'{path} is not text (byte {error.start} is not UTF-8)')
+    return InputError(f'{path} is not a CSV: {error}')
 
 
 class _Lines:
@@ -109,15 +168,7 @@ def _read(path: Path, file: Iterator[str], needed: Sequence[str], optional: Sequ
           ) -> list[FloatArray]:
     lines = _Lines(file)
     texts = iter(lines)
-    first = next(texts, None)
-    if first is None:
-        raise InputError(f'{path} is empty: expected a header with {TIME},{VOLTAGE}[,{THROTTLE}]')
-    delimiter = ';' if first.count(';') > first.count(',') else ','
-    header = [name.strip() for name in next(csv.reader([first], delimiter=delimiter))]
-    for name in needed:
-        if name not in header:
-            raise InputError(
-                f"{path}:{lines.number}: no column '{name}': {_hint(name, header)}")
+    header, delimiter = _header(path, lines, next(texts, None), needed)
     for name in (*needed, *optional):
         if header.count(name) > 1:
             raise InputError(f"{path}:{lines.number}: column '{name}' is there twice")
@@ -130,6 +181,20 @@ def _read(path: Path, file: Iterator[str], needed: Sequence[str], optional: Sequ
     arrays = [np.array(column, dtype=np.float64) for column in columns]
     arrays += [np.full(arrays[0].shape, np.nan) for name in optional if name not in names]
     return arrays
+
+
+def _header(path: Path, lines: _Lines, first: str | None, needed: Sequence[str],
+            ) -> tuple[list[str], str]:
+    """Return the names in the first line, and what separates them."""
+    if first is None:
+        raise InputError(f'{path} is empty: expected a header with {TIME},{VOLTAGE}[,{THROTTLE}]')
+    delimiter = ';' if first.count(';') > first.count(',') else ','
+    header = [name.strip() for name in next(csv.reader([first], delimiter=delimiter))]
+    for name in needed:
+        if name not in header:
+            raise InputError(
+                f"{path}:{lines.number}: no column '{name}': {_hint(name, header)}")
+    return header, delimiter
 
 
 def _cell(row: list[str], place: int, name: str, path: Path, number: int) -> float:

@@ -11,8 +11,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 import enum
+from pathlib import Path
+import shlex
 import struct
 from typing import BinaryIO
+import zlib
 
 MAGIC = b'\x89MCAP0\r\n'
 RECORD_HEAD = struct.Struct('<BQ')
@@ -23,14 +26,34 @@ FOOTER_LENGTH = RECORD_HEAD.size + 20 + len(MAGIC)
 
 
 class Op(enum.IntEnum):
-    """Opcodes that matter here; others up to 0x0F, and from 0x80 on, are valid and skipped."""
+    """Opcodes of the specification; those from 0x80 on are private, and skipped."""
 
+    HEADER = 0x01
     FOOTER = 0x02
     SCHEMA = 0x03
     CHANNEL = 0x04
     MESSAGE = 0x05
     CHUNK = 0x06
+    MESSAGE_INDEX = 0x07
+    CHUNK_INDEX = 0x08
+    ATTACHMENT = 0x09
+    ATTACHMENT_INDEX = 0x0A
+    STATISTICS = 0x0B
+    METADATA = 0x0C
+    METADATA_INDEX = 0x0D
+    SUMMARY_OFFSET = 0x0E
     DATA_END = 0x0F
+
+
+PRIVATE = 0x80
+
+# Which records may stand before the end of the data, and which after it.  A
+# message whose opcode was hit by a wrong bit must not be skipped as something else.
+_IN_DATA = {Op.HEADER, Op.SCHEMA, Op.CHANNEL, Op.MESSAGE, Op.CHUNK, Op.MESSAGE_INDEX,
+            Op.ATTACHMENT, Op.METADATA, Op.DATA_END, Op.FOOTER}
+_IN_SUMMARY = {Op.SCHEMA, Op.CHANNEL, Op.CHUNK_INDEX, Op.ATTACHMENT_INDEX, Op.STATISTICS,
+               Op.METADATA_INDEX, Op.SUMMARY_OFFSET, Op.FOOTER}
+_LENGTHS = {Op.DATA_END: 4, Op.FOOTER: 20}
 
 
 class Damage(Exception):
@@ -40,6 +63,7 @@ class Damage(Exception):
         """Keep the byte offset and the reason."""
         super().__init__(f'at byte {offset}: {why}')
         self.offset = offset
+        self.why = why
 
 
 @dataclass(frozen=True)
@@ -76,6 +100,8 @@ class Span:
         Which of the two.
     channels : frozenset of int or None
         Channels that have messages in it; None when not known.
+    index_length : int
+        Bytes of message indexes right after the chunk.
 
     """
 
@@ -85,49 +111,88 @@ class Span:
     length: int
     chunk: bool
     channels: frozenset[int] | None = None
+    index_length: int = 0
 
 
-def walk(file: BinaryIO, start: int, size: int) -> Iterator[Record]:
+def record_at(file: BinaryIO, offset: int, size: int, in_data: bool) -> Record:
     """
-    Yield the records of a file one after another, the footer last.
+    Return the record at an offset.
 
     Parameters
     ----------
     file : binary file
-        Seekable; only the heads of records are read.
-    start : int
-        Offset of the first record.
+        Seekable; only the head of the record is read.
+    offset : int
+        Of its opcode.
     size : int
         Size of the file, bytes.
+    in_data : bool
+        Whether the end of the data is still to come.
 
-    Yields
-    ------
+    Returns
+    -------
     Record
-        Every whole record.
+        A whole record.
 
     Raises
     ------
     Damage
-        When the file ends before its footer, or a record cannot be one.
+        When the file ends there, or what is there cannot be a record.
 
     """
-    offset = start
-    while True:
-        file.seek(offset)
-        head = file.read(RECORD_HEAD.size)
-        if len(head) < RECORD_HEAD.size:
-            raise Damage(offset, 'the file ends without a footer')
-        opcode, length = RECORD_HEAD.unpack(head)
-        record = Record(offset, opcode, length)
-        if opcode == 0 or Op.DATA_END < opcode < 0x80:
-            raise Damage(offset, f'no record begins with 0x{opcode:02x}')
-        if record.end > size:
-            raise Damage(offset, f'a record of {length} bytes is cut off after '
-                         f'{size - record.content}')
-        yield record
-        if opcode == Op.FOOTER:
-            return
-        offset = record.end
+    file.seek(offset)
+    head = file.read(RECORD_HEAD.size)
+    if len(head) < RECORD_HEAD.size:
+        raise Damage(offset, 'the file ends without a footer')
+    opcode, length = RECORD_HEAD.unpack(head)
+    record = Record(offset, opcode, length)
+    if opcode == 0 or Op.DATA_END < opcode < PRIVATE:
+        raise Damage(offset, f'no record begins with 0x{opcode:02x}')
+    if record.end > size:
+        raise Damage(offset, f'a record of {length} bytes is cut off after '
+                     f'{size - record.content}')
+    if opcode < PRIVATE and (
+            opcode not in (_IN_DATA if in_data else _IN_SUMMARY)
+            or (opcode == Op.HEADER and offset != len(MAGIC))
+            or length != _LENGTHS.get(Op(opcode), length)):
+        raise Damage(offset, f'a record 0x{opcode:02x} of {length} bytes does not belong there')
+    return record
+
+
+def check_passed_over(file: BinaryIO, record: Record) -> None:
+    """
+    Check that a record that is not needed is what its opcode says.
+
+    Parameters
+    ----------
+    file : binary file
+        Seekable.
+    record : Record
+        A message index, an attachment or metadata; others pass.
+
+    Raises
+    ------
+    Damage
+        When its content cannot be such a record.
+
+    """
+    if record.opcode not in (Op.MESSAGE_INDEX, Op.ATTACHMENT, Op.METADATA):
+        return
+    file.seek(record.content)
+    content = file.read(record.length)
+    if record.opcode == Op.MESSAGE_INDEX:
+        fits = len(content) >= 6 and (len(content) - 6) % 16 == 0 and (
+            int.from_bytes(content[2:6], 'little') == len(content) - 6)
+    elif record.opcode == Op.ATTACHMENT:
+        stated = int.from_bytes(content[-4:], 'little')
+        fits = len(content) >= 36 and stated in (0, zlib.crc32(content[:-4]))
+    else:
+        name = int.from_bytes(content[:4], 'little')
+        rest = content[4 + name:]
+        fits = len(rest) >= 4 and int.from_bytes(rest[:4], 'little') == len(rest) - 4
+    if not fits:
+        raise Damage(record.offset, f'a record 0x{record.opcode:02x} of {record.length} bytes '
+                     'does not hold what it should')
 
 
 def inner_records(data: bytes) -> Iterator[tuple[int, int, int]]:
@@ -155,7 +220,13 @@ def inner_records(data: bytes) -> Iterator[tuple[int, int, int]]:
         yield opcode, begin, at
 
 
-def kind_of_foreign(head: bytes) -> str:
+# First bytes of the logs that `ou-monitor convert` reads; CSV is read as it is.
+_LOGS = (
+    (b'ULog', 'a PX4 ULog'), (b'\xa3\x95\x80', 'an ArduPilot dataflash log'),
+    (b'FMT,', 'an ArduPilot log'), (b'H Product:Blackbox', 'a blackbox log'))
+
+
+def kind_of_foreign(head: bytes, path: Path = Path('LOG')) -> str:
     """Return what a file that is not MCAP seems to be, and what to do with it."""
     if head.startswith(b'SQLite format 3'):
         return ("it is an SQLite rosbag2 (.db3): convert it with 'ros2 bag convert' to the "
@@ -164,8 +235,10 @@ def kind_of_foreign(head: bytes) -> str:
         return "it is a ROS 1 bag: convert it with 'rosbags-convert'"
     if head.startswith(b'\x28\xb5\x2f\xfd'):
         return "it is compressed as a whole: unpack it with 'zstd -d' first"
-    if head.startswith(b'ULog'):
-        return 'it is a PX4 ULog'
+    for begin, log in _LOGS:
+        if head.startswith(begin):
+            command = shlex.join(['ou-monitor', 'convert', str(path), path.stem])
+            return f'it is {log}, not a recording: convert it first, with {command}'
     if head[:1] and all(byte in b'\t\n\r' or 32 <= byte < 127 for byte in head):
         return 'it is text'
     return 'its first bytes are ' + (head[:8].hex(' ') or 'missing')

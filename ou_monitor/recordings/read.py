@@ -7,35 +7,29 @@ for a clock that counts from 1970 resolves 0.24 us; more than that is not kept.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import islice
+import math
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from ou_monitor.errors import InputError
-from ou_monitor.messages.blocks import BlockClock
-from ou_monitor.messages.config import FieldSpec
-from ou_monitor.messages.extract import Extractor
-from ou_monitor.messages.throttle import hold_last
-from ou_monitor.recordings.bag import BagReader, RawMessage
-from ou_monitor.recordings.cdr import decode_block, decode_scalars, FLOAT32_ARRAY
+from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.csv_table import read_csv
-from ou_monitor.recordings.topic_choice import choose
+from ou_monitor.recordings.samples import (
+    check_throttle, dropped_words, late_words, overlap, part_words, repeated_words, SampleReader,
+    span_words, usable_voltage)
 from ou_monitor.records import FloatArray, Recording
 
-# Messages decoded at once: large enough for NumPy, small enough for memory.
-BATCH = 16384
-
-# Where the fields of the shortcut have their stamp.
-HEADER_STAMP = 'header.stamp'
+# Samples of a piece, where the caller does not say.
+PIECE = 1_000_000
 
 
 def read_recording(
     path: str | Path, *, msg_config: str | Path | None = None, voltage_topic: str | None = None,
-    throttle_topic: str | None = None, partial: bool = False,
+    throttle_topic: str | None = None, partial: bool = False, start: float | None = None,
+    end: float | None = None, progress: Callable[[float], None] | None = None,
 ) -> Recording:
     """
     Read a recording of a supply.
@@ -52,6 +46,13 @@ def read_recording(
         Topics, where the config's are not meant.
     partial : bool
         Whether a damaged bag is read as far as it holds; a note says so.
+    start, end : float, optional
+        Part to read, s after the first message of the bag (by log time) or
+        the first sample of the CSV: start <= t < end.  Of a bag only the
+        chunks in it are read, and those before it back to the last throttle,
+        which is held.
+    progress : callable, optional
+        Called with the share done, 0..1.
 
     Returns
     -------
@@ -67,14 +68,103 @@ def read_recording(
 
     """
     path = Path(path)
+    _check_part(start, end)
     if path.suffix.lower() == '.csv' and not path.is_dir():
         for name, value in (('--msg-config', msg_config), ('--voltage-topic', voltage_topic),
                             ('--throttle-topic', throttle_topic)):
             if value is not None:
                 raise InputError(f'{path} is a CSV: {name} is for bags')
-        t, voltage, throttle = read_csv(path)
-        return tidy(t, voltage, throttle, path.name, {'file': path.name, 'format': 'csv'}, [])
-    return _read_bag(BagReader(path, partial=partial), msg_config, voltage_topic, throttle_topic)
+        return _cut(tidy(*read_csv(path), path.name, {'file': path.name, 'format': 'csv'}, []),
+                    start, end)
+    reader = SampleReader(
+        BagReader(path, partial=partial), msg_config=msg_config, voltage_topic=voltage_topic,
+        throttle_topic=throttle_topic, start=start, end=end)
+    for _ in reader.batches(progress):
+        pass
+    whole = reader.take()
+    if not whole.n:
+        raise InputError(_nothing(reader, start, end))
+    return replace(whole, notes=(*reader.bag_notes(), *reader.sample_notes()))
+
+
+def read_pieces(
+    path: str | Path, *, samples: int = PIECE, msg_config: str | Path | None = None,
+    voltage_topic: str | None = None, throttle_topic: str | None = None, partial: bool = False,
+    start: float | None = None, end: float | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Iterator[Recording]:
+    """
+    Read a recording that need not fit into memory, piece by piece.
+
+    One after another the pieces are what `read_recording` returns, as long as
+    no sample comes more than `samples` samples late; one that does is dropped,
+    and a note of its piece says so.  A CSV is read whole all the same.
+
+    Parameters
+    ----------
+    path, msg_config, voltage_topic, throttle_topic, partial, start, end, progress :
+        As in `read_recording`.
+    samples : int
+        Samples of a piece; memory holds about twice as many, and the chunks
+        that overlap in time.
+
+    Yields
+    ------
+    Recording
+        Pieces in the order of time, each with its stamps after those of the
+        one before, and the throttle held from piece to piece.  Notes on the
+        bag are in the first piece, notes on all samples in the last.
+
+    Raises
+    ------
+    ValueError
+        When `samples` is not positive.
+    InputError
+        As `read_recording`.
+
+    """
+    if samples < 1:
+        raise ValueError(f'a piece must hold at least 1 sample, got {samples}')
+    path = Path(path)
+    if path.suffix.lower() == '.csv' and not path.is_dir():
+        whole = read_recording(path, msg_config=msg_config, voltage_topic=voltage_topic,
+                               throttle_topic=throttle_topic, start=start, end=end)
+        for first in range(0, whole.n, samples):
+            part = slice(first, first + samples)
+            yield Recording(whole.t[part], whole.voltage[part], whole.throttle[part], whole.name,
+                            whole.source, whole.notes if first == 0 else ())
+        return
+    _check_part(start, end)
+    reader = SampleReader(
+        BagReader(path, partial=partial), msg_config=msg_config, voltage_topic=voltage_topic,
+        throttle_topic=throttle_topic, start=start, end=end)
+    notes = reader.bag_notes()
+    # One piece is kept back, so that the last one can carry the notes on all.
+    ready: Recording | None = None
+    for piece in _taken(reader, samples, progress):
+        if ready is not None:
+            yield replace(ready, notes=notes)
+            notes = ()
+        ready = piece
+    if ready is None:
+        raise InputError(_nothing(reader, start, end))
+    yield replace(ready, notes=(*notes, *reader.sample_notes()))
+
+
+def _taken(
+    reader: SampleReader, samples: int, progress: Callable[[float], None] | None,
+) -> Iterator[Recording]:
+    """Yield pieces that hold something."""
+    for _ in reader.batches(progress):
+        # As many again stay held, for what comes late.
+        while reader.held >= 2 * samples:
+            piece = reader.take(samples)
+            if piece.n:
+                yield piece
+    while reader.held:
+        piece = reader.take(samples)
+        if piece.n:
+            yield piece
 
 
 def tidy(
@@ -106,140 +196,62 @@ def tidy(
         When no sample is left.
 
     """
-    total = t.size
-    good = np.isfinite(t) & np.isfinite(voltage)
+    check_throttle(name, throttle)
+    good = usable_voltage(t, voltage)
     if not good.all():
-        notes.append(f'{_samples(total - int(good.sum()))} dropped: not a finite number.')
+        notes.append(dropped_words(t.size - int(good.sum()), voltage[~good]))
         t, voltage, throttle = t[good], voltage[good], throttle[good]
     late = int(np.count_nonzero(np.diff(t) < 0.0))
     if late:
-        notes.append(f'{_samples(late)} came before the stamp ahead of them: sorted by stamp.')
+        notes.append(late_words(late, *overlap(t)))
         order = np.argsort(t, kind='stable')
         t, voltage, throttle = t[order], voltage[order], throttle[order]
     fresh = np.ones(t.size, dtype=bool)
     fresh[1:] = np.diff(t) > 0.0
     if not fresh.all():
-        notes.append(f'{_samples(t.size - int(fresh.sum()))} dropped: the stamp was there '
-                     'before; the first of each was kept.')
+        notes.append(repeated_words(t.size - int(fresh.sum())))
         t, voltage, throttle = t[fresh], voltage[fresh], throttle[fresh]
-    if not t.size:
-        why = ' '.join(note for note in notes if 'dropped' in note)
-        raise InputError(f'{name} holds no usable sample' + (f': {why}' if why else ''))
     throttle = np.where(np.isfinite(throttle), throttle, np.nan)
+    if not t.size:
+        raise InputError(_unusable(name, notes))
     return Recording(t, voltage, throttle, name, source, tuple(notes))
 
 
-def _samples(count: int) -> str:
-    return f'{count} sample' if count == 1 else f'{count} samples'
+def _unusable(name: str, notes: Sequence[str]) -> str:
+    why = ' '.join(note for note in notes if 'dropped' in note)
+    return f'{name} holds no usable sample' + (f': {why}' if why else '')
 
 
-def _read_bag(
-    bag: BagReader, msg_config: str | Path | None, voltage_topic: str | None,
-    throttle_topic: str | None,
-) -> Recording:
-    choice = choose(bag.path, bag.topics, msg_config=msg_config, voltage_topic=voltage_topic,
-                    throttle_topic=throttle_topic)
-    notes = [*bag.notes, *choice.notes]
-    if bag.damage is not None:
-        notes.append(f'The bag is damaged; what it still holds was read: {bag.damage}.')
-    spec = choice.voltage
-    stated = bag.sample_rates.get(spec.topic)
-    if spec.sample_rate is not None and stated is not None:
-        # The bag knows better than a config that is made for many.
-        spec = replace(spec, sample_rate=stated)
-    t, voltage = _series(bag, spec, 'voltage', notes)
-    throttle = np.full(t.shape, np.nan)
-    source = {
-        'file': bag.path.name, 'format': 'mcap', 'msg_config': choice.config.name,
-        'voltage_topic': choice.voltage.topic, 'voltage_type': choice.voltage.type}
-    if choice.throttle is not None:
-        source |= {'throttle_topic': choice.throttle.topic,
-                   'throttle_type': choice.throttle.type}
-        stamps, values = _series(bag, choice.throttle, 'throttle', notes)
-        stamps_known = np.isfinite(stamps)
-        stamps, values = stamps[stamps_known], values[stamps_known]
-        order = np.argsort(stamps, kind='stable')
-        # Stamps within a block are worked out, and may be a rounding short of a
-        # throttle that was meant to hold for that sample.
-        rate = spec.sample_rate
-        slack = 0.0 if rate is None else 0.1 / rate
-        throttle = hold_last(stamps[order], values[order], t + slack)
-    return tidy(t, voltage, throttle, bag.path.name, source, notes)
+def _nothing(reader: SampleReader, start: float | None, end: float | None) -> str:
+    """Return why a bag gave no sample."""
+    notes = reader.sample_notes()
+    if (start is None and end is None) or any('dropped' in note for note in notes):
+        return _unusable(reader.name, notes)
+    return _outside(reader.name, start, end, reader.duration)
 
 
-def _series(
-    bag: BagReader, spec: FieldSpec, what: str, notes: list[str],
-) -> tuple[FloatArray, FloatArray]:
-    """Return stamps (s) and values of one topic, in log-time order."""
-    extractor = Extractor(spec)
-    clock = None if spec.sample_rate is None else BlockClock(spec.sample_rate)
-    stamps: list[FloatArray] = [np.empty(0)]
-    values: list[FloatArray] = [np.empty(0)]
-    missing = 0
-    messages = bag.raw_messages([spec.topic])
-    while batch := list(islice(messages, BATCH)):
-        found = None if clock else _scalars(batch, spec)
-        if found is None:
-            for end, block, lost in _general(bag, batch, extractor):
-                missing += lost
-                values.append(block)
-                stamps.append(np.full(block.size, end) if clock is None
-                              else clock.stamps(end, block.size))
-            continue
-        ends, block = found
-        if spec.nan == 'drop':
-            finite = np.isfinite(block)
-            missing += block.size - int(finite.sum())
-            ends, block = ends[finite], block[finite]
-        stamps.append(ends)
-        values.append(block)
-    if missing and what == 'throttle':
-        notes.append(f'{missing} throttle value{"s" * (missing != 1)} dropped: not a finite '
-                     'number.')
-    elif missing and clock is None and spec.nan == 'drop':
-        notes.append(f'{_samples(missing)} dropped: not a finite number.')
-    if clock is not None and clock.gaps:
-        notes.append(f'{clock.gaps} gap{"s" * (clock.gaps != 1)} between blocks of samples.')
-    return np.concatenate(stamps), np.concatenate(values)
+def _check_part(start: float | None, end: float | None) -> None:
+    """Refuse a part that cannot hold anything."""
+    for name, value in (('start', start), ('end', end)):
+        if value is not None and not (math.isfinite(value) and value >= 0.0):
+            raise InputError(f'the {name} of the part to read must be 0 s or later, got {value} s')
+    if end is not None and end <= (start or 0.0):
+        raise InputError(f'the part to read ends at {end:g} s, not after its start at '
+                         f'{start or 0.0:g} s')
 
 
-def _seconds(stamps_ns: npt.NDArray[np.int64]) -> FloatArray:
-    """Return ns as s; whole seconds apart, for an epoch in ns does not fit a float64."""
-    return stamps_ns // 1_000_000_000 + (stamps_ns % 1_000_000_000) * 1e-9
+def _cut(recording: Recording, start: float | None, end: float | None) -> Recording:
+    """Return the samples in a part, s after the first one."""
+    if start is None and end is None:
+        return recording
+    t = recording.t - recording.t[0]
+    part = (t >= (start or 0.0)) & (t < (math.inf if end is None else end))
+    if not part.any():
+        raise InputError(_outside(recording.name, start, end, float(t[-1])))
+    return replace(recording, t=recording.t[part], voltage=recording.voltage[part],
+                   throttle=recording.throttle[part],
+                   notes=(*recording.notes, part_words(start, end)))
 
 
-def _scalars(batch: Sequence[RawMessage], spec: FieldSpec) -> tuple[FloatArray, FloatArray] | None:
-    """Decode a batch of a standard type at once; None when that cannot be done."""
-    if spec.stamp_field not in (None, HEADER_STAMP):
-        return None
-    found = decode_scalars(spec.type, spec.field, [message.data for message in batch])
-    if found is None:
-        return None
-    own, raw = found
-    stamps = np.array([message.log_time_ns for message in batch], dtype=np.int64)
-    if spec.stamp_field is not None:
-        if own is None:
-            return None
-        stamps = np.where(own != 0, own, stamps)
-    return _seconds(stamps), spec.sign * spec.unit_factor * raw + spec.offset
-
-
-def _general(
-    bag: BagReader, batch: Sequence[RawMessage], extractor: Extractor,
-) -> Iterator[tuple[float, FloatArray, int]]:
-    """Yield (stamp of the last sample, values, missing) of any message."""
-    spec = extractor.spec
-    scale = spec.sign * spec.unit_factor
-    quick = spec.type == FLOAT32_ARRAY and spec.field == 'data' and spec.stamp_field is None
-    decode = None
-    for message in batch:
-        logged = message.log_time_ns // 1_000_000_000 + message.log_time_ns % 1_000_000_000 * 1e-9
-        block = decode_block(message.data) if quick and spec.sample_rate else None
-        if block is not None:
-            block = block * scale + spec.offset
-            finite = np.isfinite(block)
-            yield logged, np.where(finite, block, np.nan), block.size - int(finite.sum())
-            continue
-        decode = decode or bag.decoder(spec.type)
-        found = extractor.extract(decode(message.data))
-        yield (logged if found.stamp is None else found.stamp), found.values, found.missing
+def _outside(name: str, start: float | None, end: float | None, length: float) -> str:
+    return f'{name} holds no sample {span_words(start, end)}: it lasts {length:.3f} s'

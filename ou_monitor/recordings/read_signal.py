@@ -15,8 +15,9 @@ import numpy as np
 
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.messages.config import FieldSpec
-from ou_monitor.messages.extract import Extractor
 from ou_monitor.recordings.bag import BagReader
+from ou_monitor.recordings.batches import batches
+from ou_monitor.recordings.columns import join
 from ou_monitor.recordings.csv_table import read_column
 from ou_monitor.records import FloatArray
 
@@ -59,21 +60,22 @@ def read_signal(path: str | Path, signal: str, *, partial: bool = False,
     bag = BagReader(path, partial=partial)
     topic, field = _split(path, signal, bag.topics)
     kind = bag.topics[topic]
-    extractor: Extractor | None = None
-    stamps, values = [], []
-    for message in bag.decoded([topic]):
-        if extractor is None:
-            header = hasattr(getattr(message.message, 'header', None), 'stamp')
-            extractor = Extractor(FieldSpec(
-                topic, kind, field, nan='unknown',
-                stamp_field='header.stamp' if header else None))
-        found = extractor.extract(message.message)
-        own = message.log_time_ns // 1_000_000_000 + message.log_time_ns % 1_000_000_000 * 1e-9
-        stamps.append(own if found.stamp is None else found.stamp)
-        values.append(float(found.values[0]) if found.values.size else float('nan'))
-    if not values:
+    spec = FieldSpec(topic, kind, field, nan='unknown',
+                     stamp_field='header.stamp' if _has_header(bag, topic) else None)
+    parts = [batch['signal'] for batch in batches(bag, {'signal': spec})]
+    column = join(parts)
+    if not column.n:
         raise InputError(f"{path}: topic '{topic}' holds no message")
-    return np.array(stamps), np.array(values)
+    values = np.full(column.n, np.nan)
+    values[column.count > 0] = column.values
+    return column.stamp, values
+
+
+def _has_header(bag: BagReader, topic: str) -> bool:
+    """Whether messages of a topic carry a stamp in their header."""
+    first = next(bag.decoded([topic]), None)
+    header = None if first is None else getattr(first.message, 'header', None)
+    return hasattr(header, 'stamp')
 
 
 def _split(path: Path, signal: str, topics: Mapping[str, str]) -> tuple[str, str]:

@@ -2,15 +2,15 @@
 Read and write `metadata.yaml`, the table of contents of a rosbag2 directory.
 
 Written as version 9, the one of ROS 2 Jazzy; read in every version, for only
-the list of files and the QoS of the topics are used.
+the list of files, the QoS of the topics and the custom data are used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 from ou_monitor.errors import InputError
 import yaml
@@ -52,6 +52,29 @@ class TopicInfo:
     reliability: str = 'reliable'
     durability: str = 'volatile'
     depth: int = 10
+
+
+class BagFiles(NamedTuple):
+    """
+    What a path to a bag stands for.
+
+    Attributes
+    ----------
+    paths : list of pathlib.Path
+        MCAP files in recorded order.
+    qos : dict of str to object
+        Topic name -> offered QoS.
+    about : dict of str to str
+        Custom data of the recording, such as its vehicle.
+    missing : str
+        What is missing; '' when nothing is.
+
+    """
+
+    paths: list[Path]
+    qos: dict[str, Any]
+    about: dict[str, str]
+    missing: str
 
 
 def qos_profile(topic: TopicInfo) -> list[dict[str, Any]]:
@@ -101,9 +124,31 @@ def parse_qos(text_or_list: Any) -> tuple[str, str, int]:
         depth if isinstance(depth, int) and depth > 0 else 10)
 
 
-def read_metadata(folder: Path) -> tuple[list[Path], dict[str, Any]]:
+def custom_data(content: Any) -> dict[str, str]:
     """
-    Return the MCAP files of a rosbag2 directory, and the QoS of its topics.
+    Return the custom data in the content of a metadata.yaml.
+
+    Parameters
+    ----------
+    content : object
+        As YAML gives it: the table, or what is below its root.
+
+    Returns
+    -------
+    dict of str to str
+        Empty where there is none.
+
+    """
+    info = content.get(_ROOT, content) if isinstance(content, dict) else None
+    custom = info.get('custom_data') if isinstance(info, dict) else None
+    if not isinstance(custom, dict):
+        return {}
+    return {str(key): str(value) for key, value in custom.items() if value is not None}
+
+
+def read_metadata(folder: Path) -> BagFiles:
+    """
+    Return the MCAP files of a rosbag2 directory, and what is said of them.
 
     Parameters
     ----------
@@ -112,8 +157,8 @@ def read_metadata(folder: Path) -> tuple[list[Path], dict[str, Any]]:
 
     Returns
     -------
-    tuple
-        Paths in recorded order, and topic name -> offered QoS.
+    BagFiles
+        At least one file; nothing missing.
 
     Raises
     ------
@@ -150,10 +195,16 @@ def read_metadata(folder: Path) -> tuple[list[Path], dict[str, Any]]:
         topic = entry.get('topic_metadata') if isinstance(entry, dict) else None
         if isinstance(topic, dict):
             qos[str(topic.get('name'))] = topic.get('offered_qos_profiles')
-    return files, qos
+    return BagFiles(files, qos, custom_data(info), '')
 
 
-def find_files(path: Path, partial: bool) -> tuple[list[Path], dict[str, Any], str]:
+def is_part(file: Path, folder: Path) -> bool:
+    """Return whether an .mcap file has the name that rosbag2 gives it in its folder."""
+    begin = folder.name + '_'
+    return file.stem.startswith(begin) and file.stem[len(begin):].isdigit()
+
+
+def find_files(path: Path, partial: bool) -> BagFiles:
     """
     Return what a path to a bag stands for.
 
@@ -167,9 +218,8 @@ def find_files(path: Path, partial: bool) -> tuple[list[Path], dict[str, Any], s
 
     Returns
     -------
-    tuple
-        MCAP files in order, topic name -> offered QoS, and what is missing
-        ('' when nothing is).
+    BagFiles
+        At least one file.
 
     Raises
     ------
@@ -182,22 +232,28 @@ def find_files(path: Path, partial: bool) -> tuple[list[Path], dict[str, Any], s
     if not path.exists():
         raise InputError(f'there is no bag {path}: check the path')
     if not path.is_dir():
-        return [path], {}, ''
+        return BagFiles([path], {}, {}, '')
     if (path / FILE).exists():
-        return *read_metadata(path), ''
+        return read_metadata(path)
     # NAME_0.mcap .. NAME_10.mcap: the shorter name is the earlier one.
     files = sorted(path.glob('*.mcap'), key=lambda file: (len(file.name), file.name))
     if not files:
-        raise InputError(f'{path} is not a bag: it holds neither {FILE} nor an .mcap file')
+        raise InputError(f'{path} is not a bag: it holds neither {FILE} nor an .mcap file'
+                         + ("; name one of the bags in it, or give all to 'ou-monitor fleet'"
+                            if any(path.glob(f'*/{FILE}')) else ''))
     missing = f'{FILE} is missing: the recording was cut off'
     if not partial:
+        if not all(is_part(file, path) for file in files):
+            raise InputError(
+                f'{path}: {FILE} is missing: name one of the .mcap files in it; if they are one '
+                'recording that was cut off, use --partial')
         raise InputError(f'{path}: {missing}; use --partial to take what it still holds')
-    return files, {}, missing
+    return BagFiles(files, {}, {}, missing)
 
 
 def write_metadata(
     folder: Path, file: str, topics: Iterable[TopicInfo], hashes: dict[str, str],
-    start_ns: int, end_ns: int,
+    start_ns: int, end_ns: int, custom: Mapping[str, str] | None = None,
 ) -> None:
     """
     Write metadata.yaml (version 9) of a directory with one MCAP file.
@@ -214,6 +270,8 @@ def write_metadata(
         Type -> RIHS01 hash; '' for types that are not in it.
     start_ns, end_ns : int
         Log times of the first and last message, ns.
+    custom : mapping of str to str, optional
+        Kept as 'custom_data'.
 
     """
     infos = list(topics)
@@ -241,7 +299,7 @@ def write_metadata(
             'duration': {'nanoseconds': end_ns - start_ns},
             'message_count': count,
         }],
-        'custom_data': None,
+        'custom_data': dict(custom) if custom else None,
         'ros_distro': 'jazzy',
     }}
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=False)

@@ -89,6 +89,10 @@ def choose(
                              '--voltage-topic')
         topic = found[0]
     throttle, notes = _throttle(path, config, topics, topic, throttle_topic)
+    others = [name for name in _alike(config.voltage, topics) if name != topic]
+    if voltage_topic is None and others:
+        notes = (*notes, f"{topic} was taken for the voltage; {', '.join(others)} would fit too: "
+                         'choose with --voltage-topic.')
     return Choice(config, replace(config.voltage, topic=topic), throttle, notes)
 
 
@@ -106,8 +110,13 @@ def _named(spec: FieldSpec, topics: Mapping[str, str]) -> list[str]:
     exact = _absolute(spec.topic)
     if topics.get(exact) == spec.type:
         return [exact]
+    return _alike(spec, topics)
+
+
+def _alike(spec: FieldSpec, topics: Mapping[str, str]) -> list[str]:
+    """Return the topics of its type that end with the name that a spec means."""
     return sorted(name for name, kind in topics.items()
-                  if kind == spec.type and name.endswith(exact))
+                  if kind == spec.type and name.endswith(_absolute(spec.topic)))
 
 
 def _only_of_type(config: MsgConfig, topics: Mapping[str, str]) -> list[str]:

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shlex
 
 import numpy as np
 from ou_monitor.cli.main import main
@@ -76,11 +77,12 @@ def test_table_fits_a_terminal(flight, capsys):
     assert main(['analyze', str(flight)]) == 0
     lines = capsys.readouterr().out.splitlines()
     heads = [k for k, line in enumerate(lines) if line.startswith('throttle ')]
-    assert len(heads) == 2 and all(len(line) <= 100 for line in lines)
+    assert len(heads) == 3 and all(len(line) <= 100 for line in lines)
     for k in heads:
         rows = lines[k:k + 4]
         assert rows[2].split()[:2] == ['10', '%'] and rows[3].split()[:2] == ['40', '%']
     assert 'Vrms mV' in lines[heads[0]] and 'sigma V/sqrt(s) [95 %]' in lines[heads[1]]
+    assert 'brown-out risk' in lines[heads[2]]
 
 
 def test_report_and_json_files(flight, tmp_path, capsys):
@@ -116,6 +118,10 @@ def test_unknown_is_null(tmp_path, capsys):
     (['--window', '0'], '--window'), (['--window', 'inf'], '--window'),
     (['--window', 'x'], '--window'), (['--brownout-voltage', 'x'], '--brownout-voltage'),
     (['--brownout-horizon', '-1'], '--brownout-horizon'),
+    (['--brownout-horizon', '1e6'], '--brownout-horizon: 1e+06 is not within 0.001 to 3600'),
+    (['--brownout-voltage', '5000'], '--brownout-voltage: 5000 is not within 0 to 1000'),
+    (['--from', '-1'], "--from: '-1'"), (['--to', 'x'], "--to: 'x'"),
+    (['--from', '4', '--to', '3'], '--from 4 is not before --to 3'),
     (['--report', '-'], '--report'), (['--report', '/nowhere/r.html'], '/nowhere'),
     (['--json', '/nowhere/r.json'], '/nowhere'), (['--report', '/'], 'folder'),
 ])
@@ -142,3 +148,50 @@ def test_levels_need_a_throttle(tmp_path, capsys):
     path = tmp_path / 'plain.csv'
     write(path, np.arange(100) / 100.0, 5.0 + 0.01 * np.sin(np.arange(100)))
     assert 'no throttle' in failure(capsys, 'analyze', path, '--levels', '0.1')
+
+
+@pytest.mark.parametrize('name', ['flight.ulg', 'my log.BIN', 'a.bbl'])
+def test_a_log_is_to_be_converted_first(tmp_path, name, capsys):
+    """One line with the command, quoted for a shell."""
+    path = tmp_path / name
+    path.write_bytes(b'ULog')
+    said = failure(capsys, 'analyze', path)
+    assert f'ou-monitor convert {shlex.quote(str(path))} {shlex.quote(path.stem)}' in said
+
+
+def test_text_says_which_voltage_must_not_be_undershot(flight, capsys):
+    """The node's default by name, or the one that was asked for; the JSON as well."""
+    assert main(['analyze', str(flight)]) == 0
+    text = ' '.join(capsys.readouterr().out.split())
+    assert "going below 4.5 V (the node's default" in text
+    assert main(['analyze', str(flight), '--brownout-voltage', '4.7', '--json', '-']) == 0
+    found = strict(capsys.readouterr().out)
+    assert (found['brownout']['voltage'], found['brownout']['voltage_source']) == (4.7, 'given')
+    # The sag of 0.2 V at 40 % leaves 0.1 V, two standard deviations.
+    assert found['brownout']['throttle_budget'] < 0.4
+
+
+def test_a_part_is_analyzed_alone(flight, tmp_path, capsys):
+    """Seconds 2 to 5: one level of 3 s; the page says so in its command."""
+    report = tmp_path / 'part.html'
+    assert main(['analyze', str(flight), '--from', '2', '--to', '5', '--json', '-', '--report',
+                 str(report)]) == 0
+    found = strict(capsys.readouterr().out)
+    assert (found['n'], len(found['levels'])) == (1500, 1)
+    assert found['levels'][0]['throttle'] == pytest.approx(0.1)
+    assert '--from 2 --to 5' in report.read_text(encoding='utf-8')
+    assert 'no' in failure(capsys, 'analyze', flight, '--from', '100')
+
+
+def test_the_default_of_a_5_v_rail_is_for_one(tmp_path, capsys):
+    """A battery of four cells gets no risk against 4.5 V, and the reason."""
+    rng = np.random.default_rng(3)
+    path = tmp_path / 'a.csv'
+    path.write_text('time_s,voltage_v\n' + ''.join(
+        f'{k * 1e-3:.3f},{15.0 + 0.05 * u:.5f}\n'
+        for k, u in enumerate(rng.standard_normal(2000).cumsum() * 0.03)))
+    assert main(['analyze', str(path)]) == 0
+    said = ' '.join(capsys.readouterr().out.split())
+    assert 'No brown-out risk' in said and '--brownout-voltage sets another' in said
+    assert main(['analyze', str(path), '--brownout-voltage', '14']) == 0
+    assert 'going below 14 V (as asked for)' in ' '.join(capsys.readouterr().out.split())

@@ -99,6 +99,17 @@ def test_column_and_field_path_say_the_same(table, bag, capsys):
     assert other['gain_per_v'] == pytest.approx(one['gain_per_v'], rel=1e-3)
 
 
+def test_a_part(table, bag, capsys):
+    """--from and --to: only that part of both series counts, whatever the file."""
+    for path, signal in ((table, 'gyro_x'), (bag, '/imu/angular_velocity.x')):
+        data = found(capsys, path, '--signal', signal, '--from', '4', '--to', '16')
+        low, high = data['gain_ci95']
+        assert data['duration_s'] == pytest.approx(12.0, abs=0.1) and low <= GAIN <= high
+        assert data['dropped'] == {'voltage': 0, 'signal': 0}
+        assert any('from 4 s to 16 s' in note for note in data['notes'])
+    assert "--to: '-1'" in failure(capsys, table, '--signal', 'gyro_x', '--to', '-1')
+
+
 def test_none_is_said_with_the_limit(table, capsys):
     """In words and as null."""
     data = found(capsys, table, '--signal', 'gyro_y')

@@ -17,6 +17,7 @@ from ou_monitor.offline.discover.finding import Cause, Finding, Verdict
 from ou_monitor.offline.discover.words import explain, parameters
 from ou_monitor.offline.report.discovery_page import discovery_page
 from ou_monitor.recordings.model_file import read_model
+from project import ROOT
 import pytest
 
 
@@ -66,6 +67,22 @@ def test_json_on_standard_output_is_alone(flight, capsys):
     assert [cause['name'] for cause in data['causes']] == ['load_sag']
     assert data['extended']['gain'] == pytest.approx(
         data['extended']['heldout_score'] - data['baseline']['heldout_score'])
+
+
+def test_a_part_is_read_and_said_again(flight, tmp_path, capsys, monkeypatch):
+    """--from and --to: only that part, the page repeats it, reading shows on a terminal."""
+    page = tmp_path / 'a.html'
+    part = ['--from', '2', '--to', '2.2']
+    assert main(['discover', str(flight), *part, '--json', '-', '--report', str(page)]) == 0
+    data = strict(capsys.readouterr().out)
+    assert data['n'] == 100 and data['duration_s'] == pytest.approx(0.198)
+    assert '--from 2 --to 2.2' in page.read_text()
+    assert "--from: 'x'" in failure(capsys, 'discover', flight, '--from', 'x')
+    assert 'no sample from 100 s' in failure(capsys, 'discover', flight, '--from', '100')
+    monkeypatch.setattr('sys.stderr.isatty', lambda: True)
+    bag = ROOT / 'bags' / 'load_40'
+    assert main(['discover', str(bag), '--to', '0.1', '--json', str(tmp_path / 'a.json')]) == 0
+    assert re.search(r'reading \[#+\] 100%', capsys.readouterr().err)
 
 
 def test_summary_model_and_page(flight, tmp_path, capsys):

@@ -2,9 +2,11 @@
 
 import argparse
 import enum
+import errno
 import io
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 from ou_monitor.cli import output
@@ -120,3 +122,18 @@ def test_what_a_bag_is_made_of_is_not_overwritten(tmp_path, name, part):
             output.check_paths({'RECORDING': str(bag)}, {'--report': str(bag / name)})
     else:
         output.check_paths({'RECORDING': str(bag)}, {'--report': str(bag / name)})
+
+
+def test_what_was_there_stays_when_the_disk_is_full(tmp_path, monkeypatch):
+    """Half a page is left neither in its place nor beside it."""
+    target = tmp_path / 'report.html'
+    output.write_text('old', target)
+
+    def full(path, text, **_):
+        with path.open('w') as file:
+            file.write(text[:2])
+        raise OSError(errno.ENOSPC, 'No space left on device')
+    monkeypatch.setattr(Path, 'write_text', full)
+    with pytest.raises(InputError, match='No space left'):
+        output.write_text('new page', target)
+    assert target.read_text() == 'old' and list(tmp_path.iterdir()) == [target]

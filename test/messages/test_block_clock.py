@@ -117,3 +117,23 @@ def test_stamps_that_are_none():
         BlockClock(RATE).stamps(float('nan'), 1)
     with pytest.raises(ValueError, match='-1'):
         BlockClock(RATE).stamps(1.0, -1)
+
+
+@pytest.mark.parametrize('lengths', [[100], [100, 100, 7, 0, 1, 250]])
+def test_many_at_once(lengths):
+    """The same bits as one by one, over gaps and batches, and the same gaps counted."""
+    rng = np.random.default_rng(5)
+    n = np.array(lengths * 12, dtype=np.int64)
+    ends = 1.7e9 + np.cumsum(n) / RATE + rng.uniform(0.0, 8e-3, n.size)
+    ends[30:] += 4.0
+    ends[7:] += 1.0
+    one, many = BlockClock(RATE), BlockClock(RATE)
+    expected = np.concatenate([one.stamps(end, k) for end, k in zip(ends, n.tolist())])
+    found = np.concatenate([many.stamps_of_many(ends[part], n[part])
+                            for part in (slice(0, 5), slice(5, 5), slice(5, None))])
+    np.testing.assert_array_equal(found.view(np.uint64), expected.view(np.uint64))
+    assert one.gaps == many.gaps >= 1
+    with pytest.raises(ValueError, match='finite'):
+        many.stamps_of_many(np.array([np.nan]), np.array([3]))
+    with pytest.raises(ValueError, match='-3'):
+        many.stamps_of_many(np.array([1.0]), np.array([-3]))

@@ -20,6 +20,22 @@ def test_no_limit_cycle_at_the_defaults(coupling):
     assert verdict.command < 0.4
 
 
+def test_a_steep_load_hunts_even_at_the_defaults():
+    """Where sigma grows with the cube of the load: not at a weak coupling, from 1.5 on it does."""
+    loop = Loop(steepness=3.0)
+    assert not judge(replace(loop, coupling=0.3), SECONDS).cycle
+    above = judge(replace(loop, coupling=1.5), SECONDS)
+    assert above.cycle and above.swing > 0.7 and above.quiet < 0.1
+
+
+def test_a_kalman_filter_of_limited_lag_does_not_hunt():
+    """With the same steep load and coupling, and its limit of the lag in force."""
+    verdict = judge(Loop(coupling=1.5, steepness=3.0, filter={
+        'law': 'kalman', 'signal_bandwidth': 5.0, 'signal_rms': 0.3, 'signal_poles': 2,
+        'coupling': 1.5, 'n0': 1e-7, 'max_lag': 20.0}), SECONDS)
+    assert not verdict.cycle and verdict.swing < 0.3
+
+
 def test_a_threshold_hunts_from_a_coupling_on():
     """The paper's switch: below, sigma stays on its side; above, the loop swings to and fro."""
     loop = Loop(filter=THRESHOLD)

@@ -5,7 +5,6 @@ import math
 import os
 from pathlib import Path
 import re
-from xml.etree import ElementTree
 
 import numpy as np
 import ou_monitor
@@ -22,6 +21,7 @@ from ou_monitor.model.terms.quantization import Quantization
 from ou_monitor.offline.discover.finding import Verdict
 from ou_monitor.offline.report.discovery_page import discovery_page
 from ou_monitor.records import Recording
+from pages import parsed, self_contained
 import pytest
 
 RAIL = OU(63.0, 0.3156, 5.0)
@@ -47,11 +47,6 @@ def sag():
 def names(finding):
     """Return the causes."""
     return [cause.name for cause in finding.causes]
-
-
-def parsed(html):
-    """Parse a page as XML."""
-    return ElementTree.fromstring(html.replace('<!DOCTYPE html>\n', ''))
 
 
 def test_nothing_is_found_where_nothing_is():
@@ -166,7 +161,7 @@ def test_a_path_is_read(tmp_path):
 def test_the_page_shows_it_all(sag):
     """Well formed, escaped, finite; verdict, cause, pictures before and after, command."""
     html = discovery_page(sag, 'ou-monitor discover x.csv')
-    root = parsed(html)
+    root = self_contained(html)
     text = ' '.join(''.join(root.itertext()).split())
     assert 'sag <b>' in text and '<b>' not in html
     for part in ('load_sag', 'Statistics before and after', 'ou-monitor discover x.csv',

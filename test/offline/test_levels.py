@@ -111,3 +111,27 @@ def test_bad_levels_are_refused(given, word):
 def test_no_samples_no_levels():
     """An empty recording has none."""
     assert find_levels(np.zeros(0), np.zeros(0)) == ()
+
+
+def test_short_stretches_on_ramps_are_no_level():
+    """
+    Five passages of 0.35 s at 30 % between stays of 2 s: no level, though 1.75 s were spent there.
+
+    Asked for, it is one; with one passage of 0.8 s it is found.
+    """
+    pieces = [(0.1, 2.0), (0.3, 0.35), (0.6, 2.0), (0.3, 0.35)] * 2 + [
+        (0.1, 2.0), (0.3, 0.35), (0.6, 2.0)]
+    throttle = np.concatenate([np.full(int(1000 * long), x) for x, long in pieces])
+    t = np.arange(throttle.size) / 1000.0
+    assert [level.throttle for level in find_levels(t, throttle)] == [0.1, 0.6]
+    assert len(find_levels(t, throttle, (0.1, 0.3, 0.6))[1].segments) == 5
+    longer = np.concatenate((throttle, np.full(800, 0.3)))
+    found = find_levels(np.arange(longer.size) / 1000.0, longer)
+    assert [level.throttle for level in found] == [0.1, 0.3, 0.6]
+
+
+def test_a_staircase_of_short_stays_keeps_its_levels():
+    """Where no stay is longer than 0.4 s, the stays are the levels."""
+    throttle = np.tile(np.repeat([0.1, 0.3, 0.6], 400), 5)
+    found = find_levels(np.arange(throttle.size) / 1000.0, throttle)
+    assert [level.throttle for level in found] == [0.1, 0.3, 0.6]

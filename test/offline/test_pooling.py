@@ -1,11 +1,10 @@
 """Segments of one level: pooled when they agree, doubted when they do not."""
 
-from dataclasses import replace
 import math
 
 from made_recordings import ALPHA, recording
-import numpy as np
-from ou_monitor.offline.pooling import fit_stretch, pool, standardised_increments
+from ou_monitor.offline.analyze import analyze
+from ou_monitor.offline.pooling import disagreement, fit_stretch, pool
 from ou_monitor.online.estimator import SlidingEstimator
 from ou_monitor.records import Estimate, Status
 import pytest
@@ -100,17 +99,38 @@ def test_nothing_to_pool_is_a_callers_bug():
         pool([])
 
 
-def test_increments_of_an_ou_have_unit_variance_at_any_spacing():
+def test_segments_of_one_process_disagree_as_often_as_stated():
     """
-    Standardised by the law at each step, irregular steps included.
+    150 levels of three stays of 1 s, fitted: p < 5 % in at most 18, p < 1 % in at most 7.
 
-    The sample variance of n = 5000 has a standard error of sqrt(2/n) = 2 %.
+    Binomials of 150 with 0.05 and 0.01 go beyond with probability 1e-4; the widening factor alone
+    exceeds 1.5 in every fifth.  Stays of alpha 63 and 250 1/s do disagree.
     """
-    made = recording(5, levels=((0.1, 0.3),), seconds=20.0)
-    keep = np.random.default_rng(6).uniform(size=made.n) < 0.25
-    thinned = replace(made, t=made.t[keep], voltage=made.voltage[keep],
-                      throttle=made.throttle[keep])
-    truth = one(alpha=ALPHA, var_inf=0.3 ** 2 / (2 * ALPHA), noise_std=0.0)
-    z = standardised_increments(thinned, 0, thinned.n, truth)
-    # Increments of an OU have correlations that sum to little: 4 * 2 % * 1.2.
-    assert np.mean(z ** 2) == pytest.approx(1.0, abs=0.1)
+    p_values = []
+    for seed in range(150):
+        made = recording(9000 + seed, levels=((0.1, 0.3),), seconds=3.0)
+        p_values.append(disagreement([fit_stretch(made, k, k + 1000) for k in (0, 1000, 2000)]))
+    assert sum(p < 0.05 for p in p_values) <= 18 and sum(p < 0.01 for p in p_values) <= 7
+    assert disagreement([one(63.0), one(250.0)]) < 1e-6
+    assert math.isnan(disagreement([one()])) and disagreement([one(), one()]) == 1.0
+
+
+def test_not_one_process_is_said_of_what_differs_only():
+    """Two stays of one level: with equal sigma rarely a word, with twice the sigma always."""
+    said = 0
+    for seed in range(30):
+        made = recording(seed, ((0.1, 0.3), (0.4, 0.5), (0.1, 0.3)), seconds=2.0)
+        said += any('not one process' in note for level in analyze_levels(made)
+                    for note in level.notes)
+    # A binomial of 30 and 0.01 exceeds 2 with probability 3e-3; without a test it was said of
+    # every third.
+    assert said <= 2
+    made = recording(1, ((0.1, 0.3), (0.4, 0.5), (0.1, 0.6)), seconds=2.0)
+    first, second = analyze_levels(made)
+    assert any('not one process' in note for note in first.notes) and first.scatter_p < 0.01
+    assert not second.notes and math.isnan(second.scatter_p)
+
+
+def analyze_levels(made):
+    """Return the levels of an analysis."""
+    return analyze(made, brownout_voltage=math.nan).levels

@@ -42,14 +42,17 @@ def test_measured_and_true_spectrum_agree():
     """
     made = recording(1, ((0.1, 0.3),), seconds=60.0)
     (level,) = analyze(made).levels
-    frequency, density = level_spectrum(made, level)
+    found = level_spectrum(made, level.segments, level.estimate)
+    frequency, density = found.frequency, found.density
     assert frequency.size >= 60 and frequency[0] > 0.0 and frequency[-1] < 500.0
     ratio = density / ou_spectrum(frequency, ALPHA, 0.3, 1000.0)
     assert ratio.mean() == pytest.approx(1.0, abs=0.2)
+    # The fit itself is within its 10 % of sigma and of alpha.
+    assert (density / found.fitted).mean() == pytest.approx(1.0, abs=0.2)
 
 
 def test_short_segments_give_nothing():
     """Fewer than 32 samples: empty arrays."""
     made = recording(2, ((0.1, 0.3),), seconds=0.02)
     (level,) = analyze(made).levels
-    assert level_spectrum(made, level)[0].size == 0
+    assert level_spectrum(made, level.segments, level.estimate).frequency.size == 0

@@ -1,21 +1,16 @@
-"""Headline, cautions, numbers, and the plain data behind the JSON."""
+"""Headline, cautions and numbers in words."""
 
 from dataclasses import replace
 import math
 
 from made_recordings import recording, without_throttle
+from ou_monitor.offline.analysis.quality_list import NOISE_UNKNOWN, quality_list
 from ou_monitor.offline.analyze import analyze
-from ou_monitor.offline.words import as_data, cautions, headline, NOISE_UNKNOWN, number
+from ou_monitor.offline.words import cautions, headline, number
 from ou_monitor.records import Flag
 import pytest
 
 TRUTH = ((0.1, 0.3156), (0.4, 0.632))
-LEVEL_KEYS = {
-    'throttle', 'segments', 'time_s', 'n', 'mean', 'vpp', 'peak', 'vrms', 'crest', 'alpha',
-    'alpha_se', 'alpha_ci95', 'tau', 'tau_se', 'tau_ci95', 'sigma', 'sigma_se', 'sigma_ci95',
-    'var_inf', 'var_inf_se', 'var_inf_ci95', 'u0', 'u0_se', 'noise_std', 'excess_kurtosis',
-    'excess_kurtosis_se', 'process_type', 'process_reason', 'status', 'status_text', 'flags',
-    'notes'}
 
 
 @pytest.mark.parametrize('value, digits, text', [
@@ -45,37 +40,17 @@ def test_headline_of_one_level_and_of_none():
     assert 'can be fitted' in headline(analyze(short))
 
 
-def test_data_has_all_keys_and_the_values_of_the_levels():
-    """Keys are stable; the tau interval is that of alpha, turned over."""
-    analysis = analyze(recording(6, TRUTH))
-    data = as_data(analysis)
-    assert set(data) == {'recording', 'n', 'duration_s', 'rate_hz', 'source', 'headline',
-                         'levels', 'sliding', 'notes'}
-    assert (data['n'], data['duration_s']) == (20000, pytest.approx(19.999))
-    assert data['rate_hz'] == pytest.approx(1000.0)
-    for level, found in zip(data['levels'], analysis.levels):
-        assert set(level) == LEVEL_KEYS
-        assert level['alpha'] == found.estimate.alpha
-        assert level['tau'] == pytest.approx(1.0 / level['alpha'])
-        assert level['tau_ci95'][0] == pytest.approx(1.0 / level['alpha_ci95'][1])
-        assert level['alpha_ci95'][1] / level['alpha'] == pytest.approx(
-            math.exp(1.96 * level['alpha_se']), rel=1e-4)
-        assert level['var_inf'] == pytest.approx(level['sigma'] ** 2 / (2 * level['alpha']))
-    lengths = {len(data['sliding'][name]) for name in ('t', 'alpha', 'sigma', 'status')}
-    assert len(lengths) == 1 and lengths.pop() > 10
-
-
 def test_the_same_caution_of_two_levels_is_said_once():
     """It is led by both labels."""
     analysis = analyze(recording(7, TRUTH))
 
-    def with_changes(**changes):
-        return replace(analysis, levels=tuple(
-            replace(level, estimate=replace(level.estimate, **changes))
-            for level in analysis.levels))
+    def said(**changes):
+        items = quality_list(
+            analysis.recording, [level.throttle for level in analysis.levels],
+            [replace(level.estimate, **changes) for level in analysis.levels], [(), ()])
+        return cautions(replace(analysis, quality=items))
 
-    said = cautions(with_changes(flags=(Flag.QUANTIZED,), noise_std=0.001))
-    assert said == [f'10 %, 40 %: {Flag.QUANTIZED.value}']
-    assert cautions(with_changes(flags=(), noise_std=0.001)) == []
-    assert cautions(with_changes(flags=(), noise_std=math.nan)) == [
-        f'10 %, 40 %: {NOISE_UNKNOWN}']
+    assert said(flags=(Flag.QUANTIZED,), noise_std=0.001) == [
+        f'10 %, 40 %: {Flag.QUANTIZED.value}']
+    assert said(flags=(), noise_std=0.001) == []
+    assert said(flags=(), noise_std=math.nan) == [f'10 %, 40 %: {NOISE_UNKNOWN}']

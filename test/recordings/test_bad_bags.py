@@ -65,6 +65,15 @@ def test_nothing_there(tmp_path):
     assert 'empty (0 bytes)' in complaint(tmp_path / 'empty.mcap')
     (tmp_path / 'folder').mkdir()
     assert 'neither metadata.yaml nor an .mcap' in complaint(tmp_path / 'folder')
+    (tmp_path / 'folder' / 'bag').mkdir()
+    (tmp_path / 'folder' / 'bag' / 'metadata.yaml').touch()
+    assert "name one of the bags in it, or give all to 'ou-monitor fleet'" in complaint(
+        tmp_path / 'folder')
+    (tmp_path / 'logs').mkdir()
+    (tmp_path / 'logs' / 'a.mcap').touch()
+    assert 'name one of the .mcap files in it' in complaint(tmp_path / 'logs')
+    (tmp_path / 'logs' / 'a.mcap').rename(tmp_path / 'logs' / 'logs_0.mcap')
+    assert 'was cut off; use --partial' in complaint(tmp_path / 'logs')
 
 
 @pytest.mark.parametrize('content, words', [

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.recordings.read import read_recording
+from ou_monitor.recordings.read_signal import read_signal
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_typestore, Stores
@@ -30,7 +31,7 @@ def test_convert(log, tmp_path, capsys, name, kind):
     out = tmp_path / name
     assert main(['convert', str(log), str(out), '--type', kind]) == 0
     text = capsys.readouterr().out
-    assert '3 samples' in text and 'note: 1 sample dropped' in text
+    assert '3 samples' in text and 'note: voltage_v, throttle: 1 sample dropped' in text
     back = read_recording(out)
     np.testing.assert_allclose(back.t, [0.5, 0.6, 0.7], rtol=0, atol=1e-9)
     np.testing.assert_allclose(back.voltage, [5.0, 5.1, 5.3], rtol=1e-7)
@@ -62,8 +63,18 @@ def test_json(log, tmp_path, capsys):
     (GOOD, ['log.csv', 'out', '--type', 'adc'], ['adc']),
     ('time,voltage_v\n0,5\n', ['log.csv', 'out'], ["'time_s'"]),
     ('', ['log.csv', 'out'], ['empty']),
-    ('', ['log.ulg', 'out'], ['.csv', 'formats read today']),
-    ('', ['log', 'out'], ['.csv', 'formats read today']),
+    ('', ['log.ulg', 'out'], ["'log.ulg' is empty"]),
+    ('\0\1\2', ['log', 'out'], ['ULog', 'dataflash', 'blackbox', 'CSV', 'read today']),
+    (GOOD, ['log.csv'], ['required: OUT']),
+    (GOOD, ['log.csv', 'out', '--list'], ['--list writes no bag']),
+    (GOOD, ['log.csv', '--list', 'out'], ['--list writes no bag']),
+    (GOOD, ['log.csv', 'out', '--flight', '2'], ['holds one flight']),
+    (GOOD, ['log.csv', 'out', '--flight', '0'], ["'0'"]),
+    (GOOD, ['log.csv', 'out', '--voltage', 'volts'], ["no voltage 'volts'", 'voltage_v']),
+    (GOOD, ['log.csv', 'out', '--voltage', 'throttle'], ['is a throttle']),
+    (GOOD, ['log.csv', 'out', '--drop-held', '--drop-repeats'], ['not allowed with']),
+    ('time_s,volts\n0,5\n1,5\n', ['log.csv', 'out', '--list', 'x'], ['further argument']),
+    ('time_s,volts\n0,5\n1,5\n', ['log.csv', 'out'], ["no column 'voltage_v'", '--voltage']),
 ])
 def test_bad_input(tmp_path, monkeypatch, capsys, log_text, arguments, words):
     """Exit status 2, one line on standard error, no bag."""
@@ -82,6 +93,34 @@ def test_bad_input(tmp_path, monkeypatch, capsys, log_text, arguments, words):
     for word in words:
         assert word in captured.err
     assert not (tmp_path / 'out').exists()
+
+
+def test_blocks(tmp_path):
+    """A steady 10 kHz goes into blocks, the last of which may be shorter."""
+    path = tmp_path / 'a.csv'
+    rows = ''.join(f'{k * 1e-4:.4f},{5 + k % 7 / 8},{k % 3 / 4}\n' for k in range(250))
+    path.write_text('time_s,voltage_v,throttle\n' + rows)
+    assert main(['convert', str(path), str(tmp_path / 'b'), '--type', 'adc_block']) == 0
+    back = read_recording(tmp_path / 'b')
+    np.testing.assert_array_equal(back.voltage, 5 + np.arange(250) % 7 / 8)
+    np.testing.assert_allclose(back.t, 1e-4 * np.arange(250), atol=1e-9)
+    np.testing.assert_array_equal(back.throttle, np.arange(250) % 3 / 4)
+
+
+def test_columns_of_a_csv(tmp_path, capsys):
+    """Any column can be the voltage, the throttle or the current; all are listed."""
+    path = tmp_path / 'a.csv'
+    path.write_text('time_s,bus,duty,amps,word\n0,5.0,0.1,2,x\n1,5.1,0.2,3,y\n2,5.2,0.3,4,z\n')
+    assert main(['convert', str(path), '--list']) == 0
+    text = capsys.readouterr().out
+    assert all(word in text for word in ('bus', 'duty', 'amps', "'word' does not hold numbers"))
+    assert main(['convert', str(path), '--voltage', 'bus', str(tmp_path / 'b'), '--throttle',
+                 'duty', '--current', 'amps']) == 0
+    back = read_recording(tmp_path / 'b')
+    np.testing.assert_allclose(back.voltage, [5.0, 5.1, 5.2], rtol=1e-7)
+    np.testing.assert_allclose(back.throttle, [0.1, 0.2, 0.3], rtol=1e-7)
+    assert back.source['voltage_field'] == 'bus'
+    np.testing.assert_allclose(read_signal(tmp_path / 'b', '/current/data')[1], [2, 3, 4])
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """Bags -> Recording: which topics, which stamps, what was mended."""
 
+from mcap.writer import Writer
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagWriter
@@ -53,6 +54,53 @@ def complaint(path, **options):
         read_recording(path, **options)
     assert '\n' not in str(caught.value)
     return str(caught.value)
+
+
+def with_metadata(path, name, content):
+    """Write a bag with a metadata record of another program."""
+    with path.open('wb') as file:
+        writer = Writer(file)
+        writer.start(profile='ros2', library='test')
+        writer.add_metadata(name, content)
+        schema = writer.register_schema(FLOAT32, 'ros2msg', b'float32 data')
+        channel = writer.register_channel('/voltage', 'cdr', schema)
+        throttle = writer.register_channel('/throttle', 'cdr', schema)
+        for t, data in scalars([0.5, 0.5]):
+            writer.add_message(throttle, t, data, t)
+            writer.add_message(channel, t, data, t)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize('partial', [False, True])
+@pytest.mark.parametrize('name, content, vehicle', [
+    ('ou_monitor', {'vehicle': 'uav7', 'file': 'x'}, 'uav7'),
+    ('ou_monitor', {'log_vehicle': 'uav7'}, 'uav7'),
+    ('ou_monitor', {'log_vehicle': 'uav7', 'vehicle': 'uav8'}, 'uav8'),
+    # As rosbag2 keeps what was given to `ros2 bag record --custom-data vehicle=uav7`.
+    ('rosbag2', {'serialized_metadata': 'rosbag2_bagfile_information:\n  version: 9\n  '
+                 'custom_data:\n    vehicle: uav7\n    pilot: ~\n'}, 'uav7'),
+    ('rosbag2', {'serialized_metadata': 'version: 9\ncustom_data: {vehicle: 7}\n'}, '7'),
+    ('rosbag2', {'serialized_metadata': 'custom_data: [vehicle'}, None),
+    ('rosbag2', {'serialized_metadata': 'custom_data: vehicle'}, None),
+    ('rosbag2', {}, None), ('other', {'vehicle': 'uav7'}, None)])
+def test_the_vehicle_of_a_bag(tmp_path, name, content, vehicle, partial):
+    """The metadata of a bag tell it; those of programs not known do not."""
+    found = read_recording(with_metadata(tmp_path / 'a.mcap', name, content), partial=partial)
+    assert found.source.get('vehicle') == vehicle and found.notes == ()
+    assert found.source['file'] == 'a.mcap' and 'pilot' not in found.source
+
+
+def test_metadata_that_cannot_be_read(tmp_path):
+    """The messages are read all the same, and a note says what is not known."""
+    path = with_metadata(tmp_path / 'a.mcap', 'ou_monitor', {'vehicle': 'uav7'})
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b'uav7', b'uav\xff', 1))
+    found = read_recording(path)
+    assert found.n == 2 and 'vehicle' not in found.source
+    assert len(found.notes) == 1 and 'Metadata of a.mcap cannot be read' in found.notes[0]
+    found = read_recording(path, partial=True)
+    assert 'vehicle' not in found.source and 'metadata record' in ' '.join(found.notes)
 
 
 @pytest.mark.parametrize('kind, config', [(FLOAT32, 'std_float32'), (FLOAT64, 'std_float64')])
@@ -279,3 +327,61 @@ def test_epochs_are_kept_to_what_a_float_holds(tmp_path):
     exact = np.arange(1000) * 1e-4
     assert np.abs(recording.t - 1_704_067_200 - exact).max() <= 2.0**-22
     assert recording.n == 1000
+
+
+@pytest.mark.parametrize('kind', ['csv', 'mcap'])
+def test_what_no_supply_has_is_dropped_and_told(tmp_path, kind):
+    """One value that would overflow everything behind."""
+    values = np.full(50, 5.0)
+    values[7] = 1e300
+    path = tmp_path / f'a.{kind}'
+    if kind == 'csv':
+        rows = [f'{k * 1e-3},{v}' for k, v in enumerate(values)]
+        path.write_text('\n'.join(['time_s,voltage_v', *rows]))
+    else:
+        make(path, ('/voltage', FLOAT64, scalars(values, FLOAT64)))
+    recording = read_recording(path)
+    assert recording.n == 49 and recording.voltage.max() == 5.0
+    assert '1 sample dropped: not a finite number, or beyond 1e+09 V.' in recording.notes
+
+
+@pytest.mark.parametrize('kind', ['csv', 'mcap'])
+@pytest.mark.parametrize('throttle', [[0.0, 40.0], [1000.0, 1400.0]])
+def test_throttle_in_other_units_is_refused(tmp_path, kind, throttle):
+    path = tmp_path / f'a.{kind}'
+    if kind == 'csv':
+        path.write_text('time_s,voltage_v,throttle\n' + ''.join(
+            f'{k},5.0,{u}\n' for k, u in enumerate(throttle)))
+    else:
+        make(path, ('/voltage', FLOAT32, scalars([5.0, 5.0])),
+             ('/throttle', FLOAT32, scalars(throttle, start=0)))
+    said = complaint(path)
+    assert f'throttle runs from {throttle[0]:g} to {throttle[1]:g}' in said
+    assert 'divide a percentage by 100' in said
+
+
+@pytest.mark.parametrize('kind', ['csv', 'mcap'])
+def test_a_clock_that_goes_back_is_told_by_how_far(tmp_path, kind):
+    """A stretch that lies in a time that was is more than a few late samples."""
+    t = np.concatenate((np.arange(100), 60.5 + np.arange(100))) * 1e-3 + 1.0
+    path = tmp_path / f'a.{kind}'
+    if kind == 'csv':
+        path.write_text('\n'.join(['time_s,voltage_v', *(f'{one:.6f},5.0' for one in t)]))
+    else:
+        stamps = [round(one * 1e9) for one in t]
+        make(path, ('/voltage', BATTERY_STATE, [
+            (10_000_000_000 + k * MS, message) for k, message in enumerate(
+                encode_battery(np.array(stamps), np.full(200, 5.0)))]))
+    recording = read_recording(path)
+    # From 1.0605 to 1.099 s: 39 of the second stretch lie before the end of the first.
+    note = next(note for note in recording.notes if 'clock' in note)
+    assert 'went back once, by 0.0385 s at most: 39 samples' in note and recording.n == 200
+
+
+def test_another_topic_that_would_fit_is_named(tmp_path):
+    path = make(tmp_path / 'a.mcap', ('/voltage', FLOAT32, scalars([5.0])),
+                ('/bec/voltage', FLOAT32, scalars([6.0])))
+    recording = read_recording(path)
+    assert recording.voltage.tolist() == [5.0]
+    assert any('/bec/voltage would fit too' in note for note in recording.notes)
+    assert 'fit too' not in ''.join(read_recording(path, voltage_topic='/bec/voltage').notes)

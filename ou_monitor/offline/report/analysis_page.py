@@ -8,17 +8,18 @@ import math
 import numpy as np
 
 from ou_monitor.offline.analyze import Analysis, LevelResult
-from ou_monitor.offline.report import page
+from ou_monitor.offline.report import analysis_sections as parts, page
+from ou_monitor.offline.report.cells import figure, UNKNOWN
 from ou_monitor.offline.report.scale import span
 from ou_monitor.offline.report.svg import Plot
-from ou_monitor.offline.spectrum import level_spectrum, ou_spectrum
-from ou_monitor.offline.words import cautions, headline, number
+from ou_monitor.offline.words import headline
 from ou_monitor.records import FloatArray
 
 _Z = 1.959963984540054
 # More levels than colours would repeat colours.
 _MAX_DRAWN = 6
-_UNKNOWN = '\u2013'
+# Lines marked in the spectrum of one level.
+_MAX_MARKED = 3
 
 
 def analysis_page(analysis: Analysis, command: str = '') -> str:
@@ -41,21 +42,20 @@ def analysis_page(analysis: Analysis, command: str = '') -> str:
     recording = analysis.recording
     rate = (recording.n - 1) / recording.duration if recording.duration > 0.0 else math.nan
     subtitle = (f'{recording.n} samples in {recording.duration:.4g} s, '
-                f'{_number(rate)} Hz on average')
+                f'{figure(rate)} Hz on average')
+    after = parts.transients(analysis)
     sections = [
         page.headline(headline(analysis)),
         page.section('Load levels', _levels_table(analysis.levels), _ou_table(analysis.levels)),
-        page.section('What to know before using these numbers', _remarks(analysis)),
+        page.section('What to know before using these numbers', parts.quality(analysis)),
         page.section('Over time', *_over_time(analysis)),
-        page.section('Shape', *_shape(analysis)),
+        page.section('Over throttle', *parts.curves(analysis)),
+        *([page.section('After changes of throttle', *after)] if after else []),
+        page.section('Shape', *_shape(analysis), *parts.lines(analysis)),
+        page.section('Type of process', *parts.process(analysis)),
         page.section('Where it comes from', _origin(analysis, command)),
     ]
     return page.page(f'Supply noise: {recording.name or "recording"}', subtitle, sections)
-
-
-def _number(value: float, digits: int = 3) -> str:
-    """Return a number as a page sets it: true minus, en dash for unknown."""
-    return number(value, digits).replace('-', '\u2212') if math.isfinite(value) else _UNKNOWN
 
 
 def _interval(level: LevelResult, name: str, scale: float = 1.0, invert: bool = False) -> str:
@@ -63,17 +63,17 @@ def _interval(level: LevelResult, name: str, scale: float = 1.0, invert: bool = 
     e = level.estimate
     value = getattr(e, name)
     if not math.isfinite(value):
-        return _UNKNOWN
+        return UNKNOWN
     low, high = e.interval(name)
     if invert:
         value, low, high = 1.0 / value, 1.0 / high, 1.0 / low
-    return (f'{_number(scale * value)}\n{_number(scale * low)} to {_number(scale * high)}')
+    return (f'{figure(scale * value)}\n{figure(scale * low)} to {figure(scale * high)}')
 
 
 def _levels_table(levels: Sequence[LevelResult]) -> str:
-    rows = [[level.label, _number(level.time), str(level.n), _number(level.mean, 4),
-             *[_number(1e3 * v) for v in (level.vpp, level.peak, level.vrms)],
-             _number(level.crest), level.kind.value] for level in levels]
+    rows = [[level.label, figure(level.time), str(level.n), figure(level.mean, 4),
+             *[figure(1e3 * v) for v in (level.vpp, level.peak, level.vrms)],
+             figure(level.crest), level.kind.value] for level in levels]
     return page.table(['Throttle', 'Time, s', 'Samples', 'Mean, V', 'Vpp, mV', 'Peak, mV',
                        'Vrms, mV', 'Vpp/Vrms', 'Process'], rows, left=[0, 8])
 
@@ -81,7 +81,7 @@ def _levels_table(levels: Sequence[LevelResult]) -> str:
 def _ou_table(levels: Sequence[LevelResult]) -> str:
     rows = [[level.label, _interval(level, 'alpha'), _interval(level, 'alpha', 1e3, invert=True),
              _interval(level, 'sigma'), _interval(level, 'var_inf'),
-             _number(1e3 * level.estimate.noise_std), level.estimate.status.name]
+             figure(1e3 * level.estimate.noise_std), level.estimate.status.name]
             for level in levels]
     heads = ['Throttle', '\u03b1, 1/s', '\u03c4, ms', '\u03c3, V/\u221as', 'Var\u221e, V\u00b2',
              'White noise, mV', 'Status']
@@ -89,17 +89,6 @@ def _ou_table(levels: Sequence[LevelResult]) -> str:
         'dU = \u2212\u03b1 (U \u2212 U\u2080) dt + \u03c3 dW; \u03c4 = 1/\u03b1; Var\u221e = '
         '\u03c3\u00b2/(2\u03b1). Small: 95 % interval. Vpp, peak and Vrms are of the deviation '
         'from the mean of each segment.', soft=True)
-
-
-def _remarks(analysis: Analysis) -> str:
-    warnings = cautions(analysis)
-    kinds = [f'{level.label}, {level.kind.value}: {level.reason}'.replace('+-', '\u00b1')
-             for level in analysis.levels if level.estimate.usable]
-    if not warnings:
-        warnings_html = page.paragraph('No quality flag was raised.')
-    else:
-        warnings_html = page.bullets(warnings, warn=True)
-    return warnings_html + page.bullets(kinds)
 
 
 def _over_time(analysis: Analysis) -> list[str]:
@@ -127,6 +116,8 @@ def _over_time(analysis: Analysis) -> list[str]:
     for name, title, unit in (('sigma', 'Noise intensity \u03c3', 'V/\u221as'),
                               ('alpha', 'Relaxation rate \u03b1', '1/s')):
         value = sliding.series(name)
+        if not np.isfinite(value).any():
+            continue
         factor = np.exp(_Z * np.minimum(sliding.series(name + '_se'), 5.0))
         plot = Plot(f'{title} in a sliding window of {sliding.window:g} s', 'time, s', unit,
                     height=200, log_y=True).limits(x=limits)
@@ -167,22 +158,22 @@ def _levels_caption(analysis: Analysis) -> str:
 
 
 def _shape(analysis: Analysis) -> list[str]:
-    spectrum = Plot('Spectrum (dashed: fitted OU)', 'frequency, Hz', 'PSD, V\u00b2/Hz',
-                    width=450, height=330, log_x=True, log_y=True, legend_low=True)
+    spectrum = Plot('Spectrum (dashed: fitted OU and white noise)', 'frequency, Hz',
+                    'PSD, V\u00b2/Hz', width=450, height=330, log_x=True, log_y=True,
+                    legend_low=True)
     histogram = Plot('Deviation and the normal law',
                      'deviation / standard deviation', 'density', width=450, height=330,
                      log_y=True)
     drawn = _drawn(analysis)
     fitted, counted = 0, 0
     for k, level in enumerate(drawn):
-        frequency, density = level_spectrum(analysis.recording, level)
-        e = level.estimate
-        if frequency.size:
+        measured = level.spectrum
+        if measured.frequency.size:
             fitted += 1
-            spectrum.line(frequency, density, level.label, k, 'faint')
-            if e.usable:
-                spectrum.line(frequency, ou_spectrum(frequency, e.alpha, e.sigma, e.rate,
-                                                     e.noise_std), '', k, 'dash thick')
+            spectrum.line(measured.frequency, measured.density, level.label, k, 'faint')
+            spectrum.line(measured.frequency, measured.fitted, '', k, 'dash thick')
+            for line in level.lines.lines[:_MAX_MARKED]:
+                spectrum.mark(line.frequency, f'{line.frequency:.4g} Hz')
         x, y = _histogram(level)
         if x.size:
             counted += 1

@@ -14,13 +14,13 @@ from ou_monitor.offline.discover.gain_words import MNAT, overlap_words
 from ou_monitor.offline.discover.words import (
     crossing_words, plain_model_words, plain_words, with_error)
 from ou_monitor.offline.report import page
+from ou_monitor.offline.report.cells import figure, UNKNOWN
 from ou_monitor.offline.report.dots import dot_rows
 from ou_monitor.offline.report.pictures import Picture, pictures
 from ou_monitor.offline.report.scale import span
 from ou_monitor.offline.report.svg import Plot
 from ou_monitor.offline.words import number
 
-_UNKNOWN = '\u2013'
 # Rows of statistics drawn at most.
 _ROWS = 18
 
@@ -71,7 +71,7 @@ def _typeset(text: str) -> str:
 
 
 def _value(value: float, digits: int = 3) -> str:
-    return number(value, digits).replace('-', '\u2212') if math.isfinite(value) else NOT_KNOWN
+    return figure(value, digits) if math.isfinite(value) else NOT_KNOWN
 
 
 def _with_error(value: float, error: float) -> str:
@@ -98,7 +98,7 @@ def _causes(finding: Finding) -> list[str]:
     overlap = overlap_words(finding.causes, finding.gain)
     rows = [[row.label, row.family,
              _minus(_typeset(row.gain)) + (f'\n{row.remark}' if row.remark else ''),
-             row.chance, ', '.join(row.alternatives) or _UNKNOWN] for row in found]
+             row.chance, ', '.join(row.alternatives) or UNKNOWN] for row in found]
     return [
         page.table(['Cause', 'Family', 'Gain, mnat per sample', 'p', 'Not told from'], rows,
                    left=[0, 1, 4]),
@@ -213,7 +213,7 @@ def _parameters(finding: Finding) -> list[str]:
             value = list(value) if isinstance(value, tuple) else value
             rows.append([term.NAME, spec.name,
                          _typeset(with_error(value, se.get(spec.name))),
-                         spec.metadata['unit'] or _UNKNOWN, spec.metadata['text']])
+                         spec.metadata['unit'] or UNKNOWN, spec.metadata['text']])
     about = ('Extended model: all terms fitted together on the whole recording. Its alpha and '
              'sigma are what is left of the relaxation and the noise beside all causes; those of '
              'the plain OU above, fitted on the first 60 %, hold the causes as well.'

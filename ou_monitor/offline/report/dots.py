@@ -53,7 +53,9 @@ def dot_rows(title: str, x_label: str,
                     f'{f"{value:g}".replace("-", chr(0x2212))}</text>')
     for k, (name, low, high, before, after) in enumerate(rows):
         y = _TOP + _ROW * (k + 0.5)
-        parts.append(f'<text class="legend" text-anchor="end" x="{_LEFT - 10}" '
+        # Browsers show the title of a group where one points at it.
+        parts.append(f'<g><title>{escape(_sentence(name, low, high, before, after))}</title>'
+                     f'<text class="legend" text-anchor="end" x="{_LEFT - 10}" '
                      f'y="{y + 4:.1f}">{escape(name)}</text>'
                      f'<rect class="band s0" x="{at(low):.1f}" y="{y - 8:.1f}" '
                      f'width="{at(high) - at(low):.1f}" height="16"/>')
@@ -65,6 +67,19 @@ def dot_rows(title: str, x_label: str,
             if math.isfinite(value):
                 parts.append(f'<circle cx="{at(value):.1f}" cy="{y:.1f}" r="5" '
                              f'style="fill: {fill}; stroke: var(--c1); stroke-width: 2"/>')
+        parts.append('</g>')
     parts.append(f'<text class="label" text-anchor="middle" x="{middle:.0f}" '
                  f'y="{height - 6}">{escape(x_label)}</text></svg>')
     return '\n'.join(parts)
+
+
+def _sentence(name: str, low: float, high: float, before: float, after: float) -> str:
+    """Return the numbers of a row; what is not known is left out."""
+    def text(value: float) -> str:
+        return f'{value:.3g}'.replace('-', '\u2212')
+
+    known = [(word, value) for word, value in (('before', before), ('after', after))
+             if math.isfinite(value)]
+    # A single dot is neither before nor after anything.
+    said = [f'{word} {text(value)}' if len(known) == 2 else text(value) for word, value in known]
+    return f'{name}: {", ".join([*said, f"simulations {text(low)} to {text(high)}"])}'

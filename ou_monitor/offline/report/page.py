@@ -1,9 +1,22 @@
-"""The HTML page around the plots: skeleton, tables, lists; everything is escaped here."""
+"""
+The HTML page around the plots: skeleton, tables, lists; everything is escaped here.
+
+A page with plots has one script, which makes them interactive from the data embedded beside each.
+Its content security policy names that script by its hash and forbids all other scripts, and every
+request to a network.
+"""
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
+from functools import cache
+import hashlib
 from html import escape
+from importlib import resources
+
+from ou_monitor.offline.report.embedding import embed
+from ou_monitor.offline.report.figure import Drawing
 
 # Hues of Okabe & Ito (2008), told apart with every common colour blindness;
 # lifted for the dark form.
@@ -62,6 +75,22 @@ def _stylesheet() -> str:
     return _STYLE.replace('LIGHT', names(_LIGHT)).replace('DARK', names(_DARK)) + series
 
 
+@cache
+def _file(name: str) -> str:
+    """Return a text file of this folder."""
+    return resources.files(__package__).joinpath(name).read_text(encoding='utf-8')
+
+
+@cache
+def _script() -> tuple[str, str]:
+    """Return the text of the script, and the source that names it in the policy."""
+    code = ''.join(_file(f'plots_{part}.js') for part in ('draw', 'input', 'live'))
+    # A section of character data to a parser of XML, comments to a script.
+    text = f"//<![CDATA[\n'use strict';\n{{\n{code}}}\n//]]>"
+    digest = base64.b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')
+    return text, f"'sha256-{digest}'"
+
+
 def page(title: str, subtitle: str, sections: Sequence[str]) -> str:
     """
     Return a whole page that needs nothing but itself.
@@ -80,11 +109,17 @@ def page(title: str, subtitle: str, sections: Sequence[str]) -> str:
 
     """
     body = '\n'.join(sections)
+    text, source = _script() if 'class="plot-data"' in body else ('', "'none'")
+    policy = (f"default-src 'none'; script-src {source}; style-src 'unsafe-inline'; "
+              "base-uri 'none'; form-action 'none'")
+    style = _stylesheet() + (_file('plots.css') if text else '')
+    script = f'<script>{text}</script>\n' if text else ''
     return (f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>\n'
+            f'<meta http-equiv="Content-Security-Policy" content="{policy}"/>\n'
             '<meta name="viewport" content="width=device-width, initial-scale=1"/>\n'
-            f'<title>{escape(title)}</title>\n<style>{_stylesheet()}</style></head>\n'
+            f'<title>{escape(title)}</title>\n<style>{style}</style></head>\n'
             f'<body>\n<h1>{escape(title)}</h1>\n<p class="soft">{escape(subtitle)}</p>\n'
-            f'{body}\n</body></html>\n')
+            f'{body}\n{script}</body></html>\n')
 
 
 def headline(text: str) -> str:
@@ -117,9 +152,25 @@ def bullets(items: Sequence[str], warn: bool = False) -> str:
 
 
 def figure(drawing: str, caption: str = '') -> str:
-    """Return a drawing (HTML) with a caption (plain text)."""
+    """
+    Return a drawing with a caption.
+
+    Parameters
+    ----------
+    drawing : str
+        HTML; what `Plot.svg` returns becomes interactive.
+    caption : str
+        Plain text.
+
+    Returns
+    -------
+    str
+        HTML.
+
+    """
+    data = embed(drawing.figure) if isinstance(drawing, Drawing) else ''
     below = f'<figcaption>{escape(caption)}</figcaption>' if caption else ''
-    return f'<figure>{drawing}{below}</figure>'
+    return f'<figure>{drawing}{data}{below}</figure>'
 
 
 def pair(*figures: str) -> str:

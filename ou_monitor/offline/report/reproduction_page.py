@@ -20,7 +20,6 @@ from ou_monitor.offline.reproduce.reproduce import Reproduction
 from ou_monitor.offline.reproduce.row import Row
 from ou_monitor.offline.reproduce.table2 import sigma_of
 from ou_monitor.offline.reproduce.words import headline, recomputed
-from ou_monitor.records import FloatArray
 
 _NONE = '\u2013'
 _BINS = 40
@@ -116,15 +115,6 @@ def _screens(result: Reproduction) -> list[str]:
         'something faster rides on the rail.', soft=True)]
 
 
-def _crosses(plot: Plot, x: FloatArray, y: FloatArray, width: float, height: float) -> None:
-    """Draw the points of Fig. 5 as crosses; sizes in data units."""
-    gap = math.nan
-    for k, (a, b) in enumerate(zip(x.tolist(), y.tolist())):
-        plot.line(np.array([a - width, a + width, gap, a, a]),
-                  np.array([b, b, gap, b - height, b + height]),
-                  'points of Fig. 5' if k == 0 else '', 7, 'thick')
-
-
 def _transient() -> list[str]:
     """Return Fig. 5 with its fits, in voltages and in logarithms."""
     line = transient.paper_fit()
@@ -153,14 +143,7 @@ def _transient() -> list[str]:
         plot.limits(x=(-1.5, 55.0), y=(3.0, 600.0) if log else (-10.0, 420.0))
         for k, (y, label, style) in enumerate(curves):
             plot.line(1e3 * t, np.where(y > 0.0, y, math.nan) if log else y, label, k, style)
-        x, y = 1e3 * transient.TIME, transient.VALUE
-        if log:
-            for k, (a, b) in enumerate(zip(x.tolist(), y.tolist())):
-                plot.line(np.array([a - 0.8, a + 0.8, math.nan, a, a]),
-                          np.array([b, b, math.nan, b / 1.12, b * 1.12]),
-                          'points of Fig. 5' if k == 0 else '', 7, 'thick')
-        else:
-            _crosses(plot, x, y, 0.8, 9.0)
+        plot.markers(1e3 * transient.TIME, transient.VALUE, 'points of Fig. 5', 7)
         drawn.append(page.figure(plot.svg()))
     return [page.pair(*drawn), page.paragraph(
         f'Dashed: a rail {rail / paper.ALPHA.value:.0f} times faster, seen through an AC coupling '

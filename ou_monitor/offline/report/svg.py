@@ -1,18 +1,18 @@
 """
-Plots as inline SVG, drawn here: no plotting library, no script, no network.
+Plots as inline SVG, drawn here: no plotting library, no network, shown without a script.
 
-Colours are CSS classes (``s0`` .. ``s7`` for series), so that `page` can give
-them a light and a dark form.
+On a page, `page.figure` puts the data beside the drawing, and the script of the page makes it
+interactive; paper and browsers without scripts show what is drawn here.  Colours are CSS classes
+(``s0`` .. ``s7`` for series), so that `page` can give them a light and a dark form.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from html import escape
 
 import numpy as np
 
+from ou_monitor.offline.report.figure import Curve, Drawing, Figure
 from ou_monitor.offline.report.scale import Scale, span, thin, tick_text
 from ou_monitor.records import FloatArray
 
@@ -25,16 +25,6 @@ _LETTER = 7.0
 _CAP = 7.0
 # Height of a legend in a row of its own, pixels.
 _LEGEND = 18
-
-
-@dataclass(frozen=True, eq=False)
-class _Curve:
-    x: FloatArray
-    y: FloatArray
-    high: FloatArray | None
-    label: str
-    style: str
-    kind: str
 
 
 class Plot:
@@ -68,7 +58,7 @@ class Plot:
         self._width, self._height = width, height
         self._log_x, self._log_y = log_x, log_y
         self._legend_low, self._legend_row = legend_low, legend_row
-        self._curves: list[_Curve] = []
+        self._curves: list[Curve] = []
         self._spans: list[tuple[float, float, str, str]] = []
         self._marks: list[tuple[float, str]] = []
         self._x_range: tuple[float, float] | None = None
@@ -96,14 +86,15 @@ class Plot:
             This plot.
 
         """
-        self._curves.append(_Curve(np.asarray(x, float), np.asarray(y, float), None, label,
-                                   f's{colour % SERIES} {style}'.strip(), 'line'))
+        self._curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
+                                  f's{colour % SERIES} {style}'.strip(), 'line'))
         return self
 
     def steps(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0) -> Plot:
         """Add a line that holds each value until the next point."""
-        x, y = thin(np.asarray(x, float), np.asarray(y, float), self._width)
-        return self.line(np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1], label, colour)
+        self._curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
+                                  f's{colour % SERIES}', 'steps'))
+        return self
 
     def band(self, x: FloatArray, low: FloatArray, high: FloatArray, label: str = '',
              colour: int = 0) -> Plot:
@@ -125,21 +116,21 @@ class Plot:
             This plot.
 
         """
-        self._curves.append(_Curve(
+        self._curves.append(Curve(
             np.asarray(x, float), np.asarray(low, float), np.asarray(high, float), label,
             f's{colour % SERIES}', 'band'))
         return self
 
     def markers(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0) -> Plot:
         """Add a dot at each point; none where it is NaN."""
-        self._curves.append(_Curve(np.asarray(x, float), np.asarray(y, float), None, label,
-                                   f's{colour % SERIES}', 'markers'))
+        self._curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
+                                  f's{colour % SERIES}', 'markers'))
         return self
 
     def bars(self, x: FloatArray, low: FloatArray, high: FloatArray, label: str = '',
              colour: int = 0) -> Plot:
         """Add a bar from `low` to `high` at each point, with caps; none where one is NaN."""
-        self._curves.append(_Curve(
+        self._curves.append(Curve(
             np.asarray(x, float), np.asarray(low, float), np.asarray(high, float), label,
             f's{colour % SERIES}', 'bars'))
         return self
@@ -161,14 +152,14 @@ class Plot:
         self._y_range = y or self._y_range
         return self
 
-    def svg(self) -> str:
+    def svg(self) -> Drawing:
         """
         Return the drawing.
 
         Returns
         -------
-        str
-            An ``<svg>`` element; well-formed XML.
+        Drawing
+            An ``<svg>`` element, well-formed XML; a str that remembers what it shows.
 
         """
         right, bottom = self._width - _RIGHT, self._height - _BOTTOM
@@ -205,10 +196,13 @@ class Plot:
                 parts.append(f'<line class="mark" x1="{pixel:.1f}" y1="{self._top}" '
                              f'x2="{pixel:.1f}" y2="{bottom}"/><text class="note" '
                              f'x="{pixel + 4:.1f}" y="{self._top + 12}">{escape(label)}</text>')
-        return '\n'.join([*parts, *self._legend(right, bottom), '</svg>'])
+        return Drawing('\n'.join([*parts, *self._legend(right, bottom), '</svg>']), Figure(
+            self.title, self._x_label, self._y_label, self._width, self._height, self._log_x,
+            self._log_y, (x_low, x_high), (y_low, y_high), tuple(self._curves),
+            tuple(self._spans), tuple(self._marks)))
 
     @property
-    def _named(self) -> list[_Curve]:
+    def _named(self) -> list[Curve]:
         """Return the curves of the legend."""
         return [c for c in self._curves if c.label]
 
@@ -251,7 +245,7 @@ class Plot:
                      f'{middle:.0f}) rotate(-90)">{escape(self._y_label)}</text>')
         return parts
 
-    def _draw(self, curve: _Curve, x: Scale, y: Scale) -> str:
+    def _draw(self, curve: Curve, x: Scale, y: Scale) -> str:
         if curve.kind == 'markers':
             return ''.join(
                 f'<circle class="dot {curve.style}" cx="{a:.1f}" cy="{b:.1f}" r="4"/>'
@@ -270,7 +264,11 @@ class Plot:
                 back = _points(px[run][::-1], high[run][::-1])
                 pieces.append(f'M{there}L{back}Z')
             return f'<path class="band {curve.style}" d="{"".join(pieces)}"/>'
-        px, py = thin(x(curve.x), y(curve.y), self._width)
+        px, py = x(curve.x), y(curve.y)
+        if curve.kind == 'steps':
+            px, py = thin(px, py, self._width)
+            px, py = np.repeat(px, 2)[1:], np.repeat(py, 2)[:-1]
+        px, py = thin(px, py, self._width)
         pieces = [f'M{_points(px[run], py[run])}'
                   for run in _stretches(np.isfinite(px) & np.isfinite(py))]
         return f'<path class="line {curve.style}" d="{"".join(pieces)}"/>'
@@ -293,7 +291,7 @@ class Plot:
                 *[_legend_entry(c, left + 4.0, top + 16 + 16 * k) for k, c in enumerate(named)]]
 
 
-def _legend_entry(curve: _Curve, x: float, y: int) -> str:
+def _legend_entry(curve: Curve, x: float, y: int) -> str:
     swatch = (f'<rect class="band {curve.style}" x="{x:.0f}" y="{y - 9}" width="18" height="10"/>'
               if curve.kind == 'band' else
               f'<circle class="dot {curve.style}" cx="{x + 9:.0f}" cy="{y - 4}" r="4"/>'
@@ -321,8 +319,3 @@ def _points(x: FloatArray, y: FloatArray) -> str:
     y = np.clip(y, -1e4, 1e4)
     x = np.clip(x, -1e4, 1e4)
     return 'L'.join(f'{a:.1f},{b:.1f}' for a, b in zip(x, y))
-
-
-def join(plots: Sequence[Plot]) -> str:
-    """Return several drawings one below the other."""
-    return '\n'.join(plot.svg() for plot in plots)

@@ -1,0 +1,198 @@
+#!/usr/bin/env python3
+"""
+How often `analyze` finds what is not there, and what is: `benchmarks/analysis.py [RECORDINGS]`.
+
+Recordings of three load levels, 5 s each at 1 kHz, with the paper's alpha, white noise of 3 mV and
+a sag; half of them with one thing added.  Also what each part of an analysis costs, as shares of
+the whole in one run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+import sys
+import time
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from ou_monitor.model.ou import simulate  # noqa: E402, I100
+from ou_monitor.offline import analyze as module  # noqa: E402
+from ou_monitor.offline.analyze import Analysis, analyze  # noqa: E402
+from ou_monitor.recordings.read import read_recording  # noqa: E402
+from ou_monitor.records import FloatArray, Recording  # noqa: E402
+from scipy.signal import lfilter  # noqa: E402
+
+ALPHA, RATE, SECONDS = 63.0, 1000.0, 5.0
+THROTTLES, SIGMAS = (0.1, 0.3, 0.6), (0.2, 0.4, 0.6)
+Effect = Callable[[FloatArray, FloatArray, np.random.Generator], FloatArray]
+
+
+def made(seed: int, effect: Effect | None = None, alphas: tuple[float, ...] = (ALPHA,) * 3,
+         tau: float = 0.0) -> Recording:
+    """Return a recording; the sag of 0.5 V times throttle follows with tau, or at once."""
+    rng = np.random.default_rng(seed)
+    n = int(SECONDS * RATE)
+    t = np.arange(3 * n) / RATE
+    which = np.arange(3 * n) // n
+    throttle, sigma = np.array(THROTTLES)[which], np.array(SIGMAS)[which]
+    target = 5.0 - 0.5 * throttle
+    if tau:
+        since = np.mod(t, SECONDS)
+        before = 5.0 - 0.5 * np.array(THROTTLES)[np.maximum(which - 1, 0)]
+        target = target + (before - target) * np.exp(-since / tau)
+    parts = [simulate(t[which == k], alphas[k], SIGMAS[k], rng) for k in range(3)]
+    voltage = target + np.concatenate(parts) + rng.normal(0.0, 0.003, t.size)
+    if effect is not None:
+        voltage = voltage + effect(t, sigma / np.sqrt(RATE), rng)
+    return Recording(t, voltage, throttle)
+
+
+def stays(seed: int, sag: float = 0.0, tau: float = 0.03) -> Recording:
+    """
+    Return six stays of 2.5 s at 0 and 50 %: sigma 0.1 and 0.6, the noise unbroken.
+
+    The sag at 50 %, V, follows with tau; 0: the mean does not respond to throttle at all.
+    """
+    rng = np.random.default_rng(seed)
+    t = np.arange(int(15.0 * RATE)) / RATE
+    loaded = np.floor(t / 2.5) % 2
+    phi, slow = np.exp(-ALPHA / RATE), np.exp(-1.0 / (RATE * tau))
+    shocks = (0.1 + 0.5 * loaded) * np.sqrt((1.0 - phi * phi) / (2.0 * ALPHA))
+    noise = lfilter([1.0], [1.0, -phi], shocks * rng.normal(size=t.size))
+    level = 5.0 - sag * lfilter([1.0 - slow], [1.0, -slow], loaded)
+    return Recording(t, level + noise + rng.normal(0.0, 0.003, t.size), 0.5 * loaded)
+
+
+def drift(t: FloatArray, step: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return 10 mV/s."""
+    return 0.01 * t
+
+
+def tone(t: FloatArray, step: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return 1.4 mV rms at a random frequency."""
+    return 0.002 * np.sin(2.0 * np.pi * rng.uniform(50.0, 450.0) * t)
+
+
+def glitches(t: FloatArray, step: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return one sample in 1000 off by eight steps of the noise."""
+    return np.where(rng.uniform(size=t.size) < 1e-3, 8.0 * step, 0.0)
+
+
+def kinds(analysis: Analysis) -> set[str]:
+    """Return the words for the levels."""
+    return {level.kind.value for level in analysis.levels}
+
+
+def line(analysis: Analysis) -> bool:
+    """Return whether any line was found."""
+    return any(level.lines.lines for level in analysis.levels)
+
+
+def share(count: int, effect: Effect | None, seen: Callable[[Analysis], bool],
+          first: int = 0, **options: object) -> str:
+    """Return how many recordings show something, in percent."""
+    found = sum(seen(analyze(made(first + k, effect, **options)))  # type: ignore[arg-type]
+                for k in range(count))
+    return f'{found} of {count}'
+
+
+def false_alarms(count: int) -> None:
+    """Print what is found in plain OU levels."""
+    alarms = {'a word other than diffusion': 0, 'a line': 0, 'alpha differs (stated 5 %)': 0,
+              'a transient': 0}
+    for seed in range(count):
+        found = analyze(made(seed))
+        alarms['a word other than diffusion'] += kinds(found) != {'diffusion'}
+        alarms['a line'] += line(found)
+        alarms['alpha differs (stated 5 %)'] += found.alpha_test.verdict == 'differs'
+        alarms['a transient'] += any(fit.seen for fit in found.relaxations)
+    for what, number in alarms.items():
+        print(f'  {what}: {number} of {count}')
+
+
+def throttle_goes_up_and_down(count: int) -> None:
+    """Print what is seen after falls and rises of throttle, where there is a sag and where not."""
+    for sag in (0.0, 0.1, 0.3):
+        found = [analyze(stays(20_000 + seed, sag)) for seed in range(count)]
+        seen = [fit for one in found for fit in one.relaxations if fit.seen]
+        falls, rises = (sum(one.relaxations[k].seen for one in found) for k in (0, 1))
+        told = f'  sag {sag:g} V: seen after falls in {falls}, after rises in {rises} of {count}'
+        if sag:
+            holds = sum(fit.tau_low < 0.03 < fit.tau_high for fit in seen)
+            told += (f'; {holds} of {len(seen)} intervals hold 30 ms; '
+                     f'{sum(fit.badly_fitted for fit in seen)} called badly fitted')
+        print(told)
+        said = sum(level.scatter_p < 0.01 for one in found for level in one.levels)
+        wide = sum(level.scatter > 1.5 for one in found for level in one.levels)
+        print(f'    levels called not one process: {said} of {2 * count} (their intervals widened '
+              f'by more than 1.5: {wide})')
+
+
+def power(count: int) -> None:
+    """Print how often something that is there is found."""
+    rows: tuple[tuple[str, Effect | None, Callable[[Analysis], bool], dict[str, object]], ...] = (
+        ('drift of 10 mV/s: quasi-stationary', drift,
+         lambda a: 'quasi-stationary' in kinds(a), {}),
+        ('tone of 1.4 mV rms: a line', tone, line, {}),
+        ('one sample in 1000 off by 8 steps: with impulses', glitches,
+         lambda a: 'with impulses' in kinds(a), {}),
+        ('alpha 40, 63, 100 1/s: differs', None, lambda a: a.alpha_test.verdict == 'differs',
+         {'alphas': (40.0, 63.0, 100.0)}),
+        ('sag of 0.10 and 0.15 V with tau = 30 ms: seen', None,
+         lambda a: a.relaxations[1].seen, {'tau': 0.03}),
+        ('... and its 95 % interval holds 30 ms', None,
+         lambda a: a.relaxations[1].tau_low < 0.03 < a.relaxations[1].tau_high, {'tau': 0.03}))
+    for name, effect, seen, options in rows:
+        print(f'  {name}: {share(count, effect, seen, 10_000, **options)}')
+
+
+def costs() -> None:
+    """Print the share of each part in the time of an analysis."""
+    rng = np.random.default_rng(1)
+    t = np.arange(600_000) / RATE
+    throttle = np.repeat(np.tile([0.1, 0.4, 0.25, 0.6], 15), 10_000)
+    long = Recording(t, simulate(t, ALPHA, 0.2 + throttle, rng, u0=5.0 - 0.3 * throttle),
+                     throttle, '10 minutes at 1 kHz')
+    parts = {'fit of the levels': 'fit_stretch', 'tests': 'examine_level', 'lines': 'find_lines',
+             'spectra': 'level_spectrum', 'transients': '_relaxations',
+             'sliding window and curves': 'slide'}
+    for recording in (read_recording(ROOT / 'bags' / 'flight'), long):
+        # The table of first passage is made once a process.
+        analyze(recording)
+        spent = dict.fromkeys(parts, 0.0)
+        originals = {name: getattr(module, name) for name in parts.values()}
+
+        def timed(label: str, call: Callable[..., object]) -> Callable[..., object]:
+            def run(*args: object, **kwargs: object) -> object:
+                start = time.perf_counter()
+                try:
+                    return call(*args, **kwargs)
+                finally:
+                    spent[label] += time.perf_counter() - start
+            return run
+
+        for label, name in parts.items():
+            setattr(module, name, timed(label, originals[name]))
+        start = time.perf_counter()
+        analyze(recording)
+        whole = time.perf_counter() - start
+        for name, call in originals.items():
+            setattr(module, name, call)
+        print(f'  {recording.name}: {whole:.2f} s, of which ' + ', '.join(
+            f'{label} {100.0 * s / whole:.0f} %' for label, s in spent.items()))
+
+
+if __name__ == '__main__':
+    recordings = int(sys.argv[1]) if len(sys.argv) > 1 else 200
+    print(f'False alarms in {recordings} recordings of plain OU levels (stated 1 %):')
+    false_alarms(recordings)
+    print('Six stays, up and down, sigma 0.1 and 0.6, tau 30 ms:')
+    throttle_goes_up_and_down(recordings // 2)
+    print('Found where it is there:')
+    power(recordings // 4)
+    print('Cost:')
+    costs()

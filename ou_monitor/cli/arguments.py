@@ -1,0 +1,199 @@
+"""Arguments that several commands share: how they are announced, read, and said again."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from typing import Any, TYPE_CHECKING
+
+from ou_monitor.errors import InputError
+
+if TYPE_CHECKING:
+    from ou_monitor.records import Recording
+
+_NAN = float('nan')
+
+
+# Options of the topics, by the names that the parser gives them.
+_TOPICS = ('msg_config', 'voltage_topic', 'throttle_topic')
+
+
+def add_recording(parser: argparse.ArgumentParser) -> None:
+    """
+    Announce RECORDING.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+
+    """
+    parser.add_argument(
+        'recording', metavar='RECORDING',
+        help='.mcap file, rosbag2 folder, or CSV with columns time_s, voltage_v[, throttle]')
+
+
+def add_part(parser: argparse.ArgumentParser) -> None:
+    """
+    Announce ``--from`` and ``--to``.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+
+    """
+    parser.add_argument('--from', metavar='S', dest='start',
+                        help='leave out what comes before, s after the first message')
+    parser.add_argument('--to', metavar='S', dest='end',
+                        help='leave out what comes from here on, s after the first message')
+
+
+def add_topics(parser: argparse.ArgumentParser) -> None:
+    """
+    Announce what says how bags are read: the topics, and ``--partial``.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+
+    """
+    parser.add_argument('--msg-config', metavar='NAME',
+                        help='msg_config that says which topic and field is the voltage')
+    parser.add_argument('--voltage-topic', metavar='TOPIC', help='topic of the voltage')
+    parser.add_argument('--throttle-topic', metavar='TOPIC', help='topic of the throttle')
+    parser.add_argument('--partial', action='store_true',
+                        help='use what a truncated file still holds')
+
+
+def read_given(args: argparse.Namespace, start: float | None, end: float | None) -> Recording:
+    """
+    Read RECORDING as the arguments say, with a progress bar.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Parsed; of `add_recording` and `add_topics`.
+    start, end : float or None
+        Part to read, s.
+
+    Returns
+    -------
+    Recording
+        As of `read_recording`.
+
+    Raises
+    ------
+    InputError
+        As `read_recording`.
+
+    """
+    from ou_monitor.cli import output
+    from ou_monitor.recordings.read import read_recording
+
+    with output.Progress('reading') as progress:
+        return read_recording(
+            args.recording, msg_config=args.msg_config, voltage_topic=args.voltage_topic,
+            throttle_topic=args.throttle_topic, partial=args.partial, start=start, end=end,
+            progress=progress)
+
+
+def said_again(args: argparse.Namespace, *names: str) -> list[str]:
+    """
+    Return the words of a command line that repeat how a recording is read.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Parsed.
+    *names : str
+        Further options of one value, by their names in `args`; they come
+        before the topics.
+
+    Returns
+    -------
+    list of str
+        Options that were given, and their values.
+
+    """
+    words: list[str] = []
+    given: list[tuple[str, Any]] = [
+        ('--from', getattr(args, 'start', None)), ('--to', getattr(args, 'end', None))]
+    given += [('--' + name.replace('_', '-'), getattr(args, name)) for name in (*names, *_TOPICS)]
+    for option, value in given:
+        if value is not None:
+            words += [option, str(value)]
+    return words + (['--partial'] if args.partial else [])
+
+
+def positive_number(option: str, text: str) -> float:
+    """
+    Return the number of an option.
+
+    Raises
+    ------
+    InputError
+        When it is not positive and finite.
+
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = _NAN
+    if not (math.isfinite(value) and value > 0.0):
+        raise InputError(f"{option}: '{text}' is not a positive number")
+    return value
+
+
+def throttle_levels(text: str | None) -> tuple[float, ...] | None:
+    """
+    Return the levels of ``--levels 0,0.05,...``, in order; None when not given.
+
+    Raises
+    ------
+    InputError
+        For what is not a throttle, or twice.
+
+    """
+    if text is None:
+        return None
+    levels = []
+    for word in text.split(','):
+        try:
+            value = float(word)
+        except ValueError:
+            value = _NAN
+        if not 0.0 <= value <= 1.0:
+            raise InputError(f"--levels: '{word.strip()}' is not a throttle between 0 and 1; "
+                             'write 5 % as 0.05 and separate levels by commas')
+        levels.append(value)
+    ordered = sorted(levels)
+    if any(high - low < 1e-6 for low, high in zip(ordered, ordered[1:])):
+        raise InputError(f"--levels: a level is given twice in '{text}'")
+    return tuple(ordered)
+
+
+def part_of_recording(start: str | None, end: str | None) -> tuple[float | None, float | None]:
+    """
+    Return the ends of the part to read, s, of ``--from`` and ``--to``; None where there is none.
+
+    Raises
+    ------
+    InputError
+        For what is no time, or an end before the beginning.
+
+    """
+    found: list[float | None] = []
+    for option, text in (('--from', start), ('--to', end)):
+        try:
+            value = None if text is None else float(text)
+        except ValueError:
+            value = _NAN
+        if value is not None and not (math.isfinite(value) and value >= 0.0):
+            raise InputError(f"{option}: '{text}' is not a time in seconds, 0 or more")
+        found.append(value)
+    first, last = found
+    if first is not None and last is not None and not first < last:
+        raise InputError(f'--from {start} is not before --to {end}')
+    return first, last

@@ -1,0 +1,246 @@
+"""`ou-monitor fleet RECORDING...`: many recordings -> one table and one report."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import math
+from pathlib import Path
+import shlex
+import sys
+from typing import Any, TYPE_CHECKING
+
+from ou_monitor import __version__
+from ou_monitor.cli import output
+from ou_monitor.cli.arguments import add_topics, positive_number, said_again, throttle_levels
+from ou_monitor.errors import InputError
+
+if TYPE_CHECKING:
+    from ou_monitor.offline.fleet.run import Fleet
+
+TABLE, REPORT = 'fleet.parquet', 'fleet.html'
+# What is listed at most of one kind; all of it is in the report and in the table.
+_SHOWN = 10
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        From ``ArgumentParser.add_subparsers``.
+
+    """
+    parser = subparsers.add_parser(
+        'fleet', allow_abbrev=False,
+        help='many recordings -> a table (Parquet) and a report: outliers, drift of a vehicle',
+        description='Analyze many recordings on several processes: one Parquet table with a row '
+                    'for each recording and load level, and a report with outliers and with the '
+                    'drift of each vehicle over its flights. What is done is not done again: the '
+                    'same command goes on where it was stopped.')
+    parser.add_argument(
+        'recordings', metavar='RECORDING', nargs='+',
+        help='.mcap files, rosbag2 folders, .csv files, and folders to be searched for them')
+    parser.add_argument('--output', metavar='DIR', required=True,
+                        help=f'folder for {TABLE}, {REPORT} and the parts of a run')
+    parser.add_argument('--workers', metavar='N',
+                        help='local processes (default: one a core)')
+    parser.add_argument('--scheduler', metavar='ADDRESS',
+                        help='Dask scheduler whose workers are used instead, tcp://HOST:8786; '
+                        'they see the recordings under the same paths')
+    parser.add_argument('--vehicle-from', metavar='REGEX',
+                        help="finds the vehicle in a recording's path (its first group) where "
+                        'the metadata name none (default: the folder it lies in)')
+    parser.add_argument('--discover', action='store_true',
+                        help='also look for causes; some seconds a recording (default: off)')
+    parser.add_argument('--seed', metavar='N', type=int, default=0,
+                        help='of discover (default: %(default)s)')
+    parser.add_argument('--levels', metavar='0,0.05,...',
+                        help='throttles 0..1 of the load levels (default: found in each '
+                        'recording)')
+    parser.add_argument('--window', metavar='S', default='2.0',
+                        help='window of the sliding estimate, s (default: 2.0)')
+    parser.add_argument('--brownout-voltage', metavar='V',
+                        help='also give the risk of going below this voltage, V')
+    parser.add_argument('--brownout-horizon', metavar='S', default='5.0',
+                        help='horizon of that risk, s (default: 5.0)')
+    add_topics(parser)
+    parser.add_argument('--json', metavar='FILE',
+                        help="write the result as JSON ('-': to standard output, alone)")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    Run the command.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Parsed arguments.
+
+    Returns
+    -------
+    int
+        Exit status, 0; recordings that cannot be read are rows with an error.
+
+    Raises
+    ------
+    InputError
+        When an argument cannot be used, no recording is found or can be
+        analysed, the output cannot be written, or there are no workers.
+
+    """
+    from ou_monitor.offline.fleet.cluster import check_extra, usable_cores
+
+    if not args.output:
+        raise InputError('--output: the path is empty')
+    if args.scheduler is not None and args.workers is not None:
+        raise InputError('--workers is for local processes, --scheduler for a cluster: give one')
+    workers = usable_cores() if args.workers is None else _count('--workers', args.workers)
+    if args.seed < 0:
+        raise InputError(f'--seed must be 0 or more, got {args.seed}')
+    check_extra()
+    folder = Path(args.output)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--output '{folder}' is a file: name a folder")
+    output.check_writable(args.json)
+
+    from ou_monitor.offline.fleet.find import find_recordings
+    from ou_monitor.offline.fleet.run import run_fleet
+    from ou_monitor.offline.fleet.vehicles import read_pattern
+
+    options, more = _options(args)
+    pattern = None if args.vehicle_from is None else read_pattern(args.vehicle_from)
+    found = find_recordings(args.recordings, leave_out=folder)
+    try:
+        with output.Progress('comparing') as comparing, output.Progress('analyzing') as progress:
+            fleet = run_fleet(
+                found, folder, options, version, workers=workers, scheduler=args.scheduler,
+                pattern=pattern, stated_options=more, comparing=comparing, progress=progress)
+    except KeyboardInterrupt:
+        print(f"stopped; what is done is kept in '{folder}', and the same command goes on from "
+              'there', file=sys.stderr)
+        raise
+    _write(fleet, folder, args)
+    if not fleet.analysed:
+        raise InputError(f"none of the recordings could be analysed; why is in '{folder}', and in "
+                         'the column error of the table')
+    return 0
+
+
+def version() -> str:
+    """Return the version of the package, as a worker has it."""
+    return __version__
+
+
+def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
+    from ou_monitor.offline.fleet.parts import write_whole
+    from ou_monitor.offline.fleet.table import write_table
+    from ou_monitor.offline.report.fleet_page import fleet_page
+
+    write_table(fleet.rows, folder / TABLE)
+    write_whole(folder / REPORT, fleet_page(fleet, command_line(args)).encode())
+    if args.json is not None:
+        from ou_monitor.offline.fleet.words import as_data
+        output.write_json(as_data(fleet), args.json)
+    if args.json != output.STDOUT:
+        output.say(render(fleet))
+        output.say(f'\nTable: {folder / TABLE}\nReport: {folder / REPORT}')
+
+
+def command_line(args: argparse.Namespace) -> str:
+    """
+    Return the command that repeats this fleet.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Parsed arguments.
+
+    Returns
+    -------
+    str
+        Quoted for a shell.
+
+    """
+    words = ['ou-monitor', 'fleet', *args.recordings, '--output', args.output, *said_again(
+        args, 'vehicle_from', 'levels', 'window', 'brownout_voltage', 'brownout_horizon')]
+    return shlex.join(words + (['--discover', '--seed', str(args.seed)] if args.discover else []))
+
+
+def render(fleet: Fleet) -> str:
+    """
+    Return the fleet for a terminal 100 columns wide.
+
+    Parameters
+    ----------
+    fleet : Fleet
+        Result.
+
+    Returns
+    -------
+    str
+        Plain text.
+
+    """
+    from ou_monitor.offline.fleet.words import (
+        comparison_words, failure_words, finding_words, headline, vehicle_rows,
+        VEHICLE_HEADS)
+
+    lines = [output.paragraph(headline(fleet))]
+    rows = vehicle_rows(fleet)
+    if rows:
+        lines += ['', output.table([head for head, _ in VEHICLE_HEADS], rows[:2 * _SHOWN],
+                                   left=[0])]
+        if len(rows) > 2 * _SHOWN:
+            lines.append(f'and {len(rows) - 2 * _SHOWN} more vehicles: see the report')
+    for heading, items in (
+            ('What stands out', finding_words(fleet)),
+            ('Not analysed', failure_words(fleet)),
+            ('There twice, analysed once', [f"{row['path']} is {row['duplicate_of']}"
+                                            for row in fleet.duplicates])):
+        if items:
+            lines += ['', heading + ':', *[output.item(text) for text in items[:_SHOWN]]]
+            if len(items) > _SHOWN:
+                lines.append(output.item(f'and {len(items) - _SHOWN} more: see the report'))
+    lines += ['', *[output.item(note) for note in (*fleet.notes, *comparison_words(fleet))]]
+    return '\n'.join(lines)
+
+
+def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
+    """Return the options of the work, and the content of a file that they name."""
+    from ou_monitor.offline.fleet.work import Options
+
+    config, more = args.msg_config, {}
+    if config is not None:
+        if not config:
+            raise InputError('--msg-config: the path is empty')
+        if Path(config).is_file():
+            config = str(Path(config).resolve())
+            try:
+                more['msg_config_content'] = hashlib.blake2b(Path(config).read_bytes()).hexdigest()
+            except OSError as error:
+                raise InputError(f"--msg-config: cannot read '{config}': {error.strerror}"
+                                 ) from error
+        from ou_monitor.messages.config import load_msg_config
+        load_msg_config(config)
+    return Options(
+        levels=throttle_levels(args.levels), window=positive_number('--window', args.window),
+        brownout_voltage=math.nan if args.brownout_voltage is None else positive_number(
+            '--brownout-voltage', args.brownout_voltage),
+        brownout_horizon=positive_number('--brownout-horizon', args.brownout_horizon),
+        msg_config=config, voltage_topic=args.voltage_topic, throttle_topic=args.throttle_topic,
+        partial=args.partial, discover=args.discover, seed=args.seed), more
+
+
+def _count(option: str, text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if not 1 <= value <= 1024:
+        raise InputError(f"{option}: '{text}' is not a number of processes from 1 to 1024")
+    return value

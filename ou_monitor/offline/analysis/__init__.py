@@ -1,0 +1,1 @@
+"""What `analyze` finds beyond the fit of each level: tests, lines, transients, curves."""

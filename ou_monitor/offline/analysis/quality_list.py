@@ -1,0 +1,174 @@
+"""
+Everything that is doubtful about a recording, in one list, worst first.
+
+It gathers what the estimator flags at each level, what the reader dropped or mended, and what the
+samples and stamps show by themselves.  Limits: a list without warnings says that nothing was
+found, not that there is nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import enum
+import math
+
+import numpy as np
+from ou_monitor.offline.levels import GAP_STEPS
+from ou_monitor.online.quality import examine, TAIL
+from ou_monitor.records import Estimate, Flag, Recording, Status
+
+# Flags that inform; the others make numbers doubtful.
+_INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
+# Root mean square of the steps about their median, in medians, from which a clock is uneven.
+_UNEVEN = 0.05
+# Stretches of samples looked at for ADC steps.
+_LOOKS = 8
+# What the reader's sentences are about: a word in them, the name, and whether numbers suffer.
+_READER = (('damaged', 'DAMAGED_FILE', True), ('gap', 'GAPS', True),
+           ('sorted by stamp', 'UNORDERED', True), ('stamp was there', 'REPEATED_STAMPS', True),
+           ('not a finite', 'NON_FINITE', True))
+
+NOISE_UNKNOWN = (
+    'White noise of the sensor is not told from the supply here: where there is some, alpha '
+    'and sigma come out too high (Var_inf does not).')
+
+
+class Severity(enum.IntEnum):
+    """How much it matters."""
+
+    ERROR = 3
+    WARNING = 2
+    INFO = 1
+
+
+@dataclass(frozen=True)
+class QualityItem:
+    """
+    One thing to know before using the numbers.
+
+    Attributes
+    ----------
+    name : str
+        Stable key in capitals.
+    severity : Severity
+        ERROR: there are no numbers; WARNING: they are doubtful; INFO: good to know.
+    text : str
+        One sentence.
+    throttles : tuple of float
+        Levels it is true of; empty when it is of the whole recording.
+
+    """
+
+    name: str
+    severity: Severity
+    text: str
+    throttles: tuple[float, ...] = ()
+
+
+def quality_list(recording: Recording, throttles: Sequence[float], estimates: Sequence[Estimate],
+                 notes: Sequence[Sequence[str]], more: Sequence[QualityItem] = ()
+                 ) -> tuple[QualityItem, ...]:
+    """
+    Gather what is doubtful.
+
+    Parameters
+    ----------
+    recording : Recording
+        With the reader's notes.
+    throttles : sequence of float
+        Of the levels.
+    estimates : sequence of Estimate
+        Of the levels.
+    notes : sequence of sequence of str
+        Of the levels: what pooling their segments showed.
+    more : sequence of QualityItem
+        Found elsewhere, to be ranked with the others.
+
+    Returns
+    -------
+    tuple of QualityItem
+        Worst first; what is true of several levels stands once.
+
+    """
+    found: dict[tuple[str, Severity, str], list[float]] = {}
+    for throttle, estimate, told in zip(throttles, estimates, notes):
+        for item in [*_of_estimate(estimate), *(('SEGMENTS', Severity.INFO, text)
+                                                for text in told)]:
+            found.setdefault(item, []).append(throttle)
+    items = [QualityItem(*key, tuple(where)) for key, where in found.items()]
+    items += more
+    items += [_of_reader(note) for note in recording.notes]
+    items += _of_stamps(recording) + _of_samples(recording)
+    return tuple(sorted(items, key=lambda item: -item.severity))
+
+
+def _of_estimate(e: Estimate) -> list[tuple[str, Severity, str]]:
+    items = []
+    if e.status is not Status.OK:
+        severity = Severity.WARNING if e.usable else Severity.ERROR
+        items.append((e.status.name, severity, e.status.value))
+    items += [(flag.name, Severity.INFO if flag in _INFORMS else Severity.WARNING, flag.value)
+              for flag in e.flags]
+    # Measured at 20 mV of noise beside 56 mV of OU, 1 kHz: alpha +194 %.
+    if e.usable and math.isnan(e.noise_std):
+        items.append(('NOISE_UNKNOWN', Severity.WARNING, NOISE_UNKNOWN))
+    return items
+
+
+def _of_reader(note: str) -> QualityItem:
+    for word, name, suffers in _READER:
+        if word in note:
+            return QualityItem(name, Severity.WARNING if suffers else Severity.INFO, note)
+    return QualityItem('READER', Severity.INFO, note)
+
+
+def _of_stamps(recording: Recording) -> list[QualityItem]:
+    """Return what the stamps show: pauses, and an uneven clock."""
+    steps = np.diff(recording.t)
+    if steps.size < 2:
+        return []
+    items = []
+    median = float(np.median(steps))
+    pauses = steps > GAP_STEPS * median
+    if pauses.any():
+        items.append(QualityItem('PAUSES', Severity.WARNING, (
+            f'{int(pauses.sum())} pause{"s" if pauses.sum() > 1 else ""} without samples, '
+            f'{float(steps[pauses].sum()):.3g} s in all, the longest '
+            f'{float(steps.max()):.3g} s; no level reaches across one.')))
+    jitter = float(np.sqrt(np.mean((steps[~pauses] / median - 1.0) ** 2)))
+    if jitter > _UNEVEN:
+        items.append(QualityItem('UNEVEN_CLOCK', Severity.INFO, (
+            f'The steps between stamps scatter by {100.0 * jitter:.0f} % of their median '
+            f'({1e3 * median:.3g} ms): spectra take them as even.')))
+    unknown = int(np.isnan(recording.throttle).sum())
+    if unknown and recording.has_throttle:
+        items.append(QualityItem('THROTTLE_UNKNOWN', Severity.INFO, (
+            f'Throttle is unknown for {unknown} of {recording.n} samples.')))
+    return items
+
+
+def _of_samples(recording: Recording) -> list[QualityItem]:
+    """Return what the samples show: the ADC's step, repeats, a rail of the ADC."""
+    n = recording.n
+    starts = np.unique(np.linspace(0, max(0, n - TAIL), _LOOKS).astype(int))
+    looks = [examine(recording.voltage[k:k + TAIL]) for k in starts.tolist()]
+    items = []
+    steps = [look.step for look in looks if look.step > 0.0]
+    if 2 * len(steps) > len(looks):
+        step = float(np.median(steps))
+        rms = float(np.median([look.rms_increment for look in looks if look.step > 0.0]))
+        items.append(QualityItem('ADC_STEP', Severity.INFO, (
+            f'Voltages lie on a lattice of {1e3 * step:.3g} mV, {step / rms:.2g} times the '
+            'scatter from sample to sample.')))
+    held = max((look.held for look in looks), default=1.0)
+    if held > 1.0:
+        items.append(QualityItem('REPEATS', Severity.INFO, (
+            f'The source is refreshed every {held:.3g} samples; the logger repeats it in '
+            'between.')))
+    clipped = sum(look.saturated for look in looks)
+    if clipped:
+        items.append(QualityItem('CLIPPED', Severity.WARNING, (
+            f'In {clipped} of {len(looks)} stretches looked at the voltage piles up at one end '
+            'of its range: the ADC may be at its limit.')))
+    return items

@@ -1,0 +1,1 @@
+"""Many recordings: find -> group -> work (Dask) -> parts -> table -> statistics -> report."""

@@ -1,0 +1,313 @@
+"""
+Read MCAP bags: messages one by one, or where they are for reading in bulk.
+
+A bag that is cut off or damaged is refused with the byte and the recording time
+where the trouble begins, or, when asked, read as far as it holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+import io
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+from mcap.data_stream import ReadDataStream
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.stream_reader import get_chunk_data_stream
+from mcap.summary import Summary
+from mcap_ros2.decoder import DecoderFactory
+from ou_monitor.errors import InputError, nearest
+from ou_monitor.recordings.mcap_file import McapFile, RawMessage
+from ou_monitor.recordings.record_table import Table
+from ou_monitor.recordings.rosbag2_metadata import find_files, parse_qos, TopicInfo
+from ou_monitor.recordings.time_order import backwards, in_parts, in_time_order, Part
+
+
+class DecodedMessage(NamedTuple):
+    """One message with its fields as attributes."""
+
+    topic: str
+    type: str  # noqa: A003
+    log_time_ns: int
+    message: Any
+
+
+class _LibraryCodec:
+    """Contents of records as the MCAP library reads them."""
+
+    def unpack(self, chunk: bytes) -> bytes:
+        """Return the records in a chunk, its checksum verified."""
+        record = Chunk.read(ReadDataStream(io.BytesIO(chunk)))
+        if record.compression not in ('', 'lz4', 'zstd'):
+            # The library takes what it does not know for plain bytes.
+            raise ValueError(f"unknown compression '{record.compression}'")
+        stream, length = get_chunk_data_stream(record, validate_crc=True)
+        if length != record.uncompressed_size:
+            raise ValueError(f'{length} bytes in place of {record.uncompressed_size}')
+        return stream.read(length)
+
+    def schema(self, content: bytes) -> Schema:
+        """Return a schema."""
+        record: Schema = Schema.read(ReadDataStream(io.BytesIO(content)))
+        return record
+
+    def channel(self, content: bytes) -> Channel:
+        """Return a channel."""
+        record: Channel = Channel.read(ReadDataStream(io.BytesIO(content)))
+        return record
+
+    def metadata(self, content: bytes) -> Metadata:
+        """Return a metadata record."""
+        record: Metadata = Metadata.read(ReadDataStream(io.BytesIO(content)))
+        return record
+
+    def summary(self, file: BinaryIO) -> Summary | None:
+        """Return the summary section."""
+        return make_reader(file).get_summary()
+
+
+class BagReader:
+    """
+    Reads a bag: an .mcap file or a rosbag2 directory.
+
+    Parameters
+    ----------
+    path : str or path
+        File or directory.
+    partial : bool
+        Whether a damaged bag is read as far as it holds (`damage` then says
+        what is wrong).
+
+    Attributes
+    ----------
+    topics : dict of str to str
+        Topic -> message type.
+    info : dict of str to TopicInfo
+        Topic -> type, number of messages, QoS.
+    sample_rates : dict of str to float
+        Topic -> rate of the samples within its blocks, Hz, where the bag
+        states it (those written here do).
+    about : dict of str to str
+        What the bag says of itself: the custom data of its metadata.yaml or
+        of its files, such as the vehicle.
+    origins : dict of str to dict of str to str
+        Topic -> where its values came from, where the bag states it (those
+        that `ou-monitor convert` writes do).
+    start_ns, end_ns : int
+        Log times of the first and last message, ns.
+    message_count : int
+        Messages of all topics.
+    damage : str or None
+        Where and how the bag is damaged: byte, reason, and the time of the
+        newest message before, as s into the recording and as log time.
+    notes : tuple of str
+        Topics left out, and the like.
+
+    Raises
+    ------
+    InputError
+        When the bag is missing, empty, foreign, holds no messages, or is
+        damaged and not `partial`.
+
+    """
+
+    def __init__(self, path: Path | str, *, partial: bool = False) -> None:
+        """Index the bag; messages are read later."""
+        self.path = Path(path)
+        paths, qos, about, missing = find_files(self.path, partial)
+        self._files = [McapFile(file, partial, _LibraryCodec()) for file in paths]
+        # The table of the directory is what a person edits: it holds.
+        self.about = {key: value for known in (*(file.about for file in self._files), about)
+                      for key, value in known.items()}
+        held = [file for file in self._files if file.spans]
+        self.start_ns = min((file.start_ns for file in held), default=0)
+        self.end_ns = max((file.end_ns for file in held), default=0)
+        for file in self._files:
+            file.origin_ns = self.start_ns
+        broken = [file for file in self._files if file.breaks]
+        if broken and not partial:
+            raise InputError(f'{broken[0].path} is damaged {broken[0].damage}; use --partial to '
+                             'take what it still holds')
+        damages = [f'{file.path.name} is damaged {file.damage}' for file in broken]
+        self.damage = '; '.join(([missing] if missing else []) + damages) or None
+        self.info: dict[str, TopicInfo] = {}
+        self.sample_rates: dict[str, float] = {}
+        self.origins: dict[str, dict[str, str]] = {}
+        self._schemas: dict[str, Schema] = {}
+        for file in self._files:
+            for key, topic in file.topics.items():
+                if topic.sample_rate is not None:
+                    self.sample_rates[topic.name] = topic.sample_rate
+                if topic.origin:
+                    self.origins[topic.name] = topic.origin
+                known = self.info.get(topic.name)
+                if known is None:
+                    reliability, durability, depth = parse_qos(qos.get(topic.name) or topic.qos)
+                    known = TopicInfo(topic.name, topic.type, 0, reliability, durability, depth)
+                    self._schemas[topic.type] = topic.schema
+                if known.type != topic.type:
+                    raise InputError(f"{self.path}: topic '{topic.name}' has two types, "
+                                     f'{known.type} and {topic.type}')
+                self.info[topic.name] = replace(
+                    known, count=known.count + file.counts.get(key, 0))
+        self.notes = tuple(dict.fromkeys(note for file in self._files for note in file.notes))
+        self.topics = {name: info.type for name, info in self.info.items()}
+        self.message_count = sum(info.count for info in self.info.values())
+        if self.message_count == 0:
+            why = self.damage or ' '.join(self.notes) or (
+                'topics: ' + (', '.join(self.topics) or 'none'))
+            raise InputError(f'{self.path} holds no messages ({why})')
+
+    def __enter__(self) -> BagReader:
+        """Return itself; no file stays open between reads."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Do nothing: no file stays open between reads."""
+
+    def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
+        """
+        Yield the messages in the order of their log times.
+
+        Parameters
+        ----------
+        topics : iterable of str, optional
+            Topics wanted; all when left out.
+
+        Yields
+        ------
+        RawMessage
+            Topic, type, log time (ns) and CDR bytes.
+
+        Raises
+        ------
+        InputError
+            For a topic that is not in the bag, or at a broken chunk.
+
+        """
+        yield from in_time_order(self._files, self._wanted(topics))
+
+    def tables(
+        self, topics: Iterable[str], *, start_ns: int | None = None, end_ns: int | None = None,
+    ) -> Iterator[Part]:
+        """
+        Yield where the messages are, chunk by chunk, for reading them in bulk.
+
+        Parameters
+        ----------
+        topics : iterable of str
+            Topics wanted.
+        start_ns, end_ns : int, optional
+            Log times, ns: chunks without a message in start <= t < end are
+            not read.
+
+        Yields
+        ------
+        Part
+            The messages of one chunk, and when those of later parts begin.
+
+        Raises
+        ------
+        InputError
+            As `raw_messages`.
+
+        """
+        yield from in_parts(self._files, self._wanted(topics), start_ns, end_ns)
+
+    def tables_before(self, topic: str, before_ns: int) -> Iterator[tuple[Table, int]]:
+        """
+        Yield the messages of a topic before a log time, newest chunk first.
+
+        Parameters
+        ----------
+        topic : str
+            Topic wanted.
+        before_ns : int
+            Log time, ns.
+
+        Yields
+        ------
+        tuple
+            Messages of one chunk, at least one, and the newest log time (ns)
+            that those still to come can have.
+
+        Raises
+        ------
+        InputError
+            As `raw_messages`.
+
+        """
+        yield from backwards(self._files, self._wanted([topic]), before_ns)
+
+    def definition(self, kind: str) -> str:
+        """Return the ros2msg text of a type in the bag."""
+        return str(self._schemas[kind].data.decode('utf-8', 'replace'))
+
+    def decoded(self, topics: Iterable[str] | None = None) -> Iterator[DecodedMessage]:
+        """
+        Yield the messages with their fields as attributes, in log-time order.
+
+        Parameters
+        ----------
+        topics : iterable of str, optional
+            Topics wanted; all when left out.
+
+        Yields
+        ------
+        DecodedMessage
+            Topic, type, log time (ns) and message object.
+
+        Raises
+        ------
+        InputError
+            As `raw_messages`, and for a message that does not fit its type.
+
+        """
+        decoders: dict[str, Callable[[bytes], Any]] = {}
+        for topic, kind, log_time, data in self.raw_messages(topics):
+            if kind not in decoders:
+                decoders[kind] = self.decoder(kind)
+            yield DecodedMessage(topic, kind, log_time, decoders[kind](data))
+
+    def decoder(self, kind: str) -> Callable[[bytes], Any]:
+        """
+        Return the function from CDR bytes to a message of one type in the bag.
+
+        Parameters
+        ----------
+        kind : str
+            Message type.
+
+        Returns
+        -------
+        callable
+            Raises InputError for bytes that do not fit the type.
+
+        """
+        def complain(error: Exception) -> InputError:
+            return InputError(f'{self.path}: a message of type {kind} cannot be decoded '
+                              f'({type(error).__name__}: {error})')
+        try:
+            decode = DecoderFactory().decoder_for('cdr', self._schemas[kind])
+        except Exception as error:
+            raise complain(error) from error
+        if decode is None:
+            raise InputError(f'{self.path}: type {kind} has no ros2msg definition')
+
+        def checked(data: bytes) -> Any:
+            try:
+                return decode(data)
+            except Exception as error:
+                raise complain(error) from error
+        return checked
+
+    def _wanted(self, topics: Iterable[str] | None) -> set[str]:
+        wanted = set(self.topics if topics is None else topics)
+        for topic in sorted(wanted):
+            if topic not in self.topics:
+                raise InputError(f"{self.path}: no topic '{topic}': "
+                                 f'{nearest(topic, self.topics)}')
+        return wanted

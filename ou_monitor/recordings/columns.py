@@ -1,0 +1,274 @@
+"""
+One field of a topic as arrays, whatever its type: in bulk where layouts allow.
+
+The outcome is that of the general decoder, bit for bit; `layout.py` says when
+bulk applies, and every other message goes the general way, one by one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from ou_monitor.messages.config import FieldSpec
+from ou_monitor.messages.extract import Extracted, Extractor
+from ou_monitor.messages.field_path import FieldPath, parse_field_path
+from ou_monitor.recordings.layout import Layout, layout_of, Rows
+from ou_monitor.recordings.record_table import IntArray, Table, TimeArray
+from ou_monitor.recordings.ros2msg import parse_definition, short_name
+from ou_monitor.records import FloatArray
+
+# Layouts that are tried for messages of one length; a topic with more of them
+# is not one whose messages are alike.
+MOST_LAYOUTS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """
+    A field of many messages.
+
+    Attributes
+    ----------
+    log_time : ndarray of uint64, shape (m,)
+        Log times, ns.
+    stamp : ndarray, shape (m,)
+        Stamps of the messages (of the LAST sample of a block), s; the log
+        time where a message has none.
+    count : ndarray of int64, shape (m,)
+        Values in each message; 0 where the field's array is too short.
+    values : ndarray, shape (count.sum(),)
+        Values in SI units; NaN where one is not a finite number.
+
+    """
+
+    log_time: TimeArray
+    stamp: FloatArray
+    count: IntArray
+    values: FloatArray
+
+    @property
+    def n(self) -> int:
+        """Return the number of messages."""
+        return int(self.stamp.size)
+
+    def take(self, order: IntArray) -> Column:
+        """Return the messages of given indices, shape (k,), in their order."""
+        if (self.count == 1).all():
+            values = self.values[order]
+        else:
+            begins = np.cumsum(self.count) - self.count
+            values = self.values[_spread(begins[order], self.count[order])]
+        return Column(self.log_time[order], self.stamp[order], self.count[order], values)
+
+    def split(self, at: int) -> tuple[Column, Column]:
+        """Return the first `at` messages, and the rest."""
+        cut = int(self.count[:at].sum())
+        return (Column(self.log_time[:at], self.stamp[:at], self.count[:at], self.values[:cut]),
+                Column(self.log_time[at:], self.stamp[at:], self.count[at:], self.values[cut:]))
+
+    def in_time_order(self) -> Column:
+        """Return the messages by log time; those of one time as they are."""
+        if (self.log_time[1:] >= self.log_time[:-1]).all():
+            return self
+        return self.take(np.argsort(self.log_time, kind='stable'))
+
+
+def join(parts: Sequence[Column]) -> Column:
+    """Return columns one after another; an empty one for none."""
+    if len(parts) == 1:
+        return parts[0]
+    return Column(
+        np.concatenate([np.empty(0, np.uint64), *(part.log_time for part in parts)]),
+        np.concatenate([np.empty(0), *(part.stamp for part in parts)]),
+        np.concatenate([np.empty(0, np.int64), *(part.count for part in parts)]),
+        np.concatenate([np.empty(0), *(part.values for part in parts)]))
+
+
+def seconds(log_time: TimeArray) -> FloatArray:
+    """Return ns as s; whole seconds apart, for an epoch in ns does not fit a float64."""
+    whole, rest = np.divmod(log_time, np.uint64(1_000_000_000))
+    return whole + rest * 1e-9
+
+
+def _spread(begin: IntArray, count: IntArray) -> IntArray:
+    """Return begin[0], begin[0] + 1, ..., `count` of each, one after another."""
+    ends = np.cumsum(count)
+    places: IntArray = np.repeat(begin - (ends - count), count)
+    return places + np.arange(places.size)
+
+
+class FieldReader:
+    """
+    Reads one field, and its stamp, of messages of one type.
+
+    Parameters
+    ----------
+    spec : FieldSpec
+        Which field, which stamp, which unit.  Its `nan` rule is not applied:
+        what is not finite is NaN.
+    definition : str
+        The ros2msg text of the type.
+    decoder : callable
+        Returns the general decoder of the type, bytes -> message; asked for
+        once, and only when it is needed.
+
+    Attributes
+    ----------
+    general : int
+        Messages that went the general way.
+
+    """
+
+    def __init__(
+        self, spec: FieldSpec, definition: str, decoder: Callable[[], Callable[[bytes], Any]],
+    ) -> None:
+        """Parse the definition; layouts are learned from messages."""
+        self.spec = spec
+        self.general = 0
+        self._extractor = Extractor(replace(spec, nan='unknown'))
+        self._decoder = decoder
+        self._decode: Callable[[bytes], Any] | None = None
+        self._kind = short_name(spec.type)
+        self._definitions = parse_definition(spec.type, definition)
+        self._value = parse_field_path(spec.field)
+        self._stamp: FieldPath | None = None
+        self._paths = [self._value]
+        if spec.stamp_field is not None:
+            self._stamp = parse_field_path(spec.stamp_field)
+            self._paths += [self._stamp, (*self._stamp, 'sec'), (*self._stamp, 'nanosec')]
+        # Length of the message -> layouts met.
+        self._layouts: dict[int, list[Layout]] = {}
+
+    def read(self, table: Table) -> Column:
+        """
+        Return the field of the messages of a table, in its order.
+
+        Parameters
+        ----------
+        table : Table
+            Messages of the type.
+
+        Returns
+        -------
+        Column
+            One entry for each message.
+
+        Raises
+        ------
+        InputError
+            As `Extractor`, and for bytes that do not fit the type.
+
+        """
+        logged = seconds(table.log_time)
+        stamp = logged.copy()
+        count = np.ones(table.n, np.int64)
+        bulk: list[tuple[IntArray, FloatArray]] = []
+        rest: list[IntArray] = []
+        lengths = table.end - table.begin
+        for length in np.unique(lengths).tolist():
+            left = np.nonzero(lengths == length)[0]
+            if self._definitions is not None and length:
+                left = self._in_bulk(table, left, length, stamp, bulk)
+            rest.append(left)
+        for picked, block in bulk:
+            count[picked] = block.shape[1]
+        single = {}
+        for k in np.concatenate([np.empty(0, np.int64), *rest]).tolist():
+            found = self._one(bytes(table.data[table.begin[k]:table.end[k]]))
+            single[k] = found.values
+            count[k] = found.values.size
+            if found.stamp is not None:
+                stamp[k] = found.stamp
+        self.general += len(single)
+        if not single and len(bulk) == 1:
+            # All alike, and in order.
+            return Column(table.log_time, stamp, count, bulk[0][1].reshape(-1))
+        begin = np.cumsum(count) - count
+        values = np.empty(int(count.sum()))
+        for picked, block in bulk:
+            values[begin[picked][:, None] + np.arange(block.shape[1])] = block
+        for k, block in single.items():
+            values[begin[k]:begin[k] + block.size] = block
+        return Column(table.log_time, stamp, count, values)
+
+    def _in_bulk(
+        self, table: Table, left: IntArray, length: int, stamp: FloatArray,
+        bulk: list[tuple[IntArray, FloatArray]],
+    ) -> IntArray:
+        """Read messages of one length by layouts; return those that have none."""
+        known = self._layouts.setdefault(length, [])
+        rows = table.rows(left, length)
+        for layout in known:
+            left, rows = self._by_layout(layout, left, rows, stamp, bulk)
+            if not left.size:
+                return left
+        strange: list[IntArray] = []
+        while left.size and len(known) < MOST_LAYOUTS and len(strange) < MOST_LAYOUTS:
+            found = self._learn(rows[0].tobytes())
+            if found is None or not found.holds_for(rows[:1])[0]:
+                strange.append(left[:1])
+                left, rows = left[1:], rows[1:]
+                continue
+            known.append(found)
+            left, rows = self._by_layout(found, left, rows, stamp, bulk)
+        return np.concatenate([*strange, left])
+
+    def _by_layout(
+        self, layout: Layout, left: IntArray, rows: Rows, stamp: FloatArray,
+        bulk: list[tuple[IntArray, FloatArray]],
+    ) -> tuple[IntArray, Rows]:
+        """Read the messages with a layout; return the others."""
+        fits = layout.holds_for(rows)
+        if not fits.any():
+            return left, rows
+        everything = bool(fits.all())
+        picked, mine = (left, rows) if everything else (left[fits], rows[fits])
+        own = self._stamps(layout, mine)
+        if own is not None:
+            known = np.isfinite(own) & (own != 0.0)
+            stamp[picked[known]] = own[known]
+        block = layout.places[self._value].column(mine).reshape(picked.size, -1)
+        block *= self.spec.sign * self.spec.unit_factor
+        block += self.spec.offset
+        finite = np.isfinite(block)
+        if not finite.all():
+            block[~finite] = np.nan
+        bulk.append((picked, block))
+        return (left[:0], rows[:0]) if everything else (left[~fits], rows[~fits])
+
+    def _stamps(self, layout: Layout, rows: Rows) -> FloatArray | None:
+        """Return the stamps in messages, s, by the formulas of `Extractor`."""
+        if self._stamp is None:
+            return None
+        whole = layout.places.get((*self._stamp, 'sec'))
+        if whole is None:
+            return layout.places[self._stamp].column(rows) * self.spec.stamp_factor
+        return whole.column(rows) + 1e-9 * layout.places[(*self._stamp, 'nanosec')].column(rows)
+
+    def _learn(self, message: bytes) -> Layout | None:
+        """Return the layout of a message when it gives all that is asked for."""
+        assert self._definitions is not None
+        layout = layout_of(message, self._kind, self._definitions, self._paths)
+        if layout is None:
+            return None
+        found = layout.places
+        value = found.get(self._value)
+        # An array is a block of samples, or a mistake that the general way names.
+        if value is None or (value.size is not None and self.spec.sample_rate is None):
+            return None
+        if self._stamp is not None:
+            number = found.get(self._stamp)
+            time = [found.get((*self._stamp, part)) for part in ('sec', 'nanosec')]
+            if any(place is None or place.size is not None
+                   for place in ([number] if number is not None else time)):
+                return None
+        return layout
+
+    def _one(self, message: bytes) -> Extracted:
+        """Return the field of one message the general way."""
+        if self._decode is None:
+            self._decode = self._decoder()
+        return self._extractor.extract(self._decode(message))

@@ -1,0 +1,1 @@
+"""Logs of autopilots, one module a format -> series of voltage, throttle and current."""

@@ -1,0 +1,295 @@
+"""
+Betaflight and INAV blackbox, read by orangebox.
+
+Limits first: the ADC is read more slowly than is logged, so most voltages are
+repeats (``--drop-held``).  Frames that were predicted from damaged ones are
+left out up to the next key frame.  orangebox is under GPL-3; nothing of it is
+loaded for other formats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from operator import itemgetter
+from pathlib import Path
+import re
+from typing import Any
+
+import numpy as np
+from orangebox import Parser
+from orangebox.reader import Reader
+from orangebox.types import FrameType
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.log import (
+    CURRENT, Flight, from_start, Log, Request, Series, THROTTLE, VOLTAGE)
+from ou_monitor.recordings.importers.quiet import quiet
+from ou_monitor.records import FloatArray
+
+# The clock counts us in 32 bits.
+WRAP = 2**32
+
+# Longest step between frames taken as such, s: a pause of the log is longer.
+_PAUSE = 10.0
+# Fewest frames after a step in time that are a part of the flight and not broken bytes.
+_PART = 16
+
+_FIRMWARE = re.compile(r'(Betaflight|Cleanflight|INAV|EmuFlight)\s+(\d+)\.(\d+)\.?(\d*)', re.I)
+
+
+def flights(path: Path) -> tuple[Flight, ...]:
+    """
+    Return the flights in a file, without decoding them.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        Log.
+
+    Returns
+    -------
+    tuple of Flight
+        Numbered from 1.
+
+    Raises
+    ------
+    InputError
+        When orangebox cannot read the file.
+
+    """
+    with quiet(path, 'orangebox'):
+        pointers = Reader(str(path), None, True).log_pointers
+    ends = [*pointers[1:], path.stat().st_size]
+    return tuple(Flight(k + 1, f'{end - begin} bytes from byte {begin}')
+                 for k, (begin, end) in enumerate(zip(pointers, ends)))
+
+
+def read(path: Path, request: Request) -> Log:
+    """
+    Read one flight of a blackbox file.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        Log.
+    request : Request
+        Which flight is wanted.
+
+    Returns
+    -------
+    Log
+        Candidates; stamps count from the first frame of the flight.
+
+    Raises
+    ------
+    InputError
+        When there are several flights and none is chosen, or orangebox cannot
+        read it.
+
+    """
+    held = flights(path)
+    wanted = request.flight or 1
+    notes = []
+    if request.flight is None and len(held) > 1:
+        several = f'{len(held)} flights (' + '; '.join(
+            f'{one.number}: {one.words}' for one in held) + ')'
+        if not request.everything:
+            raise InputError(f'{path} holds {several}: choose with --flight N, see what is in '
+                             'one with --flight N --list')
+        notes.append(f'The file holds {several}; this is flight 1, choose with --flight N.')
+    if not 1 <= wanted <= len(held):
+        raise InputError(f'{path} has no flight {wanted}: it holds {len(held)}')
+    with quiet(path, 'orangebox'):
+        parser = Parser.load(str(path), wanted, True)
+        headers = parser.headers
+        main = parser.reader.field_defs
+        if FrameType.INTRA not in main or FrameType.INTER not in main:
+            raise InputError(f'{path}: the header of flight {wanted} does not say which fields '
+                             'are logged: it is damaged')
+        names = [one.name for one in main[FrameType.INTRA]]
+        fields = _wanted(names)
+        if 'time' not in names:
+            raise InputError(f'{path}: flight {wanted} has no field time: it is damaged')
+        table, dropped = _frames(parser, [names.index(name) for name in fields], request)
+        end, size = parser.reader.tell(), len(parser.reader)
+        closed = bool(parser._end_of_log)
+        rest = parser.reader._frame_data[end:].removeprefix(b'End of log\0')
+        broken = int(parser._ctx.invalid_frame_count)
+    if dropped:
+        notes.append(f'At least {dropped} frame{"s" * (dropped != 1)} without a sound key frame '
+                     'before them dropped.')
+    if broken:
+        notes.append(f'{broken} piece{"s" * (broken != 1)} left out that orangebox does not '
+                     'know: broken bytes, or events of newer firmware.')
+    if not closed:
+        notes.append(f'Flight {wanted} has no end mark: it was cut off or goes on at its end; '
+                     f'{end} of {size} bytes of frames were read.')
+    elif rest.strip(b'\xff\0'):
+        # Not what flash is erased to, nor what a card is filled up with.
+        notes.append(f'{len(rest)} of {size} bytes after the end mark of flight {wanted} were '
+                     'not read.')
+    table, odd = _in_time(table)
+    if odd:
+        notes.append(f'{odd} frame{"s" * (odd != 1)} dropped: the time does not fit.')
+    columns = {name: table[:, k] for k, name in enumerate(fields)}
+    facts = _facts(headers)
+    if len(held) > 1:
+        facts['flight'] = f'{wanted} of {len(held)}'
+    t = columns['time'] * 1e-6
+    series = [*_battery(t, columns, headers, notes), *_throttles(t, columns, headers)]
+    return Log('blackbox', from_start(series), facts, tuple(notes))
+
+
+def _wanted(names: list[str]) -> list[str]:
+    """Return the fields that carry what is looked for, the time first."""
+    kinds = ('vbatLatest', 'vbat', 'sagCompensatedVBat', 'amperageLatest', 'amperage',
+             'rcCommand[3]', 'setpoint[3]')
+    return ['time', *[name for name in names
+                      if name in kinds or re.fullmatch(r'motor\[\d+\]', name)]]
+
+
+def _frames(parser: Any, places: list[int], request: Request) -> tuple[FloatArray, int]:
+    """Return the wanted fields of the sound frames, shape (n, fields), and how many were not."""
+    pick = itemgetter(*places) if len(places) > 1 else (lambda data: (data[places[0]],))
+    reader, context = parser.reader, parser._ctx
+    rows: list[tuple[int, ...]] = []
+    dropped, invalid, sound = 0, 0, False
+    count = 0
+    before = -1
+    # The parser stops at what it cannot digest; it is set going again behind that.
+    while reader.tell() < len(reader) and reader.tell() > before and not parser._end_of_log:
+        before = reader.tell()
+        try:
+            for frame in parser.frames():
+                if context.invalid_frame_count != invalid:
+                    invalid, sound = context.invalid_frame_count, False
+                # A key frame stands alone; the others add to the one before them.
+                sound = sound or frame.type == FrameType.INTRA
+                if sound:
+                    rows.append(pick(frame.data))
+                else:
+                    dropped += 1
+                count += 1
+                if request.progress is not None and count % 1024 == 0:
+                    request.progress(reader.tell() / max(1, len(reader)))
+        except (TypeError, IndexError, KeyError, ValueError, ZeroDivisionError,
+                AttributeError, StopIteration, OverflowError, RuntimeError):
+            # At the end of the bytes, or in broken ones; the bytes read are told in a note.
+            sound = False
+    table = np.array(rows, dtype=np.float64).reshape(len(rows), len(places))
+    return table, dropped
+
+
+def _in_time(table: FloatArray) -> tuple[FloatArray, int]:
+    """Return the frames in the order of an unwrapped time, and how many did not fit."""
+    if len(table) < 2:
+        return table, 0
+    time = np.unwrap(np.mod(table[:, 0], WRAP), period=WRAP)
+    steps = np.diff(time) * 1e-6
+    starts = np.concatenate(([0], np.flatnonzero((steps <= 0.0) | (steps > _PAUSE)) + 1))
+    lengths = np.diff(np.append(starts, len(table)))
+    good = np.repeat((lengths >= min(_PART, int(lengths.max()))), lengths)
+    table = table.copy()
+    table[:, 0] = time
+    kept = table[good]
+    # Parts that go back are from other bytes than this flight's.
+    ahead = np.ones(len(kept), dtype=bool)
+    ahead[1:] = kept[1:, 0] > np.maximum.accumulate(kept[:-1, 0])
+    kept = kept[ahead]
+    return kept, len(table) - len(kept)
+
+
+def _facts(headers: dict[str, Any]) -> dict[str, str]:
+    facts = {}
+    for fact, key in (('firmware', 'Firmware revision'), ('vehicle', 'Craft name'),
+                      ('board', 'Board information'), ('started', 'Log start datetime')):
+        value = headers.get(key)
+        # Without a clock the date is that of the year 0.
+        if value not in (None, '') and not str(value).startswith('0000-'):
+            facts[fact] = str(value)
+    return facts
+
+
+def _version(headers: dict[str, Any]) -> tuple[str, tuple[int, int, int]]:
+    """Return the firmware and its version; ('', (0, 0, 0)) when unknown."""
+    found = _FIRMWARE.search(str(headers.get('Firmware revision', '')))
+    if found is None:
+        return '', (0, 0, 0)
+    major, minor, patch = (int(found[k] or 0) for k in (2, 3, 4))
+    return found[1].lower(), (major, minor, patch)
+
+
+def _battery_scales(headers: dict[str, Any]) -> tuple[float | None, float | None]:
+    """
+    Return V and A per unit; None where it is not known.
+
+    As Betaflight's blackbox-log-viewer has it (flightlog_fields_presenter.js);
+    for other firmware the limits of a cell, in the header, tell the unit.
+
+    """
+    name, version = _version(headers)
+    if name == 'inav' and version >= (2, 0, 0):
+        return 0.01, 0.01
+    if name == 'betaflight' and version >= (3, 1, 0):
+        return 0.01 if version >= (4, 0, 0) else 0.1, 0.01 if version >= (3, 1, 7) else None
+    if name == 'cleanflight' and version >= (2, 0, 0):
+        return 0.1, 0.01
+    cell = headers.get('vbatcellvoltage')
+    highest = cell[-1] if isinstance(cell, list) else None
+    scale = headers.get('vbat_scale')
+    if name not in ('betaflight', 'cleanflight') and isinstance(highest, (int, float)):
+        return (0.01 if 300 <= highest <= 500 else 0.1 if 30 <= highest <= 50 else None), None
+    if isinstance(scale, (int, float)) and scale > 0:
+        # The raw ADC: 12 bits of 3.3 V, behind a divider of scale / 10.
+        return 3.3 / 4095 * scale / 10.0, None
+    return None, None
+
+
+def _battery(t: FloatArray, columns: dict[str, FloatArray], headers: dict[str, Any],
+             notes: list[str]) -> Iterator[Series]:
+    volts, amperes = _battery_scales(headers)
+    for field, quantity, words, rank in (
+            ('vbatLatest', VOLTAGE, 'battery', 0), ('vbat', VOLTAGE, 'battery', 0),
+            ('sagCompensatedVBat', VOLTAGE, 'battery, sag taken out by INAV', None),
+            ('amperageLatest', CURRENT, 'battery', 0), ('amperage', CURRENT, 'battery', 0)):
+        if field not in columns:
+            continue
+        scale = volts if quantity == VOLTAGE else amperes
+        if scale is None:
+            notes.append(f'{field} was left out: its unit is not known for the firmware '
+                         f"'{headers.get('Firmware revision', 'unknown')}'.")
+            continue
+        values = columns[field] * scale
+        one = Series(field, quantity, t, values, f'{scale:.6g}', words, rank, 'battery')
+        if one.silent:
+            one = Series(field, quantity, t, values, f'{scale:.6g}',
+                         f'{words}, always 0: no sensor', None, 'battery')
+        yield one
+
+
+def _throttles(t: FloatArray, columns: dict[str, FloatArray],
+               headers: dict[str, Any]) -> Iterator[Series]:
+    motors = [name for name in columns if name.startswith('motor[')]
+    low, high = _pair(headers.get('motorOutput')) or _pair(
+        [headers.get('minthrottle'), headers.get('maxthrottle')]) or (1000.0, 2000.0)
+    if motors:
+        mean = np.mean([columns[name] for name in motors], axis=0)
+        yield Series('motors', THROTTLE, t, (mean - low) / (high - low),
+                     f'(mean of {len(motors)} motors - {low:g}) / {high - low:g}',
+                     f'mean of {len(motors)} motors', 0)
+    if 'rcCommand[3]' in columns:
+        yield Series('rcCommand[3]', THROTTLE, t, (columns['rcCommand[3]'] - 1000.0) / 1000.0,
+                     '(x - 1000) / 1000', 'stick', 1)
+    if 'setpoint[3]' in columns:
+        yield Series('setpoint[3]', THROTTLE, t, columns['setpoint[3]'] / 1000.0, '0.001',
+                     'throttle asked for', 2)
+    for name in motors:
+        yield Series(name, THROTTLE, t, (columns[name] - low) / (high - low),
+                     f'(x - {low:g}) / {high - low:g}', 'one motor')
+
+
+def _pair(value: Any) -> tuple[float, float] | None:
+    """Return two numbers that rise; None when they are not that."""
+    if isinstance(value, list) and len(value) == 2 and all(
+            isinstance(x, (int, float)) for x in value) and value[1] > value[0]:
+        return float(value[0]), float(value[1])
+    return None

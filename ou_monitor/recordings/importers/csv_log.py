@@ -1,0 +1,71 @@
+"""
+CSV: any column can be the voltage, the throttle or the current.
+
+Limits first: the stamps are the column `time_s`, as they stand; values are
+taken as V, 0..1 and A.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.csv_table import column_names, read_columns, THROTTLE, TIME, VOLTAGE
+from ou_monitor.recordings.importers import log as logs
+from ou_monitor.recordings.importers.log import ANY, Log, one_flight, Request, Series
+
+# Column -> what it is, when nothing is said.
+KNOWN = {VOLTAGE: logs.VOLTAGE, THROTTLE: logs.THROTTLE, 'current_a': logs.CURRENT}
+
+
+def read(path: Path, request: Request) -> Log:
+    """
+    Read the columns that are known by name, and those asked for.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        File.
+    request : Request
+        Columns named by the user, or all.
+
+    Returns
+    -------
+    Log
+        One series a column.
+
+    Raises
+    ------
+    InputError
+        When the file or a wanted column cannot be read.
+
+    """
+    one_flight(path, request)
+    header = [name for name in column_names(path, TIME) if name and name != TIME]
+    wanted = [name for name in dict.fromkeys(header) if name in KNOWN or name in request.names]
+    columns = read_columns(path, [TIME, *wanted])
+    t = columns[0]
+    series = [Series(name, KNOWN.get(name, ANY), t, values, '1', 'column',
+                     0 if name in KNOWN else None)
+              for name, values in zip(wanted, columns[1:])]
+    notes = []
+    late = int(np.count_nonzero(np.diff(t) < 0.0))
+    if late:
+        notes.append(f'{late} line{"s" * (late != 1)} came before the stamp ahead of them: '
+                     'sorted by stamp.')
+        order = np.argsort(t, kind='stable')
+        series = [replace(one, t=t[order], values=one.values[order]) for one in series]
+    if request.everything:
+        for name in dict.fromkeys(header):
+            if name in wanted:
+                continue
+            try:
+                values = read_columns(path, [TIME, name])[1]
+            except InputError:
+                notes.append(f"Column '{name}' does not hold numbers.")
+                continue
+            series.append(Series(name, ANY, t, values, '1', 'column'))
+    return Log('csv', tuple(series), {}, tuple(notes))

@@ -1,0 +1,296 @@
+"""
+ArduPilot dataflash, binary and text, read by pymavlink.
+
+Limits first: ArduPilot averages the battery's ADC before it is logged, and logs
+at 10 Hz as delivered.  Which outputs are motors is known from the parameters
+`SERVOn_FUNCTION` of the log; without them outputs are taken by name only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+import re
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.log import (
+    CURRENT, from_start, Log, one_flight, Request, Series, THROTTLE, VOLTAGE)
+from ou_monitor.recordings.importers.quiet import quiet, quiet_process
+from ou_monitor.records import FloatArray
+from pymavlink import DFReader
+
+# Message, field, quantity, rank, words.
+PLAIN = (
+    ('BAT', 'Volt', VOLTAGE, 0, 'battery'),
+    ('BAT', 'VoltR', VOLTAGE, None, 'battery, resting voltage as estimated by ArduPilot'),
+    ('BAT', 'Curr', CURRENT, 0, 'battery'),
+    ('BAT2', 'Volt', VOLTAGE, 0, 'second battery'),
+    ('BAT2', 'Curr', CURRENT, 0, 'second battery'),
+    ('CURR', 'Volt', VOLTAGE, 0, 'battery'),
+    ('CURR', 'Curr', CURRENT, 0, 'battery'),
+    ('CUR2', 'Volt', VOLTAGE, 0, 'second battery'),
+    ('CUR2', 'Curr', CURRENT, 0, 'second battery'),
+    ('POWR', 'Vcc', VOLTAGE, None, '5 V rail'),
+    ('POWR', 'VServo', VOLTAGE, None, 'servo rail'),
+    ('MCU', 'MVolt', VOLTAGE, None, 'microcontroller, 3.3 V rail'),
+    ('ESC', 'Volt', VOLTAGE, None, 'at the ESC'),
+    ('ESC', 'Curr', CURRENT, None, 'at the ESC'),
+    ('CTUN', 'ThO', THROTTLE, 0, 'throttle output'),
+    ('QTUN', 'ThO', THROTTLE, 1, 'throttle output, lift motors'),
+    ('MOTB', 'ThrOut', THROTTLE, 3, 'throttle output of the mixer'),
+    ('RATE', 'AOut', THROTTLE, 4, 'throttle output'),
+)
+OUTPUTS = ('RCOU', 'RCO2', 'RCO3')
+ALSO = ('PARM', 'MSG', 'VER')
+INSTANCES = ('Inst', 'Instance', 'I')
+
+# SERVOn_FUNCTION: motors 1..8, motors 9..12, throttle, left and right throttle.
+MOTOR_FUNCTIONS = frozenset((*range(33, 41), *range(82, 86), 70, 73, 74))
+
+# (message, instance) -> field -> values; 't' holds the stamps, s.
+Table = dict[tuple[str, str], dict[str, list[float]]]
+
+
+def read(path: Path, request: Request) -> Log:
+    """
+    Read a dataflash log, binary or text.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        Log.
+    request : Request
+        What is wanted.
+
+    Returns
+    -------
+    Log
+        Candidates; stamps count from the first sample of any of them.
+
+    Raises
+    ------
+    InputError
+        When pymavlink cannot read it.
+
+    """
+    one_flight(path, request)
+    with path.open('rb') as file:
+        text = not file.read(2).startswith(b'\xa3\x95')
+    with quiet(path, 'pymavlink'), _plain_text(path, text) as (name, mended):
+        reader = DFReader.DFReader_text if text else DFReader.DFReader_binary
+        # Made before it is set up: when that fails, pymavlink leaves its files open.
+        log: Any = reader.__new__(reader)
+        try:
+            with quiet_process():
+                log.__init__(name)
+            table, banner, bad = _collect(log, request)
+            notes = mended + (_lost_text(log) if text else _lost_binary(log))
+            parameters: dict[str, float] = dict(log.params)
+            whole = {kind: _whole_numbers(log, kind) for kind, _ in table}
+        finally:
+            _close(log)
+    if bad:
+        notes.append(f'{bad} message{"s" * (bad != 1)} could not be read and were left out.')
+    series: list[Series] = []
+    for (kind, instance), columns in sorted(table.items()):
+        name = f'{kind}[{instance}]' if instance else kind
+        series += _plain(name, kind, columns, whole[kind])
+    series += _outputs(table, parameters)
+    if not series:
+        raise InputError(f'{path} holds none of the messages that carry a voltage or a throttle '
+                         f'({", ".join(dict.fromkeys(row[0] for row in PLAIN))})'
+                         + ''.join(f': {note}' for note in notes))
+    return Log('dataflash_text' if text else 'dataflash', from_start(series), _facts(banner),
+               tuple(notes))
+
+
+@contextmanager
+def _plain_text(path: Path, text: bool) -> Iterator[tuple[str, list[str]]]:
+    """Yield the name of a log that pymavlink can decode, and what that took."""
+    content = path.read_bytes() if text else b''
+    if content.isascii():
+        yield str(path), []
+        return
+    with TemporaryDirectory() as folder:
+        copy = Path(folder) / 'log'
+        copy.write_bytes(content.translate(bytes(range(0x80)) + b'?' * 0x80))
+        odd = len(content) - len(content.translate(None, bytes(range(0x80, 0x100))))
+        yield str(copy), [f'{odd} byte{"s" * (odd != 1)} that are not ASCII were read as "?".']
+
+
+def _close(log: Any) -> None:
+    for name in ('data_map', 'filehandle'):
+        # A map that the failed set-up still looks into cannot be closed; it goes with it.
+        with suppress(BufferError):
+            if hasattr(log, name):
+                getattr(log, name).close()
+
+
+def _collect(log: Any, request: Request) -> tuple[Table, list[str], int]:
+    """Return the wanted fields of all messages, what the log says in words, and bad messages."""
+    fields: dict[str, list[str]] = {}
+    for kind, field, *_ in PLAIN:
+        fields.setdefault(kind, []).append(field)
+    wanted = {*fields, *OUTPUTS, *ALSO}
+    table: Table = {}
+    banner: list[str] = []
+    bad = count = 0
+    while (message := log.recv_match(type=wanted, strict=True)) is not None:
+        count += 1
+        if request.progress is not None and count % 4096 == 0:
+            request.progress(log.percent / 100.0)
+        kind = message.get_type()
+        try:
+            if kind == 'MSG':
+                banner.append(str(message.Message))
+            if kind in ALSO:
+                continue
+            columns = message.get_fieldnames()
+            instance = next((str(int(getattr(message, name))) for name in INSTANCES
+                             if name in columns), '')
+            t = message.TimeUS * 1e-6 if 'TimeUS' in columns else message.TimeMS * 1e-3
+            names = ([name for name in columns if re.fullmatch(r'C\d+', name)]
+                     if kind in OUTPUTS else [n for n in fields[kind] if n in columns])
+            row = [float(getattr(message, name)) for name in names]
+        except (AttributeError, ValueError, TypeError, IndexError):
+            bad += 1
+            continue
+        held = table.setdefault((kind, instance), {'t': [], **{name: [] for name in names}})
+        if list(held) != ['t', *names]:
+            bad += 1
+            continue
+        for column, value in zip(held.values(), [t, *row]):
+            column.append(value)
+    return table, banner, bad
+
+
+def _whole_numbers(log: Any, kind: str) -> frozenset[str]:
+    """Return the fields of a message that are integers without a multiplier of their own."""
+    form = next(one for one in log.formats.values() if one.name == kind)
+    return frozenset(name for name, letter in zip(form.columns, form.format)
+                     if letter in 'bBhHiI')
+
+
+def _lost_binary(log: Any) -> list[str]:
+    """Say how many bytes of a binary log belong to no message."""
+    size = int(log.data_len)
+    read_bytes, end = 0, 0
+    for kind, offsets in enumerate(log.offsets):
+        length = log.formats[kind].len if kind in log.formats else 0
+        for at in offsets:
+            if at + length <= size:
+                read_bytes += length
+                end = max(end, at + length)
+    lost = size - read_bytes
+    tail = bytes(log.data_map[end:size])
+    # Flash is filled up to a page with what it is erased to.
+    if tail.strip(b'\xff') == b'' or tail.strip(b'\0') == b'':
+        lost -= len(tail)
+        tail = b''
+    if lost <= 0:
+        return []
+    where = (f'cut off at byte {end}' if lost == len(tail) else
+             f'damaged, its last whole message ends at byte {end}')
+    return [f'{lost} of {size} bytes belong to no message, so the log is {where}; '
+            'the messages around that were read.']
+
+
+def _lost_text(log: Any) -> list[str]:
+    """Say which lines pymavlink passes over, and whether the last one ends."""
+    size = int(log.data_len)
+    text = bytes(log.data_map[:size]).decode('ascii', 'replace')
+    lost = 0
+    for line in text.splitlines():
+        cells = line.split(',')
+        form = log.formats.get(cells[0].strip())
+        lost += bool(line.strip()) and (form is None or len(cells) <= len(form.format))
+    notes = []
+    if lost:
+        notes.append(f'{lost} line{"s" * (lost != 1)} left out: no message of this log.')
+    if not text.endswith('\n'):
+        notes.append(f'The last line does not end: the log was cut off at byte {size}.')
+    return notes
+
+
+def _facts(banner: list[str]) -> dict[str, str]:
+    """Return the firmware and the board from the words a log begins with."""
+    facts: dict[str, str] = {}
+    for line in banner:
+        if 'firmware' not in facts and re.match(r'(Ardu\w+|APM:\w+|Blimp|AntennaTracker)\b', line):
+            facts['firmware'] = line
+        elif 'vehicle' not in facts and re.search(r' [0-9A-F]{8} [0-9A-F]{8} [0-9A-F]{8}$', line):
+            # The board and the serial number of its processor.
+            facts['vehicle'] = line
+    return facts
+
+
+def _plain(name: str, kind: str, columns: dict[str, list[float]],
+           whole: frozenset[str]) -> Iterator[Series]:
+    t = np.array(columns['t'])
+    for source, field, quantity, rank, words in PLAIN:
+        if source != kind or field not in columns:
+            continue
+        values = np.array(columns[field])
+        scale = 1.0
+        if quantity == THROTTLE:
+            scale = _throttle_scale(values)
+        elif field in whole:
+            # Logs of before 2014 hold hundredths in whole numbers.
+            scale = 0.01
+        one = Series(f'{name}.{field}', quantity, t, values * scale, f'{scale:g}', words, rank,
+                     name)
+        if quantity != THROTTLE and one.silent:
+            one = Series(one.name, quantity, t, one.values, one.scale,
+                         f'{words}, not connected', None, name)
+        yield one
+
+
+def _throttle_scale(values: FloatArray) -> float:
+    """Return the factor to 0..1: of a share, percent (Plane), or thousandths (before 2016)."""
+    finite = np.abs(values[np.isfinite(values)])
+    highest = float(finite.max()) if finite.size else 0.0
+    return 1.0 if highest <= 1.5 else 0.01 if highest <= 110.0 else 0.001
+
+
+def _outputs(table: Table, parameters: dict[str, float]) -> Iterator[Series]:
+    """Yield the mean of the motors, which the parameters name, and each output."""
+    found: dict[int, tuple[FloatArray, FloatArray]] = {}
+    for (kind, _), columns in sorted(table.items()):
+        if kind in OUTPUTS:
+            t = np.array(columns['t'])
+            found |= {int(name[1:]): (t, np.array(values))
+                      for name, values in columns.items() if name != 't'}
+            yield from _motors(kind, t, columns, parameters)
+    for number, (t, values) in sorted(found.items()):
+        low, high = _span(number, parameters)
+        one = Series(f'RCOU.C{number}', THROTTLE, t, (values - low) / (high - low),
+                     f'(x - {low:g} us) / {high - low:g} us', 'one output, motor or servo')
+        if values.any():
+            yield one
+
+
+def _motors(kind: str, t: FloatArray, columns: dict[str, list[float]],
+            parameters: dict[str, float]) -> Iterator[Series]:
+    numbers = [int(name[1:]) for name in columns if name != 't' and int(
+        parameters.get(f'SERVO{name[1:]}_FUNCTION', 0)) in MOTOR_FUNCTIONS]
+    if not numbers:
+        return
+    shares = []
+    for number in numbers:
+        low, high = _span(number, parameters)
+        shares.append((np.array(columns[f'C{number}']) - low) / (high - low))
+    yield Series(f'{kind}.motors', THROTTLE, t, np.mean(shares, axis=0),
+                 'mean of ' + ', '.join(f'C{number}' for number in numbers)
+                 + ', each from its lowest to its highest pulse',
+                 f'mean of {len(numbers)} motors', 2)
+
+
+def _span(number: int, parameters: dict[str, float]) -> tuple[float, float]:
+    """Return the pulses that mean 0 and 1, us."""
+    low = parameters.get('MOT_PWM_MIN') or parameters.get(f'SERVO{number}_MIN') or 1000.0
+    high = parameters.get('MOT_PWM_MAX') or parameters.get(f'SERVO{number}_MAX') or 2000.0
+    return (low, high) if high > low else (1000.0, 2000.0)

@@ -1,0 +1,171 @@
+"""
+The table of log formats, told by their first bytes, and the way into them.
+
+To add a format: a module with ``read(path, request) -> Log``, and a line here.
+"""
+
+from __future__ import annotations
+
+import codecs
+from collections.abc import Callable
+from contextlib import redirect_stderr
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+import sys
+from typing import NamedTuple
+
+import numpy as np
+
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.framing import MAGIC as MCAP_MAGIC
+from ou_monitor.recordings.importers.log import Log, Progress, Request
+from ou_monitor.recordings.importers.quiet import quiet
+
+# Enough to tell every format; the formats of a text log come first in it.
+HEAD = 8192  # bytes
+
+ULOG = b'ULog\x01\x12\x35'
+DATAFLASH = b'\xa3\x95\x80'
+BLACKBOX = b'H Product:Blackbox flight data recorder'
+
+
+class Format(NamedTuple):
+    """
+    One log format.
+
+    Attributes
+    ----------
+    name : str
+        Short name.
+    words : str
+        What it is, with its usual ending.
+    fits : callable
+        Whether a file that begins with these bytes is one.
+    module : str
+        Importer.
+    package, extra : str
+        What it needs beyond the core, and the extra of setup.py that brings it.
+
+    """
+
+    name: str
+    words: str
+    fits: Callable[[bytes], bool]
+    module: str
+    package: str = ''
+    extra: str = ''
+
+
+def _is_text(head: bytes) -> bool:
+    # Text of other encodings than UTF-8 passes, so that its reader can name the byte.
+    return (head[0] < 0x80 or head.startswith(codecs.BOM_UTF8)) and all(
+        byte >= 0x20 or byte in b'\t\n\r\f' for byte in head)
+
+
+# The first that fits is taken.
+FORMATS = (
+    Format('ulog', 'PX4 ULog (.ulg)', lambda head: head.startswith(ULOG),
+           'ou_monitor.recordings.importers.ulog', 'pyulog', 'ulog'),
+    Format('dataflash', 'ArduPilot dataflash (.bin)', lambda head: head.startswith(DATAFLASH),
+           'ou_monitor.recordings.importers.dataflash', 'pymavlink', 'dataflash'),
+    Format('dataflash_text', 'ArduPilot dataflash as text (.log)',
+           lambda head: _is_text(head) and (head.startswith(b'FMT,') or b'\nFMT,' in head),
+           'ou_monitor.recordings.importers.dataflash', 'pymavlink', 'dataflash'),
+    Format('blackbox', 'Betaflight or INAV blackbox (.bbl, .bfl)',
+           lambda head: head.startswith(BLACKBOX),
+           'ou_monitor.recordings.importers.blackbox', 'orangebox', 'blackbox'),
+    Format('csv', 'CSV with the column time_s (.csv)', _is_text,
+           'ou_monitor.recordings.importers.csv_log'),
+)
+
+
+def detect(path: Path) -> Format:
+    """
+    Return the format of a file, whatever its name ends in.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        Log.
+
+    Returns
+    -------
+    Format
+        The first that fits.
+
+    Raises
+    ------
+    InputError
+        When the file is missing, a folder, empty, unreadable or of no known
+        format.
+
+    """
+    if path.is_dir():
+        raise InputError(f"'{path}' is a folder: name a log file")
+    if not path.exists():
+        raise InputError(f"there is no log '{path}': check the path")
+    try:
+        with path.open('rb') as file:
+            head = file.read(HEAD)
+    except OSError as error:
+        raise InputError(f'cannot read {path}: {error.strerror}') from error
+    if not head:
+        raise InputError(f"'{path}' is empty: there is nothing to convert")
+    if head.startswith(MCAP_MAGIC):
+        raise InputError(f"'{path}' is an MCAP bag already: analyze, discover and replay take it")
+    for one in FORMATS:
+        if one.fits(head):
+            return one
+    raise InputError(f"'{path}' cannot be converted: it begins like none of the formats read "
+                     'today: ' + '; '.join(one.words for one in FORMATS))
+
+
+def import_log(path: Path, request: Request) -> Log:
+    """
+    Read a log.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        Log.
+    request : Request
+        What is wanted of it.
+
+    Returns
+    -------
+    Log
+        Candidates for voltage, throttle and current.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, or the package that reads it is missing.
+
+    """
+    form = detect(path)
+    try:
+        module = import_module(form.module)
+    except ImportError as error:
+        # Only what the importer itself loads is an extra; a fault of ours is not hidden.
+        if not form.package or (error.name or '').split('.')[0] != form.package:
+            raise
+        raise InputError(
+            f"'{path}' is {form.words}: reading it needs {form.package}: "
+            f"pip install 'ou_monitor[{form.extra}]'") from error
+    if request.progress is not None:
+        request = replace(request, progress=_shown(request.progress))
+    # Broken bytes make numbers that no cast takes, and fields of any shape.
+    with np.errstate(all='ignore'), quiet(path, form.package or 'the reader of CSV'):
+        log: Log = module.read(path, request)
+    return log
+
+
+def _shown(progress: Progress) -> Progress:
+    """Return a progress that reaches the terminal from where parsers are kept quiet."""
+    terminal = sys.stderr
+
+    def show(share: float) -> None:
+        with redirect_stderr(terminal):
+            progress(share)
+    return show

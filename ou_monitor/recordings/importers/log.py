@@ -1,0 +1,266 @@
+"""
+What an importer returns: a `Log`, candidate `Series` with where each comes from.
+
+Limits first: a log is read whole into memory, its wanted fields only.  Stamps
+are seconds from the first moment of the log, or of the flight in it; absolute
+time is not kept.  Importers know nothing of how a log is written as a bag.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+import math
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ou_monitor.errors import InputError
+from ou_monitor.records import FloatArray
+
+VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
+# A column of a table that says nothing about what it is.
+ANY = 'any'
+UNITS = {VOLTAGE: 'V', THROTTLE: '0..1', CURRENT: 'A', ANY: '?'}
+
+# Values that only broken bytes make; a message could not hold them.
+LARGEST = 1e9
+# Stamps that only broken bytes make: further ahead than this, by so few samples.
+_FAR = 3600.0  # s
+_FEW = 16
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """
+    One quantity over time, in SI units.
+
+    Attributes
+    ----------
+    name : str
+        How the user names it, unique in the log: ``BAT[0].Volt``.
+    quantity : {'voltage', 'throttle', 'current', 'any'}
+        What it is.
+    t : ndarray, shape (n,)
+        Stamps, s from the start of the log.
+    values : ndarray, shape (n,)
+        V, 0..1, or A (positive when the battery is drained); NaN where the
+        log says "unknown".
+    scale : str
+        How the value was made from what is logged.
+    words : str
+        What it is, for people.
+    rank : int or None
+        Taken when nothing of a smaller rank is there; None: only by name.
+    group : str
+        The sensor; a voltage and a current of one sensor share it.
+
+    """
+
+    name: str
+    quantity: str
+    t: FloatArray
+    values: FloatArray
+    scale: str
+    words: str = ''
+    rank: int | None = None
+    group: str = ''
+
+    @property
+    def n(self) -> int:
+        """Return the number of samples."""
+        return int(self.t.size)
+
+    @property
+    def rate(self) -> float:
+        """Return the mean rate of the samples, Hz; NaN when unknown."""
+        span = float(self.t[-1] - self.t[0]) if self.n > 1 else 0.0
+        return (self.n - 1) / span if span > 0.0 else math.nan
+
+    @property
+    def repeats(self) -> float:
+        """Return the share of increments that are exactly zero; NaN when unknown."""
+        return float((np.diff(self.values) == 0.0).mean()) if self.n > 1 else math.nan
+
+    @property
+    def silent(self) -> bool:
+        """Whether it never holds anything but zero or "unknown"."""
+        return not bool((np.isfinite(self.values) & (self.values != 0.0)).any())
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One of several flights in a file: number from 1, and what is known without decoding."""
+
+    number: int
+    words: str
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """
+    What a log file holds.
+
+    Attributes
+    ----------
+    format : str
+        Name of the format.
+    series : tuple of Series
+        Candidates.
+    facts : dict of str to str
+        Vehicle, firmware, number of the flight: what is known.
+    notes : tuple of str
+        What was dropped or could not be read, one sentence each.
+
+    """
+
+    format: str  # noqa: A003
+    series: tuple[Series, ...]
+    facts: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Request:
+    """
+    What an importer is asked for.
+
+    Attributes
+    ----------
+    flight : int or None
+        Which flight of a file with several.
+    names : frozenset of str
+        Series the user named, for formats that read only what is asked for.
+    everything : bool
+        Whether all candidates are wanted (``--list``).
+    progress : callable or None
+        Called with the share done, 0..1.
+
+    """
+
+    flight: int | None = None
+    names: frozenset[str] = frozenset()
+    everything: bool = False
+    progress: Progress | None = None
+
+
+def one_flight(path: Path, request: Request) -> None:
+    """
+    Refuse a flight other than the first for formats that hold one flight a file.
+
+    Raises
+    ------
+    InputError
+        When another one is asked for.
+
+    """
+    if request.flight not in (None, 1):
+        raise InputError(f'{path} holds one flight: --flight {request.flight} is not there')
+
+
+def clean(series: Series) -> tuple[Series, tuple[str, ...]]:
+    """
+    Return a series with finite values and stamps that increase, and notes of what that took.
+
+    Parameters
+    ----------
+    series : Series
+        As found.
+
+    Returns
+    -------
+    tuple
+        The series, and one sentence for each kind of sample dropped.
+
+    """
+    notes: list[str] = []
+    t, values = series.t, series.values
+
+    def keep(good: npt.NDArray[np.bool_], why: str) -> None:
+        nonlocal t, values
+        dropped = int(good.size - good.sum())
+        if dropped:
+            notes.append(f'{dropped} sample{"s" * (dropped != 1)} dropped: {why}.')
+            t, values = t[good], values[good]
+
+    keep(np.isfinite(t) & np.isfinite(values), 'not a finite number')
+    keep(np.abs(values) <= LARGEST, f'beyond {LARGEST:g}')
+    keep(_near(t), f'the stamp is over {_FAR:g} s away from all others')
+    fresh = np.ones(t.size, dtype=bool)
+    fresh[1:] = np.diff(t) != 0.0
+    keep(fresh, 'the stamp was there before; the first of each was kept')
+    keep(_rising(t), 'the stamp goes back')
+    if series.quantity == THROTTLE:
+        outside = int(((values < -0.01) | (values > 1.01)).sum())
+        if outside:
+            notes.append(f'{outside} value{"s" * (outside != 1)} outside 0..1 set to its end.')
+        values = np.clip(values, 0.0, 1.0)
+    return replace(series, t=t, values=values), tuple(notes)
+
+
+def _near(t: FloatArray) -> npt.NDArray[np.bool_]:
+    """Return which stamps are not a few on the far side of a pause over an hour."""
+    order = np.argsort(t, kind='stable')
+    good = np.ones(t.size, dtype=bool)
+    pauses = np.flatnonzero(np.diff(t[order]) > _FAR) + 1
+    parts = np.split(order, pauses)
+    if max(part.size for part in parts) < _FEW:
+        # A log of a sample every few hours has no crowd to be far from.
+        return good
+    for part in parts:
+        good[part] = part.size >= _FEW
+    return good
+
+
+def _rising(t: FloatArray) -> npt.NDArray[np.bool_]:
+    """Return a longest part of the stamps that increases."""
+    good = np.ones(t.size, dtype=bool)
+    if t.size < 2 or (np.diff(t) > 0.0).all():
+        return good
+    ends: list[float] = []
+    places: list[int] = []
+    before = np.full(t.size, -1, dtype=np.int64)
+    for k, stamp in enumerate(t.tolist()):
+        length = bisect_left(ends, stamp)
+        if length == len(ends):
+            ends.append(stamp)
+            places.append(k)
+        else:
+            ends[length], places[length] = stamp, k
+        before[k] = places[length - 1] if length else -1
+    good[:] = False
+    at = places[-1]
+    while at >= 0:
+        good[at] = True
+        at = int(before[at])
+    return good
+
+
+def from_start(series: Iterable[Series], start: float = math.inf) -> tuple[Series, ...]:
+    """
+    Return series with stamps counted from the start of the log.
+
+    Parameters
+    ----------
+    series : iterable of Series
+        Stamps on one clock, s.
+    start : float
+        When the log says that it starts, s; an earlier sample is the start.
+
+    Returns
+    -------
+    tuple of Series
+        The same with the start subtracted.
+
+    """
+    held = tuple(series)
+    # Broken bytes make stamps near zero: a first sample counts when another is near it.
+    firsts = [float(one.t[_near(one.t)].min()) for one in held if one.n]
+    zero = min([start, *firsts])
+    if not math.isfinite(zero):
+        return held
+    return tuple(replace(one, t=one.t - zero) for one in held)

@@ -1,0 +1,228 @@
+"""
+PX4 ULog, read by pyulog.
+
+Limits first: ULog has no mark at its end and no checksums, so a log that was cut
+off between two messages looks whole.  PX4 may have low-passed the voltage
+(`BATn_V_FILT`).  Which of `actuator_outputs` are motors is not in the log: they
+are taken by name only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ou_monitor.recordings.importers.log import (
+    CURRENT, from_start, Log, one_flight, Progress, Request, Series, THROTTLE, VOLTAGE)
+from ou_monitor.recordings.importers.quiet import quiet
+from ou_monitor.records import FloatArray
+from pyulog import ULog
+
+TOPICS = ('battery_status', 'system_power', 'power_monitor', 'esc_status', 'actuator_motors',
+          'vehicle_thrust_setpoint', 'actuator_controls_0', 'actuator_outputs',
+          'manual_control_setpoint')
+
+# Topic, field, quantity, rank, words.  The battery comes first; rails only by name.
+PLAIN = (
+    ('battery_status', 'voltage_v', VOLTAGE, 0, 'battery'),
+    ('battery_status', 'voltage_filtered_v', VOLTAGE, None, 'battery, low-passed by PX4'),
+    ('battery_status', 'current_a', CURRENT, 0, 'battery'),
+    ('battery_status', 'current_filtered_a', CURRENT, None, 'battery, low-passed by PX4'),
+    ('system_power', 'voltage5v_v', VOLTAGE, None, '5 V rail'),
+    ('system_power', 'voltage3v3_v', VOLTAGE, None, '3.3 V rail'),
+    ('system_power', 'voltage_payload_v', VOLTAGE, None, 'payload rail'),
+    ('power_monitor', 'voltage_v', VOLTAGE, None, 'power monitor'),
+    ('power_monitor', 'current_a', CURRENT, None, 'power monitor'),
+    ('actuator_controls_0', 'control[3]', THROTTLE, 3, 'thrust asked of the mixer'),
+    ('manual_control_setpoint', 'z', THROTTLE, 4, 'stick'),
+)
+
+
+# Bytes before the content of a message: its length and its kind.
+HEAD = 3
+KINDS = frozenset(b'BFIMPQARDLCSO')
+
+
+class _Watched(io.BufferedReader):
+    """A file that remembers what its reader passes over without a word."""
+
+    progress: Progress | None = None
+    size = 1
+    reads = 0
+    cut_at: int | None = None
+    unknown_at: int | None = None
+    end = 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read, and note the first message of no known kind, and one that is cut off."""
+        data = super().read(size)
+        at = self.tell()
+        self.end = max(self.end, at)
+        self.reads += 1
+        if self.progress is not None and self.reads % 16384 == 0:
+            self.progress(at / self.size)
+        # The head of a message has 3 bytes: none of them is a regular end.
+        if size is not None and len(data) < size and (data or size != HEAD):
+            self.cut_at = at - len(data)
+        elif data:
+            self.cut_at = None
+        if size == HEAD == len(data) and data[2] not in KINDS and self.unknown_at is None:
+            self.unknown_at = at - HEAD
+        return data
+
+
+def read(path: Path, request: Request) -> Log:
+    """
+    Read a ULog.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        Log.
+    request : Request
+        What is wanted.
+
+    Returns
+    -------
+    Log
+        Candidates; stamps count from the start that the header states.
+
+    Raises
+    ------
+    InputError
+        When pyulog cannot read it.
+
+    """
+    one_flight(path, request)
+    size = path.stat().st_size
+    with quiet(path, 'pyulog') as said:
+        with _Watched(io.FileIO(path)) as file:
+            file.size, file.progress = size, request.progress
+            ulog = ULog(file, list(TOPICS))
+    notes = []
+    if file.cut_at is not None:
+        notes.append(f'The log was cut off within its last message, at byte {file.cut_at} of '
+                     f'{size}; all before that was read.')
+    elif file.end < size:
+        notes.append(f'Only {file.end} of {size} bytes were read: the log is damaged.')
+    if ulog.file_corruption or file.unknown_at is not None or said.getvalue():
+        where = '' if file.unknown_at is None else f' from byte {file.unknown_at} of {size} on'
+        notes.append(f'The log is damaged{where}: messages that pyulog could not read are '
+                     'missing, those after them were read.')
+    lost = sum(one.duration for one in ulog.dropouts) * 1e-3
+    if ulog.dropouts:
+        notes.append(f'The logger lost data {len(ulog.dropouts)} '
+                     f'time{"s" * (len(ulog.dropouts) != 1)}, {lost:.3f} s in all.')
+    series: list[Series] = []
+    for data in ulog.data_list:
+        columns: dict[str, Any] = data.data
+        if 'timestamp' in columns:
+            series += _series(f'{data.name}[{data.multi_id}]', data.name, columns)
+    facts = _facts(ulog)
+    return Log('ulog', from_start(series, ulog.start_timestamp * 1e-6), facts, tuple(notes))
+
+
+def _facts(ulog: Any) -> dict[str, str]:
+    info = ulog.msg_info_dict
+    version = ulog.get_version_info_str() or ''
+    branch, commit = str(info.get('ver_sw_branch', '')), str(info.get('ver_sw', ''))[:10]
+    firmware = ' '.join(word for word in (str(info.get('sys_name', 'PX4')), version or branch,
+                                          commit) if word)
+    facts = {'firmware': firmware}
+    board, uuid = str(info.get('ver_hw', '')), str(info.get('sys_uuid', ''))
+    if uuid.strip('0'):
+        facts['vehicle'] = f'{board} {uuid}'.lstrip()
+    elif board:
+        # Many vehicles have the same; simulators say that their number is 0.
+        facts['board'] = board
+    return facts
+
+
+def _series(name: str, topic: str, columns: dict[str, Any]) -> Iterator[Series]:
+    t = np.asarray(columns['timestamp'], dtype=np.float64) * 1e-6
+    connected = columns.get('connected')
+    # A battery that was never connected is listed, but nobody's first choice.
+    there = connected is None or bool(np.any(connected))
+    for source, field, quantity, rank, words in PLAIN:
+        if source != topic or field not in columns:
+            continue
+        values = np.asarray(columns[field], dtype=np.float64)
+        if quantity == CURRENT:
+            # The message says -1 for "not known".
+            values = np.where(values == -1.0, np.nan, values)
+        one = Series(f'{name}.{field}', quantity, t, values, '1', words, rank, name)
+        if quantity != THROTTLE and (one.silent or not there):
+            one = Series(f'{name}.{field}', quantity, t, values, '1', f'{words}, not connected',
+                         None, name)
+        yield one
+    if topic == 'actuator_motors':
+        yield from _motors(name, t, columns)
+    elif topic == 'vehicle_thrust_setpoint':
+        yield from _thrust(name, t, columns)
+    elif topic == 'manual_control_setpoint' and 'throttle' in columns:
+        yield Series(f'{name}.throttle', THROTTLE, t,
+                     (np.asarray(columns['throttle'], dtype=np.float64) + 1.0) / 2.0,
+                     '(x + 1) / 2', 'stick', 4, name)
+    elif topic == 'actuator_outputs':
+        yield from _outputs(name, t, columns)
+    elif topic == 'esc_status':
+        yield from _escs(name, t, columns)
+
+
+def _stack(columns: dict[str, Any], stem: str) -> FloatArray:
+    """Return the elements of an array field as rows."""
+    rows: list[FloatArray] = []
+    while f'{stem}[{len(rows)}]' in columns:
+        rows.append(np.asarray(columns[f'{stem}[{len(rows)}]'], dtype=np.float64))
+    return np.array(rows)
+
+
+def _motors(name: str, t: FloatArray, columns: dict[str, Any]) -> Iterator[Series]:
+    control = _stack(columns, 'control')
+    # NaN: there is no such motor, or it is stopped.
+    used = control[np.isfinite(control).any(axis=1)] if control.size else control
+    if used.size:
+        known = np.isfinite(used).sum(axis=0)
+        mean = np.nansum(used, axis=0) / len(used)
+        yield Series(name, THROTTLE, t, np.where(known > 0, mean, np.nan),
+                     f'mean of control[0..{len(used) - 1}], a stopped motor counts as 0',
+                     f'mean of {len(used)} motors', 0, name)
+
+
+def _thrust(name: str, t: FloatArray, columns: dict[str, Any]) -> Iterator[Series]:
+    for axis, sign, words, rank in ((2, -1.0, 'thrust upwards', 1),
+                                    (0, 1.0, 'thrust forwards', 2)):
+        field = f'xyz[{axis}]'
+        if field in columns:
+            values = sign * np.asarray(columns[field], dtype=np.float64)
+            one = Series(f'{name}.{field}', THROTTLE, t, values, f'{sign:g}', words, rank, name)
+            if not one.silent:
+                yield one
+
+
+def _outputs(name: str, t: FloatArray, columns: dict[str, Any]) -> Iterator[Series]:
+    output = _stack(columns, 'output')
+    count = int(np.max(columns['noutputs'])) if 'noutputs' in columns else len(output)
+    for k, values in enumerate(output[:count]):
+        low, high = float(values.min()), float(values.max())
+        if 800.0 <= low and high <= 2200.0:
+            yield Series(f'{name}.output[{k}]', THROTTLE, t, (values - 1000.0) / 1000.0,
+                         '(x - 1000 us) / 1000 us', 'one output, motor or servo', None, name)
+        elif 0.0 <= low and 0.0 < high <= 1.0:
+            yield Series(f'{name}.output[{k}]', THROTTLE, t, values, '1',
+                         'one output, motor or servo', None, name)
+
+
+def _escs(name: str, t: FloatArray, columns: dict[str, Any]) -> Iterator[Series]:
+    for field in columns:
+        quantity = (VOLTAGE if field.endswith('.esc_voltage')
+                    else CURRENT if field.endswith('.esc_current') else None)
+        if quantity is not None:
+            one = Series(f'{name}.{field}', quantity, t,
+                         np.asarray(columns[field], dtype=np.float64), '1', 'at the ESC', None,
+                         f'{name}.{field.split(".")[0]}')
+            if not one.silent:
+                yield one

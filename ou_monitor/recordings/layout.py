@@ -1,0 +1,258 @@
+"""
+Where a field is within serialized messages: the layout of one, verified in all others.
+
+CDR has no fixed places: a text or a sequence moves all that comes after it.  But
+in a recording the same texts and lengths come again and again.  So the layout is
+worked out once on one message, with every length word that it rests on, and
+holds for all messages of the same size with the same words there.  What remains
+is for the general decoder, and so is everything that it would refuse.
+
+Plain CDR version 1, little endian (OMG DDS-XTypes 7.4.3): alignment is counted
+from after the 4-byte header.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+import struct
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.messages.field_path import FieldPath
+from ou_monitor.recordings.ros2msg import Definitions, Field, PRIMITIVES, TEXT
+from ou_monitor.records import FloatArray
+
+Rows = npt.NDArray[np.uint8]
+
+# Representation identifier CDR_LE; the two bytes after it are options.
+_LITTLE_ENDIAN = b'\x00\x01'
+_HEADER = 4
+
+# Beyond these the general decoder is as quick, and no message can make the walk long.
+_MOST_STEPS = 2000
+_MOST_WORDS = 64
+_MOST_DEPTH = 50
+
+
+class _NoLayoutError(Exception):
+    """The message is for the general decoder."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """
+    Where numbers are in a message.
+
+    Attributes
+    ----------
+    offset : int
+        Byte of the first one.
+    kind : str
+        NumPy type of each.
+    size : int or None
+        How many; None for a single number that is not an array.
+
+    """
+
+    offset: int
+    kind: str
+    size: int | None = None
+
+    def column(self, rows: Rows) -> FloatArray:
+        """
+        Return the numbers of many messages.
+
+        Parameters
+        ----------
+        rows : ndarray of uint8, shape (n, length)
+            Messages that the layout holds for.
+
+        Returns
+        -------
+        ndarray, shape (n,) or (n, size)
+            Their values.
+
+        """
+        kind = np.dtype('u1' if self.kind == '?' else self.kind)
+        shape = rows.shape[:1] if self.size is None else (rows.shape[0], self.size)
+        if not rows.shape[0] or self.size == 0:
+            return np.empty(shape)
+        strides = (rows.shape[1], kind.itemsize)[:len(shape)]
+        raw: npt.NDArray[np.generic] = np.ndarray(shape, kind, rows, self.offset, strides)
+        return (raw != 0 if self.kind == '?' else raw).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """
+    The layout of one message.
+
+    Attributes
+    ----------
+    length : int
+        Bytes of the message.
+    words : tuple of (int, int)
+        (offset, value) of every uint32 that states a length.
+    texts : tuple of (int, int)
+        (offset, bytes) of every text, its closing zero left out.
+    places : dict of FieldPath to Place
+        Where the fields asked for are.
+
+    """
+
+    length: int
+    words: tuple[tuple[int, int], ...]
+    texts: tuple[tuple[int, int], ...]
+    places: dict[FieldPath, Place]
+
+    def holds_for(self, rows: Rows) -> npt.NDArray[np.bool_]:
+        """
+        Return which messages have this layout.
+
+        Parameters
+        ----------
+        rows : ndarray of uint8, shape (n, length)
+            Messages.
+
+        Returns
+        -------
+        ndarray of bool, shape (n,)
+            True where every length is the same, and every text plain ASCII
+            (that of others may be no text at all, which the general decoder
+            refuses).
+
+        """
+        same: npt.NDArray[np.bool_] = (rows[:, 0] == 0) & (rows[:, 1] == 1)
+        for offset, value in self.words:
+            word: npt.NDArray[np.uint32] = np.ndarray(
+                rows.shape[:1], '<u4', rows, offset, rows.strides[:1])
+            same &= word == value
+        for offset, size in self.texts:
+            same &= (rows[:, offset:offset + size] < 0x80).all(axis=1)
+        return same
+
+
+def layout_of(
+    message: bytes, kind: str, definitions: Definitions, wanted: Iterable[FieldPath],
+) -> Layout | None:
+    """
+    Return the layout of one message.
+
+    Parameters
+    ----------
+    message : bytes
+        Serialized.
+    kind : str
+        Its type, 'package/Type'.
+    definitions : dict
+        Fields of all types in it.
+    wanted : iterable of FieldPath
+        Fields to find; only numbers, and arrays of numbers, are found.
+
+    Returns
+    -------
+    Layout or None
+        None when the message is for the general decoder: not little endian,
+        cut off, or of an unusual kind.
+
+    """
+    if message[:2] != _LITTLE_ENDIAN or len(message) < _HEADER:
+        return None
+    walk = _Walk(message, definitions, frozenset(wanted))
+    try:
+        walk.message(kind, (), 0)
+    except _NoLayoutError:
+        return None
+    return Layout(len(message), tuple(walk.words), tuple(walk.texts), walk.places)
+
+
+class _Walk:
+    """Reads one message from front to back, noting where things are."""
+
+    def __init__(
+        self, data: bytes, definitions: Definitions, wanted: frozenset[FieldPath],
+    ) -> None:
+        self.words: list[tuple[int, int]] = []
+        self.texts: list[tuple[int, int]] = []
+        self.places: dict[FieldPath, Place] = {}
+        self._data = data
+        self._definitions = definitions
+        self._wanted = wanted
+        self._at = _HEADER
+        self._steps = 0
+
+    def message(self, kind: str, path: FieldPath, depth: int) -> None:
+        fields = self._definitions.get(kind)
+        if fields is None or depth > _MOST_DEPTH:
+            raise _NoLayoutError
+        if not fields:
+            # A message without fields is sent as one byte.
+            self._take(1, 1)
+        for field in fields:
+            self._field(field, (*path, field.name), depth)
+
+    def _field(self, field: Field, path: FieldPath, depth: int) -> None:
+        self._steps += 1
+        if self._steps > _MOST_STEPS:
+            raise _NoLayoutError
+        if not field.array:
+            self._one(field.type, path, depth)
+            return
+        size = self._word() if field.size is None else field.size
+        if field.type in PRIMITIVES:
+            self._numbers(field.type, size, path)
+            return
+        if size > _MOST_STEPS:
+            raise _NoLayoutError
+        for k in range(size):
+            self._steps += 1
+            self._one(field.type, (*path, k), depth)
+
+    def _one(self, kind: str, path: FieldPath, depth: int) -> None:
+        if kind == TEXT:
+            self._text()
+        elif kind in PRIMITIVES:
+            item = PRIMITIVES[kind]
+            width = np.dtype(item).itemsize
+            begin = self._take(width, width)
+            if path in self._wanted:
+                self.places[path] = Place(begin, item)
+        else:
+            self.message(kind, path, depth + 1)
+
+    def _numbers(self, kind: str, size: int, path: FieldPath) -> None:
+        item = PRIMITIVES[kind]
+        width = np.dtype(item).itemsize
+        # An empty array is not aligned.
+        begin = self._take(size * width, width if size else 1)
+        for wanted in self._wanted:
+            # Arrays of bytes are bytes to the general decoder, not numbers.
+            if wanted == path and item != 'u1':
+                self.places[wanted] = Place(begin, item, size)
+            elif len(wanted) == len(path) + 1 and wanted[:-1] == path:
+                k = wanted[-1]
+                if isinstance(k, int) and k < size:
+                    self.places[wanted] = Place(begin + k * width, item)
+
+    def _text(self) -> None:
+        length = self._word()
+        begin = self._take(length, 1)
+        if length > 1:
+            self.texts.append((begin, length - 1))
+
+    def _word(self) -> int:
+        begin = self._take(4, 4)
+        if len(self.words) == _MOST_WORDS:
+            raise _NoLayoutError
+        (value,) = struct.unpack_from('<I', self._data, begin)
+        self.words.append((begin, value))
+        return int(value)
+
+    def _take(self, size: int, align: int) -> int:
+        """Pass over some bytes; return where they begin."""
+        begin = self._at + (_HEADER - self._at) % align
+        self._at = begin + size
+        if self._at > len(self._data):
+            raise _NoLayoutError
+        return begin

@@ -1,0 +1,359 @@
+"""
+The samples of a bag: batches of messages -> stamps, voltage and throttle in order.
+
+Limits first: stamps are put in order among the samples held; one that comes
+later than that is dropped, counted and noted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+import math
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ou_monitor.errors import InputError
+from ou_monitor.messages.blocks import BlockClock
+from ou_monitor.messages.config import FieldSpec
+from ou_monitor.recordings.bag import BagReader
+from ou_monitor.recordings.batches import batches, last_before
+from ou_monitor.recordings.columns import Column
+from ou_monitor.recordings.topic_choice import choose
+from ou_monitor.records import FloatArray, Recording
+
+VOLTAGE, THROTTLE = 'voltage', 'throttle'
+# Squares and cubes of what is beyond this overflow; no supply comes near it.
+LARGEST = 1e9  # V
+# So many samples behind for each step back are not a few that came late.
+_STRETCH = 20
+# A throttle beyond this is none in 0..1, however generous its ends.
+MOST_THROTTLE = 2.0
+
+
+def counted(count: int, word: str = 'sample') -> str:
+    """Return '1 sample', '2 samples'."""
+    return f'{count} {word}' if count == 1 else f'{count} {word}s'
+
+
+def usable_voltage(t: FloatArray, voltage: FloatArray) -> npt.NDArray[np.bool_]:
+    """Return which samples are finite, and of a voltage that there is."""
+    usable: npt.NDArray[np.bool_] = np.isfinite(t) & (np.abs(voltage) <= LARGEST)
+    return usable
+
+
+def dropped_words(count: int, voltage: FloatArray) -> str:
+    """Return the note on samples that are not usable; `voltage`: theirs."""
+    beyond = bool((np.isfinite(voltage) & (np.abs(voltage) > LARGEST)).any())
+    return (f'{counted(count)} dropped: not a finite number'
+            + (f', or beyond {LARGEST:g} V.' if beyond else '.'))
+
+
+def check_throttle(name: str, throttle: FloatArray) -> None:
+    """
+    Refuse a throttle in percent, microseconds or counts.
+
+    Raises
+    ------
+    InputError
+        When it goes beyond `MOST_THROTTLE` to either side.
+
+    """
+    known = throttle[np.isfinite(throttle)]
+    if known.size and float(np.abs(known).max()) > MOST_THROTTLE:
+        raise InputError(
+            f'{name}: throttle runs from {known.min():g} to {known.max():g}, and 0 to 1 is '
+            'expected: divide a percentage by 100 (of a bag: unit_factor of a msg config), turn '
+            'a pulse of w microseconds into (w - 1000) / 1000')
+
+
+def overlap(t: FloatArray, highest: float = -math.inf) -> tuple[int, float]:
+    """
+    Return how many samples lie before one that came earlier, and how far at most, s.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,)
+        Stamps in the order in which they came, s.
+    highest : float
+        Largest stamp before them, s.
+
+    """
+    ahead = np.maximum(np.maximum.accumulate(t), highest) - t
+    behind = ahead > 0.0
+    return int(np.count_nonzero(behind)), float(ahead[behind].max(initial=0.0))
+
+
+def late_words(count: int, mixed: int, back: float) -> str:
+    """Return the note on samples out of order: steps back, samples behind, and how far, s."""
+    if mixed < _STRETCH * count:
+        return f'{counted(count)} came before the stamp ahead of them: sorted by stamp.'
+    times = 'once' if count == 1 else f'{count} times'
+    return (f'The clock went back {times}, by {back:.3g} s at most: {counted(mixed)} lie where '
+            'others were before, and were mixed with them; take a part before or after, or mend '
+            'the stamps.')
+
+
+def repeated_words(count: int) -> str:
+    """Return the note on stamps that are there twice."""
+    return (f'{counted(count)} dropped: the stamp was there before; the first of each was '
+            'kept.')
+
+
+def span_words(start: float | None, end: float | None) -> str:
+    """Return 'from 2 s to 5 s'."""
+    return f"from {start or 0.0:g} s to {'the end' if end is None else f'{end:g} s'}"
+
+
+def part_words(start: float | None, end: float | None) -> str:
+    """Return the note on a part."""
+    return f'Only the part {span_words(start, end)} of the recording was read.'
+
+
+class _Series:
+    """Stamps and values of one field, as its messages come."""
+
+    def __init__(self, spec: FieldSpec) -> None:
+        self.clock = None if spec.sample_rate is None else BlockClock(spec.sample_rate)
+
+    def samples(self, column: Column) -> tuple[FloatArray, FloatArray]:
+        """Return stamps (s) and values, NaN where a message holds none."""
+        if self.clock is not None:
+            return self.clock.stamps_of_many(column.stamp, column.count), column.values
+        values = np.full(column.n, np.nan)
+        values[column.count > 0] = column.values
+        return column.stamp, values
+
+
+class SampleReader:
+    """
+    Reads voltage and throttle of a bag, keeping only what has not been taken.
+
+    Parameters
+    ----------
+    bag : BagReader
+        The bag.
+    msg_config, voltage_topic, throttle_topic :
+        As in `read_recording`.
+    start, end : float or None
+        Part to read, s after the first message.
+
+    Attributes
+    ----------
+    name : str
+        Of the bag, for people.
+    duration : float
+        From the first to the last message of the whole bag, s.
+    source : dict of str to str
+        Topics, types and files; what the bag says of itself; `vehicle`, where
+        that or the log it was converted from names one.
+    held : int
+        Samples read and not taken.
+
+    Raises
+    ------
+    InputError
+        When the topics cannot be told, or the part holds no voltage.
+
+    """
+
+    def __init__(
+        self, bag: BagReader, *, msg_config: str | Path | None, voltage_topic: str | None,
+        throttle_topic: str | None, start: float | None, end: float | None,
+    ) -> None:
+        """Choose the topics; nothing is read yet but the throttle before the part."""
+        choice = choose(bag.path, bag.topics, msg_config=msg_config, voltage_topic=voltage_topic,
+                        throttle_topic=throttle_topic)
+        self._bag = bag
+        self._notes = [*bag.notes, *choice.notes]
+        if bag.damage is not None:
+            self._notes.append(
+                f'The bag is damaged; what it still holds was read: {bag.damage}.')
+        if start is not None or end is not None:
+            self._notes.append(part_words(start, end))
+        self.name = bag.path.name
+        self.duration = (bag.end_ns - bag.start_ns) * 1e-9
+        self.source = {
+            **bag.about, 'file': bag.path.name, 'format': 'mcap', 'msg_config': choice.config.name,
+            'voltage_topic': choice.voltage.topic, 'voltage_type': choice.voltage.type,
+            **bag.origins.get(choice.voltage.topic, {})}
+        spec = choice.voltage
+        stated = bag.sample_rates.get(spec.topic)
+        if spec.sample_rate is not None and stated is not None:
+            # The bag knows better than a config that is made for many.
+            spec = replace(spec, sample_rate=stated)
+        self._specs = {VOLTAGE: spec}
+        # Stamps within a block are worked out, and may be a rounding short of a
+        # throttle that was meant to hold for that sample.
+        self._slack = 0.0 if spec.sample_rate is None else 0.1 / spec.sample_rate
+        self._series = {VOLTAGE: _Series(spec)}
+        if choice.throttle is not None:
+            self.source |= {'throttle_topic': choice.throttle.topic,
+                            'throttle_type': choice.throttle.type,
+                            **bag.origins.get(choice.throttle.topic, {})}
+            self._specs[THROTTLE] = choice.throttle
+            self._series[THROTTLE] = _Series(choice.throttle)
+        # `ou-monitor convert` keeps what the log says apart from what people say of the bag.
+        vehicle = self.source.get('vehicle') or self.source.get('log_vehicle')
+        if vehicle:
+            self.source['vehicle'] = vehicle
+        self._start_ns, self._end_ns = self._limits(start), self._limits(end)
+        self._t: list[FloatArray] = []
+        self._voltage: list[FloatArray] = []
+        self.held = 0
+        self._newest = self._highest = self._taken = -math.inf
+        self._largest = self._back = 0.0
+        self._throttle_t, self._throttle = np.empty(0), np.empty(0)
+        self._fresh: list[tuple[FloatArray, FloatArray]] = []
+        self._tally = dict.fromkeys((
+            'dropped', 'late', 'mixed', 'repeated', 'too_late', 'throttle'), 0)
+        if self._start_ns is not None and choice.throttle is not None:
+            self._add_throttle(last_before(bag, choice.throttle, self._start_ns))
+            self._tally['throttle'] = 0
+            self._series[THROTTLE] = _Series(choice.throttle)
+
+    def _limits(self, at: float | None) -> int | None:
+        """Return a time of the recording as log time, ns."""
+        if at is None:
+            return None
+        # Beyond the bag every time is the same.
+        after = min(at * 1e9, float(self._bag.end_ns - self._bag.start_ns + 1))
+        return self._bag.start_ns + round(after)
+
+    def batches(self, progress: Callable[[float], None] | None) -> Iterator[int]:
+        """
+        Read on; yield the number of samples held after each batch.
+
+        Parameters
+        ----------
+        progress : callable or None
+            Called with the share done, 0..1.
+
+        Yields
+        ------
+        int
+            Samples held.
+
+        Raises
+        ------
+        InputError
+            At a broken chunk, or for bytes that are no message.
+
+        """
+        for batch in batches(self._bag, self._specs, start_ns=self._start_ns,
+                             end_ns=self._end_ns, progress=progress):
+            if THROTTLE in batch:
+                self._add_throttle(batch[THROTTLE])
+            if VOLTAGE in batch:
+                self._add_voltage(batch[VOLTAGE])
+            yield self.held
+
+    def _add_voltage(self, column: Column) -> None:
+        t, voltage = self._series[VOLTAGE].samples(column)
+        good = usable_voltage(t, voltage)
+        if not good.all():
+            self._tally['dropped'] += t.size - int(good.sum())
+            lost = np.abs(voltage[~good])
+            self._largest = max(self._largest, float(lost[np.isfinite(lost)].max(initial=0.0)))
+            t, voltage = t[good], voltage[good]
+        if not t.size:
+            return
+        self._tally['late'] += int(np.count_nonzero(np.diff(t) < 0.0)) + int(t[0] < self._newest)
+        mixed, back = overlap(t, self._highest)
+        self._tally['mixed'] += mixed
+        self._back = max(self._back, back)
+        self._newest, self._highest = float(t[-1]), max(self._highest, float(t.max()))
+        self._t.append(t)
+        self._voltage.append(voltage)
+        self.held += t.size
+
+    def _add_throttle(self, column: Column) -> None:
+        t, values = self._series[THROTTLE].samples(column)
+        known = np.isfinite(t)
+        if self._specs[THROTTLE].nan == 'drop':
+            finite = np.isfinite(values)
+            self._tally['throttle'] += int(np.count_nonzero(~finite))
+            known &= finite
+        check_throttle(self.name, values[known])
+        self._fresh.append((t[known], values[known]))
+
+    def take(self, most: int | None = None) -> Recording:
+        """
+        Return the first samples held, in order, each stamp once; they are held no longer.
+
+        Parameters
+        ----------
+        most : int, optional
+            Samples to take, and those with the stamp of the last one; all
+            when left out.
+
+        Returns
+        -------
+        Recording
+            Its stamps come after those taken before.
+
+        """
+        t = np.concatenate([np.empty(0), *self._t])
+        voltage = np.concatenate([np.empty(0), *self._voltage])
+        if (np.diff(t) < 0.0).any():
+            order = np.argsort(t, kind='stable')
+            t, voltage = t[order], voltage[order]
+        cut = t.size
+        if most is not None and most < cut:
+            cut = int(np.searchsorted(t, t[most - 1], 'right'))
+        self._t, self._voltage, self.held = [t[cut:]], [voltage[cut:]], t.size - cut
+        t, voltage = t[:cut], voltage[:cut]
+        fresh = np.ones(t.size, dtype=bool)
+        fresh[1:] = np.diff(t) > 0.0
+        old = t < self._taken
+        fresh &= t > self._taken
+        self._tally['too_late'] += int(np.count_nonzero(old))
+        self._tally['repeated'] += int(np.count_nonzero(~fresh & ~old))
+        t, voltage = t[fresh], voltage[fresh]
+        if t.size:
+            self._taken = float(t[-1])
+        return Recording(t, voltage, self._held_throttle(t), self.name, dict(self.source))
+
+    def _held_throttle(self, t: FloatArray) -> FloatArray:
+        """Return the throttle at stamps that come after all before; forget what is older."""
+        if self._fresh:
+            stamps = np.concatenate([self._throttle_t, *(part[0] for part in self._fresh)])
+            values = np.concatenate([self._throttle, *(part[1] for part in self._fresh)])
+            order = np.argsort(stamps, kind='stable')
+            self._throttle_t, self._throttle, self._fresh = stamps[order], values[order], []
+        # From which sample on each throttle holds: both are in order, and throttles are few.
+        first = np.searchsorted(t + self._slack, self._throttle_t, 'left')
+        edges = np.concatenate([[0], first, [t.size]])
+        held = np.repeat(np.append(np.nan, self._throttle), np.diff(edges))
+        if t.size:
+            past = int(np.searchsorted(self._throttle_t, t[-1] + self._slack, 'right')) - 1
+            self._throttle_t = self._throttle_t[max(past, 0):]
+            self._throttle = self._throttle[max(past, 0):]
+        return held
+
+    def bag_notes(self) -> tuple[str, ...]:
+        """Return what is to be said before any sample is read."""
+        return tuple(self._notes)
+
+    def sample_notes(self) -> tuple[str, ...]:
+        """Return what was dropped or mended so far, one sentence each."""
+        notes = []
+        tally = self._tally
+        if tally['dropped']:
+            notes.append(dropped_words(tally['dropped'], np.array([self._largest])))
+        if tally['throttle']:
+            notes.append(f"{counted(tally['throttle'], 'throttle value')} dropped: not a finite "
+                         'number.')
+        clock = self._series[VOLTAGE].clock
+        if clock is not None and clock.gaps:
+            notes.append(f'{counted(clock.gaps, "gap")} between blocks of samples.')
+        if tally['late']:
+            notes.append(late_words(tally['late'], tally['mixed'], self._back))
+        if tally['too_late']:
+            notes.append(f"{counted(tally['too_late'])} dropped: they came more than a piece "
+                         'late.')
+        if tally['repeated']:
+            notes.append(repeated_words(tally['repeated']))
+        return tuple(notes)

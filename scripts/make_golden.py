@@ -1,0 +1,72 @@
+#!/usr/bin/env python3
+"""
+Write the golden tables: `scripts/make_golden.py [NAME ...]` (default: every bag in bags/).
+
+test/offline/golden/NAME.json is what `ou-monitor analyze bags/NAME --json -` finds, without the
+long series (of those every sixteenth value).  Run it after a change that is meant to move the
+numbers, and look at the difference before it is committed.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import sys
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from ou_monitor.cli.output import plain  # noqa: E402, I100
+from ou_monitor.offline.analysis.data import as_data  # noqa: E402
+from ou_monitor.offline.analyze import analyze  # noqa: E402
+from ou_monitor.recordings.read import read_recording  # noqa: E402
+
+BAGS = ROOT / 'bags'
+GOLDEN = ROOT / 'test' / 'offline' / 'golden'
+# Series longer than this are thinned.
+_LONG, _EVERY = 64, 16
+
+
+def golden(name: str) -> Any:
+    """
+    Return the golden table of a bag, computed now.
+
+    Parameters
+    ----------
+    name : str
+        Folder in bags/.
+
+    Returns
+    -------
+    object
+        Plain data.
+
+    """
+    data = as_data(analyze(read_recording(BAGS / name)))
+    # Where it was read from is the reader's to say.
+    del data['source']
+    return thinned(plain(data))
+
+
+def thinned(value: Any) -> Any:
+    """Return plain data with every sixteenth value of its long lists, to nine digits."""
+    if isinstance(value, dict):
+        return {key: thinned(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [thinned(item) for item in (value[::_EVERY] if len(value) > _LONG else value)]
+    # More digits change with the machine.
+    return float(f'{value:.9g}') if isinstance(value, float) else value
+
+
+def main(argv: list[str]) -> int:
+    """Write the tables of the bags named."""
+    for name in argv or sorted(path.name for path in BAGS.iterdir() if path.is_dir()):
+        text = json.dumps(golden(name), indent=1, allow_nan=False, ensure_ascii=False)
+        (GOLDEN / f'{name}.json').write_text(text + '\n', encoding='utf-8')
+        print(GOLDEN / f'{name}.json')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main(sys.argv[1:]))

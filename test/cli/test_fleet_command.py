@@ -1,0 +1,317 @@
+"""`ou-monitor fleet` as a user runs it: whole, with bad files, killed, interrupted, taken up."""
+
+import csv
+import json
+import os
+from pathlib import Path
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+from ou_monitor.cli.main import main
+from ou_monitor.model.ou import simulate
+from ou_monitor.offline.fleet.columns import COLUMNS, NAMES
+from ou_monitor.recordings.write import write_recording
+from ou_monitor.records import Recording
+from project import ROOT
+import pyarrow
+from pyarrow import parquet
+import pytest
+
+FLIGHTS = 8
+# Starting Python and Dask on a busy machine, s.
+PATIENCE = 60.0
+
+
+def flight(seed: int, sigma: float = 0.4, n: int = 6000) -> Recording:
+    """Return an OU of some seconds at 1 kHz, two levels of throttle."""
+    t = np.arange(n) * 1e-3
+    throttle = np.where(t < t[n // 2], 0.2, 0.5)
+    return Recording(t, simulate(t, 63.0, np.full(n, sigma), np.random.default_rng(seed),
+                                 u0=5.0 - 0.5 * throttle), throttle, 'made')
+
+
+def write_csv(made: Recording, path: Path) -> None:
+    """Write a recording as a CSV."""
+    with path.open('w', newline='', encoding='utf-8') as file:
+        rows = csv.writer(file)
+        rows.writerow(['time_s', 'voltage_v', 'throttle'])
+        rows.writerows(zip(made.t.tolist(), made.voltage.tolist(), made.throttle.tolist()))
+
+
+@pytest.fixture(scope='module')
+def logs(tmp_path_factory) -> Path:
+    """Return a folder of two vehicles, with a bad file, a copy, and what is no recording."""
+    folder = tmp_path_factory.mktemp('some logs')
+    for k, vehicle in enumerate(('uav1', 'uav2')):
+        (folder / vehicle).mkdir()
+        for number in range(1, FLIGHTS + 1):
+            write_csv(flight(100 * k + number), folder / vehicle / f'flight_{number}.csv')
+    write_recording(flight(7), folder / 'uav2' / 'bag_9', type='float32',
+                    start_ns=1_700_000_000_000_000_000)
+    (folder / 'uav1' / 'bad.mcap').write_text('this is no bag')
+    (folder / 'uav1' / 'tuning.csv').write_text('gain,value\n1,2\n')
+    (folder / 'uav1' / 'raw.ulg').write_bytes(b'ULog')
+    (folder / 'empty').mkdir()
+    shutil.copy2(folder / 'uav1' / 'flight_3.csv', folder / 'uav2' / 'stray.csv')
+    return folder
+
+
+def command(*arguments: object) -> list[str]:
+    """Return the command line of a process of its own."""
+    return [sys.executable, '-m', 'ou_monitor.cli.main', 'fleet', *map(str, arguments)]
+
+
+def environment() -> dict[str, str]:
+    """Return an environment with the package of this checkout; compiling would only cost time."""
+    return {**os.environ, 'PYTHONPATH': str(ROOT), 'OU_MONITOR_COMPILED': '0'}
+
+
+def run(*arguments: object, **options: object) -> subprocess.CompletedProcess:
+    """Run the command to its end."""
+    return subprocess.run(command(*arguments), capture_output=True, text=True, cwd=ROOT,
+                          env=environment(), timeout=PATIENCE, **options)
+
+
+def parts(out: Path) -> dict[str, int]:
+    """Return the results that are kept, with their times."""
+    return {p.name: p.stat().st_mtime_ns for p in (out / 'parts').glob('*.json')}
+
+
+def alive(session: int) -> list[str]:
+    """Return the processes of a session that still run."""
+    found = []
+    for stat in Path('/proc').glob('[0-9]*/stat'):
+        try:
+            state, _, _, its_session = stat.read_text().rpartition(')')[2].split()[:4]
+        except OSError:
+            continue
+        if int(its_session) == session and state != 'Z':
+            found.append(stat.parent.name)
+    return found
+
+
+@pytest.fixture(scope='module')
+def story(logs, tmp_path_factory) -> tuple[Path, list, subprocess.CompletedProcess]:
+    """
+    Run a fleet that is killed, then interrupted, then left to end.
+
+    Returns
+    -------
+    tuple
+        Output folder; for each stop its exit status, standard error, results
+        kept before and after, and its processes that outlive it; the last run.
+
+    """
+    out = tmp_path_factory.mktemp('fleet') / 'out'
+    arguments = (logs, '--output', out, '--workers', 1, '--brownout-voltage', 4.5, '--json',
+                 out.parent / 'fleet.json')
+    stops = []
+    before: dict[str, int] = {}
+    for stop in (signal.SIGKILL, signal.SIGINT):
+        # In a session of its own, as a terminal has it: Ctrl-C reaches the workers too.
+        process = subprocess.Popen(command(*arguments), cwd=ROOT, env=environment(), text=True,
+                                   start_new_session=True, stdout=subprocess.PIPE,
+                                   stderr=subprocess.PIPE)
+        deadline = time.monotonic() + PATIENCE
+        try:
+            while len(parts(out)) < len(before) + 2 and process.poll() is None:
+                assert time.monotonic() < deadline
+                time.sleep(0.002)
+            if stop == signal.SIGKILL:
+                process.kill()
+            else:
+                os.killpg(process.pid, stop)
+            _, said = process.communicate(timeout=PATIENCE)
+            while alive(process.pid) and time.monotonic() < deadline:
+                time.sleep(0.02)
+        finally:
+            process.kill()
+            process.wait()
+        stops.append((process.returncode, said, before, parts(out), alive(process.pid)))
+        before = parts(out)
+    last = run(*arguments)
+    assert last.returncode == 0, last.stderr
+    return out, stops, last
+
+
+@pytest.fixture(scope='module')
+def whole(story) -> tuple[Path, subprocess.CompletedProcess]:
+    """Return the output of the run that ended, and what it said."""
+    return story[0], story[2]
+
+
+@pytest.fixture(scope='module')
+def rows(whole) -> list[dict]:
+    """Return the rows of the table."""
+    return parquet.read_table(whole[0] / 'fleet.parquet').to_pylist()
+
+
+def test_every_recording_has_its_rows(rows):
+    """One row a level of each good one, one row for a bad one and for a copy."""
+    levels: dict[str, list] = {}
+    for row in rows:
+        levels.setdefault(Path(row['path']).name, []).append(row['throttle'])
+    for number in range(1, FLIGHTS + 1):
+        # Two vehicles have a flight of this name; throttle is that of the file.
+        assert levels[f'flight_{number}.csv'] == [pytest.approx(0.2), pytest.approx(0.5)] * 2
+    assert levels['bag_9'] == [pytest.approx(0.2), pytest.approx(0.5)]
+    assert levels['bad.mcap'] == levels['stray.csv'] == [None]
+    assert set(levels) == {f'flight_{n}.csv' for n in range(1, FLIGHTS + 1)} | {
+        'bag_9', 'bad.mcap', 'stray.csv'}
+
+
+def test_the_numbers_are_those_of_analyze(rows, logs):
+    """The same recording analysed alone gives the same estimate."""
+    from ou_monitor.offline.analyze import analyze
+    from ou_monitor.recordings.read import read_recording
+    path = logs / 'uav2' / 'flight_5.csv'
+    alone = analyze(read_recording(path), brownout_voltage=4.5)
+    mine = [row for row in rows if row['path'] == str(path.resolve())]
+    for row, level in zip(mine, alone.levels, strict=True):
+        for name in ('alpha', 'alpha_se', 'sigma', 'sigma_se', 'var_inf', 'u0'):
+            # Sums of compiled code and of NumPy differ in their order.
+            assert row[name] == pytest.approx(getattr(level.estimate, name), rel=1e-7)
+        assert 0.0 <= row['risk'] <= 1.0
+
+
+def test_bad_files_are_rows(rows, whole):
+    """The reason is in the row and on the terminal; the others are not harmed."""
+    (bad,) = (row for row in rows if row['error'])
+    assert bad['path'].endswith('bad.mcap') and 'not an MCAP file' in bad['error']
+    assert 'bad.mcap: is not an MCAP file' in whole[1].stdout
+    assert 'Traceback' not in whole[1].stderr
+
+
+def test_copies_are_analysed_once_and_named(rows, whole):
+    """The copy points to the original, which is the older one, and the other vehicle is told."""
+    (copy,) = (row for row in rows if row['duplicate_of'])
+    assert copy['path'].endswith('stray.csv') and copy['sigma'] is None
+    assert copy['duplicate_of'].endswith('flight_3.csv') and copy['flight'] is None
+    assert 'one of the two is in the wrong place' in ' '.join(whole[1].stdout.split())
+
+
+def test_what_was_passed_over_is_told(whole):
+    """A CSV of something else and a log of another format are named."""
+    said = ' '.join(whole[1].stdout.split())
+    assert 'tuning.csv' in said and 'raw.ulg' in said and 'ou-monitor convert' in said
+
+
+def test_vehicles_flights_and_dates(rows, whole):
+    """Folders are vehicles, flights are counted, and a date is there only where it is known."""
+    flights = {(row['vehicle'], row['flight']) for row in rows if row['flight']}
+    assert flights == {(v, k) for v, last in (('uav1', FLIGHTS), ('uav2', FLIGHTS + 1))
+                       for k in range(1, last + 1)}
+    dated = {row['recording']: row['start'] for row in rows if row['start']}
+    assert set(dated) == {'bag_9'} and dated['bag_9'].timestamp() == 1_700_000_000
+    said = ' '.join(whole[1].stdout.split())
+    assert 'vehicles by the folder they lie in' in said and 'in the order of their names' in said
+
+
+def test_the_table_says_what_it_holds(whole):
+    """Each column has its unit and meaning, and the JSON holds the same rows."""
+    table = parquet.read_table(whole[0] / 'fleet.parquet')
+    assert tuple(table.column_names) == NAMES
+    for column in COLUMNS:
+        field = table.schema.field(column.name)
+        assert field.metadata[b'unit'].decode() == column.unit and field.metadata[b'meaning']
+    assert pyarrow.types.is_timestamp(table.schema.field('start').type)
+    data = json.loads((whole[0].parent / 'fleet.json').read_text())
+    assert len(data['rows']) == table.num_rows and data['failed'] == data['duplicates'] == 1
+    assert [row['sigma'] for row in data['rows']] == table.column('sigma').to_pylist()
+
+
+def test_columns_are_documented():
+    """Each has its row in the documentation, with its unit."""
+    text = (ROOT / 'doc' / 'fleet.md').read_text(encoding='utf-8')
+    for column in COLUMNS:
+        assert f'| `{column.name}` | {column.unit or "-"} |' in text
+
+
+def test_what_is_done_is_kept(story):
+    """SIGKILL and Ctrl-C come in the middle; nothing of before is done again, nobody is left."""
+    out, stops, _ = story
+    for code, said, before, after, left in stops:
+        assert len(before) < len(after) < 2 * FLIGHTS + 1
+        assert before.items() <= after.items() and not left
+    assert [code for code, *_ in stops] == [-signal.SIGKILL, 130]
+    # One line for a person who pressed Ctrl-C, of all processes together.
+    assert stops[1][1].count('\n') == 1 and 'is kept' in stops[1][1]
+    assert stops[1][3].items() <= parts(out).items() and len(parts(out)) == 2 * FLIGHTS + 1
+    assert not list((out / 'parts').glob('*.draft'))
+
+
+def test_killed_and_resumed_gives_the_same(logs, rows, tmp_path, one_process):
+    """The table is that of a run in one go, here without other processes."""
+    again = tmp_path / 'out'
+    assert main(['fleet', str(logs), '--output', str(again), '--brownout-voltage', '4.5']) == 0
+    other = parquet.read_table(again / 'fleet.parquet').to_pylist()
+    assert len(other) == len(rows)
+    for mine, one in zip(rows, other):
+        for name, value in one.items():
+            # Sums of compiled code and of NumPy differ in their order.
+            assert mine[name] == (pytest.approx(value, rel=1e-7, abs=1e-12)
+                                  if isinstance(value, float) else value), name
+    assert (again / 'fleet.html').read_text().startswith('<!DOCTYPE html>')
+
+
+def refused(capsys, *arguments: object) -> str:
+    """Return the one line with which the command refuses."""
+    assert main(['fleet', *map(str, arguments)]) == 2
+    said = capsys.readouterr()
+    assert said.out == '' and len(said.err.splitlines()) == 1
+    return said.err
+
+
+@pytest.mark.parametrize('arguments, words', [
+    (['LOGS/empty', '--output', 'OUT'], ['no recording in', 'time_s']),
+    (['LOGS/none', '--output', 'OUT'], ['there is no recording or folder', 'none']),
+    (['', '--output', 'OUT'], ['the path is empty']),
+    (['LOGS', '--output', 'LOGS/uav1/bad.mcap'], ['is a file: name a folder']),
+    (['LOGS', '--output', 'LOGS/uav1/bad.mcap/inside'], ['cannot write into', 'Not a directory']),
+    (['LOGS', '--output', 'OUT', '--workers', '0'], ['--workers', 'from 1']),
+    (['LOGS', '--output', 'OUT', '--workers', '1', '--scheduler', 'tcp://x:1'], ['give one']),
+    (['LOGS', '--output', 'OUT', '--scheduler', 'nonsense://x'], ['--scheduler', 'nonsense']),
+    (['LOGS', '--output', 'OUT', '--vehicle-from', '('], ['--vehicle-from', 'regular expression']),
+    (['LOGS', '--output', 'OUT', '--seed', '-1'], ['--seed']),
+    (['LOGS', '--output', 'OUT', '--msg-config', 'no_such'], ['no_such']),
+    (['LOGS', '--output', 'OUT', '--levels', '2'], ['--levels']),
+])
+def test_bad_input_is_one_line(arguments, words, logs, tmp_path, capsys):
+    """What was wrong, where, what to do; exit status 2, and nothing is left behind."""
+    given = [a.replace('LOGS', str(logs)).replace('OUT', str(tmp_path / 'out'))
+             for a in arguments]
+    said = refused(capsys, *given)
+    assert all(word in said for word in words), said
+
+
+def test_a_fleet_of_bad_files_alone_is_refused(tmp_path, one_process, capsys):
+    """The table with its error is there, and the exit status says that there are no numbers."""
+    bad = tmp_path / 'bad.mcap'
+    bad.write_bytes(b'no bag')
+    assert main(['fleet', str(bad), '--output', str(tmp_path / 'out')]) == 2
+    assert 'none of the recordings could be analysed' in capsys.readouterr().err
+    table = parquet.read_table(tmp_path / 'out' / 'fleet.parquet')
+    assert 'not an MCAP file' in table.column('error').to_pylist()[0]
+
+
+def test_missing_extra_is_named(logs, tmp_path, capsys, monkeypatch):
+    """Without Dask or Arrow the line says what to install."""
+    import importlib.util
+    real = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, 'find_spec',
+                        lambda name, *a: None if name == 'pyarrow' else real(name, *a))
+    said = refused(capsys, logs, '--output', tmp_path / 'out')
+    assert "pyarrow is not installed: pip install 'ou_monitor[fleet]'" in said
+
+
+def test_full_disk_is_told_before_the_work(logs, tmp_path):
+    """Nothing can be written: one line, at once, also where one is root."""
+    done = run(logs, '--output', tmp_path / 'out', preexec_fn=lambda: resource.setrlimit(
+        resource.RLIMIT_FSIZE, (0, 0)))
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
+    assert 'cannot write' in done.stderr and 'File too large' in done.stderr

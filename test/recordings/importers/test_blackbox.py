@@ -1,0 +1,188 @@
+"""Betaflight and INAV blackbox: scales, flights, the clock, and logs that are cut or broken."""
+
+from made_logs import blackbox, END, quad
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.choose import choose
+from ou_monitor.recordings.importers.formats import import_log
+from ou_monitor.recordings.importers.held import drop_held
+from ou_monitor.recordings.importers.log import Request
+import pytest
+
+TIME, STICK, VOLTS, AMPERES = 1, 2, 3, 4
+
+
+def load(tmp_path, content, flight=None):
+    """Write a log and import it."""
+    path = tmp_path / 'a.bbl'
+    path.write_bytes(content if isinstance(content, bytes) else b''.join(content))
+    return path, import_log(path, Request(flight))
+
+
+def test_a_flight(tmp_path):
+    """Voltage, motors and current are those that were written, on the clock of the log."""
+    rows = quad()
+    path, log = load(tmp_path, blackbox(rows))
+    chosen = choose(path, log)
+    assert log.notes == ()
+    assert log.facts == {'firmware': 'Betaflight 4.3.0 (abc) STM32F405', 'vehicle': 'Maker'}
+    np.testing.assert_allclose(chosen.voltage.values, rows[:, VOLTS] / 100, rtol=1e-12)
+    np.testing.assert_allclose(chosen.current.values, rows[:, AMPERES] / 100, rtol=1e-12)
+    np.testing.assert_allclose(
+        chosen.throttle.values, (rows[:, 5:7].mean(axis=1) - 100) / 2000, rtol=1e-12)
+    np.testing.assert_allclose(
+        chosen.voltage.t, (rows[:, TIME] - rows[0, TIME]) * 1e-6, rtol=0, atol=1e-9)
+    stick = choose(path, log, throttle='rcCommand[3]').throttle
+    np.testing.assert_allclose(stick.values, (rows[:, STICK] - 1000) / 1000, rtol=1e-12)
+
+
+@pytest.mark.parametrize('firmware, headers, volts, amperes', [
+    ('Betaflight 4.0.0', {}, 0.01, 0.01),
+    ('Betaflight 3.5.7 (x)', {}, 0.1, 0.01),
+    ('Betaflight 3.1.6', {}, 0.1, None),
+    ('Betaflight 2.9.1', {'vbat_scale': '110'}, 3.3 / 4095 * 11, None),
+    ('INAV 6.1.1 (x) KAKUTEF7', {}, 0.01, 0.01),
+    ('EmuFlight 0.4.1 (x)', {'vbatcellvoltage': '330,350,430'}, 0.01, None),
+    ('EmuFlight 0.3.4 (x)', {'vbatcellvoltage': '33,35,43'}, 0.1, None),
+    ('', {'vbatcellvoltage': '33,35,43'}, 0.1, None),
+])
+def test_units(tmp_path, firmware, headers, volts, amperes):
+    """The unit of the voltage follows the firmware, as in Betaflight's own viewer."""
+    rows = quad(64)
+    path, log = load(tmp_path, blackbox(rows, headers={'Firmware revision': firmware, **headers}))
+    found = {one.name: one for one in log.series}
+    np.testing.assert_allclose(found['vbatLatest'].values, rows[:, VOLTS] * volts, rtol=1e-12)
+    if amperes is None:
+        # What cannot be scaled is told, not guessed.
+        assert 'amperageLatest' not in found
+        assert any('amperageLatest was left out' in note for note in log.notes)
+    else:
+        np.testing.assert_allclose(
+            found['amperageLatest'].values, rows[:, AMPERES] * amperes, rtol=1e-12)
+
+
+def test_no_sensor(tmp_path):
+    """A current that is always zero is no measurement."""
+    rows = quad(64)
+    rows[:, AMPERES] = 0
+    path, log = load(tmp_path, blackbox(rows))
+    assert choose(path, log).current is None
+
+
+def test_several_flights(tmp_path):
+    """They are put to the user, and each is read on its own."""
+    first, second = quad(100), quad(160, start_us=1000)
+    second[:, VOLTS] += 50
+    content = b''.join(blackbox(first)) + b''.join(blackbox(second))
+    with pytest.raises(InputError, match='holds 2 flights .*--flight N'):
+        load(tmp_path, content)
+    for number, rows in ((1, first), (2, second)):
+        path, log = load(tmp_path, content, number)
+        np.testing.assert_allclose(choose(path, log).voltage.values, rows[:, VOLTS] / 100)
+        assert log.facts['flight'] == f'{number} of 2' and log.notes == ()
+    listed = import_log(path, Request(everything=True))
+    assert listed.series[0].n == 100 and 'holds 2 flights' in listed.notes[0]
+    with pytest.raises(InputError, match='no flight 3'):
+        load(tmp_path, content, 3)
+
+
+@pytest.mark.parametrize('before_wrap', [1, 31, 32, 33, 100, 299])
+def test_the_clock_wraps(tmp_path, before_wrap):
+    """After 71.6 minutes the 32 bits begin anew; the stamps go on."""
+    rows = quad(300)
+    rows[:, TIME] = (2**32 - 2000 * before_wrap + 2000 * np.arange(300)) % 2**32
+    path, log = load(tmp_path, blackbox(rows))
+    voltage = choose(path, log).voltage
+    assert log.notes == ()
+    np.testing.assert_allclose(voltage.t, 2e-3 * np.arange(300), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(voltage.values, rows[:, VOLTS] / 100)
+
+
+def test_a_pause_of_the_log(tmp_path):
+    """A log that is switched off and on again keeps both parts and the time between."""
+    rows = quad(320)
+    rows[160:, TIME] += 100_000_000
+    path, log = load(tmp_path, blackbox(rows))
+    voltage = choose(path, log).voltage
+    assert voltage.n == 320 and log.notes == ()
+    assert np.diff(voltage.t).max() == pytest.approx(100.002)
+
+
+def test_frames_before_the_first_key_frame(tmp_path):
+    """What only adds to a frame that is not there is dropped, and told."""
+    pieces = blackbox(quad(128))
+    path, log = load(tmp_path, [pieces[0], *pieces[5:]])
+    assert choose(path, log).voltage.n == 96
+    assert 'without a sound key frame before them dropped' in log.notes[0]
+
+
+def test_held_samples(tmp_path):
+    """The refreshes of the ADC are found again."""
+    rows = quad(2000, refresh=5)
+    path, log = load(tmp_path, blackbox(rows))
+    kept, sentence = drop_held(choose(path, log).voltage)
+    assert '1600 of 2000 held samples dropped' in sentence
+    np.testing.assert_allclose(kept.values, rows[::5, VOLTS] / 100)
+
+
+def test_cut_anywhere(tmp_path):
+    """What came before the cut is read, and the cut is told."""
+    rows = quad(200)
+    pieces = blackbox(rows)
+    whole = b''.join(pieces)
+    rng = np.random.default_rng(10)
+    for at in rng.integers(len(pieces[0]) + 100, len(whole) - 1, 40).tolist():
+        path, log = load(tmp_path, whole[:at])
+        voltage = choose(path, log).voltage
+        held = int(np.searchsorted(np.cumsum([len(p) for p in pieces]), at, side='right')) - 1
+        # Of the frame that was cut nothing is taken; the one before it cannot be checked.
+        assert held - 1 <= voltage.n <= held
+        np.testing.assert_allclose(voltage.values, rows[:voltage.n, VOLTS] / 100)
+        assert any('no end mark' in note for note in log.notes)
+
+
+def test_cut_within_the_header(tmp_path):
+    """Without its header a flight is one line."""
+    head = blackbox(quad(10))[0]
+    refused = 0
+    for at in range(60, len(head), 17):
+        try:
+            path, log = load(tmp_path, head[:at])
+            choose(path, log)
+        except InputError as error:
+            assert '\n' not in str(error)
+            refused += 1
+    assert refused == len(range(60, len(head), 17))
+
+
+def test_broken_anywhere(tmp_path):
+    """Flipped bytes end in one line or in a read of sound frames; what went is told."""
+    rows = quad(600)
+    truth = dict(zip(((rows[:, TIME] - rows[0, TIME]) * 1e-6).round(6), rows[:, VOLTS] / 100))
+    pieces = blackbox(rows)
+    whole, head = b''.join(pieces), len(pieces[0])
+    rng = np.random.default_rng(11)
+    right = total = 0
+    for _ in range(40):
+        broken = bytearray(whole)
+        for at in rng.integers(head + 60, len(whole) - len(END), 2):
+            broken[at] = rng.integers(0, 256)
+        path, log = load(tmp_path, bytes(broken))
+        voltage = choose(path, log).voltage
+        assert (np.diff(voltage.t) > 0).all()
+        assert log.notes or voltage.n >= 595
+        total += voltage.n
+        right += sum(truth.get(round(t, 6)) == pytest.approx(v)
+                     for t, v in zip(voltage.t.tolist(), voltage.values.tolist()))
+    # A flip that leaves a frame well formed cannot be seen until the next key frame: at most
+    # 32 frames each, so of two flips 64 in 600, were every one of this kind.
+    assert total > 0.8 * 40 * 600
+    assert right > (1 - 64 / 600) * total
+
+
+def test_leftovers_after_the_end(tmp_path):
+    """Bytes after the end mark are told, unless they are those of erased flash."""
+    _, log = load(tmp_path, b''.join(blackbox(quad(64))) + b'\xff' * 9000)
+    assert log.notes == ()
+    _, log = load(tmp_path, b''.join(blackbox(quad(64))) + b'I\x01' * 45)
+    assert any('after the end mark' in note for note in log.notes)

@@ -1,0 +1,156 @@
+"""What is taken from a log, what is dropped on the way, and how held samples go."""
+
+from pathlib import Path
+
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.choose import choose
+from ou_monitor.recordings.importers.held import drop_held
+from ou_monitor.recordings.importers.log import clean, CURRENT, from_start, Log, Series
+from ou_monitor.recordings.importers.log import THROTTLE, VOLTAGE
+import pytest
+
+PATH = Path('a.ulg')
+
+
+def series(name='v', quantity=VOLTAGE, t=(0.0, 1.0, 2.0), values=(5.0, 5.1, 5.2), rank=0,
+           group=''):
+    """Return a small series."""
+    return Series(name, quantity, np.array(t), np.array(values), '1', 'words', rank, group)
+
+
+def test_ranks():
+    """The smallest rank is taken; none at all is never taken unasked."""
+    log = Log('x', (series('a', rank=None), series('b', rank=1), series('c', rank=0)))
+    assert choose(PATH, log).voltage.name == 'c'
+    assert choose(PATH, log, voltage='a').voltage.name == 'a'
+    with pytest.raises(InputError, match='no battery voltage.*a '):
+        choose(PATH, Log('x', (series('a', rank=None),)))
+
+
+def test_names():
+    """A name that is not there has the nearest one; a throttle is no voltage."""
+    log = Log('x', (series('battery'), series('gas', THROTTLE)))
+    with pytest.raises(InputError, match="did you mean 'battery'"):
+        choose(PATH, log, voltage='batery')
+    with pytest.raises(InputError, match="'gas' is a throttle, not a voltage"):
+        choose(PATH, log, voltage='gas')
+    assert choose(PATH, log, throttle='none').throttle is None
+
+
+def test_a_name_lost_with_the_end_of_a_log():
+    """What was read of the log stands beside the name that is not there."""
+    log = Log('x', (), notes=('The log was cut off at byte 7.',))
+    with pytest.raises(InputError, match=r"no voltage 'v': there is none \(The log was cut off"):
+        choose(PATH, log, voltage='v')
+
+
+def test_values_that_no_message_holds_are_dropped():
+    mended, notes = clean(series(values=(5.0, 1e300, 5.2)))
+    assert mended.values.tolist() == [5.0, 5.2] and 'beyond 1e+09' in notes[0]
+
+
+def test_several_throttles():
+    """Two of one rank are put to the user."""
+    log = Log('x', (series(), series('a', THROTTLE), series('b', THROTTLE)))
+    with pytest.raises(InputError, match='several: a .*b .*--throttle'):
+        choose(PATH, log)
+
+
+def test_the_current_beside_the_voltage():
+    """The current of the same sensor is taken; that of another only with a lone battery."""
+    log = Log('x', (series('v0', group='0'), series('v1', rank=None, group='1'),
+                    series('i0', CURRENT, group='0'), series('i1', CURRENT, group='1')))
+    assert choose(PATH, log, voltage='v1').current.name == 'i1'
+    assert choose(PATH, log).current.name == 'i0'
+    assert choose(PATH, log, current='none').current is None
+    assert choose(PATH, log, current='i1').current.name == 'i1'
+    log = Log('x', (series('rail', rank=None), series('i', CURRENT), series('i2', CURRENT)))
+    chosen = choose(PATH, log, voltage='rail')
+    assert chosen.current is None
+    assert any('--current' in note for note in chosen.notes)
+
+
+def test_clean():
+    """What cannot be a sample goes, each kind with its own sentence."""
+    t = [0.0, 1.0, 1.0, np.nan, 2.0, 1.5, 3.0, 1e9, 4.0, *range(5, 20)]
+    mended, notes = clean(series(t=t, values=[1, 2, 3, 4, np.inf, 6, 7, 8, 9.0, *range(15)]))
+    np.testing.assert_array_equal(mended.t[:5], [0.0, 1.0, 1.5, 3.0, 4.0])
+    np.testing.assert_array_equal(mended.values[:5], [1, 2, 6, 7, 9])
+    assert [note.split('dropped: ')[1].split(';')[0].rstrip('.') for note in notes] == [
+        'not a finite number', 'the stamp is over 3600 s away from all others',
+        'the stamp was there before']
+    assert 24 - mended.n == sum(int(note.split()[0]) for note in notes)
+
+
+def test_a_sample_every_few_hours():
+    """Slow is not wrong."""
+    t = 7200.0 * np.arange(50)
+    mended, notes = clean(series(t=t, values=np.arange(50.0)))
+    assert mended.n == 50 and notes == ()
+
+
+def test_a_lone_wrong_stamp_costs_one_sample():
+    """Ahead or behind, it does not take the others with it."""
+    for wrong in (0.0, 500.0):
+        t = np.arange(100.0)
+        t[50] = wrong
+        mended, notes = clean(series(t=t, values=np.arange(100.0)))
+        assert mended.n == 99 and 50.0 not in mended.values
+        assert len(notes) == 1
+
+
+def test_throttle_is_a_share():
+    """Beyond 0..1 it is set to the end, and told when it is more than rounding."""
+    mended, notes = clean(series('u', THROTTLE, values=(-0.001, 0.5, 1.002)))
+    np.testing.assert_array_equal(mended.values, [0.0, 0.5, 1.0])
+    assert notes == ()
+    mended, notes = clean(series('u', THROTTLE, values=(-0.1, 0.5, 1.4)))
+    np.testing.assert_array_equal(mended.values, [0.0, 0.5, 1.0])
+    assert '2 values outside 0..1' in notes[0]
+
+
+def test_nothing_left():
+    """A voltage without a usable sample is refused; a throttle is left out, and told."""
+    bad = series(values=(np.nan,) * 3)
+    with pytest.raises(InputError, match='no usable sample'):
+        choose(PATH, Log('x', (bad,)))
+    log = Log('x', (series(), series('u', THROTTLE, values=(np.nan,) * 3)))
+    chosen = choose(PATH, log)
+    assert chosen.throttle is None and 'u has no usable sample.' in chosen.notes
+
+
+def test_from_start():
+    """The start is that of the log, or an earlier sample; not one of broken bytes."""
+    one, two = series(t=(100.0, 101.0, 102.0)), series(t=(99.0, 101.0, 102.0))
+    assert [x.t[0] for x in from_start([one, two], 99.5)] == [1.0, 0.0]
+    assert [x.t[0] for x in from_start([one, two], 90.0)] == [10.0, 9.0]
+    t = np.concatenate(([0.0], 1e5 + np.arange(100.0)))
+    assert from_start([series(t=t, values=t)])[0].t[1] == 0.0
+
+
+@pytest.mark.parametrize('period', [2, 2.5, 3.3, 10])
+def test_held_samples_are_dropped_by_their_period(period):
+    """Each refresh is kept once, also one that gave the same value as the one before."""
+    rng = np.random.default_rng(12)
+    fresh = np.rint(rng.standard_normal(400) * 5) / 100 + 5
+    place = np.floor(np.arange(int(400 * period)) / period).astype(int)
+    t = 0.002 * np.arange(place.size)
+    kept, sentence = drop_held(series(t=t, values=fresh[place]))
+    ties = int((np.diff(fresh) == 0).sum())
+    assert ties > 10
+    np.testing.assert_array_equal(kept.values, fresh[:kept.n])
+    assert kept.n >= 399 and 'held samples dropped' in sentence
+
+
+def test_ties_without_a_period():
+    """Where repeats come at no steady distance nothing is dropped, unless all are to go."""
+    rng = np.random.default_rng(13)
+    values = np.rint(rng.standard_normal(3000)) / 100 + 5
+    one = series(t=0.01 * np.arange(3000), values=values)
+    kept, sentence = drop_held(one)
+    assert kept.n == 3000 and 'no steady distance' in sentence
+    kept, sentence = drop_held(one, every=True)
+    assert (np.diff(kept.values) != 0).all() and 'readings that agree went too' in sentence
+    kept, sentence = drop_held(series())
+    assert kept.n == 3 and 'no sample repeats' in sentence

@@ -1,0 +1,192 @@
+"""ArduPilot dataflash: what is found, how it is scaled, and logs that are cut or broken."""
+
+import struct
+
+from made_logs import copter, Dataflash
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.choose import choose
+from ou_monitor.recordings.importers.formats import import_log
+from ou_monitor.recordings.importers.log import Request
+import pytest
+
+
+def load(tmp_path, content, name='a.bin'):
+    """Write a log and import it."""
+    path = tmp_path / name
+    path.write_bytes(content)
+    return path, import_log(path, Request())
+
+
+def named(log):
+    """Return the series by name."""
+    return {one.name: one for one in log.series}
+
+
+@pytest.mark.parametrize('form', ['dataflash', 'dataflash_text'])
+def test_a_flight(tmp_path, form):
+    """Binary and text give the battery, the throttle and the current, bit for bit."""
+    made, t, volts, share, amperes, pulses = copter()
+    path, log = load(tmp_path, made.binary if form == 'dataflash' else made.text)
+    chosen = choose(path, log)
+    assert log.format == form and log.notes == ()
+    assert log.facts == {'firmware': 'ArduCopter V4.5.1 (abcd1234)',
+                         'vehicle': 'CubeOrange 00380038 3533510A 38373438'}
+    assert (chosen.voltage.name, chosen.throttle.name, chosen.current.name) == (
+        'BAT[0].Volt', 'CTUN.ThO', 'BAT[0].Curr')
+    np.testing.assert_array_equal(chosen.voltage.values, volts[0].astype(float))
+    np.testing.assert_array_equal(chosen.throttle.values, share.astype(float))
+    np.testing.assert_array_equal(chosen.current.values, amperes.astype(float))
+    np.testing.assert_allclose(chosen.voltage.t, t, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(chosen.throttle.t, t + 5e-4, rtol=0, atol=1e-9)
+    assert any('POWR.Vcc (5 V rail)' in note and 'POWR.VServo' in note for note in chosen.notes)
+    # The outputs that the parameters call motors, on the span that they state.
+    motors = named(log)['RCOU.motors']
+    np.testing.assert_allclose(
+        motors.values, ((pulses[:, :2] - 1100) / 800).mean(axis=1), rtol=1e-12)
+
+
+def test_the_rail_by_name(tmp_path):
+    """The 5 V rail is there for who asks for it; the battery's current goes with it."""
+    path, log = load(tmp_path, copter()[0].binary)
+    chosen = choose(path, log, voltage='POWR.Vcc', throttle='RCOU.C3')
+    assert chosen.voltage.words == '5 V rail' and set(chosen.voltage.values) == {5.0}
+    assert chosen.current.name == 'BAT[0].Curr'
+    assert chosen.throttle.name == 'RCOU.C3'
+
+
+def test_two_batteries(tmp_path):
+    """Instances are kept apart, and put to the user."""
+    made, _, volts, *_ = copter(batteries=2)
+    path, log = load(tmp_path, made.binary)
+    with pytest.raises(InputError, match=r'BAT\[0\].Volt.*BAT\[1\].Volt.*--voltage'):
+        choose(path, log)
+    chosen = choose(path, log, voltage='BAT[1].Volt')
+    np.testing.assert_array_equal(chosen.voltage.values, volts[1].astype(float))
+    assert chosen.current.name == 'BAT[1].Curr'
+
+
+@pytest.mark.parametrize('factor', [1.0, 100.0, 1000.0])
+def test_scales_of_the_throttle(tmp_path, factor):
+    """A share, percent and thousandths all become 0..1."""
+    made, _, _, share, *_ = copter(throttle_factor=factor)
+    path, log = load(tmp_path, made.binary)
+    throttle = choose(path, log).throttle
+    np.testing.assert_allclose(throttle.values, share, rtol=1e-6)
+    assert float(throttle.scale) == 1.0 / factor
+
+
+def test_outputs_without_parameters(tmp_path):
+    """Without parameters nobody knows which outputs are motors."""
+    _, log = load(tmp_path, copter(parameters=False)[0].binary)
+    assert 'RCOU.motors' not in named(log)
+    assert named(log)['RCOU.C1'].rank is None
+
+
+def test_old_logs(tmp_path):
+    """Milliseconds, and hundredths of a volt in whole numbers (CURR of 2013)."""
+    log = Dataflash()
+    log.form(9, 'CURR', 'IhIhhhf', 'TimeMS,ThrOut,ThrInt,Volt,Curr,Vcc,CurrTot')
+    for k in range(50):
+        log.put('CURR', 1000 + 100 * k, 400, 0, 1100 + k, 250, 4900, 1.0)
+    path, found = load(tmp_path, log.binary)
+    chosen = choose(path, found)
+    np.testing.assert_allclose(chosen.voltage.values, 11.0 + 0.01 * np.arange(50), rtol=1e-12)
+    np.testing.assert_allclose(chosen.current.values, 2.5)
+    np.testing.assert_allclose(chosen.voltage.t, 0.1 * np.arange(50), atol=1e-9)
+
+
+def test_nothing_in_it(tmp_path):
+    """A log without the messages says which were looked for."""
+    log = Dataflash()
+    log.form(1, 'MSG', 'QZ', 'TimeUS,Message')
+    log.put('MSG', 1, 'ArduCopter V4.5.1')
+    with pytest.raises(InputError, match='none of the messages.*BAT'):
+        load(tmp_path, log.binary)
+
+
+def test_cut_anywhere(tmp_path):
+    """A cut inside a message is told with the byte; what came before is read."""
+    made, _, volts, *_ = copter(40)
+    ends = np.cumsum([len(piece) for piece in made.pieces])
+    first = int(ends[-60])
+    rng = np.random.default_rng(8)
+    for at in rng.integers(first, len(made.binary), 40).tolist():
+        path, log = load(tmp_path, made.binary[:at])
+        chosen = choose(path, log)
+        np.testing.assert_array_equal(
+            chosen.voltage.values, volts[0, :chosen.voltage.n].astype(float))
+        if at not in ends:
+            held = int(ends[np.searchsorted(ends, at) - 1])
+            assert log.notes == (
+                f'{at - held} of {at} bytes belong to no message, so the log is cut off at byte '
+                f'{held}; the messages around that were read.',)
+        else:
+            assert log.notes == ()
+
+
+def test_an_erased_page_is_no_damage(tmp_path):
+    """Flash is read to the end of a page, which may be empty."""
+    _, log = load(tmp_path, copter(30)[0].binary + b'\xff' * 200)
+    assert log.notes == ()
+
+
+@pytest.mark.parametrize('form', ['binary', 'text'])
+def test_broken_anywhere(tmp_path, form):
+    """Flipped bytes end in one line or in a read; samples that went are told."""
+    whole = getattr(copter(60)[0], form)
+    start = whole.index(b'ArduCopter') if form == 'binary' else 0
+    rng = np.random.default_rng(9)
+    refused = mended = 0
+    for _ in range(50):
+        broken = bytearray(whole)
+        for at in rng.integers(3 if form == 'text' else start // 2, len(whole), 3):
+            broken[at] = rng.integers(0, 256)
+        try:
+            path, log = load(tmp_path, bytes(broken))
+            chosen = choose(path, log)
+        except InputError as error:
+            assert '\n' not in str(error)
+            refused += 1
+            continue
+        assert (np.diff(chosen.voltage.t) > 0).all()
+        if chosen.voltage.n < 60:
+            assert log.notes or chosen.notes
+            mended += 1
+    assert mended and (refused or form == 'binary')
+
+
+def test_a_text_log_with_bytes_that_are_no_text(tmp_path):
+    """They cost their line, not the log."""
+    text = copter(30)[0].text
+    at = text.index(b'BAT, ', len(text) // 2)
+    path, log = load(tmp_path, text[:at] + b'\xfe\xff' + text[at + 2:], 'a.log')
+    assert choose(path, log).voltage.n == 29
+    assert log.notes == ('2 bytes that are not ASCII were read as "?".',
+                         '1 line left out: no message of this log.')
+
+
+def test_nothing_is_printed_by_the_parser(tmp_path, capfd):
+    """Its words on broken bytes go nowhere, also those from C."""
+    whole = copter(30)[0].binary
+    load(tmp_path, whole[:3000] + bytes(400) + whole[3000:])
+    assert capfd.readouterr() == ('', '')
+
+
+def test_a_text_log_cut_off(tmp_path):
+    """The last line is told."""
+    text = copter(30)[0].text
+    path, log = load(tmp_path, text[:-7], 'a.log')
+    assert log.notes == (
+        '1 line left out: no message of this log.',
+        f'The last line does not end: the log was cut off at byte {len(text) - 7}.')
+    assert choose(path, log).voltage.n == 30
+
+
+def test_sizes_of_the_writer():
+    """The made log is what the format says: 89 bytes for a format, 3 of head for a message."""
+    made = copter(2)[0]
+    assert len(made.pieces[0]) == 89
+    number, layout, _ = made.known['BAT']
+    piece = next(p for p in made.pieces if p[2] == number and p[:2] == b'\xa3\x95')
+    assert len(piece) == 3 + struct.calcsize(layout)

@@ -1,0 +1,105 @@
+"""The table of formats: told by their first bytes, and what is said when one cannot be read."""
+
+import subprocess
+import sys
+
+from made_logs import blackbox, copter, px4_flight, quad, ulog
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.formats import detect, FORMATS, import_log
+from ou_monitor.recordings.importers.log import Request
+from ou_monitor.recordings.read import read_recording
+from project import ROOT
+import pytest
+
+CSV = b'time_s,voltage_v,throttle\n0.5,5.0,0.1\n0.6,5.1,0.1\n'
+
+
+def made(name):
+    """Return a small log of a format."""
+    return {'ulog': lambda: b''.join(ulog(px4_flight(3)[0])),
+            'dataflash': lambda: copter(3)[0].binary,
+            'dataflash_text': lambda: copter(3)[0].text,
+            'blackbox': lambda: b''.join(blackbox(quad(40))), 'csv': lambda: CSV}[name]()
+
+
+@pytest.mark.parametrize('name', [one.name for one in FORMATS])
+@pytest.mark.parametrize('ending', ['.ulg', '.bin', '.log', '.bbl', '.csv', ''])
+def test_the_first_bytes_decide(tmp_path, name, ending):
+    """A wrong ending with the right contents is read as what it is."""
+    path = tmp_path / ('a' + ending)
+    path.write_bytes(made(name))
+    assert detect(path).name == name
+    assert import_log(path, Request()).format == name
+
+
+@pytest.mark.parametrize('content, words', [
+    (b'', 'is empty'), (b'\x89MCAP0\r\n' + bytes(20), 'an MCAP bag already'),
+    (b'\x7fELF' + bytes(100), 'none of the formats read today'),
+    (b'ULog\x01\x12', 'none of the formats'), (b'\xa3\x95', 'none of the formats'),
+    (b'nothing here', "no column 'time_s'"),
+])
+def test_what_is_no_log(tmp_path, content, words):
+    """One line says what it is, or what is read."""
+    path = tmp_path / 'a.ulg'
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        import_log(path, Request())
+
+
+@pytest.mark.parametrize('name', [one.name for one in FORMATS if one.extra])
+def test_a_log_given_as_a_recording(tmp_path, name):
+    """Who analyzes a log is told to convert it first."""
+    path = tmp_path / 'flight.log'
+    path.write_bytes(made(name))
+    with pytest.raises(InputError, match='not a recording: convert it first') as refused:
+        read_recording(path)
+    assert f'with ou-monitor convert {path} flight' in str(refused.value)
+
+
+def test_no_file(tmp_path):
+    """A missing file, and a folder."""
+    with pytest.raises(InputError, match='there is no log'):
+        detect(tmp_path / 'none.ulg')
+    with pytest.raises(InputError, match='is a folder'):
+        detect(tmp_path)
+
+
+def test_a_flight_that_is_not_there(tmp_path):
+    """Formats with one flight a file have no second one."""
+    path = tmp_path / 'a'
+    for name in ('ulog', 'dataflash', 'csv'):
+        path.write_bytes(made(name))
+        assert import_log(path, Request(flight=1)).series
+        with pytest.raises(InputError, match='holds one flight'):
+            import_log(path, Request(flight=2))
+
+
+@pytest.mark.parametrize('name', [one.name for one in FORMATS if one.extra])
+def test_a_missing_extra_is_named(tmp_path, name):
+    """Without its package a format is one line; nothing else needs the package."""
+    form = next(one for one in FORMATS if one.name == name)
+    path = tmp_path / 'a.log'
+    path.write_bytes(made(name))
+    (tmp_path / 'a.csv').write_bytes(CSV)
+    code = (f'import sys\nsys.modules[{form.package!r}] = None\n'
+            'from ou_monitor.cli.main import main\n'
+            f'assert main(["convert", {str(tmp_path / "a.csv")!r}, '
+            f'{str(tmp_path / "out")!r}]) == 0\n'
+            f'sys.exit(main(["convert", {str(path)!r}, "--list"]))')
+    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True,
+                          text=True, timeout=120)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.count('\n') == 1
+    assert f"pip install 'ou_monitor[{form.extra}]'" in done.stderr
+    assert form.package in done.stderr
+
+
+def test_the_extras_are_in_setup():
+    """Each extra named to users installs the package that it names, and 'logs' all of them."""
+    text = (ROOT / 'setup.py').read_text(encoding='utf-8')
+    extras = {}
+    exec(text[text.index('LOGS'):text.index('setup(')], extras)
+    for form in FORMATS:
+        if form.extra:
+            assert any(form.package in one for one in extras['LOGS'][form.extra])
+    assert 'logs' in text

@@ -1,0 +1,92 @@
+"""Real logs, read as a user would; their folder is not part of the project."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+from ou_monitor.cli.main import main
+from ou_monitor.recordings.read import read_recording
+from ou_monitor.recordings.read_signal import read_signal
+import pytest
+
+
+@pytest.fixture
+def folder():
+    """Return the folder of real recordings."""
+    found = os.environ.get('OU_MONITOR_REALDATA')
+    if found is None:
+        pytest.skip('OU_MONITOR_REALDATA is not set: recordings of others are not shipped')
+    return Path(found)
+
+
+def test_blackbox_gives_the_table_that_others_made_of_it(folder, tmp_path):
+    """
+    The 200 Hz table of the flight follows from its raw log of 500 Hz.
+
+    The table was made by others with another parser: its stamps are smoothed, so
+    they agree to the spacing of the log (2 ms) but for a constant; its throttle is
+    the mean of the motors.
+
+    """
+    out = tmp_path / 'gecko'
+    assert main(['convert', str(folder / 'raw' / 'ie_btfl_002.bbl'), str(out),
+                 '--drop-held']) == 0
+    table = np.loadtxt(folder / 'bf_gecko_a.csv', delimiter=',', skiprows=1)
+    back = read_recording(out)
+    assert back.source['log_vehicle'] == back.source['vehicle'] == 'Gecko'
+    assert back.source['voltage_field'] == 'vbatLatest'
+    assert back.source['voltage_scale'] == '0.01'
+    # One refresh more, at the end or the beginning.
+    assert back.n - len(table) == 1
+    matches = [np.array_equal(np.rint(100 * back.voltage[k:k + len(table)]),
+                              np.rint(100 * table[:, 1])) for k in (0, 1)]
+    assert any(matches)
+    k = matches.index(True)
+    lag = table[:, 0] - back.t[k:k + len(table)]
+    assert np.abs(lag - np.median(lag)).max() < 0.0045
+    held = back.throttle[k:k + len(table)]
+    assert np.median(np.abs(held - table[:, 2])) < 0.002
+    assert np.corrcoef(held, table[:, 2])[0, 1] > 0.999
+
+
+def test_px4(folder, tmp_path, capsys):
+    """Two batteries are put to the user; one converts, the 5 V rail as well."""
+    log = str(folder / 'raw' / 'px_sample_log_small.ulg')
+    assert main(['convert', log, str(tmp_path / 'a')]) == 2
+    said = capsys.readouterr().err
+    assert said.count('\n') == 1
+    assert 'battery_status[0].voltage_v' in said and 'battery_status[1].voltage_v' in said
+    assert '--list' in said
+    assert main(['convert', log, '--list', '--json', '-']) == 0
+    listed = {one['name']: one for one in json.loads(capsys.readouterr().out)['series']}
+    assert listed['battery_status[1].voltage_v']['n'] == 21
+    assert listed['system_power[0].voltage5v_v']['default'] is False
+    for name, level in (('battery_status[1].voltage_v', 49.8), ('system_power[0].voltage5v_v', 5)):
+        out = tmp_path / name[:3]
+        assert main(['convert', log, str(out), '--voltage', name]) == 0
+        back = read_recording(out)
+        assert back.source['voltage_field'] == name
+        assert back.voltage.mean() == pytest.approx(level, abs=0.2)
+        # The throttle keeps its own rate.
+        _, throttle = read_signal(out, '/throttle/data')
+        assert throttle.size == 1812 and throttle.max() == pytest.approx(0.407273, abs=1e-6)
+
+
+@pytest.mark.parametrize('name', ['px_sample_log_small.ulg', 'ie_btfl_002.bbl'])
+def test_cut_at_random(folder, tmp_path, capsys, name):
+    """However short it is cut, a log is one line, or a bag with a note."""
+    whole = (folder / 'raw' / name).read_bytes()[:60_000 if name.endswith('bbl') else None]
+    rng = np.random.default_rng(14)
+    for k, at in enumerate(rng.integers(1, len(whole), 8).tolist()):
+        path = tmp_path / f'{k}.log'
+        path.write_bytes(whole[:at])
+        out = tmp_path / f'{k}'
+        status = main(['convert', str(path), str(out), '--voltage',
+                       'vbatLatest' if name.endswith('bbl') else 'battery_status[1].voltage_v'])
+        said = capsys.readouterr()
+        if status == 0:
+            assert 'cut off' in said.out
+            assert read_recording(out).n > 0
+        else:
+            assert status == 2 and said.err.count('\n') == 1 and not out.exists()

@@ -1,0 +1,159 @@
+"""A log becomes a bag that gives the same numbers back, and says where they came from."""
+
+import json
+from pathlib import Path
+import resource
+import signal
+import subprocess
+import sys
+
+from made_logs import blackbox, copter, px4_flight, quad, ulog
+from mcap.reader import make_reader
+import numpy as np
+from ou_monitor.cli.main import main
+from ou_monitor.recordings.read import read_recording
+from ou_monitor.recordings.read_signal import read_signal
+from project import ROOT
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import get_typestore, Stores
+import yaml
+
+ROWS = quad(400)
+
+
+def px4():
+    """Return a ULog, and (stamps, values) of voltage, throttle, current."""
+    topics, t, volts, motors, amperes = px4_flight()
+    zero = t[0] - 500_000
+    return (b''.join(ulog(topics, start_us=int(zero), info={'sys_name': 'PX4'})),
+            ((t - zero) * 1e-6, volts), ((t + 1000 - zero) * 1e-6, motors),
+            ((t - zero) * 1e-6, amperes), 'battery_status[0].voltage_v', 'PX4')
+
+
+def ardupilot():
+    """Return a dataflash log, and what is in it."""
+    made, t, volts, share, amperes, _ = copter()
+    return (made.binary, (t, volts[0]), (t + 5e-4, share), (t, amperes), 'BAT[0].Volt',
+            'ArduCopter V4.5.1 (abcd1234)')
+
+
+def betaflight():
+    """Return a blackbox log, and what is in it."""
+    t = (ROWS[:, 1] - ROWS[0, 1]) * 1e-6
+    return (b''.join(blackbox(ROWS)), (t, ROWS[:, 3] / 100),
+            (t, (ROWS[:, 5:7].mean(axis=1) - 100) / 2000), (t, ROWS[:, 4] / 100), 'vbatLatest',
+            'Betaflight 4.3.0 (abc) STM32F405')
+
+
+@pytest.mark.parametrize('log', [px4, ardupilot, betaflight])
+@pytest.mark.parametrize('name', ['out', 'out.mcap'])
+@pytest.mark.parametrize('kind', ['battery_state', 'float64'])
+def test_log_to_bag_and_back(tmp_path, log, name, kind):
+    """Voltage, throttle and current come back, and so does where they are from."""
+    content, volts, throttle, amperes, field, firmware = log()
+    path, out = tmp_path / 'a.log', tmp_path / name
+    path.write_bytes(content)
+    assert main(['convert', str(path), str(out), '--type', kind]) == 0
+    back = read_recording(out)
+    np.testing.assert_allclose(back.t, volts[0], rtol=0, atol=2e-9)
+    if kind == 'battery_state':
+        np.testing.assert_array_equal(back.voltage, volts[1].astype(np.float32))
+    else:
+        np.testing.assert_allclose(back.voltage, volts[1].astype(float), rtol=1e-15)
+    # The throttle holds from its own stamp on.
+    last = np.searchsorted(np.rint(throttle[0] * 1e6), np.rint(volts[0] * 1e6), 'right') - 1
+    held = np.where(last >= 0, throttle[1][last].astype(np.float32), np.nan)
+    np.testing.assert_array_equal(back.throttle, held)
+    stamps, current = read_signal(out, '/current/data')
+    np.testing.assert_allclose(stamps, amperes[0], rtol=0, atol=2e-9)
+    np.testing.assert_array_equal(current, amperes[1].astype(np.float32))
+    assert back.source['voltage_field'] == field
+    assert back.source['voltage_unit'] == 'V' and back.source['throttle_unit'] == '0..1'
+    assert back.source['log_firmware'] == firmware
+    assert back.source['log_file'] == 'a.log'
+    assert back.source['log_time'] == 's from the start of the log'
+
+
+def test_a_fleet_is_grouped_by_the_vehicle_of_its_logs(tmp_path, one_process):
+    """A folder, a file, one cut off, and what a person wrote: whatever folder they lie in."""
+    path, logs = tmp_path / 'a.log', tmp_path / 'logs'
+    logs.mkdir()
+    for k, name in enumerate(('one', 'two.mcap', 'three.mcap', 'four', 'five')):
+        # None the copy of another.
+        path.write_bytes(b''.join(blackbox(ROWS[:400 - 20 * k])))
+        assert main(['convert', str(path), str(logs / name)]) == 0
+    cut = (logs / 'three.mcap').read_bytes()
+    (logs / 'three.mcap').write_bytes(cut[:len(cut) * 9 // 10])
+    for folder, before, after in (
+            # What a person writes into the table holds; without one the file still tells.
+            ('four', 'log_vehicle: Maker', 'vehicle: my own'),
+            ('five', 'log_vehicle: Maker', 'other: thing')):
+        table = logs / folder / 'metadata.yaml'
+        assert before in table.read_text()
+        table.write_text(table.read_text().replace(before, after))
+    assert main(['fleet', str(logs), '--output', str(tmp_path / 'out'), '--partial', '--json',
+                 str(tmp_path / 'a.json')]) == 0
+    rows = json.loads((tmp_path / 'a.json').read_text())['rows']
+    assert {Path(row['path']).name: row['vehicle'] for row in rows} == {
+        'one': 'Maker', 'two.mcap': 'Maker', 'three.mcap': 'Maker', 'four': 'my own',
+        'five': 'Maker'}
+
+
+def test_other_libraries_open_it(tmp_path):
+    """The rosbags library reads every topic; metadata.yaml and the MCAP record say the source."""
+    path, out = tmp_path / 'a.log', tmp_path / 'bag'
+    path.write_bytes(betaflight()[0])
+    assert main(['convert', str(path), str(out)]) == 0
+    with AnyReader([out], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        counts = {one.topic: (one.msgtype, one.msgcount) for one in reader.connections}
+        order = [t for _, t, _ in reader.messages()]
+        types = [reader.deserialize(data, one.msgtype) for one, _, data in reader.messages()]
+    assert counts == {'/voltage': ('sensor_msgs/msg/BatteryState', 400),
+                      '/throttle': ('std_msgs/msg/Float32', 400),
+                      '/current': ('std_msgs/msg/Float32', 400)}
+    assert order == sorted(order) and len(types) == 1200
+    info = yaml.safe_load((out / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
+    custom = info['custom_data']
+    # rosbag2 reads a map from text to text.
+    assert custom and all(isinstance(k, str) and isinstance(v, str) for k, v in custom.items())
+    assert custom['voltage_field'] == 'vbatLatest' and custom['current_unit'] == 'A'
+    assert (out / 'bag_0.mcap').is_file() and info['relative_file_paths'] == ['bag_0.mcap']
+    assert info['version'] == 9 and info['message_count'] == 1200
+    with (out / 'bag_0.mcap').open('rb') as file:
+        records = [one for one in make_reader(file).iter_metadata() if one.name == 'ou_monitor']
+    assert [one.metadata for one in records] == [custom]
+
+
+LIMIT = """
+import resource, signal, sys
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size}))
+from ou_monitor.cli.main import main
+sys.exit(main(['convert', {log!r}, {out!r}]))
+"""
+
+
+@pytest.mark.parametrize('size', [0, 12_000])
+@pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
+def test_disk_full(tmp_path, name, size):
+    """When the disk refuses, at whatever byte, one line says so and nothing stays behind."""
+    assert hasattr(resource, 'RLIMIT_FSIZE') and hasattr(signal, 'SIGXFSZ')
+    path, out = tmp_path / 'a.log', tmp_path / name
+    path.write_bytes(b''.join(blackbox(quad(3000))))
+    done = subprocess.run(
+        [sys.executable, '-c', LIMIT.format(size=size, log=str(path), out=str(out))],
+        cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.count('\n') == 1 and 'cannot write' in done.stderr
+    assert not out.exists()
+
+
+def test_no_permission(tmp_path, capsys):
+    """A folder that nobody may write to is one line."""
+    path = tmp_path / 'a.csv'
+    path.write_text('time_s,voltage_v\n0,5\n1,5.1\n')
+    for out in ('/proc/bag', '/proc/bag.mcap'):
+        assert main(['convert', str(path), out]) == 2
+        said = capsys.readouterr().err
+        assert said.count('\n') == 1 and f'cannot write {out}' in said

@@ -1,0 +1,171 @@
+"""PX4 ULog: what is found, how it is scaled, and logs that are cut or broken."""
+
+from made_logs import BATTERY, px4_flight, ulog, ulog_message
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.choose import choose
+from ou_monitor.recordings.importers.formats import import_log
+from ou_monitor.recordings.importers.log import Request
+import pytest
+
+
+def load(tmp_path, pieces, name='a.ulg'):
+    """Write a log and import it."""
+    path = tmp_path / name
+    path.write_bytes(pieces if isinstance(pieces, bytes) else b''.join(pieces))
+    return path, import_log(path, Request())
+
+
+def named(log):
+    """Return the series by name."""
+    return {one.name: one for one in log.series}
+
+
+def test_a_flight(tmp_path):
+    """The battery and the motors are taken, bit for bit, on the clock of the header."""
+    topics, t, volts, motors, amperes = px4_flight()
+    path, log = load(tmp_path, ulog(topics, start_us=4_000_000, info={
+        'sys_name': 'PX4', 'ver_sw_branch': 'main', 'ver_hw': 'BOARD_7'}))
+    chosen = choose(path, log)
+    assert log.facts == {'firmware': 'PX4 main', 'board': 'BOARD_7'}
+    assert log.notes == ()
+    assert chosen.voltage.name == 'battery_status[0].voltage_v'
+    assert chosen.current.name == 'battery_status[0].current_a'
+    assert chosen.throttle.name == 'actuator_motors[0]'
+    np.testing.assert_array_equal(chosen.voltage.values, volts.astype(float))
+    np.testing.assert_array_equal(chosen.current.values, amperes.astype(float))
+    np.testing.assert_allclose(chosen.throttle.values, motors, rtol=1e-12)
+    np.testing.assert_allclose(chosen.voltage.t, (t - 4_000_000) * 1e-6, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(chosen.throttle.t, (t - 3_999_000) * 1e-6, rtol=0, atol=1e-9)
+    # The rail behind a regulator is named, not taken.
+    assert any('system_power[0].voltage5v_v (5 V rail)' in note for note in chosen.notes)
+
+
+@pytest.mark.parametrize('uuid, fact', [
+    ('00060038', {'vehicle': 'BOARD_7 00060038'}), ('00000000', {'board': 'BOARD_7'})])
+def test_a_vehicle_has_a_number_of_its_own(tmp_path, uuid, fact):
+    """The kind of board is no vehicle, and neither is the number 0 of a simulator."""
+    _, log = load(tmp_path, ulog(px4_flight()[0], info={
+        'sys_name': 'PX4', 'ver_sw_branch': 'main', 'ver_hw': 'BOARD_7', 'sys_uuid': uuid}))
+    assert log.facts == {'firmware': 'PX4 main', **fact}
+
+
+def test_a_sample_before_the_start_is_the_start(tmp_path):
+    """No stamp is negative."""
+    topics, t, *_ = px4_flight()
+    _, log = load(tmp_path, ulog(topics, start_us=int(t[0]) + 70_000))
+    assert min(one.t[0] for one in log.series) == 0.0
+
+
+def test_several_batteries(tmp_path):
+    """Two connected batteries are put to the user; one that never was connected is not."""
+    topics, t, volts, *_ = px4_flight()
+    second = ('battery_status', 1, BATTERY,
+              [(int(a), b + 1, -1.0, True) for a, b in zip(t, volts)])
+    empty = ('battery_status', 2, BATTERY, [(int(a), 0.0, -1.0, False) for a in t])
+    path, log = load(tmp_path, ulog([*topics, second, empty]))
+    with pytest.raises(InputError, match=r'battery_status\[0\].*battery_status\[1\].*--list'):
+        choose(path, log)
+    chosen = choose(path, log, voltage='battery_status[1].voltage_v')
+    np.testing.assert_array_equal(chosen.voltage.values, (volts + 1).astype(float))
+    # -1 means "unknown": the current of the other battery is not this one's.
+    assert chosen.current is None
+    assert 'not connected' in named(log)['battery_status[2].voltage_v'].words
+    path, log = load(tmp_path, ulog([*topics, empty]))
+    assert choose(path, log).voltage.name == 'battery_status[0].voltage_v'
+
+
+@pytest.mark.parametrize('fields, row, name, value', [
+    ([('float[3]', 'xyz')], (0.1, 0.2, -0.7), 'vehicle_thrust_setpoint[0].xyz[2]', 0.7),
+    ([('float[8]', 'control')], (0, 0, 0, 0.6, 0, 0, 0, 0), 'actuator_controls_0[0].control[3]',
+     0.6),
+    ([('float', 'throttle')], (-0.5,), 'manual_control_setpoint[0].throttle', 0.25),
+    ([('float', 'z')], (0.3,), 'manual_control_setpoint[0].z', 0.3),
+    ([('uint32_t', 'noutputs'), ('float[2]', 'output')], (1, 1250.0, 0.0),
+     'actuator_outputs[0].output[0]', 0.25),
+])
+def test_throttles(tmp_path, fields, row, name, value):
+    """Each source of throttle is brought to 0..1."""
+    topics, *_ = px4_flight(20)
+    topic = name.split('[')[0]
+    fields = [('uint64_t', 'timestamp'), *fields]
+    rows = [(5_000_000 + 1000 * k, *row) for k in range(20)]
+    path, log = load(tmp_path, ulog([topics[0], (topic, 0, fields, rows)]))
+    np.testing.assert_allclose(named(log)[name].values, value, rtol=1e-6)
+    # Outputs may be servos: they are taken by name only.
+    taken = choose(path, log).throttle
+    assert taken is None if topic == 'actuator_outputs' else taken.name == name
+
+
+def test_no_battery(tmp_path):
+    """A log with only the rail says so; with nothing at all as well."""
+    topics, *_ = px4_flight()
+    path, log = load(tmp_path, ulog(topics[1:]))
+    with pytest.raises(InputError, match='no battery voltage.*voltage5v_v'):
+        choose(path, log)
+    path, log = load(tmp_path, ulog(topics[2:]))
+    with pytest.raises(InputError, match='holds no voltage'):
+        choose(path, log)
+
+
+def test_dropouts_are_told(tmp_path):
+    """What the logger lost is in the notes."""
+    topics, *_ = px4_flight()
+    _, log = load(tmp_path, ulog(topics, extra=ulog_message('O', b'\x2c\x01')))
+    assert log.notes == ('The logger lost data 1 time, 0.300 s in all.',)
+
+
+def test_cut_anywhere(tmp_path):
+    """A cut inside a message is told with its byte; what came before is read."""
+    topics, _, volts, *_ = px4_flight(40)
+    pieces = ulog(topics)
+    ends = np.cumsum([len(piece) for piece in pieces])
+    whole = b''.join(pieces)
+    first = int(ends[len(pieces) - 120])
+    rng = np.random.default_rng(6)
+    for at in rng.integers(first, len(whole), 60).tolist():
+        _, log = load(tmp_path, whole[:at])
+        if at in ends:
+            # No mark at the end: such a cut cannot be seen.
+            assert log.notes == ()
+            continue
+        assert len(log.notes) == 1 and f'of {at}' in log.notes[0], at
+        held = int(ends[np.searchsorted(ends, at) - 1])
+        assert f'at byte {held + 3} ' in log.notes[0] or f'at byte {held} ' in log.notes[0]
+        found = named(log).get('battery_status[0].voltage_v')
+        if found is not None:
+            np.testing.assert_array_equal(found.values, volts[:found.n].astype(float))
+
+
+def test_broken_anywhere(tmp_path):
+    """Flipped bytes end in one line or in a read; samples that went are told."""
+    topics, *_ = px4_flight(60)
+    whole = b''.join(ulog(topics))
+    rng = np.random.default_rng(7)
+    refused = mended = 0
+    for _ in range(120):
+        broken = bytearray(whole)
+        for at in rng.integers(16, len(whole), 3):
+            broken[at] = rng.integers(0, 256)
+        try:
+            path, log = load(tmp_path, bytes(broken))
+            chosen = choose(path, log)
+        except InputError as error:
+            assert '\n' not in str(error)
+            refused += 1
+            continue
+        assert (np.diff(chosen.voltage.t) > 0).all()
+        if chosen.voltage.n < 60:
+            assert log.notes or chosen.notes
+            mended += 1
+    assert refused and mended
+
+
+def test_only_a_header(tmp_path):
+    """A ULog that ends after its first bytes is one line."""
+    path = tmp_path / 'a.ulg'
+    for size in (7, 8, 15, 16, 20):
+        path.write_bytes(b''.join(ulog(px4_flight(2)[0]))[:size])
+        with pytest.raises(InputError) as caught:
+            choose(path, import_log(path, Request()))
+        assert str(path) in str(caught.value)

@@ -1,0 +1,336 @@
+"""Fields in bulk: bit for bit what the general decoder gives, or refuses."""
+
+from functools import partial
+import itertools
+
+from hypothesis import given, settings, strategies as st
+from mcap.records import Schema
+from mcap_ros2._dynamic import serialize_dynamic
+from mcap_ros2.decoder import DecoderFactory
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.messages.config import FieldSpec
+from ou_monitor.messages.extract import Extractor
+from ou_monitor.recordings import cdr
+from ou_monitor.recordings.columns import FieldReader, join, seconds
+from ou_monitor.recordings.record_table import Table
+from ou_monitor.recordings.ros2msg import Field, parse_definition
+from ou_monitor.recordings.schemas import SCHEMAS
+import pytest
+from rosbags.typesys import get_typestore, Stores
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+KIND = 'p/msg/Top'
+INTS = ('int8', 'uint8', 'byte', 'char', 'int16', 'uint16', 'int32', 'uint32', 'int64', 'uint64')
+WIDTH = {'byte': (0, 255), 'char': (-128, 127)}
+TEXTS = ('', 'a', 'base_link', 'été', '\u4e2d' * 3, 'x' * 9)
+
+
+def table_of(messages, times=None):
+    """Return serialized messages as they lie in a chunk, at odd places."""
+    gaps = [b'\xff' * (3 + k % 5) for k in range(len(messages))]
+    data = b''.join(itertools.chain.from_iterable(zip(gaps, messages)))
+    lengths = np.array([len(m) for m in messages], dtype=np.int64)
+    steps = np.array([len(g) for g in gaps], dtype=np.int64)
+    end = np.cumsum(steps + lengths)
+    times = np.arange(len(messages)) * 10**7 + 5 if times is None else times
+    return Table(data, np.zeros(len(messages), np.uint16), np.array(times, np.uint64),
+                 end - lengths, end)
+
+
+def general_decoder(kind, text):
+    """Return the decoder of the MCAP library."""
+    schema = Schema(id=1, name=kind, encoding='ros2msg', data=text.encode())
+    return DecoderFactory().decoder_for('cdr', schema)
+
+
+def one_by_one(spec, text, messages, table):
+    """Return stamps, counts and values by the general decoder, or None where it refuses."""
+    decode = general_decoder(spec.type, text)
+    extractor = Extractor(FieldSpec(**{**spec.__dict__, 'nan': 'unknown'}))
+    stamps, counts, values = [], [], [np.empty(0)]
+    for message, logged in zip(messages, seconds(table.log_time)):
+        try:
+            found = extractor.extract(decode(message))
+        except Exception:
+            return None
+        stamps.append(logged if found.stamp is None else found.stamp)
+        counts.append(found.values.size)
+        values.append(found.values)
+    return np.array(stamps), np.array(counts), np.concatenate(values)
+
+
+def in_bulk(spec, text, table):
+    """Return the same in bulk, and how many messages went the general way."""
+    reader = FieldReader(spec, text, partial(general_decoder, spec.type, text))
+    try:
+        column = reader.read(table)
+    except Exception:
+        return None, reader.general
+    return (column.stamp, column.count, column.values), reader.general
+
+
+def assert_same(found, expected):
+    """All bits are the same."""
+    assert (found is None) == (expected is None)
+    if found is not None:
+        for one, other in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(one.astype(np.float64).view(np.uint64),
+                                          other.astype(np.float64).view(np.uint64))
+
+
+def assert_both_ways(spec, text, messages):
+    """Compare the two ways."""
+    table = table_of(messages)
+    found, _ = in_bulk(spec, text, table)
+    assert_same(found, one_by_one(spec, text, messages, table))
+
+
+class Maker:
+    """Random definitions, messages and field paths."""
+
+    def __init__(self, rnd):
+        self.rnd = rnd
+        self.types = {}
+        self.make_type('Top', 2)
+
+    def make_type(self, name, depth):
+        """Define a type and those in it."""
+        fields = []
+        for k in range(self.rnd.randint(0 if depth < 2 else 1, 5)):
+            kind = self.rnd.choice((*INTS, 'bool', 'float32', 'float64', 'string', 'nested'))
+            if kind == 'nested':
+                kind = f'T{len(self.types)}{k}{depth}' if depth else 'float32'
+                if depth:
+                    self.make_type(kind, depth - 1)
+            array = self.rnd.choice(('', '', '', '[]', '[2]', '[<=3]', '[3]'))
+            fields.append((f'f{k}', kind, array))
+        self.types[name] = fields
+
+    def text(self):
+        """Return the definition as rosidl writes it."""
+        def one(name):
+            lines = ['# a comment', 'uint8 LIMIT=3']
+            lines += [f'{"p/" if k[0] == "T" else ""}{k}{a} {f}  # {f}'
+                      for f, k, a in self.types[name]]
+            return '\n'.join(lines) + '\n'
+        rest = [f'{80 * "="}\nMSG: p/{name}\n{one(name)}' for name in self.types if name != 'Top']
+        return one('Top') + ''.join(rest)
+
+    def value(self, kind):
+        """Return a random value of a type."""
+        if kind == 'string':
+            return self.rnd.choice(TEXTS)
+        if kind == 'bool':
+            return self.rnd.random() < 0.5
+        if kind in ('float32', 'float64'):
+            return self.rnd.choice((float('nan'), float('inf'), 0.0, -0.0, 0.1, 1e30, -5.0))
+        if kind in INTS:
+            low, high = WIDTH.get(kind, (0, 0)) if kind in WIDTH else (
+                (0, 2**int(kind[4:]) - 1) if kind[0] == 'u' else
+                (-2**(int(kind[3:]) - 1), 2**(int(kind[3:]) - 1) - 1))
+            return self.rnd.choice((low, high, self.rnd.randint(low, high)))
+        return self.message(kind)
+
+    def message(self, name='Top'):
+        """Return a random message as a dict."""
+        out = {}
+        for field, kind, array in self.types[name]:
+            size = {'': None, '[2]': 2, '[3]': 3}.get(array, self.rnd.randint(0, 3))
+            out[field] = (self.value(kind) if size is None
+                          else [self.value(kind) for _ in range(size)])
+        return out
+
+    def alike(self, content, name='Top'):
+        """Return a message of the same shape with other numbers."""
+        out = {}
+        for field, kind, _ in self.types[name]:
+            def other(old, kind=kind):
+                if kind == 'string':
+                    return old
+                return self.alike(old, kind) if kind in self.types else self.value(kind)
+            held = content[field]
+            out[field] = [other(x) for x in held] if isinstance(held, list) else other(held)
+        return out
+
+    def paths(self, name='Top', head=''):
+        """Return every path to a field or element."""
+        found = []
+        for field, kind, array in self.types[name]:
+            here = head + field
+            for path in ([here] if not array else [here, *(f'{here}[{k}]' for k in (0, 2))]):
+                found.append(path)
+                if kind in self.types and (not array or path.endswith(']')):
+                    found += self.paths(kind, path + '.')
+        return found
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.randoms(use_true_random=False), st.data())
+def test_any_schema_any_message(rnd, data):
+    """Random definitions, paths, shapes, texts, broken bytes: one outcome, both ways."""
+    maker = Maker(rnd)
+    text = maker.text()
+    assert parse_definition(KIND, text) is not None
+    encode = serialize_dynamic(KIND, text)[KIND]
+    base = maker.message()
+    messages = []
+    for _ in range(rnd.randint(1, 8)):
+        content = maker.alike(base) if rnd.random() < 0.8 else maker.message()
+        messages.append(encode(content))
+    paths = maker.paths()
+    spec = FieldSpec(
+        'x', KIND, rnd.choice(paths), unit_factor=0.1, sign=rnd.choice((1, -1)), offset=0.3,
+        stamp_field=rnd.choice((None, *paths)), stamp_factor=1e-6,
+        sample_rate=rnd.choice((None, 10.0)))
+    assert_both_ways(spec, text, messages)
+    # A wrong byte, most often in a word that states a length, and a lost end.
+    for _ in range(3):
+        broken = bytearray(messages[0])
+        small = [k for k, byte in enumerate(broken) if 0 < byte < 12] or [0]
+        broken[rnd.choice((rnd.choice(small), rnd.randrange(len(broken))))] = rnd.choice(
+            (0, 1, 2, 3, 4, 7, 0x80, 0xc3, 0xff))
+        assert_both_ways(spec, text, [*messages, bytes(broken)])
+    assert_both_ways(spec, text, [*messages, messages[0][:rnd.randint(1, len(messages[0]))]])
+
+
+@pytest.mark.parametrize('field', ['s', 'd', 'e', 'u', 'u[1]', 'n.x', 'n', 'a', 'a[0].x', 'a[1].x',
+                                   'f', 'f[1]', 'f[2]'])
+@pytest.mark.parametrize('rate', [None, 10.0])
+def test_cases_that_are_easily_missed(field, rate):
+    """Empty arrays are not aligned; bytes are no block; equal sizes can hide unequal shapes."""
+    text = ('string s\nstring t\nfloat64[] d\nuint8 e\nuint8[] u\nN n\nN[] a\nfloat32[] f\n'
+            + 80 * '=' + '\nMSG: p/N\nfloat64 x\n')
+    encode = serialize_dynamic(KIND, text)[KIND]
+    messages = [encode({'s': s, 't': t, 'd': d, 'e': 4, 'u': u, 'n': {'x': 2.5},
+                        'a': [{'x': float(k)} for k in range(m)], 'f': [0.5, 1.5][:m]})
+                for s, t in (('a', 'abcdefghi'), ('abcdefghi', 'a'), ('', ''), ('', 'abcdefghij'))
+                for d in ([], [1.0]) for u in ([], [7, 8]) for m in (0, 1, 2)]
+    spec = FieldSpec('x', KIND, field, sample_rate=rate)
+    for some in (messages, messages[::-1], messages[:1], messages[5:7], messages[3:40:6]):
+        assert_both_ways(spec, text, some)
+
+
+def battery(frame, volts, cells=(), stamp=(5, 7)):
+    """Return a BatteryState as an independent library writes it."""
+    message = STORE.deserialize_cdr(
+        cdr.encode_battery(np.array([1]), [volts])[0], cdr.BATTERY_STATE)
+    message.header.frame_id = frame
+    message.header.stamp.sec, message.header.stamp.nanosec = stamp
+    message.cell_voltage = np.array(cells, dtype=np.float32)
+    return bytes(STORE.serialize_cdr(message, cdr.BATTERY_STATE))
+
+
+BATTERY = FieldSpec('/v', cdr.BATTERY_STATE, 'voltage', stamp_field='header.stamp')
+
+
+def test_messages_alike_never_meet_the_general_decoder():
+    """Frames and cells of several lengths: each shape is learned once."""
+    messages = [battery(frame, k + 0.5, cells, (k, k)) for k, (frame, cells) in enumerate(
+        20 * [('', ()), ('base_link', ()), ('bat', (3.7, 3.8)), ('base_linl', ())])]
+    table = table_of(messages)
+    found, general = in_bulk(BATTERY, SCHEMAS[cdr.BATTERY_STATE], table)
+    assert general == 0
+    assert_same(found, one_by_one(BATTERY, SCHEMAS[cdr.BATTERY_STATE], messages, table))
+    assert found[2].tolist() == [k + 0.5 for k in range(80)]
+
+
+@pytest.mark.parametrize('stamp, counts', [((5, 7), True), ((0, 0), False), ((0, 1), True),
+                                           ((-1, 10**9), False)])
+def test_stamps_and_their_absence(stamp, counts):
+    """A zero stamp is none: the log time counts."""
+    table = table_of([battery('', 5.0, stamp=stamp)], [3 * 10**9])
+    (stamps, _, _), general = in_bulk(BATTERY, SCHEMAS[cdr.BATTERY_STATE], table)
+    assert general == 0
+    assert stamps[0] == (stamp[0] + 1e-9 * stamp[1] if counts else 3.0)
+
+
+def test_what_goes_the_general_way():
+    """Big endian, XCDR2, no text, cut off: only these, one by one."""
+    good = cdr.encode_scalars(cdr.FLOAT32, [1.0, 2.0, 4.0])
+    big = b'\0\0\0\0' + np.array([8.0], '>f4').tobytes()
+    xcdr2 = b'\0\x07' + good[0][2:]
+    spec = FieldSpec('/v', cdr.FLOAT32, 'data')
+    table = table_of([good[0], big, good[1], xcdr2, good[2]])
+    (_, _, values), general = in_bulk(spec, SCHEMAS[cdr.FLOAT32], table)
+    assert (values.tolist(), general) == ([1.0, 8.0, 2.0, 1.0, 4.0], 2)
+    assert in_bulk(spec, SCHEMAS[cdr.FLOAT32], table_of([good[0], good[1][:6]]))[0] is None
+    odd = bytearray(battery('base', 5.0))
+    odd[odd.index(b'base')] = 0xff
+    assert in_bulk(BATTERY, SCHEMAS[cdr.BATTERY_STATE], table_of([bytes(odd)]))[0] is None
+
+
+def test_many_shapes_end():
+    """A topic without two messages alike is read the general way, after a few tries."""
+    frames = [''.join(chr(97 + (k >> b & 1)) for b in range(6)) * (1 + k) for k in range(40)]
+    messages = [battery(frame, 5.0 + k) for k, frame in enumerate(frames)]
+    messages += [battery('x', k, [1.0] * 20) for k in range(3)]
+    table = table_of(messages)
+    found, _ = in_bulk(BATTERY, SCHEMAS[cdr.BATTERY_STATE], table)
+    assert_same(found, one_by_one(BATTERY, SCHEMAS[cdr.BATTERY_STATE], messages, table))
+
+
+@pytest.mark.parametrize('labels', [[], ['a'], ['rows', 'columns'], ['x' * 7, 'y' * 8]])
+def test_blocks_of_any_layout_and_length(labels):
+    """Dimensions are passed over; blocks of unequal length stay in order."""
+    messages = []
+    for n in (3, 0, 3, 5, 5, 1):
+        message = STORE.deserialize_cdr(cdr.encode_block(np.arange(n) + len(messages)),
+                                        cdr.FLOAT32_ARRAY)
+        dim = message.layout.dim[0]
+        message.layout.dim = [type(dim)(label, 2, 2) for label in labels]
+        messages.append(bytes(STORE.serialize_cdr(message, cdr.FLOAT32_ARRAY)))
+    spec = FieldSpec('/v', cdr.FLOAT32_ARRAY, 'data', sample_rate=10.0)
+    (_, counts, values), general = in_bulk(spec, SCHEMAS[cdr.FLOAT32_ARRAY], table_of(messages))
+    assert general == 0
+    assert counts.tolist() == [3, 0, 3, 5, 5, 1]
+    assert values.tolist() == [0, 1, 2, 2, 3, 4, 3, 4, 5, 6, 7, 4, 5, 6, 7, 8, 5]
+
+
+def test_in_time_order_keeps_what_belongs_together():
+    """Blocks move as a whole; those of one time stay as they are."""
+    messages = [cdr.encode_block([float(k)] * n) for k, n in enumerate((2, 1, 3, 0, 2))]
+    table = table_of(messages, [30, 10, 10, 5, 20])
+    spec = FieldSpec('/v', cdr.FLOAT32_ARRAY, 'data', sample_rate=10.0)
+    reader = FieldReader(spec, SCHEMAS[cdr.FLOAT32_ARRAY], lambda: None)
+    column = reader.read(table).in_time_order()
+    assert column.count.tolist() == [0, 1, 3, 2, 2]
+    assert column.values.tolist() == [1, 2, 2, 2, 4, 4, 0, 0]
+    first, rest = column.split(3)
+    assert (first.values.tolist(), rest.log_time.tolist()) == ([1, 2, 2, 2], [20, 30])
+    assert join([first, rest]).values.tolist() == column.values.tolist()
+
+
+def test_log_times_of_any_size():
+    """The largest log time that a bag can hold is no overflow."""
+    assert seconds(np.array([0, 1, 2**64 - 1], np.uint64)).tolist() == [
+        0.0, 1e-9, 18446744073 + 0.709551615]
+
+
+@pytest.mark.parametrize('line', [
+    'wstring name', 'time t', 'float32 Name', 'float32 x = 3', 'string s "a#b"', 'float32',
+    '@key float32 x', 'float32[a] x'])
+def test_definitions_with_something_unknown(line):
+    """They are left to the general decoder."""
+    assert parse_definition(KIND, f'float32 volts\n{line}\n') is None
+
+
+def test_a_definition():
+    """Comments, constants, defaults, bounds, arrays and nested types."""
+    text = ('# all\nint8 A=1\nstring B="x"\nfloat32 x 1.5 # V\nstring<=5 s "ab"\nint16[<=3] u\n'
+            'int16[2] w\nCell[] c\nstd_msgs/Header h\n' + 80 * '='
+            + '\nMSG: p/Cell\n\n' + 80 * '=' + '\nMSG: std_msgs/msg/Header\nuint8 q\n')
+    found = parse_definition(KIND, text)
+    assert found['p/Top'] == (
+        Field('x', 'float32'), Field('s', 'string'), Field('u', 'int16', True),
+        Field('w', 'int16', True, 2), Field('c', 'p/Cell', True), Field('h', 'std_msgs/Header'))
+    assert found['p/Cell'] == () and found['std_msgs/Header'] == (Field('q', 'uint8'),)
+
+
+def test_a_wrong_path_is_told_by_the_general_way():
+    """The nearest field is named, as it is for messages one by one."""
+    spec = FieldSpec('/v', cdr.BATTERY_STATE, 'voltagee')
+    text = SCHEMAS[cdr.BATTERY_STATE]
+    reader = FieldReader(spec, text, partial(general_decoder, spec.type, text))
+    with pytest.raises(InputError, match="did you mean 'voltage'"):
+        reader.read(table_of([battery('', 5.0)]))

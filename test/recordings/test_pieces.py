@@ -1,0 +1,315 @@
+"""Bags written in every way, read whole, in pieces and in part: always the same samples."""
+
+import itertools
+import shutil
+
+from mcap.writer import CompressionType, IndexType, Writer
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.bag import BagReader, BagWriter
+from ou_monitor.recordings.cdr import (
+    BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY)
+from ou_monitor.recordings.mcap_file import McapFile
+from ou_monitor.recordings.read import read_pieces, read_recording
+from ou_monitor.recordings.schemas import SCHEMAS
+import pytest
+
+START = 1_704_067_200_000_000_000
+MS = 1_000_000
+COUNT = 3000
+
+
+def flight(seed=3, stamped=True):
+    """Return (topic, type, log time, bytes) as a driver sends them: late, and not in order."""
+    rng = np.random.default_rng(seed)
+    stamps = START + np.arange(COUNT) * MS
+    logged = stamps + (rng.exponential(3.0, COUNT) * MS).astype(np.int64)
+    values = rng.normal(5.0, 0.1, COUNT)
+    values[::97] = np.nan
+    # Some stamps are repeated, as by a driver that sends its last value again.
+    stamps[50::170] = stamps[49::170][:stamps[50::170].size]
+    kind = BATTERY_STATE if stamped else FLOAT32
+    data = encode_battery(stamps, values) if stamped else encode_scalars(FLOAT32, values)
+    out = [('/voltage', kind, int(t), d) for t, d in zip(logged, data)]
+    for k, d in enumerate(encode_scalars(FLOAT32, rng.random(COUNT // 50))):
+        out.append(('/throttle', FLOAT32, START + (k * 50 + 20) * MS, d))
+    out += [('/other', FLOAT32, START + k * 30 * MS, d)
+            for k, d in enumerate(encode_scalars(FLOAT32, np.arange(COUNT // 30)))]
+    # Neither the order of log times nor that of stamps, but nearly.
+    place = rng.normal(0.0, 4.0 * MS, len(out)) + np.array([row[2] for row in out])
+    return [out[k] for k in np.argsort(place, kind='stable')]
+
+
+def write(path, rows, **options):
+    """Write messages in the order given."""
+    with path.open('wb') as file:
+        writer = Writer(file, **{'chunk_size': 20_000, **options})
+        writer.start(profile='ros2', library='test')
+        channels = {}
+        for topic, kind, t, data in rows:
+            if topic not in channels:
+                schema = writer.register_schema(kind, 'ros2msg', SCHEMAS[kind].encode())
+                channels[topic] = writer.register_channel(topic, 'cdr', schema)
+            writer.add_message(channels[topic], t, data, t)
+        writer.finish()
+    return path
+
+
+def same(one, other):
+    """All bits of two recordings are the same."""
+    for name in ('t', 'voltage', 'throttle'):
+        np.testing.assert_array_equal(getattr(one, name).view(np.uint64),
+                                      getattr(other, name).view(np.uint64))
+
+
+@pytest.fixture(scope='module')
+def rows():
+    """Return the messages."""
+    return flight()
+
+
+@pytest.fixture(scope='module')
+def bag(rows, tmp_path_factory):
+    """Return them in a bag of many chunks."""
+    return write(tmp_path_factory.mktemp('bag') / 'bag.mcap', rows)
+
+
+def expected(rows):
+    """Return t, voltage and throttle by other means: sorting and looking up in plain Python."""
+    samples, throttle = {}, []
+    for k, (topic, _, t, data) in sorted(enumerate(rows), key=lambda item: (item[1][2], item[0])):
+        if topic == '/throttle':
+            throttle.append((t * 1e-9 - START * 1e-9, np.frombuffer(data, '<f4', 1, 4)[0]))
+        elif topic == '/voltage':
+            sec, nanosec = np.frombuffer(data, '<u4', 2, 4).tolist()
+            value = float(np.frombuffer(data, '<f4', 1, 20)[0])
+            if np.isfinite(value):
+                samples.setdefault(sec * 10**9 + nanosec, value)
+    stamps = sorted(samples)
+    held = []
+    for t in stamps:
+        before = [v for at, v in throttle if at <= t * 1e-9 - START * 1e-9 + 1e-7]
+        held.append(before[-1] if before else np.nan)
+    return stamps, [samples[t] for t in stamps], held
+
+
+def test_whole(bag, rows):
+    """Every sample, sorted by stamp, each stamp once; the last throttle held."""
+    recording = read_recording(bag)
+    stamps, voltage, throttle = expected(rows)
+    np.testing.assert_allclose(recording.t - START * 1e-9, (np.array(stamps) - START) * 1e-9,
+                               rtol=0, atol=3e-7)
+    assert recording.voltage.tolist() == voltage
+    np.testing.assert_array_equal(recording.throttle, throttle)
+    notes = ' '.join(recording.notes)
+    assert '31 samples dropped: not a finite' in notes
+    assert 'sorted by stamp' in notes and 'the stamp was there before' in notes
+
+
+@pytest.mark.parametrize('compression', list(CompressionType))
+@pytest.mark.parametrize('options', [
+    {}, {'use_chunking': False}, {'index_types': IndexType.CHUNK}, {'index_types': IndexType.NONE},
+    {'use_statistics': False}, {'enable_crcs': False}, {'enable_data_crcs': True},
+    {'use_chunking': False, 'use_statistics': False, 'index_types': IndexType.NONE,
+     'use_summary_offsets': False, 'repeat_channels': False, 'repeat_schemas': False}])
+def test_every_way_of_writing(bag, rows, tmp_path, compression, options):
+    """Compressed, chunked, indexed, summarised or not: the same recording, whole or partial."""
+    path = write(tmp_path / 'bag.mcap', rows, compression=compression, **options)
+    whole = read_recording(bag)
+    for partial in (False, True):
+        other = read_recording(path, partial=partial)
+        same(other, whole)
+        assert other.notes == whole.notes
+
+
+def test_by_the_index_alone(bag, monkeypatch):
+    """A bag with indexes is not walked."""
+    def refuse(*_, **__):
+        raise AssertionError
+    monkeypatch.setattr('ou_monitor.recordings.mcap_file.find_messages', refuse)
+    assert read_recording(bag).n > 2900
+
+
+def test_several_files(bag, rows, tmp_path):
+    """A rosbag2 directory of several files that overlap in time is one recording."""
+    folder = tmp_path / 'bag'
+    folder.mkdir()
+    parts = [rows[:1000], rows[1000:2500], rows[2500:]]
+    names = [write(folder / f'bag_{k}.mcap', part).name for k, part in enumerate(parts)]
+    (folder / 'metadata.yaml').write_text(
+        'rosbag2_bagfile_information:\n  storage_identifier: mcap\n  relative_file_paths: '
+        f'{names}\n')
+    whole = read_recording(bag)
+    same(read_recording(folder), whole)
+    same(join(read_pieces(folder, samples=500)), whole)
+
+
+def join(pieces):
+    """Return pieces as one recording."""
+    pieces = list(pieces)
+    whole = pieces[0]
+    return type(whole)(*(np.concatenate([getattr(p, name) for p in pieces])
+                         for name in ('t', 'voltage', 'throttle')), whole.name, whole.source,
+                       tuple(itertools.chain.from_iterable(p.notes for p in pieces)))
+
+
+@pytest.mark.parametrize('samples', [60, 500, 2900, 10**6])
+@pytest.mark.parametrize('start, end', [(None, None), (0.7, None), (None, 1.1), (1.234, 2.5)])
+def test_pieces_make_the_whole(bag, samples, start, end):
+    """One after another they are the recording, notes included; none is empty or too long."""
+    pieces = list(read_pieces(bag, samples=samples, start=start, end=end))
+    whole = read_recording(bag, start=start, end=end)
+    same(join(pieces), whole)
+    assert join(pieces).notes == whole.notes
+    assert all(0 < piece.n <= samples for piece in pieces)
+    assert len(pieces) >= whole.n / samples
+    assert all(piece.source == whole.source for piece in pieces)
+
+
+def test_what_comes_later_than_a_piece(bag):
+    """It is dropped and counted: the sum is that of the whole."""
+    pieces = list(read_pieces(bag, samples=2))
+    whole = read_recording(bag)
+    (note,) = [note for note in pieces[-1].notes if 'more than a piece late' in note]
+    lost = int(note.split()[0])
+    again = sum(int(note.split()[0]) for note in pieces[-1].notes if 'was there before' in note)
+    first = sum(int(note.split()[0]) for note in whole.notes if 'was there before' in note)
+    assert 0 < lost
+    assert sum(piece.n for piece in pieces) + lost + again == whole.n + first
+    t = join(pieces).t
+    assert (np.diff(t) > 0).all()
+
+
+def test_pieces_of_blocks(tmp_path):
+    """The time line of the samples goes on from piece to piece."""
+    rng = np.random.default_rng(4)
+    with BagWriter(tmp_path / 'bag.mcap') as bag:
+        bag.add_topic('voltage', FLOAT32_ARRAY, sample_rate=1000.0)
+        bag.add_topic('throttle', FLOAT32)
+        for k in range(400):
+            bag.write('voltage', (k * 100 + int(rng.integers(5))) * MS,
+                      encode_block(rng.normal(size=100)))
+            bag.write('throttle', k * 100 * MS + 7, encode_scalars(FLOAT32, [k / 400])[0])
+    whole = read_recording(tmp_path / 'bag.mcap')
+    assert whole.n == 40_000
+    same(join(read_pieces(tmp_path / 'bag.mcap', samples=3333)), whole)
+
+
+@pytest.mark.parametrize('stamped', [True, False])
+@pytest.mark.parametrize('start, end', [(0.0, 0.5), (0.5, 1.0), (1.0, None), (2.9, 99.0),
+                                        (0.001, 0.004)])
+def test_a_part_is_that_part_of_the_whole(tmp_path, start, end, stamped):
+    """By log time; the throttle of before is held."""
+    rows = flight(stamped=stamped)
+    path = write(tmp_path / 'bag.mcap', rows)
+    first = min(row[2] for row in rows if row[0] in ('/voltage', '/throttle', '/other'))
+    low = first + round(start * 1e9)
+    high = 2**62 if end is None else first + round(end * 1e9)
+    inside = [row for row in rows if row[0] == '/throttle' or low <= row[2] < high]
+    expect = read_recording(write(tmp_path / 'cut.mcap', inside))
+    part = read_recording(path, start=start, end=end)
+    # A throttle from after the part has no say.
+    same(part, expect)
+    assert any('Only the part from' in note for note in part.notes)
+
+
+def test_parts_side_by_side_are_the_whole(tmp_path):
+    """Each message belongs to exactly one part."""
+    path = write(tmp_path / 'bag.mcap', [row for row in flight(stamped=False)
+                                         if row[0] != '/voltage' or row[2] % 3])
+    edges = [0.0, 0.02, 0.7, 0.71, 1.9, 2.6, None]
+    parts = [read_recording(path, start=a, end=b) for a, b in itertools.pairwise(edges)]
+    whole = read_recording(path)
+    t = np.concatenate([part.t for part in parts])
+    np.testing.assert_array_equal(t, whole.t)
+    np.testing.assert_array_equal(np.concatenate([p.throttle for p in parts]), whole.throttle)
+
+
+def test_only_the_chunks_needed_are_read(bag, monkeypatch):
+    """A part in the middle costs what is in it, and the way back to the last throttle."""
+    read = []
+    original = McapFile.tables
+    monkeypatch.setattr(McapFile, 'tables', lambda self, span, wanted: read.append(span)
+                        or original(self, span, wanted))
+    read_recording(bag, start=1.5, end=1.6)
+    touched = len(set(read))
+    read.clear()
+    read_recording(bag)
+    assert touched <= 6 < 12 < len(set(read))
+
+
+@pytest.mark.parametrize('start, end, words', [
+    (-1.0, None, '0 s or later'), (float('nan'), None, '0 s or later'), (2.0, 2.0, 'not after'),
+    (None, 0.0, 'not after'), (50.0, None, 'no sample from 50 s to the end: it lasts 3.0'),
+    (50.0, 60.0, 'no sample from 50 s to 60 s')])
+def test_parts_that_are_none(bag, start, end, words):
+    """One line says why."""
+    for read in (read_recording, lambda *a, **k: list(read_pieces(*a, **k))):
+        with pytest.raises(InputError, match=words):
+            read(bag, start=start, end=end)
+
+
+def test_csv(tmp_path):
+    """A CSV is read in part and in pieces too."""
+    path = tmp_path / 'log.csv'
+    path.write_text('time_s,voltage_v\n' + ''.join(f'{5 + k},{k}\n' for k in range(10)))
+    part = read_recording(path, start=2.0, end=5.0)
+    assert part.voltage.tolist() == [2.0, 3.0, 4.0]
+    assert 'from 2 s to 5 s' in part.notes[-1]
+    pieces = list(read_pieces(path, samples=4))
+    assert [piece.n for piece in pieces] == [4, 4, 2]
+    same(join(pieces), read_recording(path))
+    with pytest.raises(InputError, match='no sample from 20 s'):
+        read_recording(path, start=20.0)
+    with pytest.raises(ValueError, match='at least 1'):
+        next(read_pieces(path, samples=0))
+
+
+def test_progress_ends_at_one(bag):
+    """It rises to 1."""
+    shares = []
+    read_recording(bag, progress=shares.append)
+    assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) > 5
+
+
+def test_fewer_messages_than_stated(bag, tmp_path):
+    """A summary without its checksum that lost a chunk is not believed."""
+    path = tmp_path / 'bag.mcap'
+    shutil.copy(bag, path)
+    reader = BagReader(path)
+    del reader._files[0].spans[3]
+    from ou_monitor.recordings.batches import batches
+    from ou_monitor.recordings.topic_choice import choose
+    spec = choose(path, reader.topics).voltage
+    with pytest.raises(InputError, match='states 3000 messages'):
+        list(batches(reader, {'voltage': spec}))
+
+
+def test_the_first_piece_does_not_wait_for_the_last_chunk(bag, monkeypatch):
+    """Memory is that of the pieces: chunks are read as pieces are taken."""
+    read = []
+    original = McapFile.tables
+    monkeypatch.setattr(McapFile, 'tables', lambda self, span, wanted: read.append(span)
+                        or original(self, span, wanted))
+    pieces = read_pieces(bag, samples=100)
+    next(pieces)
+    early = len(read)
+    rest = list(pieces)
+    assert early <= len(read) / 3 and len(rest) > 20
+
+
+def test_two_publishers_of_one_topic(tmp_path):
+    """Two channels of one topic are one series, by log time."""
+    path = tmp_path / 'bag.mcap'
+    data = encode_scalars(FLOAT32, np.arange(300.0))
+    with path.open('wb') as file:
+        writer = Writer(file, chunk_size=3000)
+        writer.start(profile='ros2', library='test')
+        schema = writer.register_schema(FLOAT32, 'ros2msg', SCHEMAS[FLOAT32].encode())
+        channels = [writer.register_channel('/voltage', 'cdr', schema, {'k': str(k)})
+                    for k in range(2)]
+        for k in range(300):
+            writer.add_message(channels[k % 3 == 0], (k + 1) * MS, data[k], 0)
+        writer.finish()
+    for partial in (False, True):
+        assert read_recording(path, partial=partial).voltage.tolist() == list(range(300))
