@@ -1,8 +1,16 @@
 """Which tests may run beside each other: files may, but all that starts ROS goes one by one."""
 
+import signal
+
 import pytest
 
 _ROS = ('nodes/', 'test_package.py', 'test_scripts.py', 'test_readme.py')
+
+
+def pytest_configure():
+    """Let Ctrl-C work in what the tests start: a shell has it ignored below a background job."""
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -263,9 +263,7 @@ def test_ctrl_c(tmp_path, name):
     process = subprocess.Popen(
         [sys.executable, '-m', 'ou_monitor.cli.main', 'simulate', '--duration', '3600', '--rate',
          '20000', '--output', str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        text=True, env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        # A shell that runs the tests in the background has SIGINT ignored by all below it.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+        text=True, env={**os.environ, 'PYTHONPATH': str(ROOT)})
     try:
         end = time.monotonic() + 60.0
         while sum(p.stat().st_size for p in tmp_path.rglob('*.mcap')) < 100_000:
