@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from importlib import import_module
+from io import TextIOWrapper
 import sys
 from typing import NoReturn
 
@@ -108,6 +109,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if argv is None else argv)
     where = PROGRAM
+    if isinstance(sys.stdout, TextIOWrapper):
+        # As standard error has it: a file name that the terminal cannot show is no failure.
+        sys.stdout.reconfigure(errors='backslashreplace')
     try:
         try:
             args = _parse(given)

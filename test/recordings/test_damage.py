@@ -129,6 +129,18 @@ def test_cut_at_every_record(sound, tmp_path):
                 check_cut(tmp_path / 'cut.mcap', data, rows, cut, walked)
 
 
+def test_what_follows_the_end_is_told(sound, tmp_path):
+    """Another file behind the first would be lost without a word."""
+    _, data, rows = sound
+    for more in (data, b'\0', bytes(100)):
+        path = tmp_path / 'bag.mcap'
+        path.write_bytes(data + more)
+        assert f'at byte {len(data)}: {len(more)} bytes follow' in refusal(lambda: BagReader(path))
+        found, reader = taken(path, partial=True)
+        assert found == rows
+        assert f'at byte {len(data)}:' in reader.damage
+
+
 def test_cut_at_random_bytes(sound, tmp_path):
     """Anywhere, down to the first byte."""
     _, data, rows = sound
