@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from importlib import import_module
 from io import TextIOWrapper
+import os
 import sys
 from typing import NoReturn
 
@@ -109,6 +110,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if argv is None else argv)
     where = PROGRAM
+    for name in ('stdout', 'stderr'):
+        # Closed by whoever started this, as daemons do: nobody listens, and nothing fails for it.
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, 'w', encoding='utf-8'))
     if isinstance(sys.stdout, TextIOWrapper):
         # As standard error has it: a file name that the terminal cannot show is no failure.
         sys.stdout.reconfigure(errors='backslashreplace')

@@ -88,6 +88,25 @@ def test_a_file_name_that_the_terminal_cannot_show(tmp_path, encoding):
     assert '\\udcff\xe4.csv' in page.read_text(encoding='utf-8')
 
 
+@pytest.mark.parametrize('closed', ['>&-', '2>&-', '>&- 2>&-'])
+def test_closed_outputs(tmp_path, closed):
+    """What a daemon has closed is no failure, and a bad input is one still."""
+    def run(arguments):
+        return subprocess.run(
+            ['sh', '-c', f'"$0" -m ou_monitor.cli.main {arguments} {closed}', sys.executable],
+            capture_output=True, text=True, cwd=tmp_path,
+            env={**os.environ, 'PYTHONPATH': os.pathsep.join(map(os.path.abspath, sys.path))})
+
+    done = run('simulate --duration 1 --output a.mcap')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert (tmp_path / 'a.mcap').stat().st_size > 1000
+    assert run('--help').returncode == 0
+    done = run('convert nothere out')
+    assert done.returncode == 2 and done.stdout == ''
+    assert done.stderr == ('' if '2' in closed
+                           else "ou-monitor convert: there is no log 'nothere': check the path\n")
+
+
 def test_interrupt_is_quiet(monkeypatch, capsys):
     """Ctrl-C: 130 and no text."""
     def run(args):
