@@ -11,7 +11,7 @@ import sys
 from typing import NoReturn
 
 from ou_monitor import __version__
-from ou_monitor.errors import InputError, nearest
+from ou_monitor.errors import InputError, nearest, refusal
 
 # One module a command.  Each has ``add_parser(subparsers)``, which sets the
 # default ``run``: a function of the parsed arguments that returns the exit
@@ -142,6 +142,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         # not by the flush at exit.
         abandon_stdout()
         return 0
+    except OSError as error:
+        # What the system refuses, such as to look into a folder, may come from any call.
+        print(f'{where}: {refusal(error)}', file=sys.stderr)
+        return BAD_INPUT
+    except MemoryError:
+        print(f'{where}: not enough memory: take a part of the recording (--from, --to), or read '
+              'it in pieces (read_pieces in Python)', file=sys.stderr)
+        return BAD_INPUT
 
 
 if __name__ == '__main__':

@@ -14,7 +14,7 @@ import signal
 import sys
 from typing import Any
 
-from ou_monitor.errors import InputError
+from ou_monitor.errors import InputError, refusal
 
 BAD_INPUT = 2
 # Longest wait inside the executor, s; a signal wakes it anyway.
@@ -110,6 +110,9 @@ def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: li
         return 0 if stopped else work()
     except (InputError, ParameterException, NameValidationException) as error:
         rclpy.logging.get_logger(name).fatal(one_line(error))
+        return BAD_INPUT
+    except OSError as error:
+        rclpy.logging.get_logger(name).fatal(one_line(refusal(error)))
         return BAD_INPUT
     except ExternalShutdownException:
         return 0

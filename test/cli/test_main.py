@@ -107,6 +107,30 @@ def test_closed_outputs(tmp_path, closed):
                            else "ou-monitor convert: there is no log 'nothere': check the path\n")
 
 
+@pytest.mark.parametrize('error, words', [
+    (PermissionError(13, 'Permission denied', '/locked/x'),
+     "cannot use '/locked/x': Permission denied"),
+    (OSError(28, 'No space left on device'), 'analyze: No space left on device'),
+    (OSError('a\nb'), 'analyze: a b'),
+    (MemoryError(), 'not enough memory: take a part'),
+])
+def test_what_the_system_refuses_is_one_line(monkeypatch, capsys, error, words):
+    """Whatever call it came from."""
+    def run(args):
+        raise error
+
+    stand_in(monkeypatch, run)
+    assert words in failure(capsys, 'analyze')
+
+
+@pytest.mark.parametrize('command', [['analyze'], ['convert', '--list'], ['discover'],
+                                     ['fleet', '--output', 'out']])
+def test_a_path_that_is_too_long(tmp_path, monkeypatch, capsys, command):
+    """The system refuses to look for it."""
+    monkeypatch.chdir(tmp_path)
+    assert 'File name too long' in failure(capsys, *command, 'x' * 300)
+
+
 def test_interrupt_is_quiet(monkeypatch, capsys):
     """Ctrl-C: 130 and no text."""
     def run(args):
