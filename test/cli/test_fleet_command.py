@@ -192,7 +192,8 @@ def test_copies_are_analysed_once_and_named(rows, whole):
     (copy,) = (row for row in rows if row['duplicate_of'])
     assert copy['path'].endswith('stray.csv') and copy['sigma'] is None
     assert copy['duplicate_of'].endswith('flight_3.csv') and copy['flight'] is None
-    assert 'one of the two is in the wrong place' in ' '.join(whole[1].stdout.split())
+    said = ' '.join(whole[1].stdout.split())
+    assert '1 is a copy of another' in said and 'one of the two is in the wrong place' in said
 
 
 def test_what_was_passed_over_is_told(whole):
