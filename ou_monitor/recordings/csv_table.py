@@ -2,8 +2,8 @@
 Read a CSV with the columns `time_s`, `voltage_v` and, if there is one, `throttle`.
 
 Limits first: one header line is required; the decimal mark is a point.  Other
-columns are ignored, as are blank lines and lines that begin with '#'; commas
-or semicolons separate.  A line with more cells than the header has names is
+columns are ignored, as are blank lines and lines that begin with '#'; commas,
+semicolons or tabs separate.  A line with more cells than the header has names is
 refused: with decimal commas 5,01 would be the two numbers 5 and 1.
 """
 
@@ -21,6 +21,7 @@ from ou_monitor.records import FloatArray
 
 TIME, VOLTAGE, THROTTLE = 'time_s', 'voltage_v', 'throttle'
 
+_DELIMITERS = ',;\t'
 # What loggers write for a number they do not have.
 _MISSING = frozenset(('', 'nan', 'null', 'none', 'na', 'n/a'))
 # Added where a cell looks like it.
@@ -197,7 +198,7 @@ def _header(path: Path, lines: _Lines, first: str | None, needed: Sequence[str],
     """Return the names in the first line, and what separates them."""
     if first is None:
         raise InputError(f'{path} is empty: expected a header with {TIME},{VOLTAGE}[,{THROTTLE}]')
-    delimiter = ';' if first.count(';') > first.count(',') else ','
+    delimiter = max(_DELIMITERS, key=first.count)
     header = [name.strip() for name in next(csv.reader([first], delimiter=delimiter))]
     for name in needed:
         if name not in header:

@@ -17,6 +17,7 @@ def written(tmp_path, text, encoding='utf-8'):
 @pytest.mark.parametrize('text', [
     'time_s,voltage_v,throttle\n0,5.0,0.1\n1,5.5,0.2\n',
     'time_s;voltage_v;throttle\r\n0;5.0;0.1\r\n1;5.5;0.2\r\n',
+    'time_s\tvoltage_v\tthrottle\n0\t5.0\t0.1\n1\t5.5\t0.2\n',
     '\ufeff# made by hand\n\nnote, throttle ,voltage_v, time_s\n'
     'a,0.1,5.0,0\n\n# more\n"b, ""c""",0.2,5.5,1\n',
     'time_s,voltage_v,throttle,note\n0,5.0,0.1,"two\nlines"\n1,5.5,0.2,x\n',
