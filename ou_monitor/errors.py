@@ -22,6 +22,25 @@ class InputError(Exception):
     """
 
 
+def refusal(error: OSError) -> str:
+    """
+    Return what the system refused, in one line.
+
+    Parameters
+    ----------
+    error : OSError
+        As raised by a call that nobody caught nearer to what was wanted.
+
+    Returns
+    -------
+    str
+        The file, where there is one, and the reason.
+
+    """
+    why = ' '.join((error.strerror or str(error)).split())
+    return why if error.filename is None else f"cannot use '{error.filename}': {why}"
+
+
 def nearest(word: str, valid: Iterable[str]) -> str:
     """
     Return a hint that names the valid word nearest to a misspelt one.

@@ -265,8 +265,9 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """Time from the first to the last sample, s."""
-        return float(self.t[-1] - self.t[0]) if self.t.size else 0.0
+        """Time from the first to the last sample, s; in whatever order they are."""
+        known = self.t[np.isfinite(self.t)]
+        return float(np.ptp(known)) if known.size else 0.0
 
     @property
     def has_throttle(self) -> bool:

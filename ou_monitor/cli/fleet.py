@@ -142,7 +142,9 @@ def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
     from ou_monitor.offline.report.fleet_page import fleet_page
 
     write_table(fleet.rows, folder / TABLE)
-    write_whole(folder / REPORT, fleet_page(fleet, command_line(args)).encode())
+    page = fleet_page(fleet, command_line(args))
+    # A file name may hold bytes that are no text.
+    write_whole(folder / REPORT, page.encode(errors='backslashreplace'))
     if args.json is not None:
         from ou_monitor.offline.fleet.words import as_data
         output.write_json(as_data(fleet), args.json)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from importlib import import_module
+from io import TextIOWrapper
+import os
 import sys
 from typing import NoReturn
 
 from ou_monitor import __version__
-from ou_monitor.errors import InputError, nearest
+from ou_monitor.errors import InputError, nearest, refusal
 
 # One module a command.  Each has ``add_parser(subparsers)``, which sets the
 # default ``run``: a function of the parsed arguments that returns the exit
@@ -108,6 +110,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if argv is None else argv)
     where = PROGRAM
+    for name in ('stdout', 'stderr'):
+        # Closed by whoever started this, as daemons do: nobody listens, and nothing fails for it.
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, 'w', encoding='utf-8'))
+    if isinstance(sys.stdout, TextIOWrapper):
+        # As standard error has it: a file name that the terminal cannot show is no failure.
+        sys.stdout.reconfigure(errors='backslashreplace')
     try:
         try:
             args = _parse(given)
@@ -133,6 +142,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         # not by the flush at exit.
         abandon_stdout()
         return 0
+    except OSError as error:
+        # What the system refuses, such as to look into a folder, may come from any call.
+        print(f'{where}: {refusal(error)}', file=sys.stderr)
+        return BAD_INPUT
+    except MemoryError:
+        print(f'{where}: not enough memory: take a part of the recording (--from, --to), or read '
+              'it in pieces (read_pieces in Python)', file=sys.stderr)
+        return BAD_INPUT
 
 
 if __name__ == '__main__':

@@ -75,7 +75,8 @@ def write_json(data: Mapping[str, Any], target: str) -> None:
         When it cannot be written.
 
     """
-    text = json.dumps(plain(data), indent=2, allow_nan=False, ensure_ascii=False)
+    # ASCII: whatever the encoding of standard output, and bytes of a file name that are no text.
+    text = json.dumps(plain(data), indent=2, allow_nan=False)
     if target == STDOUT:
         say(text)
     else:
@@ -141,7 +142,8 @@ def write_text(text: str, target: str | Path) -> None:
     draft = path if path.exists() and not path.is_file() else path.with_name(
         f'.{path.name}.{os.getpid()}.draft')
     try:
-        draft.write_text(text, encoding='utf-8')
+        # A file name may hold bytes that are no text.
+        draft.write_text(text, encoding='utf-8', errors='backslashreplace')
         if draft is not path:
             os.replace(draft, path)
     except OSError as error:

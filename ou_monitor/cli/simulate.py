@@ -85,6 +85,14 @@ def run(args: argparse.Namespace) -> int:
     from ou_monitor.recordings.model_file import as_yaml, ModelFile, read_model
 
     if args.list:
+        if args.json is not None:
+            output.write_json({
+                'presets': {name: {'throttle': p.throttle, 'rate_hz': p.rate,
+                                   'duration_s': p.duration, 'text': p.text}
+                            for name, p in PRESETS.items()},
+                'profiles': {name: text for name, (_, text) in PROFILES.items()}}, args.json)
+            if args.json == output.STDOUT:
+                return 0
         output.say(output.table(['Preset', 'Throttle', 'Rate, Hz', 'Length, s', 'What it is'], [
             [name, p.throttle, f'{p.rate:g}', f'{p.duration:g}', p.text]
             for name, p in PRESETS.items()], left=[0, 1, 4]))

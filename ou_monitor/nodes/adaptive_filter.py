@@ -3,13 +3,15 @@ Executable `adaptive_filter`: a low-pass whose cutoff follows sigma.
 
 ros2 run ou_monitor adaptive_filter --ros-args -r input:=/imu -r sigma:=ou_estimator/sigma \
     -r state:=ou_estimator/state
+
+'ros2 param describe' shows what each parameter means and its range.
 """
 
 from __future__ import annotations
 
 import sys
 
-from ou_monitor.nodes.run import run, spin
+from ou_monitor.nodes.run import run_node, spin
 
 NAME = 'ou_adaptive_filter'
 
@@ -21,7 +23,7 @@ def _work() -> int:
 
 def main() -> int:
     """Run the executable; return the exit status."""
-    return run(NAME, _work)
+    return run_node(NAME, __doc__, _work)
 
 
 if __name__ == '__main__':

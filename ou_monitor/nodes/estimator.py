@@ -2,13 +2,15 @@
 Executable `estimator`: voltage and throttle -> OU estimate and brown-out risk.
 
 ros2 run ou_monitor estimator --ros-args -r voltage:=/battery_voltage -p msg_config:=std_float64
+
+'ros2 param describe' shows what each parameter means and its range.
 """
 
 from __future__ import annotations
 
 import sys
 
-from ou_monitor.nodes.run import run, spin
+from ou_monitor.nodes.run import run_node, spin
 
 NAME = 'ou_estimator'
 
@@ -20,7 +22,7 @@ def _work() -> int:
 
 def main() -> int:
     """Run the executable; return the exit status."""
-    return run(NAME, _work)
+    return run_node(NAME, __doc__, _work)
 
 
 if __name__ == '__main__':

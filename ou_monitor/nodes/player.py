@@ -16,6 +16,7 @@ from ou_monitor.nodes.message_types import message_class
 from ou_monitor.nodes.pacing import SpacingError, wait_until
 from ou_monitor.nodes.prefetch import Prefetch
 from ou_monitor.recordings.bag import BagReader
+from ou_monitor.recordings.write import LAST_HEADER_NS
 from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -67,6 +68,9 @@ class Player(Node):
                 '; '.join(self._skipped.values()) or 'it holds no messages'))
         self._clock_output = self.create_publisher(
             ClockMessage, '/clock', 10) if options.clock > 0.0 else None
+        if self._clock_output is not None and self._bag.end_ns > LAST_HEADER_NS:
+            raise InputError(f"'{options.bag}' has log times after 2^31 s, which /clock cannot "
+                             'tell: play it with --clock 0')
         self._sent = dict.fromkeys(self._outputs, 0)
         self._spacing = SpacingError()
         self._passes = 0
@@ -171,7 +175,9 @@ class Player(Node):
         if self._clock_output is None:
             return
         now = origin + round((time.monotonic() - start) * self._options.rate * 1e9)
-        self._send(self._clock_output, ClockMessage(clock=Time(nanoseconds=max(now, 0)).to_msg()))
+        # At a high rate the last tick would be beyond what a stamp can hold.
+        now = min(max(now, 0), LAST_HEADER_NS)
+        self._send(self._clock_output, ClockMessage(clock=Time(nanoseconds=now).to_msg()))
 
     def _send(self, output: Publisher, message: Any) -> None:
         try:

@@ -14,7 +14,7 @@ import signal
 import sys
 from typing import Any
 
-from ou_monitor.errors import InputError
+from ou_monitor.errors import InputError, refusal
 
 BAD_INPUT = 2
 # Longest wait inside the executor, s; a signal wakes it anyway.
@@ -58,6 +58,41 @@ def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> in
             signal.signal(number, handler)
 
 
+def run_node(name: str, about: str, work: Callable[[], int]) -> int:
+    """
+    Run an executable that takes ROS arguments only.
+
+    Parameters
+    ----------
+    name : str
+        As of `run`.
+    about : str
+        What --help shows.
+    work : callable
+        As of `run`.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    """
+    if {'-h', '--help'} & set(sys.argv[1:]):
+        print(about.strip())
+        return 0
+
+    def checked() -> int:
+        from rclpy.utilities import remove_ros_args
+        left = remove_ros_args(sys.argv)[1:]
+        if left:
+            # rclpy would start without it: with another fmin, say, than was asked for.
+            raise InputError(f"'{left[0]}' is not taken: parameters and remappings go behind "
+                             '--ros-args, as in --ros-args -p NAME:=VALUE -r FROM:=TO')
+        return work()
+
+    return run(name, checked)
+
+
 def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: list[int]) -> int:
     try:
         import rclpy
@@ -75,6 +110,9 @@ def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: li
         return 0 if stopped else work()
     except (InputError, ParameterException, NameValidationException) as error:
         rclpy.logging.get_logger(name).fatal(one_line(error))
+        return BAD_INPUT
+    except OSError as error:
+        rclpy.logging.get_logger(name).fatal(one_line(refusal(error)))
         return BAD_INPUT
     except ExternalShutdownException:
         return 0

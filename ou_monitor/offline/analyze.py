@@ -200,9 +200,12 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     Raises
     ------
     ValueError
-        For a level, window, voltage or horizon out of range.
+        For a level, window, voltage or horizon out of range, and for stamps
+        that are not as `Recording` says.
 
     """
+    if not (np.diff(recording.t) > 0.0).all():
+        raise ValueError('stamps must be finite and increase, as read_recording leaves them')
     tell: Progress = progress or (lambda share: None)
     voltage = _default_voltage(recording) if brownout_voltage is None else brownout_voltage
     found = find_levels(recording.t, recording.throttle, levels)

@@ -54,7 +54,8 @@ class BagWriter:
 
     def __init__(self, path: Path | str, *, about: Mapping[str, str] | None = None) -> None:
         """Open the target."""
-        self._about = dict(about or {})
+        # A file name may hold bytes that are no text, which neither MCAP nor YAML can hold.
+        self._about = {key: _as_text(value) for key, value in (about or {}).items()}
         self.path = Path(path)
         self._target = BagTarget(self.path)
         self._topics: dict[str, TopicInfo] = {}
@@ -121,7 +122,7 @@ class BagWriter:
                     'topic_type_hash': TYPE_HASHES.get(type, '')}
         if sample_rate is not None:
             metadata[SAMPLE_RATE] = repr(float(sample_rate))
-        metadata |= {ORIGIN + key: value for key, value in (origin or {}).items()}
+        metadata |= {ORIGIN + key: _as_text(value) for key, value in (origin or {}).items()}
         self._channels[topic] = self._writer.register_channel(
             topic, 'cdr', self._schemas[type], metadata)
         self._counts[topic] = 0
@@ -209,3 +210,7 @@ class BagWriter:
             self.close()
         else:
             self._target.remove()
+
+
+def _as_text(value: str) -> str:
+    return value.encode('utf-8', 'backslashreplace').decode()

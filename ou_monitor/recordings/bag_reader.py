@@ -8,6 +8,7 @@ where the trouble begins, or, when asked, read as far as it holds.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import redirect_stderr
 from dataclasses import replace
 import io
 from pathlib import Path
@@ -100,6 +101,8 @@ class BagReader:
         Log times of the first and last message, ns.
     message_count : int
         Messages of all topics.
+    partial : bool
+        As given.
     damage : str or None
         Where and how the bag is damaged: byte, reason, and the time of the
         newest message before, as s into the recording and as log time.
@@ -117,6 +120,7 @@ class BagReader:
     def __init__(self, path: Path | str, *, partial: bool = False) -> None:
         """Index the bag; messages are read later."""
         self.path = Path(path)
+        self.partial = partial
         paths, qos, about, missing = find_files(self.path, partial)
         self._files = [McapFile(file, partial, _LibraryCodec()) for file in paths]
         # The table of the directory is what a person edits: it holds.
@@ -291,7 +295,9 @@ class BagReader:
             return InputError(f'{self.path}: a message of type {kind} cannot be decoded '
                               f'({type(error).__name__}: {error})')
         try:
-            decode = DecoderFactory().decoder_for('cdr', self._schemas[kind])
+            # The library tells a definition that it cannot read on standard error as well.
+            with redirect_stderr(io.StringIO()):
+                decode = DecoderFactory().decoder_for('cdr', self._schemas[kind])
         except Exception as error:
             raise complain(error) from error
         if decode is None:

@@ -14,16 +14,26 @@ from ou_monitor.errors import InputError
 from ou_monitor.messages.config import FieldSpec
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.columns import Column, FieldReader, join
+from ou_monitor.recordings.framing import moment
 
 
-def field_reader(bag: BagReader, spec: FieldSpec) -> FieldReader:
-    """Return the reader of a field of a topic of a bag."""
-    return FieldReader(spec, bag.definition(spec.type), partial(bag.decoder, spec.type))
+Broken = Callable[[int, InputError], None]
+
+
+def field_reader(bag: BagReader, spec: FieldSpec, broken: Broken | None = None) -> FieldReader:
+    """Return the reader of a field of a topic of a bag; `broken` as of `batches`."""
+    def refuse(log_time: int, error: InputError) -> None:
+        raise InputError(f'{error} ({moment(log_time, bag.start_ns)}); use --partial to leave it '
+                         'out') from error
+
+    return FieldReader(spec, bag.definition(spec.type), partial(bag.decoder, spec.type),
+                       broken or refuse)
 
 
 def batches(
     bag: BagReader, specs: Mapping[str, FieldSpec], *, start_ns: int | None = None,
     end_ns: int | None = None, progress: Callable[[float], None] | None = None,
+    broken: Broken | None = None,
 ) -> Iterator[dict[str, Column]]:
     """
     Yield fields of a bag, batch by batch.
@@ -38,6 +48,10 @@ def batches(
         Log times, ns: only messages in start <= t < end.
     progress : callable, optional
         Called with the share done, 0..1.
+    broken : callable, optional
+        Called with the log time (ns) of a message that cannot be decoded and
+        with the error; when it returns, the message is left out.  Without it
+        such a message is refused.
 
     Yields
     ------
@@ -52,7 +66,7 @@ def batches(
         messages are there than the bag says.
 
     """
-    readers = {name: field_reader(bag, spec) for name, spec in specs.items()}
+    readers = {name: field_reader(bag, spec, broken) for name, spec in specs.items()}
     pending: dict[str, list[Column]] = {name: [] for name in specs}
     counts = dict.fromkeys(specs, 0)
     topics = [spec.topic for spec in specs.values()]
@@ -89,7 +103,8 @@ def _check_count(bag: BagReader, topic: str, found: int) -> None:
             'found; use --partial to take what it still holds')
 
 
-def last_before(bag: BagReader, spec: FieldSpec, before_ns: int) -> Column:
+def last_before(bag: BagReader, spec: FieldSpec, before_ns: int,
+                broken: Broken | None = None) -> Column:
     """
     Return messages of a topic up to the last one before a log time that says something.
 
@@ -101,6 +116,8 @@ def last_before(bag: BagReader, spec: FieldSpec, before_ns: int) -> Column:
         The field.
     before_ns : int
         Log time, ns.
+    broken : callable, optional
+        As of `batches`.
 
     Returns
     -------
@@ -114,7 +131,7 @@ def last_before(bag: BagReader, spec: FieldSpec, before_ns: int) -> Column:
         As `batches`.
 
     """
-    reader = field_reader(bag, spec)
+    reader = field_reader(bag, spec, broken)
     found: list[Column] = []
     newest = -1
     for table, older in bag.tables_before(spec.topic, before_ns):

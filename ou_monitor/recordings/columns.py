@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from ou_monitor.errors import InputError
 from ou_monitor.messages.config import FieldSpec
 from ou_monitor.messages.extract import Extracted, Extractor
 from ou_monitor.messages.field_path import FieldPath, parse_field_path
@@ -114,6 +115,9 @@ class FieldReader:
     decoder : callable
         Returns the general decoder of the type, bytes -> message; asked for
         once, and only when it is needed.
+    broken : callable, optional
+        Called with the log time (ns) of a message that cannot be decoded and
+        with the error; when it returns, the message is left out.
 
     Attributes
     ----------
@@ -124,12 +128,14 @@ class FieldReader:
 
     def __init__(
         self, spec: FieldSpec, definition: str, decoder: Callable[[], Callable[[bytes], Any]],
+        broken: Callable[[int, InputError], None] | None = None,
     ) -> None:
         """Parse the definition; layouts are learned from messages."""
         self.spec = spec
         self.general = 0
         self._extractor = Extractor(replace(spec, nan='unknown'))
         self._decoder = decoder
+        self._broken = broken
         self._decode: Callable[[bytes], Any] | None = None
         self._kind = short_name(spec.type)
         self._definitions = parse_definition(spec.type, definition)
@@ -154,7 +160,7 @@ class FieldReader:
         Returns
         -------
         Column
-            One entry for each message.
+            One entry for each message that is not left out.
 
         Raises
         ------
@@ -176,14 +182,20 @@ class FieldReader:
         for picked, block in bulk:
             count[picked] = block.shape[1]
         single = {}
-        for k in np.concatenate([np.empty(0, np.int64), *rest]).tolist():
-            found = self._one(bytes(table.data[table.begin[k]:table.end[k]]))
+        broken: list[int] = []
+        for k in np.sort(np.concatenate([np.empty(0, np.int64), *rest])).tolist():
+            found = self._one(
+                bytes(table.data[table.begin[k]:table.end[k]]), int(table.log_time[k]))
+            if found is None:
+                broken.append(k)
+                count[k] = 0
+                continue
             single[k] = found.values
             count[k] = found.values.size
             if found.stamp is not None:
                 stamp[k] = found.stamp
         self.general += len(single)
-        if not single and len(bulk) == 1:
+        if not single and not broken and len(bulk) == 1:
             # All alike, and in order.
             return Column(table.log_time, stamp, count, bulk[0][1].reshape(-1))
         begin = np.cumsum(count) - count
@@ -192,7 +204,11 @@ class FieldReader:
             values[begin[picked][:, None] + np.arange(block.shape[1])] = block
         for k, block in single.items():
             values[begin[k]:begin[k] + block.size] = block
-        return Column(table.log_time, stamp, count, values)
+        if not broken:
+            return Column(table.log_time, stamp, count, values)
+        kept = np.ones(table.n, dtype=bool)
+        kept[broken] = False
+        return Column(table.log_time[kept], stamp[kept], count[kept], values)
 
     def _in_bulk(
         self, table: Table, left: IntArray, length: int, stamp: FloatArray,
@@ -267,8 +283,15 @@ class FieldReader:
                 return None
         return layout
 
-    def _one(self, message: bytes) -> Extracted:
-        """Return the field of one message the general way."""
+    def _one(self, message: bytes, log_time: int) -> Extracted | None:
+        """Return the field of one message the general way; None: it is to be left out."""
         if self._decode is None:
             self._decode = self._decoder()
-        return self._extractor.extract(self._decode(message))
+        try:
+            decoded = self._decode(message)
+        except InputError as error:
+            if self._broken is None:
+                raise
+            self._broken(log_time, error)
+            return None
+        return self._extractor.extract(decoded)

@@ -2,8 +2,9 @@
 Read a CSV with the columns `time_s`, `voltage_v` and, if there is one, `throttle`.
 
 Limits first: one header line is required; the decimal mark is a point.  Other
-columns are ignored, as are blank lines and lines that begin with '#'; commas
-or semicolons separate.
+columns are ignored, as are blank lines and lines that begin with '#'; commas,
+semicolons or tabs separate.  A line with more cells than the header has names is
+refused: with decimal commas 5,01 would be the two numbers 5 and 1.
 """
 
 from __future__ import annotations
@@ -20,8 +21,13 @@ from ou_monitor.records import FloatArray
 
 TIME, VOLTAGE, THROTTLE = 'time_s', 'voltage_v', 'throttle'
 
+_DELIMITERS = ',;\t'
 # What loggers write for a number they do not have.
 _MISSING = frozenset(('', 'nan', 'null', 'none', 'na', 'n/a'))
+# Added where a cell looks like it.
+_MARK = ': the decimal mark is a point'
+# Characters of a cell that are shown.
+_LONGEST = 40
 
 
 def read_csv(path: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -176,6 +182,10 @@ def _read(path: Path, file: Iterator[str], needed: Sequence[str], optional: Sequ
     places = [header.index(name) for name in names]
     columns = [array('d') for _ in names]
     for row in csv.reader(texts, delimiter=delimiter):
+        if len(row) > len(header) and any(cell.strip() for cell in row[len(header):]):
+            raise InputError(
+                f'{path}:{lines.number}: {len(row)} cells, and the header names {len(header)} '
+                'columns: mend the line; the decimal mark is a point')
         for name, place, column in zip(names, places, columns):
             column.append(_cell(row, place, name, path, lines.number))
     arrays = [np.array(column, dtype=np.float64) for column in columns]
@@ -188,7 +198,7 @@ def _header(path: Path, lines: _Lines, first: str | None, needed: Sequence[str],
     """Return the names in the first line, and what separates them."""
     if first is None:
         raise InputError(f'{path} is empty: expected a header with {TIME},{VOLTAGE}[,{THROTTLE}]')
-    delimiter = ';' if first.count(';') > first.count(',') else ','
+    delimiter = max(_DELIMITERS, key=first.count)
     header = [name.strip() for name in next(csv.reader([first], delimiter=delimiter))]
     for name in needed:
         if name not in header:
@@ -206,8 +216,14 @@ def _cell(row: list[str], place: int, name: str, path: Path, number: int) -> flo
     except ValueError:
         if text.strip().lower() in _MISSING:
             return float('nan')
-        raise InputError(
-            f"{path}:{number}: column '{name}' holds '{text.strip()}', not a number") from None
+        raise InputError(f"{path}:{number}: column '{name}' holds '{_shown(text)}', not a "
+                         'number' + _MARK * (text.count(',') == 1)) from None
+
+
+def _shown(text: str) -> str:
+    """Return what fits in one line: an open quote makes the rest of a file one cell."""
+    shown = text.strip()
+    return shown if len(shown) <= _LONGEST else shown[:_LONGEST] + '...'
 
 
 def _hint(name: str, header: list[str]) -> str:

@@ -66,6 +66,12 @@ class Damage(Exception):
         self.why = why
 
 
+def moment(log_time_ns: int, origin_ns: int) -> str:
+    """Return a log time in words, also counted from the start of the recording."""
+    return (f'{(log_time_ns - origin_ns) / 1e9:.3f} s into the recording, log time '
+            f'{log_time_ns // 10**9}.{log_time_ns % 10**9:09d} s')
+
+
 @dataclass(frozen=True)
 class Record:
     """Where a record is: offset of its opcode, and the length of its content."""

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.framing import (
     check_passed_over, Damage, FOOTER_LENGTH, inner_records, kind_of_foreign, MAGIC,
-    MESSAGE_HEAD, Op, record_at, RECORD_HEAD, Span)
+    MESSAGE_HEAD, moment, Op, record_at, RECORD_HEAD, Span)
 from ou_monitor.recordings.mcap_index import Break, Codec, McapIndex, TopicRecord
 from ou_monitor.recordings.mcap_scan import scan
 from ou_monitor.recordings.record_table import find_by_index, find_messages, Table
@@ -80,9 +80,7 @@ class McapFile(McapIndex):
         """Return the byte, the reason and the time of a damage in words."""
         if found.after_ns is None:
             return f'{found.why} (before the first message)'
-        seconds = (found.after_ns - self.origin_ns) / 1e9
-        return (f'{found.why} ({seconds:.3f} s into the recording, log time '
-                f'{found.after_ns // 10**9}.{found.after_ns % 10**9:09d} s)')
+        return f'{found.why} ({moment(found.after_ns, self.origin_ns)})'
 
     @property
     def damage(self) -> str | None:

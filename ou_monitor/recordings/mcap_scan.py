@@ -110,6 +110,10 @@ class _Scan:
                 self._file.seek(record.end)
                 if self._file.read(len(MAGIC)) != MAGIC:
                     raise Damage(record.end, 'the file ends without its closing mark')
+                end = record.end + len(MAGIC)
+                if end < self._size:
+                    raise Damage(end, f'{self._size - end} bytes follow the end of the recording, '
+                                 'which may be another one')
                 return
             elif record.opcode >= PRIVATE:
                 self._private.append(record)

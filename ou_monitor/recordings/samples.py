@@ -21,6 +21,7 @@ from ou_monitor.messages.config import FieldSpec
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.batches import batches, last_before
 from ou_monitor.recordings.columns import Column
+from ou_monitor.recordings.framing import moment
 from ou_monitor.recordings.topic_choice import choose
 from ou_monitor.records import FloatArray, Recording
 
@@ -208,9 +209,11 @@ class SampleReader:
         self._throttle_t, self._throttle = np.empty(0), np.empty(0)
         self._fresh: list[tuple[FloatArray, FloatArray]] = []
         self._tally = dict.fromkeys((
-            'dropped', 'late', 'mixed', 'repeated', 'too_late', 'throttle'), 0)
+            'dropped', 'late', 'mixed', 'repeated', 'too_late', 'throttle', 'undecodable'), 0)
+        self._undecodable = ''
+        self._broken = self._leave_out if bag.partial else None
         if self._start_ns is not None and choice.throttle is not None:
-            self._add_throttle(last_before(bag, choice.throttle, self._start_ns))
+            self._add_throttle(last_before(bag, choice.throttle, self._start_ns, self._broken))
             self._tally['throttle'] = 0
             self._series[THROTTLE] = _Series(choice.throttle)
 
@@ -243,12 +246,19 @@ class SampleReader:
 
         """
         for batch in batches(self._bag, self._specs, start_ns=self._start_ns,
-                             end_ns=self._end_ns, progress=progress):
+                             end_ns=self._end_ns, progress=progress,
+                             broken=self._broken):
             if THROTTLE in batch:
                 self._add_throttle(batch[THROTTLE])
             if VOLTAGE in batch:
                 self._add_voltage(batch[VOLTAGE])
             yield self.held
+
+    def _leave_out(self, log_time: int, error: InputError) -> None:
+        """Count a message that cannot be decoded."""
+        self._tally['undecodable'] += 1
+        self._undecodable = self._undecodable or (
+            f'{error} ({moment(log_time, self._bag.start_ns)})')
 
     def _add_voltage(self, column: Column) -> None:
         t, voltage = self._series[VOLTAGE].samples(column)
@@ -341,6 +351,9 @@ class SampleReader:
         """Return what was dropped or mended so far, one sentence each."""
         notes = []
         tally = self._tally
+        if tally['undecodable']:
+            notes.append(f"{counted(tally['undecodable'], 'message')} dropped, the first: "
+                         f'{self._undecodable}.')
         if tally['dropped']:
             notes.append(dropped_words(tally['dropped'], np.array([self._largest])))
         if tally['throttle']:

@@ -33,6 +33,9 @@ SLICE = 1024
 # late, or a bag played from the middle, knows it soon.
 THROTTLE_PERIOD_NS = 1_000_000_000
 
+# Stamps of 64 bits with room to be moved.
+_LAST_NS = 2.0**62
+
 # The header's stamp counts seconds in an int32.
 LAST_HEADER_NS = (2**31) * 1_000_000_000 - 1
 
@@ -92,6 +95,36 @@ def write_recording(
             if progress is not None:
                 progress(min(1.0, (first + SLICE) / rec.n))
     return writer.notes
+
+
+def as_nanoseconds(t: FloatArray, name: str) -> npt.NDArray[np.int64]:
+    """
+    Return stamps as a bag holds them.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,)
+        Stamps, s, finite.
+    name : str
+        Whose they are, for the message.
+
+    Returns
+    -------
+    ndarray of int64, shape (n,)
+        Stamps, ns.
+
+    Raises
+    ------
+    InputError
+        When they are too large for that.
+
+    """
+    stamps = np.rint(t * 1e9)
+    far = float(np.abs(stamps).max(initial=0.0))
+    if far > _LAST_NS:
+        raise InputError(f"'{name}' has stamps up to {far * 1e-9:.4g} s, and a bag holds "
+                         f'{_LAST_NS * 1e-9:.2g} s: are they in ms or us?')
+    return stamps.astype(np.int64)
 
 
 class RecordingWriter:
@@ -161,7 +194,7 @@ class RecordingWriter:
         """
         if not piece.n:
             return
-        stamps = np.rint(piece.t * 1e9).astype(np.int64) + self._shift
+        stamps = as_nanoseconds(piece.t, piece.name) + self._shift
         if self._first is None:
             if stamps[0] < 0:
                 self.notes += (f'Stamps were moved by {-stamps[0] * 1e-9:.9f} s: a bag cannot '

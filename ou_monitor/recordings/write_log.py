@@ -19,7 +19,7 @@ from ou_monitor.recordings import cdr
 from ou_monitor.recordings.bag import BagWriter
 from ou_monitor.recordings.importers.choose import Chosen
 from ou_monitor.recordings.importers.log import Series, UNITS
-from ou_monitor.recordings.write import LAST_HEADER_NS, TYPES
+from ou_monitor.recordings.write import as_nanoseconds, LAST_HEADER_NS, TYPES
 
 # Messages encoded at once; bounds memory.
 SLICE = 4096
@@ -74,7 +74,7 @@ def write_log(
     total = sum(series.n for _, series in held)
     topics: dict[str, str] = {}
     # Refused before anything is on disk.
-    stamps = [np.rint(series.t * 1e9).astype(np.int64) + shift for _, series in held]
+    stamps = [as_nanoseconds(series.t, series.name) + shift for _, series in held]
     if kind == 'adc_block':
         _check_steady(chosen.voltage, stamps[-1])
     elif kind == 'battery_state' and stamps[-1][-1] > LAST_HEADER_NS:

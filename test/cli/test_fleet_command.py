@@ -192,7 +192,8 @@ def test_copies_are_analysed_once_and_named(rows, whole):
     (copy,) = (row for row in rows if row['duplicate_of'])
     assert copy['path'].endswith('stray.csv') and copy['sigma'] is None
     assert copy['duplicate_of'].endswith('flight_3.csv') and copy['flight'] is None
-    assert 'one of the two is in the wrong place' in ' '.join(whole[1].stdout.split())
+    said = ' '.join(whole[1].stdout.split())
+    assert '1 is a copy of another' in said and 'one of the two is in the wrong place' in said
 
 
 def test_what_was_passed_over_is_told(whole):
@@ -297,6 +298,20 @@ def test_a_fleet_of_bad_files_alone_is_refused(tmp_path, one_process, capsys):
     assert 'none of the recordings could be analysed' in capsys.readouterr().err
     table = parquet.read_table(tmp_path / 'out' / 'fleet.parquet')
     assert 'not an MCAP file' in table.column('error').to_pylist()[0]
+
+
+def test_a_strange_clock_and_a_strange_name(tmp_path, one_process):
+    """Stamps in milliseconds since 1970 have no date; a name that is no text is still told."""
+    made = flight(1, n=3000)
+    logs = tmp_path / 'logs'
+    logs.mkdir()
+    write_csv(Recording(1.7e12 + 1e3 * made.t, made.voltage, made.throttle, ''), logs / 'ms.csv')
+    write_csv(made, logs / os.fsdecode(b'\xff.csv'))
+    assert main(['fleet', str(logs), '--output', str(tmp_path / 'out')]) == 0
+    rows = parquet.read_table(tmp_path / 'out' / 'fleet.parquet').to_pylist()
+    assert {row['recording']: row['start'] for row in rows} == {
+        'ms.csv': None, '\\udcff.csv': None}
+    assert not any(row['error'] for row in rows)
 
 
 def test_missing_extra_is_named(logs, tmp_path, capsys, monkeypatch):

@@ -73,6 +73,64 @@ def test_input_errors_are_one_line_whatever_their_text(monkeypatch, capsys):
     assert failure(capsys, 'analyze') == "ou-monitor analyze: cannot read 'a b'\n"
 
 
+@pytest.mark.parametrize('encoding', ['utf-8', 'ascii'])
+def test_a_file_name_that_the_terminal_cannot_show(tmp_path, encoding):
+    """Its bytes are no text, or not in the encoding: shown by their numbers."""
+    path = os.fsdecode(os.path.join(os.fsencode(tmp_path), b'\xff\xc3\xa4.csv'))
+    with open(path, 'w') as file:
+        file.writelines(['time_s,voltage_v\n', '0,5\n', '1,5\n'])
+    page = tmp_path / 'page.html'
+    done = subprocess.run(
+        [sys.executable, '-m', 'ou_monitor.cli.main', 'analyze', path, '--report', str(page)],
+        env={**os.environ, 'PYTHONIOENCODING': encoding}, capture_output=True)
+    assert (done.returncode, done.stderr) == (0, b'')
+    assert b'\\udcff' in done.stdout
+    assert '\\udcff\xe4.csv' in page.read_text(encoding='utf-8')
+
+
+@pytest.mark.parametrize('closed', ['>&-', '2>&-', '>&- 2>&-'])
+def test_closed_outputs(tmp_path, closed):
+    """What a daemon has closed is no failure, and a bad input is one still."""
+    def run(arguments):
+        return subprocess.run(
+            ['sh', '-c', f'"$0" -m ou_monitor.cli.main {arguments} {closed}', sys.executable],
+            capture_output=True, text=True, cwd=tmp_path,
+            env={**os.environ, 'PYTHONPATH': os.pathsep.join(map(os.path.abspath, sys.path))})
+
+    done = run('simulate --duration 1 --output a.mcap')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert (tmp_path / 'a.mcap').stat().st_size > 1000
+    assert run('--help').returncode == 0
+    done = run('convert nothere out')
+    assert done.returncode == 2 and done.stdout == ''
+    assert done.stderr == ('' if '2' in closed
+                           else "ou-monitor convert: there is no log 'nothere': check the path\n")
+
+
+@pytest.mark.parametrize('error, words', [
+    (PermissionError(13, 'Permission denied', '/locked/x'),
+     "cannot use '/locked/x': Permission denied"),
+    (OSError(28, 'No space left on device'), 'analyze: No space left on device'),
+    (OSError('a\nb'), 'analyze: a b'),
+    (MemoryError(), 'not enough memory: take a part'),
+])
+def test_what_the_system_refuses_is_one_line(monkeypatch, capsys, error, words):
+    """Whatever call it came from."""
+    def run(args):
+        raise error
+
+    stand_in(monkeypatch, run)
+    assert words in failure(capsys, 'analyze')
+
+
+@pytest.mark.parametrize('command', [['analyze'], ['convert', '--list'], ['discover'],
+                                     ['fleet', '--output', 'out']])
+def test_a_path_that_is_too_long(tmp_path, monkeypatch, capsys, command):
+    """The system refuses to look for it."""
+    monkeypatch.chdir(tmp_path)
+    assert 'File name too long' in failure(capsys, *command, 'x' * 300)
+
+
 def test_interrupt_is_quiet(monkeypatch, capsys):
     """Ctrl-C: 130 and no text."""
     def run(args):

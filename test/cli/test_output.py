@@ -31,12 +31,12 @@ def test_plain_is_strict_json_at_any_depth():
 
 
 def test_write_json_to_a_file_and_to_standard_output(tmp_path, capsys):
-    """Both hold the same text, UTF-8, one object."""
+    """Both hold the same text, one object, in any encoding."""
     target = tmp_path / 'x.json'
     output.write_json({'unit': 'V/√s', 'x': math.nan}, str(target))
     output.write_json({'unit': 'V/√s', 'x': math.nan}, '-')
-    assert target.read_text(encoding='utf-8') == capsys.readouterr().out
-    assert json.loads(target.read_text(encoding='utf-8')) == {'unit': 'V/√s', 'x': None}
+    assert target.read_text(encoding='ascii') == capsys.readouterr().out
+    assert json.loads(target.read_text(encoding='ascii')) == {'unit': 'V/√s', 'x': None}
 
 
 def test_what_cannot_be_written_is_named(tmp_path):

@@ -73,6 +73,15 @@ def test_default_is_a_flight(tmp_path, capsys):
     assert PRESETS['flight'].duration == 120.0
 
 
+def test_list_as_json(tmp_path, capsys):
+    """For programs, alone on standard output."""
+    simulate('--list', '--json', '-')
+    listed = json.loads(capsys.readouterr().out)
+    assert listed['presets']['load_40']['throttle'] == '0.4'
+    assert listed['presets']['flight']['rate_hz'] == 1000.0
+    assert set(listed['profiles']) == {'flight', 'hover', 'loads', 'transient'}
+
+
 def test_list(capsys):
     """Every preset and every profile, within a terminal; nothing is written."""
     simulate('--list')

@@ -35,6 +35,17 @@ def test_signals_end_the_nodes(world, number):
     wait_until(lambda: not expected & set(names(probe)), 30.0, 'the nodes to be gone')
 
 
+@pytest.mark.parametrize('name', NODES)
+def test_arguments_that_rclpy_would_pass_over(world, name):
+    """A parameter without --ros-args is refused, not ignored; --help helps."""
+    process = world.start(name, 'fmin:=30.0', '--ros-args', '-p', 'publish_rate:=5.0')
+    assert process.wait() == 2
+    assert "'fmin:=30.0' is not taken" in process.err and '--ros-args -p' in process.err
+    process = world.start(name, '--help')
+    assert process.wait() == 0
+    assert not process.err
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=['SIGINT', 'SIGTERM'])
 def test_a_signal_at_any_moment_of_the_start(world, number):
     """While it imports, while it makes its node: status 0 all the same."""

@@ -174,7 +174,25 @@ def empty(folder):
     return path
 
 
+def late(folder):
+    """Return a bag of the year 2242."""
+    path = folder / 'late.mcap'
+    with BagWriter(path) as bag:
+        name = bag.add_topic('/voltage', 'std_msgs/msg/Float32')
+        for k in range(10):
+            bag.write(name, 2**63 + k * 1_000_000, {'data': 5.0})
+    return path
+
+
+def test_times_that_the_clock_cannot_tell(world, numbered):
+    """Without the clock they are played; a rate that outruns the clock holds it at its end."""
+    processes = [world.start('replay', *arguments, '--wait', '0', '--json', '-') for arguments in (
+        [late(world.folder), '--clock', '0'], [numbered, '--rate', '1e13'])]
+    assert [summary_of(process)['messages'] for process in processes] == [10, 2000]
+
+
 @pytest.mark.parametrize('arguments, words', [
+    ([late], 'play it with --clock 0'),
     ([foreign], 'not an MCAP file'),
     ([empty], 'no messages'),
     (['missing.mcap'], 'no bag missing.mcap'),

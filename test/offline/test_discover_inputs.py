@@ -90,6 +90,7 @@ def test_what_is_wrong_is_told_and_nothing_made_up(what):
     data = found.as_data()
     json.dumps(data, allow_nan=False)
     assert data['baseline']['params']['alpha'] > 0.0 and math.isfinite(found.gain)
+    assert data['duration_s'] > 0.0
 
 
 def test_a_rail_is_the_same_in_any_unit_and_era():

@@ -5,6 +5,7 @@ from dataclasses import replace
 from made_recordings import recording
 import numpy as np
 from ou_monitor.offline.analysis.quality_list import quality_list, Severity
+from ou_monitor.recordings.samples import late_words
 from ou_monitor.records import Estimate, Flag, Recording, Status
 import pytest
 
@@ -45,6 +46,9 @@ def test_worst_comes_first_and_levels_share_an_entry():
     ('1 sample dropped: the stamp was there before; the first of each was kept.',
      'REPEATED_STAMPS', Severity.WARNING),
     ('1 sample dropped: not a finite number.', 'NON_FINITE', Severity.WARNING),
+    ('3 messages dropped, the first: x.mcap: a message of type y cannot be decoded (z).',
+     'DAMAGED_FILE', Severity.WARNING),
+    (late_words(1, 900, 2.0), 'UNORDERED', Severity.WARNING),
     ('Something else.', 'READER', Severity.INFO)])
 def test_what_the_reader_noted_is_in_it(note, name, severity):
     """As the reader words it."""

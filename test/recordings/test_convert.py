@@ -74,6 +74,11 @@ def test_json(log, tmp_path, capsys):
     (GOOD, ['log.csv', 'out', '--voltage', 'throttle'], ['is a throttle']),
     (GOOD, ['log.csv', 'out', '--drop-held', '--drop-repeats'], ['not allowed with']),
     ('time_s,volts\n0,5\n1,5\n', ['log.csv', 'out', '--list', 'x'], ['further argument']),
+    ('time_s,voltage_v\n', ['log.csv', 'out'], ['no line below']),
+    ('time_s,voltage_v\n1.7e12,5\n1.8e12,5\n', ['log.csv', 'out'],
+     ["'voltage_v' has stamps up to 1.8e+12 s", 'in ms']),
+    ('time_s,voltage_v,throttle\n0,5,40\n1,5,50\n', ['log.csv', 'out'],
+     ['throttle runs from 40 to 50', 'percentage']),
     ('time_s,volts\n0,5\n1,5\n', ['log.csv', 'out'], ["no column 'voltage_v'", '--voltage']),
 ])
 def test_bad_input(tmp_path, monkeypatch, capsys, log_text, arguments, words):
@@ -93,6 +98,17 @@ def test_bad_input(tmp_path, monkeypatch, capsys, log_text, arguments, words):
     for word in words:
         assert word in captured.err
     assert not (tmp_path / 'out').exists()
+
+
+def test_a_name_that_is_no_text(tmp_path, capsys):
+    """Bytes of a file name are shown as what they are, in the bag as in the JSON."""
+    path = os.path.join(os.fsencode(tmp_path), b'\xff.csv')
+    Path(os.fsdecode(path)).write_text(GOOD)
+    for out in ('out', 'out.mcap', os.fsdecode(b'\xfe'), os.fsdecode(b'\xfe.mcap')):
+        assert main(['convert', os.fsdecode(path), str(tmp_path / out), '--json', '-']) == 0
+        assert json.loads(capsys.readouterr().out)['log'] == os.fsdecode(path)
+        source = read_recording(tmp_path / out).source
+        assert source['log_file'] == '\\udcff.csv'
 
 
 def test_blocks(tmp_path):

@@ -129,6 +129,18 @@ def test_cut_at_every_record(sound, tmp_path):
                 check_cut(tmp_path / 'cut.mcap', data, rows, cut, walked)
 
 
+def test_what_follows_the_end_is_told(sound, tmp_path):
+    """Another file behind the first would be lost without a word."""
+    _, data, rows = sound
+    for more in (data, b'\0', bytes(100)):
+        path = tmp_path / 'bag.mcap'
+        path.write_bytes(data + more)
+        assert f'at byte {len(data)}: {len(more)} bytes follow' in refusal(lambda: BagReader(path))
+        found, reader = taken(path, partial=True)
+        assert found == rows
+        assert f'at byte {len(data)}:' in reader.damage
+
+
 def test_cut_at_random_bytes(sound, tmp_path):
     """Anywhere, down to the first byte."""
     _, data, rows = sound
@@ -233,6 +245,31 @@ def test_a_broken_chunk_is_told_with_its_time(tmp_path, way):
     assert f'at 1 more place, the last at byte {chunks[7][0] + 9}' in reader.damage
     # A part that does not touch the broken chunks is read without --partial.
     assert read_recording(path, start=0.0, end=(last - START) / 1e9).n > 50
+
+
+def test_a_message_that_is_cut_short(tmp_path):
+    """Whole in its chunk and no message of its type: told with its time, or left out alone."""
+    path = tmp_path / 'bag.mcap'
+    with path.open('wb') as file:
+        writer = Writer(file)
+        writer.start(profile='ros2', library='test')
+        schema = writer.register_schema(FLOAT64, 'ros2msg', SCHEMAS[FLOAT64].encode())
+        channel = writer.register_channel('/voltage', 'cdr', schema)
+        for k, data in enumerate(encode_scalars(FLOAT64, 5.0 + np.arange(COUNT))):
+            short = data[:7] if k in (100, 200) else b'' if k == 300 else data
+            writer.add_message(channel, START + k * MS, short, START + k * MS)
+        writer.finish()
+    where = '(0.100 s into the recording, log time 1704067200.100000000 s)'
+    for read in (read_recording, lambda path: list(read_pieces(path))):
+        text = refusal(lambda read=read: read(path))
+        assert 'cannot be decoded' in text and where in text and '--partial' in text
+    whole = read_recording(path, partial=True)
+    pieces = list(read_pieces(path, samples=50, partial=True))
+    kept = np.delete(5.0 + np.arange(COUNT), [100, 200, 300])
+    for voltage, notes in ((whole.voltage, whole.notes), (
+            np.concatenate([piece.voltage for piece in pieces]), pieces[-1].notes)):
+        np.testing.assert_array_equal(voltage, kept)
+        assert any('3 messages dropped' in note and where in note for note in notes)
 
 
 def test_definitions_from_the_summary(tmp_path):

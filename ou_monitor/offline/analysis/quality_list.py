@@ -25,8 +25,9 @@ _UNEVEN = 0.05
 # Stretches of samples looked at for ADC steps.
 _LOOKS = 8
 # What the reader's sentences are about: a word in them, the name, and whether numbers suffer.
-_READER = (('damaged', 'DAMAGED_FILE', True), ('gap', 'GAPS', True),
-           ('sorted by stamp', 'UNORDERED', True), ('stamp was there', 'REPEATED_STAMPS', True),
+_READER = (('cannot be decoded', 'DAMAGED_FILE', True), ('damaged', 'DAMAGED_FILE', True),
+           ('gap', 'GAPS', True), ('sorted by stamp', 'UNORDERED', True),
+           ('clock went back', 'UNORDERED', True), ('stamp was there', 'REPEATED_STAMPS', True),
            ('not a finite', 'NON_FINITE', True))
 
 NOISE_UNKNOWN = (

@@ -115,8 +115,7 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
 
 def _insufficient(recording: Recording, state: Integrity, reason: str, seed: int) -> Finding:
     return Finding(
-        recording=recording.name, n=recording.n,
-        duration=recording.duration if math.isfinite(recording.duration) else math.nan,
+        recording=recording.name, n=recording.n, duration=recording.duration,
         verdict=Verdict.INSUFFICIENT_DATA, sentence=f'Nothing can be said of it. {reason}',
         notes=state.notes, seed=seed)
 

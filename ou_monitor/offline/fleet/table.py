@@ -65,6 +65,13 @@ def _known(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
+def _as_text(value: Any) -> Any:
+    """Return texts without what is no text, such as bytes in a file name."""
+    if isinstance(value, str):
+        return value.encode('utf-8', 'backslashreplace').decode()
+    return [_as_text(item) for item in value] if isinstance(value, list) else value
+
+
 def write_table(rows: Sequence[Row], path: Path) -> None:
     """
     Write the rows as Parquet, with units and meanings in the fields' metadata.
@@ -93,6 +100,7 @@ def write_table(rows: Sequence[Row], path: Path) -> None:
                       metadata={'unit': column.unit, 'meaning': column.meaning})
         for column in COLUMNS])
     content = io.BytesIO()
-    parquet.write_table(pyarrow.Table.from_pylist(list(rows), schema=schema), content,
+    plain = [{name: _as_text(value) for name, value in row.items()} for row in rows]
+    parquet.write_table(pyarrow.Table.from_pylist(plain, schema=schema), content,
                         compression='zstd')
     write_whole(path, content.getvalue())

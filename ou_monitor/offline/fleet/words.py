@@ -48,7 +48,8 @@ def headline(fleet: Fleet) -> str:
     if fleet.failed:
         parts.append(f'{len(fleet.failed)} could not be')
     if fleet.duplicates:
-        parts.append(f'{_are(fleet.duplicates)} copies of others')
+        parts.append('1 is a copy of another' if len(fleet.duplicates) == 1 else
+                     f'{len(fleet.duplicates)} are copies of others')
     without = {row['path'] for row in fleet.rows if row['status'] is not None} - {
         row['path'] for row in fleet.rows if row['status'] in USABLE}
     if without:
@@ -70,10 +71,6 @@ def headline(fleet: Fleet) -> str:
         text += (' Nothing stands out.' if tested else
                  ' There are too few recordings a vehicle to tell what stands out.')
     return text
-
-
-def _are(found: Sequence[object]) -> str:
-    return f"{len(found)} {'is' if len(found) == 1 else 'are'}"
 
 
 def _listed(names: list[str], most: int = 5) -> str:

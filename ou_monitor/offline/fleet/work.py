@@ -15,8 +15,9 @@ from ou_monitor.online.risk import brownout_probability
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import NAN, Recording
 
-# A clock that says less than the year 2000 counts from a start-up, not from 1970.
-_EPOCH = 946684800.0
+# A clock that says less than the year 2000 counts from a start-up, not from 1970; one that says
+# more than 2100 does not count seconds.
+_EPOCH, _LATEST = 946684800.0, 4102444800.0
 # Levels nearer than this tell no slope over throttle.
 _SAG_SPAN = 0.1
 
@@ -114,7 +115,7 @@ def _analysed(path: str, options: Options) -> dict[str, Any]:
         return {
             'error': '', 'recording': recording.name,
             'vehicle': recording.source.get('vehicle', ''),
-            'start': start if start >= _EPOCH else NAN, 'duration_s': recording.duration,
+            'start': start if _EPOCH <= start < _LATEST else NAN, 'duration_s': recording.duration,
             'samples': recording.n, 'rate_hz': (recording.n - 1) / recording.duration,
             'sag': sag, 'sag_se': sag_se, 'risk_max': float(known.max()) if known.size else NAN,
             'alpha_p': analysis.alpha_test.p_value,

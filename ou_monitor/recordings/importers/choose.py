@@ -14,6 +14,7 @@ from pathlib import Path
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers.log import (
     ANY, clean, CURRENT, Log, Series, THROTTLE, VOLTAGE)
+from ou_monitor.recordings.samples import check_throttle
 
 # What leaves a quantity out.
 NONE = 'none'
@@ -74,6 +75,9 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
     if volts is None:
         raise InputError(_no_voltage(path, log))
     first = _pick(path, log, THROTTLE, throttle)
+    if first is not None and log.format == 'csv':
+        # Readers of autopilot logs know the scale of theirs; a column says nothing of it.
+        check_throttle(f'{path}: {first.name}', first.values)
     if current is not None:
         second = _pick(path, log, CURRENT, current)
     else:

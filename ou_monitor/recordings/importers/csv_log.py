@@ -48,6 +48,8 @@ def read(path: Path, request: Request) -> Log:
     wanted = [name for name in dict.fromkeys(header) if name in KNOWN or name in request.names]
     columns = read_columns(path, [TIME, *wanted])
     t = columns[0]
+    if not t.size:
+        raise InputError(f'{path} holds a header and no line below it')
     series = [Series(name, KNOWN.get(name, ANY), t, values, '1', 'column',
                      0 if name in KNOWN else None)
               for name, values in zip(wanted, columns[1:])]
