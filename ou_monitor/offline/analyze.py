@@ -24,6 +24,7 @@ from ou_monitor.offline.analysis.quality_list import quality_list, QualityItem
 from ou_monitor.offline.analysis.relaxation import fit_relaxation, Relaxation
 from ou_monitor.offline.analysis.settling import unsettled
 from ou_monitor.offline.analysis.steps import find_steps
+from ou_monitor.offline.analysis.stick import without_jitter
 from ou_monitor.offline.analysis.whitening import fresh
 from ou_monitor.offline.levels import find_levels, LoadLevel, Segment
 from ou_monitor.offline.pooling import disagreement, fit_stretch, pool
@@ -206,14 +207,15 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     tell: Progress = progress or (lambda share: None)
     voltage = _default_voltage(recording) if brownout_voltage is None else brownout_voltage
     found = find_levels(recording.t, recording.throttle, levels)
+    still = replace(recording, voltage=without_jitter(recording, found))
     results = []
     for k, level in enumerate(found):
-        results.append(_level(recording, level, len(found)))
+        results.append(_level(recording, still, level, len(found)))
         tell(0.5 * (k + 1) / len(found))
     judged = _judged(recording, results)
     throttles = [level.throttle for level in judged]
     estimates = [level.estimate for level in judged]
-    relaxations = _relaxations(recording, judged)
+    relaxations = _relaxations(still, judged)
     settling = unsettled(relaxations, throttles, estimates, [level.time for level in judged])
     moving = {x for item in settling for x in item.throttles}
     alpha = alpha_constancy(throttles, estimates, [level.doubted or level.throttle in moving
@@ -235,8 +237,8 @@ def _default_voltage(recording: Recording) -> float:
     return MonitorSettings().brownout_voltage if low <= middle <= high else NAN
 
 
-def _level(recording: Recording, level: LoadLevel, levels: int) -> LevelResult:
-    """Return the result of one level, its kind not judged yet."""
+def _level(recording: Recording, still: Recording, level: LoadLevel, levels: int) -> LevelResult:
+    """Return the result of one level, its kind not judged yet; `still` is without jitter."""
     segments = [s for s in level.segments if s.stop - s.start >= _MIN_SEGMENT]
     if not segments:
         segments = [s for s in level.segments if s.stop - s.start >= 2]
@@ -259,9 +261,10 @@ def _level(recording: Recording, level: LoadLevel, levels: int) -> LevelResult:
         n=deviation.size, mean=float(np.concatenate(parts).mean()),
         vpp=float(np.ptp(deviation)), peak=float(np.abs(deviation).max()),
         vrms=float(np.sqrt(np.mean(deviation ** 2))), deviation=deviation, estimate=estimate,
-        shape=examine_level([_kept(recording, s, estimate) for s in segments], estimate),
-        spectrum=level_spectrum(recording, segments, estimate),
-        lines=find_lines(parts, rate, levels=levels, memory=memory),
+        shape=examine_level([_kept(still, s, estimate) for s in segments], estimate),
+        spectrum=level_spectrum(still, segments, estimate),
+        lines=find_lines([still.voltage[s.start:s.stop] for s in segments], rate,
+                         levels=levels, memory=memory),
         notes=_level_notes(fits, estimate), scatter=scatter, scatter_p=disagreement(fits))
 
 

@@ -26,7 +26,7 @@ BoolArray = npt.NDArray[np.bool_]
 # holds the jitter of a careful stick or of a hover controller.
 HALF_WIDTH = 0.02
 # Of a stick that moves more it is this many of its standard deviations, and this at most.
-_SPREADS, _WIDEST = 2.5, 0.04
+_SPREADS, _WIDEST = 2.5, 0.03
 # Stretches over which the jitter is looked at, s, and the share of them that it holds for:
 # many a stick is still at idle and jitters only in flight.
 _LOOK, _QUIETER = 1.0, 0.75
