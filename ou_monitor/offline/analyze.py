@@ -19,6 +19,7 @@ from ou_monitor.offline.analysis.cause import Cause, judge_cause
 from ou_monitor.offline.analysis.level_sag import level_sags, LevelSag
 from ou_monitor.offline.analysis.level_tests import (
     adjusted, examine_level, FAMILY_WISE, holm, Shape)
+from ou_monitor.offline.analysis.line_removal import line_item, without_lines
 from ou_monitor.offline.analysis.lines import find_lines, LineSearch
 from ou_monitor.offline.analysis.quality_list import quality_list, QualityItem
 from ou_monitor.offline.analysis.relaxation import fit_relaxation, Relaxation
@@ -67,7 +68,7 @@ class LevelResult:
     deviation : ndarray, shape (n,)
         That deviation, V.
     estimate : Estimate
-        OU parameters, pooled over the segments.
+        OU parameters, pooled over the segments, of the voltage without its lines.
     shape : Shape
         Tests of the kind of process, adjusted over all levels.
     verdict : Verdict
@@ -78,6 +79,8 @@ class LevelResult:
         PSD, measured and fitted.
     lines : LineSearch
         Spectral lines, and what would have been found.
+    with_lines : Estimate or None
+        As the node would see the level, when its lines were taken out; None when they were not.
     notes : tuple of str
         What to know before using the numbers.
     scatter : float
@@ -104,6 +107,7 @@ class LevelResult:
     sag: LevelSag = LevelSag()
     spectrum: Spectrum = field(default_factory=Spectrum)
     lines: LineSearch = field(default_factory=LineSearch)
+    with_lines: Estimate | None = None
     notes: tuple[str, ...] = ()
     scatter: float = 1.0
     scatter_p: float = NAN
@@ -115,8 +119,9 @@ class LevelResult:
 
     @property
     def doubted(self) -> bool:
-        """Whether one OU in white noise does not describe it: lines, or another relaxation."""
-        return bool(self.lines.lines) or self.shape['one_relaxation'].rejects
+        """Whether one OU in white noise does not describe what was fitted."""
+        lines_in = bool(self.lines.lines) and self.with_lines is None
+        return lines_in or self.shape['one_relaxation'].rejects
 
     @property
     def crest(self) -> float:
@@ -218,6 +223,8 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     relaxations = _relaxations(still, judged)
     settling = unsettled(relaxations, throttles, estimates, [level.time for level in judged])
     moving = {x for item in settling for x in item.throttles}
+    lines = [line_item(level.throttle, level.estimate, level.with_lines) for level in judged
+             if level.lines.lines]
     alpha = alpha_constancy(throttles, estimates, [level.doubted or level.throttle in moving
                                                    for level in judged])
     sliding = slide(recording, window, voltage, brownout_horizon,
@@ -226,7 +233,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
         recording, judged, relaxations, tuple(judge_cause(r, alpha) for r in relaxations), alpha,
         by_throttle(sliding, recording.has_throttle), sliding,
         quality_list(recording, throttles, estimates, [level.notes for level in judged],
-                     settling),
+                     settling + lines),
         brownout_voltage is None, recording.notes + _left_out(recording, found))
 
 
@@ -247,25 +254,48 @@ def _level(recording: Recording, still: Recording, level: LoadLevel, levels: int
         return LevelResult(level.throttle, (), 0.0, 0, NAN, NAN, NAN, NAN, np.zeros(0), nothing,
                            examine_level([], nothing))
     fits = [fit_stretch(recording, s.start, s.stop) for s in segments]
-    estimate, scatter = pool(fits)
-    # Within a level throttle is meant to stand still.
-    flags = tuple(f for f in estimate.flags if f is not Flag.NO_EXCITATION)
-    estimate = replace(estimate, flags=flags)
+    estimate, scatter = _pooled(fits)
     parts = [recording.voltage[s.start:s.stop] for s in segments]
-    deviation = np.concatenate([v - v.mean() for v in parts])
     rate = segment_rate(recording, segments)
     memory = math.exp(-estimate.alpha / rate) if estimate.usable and rate > 0.0 else 0.0
+    lines = find_lines([still.voltage[s.start:s.stop] for s in segments], rate,
+                       levels=levels, memory=memory)
+    shape = examine_level([_kept(still, s, estimate) for s in segments], estimate)
+    with_lines = None
+    # Impulses at even distances have lines, too: those are not taken out.
+    if lines.lines and not holm([shape])[0]['impulses'].rejects:
+        with_lines = estimate
+        clean, quiet = (_without_lines(x, segments, rate, lines) for x in (recording, still))
+        fits = [fit_stretch(clean, s.start, s.stop) for s in segments]
+        estimate, scatter = _pooled(fits)
+        shape = examine_level([_kept(quiet, s, estimate) for s in segments], estimate)
+    deviation = np.concatenate([v - v.mean() for v in parts])
     return LevelResult(
         throttle=level.throttle, segments=tuple(segments),
         time=float(sum(recording.t[s.stop - 1] - recording.t[s.start] for s in segments)),
         n=deviation.size, mean=float(np.concatenate(parts).mean()),
         vpp=float(np.ptp(deviation)), peak=float(np.abs(deviation).max()),
         vrms=float(np.sqrt(np.mean(deviation ** 2))), deviation=deviation, estimate=estimate,
-        shape=examine_level([_kept(still, s, estimate) for s in segments], estimate),
-        spectrum=level_spectrum(still, segments, estimate),
-        lines=find_lines([still.voltage[s.start:s.stop] for s in segments], rate,
-                         levels=levels, memory=memory),
+        shape=shape, spectrum=level_spectrum(still, segments, estimate), lines=lines,
+        with_lines=with_lines,
         notes=_level_notes(fits, estimate), scatter=scatter, scatter_p=disagreement(fits))
+
+
+def _pooled(fits: Sequence[Estimate]) -> tuple[Estimate, float]:
+    """Return the estimate of a level and the scatter of its segments."""
+    estimate, scatter = pool(fits)
+    # Within a level throttle is meant to stand still.
+    return replace(estimate, flags=tuple(
+        flag for flag in estimate.flags if flag is not Flag.NO_EXCITATION)), scatter
+
+
+def _without_lines(recording: Recording, segments: Sequence[Segment], rate: float,
+                   lines: LineSearch) -> Recording:
+    """Return the recording without the spectral lines of a level, in its segments."""
+    voltage = recording.voltage.copy()
+    for s in segments:
+        voltage[s.start:s.stop] = without_lines(voltage[s.start:s.stop], rate, lines.lines)
+    return replace(recording, voltage=voltage)
 
 
 def _kept(recording: Recording, segment: Segment, estimate: Estimate

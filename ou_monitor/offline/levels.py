@@ -281,6 +281,8 @@ def stays(throttle: FloatArray, centres: Sequence[float], width: float
         In order of time, each with the number of its level; settling included.
 
     """
+    if not centres:
+        return []
     level = np.asarray(centres)
     nearest = _nearest(centres)
     inner = _inner(centres, width)

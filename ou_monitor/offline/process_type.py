@@ -135,10 +135,10 @@ def classify(estimate: Estimate, shape: Shape, line_share: float = 0.0) -> Verdi
     moves, figures = [], []
     if drift.rejects:
         moves.append('the mean moves')
-        figures.append(f'by {drift.effect:.2g} standard deviations, {_p(drift)}')
+        figures.append(f'the mean by {drift.effect:.2g} standard deviations, {_p(drift)}')
     if intensity.rejects:
         moves.append('the intensity changes')
-        figures.append(f'by {100.0 * intensity.effect:.0f} %, {_p(intensity)}')
+        figures.append(f'the intensity by {100.0 * intensity.effect:.0f} %, {_p(intensity)}')
     return Verdict(ProcessType.QUASI_STATIONARY,
                    f'from block to block {" and ".join(moves)}; apart from that '
                    f'{rest.kind.value}', '; '.join(figures), rest.kind)
@@ -190,8 +190,9 @@ def _gaussian(estimate: Estimate, shape: Shape, line_share: float, normal: str) 
     if rest.rejects:
         return _plain(ProcessType.STATIONARY, 'one relaxation leaves correlated innovations',
                       f'{_p(rest)}; {normal}')
+    beside = f'; beside lines of {100.0 * line_share:.2g} % of the variance' if line_share else ''
     return _plain(ProcessType.DIFFUSION, 'one relaxation, slower than the sampling, leaves '
-                  'independent Gaussian innovations', f'alpha dt = {step:.2g}; {normal}')
+                  'independent Gaussian innovations', f'alpha dt = {step:.2g}; {normal}{beside}')
 
 
 def _plain(kind: ProcessType, why: str, figures: str = '') -> Verdict:

@@ -104,6 +104,8 @@ def _level(level: LevelResult) -> dict[str, Any]:
                    'rms': line.rms, 'rms_ci95': [line.rms_low, line.rms_high],
                    'share_of_variance': line.share, 'p_value': line.p_value}
                   for line in level.lines.lines],
+        'with_lines': None if level.with_lines is None else {
+            name: getattr(level.with_lines, name) for name in ('alpha', 'sigma', 'var_inf')},
         'line_search': {'from_hz': level.lines.lowest, 'to_hz': level.lines.highest,
                         'tested': level.lines.tested, 'detectable_rms': level.lines.detectable,
                         'not_done': level.lines.why_not},
