@@ -14,7 +14,8 @@ hundred times.  The first that applies names the level:
 5. neighbours uncorrelated, or more white noise than relaxation, or relaxation
    faster than the sampling: 'Gaussian';
 6. lines carry most of the variance, or one relaxation does not leave
-   independent innovations: 'stationary stochastic'; if it does: 'diffusion';
+   independent innovations, or a second one is seen: 'stationary stochastic'; if it does:
+   'diffusion';
    without a usable fit 'undetermined'.
 
 Limits: a word stands for what was found, and the tests that did not reject
@@ -190,6 +191,11 @@ def _gaussian(estimate: Estimate, shape: Shape, line_share: float, normal: str) 
     if rest.rejects:
         return _plain(ProcessType.STATIONARY, 'one relaxation leaves correlated innovations',
                       f'{_p(rest)}; {normal}')
+    second = shape['second_relaxation']
+    if second.rejects:
+        return _plain(ProcessType.STATIONARY, 'a second relaxation, slower or faster, stands '
+                      'beside the one that was fitted: alpha is neither of them',
+                      f'some {100.0 * second.effect:.0f} % of Var_inf, {_p(second)}; {normal}')
     beside = f'; beside lines of {100.0 * line_share:.2g} % of the variance' if line_share else ''
     return _plain(ProcessType.DIFFUSION, 'one relaxation, slower than the sampling, leaves '
                   'independent Gaussian innovations', f'alpha dt = {step:.2g}; {normal}{beside}')

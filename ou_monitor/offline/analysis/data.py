@@ -10,7 +10,8 @@ from ou_monitor.offline.analysis.cause import Cause
 from ou_monitor.offline.analysis.level_tests import EFFECT, FAMILY_WISE, LEAST
 from ou_monitor.offline.analysis.lines import FALSE_ALARM
 from ou_monitor.offline.analysis.relaxation import Relaxation
-from ou_monitor.offline.analyze import Analysis, LevelResult
+from ou_monitor.offline.analyze import Analysis
+from ou_monitor.offline.level_result import LevelResult
 from ou_monitor.offline.words import headline
 
 

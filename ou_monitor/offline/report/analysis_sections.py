@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 from ou_monitor.offline.analysis.relaxation import Relaxation
-from ou_monitor.offline.analyze import Analysis, LevelResult
+from ou_monitor.offline.analyze import Analysis
+from ou_monitor.offline.level_result import LevelResult
 from ou_monitor.offline.report import page
 from ou_monitor.offline.report.cells import figure, probability, UNKNOWN
 from ou_monitor.offline.report.svg import Plot
