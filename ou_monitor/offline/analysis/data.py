@@ -125,7 +125,7 @@ def _relaxation(fit: Relaxation, cause: Cause) -> dict[str, Any]:
         'kind': fit.kind,
         'tau': fit.tau, 'tau_ci95': [fit.tau_low, fit.tau_high],
         'misfit': fit.misfit, 'misfit_p_value': fit.misfit_p, 'badly_fitted': fit.badly_fitted,
-        'likelihood_gain': fit.likelihood_gain,
+        'left_out_s': fit.left_out, 'likelihood_gain': fit.likelihood_gain,
         'tau_alpha': cause.ratio, 'tau_alpha_ci95': [cause.ratio_low, cause.ratio_high],
         'tau_alpha_p_value': cause.p_value,
         'against_noise': cause.noise,
