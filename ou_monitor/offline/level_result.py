@@ -254,7 +254,7 @@ def _scatter_notes(scatter: float, p: float) -> tuple[str, ...]:
 def _level_notes(fits: list[Estimate], pooled: Estimate) -> tuple[str, ...]:
     notes = []
     used = sum(e.usable for e in fits)
-    if not pooled.usable and len(fits) > 1:
+    if not pooled.usable and len({e.status for e in fits}) > 1:
         notes.append('Most of its segments are too short to be fitted, or show no relaxation.')
     elif used < len(fits) and len(fits) > 1:
         notes.append(f'{len(fits) - used} of {len(fits)} segments could not be fitted; alpha, '

@@ -195,10 +195,15 @@ def _gaussian(estimate: Estimate, shape: Shape, line_share: float, normal: str) 
     if second.rejects:
         return _plain(ProcessType.STATIONARY, 'a second relaxation, slower or faster, stands '
                       'beside the one that was fitted: alpha is neither of them',
-                      f'some {100.0 * second.effect:.0f} % of Var_inf, {_p(second)}; {normal}')
+                      f'{_share(second.effect)}, {_p(second)}; {normal}')
     beside = f'; beside lines of {100.0 * line_share:.2g} % of the variance' if line_share else ''
     return _plain(ProcessType.DIFFUSION, 'one relaxation, slower than the sampling, leaves '
                   'independent Gaussian innovations', f'alpha dt = {step:.2g}; {normal}{beside}')
+
+
+def _share(share: float) -> str:
+    """Return a share of Var_inf to first order, which beyond the whole says no more than that."""
+    return 'as large as Var_inf' if share > 1.0 else f'some {100.0 * share:.0f} % of Var_inf'
 
 
 def _plain(kind: ProcessType, why: str, figures: str = '') -> Verdict:

@@ -257,12 +257,18 @@ def test_a_rail_much_faster_than_the_instrument_is_left_out():
 
 def test_a_step_that_is_not_one_exponential_is_said_so():
     """
-    A rail of 10 ms behind a high-pass of 16 ms: its tau is not to be trusted, and the words say so.
+    A rail of 10 ms behind a high-pass of 16 ms: tau is not to be trusted, and the words say so.
 
+    Of twelve at least seven (17 of 20 were measured; binomial: 5e-3 below seven); the others say
+    what they left out.
     Of 40 plain sags of 0.4 V one may be called badly fitted (p = 1e-3 each).
     """
-    fit = behind_a_high_pass(1, 0.01)
-    assert fit.badly_fitted and fit.misfit_p < 1e-3
+    fits = [behind_a_high_pass(seed, 0.01) for seed in range(12)]
+    assert all(fit.caveat for fit in fits)
+    bad = [fit for fit in fits if fit.badly_fitted]
+    assert len(bad) >= 7
+    fit = bad[0]
+    assert fit.misfit_p < 1e-3
     # The interval excludes both time constants.
     assert fit.tau_low > 1.0 / (2.0 * math.pi * 10.0)
     assert 'not describe it' in fit.caveat and 'trusted' in fit.caveat

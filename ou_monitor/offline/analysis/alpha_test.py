@@ -90,7 +90,7 @@ class AlphaTest:
         seen = (f'a change by a factor of {_factor(self.detectable_ratio)} from the lowest to the '
                 'highest throttle would have been seen (90 %)')
         if self.verdict == 'differs':
-            return (f'Alpha is not the same at all loads (p = {self.p_value:.1g}): from the '
+            return (f'Alpha is not the same at all loads (p = {self.p_value:.2g}): from the '
                     f'lowest to the highest throttle it changes by a factor of '
                     f'{_factor(self.ratio)} (95 % {_factor(self.ratio_low)} to '
                     f'{_factor(self.ratio_high)}); '

@@ -132,8 +132,9 @@ def _of_units(recording: Recording) -> list[QualityItem]:
     if middle > _MOST_VOLTS:
         items.append(QualityItem('VOLTAGE_UNIT', Severity.WARNING, (
             f'Half of the voltages are beyond {middle:.4g}, as no supply of a UAV is in volts: '
-            'millivolts, or counts of an ADC? Alpha and tau hold; everything in volts is wrong by '
-            'that factor: divide by it (of a bag: unit_factor of a msg config).')))
+            'millivolts, or counts of an ADC? Alpha and tau hold all the same; what is given in V '
+            'is in that unit instead, and there is no risk: divide millivolts by 1000 (of a bag: '
+            'unit_factor of a msg config).')))
     known = recording.throttle[np.isfinite(recording.throttle)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
     if low < -HALF_WIDTH or high > 1.0 + HALF_WIDTH:
