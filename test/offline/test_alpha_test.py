@@ -105,8 +105,8 @@ def test_levels_that_one_ou_does_not_describe_are_withheld():
     found = alpha_constancy(THROTTLES, four, [False, False, False, True])
     assert (found.verdict, found.levels, found.withheld) == ('constant', 3, (0.7,))
     assert found.sentence.endswith(
-        'Withheld: 70 %, where more than one relaxation is seen, lines stand beside impulses, or '
-        'a change of throttle still settles.')
+        'Withheld: 70 %; more than one relaxation is seen there or at another level, lines stand '
+        'beside impulses, or a change of throttle still settles.')
     alone = alpha_constancy(THROTTLES, four, [False, True, True, True])
     assert alone.verdict == 'undetermined' and 'cannot be told: one load' in alone.sentence
     none = alpha_constancy(THROTTLES, four, [True] * 4)

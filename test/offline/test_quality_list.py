@@ -62,7 +62,7 @@ def test_millivolts_are_called_so(factor, named):
 
 
 @pytest.mark.parametrize('low, high, named', [
-    (0.0, 1.0, False), (-0.01, 1.01, False), (-0.4, 1.0, True), (0.0, 1.3, True)])
+    (0.0, 1.0, False), (-0.04, 1.04, False), (-0.4, 1.0, True), (0.0, 1.3, True)])
 def test_a_throttle_outside_of_its_range_is_called_so(low, high, named):
     """Reverse thrust, or a stick that goes both ways; a little beyond is trim."""
     made = recording(3, ((0.1, 0.3),))

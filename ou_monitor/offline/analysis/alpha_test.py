@@ -79,8 +79,8 @@ class AlphaTest:
         if not self.withheld:
             return ''
         names = ', '.join('all' if math.isnan(x) else f'{100.0 * x:.3g} %' for x in self.withheld)
-        return (f' Withheld: {names}, where more than one relaxation is seen, lines stand beside '
-                'impulses, or a change of throttle still settles.')
+        return (f' Withheld: {names}; more than one relaxation is seen there or at another level, '
+                'lines stand beside impulses, or a change of throttle still settles.')
 
     def _verdict(self) -> str:
         if self.levels < 2:

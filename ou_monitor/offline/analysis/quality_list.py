@@ -14,7 +14,7 @@ import enum
 import math
 
 import numpy as np
-from ou_monitor.offline.levels import GAP_STEPS, HALF_WIDTH
+from ou_monitor.offline.levels import GAP_STEPS
 from ou_monitor.online.quality import examine, TAIL
 from ou_monitor.records import Estimate, Flag, Recording, Status
 
@@ -24,6 +24,9 @@ _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
 _UNEVEN = 0.05
 # No supply of a UAV has more, V; the millivolts of any do.
 _MOST_VOLTS = 1000.0
+# Throttle may go beyond 0..1 by so much, as sticks out of trim do, and by more for so small a
+# share of the samples.
+_TRIM, _RARE = 0.05, 0.01
 # Stretches of samples looked at for ADC steps.
 _LOOKS = 8
 # What the reader's sentences are about: a word in them, the name, and whether numbers suffer.
@@ -136,8 +139,8 @@ def _of_units(recording: Recording) -> list[QualityItem]:
             'is in that unit instead, and there is no risk: divide millivolts by 1000 (of a bag: '
             'unit_factor of a msg config).')))
     known = recording.throttle[np.isfinite(recording.throttle)]
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    if low < -HALF_WIDTH or high > 1.0 + HALF_WIDTH:
+    low, high = np.quantile(known, (_RARE, 1.0 - _RARE)) if known.size else (0.0, 1.0)
+    if low < -_TRIM or high > 1.0 + _TRIM:
         items.append(QualityItem('THROTTLE_RANGE', Severity.WARNING, (
             f'Throttle runs from {low:.3g} to {high:.3g}, and 0 to 1 is expected: the curves, the '
             'risk and the throttle budget know nothing outside, and sag counts from the lowest '

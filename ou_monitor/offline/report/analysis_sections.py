@@ -21,7 +21,7 @@ _MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
 _LEAST_RISK = 1e-9
 _TESTS = {'mean_drift': 'Mean moves', 'variance_drift': 'Intensity moves',
           'gaussian': 'Not Gaussian', 'impulses': 'Impulses', 'correlated': 'Correlated',
-          'one_relaxation': 'More than one relaxation'}
+          'one_relaxation': 'Not one relaxation', 'second_relaxation': 'Second relaxation'}
 
 
 def quality(analysis: Analysis) -> str:
