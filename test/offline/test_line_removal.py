@@ -82,7 +82,7 @@ BAD = Estimate(status=Status.NO_RELAXATION)
     (GOOD, BAD, Severity.WARNING, 'only then'),
     (BAD, GOOD, Severity.WARNING, 'nothing that can be fitted'),
     (BAD, BAD, Severity.INFO, 'nothing that can be fitted'),
-    (GOOD, None, Severity.WARNING, 'left in')])
+    (GOOD, None, Severity.WARNING, 'left in'), (BAD, None, Severity.INFO, 'left in')])
 def test_it_warns_where_the_numbers_hang_on_it(without, with_lines, severity, words):
     """Out of the 95 % interval, or a fit with and none without."""
     item = line_item(0.4, without, with_lines)

@@ -85,7 +85,8 @@ def line_item(throttle: float, without: Estimate, with_lines: Estimate | None) -
 
     """
     if with_lines is None:
-        return QualityItem('LINES_LEFT_IN', Severity.WARNING, (
+        worry = Severity.WARNING if without.usable else Severity.INFO
+        return QualityItem('LINES_LEFT_IN', worry, (
             'Impulses stand beside spectral lines, which may be theirs and were left in: alpha '
             'and sigma hold both.'), (throttle,))
     taken = 'Spectral lines were taken out before the fit'
