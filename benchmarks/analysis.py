@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from ou_monitor.model.ou import simulate  # noqa: E402, I100
-from ou_monitor.offline import analyze as module  # noqa: E402
+from ou_monitor.offline import analyze as module, level_result  # noqa: E402
 from ou_monitor.offline.analyze import Analysis, analyze  # noqa: E402
 from ou_monitor.recordings.read import read_recording  # noqa: E402
 from ou_monitor.records import FloatArray, Recording  # noqa: E402
@@ -157,14 +157,15 @@ def costs() -> None:
     throttle = np.repeat(np.tile([0.1, 0.4, 0.25, 0.6], 15), 10_000)
     long = Recording(t, simulate(t, ALPHA, 0.2 + throttle, rng, u0=5.0 - 0.3 * throttle),
                      throttle, '10 minutes at 1 kHz')
-    parts = {'fit of the levels': 'fit_stretch', 'tests': 'examine_level', 'lines': 'find_lines',
-             'spectra': 'level_spectrum', 'transients': '_relaxations',
-             'sliding window and curves': 'slide'}
+    parts = {'fit of the levels': (level_result, 'fit_stretch'),
+             'tests': (level_result, 'examine_level'), 'lines': (level_result, 'find_lines'),
+             'spectra': (level_result, 'level_spectrum'), 'transients': (module, '_relaxations'),
+             'sliding window and curves': (module, 'slide')}
     for recording in (read_recording(ROOT / 'bags' / 'flight'), long):
         # The table of first passage is made once a process.
         analyze(recording)
         spent = dict.fromkeys(parts, 0.0)
-        originals = {name: getattr(module, name) for name in parts.values()}
+        originals = {label: getattr(*place) for label, place in parts.items()}
 
         def timed(label: str, call: Callable[..., object]) -> Callable[..., object]:
             def run(*args: object, **kwargs: object) -> object:
@@ -175,13 +176,13 @@ def costs() -> None:
                     spent[label] += time.perf_counter() - start
             return run
 
-        for label, name in parts.items():
-            setattr(module, name, timed(label, originals[name]))
+        for label, (where, name) in parts.items():
+            setattr(where, name, timed(label, originals[label]))
         start = time.perf_counter()
         analyze(recording)
         whole = time.perf_counter() - start
-        for name, call in originals.items():
-            setattr(module, name, call)
+        for label, (where, name) in parts.items():
+            setattr(where, name, originals[label])
         print(f'  {recording.name}: {whole:.2f} s, of which ' + ', '.join(
             f'{label} {100.0 * s / whole:.0f} %' for label, s in spent.items()))
 

@@ -6,9 +6,11 @@ import math
 
 from ou_monitor.cli.output import item, paragraph, table
 from ou_monitor.offline.analysis.relaxation import Relaxation
-from ou_monitor.offline.analyze import Analysis, LevelResult
+from ou_monitor.offline.analyze import Analysis
+from ou_monitor.offline.level_result import LevelResult
 from ou_monitor.offline.words import (
     brownout_sentence, caution, headline, number, relaxation_sentence)
+from ou_monitor.records import Recording
 
 _UNKNOWN = '-'
 # Rows of a table for people; the JSON has them all.
@@ -34,10 +36,25 @@ def render(analysis: Analysis) -> str:
     rate = (recording.n - 1) / recording.duration if recording.duration > 0.0 else math.nan
     parts = [
         f'{recording.name}: {recording.n} samples in {recording.duration:.4g} s '
-        f'({number(rate)} Hz)', paragraph(headline(analysis)), _levels(analysis),
+        f'({number(rate)} Hz)\n{_origin(recording)}', paragraph(headline(analysis)),
+        _levels(analysis),
         _parameters(analysis), _kinds(analysis), _lines(analysis), _transients(analysis),
         paragraph(analysis.alpha_test.sentence), _by_throttle(analysis), _remarks(analysis)]
     return '\n\n'.join(part for part in parts if part)
+
+
+def _origin(recording: Recording) -> str:
+    """Say which topics or columns voltage and throttle came from."""
+    source, origins = recording.source, []
+    if 'voltage_topic' not in source:
+        throttle = 'column throttle' if recording.has_throttle else 'none'
+        return f'voltage: column voltage_v; throttle: {throttle}'
+    for name in ('voltage', 'throttle'):
+        kind = source.get(f'{name}_type', '').split('/')[-1]
+        origins.append(f'{name}: ' + (
+            f'{source[f"{name}_topic"]} ({kind}.{source.get(f"{name}_field", "")})'
+            if f'{name}_topic' in source else 'none'))
+    return paragraph('; '.join([*origins, f'config: {source["msg_config"]}']))
 
 
 def _levels(analysis: Analysis) -> str:

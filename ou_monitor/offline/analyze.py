@@ -1,131 +1,32 @@
-"""
-A recording -> the paper's Tables 1 and 2 for it, with intervals.
-
-Every number of the OU comes from the estimator that flies
-(`ou_monitor.online.estimator.SlidingEstimator`); here it gets a window as
-long as the stretch of constant load.
-"""
+"""A recording -> the paper's Tables 1 and 2 for it, with intervals, and what they rest on."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
 from ou_monitor.offline.analysis.alpha_test import alpha_constancy, AlphaTest
 from ou_monitor.offline.analysis.by_throttle import by_throttle, ByThrottle
 from ou_monitor.offline.analysis.cause import Cause, judge_cause
-from ou_monitor.offline.analysis.level_sag import level_sags, LevelSag
-from ou_monitor.offline.analysis.level_tests import (
-    adjusted, examine_level, FAMILY_WISE, holm, Shape)
-from ou_monitor.offline.analysis.lines import find_lines, LineSearch
+from ou_monitor.offline.analysis.line_removal import line_item
 from ou_monitor.offline.analysis.quality_list import quality_list, QualityItem
 from ou_monitor.offline.analysis.relaxation import fit_relaxation, Relaxation
+from ou_monitor.offline.analysis.second_relaxation import second_items
 from ou_monitor.offline.analysis.settling import unsettled
 from ou_monitor.offline.analysis.steps import find_steps
-from ou_monitor.offline.analysis.whitening import fresh
-from ou_monitor.offline.levels import find_levels, LoadLevel, Segment
-from ou_monitor.offline.pooling import disagreement, fit_stretch, pool
-from ou_monitor.offline.process_type import classify, ProcessType, Verdict
+from ou_monitor.offline.analysis.stick import without_jitter
+from ou_monitor.offline.level_result import fit_level, judge_levels, LevelResult
+from ou_monitor.offline.levels import find_levels, LoadLevel
 from ou_monitor.offline.sliding import slide, Sliding
-from ou_monitor.offline.spectrum import level_spectrum, segment_rate, Spectrum
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Recording, Status
+from ou_monitor.records import NAN, Recording
 
 Progress = Callable[[float], None]
 
 # Voltages, V, between which the median of a 5 V rail lies.
 RAIL = (4.0, 6.0)
-# Fewer samples than this are not even offered to the estimator.
-_MIN_SEGMENT = 16
-# Intervals widened by more than this factor are spoken of.
-_WIDENED = 1.5
-
-
-@dataclass(frozen=True, eq=False)
-class LevelResult:
-    """
-    What one load level shows.
-
-    Attributes
-    ----------
-    throttle : float
-        Throttle, 0..1; NaN for a level that holds the whole recording.
-    segments : tuple of Segment
-        Stretches of samples that were used.
-    time : float
-        Time in them, s.
-    n : int
-        Samples in them.
-    mean : float
-        Mean voltage, V.
-    vpp, peak, vrms : float
-        Peak to peak, largest absolute value and rms of the deviation from the
-        mean of its segment, V (as an AC-coupled oscilloscope would show it).
-    deviation : ndarray, shape (n,)
-        That deviation, V.
-    estimate : Estimate
-        OU parameters, pooled over the segments.
-    shape : Shape
-        Tests of the kind of process, adjusted over all levels.
-    verdict : Verdict
-        Kind of process, and why.
-    sag : LevelSag
-        How far the mean lies below that of the lowest throttle.
-    spectrum : Spectrum
-        PSD, measured and fitted.
-    lines : LineSearch
-        Spectral lines, and what would have been found.
-    notes : tuple of str
-        What to know before using the numbers.
-    scatter : float
-        How much more its segments differ than their errors allow; those of the pooled estimate
-        are already widened by it.
-    scatter_p : float
-        Probability that segments of one process differ as much, after Holm over all levels; NaN
-        with fewer than two segments.
-
-    """
-
-    throttle: float
-    segments: tuple[Segment, ...]
-    time: float
-    n: int
-    mean: float
-    vpp: float
-    peak: float
-    vrms: float
-    deviation: FloatArray
-    estimate: Estimate
-    shape: Shape
-    verdict: Verdict = Verdict(ProcessType.UNDETERMINED, 'not judged')
-    sag: LevelSag = LevelSag()
-    spectrum: Spectrum = field(default_factory=Spectrum)
-    lines: LineSearch = field(default_factory=LineSearch)
-    notes: tuple[str, ...] = ()
-    scatter: float = 1.0
-    scatter_p: float = NAN
-
-    @property
-    def kind(self) -> ProcessType:
-        """Kind of process."""
-        return self.verdict.kind
-
-    @property
-    def doubted(self) -> bool:
-        """Whether one OU in white noise does not describe it: lines, or another relaxation."""
-        return bool(self.lines.lines) or self.shape['one_relaxation'].rejects
-
-    @property
-    def crest(self) -> float:
-        """Vpp over Vrms, dimensionless."""
-        return self.vpp / self.vrms if self.vrms > 0.0 else NAN
-
-    @property
-    def label(self) -> str:
-        """Name of the level for people."""
-        return 'all' if math.isnan(self.throttle) else f'{100.0 * self.throttle:.3g} %'
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,25 +110,31 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     tell: Progress = progress or (lambda share: None)
     voltage = _default_voltage(recording) if brownout_voltage is None else brownout_voltage
     found = find_levels(recording.t, recording.throttle, levels)
+    still = replace(recording, voltage=without_jitter(recording, found))
     results = []
     for k, level in enumerate(found):
-        results.append(_level(recording, level, len(found)))
+        results.append(fit_level(recording, still, level, len(found)))
         tell(0.5 * (k + 1) / len(found))
-    judged = _judged(recording, results)
+    judged = judge_levels(recording, results)
     throttles = [level.throttle for level in judged]
     estimates = [level.estimate for level in judged]
-    relaxations = _relaxations(recording, judged)
+    relaxations = _relaxations(still, judged)
     settling = unsettled(relaxations, throttles, estimates, [level.time for level in judged])
     moving = {x for item in settling for x in item.throttles}
-    alpha = alpha_constancy(throttles, estimates, [level.doubted or level.throttle in moving
-                                                   for level in judged])
+    lines = [line_item(level.throttle, level.estimate, level.with_lines) for level in judged
+             if level.lines.lines]
+    # A second relaxation is the supply's: where it is too faint to be seen it still bends alpha.
+    wanders = any(level.wanders for level in judged)
+    alpha = alpha_constancy(throttles, estimates, [
+        wanders or level.doubted or level.throttle in moving for level in judged])
     sliding = slide(recording, window, voltage, brownout_horizon,
                     lambda share: tell(0.5 + 0.5 * share))
     return Analysis(
         recording, judged, relaxations, tuple(judge_cause(r, alpha) for r in relaxations), alpha,
         by_throttle(sliding, recording.has_throttle), sliding,
         quality_list(recording, throttles, estimates, [level.notes for level in judged],
-                     settling),
+                     settling + lines + second_items(
+                         [level.throttle for level in judged if level.wanders])),
         brownout_voltage is None, recording.notes + _left_out(recording, found))
 
 
@@ -236,59 +143,6 @@ def _default_voltage(recording: Recording) -> float:
     low, high = RAIL
     middle = float(np.median(recording.voltage)) if recording.n else NAN
     return MonitorSettings().brownout_voltage if low <= middle <= high else NAN
-
-
-def _level(recording: Recording, level: LoadLevel, levels: int) -> LevelResult:
-    """Return the result of one level, its kind not judged yet."""
-    segments = [s for s in level.segments if s.stop - s.start >= _MIN_SEGMENT]
-    if not segments:
-        segments = [s for s in level.segments if s.stop - s.start >= 2]
-    if not segments:
-        nothing = Estimate(throttle=level.throttle, status=Status.TOO_FEW_SAMPLES)
-        return LevelResult(level.throttle, (), 0.0, 0, NAN, NAN, NAN, NAN, np.zeros(0), nothing,
-                           examine_level([], nothing))
-    fits = [fit_stretch(recording, s.start, s.stop) for s in segments]
-    estimate, scatter = pool(fits)
-    # Within a level throttle is meant to stand still.
-    flags = tuple(f for f in estimate.flags if f is not Flag.NO_EXCITATION)
-    estimate = replace(estimate, flags=flags)
-    parts = [recording.voltage[s.start:s.stop] for s in segments]
-    deviation = np.concatenate([v - v.mean() for v in parts])
-    rate = segment_rate(recording, segments)
-    memory = math.exp(-estimate.alpha / rate) if estimate.usable and rate > 0.0 else 0.0
-    return LevelResult(
-        throttle=level.throttle, segments=tuple(segments),
-        time=float(sum(recording.t[s.stop - 1] - recording.t[s.start] for s in segments)),
-        n=deviation.size, mean=float(np.concatenate(parts).mean()),
-        vpp=float(np.ptp(deviation)), peak=float(np.abs(deviation).max()),
-        vrms=float(np.sqrt(np.mean(deviation ** 2))), deviation=deviation, estimate=estimate,
-        shape=examine_level([_kept(recording, s, estimate) for s in segments], estimate),
-        spectrum=level_spectrum(recording, segments, estimate),
-        lines=find_lines(parts, rate, levels=levels, memory=memory),
-        notes=_level_notes(fits, estimate), scatter=scatter, scatter_p=disagreement(fits))
-
-
-def _kept(recording: Recording, segment: Segment, estimate: Estimate
-          ) -> tuple[FloatArray, FloatArray]:
-    """Return stamps and voltages of a segment, repeats of the logger left out."""
-    t = recording.t[segment.start:segment.stop]
-    voltage = recording.voltage[segment.start:segment.stop]
-    keep = fresh(voltage, estimate)
-    return t[keep], voltage[keep]
-
-
-def _judged(recording: Recording, results: Sequence[LevelResult]) -> tuple[LevelResult, ...]:
-    """Name the kind of each level, the tests of all adjusted together; and compare means."""
-    shapes = holm([level.shape for level in results])
-    sags = level_sags(recording, [level.throttle for level in results],
-                      [level.segments for level in results],
-                      [level.estimate for level in results], [level.vrms for level in results])
-    apart = adjusted([level.scatter_p for level in results])
-    return tuple(
-        replace(level, shape=shape, sag=sag, scatter_p=p,
-                notes=level.notes + _scatter_notes(level.scatter, p), verdict=classify(
-                    level.estimate, shape, sum(line.share for line in level.lines.lines)))
-        for level, shape, sag, p in zip(results, shapes, sags, apart))
 
 
 def _relaxations(recording: Recording, levels: Sequence[LevelResult]) -> tuple[Relaxation, ...]:
@@ -301,29 +155,6 @@ def _relaxations(recording: Recording, levels: Sequence[LevelResult]) -> tuple[R
         fit_relaxation(recording, kind, [step for step, down in zip(steps, falls)
                                          if down == wanted], throttles, estimates, rms)
         for kind, wanted in (('release', True), ('load', False)))
-
-
-def _scatter_notes(scatter: float, p: float) -> tuple[str, ...]:
-    """Say that the segments differ: that they are not one process, or only what was widened."""
-    if p < FAMILY_WISE:
-        return (f'Its segments differ {scatter:.1f} times more than sampling allows (p = '
-                f'{p:.1g}): the level is not one process; the intervals were widened by that '
-                'factor.',)
-    if scatter > _WIDENED:
-        return (f'The intervals are wider by a factor of {scatter:.1f}, by which its segments '
-                'scatter more than their errors; so much comes by chance.',)
-    return ()
-
-
-def _level_notes(fits: list[Estimate], pooled: Estimate) -> tuple[str, ...]:
-    notes = []
-    used = sum(e.usable for e in fits)
-    if not pooled.usable and len(fits) > 1:
-        notes.append('Most of its segments are too short to be fitted, or show no relaxation.')
-    elif used < len(fits) and len(fits) > 1:
-        notes.append(f'{len(fits) - used} of {len(fits)} segments could not be fitted; alpha, '
-                     'sigma and Var_inf rest on the others.')
-    return tuple(notes)
 
 
 def _left_out(recording: Recording, found: tuple[LoadLevel, ...]) -> tuple[str, ...]:

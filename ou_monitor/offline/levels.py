@@ -1,14 +1,17 @@
 """
 Load levels: which stretches of a recording were flown at which throttle.
 
-A level is a throttle at which much time was spent; its segments are the
-unbroken stretches within `HALF_WIDTH` of it.  Limits: throttle is a command,
-not a current, so two stretches at one throttle can carry different loads; and
-a stretch is only as stationary as its throttle says.
+A level is a throttle that was held: its segments begin within the half width of it, and end where
+throttle leaves twice that, so that the jitter of a stick breaks none of them.  The half width is
+`HALF_WIDTH`, or as much more as the stick moves while it is held.  A steady ramp through a
+throttle is no stay at it.  Limits: throttle is a command, not a current, so two stretches at one
+throttle can carry different loads; a stretch is only as stationary as its throttle says; levels
+closer than the jitter of the stick are one.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
@@ -20,24 +23,35 @@ from ou_monitor.records import FloatArray, NAN
 BoolArray = npt.NDArray[np.bool_]
 
 # The paper's levels lie 5 % apart; +-2 % keeps neighbours apart and still
-# holds the jitter of a stick or of a hover controller.
+# holds the jitter of a careful stick or of a hover controller.
 HALF_WIDTH = 0.02
+# Of a stick that moves more it is this many of its standard deviations, and this at most.
+_SPREADS, _WIDEST = 2.5, 0.03
+# Stretches over which the jitter is looked at, s, and the share of them that it holds for:
+# many a stick is still at idle and jitters only in flight.
+_LOOK, _QUIETER = 1.0, 0.75
 # Left out after throttle came from more than two half widths away: six
 # relaxation times of the paper's rail (tau = 15.9 ms), when 0.2 % of the step
 # is left.
 SETTLE = 0.1
-# A level needs this share of the recording (and this many seconds) to be
-# found without being asked for.
-MIN_SHARE = 0.02
+# A level needs this share of the recording, or one stay as long as this, s, to be
+# found without being asked for: a few seconds at full throttle matter in any flight.
+MIN_SHARE, LONG_STAY = 0.02, 2.0
+# Time at a throttle, s, from which it is looked at.
 MIN_TIME = 0.25
 # And one stretch that can be fitted by itself, s: thirty relaxation times of the
 # paper's rail.  A ramp that lingers here and there is no level where others are.
 MIN_STRETCH = 0.5
-MAX_LEVELS = 10
+MAX_LEVELS = 20
+# A stretch shorter than this, s, through which throttle goes steadily is a passage: quarters at
+# its ends differ by more than this share of its range (of a ramp 0.75), and of the half width.
+_PASSAGE, _STEADY, _CROSSED = 3.0, 0.65, 0.75
 # A pause of more than this many median steps breaks a segment.
 GAP_STEPS = 20.0
 
 _GRID = 0.0025
+# Between two levels time falls to less than this share of that at the lesser of them.
+_VALLEY = 0.7
 
 
 @dataclass(frozen=True)
@@ -99,69 +113,90 @@ def find_levels(t: FloatArray, throttle: FloatArray,
     """
     if not t.size:
         return ()
-    broken = _gaps(t)
-    centres = _checked(given) if given is not None else _modes(t, throttle)
+    width = half_width(t, throttle)
+    if given is not None:
+        return _split(t, throttle, _checked(given), width, True)
+    whole = (LoadLevel(NAN, tuple(_cut(Segment(0, t.size), _gaps(t)))),)
+    centres = _modes(t, throttle, width)
     while centres:
-        found = _split(t, throttle, centres, broken, given is not None)
-        held = [given is not None or _longest(t, level) >= _least(t) for level in found]
-        if all(held) or not any(held):
+        found = _split(t, throttle, centres, width, False)
+        held = [_held(t, level) for level in found]
+        if all(held):
+            return _most(t, found)
+        if not any(held):
             # Where every stay is short, short stays are all there is to tell from.
-            return found
+            enough = 0.5 * float(t[-1] - t[0]) <= sum(_time(t, level) for level in found)
+            return _most(t, found) if enough else whole
         # What was taken for a level may be its neighbours'.
         centres = [centre for centre, kept in zip(centres, held) if kept]
-    return (LoadLevel(NAN, _runs(np.ones(t.size, dtype=np.bool_), broken)),)
+    return whole
 
 
-def _least(t: FloatArray) -> float:
-    """Return the stretch that a level needs, s; a short recording may be all one level."""
-    return min(MIN_STRETCH, 0.25 * float(t[-1] - t[0]))
-
-
-def _longest(t: FloatArray, level: LoadLevel) -> float:
-    """Return the longest stretch of a level, s; settling left out."""
-    return max((float(t[s.stop - 1] - t[s.start]) for s in level.segments), default=0.0)
-
-
-def _split(t: FloatArray, throttle: FloatArray, centres: list[float], broken: BoolArray,
-           named: bool) -> tuple[LoadLevel, ...]:
-    """Give each sample near a centre to the nearest one."""
-    nearest = np.abs(throttle[:, None] - np.asarray(centres)[None, :])
-    nearest[~np.isfinite(nearest)] = math.inf
-    owner = nearest.argmin(axis=1)
-    reach = HALF_WIDTH
-    if len(centres) > 1:
-        reach = min(reach, 0.5 * float(np.diff(centres).min()))
-    inside = nearest.min(axis=1) <= reach + 1e-9
-    found = []
-    for k, centre in enumerate(centres):
-        runs = _runs(inside & (owner == k), broken)
-        away = ~(np.abs(throttle - centre) <= 2.0 * HALF_WIDTH)
-        kept, lost = _settle(t, runs, away, broken)
-        mean = centre
-        if not named and kept:
-            mean = float(np.median(np.concatenate([throttle[s.start:s.stop] for s in kept])))
-        found.append(LoadLevel(mean, kept, lost))
-    return tuple(found)
-
-
-def runs_at(t: FloatArray, throttle: FloatArray, centre: float) -> tuple[Segment, ...]:
+def half_width(t: FloatArray, throttle: FloatArray) -> float:
     """
-    Return the unbroken stretches within `HALF_WIDTH` of a throttle, settling included.
+    Return how far from its middle a level reaches.
 
     Parameters
     ----------
     t, throttle : ndarray, shape (n,)
         Stamps, s, and throttle 0..1.
-    centre : float
-        Throttle of the level.
 
     Returns
     -------
-    tuple of Segment
-        In order of time.
+    float
+        `HALF_WIDTH`, or more where the stick moves more while it is held: from the medians of
+        stretches of a second, so that steps do not count.
 
     """
-    return _runs(np.abs(throttle - centre) <= HALF_WIDTH + 1e-9, _gaps(t))
+    known = throttle[np.isfinite(throttle)]
+    step = float(np.median(np.diff(t))) if t.size > 1 else 0.0
+    size = max(8, round(_LOOK / step)) if step > 0.0 else known.size + 1
+    blocks = known[:known.size // size * size].reshape(-1, size)
+    if not blocks.size:
+        return HALF_WIDTH
+    away = np.abs(blocks - np.median(blocks, axis=1, keepdims=True))
+    jitter = float(np.quantile(np.median(away, axis=1), _QUIETER)) / 0.6745
+    return max(HALF_WIDTH, min(_WIDEST, _SPREADS * jitter))
+
+
+def _time(t: FloatArray, level: LoadLevel) -> float:
+    """Return the time at a level, s; settling left out."""
+    return sum(float(t[s.stop - 1] - t[s.start]) for s in level.segments)
+
+
+def _held(t: FloatArray, level: LoadLevel) -> bool:
+    """Tell whether a level was held: a long stretch, or one of some length and a share of time."""
+    whole = float(t[-1] - t[0])
+    longest = max((float(t[s.stop - 1] - t[s.start]) for s in level.segments), default=0.0)
+    # A short recording may be all one level.
+    return longest >= min(MIN_STRETCH, 0.25 * whole) and (
+        longest >= LONG_STAY or _time(t, level) >= MIN_SHARE * whole)
+
+
+def _most(t: FloatArray, found: tuple[LoadLevel, ...]) -> tuple[LoadLevel, ...]:
+    """Return the levels at which most time was spent, in their order."""
+    least = sorted((_time(t, level) for level in found), reverse=True)[:MAX_LEVELS][-1]
+    return tuple(level for level in found if _time(t, level) >= least)[:MAX_LEVELS]
+
+
+def _split(t: FloatArray, throttle: FloatArray, centres: list[float], width: float,
+           named: bool) -> tuple[LoadLevel, ...]:
+    """Give each level its stretches; passages through a level that nobody named are left out."""
+    broken = _gaps(t)
+    runs: list[list[Segment]] = [[] for _ in centres]
+    for run, k in stays(throttle, centres, width):
+        runs[k] += _cut(run, broken)
+    found = []
+    for centre, inner, mine in zip(centres, _inner(centres, width), runs):
+        if not named:
+            mine = [run for run in mine if not _passage(t, throttle, run, inner)]
+        away = ~(np.abs(throttle - centre) <= 2.0 * width)
+        kept, lost = _settle(t, mine, away, broken)
+        mean = centre
+        if not named and kept:
+            mean = float(np.median(np.concatenate([throttle[s.start:s.stop] for s in kept])))
+        found.append(LoadLevel(mean, kept, lost))
+    return tuple(found)
 
 
 def _checked(given: tuple[float, ...]) -> list[float]:
@@ -183,50 +218,129 @@ def _gaps(t: FloatArray) -> BoolArray:
     return np.concatenate(([False], steps > GAP_STEPS * np.median(steps)))
 
 
-def _modes(t: FloatArray, throttle: FloatArray) -> list[float]:
-    """Return the throttles at which most time was spent, increasing."""
+def _modes(t: FloatArray, throttle: FloatArray, width: float) -> list[float]:
+    """Return the throttles at which time was spent, increasing."""
     known = np.isfinite(throttle)
     if not known.any():
         return []
     steps = np.diff(t, append=t[-1])
     steps = np.minimum(steps, GAP_STEPS * max(float(np.median(steps)), 1e-9))
     value, spent = throttle[known], steps[known]
-    low = float(value.min()) - HALF_WIDTH
-    bins = int(math.ceil((float(value.max()) + HALF_WIDTH - low) / _GRID)) + 1
+    low = float(value.min()) - width
+    bins = int(math.ceil((float(value.max()) + width - low) / _GRID)) + 1
     where = np.minimum(np.rint((value - low) / _GRID).astype(np.intp), bins - 1)
     time_at = np.bincount(where, weights=spent, minlength=bins)
-    # A triangle, not a box: a box midway between two levels would hold both.
-    reach = int(round(HALF_WIDTH / _GRID))
-    kernel = 1.0 - np.abs(np.arange(-reach, reach + 1)) / (reach + 1.0)
+    reach = int(round(width / _GRID))
+    fine = np.convolve(time_at, _triangle(reach // 2), mode='same')
     # A recording of less than a second may be all one level.
-    total = float(spent.sum())
-    least = max(min(MIN_TIME, 0.25 * total), MIN_SHARE * total)
-    found: list[float] = []
-    while len(found) < MAX_LEVELS:
-        peak = int(np.convolve(time_at, kernel, mode='same').argmax())
+    least = min(MIN_TIME, 0.25 * float(spent.sum()))
+    found: list[int] = []
+    while True:
+        peak = int(np.convolve(time_at, _triangle(reach), mode='same').argmax())
         left, right = max(0, peak - reach), peak + reach + 1
         held = float(time_at[left:right].sum())
         if held < least or not held > 0.0:
-            break
-        centre = low + peak * _GRID
-        if all(abs(centre - other) > HALF_WIDTH for other in found):
-            found.append(centre)
+            return [low + _GRID * k for k in sorted(found)]
+        if all(_apart(fine, peak, other, reach) for other in found):
+            found.append(peak)
         time_at[left:right] = 0.0
-    return sorted(found)
 
 
-def _runs(inside: BoolArray, broken: BoolArray) -> tuple[Segment, ...]:
-    """Return unbroken stretches of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], inside.astype(np.int8), [0]))))
-    runs: list[Segment] = []
-    for start, stop in zip(edges[::2], edges[1::2]):
-        cuts = start + np.flatnonzero(broken[start:stop])
-        ends = [int(start), *(int(c) for c in cuts if c > start), int(stop)]
-        runs.extend(Segment(a, b) for a, b in zip(ends, ends[1:]))
-    return tuple(runs)
+def _triangle(reach: int) -> FloatArray:
+    """Return weights that fall on both sides: a box midway between two levels would hold both."""
+    return 1.0 - np.abs(np.arange(-reach, reach + 1)) / (reach + 1.0)
 
 
-def _settle(t: FloatArray, runs: tuple[Segment, ...], away: BoolArray,
+def _apart(density: FloatArray, peak: int, other: int, reach: int) -> bool:
+    """Tell whether a second peak is a level of its own, not a shoulder of the other."""
+    if abs(peak - other) > 2 * reach:
+        return True
+    between = density[min(peak, other):max(peak, other) + 1]
+    return abs(peak - other) > reach and bool(
+        between.min() < _VALLEY * min(density[peak], density[other]))
+
+
+def stays(throttle: FloatArray, centres: Sequence[float], width: float
+          ) -> list[tuple[Segment, int]]:
+    """
+    Return the stays of throttle at levels.
+
+    Parameters
+    ----------
+    throttle : ndarray, shape (n,)
+        0..1, NaN where unknown.
+    centres : sequence of float
+        Of the levels, increasing.
+    width : float
+        Half width within which a stay begins and ends; in between it may go twice as far, as
+        long as it does not arrive at the next level.
+
+    Returns
+    -------
+    list of (Segment, int)
+        In order of time, each with the number of its level; settling included.
+
+    """
+    if not centres:
+        return []
+    level = np.asarray(centres)
+    nearest = _nearest(centres)
+    inner = _inner(centres, width)
+    # Of two levels that lie close, the other one is arrived at somewhat short of it.
+    outer = np.maximum(inner, np.minimum(2.0 * width, 0.8 * nearest))
+    edges = np.unique(np.concatenate((level - outer, level - inner, level + inner,
+                                      level + outer)))
+    zone = np.searchsorted(edges, throttle)
+    middles = np.concatenate(([-math.inf], 0.5 * (edges[1:] + edges[:-1]), [math.inf]))
+    away = np.abs(middles[:, None] - level)
+    at = np.where((away <= inner).any(axis=1), away.argmin(axis=1), -1).tolist()
+    near = (away <= outer).tolist()
+    starts = np.flatnonzero(np.diff(zone, prepend=-1))
+    found: list[tuple[Segment, int]] = []
+    here, begin, last = -1, 0, 0
+    for start, stop, where in zip(starts.tolist(), [*starts[1:].tolist(), throttle.size],
+                                  zone[starts].tolist()):
+        if here >= 0 and not near[where][here]:
+            found.append((Segment(begin, last), here))
+            here = -1
+        if here < 0 and at[where] >= 0:
+            here, begin = at[where], start
+        if here >= 0 and at[where] == here:
+            last = stop
+    if here >= 0:
+        found.append((Segment(begin, last), here))
+    return found
+
+
+def _nearest(centres: Sequence[float]) -> FloatArray:
+    """Return how far the nearest other level is."""
+    apart = np.diff(np.asarray(centres), prepend=-math.inf, append=math.inf)
+    return np.minimum(apart[:-1], apart[1:])
+
+
+def _inner(centres: Sequence[float], width: float) -> FloatArray:
+    """Return the half width of each level, less where another is near."""
+    return np.minimum(width, 0.5 * _nearest(centres)) + 1e-9
+
+
+def _cut(run: Segment, broken: BoolArray) -> list[Segment]:
+    """Return the pieces of a stretch between pauses."""
+    cuts = run.start + 1 + np.flatnonzero(broken[run.start + 1:run.stop])
+    ends = [run.start, *cuts.tolist(), run.stop]
+    return [Segment(a, b) for a, b in zip(ends, ends[1:])]
+
+
+def _passage(t: FloatArray, throttle: FloatArray, run: Segment, width: float) -> bool:
+    """Tell whether throttle only passes through, from one side to the other."""
+    if t[run.stop - 1] - t[run.start] >= _PASSAGE:
+        return False
+    inside = throttle[run.start:run.stop]
+    quarter = max(1, inside.size // 4)
+    moved = abs(float(inside[-quarter:].mean()) - float(inside[:quarter].mean()))
+    return moved > max(_CROSSED * width, _STEADY * float(np.ptp(inside)))
+
+
+def _settle(t: FloatArray, runs: Sequence[Segment], away: BoolArray,
             broken: BoolArray) -> tuple[tuple[Segment, ...], float]:
     """Leave out the time after throttle came from far away; jitter is not a step."""
     kept, lost = [], 0.0

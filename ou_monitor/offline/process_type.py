@@ -14,7 +14,8 @@ hundred times.  The first that applies names the level:
 5. neighbours uncorrelated, or more white noise than relaxation, or relaxation
    faster than the sampling: 'Gaussian';
 6. lines carry most of the variance, or one relaxation does not leave
-   independent innovations: 'stationary stochastic'; if it does: 'diffusion';
+   independent innovations, or a second one is seen: 'stationary stochastic'; if it does:
+   'diffusion';
    without a usable fit 'undetermined'.
 
 Limits: a word stands for what was found, and the tests that did not reject
@@ -135,10 +136,10 @@ def classify(estimate: Estimate, shape: Shape, line_share: float = 0.0) -> Verdi
     moves, figures = [], []
     if drift.rejects:
         moves.append('the mean moves')
-        figures.append(f'by {drift.effect:.2g} standard deviations, {_p(drift)}')
+        figures.append(f'the mean by {drift.effect:.2g} standard deviations, {_p(drift)}')
     if intensity.rejects:
         moves.append('the intensity changes')
-        figures.append(f'by {100.0 * intensity.effect:.0f} %, {_p(intensity)}')
+        figures.append(f'the intensity by {100.0 * intensity.effect:.0f} %, {_p(intensity)}')
     return Verdict(ProcessType.QUASI_STATIONARY,
                    f'from block to block {" and ".join(moves)}; apart from that '
                    f'{rest.kind.value}', '; '.join(figures), rest.kind)
@@ -190,8 +191,19 @@ def _gaussian(estimate: Estimate, shape: Shape, line_share: float, normal: str) 
     if rest.rejects:
         return _plain(ProcessType.STATIONARY, 'one relaxation leaves correlated innovations',
                       f'{_p(rest)}; {normal}')
+    second = shape['second_relaxation']
+    if second.rejects:
+        return _plain(ProcessType.STATIONARY, 'a second relaxation, slower or faster, stands '
+                      'beside the one that was fitted: alpha is neither of them',
+                      f'{_share(second.effect)}, {_p(second)}; {normal}')
+    beside = f'; beside lines of {100.0 * line_share:.2g} % of the variance' if line_share else ''
     return _plain(ProcessType.DIFFUSION, 'one relaxation, slower than the sampling, leaves '
-                  'independent Gaussian innovations', f'alpha dt = {step:.2g}; {normal}')
+                  'independent Gaussian innovations', f'alpha dt = {step:.2g}; {normal}{beside}')
+
+
+def _share(share: float) -> str:
+    """Return a share of Var_inf to first order, which beyond the whole says no more than that."""
+    return 'as large as Var_inf' if share > 1.0 else f'some {100.0 * share:.0f} % of Var_inf'
 
 
 def _plain(kind: ProcessType, why: str, figures: str = '') -> Verdict:

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import math
 
 import numpy as np
 
 from ou_monitor.offline.analysis.quality_list import QualityItem, Severity
 from ou_monitor.offline.analyze import Analysis
+from ou_monitor.offline.level_result import LevelResult
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, NAN, Status
+
+
+# What changes the meaning of the numbers in the headline itself.
+_BEWARE = {
+    'VOLTAGE_UNIT': 'Beware: the voltages seem to be millivolts or counts, not volts.',
+    'SECOND_RELAXATION': 'Beware: a second relaxation is seen, and tau is of a mixture.',
+    'NOT_SETTLED': 'Beware: levels hold the settling after changes of throttle; so does tau.'}
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -59,7 +68,23 @@ def headline(analysis: Analysis) -> str:
     good = ([level for level in analysis.levels if level.estimate.status is Status.OK]
             or [level for level in analysis.levels if level.estimate.usable])
     if not good:
-        return 'No load level of this recording can be fitted: the notes on quality say why.'
+        return _none_fitted(analysis)
+    beware = ''.join(f' {words}' for name, words in _BEWARE.items()
+                     if any(item.name == name for item in analysis.quality))
+    return _numbers(good) + beware
+
+
+def _none_fitted(analysis: Analysis) -> str:
+    """Say why most of the time cannot be fitted."""
+    time: dict[Status, float] = {}
+    for level in analysis.levels:
+        time[level.estimate.status] = time.get(level.estimate.status, 0.0) + level.time
+    why = max(time, key=lambda status: time[status]).value if time else ''
+    return f'No load level of this recording can be fitted. {why}'.rstrip()
+
+
+def _numbers(good: Sequence[LevelResult]) -> str:
+    """Return how sigma goes with throttle, and tau."""
     low, high = good[0], good[-1]
     if len(good) == 1:
         e = low.estimate

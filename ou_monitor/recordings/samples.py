@@ -179,6 +179,7 @@ class SampleReader:
         self.source = {
             **bag.about, 'file': bag.path.name, 'format': 'mcap', 'msg_config': choice.config.name,
             'voltage_topic': choice.voltage.topic, 'voltage_type': choice.voltage.type,
+            'voltage_field': choice.voltage.field,
             **bag.origins.get(choice.voltage.topic, {})}
         spec = choice.voltage
         stated = bag.sample_rates.get(spec.topic)
@@ -193,6 +194,7 @@ class SampleReader:
         if choice.throttle is not None:
             self.source |= {'throttle_topic': choice.throttle.topic,
                             'throttle_type': choice.throttle.type,
+                            'throttle_field': choice.throttle.field,
                             **bag.origins.get(choice.throttle.topic, {})}
             self._specs[THROTTLE] = choice.throttle
             self._series[THROTTLE] = _Series(choice.throttle)

@@ -8,6 +8,7 @@ import shlex
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.model.ou import simulate
+from project import ROOT
 import pytest
 
 ALPHA, SECONDS = 63.0, 6.0
@@ -83,6 +84,20 @@ def test_table_fits_a_terminal(flight, capsys):
         assert rows[2].split()[:2] == ['10', '%'] and rows[3].split()[:2] == ['40', '%']
     assert 'Vrms mV' in lines[heads[0]] and 'sigma V/sqrt(s) [95 %]' in lines[heads[1]]
     assert 'brown-out risk' in lines[heads[2]]
+
+
+def test_it_says_where_voltage_and_throttle_came_from(flight, tmp_path, capsys):
+    """Columns of a CSV, with and without throttle; topics and fields of a bag."""
+    assert main(['analyze', str(flight)]) == 0
+    assert '\nvoltage: column voltage_v; throttle: column throttle\n' in capsys.readouterr().out
+    alone = tmp_path / 'alone.csv'
+    write(alone, np.arange(600) / 100.0, 5.0 + 0.01 * np.random.default_rng(1).normal(size=600))
+    assert main(['analyze', str(alone)]) == 0
+    assert '\nvoltage: column voltage_v; throttle: none\n' in capsys.readouterr().out
+    assert main(['analyze', str(ROOT / 'bags' / 'transient')]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r'\nvoltage: /\S+ \(\w+\.\w+\); throttle: /\S+ \(Float32\.data\); '
+                     r'config: \w+\n', out)
 
 
 def test_report_and_json_files(flight, tmp_path, capsys):

@@ -138,6 +138,24 @@ def test_heavy_tails_are_no_change_of_intensity():
     assert calm >= 37
 
 
+def test_a_few_large_impulses_are_no_change_of_intensity():
+    """
+    Seven samples in 5000 off by 65 standard deviations, scattered: 'impulses', and steady apart.
+
+    At most 3 of 40 at 1 % (binomial: 7e-4); with the impulses in, the variances of blocks with and
+    without one differ by a factor of ten, and most reject.
+    """
+    calm = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        z = rng.standard_normal(T.size)
+        z[rng.integers(0, T.size, 7)] += 65.0
+        found = examine_level([(T, 5.0 + 0.01 * z)], Estimate(status=Status.NO_RELAXATION))
+        calm += found['variance_drift'].p_value > 0.01
+        assert found['impulses'].p_value < 1e-6
+    assert calm >= 37
+
+
 def test_steps_of_the_adc_hide_the_shape():
     """Flagged as quantized: no p-value, and the reason instead."""
     found = examined(np.round(ou(1), 2), truth(flags=(Flag.QUANTIZED,)))

@@ -1,8 +1,9 @@
 """Load levels: found, given, split at pauses, settled."""
 
 import numpy as np
-from ou_monitor.offline.levels import find_levels, HALF_WIDTH, SETTLE
+from ou_monitor.offline.levels import find_levels, half_width, SETTLE
 import pytest
+from scipy.signal import lfilter
 
 RATE = 200.0
 
@@ -33,9 +34,8 @@ def test_every_sample_of_a_level_is_at_its_throttle():
     for level in levels:
         for s in level.segments:
             seen[s.start:s.stop] += 1
-            # The centre is where most time is; the name is the median, at
-            # most one half width away from it.
-            assert np.ptp(throttle[s.start:s.stop]) <= 2.0 * HALF_WIDTH + 1e-6
+            # A stay ends two half widths away from the middle.
+            assert np.ptp(throttle[s.start:s.stop]) <= 4.0 * half_width(t, throttle) + 1e-6
     assert seen.max() == 1
 
 
@@ -48,7 +48,65 @@ def test_settling_is_left_out_after_a_step_only():
     t, throttle = profile((0.1, 2), (0.13, 0.05), (0.1, 2))
     (level,) = find_levels(t, throttle, (0.1,))
     assert level.settling == 0.0
-    assert sum(s.stop - s.start for s in level.segments) == int(4 * RATE)
+    assert [(s.start, s.stop) for s in level.segments] == [(0, t.size)]
+
+
+def stick(t, spread, seed, relaxation=0.3):
+    """Return the jitter of a hand: an OU of that standard deviation."""
+    phi = np.exp(-1.0 / (RATE * relaxation))
+    steps = np.random.default_rng(seed).normal(0.0, spread * np.sqrt(1.0 - phi ** 2), t.size)
+    steps[0] /= np.sqrt(1.0 - phi ** 2)
+    return lfilter([1.0], [1.0, -phi], steps)
+
+
+@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('spread', [0.005, 0.01, 0.015, 0.02])
+def test_a_nervous_stick_breaks_no_level(spread, seed):
+    """Three levels, each nearly whole; what lies at the sides of a level is no level."""
+    t, throttle = profile((0.0, 5), (0.3, 15), (0.6, 5), (0.3, 10))
+    levels = find_levels(t, throttle + stick(t, spread, seed))
+    assert len(levels) == 3
+    for level, middle, long, stays in zip(levels, (0.0, 0.3, 0.6), (5, 25, 5), (1, 2, 1)):
+        # The median of a stay: its error is that of some 5 s / (2 * 0.3 s) values, times 1.25.
+        assert abs(level.throttle - middle) < 4.0 * 1.25 * spread / np.sqrt(5.0 / 0.6)
+        assert len(level.segments) <= stays + 2
+        assert sum(t[s.stop - 1] - t[s.start] for s in level.segments) > 0.9 * long
+
+
+def test_levels_five_percent_apart_are_told_under_a_stick_of_one_percent():
+    """As the paper's lowest are."""
+    t, throttle = profile((0.30, 10), (0.35, 10))
+    levels = find_levels(t, throttle + stick(t, 0.01, 3))
+    assert [round(level.throttle, 2) for level in levels] == [0.30, 0.35]
+
+
+def test_a_ramp_between_stays_makes_no_level():
+    """Five seconds from each level to the next, at 4 and 8 % a second."""
+    t = np.arange(int(32 * RATE)) / RATE
+    throttle = np.interp(t, [0, 8, 13, 16, 21, 24, 29, 32], [0, 0, 0.2, 0.2, 0.4, 0.4, 0.8, 0.8])
+    levels = find_levels(t, throttle)
+    assert [round(level.throttle, 2) for level in levels] == [0.0, 0.2, 0.4, 0.8]
+    # Asked for, the passage is there.
+    (passed,) = find_levels(t, throttle, (0.6,))
+    assert len(passed.segments) == 1
+
+
+def test_a_few_seconds_of_full_throttle_are_a_level_of_a_long_flight():
+    """Four seconds of 300."""
+    t, throttle = profile((0.1, 150), (0.9, 4), (0.4, 146))
+    assert [level.throttle for level in find_levels(t, throttle)] == [0.1, 0.4, 0.9]
+
+
+def test_a_slow_drift_of_throttle_within_a_level_does_not_split_it():
+    """Four percent in 20 s."""
+    t, throttle = profile((0.2, 20), (0.5, 20))
+    assert len(find_levels(t, throttle + 0.002 * t)) == 2
+
+
+def test_a_staircase_of_twelve_is_twelve_levels():
+    """None is left out."""
+    t, throttle = profile(*((0.08 * k, 4) for k in range(12)))
+    assert len(find_levels(t, throttle)) == 12
 
 
 def test_a_pause_breaks_a_segment():

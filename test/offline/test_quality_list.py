@@ -57,6 +57,23 @@ def test_what_the_reader_noted_is_in_it(note, name, severity):
     assert (item.name, item.severity, item.text) == (name, severity, note)
 
 
+@pytest.mark.parametrize('factor, named', [(1.0, False), (80.0, False), (1e3, True), (3e3, True)])
+def test_millivolts_are_called_so(factor, named):
+    """A rail of 5 V, a battery of 400 V; 5000 and 15000 are no volts."""
+    made = recording(3, ((0.1, 0.3),))
+    items = names(listed(replace(made, voltage=factor * made.voltage)))
+    assert (items.get('VOLTAGE_UNIT') is Severity.WARNING) == named
+
+
+@pytest.mark.parametrize('low, high, named', [
+    (0.0, 1.0, False), (-0.04, 1.04, False), (-0.4, 1.0, True), (0.0, 1.3, True)])
+def test_a_throttle_outside_of_its_range_is_called_so(low, high, named):
+    """Reverse thrust, or a stick that goes both ways; a little beyond is trim."""
+    made = recording(3, ((0.1, 0.3),))
+    items = names(listed(replace(made, throttle=np.linspace(low, high, made.n))))
+    assert (items.get('THROTTLE_RANGE') is Severity.WARNING) == named
+
+
 def test_pauses_and_an_uneven_clock_are_measured():
     """A pause of 2 s; stamps off by 10 % of a step at random."""
     made = recording(2, ((0.1, 0.3),))

@@ -230,21 +230,45 @@ def test_rises_are_fitted_alike():
     assert all(change.amplitude > 0.0 for change in fit.releases)
 
 
+def behind_a_high_pass(seed, tau):
+    """Return the fit of falls of 1 V of a rail of that tau behind a high-pass of 15.9 ms."""
+    made = steps_of(11, tau=tau, sag=1.0)
+    sag = made.voltage - steps_of(11, tau=tau, sag=0.0).voltage
+    rng = np.random.default_rng(seed)
+    noise = simulate(made.t, ALPHA, 0.1, rng, u0=0.0) + rng.normal(0.0, NOISE, made.n)
+    shape = butter(1, 10.0, 'high', fs=1000.0)
+    return fitted(replace(made, voltage=5.0 + lfilter(*shape, sag) + noise),
+                  estimate=replace(ESTIMATE, sigma=0.1, var_inf=0.01 / (2.0 * ALPHA)))
+
+
+def test_a_rail_much_faster_than_the_instrument_is_left_out():
+    """
+    A rail of 1 ms behind a high-pass of 15.9 ms: after a third of tau only the latter is there.
+
+    Twelve recordings: at least nine intervals hold it (of 95 %, binomial: 2e-3 below), and the
+    words say what was left out; with the beginning in, none did.
+    """
+    fits = [behind_a_high_pass(seed, 0.001) for seed in range(12)]
+    mended = [fit for fit in fits if fit.left_out > 0.0]
+    assert len(mended) >= 9
+    assert all('are left out' in fit.caveat and not fit.badly_fitted for fit in mended)
+    assert sum(fit.tau_low < 1.0 / (20.0 * math.pi) < fit.tau_high for fit in mended) >= 9
+
+
 def test_a_step_that_is_not_one_exponential_is_said_so():
     """
-    A rail of 5 ms behind a high-pass of 16 ms: its tau is not to be trusted, and the words say so.
+    A rail of 10 ms behind a high-pass of 16 ms: tau is not to be trusted, and the words say so.
 
+    Of twelve at least seven (17 of 20 were measured; binomial: 5e-3 below seven); the others say
+    what they left out.
     Of 40 plain sags of 0.4 V one may be called badly fitted (p = 1e-3 each).
     """
-    shape = butter(1, 10.0, 'high', fs=1000.0)
-    made = steps_of(11, tau=0.005, sag=1.0)
-    quiet = replace(ESTIMATE, sigma=0.1, var_inf=0.01 / (2.0 * ALPHA))
-    noise = simulate(made.t, ALPHA, 0.1, np.random.default_rng(1), u0=0.0)
-    sag = steps_of(11, tau=0.005, sag=1.0).voltage - steps_of(11, tau=0.005, sag=0.0).voltage
-    white = np.random.default_rng(2).normal(0.0, NOISE, made.n)
-    fit = fitted(replace(made, voltage=5.0 + lfilter(*shape, sag) + noise + white),
-                 estimate=quiet)
-    assert fit.badly_fitted and fit.misfit_p < 1e-3
+    fits = [behind_a_high_pass(seed, 0.01) for seed in range(12)]
+    assert all(fit.caveat for fit in fits)
+    bad = [fit for fit in fits if fit.badly_fitted]
+    assert len(bad) >= 7
+    fit = bad[0]
+    assert fit.misfit_p < 1e-3
     # The interval excludes both time constants.
     assert fit.tau_low > 1.0 / (2.0 * math.pi * 10.0)
     assert 'not describe it' in fit.caveat and 'trusted' in fit.caveat

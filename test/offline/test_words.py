@@ -33,11 +33,21 @@ def test_headline_tells_growth_with_its_interval():
 
 
 def test_headline_of_one_level_and_of_none():
-    """One level is described; without any the reader is sent to the statuses."""
+    """One level is described; without any the reader is told why."""
     made = without_throttle(recording(4, ((0.1, 0.3),)))
     assert headline(analyze(made)).startswith('The supply wanders with sigma = 0.')
     short = recording(5, ((0.1, 0.3),), seconds=0.012)
-    assert 'can be fitted' in headline(analyze(short))
+    analysis = analyze(short)
+    assert headline(analysis) == ('No load level of this recording can be fitted. '
+                                  + analysis.levels[0].estimate.status.value)
+
+
+def test_headline_warns_of_what_changes_its_own_numbers():
+    """Millivolts; nothing where nothing is wrong."""
+    made = recording(1, TRUTH)
+    assert 'Beware' not in headline(analyze(made))
+    told = headline(analyze(replace(made, voltage=1e3 * made.voltage)))
+    assert told.endswith('Beware: the voltages seem to be millivolts or counts, not volts.')
 
 
 def test_the_same_caution_of_two_levels_is_said_once():

@@ -5,13 +5,13 @@ chi^2 of ln(alpha) of the levels about their weighted mean, each with its standa
 error is carried over to the common alpha, for it grows with 1/sqrt(alpha T) and a level whose
 alpha came out high by chance would weigh too much.
 
-A level that one OU in white noise does not describe (a spectral line, more than one relaxation,
-the settling after a change of throttle) is withheld: its alpha stands for both, and the error of a
-fit knows nothing of it.
+A level that one OU in white noise does not describe (more than one relaxation, lines beside
+impulses, the settling after a change of throttle) is withheld: its alpha stands for both, and the
+error of a fit knows nothing of it.
 
-Limits: only levels with a usable fit count; a line too faint to be found is not known of; "no
-change seen" is no proof that there is none, so the ratio that would have been seen stands beside
-it.
+Limits: only levels with a usable fit count; a spectral line too faint to be found, and taken out
+before the fit, is not known of; "no change seen" is no proof that there is none, so the ratio that
+would have been seen stands beside it.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ class AlphaTest:
         if not self.withheld:
             return ''
         names = ', '.join('all' if math.isnan(x) else f'{100.0 * x:.3g} %' for x in self.withheld)
-        return (f' Withheld: {names}, where a spectral line stands, more than one relaxation is '
-                'seen, or a change of throttle still settles.')
+        return (f' Withheld: {names}; more than one relaxation is seen there or at another level, '
+                'lines stand beside impulses, or a change of throttle still settles.')
 
     def _verdict(self) -> str:
         if self.levels < 2:
@@ -90,7 +90,7 @@ class AlphaTest:
         seen = (f'a change by a factor of {_factor(self.detectable_ratio)} from the lowest to the '
                 'highest throttle would have been seen (90 %)')
         if self.verdict == 'differs':
-            return (f'Alpha is not the same at all loads (p = {self.p_value:.1g}): from the '
+            return (f'Alpha is not the same at all loads (p = {self.p_value:.2g}): from the '
                     f'lowest to the highest throttle it changes by a factor of '
                     f'{_factor(self.ratio)} (95 % {_factor(self.ratio_low)} to '
                     f'{_factor(self.ratio_high)}); '

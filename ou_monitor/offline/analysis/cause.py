@@ -94,7 +94,7 @@ def judge_cause(relaxation: Relaxation, alpha: AlphaTest) -> Cause:
     corner = 1.0 / (2.0 * math.pi * relaxation.tau)
     of_noise = {
         'agrees': 'tau agrees with 1/alpha of the noise',
-        'differs': f'tau is not 1/alpha of the noise (p = {p:.1g})',
+        'differs': f'tau is not 1/alpha of the noise (p {_small(p)})',
         'undetermined': 'tau and 1/alpha of the noise cannot be told apart or held equal'}[noise]
     if math.isfinite(low):
         of_noise += f' (tau alpha = {ratio:.2f}, 95 % {low:.2f} to {high:.2f})'
@@ -110,6 +110,10 @@ def judge_cause(relaxation: Relaxation, alpha: AlphaTest) -> Cause:
                         'not known well enough'}[instrument]
     return Cause(noise, ratio, low, high, p, instrument, corner, step, step_se,
                  f'{of_noise[0].upper()}{of_noise[1:]}; {of_instrument}.')
+
+
+def _small(p: float) -> str:
+    return '< 1e-6' if p < 1e-6 else f'= {p:.1g}'
 
 
 def _nothing(relaxation: Relaxation) -> str:

@@ -10,7 +10,8 @@ from ou_monitor.offline.analysis.cause import Cause
 from ou_monitor.offline.analysis.level_tests import EFFECT, FAMILY_WISE, LEAST
 from ou_monitor.offline.analysis.lines import FALSE_ALARM
 from ou_monitor.offline.analysis.relaxation import Relaxation
-from ou_monitor.offline.analyze import Analysis, LevelResult
+from ou_monitor.offline.analyze import Analysis
+from ou_monitor.offline.level_result import LevelResult
 from ou_monitor.offline.words import headline
 
 
@@ -104,6 +105,8 @@ def _level(level: LevelResult) -> dict[str, Any]:
                    'rms': line.rms, 'rms_ci95': [line.rms_low, line.rms_high],
                    'share_of_variance': line.share, 'p_value': line.p_value}
                   for line in level.lines.lines],
+        'with_lines': None if level.with_lines is None else {
+            name: getattr(level.with_lines, name) for name in ('alpha', 'sigma', 'var_inf')},
         'line_search': {'from_hz': level.lines.lowest, 'to_hz': level.lines.highest,
                         'tested': level.lines.tested, 'detectable_rms': level.lines.detectable,
                         'not_done': level.lines.why_not},
@@ -122,7 +125,7 @@ def _relaxation(fit: Relaxation, cause: Cause) -> dict[str, Any]:
         'kind': fit.kind,
         'tau': fit.tau, 'tau_ci95': [fit.tau_low, fit.tau_high],
         'misfit': fit.misfit, 'misfit_p_value': fit.misfit_p, 'badly_fitted': fit.badly_fitted,
-        'likelihood_gain': fit.likelihood_gain,
+        'left_out_s': fit.left_out, 'likelihood_gain': fit.likelihood_gain,
         'tau_alpha': cause.ratio, 'tau_alpha_ci95': [cause.ratio_low, cause.ratio_high],
         'tau_alpha_p_value': cause.p_value,
         'against_noise': cause.noise,

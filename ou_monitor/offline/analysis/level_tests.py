@@ -14,6 +14,8 @@ impulses       the largest innovation (Sidak) or a positive excess kurtosis, eac
 correlated     lags 1..5 of the deviation, with variances robust against changing
                intensity (Lo & MacKinlay, Rev. Financ. Stud. 1, 1988)
 one_relaxation lags 1..10 of the innovations, likewise
+second_relaxation
+               `ou_monitor.offline.analysis.second_relaxation`, in their periodogram
 =============  ========================================================================
 
 A test that rejects counts only when its effect is of consequence, too: with 10^5 samples a
@@ -30,6 +32,7 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
+from ou_monitor.offline.analysis.second_relaxation import second_relaxation
 from ou_monitor.offline.analysis.whitening import innovations, join
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Status
 from scipy import stats
@@ -41,17 +44,22 @@ FEWEST = 50
 _BLOCKS = 16
 # Relaxation times of a block of the test of the mean.
 _MEAN_BLOCK = 5.0
+# Standard deviations beyond which nothing counts for a change of intensity: a few impulses decide
+# the variance of a block, while of heavy tails (Student's t of 5 degrees) 1 in 10^4 goes.
+_FAR = 10.0
 _LAGS_RAW, _LAGS_FITTED = 5, 10
 # Least effects of consequence, in the unit of each test.
 LEAST = {'mean_drift': 0.25, 'variance_drift': 0.1, 'gaussian': 0.3, 'impulses': 0.5,
-         'correlated': 0.0, 'one_relaxation': 0.1}
+         'correlated': 0.0, 'one_relaxation': 0.1,
+         'second_relaxation': 0.1}
 EFFECT = {
     'mean_drift': 'standard deviation of the mean beyond sampling, over that of the voltage',
     'variance_drift': 'relative standard deviation of the intensity beyond sampling',
     'gaussian': 'larger of |skewness| and |excess kurtosis| / 2',
     'impulses': 'excess kurtosis, or impulses over the size that noise reaches, per 1000 samples',
     'correlated': 'root of the sum of squared autocorrelations',
-    'one_relaxation': 'root of the sum of squared autocorrelations'}
+    'one_relaxation': 'root of the sum of squared autocorrelations',
+    'second_relaxation': 'variance of a second relaxation, over Var_inf'}
 
 
 @dataclass(frozen=True)
@@ -157,8 +165,9 @@ def examine_level(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Esti
             correlated if name == 'correlated' else TestResult(name, why_not=why)
             for name in EFFECT))
     alpha, var_inf, noise = model or (math.inf, spread ** 2, 0.0)
-    z = join([innovations(t, d, alpha, var_inf, noise * noise)
-              for (t, _), d in zip(parts, own)])
+    apart = [innovations(t, d, alpha, var_inf, noise * noise)
+             for (t, _), d in zip(parts, own)]
+    z = join(apart)
     tests = [_mean_drift(parts, estimate, alpha, var_inf, noise * noise, spread),
              _variance_drift(z)]
     local = _per_block(z)
@@ -175,9 +184,15 @@ def examine_level(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Esti
             TestResult('gaussian', float(stats.normaltest(local).pvalue),
                        max(abs(skewness), 0.5 * abs(kurtosis))),
             _impulses(local, kurtosis, count)]
-    tests += [correlated,
-              _correlated('one_relaxation', [z], _LAGS_FITTED) if model else
-              TestResult('one_relaxation', why_not='there is no fitted model')]
+    tests.append(correlated)
+    if model:
+        p, share = second_relaxation(apart, (n - len(parts)) / time, alpha, var_inf, noise * noise)
+        tests += [_correlated('one_relaxation', [z], _LAGS_FITTED),
+                  TestResult('second_relaxation', p, share,
+                             why_not='' if math.isfinite(p) else 'too few samples')]
+    else:
+        tests += [TestResult(name, why_not='there is no fitted model')
+                  for name in ('one_relaxation', 'second_relaxation')]
     return Shape(tuple(tests), n, skewness, kurtosis, count, _poisson(count, time))
 
 
@@ -296,7 +311,7 @@ def _variance_drift(z: FloatArray) -> TestResult:
     blocks = _block_count(z.size)
     if blocks < 3:
         return TestResult('variance_drift', why_not=f'fewer than three blocks of {FEWEST} samples')
-    pieces = np.array_split(z, blocks)
+    pieces = [_without_impulses(piece) for piece in np.array_split(z, blocks)]
     free = np.array([piece.size - 1.0 for piece in pieces])
     logs = np.log([max(float(piece.var(ddof=1)), 1e-300) for piece in pieces])
     centred = [piece - piece.mean() for piece in pieces]
@@ -309,6 +324,13 @@ def _variance_drift(z: FloatArray) -> TestResult:
     # ln sigma is half of ln variance.
     return TestResult('variance_drift', float(stats.chi2.sf(q, blocks - 1)),
                       0.5 * math.sqrt(beyond))
+
+
+def _without_impulses(piece: FloatArray) -> FloatArray:
+    """Return a block without what lies further out than any of its noise; impulses have a test."""
+    away = np.abs(piece - np.median(piece))
+    middle = float(np.median(away)) / 0.6745
+    return piece[away <= _FAR * middle] if middle > 0.0 else piece
 
 
 def _impulses(z: FloatArray, kurtosis: float, count: int) -> TestResult:

@@ -22,6 +22,11 @@ from ou_monitor.records import Estimate, Flag, Recording, Status
 _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
 # Root mean square of the steps about their median, in medians, from which a clock is uneven.
 _UNEVEN = 0.05
+# No supply of a UAV has more, V; the millivolts of any do.
+_MOST_VOLTS = 1000.0
+# Throttle may go beyond 0..1 by so much, as sticks out of trim do, and by more for so small a
+# share of the samples.
+_TRIM, _RARE = 0.05, 0.01
 # Stretches of samples looked at for ADC steps.
 _LOOKS = 8
 # What the reader's sentences are about: a word in them, the name, and whether numbers suffer.
@@ -100,7 +105,7 @@ def quality_list(recording: Recording, throttles: Sequence[float], estimates: Se
     items = [QualityItem(*key, tuple(where)) for key, where in found.items()]
     items += more
     items += [_of_reader(note) for note in recording.notes]
-    items += _of_stamps(recording) + _of_samples(recording)
+    items = _of_units(recording) + items + _of_stamps(recording) + _of_samples(recording)
     return tuple(sorted(items, key=lambda item: -item.severity))
 
 
@@ -122,6 +127,27 @@ def _of_reader(note: str) -> QualityItem:
         if word in note:
             return QualityItem(name, Severity.WARNING if suffers else Severity.INFO, note)
     return QualityItem('READER', Severity.INFO, note)
+
+
+def _of_units(recording: Recording) -> list[QualityItem]:
+    """Return what the sizes of the numbers say of their units."""
+    items = []
+    middle = float(np.median(np.abs(recording.voltage))) if recording.n else 0.0
+    if middle > _MOST_VOLTS:
+        items.append(QualityItem('VOLTAGE_UNIT', Severity.WARNING, (
+            f'Half of the voltages are beyond {middle:.4g}, as no supply of a UAV is in volts: '
+            'millivolts, or counts of an ADC? Alpha and tau hold all the same; what is given in V '
+            'is in that unit instead, and there is no risk: divide millivolts by 1000 (of a bag: '
+            'unit_factor of a msg config).')))
+    known = recording.throttle[np.isfinite(recording.throttle)]
+    low, high = np.quantile(known, (_RARE, 1.0 - _RARE)) if known.size else (0.0, 1.0)
+    if low < -_TRIM or high > 1.0 + _TRIM:
+        items.append(QualityItem('THROTTLE_RANGE', Severity.WARNING, (
+            f'Throttle runs from {low:.3g} to {high:.3g}, and 0 to 1 is expected: the curves, the '
+            'risk and the throttle budget know nothing outside, and sag counts from the lowest '
+            'throttle. Of a stick from -1 to 1 take (x + 1) / 2; of reverse thrust the absolute '
+            'value.')))
+    return items
 
 
 def _of_stamps(recording: Recording) -> list[QualityItem]:

@@ -10,7 +10,8 @@ The noise itself is where the level before left it: the louder of the two levels
 of its first deviation, which then decays.  Only what goes beyond that is a relaxation.
 
 Whether one exponential is enough is tested with two more, four times as fast and as slow, each
-change with amplitudes of its own.
+change with amplitudes of its own.  Where it is not, the first third of tau is left out, if that
+makes it fit: late motors, or a rail much faster than the instrument, are over by then.
 
 Limits: one exponential; alpha, sigma and noise of the level count as known; motors that follow
 their command late bend the first milliseconds; after slow ramps little is left to relax, which
@@ -24,15 +25,13 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor.model.innovations import Filter, StateSpace
 from ou_monitor.offline.analysis.level_sag import mean_variance
+from ou_monitor.offline.analysis.relaxation_window import Window
 from ou_monitor.offline.analysis.steps import Step
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
 from scipy import stats
 
-# What is watched after a change: so many relaxation times of the noise, and seconds, at least.
-_WATCHED, _WATCHED_S = 20.0, 0.5
-_FEWEST, _MOST = 12, 2000
+_FEWEST = 12
 _COARSE, _FINE = 41, 61
 # Of the voltage before a change the last so many seconds give its level.
 _BEFORE_S, _SETTLED_S = 0.5, 0.1
@@ -40,9 +39,11 @@ _HALF_95 = 1.920729410347062
 _Z = 1.959963984540054
 # Probability that noise alone is seen to relax; an amplitude for each change, and tau.
 _CHANCE = 1e-4
-# Probability that one exponential is said not to be enough where it is, and the time constants of
-# those that are tried beside it, in tau.
-BADLY_FITTED, _BESIDE = 1e-3, (0.25, 4.0)
+# Probability that one exponential is said not to be enough where it is.
+BADLY_FITTED = 1e-3
+# Where it is not, so much of tau is left out at first, and what is left has to fit this well: of
+# a rail 16 times faster than the instrument, or motors that follow late, nothing is left by then.
+_LATER, _WELL = 1.0 / 3.0, 0.05
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,9 @@ class Relaxation:
     likelihood_gain : float
         Twice the gain of log likelihood over no relaxation at all; large without a tau when the
         voltage moves on over the whole time watched.
+    left_out : float
+        Of the time after throttle arrived so much was left out, s: one exponential describes what
+        follows, and not that.
 
     """
 
@@ -124,6 +128,7 @@ class Relaxation:
     misfit: float = NAN
     likelihood_gain: float = NAN
     misfit_p: float = NAN
+    left_out: float = 0.0
 
     @property
     def badly_fitted(self) -> bool:
@@ -134,7 +139,9 @@ class Relaxation:
     def caveat(self) -> str:
         """Return what to say next to tau when one exponential is not enough; else empty."""
         if not self.badly_fitted:
-            return ''
+            return (f'The first {1e3 * self.left_out:.2g} ms after throttle had arrived are left '
+                    'out: with them one exponential does not describe it, and a second one nearly '
+                    'as slow would still bend tau.' if self.left_out > 0.0 else '')
         p = '< 1e-6' if self.misfit_p < 1e-6 else f'= {self.misfit_p:.1g}'
         return (f'One exponential does not describe it (p {p}; mean square of the residuals '
                 f'{self.misfit:.2f} of what the noise has): neither tau nor its interval is to be '
@@ -156,76 +163,6 @@ class Relaxation:
     def moves_on(self) -> bool:
         """Whether the voltage moves, and does not level off while watched."""
         return not self.seen and self.likelihood_gain > _limit(len(self.releases))
-
-
-class _Window:
-    """The samples after one change, made independent."""
-
-    def __init__(self, recording: Recording, step: Step, estimate: Estimate, rms: float,
-                 before: float) -> None:
-        t = recording.t
-        alpha = estimate.alpha if estimate.usable else math.inf
-        reach = max(_WATCHED / alpha, _WATCHED_S) if math.isfinite(alpha) else 2.0 * _WATCHED_S
-        stop = min(step.stop, int(np.searchsorted(t, t[step.enter] + reach)))
-        stride = max(1, -(-(stop - step.enter) // _MOST))
-        self.since = t[step.enter:stop:stride] - t[step.enter]
-        self.voltage = recording.voltage[step.enter:stop:stride]
-        self.n = self.since.size
-        noise = estimate.noise_std if estimate.noise_std > 0.0 else 0.0
-        if not math.isfinite(alpha):
-            self.var_inf, self.noise_var = 0.0, rms * rms
-            self.filter = None
-            self.sd = np.full(self.n, rms)
-        else:
-            self.var_inf, self.noise_var = estimate.var_inf, noise * noise
-            first = max(self.var_inf, before)
-            self.filter = Filter(_ou(self.since, alpha, self.var_inf, self.noise_var, first))
-            self.sd = np.sqrt(self.var_inf + self.noise_var
-                              + (first - self.var_inf) * np.exp(-2.0 * alpha * self.since))
-        e = self.whitened(np.column_stack([self.voltage, np.ones(self.n)]))
-        self._one = e[:, 1]
-        self._y = e[:, 0] - _project(self._one, e[:, 0])
-        self.rss_flat = float(self._y @ self._y)
-
-    def whitened(self, columns: FloatArray) -> FloatArray:
-        """Return columns as standardised innovations."""
-        if self.filter is None:
-            return columns / math.sqrt(self.noise_var)
-        e = self.filter.innovations(columns)
-        return np.asarray(e / np.sqrt(self.filter.variance[:self.n])[:, None])
-
-    def rss(self, taus: FloatArray) -> FloatArray:
-        """Return the residual sum of squares for each tau, level and amplitude fitted."""
-        basis = self.whitened(np.exp(-self.since[:, None] / taus[None, :]))
-        basis -= np.outer(self._one, self._one @ basis) / float(self._one @ self._one)
-        size = np.maximum((basis ** 2).sum(axis=0), 1e-300)
-        found: FloatArray = self.rss_flat - (self._y @ basis) ** 2 / size
-        return found
-
-    def more(self, tau: float) -> tuple[float, int]:
-        """Return by how much exponentials beside tau lower the sum of squares, and how many."""
-        times = tau * np.array((1.0, *_BESIDE))
-        basis = self.whitened(np.exp(-self.since[:, None] / times[None, :]))
-        basis -= np.outer(self._one, self._one @ basis) / float(self._one @ self._one)
-        basis /= np.maximum(np.sqrt((basis ** 2).sum(axis=0)), 1e-300)
-        found, _, rank, _ = np.linalg.lstsq(basis, self._y, rcond=1e-6)
-        rest = self._y - basis @ found
-        alone = self._y - basis[:, 0] * float(basis[:, 0] @ self._y)
-        return max(0.0, float(alone @ alone - rest @ rest)), int(rank) - 1
-
-    def solve(self, tau: float, scale: float) -> tuple[float, float, float, float]:
-        """Return U0 and A with their standard errors; of U0 alone without a tau to be seen."""
-        x = self.whitened(np.column_stack([self.voltage, np.ones(self.n)]))
-        if not tau < self.since[-1]:
-            size = float(x[:, 1] @ x[:, 1])
-            return float(x[:, 1] @ x[:, 0]) / size, math.sqrt(scale / size), NAN, NAN
-        decay = np.exp(-self.since / tau)
-        x = np.column_stack([x, self.whitened(decay[:, None])])
-        found = np.linalg.lstsq(x[:, 1:], x[:, 0], rcond=None)[0]
-        bend = self.whitened((found[1] * decay * self.since / tau)[:, None])
-        jacobian = np.column_stack([x[:, 1:], bend])
-        errors = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian) * scale))
-        return float(found[0]), float(errors[0]), float(found[1]), float(errors[1])
 
 
 def fit_relaxation(recording: Recording, kind: str, steps: Sequence[Step],
@@ -255,17 +192,18 @@ def fit_relaxation(recording: Recording, kind: str, steps: Sequence[Step],
         NaN for tau when nothing is seen to relax.
 
     """
-    used, windows = [], []
-    for step in steps:
-        if step.stop - step.enter >= _FEWEST and rms[step.after] > 0.0:
-            window = _Window(recording, step, estimates[step.after], rms[step.after],
-                             _variance(estimates[step.before], rms[step.before]))
-            if window.n >= _FEWEST:
-                used.append(step)
-                windows.append(window)
+    used, windows = _watched(recording, steps, estimates, rms, 0.0)
     if not windows:
         return Relaxation(kind, ())
-    tau, low, high, scale, drop = _profile(windows)
+    fit, left_out = _profile(windows), 0.0
+    misfit_p = _misfit_p(windows, fit[0], fit[3])
+    if misfit_p < BADLY_FITTED:
+        rest, once, p = _later(recording, steps, estimates, rms, _LATER * fit[0])
+        _, twice, _ = _later(recording, steps, estimates, rms, 2.0 * _LATER * fit[0])
+        # Where more of it moves tau again, it is not the beginning alone that does not fit.
+        if p > _WELL and len(rest) == len(used) and once[1] < twice[0] < once[2]:
+            left_out, windows, fit, misfit_p = _LATER * fit[0], rest, once, p
+    tau, low, high, scale, drop = fit
     releases = []
     for step, window in zip(used, windows):
         level, level_se, amplitude, amplitude_se = window.solve(tau, scale)
@@ -280,8 +218,33 @@ def fit_relaxation(recording: Recording, kind: str, steps: Sequence[Step],
             float(recording.t[step.enter]), throttles[step.before], throttles[step.after],
             before, before_se, level, level_se, amplitude, amplitude_se, beyond, bound,
             float(window.since[-1]), window.n))
-    return Relaxation(kind, tuple(releases), tau, low, high, scale, drop,
-                      _misfit_p(windows, tau, scale))
+    return Relaxation(kind, tuple(releases), tau, low, high, scale, drop, misfit_p, left_out)
+
+
+def _watched(recording: Recording, steps: Sequence[Step], estimates: Sequence[Estimate],
+             rms: Sequence[float], later: float) -> tuple[list[Step], list[Window]]:
+    """Return the changes with enough to watch from `later` s after throttle arrived."""
+    used, windows = [], []
+    for step in steps:
+        begin = int(np.searchsorted(recording.t, recording.t[step.enter] + later))
+        if step.stop - begin >= _FEWEST and rms[step.after] > 0.0:
+            window = Window(recording, step, estimates[step.after], rms[step.after],
+                            _variance(estimates[step.before], rms[step.before]), later)
+            if window.n >= _FEWEST:
+                used.append(step)
+                windows.append(window)
+    return used, windows
+
+
+def _later(recording: Recording, steps: Sequence[Step], estimates: Sequence[Estimate],
+           rms: Sequence[float], later: float
+           ) -> tuple[list[Window], tuple[float, float, float, float, float], float]:
+    """Return windows that begin later, what `_profile` finds in them, and how well it fits."""
+    _, windows = _watched(recording, steps, estimates, rms, later)
+    if not windows:
+        return [], (NAN, NAN, NAN, NAN, NAN), NAN
+    fit = _profile(windows)
+    return windows, fit, _misfit_p(windows, fit[0], fit[3])
 
 
 def _limit(changes: int) -> float:
@@ -294,21 +257,7 @@ def _variance(estimate: Estimate, rms: float) -> float:
     return estimate.var_inf if estimate.usable else rms * rms if rms > 0.0 else 0.0
 
 
-def _ou(since: FloatArray, alpha: float, var_inf: float, noise_var: float, first: float
-        ) -> StateSpace:
-    """Return the level's noise as a state-space model, with the variance it comes with."""
-    dt = np.diff(since)
-    f = np.concatenate(([0.0], np.exp(-alpha * dt)))[:, None, None]
-    q = np.concatenate(([first], -var_inf * np.expm1(-2.0 * alpha * dt)))[:, None, None]
-    r = np.full(since.size, max(noise_var, 1e-6 * float(q.min())))
-    return StateSpace(f, q, np.ones(1), r)
-
-
-def _project(direction: FloatArray, y: FloatArray) -> FloatArray:
-    return np.asarray(direction * float(direction @ y) / float(direction @ direction))
-
-
-def _profile(windows: Sequence[_Window]) -> tuple[float, float, float, float, float]:
+def _profile(windows: Sequence[Window]) -> tuple[float, float, float, float, float]:
     """Return tau, its interval, the scale of the residuals, and twice the gain of likelihood."""
     shortest = min(float(np.median(np.diff(w.since))) for w in windows)
     longest = max(float(w.since[-1]) for w in windows)
@@ -343,7 +292,7 @@ def _profile(windows: Sequence[_Window]) -> tuple[float, float, float, float, fl
             math.exp(high) if math.isfinite(high) else math.inf, scale, drop)
 
 
-def _misfit_p(windows: Sequence[_Window], tau: float, scale: float) -> float:
+def _misfit_p(windows: Sequence[Window], tau: float, scale: float) -> float:
     """Return the probability that exponentials beside tau gain as much by chance; F test."""
     if not math.isfinite(tau):
         return NAN

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from ou_monitor.offline.levels import HALF_WIDTH, runs_at
+from ou_monitor.offline.levels import HALF_WIDTH, half_width, stays
 from ou_monitor.records import Recording
 
 # Longest way from one level to the other, s: after a slower one nothing is left to relax.
@@ -66,9 +66,11 @@ def find_steps(recording: Recording, throttles: Sequence[float]) -> tuple[Step, 
 
     """
     t, throttle = recording.t, recording.throttle
-    runs = sorted((run.start, run.stop, k) for k, value in enumerate(throttles)
-                  if np.isfinite(value) for run in runs_at(t, throttle, value)
-                  if t[run.stop - 1] - t[run.start] >= SHORTEST_STAY)
+    if not np.isfinite(throttles).all():
+        return ()
+    width = half_width(t, throttle)
+    runs = [(run.start, run.stop, k) for run, k in stays(throttle, throttles, width)
+            if t[run.stop - 1] - t[run.start] >= SHORTEST_STAY]
     found = []
     for (begin, leave, before), (start, stop, after) in zip(runs, runs[1:]):
         change = abs(throttles[after] - throttles[before])
@@ -77,7 +79,9 @@ def find_steps(recording: Recording, throttles: Sequence[float]) -> tuple[Step, 
         if t[start] - t[leave - 1] > LONGEST_RAMP:
             continue
         stay = throttle[start:stop]
-        still = np.abs(stay - np.median(stay)) <= _STILL * change
+        # Where the stick jitters as wide as that, what is still is as wide as the jitter.
+        wide = width if width > HALF_WIDTH else 0.0
+        still = np.abs(stay - np.median(stay)) <= max(_STILL * change, wide)
         enter = start + int(still.argmax())
         moved = np.flatnonzero(~still[enter - start:])
         end = enter + int(moved[0]) if moved.size else stop

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.offline.analyze import Analysis, analyze, LevelResult
+from ou_monitor.offline.analyze import Analysis, analyze
+from ou_monitor.offline.level_result import LevelResult
 from ou_monitor.online.compiled import kernels
 from ou_monitor.online.risk import brownout_probability
 from ou_monitor.recordings.read import read_recording

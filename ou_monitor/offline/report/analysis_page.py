@@ -7,7 +7,8 @@ import math
 
 import numpy as np
 
-from ou_monitor.offline.analyze import Analysis, LevelResult
+from ou_monitor.offline.analyze import Analysis
+from ou_monitor.offline.level_result import LevelResult
 from ou_monitor.offline.report import analysis_sections as parts, page
 from ou_monitor.offline.report.cells import figure, UNKNOWN
 from ou_monitor.offline.report.scale import span

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 from ou_monitor.offline.analysis.relaxation import Relaxation
-from ou_monitor.offline.analyze import Analysis, LevelResult
+from ou_monitor.offline.analyze import Analysis
+from ou_monitor.offline.level_result import LevelResult
 from ou_monitor.offline.report import page
 from ou_monitor.offline.report.cells import figure, probability, UNKNOWN
 from ou_monitor.offline.report.svg import Plot
@@ -20,7 +21,7 @@ _MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
 _LEAST_RISK = 1e-9
 _TESTS = {'mean_drift': 'Mean moves', 'variance_drift': 'Intensity moves',
           'gaussian': 'Not Gaussian', 'impulses': 'Impulses', 'correlated': 'Correlated',
-          'one_relaxation': 'More than one relaxation'}
+          'one_relaxation': 'Not one relaxation', 'second_relaxation': 'Second relaxation'}
 
 
 def quality(analysis: Analysis) -> str:
