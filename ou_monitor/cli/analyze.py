@@ -7,8 +7,8 @@ import shlex
 from typing import Any
 
 from ou_monitor.cli.arguments import (
-    add_part, add_recording, add_topics, part_of_recording, positive_number, read_given,
-    said_again, throttle_levels)
+    add_estimate, add_json, add_part, add_recording, add_topics, part_of_recording,
+    positive_number, read_given, said_again, throttle_levels)
 from ou_monitor.errors import InputError
 
 
@@ -31,15 +31,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--levels', metavar='0,0.05,...',
                         help='throttles 0..1 of the load levels (default: found)')
     add_part(parser)
-    parser.add_argument('--window', metavar='S', default='2.0',
-                        help='window of the sliding estimate, s (default: 2.0)')
-    parser.add_argument('--brownout-voltage', metavar='V',
-                        help='voltage that must not be undershot, V (default: as the node, 4.5)')
-    parser.add_argument('--brownout-horizon', metavar='S', default='5.0',
-                        help='horizon of that risk, s (default: 5.0)')
+    add_estimate(parser, 'voltage that must not be undershot, V (default: as the node, 4.5)')
     add_topics(parser)
-    parser.add_argument('--json', metavar='FILE',
-                        help="write the result as JSON ('-': to standard output, alone)")
+    add_json(parser)
     parser.add_argument('--report', metavar='FILE.html',
                         help='write a self-contained HTML page')
     parser.set_defaults(run=run)

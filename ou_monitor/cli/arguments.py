@@ -67,6 +67,39 @@ def add_topics(parser: argparse.ArgumentParser) -> None:
                         help='use what a truncated file still holds')
 
 
+def add_estimate(parser: argparse.ArgumentParser, voltage: str) -> None:
+    """
+    Announce ``--window``, ``--brownout-voltage`` and ``--brownout-horizon``.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    voltage : str
+        What the voltage is for, with its default.
+
+    """
+    parser.add_argument('--window', metavar='S', default='2.0',
+                        help='window of the sliding estimate, s (default: 2.0)')
+    parser.add_argument('--brownout-voltage', metavar='V', help=voltage)
+    parser.add_argument('--brownout-horizon', metavar='S', default='5.0',
+                        help='horizon of that risk, s (default: 5.0)')
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """
+    Announce ``--json``.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+
+    """
+    parser.add_argument('--json', metavar='FILE',
+                        help="write the result as JSON ('-': to standard output, alone)")
+
+
 def read_given(args: argparse.Namespace, start: float | None, end: float | None) -> Recording:
     """
     Read RECORDING as the arguments say, with a progress bar.

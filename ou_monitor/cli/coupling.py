@@ -8,7 +8,7 @@ from typing import Any, TYPE_CHECKING
 
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    add_part, add_recording, add_topics, part_of_recording, read_given)
+    add_json, add_part, add_recording, add_topics, part_of_recording, read_given)
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
@@ -40,8 +40,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--level', metavar='P', default='0.05',
                         help='probability of a false alarm (default: 0.05)')
     add_topics(parser)
-    parser.add_argument('--json', metavar='FILE',
-                        help="write the result as JSON ('-': to standard output, alone)")
+    add_json(parser)
     parser.set_defaults(run=run)
 
 

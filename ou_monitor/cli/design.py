@@ -7,6 +7,7 @@ from dataclasses import asdict
 import math
 from typing import Any, TYPE_CHECKING
 
+from ou_monitor.cli.arguments import add_json
 from ou_monitor.cli.quantities import component, quantity, read_network, value_of
 from ou_monitor.errors import InputError
 
@@ -38,9 +39,9 @@ def add_parser(subparsers: Any) -> None:
                     'components of its power network, over bulk capacitances, and the least one '
                     'that meets a risk.',
         epilog='Values are in SI units, or with prefix and unit: 470uF, 40mOhm, 24kHz.')
-    parser.add_argument('--risk', metavar='X', required=True,
+    parser.add_argument('--risk', metavar='X',
                         help='probability of a brown-out allowed within the horizon, 0..1')
-    parser.add_argument('--throttle', metavar='Y', required=True, help='throttle, 0..1')
+    parser.add_argument('--throttle', metavar='Y', help='throttle, 0..1')
     parser.add_argument('--rail', choices=('bus', 'regulated'), default='bus',
                         help='the battery bus at the ESCs, or the regulated rail '
                              '(default: %(default)s)')
@@ -60,29 +61,27 @@ def add_parser(subparsers: Any) -> None:
                              '(see --list)')
     parser.add_argument('--network', metavar='FILE.yaml',
                         help='components as a YAML mapping of name to value; --set goes first')
-    parser.add_argument('--list', action=_List, help='list the components and their defaults')
-    parser.add_argument('--json', metavar='FILE',
-                        help="write the result as JSON ('-': to standard output, alone)")
+    parser.add_argument('--list', action='store_true',
+                        help='list the components and their defaults')
+    add_json(parser)
     parser.set_defaults(run=run)
 
 
-class _List(argparse.Action):
-    """Print the components with defaults and units, and leave."""
+def _list(target: str | None) -> None:
+    """Show the components with defaults and units; as JSON where that is asked for."""
+    from ou_monitor.cli import output
+    from ou_monitor.model.network.components import PowerNetwork, UNITS
 
-    def __init__(self, option_strings: list[str], dest: str, **options: Any) -> None:
-        """Take no value."""
-        super().__init__(option_strings, dest, nargs=0, **options)
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        """Print and leave with status 0."""
-        from ou_monitor.cli.output import say, table
-        from ou_monitor.model.network.components import PowerNetwork, UNITS
-
-        network = PowerNetwork()
-        rows = [[name, _shown(value, network), UNITS.get(name, '')]
-                for name, value in asdict(network).items()]
-        say(table(['component', 'default', 'unit'], rows, left=[0, 2]))
-        parser.exit()
+    network = PowerNetwork()
+    values = asdict(network)
+    if target is not None:
+        output.write_json({name: {'default': network.line_feedthrough if value is None else value,
+                                  'unit': UNITS.get(name, '')}
+                           for name, value in values.items()}, target)
+    if target != output.STDOUT:
+        output.say(output.table(['component', 'default', 'unit'], [
+            [name, _shown(value, network), UNITS.get(name, '')]
+            for name, value in values.items()], left=[0, 2]))
 
 
 def _shown(value: object, network: PowerNetwork) -> str:
@@ -114,6 +113,13 @@ def run(args: argparse.Namespace) -> int:
     from ou_monitor.cli import output
 
     output.check_paths({'--network': args.network}, {'--json': args.json})
+    if args.list:
+        _list(args.json)
+        return 0
+    for option, value in (('--risk', args.risk), ('--throttle', args.throttle)):
+        if value is None:
+            raise InputError(f'{option} is missing: ou-monitor design --risk 1e-3 --throttle 0.4 '
+                             'asks for a risk of 1e-3 at 40 %')
     numbers = {name: quantity(f'--{name.replace("_", "-")}', getattr(args, name), unit)
                for name, unit in _OPTIONS.items()}
     if numbers['throttle'] > 1.0:

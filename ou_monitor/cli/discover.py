@@ -11,7 +11,7 @@ from typing import Any, TYPE_CHECKING
 from ou_monitor import __version__
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    add_part, add_recording, add_topics, part_of_recording, read_given, said_again)
+    add_json, add_part, add_recording, add_topics, part_of_recording, read_given, said_again)
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
@@ -41,8 +41,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--seed', metavar='N', type=int, default=0,
                         help='same seed, same result (default: %(default)s)')
     add_topics(parser)
-    parser.add_argument('--json', metavar='FILE',
-                        help="write the result as JSON ('-': to standard output, alone)")
+    add_json(parser)
     parser.add_argument('--save-model', metavar='FILE.yaml',
                         help='write the extended model, for simulate --model and the estimator')
     parser.add_argument('--report', metavar='FILE.html',

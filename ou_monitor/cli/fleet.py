@@ -12,7 +12,8 @@ from typing import Any, TYPE_CHECKING
 
 from ou_monitor import __version__
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import add_topics, positive_number, said_again, throttle_levels
+from ou_monitor.cli.arguments import (
+    add_estimate, add_json, add_topics, positive_number, said_again, throttle_levels)
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
@@ -60,15 +61,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--levels', metavar='0,0.05,...',
                         help='throttles 0..1 of the load levels (default: found in each '
                         'recording)')
-    parser.add_argument('--window', metavar='S', default='2.0',
-                        help='window of the sliding estimate, s (default: 2.0)')
-    parser.add_argument('--brownout-voltage', metavar='V',
-                        help='also give the risk of going below this voltage, V')
-    parser.add_argument('--brownout-horizon', metavar='S', default='5.0',
-                        help='horizon of that risk, s (default: 5.0)')
+    add_estimate(parser, 'also give the risk of going below this voltage, V')
     add_topics(parser)
-    parser.add_argument('--json', metavar='FILE',
-                        help="write the result as JSON ('-': to standard output, alone)")
+    add_json(parser)
     parser.set_defaults(run=run)
 
 

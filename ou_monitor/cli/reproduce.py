@@ -6,6 +6,7 @@ import argparse
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor.cli import output
+from ou_monitor.cli.arguments import add_json
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
@@ -29,8 +30,7 @@ def add_parser(subparsers: Any) -> None:
                     'whether it agrees, differs by rounding, or does not hold.')
     parser.add_argument('--seed', metavar='N', type=int, default=1,
                         help='same seed, same simulations (default: %(default)s)')
-    parser.add_argument('--json', metavar='FILE',
-                        help="write the result as JSON ('-': to standard output, alone)")
+    add_json(parser)
     parser.add_argument('--report', metavar='FILE.html',
                         help='write a self-contained HTML page')
     parser.set_defaults(run=run)

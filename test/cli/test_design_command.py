@@ -93,6 +93,18 @@ def test_list(capsys):
     assert re.search(r'^bulk_capacitance +0.00047  F$', out, re.MULTILINE)
     assert re.search(r'^line_gain +0.2252$', out, re.MULTILINE)
     assert len(out.splitlines()) == 2 + len(PowerNetwork.__dataclass_fields__)
+    assert main(['design', '--list', '--json', '-']) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert values['bulk_capacitance'] == {'default': 470e-6, 'unit': 'F'}
+    assert values.keys() == PowerNetwork.__dataclass_fields__.keys()
+
+
+@pytest.mark.parametrize('given, missing', [('--risk=1e-3', '--throttle'),
+                                            ('--throttle=0.4', '--risk')])
+def test_what_is_missing_is_named(capsys, given, missing):
+    """Risk and throttle have no default."""
+    assert main(['design', given]) == 2
+    assert re.match(rf'.*{missing} is missing', capsys.readouterr().err)
 
 
 @pytest.mark.parametrize('more, words', [
