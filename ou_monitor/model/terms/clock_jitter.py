@@ -72,18 +72,19 @@ class ClockJitter(Term):
             # Errors of half a step at the most leave less; and a step that was too
             # long makes the next too short.
             return None
-        z = z[:_SHORT]
+        pull = _pull(view)
+        z, inside = z[:_SHORT], pull[view.train][:_SHORT]
 
         def value(x: FloatArray) -> float:
             if not -4.0 < x[0] < -0.8:
                 return -math.inf
-            return float(_errors(z, x)[1].sum())
+            return float(_errors(z, inside, x)[1].sum())
 
         x, _ = climb(value, start, most=most)
-        before, density, std, law = _errors(view.z, x)
+        before, density, std, mean, law = _errors(view.z, pull, x)
         weight = (before[:, :, None] * law[None, None, :]).reshape(view.z.size, -1)
         wide = np.broadcast_to(std.reshape(-1), weight.shape)
-        scores = normal_scores(mixture_cdf(view.z, weight, np.zeros_like(weight), wide))
+        scores = normal_scores(mixture_cdf(view.z, weight, pull[:, None] * mean.reshape(-1), wide))
         error = math.exp(x[0]) * step
         return LawFit(cls(error), {'std': error * float(curvature_se(value, x)[0])}, scores,
                       density - log_normal(view.z), 2)
@@ -102,15 +103,27 @@ _SHORT, _MOST_KURTOSIS, _MOST_TOGETHER = 15000, 6.0, 4.0
 _LEVELS = 7
 
 
-def _errors(z: FloatArray, x: FloatArray
-            ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the law of the error before, densities, scales of each pair, and the prior."""
+def _pull(view: View) -> FloatArray:
+    """Return by how many scores the rail relaxes further in a step that is one step longer."""
+    phi = np.maximum(view.phi, _LEAST)
+    pull: FloatArray = phi * np.log(phi) * view.state / np.sqrt(view.variance)
+    return pull
+
+
+# Coefficient that stands for none.
+_LEAST = 1e-12
+
+
+def _errors(z: FloatArray, pull: FloatArray, x: FloatArray
+            ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the law of the error before, densities, scales and shifts of pairs, and the prior."""
     nodes = np.linspace(-2.4, 2.4, _LEVELS)
     law = np.exp(-0.5 * nodes * nodes)
     law /= law.sum()
     error = math.exp(x[0]) * nodes
-    var = math.exp(2.0 * x[1]) * np.maximum(1.0 + error[None, :] - error[:, None], 0.05)
+    longer = error[None, :] - error[:, None]
+    var = math.exp(2.0 * x[1]) * np.maximum(1.0 + longer, 0.05)
     transition = np.broadcast_to(law, (_LEVELS, _LEVELS))
-    log_density = log_normal(z, 0.0, var[:, :, None])
+    log_density = log_normal(z, longer[:, :, None] * pull, var[:, :, None])
     before, density = forward(log_density.transpose(2, 0, 1), transition, law)
-    return before, density, np.sqrt(var), law
+    return before, density, np.sqrt(var), longer, law

@@ -15,7 +15,7 @@ from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.offline.discover.battery import is_sign, statistics
 from ou_monitor.offline.discover.composite import Composite, scene_of, view_of
 from ou_monitor.offline.discover.data import Samples
-from ou_monitor.offline.discover.fitting import best_start, fitted
+from ou_monitor.offline.discover.fitting import best_start, fitted, sag_with_lag
 from ou_monitor.offline.discover.null_bank import NullBank
 
 # A statistic this far off asks for the terms that it is a sign of.
@@ -25,6 +25,8 @@ ASK_DEAR = 3.2
 # Evidence from which a cause that leaves nothing off (so far) spares trials of
 # other families.
 CLEAR, _LEFT = 30.0, 4.5
+# Evidence up to which the sag and its lag are tried together, nats.
+WORTHLESS = 3.0
 # What a fit to some thousand samples may lack of that to all, nats.
 ROUGH = 20.0
 # Kinds of which there may be one more.
@@ -32,13 +34,16 @@ AGAIN = frozenset({'tone', 'throttle_tone', 'resonance', 'second_relaxation', 'l
 # Kinds that imitate each other: one beside another would only mend its form.
 _ALIKE = (frozenset({'volatility', 'regime_switching', 'heavy_tails', 'jumps'}),
           frozenset({'glitches', 'jumps', 'heavy_tails', 'clock_jitter'}),
-          frozenset({'second_relaxation', 'flicker_noise', 'regime_switching'}))
+          frozenset({'second_relaxation', 'flicker_noise', 'regime_switching'}),
+          frozenset({'nonlinear_restoring', 'regime_switching'}))
 # What filters may cost before no further dear kind is tried, s, about.
 MOST_WORK = 10.0
 # Turns: measured inputs, laws where there are clear outliers, the rest.
 TIERS = 3
 _SHAPE = ('kurtosis', 'tails')
 _CLEAR_SHAPE = 25.0
+# Line that follows throttle, as a score, from which on it is no chance.
+_CLEAR_LINE = 10.0
 # Correlation of small neighbours, as a score, from which on it is white noise.
 _WHITE = -8.0
 
@@ -48,13 +53,15 @@ class Trial:
     """
     A candidate, fitted beside what was accepted before.
 
-    `left` are the statistics of the model with it, where its evidence is clear.
+    `left` are the statistics of the model with it, where its evidence is clear; `beside` is
+    the name of what comes with it, if anything.
     """
 
     name: str
     composite: Composite
     evidence: float
     left: dict[str, float] | None = None
+    beside: str = ''
 
 
 def criticise(samples: Samples, composite: Composite, bank: NullBank) -> dict[str, float]:
@@ -104,6 +111,13 @@ def trials_of(samples: Samples, composite: Composite, values: dict[str, float],
             if trial.evidence > CLEAR:
                 trial = replace(trial, left=criticise(samples, best, bank))
             found.append(trial)
+    alone = {trial.name: trial for trial in found}
+    pair = [alone.get(name) for name in ('load_sag', 'load_transient')]
+    if not composite.has('load_sag') and all(t and t.evidence <= WORTHLESS for t in pair):
+        both = sag_with_lag(samples, composite, view)
+        if both is not None:
+            found.append(Trial('load_transient', both, both.score(samples) - before,
+                               beside='load_sag'))
     return found
 
 
@@ -167,7 +181,9 @@ def _settled(trial: Trial, kind: type[Term]) -> bool:
 
 def tier_of(kind: type[Term], values: dict[str, float]) -> int:
     """Return when a kind has its turn: measured inputs, clear outliers, the rest."""
-    if is_measured(kind):
+    if is_measured(kind) or (
+            kind.NAME == 'throttle_tone' and values.get('order line', 0.0) > _CLEAR_LINE):
+        # A line that is clearly there would pass for sigma or alpha that follow throttle.
         return 0
     shape = max((abs(value) for name, value in values.items()
                  if name.startswith(_SHAPE)), default=0.0)
