@@ -21,6 +21,8 @@ from ou_monitor.records import FloatArray
 
 # Starting points that are fitted in full, and samples that tell which.
 _FULL, _GLANCE = 2, 8000
+# Lags of a sag that are fitted in full.
+_LAGS = 4
 
 
 def best_start(samples: Samples, composite: Composite, kind: type[Term], view: View
@@ -55,7 +57,10 @@ def sag_with_lag(samples: Samples, composite: Composite, view: View) -> Composit
     """
     sag = LoadSag.candidates(view)[0]
     lags = _screened(samples, list(LoadTransient.candidates(view)), view, beside=[sag])
-    return joined(samples, composite, [sag, lags[0]], rough=True) if lags else None
+    # The rate of the rail is not what it seemed to be, and with it goes the lag that fits best.
+    made = [joined(samples, composite, [sag, lag], rough=True) for lag in lags[:_LAGS]]
+    return max((fit for fit in made if fit is not None), default=None,
+               key=lambda fit: fit.score(samples))
 
 
 def joined(samples: Samples, composite: Composite, starts: Sequence[Term], rough: bool

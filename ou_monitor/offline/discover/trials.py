@@ -25,8 +25,6 @@ ASK_DEAR = 3.2
 # Evidence from which a cause that leaves nothing off (so far) spares trials of
 # other families.
 CLEAR, _LEFT = 30.0, 4.5
-# Evidence up to which the sag and its lag are tried together, nats.
-WORTHLESS = 3.0
 # What a fit to some thousand samples may lack of that to all, nats.
 ROUGH = 20.0
 # Kinds of which there may be one more.
@@ -111,9 +109,8 @@ def trials_of(samples: Samples, composite: Composite, values: dict[str, float],
             if trial.evidence > CLEAR:
                 trial = replace(trial, left=criticise(samples, best, bank))
             found.append(trial)
-    alone = {trial.name: trial for trial in found}
-    pair = [alone.get(name) for name in ('load_sag', 'load_transient')]
-    if not composite.has('load_sag') and all(t and t.evidence <= WORTHLESS for t in pair):
+    if not composite.has('load_sag') and {'load_sag', 'load_transient'} <= {
+            trial.name for trial in found}:
         both = sag_with_lag(samples, composite, view)
         if both is not None:
             found.append(Trial('load_transient', both, both.score(samples) - before,
