@@ -85,7 +85,8 @@ class ClockJitter(Term):
         before, density, std, mean, law = _errors(view.z, state, phi, x)
         weight = (before[:, :, None] * law[None, None, :]).reshape(view.z.size, -1)
         wide = np.broadcast_to(std.reshape(-1), weight.shape)
-        scores = normal_scores(mixture_cdf(view.z, weight, state[:, None] * mean.reshape(-1), wide))
+        moved = state[:, None] * mean.reshape(-1)
+        scores = normal_scores(mixture_cdf(view.z, weight, moved, wide))
         error = math.exp(x[0]) * step
         return LawFit(cls(error), {'std': error * float(curvature_se(value, x)[0])}, scores,
                       density - log_normal(view.z), 2)
@@ -111,7 +112,7 @@ _LEAST = 1e-12
 def _errors(z: FloatArray, state: FloatArray, phi: float, x: FloatArray
             ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """
-    Return the law of the error before, densities, scales and shifts of pairs, and the prior.
+    Return the law of the error before, densities, scales, shifts of pairs, and the prior.
 
     A shift is what a step that is longer moves the score by, per score that the rail is
     away from its mean.

@@ -109,8 +109,8 @@ def _linearised(x: FloatArray, span: FloatArray, linear: float, square: float, c
     """
     Return what the force moves a deviation by in a step, and how noise spreads in it.
 
-    The force is taken as linear about the deviation at the begin of the step, and the
-    bend of it by its mean effect (Shoji & Ozaki, Stoch. Anal. Appl. 16 (1998) 733).
+    The force is taken as linear about the deviation at the begin of a part of the step, and
+    the bend of it by its mean effect (Shoji & Ozaki, Stoch. Anal. Appl. 16 (1998) 733).
 
     Returns
     -------
@@ -120,13 +120,29 @@ def _linearised(x: FloatArray, span: FloatArray, linear: float, square: float, c
         Variance at the end of the step over that without a force.
 
     """
-    force = -(linear + (square + cube * x) * x) * x
-    turn = np.clip(-(linear + (2.0 * square + 3.0 * cube * x) * x) * span, -_STIFF, _LOOSE)
-    turn[np.abs(turn) < _FLAT] = _FLAT
-    grown = np.expm1(turn)
-    bend = -(square + 3.0 * cube * x) * variance
-    move = (force * grown + bend * (grown - turn) / turn) * span / turn
-    return move, np.expm1(2.0 * turn) / (2.0 * turn)
+    # A force that softens stays as large as it has become: it does not push away.
+    tops = np.roots([3.0 * cube, 2.0 * square, linear])
+    tops = tops[np.isreal(tops)].real
+    low = np.max(tops, initial=-np.inf, where=tops < 0.0)
+    high = np.min(tops, initial=np.inf, where=tops > 0.0)
+
+    def slope(y: FloatArray) -> FloatArray:
+        turns: FloatArray = -(linear + (2.0 * square + 3.0 * cube * y) * y) * span
+        return turns
+
+    steepest = -float(slope(np.clip(x, low, high)).min())
+    parts = int(min(max(math.ceil(steepest / _TURN), 1), _PARTS))
+    span, noise = span / parts, variance / parts
+    at, spread = x, np.zeros(x.size)
+    for _ in range(parts):
+        y = np.clip(at, low, high)
+        turn = np.clip(slope(y), -_STIFF, -_FLAT)
+        grown = np.expm1(turn) / turn
+        curve = -(square + 3.0 * cube * y)
+        force = -(linear + (square + cube * y) * y) * y + curve * spread
+        at = at + (force * grown + curve * noise * (grown - 1.0) / turn) * span
+        spread = spread * np.exp(2.0 * turn) + noise * np.expm1(2.0 * turn) / (2.0 * turn)
+    return at - x, spread / variance
 
 
 def _climbed(density: Callable[[FloatArray], FloatArray], b: FloatArray, error: FloatArray
@@ -150,8 +166,9 @@ def _climbed(density: Callable[[FloatArray], FloatArray], b: FloatArray, error: 
 
 # Cube at least, in square^2/alpha: from 1/4 on the force has one zero only.
 _HOLDS = 0.26
-# Slopes of the force times the step: limits, and what counts as none.
-_STIFF, _LOOSE, _FLAT = 20.0, 0.5, 1e-9
+# Slopes of the force times the step: the steepest, what counts as none, and up to which a
+# part of the step may be; parts at most.
+_STIFF, _FLAT, _TURN, _PARTS = 20.0, 1e-9, 0.4, 6
 # Rounds of scoring, and the gain of one that is too little for another, nats.
 _ROUNDS, _SETTLED = 5, 0.05
 # Steps of numerical scores, in standard errors.
