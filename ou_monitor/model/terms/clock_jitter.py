@@ -72,18 +72,21 @@ class ClockJitter(Term):
             # Errors of half a step at the most leave less; and a step that was too
             # long makes the next too short.
             return None
-        z = z[:_SHORT]
+        state = view.state / np.sqrt(view.variance)
+        z, inside = z[:_SHORT], state[view.train][:_SHORT]
+        phi = min(max(float(np.median(view.phi[1:])), _LEAST), 1.0 - _LEAST)
 
         def value(x: FloatArray) -> float:
             if not -4.0 < x[0] < -0.8:
                 return -math.inf
-            return float(_errors(z, x)[1].sum())
+            return float(_errors(z, inside, phi, x)[1].sum())
 
         x, _ = climb(value, start, most=most)
-        before, density, std, law = _errors(view.z, x)
+        before, density, std, mean, law = _errors(view.z, state, phi, x)
         weight = (before[:, :, None] * law[None, None, :]).reshape(view.z.size, -1)
         wide = np.broadcast_to(std.reshape(-1), weight.shape)
-        scores = normal_scores(mixture_cdf(view.z, weight, np.zeros_like(weight), wide))
+        moved = state[:, None] * mean.reshape(-1)
+        scores = normal_scores(mixture_cdf(view.z, weight, moved, wide))
         error = math.exp(x[0]) * step
         return LawFit(cls(error), {'std': error * float(curvature_se(value, x)[0])}, scores,
                       density - log_normal(view.z), 2)
@@ -102,15 +105,27 @@ _SHORT, _MOST_KURTOSIS, _MOST_TOGETHER = 15000, 6.0, 4.0
 _LEVELS = 7
 
 
-def _errors(z: FloatArray, x: FloatArray
-            ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the law of the error before, densities, scales of each pair, and the prior."""
+# As near as coefficients come to 0 and 1.
+_LEAST = 1e-12
+
+
+def _errors(z: FloatArray, state: FloatArray, phi: float, x: FloatArray
+            ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """
+    Return the law of the error before, densities, scales, shifts of pairs, and the prior.
+
+    A shift is what a step that is longer moves the score by, per score that the rail is
+    away from its mean.
+    """
     nodes = np.linspace(-2.4, 2.4, _LEVELS)
     law = np.exp(-0.5 * nodes * nodes)
     law /= law.sum()
     error = math.exp(x[0]) * nodes
-    var = math.exp(2.0 * x[1]) * np.maximum(1.0 + error[None, :] - error[:, None], 0.05)
+    span = np.maximum(1.0 + error[None, :] - error[:, None], 0.05)
+    keep = phi ** span
+    var = math.exp(2.0 * x[1]) * (1.0 - keep * keep) / (1.0 - phi * phi)
+    shift = keep - phi
     transition = np.broadcast_to(law, (_LEVELS, _LEVELS))
-    log_density = log_normal(z, 0.0, var[:, :, None])
+    log_density = log_normal(z, shift[:, :, None] * state, var[:, :, None])
     before, density = forward(log_density.transpose(2, 0, 1), transition, law)
-    return before, density, np.sqrt(var), law
+    return before, density, np.sqrt(var), shift, law

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -197,9 +198,11 @@ def order_lines(view: View) -> list[tuple[float, float]]:
     if view.throttle is None:
         return []
     z, u = view.z[view.train], view.throttle[view.train]
-    best = _hough(z, u, view.rate)
-    return [_refined(z, u, view.rate, idle, slope, view.rate / (2.0 * _length(view.rate)))
-            for _, idle, slope in best[:_MOST]]
+    found = sorted((line for length in _lengths(view.rate)
+                    for line in _hough(z, u, view.rate, length)[:_MOST]),
+                   key=lambda line: -line.rise)
+    return [_refined(z, u, view.rate, line.idle, line.slope, view.rate / (2.0 * line.length))
+            for line in found[:_MOST]]
 
 
 def order_power(z: FloatArray, u: FloatArray, rate: float) -> tuple[float, float]:
@@ -221,30 +224,49 @@ def order_power(z: FloatArray, u: FloatArray, rate: float) -> tuple[float, float
         Lines looked at; 0 where there is nothing to look at.
 
     """
-    best = _hough(z, u, rate)
-    if not best:
-        return 0.0, 0.0
-    count = z.size // _length(rate)
-    # A mean of `count` exponentials, about; its tail by the Cramer bound.
-    mean = best[0][0]
-    rise = count * (mean - 1.0 - math.log(max(mean, 1e-9)))
-    return rise, _INDEPENDENT * 2.0 * _length(rate) * len(best)
+    top, trials = 0.0, 0.0
+    for length in _lengths(rate):
+        best = _hough(z, u, rate, length)
+        if best:
+            top = max(top, best[0].rise)
+            trials += _INDEPENDENT * 2.0 * length * len(best)
+    return top, trials
 
 
 # Share of the lines looked at that are as good as independent: neighbours share
 # most of their bins.  Found by simulation: of 120 flights of white noise 5 % were
 # to exceed the 95 % point, and 1 did.
 _INDEPENDENT = 0.02
+# Slopes looked at, in sampling rates: idle to full throttle may fold once and come back.
+_REACH = 1.0
+# By how much a stretch is shorter that shows lines which throttle moves fast.
+_SHORTER = 8
 
 
-def _length(rate: float) -> int:
-    """Return the samples in a stretch of a quarter of a second."""
-    return int(1 << max(5, round(math.log2(max(32.0, 0.25 * rate)))))
+def _lengths(rate: float) -> tuple[int, ...]:
+    """Return the samples in a stretch: a quarter of a second, and an eighth of that."""
+    long = int(1 << max(5, round(math.log2(max(32.0, 0.25 * rate)))))
+    short = max(long // _SHORTER, 32)
+    return (long,) if short == long else (long, short)
 
 
-def _hough(z: FloatArray, u: FloatArray, rate: float) -> list[tuple[float, float, float]]:
-    """Return mean power, idle and slope of the best idle for each slope, best first."""
-    length = _length(rate)
+@dataclass(frozen=True)
+class _Line:
+    """
+    A line that follows throttle.
+
+    `rise` is such that exp(-rise) is the chance of one trial to be beaten; `length` are the
+    samples in a stretch.
+    """
+
+    rise: float
+    idle: float
+    slope: float
+    length: int
+
+
+def _hough(z: FloatArray, u: FloatArray, rate: float, length: int) -> list[_Line]:
+    """Return the best idle for each slope, the strongest line first."""
     count = z.size // length
     if count < 8 or np.ptp(u) < 0.02:
         return []
@@ -255,20 +277,23 @@ def _hough(z: FloatArray, u: FloatArray, rate: float) -> list[tuple[float, float
     load = u[:count * length].reshape(count, length).mean(axis=1)
     width = rate / (2.0 * length)
     bins = power.shape[1] - 1
-    best: list[tuple[float, float, float]] = []
-    reach = 0.6 * 0.5 * rate
+    best: list[_Line] = []
     # Beyond the Nyquist frequency a line comes back.
     fold = np.abs((np.arange(3 * bins) + bins) % (2 * bins) - bins)
     folded = np.ascontiguousarray(power[:, fold])
     total = np.empty(bins, dtype=np.float32)
+    reach = _REACH * rate
     for slope in np.arange(-reach, reach, 2.0 * width / np.ptp(load)):
         shift = np.rint(slope * load / width).astype(np.int64)
         total[:] = 0.0
         for row, first in zip(folded, (shift % (2 * bins)).tolist(), strict=True):
             total += row[first:first + bins]
         k = int(np.argmax(total))
-        best.append((float(total[k]) / count, k * width, float(slope)))
-    best.sort(reverse=True)
+        # A mean of `count` exponentials, about; its tail by the Cramer bound.
+        mean = float(total[k]) / count
+        rise = count * (mean - 1.0 - math.log(max(mean, 1e-9)))
+        best.append(_Line(rise if mean > 1.0 else 0.0, k * width, float(slope), length))
+    best.sort(key=lambda line: -line.rise)
     return best
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 import math
 from typing import ClassVar
@@ -11,6 +12,7 @@ import numpy as np
 from ou_monitor.model.terms.laws import log_normal
 from ou_monitor.model.terms.term import (
     Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
+from ou_monitor.records import FloatArray
 
 
 @dataclass(frozen=True)
@@ -56,33 +58,118 @@ class NonlinearRestoring(Term):
     @classmethod
     def _regressed(cls, view: View, powers: tuple[int, ...]) -> LawFit | None:
         """Return the fit with some powers; the linear force is fitted again with them."""
+        train = view.train
         span = np.where(np.isfinite(view.step), view.step, 0.0)
         s, x = np.sqrt(view.variance), view.state
         columns = np.stack((x, *(-x**power for power in powers)), axis=1) * (span / s)[:, None]
-        columns -= columns[view.train].mean(axis=0)
-        inside = columns[view.train]
+        columns -= columns[train].mean(axis=0)
+        inside = columns[train]
         gram = inside.T @ inside
         scale = np.sqrt(gram.diagonal())
         if not (scale > 0.0).all():
             return None
         inverse = np.linalg.pinv(gram / np.outer(scale, scale)) / np.outer(scale, scale)
-        b = inverse @ (inside.T @ view.z[view.train])
+        error = np.sqrt(np.maximum(inverse.diagonal(), 0.0))
+        alpha = -math.log(min(max(float(np.median(view.phi[1:])), 1e-300), 1.0 - 1e-9)) * view.rate
+        shift = view.z * s + (view.phi - 1.0) * x
+        widest = float(np.median(view.variance[train]))
+
+        def scored(b: FloatArray, part: slice) -> tuple[FloatArray, FloatArray]:
+            """Return scores and log densities of a part with these coefficients."""
+            by = dict(zip(powers, b[1:].tolist(), strict=True))
+            move, spread = _linearised(x[part], span[part], alpha - b[0], by.get(2, 0.0),
+                                       by.get(3, 0.0), widest)
+            e = (shift[part] - move) / s[part]
+            if part == train:
+                level[0] = float(e.mean())
+                level[1] = float(np.mean((e - level[0]) ** 2 / spread))
+            spread *= level[1]
+            scores = (e - level[0]) / np.sqrt(spread)
+            return scores, log_normal(scores) - 0.5 * np.log(spread)
+
+        level = [0.0, 1.0]
+        # The regression takes the force at the begin of a step for that throughout.
+        b = _climbed(lambda b: scored(b, train)[1], inverse @ (inside.T @ view.z[train]), error)
+        if not alpha > b[0]:
+            return None
+        scored(b, train)
+        scores, density = scored(b, slice(None))
         by = dict(zip(powers, b[1:].tolist(), strict=True))
-        error = dict(zip(powers, np.sqrt(np.maximum(inverse.diagonal()[1:], 0.0)).tolist(),
-                         strict=True))
+        errors = dict(zip(powers, error[1:].tolist(), strict=True))
         square, cube = by.get(2, 0.0), by.get(3, 0.0)
-        # A steeper force also leaves less noise at the end of a step.
-        part = 1.0 - np.clip((2.0 * square * x + 3.0 * cube * x * x) * span, -0.5, 0.5)
-        part /= float(np.mean(part[view.train]))
-        scores = (view.z - columns @ b) / np.sqrt(part)
-        gain = log_normal(scores) - 0.5 * np.log(part) - log_normal(view.z)
         # A force that would push away at large deviations is held just short of it.
-        alpha = -math.log(max(float(np.median(view.phi[1:])), 1e-300)) * view.rate
         cube = max(cube, _HOLDS * square * square / alpha)
-        return LawFit(cls(square, cube), {'square': error.get(2, math.nan),
-                                          'cube': error.get(3, math.nan)}, scores, gain,
-                      len(powers))
+        return LawFit(cls(square, cube), {'square': errors.get(2, math.nan),
+                                          'cube': errors.get(3, math.nan)}, scores,
+                      density - log_normal(view.z), len(powers))
+
+
+def _linearised(x: FloatArray, span: FloatArray, linear: float, square: float, cube: float,
+                variance: float) -> tuple[FloatArray, FloatArray]:
+    """
+    Return what the force moves a deviation by in a step, and how noise spreads in it.
+
+    The force is taken as linear about the deviation at the begin of a part of the step, and
+    the bend of it by its mean effect (Shoji & Ozaki, Stoch. Anal. Appl. 16 (1998) 733).
+
+    Returns
+    -------
+    move : ndarray, shape (n,)
+        V.
+    part : ndarray, shape (n,)
+        Variance at the end of the step over that without a force.
+
+    """
+    # A force that softens stays as large as it has become: it does not push away.
+    tops = np.roots([3.0 * cube, 2.0 * square, linear])
+    tops = tops[np.isreal(tops)].real
+    low = np.max(tops, initial=-np.inf, where=tops < 0.0)
+    high = np.min(tops, initial=np.inf, where=tops > 0.0)
+
+    def slope(y: FloatArray) -> FloatArray:
+        turns: FloatArray = -(linear + (2.0 * square + 3.0 * cube * y) * y) * span
+        return turns
+
+    steepest = -float(slope(np.clip(x, low, high)).min())
+    parts = int(min(max(math.ceil(steepest / _TURN), 1), _PARTS))
+    span, noise = span / parts, variance / parts
+    at, spread = x, np.zeros(x.size)
+    for _ in range(parts):
+        y = np.clip(at, low, high)
+        turn = np.clip(slope(y), -_STIFF, -_FLAT)
+        grown = np.expm1(turn) / turn
+        curve = -(square + 3.0 * cube * y)
+        force = -(linear + (square + cube * y) * y) * y + curve * spread
+        at = at + (force * grown + curve * noise * (grown - 1.0) / turn) * span
+        spread = spread * np.exp(2.0 * turn) + noise * np.expm1(2.0 * turn) / (2.0 * turn)
+    return at - x, spread / variance
+
+
+def _climbed(density: Callable[[FloatArray], FloatArray], b: FloatArray, error: FloatArray
+             ) -> FloatArray:
+    """Return the coefficients of the largest likelihood near `b`, by numerical scores."""
+    now = density(b)
+    for _ in range(_ROUNDS):
+        scores = np.stack([density(b + _NEAR * step) - now for step in np.diag(error)],
+                          axis=1) / _NEAR
+        move = error * (np.linalg.pinv(scores.T @ scores) @ scores.sum(axis=0))
+        for share in (1.0, 0.3, 0.1):
+            new = density(b + share * move)
+            gain = float((new - now).sum())
+            if gain > 0.0:
+                b, now = b + share * move, new
+                break
+        if not gain > _SETTLED:
+            break
+    return b
 
 
 # Cube at least, in square^2/alpha: from 1/4 on the force has one zero only.
 _HOLDS = 0.26
+# Slopes of the force times the step: the steepest, what counts as none, and up to which a
+# part of the step may be; parts at most.
+_STIFF, _FLAT, _TURN, _PARTS = 20.0, 1e-9, 0.4, 6
+# Rounds of scoring, and the gain of one that is too little for another, nats.
+_ROUNDS, _SETTLED = 5, 0.05
+# Steps of numerical scores, in standard errors.
+_NEAR = 0.1

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import ClassVar
 
 import numpy as np
 
 from ou_monitor.model.hidden_chain import forward, log_likelihood
+from ou_monitor.model.terms.hidden_levels import faster_by, moving, relaxing, units_of
 from ou_monitor.model.terms.laws import climb, curvature_se, log_normal, normal_scores
 from ou_monitor.model.terms.recursion import first_order
 from ou_monitor.model.terms.term import (
@@ -38,7 +39,8 @@ class RegimeSwitching(Term):
     ROLE: ClassVar[Role] = Role.LAW
     DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = (
-        '+clustering', '+kurtosis', '+band 0', '+band 1', '+band 2', '+band 3')
+        '+clustering', '+kurtosis', '+band 0', '+band 1', '+band 2', '+band 3', 'state squared',
+        'state cubed')
 
     rate_up: float = parameter('1/s', 'rate of going to each higher state', 0.0, above=True)
     rate_down: float = parameter('1/s', 'rate of going to each lower state', 0.0, above=True)
@@ -110,32 +112,62 @@ class RegimeSwitching(Term):
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Fit a hidden chain of two states that share a level and a scale."""
-        best: tuple[float, FloatArray, float] | None = None
-        z, phi = view.z[view.train], view.phi[view.train]
+        # The best with a level of its own, and without.
+        best: dict[bool, tuple[float, FloatArray, float, View]] = {}
         spread = math.sqrt(float(np.mean(view.residual[view.train] ** 2)))
-        unit = math.sqrt(float(np.median(view.variance)))
         step = 1.0 / view.rate
-        z, phi = z[:_SHORT], phi[:_SHORT]
-
-        def value(x: FloatArray) -> float:
-            if not _inside(x, view):
-                return -math.inf
-            return log_likelihood(*_chain(z, phi, step, x, once)[0])
-
+        first = slice(0, min(_SHORT, view.train.stop))
+        busy = moving(view.residual[view.train], first.stop)
         # Coordinates: ln rates, level in innovations, ln sigma ratio, ln scale.
         shortest = math.exp(-_fastest(view))
-        for dwell in (5.0 * shortest, 50.0 * shortest):
-            for level, ratio, once in ((0.0, 0.7, 1.0), (spread / unit, 0.0, 1.0),
-                                       (spread / unit, 0.0, 0.0)):
-                rate = -math.log(dwell)
-                x, top = climb(value, [rate, rate, level, ratio, -0.3 * ratio], most=40)
-                if best is None or top > best[0]:
-                    best = top, x, once
-        if best is None:
-            return None
-        two = cls._finished(view, best[1], best[2], 80)
-        if two is None:
-            return None
+        for faster in _FASTER:
+            seen = relaxing(view, faster)
+            unit = math.sqrt(float(np.median(seen.variance)))
+            units = units_of(seen)
+            # Two levels that hide how fast the rail relaxes make most of the spread.
+            height = (1.0 if faster == 1.0 else 2.0) * spread / unit
+            # Densities of volts, over those without states.
+            plain = log_normal(view.z) - 0.5 * np.log(view.variance / seen.variance)
+
+            def value(x: FloatArray) -> float:
+                if not _inside(x, view):
+                    return -math.inf
+                chain = _chain(seen.z[part], seen.phi[part], units[part], step, x, once)[0]
+                return log_likelihood(*chain) - float(plain[part].sum())
+
+            for dwell in (5.0 * shortest, 50.0 * shortest):
+                for level, ratio, once in ((0.0, 0.7, 1.0), (height, 0.0, 1.0),
+                                           (height, 0.0, 0.0)):
+                    if level == 0.0 and faster > 1.0:
+                        continue
+                    part = busy if level else first
+                    rate = -math.log(dwell)
+                    x, top = climb(value, [rate, rate, level, ratio, -0.3 * ratio], most=40)
+                    if (level != 0.0) not in best or top > best[level != 0.0][0]:
+                        best[level != 0.0] = top, x, once, seen
+        two: LawFit | None = None
+        trials = list(best.values())
+        while trials:
+            _, x, once, seen = trials.pop()
+            fit = cls._finished(seen, x, once, 80)
+            if fit is None:
+                continue
+            if x is best.get(True, (0.0, None))[1] and fit.offset is not None:
+                # What is left without the levels tells how fast the rail relaxes.
+                again = relaxing(view, faster_by(view, fit.offset))
+                unit = math.sqrt(float(np.median(again.variance)))
+                term = fit.term
+                assert isinstance(term, RegimeSwitching)
+                trials.append((0.0, np.array([
+                    math.log(term.rate_up), math.log(term.rate_down), term.level / unit, 0.0,
+                    0.0]), once, again))
+            if seen is not view:
+                fit = replace(fit, gain=fit.gain + log_normal(seen.z) - log_normal(view.z)
+                              - 0.5 * np.log(seen.variance / view.variance))
+            if two is None or float((fit.gain - two.gain)[view.train].sum()) > 0.0:
+                two, begin, at_once, chosen = fit, x, once, seen
+        if two is None or chosen is not view:
+            return two
         if two.power is None:
             slow, ahead, states = _slow_levels(view)
             if slow is not None and ahead > max(float(two.gain[view.train].sum()), _SLOW_AHEAD):
@@ -144,10 +176,10 @@ class RegimeSwitching(Term):
         # Three states: of sigma, or of the level, whichever the two differ in.
         starts = [np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]
         if two.power is None:
-            starts = [np.array(best[1]) * [1.0, 1.0, 0.6, 0.0, 1.0]]
+            starts = [np.array(begin) * [1.0, 1.0, 0.6, 0.0, 1.0]]
         part, found = slice(0, min(view.train.stop, _LONG)), two
         for start in starts:
-            three = cls._finished(view, start, best[2], 70, 3)
+            three = cls._finished(view, start, at_once, 70, 3)
             ahead = _THIRD if found is two else 0.0
             if three is not None and float((three.gain - found.gain)[part].sum()) > ahead:
                 found = three
@@ -173,17 +205,23 @@ class RegimeSwitching(Term):
                   states: int = 2) -> LawFit | None:
         """Return the fit near a start."""
         z, phi = view.z[view.train][:_LONG], view.phi[view.train][:_LONG]
+        units = units_of(view)
+        within = units[view.train][:_LONG]
         step, unit = 1.0 / view.rate, math.sqrt(float(np.median(view.variance)))
 
         def value(x: FloatArray) -> float:
             if not _inside(x, view):
                 return -math.inf
-            return log_likelihood(*_chain(z, phi, step, x, at_once, states)[0])
+            return log_likelihood(*_chain(z, phi, within, step, x, at_once, states)[0])
 
+        if states == 2:
+            # Few changes in few samples say little of rates; what is counted in all says more.
+            counted = _counted(forward(*_chain(z, phi, within, step, start, at_once)[0])[0], step)
+            start = max(np.array(start), np.append(counted, start[2:]), key=value)
         x, top = climb(value, start, size=0.2, most=most)
         if top == -math.inf:
             return None
-        chain, mean, std = _chain(view.z, view.phi, step, x, at_once, states)
+        chain, mean, std = _chain(view.z, view.phi, units, step, x, at_once, states)
         before, density = forward(*chain)
         chance = np.zeros(view.z.size)
         for i, j in np.ndindex(states, states):
@@ -205,6 +243,15 @@ class RegimeSwitching(Term):
         power = 1.0 / (known @ np.exp(-2.0 * (x[4] + x[3] * np.arange(states))))
         return LawFit(term, se, scores, density - log_normal(view.z), 5,
                       power=None if abs(x[3]) < _NO_RATIO else power, offset=offset)
+
+
+def _counted(before: FloatArray, step: float) -> FloatArray:
+    """Return the logarithms of the rates that the likelier of two states is left at."""
+    high = before[:, 1] > 0.5
+    ups, downs = (int((high[1:] & ~high[:-1]).sum()), int((~high[1:] & high[:-1]).sum()))
+    spent = step * np.array([(~high).sum(), high.sum()])
+    rates: FloatArray = np.log((np.array([ups, downs]) + 0.5) / np.maximum(spent, step))
+    return rates
 
 
 def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
@@ -268,6 +315,8 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
     return np.array([x[0], x[1], x[2] * spread / unit, 0.0, 0.0]), best[0] - least, best[2]
 
 
+# How much faster the rail may relax than it seems to with levels on it.
+_FASTER = 1.0, 3.0, 9.0
 # Evidence from which slow levels are tried, nats.
 _SLOW_AHEAD = 8.0
 # Samples on which starts are tried, and on which the best is fitted.
@@ -322,14 +371,14 @@ def _transition(x: FloatArray, step: float, states: int) -> FloatArray:
     return moved
 
 
-def _chain(z: FloatArray, phi: FloatArray, step: float, x: FloatArray, at_once: float,
-           states: int = 2) -> tuple[tuple[FloatArray, FloatArray, FloatArray],
-                                     FloatArray, FloatArray]:
+def _chain(z: FloatArray, phi: FloatArray, unit: FloatArray, step: float, x: FloatArray,
+           at_once: float, states: int = 2
+           ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], FloatArray, FloatArray]:
     """
     Return what a filter takes, and what each pair of states expects.
 
     The mean of each pair, shape (states, states, n), and the deviation of each
-    state.
+    state.  `unit` is that of the level in each score: steps may be uneven.
     """
     state = np.arange(states, dtype=np.float64)
     transition = _transition(x, step, states)
@@ -337,9 +386,10 @@ def _chain(z: FloatArray, phi: FloatArray, step: float, x: FloatArray, at_once: 
     std = np.exp(x[4] + x[3] * state)
     # The level enters the innovations where it changes, and a little while it is on;
     # where it comes at the rate alpha, only the latter.
-    pull = x[2] * (1.0 - phi)
+    height = x[2] * unit
+    pull = height * (1.0 - phi)
     mean, log = np.empty((states, states, z.size)), np.empty((states, states, z.size))
     for i, j in np.ndindex(states, states):
-        mean[i, j] = pull * (i - float(law @ state)) + x[2] * at_once * (j - i)
+        mean[i, j] = pull * (i - float(law @ state)) + height * at_once * (j - i)
         log[i, j] = log_normal(z, mean[i, j], float(std[j]) ** 2)
     return (log.transpose(2, 0, 1), transition, law), mean, std

@@ -11,6 +11,8 @@ import math
 
 import numpy as np
 
+from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.load_transient import LoadTransient
 from ou_monitor.model.terms.term import Role, Term, View
 from ou_monitor.offline.discover.composite import Composite, fit_composite
 from ou_monitor.offline.discover.data import Samples
@@ -19,6 +21,8 @@ from ou_monitor.records import FloatArray
 
 # Starting points that are fitted in full, and samples that tell which.
 _FULL, _GLANCE = 2, 8000
+# Lags of a sag that are fitted in full.
+_LAGS = 4
 
 
 def best_start(samples: Samples, composite: Composite, kind: type[Term], view: View
@@ -42,6 +46,21 @@ def best_start(samples: Samples, composite: Composite, kind: type[Term], view: V
                 best is None or made.score(samples) > best.score(samples)):
             best = made
     return best
+
+
+def sag_with_lag(samples: Samples, composite: Composite, view: View) -> Composite | None:
+    """
+    Return the best fit with a sag that comes at its own rate, or later.
+
+    Neither the sag nor its lag may be worth anything alone: a rail that relaxes to where
+    throttle puts it does not jump.
+    """
+    sag = LoadSag.candidates(view)[0]
+    lags = _screened(samples, list(LoadTransient.candidates(view)), view, beside=[sag])
+    # The rate of the rail is not what it seemed to be, and with it goes the lag that fits best.
+    made = [joined(samples, composite, [sag, lag], rough=True) for lag in lags[:_LAGS]]
+    return max((fit for fit in made if fit is not None), default=None,
+               key=lambda fit: fit.score(samples))
 
 
 def joined(samples: Samples, composite: Composite, starts: Sequence[Term], rough: bool
@@ -85,13 +104,15 @@ def _likely(samples: Samples, composite: Composite, starts: list[Term]) -> list[
     return sorted(starts, key=lambda start: -value(start))
 
 
-def _screened(samples: Samples, starts: list[Term], view: View) -> list[Term]:
-    """Return starts in the order of how much of the scores their columns explain."""
+def _screened(samples: Samples, starts: list[Term], view: View, beside: Sequence[Term] = ()
+              ) -> list[Term]:
+    """Return starts in the order of how much of the scores they explain with those beside them."""
     s = samples.stretch(1.0, 0.0)
+    known = [term.columns(s) for term in beside]
     scale = np.sqrt(view.variance)
 
     def explained(term: Term) -> float:
-        columns = term.columns(s)
+        columns = np.concatenate([*known, term.columns(s)], axis=1)
         through = columns.copy()
         through[1:] -= view.phi[1:, None] * columns[:-1]
         through = (through / scale[:, None])[view.train]

@@ -142,7 +142,7 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
                           + ', '.join(f'{t.name} {t.evidence:.1f}' for t in trials[:6]
                                       if t is not best))
         search.composite = best.composite
-        search.accepted.append(best.name)
+        search.accepted += [name for name in (best.beside, best.name) if name]
         search.largest = max(search.largest, best.evidence)
         _other_means(samples, search, trials)
         after = criticise(samples, search.composite, bank)

@@ -113,8 +113,10 @@ def position(model: Composite, names: list[str] | tuple[str, ...], k: int) -> in
 
 def _whole(samples: Samples, model: Composite) -> Composite:
     """Return a model fitted on everything; as it is where that cannot be done."""
+    # Without the levels that switching adds, the rail would seem to relax slower.
+    known = model if model.offset is not None else None
     try:
-        again = fit_composite(samples, model.terms, slice(0, samples.n))
+        again = fit_composite(samples, model.terms, slice(0, samples.n), known)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return model
     return again if again is not None and math.isfinite(float(again.density.sum())) else model

@@ -15,7 +15,7 @@ from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.offline.discover.battery import is_sign, statistics
 from ou_monitor.offline.discover.composite import Composite, scene_of, view_of
 from ou_monitor.offline.discover.data import Samples
-from ou_monitor.offline.discover.fitting import best_start, fitted
+from ou_monitor.offline.discover.fitting import best_start, fitted, sag_with_lag
 from ou_monitor.offline.discover.null_bank import NullBank
 
 # A statistic this far off asks for the terms that it is a sign of.
@@ -32,13 +32,16 @@ AGAIN = frozenset({'tone', 'throttle_tone', 'resonance', 'second_relaxation', 'l
 # Kinds that imitate each other: one beside another would only mend its form.
 _ALIKE = (frozenset({'volatility', 'regime_switching', 'heavy_tails', 'jumps'}),
           frozenset({'glitches', 'jumps', 'heavy_tails', 'clock_jitter'}),
-          frozenset({'second_relaxation', 'flicker_noise', 'regime_switching'}))
+          frozenset({'second_relaxation', 'flicker_noise', 'regime_switching'}),
+          frozenset({'nonlinear_restoring', 'regime_switching'}))
 # What filters may cost before no further dear kind is tried, s, about.
 MOST_WORK = 10.0
 # Turns: measured inputs, laws where there are clear outliers, the rest.
 TIERS = 3
 _SHAPE = ('kurtosis', 'tails')
 _CLEAR_SHAPE = 25.0
+# Line that follows throttle, as a score, from which on it is no chance.
+_CLEAR_LINE = 10.0
 # Correlation of small neighbours, as a score, from which on it is white noise.
 _WHITE = -8.0
 
@@ -48,13 +51,15 @@ class Trial:
     """
     A candidate, fitted beside what was accepted before.
 
-    `left` are the statistics of the model with it, where its evidence is clear.
+    `left` are the statistics of the model with it, where its evidence is clear; `beside` is
+    the name of what comes with it, if anything.
     """
 
     name: str
     composite: Composite
     evidence: float
     left: dict[str, float] | None = None
+    beside: str = ''
 
 
 def criticise(samples: Samples, composite: Composite, bank: NullBank) -> dict[str, float]:
@@ -104,6 +109,12 @@ def trials_of(samples: Samples, composite: Composite, values: dict[str, float],
             if trial.evidence > CLEAR:
                 trial = replace(trial, left=criticise(samples, best, bank))
             found.append(trial)
+    if not composite.has('load_sag') and {'load_sag', 'load_transient'} <= {
+            trial.name for trial in found}:
+        both = sag_with_lag(samples, composite, view)
+        if both is not None:
+            found.append(Trial('load_transient', both, both.score(samples) - before,
+                               beside='load_sag'))
     return found
 
 
@@ -167,7 +178,9 @@ def _settled(trial: Trial, kind: type[Term]) -> bool:
 
 def tier_of(kind: type[Term], values: dict[str, float]) -> int:
     """Return when a kind has its turn: measured inputs, clear outliers, the rest."""
-    if is_measured(kind):
+    if is_measured(kind) or (
+            kind.NAME == 'throttle_tone' and values.get('order line', 0.0) > _CLEAR_LINE):
+        # A line that is clearly there would pass for sigma or alpha that follow throttle.
         return 0
     shape = max((abs(value) for name, value in values.items()
                  if name.startswith(_SHAPE)), default=0.0)
