@@ -14,7 +14,7 @@ setup(
     name=NAME,
     version='0.1.0',
     packages=find_packages(include=[NAME, NAME + '.*']),
-    package_data={NAME + '.offline.report': ['*.css', '*.js']},
+    package_data={NAME + '.report': ['*.css', '*.js']},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + NAME]),
         (SHARE, ['package.xml']),

@@ -11,7 +11,7 @@ import data
 from data import Array, SENSORS, TRUTH
 import kalman
 import numpy as np
-from ou_monitor.online.estimator import SlidingEstimator
+from ou_monitor.online.estimator.estimator import SlidingEstimator
 import peers
 from records import Fit, Fits, NAMES, rmse_ratio
 

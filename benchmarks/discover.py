@@ -23,10 +23,9 @@ for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
     os.environ[_name] = '1'
 _ROOT = Path(__file__).resolve().parent.parent
 # What is tested, and what counts as right.
-sys.path[:0] = [str(_ROOT), str(_ROOT / 'test' / 'offline')]
+sys.path[:0] = [str(_ROOT), *(str(_ROOT / 'test' / name) for name in ('support', 'hidden'))]
 
-from discover_limits import (  # noqa: E402
-    CAUSES, DURATIONS, figure, limits_table, Point, Search)
+from discover_limits import CAUSES, DURATIONS, figure, limits_table, Point, Search  # noqa: E402
 import discover_runs as runs  # noqa: E402
 from discover_tables import heat_map, report  # noqa: E402
 from drawing import put  # noqa: E402

@@ -11,8 +11,8 @@ from blind_scores import from_data
 from discover_runs import key_of, Results, Task
 from drawing import drawing
 import numpy as np
-from ou_monitor.offline.report.svg import Plot
 from ou_monitor.records import FloatArray
+from ou_monitor.report.svg import Plot
 from scipy.special import log_expit
 from tables import table
 

@@ -28,7 +28,7 @@ import filter_methods as methods
 import filter_node
 from filter_signals import CASES, fly, RATE
 import numpy as np
-from ou_monitor.offline.report.svg import Plot
+from ou_monitor.report.svg import Plot
 
 SEED = 20261121
 BAGS = Path(__file__).resolve().parent.parent / 'bags'

@@ -15,7 +15,7 @@ import math
 import filter_methods as methods
 from filter_signals import BODY, Case, Flights, fly, kalman, RATE, SPREAD
 import numpy as np
-from ou_monitor.offline.report.svg import Plot
+from ou_monitor.report.svg import Plot
 from tables import number, table
 
 CASE = Case('D term of a body rate of two poles at 5 Hz, alpha 600', 'smooth', 600.0, 5.0, 2,

@@ -14,7 +14,7 @@ from pathlib import Path
 import filter_methods as methods
 from filter_signals import ADC, Case, CASES, Flights, fly, kalman, RATE
 import numpy as np
-from ou_monitor.online.cutoff_laws import wanted_cutoff
+from ou_monitor.online.filter.cutoff_laws import wanted_cutoff
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.recordings.read import read_recording
 from tables import number, table

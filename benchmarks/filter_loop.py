@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 import math
 
+from control_loop import critical_gain, judge, Loop, SWING, Verdict
 import numpy as np
-from ou_monitor.offline.control_loop import critical_gain, judge, Loop, SWING, Verdict
-from ou_monitor.offline.report.svg import Plot
+from ou_monitor.report.svg import Plot
 from tables import number, table
 
 COUPLINGS = (0.1, 0.3, 1.0, 1.5, 2.0, 3.0, 4.0)

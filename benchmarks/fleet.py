@@ -25,13 +25,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from ou_monitor.offline.fleet.cluster import usable_cores, Workers  # noqa: E402
-from ou_monitor.offline.fleet.work import Options, work  # noqa: E402
-from ou_monitor.offline.presets import PRESETS  # noqa: E402
-from ou_monitor.offline.profiles import read_profile  # noqa: E402
-from ou_monitor.offline.simulation import simulated  # noqa: E402
+from ou_monitor.fleet.cluster import usable_cores, Workers  # noqa: E402, I202
+from ou_monitor.fleet.work import Options, work  # noqa: E402
 from ou_monitor.recordings.write import write_recording  # noqa: E402
 from ou_monitor.records import Recording  # noqa: E402
+from ou_monitor.simulate.presets import PRESETS  # noqa: E402
+from ou_monitor.simulate.profiles import read_profile  # noqa: E402
+from ou_monitor.simulate.simulation import simulated  # noqa: E402
 from tables import table  # noqa: E402
 
 BEGIN, END = '<!-- benchmark begins -->', '<!-- benchmark ends -->'

@@ -23,8 +23,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from drawing import drawing, put  # noqa: E402
 import numpy as np  # noqa: E402
 from ou_monitor import brownout_probability  # noqa: E402
-from ou_monitor.offline.report.svg import Plot  # noqa: E402
 from ou_monitor.records import Estimate, Status  # noqa: E402
+from ou_monitor.report.svg import Plot  # noqa: E402
 from risk_alarms import METHODS, Score, score, settings, timelines  # noqa: E402
 from risk_flights import fly  # noqa: E402
 from risk_scores import brier, Horizon, predict, reliability  # noqa: E402

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor.online.flag import FlagLevel
 from ou_monitor.online.monitor import SupplyMonitor
+from ou_monitor.online.risk.flag import FlagLevel
 from risk_flights import Flights, RATE
 from risk_scores import monitor_settings, stationary, WARM
 

@@ -45,12 +45,12 @@ def main(quick: bool) -> None:
     sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     import data
     import numpy as np
-    from ou_monitor.online.estimator import SlidingEstimator
+    from ou_monitor.online.estimator.estimator import SlidingEstimator
 
     compiled = False
     if os.environ.get('OU_MONITOR_COMPILED', '1') != '0':
         try:
-            from ou_monitor.online.compiled import kernels
+            from ou_monitor.online.estimator.compiled import kernels
             compiled = kernels(wait=True) is not None
         except ImportError:
             pass

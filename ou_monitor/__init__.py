@@ -12,26 +12,26 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from ou_monitor.discover.discover import discover
     from ou_monitor.errors import InputError
-    from ou_monitor.offline.discover.run import discover
-    from ou_monitor.online.estimator import SlidingEstimator
-    from ou_monitor.online.lowpass import AdaptiveLowPass
-    from ou_monitor.online.risk import brownout_probability
+    from ou_monitor.online.estimator.estimator import SlidingEstimator
+    from ou_monitor.online.filter.lowpass import AdaptiveLowPass
+    from ou_monitor.online.risk.first_passage import brownout_probability
     from ou_monitor.recordings.read import read_pieces, read_recording
     from ou_monitor.records import Estimate, Flag, Recording, Status
 
 __version__ = '0.1.0'
 
 _HOMES = {
-    'AdaptiveLowPass': 'ou_monitor.online.lowpass',
+    'AdaptiveLowPass': 'ou_monitor.online.filter.lowpass',
     'Estimate': 'ou_monitor.records',
     'Flag': 'ou_monitor.records',
     'InputError': 'ou_monitor.errors',
     'Recording': 'ou_monitor.records',
-    'SlidingEstimator': 'ou_monitor.online.estimator',
+    'SlidingEstimator': 'ou_monitor.online.estimator.estimator',
     'Status': 'ou_monitor.records',
-    'brownout_probability': 'ou_monitor.online.risk',
-    'discover': 'ou_monitor.offline.discover.run',
+    'brownout_probability': 'ou_monitor.online.risk.first_passage',
+    'discover': 'ou_monitor.discover.discover',
     'read_pieces': 'ou_monitor.recordings.read',
     'read_recording': 'ou_monitor.recordings.read',
 }

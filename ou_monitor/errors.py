@@ -23,41 +23,13 @@ class InputError(Exception):
 
 
 def refusal(error: OSError) -> str:
-    """
-    Return what the system refused, in one line.
-
-    Parameters
-    ----------
-    error : OSError
-        As raised by a call that nobody caught nearer to what was wanted.
-
-    Returns
-    -------
-    str
-        The file, where there is one, and the reason.
-
-    """
+    """Return what the system refused, in one line."""
     why = ' '.join((error.strerror or str(error)).split())
     return why if error.filename is None else f"cannot use '{error.filename}': {why}"
 
 
 def nearest(word: str, valid: Iterable[str]) -> str:
-    """
-    Return a hint that names the valid word nearest to a misspelt one.
-
-    Parameters
-    ----------
-    word : str
-        What the user wrote.
-    valid : iterable of str
-        What is accepted.
-
-    Returns
-    -------
-    str
-        ``did you mean 'x'?`` or, when nothing is near, the list of valid words.
-
-    """
+    """Return a hint that names the valid word nearest to a misspelt one."""
     choices = list(valid)
     close = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
     if close:

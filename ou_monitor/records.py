@@ -13,6 +13,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.text import Z95
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -193,7 +194,7 @@ class Estimate:
         """Relaxation time 1/alpha, s."""
         return 1.0 / self.alpha if self.alpha > 0.0 else NAN
 
-    def interval(self, name: str, z: float = 1.959963984540054) -> tuple[float, float]:
+    def interval(self, name: str, z: float = Z95) -> tuple[float, float]:
         """
         Return the interval of one parameter, symmetric on the log scale.
 

@@ -174,7 +174,7 @@ def test_pip_gives_the_offline_half(offline, tmp_path):
 
 def test_pip_installs_the_message_descriptions(offline, tmp_path):
     """The installed package finds all of msg_config."""
-    code = 'from ou_monitor.messages.config import list_msg_configs as f; print(*f())'
+    code = 'from ou_monitor.stream.config import list_msg_configs as f; print(*f())'
     done = run(offline / 'python', '-c', code, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == sorted(path.stem for path in ROOT.glob('msg_config/*.yaml'))

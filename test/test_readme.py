@@ -113,9 +113,9 @@ def test_filter_numbers_are_those_of_the_laws():
     """Noise taken off between 150 and 20 Hz, lags, and what the pole of Kalman loses."""
     import math
 
-    from ou_monitor.online.cutoff_laws import supply_noise
-    from ou_monitor.online.wiener import squared_error
-    from ou_monitor.online.lag import cutoff_for_lag
+    from ou_monitor.online.filter.cutoff_laws import supply_noise
+    from ou_monitor.online.filter.lag import cutoff_for_lag
+    from ou_monitor.online.filter.wiener import squared_error
     off = {mode: 1.0 - math.sqrt(supply_noise(mode, 2, 20.0, 63.0)
                                  / supply_noise(mode, 2, 150.0, 63.0))
            for mode in ('lowpass', 'derivative')}
@@ -144,7 +144,7 @@ def test_python_example_runs():
 
 def test_message_example_is_accepted(tmp_path):
     """The example of a message description is one that the package reads."""
-    from ou_monitor.messages.config import load_msg_config
+    from ou_monitor.stream.config import load_msg_config
     (text,) = blocks('yaml')
     path = tmp_path / 'my_adc.yaml'
     path.write_text(text, encoding='utf-8')

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
+from ou_monitor.analyze.analyze import Analysis
+from ou_monitor.analyze.level_result import LevelResult
+from ou_monitor.analyze.relaxation import Relaxation
+from ou_monitor.analyze.words import brownout_sentence, caution, headline, relaxation_sentence
 from ou_monitor.cli.output import item, paragraph, table
-from ou_monitor.offline.analysis.relaxation import Relaxation
-from ou_monitor.offline.analyze import Analysis
-from ou_monitor.offline.level_result import LevelResult
-from ou_monitor.offline.words import (
-    brownout_sentence, caution, headline, number, relaxation_sentence)
 from ou_monitor.records import Recording
+from ou_monitor.text import number
 
 _UNKNOWN = '-'
 # Rows of a table for people; the JSON has them all.
@@ -18,20 +18,7 @@ _MOST_LINES, _MOST_CHANGES = 12, 8
 
 
 def render(analysis: Analysis) -> str:
-    """
-    Return the tables and notes for a terminal 100 columns wide.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        Result.
-
-    Returns
-    -------
-    str
-        Plain text.
-
-    """
+    """Return the tables and notes for a terminal 100 columns wide."""
     recording = analysis.recording
     rate = (recording.n - 1) / recording.duration if recording.duration > 0.0 else math.nan
     parts = [

@@ -13,15 +13,7 @@ from ou_monitor.errors import InputError
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        From ``ArgumentParser.add_subparsers``.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'analyze', allow_abbrev=False,
         help='Vpp, Vrms, alpha, tau, sigma, Var_inf with 95 %% intervals per load level',
@@ -40,25 +32,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """
-    Run the command.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed arguments.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    Raises
-    ------
-    InputError
-        When an argument or the recording cannot be used.
-
-    """
+    """Run the command."""
     from ou_monitor.cli import output
     from ou_monitor.cli.analysis_text import render
 
@@ -77,8 +51,8 @@ def run(args: argparse.Namespace) -> int:
     output.check_writable(args.json)
     output.check_writable(args.report)
 
-    from ou_monitor.offline.analysis.data import as_data
-    from ou_monitor.offline.analyze import analyze
+    from ou_monitor.analyze.analyze import analyze
+    from ou_monitor.analyze.data import as_data
 
     recording = read_given(args, start, end)
     if recording.n < 2:
@@ -91,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         analysis = analyze(recording, levels=levels, window=window, brownout_voltage=voltage,
                            brownout_horizon=horizon, progress=progress)
     if args.report is not None:
-        from ou_monitor.offline.report.analysis_page import analysis_page
+        from ou_monitor.report.analysis_page import analysis_page
         output.write_text(analysis_page(analysis, command_line(args)), args.report)
     if args.json is not None:
         output.write_json(as_data(analysis), args.json)
@@ -103,20 +77,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def command_line(args: argparse.Namespace) -> str:
-    """
-    Return the command that repeats this analysis.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed arguments.
-
-    Returns
-    -------
-    str
-        Quoted for a shell; without the outputs.
-
-    """
+    """Return the command that repeats this analysis."""
     return shlex.join(['ou-monitor', 'analyze', args.recording, *said_again(
         args, 'levels', 'window', 'brownout_voltage', 'brownout_horizon')])
 

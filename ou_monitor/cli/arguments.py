@@ -19,30 +19,14 @@ _TOPICS = ('msg_config', 'voltage_topic', 'throttle_topic')
 
 
 def add_recording(parser: argparse.ArgumentParser) -> None:
-    """
-    Announce RECORDING.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-
-    """
+    """Announce RECORDING."""
     parser.add_argument(
         'recording', metavar='RECORDING',
         help='.mcap file, rosbag2 folder, or CSV with columns time_s, voltage_v[, throttle]')
 
 
 def add_part(parser: argparse.ArgumentParser) -> None:
-    """
-    Announce ``--from`` and ``--to``.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-
-    """
+    """Announce ``--from`` and ``--to``."""
     parser.add_argument('--from', metavar='S', dest='start',
                         help='leave out what comes before, s after the first message')
     parser.add_argument('--to', metavar='S', dest='end',
@@ -50,15 +34,7 @@ def add_part(parser: argparse.ArgumentParser) -> None:
 
 
 def add_topics(parser: argparse.ArgumentParser) -> None:
-    """
-    Announce what says how bags are read: the topics, and ``--partial``.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-
-    """
+    """Announce what says how bags are read: the topics, and ``--partial``."""
     parser.add_argument('--msg-config', metavar='NAME',
                         help='msg_config that says which topic and field is the voltage')
     parser.add_argument('--voltage-topic', metavar='TOPIC', help='topic of the voltage')
@@ -68,17 +44,7 @@ def add_topics(parser: argparse.ArgumentParser) -> None:
 
 
 def add_estimate(parser: argparse.ArgumentParser, voltage: str) -> None:
-    """
-    Announce ``--window``, ``--brownout-voltage`` and ``--brownout-horizon``.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    voltage : str
-        What the voltage is for, with its default.
-
-    """
+    """Announce ``--window``, ``--brownout-voltage`` and ``--brownout-horizon``."""
     parser.add_argument('--window', metavar='S', default='2.0',
                         help='window of the sliding estimate, s (default: 2.0)')
     parser.add_argument('--brownout-voltage', metavar='V', help=voltage)
@@ -87,41 +53,13 @@ def add_estimate(parser: argparse.ArgumentParser, voltage: str) -> None:
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
-    """
-    Announce ``--json``.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-
-    """
+    """Announce ``--json``."""
     parser.add_argument('--json', metavar='FILE',
                         help="write the result as JSON ('-': to standard output, alone)")
 
 
 def read_given(args: argparse.Namespace, start: float | None, end: float | None) -> Recording:
-    """
-    Read RECORDING as the arguments say, with a progress bar.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed; of `add_recording` and `add_topics`.
-    start, end : float or None
-        Part to read, s.
-
-    Returns
-    -------
-    Recording
-        As of `read_recording`.
-
-    Raises
-    ------
-    InputError
-        As `read_recording`.
-
-    """
+    """Read RECORDING as the arguments say, with a progress bar (start, end in s)."""
     from ou_monitor.cli import output
     from ou_monitor.recordings.read import read_recording
 
@@ -133,23 +71,7 @@ def read_given(args: argparse.Namespace, start: float | None, end: float | None)
 
 
 def said_again(args: argparse.Namespace, *names: str) -> list[str]:
-    """
-    Return the words of a command line that repeat how a recording is read.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed.
-    *names : str
-        Further options of one value, by their names in `args`; they come
-        before the topics.
-
-    Returns
-    -------
-    list of str
-        Options that were given, and their values.
-
-    """
+    """Return the words of a command line that repeat how a recording is read."""
     words: list[str] = []
     given: list[tuple[str, Any]] = [
         ('--from', getattr(args, 'start', None)), ('--to', getattr(args, 'end', None))]
@@ -161,15 +83,7 @@ def said_again(args: argparse.Namespace, *names: str) -> list[str]:
 
 
 def positive_number(option: str, text: str) -> float:
-    """
-    Return the number of an option.
-
-    Raises
-    ------
-    InputError
-        When it is not positive and finite.
-
-    """
+    """Return the number of an option."""
     try:
         value = float(text)
     except ValueError:
@@ -180,15 +94,7 @@ def positive_number(option: str, text: str) -> float:
 
 
 def throttle_levels(text: str | None) -> tuple[float, ...] | None:
-    """
-    Return the levels of ``--levels 0,0.05,...``, in order; None when not given.
-
-    Raises
-    ------
-    InputError
-        For what is not a throttle, or twice.
-
-    """
+    """Return the levels of ``--levels 0,0.05,...``, in order; None when not given."""
     if text is None:
         return None
     levels = []
@@ -208,15 +114,7 @@ def throttle_levels(text: str | None) -> tuple[float, ...] | None:
 
 
 def part_of_recording(start: str | None, end: str | None) -> tuple[float | None, float | None]:
-    """
-    Return the ends of the part to read, s, of ``--from`` and ``--to``; None where there is none.
-
-    Raises
-    ------
-    InputError
-        For what is no time, or an end before the beginning.
-
-    """
+    """Return the ends of ``--from`` and ``--to``, s; None where there is none."""
     found: list[float | None] = []
     for option, text in (('--from', start), ('--to', end)):
         try:

@@ -19,15 +19,7 @@ READ = ('PX4 ULog (.ulg), ArduPilot dataflash (.bin, .log), Betaflight and INAV 
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command to the parser.
-
-    Parameters
-    ----------
-    subparsers : argparse subparsers
-        Where to add it.
-
-    """
+    """Add the command to the parser."""
     parser: argparse.ArgumentParser = subparsers.add_parser(
         'convert', help='a log becomes an MCAP bag',
         description='Convert a log to a bag with the topics /voltage, /throttle and /current '
@@ -85,26 +77,7 @@ def _number(text: str) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    """
-    Convert, or list.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        As parsed.
-
-    Returns
-    -------
-    int
-        Exit status, 0.
-
-    Raises
-    ------
-    InputError
-        When LOG cannot be read, the choice is not clear, or OUT cannot be
-        written.
-
-    """
+    """Convert, or list."""
     if args.list:
         if args.out is not None:
             raise InputError(f"--list writes no bag: leave '{args.out}' out")
@@ -179,7 +152,6 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
 
 def _list(args: argparse.Namespace, log: Any) -> int:
     import numpy as np
-
     from ou_monitor.recordings.importers.choose import default
     from ou_monitor.recordings.importers.log import CURRENT, THROTTLE, UNITS, VOLTAGE
 

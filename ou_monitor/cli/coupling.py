@@ -12,19 +12,11 @@ from ou_monitor.cli.arguments import (
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
-    from ou_monitor.offline.coupling import Coupling
+    from ou_monitor.coupling.coupling import Coupling
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        From ``ArgumentParser.add_subparsers``.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'coupling', allow_abbrev=False,
         help='gain from the supply voltage to a signal, such as a gyro axis',
@@ -45,32 +37,14 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """
-    Run the command.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed arguments.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    Raises
-    ------
-    InputError
-        When an argument or the recording cannot be used.
-
-    """
+    """Run the command."""
     output.check_paths({'RECORDING': args.recording, '--msg-config': args.msg_config},
                        {'--json': args.json})
     output.check_writable(args.json)
     band, level = _band(args.band), _level(args.level)
     start, end = part_of_recording(args.start, args.end)
 
-    from ou_monitor.offline.coupling import estimate_coupling
+    from ou_monitor.coupling.coupling import estimate_coupling
     from ou_monitor.recordings.read_signal import read_signal
 
     recording = read_given(args, start, end)
@@ -92,24 +66,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def as_data(found: Coupling, name: str, signal: str, notes: tuple[str, ...]) -> dict[str, Any]:
-    """
-    Return the result for JSON.
-
-    Parameters
-    ----------
-    found : Coupling
-        Result.
-    name, signal : str
-        Recording and signal.
-    notes : tuple of str
-        Of the recording.
-
-    Returns
-    -------
-    dict
-        Units are in the keys; a gain is in signal units per volt.
-
-    """
+    """Return the result for JSON."""
     return {
         'recording': name, 'signal': signal, 'seen': found.seen, 'p_value': found.p_value,
         'level': found.level, 'gain_per_v': found.gain, 'gain_ci95': found.gain_ci95,
@@ -126,24 +83,7 @@ def as_data(found: Coupling, name: str, signal: str, notes: tuple[str, ...]) -> 
 
 
 def render(found: Coupling, name: str, signal: str, notes: tuple[str, ...]) -> str:
-    """
-    Return the finding for a terminal 100 columns wide.
-
-    Parameters
-    ----------
-    found : Coupling
-        Result.
-    name, signal : str
-        Recording and signal.
-    notes : tuple of str
-        Of the recording.
-
-    Returns
-    -------
-    str
-        Plain text.
-
-    """
+    """Return the finding for a terminal 100 columns wide."""
     grid = found.grid
     low, high = found.frequency[0], found.frequency[-1]
     peak = int(found.coherence.argmax())

@@ -12,8 +12,8 @@ from ou_monitor.cli.quantities import component, quantity, read_network, value_o
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
-    from ou_monitor.model.network.components import PowerNetwork
-    from ou_monitor.offline.design import Design
+    from ou_monitor.paper.network.components import PowerNetwork
+    from ou_monitor.paper.network.design import Design
 
 # One row of the printed table for this many rows of the calculation.
 _EVERY = 10
@@ -23,15 +23,7 @@ _OPTIONS = {'risk': '', 'throttle': '', 'horizon': 's', 'capacitance_min': 'F',
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        From ``ArgumentParser.add_subparsers``.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'design', allow_abbrev=False,
         help='which capacitance brings the brown-out risk under X at throttle Y',
@@ -70,7 +62,7 @@ def add_parser(subparsers: Any) -> None:
 def _list(target: str | None) -> None:
     """Show the components with defaults and units; as JSON where that is asked for."""
     from ou_monitor.cli import output
-    from ou_monitor.model.network.components import PowerNetwork, UNITS
+    from ou_monitor.paper.network.components import PowerNetwork, UNITS
 
     network = PowerNetwork()
     values = asdict(network)
@@ -91,25 +83,7 @@ def _shown(value: object, network: PowerNetwork) -> str:
 
 
 def run(args: argparse.Namespace) -> int:
-    """
-    Run the command.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed arguments.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    Raises
-    ------
-    InputError
-        When an argument or the network cannot be used.
-
-    """
+    """Run the command."""
     from ou_monitor.cli import output
 
     output.check_paths({'--network': args.network}, {'--json': args.json})
@@ -134,9 +108,9 @@ def run(args: argparse.Namespace) -> int:
         values[name] = value_of(f'--set {name}', name, text)
     output.check_writable(args.json)
 
-    from ou_monitor.model.network.components import PowerNetwork
-    from ou_monitor.offline.design import default_voltage, design
-    from ou_monitor.offline.design_words import as_data
+    from ou_monitor.paper.network.components import PowerNetwork
+    from ou_monitor.paper.network.design import default_voltage, design
+    from ou_monitor.paper.network.design_words import as_data
 
     try:
         network = PowerNetwork(**values)
@@ -157,25 +131,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def render(result: Design, source: str) -> str:
-    """
-    Return the table and the answer for a terminal 100 columns wide.
-
-    Parameters
-    ----------
-    result : Design
-        Result.
-    source : str
-        Where the brown-out level comes from.
-
-    Returns
-    -------
-    str
-        Plain text.
-
-    """
+    """Return the table and the answer for a terminal 100 columns wide."""
     from ou_monitor.cli.output import paragraph, table
-    from ou_monitor.offline.design_words import answer, effect, probability, remarks
-    from ou_monitor.offline.words import number
+    from ou_monitor.paper.network.design_words import answer, effect, probability, remarks
+    from ou_monitor.text import number
 
     present = result.present
     chosen = [(present, 'present')]
@@ -203,6 +162,6 @@ def render(result: Design, source: str) -> str:
 
 
 def _time(value: float) -> str:
-    from ou_monitor.offline.words import number
+    from ou_monitor.text import number
 
     return 'never' if value > 1e100 else f'{number(value)} s'

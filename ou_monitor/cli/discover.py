@@ -15,22 +15,14 @@ from ou_monitor.cli.arguments import (
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
-    from ou_monitor.offline.discover.finding import Finding
+    from ou_monitor.discover.finding import Finding
 
 # Statistics and notes shown at most; all of them are in the report.
 _SHOWN = 8
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        From ``ArgumentParser.add_subparsers``.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'discover', allow_abbrev=False,
         help='criticise the simulation, name the cause, extend, measure the gain',
@@ -50,26 +42,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """
-    Run the command.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        As parsed.
-
-    Returns
-    -------
-    int
-        Exit status, 0; that nothing or too little was found is a result.
-
-    Raises
-    ------
-    InputError
-        When an option, the recording or an output cannot be used, and when
-        there is no model to save; report and JSON are written all the same.
-
-    """
+    """Run the command."""
     if args.seed < 0:
         raise InputError(f'--seed must be 0 or more, got {args.seed}')
     start, end = part_of_recording(args.start, args.end)
@@ -83,8 +56,7 @@ def run(args: argparse.Namespace) -> int:
     output.check_writable(args.json)
 
     import numpy as np
-
-    from ou_monitor.offline.discover.run import discover
+    from ou_monitor.discover.discover import discover
 
     recording = read_given(args, start, end)
     # What overflows on the way ends as not finite, which the search refuses: a user has no
@@ -92,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     with output.Progress('discovering') as progress, np.errstate(all='ignore'):
         finding = discover(recording, seed=args.seed, progress=progress)
     if args.report is not None:
-        from ou_monitor.offline.report.discovery_page import discovery_page
+        from ou_monitor.report.discovery_page import discovery_page
         with output.Progress('drawing') as progress:
             text = discovery_page(finding, command_line(args), progress)
         output.write_text(text, args.report)
@@ -110,43 +82,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def command_line(args: argparse.Namespace) -> str:
-    """
-    Return the command that repeats this discovery.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed arguments.
-
-    Returns
-    -------
-    str
-        Quoted for a shell; without the outputs.
-
-    """
+    """Return the command that repeats this discovery."""
     return shlex.join(['ou-monitor', 'discover', args.recording, *said_again(args, 'seed')])
 
 
 def model_text(finding: Finding) -> str:
-    """
-    Return the extended model as the text of a model file.
-
-    Parameters
-    ----------
-    finding : Finding
-        Result.
-
-    Returns
-    -------
-    str
-        YAML.
-
-    Raises
-    ------
-    InputError
-        When there is no model.
-
-    """
+    """Return the extended model as the text of a model file."""
     from ou_monitor.recordings.model_file import as_yaml, ModelFile
 
     if finding.model is None:
@@ -165,25 +106,11 @@ def model_text(finding: Finding) -> str:
 
 
 def render(finding: Finding) -> str:
-    """
-    Return the finding for a terminal 100 columns wide.
-
-    Parameters
-    ----------
-    finding : Finding
-        Result.
-
-    Returns
-    -------
-    str
-        Plain text.
-
-    """
-    from ou_monitor.offline.discover.cause_rows import cause_rows
-    from ou_monitor.offline.discover.gain_words import MNAT, overlap_words
-    from ou_monitor.offline.discover.words import (
-        crossing_words, plain_model_words, plain_words)
-    from ou_monitor.offline.words import number
+    """Return the finding for a terminal 100 columns wide."""
+    from ou_monitor.discover.cause_rows import cause_rows
+    from ou_monitor.discover.gain_words import MNAT, overlap_words
+    from ou_monitor.discover.words import crossing_words, plain_model_words, plain_words
+    from ou_monitor.text import number
 
     used = '' if finding.samples is None or finding.samples.n == finding.n else (
         f', {finding.samples.n} used')

@@ -17,7 +17,7 @@ from ou_monitor.cli.arguments import (
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
-    from ou_monitor.offline.fleet.run import Fleet
+    from ou_monitor.fleet.run import Fleet
 
 TABLE, REPORT = 'fleet.parquet', 'fleet.html'
 # What is listed at most of one kind; all of it is in the report and in the table.
@@ -25,15 +25,7 @@ _SHOWN = 10
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        From ``ArgumentParser.add_subparsers``.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'fleet', allow_abbrev=False,
         help='many recordings -> a table (Parquet) and a report: outliers, drift of a vehicle',
@@ -68,27 +60,8 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """
-    Run the command.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed arguments.
-
-    Returns
-    -------
-    int
-        Exit status, 0; recordings that cannot be read are rows with an error.
-
-    Raises
-    ------
-    InputError
-        When an argument cannot be used, no recording is found or can be
-        analysed, the output cannot be written, or there are no workers.
-
-    """
-    from ou_monitor.offline.fleet.cluster import check_extra, usable_cores
+    """Run the command."""
+    from ou_monitor.fleet.cluster import check_extra, usable_cores
 
     if not args.output:
         raise InputError('--output: the path is empty')
@@ -103,9 +76,9 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--output '{folder}' is a file: name a folder")
     output.check_writable(args.json)
 
-    from ou_monitor.offline.fleet.find import find_recordings
-    from ou_monitor.offline.fleet.run import run_fleet
-    from ou_monitor.offline.fleet.vehicles import read_pattern
+    from ou_monitor.fleet.find import find_recordings
+    from ou_monitor.fleet.run import run_fleet
+    from ou_monitor.fleet.vehicles import read_pattern
 
     options, more = _options(args)
     pattern = None if args.vehicle_from is None else read_pattern(args.vehicle_from)
@@ -132,16 +105,16 @@ def version() -> str:
 
 
 def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
-    from ou_monitor.offline.fleet.parts import write_whole
-    from ou_monitor.offline.fleet.table import write_table
-    from ou_monitor.offline.report.fleet_page import fleet_page
+    from ou_monitor.fleet.parts import write_whole
+    from ou_monitor.fleet.table import write_table
+    from ou_monitor.report.fleet_page import fleet_page
 
     write_table(fleet.rows, folder / TABLE)
     page = fleet_page(fleet, command_line(args))
     # A file name may hold bytes that are no text.
     write_whole(folder / REPORT, page.encode(errors='backslashreplace'))
     if args.json is not None:
-        from ou_monitor.offline.fleet.words import as_data
+        from ou_monitor.fleet.words import as_data
         output.write_json(as_data(fleet), args.json)
     if args.json != output.STDOUT:
         output.say(render(fleet))
@@ -149,43 +122,16 @@ def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
 
 
 def command_line(args: argparse.Namespace) -> str:
-    """
-    Return the command that repeats this fleet.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed arguments.
-
-    Returns
-    -------
-    str
-        Quoted for a shell.
-
-    """
+    """Return the command that repeats this fleet."""
     words = ['ou-monitor', 'fleet', *args.recordings, '--output', args.output, *said_again(
         args, 'vehicle_from', 'levels', 'window', 'brownout_voltage', 'brownout_horizon')]
     return shlex.join(words + (['--discover', '--seed', str(args.seed)] if args.discover else []))
 
 
 def render(fleet: Fleet) -> str:
-    """
-    Return the fleet for a terminal 100 columns wide.
-
-    Parameters
-    ----------
-    fleet : Fleet
-        Result.
-
-    Returns
-    -------
-    str
-        Plain text.
-
-    """
-    from ou_monitor.offline.fleet.words import (
-        comparison_words, failure_words, finding_words, headline, vehicle_rows,
-        VEHICLE_HEADS)
+    """Return the fleet for a terminal 100 columns wide."""
+    from ou_monitor.fleet.words import (
+        comparison_words, failure_words, finding_words, headline, VEHICLE_HEADS, vehicle_rows)
 
     lines = [output.paragraph(headline(fleet))]
     rows = vehicle_rows(fleet)
@@ -209,7 +155,7 @@ def render(fleet: Fleet) -> str:
 
 def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     """Return the options of the work, and the content of a file that they name."""
-    from ou_monitor.offline.fleet.work import Options
+    from ou_monitor.fleet.work import Options
 
     config, more = args.msg_config, {}
     if config is not None:
@@ -222,7 +168,7 @@ def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
             except OSError as error:
                 raise InputError(f"--msg-config: cannot read '{config}': {error.strerror}"
                                  ) from error
-        from ou_monitor.messages.config import load_msg_config
+        from ou_monitor.stream.config import load_msg_config
         load_msg_config(config)
     return Options(
         levels=throttle_levels(args.levels), window=positive_number('--window', args.window),

@@ -42,20 +42,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def build_parser(commands: Sequence[str] | None = None) -> argparse.ArgumentParser:
-    """
-    Return the parser.
-
-    Parameters
-    ----------
-    commands : sequence of str, optional
-        Commands to load; all of them when left out.
-
-    Returns
-    -------
-    argparse.ArgumentParser
-        With one subparser a command.
-
-    """
+    """Return the parser."""
     parser = Parser(
         prog=PROGRAM, allow_abbrev=False,
         description='Ornstein-Uhlenbeck statistics of UAV supply rails, on the bench.',
@@ -93,21 +80,7 @@ def _options(parser: argparse.ArgumentParser, command: str) -> list[str]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """
-    Run a command.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments without the program; those of the process when left out.
-
-    Returns
-    -------
-    int
-        0 on success, 2 on bad input (one line on standard error), 130 when
-        interrupted.
-
-    """
+    """Run a command."""
     given = list(sys.argv[1:] if argv is None else argv)
     where = PROGRAM
     for name in ('stdout', 'stderr'):

@@ -17,7 +17,6 @@ import time
 from typing import Any
 
 import numpy as np
-
 from ou_monitor.errors import InputError
 
 STDOUT = '-'
@@ -28,21 +27,7 @@ _STORAGE = ('.mcap', '.db3', '.zst', '.zstd', '.lz4')
 
 
 def plain(value: Any) -> Any:
-    """
-    Return a value as strict JSON can hold it.
-
-    Parameters
-    ----------
-    value : object
-        Numbers, arrays, enums, mappings and sequences, nested.
-
-    Returns
-    -------
-    object
-        The same with NaN and infinities as None, arrays as lists and enums as
-        their names.
-
-    """
+    """Return a value as strict JSON can hold it."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
@@ -59,22 +44,7 @@ def plain(value: Any) -> Any:
 
 
 def write_json(data: Mapping[str, Any], target: str) -> None:
-    """
-    Write strict JSON.
-
-    Parameters
-    ----------
-    data : mapping
-        What to write, see `plain`.
-    target : str
-        A file, or ``-`` for standard output.
-
-    Raises
-    ------
-    InputError
-        When it cannot be written.
-
-    """
+    """Write strict JSON (target in A)."""
     # ASCII: whatever the encoding of standard output, and bytes of a file name that are no text.
     text = json.dumps(plain(data), indent=2, allow_nan=False)
     if target == STDOUT:
@@ -84,24 +54,7 @@ def write_json(data: Mapping[str, Any], target: str) -> None:
 
 
 def say(text: str, end: str = '\n') -> None:
-    """
-    Write to standard output, at once.
-
-    Parameters
-    ----------
-    text : str
-        What to write.
-    end : str
-        What follows it.
-
-    Raises
-    ------
-    InputError
-        When standard output cannot be written, such as on a full disk.
-    BrokenPipeError
-        When its reader has gone, which is no error of the user.
-
-    """
+    """Write to standard output, at once."""
     try:
         sys.stdout.write(text + end)
         sys.stdout.flush()
@@ -121,22 +74,7 @@ def abandon_stdout() -> None:
 
 
 def write_text(text: str, target: str | Path) -> None:
-    """
-    Write a text file in UTF-8.
-
-    Parameters
-    ----------
-    text : str
-        What to write.
-    target : str or Path
-        The file.
-
-    Raises
-    ------
-    InputError
-        When it cannot be written.
-
-    """
+    """Write a text file in UTF-8."""
     path = Path(target)
     # What is there stays until the new one is whole; a device or a pipe is written as it is.
     draft = path if path.exists() and not path.is_file() else path.with_name(
@@ -153,25 +91,7 @@ def write_text(text: str, target: str | Path) -> None:
 
 
 def path_argument(text: str) -> Path:
-    """
-    Return a path given as an argument; an empty one would be the current folder.
-
-    Parameters
-    ----------
-    text : str
-        As typed.
-
-    Returns
-    -------
-    pathlib.Path
-        The path.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        When it is empty.
-
-    """
+    """Return a path given as an argument; an empty one would be the current folder."""
     if not text:
         raise argparse.ArgumentTypeError('the path is empty')
     return Path(text)
@@ -179,22 +99,7 @@ def path_argument(text: str) -> Path:
 
 def check_paths(inputs: Mapping[str, str | Path | None],
                 outputs: Mapping[str, str | Path | None]) -> None:
-    """
-    Refuse paths that are empty, and outputs that would overwrite an input or each other.
-
-    Parameters
-    ----------
-    inputs : mapping of str to str or Path or None
-        What is read, by argument; None where left out.
-    outputs : mapping of str to str or Path or None
-        What is written, by option; None where left out, ``-`` passes.
-
-    Raises
-    ------
-    InputError
-        Names both arguments.
-
-    """
+    """Refuse paths that are empty, and outputs that would overwrite an input or each other."""
     for name, given in (*inputs.items(), *outputs.items()):
         if given is not None and not str(given):
             raise InputError(f'{name}: the path is empty')
@@ -234,20 +139,7 @@ def _overwrites(target: Path, source: Path) -> bool:
 
 
 def check_writable(target: str | None) -> None:
-    """
-    Refuse an output before the work, when it can be seen that it will fail.
-
-    Parameters
-    ----------
-    target : str or None
-        A file; ``-`` and None pass.
-
-    Raises
-    ------
-    InputError
-        When the folder does not exist, or the target is a folder.
-
-    """
+    """Refuse an output before the work, when it can be seen that it will fail (target in A)."""
     if target is None or target == STDOUT:
         return
     path = Path(target)
@@ -258,22 +150,7 @@ def check_writable(target: str | None) -> None:
 
 
 def paragraph(text: str, begin: str = '') -> str:
-    """
-    Break a paragraph into lines; words and paths stay whole.
-
-    Parameters
-    ----------
-    text : str
-        One paragraph.
-    begin : str
-        What its first line begins with; the others are indented as far.
-
-    Returns
-    -------
-    str
-        Lines of `COLUMNS` columns.
-
-    """
+    """Break a paragraph into lines; words and paths stay whole."""
     return fill(text, COLUMNS, initial_indent=begin, subsequent_indent=' ' * len(begin),
                 break_long_words=False, break_on_hyphens=False)
 
@@ -284,24 +161,7 @@ def item(text: str) -> str:
 
 
 def table(headers: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:
-    """
-    Lay out an aligned table in plain text.
-
-    Parameters
-    ----------
-    headers : sequence of str
-        Column heads, units included.
-    rows : sequence of sequence of str
-        Cells.
-    left : sequence of int
-        Columns set flush left; the others are numbers, flush right.
-
-    Returns
-    -------
-    str
-        Lines without a trailing newline.
-
-    """
+    """Lay out an aligned table in plain text."""
     grid = [list(headers), *[list(row) for row in rows]]
     widths = [max(len(line[k]) for line in grid) for k in range(len(headers))]
 

@@ -16,29 +16,7 @@ _QUANTITY = re.compile(r'([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([pnuµmk
 
 
 def quantity(where: str, text: object, unit: str) -> float:
-    """
-    Return a number that may have an SI prefix and a unit.
-
-    Parameters
-    ----------
-    where : str
-        Option or key, for the error.
-    text : object
-        What was written: a number or text such as ``470uF``.
-    unit : str
-        The unit that may follow; empty for none.
-
-    Returns
-    -------
-    float
-        In SI units.
-
-    Raises
-    ------
-    InputError
-        When it is not a finite number, or in another unit.
-
-    """
+    """Return a number that may have an SI prefix and a unit."""
     match = _QUANTITY.fullmatch(str(text).strip())
     value = math.nan
     if match and not isinstance(text, bool):
@@ -55,25 +33,7 @@ def quantity(where: str, text: object, unit: str) -> float:
 
 
 def read_network(path: str) -> dict[str, Any]:
-    """
-    Return the components that a YAML file gives.
-
-    Parameters
-    ----------
-    path : str
-        A mapping of component to value.
-
-    Returns
-    -------
-    dict
-        Values by name.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read or names no component.
-
-    """
+    """Return the components that a YAML file gives (path in A)."""
     import yaml
 
     if not Path(path).is_file():
@@ -90,28 +50,8 @@ def read_network(path: str) -> dict[str, Any]:
 
 
 def component(name: str, where: str) -> str:
-    """
-    Return the name of a component when there is such a one.
-
-    Parameters
-    ----------
-    name : str
-        As written.
-    where : str
-        Option or file, for the error.
-
-    Returns
-    -------
-    str
-        The name.
-
-    Raises
-    ------
-    InputError
-        When there is no such component; names the nearest.
-
-    """
-    from ou_monitor.model.network.components import PowerNetwork
+    """Return the name of a component when there is such a one."""
+    from ou_monitor.paper.network.components import PowerNetwork
 
     valid = [field.name for field in fields(PowerNetwork)]
     if name not in valid:
@@ -120,30 +60,8 @@ def component(name: str, where: str) -> str:
 
 
 def value_of(where: str, name: str, text: object) -> Any:
-    """
-    Return the value of a component.
-
-    Parameters
-    ----------
-    where : str
-        Option or key, for the error.
-    name : str
-        The component.
-    text : object
-        What was written.
-
-    Returns
-    -------
-    float, int or bool
-        In the component's unit.
-
-    Raises
-    ------
-    InputError
-        When it is no such value.
-
-    """
-    from ou_monitor.model.network.components import UNITS
+    """Return the value of a component."""
+    from ou_monitor.paper.network.components import UNITS
 
     if name == 'constant_power':
         word = str(text).strip().lower()

@@ -10,19 +10,11 @@ from ou_monitor.cli.arguments import add_json
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
-    from ou_monitor.offline.reproduce.reproduce import Reproduction
+    from ou_monitor.paper.reproduce.reproduce import Reproduction
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        From ``ArgumentParser.add_subparsers``.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'reproduce', allow_abbrev=False,
         help='recompute every number of the paper, verdict per row',
@@ -37,25 +29,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """
-    Reproduce.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        As parsed.
-
-    Returns
-    -------
-    int
-        Exit status, 0; that a number of the paper does not hold is a result.
-
-    Raises
-    ------
-    InputError
-        When an option makes no sense or a file cannot be written.
-
-    """
+    """Reproduce."""
     if args.seed < 0:
         raise InputError(f'--seed must be 0 or more, got {args.seed}')
     if args.report == output.STDOUT:
@@ -64,13 +38,13 @@ def run(args: argparse.Namespace) -> int:
     output.check_writable(args.json)
     output.check_writable(args.report)
 
-    from ou_monitor.offline.reproduce.reproduce import reproduce
-    from ou_monitor.offline.reproduce.words import as_data
+    from ou_monitor.paper.reproduce.reproduce import reproduce
+    from ou_monitor.paper.reproduce.words import as_data
 
     with output.Progress('recomputing') as progress:
         result = reproduce(args.seed, progress)
     if args.report is not None:
-        from ou_monitor.offline.report.reproduction_page import reproduction_page
+        from ou_monitor.report.reproduction_page import reproduction_page
         output.write_text(
             reproduction_page(result, f'ou-monitor reproduce --seed {args.seed}'), args.report)
     if args.json is not None:
@@ -83,22 +57,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def render(result: Reproduction) -> str:
-    """
-    Return the rows and points for a terminal 100 columns wide.
-
-    Parameters
-    ----------
-    result : Reproduction
-        Rows and points.
-
-    Returns
-    -------
-    str
-        Plain text.
-
-    """
-    from ou_monitor.offline.reproduce.points import tally
-    from ou_monitor.offline.reproduce.words import headline, recomputed
+    """Return the rows and points for a terminal 100 columns wide."""
+    from ou_monitor.paper.reproduce.points import tally
+    from ou_monitor.paper.reproduce.words import headline, recomputed
 
     lines = [output.paragraph(headline(result))]
     rows = [[row.where if k == 0 or row.where != found[k - 1].where else '',

@@ -21,15 +21,7 @@ _DURATION_MOST = 9e9
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command to the parser.
-
-    Parameters
-    ----------
-    subparsers : argparse subparsers
-        Where to add it.
-
-    """
+    """Add the command to the parser."""
     parser: argparse.ArgumentParser = subparsers.add_parser(
         'simulate', help='a recording from a model',
         description='Draw a recording from a model of a supply, exact in law at any rate. '
@@ -61,28 +53,10 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """
-    Simulate.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        As parsed.
-
-    Returns
-    -------
-    int
-        Exit status, 0.
-
-    Raises
-    ------
-    InputError
-        When an option makes no sense or a file cannot be read or written.
-
-    """
-    from ou_monitor.offline.presets import PRESETS
-    from ou_monitor.offline.profiles import PROFILES, read_profile
+    """Simulate."""
     from ou_monitor.recordings.model_file import as_yaml, ModelFile, read_model
+    from ou_monitor.simulate.presets import PRESETS
+    from ou_monitor.simulate.profiles import PROFILES, read_profile
 
     if args.list:
         if args.json is not None:
@@ -160,8 +134,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _write(args: argparse.Namespace, model: Any, profile: Any, duration: float, rate: float,
            kind: str, name: str) -> dict[str, Any]:
-    from ou_monitor.offline.simulation import simulated
     from ou_monitor.recordings.write import RecordingWriter
+    from ou_monitor.simulate.simulation import simulated
 
     total, done = round(duration * rate), 0
     with RecordingWriter(args.output, type=kind, sample_rate=rate) as writer, \

@@ -19,22 +19,7 @@ import math
 
 
 def block_autocovariance(a: float, m: int) -> tuple[float, float]:
-    """
-    Return the autocovariances of noise-free block means at lags 0 and 1.
-
-    Parameters
-    ----------
-    a : float
-        alpha D, relaxation rate times the step between blocks, > 0.
-    m : int
-        Samples averaged per block; 1 for plain samples.
-
-    Returns
-    -------
-    gamma0, gamma1 : float
-        In units of sigma^2 D.
-
-    """
+    """Return the autocovariances of noise-free block means at lags 0 and 1."""
     variance = 0.5 / a
     if m == 1:
         return variance, variance * math.exp(-a)
@@ -60,22 +45,7 @@ def noise_free_theta(a: float, m: int) -> float:
 
 
 def theta_at(a: float, m: int, share: float) -> float:
-    """
-    Return the moving-average coefficient at a noise share.
-
-    Parameters
-    ----------
-    a, m :
-        As in `block_autocovariance`.
-    share : float
-        Noise variance of one block mean in units of sigma^2 D, >= 0.
-
-    Returns
-    -------
-    float
-        theta, |theta| < 1.
-
-    """
+    """Return the moving-average coefficient at a noise share."""
     phi = math.exp(-a)
     gamma0, gamma1 = block_autocovariance(a, m)
     gamma0 += share
@@ -84,24 +54,7 @@ def theta_at(a: float, m: int, share: float) -> float:
 
 
 def noise_share(a: float, theta: float, m: int) -> float:
-    """
-    Return lam, the noise variance of one z in units of sigma^2 D.
-
-    Parameters
-    ----------
-    a : float
-        alpha D.
-    theta : float
-        Moving-average coefficient, below exp(-a).
-    m : int
-        Samples per block.
-
-    Returns
-    -------
-    float
-        Noise share; negative when theta is below `noise_free_theta`.
-
-    """
+    """Return lam, the noise variance of one z in units of sigma^2 D."""
     phi = math.exp(-a)
     gamma0, gamma1 = block_autocovariance(a, m)
     total = gamma1 * (1.0 + theta * theta - 2.0 * phi * theta) / (
@@ -124,19 +77,6 @@ def log_covariance(a: float, theta: float, m: int, n: int) -> tuple[float, float
     [[(1-phi^2)(1-phi theta), (1-phi^2)(1-theta^2)], [., (1-theta^2)(1-phi
     theta)]], and that of ln q is 2/n (Box & Jenkins, Time Series Analysis,
     7.2.6); the delta method carries it to the logarithms.
-
-    Parameters
-    ----------
-    a, theta, m :
-        As above.
-    n : int
-        Number of blocks.
-
-    Returns
-    -------
-    tuple of float
-        Variances, dimensionless.
-
     """
     phi = math.exp(-a)
     one, other = -math.expm1(-2.0 * a), 1.0 - theta * theta

@@ -102,24 +102,7 @@ class _Likelihood:
 
 
 def fit_exact(t: FloatArray, y: FloatArray, regressors: FloatArray) -> ExactFit:
-    """
-    Fit alpha, sigma, the white noise and the mean by restricted likelihood.
-
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-        Strictly increasing stamps, s.
-    y : ndarray, shape (n,)
-        Voltage, V.
-    regressors : ndarray, shape (n, p)
-        Columns of the mean, the first one constant, of full rank; n > p + 2.
-
-    Returns
-    -------
-    ExactFit
-        The fit.
-
-    """
+    """Fit alpha, sigma, the white noise and the mean by restricted likelihood (t in s, y in V)."""
     likelihood = _Likelihood(t, y, regressors)
     # Slowest rate worth a name: one relaxation in ten windows; fastest: the
     # correlation of neighbours is below 1e-4.

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-
 from ou_monitor.records import FloatArray
 
 # Products, and levels of products of two, between two scalings: far from the smallest
@@ -26,28 +25,7 @@ _NONE = 1e-300
 
 def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
             ) -> tuple[FloatArray, FloatArray]:
-    """
-    Filter.
-
-    Parameters
-    ----------
-    log_density : ndarray, shape (n, k, k)
-        Log density of each sample given the states before and at it; a
-        transposed array of shape (k, k, n) saves a copy.
-    transition : ndarray, shape (k, k)
-        Probabilities; rows add up to 1.
-    start : ndarray, shape (k,)
-        Law of the state before the first sample.
-
-    Returns
-    -------
-    before : ndarray, shape (n, k)
-        Law of the state before each sample, given all samples before.
-    evidence : ndarray, shape (n,)
-        Log predictive density of each sample; at least that of the likeliest
-        state less 691, where that state cannot be reached.
-
-    """
+    """Filter."""
     n, k, _ = log_density.shape
     top, padded = _in_blocks(log_density, transition)
     size, blocks = padded.shape[0], padded.shape[3]
@@ -65,24 +43,7 @@ def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
 
 
 def log_likelihood(log_density: FloatArray, transition: FloatArray, start: FloatArray) -> float:
-    """
-    Return the sum of the evidence of `forward`, at a small part of its cost.
-
-    Parameters
-    ----------
-    log_density : ndarray, shape (n, k, k)
-        As `forward`.
-    transition : ndarray, shape (k, k)
-        As `forward`.
-    start : ndarray, shape (k,)
-        As `forward`.
-
-    Returns
-    -------
-    float
-        Log density of all samples; -inf where they cannot be.
-
-    """
+    """Return the sum of the evidence of `forward`, at a small part of its cost."""
     k = transition.shape[0]
     log: FloatArray = log_density.transpose(1, 2, 0)
     top = _largest(log)

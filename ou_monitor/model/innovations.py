@@ -129,20 +129,7 @@ class Filter:
         return variance
 
     def innovations(self, y: FloatArray) -> FloatArray:
-        """
-        Return one-step innovations.
-
-        Parameters
-        ----------
-        y : ndarray, shape (n,) or (n, p)
-            Series; the filter is linear, so regressors pass as the data do.
-
-        Returns
-        -------
-        ndarray
-            Of the shape of `y`, in its unit.
-
-        """
+        """Return one-step innovations."""
         columns = y[:, None] if y.ndim == 1 else y
         length = self._gain.shape[0]
         if length == self._n:

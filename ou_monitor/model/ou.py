@@ -24,26 +24,7 @@ def transition(alpha: float, sigma: float, dt: npt.ArrayLike) -> tuple[FloatArra
     """
     Return the exact one-step law over a time `dt`.
 
-    Parameters
-    ----------
-    alpha : float
-        Relaxation rate, 1/s, > 0.
-    sigma : float
-        Noise intensity, V/sqrt(s), >= 0.
-    dt : array_like
-        Steps, s, >= 0.
-
-    Returns
-    -------
-    phi, q : ndarray
-        Coefficient exp(-alpha dt) and innovation variance
-        Var_inf (1 - phi^2), V^2, of the shape of `dt`.
-
-    Raises
-    ------
-    ValueError
-        When alpha <= 0, sigma < 0 or a step is negative or not finite.
-
+    alpha in 1/s, sigma in V/sqrt(s), dt in s.
     """
     steps = np.asarray(dt, dtype=np.float64)
     if not alpha > 0.0 or not math.isfinite(alpha):
@@ -64,34 +45,7 @@ def simulate(
     """
     Draw a path at the given stamps, exact in law at any spacing.
 
-    Parameters
-    ----------
-    t : array_like, shape (n,)
-        Stamps, s, not decreasing.
-    alpha : float
-        Relaxation rate, 1/s, > 0.
-    sigma : float or array_like, shape (n,)
-        Noise intensity, V/sqrt(s); an array holds from the stamp before to
-        its own stamp.
-    rng : numpy.random.Generator
-        Source of randomness.
-    u0 : float or array_like, shape (n,)
-        Mean level added to the deviation, V (the level follows `u0` at once:
-        a sag, not a force).
-    start : float, optional
-        First deviation from `u0`, V; drawn from the stationary law when left
-        out.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Voltage, V.
-
-    Raises
-    ------
-    ValueError
-        When a parameter is out of range or `t` decreases.
-
+    t in s, alpha in 1/s, sigma in V/sqrt(s), u0 in V, start in V, result in V.
     """
     stamps = np.asarray(t, dtype=np.float64)
     if stamps.ndim != 1:

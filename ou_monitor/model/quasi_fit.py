@@ -8,7 +8,7 @@ is small).  Restricted form: the level, and other regressors of the mean
 through `tilt`, are integrated out.  One evaluation costs K multiplications; no data is touched.
 
 The same text runs in plain Python and, where Numba is installed, compiled
-(`ou_monitor.online.compiled`): scalars and loops only, hence no classes here.
+(`ou_monitor.online.estimator.compiled`): scalars and loops only, hence no classes here.
 """
 
 from __future__ import annotations
@@ -29,29 +29,7 @@ _NEAR = 1e-5
 
 def objective(c0: float, c: Sequence[float], free: float, log_a: float, theta: float,
               tilt_a: float, tilt_t: float) -> tuple[float, float, float]:
-    """
-    Return minus the log-likelihood and its gradient in (ln a, theta).
-
-    Parameters
-    ----------
-    c0 : float
-        Sample variance of the residual, V^2.
-    c : sequence of float, length K
-        Sample autocovariances at lags 1..K, V^2.
-    free : float
-        Samples less regressors.
-    log_a, theta : float
-        ln(alpha D) and the moving-average coefficient, theta < phi.
-    tilt_a, tilt_t : float
-        Gradient of what other regressors than the level add (half the
-        log-determinant of their information), taken linear.
-
-    Returns
-    -------
-    value, by_log_a, by_theta : float
-        Nats; value is inf where the parameters contradict the data.
-
-    """
+    """Return minus the log-likelihood and its gradient in (ln a, theta) (c0 in V^2, c in V^2)."""
     a = math.exp(log_a)
     phi = math.exp(-a)
     g = 0.0
@@ -107,25 +85,6 @@ def polish(c0: float, c: Sequence[float], free: float, log_a: float, theta: floa
 
     Two steps of Newton with one curvature, from differences of the gradient; a
     step counts if the gradient falls in the metric of the curvature.
-
-    Parameters
-    ----------
-    c0, c, free, log_a, theta, tilt_a, tilt_t :
-        As in `objective`.
-    value, g_a, g_t : float
-        Its result there.
-    on_bound : bool
-        Whether theta stays on its bound; else it must not fall below.
-    floor, slope : float
-        The bound: floor + slope ln a.
-    low, high : float
-        Range of ln a.
-
-    Returns
-    -------
-    log_a, theta, value : float
-        The minimiser, to rounding, and the value there.
-
     """
     turn = slope if on_bound else 0.0
     step = _NEAR * (1.0 - theta)
@@ -164,30 +123,6 @@ def minimise(c0: float, c: Sequence[float], free: float, log_a: float, theta: fl
 
     Quasi-Newton (BFGS) from the expected information, with step halving, then
     `polish`; on the bound (no measurement noise) the search goes along it.
-
-    Parameters
-    ----------
-    c0, c, free :
-        As in `objective`.
-    log_a, theta : float
-        Start.
-    floor, slope : float
-        Least theta at the start (`arma.noise_free_theta`) and its derivative
-        in ln a, taken linear.
-    low, high : float
-        Range of ln a.
-    tilt_a, tilt_t : float
-        As in `objective`.
-
-    Returns
-    -------
-    log_a, theta, value : float
-        The minimiser and the value there.
-    on_bound : bool
-        Whether theta ended on its bound.
-    steps : int
-        Iterations; `MAX_STEPS` when it did not settle.
-
     """
     start = log_a
     theta = max(theta, floor)

@@ -66,26 +66,7 @@ def _descend(c0: float, c: Sequence[float], free: float, log_a: float, theta: fl
 
 def search(c0: float, c: Sequence[float], free: float, log_a: float, theta: float, m: int,
            tilt_a: float, tilt_t: float) -> tuple[float, float, bool]:
-    """
-    Minimise `quasi_fit.objective` with the bound on theta, which bends with ln a.
-
-    Parameters
-    ----------
-    c0, c, free, tilt_a, tilt_t :
-        As in `quasi_fit.objective`.
-    log_a, theta : float
-        Start.
-    m : int
-        Raw samples in each sample.
-
-    Returns
-    -------
-    log_a, theta : float
-        The minimiser.
-    on_bound : bool
-        Whether no measurement noise was found.
-
-    """
+    """Minimise `quasi_fit.objective` with the bound on theta, which bends with ln a."""
     theta = min(theta, 0.9 * math.exp(-math.exp(log_a)))
     log_a, theta, on_bound, value = _descend(c0, c, free, log_a, theta, m, tilt_a, tilt_t)
     if not value < math.inf:
@@ -114,25 +95,7 @@ def search(c0: float, c: Sequence[float], free: float, log_a: float, theta: floa
 def finish(c0: float, c: Sequence[float], n: int, free: float, log_a: float, theta: float,
            on_bound: bool, m: int
            ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """
-    Return scale, noise and errors at the minimiser.
-
-    Returns
-    -------
-    a, theta : float
-        alpha D and the moving-average coefficient, pulled (see `PULL`).
-    q : float
-        Innovation variance, V^2.
-    scale : float
-        sigma^2 D, V^2.
-    share : float
-        Noise variance of one sample in units of scale.
-    score : float
-        Distance from "no noise" in standard errors.
-    log_alpha_var, log_sigma_var, log_var_inf_var : float
-        Variances of the logarithms.
-
-    """
+    """Return scale, noise and errors at the minimiser."""
     floor = noise_free_theta(math.exp(log_a), m)
     phi = math.exp(-math.exp(log_a))
     i_aa, i_at, _ = information(log_a, theta)
@@ -157,28 +120,7 @@ def finish(c0: float, c: Sequence[float], n: int, free: float, log_a: float, the
 
 def trend_score(c0: float, c: Sequence[float], n: int, place: float, change: Sequence[float],
                 pairs: Sequence[float], log_a: float, theta: float) -> float:
-    """
-    Return a trend over its standard error.
-
-    Parameters
-    ----------
-    c0, c :
-        Autocovariances of the voltage, V^2, at lag 0 and lags 1..K.
-    n : int
-        Samples.
-    place : float
-        Covariance of voltage and sample number, in windows, V.
-    change, pairs : sequence of float, length K
-        Sums of z_j - z_{j-k}, V, and of pairs.
-    log_a, theta : float
-        Noise.
-
-    Returns
-    -------
-    float
-        Signed score, dimensionless.
-
-    """
+    """Return a trend over its standard error (place in V)."""
     phi = math.exp(-math.exp(log_a))
     lead = 1.0 + phi * phi - 2.0 * phi * theta
     tail = 2.0 * (1.0 - phi * theta) * (theta - phi)
@@ -202,24 +144,7 @@ def trend_score(c0: float, c: Sequence[float], n: int, place: float, change: Seq
 def fit_still(c0: float, c: Sequence[float], n: int, place: float, change: Sequence[float],
               pairs: Sequence[float], log_a: float, theta: float, m: int
               ) -> tuple[float, float, float, float, float, float, float, float, float, float]:
-    """
-    Fit a window whose mean is a constant.
-
-    Parameters
-    ----------
-    c0, c, n, place, change, pairs :
-        As in `trend_score`.
-    log_a, theta : float
-        Start; NaN for none.
-    m : int
-        Raw samples in each sample.
-
-    Returns
-    -------
-    tuple of float
-        What `finish` returns, and the trend score.
-
-    """
+    """Fit a window whose mean is a constant."""
     if math.isnan(log_a):
         log_a, theta = guess(c0, c)
     log_a, theta, on_bound = search(c0, c, n - 1.0, log_a, theta, m, 0.0, 0.0)
@@ -231,26 +156,7 @@ def fit_still(c0: float, c: Sequence[float], n: int, place: float, change: Seque
 def fit_sums(sums: Sequence[float], lags: int, log_a: float, theta: float, m: int
              ) -> tuple[float, float, float, float, float, float, float, float, float, float,
                         float, float]:
-    """
-    Fit a window whose mean is a constant, from its sums over lags.
-
-    Parameters
-    ----------
-    sums : sequence of float, length 4 + 3 K
-        Samples; their sum, V; sum of sample times number; sum of squares; then
-        for each lag pairs, sum of differences, sum of squared differences.
-    lags : int
-        K.
-    log_a, theta, m :
-        As in `fit_still`.
-
-    Returns
-    -------
-    tuple of float
-        Mean, V; variance about it, V^2; then what `fit_still` returns, NaN
-        where neighbouring samples are not correlated.
-
-    """
+    """Fit a window whose mean is a constant, from its sums over lags (sums in V)."""
     n = int(sums[0])
     mean = sums[1] / n
     c0 = sums[3] / n - mean * mean

@@ -13,7 +13,6 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Effect, Stage, Stretch, Term
 from ou_monitor.records import FloatArray
@@ -141,28 +140,7 @@ class Simulation:
         self._last = -math.inf
 
     def advance(self, t: npt.ArrayLike, throttle: npt.ArrayLike | None = None) -> FloatArray:
-        """
-        Draw the next samples.
-
-        Parameters
-        ----------
-        t : array_like, shape (n,)
-            Stamps, s, rising, after those drawn before.
-        throttle : array_like, shape (n,), optional
-            0..1.
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            What is logged, V.
-
-        Raises
-        ------
-        ValueError
-            When stamps do not rise, shapes differ, or a term needs throttle
-            that is not given or not finite.
-
-        """
+        """Draw the next samples (t in s, result in V)."""
         stamps = np.asarray(t, dtype=np.float64)
         if stamps.ndim != 1:
             raise ValueError(f't must have shape (n,), got {stamps.shape}')

@@ -28,8 +28,8 @@ from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of
 from ou_monitor.nodes.inputs import INPUT_QOS, Silence, Stamper, types_on
 from ou_monitor.nodes.message_types import message_class
 from ou_monitor.nodes.supply_input import Supply, SupplyInput
-from ou_monitor.online.cutoff_control import Bound
-from ou_monitor.online.lowpass import AdaptiveLowPass, FilterCounters
+from ou_monitor.online.filter.cutoff_control import Bound
+from ou_monitor.online.filter.lowpass import AdaptiveLowPass, FilterCounters
 from ou_monitor.online.monitor import Level
 from ou_monitor.online.settings import (
     FILTER_PARAMETERS, filter_settings, FilterSettings, Parameter)

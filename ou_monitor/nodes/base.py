@@ -15,8 +15,8 @@ from typing import Any
 
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.online.settings import Parameter
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.msg import (
+    FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult)
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node

@@ -10,30 +10,7 @@ from rclpy.time import Time
 
 def diagnostic(name: str, level: int, summary: str, fields: Mapping[str, str],
                stamp: float, hardware_id: str = '') -> DiagnosticArray:
-    """
-    Return one status as a stamped message.
-
-    Parameters
-    ----------
-    name : str
-        Full name of the node, with what it reports on.
-    level : int
-        0 OK, 1 WARN, 2 ERROR, 3 STALE.
-    summary : str
-        One line for the pilot.
-    fields : mapping of str to str
-        Keys and values.
-    stamp : float
-        Stamp of the header, s; 0 when not finite or negative.
-    hardware_id : str
-        What is monitored.
-
-    Returns
-    -------
-    DiagnosticArray
-        Message with that one status.
-
-    """
+    """Return one status as a stamped message (stamp in s)."""
     message = DiagnosticArray()
     message.header.stamp = to_time(stamp)
     message.status = [DiagnosticStatus(

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.messages.config import FieldSpec
-from ou_monitor.messages.extract import Extractor
-from ou_monitor.messages.field_path import FieldPath, parse_field_path
 from ou_monitor.nodes.message_types import message_class
+from ou_monitor.stream.config import FieldSpec
+from ou_monitor.stream.extract import Extractor
+from ou_monitor.stream.field_path import FieldPath, parse_field_path
 
 
 @dataclass(frozen=True)
@@ -65,28 +65,7 @@ CHANNELS: dict[str, Channels] = {
 
 
 def channels_of(kind: str, field: str) -> Channels:
-    """
-    Return the signals of a type.
-
-    Parameters
-    ----------
-    kind : str
-        Message type, 'package/msg/Type'.
-    field : str
-        Field path of a number with a fraction; empty: as `CHANNELS` says.
-
-    Returns
-    -------
-    Channels
-        Signals.
-
-    Raises
-    ------
-    InputError
-        When the type needs a field and none is given, its package is not
-        installed, or the field is not there or holds no such number.
-
-    """
+    """Return the signals of a type."""
     if field:
         return _field_channel(kind, field)
     if kind not in CHANNELS:

@@ -9,28 +9,7 @@ from ou_monitor.errors import InputError, nearest
 
 
 def message_class(name: str, install: str = '') -> Any:
-    """
-    Return the class of a message type.
-
-    Parameters
-    ----------
-    name : str
-        'package/msg/Type'.
-    install : str
-        What to install when the package is missing; guessed when empty.
-
-    Returns
-    -------
-    type
-        Class of the message.
-
-    Raises
-    ------
-    InputError
-        When the name is malformed, the package is not installed, or it has no
-        such message.
-
-    """
+    """Return the class of a message type."""
     parts = name.split('/')
     if len(parts) != 3 or parts[1] != 'msg' or not all(part.isidentifier() for part in parts):
         raise InputError(f"'{name}' is not a message type: write 'package/msg/Type'")

@@ -24,20 +24,7 @@ class ModelChoice:
         self._checked: tuple[str, SupplyModel | None] = self._used
 
     def check(self, path: str) -> None:
-        """
-        Read the file, unless it is the one in use.
-
-        Parameters
-        ----------
-        path : str
-            Path; empty: no model.
-
-        Raises
-        ------
-        ValueError
-            One line that says what is wrong with the file.
-
-        """
+        """Read the file, unless it is the one in use."""
         if path == self._used[0]:
             return
         try:
@@ -46,15 +33,7 @@ class ModelChoice:
             raise ValueError(f'model_file: {error}') from error
 
     def use(self, path: str) -> SupplyModel | None:
-        """
-        Bring a path that was checked last into force; return its model.
-
-        Raises
-        ------
-        ValueError
-            When the path has not been checked.
-
-        """
+        """Bring a path that was checked last into force; return its model."""
         if path != self._used[0]:
             if path != self._checked[0]:
                 raise ValueError(f'model_file {path} has not been checked')

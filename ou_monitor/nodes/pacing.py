@@ -20,22 +20,7 @@ NAP = 0.05
 
 
 def wait_until(instant: float, going: Callable[[], bool]) -> bool:
-    """
-    Wait until `time.monotonic()` reaches an instant.
-
-    Parameters
-    ----------
-    instant : float
-        When, s.
-    going : callable
-        Asked at least every 50 ms; False ends the wait.
-
-    Returns
-    -------
-    bool
-        What `going` said last.
-
-    """
+    """Wait until `time.monotonic()` reaches an instant (instant in s)."""
     while True:
         if not going():
             return False

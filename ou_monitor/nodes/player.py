@@ -98,15 +98,7 @@ class Player(Node):
         return bool(self.context.ok())
 
     def play(self) -> dict[str, Any]:
-        """
-        Play until the end, or a signal; return what was done.
-
-        Returns
-        -------
-        dict
-            Ready for JSON; spacing errors in s of real time.
-
-        """
+        """Play until the end, or a signal; return what was done."""
         self._wait_for_subscriber()
         # The garbage collector's pauses would be seen in the spacing.
         gc.collect()

@@ -27,24 +27,7 @@ def one_line(text: object) -> str:
 
 
 def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> int:
-    """
-    Initialise ROS 2, do the work, shut down; return the exit status.
-
-    Parameters
-    ----------
-    name : str
-        Name of the logger for what goes wrong before there is a node.
-    work : callable
-        Imports and builds the node and spins it; returns the exit status.
-    args : list of str, optional
-        Command line with the program first; `sys.argv` when omitted.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Initialise ROS 2, do the work, shut down; return the exit status."""
     # rclpy ends the context on SIGINT and SIGTERM and then calls the handler that was there
     # before.  Python's own would raise KeyboardInterrupt inside whatever callback runs, and the
     # EventsExecutor turns that into SystemError: so ours only notes the signal, from the start.
@@ -59,24 +42,7 @@ def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> in
 
 
 def run_node(name: str, about: str, work: Callable[[], int]) -> int:
-    """
-    Run an executable that takes ROS arguments only.
-
-    Parameters
-    ----------
-    name : str
-        As of `run`.
-    about : str
-        What --help shows.
-    work : callable
-        As of `run`.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Run an executable that takes ROS arguments only."""
     if {'-h', '--help'} & set(sys.argv[1:]):
         print(about.strip())
         return 0
@@ -102,8 +68,8 @@ def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: li
               '/opt/ros/jazzy/setup.bash, or run ./scripts/demo once and use its .venv',
               file=sys.stderr)
         return BAD_INPUT
-    from rclpy.exceptions import InvalidHandle, NameValidationException
-    from rclpy.exceptions import NotInitializedException, ParameterException
+    from rclpy.exceptions import (
+        InvalidHandle, NameValidationException, NotInitializedException, ParameterException)
     from rclpy.executors import ExternalShutdownException
     try:
         _init(rclpy, binding, args)
@@ -140,22 +106,6 @@ def spin(node: Any) -> int:
 
     The EventsExecutor takes 10 000 messages/s where the SingleThreadedExecutor
     loses most of them; it is used where this rclpy has it.
-
-    Parameters
-    ----------
-    node : MonitorNode
-        Its `failure` holds what a callback raised, if one did.
-
-    Returns
-    -------
-    int
-        0.
-
-    Raises
-    ------
-    BaseException
-        Whatever a callback of the node raised.
-
     """
     from rclpy.executors import ExternalShutdownException
     executor = make_executor()

@@ -10,11 +10,10 @@ from collections.abc import Callable
 import math
 
 import numpy as np
-
-from ou_monitor.messages.blocks import BlockClock
-from ou_monitor.messages.extract import Extractor
-from ou_monitor.messages.throttle import ThrottleHold
 from ou_monitor.online.monitor import SupplyMonitor
+from ou_monitor.stream.blocks import BlockClock
+from ou_monitor.stream.extract import Extractor
+from ou_monitor.stream.throttle import ThrottleHold
 
 # A stamp that is older than the newest by more than this, s, is a clock or a bag that went back.
 # One publisher's messages arrive in order; what several interleave is milliseconds.
@@ -76,30 +75,7 @@ class SampleStream:
         return self._last_throttle
 
     def take_voltage(self, message: object, source_time: Callable[[], float]) -> bool:
-        """
-        Take one voltage message.
-
-        Parameters
-        ----------
-        message : object
-            Message.
-        source_time : callable
-            When it was sent, s, asked only when it has no stamp; NaN when not
-            known.
-
-        Returns
-        -------
-        bool
-            Whether it held a voltage that can be used.
-
-        Raises
-        ------
-        ValueError
-            Before `open_voltage`.
-        InputError
-            When the field is not what the msg_config says.
-
-        """
+        """Take one voltage message (source_time in s)."""
         if self._voltage is None:
             raise ValueError('take_voltage before open_voltage')
         self.messages += 1

@@ -25,7 +25,6 @@ from collections.abc import Sequence
 import math
 
 import numpy as np
-
 from ou_monitor.records import FloatArray
 
 # Looked at: so many messages, and so many seconds of them, whichever is more.
@@ -54,23 +53,7 @@ _POINTS = 400
 
 
 def line_under(times: Sequence[float] | FloatArray) -> tuple[float, float]:
-    """
-    Return the period of a source, and how steady it is.
-
-    Parameters
-    ----------
-    times : sequence of float, length n >= 2
-        Source timestamps in order, s.
-
-    Returns
-    -------
-    period : float
-        Slope of the lower convex hull at the middle of the time, s a message.
-    share : float
-        Share of the messages within ``NEAR * sqrt(n)`` periods, or one, of that
-        line.
-
-    """
+    """Return the period of a source, and how steady it is (times in s)."""
     stamps = np.asarray(times, dtype=np.float64)
     stamps = stamps - stamps[0]
     n = stamps.size
@@ -128,20 +111,7 @@ class SendClock:
         return 1.0 / self._period
 
     def __call__(self, source: float) -> float:
-        """
-        Return the stamp of the next sample.
-
-        Parameters
-        ----------
-        source : float
-            When it was sent, s.
-
-        Returns
-        -------
-        float
-            When it was taken, s, but for a constant delay.
-
-        """
+        """Return the stamp of the next sample (source in s)."""
         times = self._times
         if times and not -BACK < source - times[-1] < self._gap:
             del times[:]

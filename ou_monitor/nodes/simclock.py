@@ -44,22 +44,7 @@ class SimClockMap:
         return self._rate
 
     def add(self, source: float, clock: float) -> bool:
-        """
-        Take one message of `/clock`.
-
-        Parameters
-        ----------
-        source : float
-            When it was sent, by the sender's own clock, s.
-        clock : float
-            The simulated time it carries, s.
-
-        Returns
-        -------
-        bool
-            Whether the clock stepped, so that what went before is void.
-
-        """
+        """Take one message of `/clock` (source in s, clock in s)."""
         stepped = False
         if self._pairs:
             last_source, last_clock = self._pairs[-1]

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ou_monitor.errors import InputError
-from ou_monitor.messages.config import FieldSpec, list_msg_configs, load_msg_config
-from ou_monitor.messages.extract import Extractor
 from ou_monitor.nodes.message_types import message_class
 from ou_monitor.online.settings import Parameter
+from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config
+from ou_monitor.stream.extract import Extractor
 
 AUTO = 'auto'
 
@@ -81,16 +81,7 @@ class Source:
         return list(dict.fromkeys(c.spec.type for c in self.candidates if c.spec is not None))
 
     def open(self) -> tuple[Any, Extractor]:  # noqa: A003
-        """
-        Return the message class and the extractor, tried on an empty message.
-
-        Raises
-        ------
-        InputError
-            When the package is not installed, or the message has no such
-            field.
-
-        """
+        """Return the message class and the extractor, tried on an empty message."""
         if self.spec is None:
             raise InputError(f'the type of the {self.quantity} is not known yet')
         message = message_class(self.spec.type, self.install)
@@ -100,27 +91,7 @@ class Source:
 
 
 def find_source(quantity: str, values: Mapping[str, Any]) -> Source | None:
-    """
-    Return where a quantity comes from, by the parameters.
-
-    Parameters
-    ----------
-    quantity : {'voltage', 'throttle'}
-        Quantity.
-    values : mapping
-        `SOURCE_PARAMETERS` by name.
-
-    Returns
-    -------
-    Source or None
-        None when the msg_config has no such quantity.
-
-    Raises
-    ------
-    InputError
-        For an unknown msg_config, or overrides that do not suffice.
-
-    """
+    """Return where a quantity comes from, by the parameters."""
     topic, kind, field = (str(values[f'{quantity}.{key}']) for key in ('topic', 'type', 'field'))
     rate = float(values['adc.sample_rate']) if quantity == 'voltage' else 0.0
     if values['msg_config'] == AUTO:

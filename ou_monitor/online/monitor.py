@@ -12,11 +12,10 @@ import enum
 import math
 
 import numpy.typing as npt
-
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.online.estimator import SlidingEstimator
-from ou_monitor.online.flag import BrownoutFlag, FlagLevel, FlagState
-from ou_monitor.online.outlook import Outlook
+from ou_monitor.online.estimator.estimator import SlidingEstimator
+from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
+from ou_monitor.online.risk.outlook import Outlook
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, Flag, NAN, Status
 

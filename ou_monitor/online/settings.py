@@ -15,7 +15,7 @@ from numbers import Real
 from typing import Any
 
 from ou_monitor.errors import nearest
-from ou_monitor.online.lag import cutoff_for_lag, most_lag
+from ou_monitor.online.filter.lag import cutoff_for_lag, most_lag
 
 
 @dataclass(frozen=True)
@@ -298,12 +298,6 @@ class FilterSettings:
 
         Where `fallback` is not given it is moved into fmin..fmax, so that a
         caller who gives only the limits is not refused.
-
-        Raises
-        ------
-        ValueError
-            For an unknown option (the nearest is named) or a bad value.
-
         """
         known = {f.name for f in fields(cls)}
         for name in options:
@@ -325,28 +319,12 @@ class FilterSettings:
 
 
 def monitor_settings(values: Mapping[str, object]) -> MonitorSettings:
-    """
-    Return settings from dotted parameter names.
-
-    Raises
-    ------
-    ValueError
-        One line that names the parameter, its value and the mend.
-
-    """
+    """Return settings from dotted parameter names."""
     return MonitorSettings(**_by_field(ESTIMATOR_PARAMETERS, values))
 
 
 def filter_settings(values: Mapping[str, object]) -> FilterSettings:
-    """
-    Return settings from parameter names.
-
-    Raises
-    ------
-    ValueError
-        One line that names the parameter, its value and the mend.
-
-    """
+    """Return settings from parameter names."""
     return FilterSettings(**_by_field(FILTER_PARAMETERS, values))
 
 

@@ -76,37 +76,7 @@ class BagWriter:
         schema: str | None = None, reliability: str = 'reliable',
         sample_rate: float | None = None, origin: Mapping[str, str] | None = None,
     ) -> str:
-        """
-        Announce a topic.
-
-        Parameters
-        ----------
-        name : str
-            Topic; made absolute, as rosbag2 has it.
-        type : str
-            Message type, 'package/msg/Type'.
-        schema : str, optional
-            Its ros2msg definition; needed for types not in `schemas.SCHEMAS`.
-        reliability : {'reliable', 'best_effort'}
-            QoS to be offered at playback.
-        sample_rate : float, optional
-            Rate of the samples within a block, Hz; kept in the channel's
-            metadata, where `BagReader` finds it.
-        origin : mapping of str to str, optional
-            Where the values came from; kept there as well, see
-            `BagReader.origins`.
-
-        Returns
-        -------
-        str
-            The absolute name, for `write`.
-
-        Raises
-        ------
-        ValueError
-            When the topic is there already, or the definition is not known.
-
-        """
+        """Announce a topic (sample_rate in Hz)."""
         topic = '/' + name.lstrip('/')
         if topic in self._topics:
             raise ValueError(f"topic '{topic}' was added before")
@@ -129,27 +99,7 @@ class BagWriter:
         return topic
 
     def write(self, topic: str, t_ns: int, message: Any) -> None:
-        """
-        Write one message.
-
-        Parameters
-        ----------
-        topic : str
-            A topic added before.
-        t_ns : int
-            Log time, ns, not negative.
-        message : bytes, dict or object
-            CDR bytes as they are, or a message (dict of fields, or an object
-            with attributes) to be serialized.
-
-        Raises
-        ------
-        ValueError
-            When the topic was not added or the time is negative.
-        InputError
-            When the disk refuses.
-
-        """
+        """Write one message (topic in A, t_ns in ns)."""
         name = topic if topic in self._counts else '/' + topic
         if name not in self._counts:
             raise ValueError(f"topic '{topic}' was not added")
@@ -176,15 +126,7 @@ class BagWriter:
         return self._encoders[kind](message)
 
     def close(self) -> None:
-        """
-        Finish the bag.
-
-        Raises
-        ------
-        InputError
-            When the disk refuses.
-
-        """
+        """Finish the bag."""
         if self._target.file.closed:
             return
         finish: Callable[[], None] = self._writer.finish

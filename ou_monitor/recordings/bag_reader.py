@@ -173,25 +173,7 @@ class BagReader:
         """Do nothing: no file stays open between reads."""
 
     def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
-        """
-        Yield the messages in the order of their log times.
-
-        Parameters
-        ----------
-        topics : iterable of str, optional
-            Topics wanted; all when left out.
-
-        Yields
-        ------
-        RawMessage
-            Topic, type, log time (ns) and CDR bytes.
-
-        Raises
-        ------
-        InputError
-            For a topic that is not in the bag, or at a broken chunk.
-
-        """
+        """Yield the messages in the order of their log times."""
         yield from in_time_order(self._files, self._wanted(topics))
 
     def tables(
@@ -200,24 +182,7 @@ class BagReader:
         """
         Yield where the messages are, chunk by chunk, for reading them in bulk.
 
-        Parameters
-        ----------
-        topics : iterable of str
-            Topics wanted.
-        start_ns, end_ns : int, optional
-            Log times, ns: chunks without a message in start <= t < end are
-            not read.
-
-        Yields
-        ------
-        Part
-            The messages of one chunk, and when those of later parts begin.
-
-        Raises
-        ------
-        InputError
-            As `raw_messages`.
-
+        start_ns, end_ns in ns.
         """
         yield from in_parts(self._files, self._wanted(topics), start_ns, end_ns)
 
@@ -225,24 +190,7 @@ class BagReader:
         """
         Yield the messages of a topic before a log time, newest chunk first.
 
-        Parameters
-        ----------
-        topic : str
-            Topic wanted.
-        before_ns : int
-            Log time, ns.
-
-        Yields
-        ------
-        tuple
-            Messages of one chunk, at least one, and the newest log time (ns)
-            that those still to come can have.
-
-        Raises
-        ------
-        InputError
-            As `raw_messages`.
-
+        before_ns in ns.
         """
         yield from backwards(self._files, self._wanted([topic]), before_ns)
 
@@ -251,25 +199,7 @@ class BagReader:
         return str(self._schemas[kind].data.decode('utf-8', 'replace'))
 
     def decoded(self, topics: Iterable[str] | None = None) -> Iterator[DecodedMessage]:
-        """
-        Yield the messages with their fields as attributes, in log-time order.
-
-        Parameters
-        ----------
-        topics : iterable of str, optional
-            Topics wanted; all when left out.
-
-        Yields
-        ------
-        DecodedMessage
-            Topic, type, log time (ns) and message object.
-
-        Raises
-        ------
-        InputError
-            As `raw_messages`, and for a message that does not fit its type.
-
-        """
+        """Yield the messages with their fields as attributes, in log-time order."""
         decoders: dict[str, Callable[[bytes], Any]] = {}
         for topic, kind, log_time, data in self.raw_messages(topics):
             if kind not in decoders:
@@ -277,20 +207,7 @@ class BagReader:
             yield DecodedMessage(topic, kind, log_time, decoders[kind](data))
 
     def decoder(self, kind: str) -> Callable[[bytes], Any]:
-        """
-        Return the function from CDR bytes to a message of one type in the bag.
-
-        Parameters
-        ----------
-        kind : str
-            Message type.
-
-        Returns
-        -------
-        callable
-            Raises InputError for bytes that do not fit the type.
-
-        """
+        """Return the function from CDR bytes to a message of one type in the bag."""
         def complain(error: Exception) -> InputError:
             return InputError(f'{self.path}: a message of type {kind} cannot be decoded '
                               f'({type(error).__name__}: {error})')

@@ -11,11 +11,10 @@ from functools import partial
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.messages.config import FieldSpec
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.columns import Column, FieldReader, join
 from ou_monitor.recordings.framing import moment
-
+from ou_monitor.stream.config import FieldSpec
 
 Broken = Callable[[int, InputError], None]
 
@@ -35,37 +34,7 @@ def batches(
     end_ns: int | None = None, progress: Callable[[float], None] | None = None,
     broken: Broken | None = None,
 ) -> Iterator[dict[str, Column]]:
-    """
-    Yield fields of a bag, batch by batch.
-
-    Parameters
-    ----------
-    bag : BagReader
-        Where from.
-    specs : mapping of str to FieldSpec
-        Name -> field; the topics are absolute.
-    start_ns, end_ns : int, optional
-        Log times, ns: only messages in start <= t < end.
-    progress : callable, optional
-        Called with the share done, 0..1.
-    broken : callable, optional
-        Called with the log time (ns) of a message that cannot be decoded and
-        with the error; when it returns, the message is left out.  Without it
-        such a message is refused.
-
-    Yields
-    ------
-    dict of str to Column
-        Name -> messages by log time, none of them before one of an earlier
-        batch; a name without messages is left out.
-
-    Raises
-    ------
-    InputError
-        At a broken chunk, for bytes that are no message, and when fewer
-        messages are there than the bag says.
-
-    """
+    """Yield fields of a bag, batch by batch (start_ns, end_ns in ns, progress 0..1)."""
     readers = {name: field_reader(bag, spec, broken) for name, spec in specs.items()}
     pending: dict[str, list[Column]] = {name: [] for name in specs}
     counts = dict.fromkeys(specs, 0)
@@ -108,28 +77,7 @@ def last_before(bag: BagReader, spec: FieldSpec, before_ns: int,
     """
     Return messages of a topic up to the last one before a log time that says something.
 
-    Parameters
-    ----------
-    bag : BagReader
-        Where from.
-    spec : FieldSpec
-        The field.
-    before_ns : int
-        Log time, ns.
-    broken : callable, optional
-        As of `batches`.
-
-    Returns
-    -------
-    Column
-        By log time; it holds the last message before `before_ns` whose value
-        counts under the `nan` rule of `spec`, where there is one.
-
-    Raises
-    ------
-    InputError
-        As `batches`.
-
+    before_ns in ns.
     """
     reader = field_reader(bag, spec, broken)
     found: list[Column] = []

@@ -32,22 +32,7 @@ _BATTERY = np.dtype([
 
 
 def encode_scalars(kind: str, values: npt.ArrayLike) -> list[bytes]:
-    """
-    Return one std_msgs/Float32 or Float64 message for each value.
-
-    Parameters
-    ----------
-    kind : str
-        `FLOAT32` or `FLOAT64`.
-    values : array_like, shape (n,)
-        Content of `data`.
-
-    Returns
-    -------
-    list of bytes, length n
-        Serialized messages.
-
-    """
+    """Return one std_msgs/Float32 or Float64 message for each value."""
     layout = {FLOAT32: _FLOAT32, FLOAT64: _FLOAT64}[kind]
     rows = np.zeros(np.size(values), layout)
     rows['head'] = np.void(HEADER)
@@ -59,18 +44,7 @@ def encode_battery(stamps_ns: npt.NDArray[np.int64], voltage: npt.ArrayLike) -> 
     """
     Return one sensor_msgs/BatteryState for each voltage; the rest is "not measured".
 
-    Parameters
-    ----------
-    stamps_ns : ndarray of int64, shape (n,)
-        Header stamps, ns, 0 <= stamp < 2^31 s.
-    voltage : array_like, shape (n,)
-        Voltage, V.
-
-    Returns
-    -------
-    list of bytes, length n
-        Serialized messages.
-
+    stamps_ns in ns, voltage in V.
     """
     rows = np.zeros(stamps_ns.size, _BATTERY)
     rows['head'] = np.void(HEADER)
@@ -86,20 +60,7 @@ def encode_battery(stamps_ns: npt.NDArray[np.int64], voltage: npt.ArrayLike) -> 
 
 
 def encode_block(samples: npt.ArrayLike) -> bytes:
-    """
-    Return one std_msgs/Float32MultiArray with one dimension named 'samples'.
-
-    Parameters
-    ----------
-    samples : array_like, shape (n,)
-        Content of `data`.
-
-    Returns
-    -------
-    bytes
-        Serialized message.
-
-    """
+    """Return one std_msgs/Float32MultiArray with one dimension named 'samples'."""
     data = np.asarray(samples, dtype='<f4')
     layout = struct.pack('<II8sIII', 1, 8, b'samples', data.size, data.size, 0)
     return HEADER + layout + struct.pack('<I', data.size) + data.tobytes()

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.messages.config import FieldSpec
-from ou_monitor.messages.extract import Extracted, Extractor
-from ou_monitor.messages.field_path import FieldPath, parse_field_path
 from ou_monitor.recordings.layout import Layout, layout_of, Rows
 from ou_monitor.recordings.record_table import IntArray, Table, TimeArray
 from ou_monitor.recordings.ros2msg import parse_definition, short_name
 from ou_monitor.records import FloatArray
+from ou_monitor.stream.config import FieldSpec
+from ou_monitor.stream.extract import Extracted, Extractor
+from ou_monitor.stream.field_path import FieldPath, parse_field_path
 
 # Layouts that are tried for messages of one length; a topic with more of them
 # is not one whose messages are alike.
@@ -149,25 +149,7 @@ class FieldReader:
         self._layouts: dict[int, list[Layout]] = {}
 
     def read(self, table: Table) -> Column:
-        """
-        Return the field of the messages of a table, in its order.
-
-        Parameters
-        ----------
-        table : Table
-            Messages of the type.
-
-        Returns
-        -------
-        Column
-            One entry for each message that is not left out.
-
-        Raises
-        ------
-        InputError
-            As `Extractor`, and for bytes that do not fit the type.
-
-        """
+        """Return the field of the messages of a table, in its order."""
         logged = seconds(table.log_time)
         stamp = logged.copy()
         count = np.ones(table.n, np.int64)

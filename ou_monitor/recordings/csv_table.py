@@ -15,7 +15,6 @@ import csv
 from pathlib import Path
 
 import numpy as np
-
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.records import FloatArray
 
@@ -31,53 +30,13 @@ _LONGEST = 40
 
 
 def read_csv(path: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """
-    Return the columns of a CSV as they stand, unsorted and with NaN kept.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        File.
-
-    Returns
-    -------
-    tuple of ndarray, each of shape (n,)
-        Stamps, s; voltage, V; throttle, 0..1.  An empty cell is NaN; so is the
-        whole throttle when there is no such column.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, a column is missing (with the nearest
-        one), or a cell is not a number (with its line).
-
-    """
+    """Return the columns of a CSV as they stand, unsorted and with NaN kept."""
     columns = _columns(path, (TIME, VOLTAGE), (THROTTLE,))
     return columns[0], columns[1], columns[2]
 
 
 def read_column(path: Path, name: str) -> tuple[FloatArray, FloatArray]:
-    """
-    Return the stamps and one column of a CSV as they stand, NaN kept.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        File.
-    name : str
-        Column.
-
-    Returns
-    -------
-    tuple of ndarray, each of shape (n,)
-        Stamps, s, and values.
-
-    Raises
-    ------
-    InputError
-        As `read_csv`.
-
-    """
+    """Return the stamps and one column of a CSV as they stand, NaN kept."""
     if name == TIME:
         raise InputError(f"{path}: '{TIME}' is the time, not a signal")
     columns = _columns(path, (TIME, name), ())
@@ -85,27 +44,7 @@ def read_column(path: Path, name: str) -> tuple[FloatArray, FloatArray]:
 
 
 def column_names(path: Path, needed: str) -> list[str]:
-    """
-    Return the names of the columns of a CSV.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        File.
-    needed : str
-        A column that must be there.
-
-    Returns
-    -------
-    list of str
-        As in the header, from left to right.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, or the column is missing.
-
-    """
+    """Return the names of the columns of a CSV (needed in A)."""
     try:
         with path.open(encoding='utf-8-sig', newline='') as file:
             lines = _Lines(file)
@@ -115,27 +54,7 @@ def column_names(path: Path, needed: str) -> list[str]:
 
 
 def read_columns(path: Path, names: Sequence[str]) -> list[FloatArray]:
-    """
-    Return columns of a CSV as they stand, NaN kept.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        File.
-    names : sequence of str
-        Columns; each must be there.
-
-    Returns
-    -------
-    list of ndarray, each of shape (n,)
-        Values.
-
-    Raises
-    ------
-    InputError
-        As `read_csv`.
-
-    """
+    """Return columns of a CSV as they stand, NaN kept."""
     return _columns(path, names, ())
 
 

@@ -121,31 +121,7 @@ class Span:
 
 
 def record_at(file: BinaryIO, offset: int, size: int, in_data: bool) -> Record:
-    """
-    Return the record at an offset.
-
-    Parameters
-    ----------
-    file : binary file
-        Seekable; only the head of the record is read.
-    offset : int
-        Of its opcode.
-    size : int
-        Size of the file, bytes.
-    in_data : bool
-        Whether the end of the data is still to come.
-
-    Returns
-    -------
-    Record
-        A whole record.
-
-    Raises
-    ------
-    Damage
-        When the file ends there, or what is there cannot be a record.
-
-    """
+    """Return the record at an offset (size in bytes)."""
     file.seek(offset)
     head = file.read(RECORD_HEAD.size)
     if len(head) < RECORD_HEAD.size:
@@ -166,22 +142,7 @@ def record_at(file: BinaryIO, offset: int, size: int, in_data: bool) -> Record:
 
 
 def check_passed_over(file: BinaryIO, record: Record) -> None:
-    """
-    Check that a record that is not needed is what its opcode says.
-
-    Parameters
-    ----------
-    file : binary file
-        Seekable.
-    record : Record
-        A message index, an attachment or metadata; others pass.
-
-    Raises
-    ------
-    Damage
-        When its content cannot be such a record.
-
-    """
+    """Check that a record that is not needed is what its opcode says (record in A)."""
     if record.opcode not in (Op.MESSAGE_INDEX, Op.ATTACHMENT, Op.METADATA):
         return
     file.seek(record.content)
@@ -202,15 +163,7 @@ def check_passed_over(file: BinaryIO, record: Record) -> None:
 
 
 def inner_records(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """
-    Yield (opcode, begin, end) of the content of each record in a chunk or run.
-
-    Raises
-    ------
-    Damage
-        At the offset within `data` where a record does not fit.
-
-    """
+    """Yield (opcode, begin, end) of the content of each record in a chunk or run."""
     at, size = 0, len(data)
     head, step = RECORD_HEAD.unpack_from, RECORD_HEAD.size
     while at < size:

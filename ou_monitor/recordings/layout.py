@@ -19,9 +19,9 @@ import struct
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.messages.field_path import FieldPath
 from ou_monitor.recordings.ros2msg import Definitions, Field, PRIMITIVES, TEXT
 from ou_monitor.records import FloatArray
+from ou_monitor.stream.field_path import FieldPath
 
 Rows = npt.NDArray[np.uint8]
 
@@ -60,20 +60,7 @@ class Place:
     size: int | None = None
 
     def column(self, rows: Rows) -> FloatArray:
-        """
-        Return the numbers of many messages.
-
-        Parameters
-        ----------
-        rows : ndarray of uint8, shape (n, length)
-            Messages that the layout holds for.
-
-        Returns
-        -------
-        ndarray, shape (n,) or (n, size)
-            Their values.
-
-        """
+        """Return the numbers of many messages."""
         kind = np.dtype('u1' if self.kind == '?' else self.kind)
         shape = rows.shape[:1] if self.size is None else (rows.shape[0], self.size)
         if not rows.shape[0] or self.size == 0:
@@ -107,22 +94,7 @@ class Layout:
     places: dict[FieldPath, Place]
 
     def holds_for(self, rows: Rows) -> npt.NDArray[np.bool_]:
-        """
-        Return which messages have this layout.
-
-        Parameters
-        ----------
-        rows : ndarray of uint8, shape (n, length)
-            Messages.
-
-        Returns
-        -------
-        ndarray of bool, shape (n,)
-            True where every length is the same, and every text plain ASCII
-            (that of others may be no text at all, which the general decoder
-            refuses).
-
-        """
+        """Return which messages have this layout."""
         same: npt.NDArray[np.bool_] = (rows[:, 0] == 0) & (rows[:, 1] == 1)
         for offset, value in self.words:
             word: npt.NDArray[np.uint32] = np.ndarray(
@@ -136,27 +108,7 @@ class Layout:
 def layout_of(
     message: bytes, kind: str, definitions: Definitions, wanted: Iterable[FieldPath],
 ) -> Layout | None:
-    """
-    Return the layout of one message.
-
-    Parameters
-    ----------
-    message : bytes
-        Serialized.
-    kind : str
-        Its type, 'package/Type'.
-    definitions : dict
-        Fields of all types in it.
-    wanted : iterable of FieldPath
-        Fields to find; only numbers, and arrays of numbers, are found.
-
-    Returns
-    -------
-    Layout or None
-        None when the message is for the general decoder: not little endian,
-        cut off, or of an unusual kind.
-
-    """
+    """Return the layout of one message."""
     if message[:2] != _LITTLE_ENDIAN or len(message) < _HEADER:
         return None
     walk = _Walk(message, definitions, frozenset(wanted))

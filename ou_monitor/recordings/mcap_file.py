@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.framing import (
-    check_passed_over, Damage, FOOTER_LENGTH, inner_records, kind_of_foreign, MAGIC,
-    MESSAGE_HEAD, moment, Op, record_at, RECORD_HEAD, Span)
+    check_passed_over, Damage, FOOTER_LENGTH, inner_records, kind_of_foreign, MAGIC, MESSAGE_HEAD,
+    moment, Op, record_at, RECORD_HEAD, Span)
 from ou_monitor.recordings.mcap_index import Break, Codec, McapIndex, TopicRecord
 from ou_monitor.recordings.mcap_scan import scan
 from ou_monitor.recordings.record_table import find_by_index, find_messages, Table

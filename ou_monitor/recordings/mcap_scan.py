@@ -22,22 +22,7 @@ RUN_SIZE = 1024 * 1024  # bytes
 
 
 def scan(index: McapIndex, file: BinaryIO, size: int, summary: Any) -> None:
-    """
-    Fill an index by reading the whole file once.
-
-    Parameters
-    ----------
-    index : McapIndex
-        Empty, but for its notes.
-    file : binary file
-        Seekable.
-    size : int
-        Its size, bytes.
-    summary : object or None
-        The summary section when it is whole: it tells where the walk can go on
-        after a damage, and how many messages there should be.
-
-    """
+    """Fill an index by reading the whole file once (size in bytes)."""
     _Scan(index, file, size, summary).run()
 
 

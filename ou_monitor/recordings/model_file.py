@@ -49,26 +49,7 @@ class ModelFile:
 
 
 def read_model(path: str | Path) -> ModelFile:
-    """
-    Read a model file.
-
-    Parameters
-    ----------
-    path : str or path
-        YAML.
-
-    Returns
-    -------
-    ModelFile
-        Checked.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read, or names an unknown term, misses or exceeds
-        the parameters of a term, or holds a value out of range.
-
-    """
+    """Read a model file."""
     path = Path(path)
     try:
         data = yaml.safe_load(path.read_text(encoding='utf-8'))
@@ -83,27 +64,7 @@ def read_model(path: str | Path) -> ModelFile:
 
 
 def parse_model(data: Any, where: str) -> ModelFile:
-    """
-    Return the model that parsed YAML describes.
-
-    Parameters
-    ----------
-    data : object
-        What the YAML parser returned.
-    where : str
-        Its source, for messages.
-
-    Returns
-    -------
-    ModelFile
-        Checked.
-
-    Raises
-    ------
-    InputError
-        As `read_model`.
-
-    """
+    """Return the model that parsed YAML describes."""
     if not isinstance(data, dict) or 'model' not in data:
         raise InputError(f"{where}: a model file needs 'model:', a list of terms")
     for key in data:
@@ -171,20 +132,7 @@ def _error(name: str, value: Any) -> Any:
 
 
 def as_yaml(file: ModelFile) -> str:
-    """
-    Return the text of a model file; `parse_model` gives the same model back.
-
-    Parameters
-    ----------
-    file : ModelFile
-        What to write.
-
-    Returns
-    -------
-    str
-        YAML.
-
-    """
+    """Return the text of a model file; `parse_model` gives the same model back."""
     entries = []
     for k, term in enumerate(file.model.terms):
         entry: dict[str, Any] = {'term': term.NAME, 'params': _plain(term.values())}

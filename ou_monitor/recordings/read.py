@@ -13,7 +13,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.csv_table import read_csv
@@ -171,31 +170,7 @@ def tidy(
     t: FloatArray, voltage: FloatArray, throttle: FloatArray, name: str,
     source: dict[str, str], notes: list[str],
 ) -> Recording:
-    """
-    Return a `Recording`: finite, in order, each stamp once; notes say what that took.
-
-    Parameters
-    ----------
-    t, voltage, throttle : ndarray, shape (n,)
-        As found.
-    name : str
-        For people.
-    source : dict of str to str
-        Where it came from.
-    notes : list of str
-        Notes so far.
-
-    Returns
-    -------
-    Recording
-        At least one sample.
-
-    Raises
-    ------
-    InputError
-        When no sample is left.
-
-    """
+    """Return a `Recording`: finite, in order, each stamp once; notes say what that took."""
     check_throttle(name, throttle)
     good = usable_voltage(t, voltage)
     if not good.all():

@@ -12,14 +12,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.messages.config import FieldSpec
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.batches import batches
 from ou_monitor.recordings.columns import join
 from ou_monitor.recordings.csv_table import read_column
 from ou_monitor.records import FloatArray
+from ou_monitor.stream.config import FieldSpec
 
 # Types whose only number need not be named.
 _SCALARS = ('std_msgs/msg/Float32', 'std_msgs/msg/Float64')
@@ -27,31 +26,7 @@ _SCALARS = ('std_msgs/msg/Float32', 'std_msgs/msg/Float64')
 
 def read_signal(path: str | Path, signal: str, *, partial: bool = False,
                 ) -> tuple[FloatArray, FloatArray]:
-    """
-    Read one scalar over time.
-
-    Parameters
-    ----------
-    path : str or path
-        Recording, as for `read_recording`.
-    signal : str
-        Of a bag TOPIC/FIELD.PATH, such as ``/imu/angular_velocity.x``; of a
-        CSV the name of a column.
-    partial : bool
-        Whether a damaged bag is read as far as it holds.
-
-    Returns
-    -------
-    tuple of ndarray, each of shape (n,)
-        Stamps, s, and values as they stand; NaN are kept.
-
-    Raises
-    ------
-    InputError
-        When there is no such topic, field or column (with the nearest), or it
-        holds no number.
-
-    """
+    """Read one scalar over time."""
     path = Path(path)
     if not signal:
         raise InputError('the name of the signal is empty: TOPIC/FIELD or a column')

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-
 from ou_monitor.recordings.framing import Damage, MESSAGE_HEAD, Op, RECORD_HEAD
 
 IntArray = npt.NDArray[np.int64]
@@ -72,45 +71,13 @@ class Table:
         return Table(self.data, self.channel[:n], self.log_time[:n], self.begin[:n], self.end[:n])
 
     def rows(self, picked: IntArray, length: int) -> npt.NDArray[np.uint8]:
-        """
-        Return serialized messages of one length as rows.
-
-        Parameters
-        ----------
-        picked : ndarray of int, shape (m,)
-            Which messages.
-        length : int
-            Length of each of them, bytes, at least 1.
-
-        Returns
-        -------
-        ndarray of uint8, shape (m, length)
-            Their bytes.
-
-        """
+        """Return serialized messages of one length as rows; the length is in bytes."""
         return gather(self.data, self.begin[picked], f'V{length}').view(np.uint8).reshape(
             -1, length)
 
 
 def gather(data: bytes, at: IntArray, kind: str) -> npt.NDArray[Any]:
-    """
-    Return items of a kind from anywhere in a block of bytes.
-
-    Parameters
-    ----------
-    data : bytes
-        The block.
-    at : ndarray of int, shape (n,)
-        Offsets, each with room for an item behind it.
-    kind : str
-        NumPy type of the items.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        The items, in an array of their own.
-
-    """
+    """Return items of a kind from anywhere in a block of bytes."""
     size = np.dtype(kind).itemsize
     if not at.size:
         return np.empty(0, kind)
@@ -124,31 +91,7 @@ def gather(data: bytes, at: IntArray, kind: str) -> npt.NDArray[Any]:
 def find_messages(
     data: bytes, *, messages_only: bool = False,
 ) -> tuple[Table, list[tuple[int, int, int]], int]:
-    """
-    Find the messages in a chunk, or in a run of plain records.
-
-    Parameters
-    ----------
-    data : bytes
-        Records.
-    messages_only : bool
-        Stop at the first record that is not a whole message.
-
-    Returns
-    -------
-    table : Table
-        The messages.
-    others : list of tuple of int
-        (opcode, begin, end) of the content of each other record.
-    stop : int
-        Offset behind the last record taken.
-
-    Raises
-    ------
-    Damage
-        At the offset within `data` where a record does not fit.
-
-    """
+    """Find the messages in a chunk, or in a run of plain records."""
     found: list[IntArray] = []
     single: list[int] = []
     others: list[tuple[int, int, int]] = []
@@ -214,23 +157,7 @@ def _table(data: bytes, at: IntArray) -> Table:
 
 
 def find_by_index(data: bytes, index: bytes) -> Table | None:
-    """
-    Find the messages of a chunk with the message indexes behind it.
-
-    Parameters
-    ----------
-    data : bytes
-        Records of the chunk.
-    index : bytes
-        Its message index records.
-
-    Returns
-    -------
-    Table or None
-        None unless the indexes name every message of the chunk: the records
-        they name, and others between them, must fill it from end to end.
-
-    """
+    """Find the messages of a chunk with the message indexes behind it."""
     parts: list[IntArray] = []
     at = 0
     while at < len(index):

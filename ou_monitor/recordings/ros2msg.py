@@ -65,22 +65,7 @@ def short_name(kind: str) -> str:
 
 
 def parse_definition(kind: str, text: str) -> Definitions | None:
-    """
-    Return the fields of a type and of those that it uses.
-
-    Parameters
-    ----------
-    kind : str
-        Message type, 'package/msg/Type'.
-    text : str
-        Its definition, followed by those of the types in it.
-
-    Returns
-    -------
-    dict or None
-        package/Type -> fields; None when the text holds something unknown.
-
-    """
+    """Return the fields of a type and of those that it uses."""
     found: Definitions = {'builtin_interfaces/Time': _TIME, 'builtin_interfaces/Duration': _TIME}
     name = short_name(kind)
     for part in _SEPARATOR.split(text.replace('\r', '')):

@@ -89,20 +89,7 @@ def qos_profile(topic: TopicInfo) -> list[dict[str, Any]]:
 
 
 def parse_qos(text_or_list: Any) -> tuple[str, str, int]:
-    """
-    Return (reliability, durability, depth) of a recorded QoS.
-
-    Parameters
-    ----------
-    text_or_list : str or list
-        YAML text (versions to 8, and MCAP channels) or the list itself.
-
-    Returns
-    -------
-    tuple of str, str, int
-        The defaults of ROS 2 where the bag says nothing usable.
-
-    """
+    """Return (reliability, durability, depth) of a recorded QoS."""
     profiles = text_or_list
     if isinstance(profiles, str):
         try:
@@ -125,20 +112,7 @@ def parse_qos(text_or_list: Any) -> tuple[str, str, int]:
 
 
 def custom_data(content: Any) -> dict[str, str]:
-    """
-    Return the custom data in the content of a metadata.yaml.
-
-    Parameters
-    ----------
-    content : object
-        As YAML gives it: the table, or what is below its root.
-
-    Returns
-    -------
-    dict of str to str
-        Empty where there is none.
-
-    """
+    """Return the custom data in the content of a metadata.yaml."""
     info = content.get(_ROOT, content) if isinstance(content, dict) else None
     custom = info.get('custom_data') if isinstance(info, dict) else None
     if not isinstance(custom, dict):
@@ -147,26 +121,7 @@ def custom_data(content: Any) -> dict[str, str]:
 
 
 def read_metadata(folder: Path) -> BagFiles:
-    """
-    Return the MCAP files of a rosbag2 directory, and what is said of them.
-
-    Parameters
-    ----------
-    folder : pathlib.Path
-        Directory with a metadata.yaml.
-
-    Returns
-    -------
-    BagFiles
-        At least one file; nothing missing.
-
-    Raises
-    ------
-    InputError
-        When metadata.yaml is not what it should be, the storage is not MCAP,
-        or a file is missing.
-
-    """
+    """Return the MCAP files of a rosbag2 directory, and what is said of them."""
     path = folder / FILE
     try:
         content = yaml.safe_load(path.read_text(encoding='utf-8'))
@@ -205,28 +160,7 @@ def is_part(file: Path, folder: Path) -> bool:
 
 
 def find_files(path: Path, partial: bool) -> BagFiles:
-    """
-    Return what a path to a bag stands for.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        An .mcap file, a rosbag2 directory, or its metadata.yaml.
-    partial : bool
-        Whether a directory without metadata.yaml (rosbag2 writes it last, so
-        a recording that was cut off has none) is taken as its MCAP files.
-
-    Returns
-    -------
-    BagFiles
-        At least one file.
-
-    Raises
-    ------
-    InputError
-        When there is nothing at `path`, or it is not a bag.
-
-    """
+    """Return what a path to a bag stands for."""
     if path.name == FILE and path.is_file():
         path = path.parent
     if not path.exists():
@@ -255,25 +189,7 @@ def write_metadata(
     folder: Path, file: str, topics: Iterable[TopicInfo], hashes: dict[str, str],
     start_ns: int, end_ns: int, custom: Mapping[str, str] | None = None,
 ) -> None:
-    """
-    Write metadata.yaml (version 9) of a directory with one MCAP file.
-
-    Parameters
-    ----------
-    folder : pathlib.Path
-        Where to write.
-    file : str
-        Name of the MCAP file.
-    topics : iterable of TopicInfo
-        Topics with their counts.
-    hashes : dict of str to str
-        Type -> RIHS01 hash; '' for types that are not in it.
-    start_ns, end_ns : int
-        Log times of the first and last message, ns.
-    custom : mapping of str to str, optional
-        Kept as 'custom_data'.
-
-    """
+    """Write metadata.yaml (version 9) of a directory with one MCAP file."""
     infos = list(topics)
     count = sum(topic.count for topic in infos)
     content = {_ROOT: {

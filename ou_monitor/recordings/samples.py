@@ -14,16 +14,15 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-
 from ou_monitor.errors import InputError
-from ou_monitor.messages.blocks import BlockClock
-from ou_monitor.messages.config import FieldSpec
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.batches import batches, last_before
 from ou_monitor.recordings.columns import Column
 from ou_monitor.recordings.framing import moment
 from ou_monitor.recordings.topic_choice import choose
 from ou_monitor.records import FloatArray, Recording
+from ou_monitor.stream.blocks import BlockClock
+from ou_monitor.stream.config import FieldSpec
 
 VOLTAGE, THROTTLE = 'voltage', 'throttle'
 # Squares and cubes of what is beyond this overflow; no supply comes near it.
@@ -53,15 +52,7 @@ def dropped_words(count: int, voltage: FloatArray) -> str:
 
 
 def check_throttle(name: str, throttle: FloatArray) -> None:
-    """
-    Refuse a throttle in percent, microseconds or counts.
-
-    Raises
-    ------
-    InputError
-        When it goes beyond `MOST_THROTTLE` to either side.
-
-    """
+    """Refuse a throttle in percent, microseconds or counts."""
     known = throttle[np.isfinite(throttle)]
     if known.size and float(np.abs(known).max()) > MOST_THROTTLE:
         raise InputError(
@@ -74,13 +65,7 @@ def overlap(t: FloatArray, highest: float = -math.inf) -> tuple[int, float]:
     """
     Return how many samples lie before one that came earlier, and how far at most, s.
 
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-        Stamps in the order in which they came, s.
-    highest : float
-        Largest stamp before them, s.
-
+    t in s, highest in s.
     """
     ahead = np.maximum(np.maximum.accumulate(t), highest) - t
     behind = ahead > 0.0
@@ -228,25 +213,7 @@ class SampleReader:
         return self._bag.start_ns + round(after)
 
     def batches(self, progress: Callable[[float], None] | None) -> Iterator[int]:
-        """
-        Read on; yield the number of samples held after each batch.
-
-        Parameters
-        ----------
-        progress : callable or None
-            Called with the share done, 0..1.
-
-        Yields
-        ------
-        int
-            Samples held.
-
-        Raises
-        ------
-        InputError
-            At a broken chunk, or for bytes that are no message.
-
-        """
+        """Read on; yield the number of samples held after each batch (progress 0..1)."""
         for batch in batches(self._bag, self._specs, start_ns=self._start_ns,
                              end_ns=self._end_ns, progress=progress,
                              broken=self._broken):
@@ -292,21 +259,7 @@ class SampleReader:
         self._fresh.append((t[known], values[known]))
 
     def take(self, most: int | None = None) -> Recording:
-        """
-        Return the first samples held, in order, each stamp once; they are held no longer.
-
-        Parameters
-        ----------
-        most : int, optional
-            Samples to take, and those with the stamp of the last one; all
-            when left out.
-
-        Returns
-        -------
-        Recording
-            Its stamps come after those taken before.
-
-        """
+        """Return the first samples held, in order, each stamp once; they are held no longer."""
         t = np.concatenate([np.empty(0), *self._t])
         voltage = np.concatenate([np.empty(0), *self._voltage])
         if (np.diff(t) < 0.0).any():

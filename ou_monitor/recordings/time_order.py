@@ -53,30 +53,7 @@ def in_parts(
     files: Iterable[McapFile], wanted: set[str], start_ns: int | None = None,
     end_ns: int | None = None,
 ) -> Iterator[Part]:
-    """
-    Yield the messages of several files part by part.
-
-    Parameters
-    ----------
-    files : iterable of McapFile
-        Parts of one bag.
-    wanted : set of str
-        Topics.
-    start_ns, end_ns : int, optional
-        Log times, ns: messages outside start <= t < end are left out, and
-        chunks that hold no other are not read.
-
-    Yields
-    ------
-    Part
-        In the order of their first log times.
-
-    Raises
-    ------
-    InputError
-        At a broken chunk.
-
-    """
+    """Yield the messages of several files part by part."""
     spans = [(span, file) for span, file in _spans(files, wanted)
              if (start_ns is None or span.end_ns >= start_ns)
              and (end_ns is None or span.start_ns < end_ns)]
@@ -107,26 +84,7 @@ def backwards(
     """
     Yield the messages of a topic before a log time, the chunk that ends last first.
 
-    Parameters
-    ----------
-    files : iterable of McapFile
-        Parts of one bag.
-    wanted : set of str
-        The topic.
-    before_ns : int
-        Log time, ns.
-
-    Yields
-    ------
-    tuple
-        Messages of one chunk with log times before, at least one, and the
-        newest log time (ns) that those still to come can have.
-
-    Raises
-    ------
-    InputError
-        At a broken chunk.
-
+    before_ns in ns.
     """
     spans = [pair for pair in _spans(files, wanted) if pair[0].start_ns < before_ns]
     spans.sort(key=lambda pair: pair[0].end_ns, reverse=True)
@@ -142,24 +100,6 @@ def in_time_order(files: Iterable[McapFile], wanted: set[str]) -> Iterator[RawMe
     Yield the messages of several files in the order of their log times.
 
     Holds in memory only spans that overlap in time.
-
-    Parameters
-    ----------
-    files : iterable of McapFile
-        Parts of one bag.
-    wanted : set of str
-        Topics to yield.
-
-    Yields
-    ------
-    RawMessage
-        Messages; those of one log time in the order of the file.
-
-    Raises
-    ------
-    InputError
-        At a broken chunk.
-
     """
     spans = _spans(files, wanted)
     pending: list[RawMessage] = []

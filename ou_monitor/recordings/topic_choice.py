@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.messages.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
+from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
 
 
 @dataclass(frozen=True)
@@ -42,31 +42,7 @@ def choose(
     path: Path, topics: Mapping[str, str], *, msg_config: str | Path | None = None,
     voltage_topic: str | None = None, throttle_topic: str | None = None,
 ) -> Choice:
-    """
-    Choose the config and the topics.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        The bag, for messages.
-    topics : mapping of str to str
-        Topic -> type, as in the bag.
-    msg_config : str or path, optional
-        Name or file of the config; found out when left out.
-    voltage_topic, throttle_topic : str, optional
-        Topics; those of the config when left out.
-
-    Returns
-    -------
-    Choice
-        What to read.
-
-    Raises
-    ------
-    InputError
-        When nothing fits, or several things do; lists what there is.
-
-    """
+    """Choose the config and the topics."""
     for topic in (voltage_topic, throttle_topic):
         if topic is not None and _absolute(topic) not in topics:
             raise InputError(f"{path}: no topic '{topic}': {nearest(_absolute(topic), topics)}")

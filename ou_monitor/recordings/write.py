@@ -14,7 +14,6 @@ from types import TracebackType
 
 import numpy as np
 import numpy.typing as npt
-
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings import cdr
 from ou_monitor.recordings.bag import BagWriter
@@ -54,36 +53,7 @@ def write_recording(
     """
     Write topics `/voltage` and, where throttle is known, `/throttle`.
 
-    Parameters
-    ----------
-    rec : Recording
-        What to write.
-    path : str or path
-        Ends in .mcap for one file; else a rosbag2 directory.
-    type : {'battery_state', 'float32', 'float64', 'adc_block'}
-        Message of the voltage.  Throttle is std_msgs/Float32, at the first
-        sample, at each change, and at least once a second.
-    start_ns : int
-        Added to every stamp, ns.
-    sample_rate : float
-        Rate of the samples, Hz, for 'adc_block' (which has no stamps of its
-        own but that of the last sample of each block).
-    block : int
-        Samples in a block.
-    progress : callable, optional
-        Called with the share done, 0..1.
-
-    Returns
-    -------
-    tuple of str
-        What was changed on the way, one sentence each.
-
-    Raises
-    ------
-    InputError
-        When the target cannot be written, or the recording does not fit the
-        type.
-
+    start_ns in ns, sample_rate in Hz, progress 0..1.
     """
     if rec.n == 0:
         raise InputError(f"'{rec.name}' holds no sample: there is nothing to write")
@@ -98,27 +68,7 @@ def write_recording(
 
 
 def as_nanoseconds(t: FloatArray, name: str) -> npt.NDArray[np.int64]:
-    """
-    Return stamps as a bag holds them.
-
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-        Stamps, s, finite.
-    name : str
-        Whose they are, for the message.
-
-    Returns
-    -------
-    ndarray of int64, shape (n,)
-        Stamps, ns.
-
-    Raises
-    ------
-    InputError
-        When they are too large for that.
-
-    """
+    """Return stamps as a bag holds them (t in s)."""
     stamps = np.rint(t * 1e9)
     far = float(np.abs(stamps).max(initial=0.0))
     if far > _LAST_NS:
@@ -178,20 +128,7 @@ class RecordingWriter:
         return topic
 
     def write(self, piece: Recording) -> None:
-        """
-        Write the next samples.
-
-        Parameters
-        ----------
-        piece : Recording
-            Stamps go on from the piece before.
-
-        Raises
-        ------
-        InputError
-            When the piece does not fit the type, or the disk refuses.
-
-        """
+        """Write the next samples."""
         if not piece.n:
             return
         stamps = as_nanoseconds(piece.t, piece.name) + self._shift
@@ -217,15 +154,7 @@ class RecordingWriter:
             self._bag.write(self._names[topic], t, data)
 
     def close(self) -> None:
-        """
-        Finish the bag.
-
-        Raises
-        ------
-        InputError
-            When the disk refuses.
-
-        """
+        """Finish the bag."""
         stamps, samples = self._rest
         if samples.size:
             self._bag.write(self._names[VOLTAGE], int(stamps[-1]), cdr.encode_block(samples))

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-
 from ou_monitor.errors import InputError
 from ou_monitor.recordings import cdr
 from ou_monitor.recordings.bag import BagWriter
@@ -35,34 +34,7 @@ def write_log(
     chosen: Chosen, path: Path, about: Mapping[str, str], *, kind: str = 'battery_state',
     progress: Callable[[float], None] | None = None,
 ) -> tuple[dict[str, str], tuple[str, ...]]:
-    """
-    Write a bag.
-
-    Parameters
-    ----------
-    chosen : Chosen
-        What to write.
-    path : pathlib.Path
-        Ends in .mcap for one file; else a rosbag2 directory.
-    about : mapping of str to str
-        Where it came from: file, format, vehicle, firmware.
-    kind : {'battery_state', 'float32', 'float64', 'adc_block'}
-        Message of the voltage; the others are std_msgs/Float32.
-    progress : callable, optional
-        Called with the share done, 0..1.
-
-    Returns
-    -------
-    tuple
-        Topic -> message type, and what was changed on the way, one sentence
-        each.
-
-    Raises
-    ------
-    InputError
-        When the target cannot be written, or the voltage does not fit `kind`.
-
-    """
+    """Write a bag (progress 0..1)."""
     # At one instant what holds for the sample goes before it, the voltage last.
     held = [(name, series) for name, series in (
         ('throttle', chosen.throttle), ('current', chosen.current)) if series is not None]

@@ -6,7 +6,7 @@ import re
 from ou_monitor.cli.main import main
 from ou_monitor.cli.quantities import quantity
 from ou_monitor.errors import InputError
-from ou_monitor.model.network.components import PowerNetwork
+from ou_monitor.paper.network.components import PowerNetwork
 import pytest
 
 QUESTION = ['design', '--risk', '1e-3', '--throttle', '0.4']

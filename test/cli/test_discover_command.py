@@ -7,16 +7,16 @@ from xml.etree import ElementTree
 import numpy as np
 from ou_monitor.cli.discover import render
 from ou_monitor.cli.main import main
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.discover.finding import Cause, Finding, Verdict
+from ou_monitor.discover.words import explain, parameters
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.drift import Drift
 from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.tone import Tone
-from ou_monitor.offline.discover.data import Samples
-from ou_monitor.offline.discover.finding import Cause, Finding, Verdict
-from ou_monitor.offline.discover.words import explain, parameters
-from ou_monitor.offline.report.discovery_page import discovery_page
 from ou_monitor.recordings.model_file import read_model
+from ou_monitor.report.discovery_page import discovery_page
 from project import ROOT
 import pytest
 

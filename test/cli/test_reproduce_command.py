@@ -5,7 +5,7 @@ import re
 from xml.etree import ElementTree
 
 from ou_monitor.cli.main import main
-from ou_monitor.offline.reproduce import reproduce as module
+from ou_monitor.paper.reproduce import reproduce as module
 import pytest
 
 

@@ -13,10 +13,10 @@ import time
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
-from ou_monitor.offline.presets import PRESETS
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.read import read_recording
+from ou_monitor.simulate.presets import PRESETS
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from term_examples import (agrees, ALPHA, clusters, has_covariance, SIGMA, still, supply, term,
-                           U0)
+from term_examples import agrees, ALPHA, clusters, has_covariance, SIGMA, still, supply, term, U0
 
 VAR = 0.632 ** 2 / 126.0
 

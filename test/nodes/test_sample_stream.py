@@ -3,9 +3,9 @@
 import math
 from types import SimpleNamespace
 
-from ou_monitor.messages.config import FieldSpec
-from ou_monitor.messages.extract import Extractor
 from ou_monitor.nodes.sample_stream import SampleStream
+from ou_monitor.stream.config import FieldSpec
+from ou_monitor.stream.extract import Extractor
 import pytest
 
 

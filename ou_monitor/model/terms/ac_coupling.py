@@ -8,7 +8,6 @@ import math
 from typing import ClassVar
 
 import numpy as np
-
 from ou_monitor.model.terms.recursion import first_order
 from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray
@@ -101,20 +100,7 @@ def bridge(alpha: FloatArray, rate: float, step: FloatArray
 
     l_k = exp(-rate step) l_{k-1} + start x_{k-1} + end x_k + sigma sqrt(spread) z.
 
-    Parameters
-    ----------
-    alpha : ndarray, shape (n,)
-        Rate of the OU, 1/s.
-    rate : float
-        Rate of the low-pass, 1/s.
-    step : ndarray, shape (n,)
-        Steps, s.
-
-    Returns
-    -------
-    start, end, spread : ndarray, shape (n,)
-        Coefficients, and a variance per unit sigma^2, s.
-
+    alpha in 1/s, rate in 1/s, step in s, result in s.
     """
     a = np.where(np.abs(alpha / rate - 1.0) < _APART, rate * (1.0 + _APART), alpha)
     share = rate / (rate - a)

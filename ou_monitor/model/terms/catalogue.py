@@ -18,15 +18,7 @@ from ou_monitor.model.terms.term import Term
 
 @cache
 def catalogue() -> Mapping[str, type[Term]]:
-    """
-    Return all terms by name, the `ou` first.
-
-    Returns
-    -------
-    mapping
-        Name to class, read-only.
-
-    """
+    """Return all terms by name, the `ou` first."""
     found: dict[str, type[Term]] = {}
     for info in iter_modules(folder.__path__):
         module = import_module(f'{folder.__name__}.{info.name}')

@@ -7,12 +7,9 @@ import math
 from typing import ClassVar
 
 import numpy as np
-
 from ou_monitor.model.hidden_chain import forward
-from ou_monitor.model.terms.laws import (
-    climb, curvature_se, log_normal, mixture_cdf, normal_scores)
-from ou_monitor.model.terms.term import (
-    Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
+from ou_monitor.model.terms.laws import climb, curvature_se, log_normal, mixture_cdf, normal_scores
+from ou_monitor.model.terms.term import Effect, LawFit, parameter, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-
 from ou_monitor.model.terms.term import (
     Effect, NEXT_TO_ZERO, parameter, Role, Stage, Stretch, Term, View)
 

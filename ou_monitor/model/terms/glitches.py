@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.hidden_chain import forward
 from ou_monitor.model.terms.laws import log_normal, normal_scores
-from ou_monitor.model.terms.term import (
-    Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
+from ou_monitor.model.terms.term import Effect, LawFit, parameter, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray
 from scipy.special import ndtr
 
@@ -130,22 +129,6 @@ def bad_samples(view: View, share: float, spread: float, lengths: FloatArray
 
     Of all sets of runs of up to three samples, with a good sample between any
     two, that which explains most.
-
-    Parameters
-    ----------
-    view : View
-        Scores and coefficients.
-    share, spread : float
-        Share of samples at which a run of bad ones begins, and the standard
-        deviation of their errors, V.
-    lengths : ndarray, shape (3,)
-        Chances that a run is of one, of two, of three.
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
-        Where taking samples out explains two innovations or more.
-
     """
     z, phi, n = view.z, view.phi, view.z.size
     size = 0.5 * math.log1p(spread * spread / float(np.median(view.variance)))

@@ -7,10 +7,8 @@ import math
 from typing import ClassVar
 
 import numpy as np
-
 from ou_monitor.model.terms.laws import climb, curvature_se, log_normal, normal_scores
-from ou_monitor.model.terms.term import (
-    Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
+from ou_monitor.model.terms.term import Effect, LawFit, parameter, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray
 from scipy.special import gammaln, stdtr
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 import math
 
 import numpy as np
-
 from ou_monitor.model.terms.term import View
 from ou_monitor.records import FloatArray
 

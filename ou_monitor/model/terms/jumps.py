@@ -7,13 +7,10 @@ import math
 from typing import ClassVar
 
 import numpy as np
-
 from ou_monitor.model.terms.laws import log_normal, normal_scores
-from ou_monitor.model.terms.term import (
-    Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
+from ou_monitor.model.terms.term import Effect, LawFit, parameter, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray
 from scipy.special import ndtr
-
 
 # Events drawn for one stretch at most: bounds time and memory.
 _MOST = 5_000_000

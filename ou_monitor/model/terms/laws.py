@@ -30,28 +30,7 @@ def log_normal(z: FloatArray, mean: FloatArray | float = 0.0, var: FloatArray | 
 
 def climb(value: Callable[[FloatArray], float], start: Sequence[float] | FloatArray,
           size: float = 0.4, most: int = 200) -> tuple[FloatArray, float]:
-    """
-    Maximise a function of a few parameters (Nelder & Mead).
-
-    Parameters
-    ----------
-    value : callable
-        Of an array of parameters; may be -inf.
-    start : sequence or array of float
-        Where to begin.
-    size : float
-        Extent of the first simplex.
-    most : int
-        Evaluations at most.
-
-    Returns
-    -------
-    x : ndarray
-        The maximiser found.
-    top : float
-        The value there.
-
-    """
+    """Maximise a function of a few parameters (Nelder & Mead)."""
     x0 = np.asarray(start, dtype=np.float64)
     simplex = np.vstack([x0, x0 + size * np.eye(x0.size)])
     found = minimize(lambda x: -value(x), x0, method='Nelder-Mead',
@@ -76,21 +55,6 @@ def curvature_se(value: Callable[[FloatArray], float], at: FloatArray, step: flo
 
 def mixture_cdf(z: FloatArray, weight: FloatArray, mean: FloatArray, std: FloatArray
                 ) -> FloatArray:
-    """
-    Return the cdf of normal mixtures.
-
-    Parameters
-    ----------
-    z : ndarray, shape (n,)
-        Arguments.
-    weight, mean, std : ndarray, shape (n, k)
-        Of the components.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Probabilities.
-
-    """
+    """Return the cdf of normal mixtures."""
     result: FloatArray = (weight * ndtr((z[:, None] - mean) / std)).sum(axis=1)
     return result

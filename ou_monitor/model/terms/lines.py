@@ -15,43 +15,12 @@ _MOST = 3
 
 
 def lines_at(view: View, most: int = _MOST) -> list[float]:
-    """
-    Return the frequencies of the strongest sharp lines.
-
-    Parameters
-    ----------
-    view : View
-        Scores, on a grid that is even but for gaps.
-    most : int
-        Lines at most.
-
-    Returns
-    -------
-    list of float
-        Hz, strongest first, refined to a small part of a bin.
-
-    """
+    """Return the frequencies of the strongest sharp lines."""
     return [frequency for frequency, _ in lines_with_height(view, most)]
 
 
 def lines_with_height(view: View, most: int) -> list[tuple[float, float]]:
-    """
-    Return the frequencies of the strongest sharp lines and what each is worth.
-
-    Parameters
-    ----------
-    view : View
-        Scores, on a grid that is even but for gaps.
-    most : int
-        Lines at most.
-
-    Returns
-    -------
-    list of (float, float)
-        Hz, and the gain in log-likelihood of a line there beside white noise,
-        nats; strongest first.
-
-    """
+    """Return the frequencies of the strongest sharp lines and what each is worth."""
     # All of them: a line may have begun late, and its frequency is no parameter of
     # a likelihood, but pays for its search.
     z = view.z
@@ -80,26 +49,7 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
     The first has the autocovariance std^2 exp(-damping t) (cos + lag sin) of the
     angle turned in t.
 
-    Parameters
-    ----------
-    turn : ndarray, shape (n,)
-        Angle of each step, rad.
-    damping : float
-        Rate at which they die out, 1/s.
-    step : ndarray, shape (n,)
-        Steps, s; infinite before the first sample.
-    std : float
-        Standard deviation of the first, V.
-    lag : float
-        Share of the sine; of the size of damping over angular frequency at most.
-
-    Returns
-    -------
-    f, q : ndarray, shape (n, 2, 2)
-        Transition and covariance of what is added, V^2.
-    h : ndarray, shape (2,)
-        What is seen: the first.
-
+    damping in 1/s, step in s, std in V, result in V^2.
     """
     shrink = np.exp(-damping * step)
     f, q = np.empty((step.size, 2, 2)), np.zeros((step.size, 2, 2))
@@ -124,18 +74,7 @@ def keeps_its_height(view: View, frequency: float, linewidth: float) -> bool:
     """
     Return whether a line keeps its amplitude, as what is generated does and ringing does not.
 
-    Parameters
-    ----------
-    view : View
-        The residual is looked at, on the part for fitting.
-    frequency, linewidth : float
-        Of the line, Hz.
-
-    Returns
-    -------
-    bool
-        False where the part is too short to tell.
-
+    frequency, linewidth in Hz.
     """
     length = int(view.rate / (_FINE * max(linewidth, 1.0 / float(view.at[-1]))))
     v, at = view.residual[view.train], view.at[view.train]
@@ -148,22 +87,7 @@ def keeps_its_height(view: View, frequency: float, linewidth: float) -> bool:
 
 
 def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
-    """
-    Return the broad peaks of scores.
-
-    Parameters
-    ----------
-    z : ndarray, shape (n,)
-        Scores.
-    rate : float
-        Samples per second, Hz.
-
-    Returns
-    -------
-    list of (float, float)
-        Frequency, Hz, and half width, 1/s, at several resolutions.
-
-    """
+    """Return the broad peaks of scores (rate in Hz)."""
     found = []
     for length in (64, 256, 1024, 4096):
         if z.size < 4 * length:
@@ -183,17 +107,6 @@ def order_lines(view: View) -> list[tuple[float, float]]:
     The power of short stretches is added up along frequency = idle + slope *
     throttle for many idles and slopes (a Hough transform); the best are
     refined by adding up amplitudes over longer stretches.
-
-    Parameters
-    ----------
-    view : View
-        Scores and throttle.
-
-    Returns
-    -------
-    list of (float, float)
-        Idle frequency and slope, Hz, best first.
-
     """
     if view.throttle is None:
         return []
@@ -206,24 +119,7 @@ def order_lines(view: View) -> list[tuple[float, float]]:
 
 
 def order_power(z: FloatArray, u: FloatArray, rate: float) -> tuple[float, float]:
-    """
-    Return the power of the strongest line that follows throttle.
-
-    Parameters
-    ----------
-    z, u : ndarray, shape (n,)
-        Scores and throttle.
-    rate : float
-        Samples per second, Hz.
-
-    Returns
-    -------
-    power : float
-        Such that its exponential is the chance of one trial to be beaten.
-    trials : float
-        Lines looked at; 0 where there is nothing to look at.
-
-    """
+    """Return the power of the strongest line that follows throttle (rate in Hz)."""
     top, trials = 0.0, 0.0
     for length in _lengths(rate):
         best = _hough(z, u, rate, length)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-
 from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
 
 

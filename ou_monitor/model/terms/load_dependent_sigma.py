@@ -8,7 +8,6 @@ import math
 from typing import ClassVar
 
 import numpy as np
-
 from ou_monitor.model.terms.term import Effect, parameters, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray
 

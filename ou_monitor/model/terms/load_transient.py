@@ -8,7 +8,6 @@ import math
 from typing import ClassVar
 
 import numpy as np
-
 from ou_monitor.model.terms.recursion import first_order
 from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
 

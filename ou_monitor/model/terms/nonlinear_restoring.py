@@ -8,10 +8,8 @@ import math
 from typing import ClassVar
 
 import numpy as np
-
 from ou_monitor.model.terms.laws import log_normal
-from ou_monitor.model.terms.term import (
-    Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
+from ou_monitor.model.terms.term import Effect, LawFit, parameter, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray
 
 
@@ -112,13 +110,7 @@ def _linearised(x: FloatArray, span: FloatArray, linear: float, square: float, c
     The force is taken as linear about the deviation at the begin of a part of the step, and
     the bend of it by its mean effect (Shoji & Ozaki, Stoch. Anal. Appl. 16 (1998) 733).
 
-    Returns
-    -------
-    move : ndarray, shape (n,)
-        V.
-    part : ndarray, shape (n,)
-        Variance at the end of the step over that without a force.
-
+    result in V.
     """
     # A force that softens stays as large as it has become: it does not push away.
     tops = np.roots([3.0 * cube, 2.0 * square, linear])

@@ -8,7 +8,6 @@ from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
-
 from ou_monitor.model.terms.recursion import first_order, steady
 from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
 from ou_monitor.records import FloatArray

@@ -9,22 +9,7 @@ from scipy.signal import lfilter
 
 
 def first_order(phi: FloatArray, e: FloatArray, before: float) -> FloatArray:
-    """
-    Run the recursion.
-
-    Parameters
-    ----------
-    phi, e : ndarray, shape (n,)
-        Coefficients, 0..1, and what is added.
-    before : float
-        Value before the first.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        x.
-
-    """
+    """Run the recursion."""
     n = e.size
     if not n:
         return np.empty(0)
@@ -44,20 +29,7 @@ def first_order(phi: FloatArray, e: FloatArray, before: float) -> FloatArray:
 
 
 def steady(values: FloatArray) -> bool:
-    """
-    Tell whether all values are the same.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        Any numbers; one number seen n times (`numpy.broadcast_to`) costs nothing.
-
-    Returns
-    -------
-    bool
-        True also where there is none.
-
-    """
+    """Tell whether all values are the same."""
     # The last one first: what varies mostly differs there.
     return not values.size or values.strides == (0,) or bool(
         values[0] == values[-1] and (values == values[0]).all())

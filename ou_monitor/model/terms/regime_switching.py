@@ -7,17 +7,14 @@ import math
 from typing import ClassVar
 
 import numpy as np
-
 from ou_monitor.model.hidden_chain import forward, log_likelihood
 from ou_monitor.model.terms.hidden_levels import faster_by, moving, relaxing, units_of
 from ou_monitor.model.terms.laws import climb, curvature_se, log_normal, normal_scores
 from ou_monitor.model.terms.recursion import first_order
-from ou_monitor.model.terms.term import (
-    Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
+from ou_monitor.model.terms.term import Effect, LawFit, parameter, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray
 from scipy.linalg import expm
 from scipy.special import ndtr
-
 
 # Events drawn for one stretch at most: bounds time and memory.
 _MOST = 5_000_000
@@ -260,16 +257,6 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
 
     Means over half a relaxation time are levels and a first-order noise, of which
     the correlation is fitted with them: that of the samples is of both together.
-
-    Returns
-    -------
-    start : ndarray or None
-        Coordinates as in `fit_law`.
-    evidence : float
-        Gain in log-likelihood over the noise alone, nats.
-    states : int
-        Levels, 2 or 3.
-
     """
     r = view.residual[view.train]
     a = -math.log(min(max(float(np.median(view.phi[view.train])), 1e-6), 1.0 - 1e-6))

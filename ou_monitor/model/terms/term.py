@@ -16,7 +16,6 @@ import math
 from typing import Any, ClassVar, Self
 
 import numpy as np
-
 from ou_monitor.records import FloatArray
 
 
@@ -196,26 +195,7 @@ class LawFit:
 
 def parameter(unit: str, text: str, low: float = -math.inf, high: float = math.inf, *,
               above: bool = False) -> Any:
-    """
-    Declare a parameter of a term.
-
-    Parameters
-    ----------
-    unit : str
-        SI unit; empty for a pure number.
-    text : str
-        What it is.
-    low, high : float
-        Range.
-    above : bool
-        Whether it must be above `low`, not at it.
-
-    Returns
-    -------
-    dataclass field
-        With that as its metadata.
-
-    """
+    """Declare a parameter of a term."""
     return field(metadata={'unit': unit, 'text': text, 'low': low, 'high': high, 'above': above})
 
 

@@ -8,7 +8,6 @@ import math
 from typing import ClassVar
 
 import numpy as np
-
 from ou_monitor.model.terms.lines import keeps_its_height, lines_at, rotation
 from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray

@@ -7,11 +7,9 @@ import math
 from typing import ClassVar
 
 import numpy as np
-
 from ou_monitor.model.terms.laws import climb, curvature_se, normal_scores
 from ou_monitor.model.terms.recursion import first_order
-from ou_monitor.model.terms.term import (
-    Effect, LawFit, parameter, Role, Stage, Stretch, Term, View)
+from ou_monitor.model.terms.term import Effect, LawFit, parameter, Role, Stage, Stretch, Term, View
 from ou_monitor.records import FloatArray
 from scipy.special import ndtr
 from scipy.stats import binom

@@ -37,25 +37,7 @@ _FIRMWARE = re.compile(r'(Betaflight|Cleanflight|INAV|EmuFlight)\s+(\d+)\.(\d+)\
 
 
 def flights(path: Path) -> tuple[Flight, ...]:
-    """
-    Return the flights in a file, without decoding them.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        Log.
-
-    Returns
-    -------
-    tuple of Flight
-        Numbered from 1.
-
-    Raises
-    ------
-    InputError
-        When orangebox cannot read the file.
-
-    """
+    """Return the flights in a file, without decoding them."""
     with quiet(path, 'orangebox'):
         pointers = Reader(str(path), None, True).log_pointers
     ends = [*pointers[1:], path.stat().st_size]
@@ -64,28 +46,7 @@ def flights(path: Path) -> tuple[Flight, ...]:
 
 
 def read(path: Path, request: Request) -> Log:
-    """
-    Read one flight of a blackbox file.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        Log.
-    request : Request
-        Which flight is wanted.
-
-    Returns
-    -------
-    Log
-        Candidates; stamps count from the first frame of the flight.
-
-    Raises
-    ------
-    InputError
-        When there are several flights and none is chosen, or orangebox cannot
-        read it.
-
-    """
+    """Read one flight of a blackbox file."""
     held = flights(path)
     wanted = request.flight or 1
     notes = []

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.recordings.importers.log import (
-    ANY, clean, CURRENT, Log, Series, THROTTLE, VOLTAGE)
+from ou_monitor.recordings.importers.log import ANY, clean, CURRENT, Log, Series, THROTTLE, VOLTAGE
 from ou_monitor.recordings.samples import check_throttle
 
 # What leaves a quantity out.
@@ -47,30 +46,7 @@ class Chosen:
 
 def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | None = None,
            current: str | None = None) -> Chosen:
-    """
-    Choose, and drop what cannot be a sample.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        Log, for messages.
-    log : Log
-        What it holds.
-    voltage, throttle, current : str, optional
-        Names of series; 'none' leaves throttle or current out.
-
-    Returns
-    -------
-    Chosen
-        What to write.
-
-    Raises
-    ------
-    InputError
-        When a name is not there, the choice is not clear, or no voltage is
-        left.
-
-    """
+    """Choose, and drop what cannot be a sample."""
     volts = _pick(path, log, VOLTAGE, voltage)
     if volts is None:
         raise InputError(_no_voltage(path, log))
@@ -109,22 +85,7 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
 
 
 def default(log: Log, quantity: str) -> list[Series]:
-    """
-    Return the series that are taken when nothing is said; several: it is not clear.
-
-    Parameters
-    ----------
-    log : Log
-        What it holds.
-    quantity : {'voltage', 'throttle', 'current'}
-        Of which quantity.
-
-    Returns
-    -------
-    list of Series
-        Those of the smallest rank.
-
-    """
+    """Return the series that are taken when nothing is said; several: it is not clear."""
     ranked = [one for one in _of(log, quantity) if one.rank is not None and one.n]
     least = min((one.rank for one in ranked if one.rank is not None), default=None)
     return [one for one in ranked if one.rank == least]

@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.csv_table import column_names, read_columns, THROTTLE, TIME, VOLTAGE
 from ou_monitor.recordings.importers import log as logs
@@ -22,27 +21,7 @@ KNOWN = {VOLTAGE: logs.VOLTAGE, THROTTLE: logs.THROTTLE, 'current_a': logs.CURRE
 
 
 def read(path: Path, request: Request) -> Log:
-    """
-    Read the columns that are known by name, and those asked for.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        File.
-    request : Request
-        Columns named by the user, or all.
-
-    Returns
-    -------
-    Log
-        One series a column.
-
-    Raises
-    ------
-    InputError
-        When the file or a wanted column cannot be read.
-
-    """
+    """Read the columns that are known by name, and those asked for."""
     one_flight(path, request)
     header = [name for name in column_names(path, TIME) if name and name != TIME]
     wanted = [name for name in dict.fromkeys(header) if name in KNOWN or name in request.names]

@@ -56,27 +56,7 @@ Table = dict[tuple[str, str], dict[str, list[float]]]
 
 
 def read(path: Path, request: Request) -> Log:
-    """
-    Read a dataflash log, binary or text.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        Log.
-    request : Request
-        What is wanted.
-
-    Returns
-    -------
-    Log
-        Candidates; stamps count from the first sample of any of them.
-
-    Raises
-    ------
-    InputError
-        When pymavlink cannot read it.
-
-    """
+    """Read a dataflash log, binary or text."""
     one_flight(path, request)
     with path.open('rb') as file:
         text = not file.read(2).startswith(b'\xa3\x95')

@@ -16,7 +16,6 @@ import sys
 from typing import NamedTuple
 
 import numpy as np
-
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.framing import MAGIC as MCAP_MAGIC
 from ou_monitor.recordings.importers.log import Log, Progress, Request
@@ -81,26 +80,7 @@ FORMATS = (
 
 
 def detect(path: Path) -> Format:
-    """
-    Return the format of a file, whatever its name ends in.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        Log.
-
-    Returns
-    -------
-    Format
-        The first that fits.
-
-    Raises
-    ------
-    InputError
-        When the file is missing, a folder, empty, unreadable or of no known
-        format.
-
-    """
+    """Return the format of a file, whatever its name ends in."""
     if path.is_dir():
         raise InputError(f"'{path}' is a folder: name a log file")
     if not path.exists():
@@ -122,27 +102,7 @@ def detect(path: Path) -> Format:
 
 
 def import_log(path: Path, request: Request) -> Log:
-    """
-    Read a log.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        Log.
-    request : Request
-        What is wanted of it.
-
-    Returns
-    -------
-    Log
-        Candidates for voltage, throttle and current.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read, or the package that reads it is missing.
-
-    """
+    """Read a log."""
     form = detect(path)
     try:
         module = import_module(form.module)

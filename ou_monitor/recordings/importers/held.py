@@ -11,28 +11,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-
-from ou_monitor.online.repeats import refresh_period, Repeats, whole
+from ou_monitor.online.estimator.repeats import refresh_period, Repeats, whole
 from ou_monitor.recordings.importers.log import Series
 
 
 def drop_held(series: Series, *, every: bool = False) -> tuple[Series, str]:
-    """
-    Return a series without repeats, and one sentence on what was done.
-
-    Parameters
-    ----------
-    series : Series
-        Clean: finite, stamps that increase.
-    every : bool
-        Whether each repeat is dropped where no steady refresh is found.
-
-    Returns
-    -------
-    tuple
-        The series and the sentence.
-
-    """
+    """Return a series without repeats, and one sentence on what was done."""
     share = series.repeats
     period = refresh_period(series.values) if series.n > 1 else 1.0
     batch = whole(np.stack([series.t, series.values, np.full(series.n, np.nan)]))

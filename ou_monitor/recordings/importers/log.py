@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-
 from ou_monitor.errors import InputError
 from ou_monitor.records import FloatArray
 
@@ -149,34 +148,13 @@ class Request:
 
 
 def one_flight(path: Path, request: Request) -> None:
-    """
-    Refuse a flight other than the first for formats that hold one flight a file.
-
-    Raises
-    ------
-    InputError
-        When another one is asked for.
-
-    """
+    """Refuse a flight other than the first for formats that hold one flight a file."""
     if request.flight not in (None, 1):
         raise InputError(f'{path} holds one flight: --flight {request.flight} is not there')
 
 
 def clean(series: Series) -> tuple[Series, tuple[str, ...]]:
-    """
-    Return a series with finite values and stamps that increase, and notes of what that took.
-
-    Parameters
-    ----------
-    series : Series
-        As found.
-
-    Returns
-    -------
-    tuple
-        The series, and one sentence for each kind of sample dropped.
-
-    """
+    """Return a series with finite values and stamps that increase, and notes of what that took."""
     notes: list[str] = []
     t, values = series.t, series.values
 
@@ -241,22 +219,7 @@ def _rising(t: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def from_start(series: Iterable[Series], start: float = math.inf) -> tuple[Series, ...]:
-    """
-    Return series with stamps counted from the start of the log.
-
-    Parameters
-    ----------
-    series : iterable of Series
-        Stamps on one clock, s.
-    start : float
-        When the log says that it starts, s; an earlier sample is the start.
-
-    Returns
-    -------
-    tuple of Series
-        The same with the start subtracted.
-
-    """
+    """Return series with stamps counted from the start of the log (series in s, start in s)."""
     held = tuple(series)
     # Broken bytes make stamps near zero: a first sample counts when another is near it.
     firsts = [float(one.t[_near(one.t)].min()) for one in held if one.n]

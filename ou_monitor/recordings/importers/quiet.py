@@ -15,27 +15,7 @@ from ou_monitor.errors import InputError
 
 @contextmanager
 def quiet(path: Path, parser: str) -> Iterator[io.StringIO]:
-    """
-    Catch what a parser prints, and turn any failure of it into an `InputError`.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        Log, for the message.
-    parser : str
-        Its name, for the message.
-
-    Yields
-    ------
-    io.StringIO
-        What it has printed.
-
-    Raises
-    ------
-    InputError
-        When the block fails: broken bytes make parsers fail in any way.
-
-    """
+    """Catch what a parser prints, and turn any failure of it into an `InputError`."""
     said = io.StringIO()
     logger = logging.getLogger(parser)
     before = logger.disabled, logger.propagate
@@ -59,15 +39,7 @@ def quiet(path: Path, parser: str) -> Iterator[io.StringIO]:
 
 @contextmanager
 def quiet_process() -> Iterator[None]:
-    """
-    Send standard error nowhere, also for parsers in C, which do not know Python's.
-
-    Yields
-    ------
-    None
-        Once.
-
-    """
+    """Send standard error nowhere, also for parsers in C, which do not know Python's."""
     sys.stderr.flush()
     kept = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)

@@ -75,27 +75,7 @@ class _Watched(io.BufferedReader):
 
 
 def read(path: Path, request: Request) -> Log:
-    """
-    Read a ULog.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        Log.
-    request : Request
-        What is wanted.
-
-    Returns
-    -------
-    Log
-        Candidates; stamps count from the start that the header states.
-
-    Raises
-    ------
-    InputError
-        When pyulog cannot read it.
-
-    """
+    """Read a ULog."""
     one_flight(path, request)
     size = path.stat().st_size
     with quiet(path, 'pyulog') as said:

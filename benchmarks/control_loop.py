@@ -1,0 +1,301 @@
+"""
+The loop that an adaptive D term closes: does the cutoff hunt.
+
+    throttle -> load -> sigma and sag -> SlidingEstimator -> cutoff -> D term -> throttle
+
+Limits first: one rate axis of a multirotor in hover, four motors in two pairs,
+first-order motors, no air.  What counts is the order of magnitude of the
+margins, not the third digit of a boundary.
+
+The load is the root mean square of the motors' commands, sqrt(u^2 + d^2) for
+the collective u and the differential d: noise in d costs current.  sigma is
+`intensity` (load / hover)^steepness; the paper's 10 % and 40 % loads have a
+steepness of ln(0.632 / 0.3156) / ln(4) = 0.5.  The collective holds the thrust
+as the voltage sags.  Around a mean, with s the share of the load that the
+noise makes (d ln load / d ln d) and p = s steepness, noise in d raises sigma
+at once by a gain p, and the law `constant_noise` takes it back behind the
+estimator's window and the smoothing, by a gain p / (1 - p).  A moving average
+of the window's length and a smoothing of a quarter of it, the worst case,
+oscillate from a gain of about 4.5: p = 0.82.  See `critical_gain`.  A
+`threshold` has no finite gain: it hunts wherever sigma lies below the
+threshold at fmin and above it at fmax.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+import math
+from typing import Any
+
+import numpy as np
+from ou_monitor.online.estimator.estimator import SlidingEstimator
+from ou_monitor.online.filter.lowpass import AdaptiveLowPass
+from ou_monitor.records import FloatArray, NAN
+from scipy.optimize import brentq
+
+# Of the cutoff, octaves: below, whatever it does is of no consequence to a loop.
+SWING = 0.5
+# How much more the cutoff must swing than with the loop cut.
+FACTOR = 3.0
+
+
+@dataclass(frozen=True)
+class Loop:
+    """
+    Vehicle, controller, supply, estimator and filter.
+
+    Attributes
+    ----------
+    hover : float
+        Collective throttle that holds the thrust at `nominal` volts, 0..1.
+    authority : float
+        Angular acceleration of a unit differential command, rad/s^2.
+    motor_lag : float
+        Time constant of the motors, s.
+    p, i, d : float
+        Gains on rad/s, rad and rad/s^2 to differential command; D on the
+        measurement.
+    gyro_noise : float
+        White noise of a sample, rad/s.
+    gust : float
+        White angular acceleration, rad/s^2/sqrt(Hz).
+    coupling : float
+        Supply noise in the gyro, rad/s per V.
+    nominal, sag : float
+        Voltage without load, V; its fall per unit load, V.
+    alpha, intensity, steepness : float
+        Of the supply: 1/s; sigma in a quiet hover, V/sqrt(s); power of the load.
+    adc_noise : float
+        White noise of a voltage sample, V.
+    rate, every : float
+        Samples per second, Hz; time between estimates, s.
+    window : float
+        Of the estimator, s.
+    filter : dict
+        Options of `AdaptiveLowPass` beside its mode.
+    closed : bool
+        Whether what the D term commands counts as load.
+
+    """
+
+    hover: float = 0.4
+    authority: float = 100.0
+    motor_lag: float = 0.03
+    p: float = 0.4
+    i: float = 0.8
+    d: float = 0.01
+    gyro_noise: float = 0.005
+    gust: float = 0.3
+    coupling: float = 0.1
+    nominal: float = 5.0
+    sag: float = 0.75
+    alpha: float = 63.0
+    intensity: float = 0.632
+    steepness: float = 0.5
+    adc_noise: float = 0.002
+    rate: float = 500.0
+    every: float = 0.05
+    window: float = 2.0
+    filter: Mapping[str, Any] = field(default_factory=dict)  # noqa: A003
+    closed: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """
+    What happened, at the estimates.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n,)
+        s.
+    cutoff : ndarray, shape (n,)
+        Hz.
+    sigma, seen : ndarray, shape (n,)
+        V/sqrt(s), of the supply and as estimated (NaN while unknown).
+    command : ndarray, shape (n,)
+        Rms of the differential command since the estimate before.
+    turn : ndarray, shape (n,)
+        Rms of the body rate since the estimate before, rad/s.
+
+    """
+
+    t: FloatArray
+    cutoff: FloatArray
+    sigma: FloatArray
+    seen: FloatArray
+    command: FloatArray
+    turn: FloatArray
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """
+    Whether the cutoff hunts.
+
+    Attributes
+    ----------
+    cycle : bool
+        Whether it does.
+    swing, quiet : float
+        95 % less 5 % quantile of the cutoff, octaves, and the same with the
+        loop cut (NaN where the first is below `SWING`: no need).
+    period : float
+        s; NaN when there is no cycle.
+    command : float
+        Rms of the differential command, 0..1.
+
+    """
+
+    cycle: bool
+    swing: float
+    quiet: float
+    period: float
+    command: float
+
+
+def fly(loop: Loop, seconds: float, seed: int) -> Flight:
+    """
+    Simulate.
+
+    Parameters
+    ----------
+    loop : Loop
+        What is simulated.
+    seconds : float
+        Length, s.
+    seed : int
+        Same seed, same noise, whatever the loop.
+
+    Returns
+    -------
+    Flight
+
+    """
+    dt = 1.0 / loop.rate
+    n = round(seconds * loop.rate)
+    block = max(1, round(loop.every * loop.rate))
+    draws = np.random.default_rng(seed).standard_normal((n, 4))
+    kicks, gusts, gyro = (draws[:, k].tolist() for k in range(3))
+    adc = loop.adc_noise * draws[:, 3]
+    estimator = SlidingEstimator(window=loop.window)
+    low_pass = AdaptiveLowPass(mode='derivative', **loop.filter)
+    phi = math.exp(-loop.alpha * dt)
+    step = math.sqrt((1.0 - phi * phi) / (2.0 * loop.alpha))
+    motor = -math.expm1(-dt / loop.motor_lag)
+    gust = loop.gust * math.sqrt(dt)
+    noise = rate = thrust = integral = 0.0
+    load = collective = loop.hover
+    level, sigma = loop.nominal - loop.sag * load, loop.intensity
+    seen = error = alpha = NAN
+    voltage, throttle = np.empty(block), np.empty(block)
+    rows: list[tuple[float, ...]] = []
+    commands = turns = 0.0
+    for k in range(n):
+        t = k * dt
+        noise = phi * noise + step * sigma * kicks[k]
+        at = k % block
+        voltage[at], throttle[at] = level + noise + adc[k], collective
+        measured = rate + loop.coupling * noise + loop.gyro_noise * gyro[k]
+        slope = low_pass.step(t, measured, seen, error, alpha, collective)
+        integral = min(max(integral - loop.i * measured * dt, -0.3), 0.3)
+        command = min(max(integral - loop.p * measured - loop.d * slope, -1.0), 1.0)
+        # Nominal collective: a sagging supply takes more of it for one thrust.
+        collective = min(loop.hover * loop.nominal / max(level, 0.5 * loop.nominal), 1.0)
+        load = math.sqrt(collective * collective + (command * command if loop.closed else 0.0))
+        level += motor * (loop.nominal - loop.sag * load - level)
+        sigma = loop.intensity * (load / loop.hover) ** loop.steepness
+        strength = loop.authority * (level / loop.nominal)
+        thrust += motor * (command - thrust)
+        rate += strength * thrust * dt + gust * gusts[k]
+        commands += command * command
+        turns += rate * rate
+        if at == block - 1:
+            estimator.push(dt * np.arange(k + 1 - block, k + 1), voltage, throttle)
+            e = estimator.estimate()
+            seen = e.sigma if e.usable else NAN
+            error, alpha = e.sigma_se * e.sigma, e.alpha
+            rows.append((t, low_pass.cutoff, sigma, seen, math.sqrt(commands / block),
+                         math.sqrt(turns / block)))
+            commands = turns = 0.0
+    return Flight(*np.array(rows).T)
+
+
+def judge(loop: Loop, seconds: float = 40.0, seed: int = 1) -> Verdict:
+    """
+    Fly with the loop closed and cut, and compare the cutoffs.
+
+    Parameters
+    ----------
+    loop : Loop
+        What is judged.
+    seconds : float
+        Length of each flight, s; the first half settles.
+    seed : int
+        Of the noise.
+
+    Returns
+    -------
+    Verdict
+        A cycle swings by `SWING` octaves at least, and `FACTOR` times as much
+        as the scatter of the estimate makes the cutoff swing with the loop cut.
+
+    """
+    closed = fly(replace(loop, closed=True), seconds, seed)
+    half = closed.t.size // 2
+    octaves = np.log2(closed.cutoff[half:])
+    swing, quiet = _swing(octaves), NAN
+    cycle = swing >= SWING
+    if cycle:
+        cut = fly(replace(loop, closed=False), seconds, seed)
+        quiet = _swing(np.log2(cut.cutoff[half:]))
+        cycle = swing >= FACTOR * quiet
+    return Verdict(cycle, swing, quiet, _period(octaves) * loop.every if cycle else NAN,
+                   float(np.sqrt(np.mean(closed.command[half:]**2))))
+
+
+def _swing(octaves: FloatArray) -> float:
+    low, high = np.quantile(octaves, [0.05, 0.95])
+    return float(high - low)
+
+
+def _period(octaves: FloatArray) -> float:
+    """Return the steps of the first maximum of the autocorrelation behind its first zero."""
+    x = octaves - octaves.mean()
+    correlation = np.correlate(x, x, 'full')[x.size - 1:]
+    below = np.flatnonzero(correlation < 0.0)
+    if not below.size or below[0] >= x.size // 2:
+        return NAN
+    return float(below[0] + np.argmax(correlation[below[0]:x.size * 3 // 4]))
+
+
+def critical_gain(window: float, smoothing: float) -> float:
+    """
+    Return the loop gain from which the cutoff hunts, in the linear theory.
+
+    The estimate is a moving average over the window, sinc(w W / 2)
+    exp(-i w W / 2), the cutoff follows with one pole, 1 / (1 + i w smoothing).
+    Negative feedback oscillates where both together lag by half a turn.
+
+    Parameters
+    ----------
+    window, smoothing : float
+        s.
+
+    Returns
+    -------
+    float
+        Gain; infinite without smoothing, for a moving average alone lags by
+        half a turn only where it is zero.
+
+    """
+    if smoothing <= 0.0:
+        return math.inf
+    ratio = 2.0 * smoothing / window
+
+    def off(x: float) -> float:
+        return x + math.atan(ratio * x) - math.pi
+
+    x = float(brentq(off, 0.1, math.pi))
+    return x / math.sin(x) * math.hypot(1.0, ratio * x)

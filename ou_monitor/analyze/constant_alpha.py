@@ -1,0 +1,160 @@
+"""
+Whether alpha is the same at every load, as the paper assumes.
+
+chi^2 of ln(alpha) of the levels about their weighted mean, each with its standard error; that
+error is carried over to the common alpha, for it grows with 1/sqrt(alpha T) and a level whose
+alpha came out high by chance would weigh too much.
+
+A level that one OU in white noise does not describe (more than one relaxation, lines beside
+impulses, the settling after a change of throttle) is withheld: its alpha stands for both, and the
+error of a fit knows nothing of it.
+
+Limits: only levels with a usable fit count; a spectral line too faint to be found, and taken out
+before the fit, is not known of; "no change seen" is no proof that there is none, so the ratio that
+would have been seen stands beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+import math
+
+import numpy as np
+from ou_monitor.records import Estimate, NAN
+from scipy import stats
+
+# Probability of "differs" where alpha is the same, and of seeing `detectable_ratio`.
+LEVEL, POWER = 0.05, 0.9
+# A change by less than this factor changes no decision here: tau is known no better in most
+# recordings of a flight.
+NARROW = 1.5
+
+
+@dataclass(frozen=True)
+class AlphaTest:
+    """
+    Result of the test.
+
+    Attributes
+    ----------
+    verdict : str
+        ``differs``, ``constant`` (a change by `NARROW` would have been seen) or
+        ``undetermined``.
+    levels : int
+        Levels that count.
+    alpha, alpha_se : float
+        Common alpha, 1/s, and the standard error of its logarithm.
+    statistic, p_value : float
+        chi^2 with levels - 1 degrees of freedom.
+    detectable_ratio : float
+        Ratio of alpha between the lowest and the highest level, ln(alpha) going straight with
+        throttle, that is seen with 90 % probability.
+    ratio, ratio_low, ratio_high : float
+        That ratio as fitted, highest over lowest throttle, and its 95 % interval.
+    withheld : tuple of float
+        Throttles of usable levels that one OU in white noise does not describe.
+
+    """
+
+    verdict: str
+    levels: int
+    alpha: float = NAN
+    alpha_se: float = NAN
+    statistic: float = NAN
+    p_value: float = NAN
+    detectable_ratio: float = NAN
+    ratio: float = NAN
+    ratio_low: float = NAN
+    ratio_high: float = NAN
+    withheld: tuple[float, ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """Return the verdict in words."""
+        return self._verdict() + self._withheld()
+
+    def _withheld(self) -> str:
+        if not self.withheld:
+            return ''
+        names = ', '.join('all' if math.isnan(x) else f'{100.0 * x:.3g} %' for x in self.withheld)
+        return (f' Withheld: {names}; more than one relaxation is seen there or at another level, '
+                'lines stand beside impulses, or a change of throttle still settles.')
+
+    def _verdict(self) -> str:
+        if self.levels < 2:
+            return ('Whether alpha is the same at all loads cannot be told: '
+                    f'{"one load level has" if self.levels else "no load level has"} '
+                    f'a usable fit{" that one OU describes" if self.withheld else ""}.')
+        seen = (f'a change by a factor of {_factor(self.detectable_ratio)} from the lowest to the '
+                'highest throttle would have been seen (90 %)')
+        if self.verdict == 'differs':
+            return (f'Alpha is not the same at all loads (p = {self.p_value:.2g}): from the '
+                    f'lowest to the highest throttle it changes by a factor of '
+                    f'{_factor(self.ratio)} (95 % {_factor(self.ratio_low)} to '
+                    f'{_factor(self.ratio_high)}); '
+                    'the paper assumes that it does not.')
+        if self.verdict == 'constant':
+            return (f'Alpha is the same at all loads as far as can be seen (p = '
+                    f'{self.p_value:.2g}); {seen}.')
+        return (f'Whether alpha is the same at all loads cannot be told from this recording (p = '
+                f'{self.p_value:.2g}): only {seen}.')
+
+
+def _factor(ratio: float) -> str:
+    """Return a ratio as people say it; beyond a factor of 100 either way only that."""
+    if ratio > 100.0:
+        return 'more than 100'
+    return 'less than 0.01' if ratio < 0.01 else f'{ratio:#.3g}'.rstrip('.')
+
+
+def alpha_constancy(throttles: Sequence[float], estimates: Sequence[Estimate],
+                    doubted: Sequence[bool] | None = None) -> AlphaTest:
+    """Test whether the levels share one alpha (throttles 0..1)."""
+    usable = [k for k, e in enumerate(estimates)
+              if e.usable and e.alpha_se > 0.0 and math.isfinite(throttles[k])]
+    good = [k for k in usable if doubted is None or not doubted[k]]
+    withheld = tuple(throttles[k] for k in usable if k not in good)
+    if not good:
+        return AlphaTest('undetermined', 0, withheld=withheld)
+    x = np.array([throttles[k] for k in good])
+    logs = np.log([estimates[k].alpha for k in good])
+    own = np.array([estimates[k].alpha_se for k in good])
+    # The relative error is sqrt(2 / (alpha T)) times what the noise adds: at a common alpha
+    # that factor goes with the root.
+    se = own
+    for _ in range(20):
+        weight = 1.0 / se ** 2
+        mean = float(weight @ logs / weight.sum())
+        se = own * np.exp(0.5 * (logs - mean))
+    weight = 1.0 / se ** 2
+    mean = float(weight @ logs / weight.sum())
+    common = (math.exp(mean), float(1.0 / math.sqrt(weight.sum())))
+    if len(good) < 2:
+        return AlphaTest('undetermined', len(good), *common, withheld=withheld)
+    freedom = len(good) - 1
+    statistic = float(weight @ (logs - mean) ** 2)
+    p = float(stats.chi2.sf(statistic, freedom))
+    # Straight line of ln(alpha) over throttle, from the lowest to the highest level.
+    reach = float(np.ptp(x))
+    along = (x - float(weight @ x / weight.sum())) / reach
+    size = float(weight @ along ** 2)
+    slope = float(weight @ (along * logs)) / size
+    wide = float(stats.norm.ppf(0.975)) / math.sqrt(size)
+    seen = math.exp(math.sqrt(_noncentrality(freedom) / size))
+    verdict = 'differs' if p < LEVEL else 'constant' if seen <= NARROW else 'undetermined'
+    return AlphaTest(verdict, len(good), *common, statistic, p, seen, math.exp(slope),
+                     math.exp(slope - wide), math.exp(slope + wide), withheld)
+
+
+@lru_cache(maxsize=64)
+def _noncentrality(freedom: int) -> float:
+    """Return the noncentrality at which chi^2 rejects with probability `POWER`."""
+    limit = float(stats.chi2.isf(LEVEL, freedom))
+    low, high = 0.0, 200.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        enough = float(stats.ncx2.sf(limit, freedom, middle)) >= POWER
+        low, high = (low, middle) if enough else (middle, high)
+    return high

@@ -1,0 +1,227 @@
+"""
+One load level of a recording -> its fit, tests, spectrum and lines.
+
+Every number of the OU comes from the estimator that flies
+(`ou_monitor.online.estimator.estimator.SlidingEstimator`); here it gets a window as
+long as the stretch of constant load, and of a voltage whose spectral lines
+were taken out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+import math
+
+import numpy as np
+from ou_monitor.analyze.level_sag import level_sags, LevelSag
+from ou_monitor.analyze.levels import LoadLevel, Segment
+from ou_monitor.analyze.pooling import disagreement, fit_stretch, pool
+from ou_monitor.analyze.process_type import classify, ProcessType, Verdict
+from ou_monitor.analyze.spectrum import level_spectrum, segment_rate, Spectrum
+from ou_monitor.criticism.level_tests import adjusted, examine_level, FAMILY_WISE, holm, Shape
+from ou_monitor.criticism.line_removal import without_lines
+from ou_monitor.criticism.lines import find_lines, LineSearch
+from ou_monitor.criticism.whitening import fresh
+from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Recording, Status
+
+# Fewer samples than this are not even offered to the estimator.
+_MIN_SEGMENT = 16
+# Intervals widened by more than this factor are spoken of.
+_WIDENED = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class LevelResult:
+    """
+    What one load level shows.
+
+    Attributes
+    ----------
+    throttle : float
+        Throttle, 0..1; NaN for a level that holds the whole recording.
+    segments : tuple of Segment
+        Stretches of samples that were used.
+    time : float
+        Time in them, s.
+    n : int
+        Samples in them.
+    mean : float
+        Mean voltage, V.
+    vpp, peak, vrms : float
+        Peak to peak, largest absolute value and rms of the deviation from the
+        mean of its segment, V (as an AC-coupled oscilloscope would show it).
+    deviation : ndarray, shape (n,)
+        That deviation, V.
+    estimate : Estimate
+        OU parameters, pooled over the segments, of the voltage without its lines.
+    shape : Shape
+        Tests of the kind of process, adjusted over all levels.
+    verdict : Verdict
+        Kind of process, and why.
+    sag : LevelSag
+        How far the mean lies below that of the lowest throttle.
+    spectrum : Spectrum
+        PSD, measured and fitted.
+    lines : LineSearch
+        Spectral lines, and what would have been found.
+    with_lines : Estimate or None
+        As the node would see the level, when its lines were taken out; None when they were not.
+    notes : tuple of str
+        What to know before using the numbers.
+    scatter : float
+        How much more its segments differ than their errors allow; those of the pooled estimate
+        are already widened by it.
+    scatter_p : float
+        Probability that segments of one process differ as much, after Holm over all levels; NaN
+        with fewer than two segments.
+
+    """
+
+    throttle: float
+    segments: tuple[Segment, ...]
+    time: float
+    n: int
+    mean: float
+    vpp: float
+    peak: float
+    vrms: float
+    deviation: FloatArray
+    estimate: Estimate
+    shape: Shape
+    verdict: Verdict = Verdict(ProcessType.UNDETERMINED, 'not judged')
+    sag: LevelSag = LevelSag()
+    spectrum: Spectrum = field(default_factory=Spectrum)
+    lines: LineSearch = field(default_factory=LineSearch)
+    with_lines: Estimate | None = None
+    notes: tuple[str, ...] = ()
+    scatter: float = 1.0
+    scatter_p: float = NAN
+
+    @property
+    def kind(self) -> ProcessType:
+        """Kind of process."""
+        return self.verdict.kind
+
+    @property
+    def doubted(self) -> bool:
+        """Whether one OU in white noise does not describe what was fitted."""
+        lines_in = bool(self.lines.lines) and self.with_lines is None
+        return lines_in or self.shape['one_relaxation'].rejects or self.wanders
+
+    @property
+    def wanders(self) -> bool:
+        """Whether a second relaxation is seen."""
+        return self.shape['second_relaxation'].rejects
+
+    @property
+    def crest(self) -> float:
+        """Vpp over Vrms, dimensionless."""
+        return self.vpp / self.vrms if self.vrms > 0.0 else NAN
+
+    @property
+    def label(self) -> str:
+        """Name of the level for people."""
+        return 'all' if math.isnan(self.throttle) else f'{100.0 * self.throttle:.3g} %'
+
+
+def fit_level(recording: Recording, still: Recording, level: LoadLevel, levels: int
+              ) -> LevelResult:
+    """Return the result of one level, its kind not judged yet."""
+    segments = [s for s in level.segments if s.stop - s.start >= _MIN_SEGMENT]
+    if not segments:
+        segments = [s for s in level.segments if s.stop - s.start >= 2]
+    if not segments:
+        nothing = Estimate(throttle=level.throttle, status=Status.TOO_FEW_SAMPLES)
+        return LevelResult(level.throttle, (), 0.0, 0, NAN, NAN, NAN, NAN, np.zeros(0), nothing,
+                           examine_level([], nothing))
+    fits = [fit_stretch(recording, s.start, s.stop) for s in segments]
+    estimate, scatter = _pooled(fits)
+    parts = [recording.voltage[s.start:s.stop] for s in segments]
+    rate = segment_rate(recording, segments)
+    memory = math.exp(-estimate.alpha / rate) if estimate.usable and rate > 0.0 else 0.0
+    lines = find_lines([still.voltage[s.start:s.stop] for s in segments], rate,
+                       levels=levels, memory=memory)
+    shape = examine_level([_kept(still, s, estimate) for s in segments], estimate)
+    with_lines = None
+    # Impulses at even distances have lines, too: those are not taken out.
+    if lines.lines and not holm([shape])[0]['impulses'].rejects:
+        with_lines = estimate
+        clean, quiet = (_without_lines(x, segments, rate, lines) for x in (recording, still))
+        fits = [fit_stretch(clean, s.start, s.stop) for s in segments]
+        estimate, scatter = _pooled(fits)
+        shape = examine_level([_kept(quiet, s, estimate) for s in segments], estimate)
+    deviation = np.concatenate([v - v.mean() for v in parts])
+    return LevelResult(
+        throttle=level.throttle, segments=tuple(segments),
+        time=float(sum(recording.t[s.stop - 1] - recording.t[s.start] for s in segments)),
+        n=deviation.size, mean=float(np.concatenate(parts).mean()),
+        vpp=float(np.ptp(deviation)), peak=float(np.abs(deviation).max()),
+        vrms=float(np.sqrt(np.mean(deviation ** 2))), deviation=deviation, estimate=estimate,
+        shape=shape, spectrum=level_spectrum(still, segments, estimate), lines=lines,
+        with_lines=with_lines,
+        notes=_level_notes(fits, estimate), scatter=scatter, scatter_p=disagreement(fits))
+
+
+def _pooled(fits: Sequence[Estimate]) -> tuple[Estimate, float]:
+    """Return the estimate of a level and the scatter of its segments."""
+    estimate, scatter = pool(fits)
+    # Within a level throttle is meant to stand still.
+    return replace(estimate, flags=tuple(
+        flag for flag in estimate.flags if flag is not Flag.NO_EXCITATION)), scatter
+
+
+def _without_lines(recording: Recording, segments: Sequence[Segment], rate: float,
+                   lines: LineSearch) -> Recording:
+    """Return the recording without the spectral lines of a level, in its segments."""
+    voltage = recording.voltage.copy()
+    for s in segments:
+        voltage[s.start:s.stop] = without_lines(voltage[s.start:s.stop], rate, lines.lines)
+    return replace(recording, voltage=voltage)
+
+
+def _kept(recording: Recording, segment: Segment, estimate: Estimate
+          ) -> tuple[FloatArray, FloatArray]:
+    """Return stamps and voltages of a segment, repeats of the logger left out."""
+    t = recording.t[segment.start:segment.stop]
+    voltage = recording.voltage[segment.start:segment.stop]
+    keep = fresh(voltage, estimate)
+    return t[keep], voltage[keep]
+
+
+def judge_levels(recording: Recording, results: Sequence[LevelResult]
+                 ) -> tuple[LevelResult, ...]:
+    """Name the kind of each level, the tests of all adjusted together; and compare means."""
+    shapes = holm([level.shape for level in results])
+    sags = level_sags(recording, [level.throttle for level in results],
+                      [level.segments for level in results],
+                      [level.estimate for level in results], [level.vrms for level in results])
+    apart = adjusted([level.scatter_p for level in results])
+    return tuple(
+        replace(level, shape=shape, sag=sag, scatter_p=p,
+                notes=level.notes + _scatter_notes(level.scatter, p), verdict=classify(
+                    level.estimate, shape, sum(line.share for line in level.lines.lines)))
+        for level, shape, sag, p in zip(results, shapes, sags, apart))
+
+
+def _scatter_notes(scatter: float, p: float) -> tuple[str, ...]:
+    """Say that the segments differ: that they are not one process, or only what was widened."""
+    if p < FAMILY_WISE:
+        return (f'Its segments differ {scatter:.1f} times more than sampling allows (p = '
+                f'{p:.1g}): the level is not one process; the intervals were widened by that '
+                'factor.',)
+    if scatter > _WIDENED:
+        return (f'The intervals are wider by a factor of {scatter:.1f}, by which its segments '
+                'scatter more than their errors; so much comes by chance.',)
+    return ()
+
+
+def _level_notes(fits: list[Estimate], pooled: Estimate) -> tuple[str, ...]:
+    notes = []
+    used = sum(e.usable for e in fits)
+    if not pooled.usable and len({e.status for e in fits}) > 1:
+        notes.append('Most of its segments are too short to be fitted, or show no relaxation.')
+    elif used < len(fits) and len(fits) > 1:
+        notes.append(f'{len(fits) - used} of {len(fits)} segments could not be fitted; alpha, '
+                     'sigma and Var_inf rest on the others.')
+    return tuple(notes)

@@ -1,0 +1,300 @@
+"""
+Load levels: which stretches of a recording were flown at which throttle.
+
+A level is a throttle that was held: its segments begin within the half width of it, and end where
+throttle leaves twice that, so that the jitter of a stick breaks none of them.  The half width is
+`HALF_WIDTH`, or as much more as the stick moves while it is held.  A steady ramp through a
+throttle is no stay at it.  Limits: throttle is a command, not a current, so two stretches at one
+throttle can carry different loads; a stretch is only as stationary as its throttle says; levels
+closer than the jitter of the stick are one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.records import FloatArray, NAN
+
+BoolArray = npt.NDArray[np.bool_]
+
+# The paper's levels lie 5 % apart; +-2 % keeps neighbours apart and still
+# holds the jitter of a careful stick or of a hover controller.
+HALF_WIDTH = 0.02
+# Of a stick that moves more it is this many of its standard deviations, and this at most.
+_SPREADS, _WIDEST = 2.5, 0.03
+# Stretches over which the jitter is looked at, s, and the share of them that it holds for:
+# many a stick is still at idle and jitters only in flight.
+_LOOK, _QUIETER = 1.0, 0.75
+# Left out after throttle came from more than two half widths away: six
+# relaxation times of the paper's rail (tau = 15.9 ms), when 0.2 % of the step
+# is left.
+SETTLE = 0.1
+# A level needs this share of the recording, or one stay as long as this, s, to be
+# found without being asked for: a few seconds at full throttle matter in any flight.
+MIN_SHARE, LONG_STAY = 0.02, 2.0
+# Time at a throttle, s, from which it is looked at.
+MIN_TIME = 0.25
+# And one stretch that can be fitted by itself, s: thirty relaxation times of the
+# paper's rail.  A ramp that lingers here and there is no level where others are.
+MIN_STRETCH = 0.5
+MAX_LEVELS = 20
+# A stretch shorter than this, s, through which throttle goes steadily is a passage: quarters at
+# its ends differ by more than this share of its range (of a ramp 0.75), and of the half width.
+_PASSAGE, _STEADY, _CROSSED = 3.0, 0.65, 0.75
+# A pause of more than this many median steps breaks a segment.
+GAP_STEPS = 20.0
+
+_GRID = 0.0025
+# Between two levels time falls to less than this share of that at the lesser of them.
+_VALLEY = 0.7
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A stretch of samples: indices ``start <= k < stop`` of the recording."""
+
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class LoadLevel:
+    """
+    One throttle and where in the recording it was held.
+
+    Attributes
+    ----------
+    throttle : float
+        Throttle of the level, 0..1; NaN for a level that holds everything.
+    segments : tuple of Segment
+        Stretches at this throttle, settling left out.
+    settling : float
+        Time left out after changes of throttle, s.
+
+    """
+
+    throttle: float
+    segments: tuple[Segment, ...]
+    settling: float = 0.0
+
+
+def find_levels(t: FloatArray, throttle: FloatArray,
+                given: tuple[float, ...] | None = None) -> tuple[LoadLevel, ...]:
+    """Split a recording into load levels (t in s)."""
+    if not t.size:
+        return ()
+    width = half_width(t, throttle)
+    if given is not None:
+        return _split(t, throttle, _checked(given), width, True)
+    whole = (LoadLevel(NAN, tuple(_cut(Segment(0, t.size), _gaps(t)))),)
+    centres = _modes(t, throttle, width)
+    while centres:
+        found = _split(t, throttle, centres, width, False)
+        held = [_held(t, level) for level in found]
+        if all(held):
+            return _most(t, found)
+        if not any(held):
+            # Where every stay is short, short stays are all there is to tell from.
+            enough = 0.5 * float(t[-1] - t[0]) <= sum(_time(t, level) for level in found)
+            return _most(t, found) if enough else whole
+        # What was taken for a level may be its neighbours'.
+        centres = [centre for centre, kept in zip(centres, held) if kept]
+    return whole
+
+
+def half_width(t: FloatArray, throttle: FloatArray) -> float:
+    """Return how far from its middle a level reaches."""
+    known = throttle[np.isfinite(throttle)]
+    step = float(np.median(np.diff(t))) if t.size > 1 else 0.0
+    size = max(8, round(_LOOK / step)) if step > 0.0 else known.size + 1
+    blocks = known[:known.size // size * size].reshape(-1, size)
+    if not blocks.size:
+        return HALF_WIDTH
+    away = np.abs(blocks - np.median(blocks, axis=1, keepdims=True))
+    jitter = float(np.quantile(np.median(away, axis=1), _QUIETER)) / 0.6745
+    return max(HALF_WIDTH, min(_WIDEST, _SPREADS * jitter))
+
+
+def _time(t: FloatArray, level: LoadLevel) -> float:
+    """Return the time at a level, s; settling left out."""
+    return sum(float(t[s.stop - 1] - t[s.start]) for s in level.segments)
+
+
+def _held(t: FloatArray, level: LoadLevel) -> bool:
+    """Tell whether a level was held: a long stretch, or one of some length and a share of time."""
+    whole = float(t[-1] - t[0])
+    longest = max((float(t[s.stop - 1] - t[s.start]) for s in level.segments), default=0.0)
+    # A short recording may be all one level.
+    return longest >= min(MIN_STRETCH, 0.25 * whole) and (
+        longest >= LONG_STAY or _time(t, level) >= MIN_SHARE * whole)
+
+
+def _most(t: FloatArray, found: tuple[LoadLevel, ...]) -> tuple[LoadLevel, ...]:
+    """Return the levels at which most time was spent, in their order."""
+    least = sorted((_time(t, level) for level in found), reverse=True)[:MAX_LEVELS][-1]
+    return tuple(level for level in found if _time(t, level) >= least)[:MAX_LEVELS]
+
+
+def _split(t: FloatArray, throttle: FloatArray, centres: list[float], width: float,
+           named: bool) -> tuple[LoadLevel, ...]:
+    """Give each level its stretches; passages through a level that nobody named are left out."""
+    broken = _gaps(t)
+    runs: list[list[Segment]] = [[] for _ in centres]
+    for run, k in stays(throttle, centres, width):
+        runs[k] += _cut(run, broken)
+    found = []
+    for centre, inner, mine in zip(centres, _inner(centres, width), runs):
+        if not named:
+            mine = [run for run in mine if not _passage(t, throttle, run, inner)]
+        away = ~(np.abs(throttle - centre) <= 2.0 * width)
+        kept, lost = _settle(t, mine, away, broken)
+        mean = centre
+        if not named and kept:
+            mean = float(np.median(np.concatenate([throttle[s.start:s.stop] for s in kept])))
+        found.append(LoadLevel(mean, kept, lost))
+    return tuple(found)
+
+
+def _checked(given: tuple[float, ...]) -> list[float]:
+    levels = sorted(float(value) for value in given)
+    for value in levels:
+        if not 0.0 <= value <= 1.0:
+            raise ValueError(f'a load level is a throttle between 0 and 1, got {value:g}')
+    for low, high in zip(levels, levels[1:]):
+        if high - low < 1e-6:
+            raise ValueError(f'load level {low:g} is given twice')
+    return levels
+
+
+def _gaps(t: FloatArray) -> BoolArray:
+    """Return where a pause lies before the sample; shape (n,)."""
+    steps = np.diff(t)
+    if not steps.size:
+        return np.zeros(t.size, dtype=np.bool_)
+    return np.concatenate(([False], steps > GAP_STEPS * np.median(steps)))
+
+
+def _modes(t: FloatArray, throttle: FloatArray, width: float) -> list[float]:
+    """Return the throttles at which time was spent, increasing."""
+    known = np.isfinite(throttle)
+    if not known.any():
+        return []
+    steps = np.diff(t, append=t[-1])
+    steps = np.minimum(steps, GAP_STEPS * max(float(np.median(steps)), 1e-9))
+    value, spent = throttle[known], steps[known]
+    low = float(value.min()) - width
+    bins = int(math.ceil((float(value.max()) + width - low) / _GRID)) + 1
+    where = np.minimum(np.rint((value - low) / _GRID).astype(np.intp), bins - 1)
+    time_at = np.bincount(where, weights=spent, minlength=bins)
+    reach = int(round(width / _GRID))
+    fine = np.convolve(time_at, _triangle(reach // 2), mode='same')
+    # A recording of less than a second may be all one level.
+    least = min(MIN_TIME, 0.25 * float(spent.sum()))
+    found: list[int] = []
+    while True:
+        peak = int(np.convolve(time_at, _triangle(reach), mode='same').argmax())
+        left, right = max(0, peak - reach), peak + reach + 1
+        held = float(time_at[left:right].sum())
+        if held < least or not held > 0.0:
+            return [low + _GRID * k for k in sorted(found)]
+        if all(_apart(fine, peak, other, reach) for other in found):
+            found.append(peak)
+        time_at[left:right] = 0.0
+
+
+def _triangle(reach: int) -> FloatArray:
+    """Return weights that fall on both sides: a box midway between two levels would hold both."""
+    return 1.0 - np.abs(np.arange(-reach, reach + 1)) / (reach + 1.0)
+
+
+def _apart(density: FloatArray, peak: int, other: int, reach: int) -> bool:
+    """Tell whether a second peak is a level of its own, not a shoulder of the other."""
+    if abs(peak - other) > 2 * reach:
+        return True
+    between = density[min(peak, other):max(peak, other) + 1]
+    return abs(peak - other) > reach and bool(
+        between.min() < _VALLEY * min(density[peak], density[other]))
+
+
+def stays(throttle: FloatArray, centres: Sequence[float], width: float
+          ) -> list[tuple[Segment, int]]:
+    """Return the stays of throttle at levels."""
+    if not centres:
+        return []
+    level = np.asarray(centres)
+    nearest = _nearest(centres)
+    inner = _inner(centres, width)
+    # Of two levels that lie close, the other one is arrived at somewhat short of it.
+    outer = np.maximum(inner, np.minimum(2.0 * width, 0.8 * nearest))
+    edges = np.unique(np.concatenate((level - outer, level - inner, level + inner,
+                                      level + outer)))
+    zone = np.searchsorted(edges, throttle)
+    middles = np.concatenate(([-math.inf], 0.5 * (edges[1:] + edges[:-1]), [math.inf]))
+    away = np.abs(middles[:, None] - level)
+    at = np.where((away <= inner).any(axis=1), away.argmin(axis=1), -1).tolist()
+    near = (away <= outer).tolist()
+    starts = np.flatnonzero(np.diff(zone, prepend=-1))
+    found: list[tuple[Segment, int]] = []
+    here, begin, last = -1, 0, 0
+    for start, stop, where in zip(starts.tolist(), [*starts[1:].tolist(), throttle.size],
+                                  zone[starts].tolist()):
+        if here >= 0 and not near[where][here]:
+            found.append((Segment(begin, last), here))
+            here = -1
+        if here < 0 and at[where] >= 0:
+            here, begin = at[where], start
+        if here >= 0 and at[where] == here:
+            last = stop
+    if here >= 0:
+        found.append((Segment(begin, last), here))
+    return found
+
+
+def _nearest(centres: Sequence[float]) -> FloatArray:
+    """Return how far the nearest other level is."""
+    apart = np.diff(np.asarray(centres), prepend=-math.inf, append=math.inf)
+    return np.minimum(apart[:-1], apart[1:])
+
+
+def _inner(centres: Sequence[float], width: float) -> FloatArray:
+    """Return the half width of each level, less where another is near."""
+    return np.minimum(width, 0.5 * _nearest(centres)) + 1e-9
+
+
+def _cut(run: Segment, broken: BoolArray) -> list[Segment]:
+    """Return the pieces of a stretch between pauses."""
+    cuts = run.start + 1 + np.flatnonzero(broken[run.start + 1:run.stop])
+    ends = [run.start, *cuts.tolist(), run.stop]
+    return [Segment(a, b) for a, b in zip(ends, ends[1:])]
+
+
+def _passage(t: FloatArray, throttle: FloatArray, run: Segment, width: float) -> bool:
+    """Tell whether throttle only passes through, from one side to the other."""
+    if t[run.stop - 1] - t[run.start] >= _PASSAGE:
+        return False
+    inside = throttle[run.start:run.stop]
+    quarter = max(1, inside.size // 4)
+    moved = abs(float(inside[-quarter:].mean()) - float(inside[:quarter].mean()))
+    return moved > max(_CROSSED * width, _STEADY * float(np.ptp(inside)))
+
+
+def _settle(t: FloatArray, runs: Sequence[Segment], away: BoolArray,
+            broken: BoolArray) -> tuple[tuple[Segment, ...], float]:
+    """Leave out the time after throttle came from far away; jitter is not a step."""
+    kept, lost = [], 0.0
+    for run in runs:
+        start = run.start
+        if start > 0 and not broken[start]:
+            first = int(np.searchsorted(t, t[start] - SETTLE))
+            far = np.flatnonzero(away[first:start])
+            if far.size:
+                start = int(np.searchsorted(t, t[first + far[-1]] + SETTLE))
+        start = min(max(start, run.start), run.stop)
+        lost += float(t[min(start, run.stop - 1)] - t[run.start])
+        if start < run.stop - 1:
+            kept.append(Segment(start, run.stop))
+    return tuple(kept), lost

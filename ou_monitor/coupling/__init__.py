@@ -1,0 +1,1 @@
+"""How much of a signal is noise of the supply."""

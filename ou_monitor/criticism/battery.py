@@ -1,0 +1,263 @@
+"""
+Signed statistics of normal scores: what a right model leaves nothing in.
+
+Each is scaled to be about N(0, 1) for independent normal scores; how it really
+spreads, the throttle and the fit being what they are, is found by simulation
+(`null_bank`).  Names begin with the kind, by which terms ask for them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from ou_monitor.criticism.battery_history import after_large, score
+from ou_monitor.model.terms.lines import order_power
+from ou_monitor.records import FloatArray
+from scipy.signal import lfilter
+from scipy.special import ndtri
+
+# Lags grouped.
+_LAGS = ((1, 1), (2, 2), (3, 5), (6, 15), (16, 50))
+# Spectral bands: edges in shares of the Nyquist frequency, from the slowest on.
+_BANDS = 8
+# Scores up to this are small.
+_SMALL = 2.5
+_CLUSTERS = (0.02, 0.1, 0.5, 2.5, 8.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """
+    What the scores are held against.
+
+    Attributes
+    ----------
+    state : ndarray, shape (n,)
+        Deviation of the sample before, V.
+    at : ndarray, shape (n,)
+        Time, s.
+    throttle : ndarray, shape (n,), or None
+        0..1.
+    rate : float
+        Samples per second, Hz.
+    keep : float
+        What the state keeps from one sample to the next.
+    large : ndarray, shape (n,), or None
+        Where large errors begin, as `large_ones` returns them.
+    paths : tuple of (str, ndarray of shape (n,))
+        As `throttle_paths` yields them.
+
+    """
+
+    state: FloatArray
+    at: FloatArray
+    throttle: FloatArray | None
+    rate: float
+    keep: float
+    large: FloatArray | None = None
+    paths: tuple[tuple[str, FloatArray], ...] = ()
+
+
+def statistics(z: FloatArray, scene: Scene, *, lines: bool = True) -> dict[str, float]:
+    """Return all statistics."""
+    return dict(_all(z, scene, lines))
+
+
+def is_sign(sign: str, name: str, value: float) -> bool:
+    """Return whether a statistic is what a sign means."""
+    if sign[0] in '+-':
+        return name.startswith(sign[1:]) and (value > 0.0) == (sign[0] == '+')
+    return name.startswith(sign)
+
+
+def _all(z: FloatArray, scene: Scene, lines: bool) -> Iterator[tuple[str, float]]:
+    # The scores of a far outlier must not rule all that is not about outliers.
+    w = np.clip(z, -5.0, 5.0)
+    square = np.minimum(z * z, 25.0) - 1.0
+    square -= square.mean()
+    yield from _correlations(w)
+    yield from _among_small(w)
+    yield from _spectrum(w, scene)
+    if lines and scene.throttle is not None:
+        yield 'order line', _order(w, scene)
+    yield from _moments(z)
+    yield from _clustering(square, scene)
+    yield from _inputs(w, square, scene)
+    yield from _state(w, square, scene)
+    for name, path in scene.paths:
+        yield name, score(w, path)
+    if scene.large is not None:
+        yield from after_large(w, square, scene.large)
+    yield from _beyond_second_order(w, scene)
+
+
+def _correlations(w: FloatArray) -> Iterator[tuple[str, float]]:
+    n = w.size
+    c = w - w.mean()
+    power = float(c @ c)
+    for low, high in _LAGS:
+        if 4 * high > n:
+            return
+        r = sum(float(c[k:] @ c[:-k]) for k in range(low, high + 1)) / power
+        name = f'autocorrelation lag {low}' + ('' if low == high else f' to {high}')
+        yield name, math.sqrt(n / (high - low + 1.0)) * r
+
+
+def _among_small(w: FloatArray) -> Iterator[tuple[str, float]]:
+    """Yield the correlation of neighbours that are both small: outliers have no part in it."""
+    small = (np.abs(w[1:]) < _SMALL) & (np.abs(w[:-1]) < _SMALL)
+    if int(small.sum()) > 30:
+        yield 'small errors lag 1', score(w[1:][small], w[:-1][small])
+
+
+def _spectrum(w: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
+    n = w.size
+    power = np.abs(np.fft.rfft(w - w.mean())[1:]) ** 2
+    power /= power.mean()
+    edges = np.unique(np.round(np.geomspace(1.0, power.size, _BANDS + 1)).astype(int))
+    edges[0] = 0
+    for k, (a, b) in enumerate(zip(edges[:-1], edges[1:])):
+        if b - a >= 2:
+            # A mean of exponentials, made more normal by the cube root (Wilson & Hilferty).
+            m = b - a
+            mean = float(power[a:b].mean())
+            value = (mean ** (1.0 / 3.0) - 1.0 + 1.0 / (9.0 * m)) * 3.0 * math.sqrt(m)
+            yield f'band {k}, {_hertz(a, n, scene)} to {_hertz(b, n, scene)} Hz', value
+    # The highest of many exponentials: its chance, as a normal score.
+    yield 'line', _gumbel(float(power[3:].max()), power.size - 3)
+
+
+def _hertz(bin_: int, n: int, scene: Scene) -> str:
+    return f'{max(bin_, 1) * scene.rate / n:.3g}'
+
+
+def _gumbel(top: float, count: float) -> float:
+    """Return the normal score of the largest of `count` exponentials."""
+    chance = -math.expm1(-count * math.exp(-top)) if top < 700.0 else 0.0
+    return _from_tail(chance if chance > 0.0 else math.exp(-700.0))
+
+
+def _from_tail(chance: float) -> float:
+    return -float(ndtri(min(max(chance, 1e-300), 0.999)))
+
+
+def _order(w: FloatArray, scene: Scene) -> float:
+    """Return the strongest line whose frequency follows throttle, as a normal score."""
+    assert scene.throttle is not None
+    top, count = order_power(w, scene.throttle, scene.rate)
+    return 0.0 if count == 0 else _from_tail(-math.expm1(-count * math.exp(-top)))
+
+
+def _moments(z: FloatArray) -> Iterator[tuple[str, float]]:
+    n = z.size
+    c = z - z.mean()
+    c = c / math.sqrt(float(c @ c) / n)
+    yield 'skewness', math.sqrt(n / 6.0) * float(np.mean(c**3))
+    yield 'kurtosis', math.sqrt(n / 24.0) * (float(np.mean(c**4)) - 3.0)
+    for limit, chance in ((4.0, 6.334e-5), (5.5, 3.798e-8)):
+        found, expected = float((np.abs(z) > limit).sum()), n * chance
+        # Poisson counts, made normal by the square root (Anscombe).
+        value = 2.0 * (math.sqrt(found + 0.375) - math.sqrt(expected + 0.375))
+        yield f'tails beyond {limit:g}', value
+
+
+def _clustering(square: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
+    n = square.size
+    yield 'clustering next sample', score(square[1:], square[:-1])
+    yield 'clustering few samples', score(
+        square[10:], lfilter(np.ones(9), [1.0], square)[9:-1] if n > 20 else square[10:])
+    for span in _CLUSTERS:
+        m = round(span * scene.rate)
+        count = n // m if m else 0
+        if m < 4 or count < 12:
+            continue
+        mean = square[:count * m].reshape(count, m).mean(axis=1)
+        yield f'clustering {span:g} s', score(mean[1:], mean[:-1])
+        spread = float(mean.var()) * m / max(float(square.var()), 1e-12)
+        value = (spread ** (1.0 / 3.0) - 1.0 + 2.0 / (9.0 * count)) * math.sqrt(9.0 * count / 2.0)
+        yield f'clustering spread {span:g} s', value
+
+
+def _inputs(w: FloatArray, square: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
+    t = np.linspace(-1.0, 1.0, w.size)
+    yield 'time', score(w, t)
+    yield 'time squared', score(w, t * t)
+    yield 'variance time', score(square, t)
+    u = scene.throttle
+    if u is None:
+        return
+    yield 'throttle', score(w, u)
+    centre = u - u.mean()
+    slope = float((centre * centre * centre).mean()) / max(float((centre * centre).mean()), 1e-12)
+    yield 'throttle squared', score(w, centre * centre - slope * centre)
+    change = np.diff(u, prepend=u[0])
+    for span in (0.002, 0.01, 0.05, 0.3, 2.0, 12.0):
+        tau = span * scene.rate
+        if 0.5 <= tau < 0.25 * w.size:
+            keep = math.exp(-1.0 / tau)
+            recent = lfilter([1.0], [1.0, -keep], change)
+            yield f'throttle change over {span:g} s', score(w, recent)
+            if span in (0.05, 2.0):
+                yield f'throttle direction over {span:g} s', score(w, np.abs(recent))
+    yield 'variance throttle', score(square, u)
+    yield 'variance throttle squared', score(square, centre * centre - slope * centre)
+    keep = math.exp(-1.0 / max(0.05 * scene.rate, 1.0))
+    yield 'variance change of throttle', score(
+        square, lfilter([1.0], [1.0, -keep], np.abs(change)))
+
+
+def _state(w: FloatArray, square: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
+    x = scene.state / max(float(scene.state.std()), 1e-12)
+    x = np.clip(x, -4.0, 4.0)
+    yield 'state squared', score(w, x * x - float((x**3).mean()) * x)
+    yield 'state cubed', score(w, x**3 - float((x**4).mean()) * x)
+    yield 'variance state', score(square, x)
+    yield 'variance state squared', score(square, x * x)
+    yield 'irreversibility', _mean_score(
+        w[1:] * (w[:-1] ** 2 - 1.0) - w[:-1] * (w[1:] ** 2 - 1.0))
+    large = np.flatnonzero(np.abs(w[:-1]) > 3.0)
+    pairs = w[large] * w[large + 1]
+    yield 'pairs after a large one', float(pairs.sum()) / math.sqrt(
+        max(float((w[large] ** 2).sum()), 9.0))
+    if scene.throttle is not None:
+        u = scene.throttle - scene.throttle.mean()
+        yield 'state throttle', score(w, x * u - float((x * x * u).mean()) * x)
+
+
+# Samples in a stretch whose spectrum is looked at, and lags of products of three.
+_STRETCHES, _TRIPLES = (32, 128, 512), 10
+
+
+def _beyond_second_order(w: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
+    """Yield what a spectrum does not show: power that comes and goes, and products of three."""
+    n = w.size
+    for length in _STRETCHES:
+        count = n // length
+        if count < 16:
+            break
+        rows = w[:count * length].reshape(count, length) * np.hanning(length)
+        power = np.abs(np.fft.rfft(rows, axis=1)[:, 1:-1]) ** 2
+        power /= power.mean(axis=0)
+        # Exponentials: mean square 2, of variance 20.
+        value = (float((power * power).mean()) - 2.0) * math.sqrt(power.size / 20.0)
+        yield f'bursts within {length / scene.rate:.2g} s', value
+    if n > 4 * _TRIPLES:
+        # Hinich, J. Nonparametr. Stat. 6 (1996) 205.
+        c = (w - w.mean()) / float(w.std())
+        total, count = 0.0, 0
+        for j in range(1, _TRIPLES):
+            pair = c[j:] * c[:-j]
+            for k in range(j + 1, _TRIPLES + 1):
+                third = float(pair[k - j:] @ c[:n - k])
+                total += third * third / (n - k)
+                count += 1
+        yield 'products of three', ((total / count) ** (1.0 / 3.0) - 1.0 + 2.0 / (9.0 * count)
+                                    ) * math.sqrt(9.0 * count / 2.0)
+
+
+def _mean_score(a: FloatArray) -> float:
+    spread = float(a.std())
+    return math.sqrt(a.size) * float(a.mean()) / spread if spread > 0.0 else 0.0

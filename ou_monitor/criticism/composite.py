@@ -1,0 +1,158 @@
+"""
+A whole model, fitted: the Gaussian part, then laws of its innovations in turn.
+
+Each law turns normal scores into better ones and tells the ratio of densities,
+so laws compose; events that a law finds go back into the Gaussian part as
+extra variance, and both are fitted again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+from ou_monitor.criticism.battery import Scene
+from ou_monitor.criticism.battery_history import large_ones, throttle_paths
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.structure import Events, fit_gaussian, GaussianFit
+from ou_monitor.model.terms.term import LawFit, Role, Term, View
+from ou_monitor.records import FloatArray
+
+# Rounds between events and the Gaussian part.
+_ROUNDS = 3
+# Factors on the noise at most and at least, and how alike they are when they count
+# as found again: the mean of their logarithms.
+_POWERS = 1e-3, 1e3
+_ALIKE = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class Composite:
+    """
+    A fitted model.
+
+    Attributes
+    ----------
+    terms : tuple of Term
+        All, laws included, with parameters.
+    se : tuple of dict
+        Standard errors, a dict a term.
+    gaussian : GaussianFit
+        Its Gaussian part.
+    z : ndarray, shape (n,)
+        Normal scores of the one-step predictions.
+    density : ndarray, shape (n,)
+        Log predictive density of each sample, nats.
+    free : int
+        Free parameters.
+    search : float
+        Penalty for what was searched beside them, nats.
+    events : Events, optional
+        What the laws found, as the Gaussian part was fitted with it.
+    offset : ndarray, shape (n,), optional
+        Likewise, V.
+
+    """
+
+    terms: tuple[Term, ...]
+    se: tuple[dict[str, float], ...]
+    gaussian: GaussianFit
+    z: FloatArray
+    density: FloatArray
+    free: int
+    search: float
+    events: Events | None = None
+    offset: FloatArray | None = None
+
+    def score(self, samples: Samples) -> float:
+        """Return evidence, nats: of the part fitted, less its price, and of the part kept."""
+        n = samples.train.stop
+        return float(self.density[samples.train].sum() + self.density[samples.test].sum()
+                     - 0.5 * self.free * math.log(n) - self.search)
+
+    def has(self, name: str) -> bool:
+        """Whether a term of that name is in."""
+        return any(term.NAME == name for term in self.terms)
+
+
+def fit_composite(samples: Samples, terms: Sequence[Term], part: slice,
+                  known: Composite | None = None, *, whole_mean: bool = False,
+                  rough: bool = False) -> Composite | None:
+    """Fit a model (known in A)."""
+    structural = [term for term in terms if term.ROLE is not Role.LAW]
+    laws = [term for term in terms if term.ROLE is Role.LAW]
+    events = None if known is None else known.events
+    offset = None if known is None else known.offset
+    fits: list[LawFit] = []
+    last = 0 if known is not None and _kinds(known.terms) == _kinds(terms) else _ROUNDS
+    for turn in range(1 + last):
+        gaussian = fit_gaussian(samples, structural, part, events, offset, whole_mean, rough)
+        z, density = gaussian.z, gaussian.density
+        fits = []
+        push, error, moved = np.zeros(samples.n), np.zeros(samples.n), np.zeros(samples.n)
+        power = np.ones(samples.n)
+        for k, law in enumerate(laws):
+            view = replace(view_of(samples, gaussian, z, part), variance=gaussian.variance * power)
+            fit = law.refit_law(view, law) if vars(law) else law.fit_law(view)
+            if fit is None:
+                return None
+            laws[k] = fit.term
+            fits.append(fit)
+            z, density = fit.z, density + fit.gain
+            push += 0.0 if fit.push is None else fit.push
+            error += 0.0 if fit.error is None else fit.error
+            moved += 0.0 if fit.offset is None else fit.offset
+            power *= 1.0 if fit.power is None else np.clip(fit.power, *_POWERS)
+        found = Events(push, error, power)
+        if _same(events, offset, found, moved, gaussian) or turn == last:
+            break
+        if push.any() or error.any() or events is not None or (power != 1.0).any():
+            events = found
+        offset = moved if moved.any() else None
+        structural = list(gaussian.terms)
+    fitted = (*gaussian.terms, *(fit.term for fit in fits))
+    free = sum(len(term.free()) + len(term.LINEAR) for term in gaussian.terms) + 1
+    return Composite(fitted, (*gaussian.se, *(fit.se for fit in fits)), gaussian, z, density,
+                     free + sum(fit.free for fit in fits), sum(term.SEARCH for term in fitted),
+                     events, offset)
+
+
+def _kinds(terms: Sequence[Term]) -> list[str]:
+    """Return the names of the laws."""
+    return [term.NAME for term in terms if term.ROLE is Role.LAW]
+
+
+def _same(events: Events | None, offset: FloatArray | None, found: Events, moved: FloatArray,
+          gaussian: GaussianFit) -> bool:
+    """Return whether the laws have found again what the Gaussian part was fitted with."""
+    before = events or Events(np.zeros(1), np.zeros(1), np.ones(1))
+    if ((found.push > 0.0) != (before.push > 0.0)).any() or (
+            (found.error > 0.0) != (before.error > 0.0)).any():
+        return False
+    if float(np.mean(np.abs(np.log(found.power / before.power)))) > _ALIKE:
+        return False
+    change = moved - (0.0 if offset is None else offset)
+    return float(np.mean(change**2)) < 0.01 * float(np.median(gaussian.variance))
+
+
+def view_of(samples: Samples, gaussian: GaussianFit, z: FloatArray, part: slice) -> View:
+    """Return what a law or a candidate may look at."""
+    residual = samples.voltage - gaussian.mean
+    return View(z=z, variance=gaussian.variance, phi=gaussian.phi,
+                state=np.concatenate(([0.0], residual[:-1])), residual=residual,
+                at=samples.t - samples.t[0], step=samples.step, throttle=samples.throttle,
+                train=part)
+
+
+def scene_of(samples: Samples, composite: Composite) -> Scene:
+    """Return what the scores of a model are held against."""
+    gaussian, events = composite.gaussian, composite.events
+    residual = samples.voltage - gaussian.mean
+    found = None if events is None else (events.push > 0.0) | (events.error > 0.0)
+    keep = float(np.median(gaussian.phi[1:]))
+    paths = () if samples.throttle is None else tuple(throttle_paths(samples.throttle, keep))
+    return Scene(np.concatenate(([0.0], residual[:-1])), samples.t - samples.t[0],
+                 samples.throttle, 1.0 / float(np.median(samples.step[1:])), keep,
+                 large_ones(gaussian.z, found), paths)

@@ -1,0 +1,270 @@
+"""
+What can be said of a recording without any model, and the samples left for one.
+
+Not-a-number, stamps, repeated values, codes and rails: exact findings, for in a
+diffusion ties have probability zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.criticism.clipped import redraw
+from ou_monitor.criticism.fast_lines import lines_lost, without_lines
+from ou_monitor.criticism.lattice import find_rails, find_step
+from ou_monitor.criticism.readings import counted, usable, why_nothing
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.squeezed import find_knee
+from ou_monitor.criticism.stamps import judge_stamps, on_grid
+from ou_monitor.criticism.thinning import choose_samples, events_between
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.clock_jitter import ClockJitter
+from ou_monitor.model.terms.held_samples import HeldSamples
+from ou_monitor.model.terms.quantization import Quantization
+from ou_monitor.model.terms.saturation import Saturation
+from ou_monitor.model.terms.term import Term
+from ou_monitor.online.estimator.intake import Batch
+from ou_monitor.online.estimator.repeats import refresh_period, Repeats
+from ou_monitor.records import FloatArray, Recording
+
+# Fewer samples than this are not fitted.
+LEAST = 100
+# Steps of the ADC from this share of the innovations' standard deviation are named.
+NAMED_STEP = 0.3
+# Throttle that moves less than this says nothing.
+MOVES = 0.01
+# Repeats that are called so, at least; and the share of ties by chance up to which
+# an ADC is fine enough to tell them.
+_FEWEST_TIES, _FINE = 20, 0.15
+_FLOAT32 = 1.2e-7
+# Samples looked at for repeats, and passed at once.
+_LOOK, _CHUNK = 200_000, 500_000
+
+
+@dataclass(frozen=True, eq=False)
+class Integrity:
+    """
+    What a recording is, before any model.
+
+    Attributes
+    ----------
+    samples : Samples or None
+        For the fit; None when there is nothing to fit.
+    exact : tuple of Term
+        What was found, with parameters.
+    notes : tuple of str
+        What was dropped or left out, one sentence each.
+    reason : str
+        Why there is nothing to fit; empty when there is.
+    raw : Samples or None
+        The samples as logged, repeats included, where those differ from
+        `samples` by an exact finding: for the score of the plain model.
+    drawn : ndarray of bool, shape (samples.n,), or None
+        Samples that were drawn and not measured: they take no part in scores.
+
+    """
+
+    samples: Samples | None
+    exact: tuple[Term, ...]
+    notes: tuple[str, ...]
+    reason: str = ''
+    raw: Samples | None = None
+    drawn: npt.NDArray[np.bool_] | None = None
+
+
+def examine(recording: Recording, progress: Callable[[float], None] | None = None) -> Integrity:
+    """Examine a recording."""
+    tell = progress or (lambda share: None)
+    notes = list(recording.notes)
+    t, v, u = usable(recording, notes)
+    if v.size < LEAST:
+        return Integrity(None, (), tuple(notes), f'It holds {counted(v.size, "usable sample")}; '
+                         f'at least {LEAST} are needed.')
+    reason = why_nothing(v)
+    if reason:
+        return Integrity(None, (), tuple(notes), reason)
+    tell(0.2)
+    exact: list[Term] = []
+    logged = (t, v, u)
+    t, v, u, period = _without_repeats(t, v, u)
+    if period > 1.0:
+        fresh = (v.size - 1) / float(t[-1] - t[0])
+        exact.append(HeldSamples(fresh))
+        notes.append(f'The logger repeats its last value: the source refreshes at {fresh:.4g} Hz; '
+                     f'{logged[0].size - v.size} repeats were dropped.')
+    tell(0.4)
+    rate = (v.size - 1) / float(t[-1] - t[0])
+    which, note = choose_samples(v, rate)
+    if note:
+        notes.append(note)
+    lines = lines_lost(t, v, which)
+    for line in lines:
+        notes.append(f'The line at {line.frequency:.6g} Hz was found in all samples and taken '
+                     'out of those used, which are too few to show it.')
+    between = events_between(v, u, rate, which)
+    origin = float(t[which.start])
+    events = (t[between], without_lines(t[between], v[between], origin, lines),
+              None if u is None else u[between])
+    t, v, u = t[which], v[which], None if u is None else u[which]
+    v = without_lines(t, v, origin, lines)
+    exact += lines
+    tell(0.6)
+    drawn = None
+    noise = _innovation_std(v)
+    step = find_step(v)
+    low, high = find_rails(v, step, noise)
+    soft = 'readings squeezed near the end of the range'
+    if not math.isfinite(low) and not math.isfinite(high):
+        low, high = _knees(v, noise)
+    else:
+        soft = 'samples at the end of the range'
+    if math.isfinite(low) or math.isfinite(high):
+        drawn = (v <= low) | (v >= high)
+        exact.append(_saturation(v, low, high))
+        notes.append(f'{int(drawn.sum())} {soft} were drawn anew from '
+                     'what an OU does beyond it, given their neighbours.')
+        v = redraw(v, low, high, step, np.random.default_rng(0))
+    _judge_step(step, _innovation_std(v), exact, notes)
+    stamps = judge_stamps(t, v)
+    notes += stamps.notes
+    if stamps.error > 0.0:
+        exact.append(ClockJitter(stamps.error))
+    useful = _useful(u, recording.has_throttle, notes)
+    samples = Samples(stamps.t, v, useful)
+    if between.size and drawn is None and stamps.error == 0.0:
+        samples = _joined(samples, *events)
+        notes.append(f'{between.size} samples about changes that stand out between neighbours '
+                     'were kept, too.')
+    tell(1.0)
+    return Integrity(samples, tuple(exact), tuple(notes), raw=_as_logged(*logged, exact),
+                     drawn=drawn)
+
+
+def _without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
+                     ) -> tuple[FloatArray, FloatArray, FloatArray | None, float]:
+    """Return the refreshes, and the samples a refresh: 1 where none repeats."""
+    first = max(0, (v.size - _LOOK) // 2)
+    look = v[first:first + _LOOK]
+    period = refresh_period(look)
+    if period <= 1.0:
+        if not _ties(look):
+            return t, v, u, 1.0
+        fresh = np.concatenate(([True], v[1:] != v[:-1]))
+        return t[fresh], v[fresh], None if u is None else u[fresh], v.size / fresh.sum()
+    repeats = Repeats()
+    repeats.period = period
+    parts = []
+    for begin in range(0, v.size, _CHUNK):
+        part = slice(begin, begin + _CHUNK)
+        step = np.diff(t[part])
+        made = repeats.drop(Batch(
+            t[part], v[part], None if u is None else u[part],
+            float(step.min(initial=math.inf)), float(step.max(initial=0.0)), False))
+        if made is not None:
+            parts.append(made)
+    t = np.concatenate([part.t for part in parts])
+    v = np.concatenate([part.y for part in parts])
+    known = [part.u for part in parts if part.u is not None]
+    # The first one was there before the recording began: since when is not known.
+    return (_refreshed(t[1:], period), v[1:], np.concatenate(known)[1:] if known else None,
+            period)
+
+
+def _ties(v: FloatArray) -> bool:
+    """Return whether more samples repeat the one before than the codes of the ADC explain."""
+    step = np.diff(v)
+    # At the ends of the range there are other reasons to repeat.
+    inner = (v[1:] > v.min()) & (v[1:] < v.max())
+    equal = int(((step == 0.0) & inner).sum())
+    count = int(inner.sum())
+    if equal < _FEWEST_TIES:
+        return False
+    code = max(find_step(v), _FLOAT32 * float(np.abs(v).max()))
+    moved = step[(step != 0.0) & inner]
+    if not moved.size:
+        return False
+    # Chance of two normal values one code apart or less, on average over their codes.
+    chance = min(1.0, code / (math.sqrt(2.0 * math.pi) * float(np.sqrt(np.mean(moved**2)))))
+    expected = 1.5 * count * chance
+    return chance < _FINE and equal - expected > 6.0 * math.sqrt(equal) + 0.01 * count
+
+
+def _refreshed(t: FloatArray, period: float) -> FloatArray:
+    """Return when a source with a clock of its own was read, from when that was logged."""
+    if abs(period - round(period)) < 0.02:
+        return t
+    usual = (t[-1] - t[0]) / (t.size - 1)
+    grid = on_grid(t, np.maximum(1.0, np.rint(np.diff(t) / usual)))
+    # The logger is late by up to one of its own steps, 1/period of those here.
+    return grid if float(np.abs(t - grid).max()) < 1.5 * usual / period else t
+
+
+def _joined(samples: Samples, t: FloatArray, v: FloatArray, u: FloatArray | None) -> Samples:
+    """Return samples with more between them."""
+    at = np.searchsorted(samples.t, t)
+    more = None if samples.throttle is None or u is None else np.insert(samples.throttle, at, u)
+    return Samples(np.insert(samples.t, at, t), np.insert(samples.voltage, at, v), more)
+
+
+def _innovation_std(v: FloatArray) -> float:
+    """Return the standard deviation of what the sample before does not tell, V."""
+    a, b = v[:-1] - v[:-1].mean(), v[1:] - v[1:].mean()
+    e = b - float(a @ b) / max(float(a @ a), 1e-300) * a
+    # Events and load steps are no noise.
+    middle = float(np.quantile(np.abs(e), 0.95))
+    return float(np.minimum(np.abs(e), middle).std()) if middle == 0.0 else float(
+        np.sqrt(np.mean(np.square(np.clip(e, -middle, middle)))) / 0.8729)
+
+
+def _judge_step(step: float, noise: float, exact: list[Term], notes: list[str]) -> None:
+    """Name the step of the ADC where it matters."""
+    if step <= 0.0:
+        return
+    # Rounding adds step^2/12 to each sample, and so up to twice that to an innovation.
+    own = math.sqrt(max(noise * noise - step * step / 6.0, 0.01 * noise * noise))
+    if step >= NAMED_STEP * own:
+        exact.append(Quantization(step))
+        notes.append(f'The ADC counts in steps of {1e3 * step:.3g} mV, {step / own:.2g} times the '
+                     'noise between samples.')
+    else:
+        notes.append(f'The ADC counts in steps of {1e3 * step:.3g} mV, small beside the noise '
+                     'between samples.')
+
+
+def _knees(v: FloatArray, noise: float) -> tuple[float, float]:
+    """Return the limits beyond which readings are squeezed; infinite where there is none."""
+    if not noise > 0.0:
+        return -math.inf, math.inf
+    bottom, top = find_knee(v, noise, -1.0), find_knee(v, noise, 1.0)
+    return -math.inf if bottom is None else bottom, math.inf if top is None else top
+
+
+def _saturation(v: FloatArray, low: float, high: float) -> Term:
+    """Return the term; a rail that was not met is put where no reading comes."""
+    far = 1e3 * (float(v.max()) - float(v.min()))
+    return Saturation(
+        low=low if math.isfinite(low) else float(v.min()) - far,
+        high=high if math.isfinite(high) else float(v.max()) + far)
+
+
+def _useful(u: FloatArray | None, recorded: bool, notes: list[str]) -> FloatArray | None:
+    """Return throttle where it moves; say what cannot be tested where it does not."""
+    if u is not None and float(u.max() - u.min()) >= MOVES:
+        return u
+    names = [name for name, kind in catalogue().items() if kind.NEEDS_THROTTLE]
+    why = 'constant' if u is not None else 'not usable' if recorded else 'not recorded'
+    notes.append(f'Throttle is {why}: {", ".join(names)} cannot be tested.')
+    return None
+
+
+def _as_logged(t: FloatArray, v: FloatArray, u: FloatArray | None, exact: list[Term]
+               ) -> Samples | None:
+    """Return the first samples as logged, where the fit works on others."""
+    if not any(term.NAME in ('held_samples', 'saturation', 'clock_jitter') for term in exact):
+        return None
+    part = slice(0, min(v.size, _LOOK))
+    return Samples(t[part], v[part], None)

@@ -1,0 +1,329 @@
+"""
+Tests of what kind of process a load level shows, with p-values that hold.
+
+Each test works on the one-step innovations of the level's fitted model, which are independent
+and standard normal when the level is a stationary OU in white noise:
+
+=============  ========================================================================
+mean_drift     means of blocks of innovations, F with the error of alpha in it
+variance_drift Layard's test of equal variances of blocks (J. Am. Stat. Assoc. 68, 1973),
+               which heavy tails do not upset
+gaussian       D'Agostino & Pearson's K^2 of skewness and kurtosis, of innovations over
+               the standard deviation of their block
+impulses       the largest innovation (Sidak) or a positive excess kurtosis, each at half
+correlated     lags 1..5 of the deviation, with variances robust against changing
+               intensity (Lo & MacKinlay, Rev. Financ. Stud. 1, 1988)
+one_relaxation lags 1..10 of the innovations, likewise
+second_relaxation
+               `ou_monitor.criticism.second_relaxation`, in their periodogram
+=============  ========================================================================
+
+A test that rejects counts only when its effect is of consequence, too: with 10^5 samples a
+change of sigma of 1 % is found and means nothing.  Limits: the OU's parameters are fitted to the
+same samples, so what a fit can absorb (slow drift, a second time constant) is found late; coarse
+ADC steps make the shape unknowable; changes faster than a sixteenth of the level average out;
+correlation that no relaxation describes (a tone) makes the tests of the shape a little sharp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+from ou_monitor.criticism.second_relaxation import second_relaxation
+from ou_monitor.criticism.whitening import innovations, join
+from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Status
+from scipy import stats
+
+# Family-wise: a recording of stationary OU levels has any test reject with this probability.
+FAMILY_WISE = 0.01
+# Fewer samples than this are not tested; a block has at least as many innovations.
+FEWEST = 50
+_BLOCKS = 16
+# Relaxation times of a block of the test of the mean.
+_MEAN_BLOCK = 5.0
+# Standard deviations beyond which nothing counts for a change of intensity: a few impulses decide
+# the variance of a block, while of heavy tails (Student's t of 5 degrees) 1 in 10^4 goes.
+_FAR = 10.0
+_LAGS_RAW, _LAGS_FITTED = 5, 10
+# Least effects of consequence, in the unit of each test.
+LEAST = {'mean_drift': 0.25, 'variance_drift': 0.1, 'gaussian': 0.3, 'impulses': 0.5,
+         'correlated': 0.0, 'one_relaxation': 0.1,
+         'second_relaxation': 0.1}
+EFFECT = {
+    'mean_drift': 'standard deviation of the mean beyond sampling, over that of the voltage',
+    'variance_drift': 'relative standard deviation of the intensity beyond sampling',
+    'gaussian': 'larger of |skewness| and |excess kurtosis| / 2',
+    'impulses': 'excess kurtosis, or impulses over the size that noise reaches, per 1000 samples',
+    'correlated': 'root of the sum of squared autocorrelations',
+    'one_relaxation': 'root of the sum of squared autocorrelations',
+    'second_relaxation': 'variance of a second relaxation, over Var_inf'}
+
+
+@dataclass(frozen=True)
+class TestResult:
+    """
+    One test of one level.
+
+    Attributes
+    ----------
+    name : str
+        Key of `EFFECT`.
+    p_value : float
+        Probability of as much under the model; NaN when it could not be done.
+    effect : float
+        How large what was found is, see `EFFECT`.
+    p_adjusted : float
+        After Holm, over all tests of all levels of the recording.
+    why_not : str
+        Why it could not be done; empty when it was.
+
+    """
+
+    name: str
+    p_value: float = NAN
+    effect: float = NAN
+    p_adjusted: float = NAN
+    why_not: str = ''
+
+    # Not a class of pytest's.
+    __test__ = False
+
+    @property
+    def rejects(self) -> bool:
+        """Whether it rejects at `FAMILY_WISE`, with an effect of consequence."""
+        return self.p_adjusted < FAMILY_WISE and self.effect >= LEAST[self.name]
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """
+    What the innovations of a level look like.
+
+    Attributes
+    ----------
+    tests : tuple of TestResult
+        In the order of `EFFECT`.
+    n : int
+        Innovations.
+    skewness, kurtosis : float
+        Of the innovations over the standard deviation of their block; kurtosis is in excess.
+    impulses : int
+        Innovations beyond what the largest of as many normal ones stays under with 99 %.
+    impulse_rate : tuple of float
+        Their rate, 1/s, and its 95 % interval (Poisson).
+
+    """
+
+    tests: tuple[TestResult, ...]
+    n: int
+    skewness: float
+    kurtosis: float
+    impulses: int
+    impulse_rate: tuple[float, float, float]
+
+    def __getitem__(self, name: str) -> TestResult:
+        """Return a test by name."""
+        return next(test for test in self.tests if test.name == name)
+
+
+def examine_level(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estimate) -> Shape:
+    """Test one level (parts in s)."""
+    parts = [(t, v) for t, v in parts if t.size >= 2]
+    n = sum(t.size for t, _ in parts)
+    time = sum(float(t[-1] - t[0]) for t, _ in parts)
+    if n < FEWEST:
+        return _untested(n, f'fewer than {FEWEST} samples')
+    model = (estimate.alpha, estimate.var_inf, max(0.0, estimate.noise_std)
+             if math.isfinite(estimate.noise_std) else 0.0) if estimate.usable else None
+    own = [v - v.mean() for _, v in parts]
+    spread = float(np.sqrt(np.mean(join(own) ** 2)))
+    if not spread > 0.0:
+        return _untested(n, 'the voltage never changes')
+    correlated = _correlated('correlated', own, _LAGS_RAW)
+    if model is None and estimate.status is not Status.NO_RELAXATION:
+        why = 'without a usable fit the samples cannot be made independent'
+        return replace(_untested(n, why), tests=tuple(
+            correlated if name == 'correlated' else TestResult(name, why_not=why)
+            for name in EFFECT))
+    alpha, var_inf, noise = model or (math.inf, spread ** 2, 0.0)
+    apart = [innovations(t, d, alpha, var_inf, noise * noise)
+             for (t, _), d in zip(parts, own)]
+    z = join(apart)
+    tests = [_mean_drift(parts, estimate, alpha, var_inf, noise * noise, spread),
+             _variance_drift(z)]
+    local = _per_block(z)
+    skewness, kurtosis = float(stats.skew(local)), float(stats.kurtosis(local))
+    far = float(stats.norm.isf(0.5 * -math.expm1(math.log1p(-0.01) / n)))
+    count = int((np.abs(local) > far).sum())
+    if Flag.QUANTIZED in estimate.flags:
+        lost = 'steps of the ADC hide the shape of the noise'
+        tests += [TestResult('gaussian', why_not=lost), TestResult('impulses', why_not=lost)]
+        skewness = kurtosis = NAN
+        count = 0
+    else:
+        tests += [
+            TestResult('gaussian', float(stats.normaltest(local).pvalue),
+                       max(abs(skewness), 0.5 * abs(kurtosis))),
+            _impulses(local, kurtosis, count)]
+    tests.append(correlated)
+    if model:
+        p, share = second_relaxation(apart, (n - len(parts)) / time, alpha, var_inf, noise * noise)
+        tests += [_correlated('one_relaxation', [z], _LAGS_FITTED),
+                  TestResult('second_relaxation', p, share,
+                             why_not='' if math.isfinite(p) else 'too few samples')]
+    else:
+        tests += [TestResult(name, why_not='there is no fitted model')
+                  for name in ('one_relaxation', 'second_relaxation')]
+    return Shape(tuple(tests), n, skewness, kurtosis, count, _poisson(count, time))
+
+
+def holm(shapes: Sequence[Shape]) -> tuple[Shape, ...]:
+    """Adjust the p-values of all levels together (Holm 1979)."""
+    flat = [test.p_value for shape in shapes for test in shape.tests]
+    found = iter(adjusted(flat))
+    return tuple(replace(shape, tests=tuple(
+        replace(test, p_adjusted=next(found)) for test in shape.tests)) for shape in shapes)
+
+
+def adjusted(p_values: Sequence[float]) -> tuple[float, ...]:
+    """Adjust p-values of one family (Holm 1979)."""
+    done = sorted((p, k) for k, p in enumerate(p_values) if math.isfinite(p))
+    found = [NAN] * len(p_values)
+    largest = 0.0
+    for rank, (p, k) in enumerate(done):
+        found[k] = largest = max(largest, min(1.0, (len(done) - rank) * p))
+    return tuple(found)
+
+
+def _untested(n: int, why: str) -> Shape:
+    return Shape(tuple(TestResult(name, why_not=why) for name in EFFECT), n, NAN, NAN, 0,
+                 (NAN, NAN, NAN))
+
+
+def _mean_drift(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estimate, alpha: float,
+                var_inf: float, noise_var: float, spread: float) -> TestResult:
+    """Compare means of blocks: of innovations about one mean of the whole level."""
+    total = join([v for _, v in parts])
+    time = sum(float(t[-1] - t[0]) for t, _ in parts)
+    blocks = _BLOCKS if math.isinf(alpha) else min(_BLOCKS, int(alpha * time / _MEAN_BLOCK))
+    blocks = min(blocks, total.size // FEWEST)
+    if blocks < 3:
+        return TestResult('mean_drift', why_not=(
+            f'fewer than three blocks of {_MEAN_BLOCK:g} relaxation times'))
+    centre = float(total.mean())
+    z = join([innovations(t, v - centre, alpha, var_inf, noise_var) for t, v in parts])
+    # A constant c of the voltage is a constant of the innovations; not so of a first one, which
+    # has no past.  It is one of hundreds, and left out.
+    ends = np.cumsum([t.size for t, _ in parts])[:-1]
+    z = np.delete(z, np.concatenate(([0], ends)).astype(np.intp))
+    pieces = np.array_split(z, blocks)
+    means = np.array([piece.mean() for piece in pieces])
+    counts = np.array([piece.size for piece in pieces])
+    q = float(counts @ (means - float(z.mean())) ** 2)
+    scale = 1.0
+    if math.isinf(alpha):
+        # What correlation of neighbours there is moves the means of blocks.
+        centred = [piece - piece.mean() for piece in pieces]
+        square = sum(float(c @ c) for c in centred)
+        near = sum(float(c[lag:] @ c[:-lag]) for c in centred
+                   for lag in range(1, _LAGS_RAW + 1)) / square
+        scale = square / (z.size - blocks) * max(1.0, 1.0 + 2.0 * near)
+    # The gain from a constant to its innovations is known as well as alpha.
+    freedom = math.inf
+    if math.isfinite(alpha):
+        error = 2.0 * math.hypot(estimate.alpha_se, estimate.sigma_se)
+        freedom = max(2.0 / error ** 2, 1.0)
+    statistic = q / ((blocks - 1) * scale)
+    p = float(stats.f.sf(statistic, blocks - 1, freedom) if math.isfinite(freedom)
+              else stats.chi2.sf(q / scale, blocks - 1))
+    gain = _constant_gain(parts, alpha, var_inf, noise_var)
+    beyond = max(0.0, float(np.mean((means - means.mean()) ** 2)) * blocks / (blocks - 1)
+                 - scale * float(np.mean(1.0 / counts)))
+    return TestResult('mean_drift', p, math.sqrt(beyond) / gain / spread)
+
+
+def _constant_gain(parts: Sequence[tuple[FloatArray, FloatArray]], alpha: float, var_inf: float,
+                   noise_var: float) -> float:
+    """Return the innovation that a constant of 1 V leaves in the long run, 1/V."""
+    t = max((t for t, _ in parts), key=len)
+    step = float(np.median(np.diff(t)))
+    steady: FloatArray = step * np.arange(float(max(64, t.size)))
+    return float(innovations(steady, np.ones(steady.size), alpha, var_inf, noise_var)[-1])
+
+
+def _block_count(n: int) -> int:
+    return max(1, min(_BLOCKS, n // FEWEST))
+
+
+def _per_block(z: FloatArray) -> FloatArray:
+    """Return innovations over the standard deviation of their block."""
+    pieces = np.array_split(z, _block_count(z.size))
+    return join([(piece - piece.mean()) / max(float(piece.std()), 1e-300) for piece in pieces])
+
+
+def _variance_drift(z: FloatArray) -> TestResult:
+    blocks = _block_count(z.size)
+    if blocks < 3:
+        return TestResult('variance_drift', why_not=f'fewer than three blocks of {FEWEST} samples')
+    pieces = [_without_impulses(piece) for piece in np.array_split(z, blocks)]
+    free = np.array([piece.size - 1.0 for piece in pieces])
+    logs = np.log([max(float(piece.var(ddof=1)), 1e-300) for piece in pieces])
+    centred = [piece - piece.mean() for piece in pieces]
+    # Kurtosis within the blocks: what makes their variances scatter more than chi^2.
+    fourth = float(np.mean(join([c ** 4 / max(float(np.mean(c ** 2)), 1e-300) ** 2
+                                 for c in centred])))
+    scatter = 2.0 + (1.0 - 1.0 / blocks) * max(fourth - 3.0, -1.0)
+    q = float(free @ (logs - free @ logs / free.sum()) ** 2) / scatter
+    beyond = max(0.0, float(np.var(logs, ddof=1)) - scatter * float(np.mean(1.0 / free)))
+    # ln sigma is half of ln variance.
+    return TestResult('variance_drift', float(stats.chi2.sf(q, blocks - 1)),
+                      0.5 * math.sqrt(beyond))
+
+
+def _without_impulses(piece: FloatArray) -> FloatArray:
+    """Return a block without what lies further out than any of its noise; impulses have a test."""
+    away = np.abs(piece - np.median(piece))
+    middle = float(np.median(away)) / 0.6745
+    return piece[away <= _FAR * middle] if middle > 0.0 else piece
+
+
+def _impulses(z: FloatArray, kurtosis: float, count: int) -> TestResult:
+    largest = float(np.abs(z).max())
+    of_largest = -math.expm1(z.size * math.log1p(-min(2.0 * float(stats.norm.sf(largest)),
+                                                      1.0 - 1e-16)))
+    of_kurtosis = float(stats.kurtosistest(z, alternative='greater').pvalue)
+    p = min(1.0, 2.0 * min(of_largest, of_kurtosis))
+    return TestResult('impulses', p, max(kurtosis, 1000.0 * count / z.size))
+
+
+def _correlated(name: str, parts: Sequence[FloatArray], lags: int) -> TestResult:
+    """Portmanteau of autocorrelations, their variances robust against changing intensity."""
+    total = sum(float(d @ d) for d in parts)
+    n = sum(d.size for d in parts)
+    if not total > 0.0 or n <= 10 * lags:
+        return TestResult(name, why_not='too few samples')
+    q, squares, freedom = 0.0, 0.0, float(lags)
+    for lag in range(1, lags + 1):
+        products = [d[lag:] * d[:-lag] for d in parts if d.size > lag]
+        top = sum(float(p.sum()) for p in products)
+        variance = sum(float(p @ p) for p in products)
+        r = top / total
+        # Removing the mean of each part has moved every correlation down a little.
+        r += len(parts) / n if name == 'correlated' else 0.0
+        se = math.sqrt(max(variance, 1e-300)) / total
+        q += (r / se) ** 2
+        squares += max(0.0, r * r - se * se)
+    # Of what is fitted, the noise alone acts on so few lags.
+    freedom = lags - 1.0 if name == 'one_relaxation' else freedom
+    return TestResult(name, float(stats.chi2.sf(q, freedom)), math.sqrt(squares))
+
+
+def _poisson(count: int, time: float) -> tuple[float, float, float]:
+    """Return a rate, 1/s, and its exact 95 % interval."""
+    if not time > 0.0:
+        return NAN, NAN, NAN
+    low = float(stats.chi2.ppf(0.025, 2 * count)) / 2.0 if count else 0.0
+    return count / time, low / time, float(stats.chi2.ppf(0.975, 2 * count + 2)) / 2.0 / time

@@ -1,0 +1,108 @@
+"""
+How the statistics spread when nothing is wrong, by simulation.
+
+Recordings of the fitted baseline, with the stamps and the throttle of the data,
+go through the same fit and the same statistics, but for what theory tells well
+enough: lines that follow throttle, which take longest, and what comes after large errors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+from ou_monitor.criticism.battery import Scene, statistics
+from ou_monitor.criticism.composite import Composite, scene_of
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.structure import evaluate
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.records import FloatArray
+from scipy.signal import lfilter
+from scipy.special import ndtr
+
+# Recordings simulated.
+SIZE = 24
+# The spread found by so few is drawn towards 1, which theory gives, as by this
+# many more.
+_PRIOR = 24.0
+
+
+@dataclass(frozen=True)
+class NullBank:
+    """
+    Means and spreads of the statistics under the baseline.
+
+    Attributes
+    ----------
+    mean, std : dict of str to float
+        By statistic.
+
+    """
+
+    mean: dict[str, float]
+    std: dict[str, float]
+
+    def standardised(self, values: dict[str, float]) -> dict[str, float]:
+        """Return statistics as they would be N(0, 1) under the baseline."""
+        return {name: (value - self.mean.get(name, 0.0)) / self.std.get(name, 1.0)
+                for name, value in values.items()}
+
+
+def simulate_bank(scene: Scene, phi: float, rng: np.random.Generator, size: int = SIZE
+                  ) -> NullBank:
+    """Simulate the bank."""
+    rows = []
+    n = scene.at.size
+    for _ in range(size):
+        y = lfilter([1.0], [1.0, -phi], rng.standard_normal(n))
+        z, state = refit(y)
+        made = replace(scene, state=state, large=None)
+        rows.append(statistics(z, made, lines=False))
+    return _summary(rows)
+
+
+def simulate_bank_of(samples: Samples, composite: Composite, rng: np.random.Generator,
+                     size: int = SIZE) -> NullBank:
+    """
+    Simulate the bank of a model that is more than the `ou`.
+
+    A step of the ADC that is as large as the noise leaves errors that are
+    neither normal nor independent, however right the model is.
+    """
+    model, rows, scene = SupplyModel(composite.terms), [], scene_of(samples, composite)
+    for _ in range(size):
+        y = model.simulate(samples.t, rng, samples.throttle)
+        made = Samples(samples.t, y, samples.throttle)
+        fit = evaluate(made, composite.terms)
+        state = np.concatenate(([0.0], (y - fit.mean)[:-1]))
+        rows.append(statistics(fit.z, replace(scene, state=state, large=None), lines=False))
+    return _summary(rows)
+
+
+def _summary(rows: list[dict[str, float]]) -> NullBank:
+    """Return means and spreads, the spreads drawn towards 1."""
+    weight = len(rows) / (len(rows) + _PRIOR)
+    mean, std = {}, {}
+    for name in rows[0]:
+        v = np.array([row[name] for row in rows if name in row])
+        # What is far from normal has a mean of its own, known as well as may be.
+        strange = abs(float(v.mean())) > 4.0 * float(v.std()) / math.sqrt(v.size) + 1.0
+        mean[name] = (1.0 if strange else weight) * float(v.mean())
+        std[name] = math.sqrt(weight * float(v.var(ddof=1)) + 1.0 - weight)
+    return NullBank(mean, std)
+
+
+def refit(y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the scores and the states of a series after the fit of the baseline to it."""
+    before = np.concatenate(([y[0]], y[:-1]))
+    a, b = before - before.mean(), y - y.mean()
+    phi = float(a @ b) / float(a @ a)
+    e = b - phi * a
+    return e / e.std(), np.concatenate(([0.0], b[:-1]))
+
+
+def family_chance(largest: float, count: int) -> float:
+    """Return the chance that the largest of `count` standard scores is at least so large."""
+    one = 2.0 * float(ndtr(-abs(largest)))
+    return -math.expm1(count * math.log1p(-min(one, 1.0 - 1e-16)))

@@ -1,0 +1,233 @@
+"""
+What of a recording is a reading at all: codes and bad samples out, throttle as 0..1.
+
+What is left out or taken otherwise is a note each.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.records import FloatArray, Recording
+from ou_monitor.text import number
+
+# Far from the others: so many times their spread, and so many times as far as they go.
+_FAR, _GAP = 50.0, 5.0
+# Samples from which one value far from all others is a code, and the share it has at most;
+# single bad samples that are left out at most, and one more for each so many samples.
+_CODE, _MOST_CODES = 3, 0.2
+_SINGLES, _EACH = 3, 100_000
+# Others from which a value of a larger share can be far.
+_OTHERS = 100
+# Values looked at for the spread.
+_LOOK = 200_000
+# Constant but for so many samples, or this share of them, says nothing.
+_ODD, _ODD_SHARE = 3, 1e-3
+# Volts beyond which nothing is measured, and which squares and fourth powers still hold.
+_LARGEST, _SMALLEST = 1e30, 1e-30
+# Volts above which they may be millivolts.
+_MILLIVOLTS = 1000.0
+# Throttle: as 0..1 with what calibration adds; a percentage; microseconds of a servo pulse.
+_UNIT, _PERCENT, _PULSE = (-1.5, 1.5), (-1.0, 150.0), (700.0, 2400.0)
+_EDGE = 0.05
+# Second differences up to so many roundings are none.
+_ROUNDINGS = 16.0
+
+
+def counted(count: int, what: str) -> str:
+    """Return a number of things, with its plural."""
+    return f'{count} {what}' + ('' if count == 1 else 's')
+
+
+def usable(recording: Recording, notes: list[str]
+           ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Return the readings of a recording, in order."""
+    t, v = recording.t, recording.voltage
+    u: FloatArray | None = recording.throttle if recording.has_throttle else None
+    good = np.isfinite(t) & np.isfinite(v)
+    if not good.all():
+        notes.append(f'{counted(int(good.size - good.sum()), "sample")} dropped: not a finite '
+                     'number.')
+        t, v, u = t[good], v[good], None if u is None else u[good]
+    # Not by differences: they would take as much memory as the stamps.
+    rising = t[1:] > t[:-1]
+    if not rising.all():
+        order = np.argsort(t, kind='stable')
+        order = order[np.concatenate(([True], np.diff(t[order]) > 0.0))]
+        notes.append(f'{counted(int((~rising).sum()), "stamp")} did not rise: sorted; '
+                     f'{t.size - order.size} dropped, whose stamp was there before.')
+        t, v, u = t[order], v[order], None if u is None else u[order]
+    bad = find_bad(v)
+    if bad.any():
+        notes += _bad_notes(t, v, bad)
+        t, v, u = t[~bad], v[~bad], None if u is None else u[~bad]
+    usual = _quantiles(v[:_LOOK], 0.5)[0] if v.size else 0.0
+    if _MILLIVOLTS < abs(usual) <= _LARGEST:
+        notes.append(f'The voltage is near {number(usual)}: taken as volts. Where it is in '
+                     'millivolts or counts of the ADC, so is every number in V here; give it in '
+                     'volts.')
+    if u is not None:
+        u = _held(t, _as_share(u, notes), notes) if np.isfinite(u).any() else None
+    return t, v, u
+
+
+def find_bad(v: FloatArray) -> npt.NDArray[np.bool_]:
+    """Return which samples are no readings of a supply (v in V)."""
+    bad = np.zeros(v.size, dtype=np.bool_)
+    some = v[::max(1, v.size // _LOOK)]
+    if some.size < 2:
+        return bad
+    off = _resting(some)
+    if off is not None:
+        bad[v == off] = True
+        bad[~bad] = find_bad(v[~bad])
+        return bad
+    low, middle, high = _quantiles(some, 0.2, 0.5, 0.8)
+    if low == high:
+        low, high = _quantiles(some, 0.05, 0.95)
+    # The half-width of the inner 60 %, as of a normal law.
+    spread = (high - low) / 1.683
+    with np.errstate(over='ignore'):
+        away = np.abs(v - middle)
+    if not spread > 0.0 or not (away > _FAR * spread).any():
+        return bad
+    far = np.flatnonzero(away > _FAR * spread)
+    reach = float(away[away <= _FAR * spread].max())
+    order = far[np.argsort(away[far], kind='stable')]
+    before = np.concatenate(([reach], away[order][:-1]))
+    alone = np.flatnonzero(away[order] > _GAP * before)
+    if not alone.size:
+        return bad
+    far = order[alone[0]:]
+    values, which, count = np.unique(v[far], return_inverse=True, return_counts=True)
+    code = (count >= _CODE)[which]
+    single = far[~code]
+    if int(code.sum()) <= _MOST_CODES * v.size:
+        bad[far[code]] = True
+    if single.size <= max(_SINGLES, v.size // _EACH):
+        bad[single] = True
+    return bad
+
+
+def _resting(v: FloatArray) -> float | None:
+    """Return the value of a large share of the samples that is far from all others, if any."""
+    values, count = np.unique(v, return_counts=True)
+    value = float(values[count.argmax()])
+    others = v[v != value]
+    if int(count.max()) <= _MOST_CODES * v.size or others.size < _OTHERS:
+        return None
+    low, middle, high = _quantiles(others, 0.2, 0.5, 0.8)
+    away = np.abs(others - middle)
+    near = away[away <= _FAR * (high - low) / 1.683]
+    reach = max(_FAR * (high - low) / 1.683, _GAP * float(near.max()))
+    return value if high > low and abs(value - middle) > reach else None
+
+
+def _quantiles(v: FloatArray, *shares: float) -> list[float]:
+    """Return values of the sample itself: a mean of two of them might overflow."""
+    at = [round(share * (v.size - 1)) for share in shares]
+    found: list[float] = np.partition(v, at)[at].tolist()
+    return found
+
+
+def _bad_notes(t: FloatArray, v: FloatArray, bad: npt.NDArray[np.bool_]) -> list[str]:
+    """Return what was left out, codes first."""
+    rest = f'while all others lie within {_range(v[~bad])} V'
+    values, count = np.unique(v[bad], return_counts=True)
+    notes = [f'{many} samples read exactly {_short(value)} V, {rest}: taken as a code for no '
+             'reading, or as the supply being off, and left out.'
+             for value, many in zip(values.tolist(), count.tolist()) if many >= _CODE]
+    single = np.flatnonzero(bad & np.isin(v, values[count < _CODE]))
+    if single.size:
+        where = ', '.join(f'{_short(float(v[k]))} V at {number(float(t[k] - t[0]), 4)} s'
+                          for k in single[:_SINGLES])
+        more = '' if single.size <= _SINGLES else f' and {single.size - _SINGLES} more'
+        notes.append(f'{counted(single.size, "bad sample")} left out: {where}{more}, {rest}. '
+                     'Single glitches of the sensor or the bus look like this.')
+    return notes
+
+
+def _range(v: FloatArray) -> str:
+    return f'{_short(float(v.min()))} to {_short(float(v.max()))}'
+
+
+def _short(value: float) -> str:
+    return f'{value:.6g}'
+
+
+def why_nothing(v: FloatArray) -> str:
+    """Return why nothing can be fitted to voltages, as a sentence; empty where it can (v in V)."""
+    if float(v.min()) == float(v.max()):
+        return ('The voltage does not change at all: the sensor is stuck, or its step is larger '
+                'than the noise.')
+    usual = _quantiles(v, 0.5)[0]
+    odd = int((v != usual).sum())
+    if odd <= max(_ODD, _ODD_SHARE * v.size):
+        return (f'All but {odd} of its {v.size} samples read {_short(usual)} V: the sensor is '
+                'stuck, or its step is larger than the noise.')
+    largest = float(np.abs(v).max())
+    if largest > _LARGEST:
+        return f'The voltage reaches {_short(largest)} V: no supply does; check its unit.'
+    if float(v.max()) - float(v.min()) < _SMALLEST:
+        return (f'The voltage moves by {_short(float(v.max()) - float(v.min()))} V only: no '
+                'sensor resolves that; check its unit.')
+    if float(np.abs(np.diff(v, 2)).max(initial=0.0)) <= _ROUNDINGS * 2.3e-16 * largest:
+        return 'The voltage is a straight line without any noise: there is nothing to simulate.'
+    return ''
+
+
+def _as_share(u: FloatArray, notes: list[str]) -> FloatArray:
+    """Return throttle as 0..1, NaN where it cannot be; say which unit it was taken for."""
+    known = u[np.isfinite(u)]
+    # A few wild values are no unit.
+    low, high = _quantiles(known[::max(1, known.size // _LOOK)], 0.005, 0.995)
+    within = _UNIT
+    if _UNIT[0] <= low and high <= _UNIT[1]:
+        if low < -_EDGE or high > 1.0 + _EDGE:
+            notes.append(f'Throttle lies within {number(low)} to {number(high)}, not 0 to 1: used '
+                         'as it is.')
+    elif _PULSE[0] <= low and high <= _PULSE[1]:
+        u = (u - 1000.0) / 1000.0
+        notes.append(f'Throttle lies within {number(low, 4)} to {number(high, 4)}: taken as '
+                     'pulses in microseconds, throttle = (value - 1000) / 1000. All results, and '
+                     'the model file, are for throttle 0 to 1.')
+        within = ((_PULSE[0] - 1000.0) / 1000.0, (_PULSE[1] - 1000.0) / 1000.0)
+    elif _PERCENT[0] <= low and high <= _PERCENT[1]:
+        u = u / 100.0
+        notes.append(f'Throttle lies within {number(low)} to {number(high)}: taken as percent, '
+                     'throttle = value / 100. All results, and the model file, are for throttle '
+                     '0 to 1.')
+    else:
+        notes.append(f'Throttle lies within {number(low)} to {number(high)}, of no unit that is '
+                     'known here: not used. Give it as 0 to 1.')
+        return np.full(u.size, np.nan)
+    with np.errstate(invalid='ignore'):
+        wild = np.isfinite(u) & ((u < within[0]) | (u > within[1]))
+    if wild.any():
+        notes.append(f'Throttle is far outside its range at {counted(int(wild.sum()), "sample")}: '
+                     'taken as unknown there.')
+        u = np.where(wild, np.nan, u)
+    return u
+
+
+def _held(t: FloatArray, u: FloatArray, notes: list[str]) -> FloatArray | None:
+    """Return throttle with its holes filled, and say how much of it that is."""
+    there = np.isfinite(u)
+    known = np.flatnonzero(there)
+    if not known.size:
+        return None
+    if known.size == u.size:
+        return u
+    step = np.diff(t, append=t[-1])
+    total = float(step[~there].sum())
+    # Lengths of the holes: sums between the samples where it is known.
+    lost = np.concatenate(([0.0], np.cumsum(np.where(there, 0.0, step))))
+    ends = lost[np.concatenate((known, [u.size]))]
+    longest = float(np.diff(ends, prepend=0.0).max())
+    notes.append(
+        f'Throttle is unknown at {counted(u.size - known.size, "sample")} ({number(total)} of '
+        f'{number(float(t[-1] - t[0]))} s, the longest stretch {number(longest)} s): the last '
+        'value known is held there' + ('' if there[0] else ', and the first one before it')
+        + '. Where throttle moved meanwhile, what is said of it is wrong.')
+    at = np.searchsorted(known, np.arange(u.size), side='right') - 1
+    return u[known[np.maximum(at, 0)]]

@@ -1,0 +1,376 @@
+"""
+The Gaussian part of a model: mean, poles, intensities, noise; fitted together.
+
+A model is a list of terms.  Those of `Role.MEAN` are columns of a regression,
+`DRIVE` changes alpha and sigma along the recording, `BLOCK` adds states and
+`NOISE` white errors; `LAW` terms are left to `laws`.  Events found by a law
+enter as extra variance at their samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.model.innovations import Filter, StateSpace
+from ou_monitor.model.terms.ac_coupling import ACCoupling, bridge
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.term import Role, Stretch, Term
+from ou_monitor.records import FloatArray
+
+# Measurement noise that stands for none, as a share of what a step adds.
+NO_NOISE = 1e-6
+# Steps of the numerical scores, in the logarithm of a parameter.
+_STEP = 1e-4
+_ROUNDS, _FEW_ROUNDS, _LAST_ROUNDS = 12, 6, 2
+# Columns up to which least squares are solved without the normal equations.
+_NARROW = 8
+# Samples times further states that are too dear to begin with.
+_DEAR = 30000
+# With more states than this the part has to do.
+_MANY = 4
+# Blocks of one state.
+_SINGLE = ('second_relaxation', 'ac_coupling')
+# Samples in which the gain of a constant model has settled: the predictive
+# variance is then within some 1e-5 of its limit.
+_SETTLES = 1024
+# Settled: a step gains less than this, nats.
+_SETTLED, _NEARLY = 0.02, 0.5
+_RNG = np.random.default_rng(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Events:
+    """
+    Variance that events add, V^2, and by what the noise is more or less.
+
+    Attributes
+    ----------
+    push, error : ndarray, shape (n,)
+        To the state, and to the measurement.
+    power : ndarray, shape (n,)
+        Factor on what the noise of the `ou` adds to the state.
+
+    """
+
+    push: FloatArray
+    error: FloatArray
+    power: FloatArray
+
+    def part(self, part: slice) -> Events:
+        """Return a part."""
+        return Events(self.push[part], self.error[part], self.power[part])
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianFit:
+    """
+    A fitted Gaussian model.
+
+    Attributes
+    ----------
+    terms : tuple of Term
+        With their parameters; the first is the `ou`.
+    se : tuple of dict
+        Standard errors by parameter, a dict a term.
+    mean : ndarray, shape (n,)
+        Of the voltage, V.
+    innovation, variance : ndarray, shape (n,)
+        One-step errors, V, and their predictive variances, V^2, events not
+        counted at their own sample.
+    density : ndarray, shape (n,)
+        Log predictive density of each sample, nats.
+    phi : ndarray, shape (n,)
+        Coefficient of the OU in each step.
+
+    """
+
+    terms: tuple[Term, ...]
+    se: tuple[dict[str, float], ...]
+    mean: FloatArray
+    innovation: FloatArray
+    variance: FloatArray
+    density: FloatArray
+    phi: FloatArray
+
+    @property
+    def z(self) -> FloatArray:
+        """Return the standardised innovations."""
+        return self.innovation / np.sqrt(self.variance)
+
+
+def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
+                 events: Events | None = None, offset: FloatArray | None = None,
+                 whole_mean: bool = False, rough: bool = False) -> GaussianFit:
+    """Fit the Gaussian part by maximum likelihood on a part of the recording (offset in V)."""
+    voltage = samples.voltage if offset is None else samples.voltage - offset
+    seen = samples.part(part, voltage)
+    inside = None if events is None else events.part(part)
+    start = tuple(terms)
+    terms, se = _maximise(seen, start, inside, rough)
+    if whole_mean and seen.n < samples.n:
+        terms = _regress(samples.part(slice(None), voltage), terms, events)
+    return evaluate(samples, terms, events, se)
+
+
+def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = None,
+             se: Sequence[dict[str, float]] = (), inside: bool = False) -> GaussianFit:
+    """Return what a model with given parameters says of a recording."""
+    s, run, plain, full = _filter(samples, terms, events)
+    columns = _columns(samples, terms, s)
+    beta = np.concatenate([_linear(term) for term in terms])
+    mean = columns @ beta
+    e = run.innovations(samples.voltage - mean)
+    # An event is the law's to expect, at its own sample: not so while it is fitted around.
+    variance = full if inside else plain
+    return GaussianFit(tuple(terms), tuple(se), mean, e, variance, _log_density(e, variance),
+                       np.exp(-s.alpha * s.step))
+
+
+def _log_density(e: FloatArray, variance: FloatArray) -> FloatArray:
+    density: FloatArray = -0.5 * (np.log(2.0 * math.pi * variance) + e * e / variance)
+    return density
+
+
+def _linear(term: Term) -> FloatArray:
+    """Return the coefficients of a term's columns."""
+    if isinstance(term, OU):
+        return np.array([term.u0])
+    return np.array(term.linear_values() if term.ROLE is Role.MEAN else [], dtype=np.float64)
+
+
+def _columns(samples: Samples, terms: Sequence[Term], s: Stretch) -> FloatArray:
+    """Return all columns of the mean, through the instrument."""
+    parts = [np.ones((s.t.size, 1))]
+    for term in terms:
+        if term.ROLE is Role.MEAN and term.NAME != 'ou':
+            # Its coefficients apart, a term has the same columns again and again.
+            unit = term.with_linear([1.0] * len(term.LINEAR))
+            if unit not in samples.columns:
+                samples.columns[unit] = term.columns(s)
+            parts.append(samples.columns[unit])
+    columns = np.concatenate(parts, axis=1)
+    for term in terms:
+        if isinstance(term, ACCoupling):
+            # What the instrument shows has a level of its own.
+            columns[:, 1:] = term.pass_through(columns[:, 1:], s)
+    return columns
+
+
+def _filter(samples: Samples, terms: Sequence[Term], events: Events | None
+            ) -> tuple[Stretch, Filter, FloatArray, FloatArray]:
+    """Return the stretch, its filter, and variances: events at their own sample not in, and in."""
+    if events is not None and _states(terms) >= _MANY and not events.error.any():
+        # Where noise or pushes enter the state and nothing hides them, the gains of
+        # several states hardly change: a filter that is settled saves most of the time.
+        s, space, _ = _space(samples, terms, None)
+        run = Filter(space, samples.n)
+        q = s.sigma * s.sigma * -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
+        return s, run, run.variance, run.variance + (events.power - 1.0) * q + events.push
+    s, space, own = _space(samples, terms, events)
+    run = Filter(space, samples.n)
+    return s, run, run.variance - own, run.variance
+
+
+def _states(terms: Sequence[Term]) -> int:
+    """Return about how many states a model has: flicker noise is many, other blocks one or two."""
+    return 1 + sum(_MANY if term.NAME == 'flicker_noise' else 1 if term.NAME in _SINGLE else 2
+                   for term in terms if term.ROLE is Role.BLOCK)
+
+
+def _space(samples: Samples, terms: Sequence[Term], events: Events | None
+           ) -> tuple[Stretch, StateSpace, FloatArray | float]:
+    """Return the stretch, the state space, and what events add to each variance predicted."""
+    ou = terms[0]
+    assert isinstance(ou, OU)
+    s = samples.stretch(ou.alpha, ou.sigma)
+    for term in terms:
+        if term.ROLE is Role.DRIVE:
+            term.start(_RNG)(s)
+    whole = s
+    if events is None and samples.n > _SETTLES and samples.even and not any(
+            term.ROLE is Role.DRIVE or (term.ROLE is Role.BLOCK and term.NEEDS_THROTTLE)
+            for term in terms):
+        s = _first(s, _SETTLES)
+    n = s.t.size
+    phi = np.exp(-s.alpha * s.step)
+    q = s.sigma * s.sigma * -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
+    floor = NO_NOISE * q[1:].mean()
+    blocks = [(phi[:, None, None], q[:, None, None], np.ones(1))]
+    for term in terms:
+        if isinstance(term, ACCoupling):
+            blocks[0] = _coupled(term, s, phi, q)
+    own: FloatArray | float = 0.0
+    if events is not None:
+        f, cov, h = blocks[0]
+        more = (events.power - 1.0)[:, None, None] * cov
+        more[:, 0, 0] += events.push
+        blocks[0] = f, cov + more, h
+        own = (more @ h) @ h + events.error
+    blocks += [term.block(s) for term in terms
+               if term.ROLE is Role.BLOCK and not isinstance(term, ACCoupling)]
+    d = sum(h.size for _, _, h in blocks)
+    # Element by element along the samples, as the filter takes them.
+    f_all, q_all = (np.zeros((d, d, n)).transpose(2, 0, 1) for _ in range(2))
+    h_all = np.zeros(d)
+    at = 0
+    for f, cov, h in blocks:
+        to = at + h.size
+        f_all[:, at:to, at:to], q_all[:, at:to, at:to], h_all[at:to] = f, cov, h
+        at = to
+    # Measured: some 0.1 us a sample, and as the square of the states.
+    samples.work[0] += 1e-7 * n * d * d + 2e-8 * samples.n * d
+    r = np.full(n, floor + sum(term.variance() for term in terms))
+    if events is not None:
+        r += events.error
+    return whole, StateSpace(f_all, q_all, h_all, r), own
+
+
+def _first(s: Stretch, n: int) -> Stretch:
+    """Return the first samples of a stretch."""
+    return replace(s, **{name: getattr(s, name)[:n] for name in (
+        't', 'at', 'step', 'throttle', 'alpha', 'sigma', 'power', 'push', 'x', 'level',
+        'voltage')})
+
+
+def _coupled(term: ACCoupling, s: Stretch, phi: FloatArray, q: FloatArray
+             ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the OU and its low-pass, which the instrument subtracts."""
+    rate = 2.0 * math.pi * term.corner
+    step = s.step.copy()
+    step[0] = 1.0
+    start, end, spread = bridge(s.alpha, rate, step)
+    f, cov = np.zeros((s.t.size, 2, 2)), np.zeros((s.t.size, 2, 2))
+    f[:, 0, 0], f[:, 1, 1] = phi, np.exp(-rate * s.step)
+    f[:, 1, 0] = start + end * phi
+    cov[:, 0, 0], cov[:, 0, 1] = q, end * q
+    cov[:, 1, 1] = end * end * q + s.sigma * s.sigma * spread
+    share = rate / (rate + s.alpha[0])
+    cov[0] = q[0] * np.array([[1.0, share], [share, share]])
+    cov[:, 1, 0] = cov[:, 0, 1]
+    return f, cov, np.array([1.0, -1.0])
+
+
+def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
+              rough: bool = False, only: Sequence[int] | None = None
+              ) -> tuple[tuple[Term, ...], tuple[dict[str, float], ...]]:
+    """Fit by scoring: the outer product of numerical scores stands for the information."""
+    rounds = _FEW_ROUNDS if rough else _ROUNDS
+    states = _filter(samples, terms, events)[1].shape
+    few = max(_DEAR // (2 * states[1]), 2000)
+    if states[0] * (states[1] - 1) > _DEAR and few < samples.n:
+        # Far from the top a part of the samples shows the way.
+        part = _telling(samples, few)
+        # What was fitted to all samples before is known better than a part can tell.
+        terms, se_part = _maximise(
+            samples.part(part), terms, None if events is None else events.part(part),
+            only=(0, len(terms) - 1) if rough else None)
+        if rough or states[1] > _MANY:
+            shrink = math.sqrt((part.stop - part.start) / samples.n)
+            return _regress(samples, terms, events), tuple(
+                {name: value * shrink for name, value in errors.items()} for errors in se_part)
+        rounds = _LAST_ROUNDS
+    free = [(k, name) for k, term in enumerate(terms) for name in term.free()
+            if only is None or k in only]
+    base = _with_mean(samples, terms, events)
+    terms = base.terms
+    value, damping, inverse = float(base.density.sum()), 0.0, np.zeros((0, 0))
+    for _ in range(rounds):
+        scores = np.empty((samples.n, len(free)))
+        for j, (k, name) in enumerate(free):
+            moved = _moved(terms, k, name, _STEP)
+            there = evaluate(samples, moved, events, inside=True)
+            scores[:, j] = (there.density - base.density) / _STEP
+        information = scores.T @ scores
+        gradient = scores.sum(axis=0)
+        scale = np.sqrt(information.diagonal()) + 1e-12
+        better = None
+        for _ in range(6):
+            ridge = (damping + 1e-9) * np.eye(len(free))
+            step = np.linalg.solve(information / np.outer(scale, scale) + ridge,
+                                   gradient / scale) / scale
+            step = np.clip(step, -1.5, 1.5)
+            trial = terms
+            for (k, name), by in zip(free, step.tolist(), strict=True):
+                trial = _moved(trial, k, name, by)
+            new = _with_mean(samples, trial, events)
+            if float(new.density.sum()) > value - 1e-9 * abs(value):
+                better = new
+                break
+            damping = max(10.0 * damping, 0.1)
+        if better is None:
+            break
+        gain = float(better.density.sum()) - value
+        terms, base, value = better.terms, better, float(better.density.sum())
+        damping *= 0.3
+        if gain < (_NEARLY if rough else _SETTLED):
+            break
+    inverse = np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+    se: list[dict[str, float]] = [{} for _ in terms]
+    for j, (k, name) in enumerate(free):
+        se[k][name] = math.sqrt(max(inverse[j, j], 0.0)) * abs(terms[k].per_coordinate(name))
+    return terms, tuple(se)
+
+
+def _solved(columns: FloatArray, y: FloatArray) -> FloatArray:
+    """Return least squares; coefficients that nothing determines come out as small as may be."""
+    if columns.shape[1] <= _NARROW:
+        few: FloatArray = np.asarray(np.linalg.lstsq(columns, y, rcond=1e-10)[0])
+        return few
+    # Of many columns, lines mostly and so nearly at right angles, the normal equations.
+    scale = np.sqrt(np.einsum('ij,ij->j', columns, columns))
+    scale[scale == 0.0] = 1.0
+    gram = columns.T @ columns / np.outer(scale, scale)
+    inverse = np.asarray(np.linalg.pinv(gram, rcond=1e-12, hermitian=True), dtype=np.float64)
+    many: FloatArray = inverse @ (
+        columns.T @ y / scale) / scale
+    return many
+
+
+def _telling(samples: Samples, size: int) -> slice:
+    """Return the stretch of a size in which throttle moves most; the first without throttle."""
+    if samples.throttle is None:
+        return slice(0, size)
+    first = np.arange(0, samples.n - size + 1, max(size // 4, 1))
+    moves = [float(samples.throttle[k:k + size].std()) for k in first.tolist()]
+    begin = int(first[int(np.argmax(moves))])
+    return slice(begin, begin + size)
+
+
+def _moved(terms: tuple[Term, ...], k: int, name: str, by: float) -> tuple[Term, ...]:
+    changed = terms[k].moved(name, by)
+    return (*terms[:k], changed, *terms[k + 1:])
+
+
+def _regress(samples: Samples, terms: tuple[Term, ...], events: Events | None
+             ) -> tuple[Term, ...]:
+    """Fit the coefficients of the mean."""
+    return _with_mean(samples, terms, events).terms
+
+
+def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None) -> GaussianFit:
+    """Fit the coefficients of the mean by generalised least squares; events count as known."""
+    s, run, _, variance = _filter(samples, terms, events)
+    columns = _columns(samples, terms, s)
+    if not (variance > 0.0).all():
+        raise ArithmeticError('variances that are not above 0')
+    weight = 1.0 / np.sqrt(variance)
+    through = run.innovations(np.column_stack((samples.voltage, columns))) * weight[:, None]
+    beta = _solved(through[:, 1:], through[:, 0])
+    samples.work[0] += 1e-8 * samples.n * beta.size
+    ou = terms[0]
+    assert isinstance(ou, OU)
+    result: list[Term] = [replace(ou, u0=float(beta[0]))]
+    at = 1
+    for term in terms[1:]:
+        if isinstance(term, ACCoupling):
+            term = replace(term, offset=float(beta[0]))
+        size = len(term.LINEAR) if term.ROLE is Role.MEAN else 0
+        result.append(term.with_linear(beta[at:at + size].tolist()) if size else term)
+        at += size
+    e = (through[:, 0] - through[:, 1:] @ beta) / weight
+    return GaussianFit(tuple(result), (), columns @ beta, e, variance,
+                       _log_density(e, variance), np.exp(-s.alpha * s.step))

@@ -1,0 +1,280 @@
+"""What a discovery found: frozen records, and the same as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+import enum
+import math
+from typing import Any
+
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.term import Term
+from ou_monitor.records import NAN
+from ou_monitor.text import Z95
+
+
+class Verdict(enum.Enum):
+    """What became of a recording."""
+
+    NO_EFFECT = 'no_effect'
+    EXPLAINED = 'explained'
+    PARTLY_EXPLAINED = 'partly_explained'
+    UNEXPLAINED = 'unexplained'
+    INSUFFICIENT_DATA = 'insufficient_data'
+
+
+@dataclass(frozen=True)
+class Criticism:
+    """
+    One statistic of the data, and where simulations put it.
+
+    Attributes
+    ----------
+    statistic : str
+        Name.
+    before, after : float
+        Normal score of the data under the plain and under the extended model.
+    low, high : float
+        Band that simulations of the right model leave once in a hundred
+        recordings, all statistics taken together.
+    p_before, p_after : float
+        Chance that any statistic of a right model is as far off.
+
+    """
+
+    statistic: str
+    before: float
+    after: float
+    low: float
+    high: float
+    p_before: float
+    p_after: float
+
+    @property
+    def was_off(self) -> bool:
+        """Whether the plain model leaves it outside the band."""
+        return not self.low <= self.before <= self.high
+
+    @property
+    def is_off(self) -> bool:
+        """Whether the extended model leaves it outside the band."""
+        return not self.low <= self.after <= self.high
+
+
+@dataclass(frozen=True, eq=False)
+class Cause:
+    """
+    A cause that was named.
+
+    Attributes
+    ----------
+    term : Term
+        With its parameters.
+    se : dict of str to float or list
+        Standard errors, in the units of the parameters; NaN where not known.
+    gain, gain_se : float
+        What is lost of the held-out score without it, nats per sample.
+    p_value : float
+        See `gain.worth`; 0 for exact findings, which have no chance at all.
+    alternatives : tuple of str
+        Causes that this recording cannot tell from it.
+    explanation : str
+        For people.
+    exact : bool
+        Found without a model.
+
+    """
+
+    term: Term
+    se: Mapping[str, Any]
+    gain: float
+    gain_se: float
+    p_value: float
+    alternatives: tuple[str, ...]
+    explanation: str
+    exact: bool
+
+    @property
+    def name(self) -> str:
+        """Return the name of the cause."""
+        return self.term.NAME
+
+    @property
+    def measurable(self) -> bool:
+        """Whether the gain can be told from zero."""
+        return self.gain > Z95 * self.gain_se
+
+
+@dataclass(frozen=True)
+class CrossingRate:
+    """
+    How often the voltage falls through a level, on the part kept.
+
+    Attributes
+    ----------
+    level : float
+        V.
+    observed, baseline, extended : float
+        Crossings per minute in the data and on average in simulations.
+    observed_se, baseline_se, extended_se : float
+        Standard errors: of the count, as if crossings were independent, and of
+        the averages.
+
+    """
+
+    level: float = NAN
+    observed: float = NAN
+    baseline: float = NAN
+    extended: float = NAN
+    observed_se: float = NAN
+    baseline_se: float = NAN
+    extended_se: float = NAN
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """
+    Result of `discover`.
+
+    Attributes
+    ----------
+    recording : str
+        Name.
+    n : int
+        Samples of the recording.
+    duration : float
+        s.
+    verdict : Verdict
+        What became of it.
+    sentence : str
+        The same in a sentence.
+    baseline : OU or None
+        The plain model, fitted on the first part.
+    baseline_score : float
+        Mean log predictive density on the rest, nats per sample.
+    criticism : tuple of Criticism
+        All statistics.
+    causes : tuple of Cause
+        As accepted.
+    model : SupplyModel or None
+        The extended model, fitted on everything.
+    se : tuple of dict
+        Its standard errors, a dict a term.
+    score, gain, gain_se : float
+        Of the extended model on the part kept, nats per sample.
+    crossing : CrossingRate
+        What a pilot feels.
+    notes : tuple of str
+        What was dropped, left out or cannot be decided.
+    samples : Samples or None
+        What was fitted.
+    simulated : SupplyModel or None
+        The extended model as it makes `samples`: without what was undone in
+        them, such as repeats.
+    seed : int
+        Of all randomness.
+
+    """
+
+    recording: str
+    n: int
+    duration: float
+    verdict: Verdict
+    sentence: str
+    baseline: OU | None = None
+    baseline_score: float = NAN
+    criticism: tuple[Criticism, ...] = ()
+    causes: tuple[Cause, ...] = ()
+    model: SupplyModel | None = None
+    se: tuple[Mapping[str, Any], ...] = ()
+    score: float = NAN
+    gain: float = NAN
+    gain_se: float = NAN
+    crossing: CrossingRate = field(default_factory=CrossingRate)
+    notes: tuple[str, ...] = ()
+    samples: Samples | None = None
+    simulated: SupplyModel | None = None
+    seed: int = 0
+
+    @property
+    def discrepancies(self) -> tuple[Criticism, ...]:
+        """Return what the plain model gets wrong, worst first."""
+        return tuple(sorted((c for c in self.criticism if c.was_off),
+                            key=lambda c: -abs(c.before)))
+
+    @property
+    def remaining(self) -> tuple[Criticism, ...]:
+        """Return what the extended model gets wrong, worst first."""
+        return tuple(sorted((c for c in self.criticism if c.is_off), key=lambda c: -abs(c.after)))
+
+    def as_data(self) -> dict[str, Any]:
+        """
+        Return the finding as JSON holds it.
+
+        Returns
+        -------
+        dict
+            As CONTRACT section 5, and beside it `sentence`, `remaining`,
+            `notes`, and `se` and `units` beside all `params`.
+
+        """
+        baseline = self.baseline
+        found: dict[str, Any] = _plain({
+            'recording': self.recording, 'n': self.n, 'duration_s': self.duration,
+            'verdict': self.verdict.value, 'sentence': self.sentence,
+            'baseline': {
+                'params': dict.fromkeys(('alpha', 'sigma', 'u0')) if baseline is None
+                else baseline.values(),
+                'units': _units(OU), 'heldout_score': self.baseline_score},
+            'discrepancies': [_discrepancy(c, c.before, c.p_before) for c in self.discrepancies],
+            'causes': [{
+                'name': cause.name, 'family': cause.term.FAMILY, 'gain': cause.gain,
+                'gain_se': cause.gain_se, 'p_value': cause.p_value, 'exact': cause.exact,
+                'params': cause.term.values(), 'se': dict(cause.se),
+                'units': _units(type(cause.term)), 'alternatives': list(cause.alternatives),
+                'explanation': cause.explanation} for cause in self.causes],
+            'extended': {
+                **self._extended(), 'heldout_score': self.score, 'gain': self.gain,
+                'gain_se': self.gain_se,
+                'crossing_rate': {
+                    'observed': self.crossing.observed, 'baseline': self.crossing.baseline,
+                    'extended': self.crossing.extended, 'level_v': self.crossing.level,
+                    'observed_se': self.crossing.observed_se,
+                    'baseline_se': self.crossing.baseline_se,
+                    'extended_se': self.crossing.extended_se, 'unit': '1/min'}},
+            'remaining': [_discrepancy(c, c.after, c.p_after) for c in self.remaining],
+            'notes': list(self.notes)})
+        return found
+
+    def _extended(self) -> dict[str, Any]:
+        """Return parameters, errors and units by term; a second one of a kind gets a number."""
+        found: dict[str, dict[str, Any]] = {'params': {}, 'se': {}, 'units': {}}
+        terms = () if self.model is None else self.model.terms
+        for k, term in enumerate(terms):
+            nth = sum(other.NAME == term.NAME for other in terms[:k]) + 1
+            name = term.NAME if nth == 1 else f'{term.NAME} {nth}'
+            found['params'][name] = term.values()
+            found['se'][name] = dict(self.se[k]) if k < len(self.se) else {}
+            found['units'][name] = _units(type(term))
+        return found
+
+
+def _units(kind: type[Term]) -> dict[str, str]:
+    return {name: kind.unit(name) for name in kind.parameters()}
+
+
+def _discrepancy(c: Criticism, observed: float, chance: float) -> dict[str, Any]:
+    return {'statistic': c.statistic, 'observed': observed, 'simulated_low': c.low,
+            'simulated_high': c.high, 'p_value': chance}
+
+
+def _plain(value: Any) -> Any:
+    """Return numbers that are not finite as None, and sequences as lists, all the way down."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

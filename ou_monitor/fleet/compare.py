@@ -1,0 +1,187 @@
+"""
+Recordings brought to one throttle, so that they can be compared.
+
+The logarithms of sigma and alpha follow a common curve over throttle (straight
+between knots), fitted to all levels by Huber's estimate with a level of its own
+for each vehicle; what a recording lies above it, averaged over its levels by
+time, is its deviation.
+
+Limits: the shape of the curve is taken to be that of all vehicles, and
+throttle to mean the same load on each.  Recordings without throttle are
+compared as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.records import FloatArray, NAN
+
+Row = Mapping[str, Any]
+IntArray = npt.NDArray[np.intp]
+USABLE = ('OK', 'SHORT_WINDOW')
+# Quantities that are compared -> unit; the first two on the log scale.
+QUANTITIES = {'sigma': 'V/sqrt(s)', 'alpha': '1/s', 'sag': 'V'}
+LOGARITHMIC = ('sigma', 'alpha')
+_HUBER = 1.345
+_ROUNDS = 30
+# Pieces of the curve at most, rows that each takes, and how far apart its knots are at least.
+_PIECES, _ROWS, _APART = 8, 12, 0.03
+
+
+@dataclass(frozen=True)
+class Curve:
+    """
+    The common curve over throttle of the logarithm of a quantity: straight between knots.
+
+    Attributes
+    ----------
+    reference : float
+        Throttle that all recordings are brought to; NaN when none has any.
+    knots, heights : tuple of float
+        Throttles, and the logarithm there above that at the reference; empty
+        for a flat curve.
+
+    """
+
+    reference: float
+    knots: tuple[float, ...] = ()
+    heights: tuple[float, ...] = ()
+
+    def __call__(self, throttle: FloatArray) -> FloatArray:
+        """Return what is added to the logarithm at the reference; 0 where unknown."""
+        u = np.asarray(throttle, dtype=np.float64)
+        if not self.knots:
+            return np.zeros(u.shape)
+        rise: FloatArray = np.nan_to_num(np.interp(u, self.knots, self.heights))
+        return rise
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """
+    One quantity of every recording that has it.
+
+    Attributes
+    ----------
+    name : str
+        Quantity.
+    paths : tuple of str
+        Recordings.
+    vehicles : tuple of str
+        Of each; empty where not told.
+    flights : ndarray, shape (n,)
+        Number of the flight; 0 where there is none.
+    value, error : ndarray, shape (n,)
+        Logarithm at the reference throttle (sag: V) and its standard error.
+    curve : Curve
+        What was taken out.
+
+    """
+
+    name: str
+    paths: tuple[str, ...]
+    vehicles: tuple[str, ...]
+    flights: IntArray
+    value: FloatArray
+    error: FloatArray
+    curve: Curve
+
+    def shown(self, value: FloatArray | float) -> FloatArray:
+        """Return values of `value` in the unit of the quantity."""
+        data = np.asarray(value, dtype=np.float64)
+        return np.exp(data) if self.name in LOGARITHMIC else data
+
+
+def values_of(rows: Sequence[Row], name: str) -> Values:
+    """Return one quantity of every recording."""
+    if name == 'sag':
+        once = {row['path']: row for row in rows if row['sag'] is not None}
+        return _values(name, list(once.values()), np.array([r['sag'] for r in once.values()]),
+                       np.array([r['sag_se'] for r in once.values()]), Curve(NAN))
+    good = [row for row in rows if row['status'] in USABLE and row[name] is not None]
+    y = np.log(np.array([row[name] for row in good], dtype=np.float64))
+    u = np.array([_number(row['throttle']) for row in good])
+    curve = _curve(y, u, [row['vehicle'] or '' for row in good])
+    level = y - curve(u)
+    by_path: dict[str, list[int]] = {}
+    for k, row in enumerate(good):
+        by_path.setdefault(row['path'], []).append(k)
+    value, error = [], []
+    for ks in by_path.values():
+        weight = np.array([_number(good[k]['time_s']) for k in ks])
+        weight = weight / weight.sum() if weight.sum() > 0.0 else np.full(len(ks), 1.0 / len(ks))
+        se = np.nan_to_num([_number(good[k][name + '_se']) for k in ks])
+        value.append(float(weight @ level[ks]))
+        error.append(float(np.sqrt(weight ** 2 @ se ** 2)))
+    return _values(name, [good[ks[0]] for ks in by_path.values()], np.array(value),
+                   np.array(error), curve)
+
+
+def _number(value: Any) -> float:
+    return NAN if value is None else float(value)
+
+
+def _values(name: str, rows: Sequence[Row], value: FloatArray, error: FloatArray, curve: Curve
+            ) -> Values:
+    return Values(name, tuple(row['path'] for row in rows),
+                  tuple(row['vehicle'] or '' for row in rows),
+                  np.array([row['flight'] or 0 for row in rows], dtype=np.intp),
+                  np.asarray(value, dtype=np.float64),
+                  np.nan_to_num(np.asarray(error, dtype=np.float64)), curve)
+
+
+def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str]) -> Curve:
+    """Return the common curve; flat where throttle does not vary."""
+    known = np.isfinite(u)
+    if not known.any():
+        return Curve(NAN)
+    u, y = u[known], y[known]
+    reference = float(np.median(u))
+    knots = _knots(u)
+    names = sorted(set(vehicles))
+    of = np.array([names.index(v) for v in vehicles])[known]
+    basis = [np.clip(u - low, 0.0, high - low) for low, high in zip(knots, knots[1:])]
+    if not basis or y.size <= len(names) + len(basis):
+        return Curve(reference)
+    weight = np.ones(y.size)
+    slopes = np.zeros(len(basis))
+    for _ in range(_ROUNDS):
+        # Each vehicle has a level of its own, taken out by centring.  One without throttle has
+        # no weight here, and no row.
+        count = np.maximum(np.bincount(of, weight, len(names)), 1e-300)
+        inner = np.column_stack([
+            column - (np.bincount(of, weight * column, len(names)) / count)[of]
+            for column in (*basis, y)])
+        root = np.sqrt(weight)[:, None]
+        found = np.linalg.lstsq(root * inner[:, :-1], root[:, 0] * inner[:, -1], rcond=1e-9)[0]
+        rest = inner[:, -1] - inner[:, :-1] @ found
+        scale = float(np.median(np.abs(rest))) / 0.6745
+        settled = np.allclose(found, slopes, rtol=1e-10, atol=1e-12) or not scale > 0.0
+        slopes = found
+        if settled:
+            break
+        weight = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(rest), 1e-300))
+    heights = np.concatenate(([0.0], np.cumsum(slopes * np.diff(knots))))
+    heights -= np.interp(reference, knots, heights)
+    if not np.isfinite(heights).all():
+        return Curve(reference)
+    return Curve(reference, tuple(knots), tuple(heights.tolist()))
+
+
+def _knots(u: FloatArray) -> list[float]:
+    """Return knots at even shares of the rows, not too near each other; increasing."""
+    pieces = min(max(u.size // _ROWS, 1), _PIECES)
+    wanted = np.quantile(u, np.linspace(0.0, 1.0, pieces + 1)).tolist()
+    knots = wanted[:1]
+    for knot in wanted[1:]:
+        if knot - knots[-1] >= _APART:
+            knots.append(knot)
+    # The last one holds the end, so that nothing is flat that should not be.
+    if len(knots) > 1:
+        knots[-1] = wanted[-1]
+    return [float(knot) for knot in knots]

@@ -1,0 +1,226 @@
+"""
+Which recordings there are: files, bags, and folders searched for both.
+
+Limits: links to folders are not followed, and hidden folders are not entered.
+Two recordings count as the same when every byte of their data is; a copy that
+was recompressed is another recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+import hashlib
+import os
+from pathlib import Path
+
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.rosbag2_metadata import FILE, is_part
+
+# What `convert` takes and this does not.
+_LOGS = ('.ulg', '.bin', '.bbl', '.bfl', '.db3')
+_BLOCK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Source:
+    """
+    One recording on disk.
+
+    Attributes
+    ----------
+    path : pathlib.Path
+        File, or folder of a bag; absolute, links resolved.
+    files : tuple of pathlib.Path
+        Its files of data, in order of name.
+    size : int
+        Bytes in them.
+    stamp : tuple of int
+        Times of their last change, ns.
+
+    """
+
+    path: Path
+    files: tuple[Path, ...]
+    size: int
+    stamp: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Found:
+    """
+    What a search gave.
+
+    Attributes
+    ----------
+    sources : tuple of Source
+        In order of path, each once.
+    notes : tuple of str
+        What was passed over, one sentence each.
+
+    """
+
+    sources: tuple[Source, ...]
+    notes: tuple[str, ...]
+
+
+def find_recordings(given: Sequence[str], leave_out: Path | None = None) -> Found:
+    """Return the recordings that some paths stand for."""
+    search = _Search(None if leave_out is None else leave_out.resolve())
+    for text in given:
+        if not text:
+            raise InputError('RECORDING: the path is empty')
+        path = Path(text)
+        if not path.exists():
+            raise InputError(f"there is no recording or folder '{text}': check the path")
+        if path.is_dir() and not _is_bag(path):
+            search.walk(path)
+        else:
+            search.add(path)
+    notes = search.notes()
+    if not search.paths:
+        where = ', '.join(f"'{text}'" for text in given)
+        raise InputError(f'no recording in {where}: expected .mcap files, rosbag2 folders, or '
+                         '.csv files with the columns time_s, voltage_v'
+                         + (f' ({" ".join(notes)})' if notes else ''))
+    return Found(tuple(_source(path) for path in sorted(search.paths)), tuple(notes))
+
+
+class _Search:
+    """Collects paths, and what was passed over."""
+
+    def __init__(self, leave_out: Path | None) -> None:
+        self.paths: set[Path] = set()
+        self._leave_out = leave_out
+        self._csv: list[Path] = []
+        self._logs: list[Path] = []
+        self._closed: list[str] = []
+
+    def add(self, path: Path) -> None:
+        self.paths.add(path.parent.resolve() if path.name == FILE else path.resolve())
+
+    def walk(self, root: Path) -> None:
+        """Search a folder; a bag in it is one recording, whatever it holds."""
+        def closed(error: OSError) -> None:
+            self._closed.append(f"'{error.filename}' ({error.strerror})")
+
+        for folder, inner, names in os.walk(root, onerror=closed):
+            here = Path(folder)
+            if self._leave_out is not None and here.resolve() == self._leave_out:
+                inner.clear()
+                continue
+            if here != root and _is_bag(here):
+                self.add(here)
+                inner.clear()
+                continue
+            inner[:] = sorted(name for name in inner if not name.startswith('.'))
+            for name in sorted(names):
+                self._file(here / name)
+
+    def _file(self, path: Path) -> None:
+        kind = path.suffix.lower()
+        if kind == '.mcap':
+            self.add(path)
+        elif kind == '.csv':
+            if _has_columns(path):
+                self.add(path)
+            else:
+                self._csv.append(path)
+        elif kind in _LOGS:
+            self._logs.append(path)
+
+    def notes(self) -> list[str]:
+        """Return what was passed over, one sentence a kind."""
+        found = []
+        if self._csv:
+            found.append(_passed(self._csv, '.csv file', 'without the columns time_s, voltage_v'))
+        if self._logs:
+            found.append(_passed(self._logs, 'log', "in another format: 'ou-monitor convert' "
+                                 'makes bags of them'))
+        found += [f'The folder {text} cannot be searched.' for text in self._closed]
+        return found
+
+
+def _passed(paths: Sequence[Path], what: str, why: str) -> str:
+    many = '' if len(paths) == 1 else 's'
+    return f"{len(paths)} {what}{many} passed over, such as '{paths[0]}': {why}."
+
+
+def _is_bag(folder: Path) -> bool:
+    """Return whether a folder is one bag: it has metadata, or is a bag that was cut off."""
+    if (folder / FILE).is_file():
+        return True
+    try:
+        parts = list(folder.glob('*.mcap'))
+    except OSError:
+        return False
+    # rosbag2 names the files after the folder, and writes the metadata last.
+    return bool(parts) and all(is_part(part, folder) for part in parts)
+
+
+def _has_columns(path: Path) -> bool:
+    """Return whether the first line of a file names time and voltage."""
+    try:
+        with path.open('rb') as file:
+            head = file.readline(4096).decode('utf-8', 'replace')
+    except OSError:
+        # It is a recording as far as its name says; the reader tells what is wrong with it.
+        return True
+    words = {word.strip().strip('"').lstrip('\ufeff') for word in head.split(',')}
+    return {'time_s', 'voltage_v'} <= words
+
+
+def _source(path: Path) -> Source:
+    files = [path]
+    if path.is_dir():
+        files = sorted(file for file in path.rglob('*') if file.is_file())
+    size, stamps = 0, []
+    for file in files:
+        try:
+            found = file.stat()
+        except OSError:
+            # Gone since it was found, or not to be looked at: the reader tells.
+            continue
+        size += 0 if file.name == FILE else found.st_size
+        stamps += [found.st_mtime_ns, found.st_size]
+    data = tuple(file for file in files if file.name != FILE)
+    return Source(path, data, size, tuple(stamps))
+
+
+def duplicates(sources: Sequence[Source],
+               progress: Callable[[float], None] | None = None) -> dict[Path, Path]:
+    """Return the recordings whose data another one has too (progress 0..1)."""
+    sizes: dict[int, list[Source]] = {}
+    for source in sources:
+        if source.size:
+            sizes.setdefault(source.size, []).append(source)
+    alike = [source for group in sizes.values() if len(group) > 1 for source in group]
+    total = sum(source.size for source in alike)
+    done = 0
+    first: dict[bytes, Path] = {}
+    found: dict[Path, Path] = {}
+    for source in sorted(alike, key=lambda s: (max(s.stamp[::2], default=0), str(s.path))):
+        digest = _digest(source)
+        done += source.size
+        if progress is not None:
+            progress(done / total)
+        if digest is None:
+            continue
+        if digest in first:
+            found[source.path] = first[digest]
+        else:
+            first[digest] = source.path
+    return found
+
+
+def _digest(source: Source) -> bytes | None:
+    """Return a hash of the data; None where it cannot be read, which the reader tells."""
+    digest = hashlib.blake2b()
+    try:
+        for path in source.files:
+            with path.open('rb') as file:
+                while block := file.read(_BLOCK):
+                    digest.update(block)
+    except OSError:
+        return None
+    return digest.digest()

@@ -1,0 +1,133 @@
+"""Many recordings -> rows, with what was done before left as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+import re
+from typing import Any
+
+from ou_monitor.fleet.cluster import Workers
+from ou_monitor.fleet.find import duplicates, Found, Source
+from ou_monitor.fleet.judge import judge, Judgement
+from ou_monitor.fleet.parts import Parts
+from ou_monitor.fleet.table import Row, rows_of
+from ou_monitor.fleet.vehicles import assign, number_flights
+from ou_monitor.fleet.work import Options, work
+from ou_monitor.records import NAN
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Fleet:
+    """
+    A fleet, analysed.
+
+    Attributes
+    ----------
+    rows : list of dict
+        The table, in order of vehicle, flight, path and level.
+    judgement : Judgement
+        What stands out.
+    notes : tuple of str
+        How vehicles were told, what was passed over, and the like.
+    recordings : int
+        Recordings found.
+    kept : int
+        Of these, done by an earlier run.
+
+    """
+
+    rows: list[Row]
+    judgement: Judgement
+    notes: tuple[str, ...]
+    recordings: int
+    kept: int
+
+    @property
+    def vehicles(self) -> list[str]:
+        """Return the vehicles that were told, in order."""
+        return sorted({row['vehicle'] for row in self.rows if row['vehicle'] is not None})
+
+    @property
+    def failed(self) -> list[Row]:
+        """Return the rows that have an error."""
+        return [row for row in self.rows if row['error'] is not None]
+
+    @property
+    def duplicates(self) -> list[Row]:
+        """Return the rows of recordings that are there twice."""
+        return [row for row in self.rows if row['duplicate_of'] is not None]
+
+    @property
+    def analysed(self) -> int:
+        """Return how many recordings have numbers of their own."""
+        return len({row['path'] for row in self.rows
+                    if row['error'] is None and row['duplicate_of'] is None})
+
+
+def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[], str], *,
+              workers: int, scheduler: str | None = None,
+              pattern: re.Pattern[str] | None = None, stated_options: dict[str, Any] | None = None,
+              comparing: Progress | None = None, progress: Progress | None = None) -> Fleet:
+    """Analyse all recordings that are not done yet, and judge the fleet."""
+    parts = Parts(folder, {**options.as_data(), **(stated_options or {}), 'version': version()})
+    twice = duplicates(found.sources, comparing)
+    results: dict[Path, dict[str, Any]] = {}
+    missing: list[Source] = []
+    for source in found.sources:
+        if source.path in twice:
+            continue
+        known = parts.load(source)
+        if known is None:
+            missing.append(source)
+        else:
+            results[source.path] = known
+    kept = len(results)
+    if missing:
+        with Workers(min(workers, len(missing)), scheduler, version) as pool:
+            _work(missing, results, parts, options, pool, progress)
+    rows, notes = _table(found.sources, results, twice, pattern)
+    return Fleet(rows, judge(rows), (*found.notes, *notes), len(found.sources), kept)
+
+
+def _work(missing: Sequence[Source], results: dict[Path, dict[str, Any]], parts: Parts,
+          options: Options, pool: Workers, progress: Progress | None) -> None:
+    """Analyse what is missing, and keep each result as it comes."""
+    kept = len(results)
+    # The largest first: the last one to end is then a short one.
+    order = sorted(missing, key=lambda source: (-source.size, source.path))
+    tell = progress or (lambda share: None)
+    tell(0.0)
+    tasks = [(str(source.path), options.as_data()) for source in order]
+    for done, (k, result, why) in enumerate(pool.each(work, tasks)):
+        if result is None:
+            result = {'error': why, 'levels': []}
+        if not result['error']:
+            parts.save(order[k], result)
+        results[order[k].path] = result
+        tell((kept + done + 1) / (kept + len(order)))
+
+
+def _table(sources: Sequence[Source], results: dict[Path, dict[str, Any]],
+           twice: dict[Path, Path], pattern: re.Pattern[str] | None
+           ) -> tuple[list[Row], list[str]]:
+    """Return all rows, and how vehicles and flights were told."""
+    # A copy is of the vehicle that its content names, or of that of its own path.
+    whole = {s.path: results[twice.get(s.path, s.path)] for s in sources}
+    vehicles, notes = assign({path: r.get('vehicle', '') for path, r in whole.items()}, pattern)
+    starts = {path: r.get('start', NAN) for path, r in results.items() if not r['error']}
+    flights, more = number_flights(vehicles, starts)
+    for path, first in twice.items():
+        if vehicles[path].name != vehicles[first].name:
+            notes.append(f"'{path}' has the same content as '{first}', but lies with another "
+                         f"vehicle ('{vehicles[path].name}' instead of "
+                         f"'{vehicles[first].name}'): one of the two is in the wrong place.")
+    rows = [row for source in sources for row in rows_of(
+        source, whole[source.path], vehicles[source.path], flights.get(source.path),
+        twice.get(source.path))]
+    rows.sort(key=lambda row: (row['vehicle'] is None, row['vehicle'] or '',
+                               row['flight'] is None, row['flight'] or 0, row['path']))
+    return rows, [*notes, *more]

@@ -1,0 +1,156 @@
+"""
+Which vehicle a recording is of, and which of its flights.
+
+The rule: what the recording names itself (its metadata), else what a pattern
+finds in its path, else the folder it lies in.  Recordings are compared within
+a vehicle only; where the vehicle cannot be told there is none, and the
+recording is compared with nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import math
+from pathlib import Path
+import re
+
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.samples import counted
+
+METADATA, PATTERN, FOLDER = 'metadata', 'pattern', 'folder'
+_SHOWN = 3
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """Name of a vehicle (empty: not told), and how it was told."""
+
+    name: str
+    told_by: str
+
+
+def read_pattern(text: str) -> re.Pattern[str]:
+    """Return the pattern of ``--vehicle-from``."""
+    try:
+        return re.compile(text)
+    except re.error as error:
+        raise InputError(f"--vehicle-from: '{text}' is not a regular expression: {error}"
+                         ) from error
+
+
+def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
+           ) -> tuple[dict[Path, Vehicle], list[str]]:
+    """Return the vehicle of each recording."""
+    found: dict[Path, Vehicle] = {}
+    differing, unmatched = [], []
+    folders = _folder_names({path.parent for path, name in stated.items() if not name})
+    named = {path.parent for path, name in stated.items() if name}
+    mixed = []
+    for path, name in stated.items():
+        by_pattern = _matched(pattern, path)
+        if name:
+            found[path] = Vehicle(name, METADATA)
+            if by_pattern and by_pattern != name:
+                differing.append(path)
+        elif pattern is not None:
+            found[path] = Vehicle(by_pattern, PATTERN)
+            if not by_pattern:
+                unmatched.append(path)
+        elif path.parent in named:
+            # Its neighbours name their vehicle: the folder is no vehicle of its own.
+            found[path] = Vehicle('', FOLDER)
+            mixed.append(path)
+        else:
+            found[path] = Vehicle(folders[path.parent], FOLDER)
+    notes = [_rule(found)]
+    if differing:
+        notes.append(f'{_these(differing)}: the metadata name another vehicle than '
+                     '--vehicle-from finds; the metadata hold.')
+    if unmatched:
+        notes.append(f'{_these(unmatched)}: --vehicle-from finds no vehicle in the path; they '
+                     'are compared with nothing.')
+    if mixed:
+        notes.append(f'{_these(mixed)}: no vehicle in the metadata, while others in the same '
+                     'folder name theirs; they are compared with nothing. --vehicle-from names '
+                     'them by their path.')
+    both = {v.name for v in found.values() if v.told_by == METADATA} & {
+        v.name for v in found.values() if v.told_by != METADATA and v.name}
+    if both:
+        notes.append(f'{", ".join(sorted(both))}: some recordings name this vehicle themselves, '
+                     'others were counted to it by their path; check that it is one vehicle.')
+    return found, notes
+
+
+def _matched(pattern: re.Pattern[str] | None, path: Path) -> str:
+    match = None if pattern is None else pattern.search(str(path))
+    if match is None or pattern is None:
+        return ''
+    if 'vehicle' in pattern.groupindex:
+        return str(match['vehicle'] or '')
+    return str(match[1] or '') if pattern.groups else match[0]
+
+
+def _folder_names(folders: set[Path]) -> dict[Path, str]:
+    """Return a name for each folder: its last part, with more parts where others share it."""
+    names = {}
+    for folder in folders:
+        for depth in range(1, len(folder.parts) + 1):
+            tail = folder.parts[-depth:]
+            if sum(other.parts[-depth:] == tail for other in folders) == 1:
+                break
+        names[folder] = '/'.join(part.strip('/') for part in tail) or '/'
+    return names
+
+
+def _rule(found: Mapping[Path, Vehicle]) -> str:
+    """Say how the vehicles were told."""
+    words = {METADATA: 'by their metadata', PATTERN: 'by --vehicle-from',
+             FOLDER: 'by the folder they lie in'}
+    parts = []
+    for kind, text in words.items():
+        of_kind = [v for v in found.values() if v.told_by == kind and v.name]
+        if of_kind:
+            count = len({v.name for v in of_kind})
+            parts.append(f'{counted(len(of_kind), "recording")} to {counted(count, "vehicle")} '
+                         f'{text}')
+    return 'Vehicles: ' + ('; '.join(parts) if parts else 'none could be told') + '.'
+
+
+def _these(paths: Sequence[Path]) -> str:
+    names = ', '.join(f"'{path}'" for path in paths[:_SHOWN])
+    more = len(paths) - _SHOWN
+    return names + (f' and {more} more' if more > 0 else '')
+
+
+def number_flights(vehicles: Mapping[Path, Vehicle], starts: Mapping[Path, float]
+                   ) -> tuple[dict[Path, int], list[str]]:
+    """Return which flight of its vehicle each recording is, from 1 (starts in s)."""
+    flights: dict[Path, int] = {}
+    by_name = []
+    groups: dict[str, list[Path]] = {}
+    for path in starts:
+        if vehicles[path].name:
+            groups.setdefault(vehicles[path].name, []).append(path)
+    for name, paths in groups.items():
+        dates = [starts[path] for path in paths]
+        dated = all(map(math.isfinite, dates)) and len(set(dates)) == len(dates)
+        if len(paths) > 1 and not dated:
+            by_name.append(name)
+        order = sorted(paths, key=lambda path: (starts[path],) if dated else natural(str(path)))
+        for k, path in enumerate(order):
+            flights[path] = k + 1
+    notes = []
+    if by_name:
+        some = ', '.join(sorted(by_name)[:_SHOWN])
+        more = len(by_name) - _SHOWN
+        some += f' and {more} more' if more > 0 else ''
+        notes.append(f'{some}: the flights are in the order of their names, because their '
+                     'dates are not known or not distinct.')
+    return flights, notes
+
+
+def natural(text: str) -> tuple[object, ...]:
+    """Return a key that sorts flight_2 before flight_10."""
+    return tuple((1, int(word), '') if word.isdigit() else (0, 0, word)
+                 for word in re.split(r'(\d+)', text) if word)

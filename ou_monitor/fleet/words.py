@@ -1,0 +1,246 @@
+"""A fleet in words, in table cells, and as plain data."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+import math
+import re
+from typing import Any
+
+import numpy as np
+from ou_monitor.fleet.compare import LOGARITHMIC, QUANTITIES, USABLE, Values
+from ou_monitor.fleet.drift import fewest, Trend
+from ou_monitor.fleet.judge import DRIFT_RATE, Judgement, LEAST_VEHICLES, OUTLIER_RATE
+from ou_monitor.fleet.outliers import LEAST, SIMULATIONS
+from ou_monitor.fleet.run import Fleet
+from ou_monitor.recordings.samples import counted
+from ou_monitor.records import FloatArray, NAN
+from ou_monitor.text import number
+
+# Characters of the name of a vehicle in a table.
+_NAME = 30
+# Heads of the table of vehicles for a terminal and for a page.
+VEHICLE_HEADS = (
+    ('vehicle', 'Vehicle'), ('flights', 'Flights'), ('sigma', '\u03c3, V/\u221as'),
+    ('sigma/flight', '\u03c3 a flight'), ('alpha', '\u03b1, 1/s'),
+    ('alpha/flight', '\u03b1 a flight'), ('sag', 'Sag, V'), ('sag/flight', 'Sag a flight'))
+
+
+def headline(fleet: Fleet) -> str:
+    """Return what the fleet says, a few sentences."""
+    parts = [f'{fleet.analysed} of {counted(fleet.recordings, "recording")} of '
+             f'{counted(len(fleet.vehicles), "vehicle")} analysed']
+    if fleet.failed:
+        parts.append(f'{len(fleet.failed)} could not be')
+    if fleet.duplicates:
+        parts.append('1 is a copy of another' if len(fleet.duplicates) == 1 else
+                     f'{len(fleet.duplicates)} are copies of others')
+    without = {row['path'] for row in fleet.rows if row['status'] is not None} - {
+        row['path'] for row in fleet.rows if row['status'] in USABLE}
+    if without:
+        parts.append(f'{len(without)} with no estimate at any level')
+    text = ', '.join(parts) + '.'
+    judged = fleet.judgement
+    drifting = sorted({t.vehicle for t in judged.drifting})
+    odd = {judged.values[name].paths[k] for name, k in judged.odd_recordings()}
+    vehicles = sorted({judged.vehicles[name].names[k] for name, k in judged.odd_vehicles()})
+    if drifting:
+        text += f' Drift over the flights: {_listed(drifting)}.'
+    if vehicles:
+        text += f' Unlike the rest of the fleet: {_listed(vehicles)}.'
+    if odd:
+        text += f' Unlike the other flights of their vehicle: {counted(len(odd), "recording")}.'
+    if not (drifting or vehicles or odd):
+        tested = judged.trends or any(np.isfinite(o.bound) for o in (
+            *judged.recordings.values(), *[v.outliers for v in judged.vehicles.values()]))
+        text += (' Nothing stands out.' if tested else
+                 ' There are too few recordings a vehicle to tell what stands out.')
+    return text
+
+
+def _listed(names: list[str], most: int = 5) -> str:
+    more = len(names) - most
+    return ', '.join(names[:most]) + (f' and {more} more' if more > 0 else '')
+
+
+def change(name: str, value: float) -> str:
+    """Return a change of a quantity with its sign: in % on the log scale, else in mV."""
+    if not math.isfinite(value):
+        return '-'
+    if name not in LOGARITHMIC:
+        return f'{1e3 * value:+.3g} mV'
+    percent = 100.0 * math.expm1(value)
+    if percent >= 100.0:
+        return f'x {number(math.exp(value))}'
+    return f'{percent:+.0f} %' if abs(percent) >= 10.0 else f'{percent:+.2g} %'
+
+
+def trend_words(trend: Trend) -> str:
+    """Return a drift in a sentence."""
+    flights = trend.last - trend.first
+    return (f'{trend.vehicle}: {trend.quantity} drifts by '
+            f'{change(trend.quantity, trend.slope)} a flight (95 % '
+            f'{change(trend.quantity, trend.low)} to {change(trend.quantity, trend.high)}), '
+            f'{change(trend.quantity, flights * trend.slope)} over {trend.flights} flights; '
+            f'p = {trend.p_value:.2g}, over the fleet {trend.p_family:.2g}.')
+
+
+def finding_words(fleet: Fleet) -> list[str]:
+    """Return what stands out, a sentence each: drift, vehicles, recordings."""
+    judged = fleet.judgement
+    found = [trend_words(trend) for trend in judged.drifting]
+    for name, k in judged.odd_vehicles():
+        one = judged.vehicles[name]
+        centre = float(one.outliers.centre[k])
+        found.append(f'{one.names[k]}: {name} is {shown(judged.values[name], one.value[k])}, '
+                     f'{change(name, float(one.value[k]) - centre)} beside the median of the '
+                     f'vehicles; p over the fleet {_chance(float(one.outliers.chance[k]))}.')
+    for name, k in judged.odd_recordings():
+        values, out = judged.values[name], judged.recordings[name]
+        off = change(name, float(values.value[k] - out.centre[k]))
+        found.append(f'{values.vehicles[k]}, {values.paths[k]}: {name} is '
+                     f'{shown(values, values.value[k])}, {off} beside the other flights; p over '
+                     f'the fleet {_chance(float(out.chance[k]))}.')
+    return found
+
+
+def failure_words(fleet: Fleet) -> list[str]:
+    """Return each recording without numbers and why, the path named once."""
+    found = []
+    for row in fleet.failed:
+        error = str(row['error']).removeprefix(row['path'])
+        # What is left may name a line of it, or a file within it.
+        found.append(row['path'] + (error if re.match(r':\d+:|/', error) else
+                                    f": {error.lstrip(': ')}"))
+    return found
+
+
+def shown(values: Values, value: float | FloatArray) -> str:
+    """Return one value in its unit, as it is at the reference throttle."""
+    return f'{number(float(values.shown(value)))} {QUANTITIES[values.name]}'
+
+
+def _chance(p: float) -> str:
+    return f'below {1.0 / (1 + SIMULATIONS):.1g}' if p < 1.5 / (1 + SIMULATIONS) else f'{p:.2g}'
+
+
+def comparison_words(fleet: Fleet) -> list[str]:
+    """Return sentences: how recordings were compared, and what so few cannot tell."""
+    judged = fleet.judgement
+    notes = []
+    references = [judged.values[name].curve.reference for name in LOGARITHMIC]
+    if all(map(math.isfinite, references)):
+        notes.append('sigma and alpha are compared at throttle '
+                     + ' and '.join(dict.fromkeys(f'{u:.2f}' for u in references))
+                     + ': their common curves over throttle were taken out.')
+    tests = len(judged.trends)
+    if tests:
+        need = fewest(tests, DRIFT_RATE)
+        few = sorted({t.vehicle for t in judged.trends if t.flights < need})
+        notes.append(f'Drift: {tests} tests, held to {100 * DRIFT_RATE:g} % for any false one '
+                     f'(Holm); with so many, {need} flights of a vehicle are the fewest that can '
+                     'show one' + (f', which {counted(len(few), "vehicle")} of those tested '
+                                   'do not have.' if few else '.'))
+    else:
+        notes.append('No vehicle has the 5 flights that a test for drift needs.')
+    if any(np.isfinite(o.bound) for o in judged.recordings.values()):
+        notes.append(
+            f'Outliers: a fleet with nothing wrong shows any with chance '
+            f'{100 * OUTLIER_RATE:g} % (all quantities, recordings and vehicles together, where '
+            'the scatter between good recordings is normal).')
+    else:
+        notes.append(f'No vehicle has the {LEAST} flights that outliers among them need.')
+    if len(fleet.vehicles) < LEAST_VEHICLES:
+        notes.append(f'Vehicles are not compared with each other: that needs {LEAST_VEHICLES}.')
+    return notes
+
+
+def short_names(names: Sequence[str]) -> dict[str, str]:
+    """Return names as tables show them: long ones without their middle."""
+    short = {name: name if len(name) <= _NAME else f'{name[:13]}\u2026{name[13 - _NAME + 1:]}'
+             for name in names}
+    seen = Counter(short.values())
+    return {name: text if seen[text] == 1 else name for name, text in short.items()}
+
+
+def vehicle_rows(fleet: Fleet) -> list[list[str]]:
+    """Return a row of cells for each vehicle, under `VEHICLE_HEADS`."""
+    judged = fleet.judgement
+    found = []
+    shown_as = short_names(fleet.vehicles)
+    for vehicle in fleet.vehicles:
+        flights = {row['path'] for row in fleet.rows if row['vehicle'] == vehicle
+                   and row['flight'] is not None}
+        cells = [shown_as[vehicle], str(len(flights))]
+        for name in QUANTITIES:
+            cells += [_median(judged, name, vehicle), _slope(judged, name, vehicle)]
+        found.append(cells)
+    return found
+
+
+def _median(judged: Judgement, name: str, vehicle: str) -> str:
+    one = judged.vehicles[name]
+    if vehicle not in one.names:
+        return '-'
+    k = one.names.index(vehicle)
+    star = '*' if one.outliers.found[k] else ''
+    return number(float(judged.values[name].shown(one.value[k]))) + star
+
+
+def _slope(judged: Judgement, name: str, vehicle: str) -> str:
+    for trend in judged.trends:
+        if (trend.quantity, trend.vehicle) == (name, vehicle):
+            return change(name, trend.slope) + ('*' if trend.p_family <= DRIFT_RATE else '')
+    return '-'
+
+
+def quality_counts(fleet: Fleet) -> list[tuple[str, int]]:
+    """Return statuses that are not good, flags, verdicts and causes with how often they occur."""
+    counts: Counter[str] = Counter()
+    seen: set[str] = set()
+    for row in fleet.rows:
+        if row['status'] is not None:
+            if row['status'] not in USABLE:
+                counts[f"level without estimate: {row['status']}"] += 1
+            counts.update(f'level with flag {flag}' for flag in row['flags'] or ())
+        if row['path'] not in seen and row['verdict'] is not None:
+            counts[f"recording with verdict {row['verdict']}"] += 1
+            counts.update(f'recording with cause {cause}' for cause in set(row['causes'] or ()))
+        seen.add(row['path'])
+    return counts.most_common()
+
+
+def as_data(fleet: Fleet) -> dict[str, Any]:
+    """Return a fleet as plain data; NaN stands for unknown."""
+    judged = fleet.judgement
+    odd = [{'what': 'vehicle', 'quantity': name, 'vehicle': judged.vehicles[name].names[k],
+            'path': None, 'score': float(judged.vehicles[name].outliers.score[k]),
+            'p_family': float(judged.vehicles[name].outliers.chance[k])}
+           for name, k in judged.odd_vehicles()]
+    odd += [{'what': 'recording', 'quantity': name, 'vehicle': judged.values[name].vehicles[k],
+             'path': judged.values[name].paths[k],
+             'score': float(judged.recordings[name].score[k]),
+             'p_family': float(judged.recordings[name].chance[k])}
+            for name, k in judged.odd_recordings()]
+    return {
+        'headline': headline(fleet), 'recordings': fleet.recordings, 'analysed': fleet.analysed,
+        'failed': len(fleet.failed), 'duplicates': len(fleet.duplicates),
+        'vehicles': [{
+            'vehicle': vehicle,
+            **{name: _vehicle_value(judged, name, vehicle) for name in QUANTITIES}}
+            for vehicle in fleet.vehicles],
+        'drift': [{
+            'vehicle': t.vehicle, 'quantity': t.quantity, 'flights': t.flights,
+            'slope': t.slope, 'ci95': [t.low, t.high], 'p_value': t.p_value,
+            'p_family': t.p_family, 'stands': t.p_family <= DRIFT_RATE} for t in judged.trends],
+        'outliers': odd,
+        'rows': [{name: value.isoformat() if name == 'start' and value is not None else value
+                  for name, value in row.items()} for row in fleet.rows],
+        'notes': [*fleet.notes, *comparison_words(fleet)]}
+
+
+def _vehicle_value(judged: Judgement, name: str, vehicle: str) -> float:
+    one = judged.vehicles[name]
+    return (float(judged.values[name].shown(one.value[one.names.index(vehicle)]))
+            if vehicle in one.names else NAN)

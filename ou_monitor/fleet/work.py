@@ -1,0 +1,159 @@
+"""One recording -> what the fleet table holds of it; this is what the workers run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+import math
+from typing import Any
+
+import numpy as np
+from ou_monitor.analyze.analyze import Analysis, analyze
+from ou_monitor.analyze.level_result import LevelResult
+from ou_monitor.errors import InputError
+from ou_monitor.online.estimator.compiled import kernels
+from ou_monitor.online.risk.first_passage import brownout_probability
+from ou_monitor.recordings.read import read_recording
+from ou_monitor.records import NAN, Recording
+
+# A clock that says less than the year 2000 counts from a start-up, not from 1970; one that says
+# more than 2100 does not count seconds.
+_EPOCH, _LATEST = 946684800.0, 4102444800.0
+# Levels nearer than this tell no slope over throttle.
+_SAG_SPAN = 0.1
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    How every recording of the fleet is analysed.
+
+    Attributes
+    ----------
+    levels : tuple of float or None
+        Throttles of the load levels; found in each recording when None.
+    window : float
+        Window of the sliding estimate, s.
+    brownout_voltage, brownout_horizon : float
+        Of the risk, V and s; a voltage of NaN leaves the risk unknown.
+    msg_config, voltage_topic, throttle_topic : str or None
+        As of `read_recording`.
+    partial : bool
+        Whether damaged bags are read as far as they hold.
+    discover : bool
+        Whether causes are looked for, which takes some seconds a recording.
+    seed : int
+        Of `discover`.
+
+    """
+
+    levels: tuple[float, ...] | None = None
+    window: float = 2.0
+    brownout_voltage: float = NAN
+    brownout_horizon: float = 5.0
+    msg_config: str | None = None
+    voltage_topic: str | None = None
+    throttle_topic: str | None = None
+    partial: bool = False
+    discover: bool = False
+    seed: int = 0
+
+    def as_data(self) -> dict[str, Any]:
+        """Return the options as JSON holds them."""
+        return asdict(self)
+
+
+def work(path: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Analyse one recording; whatever is wrong with it is in the result."""
+    # A run that is taken up again must give the same digits, and the compiled sums differ from
+    # NumPy's in the last ones: not some of each, as the compiler gets ready.
+    kernels(wait=True)
+    try:
+        return _analysed(path, Options(**options))
+    except InputError as error:
+        why = str(error)
+    except MemoryError:
+        why = 'The recording does not fit into the memory of the worker: use fewer workers.'
+    except Exception as error:
+        # One recording that our code cannot bear must not cost the others; the kind of error
+        # is what a report about it needs.
+        why = f'The analysis failed ({type(error).__name__}: {error}): please report it.'
+    return {'error': ' '.join(why.split()), 'levels': []}
+
+
+def _analysed(path: str, options: Options) -> dict[str, Any]:
+    recording = read_recording(
+        path, msg_config=options.msg_config, voltage_topic=options.voltage_topic,
+        throttle_topic=options.throttle_topic, partial=options.partial)
+    if recording.n < 2:
+        raise InputError(f'{recording.name} holds {recording.n} usable sample: nothing can be '
+                         'estimated from it')
+    # What overflows ends as not finite, which the analysis tells by its status.
+    with np.errstate(all='ignore'):
+        analysis = analyze(
+            recording, levels=options.levels if recording.has_throttle else None,
+            window=options.window, brownout_voltage=options.brownout_voltage,
+            brownout_horizon=options.brownout_horizon)
+        sag, sag_se = _sag(analysis)
+        start = float(recording.t[0])
+        known = analysis.sliding.risk[np.isfinite(analysis.sliding.risk)]
+        return {
+            'error': '', 'recording': recording.name,
+            'vehicle': recording.source.get('vehicle', ''),
+            'start': start if _EPOCH <= start < _LATEST else NAN, 'duration_s': recording.duration,
+            'samples': recording.n, 'rate_hz': (recording.n - 1) / recording.duration,
+            'sag': sag, 'sag_se': sag_se, 'risk_max': float(known.max()) if known.size else NAN,
+            'alpha_p': analysis.alpha_test.p_value,
+            'quality': [f'{item.severity.value}: {item.text}' for item in analysis.quality],
+            'levels': [_level(level, options) for level in analysis.levels],
+            'notes': list(analysis.notes), **_discovered(recording, options)}
+
+
+def _level(level: LevelResult, options: Options) -> dict[str, Any]:
+    e = level.estimate
+    risk = NAN if math.isnan(options.brownout_voltage) else brownout_probability(
+        e, options.brownout_voltage, options.brownout_horizon)
+    line = level.lines.lines[0] if level.lines.lines else None
+    return {
+        'level': level.label, 'throttle': level.throttle, 'time_s': level.time, 'n': level.n,
+        'mean': level.mean, 'vpp': level.vpp, 'vrms': level.vrms,
+        **{name: float(getattr(e, name)) for name in (
+            'alpha', 'alpha_se', 'sigma', 'sigma_se', 'var_inf', 'var_inf_se', 'u0', 'u0_se',
+            'noise_std')},
+        'excess_kurtosis': level.shape.kurtosis, 'impulses': level.shape.impulses,
+        'line_hz': line.frequency if line else NAN, 'line_rms': line.rms if line else NAN,
+        'process': level.kind.value, 'risk': risk, 'status': e.status.name,
+        'flags': [flag.name for flag in e.flags], 'level_notes': list(level.notes)}
+
+
+def _sag(analysis: Analysis) -> tuple[float, float]:
+    """
+    Return the slope of the mean over throttle (V per unit) and its standard error.
+
+    Weighted least squares over the levels; where three or more of them scatter
+    by more than their errors, the error is widened by that.
+    """
+    rows = [(level.throttle, level.estimate.u0, level.estimate.u0_se)
+            for level in analysis.levels if level.estimate.usable]
+    u, v, se = (np.array(column) for column in zip(*rows)) if rows else (np.zeros(0),) * 3
+    good = np.isfinite(u) & np.isfinite(v) & (se > 0.0)
+    u, v, se = u[good], v[good], se[good]
+    if u.size < 2 or float(np.ptp(u)) < _SAG_SPAN:
+        return NAN, NAN
+    weight = 1.0 / se ** 2
+    x = u - float(weight @ u / weight.sum())
+    spread = float(weight @ x ** 2)
+    slope = float((weight * x) @ v) / spread
+    rest = v - float(weight @ v / weight.sum()) - slope * x
+    widen = math.sqrt(max(1.0, float(weight @ rest ** 2) / (u.size - 2))) if u.size > 2 else 1.0
+    return slope, widen / math.sqrt(spread)
+
+
+def _discovered(recording: Recording, options: Options) -> dict[str, Any]:
+    if not options.discover:
+        return {'verdict': None, 'causes': None, 'gain': NAN, 'gain_se': NAN}
+    from ou_monitor.discover.discover import discover
+
+    finding = discover(recording, seed=options.seed)
+    return {'verdict': finding.verdict.value, 'causes': [cause.name for cause in finding.causes],
+            'gain': finding.gain, 'gain_se': finding.gain_se}

@@ -1,0 +1,1 @@
+"""First passage of the supply to a level: laws, means, samples."""

@@ -1,1 +1,0 @@
-"""On the bench: a recording -> answers."""

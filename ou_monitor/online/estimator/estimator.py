@@ -1,0 +1,385 @@
+"""
+The sliding-window OU estimator, used by the node and by the offline tools.
+
+voltage = level + response to throttle + OU(alpha, sigma) + white noise, all
+estimated together.  Limits: one relaxation (no second pole, no resonance);
+sigma constant within the window; alpha known no better than sqrt(2/(alpha T));
+sources faster than `fastest` are averaged down to it.  Measured accuracy and
+cost: doc/estimation.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.model import arma
+from ou_monitor.online.estimator import judgement
+from ou_monitor.online.estimator.compiled import kernels
+from ou_monitor.online.estimator.fitted import Fitted, from_window
+from ou_monitor.online.estimator.intake import as_column, BATCH, Batch, Intake, Thinner
+from ou_monitor.online.estimator.irregular import fit_irregular, MOST
+from ou_monitor.online.estimator.lagsums import Sums
+from ou_monitor.online.estimator.quality import examine, Quality, TAIL
+from ou_monitor.online.estimator.repeats import refresh_period, Repeats, whole
+from ou_monitor.online.estimator.resolution import FACTOR, FEWEST, LAGS, Resolution
+from ou_monitor.online.estimator.series import T, U, Y
+from ou_monitor.online.estimator.window_fit import fit_window, TREND_SCORE
+from ou_monitor.records import Estimate, FloatArray, NAN, Status
+
+# Samples from which a fit is tried.
+MIN_SAMPLES = 20
+# theta^LAGS beyond this: the lags no longer hold the noise, go coarser.
+_LOST = 0.05
+# Share of samples with a partner at the longest lag below which the window
+# counts as uneven.
+_EVEN = 0.5
+# Jitter of the stamps, in relaxation times, from which they are taken as they
+# are: an even grid is then wrong by its square.
+_JITTER = 0.1
+# An ADC step is white noise only where the OU crosses several codes within a
+# step: D >= (0.7 step / sigma)^2 (doc/estimation.md).
+_DITHER = 0.7
+# A diffusion of one step below this share of the variance is rounding of the sums.
+_EXACT = 1e-14
+# Increments that vary by less than this share of their mean square are one: a ramp.
+_RAMP = 1e-9
+# The quality of the input is looked at this many times per window.
+_LOOKS = 4
+# Where repeats are looked for: a third of the samples repeat at two a refresh, or more.
+_TIED = 0.25
+_DOUBLE = np.dtype(np.float64)
+_NOTHING = Estimate()
+
+
+class SlidingEstimator:
+    """
+    OU parameters of the last `window` seconds of a voltage.
+
+    Parameters
+    ----------
+    window : float
+        Length of the window, s, > 0; resolved to 1/40 of itself
+        (`Estimate.duration` tells the exact length).
+    fastest : float
+        Highest rate kept, Hz; sources faster than this are averaged in blocks,
+        and the fit knows it.
+
+    Raises
+    ------
+    ValueError
+        When the window or the rate is not a positive finite number.
+
+    """
+
+    def __init__(self, window: float = 2.0, *, fastest: float = 1.0e4) -> None:
+        self._window = _positive('window', window, 's')
+        self._intake = Intake()
+        self._fastest = _positive('fastest', fastest, 'Hz')
+        self._thinner = Thinner(self._fastest)
+        self._repeats = Repeats()
+        self._finest = Resolution(self._window)
+        self._tail = np.empty(0)
+        self._quality = Quality()
+        self._jitter = 0.0
+        self._looked = -math.inf
+        self._start: tuple[float, float] | None = None
+        self._cached: Estimate | None = None
+        self._last: Estimate | None = None
+        kernels()
+
+    @property
+    def window(self) -> float:
+        """Length of the window, s."""
+        return self._window
+
+    @window.setter
+    def window(self, value: float) -> None:
+        """Change the length; samples still inside the new length stay."""
+        self._work_off()
+        self._window = _positive('window', value, 's')
+        self._finest.set_window(self._window)
+        self._cached = self._last = None
+
+    def reset(self) -> None:
+        """Clear the window; the counters go on."""
+        self._work_off()
+        self._intake.forget()
+        self._intake.count(resets=1)
+        self._forget()
+        self._cached = self._last = None
+
+    def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
+             throttle: npt.ArrayLike | None = None) -> None:
+        """
+        Add samples.
+
+        Parameters
+        ----------
+        t : float or array_like, shape (n,)
+            Stamps, s.  Late samples are sorted in when they come in one batch
+            with what they are late for, else dropped and counted; a step back
+            or a pause longer than the window clears it.
+        voltage : float or array_like, shape (n,)
+            Voltage, V.  NaN and infinite samples are dropped and counted.
+        throttle : float or array_like, shape (n,), optional
+            Throttle, 0..1; NaN or left out means unknown.
+
+        Raises
+        ------
+        ValueError
+            When the shapes differ.
+
+        """
+        self._cached = None
+        # What the fast sources send, with as few steps as can be.
+        stamps: Any = t
+        volts: Any = voltage
+        if not (type(stamps) is np.ndarray is type(volts) and stamps.dtype is _DOUBLE
+                is volts.dtype and stamps.ndim == 1 == volts.ndim):
+            if isinstance(stamps, float) and isinstance(volts, float) and (
+                    throttle is None or isinstance(throttle, (float, int))):
+                if not self._intake.put_one(stamps, volts, throttle):
+                    self._work_off()
+                    self._intake.put_one(stamps, volts, throttle)
+                return
+            stamps, volts = as_column(stamps), as_column(volts)
+        if len(stamps) != len(volts) or stamps.ndim != 1 or volts.ndim != 1:
+            raise ValueError(
+                f't and voltage must have one shape (n,): got {stamps.shape} and {volts.shape}')
+        load: FloatArray | float | None = None
+        if type(throttle) is np.ndarray and throttle.dtype is _DOUBLE and (
+                throttle.shape == stamps.shape):
+            load = throttle
+        elif throttle is not None:
+            load = np.asarray(throttle, dtype=np.float64)
+            if load.ndim == 0:
+                load = float(load)
+            elif load.shape != stamps.shape:
+                raise ValueError(
+                    f'throttle must be one number or have the shape of t, {stamps.shape}: got '
+                    f'{load.shape}')
+        put = self._intake.put
+        if put(stamps, volts, load):
+            return
+        for begin in range(0, stamps.size, BATCH):
+            part = slice(begin, begin + BATCH)
+            self._work_off()
+            put(stamps[part], volts[part], load[part] if isinstance(load, np.ndarray) else load)
+
+    def estimate(self) -> Estimate:
+        """Return the estimate for the window that ends at the newest sample."""
+        if self._cached is None:
+            used = self._intake.used
+            self._work_off()
+            if self._last is not None and self._intake.used == used == self._last.counters.used:
+                # Nothing new in the window: the same numbers, not merely close ones.
+                self._last = judgement.recount(self._last, self._intake.counters)
+            else:
+                self._last = self._estimate()
+            self._cached = self._last
+        return self._cached
+
+    def _work_off(self) -> None:
+        """Move what has been pushed into the window."""
+        if not self._intake.waiting:
+            return
+        for batch in self._intake.work_off(self._window, self._thinner.step):
+            if batch.restart:
+                self._forget()
+            raw = batch.y
+            self._tail = raw[-TAIL:].copy() if raw.size >= TAIL else np.concatenate(
+                [self._tail, raw])[-TAIL:]
+            if self._looked == -math.inf and self._tail.size >= TAIL and (
+                    self._repeats.period == 1.0) and _ties(self._tail) > _TIED:
+                # Before the first estimate: where the source is thinned it would be too late.
+                self._refresh(refresh_period(self._tail))
+            self._add(batch)
+
+    def _add(self, batch: Batch | None) -> None:
+        """Add samples to the window, less repeats of a source known to repeat."""
+        if batch is not None and self._repeats.period > 1.0:
+            size = batch.t.size
+            batch = self._repeats.drop(batch)
+            dropped = size - (0 if batch is None else batch.t.size)
+            self._intake.count(held=dropped, used=-dropped)
+        if batch is not None:
+            t, y, u, breaks, restart = self._thinner.take(batch)
+            if restart:
+                # Block means of another size do not go with the old ones.
+                self._intake.count(resets=1)
+                self._finest.clear()
+                self._start = None
+            self._finest.add(t, y, u, breaks)
+
+    def _refresh(self, period: float) -> None:
+        """Take the window again, less repeats, when a source is found to repeat its last value."""
+        before, self._repeats.period = self._repeats.period, period
+        if period == 1.0:
+            self._repeats.forget()
+        if before > 1.0 or period == 1.0:
+            return
+        again = whole(self._finest.series.all_columns()) if self._thinner.m == 1 else None
+        if again is None and self._finest.series.size:
+            # Means of repeats and refreshes cannot be told apart.
+            self._intake.count(resets=1)
+        self._finest.clear()
+        self._thinner = Thinner(self._fastest)
+        self._start = None
+        self._add(again)
+
+    def _forget(self) -> None:
+        self._thinner.forget()
+        self._repeats.forget()
+        self._finest.clear()
+        self._tail = np.empty(0)
+        self._looked = -math.inf
+        self._start = None
+
+    def _look(self, t: float) -> Quality:
+        """Examine the raw samples, now and then."""
+        if not 0.0 <= t - self._looked < self._window / _LOOKS:
+            self._quality = examine(self._tail, self._repeats.period)
+            if self._quality.held != self._repeats.period:
+                self._refresh(self._quality.held)
+            steps = np.diff(self._finest.series.column(T)[-TAIL:])
+            self._jitter = float(np.std(steps)) if steps.size else 0.0
+            self._looked = t
+        return self._quality
+
+    def _estimate(self) -> Estimate:
+        """Fit the window."""
+        series, intake = self._finest.series, self._intake
+        quality = self._look(intake.newest) if series.size else self._quality
+        counters = intake.counters
+        if not series.size:
+            waiting = self._thinner.waiting(intake.newest - self._window)
+            n = waiting.size
+            if not n:
+                return Estimate(counters=counters)
+            duration = intake.newest - waiting.item(0)
+            return Estimate(t=intake.newest, voltage=float(self._tail[-1]), n=n,
+                            duration=duration, rate=(n - 1) / duration if duration else NAN,
+                            counters=counters, status=Status.TOO_FEW_SAMPLES,
+                            flags=tuple(judgement.input_flags(counters, quality, NAN)))
+        main, _, at, end = series.store(series.first)
+        duration = main.item(T, end - 1) - main.item(T, at)
+        m, n = self._thinner.m, end - at
+        base = judgement.made(
+            _NOTHING, t=intake.newest, voltage=self._tail.item(-1), throttle=series.last(U),
+            n=n * m, duration=duration, counters=counters,
+            rate=(n - 1) * m / duration if duration > 0.0 else NAN)
+        status = None
+        if n < MIN_SAMPLES:
+            status = Status.TOO_FEW_SAMPLES
+        elif main.item(Y, at) == main.item(Y, end - 1) and not np.ptp(main[Y, at:end]) > 0.0:
+            status = Status.CONSTANT
+        if status is not None:
+            return judgement.made(
+                base, status=status, u0=float(main[Y, at:end].mean()),
+                flags=tuple(judgement.input_flags(counters, quality, NAN)))
+        fit, smoothness = self._fit(quality, duration)
+        return judgement.judge(fit, base, quality, self._throttle_std(), smoothness)
+
+    def _throttle_std(self) -> float:
+        """Return the standard deviation of throttle in the window; NaN when unknown."""
+        series = self._finest.series
+        if not series.known:
+            return NAN
+        return self._finest.sums.throttle_std if series.moves else 0.0
+
+    def _fit(self, quality: Quality, duration: float) -> tuple[Fitted, float]:
+        """Return the fit, and how much smoother than it neighbouring increments are."""
+        series = self._finest.series
+        moves = series.moves and series.known
+        sums = self._finest.sums.total()
+        if self._thinner.m == 1 and series.size <= MOST and (
+                sums.pairs[-1] < _EVEN * (sums.n - LAGS)):
+            return fit_irregular(series.all_columns(), moves), NAN
+        resolution, m = self._finest, self._thinner.m
+        step = duration / (series.size - 1) if series.even else self._step(series.column(T))
+        fit = fit_window(sums, m, self._start)
+        self._start = (math.log(fit.a), fit.theta) if fit.correlated else None
+        smoothness, drifts = NAN, False
+        if fit.correlated:
+            raw, one = _increments(sums, 1)
+            if one > _RAMP * raw:
+                smoothness = _smoothness(_increments(sums, 2)[1] / one, fit.a, m)
+            drifts = _drifts(sums, one)
+            if fit.scale < _EXACT * float(sums.second[0, 0]) / sums.n:
+                # Load and trend leave nothing but rounding.
+                fit = replace(fit, correlated=False)
+            if m == 1 and series.size <= MOST and self._jitter * fit.a / step > _JITTER:
+                return fit_irregular(series.all_columns(), moves), NAN
+        # Coarser where noise, or an ADC step, hides what the lags can hold.
+        while fit.correlated and resolution.series.size >= FACTOR * FEWEST and (
+                fit.theta ** LAGS > _LOST
+                or step < (_DITHER * quality.step) ** 2 * step / fit.scale):
+            resolution = resolution.coarser()
+            m *= FACTOR
+            step *= FACTOR
+            sums = resolution.sums.total()
+            coarse = fit_window(sums, m)
+            if not coarse.correlated:
+                break
+            fit = coarse
+        found = from_window(fit, step, m, sums.n, resolution.sums.reference)
+        return replace(found, trend=True) if drifts else found, smoothness
+
+    def _step(self, t: FloatArray) -> float:
+        """Return the mean step between evenly spaced samples, s."""
+        series = self._finest.series
+        runs = series.runs(series.first, series.end)
+        even = np.diff(t)[runs[1:] > 0]
+        return float(even.mean()) if even.size else self._thinner.step
+
+
+def _smoothness(ratio: float, a: float, m: int) -> float:
+    """
+    Return how much more neighbouring increments are correlated than in an OU.
+
+    From D_1 = E(z_j - z_{j-1})^2 and D_2 = E(z_j - z_{j-2})^2, less the means
+    squared, their correlation is D_2 / (2 D_1) - 1; the ratio is D_2 / D_1.
+    """
+    gamma0, gamma1 = arma.block_autocovariance(a, m)
+    of_ou = (gamma0 - gamma1 * math.exp(-a)) / (2.0 * (gamma0 - gamma1)) - 1.0
+    return 0.5 * ratio - 1.0 - of_ou
+
+
+def _drifts(sums: Sums, one: float) -> bool:
+    """
+    Whether the voltage drifts faster than even a random walk of its increments would.
+
+    What the fit of a window that does not come back cannot tell: to it every
+    drift may be chance.  The increments over the longest lag stand for those
+    that go on in one direction for a while.
+    """
+    pairs = sums.pairs.item(-1)
+    # While throttle moves, it explains what it can.
+    if pairs < _EVEN * sums.n or sums.first.size > 1:
+        return False
+    lag = sums.pairs.size
+    variance = max(one, _increments(sums, lag)[1] / lag)
+    return sums.change.item(0, 0) ** 2 / sums.pairs.item(0) > TREND_SCORE ** 2 * variance
+
+
+def _increments(sums: Sums, lag: int) -> tuple[float, float]:
+    """Return mean square and variance, V^2, of increments over a lag."""
+    pairs = max(sums.pairs.item(lag - 1), 1.0)
+    square = sums.spread.item(lag - 1, 0, 0) / pairs
+    return square, square - (sums.change.item(lag - 1, 0) / pairs) ** 2
+
+
+def _ties(y: FloatArray) -> float:
+    """Return the share of samples that are equal to the one before."""
+    return float(np.count_nonzero(y[1:] == y[:-1])) / y.size
+
+
+def _positive(name: str, value: float, unit: str) -> float:
+    number = float(value)
+    if not (math.isfinite(number) and number > 0.0):
+        raise ValueError(f'{name} must be a positive number of {unit}, got {value}')
+    return number

@@ -1,0 +1,1 @@
+"""The adaptive low-pass: sigma -> cutoff -> output."""

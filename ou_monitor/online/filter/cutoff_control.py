@@ -1,0 +1,203 @@
+"""
+From the cutoff that a law wants to the cutoff in force.
+
+limits -> dead band -> smoothing in ln(fc), fast for a certain sigma -> slew
+limit -> 0.45 of the sample rate.  What is not known asks for the fallback.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+
+from ou_monitor.online.settings import FilterSettings
+
+LN2 = math.log(2.0)
+# Highest cutoff as a share of the sample rate (Betaflight allows 0.475).
+OF_RATE = 0.45
+# Samples over which the sample rate is averaged; how far an interval may be from the mean before
+# it is odd; and how many odd ones in a row are a new rate.
+_MEMORY = 100
+_ODD = 5.0
+_NEW = 5
+
+
+class Bound(enum.Enum):
+    """What decides the cutoff at this sample; the value is how it is told."""
+
+    NONE = 'the law'
+    LOWEST = 'fmin'
+    LAG = 'fmin by max_lag'
+    HIGHEST = 'fmax'
+    RATE = '0.45 of the sample rate'
+    SLEW = 'the slew limit'
+    SMOOTHING = 'the smoothing'
+    DEAD_BAND = 'the dead band'
+    FALLBACK = 'the fallback'
+
+
+class SampleInterval:
+    """
+    Mean time between samples, s, over some 100 of them.
+
+    An interval of more than five means is a gap and left out, unless gaps are
+    a third of all; five in a row that are five times off are a new rate, which
+    starts the mean anew.
+
+    Attributes
+    ----------
+    mean : float
+        Mean interval, s; 0 before the second sample.
+
+    """
+
+    __slots__ = ('_long', '_n', '_short', 'mean')
+
+    def __init__(self) -> None:
+        self.mean = 0.0
+        self._n = self._short = self._long = 0
+
+    def add(self, dt: float) -> float:
+        """Take an interval above 0, s; return the mean."""
+        if dt > _ODD * self.mean:
+            self._short, self._long = 0, self._long + 2
+            if self._n and self._long < 2 * _NEW:
+                return self.mean
+            return self._restart(dt)
+        if self.mean > _ODD * dt:
+            self._short += 1
+            if self._short >= _NEW:
+                return self._restart(dt)
+        else:
+            # Two normal intervals make up for a gap.
+            self._short, self._long = 0, max(self._long - 1, 0)
+        if self._n < _MEMORY:
+            self._n += 1
+        self.mean += (dt - self.mean) / self._n
+        return self.mean
+
+    def _restart(self, dt: float) -> float:
+        self.mean, self._n = dt, 1
+        self._short = self._long = 0
+        return dt
+
+
+def time_constant(settings: FilterSettings, error: float) -> float:
+    """
+    Return the time constant of the cutoff for a relative error of sigma.
+
+    A level that wanders as a random walk of intensity q, seen with an error e
+    over a correlation time T, is tracked best (steady Kalman filter) with the
+    time constant e sqrt(T) / q: proportional to the error.  So it is
+    `smoothing` at `smoothing_error`, in proportion elsewhere, within a factor
+    of `smoothing_range` (Betaflight moves its notches 1 to 10 times as fast).
+
+    result in s.
+    """
+    if error != error:
+        return settings.smoothing
+    most = settings.smoothing_range
+    return settings.smoothing * min(max(error / settings.smoothing_error, 1.0 / most), most)
+
+
+class CutoffControl:
+    """
+    The cutoff in force, and what holds it.
+
+    Parameters
+    ----------
+    settings : FilterSettings
+        Limits, smoothing, slew, dead band, fallback.
+
+    """
+
+    def __init__(self, settings: FilterSettings) -> None:
+        self._settings = settings
+        self._lowest = settings.lowest
+        self._aim = self._moving = self._cutoff = settings.fallback
+        self._wanted = math.nan
+        self._started = self._follow_exactly = self._slewing = False
+
+    @property
+    def cutoff(self) -> float:
+        """Cutoff in force, Hz."""
+        return self._cutoff
+
+    @property
+    def wanted(self) -> float:
+        """Cutoff that the law wants, Hz; NaN when it does not know."""
+        return self._wanted
+
+    @property
+    def bound(self) -> Bound:
+        """Return what decides the cutoff in force."""
+        s = self._settings
+        if self._cutoff < self._moving:
+            return Bound.RATE
+        if self._moving != self._aim:
+            return Bound.SLEW if self._slewing else Bound.SMOOTHING
+        if self._wanted != self._wanted:
+            return Bound.FALLBACK
+        if self._wanted <= self._lowest:
+            return Bound.LAG if s.max_lag else Bound.LOWEST
+        if self._wanted >= s.fmax:
+            return Bound.HIGHEST
+        return Bound.NONE if self._wanted == self._aim else Bound.DEAD_BAND
+
+    def configure(self, settings: FilterSettings) -> None:
+        """Change settings; the cutoff stays where it is, inside the new limits."""
+        self._settings = settings
+        self._lowest = settings.lowest
+        self._moving = self._clip(self._moving)
+        self._aim = self._clip(self._aim)
+        self._cutoff = min(self._cutoff, self._moving) if self._started else self._moving
+        self._follow_exactly = True
+        if not self._started:
+            self._aim = self._moving = self._cutoff = settings.fallback
+
+    def update(self, wanted: float, error: float, dt: float, interval: float) -> float:
+        """
+        Take what the law wants; return the cutoff in force.
+
+        wanted in Hz, dt in s, interval in s, result in Hz.
+        """
+        self._choose(wanted)
+        if not self._started:
+            self._started, self._moving = True, self._aim
+        elif self._moving != self._aim and dt > 0.0:
+            self._move(error, dt)
+        self._cutoff = self._moving
+        if interval > 0.0:
+            self._cutoff = min(self._cutoff, OF_RATE / interval)
+        return self._cutoff
+
+    def _choose(self, wanted: float) -> None:
+        """Set the aim: the wanted cutoff once it is outside the dead band around the old aim."""
+        if wanted != wanted:
+            self._wanted, self._aim = wanted, self._settings.fallback
+            self._follow_exactly = True
+            return
+        if wanted == self._wanted and not self._follow_exactly:
+            return
+        self._wanted = wanted
+        inside = self._clip(wanted)
+        band = self._settings.dead_band * LN2
+        if self._follow_exactly or not self._started or abs(math.log(inside / self._aim)) > band:
+            self._aim = inside
+        self._follow_exactly = False
+
+    def _move(self, error: float, dt: float) -> None:
+        s = self._settings
+        gap = math.log(self._aim / self._moving)
+        constant = time_constant(s, error)
+        step = gap * -math.expm1(-dt / constant) if constant > 0.0 else gap
+        most = s.slew * LN2 * dt if s.slew else math.inf
+        self._slewing = abs(step) > most
+        if self._slewing:
+            step = math.copysign(most, step)
+        # What is left below any meaning is not crept after for ever.
+        arrived = abs(gap - step) < 1e-6
+        self._moving = self._aim if arrived else self._moving * math.exp(step)
+
+    def _clip(self, cutoff: float) -> float:
+        return min(max(cutoff, self._lowest), self._settings.fmax)

@@ -1,0 +1,217 @@
+r"""
+Laws from sigma to the cutoff that is wanted, each derived where it is.
+
+With w = 2 pi fc, the supply U an Ornstein-Uhlenbeck process of intensity
+sigma and rate alpha, and `coupling` times its deviation in the signal, the
+output variance is (coupling sigma)^2 V(w), by the integral of
+|H(iw)|^2 / (alpha^2 + w^2) over the frequencies:
+
+    low-pass, order 1     V = w / (2 alpha (w + alpha))
+    low-pass, order 2     V = w (sqrt2 w + alpha) / (2 sqrt2 alpha (w^2 + sqrt2 w alpha + alpha^2))
+    derivative, order 1   V = w^2 / (2 (w + alpha))
+    derivative, order 2   V = w^3 / (2 sqrt2 (w^2 + sqrt2 w alpha + alpha^2))
+
+All grow with w, so that a wanted variance has one cutoff.
+
+Limits: stationary laws of a cutoff that stays; noise above half the sample
+rate, which folds down, is not in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import math
+
+from ou_monitor.online.filter.white_noise import held_cutoff
+from ou_monitor.online.filter.wiener import least_error, least_sampled_error
+from ou_monitor.online.settings import FilterSettings
+
+TWO_PI = 2.0 * math.pi
+_ROOT2 = math.sqrt(2.0)
+_ROOT8 = 2.0 * _ROOT2
+NAN = math.nan
+
+
+def wanted_cutoff(settings: FilterSettings, sigma: float, alpha: float, throttle: float,
+                  interval: float) -> float:
+    """
+    Return the cutoff that the law in force asks for.
+
+    sigma in V/sqrt(s), alpha in 1/s, throttle 0..1, interval in s.
+    """
+    if settings.law == 'throttle':
+        return throttle_law(settings, throttle)
+    if not (math.isfinite(sigma) and sigma >= 0.0):
+        return NAN
+    rate = alpha if 1e-6 <= alpha <= 1e9 else settings.alpha
+    wanted = LAWS[settings.law](settings, sigma, rate, interval)
+    return min(max(wanted, settings.lowest), settings.fmax)
+
+
+def threshold_law(settings: FilterSettings, sigma: float, alpha: float,
+                  interval: float) -> float:
+    """Return fmax up to `sigma_ref` and the lowest cutoff above it (the paper, section 6)."""
+    return settings.fmax if sigma <= settings.sigma_ref else settings.lowest
+
+
+def constant_noise_law(settings: FilterSettings, sigma: float, alpha: float,
+                       interval: float) -> float:
+    """
+    Return the cutoff at which the rms of the output noise is the wanted one.
+
+    With `coupling`: the noise is the supply's own, and `cutoff_for_noise`
+    solves coupling sigma sqrt(V) = noise_wanted (when that is not given: what
+    comes out at `sigma_ref` and fmax).
+
+    Without: white noise of a variance proportional to sigma^2, held at its
+    value for `sigma_ref` and fmax; see `relative_cutoff`.
+    """
+    if settings.coupling:
+        wanted = settings.noise_wanted or settings.coupling * settings.sigma_ref * math.sqrt(
+            supply_noise(settings.mode, settings.order, settings.fmax, alpha))
+        return cutoff_for_noise(settings.mode, settings.order, wanted,
+                                settings.coupling * sigma, alpha)
+    if sigma <= settings.sigma_ref:
+        return settings.fmax
+    return relative_cutoff(settings.mode, settings.order, settings.fmax,
+                           sigma / settings.sigma_ref, interval)
+
+
+def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
+    r"""
+    Return the cutoff that makes `times` as much white noise come out as at fmax once did.
+
+    Of the sampled filter, see `white_noise.held_cutoff`.  Far below the sample
+    rate: white noise of two-sided density N through a low-pass has the variance
+    N w / 2 (order 1) or N w / (2 sqrt 2) (order 2): rms ~ sqrt(fc), so
+    fc = fmax / times^2 for both.  Derivative, order 2: N int w'^2 |H|^2 dw' / 2 pi
+    = N w^3 / (2 sqrt 2), so rms ~ fc^(3/2) and fc = fmax / times^(2/3).
+    Derivative, order 1: the integral is infinite and the sample rate makes it
+    finite; independent samples of variance v give v w^2, so fc = fmax / times.
+
+    Parameters
+    ----------
+    mode : {'lowpass', 'derivative'}
+        What comes out.
+    order : {1, 2}
+        Order.
+    fmax : float
+        Cutoff at `times` = 1, Hz.
+    times : float
+        Sigma over sigma_ref, 1 or more.
+    interval : float
+        Time between samples, s; 0: not known, as if sampled without end.
+
+    Returns
+    -------
+    float
+        Cutoff, Hz.
+
+    """
+    if interval > 0.0 and 1e-6 < TWO_PI * fmax * interval < 1e2 and times < 1e3:
+        return held_cutoff(mode, order, fmax, times, interval)
+    if mode == 'lowpass':
+        return fmax / (times * times)
+    return float(fmax * times ** (-2.0 / 3.0)) if order == 2 else fmax / times
+
+
+def supply_noise(mode: str, order: int, cutoff: float, alpha: float) -> float:
+    """
+    Return V of the head of this module: output variance over (coupling sigma)^2.
+
+    cutoff in Hz, alpha in 1/s.
+    """
+    w = TWO_PI * cutoff
+    if order == 1:
+        return (0.5 * w / (alpha * (w + alpha)) if mode == 'lowpass' else
+                0.5 * w * w / (w + alpha))
+    spread = _ROOT8 * (w * w + _ROOT2 * w * alpha + alpha * alpha)
+    if mode == 'lowpass':
+        return w * (_ROOT2 * w + alpha) / (alpha * spread)
+    return w ** 3 / spread
+
+
+def cutoff_for_noise(mode: str, order: int, rms: float, intensity: float,
+                     alpha: float) -> float:
+    """
+    Return the cutoff at which the supply's noise comes out with a wanted rms.
+
+    Solves intensity^2 V(w) = rms^2 (V: head of this module): linear or
+    quadratic in w, a cubic for the derivative of order 2 (one positive root,
+    by Newton's iteration from above, where the cubic is convex).
+
+    alpha in 1/s.
+    """
+    if intensity <= 1e-12 * rms:
+        return math.inf
+    v = (rms / intensity) ** 2
+    if v == 0.0:
+        return 0.0
+    if mode == 'lowpass':
+        q = 2.0 * alpha * v
+        if q >= 1.0:
+            return math.inf
+        if order == 1:
+            return alpha * q / (1.0 - q) / TWO_PI
+        # sqrt2 (1 - q) u^2 + (1 - 2 q) u - sqrt2 q = 0 with u = w / alpha.
+        b, root = 1.0 - 2.0 * q, math.sqrt(1.0 + 4.0 * q - 4.0 * q * q)
+        u = 4.0 * q / (_ROOT2 * (b + root)) if b > 0.0 else (root - b) / (_ROOT8 * (1.0 - q))
+        return alpha * u / TWO_PI
+    if order == 1:
+        return 0.5 * (2.0 * v + math.sqrt(4.0 * v * v + 8.0 * v * alpha)) / TWO_PI
+    q = _ROOT8 * v
+    w = q + math.sqrt(_ROOT2 * q * alpha) + math.cbrt(q * alpha * alpha)
+    for _ in range(60):
+        off = w ** 3 - q * (w * w + _ROOT2 * w * alpha + alpha * alpha)
+        step = off / (3.0 * w * w - q * (2.0 * w + _ROOT2 * alpha))
+        w -= step
+        if abs(step) <= 1e-12 * w:
+            break
+    return w / TWO_PI
+
+
+def wiener_law(settings: FilterSettings, sigma: float, alpha: float, interval: float) -> float:
+    """
+    Return the cutoff of least mean square error.
+
+    Without `signal_bandwidth` the signal is the voltage itself, in white noise
+    of density n0.  The Kalman-Bucy filter of an OU process has one pole: from
+    its Riccati equation 0 = sigma^2 - 2 alpha P - P^2 / n0 it lies at
+    alpha + P / n0 = sqrt(alpha^2 + sigma^2 / n0).  A low-pass of gain 1 has the
+    least error a little off it, and a sampled one further; where the interval
+    is known, order 1 has the least `sampled_error`.  A second-order Butterworth
+    has the error 3 sigma^2 / (2 sqrt2 w) + n0 w / (2 sqrt2) for w >> alpha, least
+    at w = sqrt(3) sigma / sqrt(n0): the law for order 2 is
+    sqrt(alpha^2 + 3 sigma^2 / n0).
+
+    With `signal_bandwidth`: the least `squared_error`.
+    """
+    s = settings
+    if s.signal_bandwidth:
+        return least_error(s, sigma, alpha)
+    if s.order == 1 and interval > 0.0:
+        return least_sampled_error(s, sigma, alpha, interval)
+    factor = 1.0 if s.order == 1 else 3.0
+    return math.sqrt(alpha * alpha + factor * sigma * sigma / s.n0) / TWO_PI
+
+
+def throttle_law(settings: FilterSettings, throttle: float) -> float:
+    """
+    Return Betaflight's curve: fmin + (fmax - fmin) (t + e t (1 - t)), e = expo / 10.
+
+    It rises with throttle, for less delay where control is fast, and knows
+    nothing of sigma: the peer that the other laws are held against.
+    """
+    if not math.isfinite(throttle):
+        return NAN
+    t = min(max(throttle, 0.0), 1.0)
+    share = t + 0.1 * settings.expo * t * (1.0 - t)
+    return settings.lowest + (settings.fmax - settings.lowest) * min(share, 1.0)
+
+
+# The law `kalman` has no cutoff of its own: see `lowpass`.
+LAWS: dict[str, Callable[[FilterSettings, float, float, float], float]] = {
+    'constant_noise': constant_noise_law,
+    'threshold': threshold_law,
+    'wiener': wiener_law,
+}

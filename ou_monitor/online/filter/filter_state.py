@@ -1,0 +1,63 @@
+r"""
+The low-pass itself: two numbers of state, solved exactly over a step of any length.
+
+With w = 2 pi fc, input x, output y:
+
+    order 1:  y' = w (x - y)
+    order 2:  y' = w s,  s' = w (x - y - sqrt(2) s)     (Butterworth)
+
+A cutoff that moves only stretches time (dtau = w dt), so with *any* sequence
+of cutoffs y is what the one fixed filter makes of the input in another time:
+it is continuous, and bounded by the bound of the input times the integral of
+the absolute impulse response: 1 for order 1, coth(pi / 2) = 1.0903 for order 2.
+
+Between samples the input is linear.  Held at the newest value instead, it
+would lead by half a sample (18 degrees at a tenth of the sample rate); linear
+it has no phase error and an amplitude that falls short by (pi f dt)^2 / 3.
+"""
+
+from __future__ import annotations
+
+import math
+
+_ROOT2 = math.sqrt(2.0)
+
+
+class LowPassState:
+    """
+    State of one low-pass.
+
+    Attributes
+    ----------
+    y : float
+        Output, unit of the input.
+    slope : float
+        y' / w of order 2, unit of the input; 0 for order 1.
+
+    """
+
+    __slots__ = ('slope', 'y')
+
+    def __init__(self, y: float = 0.0) -> None:
+        self.y = y
+        self.slope = 0.0
+
+    def advance(self, order: int, angle: float, start: float, end: float) -> float:
+        """Solve the filter over one step."""
+        rise = end - start
+        off = self.y - start
+        if order == 1:
+            lost = math.expm1(-angle)
+            self.slope = 0.0
+            self.y += lost * off + rise * (1.0 + lost / angle)
+            return self.y
+        # Poles at w exp(+-3i pi/4): closed form of the 2 x 2 exponential, and of its integral
+        # over the ramp; written in what is small for a short step, so that nothing cancels.
+        p = angle / _ROOT2
+        decay, sin = math.exp(-p), math.sin(p)
+        c = math.expm1(-p) * math.cos(p) - 2.0 * math.sin(0.5 * p) ** 2
+        s = decay * sin
+        slope = self.slope
+        self.y += (c + s) * off + _ROOT2 * s * slope + rise * (1.0 + c / p)
+        self.slope += (c - s) * slope - _ROOT2 * s * off - rise * (c + s) / angle
+        return self.y

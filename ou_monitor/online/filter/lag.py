@@ -1,0 +1,69 @@
+"""
+Phase lag of the low-passes, and the cutoff that keeps a lag.
+
+Of the continuous filters, with r = f / fc: order 1 lags by atan r, the
+second-order Butterworth by atan2(sqrt(2) r, 1 - r^2).  The filter of this
+package takes its input as linear between samples, which has no phase of its
+own, so that these are its lags too (of a derivative: behind the true one).
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+
+_ROOT2 = math.sqrt(2.0)
+
+
+def phase_lag(order: int, cutoff: float, frequency: float) -> float:
+    """Return the phase lag of a low-pass (cutoff in Hz, frequency in Hz)."""
+    ratio = frequency / cutoff
+    if order == 1:
+        return math.degrees(math.atan(ratio))
+    return math.degrees(math.atan2(_ROOT2 * ratio, 1.0 - ratio * ratio))
+
+
+def delay(lag: float, frequency: float) -> float:
+    """Return the phase delay, s, of a `lag` in degrees at `frequency`, Hz."""
+    return lag / (360.0 * frequency)
+
+
+def most_lag(order: int) -> float:
+    """Return the lag, degrees, that a low-pass never reaches."""
+    return 90.0 * order
+
+
+def cutoff_for_lag(order: int, lag: float, frequency: float) -> float:
+    """
+    Return the cutoff whose lag at `frequency` is `lag`: the inverse of `phase_lag`.
+
+    Order 1: fc = f / tan(lag).  Order 2: with c = cot(lag), r^2 + sqrt(2) c r
+    - 1 = 0, so fc = f / r = f (c + sqrt(c^2 + 2)) / sqrt(2).
+
+    frequency in Hz, result in Hz.
+    """
+    if not 0.0 < lag < most_lag(order):
+        raise ValueError(
+            f'a low-pass of order {order} lags by more than 0 and less than '
+            f'{most_lag(order):g} degrees, got {lag:g}')
+    angle = math.radians(lag)
+    cot = math.cos(angle) / math.sin(angle)
+    if order == 1:
+        return frequency * cot
+    return frequency * (cot + math.hypot(cot, _ROOT2)) / _ROOT2
+
+
+def share_for_lag(response: complex, raw: complex, most: float) -> float:
+    """
+    Return the share of an unfiltered signal that brings a lag down to a limit.
+
+    With the angle of the mixture (1 - m) H + m R turned by the limit p, its
+    imaginary part is that of H e^(ip) and R e^(ip) in the same shares, and 0
+    where the lag is p.
+    """
+    if -cmath.phase(response) <= most:
+        return 0.0
+    turned, straight = (one * cmath.exp(1j * most) for one in (response, raw))
+    if straight.imag <= 0.0:
+        return 1.0
+    return turned.imag / (turned.imag - straight.imag)

@@ -1,0 +1,357 @@
+"""
+A low-pass, or filtered derivative, whose cutoff follows the noise of the supply.
+
+sigma -> law (`cutoff_laws`) -> wanted cutoff -> limits, smoothing, slew
+(`cutoff_control`) -> cutoff in force -> filter (`filter_state`) -> output.
+
+The derivative is the same low-pass with the slope of the input for its input:
+no term of it jumps when the cutoff moves, and it is the exact response to an
+input that is linear between samples.
+
+With the law `kalman` the output is that of `signal_kalman`; the low-pass runs
+beside it at the cutoff of the same lag, and takes over where sigma is not known.
+
+Limits: the cutoff is constant within a step; sampling folds what lies above
+half the sample rate down before any filter sees it.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.online.filter.cutoff_control import Bound, CutoffControl, OF_RATE, SampleInterval
+from ou_monitor.online.filter.cutoff_laws import wanted_cutoff
+from ou_monitor.online.filter.filter_state import LowPassState
+from ou_monitor.online.filter.lag import cutoff_for_lag, delay, most_lag, phase_lag
+from ou_monitor.online.filter.signal_kalman import SignalKalman
+from ou_monitor.online.settings import FilterSettings
+from ou_monitor.records import FloatArray
+
+NAN = math.nan
+_TWO_PI = 2.0 * math.pi
+# Signals and stamps beyond this, and steps below it, overflow in the filter.
+_LARGEST, _LATEST, _SHORTEST = 1e150, 1e18, 1e-12
+# A step of so many mean intervals is counted as a gap, once the mean stands on so many samples.
+_GAP, _KNOWN = 5.0, 10
+
+_Maybe = npt.ArrayLike | None
+
+
+@dataclass
+class FilterCounters:
+    """
+    Samples that came, and those that were not used.
+
+    Attributes
+    ----------
+    samples : int
+        Samples used.
+    non_finite : int
+        Samples that were NaN, infinite or beyond 1e150, or whose stamp was or lay beyond 1e18 s.
+    repeated : int
+        Samples with the stamp of the one before, or less than 1 ps later.
+    back : int
+        Samples with an earlier stamp; time goes on from there.
+    gaps : int
+        Steps of more than five mean intervals.
+
+    """
+
+    samples: int = 0
+    non_finite: int = 0
+    repeated: int = 0
+    back: int = 0
+    gaps: int = 0
+
+
+class AdaptiveLowPass:
+    """
+    Low-pass filter with a cutoff driven by sigma.
+
+    Parameters
+    ----------
+    **options
+        Fields of `FilterSettings`, as the parameters of the node.
+
+    Raises
+    ------
+    ValueError
+        For an option that is unknown or out of range, or that contradicts
+        another.
+
+    """
+
+    def __init__(self, **options: object) -> None:
+        self._settings = FilterSettings.from_options(options)
+        self._control = CutoffControl(self._settings)
+        self._state = LowPassState()
+        # Of the law kalman; None until its first known sigma.
+        self._kalman: SignalKalman | None = None
+        self._known = False
+        self._sigma = NAN
+        # As it was before a parameter changed, until the next sample.
+        self._before: SignalKalman | None = None
+        self._interval = SampleInterval()
+        self.counters = FilterCounters()
+        self._t: float | None = None
+        self._x = 0.0
+        self._raw = self._offset = 0.0
+        self._out = NAN
+        self._asked: tuple[float, ...] | None = None
+        self._wanted = NAN
+
+    @property
+    def settings(self) -> FilterSettings:
+        """Return the settings in force."""
+        return self._settings
+
+    @property
+    def cutoff(self) -> float:
+        """Cutoff in force, Hz; of a shadow the one that would be, of `kalman` that of its lag."""
+        told = self._of_its_lag()
+        return told if told == told else self._control.cutoff
+
+    @property
+    def wanted(self) -> float:
+        """Cutoff that the law wants, within fmin..fmax, Hz; NaN when it does not know."""
+        told = self._of_its_lag()
+        return told if told == told else self._control.wanted
+
+    @property
+    def bound(self) -> Bound:
+        """Return what decides the cutoff in force."""
+        if self._kalman is not None and self._known:
+            if self._kalman.mixed:
+                return Bound.LAG if self._settings.max_lag else Bound.LOWEST
+            within = self.cutoff * self._interval.mean < OF_RATE * (1.0 - 1e-9)
+            return Bound.NONE if within else Bound.RATE
+        return self._control.bound
+
+    @property
+    def phase_lag(self) -> float:
+        """Lag of what is in force at `lag_frequency`, degrees."""
+        s = self._settings
+        if self._kalman is not None and self._known and self._kalman.lag == self._kalman.lag:
+            return self._kalman.lag
+        return phase_lag(s.order, self.cutoff, s.lag_frequency)
+
+    @property
+    def delay(self) -> float:
+        """Phase delay of what is in force at `lag_frequency`, s."""
+        return delay(self.phase_lag, self._settings.lag_frequency)
+
+    def configure(self, **options: object) -> None:
+        """
+        Change options; the output does not move, the cutoff follows.
+
+        Where `shadow` is switched, the output goes from the one to the other
+        within the time constant of the filter.
+
+        Raises
+        ------
+        ValueError
+            For an option that cannot be used (the old ones stay), or another
+            mode: its output has another unit, which takes a new filter.
+
+        """
+        settings = FilterSettings.from_options(options, base=self._settings)
+        if settings.mode != self._settings.mode and self._t is not None:
+            raise ValueError(
+                f"mode cannot change from '{self._settings.mode}' to '{settings.mode}' while "
+                'filtering: the output would change its unit; make a new filter')
+        self._settings = settings
+        self._control.configure(settings)
+        self._asked = None
+        if settings.law != 'kalman':
+            self._kalman, self._before, self._known = None, None, False
+        elif self._kalman is not None:
+            self._before = copy(self._kalman)
+            self._kalman.configure(settings)
+        if self._t is not None:
+            self._offset = self._out - self._source()
+
+    def filter(self, t: npt.ArrayLike, x: npt.ArrayLike,  # noqa: A003
+               sigma: npt.ArrayLike, *, sigma_se: _Maybe = None, alpha: _Maybe = None,
+               throttle: _Maybe = None, level: _Maybe = None, level_se: _Maybe = None,
+               ) -> FloatArray | float:
+        """
+        Filter samples.
+
+        Parameters
+        ----------
+        t : float or array_like, shape (n,)
+            Stamps, s.  At a repeat or a step back the output stays; both are
+            counted, and time goes on from an earlier stamp.
+        x : float or array_like, shape (n,)
+            Signal, any unit.  NaN and infinite samples are counted and do not
+            move the output.
+        sigma : float or array_like, shape (n,)
+            Noise intensity, V/sqrt(s); NaN means unknown (fallback cutoff).
+        sigma_se : float or array_like, shape (n,), optional
+            Standard error of sigma, V/sqrt(s): a certain sigma moves the
+            cutoff faster.
+        alpha : float or array_like, shape (n,), optional
+            Relaxation rate of the supply, 1/s; NaN or left out: the parameter.
+        throttle : float or array_like, shape (n,), optional
+            Throttle, 0..1, for the law of that name.
+        level : float or array_like, shape (n,), optional
+            Level of the supply at the present throttle, V (`Estimate.u0`), for
+            the law `kalman` of the voltage itself.
+        level_se : float or array_like, shape (n,), optional
+            Its standard error, V; NaN or left out: it is exact.
+
+        Returns
+        -------
+        float or ndarray, shape (n,)
+            Filtered signal, or its derivative in unit/s (0 at the first
+            sample); NaN until the first finite sample.
+
+        Raises
+        ------
+        ValueError
+            When the shapes differ.
+
+        """
+        stamps, signal = np.asarray(t, dtype=np.float64), np.asarray(x, dtype=np.float64)
+        if stamps.shape != signal.shape or stamps.ndim > 1:
+            raise ValueError('t and x must be two numbers or two arrays of one shape (n,): got '
+                             f'{stamps.shape} and {signal.shape}')
+        others = [np.asarray(NAN if one is None else one, dtype=np.float64)
+                  for one in (sigma, sigma_se, alpha, throttle, level, level_se)]
+        names = ('sigma', 'sigma_se', 'alpha', 'throttle', 'level', 'level_se')
+        for name, one in zip(names, others, strict=True):
+            if one.shape not in ((), stamps.shape):
+                raise ValueError(
+                    f'{name} must be one number or of the shape of t, {stamps.shape}: got '
+                    f'{one.shape}')
+        if stamps.ndim == 0:
+            return self._step(float(stamps), float(signal), *map(float, others))
+        wide = [np.broadcast_to(one, stamps.shape).tolist() for one in others]
+        return np.array([self._step(*one) for one in
+                         zip(stamps.tolist(), signal.tolist(), *wide, strict=True)])
+
+    def step(self, t: float, x: float, sigma: float, sigma_se: float = NAN,
+             alpha: float = NAN, throttle: float = NAN, level: float = NAN,
+             level_se: float = NAN) -> float:
+        """Filter one sample; as `filter`, NaN for what is not known (the node's short way)."""
+        return self._step(t, x, sigma, sigma_se, alpha, throttle, level, level_se)
+
+    def _step(self, t: float, x: float, sigma: float, sigma_se: float, alpha: float,
+              throttle: float, level: float, level_se: float) -> float:
+        if not (abs(x) < _LARGEST and abs(t) < _LATEST):
+            self.counters.non_finite += 1
+            return self._out
+        error = sigma_se / sigma if sigma > 0.0 and sigma_se >= 0.0 else NAN
+        derivative = self._settings.mode == 'derivative'
+        if self._t is None:
+            self.counters.samples += 1
+            if self._settings.law == 'kalman':
+                # Its lag is not known before it has run.
+                self._start_kalman(x, sigma, level)
+            self._control.update(self._ask(sigma, alpha, throttle, 0.0), error, 0.0, 0.0)
+            self._state.y = self._raw = self._out = 0.0 if derivative else x
+            self._t, self._x = t, x
+            return self._out
+        dt = t - self._t
+        if dt < _SHORTEST:
+            self._stay(t, x, dt)
+            return self._out
+        self.counters.samples += 1
+        if dt > _GAP * self._interval.mean and self.counters.samples > _KNOWN:
+            self.counters.gaps += 1
+        interval = self._interval.add(dt)
+        if self._settings.law == 'kalman':
+            about = (level if abs(level) < _LARGEST else NAN, level_se)
+            self._run_kalman(dt, interval, x, sigma, error, alpha, about)
+        cutoff = self._control.update(
+            self._ask(sigma, alpha, throttle, interval), error, dt, interval)
+        angle = _TWO_PI * cutoff * dt
+        start, end = self._x, x
+        if derivative:
+            start = end = (x - self._x) / dt
+        self._t, self._x, self._raw = t, x, end
+        self._state.advance(self._settings.order, angle, start, end)
+        self._out = self._source()
+        if self._offset:
+            self._offset *= math.exp(-angle)
+            self._out += self._offset
+        return self._out
+
+    def _stay(self, t: float, x: float, dt: float) -> None:
+        """Take a sample that has no time of its own."""
+        if dt < 0.0:
+            # The slope from here to the next sample is of the new time line.
+            self._t, self._x = t, x
+            self.counters.back += 1
+        else:
+            self.counters.repeated += 1
+
+    def _source(self) -> float:
+        """Return what comes out when no switch of `shadow` is being smoothed over."""
+        if self._settings.shadow:
+            return self._raw
+        return self._kalman.y if self._kalman is not None and self._known else self._state.y
+
+    def _start_kalman(self, x: float, sigma: float, level: float) -> None:
+        """Make the Kalman filter at the first known sigma."""
+        self._known = math.isfinite(sigma) and sigma >= 0.0
+        if self._known:
+            self._sigma = sigma
+            self._kalman = SignalKalman(
+                self._settings, x, level if abs(level) < _LARGEST else NAN)
+
+    def _run_kalman(self, dt: float, interval: float, x: float, sigma: float, error: float,
+                    alpha: float, level: tuple[float, float]) -> None:
+        """Run the Kalman filter; where sigma is not known it is kept warm at the last one."""
+        begun = self._kalman is None
+        if self._kalman is None:
+            self._start_kalman(x, sigma, level[0])
+        if self._kalman is None:
+            return
+        known = math.isfinite(sigma) and sigma >= 0.0
+        if known:
+            self._sigma = sigma
+        rate = alpha if 1e-6 <= alpha <= 1e9 else self._settings.alpha
+        sample = (dt, interval, x, (x - self._x) / dt, self._sigma, error, rate, *level)
+        self._kalman.advance(*sample)
+        if begun:
+            self._offset = self._out - self._kalman.y
+        elif self._before is not None:
+            # What the old parameters would have made of this sample is where the new begin.
+            self._offset += self._before.advance(*sample) - self._kalman.y
+        self._before = None
+        if known != self._known:
+            self._known = known
+            self._offset += self._state.y - self._kalman.y if known else (
+                self._kalman.y - self._state.y)
+
+    def _ask(self, sigma: float, alpha: float, throttle: float, interval: float) -> float:
+        """Return what the law wants; asked again only when something it reads has changed."""
+        s = self._settings
+        if s.law == 'kalman':
+            return self._of_its_lag()
+        # NaN never equals itself; the jitter of the stamps is not worth a new search, and the
+        # interval is not known at the first sample.
+        rate = round(20.0 * math.log(interval)) if interval > 0.0 else math.inf
+        asked = (*(one if one == one else math.inf for one in (sigma, alpha, throttle)), rate)
+        if asked != self._asked:
+            self._wanted = wanted_cutoff(s, sigma, alpha, throttle, interval)
+            self._asked = asked
+        return self._wanted
+
+    def _of_its_lag(self) -> float:
+        """Return the cutoff of the low-pass that lags as the Kalman filter does, Hz."""
+        s = self._settings
+        if self._kalman is None or not self._known:
+            return NAN
+        lag, mean = self._kalman.lag, self._interval.mean
+        if lag != lag:
+            return NAN
+        highest = OF_RATE / mean if mean > 0.0 else s.fmax
+        if lag <= phase_lag(s.order, highest, s.lag_frequency):
+            return highest
+        return cutoff_for_lag(s.order, min(lag, 0.999 * most_lag(s.order)), s.lag_frequency)

@@ -1,0 +1,1 @@
+"""Estimate -> brown-out risk, throttle budget and flag."""

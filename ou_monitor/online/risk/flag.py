@@ -1,0 +1,197 @@
+"""
+The brown-out flag: from a risk, and a voltage floor, to a level that can be acted on.
+
+Rising is immediate (after `brownout.delay`, 0 by default); falling waits for
+`brownout.hold` and for the risk to fall below `brownout.leave` times the
+probability at which the level is entered; `brownout.latch` keeps CRITICAL until it is
+cleared.  Limits: a flag is as good as its risk; an unknown risk is UNKNOWN,
+never OK, and never a flag that says false.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import enum
+import math
+
+import numpy.typing as npt
+from ou_monitor.online.risk.floor import FloorWatch
+from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.records import NAN
+
+
+class FlagLevel(enum.Enum):
+    """Levels of the flag; the value orders the known ones."""
+
+    UNKNOWN = -1
+    OK = 0
+    WARN = 1
+    CRITICAL = 2
+
+
+@dataclass(frozen=True)
+class FlagState:
+    """
+    The flag at one instant.
+
+    Attributes
+    ----------
+    level : FlagLevel
+        Level.
+    brownout : bool or None
+        True at CRITICAL; False at OK and WARN when the risk is known; None
+        when it is not.
+    since : float
+        When the level was entered, s, on the caller's clock; NaN before the
+        first update.
+    reason : str
+        Why, in words: a clause without a full stop.
+    age : float
+        Time spent in the level, s; NaN when the time is not known.
+
+    """
+
+    level: FlagLevel = FlagLevel.UNKNOWN
+    brownout: bool | None = None
+    since: float = NAN
+    reason: str = 'nothing is known yet'
+    age: float = NAN
+
+
+class BrownoutFlag:
+    """
+    State machine of the flag.
+
+    Parameters
+    ----------
+    settings : MonitorSettings, optional
+        The `brownout_*` settings and `stale_after`; the defaults when left
+        out.
+
+    """
+
+    def __init__(self, settings: MonitorSettings | None = None) -> None:
+        self._settings = settings or MonitorSettings()
+        self._floor = FloorWatch(self._settings)
+        self._now = self._last = NAN
+        self._level = FlagLevel.UNKNOWN
+        # When the level was entered, and when it last rested on something known.
+        self._since = self._known = NAN
+        # Since when the risk is without a break at or above what a level is entered at.
+        self._above: dict[FlagLevel, float] = {}
+        self._state = FlagState()
+
+    @property
+    def settings(self) -> MonitorSettings:
+        """Return the settings in force."""
+        return self._settings
+
+    @property
+    def state(self) -> FlagState:
+        """Return what the last update found."""
+        return self._state
+
+    def configure(self, settings: MonitorSettings) -> None:
+        """Change settings; level, hold and samples stay.  Latch off ends the latch."""
+        self._settings = self._floor.settings = settings
+
+    def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike) -> None:
+        """Look at samples for the floor; see `FloorWatch.push`."""
+        self._floor.push(t, voltage)
+
+    def new_time_line(self) -> None:
+        """Forget the samples seen for the floor; the level stays as long as it is held."""
+        self._floor.reset()
+
+    def clear(self) -> bool:
+        """Drop a CRITICAL that is latched or held; the next update judges anew."""
+        if self._level is not FlagLevel.CRITICAL:
+            return False
+        self._enter(FlagLevel.UNKNOWN)
+        self._above.clear()
+        self._state = FlagState(since=self._since, reason='cleared, not judged since')
+        return True
+
+    def update(self, t: float, risk: float, *, fresh: bool = True) -> FlagState:
+        """Judge (t in s, risk 0..1)."""
+        if risk < 0.0 or risk > 1.0:
+            raise ValueError(f'a risk must lie within 0..1 or be NaN, got {risk}')
+        self._go_to(t)
+        low = self._floor.take() and fresh
+        known = fresh and not math.isnan(risk)
+        wanted, reason = self._wanted(risk, known, low)
+        level, reason = self._held(wanted, reason, known or low)
+        if level is not self._level:
+            self._enter(level)
+        if known or low:
+            self._known = self._now
+        self._state = FlagState(level, self._flag(known), self._since, reason,
+                                self._now - self._since)
+        return self._state
+
+    def _go_to(self, t: float) -> None:
+        """Set the clock; when it steps back everything remembered steps with it."""
+        self._now = t if math.isfinite(t) else NAN
+        if math.isnan(self._now):
+            return
+        step = t - self._last
+        if step < 0.0:
+            self._since += step
+            self._known += step
+            self._above = {level: start + step for level, start in self._above.items()}
+        self._last = t
+        if math.isnan(self._since):
+            self._since = t
+
+    def _enter(self, level: FlagLevel) -> None:
+        self._level, self._since = level, self._now
+
+    def _flag(self, known: bool) -> bool | None:
+        if self._level is FlagLevel.CRITICAL:
+            return True
+        return False if known and self._level is not FlagLevel.UNKNOWN else None
+
+    def _wanted(self, risk: float, known: bool, low: bool) -> tuple[FlagLevel, str]:
+        """Return the level that risk and floor ask for, hold and latch aside."""
+        s = self._settings
+        enter = {FlagLevel.WARN: s.brownout_warn, FlagLevel.CRITICAL: s.brownout_critical}
+        above = [level for level, at in enter.items() if known and risk >= at]
+        self._above = {level: self._above.get(level, self._now) for level in above}
+        if low:
+            return FlagLevel.CRITICAL, (
+                f'the voltage is at or below brownout.floor ({s.floor:g} V)')
+        if not known:
+            return FlagLevel.UNKNOWN, 'the risk is not known'
+        waited = [level for level in above if not self._waits(level)]
+        for level in (FlagLevel.CRITICAL, FlagLevel.WARN):
+            word = level.name.lower()
+            if level in waited:
+                return level, f'risk {risk:.2g} (brownout.{word}: {enter[level]:g})'
+            leave = s.brownout_leave * enter[level]
+            if self._level.value >= level.value and risk >= leave:
+                return level, (f'risk {risk:.2g} has not fallen below {leave:.2g} '
+                               f'(brownout.leave x brownout.{word})')
+        if above:
+            # The level is UNKNOWN or OK: a higher one would have been returned.
+            return self._level, (f'risk {risk:.2g} waits for brownout.delay '
+                                 f'({s.brownout_delay:g} s)')
+        return FlagLevel.OK, f'risk {risk:.2g} (brownout.warn: {s.brownout_warn:g})'
+
+    def _waits(self, level: FlagLevel) -> bool:
+        """Whether a level that is not reached yet has to wait for `brownout.delay`."""
+        return (self._level.value < level.value
+                and self._now - self._above[level] < self._settings.brownout_delay)
+
+    def _held(self, wanted: FlagLevel, reason: str, sure: bool) -> tuple[FlagLevel, str]:
+        """Return the level after latch and hold."""
+        s = self._settings
+        if wanted.value >= self._level.value:
+            return wanted, reason
+        if s.brownout_latch and self._level is FlagLevel.CRITICAL:
+            return self._level, f'latched until cleared; {reason}'
+        if self._level is FlagLevel.OK:
+            return wanted, reason
+        start = self._since if sure else self._known
+        if self._now - start < s.brownout_hold:
+            return self._level, f'held for brownout.hold ({s.brownout_hold:g} s); {reason}'
+        return wanted, reason

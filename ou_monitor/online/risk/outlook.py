@@ -1,0 +1,170 @@
+"""
+What lies ahead of the supply: the risk at the present throttle, and the throttle that is left.
+
+The window knows the supply of the last seconds; the curves learned in flight know
+the intensity of the present throttle, which after a step is not that of the
+window; and how fast the intensity has been seen to wander tells what may become of
+it within the horizon.
+
+Limits: throttle stays as it is; a throttle not flown before has the error of the
+curves' prior; the terms of a model file count as `EventRisk` says.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.model.passage.law import prepare
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.online.risk.budget import throttle_budget, ThrottleBudget
+from ou_monitor.online.risk.curves import LearnedCurves
+from ou_monitor.online.risk.events import EventRisk
+from ou_monitor.online.risk.first_passage import as_sampled, risk_of, Supply
+from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.records import Estimate, FloatArray, NAN
+
+# Share of the walk of ln sigma within the horizon that counts: the risk is of all of it,
+# not of its end, but the largest sigma counts most.
+_SHARE = 0.8
+# Largest error of ln sigma that is averaged over: beyond it sigma is unknown.
+_LARGEST = 1.0
+# Newest voltages of which the middle one is where the supply is now: one bad sample is
+# no brown-out.
+_NEWEST = 3
+
+
+class Outlook:
+    """
+    Risk and throttle budget of one supply.
+
+    Parameters
+    ----------
+    background : bool
+        Whether tables for the terms of a model are made in a thread.
+
+    """
+
+    def __init__(self, *, background: bool = True) -> None:
+        # A third of a second, once: not while samples are coming.
+        prepare()
+        self._curves = LearnedCurves()
+        self._newest = np.empty(0)
+        # Whether no throttle has come yet: all samples are then of one.
+        self._blind = True
+        self._background = background
+        self._events: EventRisk | None = None
+        self._noise = 0.0
+
+    def set_model(self, model: SupplyModel | None) -> None:
+        """Change the terms that ride along with the OU; nothing learned is lost."""
+        self._events = None if model is None else EventRisk(model, background=self._background)
+        self._noise = 0.0 if model is None else math.sqrt(sum(
+            term.std**2 for term in model.terms if isinstance(term, MeasurementNoise)))
+
+    @property
+    def events(self) -> EventRisk | None:
+        """Return what the model adds to the risk; None without a model."""
+        return self._events
+
+    @property
+    def curves(self) -> LearnedCurves:
+        """Return what has been learned in flight."""
+        return self._curves
+
+    def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike, throttle: npt.ArrayLike | None,
+             estimate: Estimate) -> None:
+        """Learn from samples, given the newest estimate; see `LearnedCurves.update`."""
+        volts = np.atleast_1d(np.asarray(voltage, dtype=np.float64))[-64:]
+        last = np.concatenate((self._newest, volts[np.isfinite(volts)]))
+        self._newest = last[-_NEWEST:]
+        if self._blind:
+            if throttle is None or not np.isfinite(np.asarray(throttle, dtype=np.float64)).any():
+                self._curves.update(t, voltage, 0.0, estimate)
+                return
+            self._blind, self._curves = False, LearnedCurves()
+        self._curves.update(t, voltage, throttle, estimate)
+
+    def new_time_line(self) -> None:
+        """Forget where the supply was last; what throttle does to it stays learned."""
+        self._newest = np.empty(0)
+
+    @property
+    def voltage(self) -> float:
+        """Where the supply is now, V: the middle one of the last three samples; NaN of one."""
+        return float(np.median(self._newest)) if self._newest.size > 1 else NAN
+
+    def supply(self, e: Estimate, horizon: float) -> Supply:
+        """Return what is known of the supply at the present throttle (horizon in s)."""
+        plain = Supply.of(e)
+        throttle = 0.0 if self._blind else e.throttle
+        if math.isnan(throttle):
+            return plain
+        sigma, level = self._curves.sigma_at(throttle), self._curves.level_at(throttle)
+        if not (math.isfinite(sigma.value) and math.isfinite(level.value)):
+            return plain
+        u0, u0_se = plain.u0, plain.u0_se
+        if level.se < float(np.asarray(u0_se)):
+            u0, u0_se = level.value, level.se
+        ln_sigma, error = self._ahead(np.array([sigma.value]), np.array([sigma.se]), horizon)
+        return Supply(u0, u0_se, plain.ln_alpha, plain.ln_alpha_se, ln_sigma.item(), error.item())
+
+    def _ahead(self, ln_sigma: FloatArray, error: FloatArray, horizon: float
+               ) -> tuple[FloatArray, FloatArray]:
+        """Return ln sigma with what it wanders, and the error of that within the horizon."""
+        wander = self._curves.wander
+        variance = error**2 + wander.variance + _SHARE * wander.fast_speed * horizon
+        return ln_sigma + wander.value, np.minimum(np.sqrt(variance), _LARGEST)
+
+    def risk(self, e: Estimate, settings: MonitorSettings) -> float:
+        """Return the probability of a brown-out within the horizon; NaN when not known."""
+        s, now = settings, self.voltage
+        if now <= s.brownout_voltage:
+            return 1.0
+        if not e.usable:
+            return NAN
+        here = None if math.isnan(now) else now
+        supply = self.supply(e, s.brownout_horizon)
+        noise = e.noise_std if e.noise_std > 0.0 else self._noise
+        risk = float(risk_of(supply, s.brownout_voltage, s.brownout_horizon, here, noise))
+        if s.brownout_watch == 'sampled':
+            risk = as_sampled(e, supply, s.brownout_voltage, s.brownout_horizon, here, risk)
+        if self._events is None:
+            return risk
+        self._events.follow(float(np.asarray(supply.ln_alpha)), float(np.asarray(supply.ln_sigma)))
+        added = self._events.survival(
+            supply.u0 if here is None else here, s.brownout_voltage, s.brownout_horizon,
+            ln_alpha=supply.ln_alpha, ln_sigma=supply.ln_sigma, u0=supply.u0)
+        return _with_events(np.array(risk), added).item()
+
+    def budget(self, e: Estimate, settings: MonitorSettings) -> ThrottleBudget:
+        """Return the throttle budget; its throttle is NaN when not known."""
+        s = settings
+        if self._blind:
+            return ThrottleBudget(NAN, NAN, NAN, s.budget_limit, 'No throttle is known.')
+
+        def probability(u0: FloatArray, u0_se: FloatArray, ln_sigma: FloatArray,
+                        ln_sigma_se: FloatArray, ln_alpha: FloatArray, ln_alpha_se: FloatArray
+                        ) -> FloatArray:
+            ln_sigma, ln_sigma_se = self._ahead(ln_sigma, ln_sigma_se, s.brownout_horizon)
+            risk = risk_of(Supply(u0, u0_se, ln_alpha, ln_alpha_se, ln_sigma, ln_sigma_se),
+                           s.brownout_voltage, s.brownout_horizon, coarse=True)
+            if self._events is None:
+                return risk
+            return _with_events(risk, self._events.survival(
+                u0, s.brownout_voltage, s.brownout_horizon, ln_alpha=ln_alpha,
+                ln_sigma=ln_sigma, u0=u0))
+
+        return throttle_budget(e, self._curves, voltage=s.brownout_voltage,
+                               horizon=s.brownout_horizon, limit=s.budget_limit,
+                               probability=probability)
+
+
+def _with_events(risk: FloatArray, added: FloatArray) -> FloatArray:
+    """Return the risk with what events add; NaN where that is not known yet."""
+    # With a risk of 1 nothing can be added.
+    inside = np.minimum(risk, 1.0 - 1e-16)
+    total: FloatArray = np.where(risk >= 1.0, 1.0, -np.expm1(np.log1p(-inside) + added))
+    return total

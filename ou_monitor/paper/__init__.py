@@ -1,0 +1,1 @@
+"""The paper: its theory, its network, and every number of it recomputed."""

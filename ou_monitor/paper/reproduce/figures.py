@@ -1,0 +1,124 @@
+"""Series behind the figures of the report: screens, transient, spectra, crest factors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from ou_monitor.model.ou import simulate
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.ac_coupling import ACCoupling
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.paper.reproduce import paper
+from ou_monitor.paper.reproduce.table1 import vpp_step, vrms_step
+from ou_monitor.paper.reproduce.table2 import sigma_of
+from ou_monitor.paper.reproduce.transient import CORNER_HZ
+from ou_monitor.records import FloatArray
+from scipy.signal import welch
+
+# Length of a drawn screen, s.
+SCREEN = 0.1
+# For the spectrum: length, s, and points a decade.
+_SPECTRUM, _PER_DECADE = 2.0, 12
+
+
+@dataclass(frozen=True, eq=False)
+class Screen:
+    """
+    One simulated oscilloscope screen.
+
+    Attributes
+    ----------
+    state : LoadState
+        The row of Table 1 it stands for.
+    t, u : ndarray, shape (n,)
+        s and V, in steps of the oscilloscope.
+
+    """
+
+    state: paper.LoadState
+    t: FloatArray
+    u: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """
+    One-sided density of a load state.
+
+    Attributes
+    ----------
+    state : LoadState
+        The row of Table 1 it stands for.
+    frequency, density : ndarray, shape (k,)
+        Hz and V^2/Hz, of a simulated recording at 1 MHz.
+    coupled : ndarray, shape (k,)
+        Of the same OU through an AC coupling of 10 Hz, V^2/Hz.
+
+    """
+
+    state: paper.LoadState
+    frequency: FloatArray
+    density: FloatArray
+    coupled: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Figures:
+    """
+    All series.
+
+    Attributes
+    ----------
+    screens : tuple of Screen
+        One a load state.
+    spectra : tuple of Spectrum
+        Of 10 and 40 %.
+
+    """
+
+    screens: tuple[Screen, ...]
+    spectra: tuple[Spectrum, ...]
+
+
+def sigma_shown(state: paper.LoadState) -> float:
+    """Return the sigma to draw, V/sqrt(s); motors off, half a step of Vrms."""
+    if state is paper.IDLE:
+        return 0.5e-3 * vrms_step().size * math.sqrt(2.0 * paper.ALPHA.value)
+    return sigma_of(state)
+
+
+def lorentzian(frequency: FloatArray, alpha: float, sigma: float) -> FloatArray:
+    """Return the one-sided density of an OU (frequency in Hz)."""
+    return np.asarray(2.0 * sigma ** 2 / (alpha ** 2 + (2.0 * math.pi * frequency) ** 2))
+
+
+def draw(rng: np.random.Generator) -> Figures:
+    """Simulate what the figures show."""
+    t = np.arange(round(SCREEN * paper.SAMPLING_HZ)) / paper.SAMPLING_HZ
+    step = 1e-3 * vpp_step().size
+    screens = tuple(
+        Screen(state, t, step * np.round(
+            simulate(t, paper.ALPHA.value, sigma_shown(state), rng) / step))
+        for state in paper.TABLE_1)
+    return Figures(screens, tuple(_spectrum(state, rng) for state in (paper.MEDIUM, paper.HIGH)))
+
+
+def _spectrum(state: paper.LoadState, rng: np.random.Generator) -> Spectrum:
+    """Return the spectrum of a simulated recording at 1 MHz, even on a log axis."""
+    t = np.arange(round(_SPECTRUM * paper.SAMPLING_HZ)) / paper.SAMPLING_HZ
+    ou = OU(paper.ALPHA.value, sigma_of(state), 0.0)
+    plain = _density(simulate(t, ou.alpha, ou.sigma, rng))
+    coupled = _density(SupplyModel((ou, ACCoupling(CORNER_HZ, 0.0))).simulate(t, rng))
+    return Spectrum(state, plain[0], plain[1], coupled[1])
+
+
+def _density(u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    frequency, density = welch(u, paper.SAMPLING_HZ, nperseg=u.size // 4)
+    frequency, density = frequency[2:-1], density[2:-1]
+    bins = np.floor(_PER_DECADE * np.log10(frequency / frequency[0])).astype(np.intp)
+    count = np.bincount(bins)
+    some = count > 0
+    return (np.bincount(bins, frequency)[some] / count[some],
+            np.bincount(bins, density)[some] / count[some])

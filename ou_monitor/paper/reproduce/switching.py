@@ -1,0 +1,152 @@
+"""
+Section 3.3, formulas (4) to (6): the switching system itself decides.
+
+The chain is drawn jump by jump and the system moved exactly between jumps; no
+limit theorem is used on the side that is recomputed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from ou_monitor.paper.reproduce.crest import mean_and_error
+from ou_monitor.paper.reproduce.row import Printed, Row
+from ou_monitor.paper.theory.diffusion import (
+    CORRECT_FACTOR, diffusion_limit, PRINTED_FACTOR, switching_drift)
+from ou_monitor.paper.theory.switched_system import SwitchedSystem
+from ou_monitor.paper.theory.switching import Generator
+from ou_monitor.records import FloatArray
+from scipy.integrate import quad
+
+WHERE = 'Section 3.3'
+# Telegraph noise of +-1 V/s that switches a thousand times a second each way.
+RATE, SPEED = 1000.0, 1.0
+# Multiplicative: dU = +-c U dt; c small beside the rate, so that the limit holds to c^2/(4 q^2).
+GROWTH = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class Spreading:
+    """
+    Variance of the integral of telegraph noise, from Monte Carlo.
+
+    Attributes
+    ----------
+    t : ndarray, shape (k,)
+        Times, s.
+    variance, error : ndarray, shape (k,)
+        V^2, with standard errors.
+    correct, printed : float
+        Rates of formula (6) with the 2 and without, V^2/s.
+
+    """
+
+    t: FloatArray
+    variance: FloatArray
+    error: FloatArray
+    correct: float
+    printed: float
+
+
+def telegraph() -> SwitchedSystem:
+    """Return dU/dt = +-SPEED, switching at RATE each way."""
+    return SwitchedSystem(Generator.telegraph(RATE, RATE), np.zeros((2, 1, 1)),
+                          np.array([[SPEED], [-SPEED]]))
+
+
+def three_states() -> SwitchedSystem:
+    """Return an additive system on three states that is not reversible, balanced."""
+    chain = Generator(RATE * np.array([[-3.0, 2.5, 0.5], [0.2, -1.2, 1.0], [2.0, 0.3, -2.3]]))
+    speeds = SPEED * np.array([2.0, -1.0, 0.5])
+    return SwitchedSystem(chain, np.zeros((3, 1, 1)),
+                          (speeds - chain.stationary @ speeds)[:, None])
+
+
+def multiplicative() -> SwitchedSystem:
+    """Return dU/dt = +-GROWTH U, switching at RATE each way."""
+    return SwitchedSystem(Generator.telegraph(RATE, RATE),
+                          np.array([[[GROWTH]], [[-GROWTH]]]))
+
+
+def variance_rate(system: SwitchedSystem, rng: np.random.Generator,
+                  paths: int) -> tuple[float, float]:
+    """
+    Return the long-run growth rate of the variance of a balanced additive system.
+
+    (Var U(T) - Var U(S)) / (T - S), which has no bias once S is longer than the
+    memory of the chain.
+    """
+    memory = 1.0 / float(system.generator.leaving.min())
+    t = memory * np.array([0.0, 10.0, 110.0])
+    u = system.simulate(t, [0.0], rng, paths=paths)[:, :, 0]
+    return mean_and_error((u[:, 2] ** 2 - u[:, 1] ** 2) / (t[2] - t[1]))
+
+
+def spreading(rng: np.random.Generator, paths: int) -> Spreading:
+    """Return the variance of the integral of telegraph noise over time."""
+    system = telegraph()
+    t = np.linspace(0.0, 30.0 / RATE, 31)
+    u = system.simulate(t, [0.0], rng, paths=paths)[:, :, 0]
+    variance = np.mean(u ** 2, axis=0)
+    error = np.std(u ** 2, axis=0) / math.sqrt(paths)
+    return Spreading(t, variance, error, *(
+        float(diffusion_limit(system, factor).intensity([0.0])[0, 0])
+        for factor in (CORRECT_FACTOR, PRINTED_FACTOR)))
+
+
+def rows(rng: np.random.Generator, paths: int = 20_000) -> list[Row]:
+    """Return the rows of formulas (4) to (6)."""
+    return [_potential(), *_intensity(rng, paths), *_drift(rng, paths)]
+
+
+def _potential() -> Row:
+    chain = telegraph().generator
+    found, _ = quad(lambda t: float(chain.transition(t)[0, 0] - chain.stationary[0]),
+                    0.0, 40.0 / RATE, epsrel=1e-10)
+    return Row(WHERE, 'R0(0, 0) of a telegraph', 'ms', Printed(f'{1e3 * found:.6g}'),
+               1e3 * float(chain.potential[0, 0]),
+               'printed integral by quadrature, against (Pi - Q)^-1 - Pi',
+               'The potential is defined rightly.')
+
+
+def _intensity(rng: np.random.Generator, paths: int) -> list[Row]:
+    found = []
+    for name, what, system in (
+            ('telegraph', f'+-{SPEED:g} V/s, {RATE:g} 1/s each way', telegraph()),
+            ('three states', 'a chain that is not reversible', three_states())):
+        printed = float(diffusion_limit(system, PRINTED_FACTOR).intensity([0.0])[0, 0])
+        rate, error = variance_rate(system, rng, paths)
+        found.append(Row(
+            WHERE, f'B of (6), {name}', 'mV^2/s', Printed(f'{1e6 * printed:.4g}'), 1e6 * rate,
+            f'long-run variance rate of the switching system ({what}), {paths} paths',
+            f'The switching system spreads {rate / printed:.3f} +- {error / printed:.3f} times '
+            'as fast as (6) says.', error=1e6 * error, point=1))
+    return found
+
+
+def _drift(rng: np.random.Generator, paths: int) -> list[Row]:
+    system = multiplicative()
+    drift = float(switching_drift(system).matrix[0, 0])
+    span = 2.0 * RATE / GROWTH ** 2
+    u = system.simulate(np.array([0.0, 0.5 * span, span]), [1.0], rng, paths=paths)[:, 1:, 0]
+    # Mean growth, over a time in which it is large beside its scatter.
+    mean, error = mean_and_error(u[:, 0])
+    rate, rate_se = 2.0 * math.log(mean) / span, 2.0 * error / mean / span
+    log, log_se = mean_and_error(np.log(u[:, 1]) / span)
+    intensity = float(diffusion_limit(system, PRINTED_FACTOR).intensity([1.0])[0, 0])
+    ito = drift - 0.5 * intensity
+    # The limit leaves out a share GROWTH^2 / (4 RATE^2) of the drift.
+    left = drift * (GROWTH / RATE) ** 2 / 4.0
+    how = f'dU = +-{GROWTH:g} U dt, {RATE:g} 1/s each way, {paths} paths: growth'
+    return [
+        Row(WHERE, 'b/U of (5), multiplicative noise', '1/s', Printed(f'{drift:.6g}', 0.0), rate,
+            f'{how} of the mean',
+            f'The mean grows {rate / drift:.3f} +- {rate_se / drift:.3f} times as fast as (5) '
+            'says, which lacks no factor.', error=rate_se,
+            inputs=(rate - left, rate + left), point=1),
+        Row(WHERE, 'growth of ln U by (4) to (6)', '1/s', Printed(f'{ito:.6g}', 0.0),
+            log, f'{how} of ln U',
+            'ln U is driven by noise of mean zero and cannot grow; b - B/2U^2 vanishes only with '
+            'the factor 2 in B.', error=log_se, point=1)]

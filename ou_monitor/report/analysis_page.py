@@ -1,0 +1,208 @@
+"""The report of `analyze`: one page, read in two minutes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+
+import numpy as np
+from ou_monitor.analyze.analyze import Analysis
+from ou_monitor.analyze.level_result import LevelResult
+from ou_monitor.analyze.words import headline
+from ou_monitor.records import FloatArray
+from ou_monitor.report import analysis_sections as parts, page
+from ou_monitor.report.cells import figure, UNKNOWN
+from ou_monitor.report.scale import span
+from ou_monitor.report.svg import Plot
+from ou_monitor.text import Z95
+
+# More levels than colours would repeat colours.
+_MAX_DRAWN = 6
+# Lines marked in the spectrum of one level.
+_MAX_MARKED = 3
+
+
+def analysis_page(analysis: Analysis, command: str = '') -> str:
+    """Return the report of an analysis."""
+    recording = analysis.recording
+    rate = (recording.n - 1) / recording.duration if recording.duration > 0.0 else math.nan
+    subtitle = (f'{recording.n} samples in {recording.duration:.4g} s, '
+                f'{figure(rate)} Hz on average')
+    after = parts.transients(analysis)
+    sections = [
+        page.headline(headline(analysis)),
+        page.section('Load levels', _levels_table(analysis.levels), _ou_table(analysis.levels)),
+        page.section('What to know before using these numbers', parts.quality(analysis)),
+        page.section('Over time', *_over_time(analysis)),
+        page.section('Over throttle', *parts.curves(analysis)),
+        *([page.section('After changes of throttle', *after)] if after else []),
+        page.section('Shape', *_shape(analysis), *parts.lines(analysis)),
+        page.section('Type of process', *parts.process(analysis)),
+        page.section('Where it comes from', _origin(analysis, command)),
+    ]
+    return page.page(f'Supply noise: {recording.name or "recording"}', subtitle, sections)
+
+
+def _interval(level: LevelResult, name: str, scale: float = 1.0, invert: bool = False) -> str:
+    """Return an estimate with its interval on a second line."""
+    e = level.estimate
+    value = getattr(e, name)
+    if not math.isfinite(value):
+        return UNKNOWN
+    low, high = e.interval(name)
+    if invert:
+        value, low, high = 1.0 / value, 1.0 / high, 1.0 / low
+    return (f'{figure(scale * value)}\n{figure(scale * low)} to {figure(scale * high)}')
+
+
+def _levels_table(levels: Sequence[LevelResult]) -> str:
+    rows = [[level.label, figure(level.time), str(level.n), figure(level.mean, 4),
+             *[figure(1e3 * v) for v in (level.vpp, level.peak, level.vrms)],
+             figure(level.crest), level.kind.value] for level in levels]
+    return page.table(['Throttle', 'Time, s', 'Samples', 'Mean, V', 'Vpp, mV', 'Peak, mV',
+                       'Vrms, mV', 'Vpp/Vrms', 'Process'], rows, left=[0, 8])
+
+
+def _ou_table(levels: Sequence[LevelResult]) -> str:
+    rows = [[level.label, _interval(level, 'alpha'), _interval(level, 'alpha', 1e3, invert=True),
+             _interval(level, 'sigma'), _interval(level, 'var_inf'),
+             figure(1e3 * level.estimate.noise_std), level.estimate.status.name]
+            for level in levels]
+    heads = ['Throttle', '\u03b1, 1/s', '\u03c4, ms', '\u03c3, V/\u221as', 'Var\u221e, V\u00b2',
+             'White noise, mV', 'Status']
+    return page.table(heads, rows, left=[0, 6]) + page.paragraph(
+        'dU = \u2212\u03b1 (U \u2212 U\u2080) dt + \u03c3 dW; \u03c4 = 1/\u03b1; Var\u221e = '
+        '\u03c3\u00b2/(2\u03b1). Small: 95 % interval. Vpp, peak and Vrms are of the deviation '
+        'from the mean of each segment.', soft=True)
+
+
+def _over_time(analysis: Analysis) -> list[str]:
+    recording, sliding = analysis.recording, analysis.sliding
+    start = float(recording.t[0]) if recording.n else 0.0
+    t = recording.t - start
+    limits = (0.0, max(recording.duration, 1e-9))
+    voltage = Plot('Voltage', 'time, s', 'V', height=230).limits(x=limits)
+    voltage.line(t, recording.voltage, colour=0)
+    drawn = [page.figure(voltage.svg(), _levels_caption(analysis))]
+    if recording.has_throttle:
+        throttle = Plot('Throttle, and the load levels found in it', 'time, s', '%', height=150)
+        throttle.limits(x=limits, y=(-5.0, 105.0)).steps(t, 100.0 * recording.throttle, colour=7)
+        for k, level in enumerate(_drawn(analysis)):
+            for s in level.segments:
+                throttle.shade(float(t[s.start]), float(t[s.stop - 1]), k)
+                voltage.shade(float(t[s.start]), float(t[s.stop - 1]), k, level.label)
+        drawn = [page.figure(voltage.svg()),
+                 page.figure(throttle.svg(), _levels_caption(analysis))]
+    if not sliding.t.size:
+        return [*drawn, page.paragraph(
+            f'No sliding estimate: the recording is shorter than half a window of '
+            f'{sliding.window:g} s.', soft=True)]
+    known = np.array([e.usable for e in sliding.estimates])
+    for name, title, unit in (('sigma', 'Noise intensity \u03c3', 'V/\u221as'),
+                              ('alpha', 'Relaxation rate \u03b1', '1/s')):
+        value = sliding.series(name)
+        if not np.isfinite(value).any():
+            continue
+        factor = np.exp(Z95 * np.minimum(sliding.series(name + '_se'), 5.0))
+        plot = Plot(f'{title} in a sliding window of {sliding.window:g} s', 'time, s', unit,
+                    height=200, log_y=True).limits(x=limits)
+        # One window that tells nothing must not flatten all the others.
+        plot.limits(y=span([value, value / factor, value * factor], log=True, trim=0.01))
+        plot.band(sliding.t - start, value / factor, value * factor, '95 % interval')
+        plot.line(sliding.t - start, value, 'estimate', style='thick')
+        drawn.append(page.figure(plot.svg()))
+    if np.isfinite(sliding.risk).any():
+        plot = Plot(f'Risk of going below {sliding.brownout_voltage:g} V within '
+                    f'{sliding.brownout_horizon:g} s', 'time, s', 'probability', height=170)
+        plot.limits(x=limits, y=(-0.02, 1.02))
+        plot.line(sliding.t - start, sliding.risk, colour=1, style='thick')
+        drawn.append(page.figure(plot.svg()))
+    lost = int((~known).sum())
+    if lost:
+        counts: dict[str, int] = {}
+        for e in sliding.estimates:
+            if not e.usable:
+                counts[e.status.value] = counts.get(e.status.value, 0) + 1
+        drawn.append(page.paragraph(f'{lost} of {known.size} windows carry no estimate:'))
+        drawn.append(page.bullets([f'{n} windows: {text}' for text, n in counts.items()],
+                                  warn=True))
+    return drawn
+
+
+def _drawn(analysis: Analysis) -> list[LevelResult]:
+    """Return the levels that get a colour: those with most time, in order of throttle."""
+    longest = sorted(analysis.levels, key=lambda level: -level.time)[:_MAX_DRAWN]
+    return [level for level in analysis.levels if level in longest]
+
+
+def _levels_caption(analysis: Analysis) -> str:
+    if not analysis.recording.has_throttle:
+        return 'Every peak is shown: each column of pixels holds its lowest and highest sample.'
+    return ('Shaded: the stretches used for the load levels, in the colours of the plots of the '
+            'shape. Every peak is shown.')
+
+
+def _shape(analysis: Analysis) -> list[str]:
+    spectrum = Plot('Spectrum (dashed: fitted OU and white noise)', 'frequency, Hz',
+                    'PSD, V\u00b2/Hz', width=450, height=330, log_x=True, log_y=True,
+                    legend_low=True)
+    histogram = Plot('Deviation and the normal law',
+                     'deviation / standard deviation', 'density', width=450, height=330,
+                     log_y=True)
+    drawn = _drawn(analysis)
+    fitted, counted = 0, 0
+    for k, level in enumerate(drawn):
+        measured = level.spectrum
+        if measured.frequency.size:
+            fitted += 1
+            spectrum.line(measured.frequency, measured.density, level.label, k, 'faint')
+            spectrum.line(measured.frequency, measured.fitted, '', k, 'dash thick')
+            for line in level.lines.lines[:_MAX_MARKED]:
+                spectrum.mark(line.frequency, f'{line.frequency:.4g} Hz')
+        x, y = _histogram(level)
+        if x.size:
+            counted += 1
+            histogram.line(x, y, level.label, k)
+    z = np.linspace(-5.0, 5.0, 201)
+    histogram.line(z, np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi), 'normal', 7, 'dash thick')
+    histogram.limits(x=(-6.0, 6.0), y=(1e-5, 1.0))
+    figures = []
+    if fitted:
+        figures.append(page.figure(spectrum.svg()))
+    if counted:
+        figures.append(page.figure(histogram.svg()))
+    if not figures:
+        return [page.paragraph('No level holds enough samples for a spectrum.', soft=True)]
+    text = ('An OU is flat below its corner \u03b1/(2\u03c0) and falls with the square of '
+            'frequency above it; a line that stands out is a tone, a flat floor at high '
+            'frequency is white noise of the sensor.')
+    extra = len(analysis.levels) - len(drawn)
+    if extra > 0:
+        text += f' The {extra} shortest levels are in the tables only.'
+    return [page.pair(*figures), page.paragraph(text, soft=True)]
+
+
+def _histogram(level: LevelResult) -> tuple[FloatArray, FloatArray]:
+    """Return the outline of the density of the standardised deviation."""
+    if level.n < 50 or not level.vrms > 0.0:
+        return np.zeros(0), np.zeros(0)
+    z = level.deviation / level.vrms
+    # Freedman-Diaconis, within what a plot can show.
+    quarter = float(np.subtract(*np.quantile(z, [0.75, 0.25])))
+    width = min(max(2.0 * quarter / level.n ** (1.0 / 3.0), 0.05), 0.5)
+    edges = np.arange(-6.0, 6.0 + width, width)
+    counts, edges = np.histogram(z, edges)
+    density = counts / (level.n * np.diff(edges))
+    x, y = np.repeat(edges, 2)[1:-1], np.repeat(density, 2)
+    return x, np.where(y > 0.0, y, np.nan)
+
+
+def _origin(analysis: Analysis, command: str) -> str:
+    recording = analysis.recording
+    rows = [[name, value] for name, value in recording.source.items()]
+    parts = [page.table(['Source', ''], rows, left=[0, 1]) if rows else '']
+    notes = [note for note in analysis.notes if note]
+    parts.append(page.bullets(notes) if notes else page.paragraph('Nothing was dropped.'))
+    if command:
+        parts += [page.paragraph('To repeat this analysis:'), page.code(command)]
+    return '\n'.join(parts)

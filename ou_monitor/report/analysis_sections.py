@@ -1,0 +1,205 @@
+"""Sections of the report of `analyze` that show tests, lines, transients and curves."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from ou_monitor.analyze.analyze import Analysis
+from ou_monitor.analyze.level_result import LevelResult
+from ou_monitor.analyze.relaxation import Relaxation
+from ou_monitor.analyze.words import brownout_sentence, caution, relaxation_sentence
+from ou_monitor.records import FloatArray
+from ou_monitor.report import page
+from ou_monitor.report.cells import figure, probability, UNKNOWN
+from ou_monitor.report.svg import Plot
+from ou_monitor.text import Z95
+
+# Changes drawn in one plot, and relaxation times of them.
+_MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
+# Smaller risks are drawn as this.
+_LEAST_RISK = 1e-9
+_TESTS = {'mean_drift': 'Mean moves', 'variance_drift': 'Intensity moves',
+          'gaussian': 'Not Gaussian', 'impulses': 'Impulses', 'correlated': 'Correlated',
+          'one_relaxation': 'Not one relaxation', 'second_relaxation': 'Second relaxation'}
+
+
+def quality(analysis: Analysis) -> str:
+    """Return the list of what is doubtful, and why each level is called what it is called."""
+    rows = [[item.severity.name.lower(), caution(item)] for item in analysis.quality]
+    if not rows:
+        return page.paragraph('No quality flag was raised.')
+    return (page.bullets([f'{severity}: {text}' for severity, text in rows
+                          if severity != 'info'], warn=True)
+            + page.bullets([text for severity, text in rows if severity == 'info']))
+
+
+def process(analysis: Analysis) -> list[str]:
+    """Return the tests behind the kind of process of each level."""
+    rows = []
+    for level in analysis.levels:
+        cells = []
+        for test in level.shape.tests:
+            strength = f'\n{figure(test.effect, 2)}' if math.isfinite(test.effect) else ''
+            mark = ' *' if test.rejects else ''
+            cells.append(probability(test.p_adjusted) + mark + strength)
+        rows.append([level.label, level.kind.value, *cells])
+    reasons = [f'{level.label}, {level.kind.value}: {level.verdict.sentence}'
+               for level in analysis.levels if level.n]
+    return [
+        page.table(['Throttle', 'Process', *_TESTS.values()], rows, left=[0, 1]),
+        page.paragraph(
+            'p-values after Holm over all tests of all levels, small the effect; * rejects: p '
+            'below 0.01 and an effect of consequence. A recording of stationary OU levels has '
+            'any of them reject once in a hundred times; that "Correlated" rejects is what a '
+            'relaxation does.', soft=True),
+        page.bullets(reasons)]
+
+
+def lines(analysis: Analysis) -> list[str]:
+    """Return the spectral lines, or what would have been seen."""
+    rows = [[level.label, f'{figure(line.frequency, 4)}\n\u00b1 {figure(line.resolution, 2)}',
+             f'{figure(1e3 * line.rms)}\n{figure(1e3 * line.rms_low)} to '
+             f'{figure(1e3 * line.rms_high)}', f'{100.0 * line.share:.2g} %',
+             probability(line.p_value)]
+            for level in analysis.levels for line in level.lines.lines]
+    searched = [level for level in analysis.levels if not level.lines.why_not]
+    if not searched:
+        return []
+    detail = ', '.join(f'{level.label}: {figure(1e3 * level.lines.detectable)} mV'
+                       for level in searched)
+    text = (f'A recording without lines has one reported once in a hundred times. RMS of a line '
+            f'that would have been seen with 90 %: {detail}.')
+    if not rows:
+        return [page.paragraph('No spectral line stands out of the noise at any level.'),
+                page.paragraph(text, soft=True)]
+    return [page.table(['Throttle', 'Line, Hz', 'RMS, mV', 'Of the variance', 'p'], rows,
+                       left=[0]), page.paragraph(text, soft=True)]
+
+
+def transients(analysis: Analysis) -> list[str]:
+    """Return what follows changes of load."""
+    if not analysis.recording.has_throttle:
+        return []
+    parts = []
+    for k, fit in enumerate(analysis.relaxations):
+        if fit.releases or k == 0:
+            parts.append(page.paragraph(relaxation_sentence(analysis, k)))
+        if fit.seen:
+            parts += [page.figure(_relaxing(analysis, fit).svg()), _changes(analysis, fit)]
+    return parts
+
+
+def _relaxing(analysis: Analysis, fit: Relaxation) -> Plot:
+    """Return voltages less the level that they settle at, and the fit."""
+    recording = analysis.recording
+    what = 'falls' if fit.kind == 'release' else 'rises'
+    plot = Plot(f'After throttle {what} (dashed: fit)', 'time since throttle arrived, ms', 'mV',
+                height=240)
+    for k, change in enumerate(fit.releases[:_MOST_DRAWN]):
+        if not math.isfinite(change.amplitude):
+            continue
+        stop = change.t + min(change.duration, _DRAWN_TAUS * fit.tau)
+        here = slice(int(np.searchsorted(recording.t, change.t)),
+                     int(np.searchsorted(recording.t, stop, side='right')))
+        since = recording.t[here] - change.t
+        plot.line(1e3 * since, 1e3 * (recording.voltage[here] - change.level),
+                  f'{100.0 * change.throttle_before:.3g} to '
+                  f'{100.0 * change.throttle_after:.3g} %', k, 'faint')
+        plot.line(1e3 * since, 1e3 * change.amplitude * np.exp(-since / fit.tau), '', k,
+                  'dash thick')
+    return plot
+
+
+def _changes(analysis: Analysis, fit: Relaxation) -> str:
+    start = float(analysis.recording.t[0])
+    side = 'Overshoot, mV' if fit.kind == 'release' else 'Undershoot, mV'
+    rows = [[figure(change.t - start, 4),
+             f'{100.0 * change.throttle_before:.3g} to {100.0 * change.throttle_after:.3g} %',
+             _with_error(change.level_before, change.level_before_se, 4, 1.0),
+             _with_error(change.level, change.level_se, 4, 1.0),
+             _with_error(change.amplitude, change.amplitude_se, 3, 1e3),
+             figure(1e3 * change.beyond), probability(change.beyond_p)]
+            for change in fit.releases]
+    return page.table(['At, s', 'Throttle', 'Level before, V', 'Level after, V', 'A, mV', side,
+                       'p of noise'], rows, left=[1])
+
+
+def _with_error(value: float, se: float, digits: int, scale: float) -> str:
+    if not math.isfinite(value):
+        return UNKNOWN
+    return f'{figure(scale * value, digits)} \u00b1 {figure(scale * se, 2)}'
+
+
+def curves(analysis: Analysis) -> list[str]:
+    """Return level, sag, intensity, alpha and risk over throttle."""
+    learned = analysis.by_throttle
+    levels = [level for level in analysis.levels
+              if math.isfinite(level.throttle) and level.n]
+    parts = []
+    if levels or learned.known.any():
+        x = 100.0 * learned.throttle
+        sag, sigma = _empty('Sag', 'mV'), _empty('Noise intensity \u03c3', 'V/\u221as')
+        shift = _sag_before(analysis)
+        sag.band(x, 1e3 * (learned.sag_low + shift), 1e3 * (learned.sag_high + shift), '95 %', 0)
+        sag.line(x, 1e3 * (learned.sag + shift), 'learned as by the node', 0, 'thick')
+        sigma.band(x, learned.sigma_low, learned.sigma_high, '95 %', 0)
+        sigma.line(x, learned.sigma, 'learned as by the node', 0, 'thick')
+        at = _column([100.0 * level.throttle for level in levels])
+        _with_bars(sag, at, 1e3 * _column([level.sag.sag for level in levels]),
+                   1e3 * _column([level.sag.sag_se for level in levels]))
+        _with_factors(sigma, at, levels, 'sigma')
+        risk, alpha = _empty(f'Risk of going below {learned.voltage:g} V within '
+                             f'{learned.horizon:g} s', 'probability', log=True), _empty(
+                                 'Relaxation rate \u03b1', '1/s')
+        risk.line(x, np.where(np.isfinite(learned.risk), np.maximum(learned.risk, _LEAST_RISK),
+                              np.nan), '', 1, 'thick')
+        risk.limits(y=(_LEAST_RISK, 2.0))
+        if math.isfinite(learned.budget):
+            risk.mark(100.0 * learned.budget, f'budget {100.0 * learned.budget:.0f} %')
+        test = analysis.alpha_test
+        reach = math.exp(Z95 * test.alpha_se) if math.isfinite(test.alpha_se) else math.nan
+        ends = np.array([0.0, 100.0])
+        alpha.band(ends, np.full(2, test.alpha / reach), np.full(2, test.alpha * reach),
+                   'common, 95 %', 2)
+        _with_factors(alpha, at, levels, 'alpha')
+        told = [plot for plot, values in (
+            (sag, [*learned.sag, *(level.sag.sag for level in levels)]),
+            (sigma, [*learned.sigma, *(level.estimate.sigma for level in levels)]),
+            (risk, list(learned.risk)),
+            (alpha, [level.estimate.alpha for level in levels])) if np.isfinite(values).any()]
+        parts += [page.pair(*(page.figure(plot.svg()) for plot in told[k:k + 2]))
+                  for k in range(0, len(told), 2)]
+    return [*parts, page.paragraph(brownout_sentence(analysis)),
+            page.paragraph(analysis.alpha_test.sentence)]
+
+
+def _sag_before(analysis: Analysis) -> float:
+    """Return the sag of the levels where the learned curve begins, V."""
+    learned = analysis.by_throttle
+    told = [level for level in analysis.levels if math.isfinite(level.sag.sag)]
+    if not told or not learned.known.any():
+        return 0.0
+    return float(np.interp(learned.throttle[int(learned.known.argmax())],
+                           [level.throttle for level in told],
+                           [level.sag.sag for level in told]))
+
+
+def _empty(title: str, unit: str, log: bool = False) -> Plot:
+    return Plot(title, 'throttle, %', unit, width=450, height=270, log_y=log,
+                legend_row=not log).limits(x=(-2.0, 102.0))
+
+
+def _column(values: list[float]) -> FloatArray:
+    return np.array(values, dtype=np.float64)
+
+
+def _with_bars(plot: Plot, x: FloatArray, y: FloatArray, se: FloatArray) -> None:
+    plot.bars(x, y - Z95 * se, y + Z95 * se, '', 7).markers(x, y, 'load levels', 7)
+
+
+def _with_factors(plot: Plot, x: FloatArray, levels: list[LevelResult], name: str) -> None:
+    ends = [level.estimate.interval(name) for level in levels]
+    plot.bars(x, _column([low for low, _ in ends]), _column([high for _, high in ends]), '', 7)
+    plot.markers(x, _column([getattr(level.estimate, name) for level in levels]), 'load levels',
+                 7)

@@ -1,0 +1,214 @@
+"""The report of `discover`: what the simulation gets wrong, why, and what it is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+import math
+
+import numpy as np
+from ou_monitor.discover.cause_rows import cause_rows, gain_remark, NOT_KNOWN
+from ou_monitor.discover.finding import Criticism, Finding
+from ou_monitor.discover.gain_words import MNAT, overlap_words
+from ou_monitor.discover.words import crossing_words, plain_model_words, plain_words, with_error
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.report import page
+from ou_monitor.report.cells import figure, UNKNOWN
+from ou_monitor.report.dots import dot_rows
+from ou_monitor.report.pictures import Picture, pictures
+from ou_monitor.report.scale import span
+from ou_monitor.report.svg import Plot
+from ou_monitor.text import number
+
+# Rows of statistics drawn at most.
+_ROWS = 18
+
+
+def discovery_page(finding: Finding, command: str = '',
+                   progress: Callable[[float], None] | None = None) -> str:
+    """Return the report of a discovery."""
+    tell = progress or (lambda share: None)
+    subtitle = f'{finding.n} samples in {number(finding.duration, 4)} s'
+    if finding.samples is not None and finding.samples.n != finding.n:
+        subtitle += f', of which {finding.samples.n} were used'
+    sections = [page.headline(_typeset(finding.sentence))]
+    if finding.baseline is not None:
+        sections += [page.section('Causes', *_causes(finding)),
+                     page.section('What it is worth' if finding.causes else 'What it predicts',
+                                  *_worth(finding)),
+                     page.section(
+                         'Statistics before and after' if finding.causes else 'Statistics',
+                         *_statistics(finding)),
+                     page.section('Data beside simulations', *_pictures(finding)),
+                     page.section('What is left', *_left(finding)),
+                     page.section('Parameters', *_parameters(finding))]
+    tell(1.0)
+    sections.append(page.section('Where it comes from', *_origin(finding, command)))
+    return page.page(f'What the simulation gets wrong: {finding.recording or "recording"}',
+                     subtitle, sections)
+
+
+def _typeset(text: str) -> str:
+    return text.replace('+-', '\u00b1')
+
+
+def _value(value: float, digits: int = 3) -> str:
+    return figure(value, digits) if math.isfinite(value) else NOT_KNOWN
+
+
+def _with_error(value: float, error: float) -> str:
+    if not math.isfinite(value):
+        return NOT_KNOWN
+    return _value(value) + (f' \u00b1 {_value(error, 2)}' if math.isfinite(error) else '')
+
+
+def _minus(text: str) -> str:
+    """Return a number that stands at the front with a true minus."""
+    return '\u2212' + text[1:] if text.startswith('-') else text
+
+
+def _total_gain(finding: Finding) -> str:
+    remark = gain_remark(finding.gain, finding.gain_se) if finding.causes else ''
+    return (f'gain {_with_error(finding.gain, finding.gain_se)}'
+            + (f'\n{remark}' if remark else ''))
+
+
+def _causes(finding: Finding) -> list[str]:
+    if not finding.causes:
+        return [page.paragraph('None was named.')]
+    found = cause_rows(finding.causes)
+    overlap = overlap_words(finding.causes, finding.gain)
+    rows = [[row.label, row.family,
+             _minus(_typeset(row.gain)) + (f'\n{row.remark}' if row.remark else ''),
+             row.chance, ', '.join(row.alternatives) or UNKNOWN] for row in found]
+    return [
+        page.table(['Cause', 'Family', 'Gain, mnat per sample', 'p', 'Not told from'], rows,
+                   left=[0, 1, 4]),
+        *([page.paragraph(overlap)] if overlap else []),
+        page.bullets([_typeset(f'{row.label}: {row.explanation}') for row in found]),
+        page.paragraph(
+            'Gain: what the held-out score loses when the cause is left out and all else is '
+            'fitted again, with the standard error of means of blocks and of the errors of the '
+            'parameters. p: of the likelihood ratio on the part fitted, searching counted, or of '
+            'the gain, doubled. Exact findings are seen in the samples themselves; the gain of '
+            'those undone in them is shared. Terms of one kind that share a gain are one row.',
+            soft=True),
+        page.paragraph(MNAT, soft=True)]
+
+
+def _worth(finding: Finding) -> list[str]:
+    c = finding.crossing
+    rows = [['Score on the last 40 %, nats per sample', _value(finding.baseline_score, 4),
+             _value(finding.score, 4), _total_gain(finding)]]
+    if math.isfinite(c.level):
+        rows.append([
+            f'Falls through {_value(c.level, 4)} V per minute',
+            _with_error(c.baseline, c.baseline_se), _with_error(c.extended, c.extended_se),
+            f'{_with_error(c.observed, c.observed_se)}, observed'])
+    head = ['', 'Plain OU', 'Extended', '']
+    if not finding.causes:
+        # Nothing was added to the plain OU: there is nothing to compare it with.
+        head, rows = ['', 'Plain OU', ''], [
+            [row[0], row[1], row[3] if 'observed' in row[3] else ''] for row in rows]
+    assert finding.baseline is not None
+    return [page.table(head, rows, left=[0]),
+            page.paragraph(_typeset(crossing_words(finding))),
+            page.paragraph(f'Plain OU, fitted on the first 60 % with nothing else in the model: '
+                           f'{plain_model_words(finding.baseline)}.', soft=True)]
+
+
+def _shown(finding: Finding) -> list[Criticism]:
+    """Return the statistics worth a row: all that are or were off, then the largest."""
+    worst = sorted(finding.criticism, key=lambda c: -max(abs(c.before), abs(c.after)))
+    return worst[:_ROWS]
+
+
+def _statistics(finding: Finding) -> list[str]:
+    rows = [(c.statistic, c.low, c.high, c.before, c.after) for c in _shown(finding)]
+    text = (f'{len(finding.discrepancies)} of {len(finding.criticism)} statistics of the '
+            'one-step errors lie outside the band for the plain OU'
+            + (f', {len(finding.remaining)} for the extended model. ' if finding.causes else '. '))
+    dots = 'Hollow: plain OU. Full: extended model' if finding.causes else 'Dot: plain OU'
+    return [page.figure(
+        dot_rows(f'{dots}. Band: what simulations produce', 'standard scores', rows),
+        text + 'The band is that of simulations through the same fit: a right model leaves it '
+        'with any of its statistics in one recording of a hundred.')]
+
+
+def _pictures(finding: Finding) -> list[str]:
+    samples, baseline, extended = finding.samples, finding.baseline, finding.simulated
+    assert samples is not None and baseline is not None and extended is not None
+    plain = SupplyModel((baseline,))
+    named = ('plain OU', 'extended model') if finding.causes else ('plain OU',)
+    made = pictures(samples, [plain, extended] if finding.causes else [plain],
+                    np.random.default_rng(finding.seed))
+    drawn = [page.figure(_plot(picture, k, name).svg())
+             for picture in made for k, name in enumerate(named)]
+    return [*[page.pair(*drawn[k:k + 2]) for k in range(0, len(drawn), 2)], page.paragraph(
+        'Line or dots: the data. Band or bars: the range of 40 simulations with the stamps and '
+        'the throttle of the data; about one point in twenty of a right model lies outside.',
+        soft=True)]
+
+
+def _plot(picture: Picture, k: int, name: str) -> Plot:
+    low, high = picture.bands[k]
+    plot = Plot(f'{picture.title}: {name}', picture.x_label, picture.y_label, width=450,
+                height=250, log_x=picture.log_x, log_y=picture.log_y, legend_row=True)
+    data = picture.data
+    if picture.log_y:
+        # A bin without samples has no place on a logarithmic axis.
+        floor = 0.3 * float(np.nanmin(np.where(data > 0.0, data, np.nan)))
+        low, high = np.where(high > 0.0, np.maximum(low, floor), np.nan), np.maximum(high, floor)
+        data = np.where(data > 0.0, data, np.nan)
+    ends = [data, *[edge for pair in picture.bands for edge in pair]]
+    # Both plots of a pair have one axis.
+    ends = [np.where(e > 0.0, np.maximum(e, floor), np.nan) for e in ends] if picture.log_y \
+        else ends
+    bottom, top = span(ends, picture.log_y)
+    plot.limits(y=(bottom, top))
+    if picture.points:
+        # Room for the markers at both ends.
+        plot.limits(span([picture.x], pad=0.12), (bottom, top))
+        plot.bars(picture.x, low, high, 'simulated', k)
+        return plot.markers(picture.x, data, 'data', 7)
+    plot.band(picture.x, low, high, 'simulated', k)
+    return plot.line(picture.x, data, 'data', 7, 'thick')
+
+
+def _left(finding: Finding) -> list[str]:
+    if not finding.remaining:
+        which = 'extended model' if finding.causes else 'plain OU'
+        return [page.paragraph(f'Nothing: no statistic of the {which} lies outside the band.')]
+    rows = [[c.statistic, _value(c.before), *([_value(c.after)] if finding.causes else []),
+             f'{c.p_after:.2g}' if math.isfinite(c.p_after) else NOT_KNOWN,
+             plain_words(c.statistic)] for c in finding.remaining]
+    head = ['Statistic', 'Plain OU', *(['Extended'] if finding.causes else []), 'p', 'In words']
+    return [page.table(head, rows, left=[0, len(head) - 1])]
+
+
+def _parameters(finding: Finding) -> list[str]:
+    rows = []
+    assert finding.model is not None
+    for term, se in zip(finding.model.terms, finding.se):
+        for spec in fields(term):
+            value = getattr(term, spec.name)
+            value = list(value) if isinstance(value, tuple) else value
+            rows.append([term.NAME, spec.name,
+                         _typeset(with_error(value, se.get(spec.name))),
+                         spec.metadata['unit'] or UNKNOWN, spec.metadata['text']])
+    about = ('Extended model: all terms fitted together on the whole recording. Its alpha and '
+             'sigma are what is left of the relaxation and the noise beside all causes; those of '
+             'the plain OU above, fitted on the first 60 %, hold the causes as well.'
+             if finding.causes else
+             'The plain OU is kept, as no cause was named: the same model as above, fitted on the '
+             'whole recording instead of its first 60 %, so that its numbers differ a little.')
+    return [page.paragraph(about),
+            page.table(['Term', 'Parameter', 'Estimate \u00b1 standard error', 'Unit',
+                        'What it is'], rows, left=[0, 1, 4])]
+
+
+def _origin(finding: Finding, command: str) -> list[str]:
+    parts = [page.bullets(list(finding.notes))]
+    if command:
+        parts += [page.paragraph('To repeat this:'), page.code(command)]
+    return parts

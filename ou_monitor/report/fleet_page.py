@@ -1,0 +1,270 @@
+"""The report of `fleet`: what stands out first, then the fleet, then every recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import math
+from typing import Any
+
+import numpy as np
+from ou_monitor.fleet.compare import LOGARITHMIC, QUANTITIES, USABLE, Values
+from ou_monitor.fleet.drift import Trend
+from ou_monitor.fleet.judge import DRIFT_RATE
+from ou_monitor.fleet.run import Fleet
+from ou_monitor.fleet.words import (
+    change, comparison_words, failure_words, finding_words, headline, quality_counts, short_names,
+    VEHICLE_HEADS, vehicle_rows)
+from ou_monitor.records import FloatArray
+from ou_monitor.report import page
+from ou_monitor.report.cells import typeset, UNKNOWN
+from ou_monitor.report.svg import Plot
+from ou_monitor.text import number, Z95
+
+_TITLES = {'sigma': 'Noise intensity \u03c3', 'alpha': 'Relaxation rate \u03b1',
+           'sag': 'Sag over throttle'}
+_UNITS = {'sigma': 'V/\u221as', 'alpha': '1/s', 'sag': 'V'}
+# Drifts drawn at most; without any, the most likely ones are drawn, so many.
+_DRAWN, _LIKELY = 8, 2
+# Trends in the table: at least, with those of p below 5 %, and at most.
+_LEAST, _MOST = 6, 30
+# Sentences and recordings listed at most; the table has all of them.
+_SENTENCES, _RECORDINGS = 40, 500
+
+
+def fleet_page(fleet: Fleet, command: str = '') -> str:
+    """Return the report of a fleet."""
+    sections = [page.headline(headline(fleet)), page.section('What stands out', *_odd(fleet))]
+    if fleet.failed or fleet.duplicates:
+        sections.append(page.section('Not in the comparison', *_left_out(fleet)))
+    sections += [
+        page.section('Vehicles', *_vehicles(fleet)),
+        page.section('Drift over the flights', *_drift(fleet)),
+        page.section('Distributions', *_distributions(fleet)),
+        page.section('Quality', *_quality(fleet)),
+        page.section('What to know before using these numbers', page.bullets(
+            [_sentence(note) for note in (*fleet.notes, *comparison_words(fleet))])),
+        page.section('Recordings', *_recordings(fleet)),
+    ]
+    if command:
+        sections.append(page.section('Where it comes from', page.paragraph(
+            'To repeat this, or to go on with recordings that came later:'), page.code(command)))
+    subtitle = (f'{fleet.recordings} recordings, {len(fleet.vehicles)} vehicles, '
+                f'{len(fleet.rows)} rows in the table')
+    return page.page('Supply noise of a fleet', subtitle, sections)
+
+
+def _sentence(text: str) -> str:
+    return text.replace('+-', '\u00b1')
+
+
+def _odd(fleet: Fleet) -> list[str]:
+    found = finding_words(fleet)
+    if not found:
+        return [page.paragraph('Nothing, at the false-alarm rates stated below.')]
+    more = len(found) - _SENTENCES
+    last = [f'and {more} more: see the table.'] if more > 0 else []
+    return [page.bullets([*found[:_SENTENCES], *last], warn=True)]
+
+
+def _left_out(fleet: Fleet) -> list[str]:
+    parts = []
+    if fleet.failed:
+        parts += [page.paragraph(f'{len(fleet.failed)} could not be analysed; the next run tries '
+                                 'them again:'),
+                  page.bullets(failure_words(fleet), warn=True)]
+    if fleet.duplicates:
+        parts += [page.paragraph(f'{len(fleet.duplicates)} have the same content as another one '
+                                 'and were not analysed again:'),
+                  page.bullets([f"{row['path']} is {row['duplicate_of']}"
+                                for row in fleet.duplicates])]
+    return parts
+
+
+def _vehicles(fleet: Fleet) -> list[str]:
+    rows = vehicle_rows(fleet)
+    if not rows:
+        return [page.paragraph('No vehicle could be told.', soft=True)]
+    numbered = [[str(k + 1), row[0], *[typeset(cell) for cell in row[1:]]]
+                for k, row in enumerate(rows)]
+    parts = [page.table(['#', *[head for _, head in VEHICLE_HEADS]], numbered, left=[1]),
+             page.paragraph('Medians over the flights, and their change a flight. A star marks '
+                            'what stands out.', soft=True)]
+    for name in LOGARITHMIC:
+        values = fleet.judgement.values[name]
+        if values.value.size:
+            parts.append(page.figure(_by_vehicle(fleet, values).svg(), (
+                'Each dot is a recording, under the number of its vehicle in the table.'
+                if name == 'sigma' else '')))
+    return parts
+
+
+def _by_vehicle(fleet: Fleet, values: Values) -> Plot:
+    """Return a strip of dots for each vehicle."""
+    names = fleet.vehicles
+    out = fleet.judgement.recordings[values.name]
+    x = np.array([names.index(v) + 1.0 if v else np.nan for v in values.vehicles])
+    spread = np.zeros(x.size)
+    # Flights lie side by side in their order, so that a drift shows as a slope.
+    for k in range(len(names)):
+        mine = np.flatnonzero(x == k + 1.0)
+        if mine.size > 1:
+            spread[mine[np.argsort(values.flights[mine], kind='stable')]] = np.linspace(
+                -0.32, 0.32, mine.size)
+    y = values.shown(values.value)
+    odd = out.found
+    plot = Plot(f'{_TITLES[values.name]} of every recording', 'vehicle', _UNITS[values.name],
+                height=260, log_y=values.name in LOGARITHMIC)
+    plot.limits(x=(0.4, max(len(names), 1) + 0.6))
+    for k in range(0, len(names), 2):
+        plot.shade(k + 0.5, k + 1.5, 7)
+    plot.markers((x + spread)[~odd], y[~odd], 'recordings', 0)
+    if odd.any():
+        plot.markers((x + spread)[odd], y[odd], 'outliers of their vehicle', 1)
+    return plot
+
+
+def _drift(fleet: Fleet) -> list[str]:
+    judged = fleet.judgement
+    drawn = list(judged.drifting[:_DRAWN]) or list(judged.trends[:_LIKELY])
+    if not drawn:
+        return [page.paragraph('No vehicle has enough flights for a test.', soft=True)]
+    parts = []
+    if not judged.drifting:
+        parts.append(page.paragraph('No drift stands at the rate of the fleet; the most likely '
+                                    'ones are drawn.'))
+    parts += _pairs([page.figure(_trend_plot(judged.values[t.quantity], t).svg(), _caption(t))
+                     for t in drawn])
+    listed = [t for k, t in enumerate(judged.trends) if k < _LEAST or t.p_value < DRIFT_RATE]
+    rows = [[t.vehicle, t.quantity, str(t.flights), typeset(change(t.quantity, t.slope)) + '\n'
+             + f'{typeset(change(t.quantity, t.low))} to {typeset(change(t.quantity, t.high))}',
+             f'{t.p_value:.2g}', f'{t.p_family:.2g}',
+             'yes' if t.p_family <= DRIFT_RATE else 'no'] for t in listed[:_MOST]]
+    parts.append(page.table(['Vehicle', 'Quantity', 'Flights', 'Change a flight', 'p',
+                             'p over the fleet', 'Stands'], rows, left=[0, 1]))
+    more = len(judged.trends) - len(rows)
+    parts.append(page.paragraph(
+        'Small: 95 % interval (Theil and Sen). p is that of Mann and Kendall, the next one after '
+        'Holm.' + (f' {more} less likely trends are not shown.' if more > 0 else ''), soft=True))
+    return parts
+
+
+def _pairs(figures: list[str]) -> list[str]:
+    """Return figures two by two; a lone one keeps half of the width."""
+    return [page.pair(*(figures[k:k + 2] + ['<div></div>'])[:2])
+            for k in range(0, len(figures), 2)]
+
+
+def _caption(trend: Trend) -> str:
+    return (f'{typeset(change(trend.quantity, trend.slope))} a flight; p over the fleet '
+            f'{trend.p_family:.2g}.')
+
+
+def _trend_plot(values: Values, trend: Trend) -> Plot:
+    mine = np.array([v == trend.vehicle for v in values.vehicles]) & (values.flights > 0)
+    x, y, se = values.flights[mine].astype(float), values.value[mine], values.error[mine]
+    plot = Plot(f'{trend.vehicle}: {_TITLES[values.name]}', 'flight', _UNITS[values.name],
+                width=450, height=260, log_y=values.name in LOGARITHMIC)
+    plot.limits(x=(trend.first - 0.5, trend.last + 0.5))
+    plot.bars(x, values.shown(y - Z95 * se), values.shown(y + Z95 * se), '', 7)
+    plot.markers(x, values.shown(y), '', 0)
+    at = np.linspace(trend.first, trend.last, 50)
+    return plot.line(at, values.shown(trend.line(at)), '', 1, 'thick')
+
+
+def _distributions(fleet: Fleet) -> list[str]:
+    figures = []
+    for name in QUANTITIES:
+        values = fleet.judgement.values[name]
+        if values.value.size >= 5:
+            x, count = _histogram(values.value)
+            # On a log axis the outline has its corners where the bins are even in the logarithm.
+            plot = Plot(f'{_TITLES[name]}, all recordings', _UNITS[name], 'recordings', width=450,
+                        height=240, log_x=name in LOGARITHMIC)
+            plot.limits(y=(0.0, 1.08 * float(count.max())))
+            figures.append(page.figure(plot.line(values.shown(x), count, '', 0, 'thick').svg()))
+    over = _over_throttle(fleet)
+    if over:
+        figures.append(page.figure(over.svg()))
+    if not figures:
+        return [page.paragraph('Fewer than five recordings have an estimate.', soft=True)]
+    parts = _pairs(figures)
+    if over:
+        parts.append(page.paragraph(
+            'Histograms are at the reference throttle. Over throttle: every level of every '
+            'recording, and the common curve that is taken out, through the median of all.',
+            soft=True))
+    return parts
+
+
+def _histogram(value: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the outline of the counts; a wild value does not decide the width of a bin."""
+    low, high = np.quantile(value, [0.25, 0.75])
+    width = max(2.0 * float(high - low) / value.size ** (1.0 / 3.0),
+                float(np.ptp(value)) / 60.0, 1e-9)
+    first = math.floor(float(value.min()) / width) * width
+    bins = int(math.ceil((float(value.max()) - first) / width + 1e-9)) or 1
+    counts, edges = np.histogram(value, first + width * np.arange(bins + 1))
+    return np.repeat(edges, 2), np.concatenate(([0.0], np.repeat(counts, 2), [0.0]))
+
+
+def _over_throttle(fleet: Fleet) -> Plot | None:
+    values = fleet.judgement.values['sigma']
+    good = [row for row in fleet.rows if row['status'] in USABLE and row['sigma'] is not None
+            and row['throttle'] is not None]
+    if len(good) < 5 or not math.isfinite(values.curve.reference):
+        return None
+    u = np.array([row['throttle'] for row in good])
+    plot = Plot(f'{_TITLES["sigma"]} over throttle, all levels', 'throttle, %', _UNITS['sigma'],
+                width=450, height=240, log_y=True)
+    plot.markers(100.0 * u, np.array([row['sigma'] for row in good]), '', 7)
+    at = np.linspace(float(u.min()), float(u.max()), 60)
+    middle = float(np.median(values.value))
+    return plot.line(100.0 * at, np.exp(middle + values.curve(at)), '', 1, 'thick')
+
+
+def _quality(fleet: Fleet) -> list[str]:
+    counts = quality_counts(fleet)
+    if not counts:
+        return [page.paragraph('Every level has an estimate, and no flag was raised.')]
+    return [page.table(['What', 'How often'], [[text, str(n)] for text, n in counts], left=[0])]
+
+
+def _recordings(fleet: Fleet) -> list[str]:
+    judged = fleet.judgement
+    places: dict[str, dict[str, int]] = {
+        name: {path: k for k, path in enumerate(values.paths)}
+        for name, values in judged.values.items()}
+    once: dict[str, Mapping[str, Any]] = {}
+    flags: dict[str, set[str]] = {}
+    for row in fleet.rows:
+        if row['error'] is not None or row['duplicate_of'] is not None:
+            continue
+        once.setdefault(row['path'], row)
+        flags.setdefault(row['path'], set()).update(row['flags'] or ())
+    rows, names = [], short_names(fleet.vehicles)
+    for path, first in list(once.items())[:_RECORDINGS]:
+        cells = [names.get(first['vehicle'], UNKNOWN), str(first['flight'] or UNKNOWN),
+                 f"{first['recording']}\n{_date(first)}",
+                 typeset(number(first['duration_s'] or math.nan))]
+        for name, values in judged.values.items():
+            cells.append(_cell(values, judged.recordings[name].score, places[name].get(path)))
+        rows.append([*cells, ', '.join(sorted(flags[path])) or UNKNOWN])
+    heads = ['Vehicle', 'Flight', 'Recording', 's', *[
+        f'{symbol}, {_UNITS[name]}' for name, symbol in zip(
+            QUANTITIES, ('\u03c3', '\u03b1', 'Sag'))], 'Flags']
+    more = len(once) - _RECORDINGS
+    return [page.table(heads, rows, left=[0, 2, 7]), page.paragraph(
+        'At the reference throttle. Small: distance from the flights of the same vehicle in '
+        'standard deviations.' + (f' {more} more recordings are in the Parquet table.'
+                                  if more > 0 else ''), soft=True)]
+
+
+def _date(row: Mapping[str, Any]) -> str:
+    return '' if row['start'] is None else row['start'].strftime('%Y-%m-%d %H:%M UTC')
+
+
+def _cell(values: Values, score: FloatArray, k: int | None) -> str:
+    if k is None:
+        return UNKNOWN
+    text = typeset(number(float(values.shown(values.value[k]))))
+    return text + (f'\n{typeset(f"{score[k]:+.1f}")}' if math.isfinite(score[k]) else '')

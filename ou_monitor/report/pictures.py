@@ -1,0 +1,192 @@
+"""Data beside simulations of two models: the same curve of each, and the band they span."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from ou_monitor.criticism.lattice import find_step
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.records import FloatArray
+
+# Simulations of each model: their range leaves out about one point in twenty.
+DRAWS = 40
+_BINS, _LEVELS, _LAGS, _BANDS = 60, 10, 40, 60
+# Up to so many distinct throttles each is a bin of its own.
+_DISTINCT = 12
+
+Curve = Callable[[FloatArray], FloatArray]
+# Title and labels, x, the curve, which axes are logarithmic, and whether it is separate points.
+_Curve = tuple[tuple[str, str, str], FloatArray, Curve, tuple[bool, bool, bool]]
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """
+    A curve of the data, and what simulations make of it.
+
+    Attributes
+    ----------
+    title, x_label, y_label : str
+        For people.
+    x, data : ndarray, shape (p,)
+        The curve; NaN where nothing is known.
+    bands : tuple of pair of ndarray, shape (p,)
+        Lowest and highest of the simulations, for each model.
+    log_x, log_y : bool
+        Axes.
+    points : bool
+        Separate values, between which there is nothing to draw a line through.
+
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    x: FloatArray
+    data: FloatArray
+    bands: tuple[tuple[FloatArray, FloatArray], ...]
+    log_x: bool = False
+    log_y: bool = False
+    points: bool = False
+
+
+def pictures(samples: Samples, models: Sequence[SupplyModel], rng: np.random.Generator,
+             draws: int = DRAWS) -> list[Picture]:
+    """Simulate the models and compare curves."""
+    curves = _curves(samples)
+    bands: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in curves]
+    for model in models:
+        low = [np.full(x.size, np.inf) for _, x, _, _ in curves]
+        high = [np.full(x.size, -np.inf) for _, x, _, _ in curves]
+        for _ in range(draws):
+            try:
+                v = model.simulate(samples.t, rng, samples.throttle)
+            except ValueError:
+                # A force that runs away has no picture.
+                break
+            for k, (_, _, curve, _) in enumerate(curves):
+                made = curve(v)
+                low[k], high[k] = np.fmin(low[k], made), np.fmax(high[k], made)
+        for k, (a, b) in enumerate(zip(low, high)):
+            bands[k].append((np.where(np.isfinite(a), a, np.nan),
+                             np.where(np.isfinite(b), b, np.nan)))
+    return [Picture(title, xl, yl, x, curve(samples.voltage), tuple(bands[k]), *log)
+            for k, ((title, xl, yl), x, curve, log) in enumerate(curves)]
+
+
+def _curves(samples: Samples) -> list[_Curve]:
+    """Return title and labels, x, the curve as a function of the voltage, and how to draw it."""
+    v, n = samples.voltage, samples.n
+    step = float(np.median(samples.step[1:]))
+    even = samples.even
+    grid = np.arange(samples.t[0], samples.t[-1] + 0.5 * step, step)
+
+    def evened(y: FloatArray) -> FloatArray:
+        # The same for data and simulations, so what it does cancels.
+        return y if even else np.interp(grid, samples.t, y)
+
+    size = n if even else grid.size
+    # Segments of an eighth, half overlapping.
+    length = max(16, size // 8)
+    frequency = np.fft.rfftfreq(length, step)[1:]
+    edges = np.unique(np.round(np.geomspace(1, frequency.size, _BANDS)).astype(int)) - 1
+    centres = np.array([frequency[a:max(b, a + 1)].mean()
+                        for a, b in zip(edges[:-1], edges[1:])])
+    window = np.hanning(length)
+    scale = 2.0 * step / float(window @ window)
+
+    def spectrum(y: FloatArray) -> FloatArray:
+        y = evened(y)
+        power = np.zeros(length // 2 + 1)
+        starts = range(0, y.size - length + 1, length // 2)
+        for a in starts:
+            part = y[a:a + length]
+            power += np.abs(np.fft.rfft(window * (part - part.mean()))) ** 2
+        power = scale * power[1:] / max(len(starts), 1)
+        return np.array([power[a:max(b, a + 1)].mean() for a, b in zip(edges[:-1], edges[1:])])
+
+    lags = np.unique(np.round(np.geomspace(1, max(size // 20, 2), _LAGS)).astype(int))
+
+    def correlation(y: FloatArray) -> FloatArray:
+        y = evened(y)
+        c = y - y.mean()
+        spectrum_ = np.abs(np.fft.rfft(c, 2 * c.size)) ** 2
+        r: FloatArray = np.fft.irfft(spectrum_)[lags] / max(float(c @ c), 1e-300)
+        return r
+
+    # Bins that hold different numbers of codes would show a comb.
+    code = find_step(v)
+    values = _bins(v, code)
+    changes = _bins(np.diff(v), code)
+    found: list[_Curve] = [
+        (('Spectrum', 'frequency, Hz', 'PSD, V\u00b2/Hz'), centres, spectrum,
+         (True, True, False)),
+        (('Autocorrelation', 'lag, s', 'correlation'), lags * step, correlation,
+         (True, False, False)),
+        (('Distribution of the voltage', 'voltage, V', 'density, 1/V'), _middle(values),
+         lambda y: _density(y, values), (False, True, False)),
+        (('Distribution of the increments', 'change from sample to sample, mV',
+          'density, 1/V'), 1e3 * _middle(changes),
+         lambda y: _density(np.diff(y), changes), (False, True, False)),
+    ]
+    u = samples.throttle
+    if u is not None:
+        which, bins = _by_throttle(u)
+        count = np.bincount(which, minlength=bins).astype(np.float64)
+        at = np.bincount(which, u, minlength=bins) / np.maximum(count, 1.0)
+        # Few levels are separate: a line would say something of what lies between.
+        few = bins <= _DISTINCT and np.unique(u).size == bins or bins < 3
+
+        def mean(y: FloatArray) -> FloatArray:
+            return _averages(y, which, count)
+
+        def spread(y: FloatArray) -> FloatArray:
+            d = np.diff(y, prepend=y[0])
+            return 1e3 * np.sqrt(_averages(d * d, which, count))
+
+        found += [
+            (('Mean voltage by throttle', 'throttle, %', 'V'), 100.0 * at, mean,
+             (False, False, few)),
+            (('Size of increments by throttle', 'throttle, %', 'rms, mV'), 100.0 * at, spread,
+             (False, False, few))]
+    return found
+
+
+def _by_throttle(u: FloatArray) -> tuple[np.ndarray, int]:
+    """Return the bin of each sample, and how many: one a distinct value when these are few."""
+    values, which = np.unique(u, return_inverse=True)
+    if values.size <= _DISTINCT:
+        return which, values.size
+    edges = np.unique(np.quantile(u, np.linspace(0.0, 1.0, _LEVELS + 1)))
+    return np.clip(np.searchsorted(edges, u, side='right') - 1, 0, edges.size - 2), edges.size - 1
+
+
+def _averages(y: FloatArray, which: np.ndarray, count: FloatArray) -> FloatArray:
+    total = np.bincount(which, y, minlength=count.size)
+    return np.where(count >= 5.0, total / np.maximum(count, 1.0), np.nan)
+
+
+def _bins(y: FloatArray, code: float = 0.0) -> FloatArray:
+    """Return edges with room for the tails; half-way between codes, each bin of as many."""
+    low, high = float(y.min()), float(y.max())
+    room = 0.15 * (high - low) or 1e-6
+    if not code > 0.0:
+        return np.linspace(low - room, high + room, _BINS + 1)
+    width = code * max(1, round((high - low + 2.0 * room) / (_BINS * code)))
+    beside = math.ceil(room / width)
+    count = 2 * beside + math.ceil((high - low + code) / width)
+    edges: FloatArray = width * np.arange(count + 1, dtype=np.float64)
+    return edges + (low - 0.5 * code - width * beside)
+
+
+def _middle(edges: FloatArray) -> FloatArray:
+    return 0.5 * (edges[1:] + edges[:-1])
+
+
+def _density(y: FloatArray, edges: FloatArray) -> FloatArray:
+    counts = np.histogram(y, edges)[0]
+    return np.asarray(counts / (y.size * np.diff(edges)), dtype=np.float64)

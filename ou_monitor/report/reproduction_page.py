@@ -1,0 +1,190 @@
+"""The report of `reproduce`: every printed number beside its recomputation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+import math
+import re
+
+import numpy as np
+from ou_monitor.paper.reproduce import paper, transient
+from ou_monitor.paper.reproduce.crest import crest
+from ou_monitor.paper.reproduce.figures import lorentzian
+from ou_monitor.paper.reproduce.network import share_above
+from ou_monitor.paper.reproduce.points import tally
+from ou_monitor.paper.reproduce.reproduce import Reproduction
+from ou_monitor.paper.reproduce.row import Row
+from ou_monitor.paper.reproduce.table2 import sigma_of
+from ou_monitor.paper.reproduce.words import headline, recomputed
+from ou_monitor.report import page
+from ou_monitor.report.scale import span
+from ou_monitor.report.svg import Plot
+
+_NONE = '\u2013'
+_BINS = 40
+
+
+def reproduction_page(result: Reproduction, command: str = '') -> str:
+    """Return the report of a reproduction."""
+    sections = [
+        page.headline(headline(result)),
+        page.section('Eight points to read the paper with', *_points(result)),
+        page.section('Figures, simulated from the numbers printed', *_figures(result)),
+        page.section('Every number', page.paragraph(
+            'Agrees: the recomputed number rounds to the printed one, or its interval (3 standard '
+            'errors, or the range given) reaches it. Rounding: it does once the readings it rests '
+            'on move within their own rounding. Claims are written as bounds: "> 0" is a claim '
+            'that something rises.', soft=True)),
+        *[page.section(f'{where}: {tally(rows)}', _table(rows), page.bullets(
+            [_typeset(f'{row.quantity}: {row.sentence} How: {row.how}.') for row in rows]))
+          for where, rows in result.parts()],
+        page.section('Where it comes from', page.paragraph(
+            f'Random numbers from seed {result.seed}; another seed moves the simulated numbers '
+            'within their standard errors.'),
+            *([page.paragraph('To repeat this:'), page.code(command)] if command else []))]
+    return page.page('The paper, recomputed',
+                     'Deterministic and stochastic matrix modeling of radiophysical processes in '
+                     'UAV microcontroller systems', sections)
+
+
+def _typeset(text: str) -> str:
+    """Return a sentence with the signs that a page has and a terminal may not."""
+    text = re.sub(r'(?<![\w.)^])-(?=[\d.])', '\u2212', text.replace('+-', '\u00b1'))
+    return text.replace(' -> ', ' \u2192 ')
+
+
+def _table(rows: Sequence[Row]) -> str:
+    return page.table(
+        ['Quantity', 'Unit', 'Printed', 'Recomputed', 'Verdict'],
+        [[f'{_typeset(row.quantity)}\n{row.where}', row.unit or _NONE, row.printed.text,
+          _cell(row), row.verdict.value] for row in rows], left=[0, 1, 4])
+
+
+def _cell(row: Row) -> str:
+    """Return the recomputed number; its band, if it has one, on a second line."""
+    text = _typeset(recomputed(row))
+    if row.band is not None:
+        text += '\n' + _typeset(f'{row.band[0]:.4g} to {row.band[1]:.4g}')
+    return text
+
+
+def _points(result: Reproduction) -> list[str]:
+    return [f'<p><strong>{point.number}. {escape(point.title)}</strong> '
+            f'<span class="soft">({escape(point.outcome)})</span><br/>'
+            f'{escape(_typeset(point.text))}</p>' for point in result.points]
+
+
+def _figures(result: Reproduction) -> list[str]:
+    return [*_screens(result), *_transient(), *_spectrum(result), *_crest_and_factor(result)]
+
+
+def _screens(result: Reproduction) -> list[str]:
+    """Return Figs. 1 to 4."""
+    drawn = []
+    for k, screen in enumerate(result.figures.screens):
+        state = screen.state
+        plot = Plot(f'{state.label}: one OU', 'time, ms', 'mV', width=450, height=230)
+        half = 0.5 * state.vpp.value
+        plot.limits(x=(0.0, 1e3 * float(screen.t[-1])), y=(-1.3 * half, 1.3 * half))
+        plot.line(1e3 * screen.t, 1e3 * screen.u, colour=k)
+        for sign, label in ((1.0, 'Vpp as printed'), (-1.0, '')):
+            plot.line(np.array([0.0, 1e3 * screen.t[-1]]), np.full(2, sign * half), label, 7,
+                      'dash')
+        drawn.append(page.figure(
+            plot.svg(), f'Vpp {1e3 * float(np.ptp(screen.u)):.4g} mV here, '
+            f'{state.vpp.text} mV printed.'))
+    return [page.pair(*drawn), page.paragraph(
+        'As Figs. 1 to 4: an OU with the printed alpha and Vrms (motors off: half a step), 1 MHz, '
+        'in steps of the oscilloscope. Where the printed Vpp is much wider than the trace, '
+        'something faster rides on the rail.', soft=True)]
+
+
+def _transient() -> list[str]:
+    """Return Fig. 5 with its fits, in voltages and in logarithms."""
+    line = transient.paper_fit()
+    plain, shifted = (transient.fit_curve(transient.TIME, transient.VALUE, offset)
+                      for offset in (False, True))
+    t = np.linspace(0.0, 0.055, 221)
+    rail = transient.TYPICAL_RAIL
+    w = 2.0 * math.pi * transient.CORNER_HZ
+    peak = math.log(rail / w) / (rail - w)
+    seen = transient.through_coupling(peak + t, rail)
+    used = slice(0, paper.FIG_5_USED)
+    misfit = np.log(transient.VALUE[used] / transient.through_coupling(
+        peak + transient.TIME[used], rail))
+    scale = math.exp(float(misfit.mean()))
+    worst = float(np.abs(np.expm1(misfit - misfit.mean())).max())
+    curves = (
+        (line.start * np.exp(-line.alpha * t), f'ln fit to 35 ms, {line.alpha:.1f} 1/s', 'thick'),
+        (plain(t), f'exponential, {plain.parameters[1]:.1f} 1/s', ''),
+        (shifted(t), f'with offset, {shifted.parameters[1]:.1f} 1/s', 'thick'),
+        (scale * seen,
+         f'rail of {rail:g} 1/s behind {transient.CORNER_HZ:g} Hz', 'dash'))
+    drawn = []
+    for log in (False, True):
+        plot = Plot('Fig. 5: decay after 20 %' + (', log scale' if log else ''), 'time, ms',
+                    '|U|, mV', width=450, height=330, log_y=log, legend_low=log)
+        plot.limits(x=(-1.5, 55.0), y=(3.0, 600.0) if log else (-10.0, 420.0))
+        for k, (y, label, style) in enumerate(curves):
+            plot.line(1e3 * t, np.where(y > 0.0, y, math.nan) if log else y, label, k, style)
+        plot.markers(1e3 * transient.TIME, transient.VALUE, 'points of Fig. 5', 7)
+        drawn.append(page.figure(plot.svg()))
+    return [page.pair(*drawn), page.paragraph(
+        f'Dashed: a rail {rail / paper.ALPHA.value:.0f} times faster, seen through an AC coupling '
+        f'of {transient.CORNER_HZ:g} Hz, comes within {100 * worst:.0f} % of the four points of '
+        f'the fit. The last point lies below it and below both exponentials.',
+        soft=True)]
+
+
+def _spectrum(result: Reproduction) -> list[str]:
+    """Return the spectra with the Lorentzian, the ESC lines and the corner."""
+    plot = Plot('Spectrum of the OU', 'frequency, Hz', 'PSD, V\u00b2/Hz', height=320, log_x=True,
+                log_y=True, legend_low=True)
+    wide = np.geomspace(1.0, 5e5, 200)
+    lines = []
+    for k, found in enumerate(result.figures.spectra):
+        state = found.state
+        curve = lorentzian(wide, paper.ALPHA.value, sigma_of(state))
+        lines += [curve, found.density]
+        plot.line(found.frequency, found.density, f'{state.label}, simulated', k, 'faint')
+        plot.line(wide, curve, f'{state.label}, Lorentzian', k, 'dash thick')
+        if state is paper.HIGH:
+            plot.line(found.frequency, found.coupled,
+                      f'{state.label}, behind {transient.CORNER_HZ:g} Hz coupling', 2)
+    plot.limits(x=(1.0, 5e5), y=span(lines, log=True))
+    plot.mark(paper.ALPHA.value / (2.0 * math.pi), 'alpha/2\u03c0 = 10.03 Hz')
+    low, high = paper.ESC_HZ
+    plot.shade(low, high, 4)
+    plot.mark(low, '').mark(high, 'ESC 24..48 kHz')
+    return [page.figure(plot.svg(), (
+        f'The ESC lines that section 4.5 expects would stand at {1e-3 * low:g} to '
+        f'{1e-3 * high:g} kHz, where the OU holds {100 * share_above(low):.2g} % of its variance; '
+        'an OU alone has no peak there. The AC coupling has its corner where the Lorentzian has '
+        'its own.'))]
+
+
+def _crest_and_factor(result: Reproduction) -> list[str]:
+    """Return the crest factors, and the variance that decides about (6)."""
+    crests = Plot('Vpp/Vrms of one OU', 'Vpp/Vrms', 'density', width=450, height=300)
+    edges = np.linspace(2.5, 10.0, 1 + _BINS)
+    for k, (ms, values) in enumerate(sorted(result.crests.by_screen.items())):
+        share, _ = np.histogram(values, edges, density=True)
+        crests.line(np.repeat(edges, 2)[1:-1], np.repeat(share, 2), f'{ms} ms', k)
+    crests.limits(x=(2.5, 10.0), y=(0.0, 1.15))
+    for state in paper.LOADED:
+        crests.mark(crest(state)[0], state.label)
+    s = result.spreading
+    t = 1e3 * s.t
+    factor = Plot('Variance under telegraph noise', 'time, ms', '10\u207b\u2076 V\u00b2',
+                  width=450, height=300)
+    factor.band(t, 1e6 * (s.variance - 3.0 * s.error), 1e6 * (s.variance + 3.0 * s.error),
+                'switching system, 3 standard errors', 0)
+    factor.line(t, 1e6 * s.variance, '', 0)
+    factor.line(t, 1e6 * s.printed * s.t, '(6) as printed', 1, 'thick')
+    factor.line(t, 1e6 * s.correct * s.t, '(6) with the 2', 2, 'dash thick')
+    left = page.figure(crests.svg(), 'Vertical: Table 1. Screens of 10, 100 and 500 ms at 1 MHz.')
+    right = page.figure(factor.svg(), (
+        'dU/dt = \u00b11 V/s, 1000 switches a second each way; the system itself lags (6) by the '
+        'memory of the chain.'))
+    return [page.pair(left, right)]

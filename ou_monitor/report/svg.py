@@ -1,0 +1,276 @@
+"""
+Plots as inline SVG, drawn here: no plotting library, no network, shown without a script.
+
+On a page, `page.figure` puts the data beside the drawing, and the script of the page makes it
+interactive; paper and browsers without scripts show what is drawn here.  Colours are CSS classes
+(``s0`` .. ``s7`` for series), so that `page` can give them a light and a dark form.
+"""
+
+from __future__ import annotations
+
+from html import escape
+
+import numpy as np
+from ou_monitor.records import FloatArray
+from ou_monitor.report.figure import Curve, Drawing, Figure
+from ou_monitor.report.scale import Scale, span, thin, tick_text
+
+SERIES = 8
+
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 30, 42
+# Width of a letter of the 12-pixel sans serif, generously.
+_LETTER = 7.0
+# Half the width of the cap of a bar, pixels.
+_CAP = 7.0
+# Height of a legend in a row of its own, pixels.
+_LEGEND = 18
+
+
+class Plot:
+    """
+    One plot with two axes.
+
+    Parameters
+    ----------
+    title : str
+        What is shown; stands above the plot and is read by screen readers.
+    x_label, y_label : str
+        Quantity and unit.
+    width, height : int
+        Size, pixels of the drawing; the page scales it.
+    log_x, log_y : bool
+        Logarithmic axes.
+    legend_low : bool
+        A legend that fits neither beside the title nor below it goes to the
+        lower left of the axes instead of the upper right.
+    legend_row : bool
+        The legend has a row of its own below the title in any case, as of plots
+        side by side that should have axes of one size.
+
+    """
+
+    def __init__(self, title: str, x_label: str, y_label: str, *, width: int = 860,
+                 height: int = 240, log_x: bool = False, log_y: bool = False,
+                 legend_low: bool = False, legend_row: bool = False) -> None:
+        self.title = title
+        self._x_label, self._y_label = x_label, y_label
+        self._width, self._height = width, height
+        self._log_x, self._log_y = log_x, log_y
+        self._legend_low, self._legend_row = legend_low, legend_row
+        self._curves: list[Curve] = []
+        self._spans: list[tuple[float, float, str, str]] = []
+        self._marks: list[tuple[float, str]] = []
+        self._x_range: tuple[float, float] | None = None
+        self._y_range: tuple[float, float] | None = None
+
+    def line(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0,
+             style: str = '') -> Plot:
+        """Add a line; NaN breaks it."""
+        self._curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
+                                  f's{colour % SERIES} {style}'.strip(), 'line'))
+        return self
+
+    def steps(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0) -> Plot:
+        """Add a line that holds each value until the next point."""
+        self._curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
+                                  f's{colour % SERIES}', 'steps'))
+        return self
+
+    def band(self, x: FloatArray, low: FloatArray, high: FloatArray, label: str = '',
+             colour: int = 0) -> Plot:
+        """Add a shaded band; NaN breaks it."""
+        self._curves.append(Curve(
+            np.asarray(x, float), np.asarray(low, float), np.asarray(high, float), label,
+            f's{colour % SERIES}', 'band'))
+        return self
+
+    def markers(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0) -> Plot:
+        """Add a dot at each point; none where it is NaN."""
+        self._curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
+                                  f's{colour % SERIES}', 'markers'))
+        return self
+
+    def bars(self, x: FloatArray, low: FloatArray, high: FloatArray, label: str = '',
+             colour: int = 0) -> Plot:
+        """Add a bar from `low` to `high` at each point, with caps; none where one is NaN."""
+        self._curves.append(Curve(
+            np.asarray(x, float), np.asarray(low, float), np.asarray(high, float), label,
+            f's{colour % SERIES}', 'bars'))
+        return self
+
+    def shade(self, start: float, stop: float, colour: int = 0, label: str = '') -> Plot:
+        """Shade a stretch of the x axis; its label is drawn where there is room."""
+        self._spans.append((start, stop, f's{colour % SERIES}', label))
+        return self
+
+    def mark(self, x: float, label: str) -> Plot:
+        """Add a labelled vertical line."""
+        self._marks.append((x, label))
+        return self
+
+    def limits(self, x: tuple[float, float] | None = None,
+               y: tuple[float, float] | None = None) -> Plot:
+        """Set the ends of an axis; what is not set follows the data."""
+        self._x_range = x or self._x_range
+        self._y_range = y or self._y_range
+        return self
+
+    def svg(self) -> Drawing:
+        """Return the drawing."""
+        right, bottom = self._width - _RIGHT, self._height - _BOTTOM
+        ends = [c.y for c in self._curves] + [c.high for c in self._curves if c.high is not None]
+        x_low, x_high = self._x_range or span([c.x for c in self._curves], self._log_x, pad=0.0)
+        y_low, y_high = self._y_range or span(ends, self._log_y)
+        x = Scale(x_low, x_high, _LEFT, right, self._log_x)
+        y = Scale(y_low, y_high, bottom, self._top, self._log_y)
+        # A nested drawing clips what leaves the axes, and needs no id.
+        inner = f'{_LEFT} {self._top} {right - _LEFT} {bottom - self._top}'
+        parts = [
+            f'<svg viewBox="0 0 {self._width} {self._height}" role="img" '
+            f'aria-label="{escape(self.title, quote=True)}">',
+            f'<text class="title" x="{_LEFT}" y="16">{escape(self.title)}</text>',
+            *self._axes(x, y, right, bottom),
+            f'<svg x="{_LEFT}" y="{self._top}" width="{right - _LEFT}" '
+            f'height="{bottom - self._top}" '
+            f'viewBox="{inner}">']
+        for start, stop, style, label in self._spans:
+            a, b = np.clip(x(np.array([start, stop])), _LEFT, right)
+            parts.append(f'<rect class="shade {style}" x="{a:.1f}" y="{self._top}" '
+                         f'width="{max(b - a, 0.5):.1f}" height="{bottom - self._top}"/>')
+            if label and b - a > _LETTER * len(label) + 8.0:
+                parts.append(f'<text class="note" text-anchor="middle" '
+                             f'x="{0.5 * (a + b):.1f}" y="{self._top + 13}">'
+                             f'{escape(label)}</text>')
+        # Bands and bars lie behind lines and dots.
+        for curve in sorted(self._curves, key=lambda c: c.kind not in ('band', 'bars')):
+            parts.append(self._draw(curve, x, y))
+        parts.append('</svg>')
+        for where, label in self._marks:
+            pixel = float(x(where))
+            if _LEFT <= pixel <= right:
+                parts.append(f'<line class="mark" x1="{pixel:.1f}" y1="{self._top}" '
+                             f'x2="{pixel:.1f}" y2="{bottom}"/><text class="note" '
+                             f'x="{pixel + 4:.1f}" y="{self._top + 12}">{escape(label)}</text>')
+        return Drawing('\n'.join([*parts, *self._legend(right, bottom), '</svg>']), Figure(
+            self.title, self._x_label, self._y_label, self._width, self._height, self._log_x,
+            self._log_y, (x_low, x_high), (y_low, y_high), tuple(self._curves),
+            tuple(self._spans), tuple(self._marks)))
+
+    @property
+    def _named(self) -> list[Curve]:
+        """Return the curves of the legend."""
+        return [c for c in self._curves if c.label]
+
+    @property
+    def _legend_place(self) -> str:
+        """Return where the legend fits without covering a curve, ``corner`` where nowhere."""
+        size = sum(_LETTER * len(c.label) + 34.0 for c in self._named)
+        right = self._width - _RIGHT
+        beside = _LEFT + 1.15 * _LETTER * len(self.title) + size < right
+        if beside and not self._legend_row:
+            return 'title'
+        return 'row' if _LEFT + size < right else 'corner'
+
+    @property
+    def _top(self) -> int:
+        """Return where the axes begin, pixels."""
+        return _TOP + (_LEGEND if self._named and self._legend_place == 'row' else 0)
+
+    def _axes(self, x: Scale, y: Scale, right: int, bottom: int) -> list[str]:
+        parts = []
+        for ticks, scale, across in ((x.ticks(7), x, True), (y.ticks(5), y, False)):
+            uneven = scale.log or len(ticks) < 2
+            for value in ticks:
+                step = abs(value) if uneven else ticks[1] - ticks[0]
+                text, pixel = escape(tick_text(value, step or 1.0)), float(scale(value))
+                if across:
+                    parts.append(f'<line class="grid" x1="{pixel:.1f}" y1="{self._top}" '
+                                 f'x2="{pixel:.1f}" y2="{bottom}"/><text class="tick" '
+                                 f'text-anchor="middle" x="{pixel:.1f}" y="{bottom + 16}">'
+                                 f'{text}</text>')
+                else:
+                    parts.append(f'<line class="grid" x1="{_LEFT}" y1="{pixel:.1f}" '
+                                 f'x2="{right}" y2="{pixel:.1f}"/><text class="tick" '
+                                 f'text-anchor="end" x="{_LEFT - 6}" y="{pixel + 4:.1f}">'
+                                 f'{text}</text>')
+        middle = 0.5 * (self._top + bottom)
+        parts.append(f'<text class="label" text-anchor="middle" x="{0.5 * (_LEFT + right):.0f}" '
+                     f'y="{self._height - 6}">{escape(self._x_label)}</text>')
+        parts.append(f'<text class="label" text-anchor="middle" transform="translate(14 '
+                     f'{middle:.0f}) rotate(-90)">{escape(self._y_label)}</text>')
+        return parts
+
+    def _draw(self, curve: Curve, x: Scale, y: Scale) -> str:
+        if curve.kind == 'markers':
+            return ''.join(
+                f'<circle class="dot {curve.style}" cx="{a:.1f}" cy="{b:.1f}" r="4"/>'
+                for a, b in _pixels(x(curve.x), y(curve.y)))
+        if curve.kind == 'bars' and curve.high is not None:
+            ends = _pixels(x(curve.x), y(curve.y), y(curve.high))
+            path = ''.join(
+                f'M{a - _CAP:.1f},{b:.1f}H{a + _CAP:.1f}M{a:.1f},{b:.1f}V{c:.1f}'
+                f'M{a - _CAP:.1f},{c:.1f}H{a + _CAP:.1f}' for a, b, c in ends)
+            return f'<path class="line thick {curve.style}" d="{path}"/>'
+        if curve.high is not None:
+            pieces = []
+            px, low, high = x(curve.x), y(curve.y), y(curve.high)
+            for run in _stretches(np.isfinite(px) & np.isfinite(low) & np.isfinite(high)):
+                there = _points(px[run], low[run])
+                back = _points(px[run][::-1], high[run][::-1])
+                pieces.append(f'M{there}L{back}Z')
+            return f'<path class="band {curve.style}" d="{"".join(pieces)}"/>'
+        px, py = x(curve.x), y(curve.y)
+        if curve.kind == 'steps':
+            px, py = thin(px, py, self._width)
+            px, py = np.repeat(px, 2)[1:], np.repeat(py, 2)[:-1]
+        px, py = thin(px, py, self._width)
+        pieces = [f'M{_points(px[run], py[run])}'
+                  for run in _stretches(np.isfinite(px) & np.isfinite(py))]
+        return f'<path class="line {curve.style}" d="{"".join(pieces)}"/>'
+
+    def _legend(self, right: int, bottom: int) -> list[str]:
+        """Return the legend: beside the title, in a row below it, or in a corner of the axes."""
+        named, place = self._named, self._legend_place
+        if not named:
+            return []
+        widths = [_LETTER * len(c.label) + 34.0 for c in named]
+        if place != 'corner':
+            starts = right - np.cumsum(widths[::-1])[::-1]
+            return [_legend_entry(c, float(x), 16 + (_LEGEND if place == 'row' else 0))
+                    for c, x in zip(named, starts)]
+        width, height = max(widths), 16 * len(named) + 8
+        left, top = ((_LEFT + 2.0, bottom - height) if self._legend_low
+                     else (right - width, self._top))
+        return [f'<rect class="panel" x="{left:.0f}" y="{top + 1}" width="{width:.0f}" '
+                f'height="{height}"/>',
+                *[_legend_entry(c, left + 4.0, top + 16 + 16 * k) for k, c in enumerate(named)]]
+
+
+def _legend_entry(curve: Curve, x: float, y: int) -> str:
+    swatch = (f'<rect class="band {curve.style}" x="{x:.0f}" y="{y - 9}" width="18" height="10"/>'
+              if curve.kind == 'band' else
+              f'<circle class="dot {curve.style}" cx="{x + 9:.0f}" cy="{y - 4}" r="4"/>'
+              if curve.kind == 'markers' else
+              f'<path class="line thick {curve.style}" '
+              f'd="M{x:.0f},{y - 4}L{x + 18:.0f},{y - 4}"/>')
+    return f'{swatch}<text class="legend" x="{x + 22:.0f}" y="{y}">{escape(curve.label)}</text>'
+
+
+def _pixels(*columns: FloatArray) -> list[list[float]]:
+    """Return the rows without NaN, within what a renderer can draw."""
+    rows = np.clip(np.column_stack(columns), -1e4, 1e4)
+    found: list[list[float]] = rows[np.isfinite(rows).all(axis=1)].tolist()
+    return found
+
+
+def _stretches(good: np.ndarray) -> list[slice]:
+    """Return the unbroken stretches of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], good.astype(np.int8), [0]))))
+    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2])]
+
+
+def _points(x: FloatArray, y: FloatArray) -> str:
+    # One wild value must not make a coordinate that a renderer chokes on.
+    y = np.clip(y, -1e4, 1e4)
+    x = np.clip(x, -1e4, 1e4)
+    return 'L'.join(f'{a:.1f},{b:.1f}' for a, b in zip(x, y))

@@ -1,0 +1,1 @@
+"""Supplies, throttle profiles and recordings to simulate."""

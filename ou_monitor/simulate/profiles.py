@@ -1,0 +1,148 @@
+"""
+Throttle over time, for simulations.
+
+A profile is a function of time, so a recording of any length can be made piece
+by piece.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ou_monitor.errors import InputError, nearest
+from ou_monitor.records import FloatArray
+
+# Stamps (s) -> throttle 0..1.
+Profile = Callable[[FloatArray], FloatArray]
+
+# A receiver updates the throttle at this rate, Hz.
+STICK_RATE = 50.0
+
+# (time s, throttle) joined by straight lines: arm, take-off, hover, two climbs
+# and descents, landing.
+FLIGHT = (
+    (0.0, 0.0), (2.0, 0.0), (2.2, 0.05), (4.0, 0.05), (4.6, 0.55), (6.0, 0.55), (6.4, 0.40),
+    (12.0, 0.40), (12.4, 0.65), (16.0, 0.65), (16.4, 0.40), (19.0, 0.40), (19.4, 0.25),
+    (23.0, 0.25), (23.4, 0.40), (26.0, 0.40), (26.3, 0.75), (28.5, 0.75), (28.9, 0.30),
+    (32.0, 0.30), (32.4, 0.40), (34.0, 0.40), (36.5, 0.20), (37.0, 0.05), (37.5, 0.0),
+    (40.0, 0.0))
+
+# The paper's auxiliary recording (section 4.3): 0 -> 20 -> 0 %.
+TRANSIENT = ((0.0, 0.0), (3.0, 0.0), (3.0, 0.20), (6.0, 0.20), (6.0, 0.0), (10.0, 0.0))
+
+# The paper's four load states in turn.
+LOADS = ((0.0, 0.0), (10.0, 0.0), (10.0, 0.05), (20.0, 0.05), (20.0, 0.10), (30.0, 0.10),
+         (30.0, 0.40), (40.0, 0.40))
+
+
+def through(points: Sequence[tuple[float, float]], period: float | None = None,
+            stick_rate: float | None = None) -> Profile:
+    """
+    Return the profile through points, level beyond the last one.
+
+    points in s, period in s, stick_rate in Hz.
+    """
+    times = np.array([t for t, _ in points], dtype=np.float64)
+    values = np.array([u for _, u in points], dtype=np.float64)
+
+    def profile(t: FloatArray) -> FloatArray:
+        # Several times as fast as t % period, and as exact as needed: one rounding.
+        at = t if period is None else t - np.floor(t / period) * period
+        if stick_rate is not None:
+            # A hair more, so that a stamp at the very update is not before it.
+            at = np.floor(at * stick_rate + 1e-6) / stick_rate
+        found: FloatArray = np.interp(at, times, values)
+        return found
+
+    return profile
+
+
+def constant(throttle: float) -> Profile:
+    """Return the profile that is `throttle` at all times."""
+    return lambda t: np.full(t.shape, throttle)
+
+
+def _hover(t: FloatArray) -> FloatArray:
+    """Return a hover at 40 % with the small corrections of a pilot."""
+    held = np.floor(t * STICK_RATE + 1e-6) / STICK_RATE
+    return 0.4 + 0.04 * np.sin(2.0 * math.pi * 0.31 * held) + 0.03 * np.sin(
+        2.0 * math.pi * 0.83 * held + 1.0) + 0.02 * np.sin(2.0 * math.pi * 2.1 * held + 2.0)
+
+
+PROFILES: dict[str, tuple[Profile, str]] = {
+    'flight': (through(FLIGHT, 40.0, STICK_RATE), 'arm, take-off, hover, climbs, landing; 40 s, '
+               'repeated'),
+    'hover': (_hover, '40 % with the small corrections of a pilot'),
+    'loads': (through(LOADS, 40.0), "the paper's 0, 5, 10, 40 % for 10 s each, repeated"),
+    'transient': (through(TRANSIENT, 10.0), "the paper's 0 -> 20 -> 0 %; 10 s, repeated"),
+}
+
+
+def read_profile(text: str) -> Profile:
+    """Return the profile that a user asks for (text in A)."""
+    if text in PROFILES:
+        return PROFILES[text][0]
+    if text.lower().endswith('.csv'):
+        return _from_csv(Path(text))
+    try:
+        number = float(text)
+    except ValueError:
+        if ':' not in text:
+            raise InputError(
+                f"no throttle profile '{text}': {nearest(text, PROFILES)} (or give a number 0..1, "
+                'points T:U,T:U,... or a CSV file)') from None
+        return through(_checked(_points(text), f"throttle '{text}'"))
+    _check_throttle(number, f"throttle '{text}'")
+    return constant(number)
+
+
+def _points(text: str) -> list[tuple[float, float]]:
+    points = []
+    for part in text.split(','):
+        try:
+            time, value = (float(word) for word in part.split(':'))
+        except ValueError:
+            raise InputError(f"throttle point '{part}' is not T:U, seconds and 0..1") from None
+        points.append((time, value))
+    return points
+
+
+def _checked(points: list[tuple[float, float]], where: str) -> list[tuple[float, float]]:
+    for (before, _), (after, _) in zip(points, points[1:]):
+        if not after >= before:
+            raise InputError(f'{where}: times must not fall, {after:g} s comes after {before:g} s')
+    for time, value in points:
+        if not math.isfinite(time):
+            raise InputError(f'{where}: times must be finite')
+        _check_throttle(value, where)
+    # A profile needs a stretch to be on.
+    return points if len(points) > 1 else [points[0], (points[0][0] + 1.0, points[0][1])]
+
+
+def _check_throttle(value: float, where: str) -> None:
+    if not 0.0 <= value <= 1.0:
+        raise InputError(f'{where}: throttle must be a number 0..1, got {value:g}')
+
+
+def _from_csv(path: Path) -> Profile:
+    try:
+        if not path.read_text(encoding='utf-8').strip():
+            raise InputError(f'{path} is empty: expected the columns time_s and throttle')
+        table: Any = np.genfromtxt(path, delimiter=',', names=True, dtype=np.float64, ndmin=1)
+    except OSError as error:
+        raise InputError(f'cannot read the throttle profile {path}: {error.strerror}') from error
+    except ValueError as error:
+        raise InputError(f'{path} is not a CSV of numbers: '
+                         f"{' '.join(str(error).split())}") from error
+    names = table.dtype.names or ()
+    if 'time_s' not in names or 'throttle' not in names:
+        raise InputError(f'{path} needs the columns time_s and throttle, it has: '
+                         f"{', '.join(names) or 'none'}")
+    points = list(zip(table['time_s'].tolist(), table['throttle'].tolist(), strict=True))
+    if not points:
+        raise InputError(f'{path} holds no row')
+    return through(_checked(points, str(path)))

@@ -1,0 +1,248 @@
+"""
+What `msg_config/*.yaml` says: which topic, type and field is the voltage.
+
+One file describes one source (an autopilot bridge, an ADC driver).  Adding a
+message type is adding a file: no code.  Every mistake in a file is one line
+that names the file, the key and the nearest valid key.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import math
+from pathlib import Path
+import re
+from typing import Any
+
+from ou_monitor.errors import InputError, nearest
+from ou_monitor.stream.field_path import parse_field_path
+import yaml
+
+NAN_RULES = ('drop', 'unknown')
+
+_TYPE = re.compile(r'[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*')
+_TOPIC = re.compile(r'[~/]?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
+
+
+@dataclass(frozen=True)
+class FieldSpec:
+    """
+    Where one quantity is found: value = sign * unit_factor * raw + offset.
+
+    Attributes
+    ----------
+    topic : str
+        Topic; relative ones ('voltage') are for remapping.
+    type : str
+        Message type, 'package/msg/Type'.
+    field : str
+        Field path, 'data', 'channels[0].value'.
+    unit_factor : float
+        SI units per unit of the field (1e-3 for mV).
+    sign : int
+        1 or -1.
+    offset : float
+        Added after scaling, SI units.
+    nan : {'drop', 'unknown'}
+        What NaN or infinity in the field means: noise of the transmission, to
+        be ignored and counted, or the driver saying "not measured".
+    sample_rate : float or None
+        Hz; when given the field is an array, a block of samples at this rate,
+        and the stamp is that of the LAST sample of the block.
+    stamp_field : str or None
+        Path of a builtin_interfaces/Time ('header.stamp') or of a number
+        ('timestamp'); None takes the source timestamp of the middleware.
+    stamp_factor : float
+        Seconds per unit of a numeric stamp (1e-6 for microseconds).
+
+    """
+
+    topic: str
+    type: str  # noqa: A003
+    field: str
+    unit_factor: float = 1.0
+    sign: int = 1
+    offset: float = 0.0
+    nan: str = 'drop'
+    sample_rate: float | None = None
+    stamp_field: str | None = None
+    stamp_factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class MsgConfig:
+    """
+    One source of voltage, and of throttle where it has one.
+
+    Attributes
+    ----------
+    name : str
+        Name of the file without its ending.
+    description : str
+        One sentence for people, limits included.
+    package : str
+        ROS package that defines the voltage's type.
+    install : str
+        What to install when that package is missing.
+    generic : bool
+        Whether the topics are ours (relative, to be remapped) rather than
+        those of a certain driver.
+    voltage : FieldSpec
+        Where the voltage is, V.
+    throttle : FieldSpec or None
+        Where the throttle is, 0..1.
+
+    """
+
+    name: str
+    description: str
+    package: str
+    install: str
+    generic: bool
+    voltage: FieldSpec
+    throttle: FieldSpec | None
+
+
+# What each key holds, as (accepted YAML types, word for it); the kinds of
+# FieldSpec and MsgConfig, for a YAML has no types of its own.
+_NUMBER = ((int, float), 'a number')
+_TEXT = ((str,), 'text')
+_FIELD_KINDS: dict[str, tuple[tuple[type, ...], str]] = {
+    'topic': _TEXT, 'type': _TEXT, 'field': _TEXT, 'unit_factor': _NUMBER,
+    'sign': ((int,), '1 or -1'), 'offset': _NUMBER, 'nan': _TEXT,
+    'sample_rate': ((int, float, type(None)), 'a number or null'),
+    'stamp_field': ((str, type(None)), 'text or null'), 'stamp_factor': _NUMBER,
+}
+_CONFIG_KINDS: dict[str, tuple[tuple[type, ...], str]] = {
+    'description': _TEXT, 'package': _TEXT, 'install': _TEXT,
+    'generic': ((bool,), 'true or false'), 'voltage': ((dict,), 'a group of keys'),
+    'throttle': ((dict, type(None)), 'a group of keys or null'),
+}
+_FIELD_NEEDED = ('topic', 'type', 'field')
+_CONFIG_NEEDED = ('description', 'package', 'install', 'generic', 'voltage')
+
+
+def msg_config_dir() -> Path:
+    """
+    Return the folder of the shipped msg configs.
+
+    In a source tree it lies beside the package; installed (colcon, a virtual
+    environment, /usr/local) it is ``share/ou_monitor/msg_config`` of the
+    prefix, found by walking up from this file.
+    """
+    here = Path(__file__).resolve()
+    root = here.parents[2]
+    if (root / 'package.xml').is_file() and (root / 'msg_config').is_dir():
+        return root / 'msg_config'
+    for folder in here.parents:
+        found = folder / 'share' / 'ou_monitor' / 'msg_config'
+        if found.is_dir():
+            return found
+    raise InputError(
+        f'no msg_config folder beside or above {root}: install ou_monitor again, '
+        'or name a YAML file by its path')
+
+
+def list_msg_configs(directory: Path | str | None = None) -> dict[str, MsgConfig]:
+    """Return every msg config of a folder by name."""
+    return {path.stem: _load(path) for path in _files(directory)}
+
+
+def load_msg_config(name_or_path: Path | str, directory: Path | str | None = None) -> MsgConfig:
+    """Return one msg config."""
+    path = Path(name_or_path)
+    if path.suffix in ('.yaml', '.yml') or len(path.parts) > 1:
+        return _load(path)
+    known = {file.stem: file for file in _files(directory)}
+    name = str(name_or_path)
+    if name not in known:
+        raise InputError(f"no msg config '{name}': {nearest(name, known)}")
+    return _load(known[name])
+
+
+def _files(directory: Path | str | None) -> list[Path]:
+    folder = msg_config_dir() if directory is None else Path(directory)
+    if not folder.is_dir():
+        raise InputError(f'no folder of msg configs {folder}')
+    return sorted(folder.glob('*.yaml'))
+
+
+def _load(path: Path) -> MsgConfig:
+    try:
+        content = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f'cannot read msg config {path}: {error}') from error
+    except yaml.YAMLError as error:
+        line = ' '.join(str(error).split())
+        raise InputError(f'{path} is not YAML: {line}') from error
+    top = _checked(content, _CONFIG_KINDS, _CONFIG_NEEDED, str(path))
+    throttle = top.get('throttle')
+    return MsgConfig(
+        name=path.stem, description=' '.join(top['description'].split()),
+        package=top['package'], install=' '.join(top['install'].split()),
+        generic=top['generic'], voltage=_field_spec(top['voltage'], f'{path}: voltage'),
+        throttle=None if throttle is None else _field_spec(throttle, f'{path}: throttle'))
+
+
+def _checked(
+    content: Any, kinds: Mapping[str, tuple[tuple[type, ...], str]],
+    needed: tuple[str, ...], where: str,
+) -> dict[str, Any]:
+    """Return the group of keys when every key and kind is known, or say which is not."""
+    if not isinstance(content, dict):
+        raise InputError(f"{where}: expected keys ({', '.join(kinds)}), found none")
+    for key, value in content.items():
+        if key not in kinds:
+            raise InputError(f"{where}: unknown key '{key}': {nearest(str(key), kinds)}")
+        accepted, word = kinds[key]
+        # In Python true is an int; in a YAML it is never meant as a number.
+        wrong_bool = isinstance(value, bool) and bool not in accepted
+        if wrong_bool or not isinstance(value, accepted):
+            hint = ''
+            if isinstance(value, str) and float in accepted:
+                # YAML 1.1 takes 1e-3 for text; 1.0e-3 is a number.
+                hint = ' (a number with an exponent needs a point: 1.0e-3)'
+            raise InputError(f"{where}: '{key}' must be {word}, found {value!r}{hint}")
+    for key in needed:
+        if key not in content:
+            raise InputError(f"{where}: key '{key}' is missing")
+    return content
+
+
+def _field_spec(content: Any, where: str) -> FieldSpec:
+    group = _checked(content, _FIELD_KINDS, _FIELD_NEEDED, where)
+    for key in ('unit_factor', 'offset', 'sample_rate', 'stamp_factor'):
+        if group.get(key) is not None:
+            group[key] = float(group[key])
+            if not math.isfinite(group[key]):
+                raise InputError(f"{where}: '{key}' must be finite, found {group[key]}")
+    spec = FieldSpec(**group)
+    if not _TYPE.fullmatch(spec.type):
+        raise InputError(
+            f"{where}: type '{spec.type}' is not of the form package/msg/Type")
+    if not _TOPIC.fullmatch(spec.topic):
+        raise InputError(f"{where}: topic '{spec.topic}' is not a valid topic name")
+    if spec.sign not in (1, -1):
+        raise InputError(f'{where}: sign must be 1 or -1, found {spec.sign}')
+    if spec.nan not in NAN_RULES:
+        raise InputError(
+            f"{where}: unknown nan rule '{spec.nan}': {nearest(spec.nan, NAN_RULES)}")
+    if spec.sample_rate is not None and spec.sample_rate <= 0.0:
+        raise InputError(
+            f'{where}: sample_rate must be above 0 Hz, found {spec.sample_rate}')
+    for key in ('unit_factor', 'stamp_factor'):
+        if not getattr(spec, key) > 0.0:
+            raise InputError(
+                f"{where}: '{key}' must be above 0 (use sign: -1 to invert), "
+                f'found {getattr(spec, key)}')
+    # A malformed path is better told now, with the file's name, than at the
+    # first message.
+    for key in ('field', 'stamp_field'):
+        path = getattr(spec, key)
+        if path is not None:
+            try:
+                parse_field_path(path)
+            except InputError as error:
+                raise InputError(f'{where}: {error}') from error
+    return spec

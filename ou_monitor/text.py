@@ -1,0 +1,28 @@
+"""Numbers and lists as words, for every message and page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+
+# Half the width of a 95 % interval, in standard errors of a normal law.
+Z95 = 1.959963984540054
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a number to some significant digits, zeros at the end included."""
+    if not math.isfinite(value):
+        return '-'
+    if value == 0.0:
+        return '0'
+    # By way of the exponent form, which rounds first: 99.96 is 1.00e+02.
+    mantissa, exponent = f'{value:.{digits - 1}e}'.split('e')
+    size = int(exponent)
+    if -3 <= size < 6:
+        return f'{value:.{max(0, digits - 1 - size)}f}'
+    return f'{mantissa}e{size}'
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names as a list in a sentence."""
+    return names[0] if len(names) == 1 else ', '.join(names[:-1]) + ' and ' + names[-1]

@@ -1,0 +1,174 @@
+"""Coupling of supply noise into a signal: gain, false alarms, common causes, resampling."""
+
+import numpy as np
+from ou_monitor.coupling.common_grid import on_grid
+from ou_monitor.coupling.coupling import estimate_coupling, POWER
+from ou_monitor.errors import InputError
+import pytest
+from scipy.signal import lfilter
+
+RATE, SECONDS, ALPHA = 500.0, 20.0, 63.0
+DRAWS = 150
+
+
+def noise(rng, n, alpha, deviation):
+    """Return an OU of unit deviation times `deviation`, at RATE."""
+    phi = np.exp(-alpha / RATE)
+    return deviation * lfilter([np.sqrt(1.0 - phi**2)], [1.0, -phi], rng.standard_normal(n))
+
+
+def flight(rng, gain=0.0, lag=0, common=0.0, square=0.0, seconds=SECONDS):
+    """
+    Return stamps, voltage, signal, throttle.
+
+    The intensity of both noises grows with throttle, as on a vehicle: that is
+    no coupling.  `common` and `square` let throttle move both, each through a
+    lag of its own.
+    """
+    n = int(seconds * RATE)
+    t = np.arange(n) / RATE
+    throttle = np.repeat(rng.uniform(0.1, 0.9, round(2 * seconds)), int(RATE / 2))
+    rise = 0.3 + 3.0 * throttle
+    supply = noise(rng, n, ALPHA, 0.03 * rise)
+    signal = noise(rng, n, 30.0, 1.0) + 2.0 * rise * rng.standard_normal(n)
+    load = common * throttle + square * throttle**2
+    pole = 1.0 - np.exp(-30.0 / RATE)
+    slow = lfilter([pole], [1.0, pole - 1.0], load)
+    return (t, 5.0 + supply - 0.1 * slow, signal + gain * np.roll(supply, lag) + load - slow,
+            throttle)
+
+
+def binomial(share, draws):
+    """Return four standard deviations of a share: 1 in 16000 by chance."""
+    return 4.0 * np.sqrt(share * (1.0 - share) / draws)
+
+
+def test_gain_is_within_its_interval_as_often_as_stated():
+    """95 % intervals hold the gain; the lag is right to a tenth of a sample."""
+    rng, gain, inside, lags, gains = np.random.default_rng(1), -40.0, 0, [], []
+    for _ in range(DRAWS):
+        t, voltage, signal, throttle = flight(rng, gain, lag=2)
+        found = estimate_coupling(t, voltage, t, signal, throttle=throttle)
+        assert found.seen and found.partial and not found.narrow and not found.signal_leads
+        inside += found.gain_ci95[0] <= gain <= found.gain_ci95[1]
+        lags.append(found.lag)
+        gains.append(found.gain)
+    assert abs(inside / DRAWS - 0.95) < binomial(0.95, DRAWS)
+    assert np.mean(gains) == pytest.approx(gain, abs=4.0 * np.std(gains) / np.sqrt(DRAWS))
+    assert np.mean(lags) == pytest.approx(2.0 / RATE, abs=0.1 / RATE)
+
+
+@pytest.mark.parametrize('cause', [{}, {'common': 20.0}, {'square': 20.0}])
+def test_no_coupling_is_not_seen(cause):
+    """At most the stated 5 % of false alarms, throttle moving both or not."""
+    rng, alarms = np.random.default_rng(2), 0
+    for _ in range(DRAWS):
+        t, voltage, signal, throttle = flight(rng, **cause)
+        found = estimate_coupling(t, voltage, t, signal, throttle=throttle)
+        alarms += found.seen
+        assert found.seen == np.isfinite(found.gain)
+    assert alarms / DRAWS < 0.05 + binomial(0.05, DRAWS)
+
+
+def test_a_common_cause_is_taken_for_coupling_where_throttle_is_not_known():
+    """So the test above has something to find; and the note says that it is missing."""
+    t, voltage, signal, throttle = flight(np.random.default_rng(3), common=40.0)
+    found = estimate_coupling(t, voltage, t, signal)
+    assert found.seen and not found.partial
+    assert any('Throttle is not known' in note for note in found.notes)
+    assert not estimate_coupling(t, voltage, t, signal, throttle=throttle).seen
+
+
+def test_the_limit_is_what_would_have_been_seen():
+    """A coupling of the limiting gain is seen as often as promised; a quarter of it rarely."""
+    rng = np.random.default_rng(4)
+    t, voltage, signal, throttle = flight(rng)
+    limit = np.mean([estimate_coupling(*s[:2], s[0], s[2], throttle=s[3]).limit
+                     for s in (flight(rng) for _ in range(20))])
+    seen = {1.0: 0, 0.25: 0}
+    for share in seen:
+        for _ in range(DRAWS):
+            t, voltage, signal, throttle = flight(rng, share * limit)
+            seen[share] += estimate_coupling(t, voltage, t, signal, throttle=throttle).seen
+    # The limit is that of the sum alone; the largest bin may only add to it.
+    assert seen[1.0] / DRAWS > POWER - binomial(POWER, DRAWS)
+    assert seen[0.25] / DRAWS < 0.5
+
+
+def test_rates_gaps_nan_and_order():
+    """A gyro at 400 Hz with jitter, gaps and NaN against a rail at 1 kHz: the same gain."""
+    rng = np.random.default_rng(5)
+    fine = 2000.0
+    n = int(40.0 * fine)
+    t = np.arange(n) / fine
+    phi = np.exp(-ALPHA / fine)
+    supply = 0.05 * lfilter([np.sqrt(1.0 - phi**2)], [1.0, -phi], rng.standard_normal(n))
+    at = np.flatnonzero(np.diff(np.floor(t * 400.0 + 0.3)) > 0) + rng.integers(0, 2)
+    keep = at[(t[at] < 11.0) | (t[at] > 13.5)]
+    signal = 30.0 * supply[keep] + 0.3 * rng.standard_normal(keep.size)
+    signal[rng.integers(0, keep.size, 5)] = np.nan
+    order = rng.permutation(keep.size)
+    voltage = 5.0 + supply[::2]
+    found = estimate_coupling(t[::2], voltage, t[keep][order], signal[order])
+    assert found.seen and found.gain_ci95[0] <= 30.0 <= found.gain_ci95[1]
+    assert found.gain == pytest.approx(30.0, rel=0.03)
+    assert abs(found.lag) < 0.25e-3
+    assert found.grid.gaps >= 1 and found.grid.duration < 37.6
+    assert found.frequency[-1] <= 101.0
+    assert found.grid.lost[1] >= 3 and found.grid.lost[0] == 0
+
+
+def test_a_much_faster_voltage_is_averaged_not_thinned():
+    """What the rail does above the signal's rate does not fold into the band."""
+    t = np.arange(400_000) / 20_000.0
+    tone = np.sin(2.0 * np.pi * 997.0 * t)
+    slow = np.sin(2.0 * np.pi * 11.0 * t)
+    at = np.arange(0.0, 20.0, 0.01)
+    grid = on_grid({'v': (t, slow + tone), 'x': (at, np.interp(at, t, slow))})
+    assert grid.rate == pytest.approx(400.0) and grid.usable == pytest.approx(25.0)
+    fast, held = grid.runs[0]
+    expected = np.sin(2.0 * np.pi * 11.0 * np.arange(fast.size) / grid.rate)
+    inner = slice(20, -20)
+    # A box of 2.5 ms leaves sinc(997/400) = 12 % of the tone, and 0.1 % less of the rest.
+    assert np.abs(fast[inner] - expected[inner]).max() < 0.15
+    assert np.abs(held[inner] - expected[inner]).max() < 0.01
+
+
+def test_a_line_that_both_share_is_called_narrow():
+    """A motor that shakes the gyro and ripples the rail at one frequency."""
+    rng = np.random.default_rng(7)
+    t, voltage, signal, throttle = flight(rng)
+    line = np.sin(2.0 * np.pi * 81.0 * t)
+    found = estimate_coupling(t, voltage + 0.03 * line, t, signal + 3.0 * line, throttle=throttle)
+    assert found.seen and found.narrow
+    assert found.frequency[found.coherence.argmax()] == pytest.approx(81.0, abs=2.0)
+
+
+def test_a_signal_that_leads_is_told():
+    """The voltage answers to the signal: said, with the lag negative."""
+    rng = np.random.default_rng(8)
+    t, voltage, signal, throttle = flight(rng)
+    found = estimate_coupling(t, voltage + 0.05 * np.roll(signal, 5), t, signal,
+                              throttle=throttle)
+    assert found.seen and found.signal_leads and found.lag < -0.005
+    assert any('ahead of the voltage' in note for note in found.notes)
+
+
+T = np.arange(5000) / RATE
+
+
+@pytest.mark.parametrize('signal_t, signal, options, words', [
+    (T + 100.0, T, {}, 'no stretch of time in common'),
+    (T, np.full(T.size, np.nan), {}, 'finite samples'),
+    (T, np.ones(T.size), {}, 'does not change'),
+    (T[:600], np.sin(99 * T[:600]), {}, 'at least 16 segments'),
+    (T[::50], np.sin(9 * T[::50]), {}, 'the slower series has 10 Hz'),
+    (T, np.sin(99 * T), {'band': (20.0, 200.0)}, 'good up to 125 Hz'),
+    (T, np.sin(99 * T), {'band': (20.0, 20.1)}, 'widen it'),
+    (T, np.sin(99 * T), {'level': 0.0}, 'between 0 and 1'),
+])
+def test_what_cannot_be_told_is_refused(signal_t, signal, options, words):
+    """One line that says why."""
+    voltage = 5.0 + np.random.default_rng(9).standard_normal(T.size)
+    with pytest.raises(InputError, match=words):
+        estimate_coupling(T, voltage, signal_t, signal, **options)

@@ -1,0 +1,98 @@
+"""Forms of an effect that a fit near the plain OU does not see: fast, large, or both at once."""
+
+import math
+
+import numpy as np
+from ou_monitor import discover, Recording
+from ou_monitor.criticism.composite import fit_composite, view_of
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.structure import fit_gaussian
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.clock_jitter import ClockJitter
+from ou_monitor.model.terms.lines import order_lines
+from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.regime_switching import RegimeSwitching
+from ou_monitor.model.terms.term import View
+import pytest
+from scipy.signal import lfilter
+
+# Of a score of independent samples, by chance once in 15000.
+FAR = 4.0
+
+
+def rail(rng, n, alpha, rate, std, mean=0.0):
+    """Return an OU, V, that relaxes to a mean which may change from sample to sample."""
+    phi = math.exp(-alpha / rate)
+    e = std * math.sqrt(1.0 - phi * phi) * rng.standard_normal(n)
+    return lfilter([1.0], [1.0, -phi], (1.0 - phi) * mean + e)
+
+
+def score(a, b):
+    """Return the correlation of two series as a normal score."""
+    a, b = a - a.mean(), b - b.mean()
+    return math.sqrt(a.size) * float(a @ b) / math.sqrt(float(a @ a) * float(b @ b))
+
+
+def test_line_that_throttle_moves_by_many_of_its_widths_in_a_quarter_of_a_second():
+    """600 Hz/s: within 0.25 s the line crosses 40 bins of 4 Hz."""
+    rng, n, rate = np.random.default_rng(1), 20000, 1000.0
+    at = np.arange(n) / rate
+    throttle = 0.5 + 0.4 * np.sin(2.0 * math.pi * 0.8 * at)
+    turns = np.cumsum(30.0 + 300.0 * throttle) / rate
+    z = rng.standard_normal(n) + 0.8 * np.sin(2.0 * math.pi * turns)
+    ones = np.ones(n)
+    view = View(z=z, variance=ones, phi=ones, state=z, residual=z, at=at, step=ones / rate,
+                throttle=throttle, train=slice(0, n))
+    idle, slope = order_lines(view)[0]
+    # What 20 s can tell: a turn in the whole recording is 0.05 Hz.
+    assert abs(slope) == pytest.approx(300.0, abs=1.0)
+    assert math.copysign(idle, idle * slope) == pytest.approx(30.0, abs=0.5)
+
+
+def test_rail_that_relaxes_to_where_throttle_puts_it():
+    """Throttle trembles: a sag at once explains nothing, and neither does a lag without it."""
+    rng, n, rate = np.random.default_rng(2), 60000, 2000.0
+    throttle = 0.5 + rail(rng, n, 2.0, rate, 0.2)
+    voltage = 12.0 + rail(rng, n, 30.0, rate, 0.015, -0.1 * throttle)
+    finding = discover(Recording(np.arange(n) / rate, voltage, throttle))
+    assert [cause.name for cause in finding.causes] == ['load_sag', 'load_transient']
+    sag, transient = (cause.term for cause in finding.causes)
+    assert sag.linear == pytest.approx(0.1, rel=0.15)
+    # All of the sag comes late, at the rate of the rail.
+    assert transient.gain == pytest.approx(sag.linear, rel=0.1)
+    assert transient.tau == pytest.approx(1.0 / 30.0, rel=0.3)
+
+
+def test_levels_that_hide_how_fast_the_rail_relaxes():
+    """With levels of 6 deviations the plain OU seems to relax at the rate of the switching."""
+    rng, n, rate, alpha, std = np.random.default_rng(3), 40000, 2000.0, 180.0, 0.046
+    turns = np.cumsum(rng.random(n) < 1.5 / rate)
+    voltage = 5.0 + rail(rng, n, alpha, rate, std) - 0.26 * (turns % 2)
+    samples = Samples(np.arange(n) / rate, voltage, None)
+    plain = fit_gaussian(samples, [OU(60.0, 0.8, 5.0)], samples.train).terms[0]
+    assert plain.alpha < 0.3 * alpha
+    made = fit_composite(samples, [plain, object.__new__(RegimeSwitching)], samples.train)
+    ou, switching = made.terms
+    # Of 12 s, alpha is known to sqrt(2 / (alpha T)) = 3 %.
+    assert ou.alpha == pytest.approx(alpha, rel=0.12)
+    assert abs(switching.level) == pytest.approx(0.26, rel=0.05)
+    assert switching.sigma_ratio == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize('law, alpha', [
+    (ClockJitter(4e-4), 600.0), (NonlinearRestoring(0.0, 6e4), 150.0)])
+def test_laws_where_a_step_is_long(law, alpha):
+    """The pull back changes within a step, or with its length: so do mean and spread."""
+    n, rate = 60000, 1000.0
+    terms = OU(alpha, 0.8, 5.0), law
+    t = np.arange(n) / rate
+    samples = Samples(t, SupplyModel(terms).simulate(t, np.random.default_rng(4)), None)
+    whole = slice(0, n)
+    plain = fit_gaussian(samples, [terms[0]], whole)
+    made = fit_composite(samples, [plain.terms[0], object.__new__(type(law))], whole)
+    state = view_of(samples, plain, plain.z, whole).state
+    square = np.clip(state / state.std(), -4.0, 4.0)**2
+    assert abs(score(plain.z[1:]**2, square[1:])) > 1.5 * FAR
+    assert abs(score(made.z[1:]**2, square[1:])) < FAR
+    assert abs(score(made.z[1:], state[1:]**3)) < FAR

@@ -1,0 +1,156 @@
+"""Gains, their errors, and crossings: against truth that is known."""
+
+import math
+
+import numpy as np
+from ou_monitor.criticism.composite import fit_composite
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.discover.errors import standard_errors
+from ou_monitor.discover.gain import (
+    BLOCKS, crossing_level, crossing_rates, crossings, mean_difference, mean_score, told, without,
+    worth)
+from ou_monitor.model.ou import simulate
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.quantization import Quantization
+import pytest
+from scipy.signal import lfilter
+
+ALPHA, SIGMA = 63.0, 0.3156
+
+
+def made(seed, n=4000, sag=0.0):
+    """Return samples of an OU with a sag, at 1 kHz, throttle of 50 ms steps."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) / 1000.0
+    u = np.repeat(rng.random(n // 50 + 1), 50)[:n]
+    return Samples(t, simulate(t, ALPHA, SIGMA, rng, u0=5.0 - sag * u), u)
+
+
+@pytest.mark.parametrize('keep', [0.0, 0.97])
+def test_the_error_of_a_mean_knows_correlation(keep):
+    """
+    Over 300 series the stated error is the true scatter within a quarter.
+
+    The scatter itself is known to 1/sqrt(600) = 4 %; correlation over 33 of
+    166 samples a block is left out by 17 % at most, of which a lag mends a part.
+    With `keep` 0.97 an error that ignores correlation is 8 times too small.
+    """
+    rng = np.random.default_rng(3)
+    stated, means = [], []
+    for _ in range(300):
+        d = lfilter([1.0], [1.0, -keep], rng.standard_normal(4000))
+        mean, error = mean_difference(d + 1.0, np.ones(d.size))
+        means.append(mean)
+        stated.append(error)
+    assert np.mean(stated) == pytest.approx(np.std(means), rel=0.25)
+    assert abs(np.mean(means)) < 4.0 * np.std(means) / math.sqrt(300)
+
+
+def test_too_few_samples_have_no_gain():
+    """Fewer than blocks: unknown; as many as blocks: known."""
+    mean, error = mean_difference(np.ones(BLOCKS - 1), np.zeros(BLOCKS - 1))
+    assert math.isnan(mean) and math.isnan(error)
+    mean, error = mean_difference(np.ones(BLOCKS), np.zeros(BLOCKS))
+    assert mean == 1.0 and error == 0.0
+    scored = np.arange(40) < BLOCKS
+    assert mean_score(np.where(scored, 2.0, 9.0), scored) == 2.0
+    assert math.isnan(mean_score(np.ones(40), np.arange(40) < BLOCKS - 1))
+
+
+def test_a_true_cause_gains_what_theory_says():
+    """
+    Sag 0.5 V: the gain is that of the true model over the plain one.
+
+    True model: the densities of the innovations at the true parameters.  The
+    fitted one may lose k / (2 n) nats for each of its five parameters.
+    """
+    samples = made(1, 20_000, 0.5)
+    start = OU(50.0, 0.3, 4.8)
+    plain = fit_composite(samples, [start], samples.train)
+    full = fit_composite(samples, [start, LoadSag(0.1, 0.0)], samples.train)
+    gain, error, chance = worth(samples, full, plain)
+    phi = math.exp(-ALPHA / 1000.0)
+    var = SIGMA**2 * (1.0 - phi**2) / (2.0 * ALPHA)
+    x = samples.voltage - (5.0 - 0.5 * samples.throttle)
+    e = x[1:] - phi * x[:-1]
+    true = -0.5 * (math.log(2.0 * math.pi * var) + e**2 / var)
+    test = samples.test
+    wanted = float((true[test.start - 1:] - plain.density[test]).mean())
+    assert gain > 5.0 * error and chance < 1e-20
+    assert abs(gain - wanted) < 3.0 * 5 / (2 * samples.train.stop) + 0.2 * error
+
+
+def test_a_cause_that_is_not_there_gains_nothing():
+    """Throttle without sag: within 3.5 errors of 0, p not small, in 20 recordings."""
+    chances = []
+    for seed in range(20):
+        samples = made(seed)
+        full = fit_composite(samples, [OU(50.0, 0.3, 5.0), LoadSag(0.0, 0.0)], samples.train)
+        gain, error, chance = worth(samples, full, without(samples, full, 1))
+        assert abs(gain) < 3.5 * error + 2.0 / samples.train.stop
+        chances.append(chance)
+    # The smallest of 20 is below 1e-3 with chance 2 %; doubling makes it rarer.
+    assert min(chances) > 1e-4 and np.median(chances) > 0.1
+
+
+def test_errors_of_the_mean_are_its_scatter():
+    """Sag and level over 40 recordings: scatter known to 11 %, tolerance three times that."""
+    found, stated = [], []
+    for seed in range(40):
+        samples = made(seed, 2000, 0.4)
+        model = fit_composite(samples, [OU(63.0, 0.3, 5.0), LoadSag(0.4, 0.01)],
+                              slice(0, samples.n))
+        se = standard_errors(samples, model, slice(0, samples.n))
+        found.append([model.terms[0].u0, model.terms[1].linear, model.terms[1].square])
+        stated.append([se[0]['u0'], se[1]['linear'], se[1]['square']])
+        assert {'alpha', 'sigma'} <= set(se[0])
+    scatter = np.std(found, axis=0, ddof=1)
+    assert np.mean(stated, axis=0) == pytest.approx(scatter, rel=0.34)
+
+
+def test_crossings_are_counted_downward():
+    """Two falls in two seconds are 60 per minute."""
+    t = np.array([0.0, 0.5, 1.0, 1.5, 2.0])
+    assert crossings(t, np.array([1.0, -1.0, 1.0, 0.5, -2.0]), 0.0) == 60.0
+
+
+def test_the_level_is_crossed_in_both_parts_and_lies_between_codes():
+    """Some crossings on either side; half-way between neighbouring codes."""
+    samples = made(2, 20_000)
+    step = 0.01
+    coded = Samples(samples.t, step * np.rint(samples.voltage / step), None)
+    level = crossing_level(coded)
+    assert level / step % 1.0 == pytest.approx(0.5, abs=1e-6)
+    assert level < coded.voltage.mean() - 0.5 * coded.voltage.std()
+    for part in (coded.train, coded.test):
+        assert crossings(coded.t[part], coded.voltage[part], level) > 0.0
+
+
+def test_crossing_rates_of_the_true_model_and_of_a_wrong_one():
+    """The truth within 4 joint errors of its own expectation; half of sigma far below."""
+    true = SupplyModel((OU(ALPHA, SIGMA, 5.0), Quantization(0.005)))
+    t = np.arange(30_000) / 1000.0
+    rng = np.random.default_rng(4)
+    samples = Samples(t, true.simulate(t, rng), None)
+    rates = crossing_rates(samples, (OU(ALPHA, 0.5 * SIGMA, 5.0),), true.terms, rng)
+    assert abs(rates.observed - rates.extended) < 4.0 * math.hypot(
+        1.3 * rates.observed_se, rates.extended_se)
+    assert rates.baseline < 0.5 * rates.observed
+
+
+def test_a_model_that_cannot_be_simulated_has_no_rate():
+    """Sag without throttle: NaN, no exception."""
+    samples = Samples(made(5).t, made(5).voltage, None)
+    rates = crossing_rates(samples, (OU(ALPHA, SIGMA, 5.0),),
+                           (OU(ALPHA, SIGMA, 5.0), LoadSag(0.5, 0.0)), np.random.default_rng(0))
+    assert math.isnan(rates.extended) and math.isfinite(rates.baseline)
+
+
+@pytest.mark.parametrize('gain, error, known', [
+    (0.00072, 0.797, False), (-1e-4, 50.0, False), (0.00072, 0.05, True), (4.0, 4.0, True),
+    (0.1, 0.02, True)])
+def test_an_error_that_leaves_nothing_known_is_no_gain(gain, error, known):
+    """Ten times as large as the gain, and large beside any; small ones are just none."""
+    assert told(gain, error) == (gain, error) if known else all(map(math.isnan, told(gain, error)))

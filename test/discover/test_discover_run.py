@@ -1,0 +1,245 @@
+"""From a recording to a finding, and to its page: clear causes, bad input, honest verdicts."""
+
+import json
+import math
+import os
+from pathlib import Path
+import re
+
+import numpy as np
+import ou_monitor
+from ou_monitor import discover
+from ou_monitor.cli.discover import render
+from ou_monitor.discover.finding import Verdict
+from ou_monitor.errors import InputError
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.drift import Drift
+from ou_monitor.model.terms.held_samples import HeldSamples
+from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.quantization import Quantization
+from ou_monitor.records import Recording
+from ou_monitor.report.discovery_page import discovery_page
+from pages import parsed, self_contained
+import pytest
+
+RAIL = OU(63.0, 0.3156, 5.0)
+# Standard deviation of what a millisecond adds, V.
+STEP_STD = RAIL.sigma * math.sqrt(-math.expm1(-0.126) / 126.0)
+
+
+def made(*terms, seed=1, n=20_000, throttle=True, name='made'):
+    """Return a recording at 1 kHz, throttle in steps of 0.4 s."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) / 1000.0
+    u = np.repeat(rng.random(n // 400 + 1), 400)[:n]
+    v = SupplyModel((RAIL, *terms)).simulate(t, rng, u)
+    return Recording(t, v, u if throttle else np.full(n, np.nan), name)
+
+
+@pytest.fixture(scope='module')
+def sag():
+    """Return what is found of a sag."""
+    return discover(made(LoadSag(0.5, 0.0), n=12_000, name='sag <b>'))
+
+
+def names(finding):
+    """Return the causes."""
+    return [cause.name for cause in finding.causes]
+
+
+def test_nothing_is_found_where_nothing_is():
+    """
+    Eight plain recordings: at most two alarms.
+
+    At 1 % for the statistics and 5 % for causes, three or more of eight have a chance of
+    1 %.
+    """
+    verdicts = [discover(made(seed=seed, n=5000)).verdict for seed in range(8)]
+    assert verdicts.count(Verdict.NO_EFFECT) >= 6
+
+
+def test_a_sag_is_found_measured_and_worth_its_gain(sag):
+    """0.5 V: named alone, within four errors, gain above zero, rail as it is without."""
+    assert sag.verdict is Verdict.EXPLAINED and names(sag) == ['load_sag']
+    (cause,) = sag.causes
+    fall = cause.term.linear + cause.term.square
+    assert abs(fall - 0.5) < 4.0 * math.hypot(*cause.se.values())
+    assert cause.measurable and cause.p_value < 1e-6
+    assert cause.gain == pytest.approx(sag.gain) and sag.score > sag.baseline_score
+    ou = sag.model.ou
+    assert abs(ou.alpha - RAIL.alpha) < 4.0 * sag.se[0]['alpha']
+    assert sag.baseline.alpha < 0.7 * RAIL.alpha
+    assert any(c.statistic.startswith('throttle') for c in sag.discrepancies)
+    assert len(sag.remaining) < len(sag.discrepancies)
+    json.dumps(sag.as_data(), allow_nan=False)
+
+
+def test_crossings_come_nearer_to_the_data(sag):
+    """The plain OU, its spread widened by the sag, misses by more."""
+    c = sag.crossing
+    assert abs(c.extended - c.observed) < abs(c.baseline - c.observed)
+
+
+def test_strong_noise_of_the_sensor_is_named():
+    """White noise as large as what a step of the rail adds."""
+    found = discover(made(MeasurementNoise(STEP_STD), n=6000))
+    assert 'measurement_noise' in names(found)
+    assert found.gain > 3.0 * found.gain_se
+
+
+def test_a_discharge_is_named():
+    """0.4 V in 10 s, fourteen standard deviations of the rail."""
+    assert 'drift' in names(discover(made(Drift(-0.04, 0.0), n=10_000)))
+
+
+def test_repeats_are_undone_and_the_rail_found_behind():
+    """Each value four times: an exact finding; alpha is that of the rail."""
+    found = discover(made(HeldSamples(250.0)))
+    assert 'held_samples' in names(found)
+    cause = found.causes[0]
+    assert cause.exact and cause.p_value == 0.0 and cause.gain > 0.0
+    assert abs(found.model.ou.alpha - RAIL.alpha) < 4.0 * found.se[0]['alpha']
+    # The model that is saved repeats; the one compared with the samples left does not.
+    assert 'held_samples' in [term.NAME for term in found.model.terms]
+    assert 'held_samples' not in [term.NAME for term in found.simulated.terms]
+
+
+def test_steps_of_the_adc_are_named_and_in_the_model():
+    """A step of 0.7 times the noise: sigma without it is too large."""
+    step = 0.7 * STEP_STD
+    found = discover(made(Quantization(step), n=8000))
+    assert 'quantization' in names(found)
+    term = next(term for term in found.model.terms if term.NAME == 'quantization')
+    assert term.step == pytest.approx(step, rel=1e-6)
+    assert abs(math.log(found.model.ou.sigma / RAIL.sigma)) < abs(
+        math.log(found.baseline.sigma / RAIL.sigma))
+
+
+@pytest.mark.parametrize('recording', [
+    Recording(np.array([0.0, 1.0]), np.array([5.0, 5.1]), np.array([0.0, 0.0]), 'two'),
+    Recording(np.arange(3000.0), np.full(3000, 3.3), np.full(3000, np.nan), 'constant'),
+    Recording(np.zeros(0), np.zeros(0), np.zeros(0), 'empty')])
+def test_too_little_is_said_so(recording):
+    """A verdict, its reason, JSON and a page; no exception."""
+    found = discover(recording)
+    assert found.verdict is Verdict.INSUFFICIENT_DATA and found.causes == ()
+    data = found.as_data()
+    json.dumps(data, allow_nan=False)
+    assert data['n'] == recording.n and data['extended']['params'] == {}
+    assert found.sentence in ''.join(parsed(discovery_page(found)).itertext())
+
+
+def test_without_throttle_its_causes_are_untestable():
+    """They are said to be so, and never named."""
+    found = discover(made(throttle=False, n=4000))
+    assert any('load_sag' in note and 'cannot be tested' in note for note in found.notes)
+    assert not any(cause.term.NEEDS_THROTTLE for cause in found.causes)
+
+
+def test_same_seed_same_finding_and_progress_to_the_end():
+    """Bit for bit; the share done rises to 1."""
+    shares = []
+    recording = made(n=4000)
+    first = discover(recording, seed=3, progress=shares.append)
+    assert first.as_data() == discover(recording, seed=3).as_data()
+    assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) > 5
+
+
+def test_a_path_is_read(tmp_path):
+    """A CSV by its name, as a string or a path; a missing one is bad input."""
+    recording = made(n=1500)
+    path = tmp_path / 'x.csv'
+    np.savetxt(path, np.column_stack([recording.t, recording.voltage]), '%.9g', ',', comments='',
+               header='time_s,voltage_v')
+    assert discover(str(path)).n == 1500 and ou_monitor.discover is discover
+    with pytest.raises(InputError, match='nowhere'):
+        discover(tmp_path / 'nowhere.csv')
+
+
+def test_the_page_shows_it_all(sag):
+    """Well formed, escaped, finite; verdict, cause, pictures before and after, command."""
+    html = discovery_page(sag, 'ou-monitor discover x.csv')
+    root = self_contained(html)
+    text = ' '.join(''.join(root.itertext()).split())
+    assert 'sag <b>' in text and '<b>' not in html
+    for part in ('load_sag', 'Statistics before and after', 'ou-monitor discover x.csv',
+                 'Mean voltage by throttle', 'Spectrum', 'Autocorrelation', 'V/sqrt(s)'):
+        assert part in text
+    assert ' '.join(sag.sentence.replace('+-', '\u00b1').split()) in text
+    drawings = root.findall('.//figure/svg')
+    # Rows of statistics, and six pictures twice.
+    assert len(drawings) == 1 + 2 * 6
+    coordinates = re.findall(r'="([^"]*)"', ''.join(
+        re.findall(r'<(?:path|line|circle|rect)[^>]*>', html)))
+    assert not any(re.search(r'nan|inf', c) for c in coordinates)
+    assert html.count('<circle') >= 2 * len(sag.discrepancies[:18])
+
+
+def test_the_mean_by_throttle_leaves_the_band_before_and_not_after(sag):
+    """The picture of a sag: data outside what the plain OU produces, inside the extended."""
+    from ou_monitor.report.pictures import pictures
+    drawn = pictures(sag.samples, [SupplyModel((sag.baseline,)), sag.simulated],
+                     np.random.default_rng(0), draws=20)
+    (mean,) = [p for p in drawn if p.title.startswith('Mean voltage')]
+    out = [((mean.data < low) | (mean.data > high)).mean() for low, high in mean.bands]
+    assert out[0] > 0.3 and out[1] < 0.3
+
+
+@pytest.mark.skipif('OU_MONITOR_REALDATA' not in os.environ, reason='no real recordings')
+def test_a_clean_bench_stays_quiet():
+    """mm_bench_5: white and clean, nothing to find."""
+    found = discover(Path(os.environ['OU_MONITOR_REALDATA']) / 'mm_bench_5.csv')
+    assert found.verdict is Verdict.NO_EFFECT
+
+
+@pytest.mark.skipif('OU_MONITOR_REALDATA' not in os.environ, reason='no real recordings')
+def test_the_line_of_a_motor_is_named():
+    """mm_bench_3: a line that wanders from 236 to 246 Hz in 0.7 s, most of the variance."""
+    found = discover(Path(os.environ['OU_MONITOR_REALDATA']) / 'mm_bench_3.csv')
+    (line,) = [cause for cause in found.causes if cause.term.FAMILY == 'line']
+    assert 232.0 < line.term.frequency < 250.0
+    assert line.gain > 5.0 * line.gain_se
+
+
+@pytest.mark.skipif('OU_MONITOR_REALDATA' not in os.environ, reason='no real recordings')
+@pytest.mark.parametrize('name', ['mm_bench_1', 'mm_bench_3'])
+def test_a_motor_that_starts_late_gains_nothing_absurd(name):
+    """What the first part did not see is left out: gains are known within errors, or unknown."""
+    found = discover(Path(os.environ['OU_MONITOR_REALDATA']) / f'{name}.csv')
+    for worth in (found, *found.causes):
+        assert math.isnan(worth.gain) == math.isnan(worth.gain_se)
+        assert math.isnan(worth.gain) or worth.gain > -3.0 * worth.gain_se - 0.05
+    known = found.samples.throttle[found.samples.train]
+    still = float(known.max() - known.min()) < 0.01
+    assert still == (name == 'mm_bench_3')
+    if still:
+        # A motor that stops in the last part only.
+        assert any('the first 60 % never had' in note for note in found.notes)
+        assert all(math.isnan(cause.gain) for cause in found.causes if cause.term.NEEDS_THROTTLE)
+
+
+def test_the_page_of_a_plain_rail_keeps_the_plain_model():
+    """No extended model is shown where nothing was added: one picture each, and it is said so."""
+    found = discover(made(seed=2, n=5000))
+    assert found.verdict is Verdict.NO_EFFECT
+    root = parsed(discovery_page(found))
+    text = ' '.join(''.join(root.itertext()).split())
+    assert 'The plain OU is kept' in text and 'xtended' not in text
+    assert len(root.findall('.//figure/svg')) == 1 + 6
+    assert 'xtended' not in render(found)
+
+
+@pytest.mark.parametrize('code, count', [(0.011, 60), (0.0007, 400), (0.05, 7)])
+def test_bins_hold_as_many_codes_each(code, count):
+    """Else the distribution of a coarse ADC would show a comb that is not in the data."""
+    from ou_monitor.report.pictures import _bins
+    codes = 4.9 + code * np.arange(count)
+    edges = _bins(codes, code)
+    held = np.histogram(codes, edges)[0]
+    inner = held[held > 0][:-1]
+    assert held.sum() == count and inner.size and (inner == inner[0]).all()
+    # Without the step they do not.
+    comb = np.histogram(codes, _bins(codes))[0]
+    assert np.ptp(comb[np.flatnonzero(comb)[0]:np.flatnonzero(comb)[-1]]) > 0

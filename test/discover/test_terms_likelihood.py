@@ -1,0 +1,282 @@
+"""
+Every term of the catalogue: what its likelihood expects is what its simulator makes.
+
+A recording is simulated with one term; filtered with the true parameters (laws are
+fitted, at the true OU), the normal scores must be independent and N(0, 1).  With
+one parameter wrong, or without the law, they must not.
+"""
+
+from dataclasses import replace
+from importlib import import_module
+import math
+
+import numpy as np
+from ou_monitor.criticism.composite import view_of
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.structure import evaluate, Events
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.term import Role
+import pytest
+from scipy.special import kolmogorov, ndtri
+
+RATE, LENGTH = 1000.0, 60000
+OU = {'alpha': 63.0, 'sigma': 0.632, 'u0': 5.0}
+# One-step error of that rail, V: 20 mV.
+STEP = 0.632 * math.sqrt(-math.expm1(-2.0 * 63.0 / RATE) / 126.0)
+
+# Terms of moderate strength, and for each parameter that a fit finds a wrong value.
+GAUSSIAN = {
+    'load_sag': ({'linear': 0.3, 'square': 0.1}, {'linear': 0.2}, {'square': 0.3}),
+    'load_transient': (
+        {'gain': -0.3, 'tau': 0.03, 'delay': 0.0}, {'gain': -0.15}, {'tau': 0.6}),
+    'load_dependent_sigma': (
+        {'throttle': [0.0, 0.5, 1.0], 'log_factor': [0.0, 0.5, 0.8]},
+        {'log_factor': [0.0, 0.3, 0.8]}, {'log_factor': [0.0, 0.5, 0.65]}),
+    'load_dependent_alpha': ({'slope': 1.0}, {'slope': -0.6}),
+    'drift': ({'rate': -0.01, 'curvature': 2e-4}, {'rate': 0.0}, {'curvature': 0.0}),
+    'measurement_noise': ({'std': 0.5 * STEP}, {'std': 0.4 * STEP}, {'std': 0.6 * STEP}),
+    'quantization': ({'step': 0.5 * STEP}, {'step': STEP}),
+    'second_relaxation': (
+        {'alpha': 3.0, 'sigma': 0.15}, {'alpha': 30.0}, {'sigma': 0.45}),
+    'resonance': (
+        {'frequency': 80.0, 'damping': 30.0, 'std': 0.02, 'tilt': 0.0}, {'frequency': 90.0},
+        {'damping': 60.0}, {'std': 0.03}),
+    'tone': (
+        {'amplitude': 0.01, 'frequency': 137.3, 'phase': 0.4, 'linewidth': 0.0},
+        {'amplitude': 0.0}, {'frequency': 137.4}, {'phase': -0.4}),
+    'throttle_tone': (
+        {'amplitude': 0.02, 'idle': 60.0, 'slope': 200.0, 'phase': 0.1, 'linewidth': 0.05},
+        {'amplitude': 0.002}, {'idle': 70.0}, {'slope': 230.0}),
+    'ac_coupling': ({'corner': 8.0, 'offset': 5.0}, {'corner': 1.0}, {'corner': 14.0}),
+    'flicker_noise': (
+        {'amplitude': 0.02, 'low': 0.05, 'high': 25.0}, {'amplitude': 0.024}, {'high': 20.0}),
+}
+LAWS = {
+    'jumps': {'rate': 2.0, 'mean': -0.06, 'std': 0.08},
+    'heavy_tails': {'dof': 4.0},
+    'glitches': {'probability': 0.006, 'std': 0.15},
+    'regime_switching': {
+        'rate_up': 0.7, 'rate_down': 1.0, 'level': 0.0, 'sigma_ratio': 2.0, 'at_once': 1.0,
+        'states': 2.0},
+    'volatility': {'std': 0.5, 'rate': 0.25},
+    'nonlinear_restoring': {'square': 0.0, 'cube': 2000.0},
+    'clock_jitter': {'std': 2.5e-4},
+}
+
+LAGS, BLOCK = 10, 500
+# Statistics of `deviations`, recordings that must pass, and the chance that one
+# of all of these is off though nothing is wrong.
+STATISTICS, RECORDINGS, CHANCE = 2 * LAGS + 7, 2 * len(LAWS) + len(GAUSSIAN), 1e-3
+LIMIT = -float(ndtri(0.5 * CHANCE / (STATISTICS * RECORDINGS)))
+
+
+def deviations(z, state):
+    """
+    Return statistics that are N(0, 1), nearly, for n independent scores N(0, 1).
+
+    `state` is the deviation from the mean one sample before each score.
+
+    Var z = 1, Var z^2 = 2, Var z^4 = 96; a correlation has the variance 1/n; the
+    sum of m squares of block means is chi-square, of variance 2 m.
+    """
+    n, square = z.size, (z * z - 1.0) / math.sqrt(2.0)
+    found = {'mean': math.sqrt(n) * z.mean(), 'variance': math.sqrt(n) * square.mean(),
+             'kurtosis': math.sqrt(n / 96.0) * float(np.mean(z**4) - 3.0)}
+    for name, series in (('score', z), ('square', square)):
+        c = series - series.mean()
+        for lag in range(1, LAGS + 1):
+            found[f'{name} lag {lag}'] = math.sqrt(n) * float(c[lag:] @ c[:-lag]) / float(c @ c)
+        blocks = c[:n // BLOCK * BLOCK].reshape(-1, BLOCK).mean(axis=1) * math.sqrt(BLOCK)
+        m = blocks.size
+        found[f'{name} slow'] = (float(blocks @ blocks) - m) / math.sqrt(2.0 * m)
+    # Also of scores and a series known before them.
+    cube = state**3
+    found['cube of the state'] = float(z @ cube) / math.sqrt(float(cube @ cube))
+    order = np.sort(z)
+    cdf = 0.5 * np.array([math.erfc(-v / math.sqrt(2.0)) for v in order])
+    ranks = np.arange(n)
+    distance = max(float((cdf - ranks / n).max()), float(((ranks + 1.0) / n - cdf).max()))
+    found['distance'] = -float(ndtri(0.5 * max(kolmogorov(math.sqrt(n) * distance), 1e-300)))
+    assert len(found) == STATISTICS
+    return found
+
+
+def worst(z, state):
+    """Return the statistic furthest off, and by how much."""
+    found = deviations(z, state)
+    name = max(found, key=lambda key: abs(found[key]))
+    return name, found[name]
+
+
+def throttle():
+    """Return throttle in steps of 50 ms, 0.2..0.9, shape (LENGTH,)."""
+    return np.repeat(np.random.default_rng(4).uniform(0.2, 0.9, LENGTH // 50), 50)
+
+
+def made(name, params, seed, **ou):
+    """Return samples of the OU with one term, and both."""
+    terms = (catalogue()['ou'](**{**OU, **ou}), catalogue()[name](**params))
+    t = np.arange(LENGTH) / RATE
+    voltage = SupplyModel(terms).simulate(t, np.random.default_rng(seed), throttle())
+    return Samples(t, voltage, throttle()), terms
+
+
+def state_of(samples, fit):
+    """Return the deviation from the mean before each sample, V."""
+    return np.concatenate(([0.0], (samples.voltage - fit.mean)[:-1]))
+
+
+def filtered(samples, terms):
+    """Return the statistic furthest off under a model with these parameters."""
+    fit = evaluate(samples, terms)
+    return worst(fit.z, state_of(samples, fit))
+
+
+def law_fitted(name, params, seed):
+    """Return a law fitted at the true OU, the scores without it, and states."""
+    samples, terms = made(name, params, seed)
+    events = None
+    for _ in range(3):
+        gaussian = evaluate(samples, terms[:1], events)
+        view = view_of(samples, gaussian, gaussian.z, slice(0, samples.n))
+        fit = catalogue()[name].fit_law(view)
+        if fit.push is None and fit.error is None:
+            break
+        none = np.zeros(samples.n)
+        events = Events(none if fit.push is None else fit.push,
+                        none if fit.error is None else fit.error, np.ones(samples.n))
+    return fit, evaluate(samples, terms[:1]).z, state_of(samples, gaussian)
+
+
+def test_every_term_with_a_likelihood_is_here():
+    """No term but the OU and the exact ones is without a test."""
+    kinds = catalogue()
+    assert {*GAUSSIAN, *LAWS} == {
+        name for name, kind in kinds.items() if name != 'ou' and kind.ROLE is not Role.EXACT}
+    assert all(kinds[name].ROLE is Role.LAW for name in LAWS)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_the_statistics_are_standard(seed):
+    """Independent N(0, 1) passes."""
+    z, state = np.random.default_rng(seed).standard_normal((2, LENGTH))
+    name, value = worst(z, state)
+    assert abs(value) < LIMIT, name
+
+
+@pytest.mark.parametrize('name', GAUSSIAN)
+def test_scores_of_the_right_model_are_white(name):
+    """With the true parameters, independent N(0, 1)."""
+    statistic, value = filtered(*made(name, GAUSSIAN[name][0], 11))
+    assert abs(value) < LIMIT, statistic
+
+
+@pytest.mark.parametrize('name, wrong', [
+    (name, wrong) for name, (_, *changes) in GAUSSIAN.items() for wrong in changes])
+def test_a_wrong_parameter_shows(name, wrong):
+    """With one parameter wrong, so far from that that nearly every recording shows it."""
+    samples, (ou, term) = made(name, GAUSSIAN[name][0], 11)
+    assert abs(filtered(samples, (ou, replace(term, **wrong)))[1]) > LIMIT + 3.0
+
+
+@pytest.mark.parametrize('name', LAWS)
+@pytest.mark.parametrize('seed', [11, 12])
+def test_scores_of_the_right_law_are_white(name, seed):
+    """With the law that was simulated, independent N(0, 1)."""
+    fit, plain, state = law_fitted(name, LAWS[name], seed)
+    statistic, value = worst(fit.z, state)
+    assert abs(value) < LIMIT, statistic
+    # Without it they are not, and the law that makes them so is worth its parameters.
+    assert abs(worst(plain, state)[1]) > LIMIT
+    assert float(fit.gain.sum()) > 20.0
+
+
+@pytest.mark.parametrize('name, coordinate, by', [
+    ('heavy_tails', 0, 0.4), ('volatility', 0, -1.5), ('clock_jitter', 0, 0.5),
+    ('regime_switching', 3, 0.5)])
+def test_a_law_with_a_wrong_parameter_shows(monkeypatch, name, coordinate, by):
+    """What a fit has found, moved off by hand, makes scores that are off."""
+    module = import_module(f'ou_monitor.model.terms.{name}')
+    climb = module.climb
+
+    def astray(*args, **others):
+        x, top = climb(*args, **others)
+        x[coordinate] += by
+        return x, top
+
+    monkeypatch.setattr(module, 'climb', astray)
+    fit, _, state = law_fitted(name, LAWS[name], 11)
+    assert abs(worst(fit.z, state)[1]) > LIMIT
+
+
+@pytest.mark.parametrize('name', ['volatility', 'clock_jitter'])
+def test_a_law_fitted_again_is_as_good(name):
+    """From where the first fit ended, the second comes to the same top, within a nat."""
+    samples, terms = made(name, LAWS[name], 11)
+    gaussian = evaluate(samples, terms[:1])
+    view = view_of(samples, gaussian, gaussian.z, slice(0, samples.n))
+    first = catalogue()[name].fit_law(view)
+    again = catalogue()[name].refit_law(view, first.term)
+    assert abs(float((again.gain - first.gain).sum())) < 1.0
+
+
+def test_sigma_may_go_where_the_fit_has_not_seen_it():
+    """A random walk of ln sigma in the part kept, quiet in the part fitted."""
+    rng = np.random.default_rng(5)
+    part = LENGTH * 6 // 10
+    steps = rng.standard_normal(LENGTH) * np.where(np.arange(LENGTH) < part, 0.07, 0.12)
+    log = np.cumsum(steps / math.sqrt(RATE))
+    samples, (ou, _) = made('volatility', {'std': 0.0, 'rate': 1.0}, 11)
+    x = samples.voltage - ou.u0
+    kicks = x[1:] - math.exp(-ou.alpha / RATE) * x[:-1]
+    z = np.concatenate(([x[0] / x.std()], kicks / kicks.std()))
+    gaussian = evaluate(samples, (ou,))
+    view = view_of(samples, gaussian, z * np.exp(log), slice(0, part))
+    fit = catalogue()['volatility'].fit_law(view)
+    name, value = worst(fit.z, state_of(samples, gaussian))
+    assert abs(value) < LIMIT, name
+    assert abs(worst(view.z, state_of(samples, gaussian))[1]) > LIMIT
+
+
+@pytest.mark.parametrize('run', [1, 2, 3])
+def test_bad_samples_are_found_and_not_their_neighbours(run):
+    """
+    Runs of samples off by one error of 12 steps, singly and in twos and threes.
+
+    To leave out the right ones explains some 100 nats or more, give or take 14,
+    and costs 15 at the most.  A good sample is left out where one chi-square of one
+    degree is above twice 7.8 nats (price of its prior and size): 8e-5 of them.
+    """
+    rng = np.random.default_rng(run)
+    samples, (ou, _) = made('glitches', {'probability': 0.0, 'std': 0.1}, 11)
+    first = np.flatnonzero(rng.random(LENGTH) < 0.005)
+    first = first[(np.diff(first, prepend=-99) > run + 2) & (first > 9) & (first < LENGTH - 9)]
+    where = np.concatenate([first + k for k in range(run)])
+    voltage = samples.voltage.copy()
+    voltage[where] += np.tile(rng.choice([-12.0, 12.0], first.size) * STEP, run)
+    bad = np.zeros(LENGTH, dtype=bool)
+    bad[where] = True
+    samples = replace(samples, voltage=voltage)
+    events = None
+    for _ in range(2):
+        gaussian = evaluate(samples, (ou,), events)
+        fit = catalogue()['glitches'].fit_law(
+            view_of(samples, gaussian, gaussian.z, slice(0, samples.n)))
+        events = Events(np.zeros(LENGTH), fit.error, np.ones(LENGTH))
+    found = fit.error > 0.0
+    beside = ~bad & (np.roll(bad, 1) | np.roll(bad, -1))
+    assert found[bad].all()
+    assert not found[beside].any()
+    expected = 8e-5 * LENGTH
+    assert found[~bad].sum() < expected + 5.0 * math.sqrt(expected)
+
+
+@pytest.mark.parametrize('dof', [3.0, 5.0])
+def test_noise_that_is_heavy_tailed_throughout_has_no_jumps(dof):
+    """A tenth of all samples with a jump in them would be no events any more."""
+    samples, terms = made('heavy_tails', {'dof': dof}, 11)
+    gaussian = evaluate(samples, terms[:1])
+    view = view_of(samples, gaussian, gaussian.z, slice(0, samples.n))
+    assert catalogue()['jumps'].fit_law(view) is None
+    assert catalogue()['heavy_tails'].fit_law(view) is not None

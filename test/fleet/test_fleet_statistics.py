@@ -1,0 +1,160 @@
+"""False-alarm rates and power of what the fleet report says, on tables whose truth is known."""
+
+import math
+
+import numpy as np
+from ou_monitor.fleet.compare import values_of
+from ou_monitor.fleet.drift import fewest, holm, LEAST, trends
+from ou_monitor.fleet.judge import DRIFT_RATE, judge, OUTLIER_RATE
+from ou_monitor.fleet.outliers import outliers
+import pytest
+
+LEVELS = ((0.1, 20.0), (0.3, 30.0), (0.5, 10.0))
+# ln sigma over throttle, a curve like the paper's.
+SLOPE, BEND = 2.4, -1.5
+
+
+def table(rng: np.random.Generator, vehicles: int, flights: int, *, scatter: float = 0.08,
+          drift: dict | None = None, odd_flights: dict | None = None,
+          odd_vehicles: dict | None = None, levels=LEVELS) -> list[dict]:
+    """Return a fleet table: a row a level; effects are on ln sigma."""
+    rows = []
+    for v in range(vehicles):
+        vehicle = 0.15 * rng.standard_normal() + (odd_vehicles or {}).get(v, 0.0)
+        for f in range(1, flights + 1):
+            sigma = math.log(0.4) + vehicle + scatter * rng.standard_normal()
+            sigma += (drift or {}).get(v, 0.0) * f + (odd_flights or {}).get((v, f), 0.0)
+            alpha = math.log(63.0) + scatter * rng.standard_normal()
+            sag = -0.5 + 0.05 * rng.standard_normal()
+            for u, time in levels:
+                se = 0.2 / math.sqrt(time)
+                rows.append({
+                    'path': f'/f/uav{v}/{f}', 'vehicle': f'uav{v}', 'flight': f, 'throttle': u,
+                    'time_s': time, 'status': 'OK', 'sag': sag, 'sag_se': 0.02,
+                    'sigma': math.exp(sigma + (0.0 if u is None else SLOPE * u + BEND * u * u)
+                                      + se * rng.standard_normal()), 'sigma_se': se,
+                    'alpha': math.exp(alpha + 2 * se * rng.standard_normal()),
+                    'alpha_se': 2 * se})
+    return rows
+
+
+def test_the_curve_over_throttle_is_taken_out():
+    """Recordings at unlike throttles become comparable; neither vehicles nor outliers bend it."""
+    rng = np.random.default_rng(1)
+    rows = table(rng, 6, 12, scatter=0.02, odd_vehicles={0: 2.0},
+                 odd_flights={(1, 3): 3.0, (2, 5): -3.0})
+    # Vehicle 0, with four times the noise, flies only at high throttle.
+    rows = [row for row in rows if row['vehicle'] != 'uav0' or row['throttle'] > 0.2]
+    values = values_of(rows, 'sigma')
+    u = np.array([0.1, 0.5])
+    truth = SLOPE * u + BEND * u * u
+    found = values.curve(u)
+    # The error of a difference of levels: 0.2 / sqrt(time) in each of some 60 recordings.
+    error = 0.2 * math.sqrt(1.0 / 20.0 + 1.0 / 10.0) / math.sqrt(60.0)
+    assert found[1] - found[0] == pytest.approx(truth[1] - truth[0], abs=4.0 * error)
+    assert len(values.paths) == 72
+
+
+def test_recordings_without_throttle_or_estimate():
+    """The one is compared as it is, the other not at all; an empty table is no error."""
+    rng = np.random.default_rng(2)
+    rows = table(rng, 1, 6, levels=((None, 20.0),))
+    rows[0] |= {'status': 'TOO_SHORT', 'sigma': None, 'alpha': None, 'sag': None}
+    values = values_of(rows, 'sigma')
+    assert len(values.paths) == 5 and values.curve(np.array([0.7])) == 0.0
+    np.testing.assert_allclose(np.exp(values.value), [row['sigma'] for row in rows[1:]])
+    assert not judge([]).trends and not judge([]).odd_recordings()
+
+
+@pytest.mark.parametrize('sizes', [(4, 4, 4), (30, 5, 12, 4, 9)])
+def test_outliers_keep_their_rate(sizes):
+    """A normal fleet of any make shows a false alarm as often as is stated."""
+    rng = np.random.default_rng(3)
+    groups = [f'v{k}' for k, n in enumerate(sizes) for _ in range(n)]
+    n, runs, rate = len(groups), 400, 0.1
+    error = rng.uniform(0.02, 0.3, n)
+    alarms = 0
+    for k in range(runs):
+        value = rng.standard_normal(n) * np.hypot(0.1, error) + np.repeat(
+            rng.standard_normal(len(sizes)), sizes)
+        alarms += outliers(value, error, groups, rate, seed=k, simulations=300).found.any()
+    # Binomial error, and that of a quantile of 300 simulations; four of them.
+    spread = math.sqrt(rate * (1 - rate) * (1 / runs + 1 / 300 / 20)) + 0.01
+    assert abs(alarms / runs - rate) < 4.0 * spread
+
+
+def test_outliers_are_found():
+    """A flight five standard deviations off is named in nearly every fleet, and only that one."""
+    rng = np.random.default_rng(4)
+    groups = ['a'] * 20 + ['b'] * 20
+    hits = others = 0
+    for k in range(100):
+        value = 0.1 * rng.standard_normal(40)
+        value[7] += 0.6 * rng.choice((-1, 1))
+        found = outliers(value, np.full(40, 0.03), groups, OUTLIER_RATE, seed=k,
+                         simulations=500).found
+        hits += found[7]
+        others += found.any() and not (found.sum() == 1 and found[7])
+    # 0.6 / hypot(0.1, 0.03) is 5.7; the bound is near 3.6: missed with chance 2 % by the normal
+    # law; of 100 fleets 90 are four standard deviations below what is expected of that.
+    assert hits >= 90
+    assert others <= 5 + 4 * math.sqrt(100 * 0.05 * 0.95)
+
+
+def test_small_groups_and_unknown_vehicles_are_not_judged():
+    """No score, no alarm, however far off they are."""
+    value = np.array([0.0, 100.0, 0.0, 1.0, -1.0, 0.5, 50.0])
+    found = outliers(value, np.zeros(7), ['a', 'a', 'a', '', '', '', ''], 0.05)
+    assert np.isnan(found.score).all() and not found.found.any()
+    # Values that do not scatter at all are no division by zero.
+    assert not outliers(np.ones(8), np.zeros(8), ['a'] * 8, 0.05, simulations=50).found.any()
+
+
+def test_holm_is_holm():
+    """Against the definition, and monotone."""
+    p = np.array([0.04, 0.01, 0.03, 0.005])
+    np.testing.assert_allclose(holm(p), [0.06, 0.03, 0.06, 0.02])
+    assert holm(np.zeros(0)).size == 0 and holm(np.array([0.9, 0.8])).max() == 1.0
+
+
+def test_fewest_flights():
+    """With one fewer, even a perfect order is not rare enough."""
+    for tests in (1, 24, 150):
+        n = fewest(tests, 0.05)
+        assert 2.0 / math.factorial(n) <= 0.05 / tests
+        assert n == LEAST or 2.0 / math.factorial(n - 1) > 0.05 / tests
+    assert fewest(1, 0.05) == LEAST == 5
+
+
+def test_drift_keeps_its_rate():
+    """Fleets without drift show one in at most as many as stated."""
+    rng = np.random.default_rng(5)
+    runs = 100
+    alarms = 0
+    for _ in range(runs):
+        rows = table(rng, 5, 9, levels=LEVELS[:1])
+        tested = trends([values_of(rows, name) for name in ('sigma', 'alpha', 'sag')])
+        assert len(tested) == 15
+        alarms += any(t.p_family <= DRIFT_RATE for t in tested)
+    # Holm bounds the rate, and an exact test of few flights lies below: one-sided.
+    assert alarms / runs < DRIFT_RATE + 3.0 * math.sqrt(DRIFT_RATE * (1 - DRIFT_RATE) / runs)
+
+
+def test_drift_and_outliers_are_told_apart():
+    """One vehicle drifts, one is off the fleet, a flight is off its vehicle: each by its name."""
+    rng = np.random.default_rng(6)
+    right = slopes = 0
+    for _ in range(8):
+        judged = judge(table(rng, 20, 10, drift={2: 0.08}, odd_vehicles={4: 2.0},
+                             odd_flights={(6, 3): 0.9}))
+        trend = next((t for t in judged.drifting if t.vehicle == 'uav2'), None)
+        flights = {(q, judged.values[q].paths[k]) for q, k in judged.odd_recordings()}
+        vehicles = {(q, judged.vehicles[q].names[k]) for q, k in judged.odd_vehicles()}
+        right += (len(judged.drifting) == 1 and trend is not None
+                  and flights == {('sigma', '/f/uav6/3')} and vehicles == {('sigma', 'uav4')})
+        slopes += trend is not None and trend.low <= 0.08 <= trend.high
+    # Effects of 8 to 13 standard deviations are always seen; a false alarm beside them has a
+    # chance of at most 5 % + 5 %: of 8 fleets, 5 have one with chance 4e-4.
+    assert right >= 4
+    # 95 % intervals: fewer than 5 of 8 hold the truth with chance 4e-4.
+    assert slopes >= 5

@@ -1,0 +1,182 @@
+"""The parts of a fleet that touch disk and processes: workers that die, parts, what is found."""
+
+import errno
+import json
+import os
+from pathlib import Path
+import re
+import signal
+from types import SimpleNamespace
+
+from ou_monitor.errors import InputError
+from ou_monitor.fleet.cluster import LOST, Workers
+from ou_monitor.fleet.find import duplicates, find_recordings
+from ou_monitor.fleet.parts import Parts, write_whole
+from ou_monitor.fleet.vehicles import assign, natural, number_flights, read_pattern
+from ou_monitor.fleet.words import failure_words
+from ou_monitor.fleet.work import Options, work
+import pytest
+
+
+def deadly(task: int, folder: str) -> dict:
+    """Die by SIGKILL: always for task 3, the first time for task 5; else tell of the process."""
+    mark = Path(folder) / f'tried_{task}_{os.getpid()}'
+    mark.touch()
+    tries = len(list(Path(folder).glob(f'tried_{task}_*')))
+    if task == 3 or (task == 5 and tries == 1):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {'task': task, 'threads': {name: os.environ.get(name) for name in (
+        'OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')}}
+
+
+def test_a_worker_that_dies_is_one_row(tmp_path):
+    """What kills its worker twice is lost, after a retry alone; all the others are done."""
+    with Workers(2) as pool:
+        done = list(pool.each(deadly, [(k, str(tmp_path)) for k in range(8)]))
+    results = {k: result for k, result, why in done if not why}
+    assert {k: why for k, _, why in done if why} == {3: LOST}
+    assert sorted(results) == [0, 1, 2, 4, 5, 6, 7]
+    # Twice each, in two processes.
+    assert len(list(tmp_path.glob('tried_3_*'))) == len(list(tmp_path.glob('tried_5_*'))) == 2
+    # One thread of linear algebra in each, whatever the machine has.
+    assert all(set(result['threads'].values()) == {'1'} for result in results.values())
+
+
+def test_a_failure_names_its_path_once():
+    """A line of a file and a file of a folder stay with it."""
+    errors = {'/f/a.csv': '/f/a.csv:1: no column', '/f/bag': '/f/bag/bag_0.mcap is damaged',
+              '/f/b.mcap': '/f/b.mcap is empty', '/f/c': 'something else'}
+    fleet = SimpleNamespace(failed=[{'path': p, 'error': e} for p, e in errors.items()])
+    assert failure_words(fleet) == ['/f/a.csv:1: no column', '/f/bag/bag_0.mcap is damaged',
+                                    '/f/b.mcap: is empty', '/f/c: something else']
+
+
+def test_work_never_raises(tmp_path, monkeypatch):
+    """A bad file, a bug and a lack of memory are errors in the result."""
+    bad = tmp_path / 'bad.csv'
+    bad.write_text('time_s,voltage_v\n')
+    assert 'bad.csv' in work(str(bad), Options().as_data())['error']
+    for error, words in ((ZeroDivisionError('x'), 'ZeroDivisionError: x'),
+                         (MemoryError(), 'fewer workers')):
+        def broken(*_: object, error=error, **__: object) -> None:
+            raise error
+        monkeypatch.setattr('ou_monitor.fleet.work.read_recording', broken)
+        assert words in work(str(bad), Options().as_data())['error']
+
+
+def csv_file(path: Path, value: float = 1.0) -> Path:
+    """Write a short recording."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text('time_s,voltage_v\n' + ''.join(f'{k},{value}\n' for k in range(3)))
+    return path
+
+
+def test_bags_are_found_as_bags(tmp_path):
+    """A folder with metadata, or cut off before it was written, is one recording."""
+    (tmp_path / 'a' / 'whole').mkdir(parents=True)
+    (tmp_path / 'a' / 'whole' / 'metadata.yaml').touch()
+    (tmp_path / 'a' / 'whole' / 'anything.mcap').touch()
+    (tmp_path / 'a' / 'cut').mkdir()
+    for k in (0, 1):
+        (tmp_path / 'a' / 'cut' / f'cut_{k}.mcap').touch()
+    (tmp_path / 'b').mkdir()
+    for name in ('one.mcap', 'two.MCAP'):
+        (tmp_path / 'b' / name).touch()
+    csv_file(tmp_path / '.hidden' / 'flight.csv')
+    csv_file(tmp_path / 'out' / 'flight.csv')
+    found = find_recordings([str(tmp_path), str(tmp_path / 'b' / 'one.mcap'),
+                             str(tmp_path / 'a' / 'whole' / 'metadata.yaml')],
+                            leave_out=tmp_path / 'out')
+    assert [s.path.relative_to(tmp_path.resolve()).as_posix() for s in found.sources] == [
+        'a/cut', 'a/whole', 'b/one.mcap', 'b/two.MCAP']
+
+
+def test_copies_are_found_by_content_not_by_name(tmp_path):
+    """Equal bytes are equal, equal size is not; of three the oldest is the original."""
+    young, old, other = (csv_file(tmp_path / name) for name in ('a.csv', 'b.csv', 'c.csv'))
+    csv_file(tmp_path / 'd.csv', 2.0)
+    for path, stamp in ((young, 300), (old, 100), (other, 200)):
+        os.utime(path, (stamp, stamp))
+    found = duplicates(find_recordings([str(tmp_path)]).sources)
+    assert found == {young.resolve(): old.resolve(), other.resolve(): old.resolve()}
+
+
+def test_parts_hold_for_the_same_recording_and_options(tmp_path):
+    """A change of the file or of an option, or a torn part, makes the work be done again."""
+    path = csv_file(tmp_path / 'a.csv')
+
+    def source():
+        return find_recordings([str(path)]).sources[0]
+
+    parts = Parts(tmp_path / 'out', {'window': 2.0})
+    parts.save(source(), {'error': '', 'sigma': 0.1 + 0.2, 'nothing': float('nan')})
+    again = Parts(tmp_path / 'out', {'window': 2.0})
+    assert again.load(source())['sigma'] == 0.1 + 0.2
+    assert Parts(tmp_path / 'out', {'window': 3.0}).load(source()) is None
+    os.utime(path, ns=(1, 1))
+    assert again.load(source()) is None
+    os.utime(path, ns=(2, 2))
+    again.save(source(), {'error': ''})
+    (newest,) = [p for p in (tmp_path / 'out' / 'parts').glob('*.json')
+                 if json.loads(p.read_text()) == {'error': ''}]
+    newest.write_text('{"err')
+    assert again.load(source()) is None
+
+
+def test_a_disk_that_fills_up_leaves_the_old_file(tmp_path, monkeypatch):
+    """The file is there as it was, no draft is left, and the line says why."""
+    target = tmp_path / 'fleet.parquet'
+    write_whole(target, b'old')
+
+    def full(self: Path, content: bytes) -> int:
+        with open(self, 'wb') as file:
+            file.write(content[:1])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(Path, 'write_bytes', full)
+    with pytest.raises(InputError, match=re.escape(f"cannot write '{target}': No space left")):
+        write_whole(target, b'new and longer')
+    assert target.read_bytes() == b'old' and [p.name for p in tmp_path.iterdir()] == [target.name]
+
+
+def paths(*names: str) -> dict[Path, str]:
+    """Return recordings without a stated vehicle."""
+    return {Path(name): '' for name in names}
+
+
+def test_vehicle_rules():
+    """Metadata, then the pattern, then the folder, with more of its path where two share it."""
+    found, notes = assign({**paths('/f/uav1/a.csv', '/x/logs/a.csv', '/y/logs/a.csv'),
+                           Path('/z/b.mcap'): 'SN42'})
+    assert [v.name for v in found.values()] == ['uav1', 'x/logs', 'y/logs', 'SN42']
+    assert len(notes) == 1 and '1 vehicle by their metadata' in notes[0]
+    found, notes = assign({**paths('/f/uav1_007.csv', '/f/other.csv'),
+                           Path('/f/uav2_b.mcap'): 'SN42'}, read_pattern(r'(uav\d)_'))
+    assert [v.name for v in found.values()] == ['uav1', '', 'SN42']
+    assert any("'/f/other.csv': --vehicle-from finds no vehicle" in note for note in notes)
+    assert any('the metadata hold' in note for note in notes)
+    by_name, _ = assign(paths('/f/x_uav7.csv'), read_pattern(r'(x)_(?P<vehicle>uav\d)'))
+    assert [v.name for v in by_name.values()] == ['uav7']
+
+
+def test_ambiguous_vehicles_are_not_pooled():
+    """Beside recordings that name their vehicle, one that does not is compared with nothing."""
+    found, notes = assign({Path('/f/a.mcap'): 'SN1', Path('/f/b.mcap'): 'SN2',
+                           Path('/f/c.mcap'): ''})
+    assert [v.name for v in found.values()] == ['SN1', 'SN2', '']
+    assert any("'/f/c.mcap': no vehicle in the metadata" in note for note in notes)
+    found, notes = assign({Path('/f/a.mcap'): 'uav1', Path('/uav1/b.mcap'): ''})
+    assert any('check that it is one vehicle' in note for note in notes)
+
+
+def test_flights_are_in_order_of_date_or_else_of_name():
+    """A date that is missing or there twice makes it the order of the names, and is told."""
+    nan = float('nan')
+    names = [Path(f'/u/flight_{k}.csv') for k in (10, 9, 1)]
+    vehicles, _ = assign(dict.fromkeys(names, ''))
+    flights, notes = number_flights(vehicles, dict(zip(names, (1.0, 2.0, 3.0))))
+    assert [flights[path] for path in names] == [1, 2, 3] and not notes
+    for dates in ((1.0, 1.0, 2.0), (1.0, nan, 2.0)):
+        flights, notes = number_flights(vehicles, dict(zip(names, dates)))
+        assert [flights[path] for path in names] == [3, 2, 1]
+        assert 'order of their names' in notes[0]
+    assert sorted(['f10', 'f9', 'g1', 'f'], key=natural) == ['f', 'f9', 'f10', 'g1']

@@ -1,0 +1,186 @@
+"""The way from the wanted cutoff to the one in force, as time lines."""
+
+import math
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+from ou_monitor.online.filter.cutoff_control import (
+    Bound, CutoffControl, SampleInterval, time_constant)
+from ou_monitor.online.settings import FilterSettings
+import pytest
+
+NAN = math.nan
+DT = 0.01
+
+
+def control(**options):
+    """Return a control without smoothing, slew and dead band unless they are given."""
+    return CutoffControl(FilterSettings(**{
+        'smoothing': 0.0, 'slew': 0.0, 'dead_band': 0.0, **options}))
+
+
+def line(made, wanted, error=NAN, interval=0.0):
+    """Return the cutoffs for a time line of wanted ones."""
+    return [made.update(one, error, DT, interval) for one in wanted]
+
+
+def test_starts_at_the_first_wanted_and_follows():
+    assert line(control(), [100.0, 50.0, 50.0]) == [100.0, 50.0, 50.0]
+
+
+def test_starts_at_the_fallback_when_nothing_is_known():
+    made = control(fallback=60.0)
+    assert line(made, [NAN, NAN]) == [60.0, 60.0] and made.bound is Bound.FALLBACK
+
+
+def test_limits_saturate_and_say_which():
+    made = control()
+    assert line(made, [1.0]) == [20.0] and made.bound is Bound.LOWEST
+    assert line(made, [1e6]) == [150.0] and made.bound is Bound.HIGHEST
+    assert line(made, [70.0]) == [70.0] and made.bound is Bound.NONE
+
+
+def test_the_lowest_cutoff_follows_from_the_lag():
+    """45 degrees at 10 Hz with order 1: 10 Hz."""
+    made = control(order=1, max_lag=45.0)
+    assert line(made, [1.0]) == [pytest.approx(10.0)] and made.bound is Bound.LAG
+
+
+def test_the_sample_rate_bounds_even_the_lowest():
+    made = control()
+    assert line(made, [100.0], interval=0.01) == [45.0] and made.bound is Bound.RATE
+    assert line(made, [100.0], interval=0.05) == [9.0]
+    assert line(made, [100.0], interval=0.001) == [100.0]
+
+
+def test_smoothing_is_exponential_in_the_logarithm():
+    made = control(smoothing=0.2)
+    line(made, [100.0])
+    got = line(made, [25.0] * 40)
+    t = DT * np.arange(1, 41)
+    assert got == pytest.approx(list(25.0 * 4.0 ** np.exp(-t / 0.2)))
+    assert made.bound is Bound.SMOOTHING
+    assert line(made, [25.0] * 400)[-1] == 25.0 and made.bound is Bound.NONE
+
+
+@pytest.mark.parametrize('error, expected', [
+    (NAN, 0.2), (0.1, 0.2), (0.05, 0.1), (0.2, 0.4), (0.0, 0.05), (5.0, 0.8), (math.inf, 0.8)])
+def test_a_certain_sigma_moves_the_cutoff_faster(error, expected):
+    """Proportional to the error, within a factor of 4; not known: as given."""
+    s = FilterSettings()
+    assert time_constant(s, error) == pytest.approx(expected)
+    made = CutoffControl(FilterSettings(slew=0.0, dead_band=0.0))
+    line(made, [100.0])
+    got = line(made, [50.0], error)[0]
+    assert got == pytest.approx(50.0 * 2.0 ** math.exp(-DT / expected))
+
+
+def test_a_range_of_one_switches_confidence_off():
+    s = FilterSettings(smoothing_range=1.0)
+    assert {time_constant(s, error) for error in (0.001, 0.1, 10.0)} == {0.2}
+
+
+def test_the_time_constant_is_that_of_the_best_tracker():
+    """
+    A random walk seen with twice the error: least squares ask for twice the time constant.
+
+    Wandering of 0.01 a step, errors of 0.1 and 0.2; the best exponential
+    smoother is found by search over 200 000 steps, and its time constant is
+    within 15 % of error / wandering steps.
+    """
+    from scipy import signal
+    rng = np.random.default_rng(9)
+    walk = np.cumsum(0.01 * rng.standard_normal(200_000))
+    noise = rng.standard_normal(200_000)
+    best = []
+    for error in (0.1, 0.2):
+        scores = {}
+        for constant in np.geomspace(3.0, 60.0, 40):
+            gain = -math.expm1(-1.0 / constant)
+            seen = signal.lfilter([gain], [1.0, gain - 1.0], walk + error * noise)
+            scores[constant] = np.mean((seen - walk)[1000:] ** 2)
+        best.append(min(scores, key=scores.get))
+    assert best == pytest.approx([10.0, 20.0], rel=0.15)
+
+
+def test_slew_limits_octaves_per_second():
+    """4 octaves/s: from 150 to 37.5 Hz takes half a second, on a straight line in log2."""
+    made = control(slew=4.0)
+    line(made, [150.0])
+    got = line(made, [37.5] * 60)
+    assert got[:50] == pytest.approx(list(150.0 * 2.0 ** (-0.04 * np.arange(1, 51))))
+    assert got[50:] == pytest.approx([37.5] * 10)
+    assert line(made, [150.0])[0] < 40.0 and made.bound is Bound.SLEW
+
+
+def test_the_fallback_is_reached_within_the_slew_too():
+    made = control(slew=4.0, fallback=75.0)
+    line(made, [150.0])
+    got = line(made, [NAN] * 30)
+    assert got[0] == pytest.approx(150.0 * 2.0 ** -0.04)
+    assert made.cutoff == 75.0 and made.bound is Bound.FALLBACK
+
+
+def test_dead_band_holds_and_then_follows():
+    made = control(dead_band=0.1)
+    assert line(made, [100.0, 106.0, 94.0]) == [100.0] * 3
+    assert made.bound is Bound.DEAD_BAND
+    # The band lies around the cutoff that was taken last: 108 Hz, down to 100.8.
+    assert line(made, [108.0, 102.0, 100.0]) == [108.0, 108.0, 100.0]
+
+
+def test_after_the_fallback_the_dead_band_does_not_hold():
+    """A sigma that has come back is followed, however near it is; then the band is there again."""
+    made = control(dead_band=0.5, fallback=75.0)
+    assert line(made, [100.0, NAN, 80.0, 85.0]) == [100.0, 75.0, 80.0, 80.0]
+
+
+def test_configure_keeps_the_cutoff_within_the_new_limits():
+    made = control()
+    line(made, [100.0])
+    made.configure(FilterSettings(fmax=60.0, fallback=50.0))
+    assert made.cutoff == 60.0
+    made.configure(FilterSettings(fmin=5.0, fmax=200.0))
+    assert made.cutoff == 60.0
+
+
+def test_the_sample_interval_is_not_taken_in_by_gaps():
+    """1 kHz with a gap of half a second in it; pairs of messages; rates that change."""
+    interval = SampleInterval()
+    for _ in range(200):
+        interval.add(1e-3)
+    interval.add(0.5)
+    assert interval.mean == pytest.approx(1e-3)
+    for _ in range(1000):
+        interval.add(4e-3)
+    assert interval.mean == pytest.approx(4e-3, rel=0.01)
+    for dt in (0.1,) * 5:
+        interval.add(dt)
+    assert interval.mean == 0.1
+    for dt in (1e-6, 2e-3) * 300:
+        interval.add(dt)
+    assert interval.mean == pytest.approx(1e-3, rel=0.02)
+
+
+def test_a_first_stamp_far_away_is_soon_forgotten():
+    """From 0 to the wall clock in one step: six samples later the rate is known."""
+    interval = SampleInterval()
+    for dt in (1.7e9, *(1e-3,) * 5):
+        interval.add(dt)
+    assert interval.mean == 1e-3
+
+
+@settings(max_examples=200, deadline=None)
+@given(wanted=st.lists(st.one_of(st.floats(1e-3, 1e5), st.just(NAN)), min_size=1, max_size=50),
+       steps=st.lists(st.floats(1e-6, 10.0), min_size=50, max_size=50),
+       error=st.one_of(st.just(NAN), st.floats(0.0, 100.0)))
+def test_always_within_the_limits_and_the_slew(wanted, steps, error):
+    """Any time line, at the defaults."""
+    made = CutoffControl(FilterSettings())
+    before = None
+    for one, dt in zip(wanted, steps):
+        now = made.update(one, error, dt, 0.0)
+        assert 20.0 <= now <= 150.0
+        if before is not None:
+            assert abs(math.log2(now / before)) <= 4.0 * dt + 2e-6
+        before = now

@@ -1,0 +1,317 @@
+"""Each law against its derivation: integrals by quadrature, simulated noise, searched minima."""
+
+import math
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+from ou_monitor.online.filter.cutoff_laws import (
+    cutoff_for_noise, LAWS, relative_cutoff, supply_noise, wanted_cutoff)
+from ou_monitor.online.filter.filter_state import LowPassState
+from ou_monitor.online.filter.lowpass import AdaptiveLowPass
+from ou_monitor.online.filter.wiener import least_error, sampled_error, squared_error
+from ou_monitor.online.settings import FilterSettings, LAWS as NAMES
+import pytest
+from scipy import integrate, optimize, signal
+
+NAN = math.nan
+TWO_PI = 2.0 * math.pi
+
+
+def power(order, w, mode, u):
+    """Return |H|^2 at the angular frequency u."""
+    gain = 1.0 / (1.0 + (u / w) ** (2 * order))
+    return gain * u * u if mode == 'derivative' else gain
+
+
+def through(spectrum):
+    """Integrate a two-sided spectrum over all frequencies, in Hz, by its logarithm."""
+    return integrate.quad(lambda s: spectrum(math.exp(s)) * math.exp(s), -25.0, 35.0, limit=500,
+                          epsrel=1e-10, epsabs=0.0)[0] / math.pi
+
+
+def test_every_law_has_its_function():
+    assert {*LAWS, 'kalman', 'throttle'} == set(NAMES)
+
+
+@pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
+@pytest.mark.parametrize('order', [1, 2])
+@pytest.mark.parametrize('fc, alpha', [(5.0, 63.0), (40.0, 63.0), (150.0, 20.0), (3.0, 400.0)])
+def test_supply_noise_is_the_integral_over_the_spectrum(order, mode, fc, alpha):
+    """|H|^2 / (alpha^2 + u^2), by quadrature; and the cutoff is found again from the noise."""
+    w = TWO_PI * fc
+    expected = through(lambda u: power(order, w, mode, u) / (alpha * alpha + u * u))
+    got = supply_noise(mode, order, fc, alpha)
+    assert got == pytest.approx(expected, rel=1e-6)
+    assert cutoff_for_noise(mode, order, 0.7 * math.sqrt(got), 0.7, alpha) == pytest.approx(fc)
+
+
+@pytest.mark.parametrize('order', [1, 2])
+def test_noise_that_is_low_enough_needs_no_filter(order):
+    """The whole supply noise has the variance sigma^2 / (2 alpha)."""
+    whole = math.sqrt(1.0 / 126.0)
+    assert cutoff_for_noise('lowpass', order, 1.001 * whole, 1.0, 63.0) == math.inf
+    assert cutoff_for_noise('lowpass', order, 0.999 * whole, 1.0, 63.0) > 300.0
+    assert cutoff_for_noise('derivative', order, 1.0, 0.0, 63.0) == math.inf
+
+
+@pytest.mark.parametrize('mode, order, law', [
+    ('lowpass', 1, 2.0), ('lowpass', 2, 2.0), ('derivative', 2, 2.0 / 3.0)])
+def test_white_noise_is_held_by_the_power_of_its_order(mode, order, law):
+    """Variance of white noise through |H|^2, by quadrature, at the cutoff for 3 times sigma."""
+    assert relative_cutoff(mode, order, 150.0, 3.0, 0.0) == pytest.approx(150.0 / 3.0 ** law)
+    assert relative_cutoff(mode, order, 150.0, 3.0, 1e-6) == pytest.approx(
+        150.0 / 3.0 ** law, rel=5e-3)
+    rms = [math.sqrt(through(lambda u, fc=fc: power(order, TWO_PI * fc, mode, u)))
+           for fc in (150.0, relative_cutoff(mode, order, 150.0, 3.0, 0.0))]
+    assert 3.0 * rms[1] == pytest.approx(rms[0], rel=1e-6)
+
+
+@pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
+@pytest.mark.parametrize('order', [1, 2])
+@pytest.mark.parametrize('fc', [20.0, 150.0, 400.0])
+@pytest.mark.parametrize('times', [1.5, 4.0])
+def test_white_samples_come_out_alike(mode, order, fc, times):
+    """The sum of squares of the sampled impulse response is the variance."""
+    dt = 1e-3
+
+    def rms(cutoff):
+        state, samples, before = LowPassState(), [], 0.0
+        angle = TWO_PI * cutoff * dt
+        for x in (1.0, *np.zeros(6000)):
+            ends = (before, x) if mode == 'lowpass' else ((x - before) / dt,) * 2
+            samples.append(state.advance(order, angle, *ends))
+            before = x
+        return math.sqrt(sum(y * y for y in samples))
+    wanted = relative_cutoff(mode, order, fc, times, dt)
+    assert wanted < fc
+    assert times * rms(wanted) == pytest.approx(rms(fc), rel=1e-5)
+
+
+@pytest.mark.parametrize('mode, order', [
+    ('lowpass', 1), ('lowpass', 2), ('derivative', 1), ('derivative', 2)])
+def test_simulated_white_noise_comes_out_alike(mode, order):
+    """
+    White noise of 1, 2 and 4 times sigma_ref through the whole filter: one rms.
+
+    Bandwidths of at least 9 Hz over 40 s: 2 fc T = 750 independent outputs
+    and more, 2.6 % for one rms and 3.7 % for a ratio; 4 of these.  Without
+    the law the rms would be 2 and 4 times as large.  fc / fs is at most 0.03:
+    what is linear between samples passes less by (pi f dt)^2 / 3, below 1 %.
+    """
+    fs, rng = 5000.0, np.random.default_rng(11)
+    t = np.arange(int(40 * fs)) / fs
+    rms = []
+    for factor in (1.0, 2.0, 4.0):
+        f = AdaptiveLowPass(mode=mode, order=order, fmin=1.0, fmax=150.0, sigma_ref=0.3,
+                            dead_band=0.0)
+        y = f.filter(t, factor * rng.standard_normal(t.size), 0.3 * factor)
+        rms.append(float(np.std(y[2000:])))
+    assert [r / rms[0] for r in rms[1:]] == pytest.approx([1.0, 1.0], abs=0.16)
+
+
+@pytest.mark.parametrize('mode, order, wanted', [
+    ('lowpass', 1, 0.02), ('lowpass', 2, 0.02), ('derivative', 1, 5.0), ('derivative', 2, 5.0)])
+def test_simulated_supply_noise_comes_out_as_wanted(mode, order, wanted):
+    """
+    An OU supply coupled in: the rms is noise_wanted, for two sigmas, alpha told.
+
+    The slowest output has a correlation time near 1 / (2 pi fc) + 1 / alpha <
+    0.1 s, so 60 s hold 300 of them: 4 % for the rms, of which 4 are allowed.
+    Cutoffs are below fs / 30.
+    """
+    fs, alpha, coupling = 5000.0, 63.0, 0.5
+    n = int(60 * fs)
+    phi = math.exp(-alpha / fs)
+    noise = np.random.default_rng(7).standard_normal(n)
+    for sigma in (0.7, 1.5):
+        step = sigma * math.sqrt((1.0 - phi * phi) / (2.0 * alpha))
+        u = signal.lfilter([step], [1.0, -phi], noise)
+        f = AdaptiveLowPass(mode=mode, order=order, fmin=0.5, fmax=160.0, coupling=coupling,
+                            noise_wanted=wanted, dead_band=0.0)
+        y = f.filter(np.arange(n) / fs, coupling * u, sigma, alpha=alpha)
+        assert 0.5 < f.cutoff < 160.0
+        assert float(np.std(y[5000:])) == pytest.approx(wanted, rel=0.16)
+
+
+def test_coupling_alone_holds_the_level_of_sigma_ref():
+    s = FilterSettings(coupling=0.2, sigma_ref=0.3, fmin=0.1)
+    assert wanted_cutoff(s, 0.3, 63.0, NAN, 1e-3) == pytest.approx(s.fmax)
+    fc = wanted_cutoff(s, 0.4, 63.0, NAN, 1e-3)
+    assert 0.4 ** 2 * supply_noise('lowpass', 2, fc, 63.0) == pytest.approx(
+        0.3 ** 2 * supply_noise('lowpass', 2, s.fmax, 63.0))
+
+
+def test_wiener_of_order_1_is_the_pole_of_the_kalman_filter():
+    """The discrete Kalman filter of a finely sampled OU, by scipy's Riccati solver."""
+    from scipy import linalg
+    alpha, sigma, n0, dt = 63.0, 0.6, 2e-6, 1e-5
+    s = FilterSettings(law='wiener', order=1, n0=n0, fmin=1.0, fmax=1000.0, fallback=75.0)
+    phi = math.exp(-alpha * dt)
+    q = sigma ** 2 * -math.expm1(-2.0 * alpha * dt) / (2.0 * alpha)
+    r = n0 / dt
+    p = linalg.solve_discrete_are([[phi]], [[1.0]], [[q]], [[r]])[0, 0]
+    pole = phi * (1.0 - p / (p + r))
+    assert wanted_cutoff(s, sigma, alpha, NAN, 0.0) == pytest.approx(
+        -math.log(pole) / dt / TWO_PI, rel=1e-2)
+
+
+@pytest.mark.parametrize('order', [1, 2])
+def test_wiener_is_least_where_the_supply_is_fast(order):
+    """For sigma^2 / n0 >> alpha^2 the closed law is the minimum of the error, to 2 %."""
+    alpha, sigma, n0 = 2.0, 1.0, 1e-6
+    s = FilterSettings(law='wiener', order=order, n0=n0, fmin=1.0, fmax=1000.0, fallback=75.0)
+    best = optimize.minimize_scalar(
+        lambda level: squared_error(order, math.exp(level), (sigma, alpha), (0.0, alpha), n0),
+        bounds=(1.0, 9.0), method='bounded', options={'xatol': 1e-8}).x
+    for interval in (0.0, 1e-6):
+        assert wanted_cutoff(s, sigma, alpha, NAN, interval) == pytest.approx(
+            math.exp(best) / TWO_PI, rel=0.02)
+
+
+@pytest.mark.parametrize('fc', [20.0, 150.0, 400.0])
+def test_sampled_error_is_the_integral_over_the_circle(fc):
+    """Of the spectra of an AR(1) process and of white noise, by the trapezoidal rule."""
+    dt, alpha, var, white = 1e-3, 63.0, 0.003, 9e-4
+    z = np.exp(1j * np.linspace(-math.pi, math.pi, 1 << 16, endpoint=False))
+    angle, phi = TWO_PI * fc * dt, math.exp(-alpha * dt)
+    # The exact response to the line between samples: y' = w (x - y) over a step.
+    q = math.exp(-angle)
+    h = ((1.0 - (1.0 - q) / angle) + ((1.0 - q) / angle - q) / z) / (1.0 - q / z)
+    of_signal = var * (1.0 - phi * phi) / np.abs(1.0 - phi / z) ** 2
+    assert sampled_error(TWO_PI * fc, dt, alpha, var, white) == pytest.approx(float(np.mean(
+        np.abs(1.0 - h) ** 2 * of_signal + white * np.abs(h) ** 2)), rel=1e-9)
+
+
+@pytest.mark.parametrize('sigma', [0.05, 0.6, 5.0])
+def test_sampled_wiener_is_the_least(sigma):
+    """Of order 1 at 1 kHz, against a fine grid of the cutoffs within the limits."""
+    alpha, dt, white = 63.0, 1e-3, 9e-4
+    s = FilterSettings(law='wiener', order=1, n0=white * dt, fmin=2.0, fmax=440.0)
+    errors = [sampled_error(TWO_PI * fc, dt, alpha, sigma ** 2 / (2.0 * alpha), white)
+              for fc in (wanted_cutoff(s, sigma, alpha, NAN, dt), *np.geomspace(2.0, 440.0, 2001))]
+    assert errors[0] <= min(errors[1:]) * (1.0 + 1e-6)
+
+
+@pytest.mark.parametrize('poles', [1, 2])
+@pytest.mark.parametrize('order', [1, 2])
+def test_squared_error_is_the_integral_over_the_spectra(order, poles):
+    """What is lost of the signal, and what comes through of both noises."""
+    w, a, b, c, d, n0 = 120.0, 2.0, 30.0, 0.7, 63.0, 1e-4
+
+    def lost(u):
+        h = 1.0 / (1j * u / w + 1.0) if order == 1 else 1.0 / (
+            (1j * u / w) ** 2 + math.sqrt(2.0) * 1j * u / w + 1.0)
+        one = a * a / (b * b + u * u)
+        two = a * a * 2.0 * math.sqrt(2.0) * b ** 3 / (b ** 4 + u ** 4)
+        return abs(1.0 - h) ** 2 * (one if poles == 1 else two)
+    expected = through(lost) + through(
+        lambda u: power(order, w, 'lowpass', u) * (c * c / (d * d + u * u) + n0))
+    assert squared_error(order, w, (a, b), (c, d), n0, poles) == pytest.approx(
+        expected, rel=1e-6)
+
+
+@pytest.mark.parametrize('order', [1, 2])
+@pytest.mark.parametrize('sigma', [0.05, 0.3, 1.0, 3.0, 20.0])
+def test_least_error_is_the_least(order, sigma):
+    """Against a fine grid of the cutoffs within the limits."""
+    s = FilterSettings(law='wiener', order=order, fmin=2.0, fmax=200.0, signal_bandwidth=3.0,
+                       signal_rms=0.2, coupling=0.5, n0=1e-7)
+    rate = TWO_PI * 3.0
+    grid = np.geomspace(2.0, 200.0, 4001)
+
+    def error(fc):
+        return squared_error(order, TWO_PI * fc, (0.2 * math.sqrt(2.0 * rate), rate),
+                             (0.5 * sigma, 63.0), 1e-7)
+    assert error(least_error(s, sigma, 63.0)) <= min(map(error, grid)) * (1.0 + 1e-6)
+
+
+def test_wiener_with_a_bandwidth_beats_its_neighbours_in_simulation():
+    """A signal and supply noise drawn: cutoffs a factor of 2.5 off do worse."""
+    fs, n, alpha, sigma = 2000.0, 200_000, 63.0, 1.0
+    rng = np.random.default_rng(2)
+
+    def ou(rate, rms):
+        phi = math.exp(-rate / fs)
+        return signal.lfilter([rms * math.sqrt(1.0 - phi * phi)], [1.0, -phi],
+                              rng.standard_normal(n))
+    true = ou(TWO_PI * 2.0, 0.1)
+    seen = true + 0.5 * ou(alpha, sigma / math.sqrt(2.0 * alpha)) + 0.05 * rng.standard_normal(n)
+    options = {'order': 1, 'fmin': 0.2, 'fmax': 300.0, 'fallback': 20.0}
+    t = np.arange(n) / fs
+    f = AdaptiveLowPass(law='wiener', signal_bandwidth=2.0, signal_rms=0.1, coupling=0.5,
+                        n0=0.05 ** 2 / fs, **options)
+    errors = {1.0: np.mean((f.filter(t, seen, sigma) - true)[1000:] ** 2)}
+    for factor in (0.4, 2.5):
+        fixed = AdaptiveLowPass(law='threshold', sigma_ref=1e3, smoothing=0.0, **{
+            **options, 'fmax': f.cutoff * factor, 'fallback': f.cutoff * factor})
+        errors[factor] = np.mean((fixed.filter(t, seen, sigma) - true)[1000:] ** 2)
+    assert errors[1.0] < errors[0.4] and errors[1.0] < errors[2.5]
+    rate = TWO_PI * 2.0
+    assert errors[1.0] == pytest.approx(squared_error(
+        1, TWO_PI * f.cutoff, (0.1 * math.sqrt(2.0 * rate), rate), (0.5 * sigma, alpha),
+        0.05 ** 2 / fs), rel=0.15)
+
+
+@pytest.mark.parametrize('throttle, expected', [
+    (0.0, 75.0), (0.5, 75.0 + 75.0 * 0.625), (1.0, 150.0), (-0.2, 75.0), (1.7, 150.0)])
+def test_throttle_law_is_betaflights(throttle, expected):
+    """Expo 5, D-term limits 75..150 Hz."""
+    s = FilterSettings(law='throttle', fmin=75.0, fmax=150.0)
+    assert wanted_cutoff(s, NAN, NAN, throttle, 1e-3) == pytest.approx(expected)
+
+
+def test_throttle_law_with_full_expo_stays_within_fmax():
+    s = FilterSettings(law='throttle', expo=10.0)
+    assert max(wanted_cutoff(s, NAN, NAN, t, 1e-3) for t in np.linspace(0.0, 1.0, 101)) <= s.fmax
+
+
+@pytest.mark.parametrize('sigma, expected', [(0.3, 150.0), (0.301, 20.0), (0.0, 150.0)])
+def test_threshold_law(sigma, expected):
+    s = FilterSettings(law='threshold')
+    assert wanted_cutoff(s, sigma, NAN, NAN, 1e-3) == expected
+
+
+@pytest.mark.parametrize('law, more', [
+    ('threshold', {}), ('constant_noise', {}), ('constant_noise', {'coupling': 1.0}),
+    ('wiener', {'n0': 1e-6}), ('throttle', {})])
+def test_what_is_not_known_is_nan(law, more):
+    s = FilterSettings(law=law, **more)
+    for bad in (NAN, math.inf, -1.0):
+        assert math.isnan(wanted_cutoff(s, bad, NAN, NAN, 1e-3))
+
+
+@pytest.mark.parametrize('law, more', [
+    ('constant_noise', {}), ('constant_noise', {'coupling': 1.0, 'noise_wanted': 0.01}),
+    ('constant_noise', {'coupling': 1.0, 'noise_wanted': 5.0, 'mode': 'derivative'}),
+    ('threshold', {}),
+    ('wiener', {'signal_bandwidth': 3.0, 'signal_rms': 0.1, 'coupling': 1.0})])
+@pytest.mark.parametrize('order', [1, 2])
+def test_more_noise_never_raises_the_cutoff(law, more, order):
+    """Within the limits for sigmas over ten decades, 0 included."""
+    s = FilterSettings(law=law, order=order, **more)
+    cutoffs = [wanted_cutoff(s, sigma, 63.0, NAN, 1e-3)
+               for sigma in (0.0, *np.geomspace(1e-6, 1e4, 41))]
+    assert all(s.fmin <= fc <= s.fmax for fc in cutoffs)
+    assert all(b <= a * (1.0 + 1e-3) for a, b in zip(cutoffs, cutoffs[1:]))
+    assert cutoffs[0] == pytest.approx(s.fmax) and cutoffs[-1] == pytest.approx(s.fmin)
+
+
+ANY = st.floats(allow_nan=True, allow_infinity=True)
+SETTINGS = [FilterSettings(**{'mode': mode, 'order': order, **more}) for mode, more in (
+    *((mode, more) for mode in ('lowpass', 'derivative') for more in (
+        {}, {'law': 'threshold'}, {'law': 'throttle'}, {'coupling': 2.0},
+        {'coupling': 1e9, 'noise_wanted': 1e-9}, {'coupling': 1e-9, 'noise_wanted': 1e12})),
+    *(('lowpass', {'law': 'wiener', **more}) for more in (
+        {'n0': 1e-300}, {'n0': 1e12}, {'signal_bandwidth': 1e-3, 'signal_rms': 1e12, 'n0': 1e-9},
+        {'signal_bandwidth': 1e6, 'signal_rms': 1e-9, 'coupling': 1e9}))) for order in (1, 2)]
+
+
+@settings(max_examples=1000, deadline=None)
+@given(s=st.sampled_from(SETTINGS), sigma=ANY, alpha=ANY, throttle=ANY,
+       interval=st.one_of(st.just(0.0), st.floats(1e-9, 1e6)))
+def test_any_number_gives_a_cutoff_within_the_limits_or_nan(s, sigma, alpha, throttle, interval):
+    """Numbers from a topic may be anything; nothing overflows, and NaN is for the unknown."""
+    got = wanted_cutoff(s, sigma, alpha, throttle, interval)
+    known = (math.isfinite(throttle) if s.law == 'throttle' else
+             math.isfinite(sigma) and sigma >= 0.0)
+    assert s.fmin <= got <= s.fmax if known else math.isnan(got)

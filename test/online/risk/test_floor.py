@@ -1,0 +1,147 @@
+"""The floor: no model, every sample, and no lone glitch."""
+
+import math
+
+from hypothesis import given, settings as hypothesis_settings, strategies as st
+import numpy as np
+from ou_monitor.online.risk.floor import FloorWatch
+from ou_monitor.online.settings import MonitorSettings
+import pytest
+
+
+def watch(**changes):
+    """Return a watch at 4.3 V and 20 ms."""
+    return FloorWatch(MonitorSettings(**changes))
+
+
+def push(floor, voltages, rate=1000.0, start=0.0):
+    """Push samples at a rate, Hz."""
+    floor.push(start + np.arange(len(voltages)) / rate, voltages)
+
+
+@pytest.mark.parametrize('rate', [1.0, 10.0, 100.0, 1000.0, 1e5])
+def test_a_lone_glitch_does_not_trip_it(rate):
+    """Of any depth, at any rate; nor every third sample."""
+    floor = watch(stale_after=5.0)
+    good = [5.0] * 50
+    push(floor, good + [0.0] + good, rate)
+    assert not floor.take()
+    floor = watch(stale_after=5.0)
+    push(floor, [5.0, 5.0, 0.0] * 50, rate)
+    assert not floor.take()
+
+
+def test_the_first_sample_alone_does_not_trip_it():
+    floor = watch()
+    push(floor, [0.0])
+    assert not floor.take()
+
+
+@pytest.mark.parametrize('rate, needed', [(1.0, 2), (100.0, 2), (1000.0, 11), (1e4, 101)])
+def test_it_trips_within_half_of_its_time(rate, needed):
+    """More than half of the samples of 20 ms, or two of three when the source is slower."""
+    for count, trips in ((needed - 1, False), (needed, True)):
+        floor = watch(stale_after=5.0)
+        push(floor, [5.0] * 1000 + [4.3] * count, rate)
+        assert floor.take() is trips, count
+
+
+def test_a_sample_as_old_as_the_time_is_outside():
+    """Five samples lie within 1.25 s of a step of 0.25 s: three low ones are enough."""
+    floor = watch(brownout_floor_time=1.25)
+    push(floor, [5.0] * 20 + [4.0] * 3, rate=4.0)
+    assert floor.take()
+
+
+def test_a_dip_between_two_reports_is_not_lost():
+    """15 ms at 1 kHz within 50 ms: told once, and over."""
+    floor = watch()
+    push(floor, [5.0] * 20 + [4.0] * 15 + [5.0] * 300)
+    assert floor.take() and not floor.take()
+
+
+@pytest.mark.parametrize('voltage, low', [(4.3, True), (4.3001, False)])
+def test_at_the_floor_counts(voltage, low):
+    floor = watch()
+    push(floor, [voltage] * 50)
+    assert floor.take() is low
+    assert floor.take() is low
+
+
+@pytest.mark.parametrize('settings, floor', [
+    ({}, 4.3), ({'brownout_voltage': 3.0}, 2.8), ({'brownout_floor': 4.0}, 4.0),
+    ({'brownout_floor': 0.0}, 0.0), ({'brownout_voltage': 0.1}, 0.0)])
+def test_where_the_floor_is(settings, floor):
+    assert MonitorSettings(**settings).floor == pytest.approx(floor, abs=1e-12)
+
+
+def test_switched_off():
+    floor = watch(brownout_floor=0.0)
+    push(floor, [0.0] * 100)
+    assert not floor.take()
+
+
+def test_switched_off_while_low():
+    floor = watch()
+    push(floor, [4.0] * 100)
+    floor.settings = MonitorSettings(brownout_floor=0.0)
+    assert not floor.take()
+
+
+def test_what_is_not_finite_is_left_out():
+    floor = watch()
+    push(floor, [4.0, math.nan, math.inf, -math.inf, 4.0, math.nan])
+    floor.push([math.nan, math.inf], [5.0, 5.0])
+    assert floor.take()
+
+
+def test_bad_shapes_are_refused():
+    with pytest.raises(ValueError, match='shape'):
+        watch().push([0.0, 1.0], [5.0])
+
+
+def test_time_back_is_another_time_line():
+    """A step back of more than 1 s forgets; late samples of less are left out."""
+    floor = watch()
+    push(floor, [5.0] * 100, start=1000.0)
+    push(floor, [4.0] * 3, start=10.0)
+    assert floor.take()
+    floor = watch()
+    push(floor, [5.0] * 100, start=1000.0)
+    push(floor, [4.0] * 50, start=999.5)
+    assert not floor.take()
+
+
+def test_old_samples_do_not_outvote_a_new_one():
+    """Two low ones, an hour, a good one: good."""
+    floor = watch()
+    floor.push([0.0, 0.5], [4.0, 4.0])
+    assert floor.take()
+    floor.push(3600.0, 5.0)
+    assert not floor.take()
+
+
+@given(st.lists(st.tuples(st.floats(0.0, 0.02), st.sampled_from([4.0, 5.0])),
+                min_size=1, max_size=80), st.lists(st.integers(1, 20), max_size=40),
+       st.randoms())
+@hypothesis_settings(max_examples=200, deadline=None)
+def test_against_the_definition(steps, sizes, random):
+    """Batches of any size, shuffled inside: the median of the last 20 ms, three at least."""
+    t = np.cumsum([max(step, 1e-6) for step, _ in steps])
+    v = np.array([value for _, value in steps])
+    expected = []
+    for k in range(t.size):
+        inside = (t[:k + 1] > t[k] - 0.02) | (np.arange(k + 1) >= k - 2)
+        low = v[:k + 1][inside] <= 4.3
+        expected.append(np.sum(low) > 1 and np.mean(low) > 0.5)
+    floor, at = watch(), 0
+    for size in [*sizes, t.size]:
+        stop = min(at + size, t.size)
+        if stop > at:
+            order = list(range(at, stop))
+            random.shuffle(order)
+            was = floor.take()
+            floor.push(t[order], v[order])
+            assert floor.take() == any(expected[at:stop])
+            assert was == (at > 0 and expected[at - 1])
+        at = stop

@@ -1,0 +1,174 @@
+"""Which capacitance meets a risk: the root, the verdicts, the two risks, what falls."""
+
+from dataclasses import replace
+import math
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+from ou_monitor.model.passage.mean_time import mean_first_passage
+from ou_monitor.paper.network.components import PowerNetwork
+from ou_monitor.paper.network.design import (
+    default_voltage, design, row_of, Verdict, with_capacitance)
+from ou_monitor.paper.network.design_words import answer, effect, remarks
+from ou_monitor.paper.network.rail import rail_at
+import pytest
+
+QUESTION = {'voltage': 19.8, 'horizon': 5.0, 'risk': 1e-3}
+
+
+def test_the_least_capacitance_meets_the_risk_and_less_does_not():
+    network = PowerNetwork()
+    result = design(network, 0.4, **QUESTION)
+    assert result.verdict is Verdict.FOUND
+    assert result.least.risk <= 1e-3
+    assert result.least.risk == pytest.approx(1e-3, rel=1e-6)
+    less = with_capacitance(network, 0.99 * result.least.capacitance)
+    assert row_of(rail_at(less, 0.4), 19.8, 5.0).risk > 1.05e-3
+    assert result.present.capacitance == 470e-6 and result.present.risk > 0.99
+
+
+def test_adding_a_capacitor_lowers_alpha_and_the_variance():
+    """Both, as the theory has it, and the sentence says so."""
+    result = design(PowerNetwork(), 0.4, **QUESTION)
+    table = np.array([[r.alpha, r.var_inf, r.risk] for r in result.rows])
+    assert (np.diff(table, axis=0) <= 0.0).all() and result.falls
+    assert {(r.sag, r.mean) for r in result.rows} == {(result.present.sag, result.present.mean)}
+    words = effect(result)
+    assert 'alpha falls from 30391' in words and 'Var_inf falls from 0.161' in words
+    assert 'risk falls from 1.0 to 0.0010' in words and 'more slowly' in words
+
+
+def test_a_row_is_the_ou_of_the_rail():
+    """All derived numbers, from alpha and Var_inf alone."""
+    row = design(PowerNetwork(), 0.3, **QUESTION).present
+    assert row.tau * row.alpha == pytest.approx(1.0)
+    assert row.sigma**2 == pytest.approx(2.0 * row.alpha * row.var_inf)
+    barrier = (row.mean - 19.8) / math.sqrt(row.var_inf)
+    assert row.mean_time == pytest.approx(mean_first_passage(0.0, barrier) / row.alpha)
+    assert row.risk_ou == pytest.approx(1.0 - math.exp(-5.0 / row.mean_time))
+    assert row.risk_crossing == pytest.approx(1.0 - math.exp(-5.0 * row.crossing_rate))
+    assert row.risk == max(row.risk_ou, row.risk_crossing)
+    assert row.rate == max(1.0 / row.mean_time, row.crossing_rate)
+
+
+def test_parallel_capacitors_keep_esr_times_capacitance():
+    network = PowerNetwork()
+    more = with_capacitance(network, 940e-6)
+    assert (more.bulk_capacitance, more.bulk_esr) == (940e-6, pytest.approx(0.015))
+    assert with_capacitance(network, 940e-6, esr_follows=False).bulk_esr == 0.03
+
+
+def test_enough():
+    result = design(PowerNetwork(), 0.1, **QUESTION)
+    assert result.verdict is Verdict.ENOUGH
+    assert result.least.capacitance == pytest.approx(10e-6)
+    assert 'No more is needed' in answer(result)
+
+
+def test_a_fixed_esr_may_leave_no_capacitance():
+    result = design(PowerNetwork(), 0.4, esr_follows=False, **QUESTION)
+    assert result.verdict is Verdict.OUT_OF_RANGE and result.least is None
+    assert 'lower ESR' in answer(result)
+    wide = design(PowerNetwork(), 0.4, esr_follows=False, capacitances=(10e-6, 0.1), **QUESTION)
+    assert 'alpha rises' in effect(wide)
+
+
+def test_no_capacitor_helps_below_the_level_and_the_resistance_that_would_is_named():
+    """At the resistance told the mean of the bus is the level."""
+    for network in (PowerNetwork(), PowerNetwork(filter_inductance=10e-6)):
+        result = design(network, 0.9, **QUESTION)
+        assert result.verdict is Verdict.LEVEL and result.least is None
+        assert result.present.risk == 1.0 and result.present.mean_time == 0.0
+        there = replace(network, battery_resistance=result.resistance)
+        assert rail_at(there, 0.9).mean == pytest.approx(19.8, rel=1e-12)
+        assert f'less than {1e3 * result.resistance:.3g} mOhm' in answer(result)
+
+
+def test_a_level_above_the_battery_has_no_resistance():
+    result = design(PowerNetwork(), 0.4, voltage=23.0, horizon=5.0, risk=1e-3)
+    assert result.verdict is Verdict.LEVEL and math.isnan(result.resistance)
+    assert 'open-circuit' in answer(result)
+    regulated = design(PowerNetwork(), 0.4, rail='regulated', voltage=5.0, horizon=5.0, risk=1e-3)
+    assert regulated.verdict is Verdict.LEVEL and 'regulator_voltage' in answer(regulated)
+
+
+def test_no_noise():
+    result = design(PowerNetwork(), 0.0, **QUESTION)
+    assert result.verdict is Verdict.ENOUGH and result.present.risk == 0.0
+    assert math.isinf(result.present.mean_time) and result.present.sigma == 0.0
+    assert effect(result) == 'There is no noise at this throttle.'
+
+
+def test_a_capacitor_may_undo_the_damping_of_a_filter():
+    """Var_inf rises with C up to an oscillation; the answer says both, and keeps what is there."""
+    network = PowerNetwork(
+        battery_resistance=0.08, bulk_capacitance=100e-6, bulk_esr=0.002, current_max=40.0,
+        switching_scale=0.05, filter_inductance=22e-6, filter_resistance=0.003,
+        filter_capacitance=4.7e-6, filter_esr=0.01)
+    question = {'rail': 'regulated', 'voltage': 4.5, 'horizon': 5.0, 'risk': 1e-3}
+    result = design(network, 0.4, **question)
+    stable = [row.stable for row in result.rows]
+    assert stable[0] and not stable[-1] and sorted(stable, reverse=True) == stable
+    assert all(row.risk == 1.0 for row in result.rows if not row.stable)
+    assert result.verdict is Verdict.ENOUGH and result.least is None and not result.falls
+    assert 'Var_inf rises' in effect(result)
+    words = ' '.join(remarks(result))
+    for part in ('unstable', 'not simply more', 'resonance at'):
+        assert part in words
+    on_the_edge = replace(network, bulk_capacitance=240e-6)
+    assert 'With 480 uF the network is unstable' in effect(design(on_the_edge, 0.4, **question))
+    with pytest.raises(ValueError, match='unstable'):
+        design(replace(network, bulk_capacitance=1e-3), 0.4, **question)
+
+
+def test_slow_noise_is_told():
+    result = design(PowerNetwork(flutter=0.05), 0.4, **QUESTION)
+    assert any('rate of the noise' in text for text in remarks(result))
+    assert 'alpha stays at 33.3' in effect(result)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.floats(0.005, 0.2), st.floats(10e-6, 10e-3), st.floats(0.001, 0.3), st.floats(8e3, 96e3),
+       st.floats(0.05, 0.95), st.floats(1.05, 10.0), st.floats(1.8, 12.0), st.booleans())
+def test_without_filter_capacitance_lowers_the_risk(
+        resistance, capacitance, esr, frequency, throttle, factor, distance, follows):
+    """
+    For levels beyond sqrt(3) standard deviations, where d exp(-d^2/2) / Var falls with Var.
+
+    The crossing rate once the network is slower than the noise; that of the OU
+    when alpha stays or falls, as it always does when the ESR follows.
+    """
+    network = PowerNetwork(battery_resistance=resistance, bulk_capacitance=capacitance,
+                           bulk_esr=esr, current_max=50.0, esc_frequency=frequency)
+    here = rail_at(network, throttle)
+    more = rail_at(with_capacitance(network, factor * capacitance, follows), throttle)
+    level = here.mean - distance * math.sqrt(here.var_inf)
+    a, b = row_of(here, level, 1.0), row_of(more, level, 1.0)
+    if 1.0 / ((resistance + esr) * capacitance) < here.load.switching_rate:
+        assert b.crossing_rate <= a.crossing_rate * (1.0 + 1e-9)
+    if b.alpha <= a.alpha:
+        assert b.mean_time >= a.mean_time * (1.0 - 1e-9)
+    if follows:
+        assert b.alpha <= a.alpha * (1.0 + 1e-6)
+
+
+def test_default_levels():
+    assert default_voltage(PowerNetwork(cells=4, battery_voltage=14.8), 'bus')[0] == 4 * 3.3
+    assert default_voltage(PowerNetwork(), 'regulated')[0] == 4.5
+    assert default_voltage(PowerNetwork(regulator_voltage=3.3), 'regulated')[0] == 2.88
+    with pytest.raises(ValueError, match='regulated rail of 9 V'):
+        default_voltage(PowerNetwork(regulator_voltage=9.0), 'regulated')
+
+
+@pytest.mark.parametrize('changed, words', [
+    ({'risk': 0.0}, 'risk must be between'), ({'risk': 1.0}, 'risk must be between'),
+    ({'risk': math.nan}, 'risk must be between'), ({'horizon': 0.0}, 'horizon must be positive'),
+    ({'voltage': math.nan}, 'voltage must be positive'),
+    ({'voltage': -1.0}, 'voltage must be positive'),
+    ({'capacitances': (1e-3, 1e-4)}, 'least capacitance must be below'),
+    ({'capacitances': (0.0, 1e-4)}, 'least capacitance must be positive'),
+    ({'capacitances': (1e-5, math.inf)}, 'most capacitance must be positive'),
+    ({'rail': 'motor'}, 'rail must be')])
+def test_bad_questions_are_refused(changed, words):
+    with pytest.raises(ValueError, match=words):
+        design(PowerNetwork(), 0.4, **{**QUESTION, **changed})

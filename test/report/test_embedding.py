@@ -1,0 +1,175 @@
+"""The data inside the page: what was plotted, within the rounding stated, peaks never lost."""
+
+from hypothesis import given, strategies as st
+import numpy as np
+from ou_monitor.report import page
+from ou_monitor.report.embedding import embed, envelope
+from ou_monitor.report.figure import Curve
+from ou_monitor.report.svg import Plot
+from pages import parsed, self_contained, unpacked
+import pytest
+
+EVIL = '</script><img src=x onerror="alert(1)"/>]]>&amp;<!--'
+
+
+def noise(n, seed=0):
+    """Return a rail with noise and its stamps, scattered about 1 kHz."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) / 1000.0 + rng.uniform(-1e-4, 1e-4, n)
+    return np.sort(t) - t.min(), 4.9 + 0.05 * rng.standard_normal(n)
+
+
+def embedded(plot, **more):
+    """Return the curves as a browser reads them."""
+    return unpacked(embed(plot.svg().figure, **more))['curves']
+
+
+def test_short_columns_are_exact():
+    """Every bit, with gaps, infinities, repeated and unsorted x."""
+    x = np.array([0.0, 0.1, 0.1, np.nan, 7.0 / 3.0, -1.0])
+    y = np.array([1e-300, np.nan, np.inf, -1e300, 0.1, np.pi])
+    (curve,) = embedded(Plot('t', 'x', 'y').line(x, y))
+    assert np.array_equal(curve['x'], x, equal_nan=True)
+    assert np.array_equal(curve['y'], y, equal_nan=True)
+
+
+@pytest.mark.parametrize('scale, offset', [(1.0, 0.0), (1e-3, 101325.0), (1e12, 0.0),
+                                           (1e-9, 0.0)])
+def test_long_columns_are_within_the_rounding_stated(scale, offset):
+    """Of x, 1/2000 of a sample; of y, 2^-24 of the value or the range, whichever is less."""
+    t, y = noise(20000)
+    y = offset + scale * y
+    y[777] = np.nan
+    (curve,) = embedded(Plot('t', 'time, s', 'V').line(t, y))
+    # The last digit of float64 beside the rounding of the place on the grid.
+    assert np.abs(curve['x'] - t).max() <= np.median(np.diff(t)) / 2000.0 + 1e-12
+    assert np.array_equal(np.isnan(curve['y']), np.isnan(y))
+    bound = 2.0 ** -24 * np.minimum(np.abs(y), np.nanmax(y) - np.nanmin(y))
+    assert np.nanmax(np.abs(curve['y'] - y) / (bound + 1e-15 * np.abs(y))) <= 1.0
+
+
+@pytest.mark.parametrize('x', [np.geomspace(1e-3, 1e6, 9000), np.arange(9000.0)[::-1],
+                               np.full(9000, 2.0), np.r_[np.zeros(8999), np.nan]])
+def test_long_x_that_fits_no_grid_is_exact(x):
+    """Falling, constant, unknown, or spread over decades."""
+    for log in (False, True):
+        (curve,) = embedded(Plot('t', 'x', 'y', log_x=log).line(x, np.sin(x)))
+        assert np.allclose(curve['x'], x, rtol=0.0, equal_nan=True,
+                           atol=np.median(np.abs(np.diff(x[:-1]))) / 2000.0)
+
+
+def test_values_that_no_float32_holds_are_exact():
+    """Beyond its range, and below it on a logarithmic axis."""
+    x = np.arange(5000.0)
+    for odd, log in ((1e300, False), (1e-40, True)):
+        y = np.where(x == 3.0, odd, 1.0)
+        (curve,) = embedded(Plot('t', 'x', 'y', log_y=log).line(x, y))
+        assert np.array_equal(curve['y'], y)
+
+
+@given(st.lists(st.sampled_from([0.0, 1.0, 2.0, np.nan]), min_size=1, max_size=30))
+def test_steps_lose_nothing(values):
+    """Between and at all stamps the embedded steps hold the same value."""
+    y = np.array(values)
+    x = np.arange(float(y.size))
+    (curve,) = embedded(Plot('t', 'x', 'y').steps(x, y))
+    held = curve['y'][np.searchsorted(curve['x'], x, side='right') - 1]
+    assert np.array_equal(held, y, equal_nan=True) and curve['x'][-1] == x[-1]
+
+
+def test_separate_points_come_in_order():
+    """Dots and bars of any order, each with its own values; one without a place is left out."""
+    x, y = np.array([3.0, np.nan, 1.0, 2.0]), np.array([30.0, 5.0, 10.0, np.nan])
+    dots, bars = embedded(Plot('t', 'x', 'y').markers(x, y).bars(x, y, y + 1.0))
+    assert dots['x'].tolist() == bars['x'].tolist() == [1.0, 2.0, 3.0]
+    assert np.array_equal(dots['y'], [10.0, np.nan, 30.0], equal_nan=True)
+    assert np.array_equal(bars['high'], [11.0, np.nan, 31.0], equal_nan=True)
+
+
+@given(st.lists(st.sampled_from([0.0, -3.0, 5.0, 9.0, np.nan, np.inf]), min_size=1, max_size=40),
+       st.integers(2, 7))
+def test_an_envelope_keeps_every_extreme_and_every_gap(values, every):
+    """Of each group the lowest, the highest and a break, as a plain loop finds them."""
+    y = np.array(values)
+    x = np.arange(float(y.size))
+    line = envelope(Curve(x, y, None, '', 's0', 'line'), every)
+    assert np.all(np.diff(line.x) > 0.0) and np.array_equal(
+        line.y, y[line.x.astype(int)], equal_nan=True)
+    band = envelope(Curve(x, y, y + 1.0, '', 's0', 'band'), every)
+    for k, start in enumerate(range(0, y.size, every)):
+        part = y[start:start + every]
+        known = part[np.isfinite(part)]
+        kept = line.y[(line.x >= start) & (line.x < start + every)]
+        whole = kept[np.isfinite(kept)]
+        assert (~np.isfinite(kept)).any() == (~np.isfinite(part)).any()
+        assert whole.size == min(known.size, np.unique(known).size, 2)
+        assert set(whole) == ({known.min(), known.max()} if known.size else set())
+        assert np.isfinite(band.y[k]) == bool(known.size)
+        if known.size:
+            assert (band.y[k], band.high[k]) == (known.min(), known.max() + 1.0)
+
+
+def test_long_recordings_become_envelopes_that_say_so():
+    """Within the points allowed; the one peak is there; short curves beside stay as they are."""
+    t, y = noise(100_000)
+    y[54321] = 99.0
+    plot = Plot('t', 'time, s', 'V').line(t, y, 'voltage').line(t[:50], y[:50], 'short')
+    plot.band(t, y - 1.0, y + 1.0, 'band')
+    line, short, band = embedded(plot, most=9000)
+    assert line['x'].size + band['x'].size <= 9000
+    assert line['every'] > 1 and band['every'] > 1 and short['every'] == 1
+    assert short['x'].size == 50
+    assert line['y'].max() == pytest.approx(99.0) and band['high'].max() == pytest.approx(100.0)
+    assert abs(line['x'][line['y'].argmax()] - t[54321]) < np.median(np.diff(line['x'])) / 1999.0
+    assert all(curve['every'] == 1 for curve in embedded(plot))
+
+
+@pytest.mark.parametrize('seconds, most', [(134, 4.0), (600, 8.0)])
+def test_pages_stay_small(seconds, most):
+    """Voltage and throttle at 1 kHz, stamps that scatter: in megabytes, every sample inside."""
+    t, y = noise(1000 * seconds)
+    throttle = np.round(50.0 + 40.0 * np.sin(t), 0)
+    voltage = Plot('Voltage', 'time, s', 'V').line(t, y)
+    html = page.page('t', 's', [
+        page.figure(voltage.svg()),
+        page.figure(Plot('Throttle', 'time, s', '%').steps(t, throttle).svg())])
+    assert len(html) < 1e6 * most
+    assert embedded(voltage)[0]['x'].size == t.size
+
+
+def test_hostile_names_stay_names():
+    """In title, axes, curves, marks and shades: one text to parsers of HTML and of XML."""
+    plot = Plot(EVIL, EVIL, EVIL).line(np.arange(3.0), np.arange(3.0), EVIL)
+    plot.shade(0.0, 1.0, 2, EVIL).mark(0.5, EVIL)
+    script = embed(plot.svg().figure)
+    assert script.count('<') == 2 and script.count('>') == 2 and '&' not in script
+    found = unpacked(script)
+    assert found['title'] == found['curves'][0]['label'] == found['marks'][0][1] == EVIL
+    assert found['shades'][0][3] == EVIL
+    html = page.page(EVIL, EVIL, [page.figure(plot.svg(), EVIL)])
+    tree = self_contained(html)
+    assert len(list(tree.iter('script'))) == 2 and '<img' not in html
+
+
+def test_a_page_without_plots_has_no_script():
+    """Nothing to run, and the policy forbids all of it."""
+    self_contained(page.page('t', 's', [page.figure('', 'c')]))
+
+
+@pytest.mark.parametrize('label, name, unit', [
+    ('time, s', 'time', 's'), ('V', '', 'V'), ('V/\u221as', '', 'V/\u221as'),
+    ('PSD, V\u00b2/Hz', 'PSD', 'V\u00b2/Hz'),
+    ('10\u207b\u2076 V\u00b2', '', '10\u207b\u2076 V\u00b2'),
+    ('probability', 'probability', ''), ('Vpp/Vrms', 'Vpp/Vrms', ''), ('%', '', '%'),
+    ('1/s', '', '1/s'), ('rms, mV', 'rms', 'mV')])
+def test_axis_labels_hold_a_name_and_a_unit(label, name, unit):
+    """A tooltip shows the unit behind the value."""
+    y = unpacked(embed(Plot('t', 'x', label).svg().figure))['y']
+    assert (y['label'], y['name'], y['unit']) == (label, name, unit)
+
+
+def test_static_drawings_carry_no_data():
+    """A drawing by itself, as in doc/, is the drawing alone; on a page it is still there."""
+    drawing = Plot('t', 'x', 'y').line(np.arange(3.0), np.arange(3.0)).svg()
+    assert 'script' not in drawing
+    assert parsed(page.figure(drawing)).find('svg/svg/path') is not None

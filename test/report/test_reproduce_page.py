@@ -1,0 +1,156 @@
+"""All rows together, their words, and the page: complete, well formed, true to the rows."""
+
+from collections import Counter
+import re
+
+from ou_monitor.paper.reproduce import paper, reproduce as module
+from ou_monitor.paper.reproduce.row import Printed, Row, Verdict
+from ou_monitor.paper.reproduce.words import as_data, headline, recomputed
+from ou_monitor.report.reproduction_page import reproduction_page
+from pages import self_contained
+import pytest
+
+
+@pytest.fixture(scope='module')
+def result():
+    """Return a reproduction with fewer simulations; every row is there."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, 'CREST_PATHS', 200)
+        patch.setattr(module, 'JUMP_SECONDS', 10.0)
+        shares = []
+        found = module.reproduce(3, shares.append)
+    assert shares == sorted(shares) and shares[-1] == 1.0
+    return found
+
+
+@pytest.fixture(scope='module')
+def tree(result):
+    """Return the page, parsed as XML."""
+    html = reproduction_page(result, 'ou-monitor reproduce --seed 3')
+    return self_contained(html)
+
+
+def test_every_printed_number_has_its_row(result):
+    """All of Table 1, Fig. 5, Table 2 and what repeats them."""
+    texts = Counter((row.where, row.printed.text) for row in result.rows)
+    for state in paper.TABLE_1:
+        for printed in (state.vpp, state.amp, state.vrms):
+            assert texts['Table 1', printed.text] >= 1, printed.text
+    for printed in [paper.TAU_MS, *paper.SIGMA.values(), *paper.VAR_INF.values()]:
+        assert texts['Table 2', printed.text] == 1, printed.text
+    assert texts['Fig. 5', '63.0'] >= 1 and texts['Fig. 5', '368'] == 1
+    assert texts['Section 5', '11.22'] == 1
+    for where, _, printed, _ in paper.RESTATED:
+        assert texts[where, printed.text] >= 1, where
+    for where in ('Section 3.1', 'Section 3.3', 'Section 4.4', 'Section 4.5', 'Section 6'):
+        assert any(row.where == where for row in result.rows), where
+
+
+def test_rows_are_complete(result):
+    """Each is unique, says how, and says what it means in one sentence."""
+    keys = [(row.where, row.quantity) for row in result.rows]
+    assert len(set(keys)) == len(keys)
+    for row in result.rows:
+        assert row.how and row.sentence.endswith('.'), row.quantity
+        assert not re.search(r'\b(nan|inf)\b', row.sentence + row.how), row.quantity
+        assert not re.search(r'[.!?] [A-Z]', row.sentence), f'two sentences: {row.sentence}'
+
+
+def test_eight_points_rest_on_rows(result):
+    """Numbered 1 to 8, each with rows of its own and at least one number in its text."""
+    assert [point.number for point in result.points] == list(range(1, 9))
+    for point in result.points:
+        assert point.rows and re.search(r'\d', point.text) and 'nan' not in point.text
+    # Each point of THEORY is a claim of the paper that the rows refuse or cannot hold up.
+    doubted = {point.number for point in result.points
+               if any(row.verdict is not Verdict.AGREES for row in point.rows)}
+    assert doubted == set(range(1, 9))
+
+
+def test_points_hold_the_numbers_of_the_theory(result):
+    """Those that do not depend on chance, as THEORY prints them."""
+    texts = {point.number: point.text for point in result.points}
+    for number, words in (
+            (2, ['2 pi x 10.03 Hz']), (3, ['61.0, 61.1, 69.3, 126.5', 'alpha 56.5', '-14.7 mV']),
+            (4, ['50 % at 5 %', '17 % at 10 %', '8 % at 40 %', '1, 3, 6']),
+            (5, ['has 8.7', 'has 8.0', 'has 5.1']), (6, ['1.58', '0.50'])):
+        for word in words:
+            assert word in texts[number], (number, word)
+
+
+def test_headline_counts_the_rows(result):
+    """72 rows or however many there are, each in one of three counts."""
+    counts = Counter(row.verdict for row in result.rows)
+    numbers = [int(n) for n in re.findall(r'\d+', headline(result))]
+    assert numbers == [len(result.rows), counts[Verdict.AGREES], counts[Verdict.ROUNDING],
+                       counts[Verdict.DOES_NOT_HOLD]]
+    assert sum(numbers[1:]) == numbers[0]
+    data = as_data(result)
+    assert data['counts'] == {verdict.name: counts[verdict] for verdict in Verdict}
+    assert len(data['rows']) == numbers[0] and len(data['points']) == 8
+
+
+@pytest.mark.parametrize('printed, value, error, text', [
+    ('63.0', 63.04585, None, '63.05'), ('15.873', 15.873016, None, '15.8730'),
+    ('1', 0.99512, 0.0123, '0.995 +- 0.012'), ('500', 1004.4, 10.7, '1004 +- 11'),
+    ('368', 373.4, 123.0, '373 +- 123'), ('> 0', -1.0, None, '-1.000')])
+def test_digits_follow_the_error(printed, value, error, text):
+    """Two digits of error; without one, more digits than were printed."""
+    row = Row('Table 0', 'x', '', Printed(printed), value, 'how', 'Says.', error=error)
+    assert recomputed(row) == text
+
+
+def test_page_shows_every_row_and_figure(result, tree):
+    """One table row each, with its verdict; 9 drawings; headline and command."""
+    text = ' '.join(tree.itertext())
+    assert headline(result) in text and 'ou-monitor reproduce --seed 3' in text
+    cells = [[''.join(cell.itertext()) for cell in line] for line in tree.iter('tr')]
+    lines = [cell for cell in cells if cell[-1] in {v.value for v in Verdict}]
+    assert len(lines) == len(result.rows)
+    shown = [(cell[2], cell[-1]) for cell in lines]
+    parts = [row for _, rows in result.parts() for row in rows]
+    assert shown == [(row.printed.text, row.verdict.value) for row in parts]
+    assert len(list(tree.iter('figure'))) == 9
+
+
+def test_drawings_have_finite_coordinates(tree):
+    """Every number in every attribute of every drawing, and curves that are there."""
+    paths = 0
+    for drawing in tree.iter('svg'):
+        for element in drawing.iter():
+            for name, value in element.attrib.items():
+                if name not in ('class', 'aria-label', 'role', 'text-anchor'):
+                    assert not re.search(r'nan|inf', value), (element.tag, name)
+            if element.tag == 'path':
+                assert element.get('d'), 'an empty curve'
+                paths += 1
+    assert paths > 25
+
+
+def test_screens_are_in_steps_and_near_their_vrms(result):
+    """
+    Each sample a multiple of 6.25 mV; rms within the scatter of a 100 ms screen.
+
+    About 100 ms / (2 tau) = 3 independent values: the rms about zero scatters by some 35 %.
+    """
+    for screen in result.figures.screens:
+        steps = screen.u / 6.2503e-3
+        assert abs(steps - steps.round()).max() < 0.01
+        if screen.state is not paper.IDLE:
+            ratio = 1e3 * (screen.u ** 2).mean() ** 0.5 / screen.state.vrms.value
+            assert 0.2 < ratio < 2.5
+
+
+def test_spectra_follow_the_lorentzian(result):
+    """
+    At 100 Hz to 10 kHz within 25 %, and halved by the coupling at its corner.
+
+    Bins there average 7 segments and several lines, so each scatters by 12 % at most.
+    """
+    for found in result.figures.spectra:
+        use = (found.frequency > 100.0) & (found.frequency < 1e4)
+        sigma = 1e-3 * found.state.vrms.value * (2.0 * 63.0) ** 0.5
+        exact = 2.0 * sigma ** 2 / (63.0 ** 2 + (2.0 * 3.141592653589793
+                                                 * found.frequency[use]) ** 2)
+        assert abs(found.density[use] / exact - 1.0).max() < 0.25
+        assert abs(found.coupled[use] / exact - 1.0).max() < 0.25

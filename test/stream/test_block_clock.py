@@ -1,0 +1,139 @@
+"""The time line of samples that travel in blocks."""
+
+import numpy as np
+from ou_monitor.stream.blocks import BlockClock, FOLLOW
+import pytest
+
+RATE = 10_000.0
+N = 100
+LENGTH = N / RATE
+
+
+def run(ends, clock=None, n=N):
+    """Return the stamps of all blocks, one after another."""
+    clock = clock or BlockClock(RATE)
+    return np.concatenate([clock.stamps(end, n) for end in ends])
+
+
+def test_the_stamp_is_that_of_the_last_sample():
+    """The first block is laid out backwards from its stamp."""
+    t = BlockClock(RATE).stamps(5.0, 4)
+    np.testing.assert_allclose(t, [4.9997, 4.9998, 4.9999, 5.0], rtol=0, atol=1e-12)
+
+
+def test_jitter_does_not_show():
+    """Arrival 0..8 ms late leaves an even spacing, within the lean of 8 ms over FOLLOW."""
+    rng = np.random.default_rng(3)
+    ends = LENGTH * np.arange(1, 3001) + rng.uniform(0.0, 8e-3, 3000)
+    clock = BlockClock(RATE)
+    t = run(ends, clock)
+    step = np.diff(t) * RATE
+    # The correction of one block is at most error * length / FOLLOW, spread
+    # over the block: relative 8 ms / FOLLOW; rounding of t at 30 s adds 4e-11.
+    assert np.abs(step - 1.0).max() < 8e-3 / FOLLOW * 1.01 + 1e-10
+    assert clock.gaps == 0
+    # It does lean on the stamps: the mean delay is 4 ms, reached within 3 FOLLOW.
+    assert t[-1] - 3000 * LENGTH == pytest.approx(4e-3, abs=1e-3)
+
+
+@pytest.mark.parametrize('drift', [1e-4, -1e-4])
+def test_drift_is_followed(drift):
+    """A clock wrong by 100 ppm is followed at a lag of drift * FOLLOW, not left behind."""
+    blocks = round(100.0 / LENGTH)
+    ends = LENGTH * (1.0 + drift) * np.arange(1, blocks + 1)
+    clock = BlockClock(RATE)
+    t = run(ends, clock)
+    assert clock.gaps == 0
+    # After 10 FOLLOW the lag is settled to exp(-10); unfollowed it would be 10 ms.
+    assert ends[-1] - t[-1] == pytest.approx(drift * FOLLOW, rel=1e-2)
+    settled = np.diff(t[-1000:]) * RATE - 1.0
+    np.testing.assert_allclose(settled, drift, rtol=1e-2)
+
+
+@pytest.mark.parametrize('gap', [0.255, 0.5, -0.3])
+def test_a_gap_is_kept(gap):
+    """Beyond max(2 blocks, 0.25 s) the time line starts anew where the stamp says."""
+    ends = LENGTH * np.arange(1, 21)
+    ends[10:] += gap
+    clock = BlockClock(RATE)
+    t = run(ends, clock).reshape(20, N)
+    assert clock.gaps == 1
+    assert t[10, 0] - t[9, -1] == pytest.approx(gap + 1 / RATE, abs=1e-9)
+    np.testing.assert_allclose(t[:, -1], ends, rtol=0, atol=1e-9)
+
+
+def test_just_below_is_no_gap():
+    """19.9 ms at blocks of 10 ms is jitter."""
+    ends = LENGTH * np.arange(1, 21)
+    ends[10:] += 0.0199
+    clock = BlockClock(RATE)
+    t = run(ends, clock)
+    assert clock.gaps == 0
+    assert np.diff(t).max() * RATE < 1.0 + 0.0199 / FOLLOW * 1.01
+
+
+def test_two_long_blocks_are_no_gap():
+    """With blocks of 200 ms a difference of 350 ms is jitter, 450 ms is not."""
+    for late, gaps in ((0.35, 0), (0.45, 1)):
+        clock = BlockClock(1000.0)
+        run([0.2, 0.4 + late], clock, n=200)
+        assert clock.gaps == gaps
+
+
+def test_blocks_of_any_length():
+    """The time line goes on over blocks of changing and of no length."""
+    clock = BlockClock(1000.0)
+    t = np.concatenate([clock.stamps(0.010, 10), clock.stamps(0.010, 0), clock.stamps(0.013, 3)])
+    np.testing.assert_allclose(t, np.arange(1, 14) / 1000.0, rtol=0, atol=1e-12)
+
+
+def test_a_clock_since_1970_is_no_worse():
+    """Adding up must not collect the rounding of large stamps: one of 2^-22 s remains."""
+    ends = 1_704_067_200.0 + LENGTH * np.arange(1, 2001)
+    t = run(ends)
+    exact = np.arange(1, 2000 * N + 1) / RATE
+    assert np.abs(t - 1_704_067_200.0 - exact).max() <= 1.02 * 2.0**-22
+
+
+def test_reset_forgets():
+    """After a reset the next stamp counts, and it is no gap."""
+    clock = BlockClock(RATE)
+    clock.stamps(100.0, N)
+    clock.reset()
+    assert clock.stamps(1.0, N)[-1] == 1.0
+    assert clock.gaps == 0
+
+
+@pytest.mark.parametrize('rate', [0.0, -1.0, float('nan'), float('inf')])
+def test_rates_that_are_none(rate):
+    """A caller's bug."""
+    with pytest.raises(ValueError, match='Hz'):
+        BlockClock(rate)
+
+
+def test_stamps_that_are_none():
+    """A caller's bug."""
+    with pytest.raises(ValueError, match='finite'):
+        BlockClock(RATE).stamps(float('nan'), 1)
+    with pytest.raises(ValueError, match='-1'):
+        BlockClock(RATE).stamps(1.0, -1)
+
+
+@pytest.mark.parametrize('lengths', [[100], [100, 100, 7, 0, 1, 250]])
+def test_many_at_once(lengths):
+    """The same bits as one by one, over gaps and batches, and the same gaps counted."""
+    rng = np.random.default_rng(5)
+    n = np.array(lengths * 12, dtype=np.int64)
+    ends = 1.7e9 + np.cumsum(n) / RATE + rng.uniform(0.0, 8e-3, n.size)
+    ends[30:] += 4.0
+    ends[7:] += 1.0
+    one, many = BlockClock(RATE), BlockClock(RATE)
+    expected = np.concatenate([one.stamps(end, k) for end, k in zip(ends, n.tolist())])
+    found = np.concatenate([many.stamps_of_many(ends[part], n[part])
+                            for part in (slice(0, 5), slice(5, 5), slice(5, None))])
+    np.testing.assert_array_equal(found.view(np.uint64), expected.view(np.uint64))
+    assert one.gaps == many.gaps >= 1
+    with pytest.raises(ValueError, match='finite'):
+        many.stamps_of_many(np.array([np.nan]), np.array([3]))
+    with pytest.raises(ValueError, match='-3'):
+        many.stamps_of_many(np.array([1.0]), np.array([-3]))

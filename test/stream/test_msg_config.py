@@ -1,0 +1,147 @@
+"""What msg_config/*.yaml says, and what is said about one that is wrong."""
+
+import shutil
+
+from ou_monitor.errors import InputError
+from ou_monitor.stream.config import list_msg_configs, load_msg_config, msg_config_dir
+import pytest
+import yaml
+
+SHIPPED = {'std_float32', 'std_float64', 'adc_block', 'battery_state', 'px4', 'mavros',
+           'ardupilot_dds'}
+
+GOOD = {
+    'description': 'a rail', 'package': 'my_msgs', 'install': 'my_msgs', 'generic': False,
+    'voltage': {'topic': '/rail', 'type': 'my_msgs/msg/Rail', 'field': 'cells[0].mv',
+                'unit_factor': 1.0e-3, 'sign': -1, 'offset': 0.5, 'nan': 'unknown',
+                'stamp_field': 'stamp_us', 'stamp_factor': 1.0e-6},
+    'throttle': None,
+}
+
+
+def written(tmp_path, change=None, part=None, name='rail.yaml'):
+    """Write GOOD with some keys changed; return the file."""
+    content = {**GOOD, 'voltage': dict(GOOD['voltage'])}
+    (content if part is None else content[part]).update(change or {})
+    path = tmp_path / name
+    path.write_text(yaml.safe_dump(content), encoding='utf-8')
+    return path
+
+
+def test_the_shipped_ones_load():
+    """Every file of the package is valid, and all that were promised are there."""
+    configs = list_msg_configs()
+    assert set(configs) >= SHIPPED
+    for name, config in configs.items():
+        assert config.name == name
+        assert config.description and config.install
+        assert config.generic == (not config.voltage.topic.startswith('/'))
+
+
+def test_a_file_says_what_it_says(tmp_path):
+    """Every key reaches the record."""
+    config = load_msg_config(written(tmp_path))
+    spec = config.voltage
+    assert (config.name, config.package, config.generic) == ('rail', 'my_msgs', False)
+    assert (spec.topic, spec.field) == ('/rail', 'cells[0].mv')
+    assert (spec.unit_factor, spec.sign, spec.offset) == (1e-3, -1, 0.5)
+    assert (spec.nan, spec.stamp_field, spec.stamp_factor) == ('unknown', 'stamp_us', 1e-6)
+    assert spec.sample_rate is None
+    assert config.throttle is None
+
+
+def test_px4_throttle_is_mapped_to_0_1():
+    """The stick is -1..1 in PX4."""
+    spec = load_msg_config('px4').throttle
+    ends = [spec.sign * spec.unit_factor * raw + spec.offset for raw in (-1.0, 1.0)]
+    assert ends == [0.0, 1.0]
+
+
+@pytest.mark.parametrize('part, change, expected', [
+    ('voltage', {'unit_facto': 1.0}, ["unknown key 'unit_facto'", "'unit_factor'", 'voltage']),
+    (None, {'descripton': 'x'}, ["unknown key 'descripton'", "'description'"]),
+    (None, {'generic': 'yes'}, ["'generic'", 'true or false', "'yes'"]),
+    (None, {'voltage': None}, ["'voltage'", 'None']),
+    ('voltage', {'unit_factor': '1e-3'}, ["'unit_factor'", 'a number', '1.0e-3']),
+    ('voltage', {'unit_factor': True}, ["'unit_factor'", 'a number', 'True']),
+    ('voltage', {'unit_factor': -1.0}, ["'unit_factor'", 'sign']),
+    ('voltage', {'offset': float('nan')}, ["'offset'", 'finite']),
+    ('voltage', {'sign': 2}, ['sign', '1 or -1', '2']),
+    ('voltage', {'nan': 'dorp'}, ["'dorp'", "'drop'"]),
+    ('voltage', {'sample_rate': 0}, ['sample_rate', 'above 0']),
+    ('voltage', {'sample_rate': -5.0}, ['sample_rate', 'above 0']),
+    ('voltage', {'type': 'my_msgs/Rail'}, ["'my_msgs/Rail'", 'package/msg/Type']),
+    ('voltage', {'topic': 'a b'}, ["'a b'", 'topic']),
+    ('voltage', {'field': 'cells[x]'}, ["'cells[x]'"]),
+    ('voltage', {'stamp_field': 3}, ["'stamp_field'", 'text or null', '3']),
+])
+def test_a_mistake_is_named(tmp_path, part, change, expected):
+    """One line: file, key, and what to write instead."""
+    path = written(tmp_path, change, part)
+    with pytest.raises(InputError) as caught:
+        load_msg_config(path)
+    text = str(caught.value)
+    assert '\n' not in text
+    for words in [str(path), *expected]:
+        assert words in text
+
+
+@pytest.mark.parametrize('key', ['topic', 'type', 'field'])
+def test_a_missing_key_is_named(tmp_path, key):
+    """A source without a topic, type or field is none."""
+    content = {**GOOD, 'voltage': {k: v for k, v in GOOD['voltage'].items() if k != key}}
+    path = tmp_path / 'rail.yaml'
+    path.write_text(yaml.safe_dump(content), encoding='utf-8')
+    with pytest.raises(InputError, match=f"voltage: key '{key}' is missing"):
+        load_msg_config(path)
+
+
+@pytest.mark.parametrize('text, expected', [
+    ('a: [', 'not YAML'), ('', 'expected keys'), ('- 1\n', 'expected keys')])
+def test_a_file_that_is_no_mapping(tmp_path, text, expected):
+    """Broken YAML and empty files are one line."""
+    path = tmp_path / 'rail.yaml'
+    path.write_text(text, encoding='utf-8')
+    with pytest.raises(InputError, match=expected) as caught:
+        load_msg_config(path)
+    assert '\n' not in str(caught.value)
+
+
+def test_unknown_name_and_missing_file(tmp_path):
+    """The nearest name is offered."""
+    with pytest.raises(InputError, match="no msg config 'batery_state'.*'battery_state'"):
+        load_msg_config('batery_state')
+    with pytest.raises(InputError, match='nowhere.yaml'):
+        load_msg_config(tmp_path / 'nowhere.yaml')
+    with pytest.raises(InputError, match='no folder'):
+        list_msg_configs(tmp_path / 'nowhere')
+
+
+def test_a_folder_of_ones_own(tmp_path):
+    """Names are looked up in the folder given."""
+    written(tmp_path)
+    assert list(list_msg_configs(tmp_path)) == ['rail']
+    assert load_msg_config('rail', tmp_path).voltage.topic == '/rail'
+    with pytest.raises(InputError, match="'rail'"):
+        load_msg_config('rails', tmp_path)
+
+
+@pytest.mark.parametrize('layout', [
+    'lib/python3.12/site-packages', 'local/lib/python3.12/dist-packages',
+    'install/ou_monitor/lib/python3.12/site-packages'])
+def test_found_when_installed(tmp_path, monkeypatch, layout):
+    """It is found from the package's place under a prefix, as pip and colcon lay it out."""
+    package = tmp_path / layout / 'ou_monitor' / 'messages'
+    package.mkdir(parents=True)
+    prefix = tmp_path / layout.split('lib/')[0]
+    share = prefix / 'share' / 'ou_monitor' / 'msg_config'
+    shutil.copytree(msg_config_dir(), share)
+    monkeypatch.setattr('ou_monitor.stream.config.__file__', str(package / 'config.py'))
+    assert msg_config_dir() == share
+
+
+def test_not_found_is_one_line(tmp_path, monkeypatch):
+    """An installation without its data says so."""
+    monkeypatch.setattr('ou_monitor.stream.config.__file__', str(tmp_path / 'a/b/c/config.py'))
+    with pytest.raises(InputError, match='no msg_config folder'):
+        msg_config_dir()

@@ -1,0 +1,23 @@
+"""Recordings with known truth, for the tests of the bench."""
+
+import numpy as np
+from ou_monitor.model.ou import simulate
+from ou_monitor.records import Recording
+
+ALPHA = 63.0
+
+
+def recording(seed: int, levels=((0.1, 0.3156), (0.4, 0.632)), seconds: float = 10.0,
+              rate: float = 1000.0, sag: float = -0.5, name: str = 'made') -> Recording:
+    """Return an OU of rate ALPHA that holds each (throttle, sigma) for some seconds."""
+    t = np.arange(int(round(seconds * rate)) * len(levels)) / rate
+    which = np.minimum((t / seconds + 1e-9).astype(int), len(levels) - 1)
+    throttle = np.array([level for level, _ in levels])[which]
+    sigma = np.array([value for _, value in levels])[which]
+    voltage = simulate(t, ALPHA, sigma, np.random.default_rng(seed), u0=5.0 + sag * throttle)
+    return Recording(t, voltage, throttle, name)
+
+
+def without_throttle(made: Recording) -> Recording:
+    """Return the same recording with its throttle unknown."""
+    return Recording(made.t, made.voltage, np.full(made.n, np.nan), made.name)

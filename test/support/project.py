@@ -1,0 +1,21 @@
+"""The files of the project, for the tests that look at or copy all of them."""
+
+from pathlib import Path
+import subprocess
+
+ROOT = Path(__file__).resolve().parents[2]
+# What running the project makes; in an unpacked archive there is no git to say so.
+MADE = {'.venv', 'build', 'install', 'log', 'out', '__pycache__', '.git', '.hypothesis',
+        '.pytest_cache', '.mypy_cache', 'ou_monitor.egg-info'}
+
+
+def project_files() -> list[Path]:
+    """Return the files of the project: those that git tracks or would track."""
+    listed = subprocess.run(
+        ['git', 'ls-files', '--cached', '--others', '--exclude-standard', '-z'],
+        cwd=ROOT, capture_output=True, check=False)
+    if (ROOT / '.git').exists() and listed.returncode == 0:
+        names = listed.stdout.decode().split('\0')
+        return [ROOT / name for name in names if name and (ROOT / name).is_file()]
+    return [path for path in ROOT.rglob('*')
+            if path.is_file() and not MADE & set(path.relative_to(ROOT).parts)]
