@@ -24,8 +24,9 @@ from typing import Any
 from mcap.writer import CompressionType, IndexType
 import numpy as np
 from ou_monitor.recordings.bag import BagWriter
-from ou_monitor.recordings.cdr import encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY
 from ou_monitor.recordings.read import read_pieces, read_recording
+from ou_monitor.recordings.standard_types import (
+    encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY)
 from reading_bags import BLOCK, cases, messages, write
 from reading_peers import check, mcap_ros2, ours, recording, rosbags, unpacked
 from tables import table

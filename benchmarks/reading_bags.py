@@ -9,9 +9,8 @@ from typing import Any
 
 from mcap.writer import Writer
 import numpy as np
-from ou_monitor.recordings.cdr import (
-    BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY)
-from ou_monitor.recordings.schemas import SCHEMAS
+from ou_monitor.recordings.standard_types import (
+    BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, SCHEMAS)
 from rosbags.typesys import get_typestore, Stores
 
 THROTTLE = '/throttle'

@@ -10,8 +10,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 import numpy as np
 from ou_monitor.recordings.bag import BagReader
-from ou_monitor.recordings.batches import batches
-from ou_monitor.recordings.columns import join
+from ou_monitor.recordings.columns import batches, join
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.recordings.topic_choice import choose
 from ou_monitor.records import Recording

@@ -109,9 +109,8 @@ def _check_new(out: Path) -> None:
 def _convert(args: argparse.Namespace, log: Any) -> int:
     from dataclasses import replace
 
-    from ou_monitor.recordings.importers.choose import choose
-    from ou_monitor.recordings.importers.held import drop_held
-    from ou_monitor.recordings.write_log import write_log
+    from ou_monitor.recordings.importers.choose import choose, drop_held
+    from ou_monitor.recordings.write import write_log
 
     chosen = choose(args.log, log, voltage=args.voltage, throttle=args.throttle,
                     current=args.current)

@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     start, end = part_of_recording(args.start, args.end)
 
     from ou_monitor.coupling.coupling import estimate_coupling
-    from ou_monitor.recordings.read_signal import read_signal
+    from ou_monitor.recordings.read import read_signal
 
     recording = read_given(args, start, end)
     t, values = read_signal(args.recording, args.signal, partial=args.partial)

@@ -8,9 +8,8 @@ from typing import Any
 
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.nodes.message_types import message_class
-from ou_monitor.stream.config import FieldSpec
+from ou_monitor.stream.config import FieldPath, FieldSpec, parse_field_path
 from ou_monitor.stream.extract import Extractor
-from ou_monitor.stream.field_path import FieldPath, parse_field_path
 
 
 @dataclass(frozen=True)

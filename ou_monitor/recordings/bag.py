@@ -7,20 +7,21 @@ take both classes from here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+import shutil
 from types import TracebackType
-from typing import Any
+from typing import Any, BinaryIO
 
 from mcap.writer import CompressionType, Writer
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag_reader import BagReader, DecodedMessage
-from ou_monitor.recordings.bag_target import BagTarget
 from ou_monitor.recordings.mcap_file import RawMessage
 from ou_monitor.recordings.mcap_index import ABOUT, ORIGIN, SAMPLE_RATE
-from ou_monitor.recordings.rosbag2_metadata import qos_profile, TopicInfo
-from ou_monitor.recordings.schemas import SCHEMAS, TYPE_HASHES
+from ou_monitor.recordings.rosbag2_metadata import qos_profile, TopicInfo, write_metadata
+from ou_monitor.recordings.standard_types import SCHEMAS, TYPE_HASHES
 import yaml
 
 __all__ = ['BagReader', 'BagWriter', 'DecodedMessage', 'RawMessage', 'TopicInfo']
@@ -28,6 +29,65 @@ __all__ = ['BagReader', 'BagWriter', 'DecodedMessage', 'RawMessage', 'TopicInfo'
 # Small chunks: a recording cut off by the brown-out it was made for loses what
 # is in the last one, here about a second at 1 kHz.
 CHUNK_SIZE = 128 * 1024  # bytes
+
+
+class BagTarget:
+    """
+    A new .mcap file, or a new rosbag2 directory with one in it.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        Ends in .mcap for a file; else a directory is made.
+
+    Attributes
+    ----------
+    file : binary file
+        The MCAP file, open for writing.
+
+    Raises
+    ------
+    InputError
+        When the target exists, its folder does not, or it cannot be written.
+
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the target; nothing that exists is touched."""
+        self.path = path
+        self._folder = None if path.suffix == '.mcap' else path
+        if path.exists() or path.is_symlink():
+            raise InputError(f'{path} exists already: remove it or choose another name')
+        if not path.parent.is_dir():
+            raise InputError(f'cannot write {path}: there is no folder {path.parent}')
+        self._mcap = path
+        try:
+            if self._folder is not None:
+                self._folder.mkdir()
+                self._mcap = self._folder / f'{path.name}_0.mcap'
+            self.file: BinaryIO = self._mcap.open('xb')
+        except OSError as error:
+            raise InputError(f'cannot write {path}: {error.strerror}') from error
+
+    def finish(
+        self, topics: Iterable[TopicInfo], hashes: dict[str, str], start_ns: int, end_ns: int,
+        custom: Mapping[str, str] | None = None,
+    ) -> None:
+        """Close the file and, in a directory, write its metadata.yaml."""
+        self.file.close()
+        if self._folder is not None:
+            write_metadata(self._folder, self._mcap.name, topics, hashes, start_ns, end_ns,
+                           custom)
+
+    def remove(self) -> None:
+        """Take away what was written; it was made by this object and by no other."""
+        # On a full disk closing fails as well: what is still in the buffer has no place.
+        with suppress(OSError):
+            self.file.close()
+        if self._folder is not None:
+            shutil.rmtree(self._folder)
+        else:
+            self._mcap.unlink()
 
 
 class BagWriter:

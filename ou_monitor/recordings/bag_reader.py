@@ -21,10 +21,10 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 from mcap_ros2.decoder import DecoderFactory
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.recordings.mcap_file import McapFile, RawMessage
-from ou_monitor.recordings.record_table import Table
+from ou_monitor.recordings.mcap_file import (
+    backwards, in_parts, in_time_order, McapFile, Part, RawMessage)
+from ou_monitor.recordings.mcap_records import Table
 from ou_monitor.recordings.rosbag2_metadata import find_files, parse_qos, TopicInfo
-from ou_monitor.recordings.time_order import backwards, in_parts, in_time_order, Part
 
 
 class DecodedMessage(NamedTuple):

@@ -16,9 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagReader
-from ou_monitor.recordings.batches import batches, last_before
-from ou_monitor.recordings.columns import Column
-from ou_monitor.recordings.framing import moment
+from ou_monitor.recordings.columns import batches, Column, last_before
+from ou_monitor.recordings.mcap_records import moment
 from ou_monitor.recordings.topic_choice import choose
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.blocks import BlockClock

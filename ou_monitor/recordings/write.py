@@ -1,12 +1,14 @@
 """
-Write a `Recording` as a bag that `replay`, `ros2 bag play` and `analyze` take.
+Write a `Recording`, or what was taken from a log, as a bag.
 
-Limits first: messages hold float32 (but std_msgs/Float64), 0.5 uV at 5 V.
+`replay`, `ros2 bag play` and `analyze` take it.  Limits: messages hold float32 (but
+std_msgs/Float64), 0.5 uV at 5 V.  Every series of a log keeps its own stamps, counted
+from the start of the log, to 10 ns of a day.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 import heapq
 import math
 from pathlib import Path
@@ -15,18 +17,25 @@ from types import TracebackType
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.recordings import cdr
 from ou_monitor.recordings.bag import BagWriter
+from ou_monitor.recordings.importers.choose import Chosen
+from ou_monitor.recordings.importers.log import Series, UNITS
+from ou_monitor.recordings.standard_types import (
+    BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, FLOAT64)
 from ou_monitor.records import FloatArray, Recording
 
 # What `type` may be -> message type of the voltage.
 TYPES = {
-    'battery_state': cdr.BATTERY_STATE, 'float32': cdr.FLOAT32, 'float64': cdr.FLOAT64,
-    'adc_block': cdr.FLOAT32_ARRAY,
+    'battery_state': BATTERY_STATE, 'float32': FLOAT32, 'float64': FLOAT64,
+    'adc_block': FLOAT32_ARRAY,
 }
 
 # Samples encoded at once; bounds memory.
 SLICE = 1024
+
+# An adc_block of a log: rate of its samples, Hz, and how many there are in one.
+BLOCK_RATE = 10000.0
+BLOCK = 100
 
 # An unchanged throttle is repeated this often, so that a subscriber that comes
 # late, or a bag played from the middle, knows it soon.
@@ -143,9 +152,9 @@ class RecordingWriter:
             raise InputError(f"'{piece.name}' has stamps after 2^31 s, which a header cannot "
                              'hold: use another type')
         if self._type == 'adc_block':
-            _check_uniform(piece, stamps - self._first, self._written, self._rate)
+            _check_steady(piece.name, stamps - self._first, self._written, self._rate)
         if THROTTLE not in self._names and piece.has_throttle:
-            self._names[THROTTLE] = self._add('throttle', cdr.FLOAT32)
+            self._names[THROTTLE] = self._add('throttle', FLOAT32)
         self._written += piece.n
         self._send(self._voltage(stamps, piece.voltage), self._throttles(stamps, piece.throttle))
 
@@ -157,7 +166,7 @@ class RecordingWriter:
         """Finish the bag."""
         stamps, samples = self._rest
         if samples.size:
-            self._bag.write(self._names[VOLTAGE], int(stamps[-1]), cdr.encode_block(samples))
+            self._bag.write(self._names[VOLTAGE], int(stamps[-1]), encode_block(samples))
             self._rest = stamps[:0], samples[:0]
         self._bag.close()
 
@@ -186,12 +195,12 @@ class RecordingWriter:
             self._rest = stamps[whole:], voltage[whole:]
             for first in range(0, whole, self._block):
                 last = first + self._block
-                yield int(stamps[last - 1]), VOLTAGE, cdr.encode_block(voltage[first:last])
+                yield int(stamps[last - 1]), VOLTAGE, encode_block(voltage[first:last])
             return
         if self._type == 'battery_state':
-            messages = cdr.encode_battery(stamps, voltage)
+            messages = encode_battery(stamps, voltage)
         else:
-            messages = cdr.encode_scalars(TYPES[self._type], voltage)
+            messages = encode_scalars(TYPES[self._type], voltage)
         for t, message in zip(stamps.tolist(), messages, strict=True):
             yield t, VOLTAGE, message
 
@@ -206,16 +215,77 @@ class RecordingWriter:
         changed |= np.diff(periods, prepend=self._period) > 0
         self._throttle, self._period = float(values[-1]), int(periods[-1])
         for t, message in zip(times[changed].tolist(),
-                              cdr.encode_scalars(cdr.FLOAT32, values[changed]), strict=True):
+                              encode_scalars(FLOAT32, values[changed]), strict=True):
             yield t, THROTTLE, message
 
 
-def _check_uniform(rec: Recording, since_first: npt.NDArray[np.int64], before: int,
-                   sample_rate: float) -> None:
+def _check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
+                  sample_rate: float) -> None:
     """Refuse what blocks without stamps cannot hold: any spacing but the stated one."""
-    grid = (before + np.arange(rec.n)) * (1e9 / sample_rate)
-    worst = np.abs(since_first - grid).max()
-    if worst > 0.5e9 / sample_rate:
+    grid = (before + np.arange(since_first.size)) * (1e9 / sample_rate)
+    if np.abs(since_first - grid).max() > 0.5e9 / sample_rate:
         raise InputError(
-            f"'{rec.name}' is not sampled at a steady {sample_rate:g} Hz, as blocks of samples "
+            f"'{name}' is not sampled at a steady {sample_rate:g} Hz, as blocks of samples "
             'need it: use another type')
+
+
+def write_log(
+    chosen: Chosen, path: Path, about: Mapping[str, str], *, kind: str = 'battery_state',
+    progress: Callable[[float], None] | None = None,
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Write a bag (progress 0..1)."""
+    # At one instant what holds for the sample goes before it, the voltage last.
+    held = [(name, series) for name, series in (
+        ('throttle', chosen.throttle), ('current', chosen.current)) if series is not None]
+    held.append(('voltage', chosen.voltage))
+    first = min(float(series.t[0]) for _, series in held)
+    shift = max(0, -round(first * 1e9))
+    notes = (f'Stamps were moved by {shift * 1e-9:.9f} s: a bag cannot hold negative ones.',
+             ) if shift else ()
+    total = sum(series.n for _, series in held)
+    topics: dict[str, str] = {}
+    # Refused before anything is on disk.
+    stamps = [as_nanoseconds(series.t, series.name) + shift for _, series in held]
+    if kind == 'adc_block':
+        _check_steady(chosen.voltage.name, stamps[-1] - stamps[-1][0], 0, BLOCK_RATE)
+    elif kind == 'battery_state' and stamps[-1][-1] > LAST_HEADER_NS:
+        raise InputError(f"'{chosen.voltage.name}' has stamps after 2^31 s, which a header "
+                         'cannot hold: use another type')
+    whole = {**about}
+    for name, series in held:
+        whole |= _origin(name, series)
+    with BagWriter(path, about=whole) as bag:
+        # The order of the table of contents: the voltage first.
+        for name, series in reversed(held):
+            message = TYPES[kind] if name == 'voltage' else FLOAT32
+            rate = BLOCK_RATE if message == FLOAT32_ARRAY else None
+            topics[bag.add_topic(name, message, sample_rate=rate,
+                                 origin={**about, **_origin(name, series)})] = message
+        streams = [_messages(k, stamps[k], series.values, topics['/' + name])
+                   for k, (name, series) in enumerate(held)]
+        for done, (t, k, data) in enumerate(heapq.merge(*streams)):
+            bag.write('/' + held[k][0], t, data)
+            if progress is not None and done % SLICE == 0:
+                progress(done / total)
+    return topics, notes
+
+
+def _origin(name: str, series: Series) -> dict[str, str]:
+    """Return where a series came from, by keys that are its own."""
+    return {f'{name}_field': series.name, f'{name}_unit': UNITS[name],
+            f'{name}_scale': series.scale, f'{name}_what': series.words}
+
+
+def _messages(place: int, stamps: npt.NDArray[np.int64], values: npt.NDArray[np.float64],
+              kind: str) -> Iterator[Timed]:
+    if kind == FLOAT32_ARRAY:
+        for first in range(0, stamps.size, BLOCK):
+            part = slice(first, first + BLOCK)
+            yield int(stamps[part][-1]), place, encode_block(values[part])
+        return
+    for first in range(0, stamps.size, SLICE):
+        part = slice(first, first + SLICE)
+        data = (encode_battery(stamps[part], values[part]) if kind == BATTERY_STATE
+                else encode_scalars(kind, values[part]))
+        for t, message in zip(stamps[part].tolist(), data, strict=True):
+            yield t, place, message

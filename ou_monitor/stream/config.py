@@ -16,12 +16,15 @@ import re
 from typing import Any
 
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.stream.field_path import parse_field_path
 import yaml
 
 NAN_RULES = ('drop', 'unknown')
 
+# Names and indices: 'channels[0].value' is ('channels', 0, 'value').
+FieldPath = tuple[str | int, ...]
+
 _TYPE = re.compile(r'[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*')
+_STEP = re.compile(r'([A-Za-z_][A-Za-z0-9_]*)((?:\[\d+\])*)')
 _TOPIC = re.compile(r'[~/]?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
 
 
@@ -121,6 +124,19 @@ _CONFIG_KINDS: dict[str, tuple[tuple[type, ...], str]] = {
 }
 _FIELD_NEEDED = ('topic', 'type', 'field')
 _CONFIG_NEEDED = ('description', 'package', 'install', 'generic', 'voltage')
+
+
+def parse_field_path(path: str) -> FieldPath:
+    """Split a field path into names and indices."""
+    steps: list[str | int] = []
+    for part in path.split('.'):
+        match = _STEP.fullmatch(part)
+        if match is None:
+            raise InputError(
+                f"field path '{path}' is not of the form name.name[0].name (at '{part}')")
+        steps.append(match[1])
+        steps += [int(index) for index in re.findall(r'\d+', match[2])]
+    return tuple(steps)
 
 
 def msg_config_dir() -> Path:

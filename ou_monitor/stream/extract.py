@@ -16,8 +16,7 @@ import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.blocks import BlockClock
-from ou_monitor.stream.config import FieldSpec
-from ou_monitor.stream.field_path import FieldPath, parse_field_path
+from ou_monitor.stream.config import FieldPath, FieldSpec, parse_field_path
 
 __all__ = ['BlockClock', 'Extracted', 'Extractor', 'FieldPath', 'parse_field_path']
 

@@ -5,8 +5,7 @@ import json
 import re
 import xml.etree.ElementTree as ElementTree
 
-from ou_monitor.stream.config import list_msg_configs
-from ou_monitor.stream.field_path import parse_field_path
+from ou_monitor.stream.config import list_msg_configs, parse_field_path
 from project import ROOT
 import pytest
 import rclpy

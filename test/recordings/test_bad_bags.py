@@ -6,9 +6,9 @@ import struct
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagReader, BagWriter
-from ou_monitor.recordings.cdr import encode_scalars, FLOAT64
-from ou_monitor.recordings.framing import MAGIC, RECORD_HEAD
+from ou_monitor.recordings.mcap_records import MAGIC, RECORD_HEAD
 from ou_monitor.recordings.read import read_recording
+from ou_monitor.recordings.standard_types import encode_scalars, FLOAT64
 import pytest
 import yaml
 

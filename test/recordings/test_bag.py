@@ -8,8 +8,7 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings import bag as bag_module
 from ou_monitor.recordings.bag import BagReader, BagWriter
-from ou_monitor.recordings.cdr import encode_scalars, FLOAT32
-from ou_monitor.recordings.schemas import SCHEMAS
+from ou_monitor.recordings.standard_types import encode_scalars, FLOAT32, SCHEMAS
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosReliability

@@ -9,11 +9,11 @@ from mcap_ros2._dynamic import serialize_dynamic
 from mcap_ros2.decoder import DecoderFactory
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.recordings import cdr
+from ou_monitor.recordings import standard_types as cdr
 from ou_monitor.recordings.columns import FieldReader, join, seconds
-from ou_monitor.recordings.record_table import Table
-from ou_monitor.recordings.ros2msg import Field, parse_definition
-from ou_monitor.recordings.schemas import SCHEMAS
+from ou_monitor.recordings.layout import Field, parse_definition
+from ou_monitor.recordings.mcap_records import Table
+from ou_monitor.recordings.standard_types import SCHEMAS
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.stream.extract import Extractor
 import pytest

@@ -8,10 +8,9 @@ from mcap.writer import CompressionType, IndexType, Writer
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagReader
-from ou_monitor.recordings.cdr import encode_scalars, FLOAT32, FLOAT64
-from ou_monitor.recordings.framing import MAGIC
+from ou_monitor.recordings.mcap_records import MAGIC
 from ou_monitor.recordings.read import read_pieces, read_recording
-from ou_monitor.recordings.schemas import SCHEMAS
+from ou_monitor.recordings.standard_types import encode_scalars, FLOAT32, FLOAT64, SCHEMAS
 import pytest
 
 START = 1_704_067_200_000_000_000

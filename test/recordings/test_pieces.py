@@ -7,11 +7,10 @@ from mcap.writer import CompressionType, IndexType, Writer
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagReader, BagWriter
-from ou_monitor.recordings.cdr import (
-    BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY)
 from ou_monitor.recordings.mcap_file import McapFile
 from ou_monitor.recordings.read import read_pieces, read_recording
-from ou_monitor.recordings.schemas import SCHEMAS
+from ou_monitor.recordings.standard_types import (
+    BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, SCHEMAS)
 import pytest
 
 START = 1_704_067_200_000_000_000
@@ -278,7 +277,7 @@ def test_fewer_messages_than_stated(bag, tmp_path):
     shutil.copy(bag, path)
     reader = BagReader(path)
     del reader._files[0].spans[3]
-    from ou_monitor.recordings.batches import batches
+    from ou_monitor.recordings.columns import batches
     from ou_monitor.recordings.topic_choice import choose
     spec = choose(path, reader.topics).voltage
     with pytest.raises(InputError, match='states 3000 messages'):

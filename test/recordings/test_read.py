@@ -4,9 +4,9 @@ from mcap.writer import Writer
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagWriter
-from ou_monitor.recordings.cdr import (
-    BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, FLOAT64)
 from ou_monitor.recordings.read import read_recording
+from ou_monitor.recordings.standard_types import (
+    BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, FLOAT64)
 import pytest
 from rosbags.typesys import get_typestore, Stores
 

@@ -21,8 +21,7 @@ from orangebox.reader import Reader
 from orangebox.types import FrameType
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, Flight, from_start, Log, Request, Series, THROTTLE, VOLTAGE)
-from ou_monitor.recordings.importers.quiet import quiet
+    CURRENT, Flight, from_start, Log, quiet, Request, Series, THROTTLE, VOLTAGE)
 from ou_monitor.records import FloatArray
 
 # The clock counts us in 32 bits.

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, from_start, Log, one_flight, Request, Series, THROTTLE, VOLTAGE)
-from ou_monitor.recordings.importers.quiet import quiet, quiet_process
+    CURRENT, from_start, Log, one_flight, quiet, quiet_process, Request, Series, THROTTLE, VOLTAGE)
 from ou_monitor.records import FloatArray
 from pymavlink import DFReader
 

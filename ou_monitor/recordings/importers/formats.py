@@ -17,9 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.framing import MAGIC as MCAP_MAGIC
-from ou_monitor.recordings.importers.log import Log, Progress, Request
-from ou_monitor.recordings.importers.quiet import quiet
+from ou_monitor.recordings.importers.log import Log, Progress, quiet, Request
+from ou_monitor.recordings.mcap_records import MAGIC as MCAP_MAGIC
 
 # Enough to tell every format; the formats of a text log come first in it.
 HEAD = 8192  # bytes

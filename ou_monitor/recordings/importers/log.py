@@ -9,10 +9,15 @@ time is not kept.  Importers know nothing of how a log is written as a bag.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
+import io
+import logging
 import math
+import os
 from pathlib import Path
+import sys
 
 import numpy as np
 import numpy.typing as npt
@@ -227,3 +232,42 @@ def from_start(series: Iterable[Series], start: float = math.inf) -> tuple[Serie
     if not math.isfinite(zero):
         return held
     return tuple(replace(one, t=one.t - zero) for one in held)
+
+
+@contextmanager
+def quiet(path: Path, parser: str) -> Iterator[io.StringIO]:
+    """Catch what a parser prints, and turn any failure of it into an `InputError`."""
+    said = io.StringIO()
+    logger = logging.getLogger(parser)
+    before = logger.disabled, logger.propagate
+    logger.propagate = False
+    handler = logging.NullHandler()
+    logger.addHandler(handler)
+    try:
+        with redirect_stdout(said), redirect_stderr(said):
+            yield said
+    except InputError:
+        raise
+    except OSError as error:
+        raise InputError(f'cannot read {path}: {error.strerror or error}') from error
+    except Exception as error:
+        raise InputError(f'{path} is damaged: it cannot be read with {parser} '
+                         f'({type(error).__name__}: {error})') from error
+    finally:
+        logger.removeHandler(handler)
+        logger.disabled, logger.propagate = before
+
+
+@contextmanager
+def quiet_process() -> Iterator[None]:
+    """Send standard error nowhere, also for parsers in C, which do not know Python's."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)

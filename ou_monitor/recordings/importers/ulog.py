@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.recordings.importers.log import (
-    CURRENT, from_start, Log, one_flight, Progress, Request, Series, THROTTLE, VOLTAGE)
-from ou_monitor.recordings.importers.quiet import quiet
+    CURRENT, from_start, Log, one_flight, Progress, quiet, Request, Series, THROTTLE, VOLTAGE)
 from ou_monitor.records import FloatArray
 from pyulog import ULog
 

@@ -3,9 +3,8 @@
 from made_logs import blackbox, END, quad
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.importers.choose import choose
+from ou_monitor.recordings.importers.choose import choose, drop_held
 from ou_monitor.recordings.importers.formats import import_log
-from ou_monitor.recordings.importers.held import drop_held
 from ou_monitor.recordings.importers.log import Request
 import pytest
 

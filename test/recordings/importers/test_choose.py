@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.importers.choose import choose
-from ou_monitor.recordings.importers.held import drop_held
+from ou_monitor.recordings.importers.choose import choose, drop_held
 from ou_monitor.recordings.importers.log import (
     clean, CURRENT, from_start, Log, Series, THROTTLE, VOLTAGE)
 import pytest

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from ou_monitor.cli.main import main
-from ou_monitor.recordings.read import read_recording
-from ou_monitor.recordings.read_signal import read_signal
+from ou_monitor.recordings.read import read_recording, read_signal
 import pytest
 
 

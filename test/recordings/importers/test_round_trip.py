@@ -11,8 +11,7 @@ from made_logs import blackbox, copter, px4_flight, quad, ulog
 from mcap.reader import make_reader
 import numpy as np
 from ou_monitor.cli.main import main
-from ou_monitor.recordings.read import read_recording
-from ou_monitor.recordings.read_signal import read_signal
+from ou_monitor.recordings.read import read_recording, read_signal
 from project import ROOT
 import pytest
 from rosbags.highlevel import AnyReader

@@ -3,8 +3,8 @@
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 import numpy as np
-from ou_monitor.recordings import cdr
-from ou_monitor.recordings.schemas import SCHEMAS, TYPE_HASHES
+from ou_monitor.recordings import standard_types as cdr
+from ou_monitor.recordings.standard_types import SCHEMAS, TYPE_HASHES
 import pytest
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 

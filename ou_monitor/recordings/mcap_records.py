@@ -1,21 +1,32 @@
 """
-Where the messages of a chunk are, as arrays: no Python object for each.
+The records of an MCAP file: their frame, and the messages in a block as arrays.
 
-Records stand one after another, each with its length, so that the place of one
-follows from those before it.  Two ways lead around that walk: the message
-indexes that follow a chunk state every place, and a run of records of one
-length is checked as a whole.  Both are verified byte by byte, never trusted:
-what comes out is what the walk would have found.
+Records stand one after another, each with its length.  Walking them tells *where* a
+file is damaged, which the library's readers do not say (they take a short read at
+the end for a whole record).  For the messages of a block two ways lead around that
+walk: the message indexes that follow a chunk state every place, and a run of records
+of one length is checked as a whole.  Both are verified byte by byte, never trusted:
+what comes out is what the walk would have found.  https://mcap.dev/spec
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+import enum
+import struct
+from typing import Any, BinaryIO
+import zlib
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.recordings.framing import Damage, MESSAGE_HEAD, Op, RECORD_HEAD
+
+MAGIC = b'\x89MCAP0\r\n'
+RECORD_HEAD = struct.Struct('<BQ')
+MESSAGE_HEAD = struct.Struct('<HIQQ')
+
+# Record, its head and the magic at the end.
+FOOTER_LENGTH = RECORD_HEAD.size + 20 + len(MAGIC)
 
 IntArray = npt.NDArray[np.int64]
 TimeArray = npt.NDArray[np.uint64]
@@ -28,6 +39,160 @@ _FIRST_RUN = 32
 # Records to walk one by one after a run that was not worth looking for: twice as
 # many each time, up to this.
 _LEAST_PAUSE, _MOST_PAUSE = 16, 2048
+
+
+class Op(enum.IntEnum):
+    """Opcodes of the specification; those from 0x80 on are private, and skipped."""
+
+    HEADER = 0x01
+    FOOTER = 0x02
+    SCHEMA = 0x03
+    CHANNEL = 0x04
+    MESSAGE = 0x05
+    CHUNK = 0x06
+    MESSAGE_INDEX = 0x07
+    CHUNK_INDEX = 0x08
+    ATTACHMENT = 0x09
+    ATTACHMENT_INDEX = 0x0A
+    STATISTICS = 0x0B
+    METADATA = 0x0C
+    METADATA_INDEX = 0x0D
+    SUMMARY_OFFSET = 0x0E
+    DATA_END = 0x0F
+
+
+PRIVATE = 0x80
+
+# Which records may stand before the end of the data, and which after it.  A
+# message whose opcode was hit by a wrong bit must not be skipped as something else.
+_IN_DATA = {Op.HEADER, Op.SCHEMA, Op.CHANNEL, Op.MESSAGE, Op.CHUNK, Op.MESSAGE_INDEX,
+            Op.ATTACHMENT, Op.METADATA, Op.DATA_END, Op.FOOTER}
+_IN_SUMMARY = {Op.SCHEMA, Op.CHANNEL, Op.CHUNK_INDEX, Op.ATTACHMENT_INDEX, Op.STATISTICS,
+               Op.METADATA_INDEX, Op.SUMMARY_OFFSET, Op.FOOTER}
+_LENGTHS = {Op.DATA_END: 4, Op.FOOTER: 20}
+
+
+class Damage(Exception):
+    """A place in the file where it stops making sense."""
+
+    def __init__(self, offset: int, why: str) -> None:
+        """Keep the byte offset and the reason."""
+        super().__init__(f'at byte {offset}: {why}')
+        self.offset = offset
+        self.why = why
+
+
+def moment(log_time_ns: int, origin_ns: int) -> str:
+    """Return a log time in words, also counted from the start of the recording."""
+    return (f'{(log_time_ns - origin_ns) / 1e9:.3f} s into the recording, log time '
+            f'{log_time_ns // 10**9}.{log_time_ns % 10**9:09d} s')
+
+
+@dataclass(frozen=True)
+class Record:
+    """Where a record is: offset of its opcode, and the length of its content."""
+
+    offset: int
+    opcode: int
+    length: int
+
+    @property
+    def content(self) -> int:
+        """Offset of the content."""
+        return self.offset + RECORD_HEAD.size
+
+    @property
+    def end(self) -> int:
+        """Offset of the record after it."""
+        return self.content + self.length
+
+
+@dataclass(frozen=True)
+class Span:
+    """
+    A part of the file that holds messages and is read in one go.
+
+    Attributes
+    ----------
+    start_ns, end_ns : int
+        Log times of its first and last message, ns.
+    offset, length : int
+        Bytes in the file: the content of a chunk, or a run of plain records.
+    chunk : bool
+        Which of the two.
+    channels : frozenset of int or None
+        Channels that have messages in it; None when not known.
+    index_length : int
+        Bytes of message indexes right after the chunk.
+
+    """
+
+    start_ns: int
+    end_ns: int
+    offset: int
+    length: int
+    chunk: bool
+    channels: frozenset[int] | None = None
+    index_length: int = 0
+
+
+def record_at(file: BinaryIO, offset: int, size: int, in_data: bool) -> Record:
+    """Return the record at an offset (size in bytes)."""
+    file.seek(offset)
+    head = file.read(RECORD_HEAD.size)
+    if len(head) < RECORD_HEAD.size:
+        raise Damage(offset, 'the file ends without a footer')
+    opcode, length = RECORD_HEAD.unpack(head)
+    record = Record(offset, opcode, length)
+    if opcode == 0 or Op.DATA_END < opcode < PRIVATE:
+        raise Damage(offset, f'no record begins with 0x{opcode:02x}')
+    if record.end > size:
+        raise Damage(offset, f'a record of {length} bytes is cut off after '
+                     f'{size - record.content}')
+    if opcode < PRIVATE and (
+            opcode not in (_IN_DATA if in_data else _IN_SUMMARY)
+            or (opcode == Op.HEADER and offset != len(MAGIC))
+            or length != _LENGTHS.get(Op(opcode), length)):
+        raise Damage(offset, f'a record 0x{opcode:02x} of {length} bytes does not belong there')
+    return record
+
+
+def check_passed_over(file: BinaryIO, record: Record) -> None:
+    """Check that a record that is not needed is what its opcode says (record in A)."""
+    if record.opcode not in (Op.MESSAGE_INDEX, Op.ATTACHMENT, Op.METADATA):
+        return
+    file.seek(record.content)
+    content = file.read(record.length)
+    if record.opcode == Op.MESSAGE_INDEX:
+        fits = len(content) >= 6 and (len(content) - 6) % 16 == 0 and (
+            int.from_bytes(content[2:6], 'little') == len(content) - 6)
+    elif record.opcode == Op.ATTACHMENT:
+        stated = int.from_bytes(content[-4:], 'little')
+        fits = len(content) >= 36 and stated in (0, zlib.crc32(content[:-4]))
+    else:
+        name = int.from_bytes(content[:4], 'little')
+        rest = content[4 + name:]
+        fits = len(rest) >= 4 and int.from_bytes(rest[:4], 'little') == len(rest) - 4
+    if not fits:
+        raise Damage(record.offset, f'a record 0x{record.opcode:02x} of {record.length} bytes '
+                     'does not hold what it should')
+
+
+def inner_records(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield (opcode, begin, end) of the content of each record in a chunk or run."""
+    at, size = 0, len(data)
+    head, step = RECORD_HEAD.unpack_from, RECORD_HEAD.size
+    while at < size:
+        if at + step > size:
+            raise Damage(at, 'a record within a chunk is cut off')
+        opcode, length = head(data, at)
+        begin = at + step
+        at = begin + length
+        if at > size:
+            raise Damage(begin - step, 'a record within a chunk is cut off')
+        if opcode == Op.MESSAGE and length < MESSAGE_HEAD.size:
+            raise Damage(begin - step, 'a message is shorter than its own head')
+        yield opcode, begin, at
 
 
 @dataclass(frozen=True, eq=False)

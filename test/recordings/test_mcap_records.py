@@ -4,8 +4,8 @@ import struct
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.recordings.framing import Damage, inner_records, MESSAGE_HEAD, Op
-from ou_monitor.recordings.record_table import find_by_index, find_messages
+from ou_monitor.recordings.mcap_records import (
+    Damage, find_by_index, find_messages, inner_records, MESSAGE_HEAD, Op)
 import pytest
 
 
