@@ -7,20 +7,15 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from ou_monitor.analyze.by_throttle import by_throttle, ByThrottle
 from ou_monitor.analyze.cause import Cause, judge_cause
-from ou_monitor.analyze.constant_alpha import alpha_constancy, AlphaTest
+from ou_monitor.analyze.level_comparison import alpha_constancy, AlphaTest
 from ou_monitor.analyze.level_result import fit_level, judge_levels, LevelResult
-from ou_monitor.analyze.levels import find_levels, LoadLevel
-from ou_monitor.analyze.quality_list import quality_list
+from ou_monitor.analyze.levels import find_levels, LoadLevel, without_jitter
+from ou_monitor.analyze.quality import (
+    line_item, quality_list, QualityItem, second_items, unsettled)
 from ou_monitor.analyze.relaxation import fit_relaxation, Relaxation
-from ou_monitor.analyze.settling import unsettled
-from ou_monitor.analyze.sliding import slide, Sliding
+from ou_monitor.analyze.replay import by_throttle, ByThrottle, slide, Sliding
 from ou_monitor.analyze.steps import find_steps
-from ou_monitor.analyze.stick import without_jitter
-from ou_monitor.criticism.line_removal import line_item
-from ou_monitor.criticism.quality_item import QualityItem
-from ou_monitor.criticism.second_relaxation import second_items
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import NAN, Recording
 

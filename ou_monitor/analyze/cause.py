@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor.analyze.constant_alpha import AlphaTest
+from ou_monitor.analyze.level_comparison import AlphaTest
 from ou_monitor.analyze.relaxation import Relaxation, Release
 from ou_monitor.records import NAN
 from ou_monitor.text import Z95

@@ -7,7 +7,7 @@ from typing import Any
 
 from ou_monitor.analyze.analyze import Analysis
 from ou_monitor.analyze.cause import Cause
-from ou_monitor.analyze.constant_alpha import LEVEL
+from ou_monitor.analyze.level_comparison import LEVEL
 from ou_monitor.analyze.level_result import LevelResult
 from ou_monitor.analyze.relaxation import Relaxation
 from ou_monitor.analyze.words import headline

@@ -1,12 +1,17 @@
 """
-Load levels: which stretches of a recording were flown at which throttle.
+Load levels: which segments of a recording were flown at which throttle.
 
 A level is a throttle that was held: its segments begin within the half width of it, and end where
 throttle leaves twice that, so that the jitter of a stick breaks none of them.  The half width is
 `HALF_WIDTH`, or as much more as the stick moves while it is held.  A steady ramp through a
-throttle is no stay at it.  Limits: throttle is a command, not a current, so two stretches at one
-throttle can carry different loads; a stretch is only as stationary as its throttle says; levels
+throttle is no stay at it.  Limits: throttle is a command, not a current, so two segments at one
+throttle can carry different loads; a segment is only as stationary as its throttle says; levels
 closer than the jitter of the stick are one.
+
+Where throttle does not stand still within a level, the supply sags with it, and that is neither
+noise nor a line of the supply.  The fit has throttle as a regressor; for tests, spectra and
+transients `without_jitter` takes that sag out, by least squares over the segments of each level.
+Limits: at once and in proportion; slow drifts that go along with throttle go too.
 """
 
 from __future__ import annotations
@@ -17,7 +22,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.records import FloatArray, NAN
+from ou_monitor.records import FloatArray, NAN, Recording
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -298,3 +303,23 @@ def _settle(t: FloatArray, runs: Sequence[Segment], away: BoolArray,
         if start < run.stop - 1:
             kept.append(Segment(start, run.stop))
     return tuple(kept), lost
+
+
+def without_jitter(recording: Recording, levels: Sequence[LoadLevel]) -> FloatArray:
+    """Return the voltage with the sag of movements within the levels taken out."""
+    voltage = recording.voltage.copy()
+    reach = 2.0 * half_width(recording.t, recording.throttle)
+    for level in levels:
+        if not np.isfinite(level.throttle):
+            continue
+        throttle, sagged = (np.concatenate([
+            x[s.start:s.stop] - x[s.start:s.stop].mean() for s in level.segments] or [np.zeros(0)])
+            for x in (recording.throttle, recording.voltage))
+        moved = float(throttle @ throttle)
+        if not moved > 0.0:
+            continue
+        others = [abs(other.throttle - level.throttle) for other in levels if other is not level]
+        away = recording.throttle - level.throttle
+        near = np.abs(away) <= min([reach, *(0.5 * x for x in others)])
+        voltage[near] -= float(throttle @ sagged) / moved * away[near]
+    return voltage

@@ -25,9 +25,8 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor.analyze.level_sag import mean_variance
-from ou_monitor.analyze.relaxation_window import Window
-from ou_monitor.analyze.steps import Step
+from ou_monitor.analyze.level_comparison import mean_variance
+from ou_monitor.analyze.steps import Step, Window
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
 from ou_monitor.text import Z95
 from scipy import stats

@@ -1,18 +1,20 @@
 """
-Where throttle goes from one load level to another and stays there.
+Where throttle goes from one load level to another, and the samples after it, made independent.
 
-Limits: throttle is a command; motors follow it some 5 to 20 ms later, which a relaxation
-watched from the end of the step does not know.
+Limits: throttle is a command; motors follow it some 5 to 20 ms later, which a relaxation watched
+from the end of the step does not know; alpha, sigma and noise of the level count as known.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from ou_monitor.analyze.levels import HALF_WIDTH, half_width, stays
-from ou_monitor.records import Recording
+from ou_monitor.model.innovations import Filter, StateSpace
+from ou_monitor.records import Estimate, FloatArray, NAN, Recording
 
 # Longest way from one level to the other, s: after a slower one nothing is left to relax.
 LONGEST_RAMP = 1.0
@@ -20,6 +22,11 @@ LONGEST_RAMP = 1.0
 SHORTEST_STAY = 0.1
 # Throttle has arrived, and stays, within this share of the change.
 _STILL = 0.1
+# What is watched after a change: so many relaxation times of the noise, and seconds, at least.
+_WATCHED, _WATCHED_S = 20.0, 0.5
+_MOST = 2000
+# Time constants of the exponentials that are tried beside the one that is fitted, in tau.
+_BESIDE = (0.25, 4.0)
 
 
 @dataclass(frozen=True)
@@ -73,3 +80,89 @@ def find_steps(recording: Recording, throttles: Sequence[float]) -> tuple[Step, 
         if t[end - 1] - t[enter] >= SHORTEST_STAY:
             found.append(Step(before, after, leave, enter, begin, end))
     return tuple(found)
+
+
+class Window:
+    """The samples after one change, made independent."""
+
+    def __init__(self, recording: Recording, step: Step, estimate: Estimate, rms: float,
+                 before: float, later: float = 0.0) -> None:
+        """Take the samples (rms in V, before in V^2, later in s)."""
+        t = recording.t
+        alpha = estimate.alpha if estimate.usable else math.inf
+        reach = max(_WATCHED / alpha, _WATCHED_S) if math.isfinite(alpha) else 2.0 * _WATCHED_S
+        stop = min(step.stop, int(np.searchsorted(t, t[step.enter] + later + reach)))
+        start = min(stop, int(np.searchsorted(t, t[step.enter] + later)))
+        stride = max(1, -(-(stop - start) // _MOST))
+        self.since = t[start:stop:stride] - t[step.enter]
+        self.voltage = recording.voltage[start:stop:stride]
+        self.n = self.since.size
+        noise = estimate.noise_std if estimate.noise_std > 0.0 else 0.0
+        if not math.isfinite(alpha):
+            self.var_inf, self.noise_var = 0.0, rms * rms
+            self.filter = None
+            self.sd = np.full(self.n, rms)
+        else:
+            self.var_inf, self.noise_var = estimate.var_inf, noise * noise
+            louder = np.exp(-2.0 * alpha * self.since) * max(0.0, before - self.var_inf)
+            first = self.var_inf + float(louder[0])
+            self.filter = Filter(_ou(self.since, alpha, self.var_inf, self.noise_var, first))
+            self.sd = np.sqrt(self.var_inf + self.noise_var + louder)
+        e = self.whitened(np.column_stack([self.voltage, np.ones(self.n)]))
+        self._one = e[:, 1]
+        self._y = e[:, 0] - _project(self._one, e[:, 0])
+        self.rss_flat = float(self._y @ self._y)
+
+    def whitened(self, columns: FloatArray) -> FloatArray:
+        """Return columns as standardised innovations."""
+        if self.filter is None:
+            return columns / math.sqrt(self.noise_var)
+        e = self.filter.innovations(columns)
+        return np.asarray(e / np.sqrt(self.filter.variance[:self.n])[:, None])
+
+    def rss(self, taus: FloatArray) -> FloatArray:
+        """Return the residual sum of squares for each tau, level and amplitude fitted."""
+        basis = self.whitened(np.exp(-self.since[:, None] / taus[None, :]))
+        basis -= np.outer(self._one, self._one @ basis) / float(self._one @ self._one)
+        size = np.maximum((basis ** 2).sum(axis=0), 1e-300)
+        found: FloatArray = self.rss_flat - (self._y @ basis) ** 2 / size
+        return found
+
+    def more(self, tau: float) -> tuple[float, int]:
+        """Return by how much exponentials beside tau lower the sum of squares, and how many."""
+        times = tau * np.array((1.0, *_BESIDE))
+        basis = self.whitened(np.exp(-self.since[:, None] / times[None, :]))
+        basis -= np.outer(self._one, self._one @ basis) / float(self._one @ self._one)
+        basis /= np.maximum(np.sqrt((basis ** 2).sum(axis=0)), 1e-300)
+        found, _, rank, _ = np.linalg.lstsq(basis, self._y, rcond=1e-6)
+        rest = self._y - basis @ found
+        alone = self._y - basis[:, 0] * float(basis[:, 0] @ self._y)
+        return max(0.0, float(alone @ alone - rest @ rest)), int(rank) - 1
+
+    def solve(self, tau: float, scale: float) -> tuple[float, float, float, float]:
+        """Return U0 and A with their standard errors; of U0 alone without a tau to be seen."""
+        x = self.whitened(np.column_stack([self.voltage, np.ones(self.n)]))
+        if not tau < self.since[-1]:
+            size = float(x[:, 1] @ x[:, 1])
+            return float(x[:, 1] @ x[:, 0]) / size, math.sqrt(scale / size), NAN, NAN
+        decay = np.exp(-self.since / tau)
+        x = np.column_stack([x, self.whitened(decay[:, None])])
+        found = np.linalg.lstsq(x[:, 1:], x[:, 0], rcond=None)[0]
+        bend = self.whitened((found[1] * decay * self.since / tau)[:, None])
+        jacobian = np.column_stack([x[:, 1:], bend])
+        errors = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian) * scale))
+        return float(found[0]), float(errors[0]), float(found[1]), float(errors[1])
+
+
+def _ou(since: FloatArray, alpha: float, var_inf: float, noise_var: float, first: float
+        ) -> StateSpace:
+    """Return the level's noise as a state-space model, with the variance it comes with."""
+    dt = np.diff(since)
+    f = np.concatenate(([0.0], np.exp(-alpha * dt)))[:, None, None]
+    q = np.concatenate(([first], -var_inf * np.expm1(-2.0 * alpha * dt)))[:, None, None]
+    r = np.full(since.size, max(noise_var, 1e-6 * float(q.min())))
+    return StateSpace(f, q, np.ones(1), r)
+
+
+def _project(direction: FloatArray, y: FloatArray) -> FloatArray:
+    return np.asarray(direction * float(direction @ y) / float(direction @ direction))

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from ou_monitor.analyze.analyze import Analysis
 from ou_monitor.analyze.level_result import LevelResult
-from ou_monitor.criticism.quality_item import QualityItem, Severity
+from ou_monitor.analyze.quality import QualityItem, Severity
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, NAN, Status
 from ou_monitor.text import number, Z95

@@ -13,14 +13,11 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.criticism.clipped import redraw
+from ou_monitor.criticism.adc import find_knee, find_rails, find_step, redraw
 from ou_monitor.criticism.fast_lines import lines_lost, without_lines
-from ou_monitor.criticism.lattice import find_rails, find_step
 from ou_monitor.criticism.readings import counted, usable, why_nothing
-from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.squeezed import find_knee
+from ou_monitor.criticism.samples import choose_samples, events_between, Samples
 from ou_monitor.criticism.stamps import judge_stamps, on_grid
-from ou_monitor.criticism.thinning import choose_samples, events_between
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.clock_jitter import ClockJitter
 from ou_monitor.model.terms.held_samples import HeldSamples

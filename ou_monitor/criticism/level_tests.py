@@ -15,7 +15,7 @@ correlated     lags 1..5 of the deviation, with variances robust against changin
                intensity (Lo & MacKinlay, Rev. Financ. Stud. 1, 1988)
 one_relaxation lags 1..10 of the innovations, likewise
 second_relaxation
-               `ou_monitor.criticism.second_relaxation`, in their periodogram
+               `ou_monitor.criticism.innovations`, in their periodogram
 =============  ========================================================================
 
 A test that rejects counts only when its effect is of consequence, too: with 10^5 samples a
@@ -32,8 +32,7 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from ou_monitor.criticism.second_relaxation import second_relaxation
-from ou_monitor.criticism.whitening import innovations, join
+from ou_monitor.criticism.innovations import innovations, join, second_relaxation
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Status
 from scipy import stats
 

@@ -1,15 +1,21 @@
 """
-Spectral lines of a level: found by a test, measured with their error.
+Spectral lines: found by a test, measured with their error, taken out.
 
 A periodogram ordinate of noise is exponential, and the sum of K of them gamma, whatever the law
 of the noise; a line stands out of its neighbours.  The level of the noise at each frequency is
 the median of neighbouring ordinates, whose law is known exactly, so the test needs no model of
 the spectrum and a second line nearby does not hide the first.
 
+A line of 4 mV beside an OU of 18 mV moves alpha by 30 % and sigma by 15 % (1 kHz, 120 Hz): the
+fit takes it for a part of the relaxation.  So each line is taken out as a sinusoid of its own
+amplitude, phase and frequency in each piece of the length that the search used, by least squares;
+a little noise of that bin goes with it.
+
 Limits: the noise is taken as level over the neighbours (some 60 bins either side), so a resonance
 narrower than that is reported as a line; samples are taken as evenly spaced; a line may be the
 alias of one above half the rate; below `FIRST` periods of a piece nothing is looked for; with
-the false-alarm rate go changes of frequency, which spread a line until it is not found.
+the false-alarm rate go changes of frequency, which spread a line until it is not found.  A tone
+that moves by more than a bin within a piece, or is modulated, leaves its sidebands.
 """
 
 from __future__ import annotations
@@ -39,6 +45,8 @@ _GUARD, _NEIGHBOURS = 4, 64
 _LOBE = 2
 _QUANTILES = 0.5 * (np.polynomial.legendre.leggauss(64)[0] + 1.0)
 _WEIGHTS = 0.5 * np.polynomial.legendre.leggauss(64)[1]
+# Frequencies tried either side of the line's, in bins, and how many.
+_REACH, _TRIED = 1.0, 33
 
 
 @dataclass(frozen=True)
@@ -254,3 +262,28 @@ def _lift(k: float, limit: float) -> float:
         seen = float(chndtr(least, 2.0 * k, middle)) <= 0.1
         low, high = (low, middle) if seen else (middle, high)
     return high
+
+
+def without_lines(voltage: FloatArray, rate: float, lines: Sequence[Line]) -> FloatArray:
+    """Return one stretch without lines (voltage in V, rate in Hz, result in V)."""
+    if not lines or not voltage.size:
+        return voltage
+    pieces = max(1, round(voltage.size * lines[0].resolution / rate))
+    return np.concatenate([_cleaned(piece, rate, lines)
+                           for piece in np.array_split(voltage, pieces)])
+
+
+def _cleaned(piece: FloatArray, rate: float, lines: Sequence[Line]) -> FloatArray:
+    """Return a piece less one sinusoid a line."""
+    mean = float(piece.mean())
+    left: FloatArray = piece - mean
+    angle = 2.0 * np.pi / rate * np.arange(piece.size)
+    window = np.hanning(piece.size + 2)[1:-1]
+    for line in lines:
+        tried = line.frequency + line.resolution * np.linspace(-_REACH, _REACH, _TRIED)
+        tried = tried[(tried > 0.0) & (tried < 0.5 * rate)]
+        power = [abs(np.exp(-1j * f * angle) @ (window * left)) for f in tried]
+        best = float(tried[int(np.argmax(power))])
+        waves = np.column_stack((np.cos(best * angle), np.sin(best * angle)))
+        left = left - waves @ np.linalg.lstsq(waves, left, rcond=None)[0]
+    return left + mean

@@ -1,14 +1,22 @@
-"""The samples that a discovery works on."""
+"""
+The samples that `discover` works on, and which of a long recording they are.
+
+Every k-th sample of an OU is an OU, and all terms keep their meaning, which averages would not
+do: so samples of a recording too long to be fitted whole are left out, not averaged.  Where that
+would lose the relaxation, a segment from the middle is used instead.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+import math
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.terms.term import Stretch, Term
 from ou_monitor.records import FloatArray
+from scipy.special import ndtri
 
 # Share of the samples that models are fitted on; the rest is kept to score them.
 TRAIN = 0.6
@@ -17,6 +25,23 @@ TRAIN = 0.6
 _BEYOND, _STILL = 0.05, 0.01
 # Steps that differ by less than this share count as alike.
 ALIKE = 0.3
+# Samples that are fitted at most.
+MOST = 80_000
+# Steps of up to this many relaxation times keep alpha identifiable.
+_STEP = 0.3
+# What (gamma(2L) - gamma(L)) / (gamma(4L) - gamma(2L)) is at that step, gamma
+# being the variogram of an OU: exp(x) / (1 + exp(-x)).  White noise cancels.
+_RATIO = math.exp(_STEP) / (1.0 + math.exp(-_STEP))
+# Values looked at for it.
+_LOOK = 1_000_000
+# Samples whose changes share a scale; chance that noise makes any change pass for an
+# event, and by what more they must be larger, for the scale is an estimate.
+_SHARE, _CHANCE, _MORE = 1024, 0.02, 1.05
+# Throttle that moves more than this in a sample steps, and for how long after it a change
+# is the load's, s.
+_STEPS, _SOON = 0.01, 0.02
+# Events that are few; of more the samples used have enough.
+_FEW = 300
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,3 +133,100 @@ class Samples:
             origin=float(self.t[0]), alpha=np.full(n, alpha), sigma=np.full(n, sigma),
             power=np.ones(n), push=np.zeros(n), bend=(0.0, 0.0), x=np.zeros(n),
             level=np.zeros(n), voltage=np.zeros(n))
+
+
+def choose_samples(voltage: FloatArray, rate: float) -> tuple[slice, str]:
+    """Return which samples to use (voltage in V, rate in Hz)."""
+    n = voltage.size
+    if n <= MOST:
+        return slice(0, n), ''
+    factor = math.ceil(n / MOST)
+    widest = _widest(voltage, factor)
+    if widest >= factor:
+        return slice(0, n, factor), (
+            f'{n} samples: every {_nth(factor)} was used ({rate / factor:.4g} Hz); lines above '
+            f'{0.5 * rate / factor:.4g} Hz show up at other frequencies.')
+    size = MOST * widest
+    first = (n - size) // 2
+    what = f'every {_nth(widest)} was used' if widest > 1 else 'all were used'
+    return slice(first, first + size, widest), (
+        f'{n} samples: {what} of the {size / rate:.4g} s in the middle ({rate / widest:.4g} Hz), '
+        'for the rail relaxes too fast for fewer; what is slower than that stretch is not seen.')
+
+
+def events_between(voltage: FloatArray, throttle: FloatArray | None, rate: float, which: slice
+                   ) -> npt.NDArray[np.int64]:
+    """
+    Return samples to keep beside those used: about changes that only neighbours show.
+
+    A jump that stands out between two samples drowns in what the noise adds on the way
+    to the k-th one.
+
+    voltage in V, rate in Hz.
+    """
+    first, stop, k = which.start, min(which.stop, voltage.size), which.step or 1
+    none = np.zeros(0, dtype=np.int64)
+    change = np.diff(voltage[first:stop])
+    blocks = change.size // _SHARE
+    if k == 1 or blocks < 1:
+        return none
+    size = np.abs(change[:blocks * _SHARE]).reshape(blocks, _SHARE)
+    scale = np.median(size, axis=1) / 0.6745
+    if not (scale > 0.0).all():
+        # Codes so coarse that most do not change.
+        return none
+    limit = -_MORE * float(ndtri(0.5 * _CHANCE / change.size))
+    row, column = np.nonzero(size > limit * scale[:, None])
+    at = first + row * _SHARE + column
+    if throttle is not None:
+        stepped = np.flatnonzero(np.abs(np.diff(throttle[first:stop])) > _STEPS) + first
+        last = np.searchsorted(stepped, at, side='right') - 1
+        since = np.where(last < 0, np.inf, at - stepped[last] if stepped.size else 0)
+        at = at[since > _SOON * rate]
+    if not 0 < at.size <= _FEW:
+        return none
+    # Before it and after it, and the next, by which a bad sample is told from a jump.
+    near: npt.NDArray[np.int64] = np.unique(np.concatenate((at, at + 1, at + 2)))
+    kept: npt.NDArray[np.int64] = near[(near < stop) & ((near - first) % k != 0)]
+    return kept
+
+
+def _nth(k: int) -> str:
+    ends = {1: 'st', 2: 'nd', 3: 'rd'}
+    return f'{k}{"th" if k % 100 in (11, 12, 13) else ends.get(k % 10, "th")}'
+
+
+def _widest(voltage: FloatArray, factor: int) -> int:
+    """Return the largest whole step, up to `factor`, that keeps the relaxation."""
+    first = max(0, (voltage.size - _LOOK) // 2)
+    v = voltage[first:first + _LOOK]
+    lag, seen = 1, False
+    coarse = bool(np.mean(v[4:] == v[:-4]) > 0.1)
+    while lag < factor and 16 * lag < v.size:
+        near, mid, far = (_variogram(v, k * lag, coarse) for k in (1, 2, 4))
+        # Squares of neighbours within 4 lags go together.
+        error = 3.0 * far * math.sqrt(8.0 * lag / v.size)
+        if far - mid > error:
+            seen = True
+            if (mid - near) / (far - mid) > _RATIO:
+                return lag
+        elif seen:
+            # Risen and level: the relaxation lies before.
+            return max(1, lag // 2)
+        lag *= 2
+    return factor
+
+
+def _variogram(v: FloatArray, lag: int, coarse: bool) -> float:
+    """
+    Return half the variance of what a lag adds, up to a factor, V^2.
+
+    Of the smaller half of the differences: the steps of a load, which are fewer,
+    take as long to level off as they are apart, and would hide how fast the
+    rail itself relaxes.  Not so for codes so coarse that half do not differ.
+    """
+    d = np.square(v[lag:] - v[:-lag])
+    if coarse:
+        return 0.5 * float(d.mean())
+    half = d.size // 2 + 1
+    return 0.5 * float(np.partition(d, half - 1)[:half].mean())

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor.criticism.lattice import find_step
+from ou_monitor.criticism.adc import find_step
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray

@@ -6,7 +6,7 @@ from made_recordings import ALPHA, recording, without_throttle
 import numpy as np
 from ou_monitor.analyze.analyze import analyze
 from ou_monitor.analyze.process_type import ProcessType
-from ou_monitor.analyze.sliding import slide
+from ou_monitor.analyze.replay import slide
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.records import Recording, Status
 import pytest

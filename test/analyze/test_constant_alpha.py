@@ -6,8 +6,8 @@ import math
 from made_recordings import ALPHA, recording
 import numpy as np
 from ou_monitor.analyze.analyze import analyze
-from ou_monitor.analyze.constant_alpha import alpha_constancy
-from ou_monitor.analyze.pooling import fit_stretch
+from ou_monitor.analyze.level_comparison import alpha_constancy
+from ou_monitor.analyze.level_result import fit_stretch
 from ou_monitor.records import Estimate, Status
 import pytest
 from scipy import stats

@@ -5,7 +5,7 @@ import math
 
 from made_recordings import ALPHA, recording
 import numpy as np
-from ou_monitor.analyze.level_sag import level_sags, mean_variance
+from ou_monitor.analyze.level_comparison import level_sags, mean_variance
 from ou_monitor.analyze.levels import Segment
 from ou_monitor.records import Estimate, Status
 import pytest

@@ -4,7 +4,7 @@ import math
 
 from made_recordings import ALPHA, recording
 from ou_monitor.analyze.analyze import analyze
-from ou_monitor.analyze.pooling import disagreement, fit_stretch, pool
+from ou_monitor.analyze.level_result import disagreement, fit_stretch, pool
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.records import Estimate, Status
 import pytest

@@ -6,7 +6,7 @@ import math
 from made_recordings import ALPHA
 import numpy as np
 from ou_monitor.analyze.cause import judge_cause
-from ou_monitor.analyze.constant_alpha import AlphaTest
+from ou_monitor.analyze.level_comparison import AlphaTest
 from ou_monitor.analyze.relaxation import fit_relaxation
 from ou_monitor.analyze.steps import find_steps
 from ou_monitor.model.ou import simulate

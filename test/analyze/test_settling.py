@@ -5,9 +5,8 @@ import math
 from made_recordings import ALPHA
 import numpy as np
 from ou_monitor.analyze.analyze import analyze
+from ou_monitor.analyze.quality import Severity, unsettled
 from ou_monitor.analyze.relaxation import Relaxation
-from ou_monitor.analyze.settling import unsettled
-from ou_monitor.criticism.quality_item import Severity
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Estimate, Recording, Status
 import pytest

@@ -1,8 +1,7 @@
 """What the jitter of the stick makes of the voltage of a level is taken out."""
 
 import numpy as np
-from ou_monitor.analyze.levels import find_levels
-from ou_monitor.analyze.stick import without_jitter
+from ou_monitor.analyze.levels import find_levels, without_jitter
 from ou_monitor.records import Recording
 
 RATE = 200.0

@@ -5,7 +5,7 @@ import math
 
 from made_recordings import recording, without_throttle
 from ou_monitor.analyze.analyze import analyze
-from ou_monitor.analyze.quality_list import NOISE_UNKNOWN, quality_list
+from ou_monitor.analyze.quality import NOISE_UNKNOWN, quality_list
 from ou_monitor.analyze.words import cautions, headline
 from ou_monitor.records import Flag
 from ou_monitor.text import number

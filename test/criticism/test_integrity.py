@@ -4,10 +4,10 @@ import math
 import tracemalloc
 
 import numpy as np
+from ou_monitor.criticism.adc import find_rails, find_step
 from ou_monitor.criticism.integrity import examine, LEAST
-from ou_monitor.criticism.lattice import find_rails, find_step
+from ou_monitor.criticism.samples import choose_samples, events_between, MOST
 from ou_monitor.criticism.stamps import judge_stamps
-from ou_monitor.criticism.thinning import choose_samples, events_between, MOST
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Recording
 import pytest

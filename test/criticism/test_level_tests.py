@@ -4,10 +4,10 @@ import math
 
 from made_recordings import ALPHA
 import numpy as np
-from ou_monitor.analyze.pooling import fit_stretch
+from ou_monitor.analyze.level_result import fit_stretch
+from ou_monitor.criticism.innovations import fresh, innovations
 from ou_monitor.criticism.level_tests import (
     EFFECT, examine_level, FAMILY_WISE, holm, Shape, TestResult)
-from ou_monitor.criticism.whitening import fresh, innovations
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Estimate, Flag, Recording, Status
 import pytest

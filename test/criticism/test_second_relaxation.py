@@ -3,8 +3,9 @@
 import numpy as np
 from ou_monitor.analyze.analyze import analyze
 from ou_monitor.analyze.process_type import ProcessType
+from ou_monitor.analyze.quality import second_items
+from ou_monitor.criticism.innovations import second_relaxation
 from ou_monitor.criticism.level_tests import FAMILY_WISE
-from ou_monitor.criticism.second_relaxation import second_items, second_relaxation
 from ou_monitor.records import Recording
 import pytest
 from scipy.signal import lfilter

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 from ou_monitor import discover
 from ou_monitor.cli.main import main
-from ou_monitor.criticism.thinning import choose_samples, MOST
+from ou_monitor.criticism.samples import choose_samples, MOST
 import ou_monitor.discover.discover as discovering
 from ou_monitor.discover.finding import Verdict
 from ou_monitor.model.supply import SupplyModel

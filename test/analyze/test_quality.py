@@ -4,8 +4,7 @@ from dataclasses import replace
 
 from made_recordings import recording
 import numpy as np
-from ou_monitor.analyze.quality_list import quality_list
-from ou_monitor.criticism.quality_item import Severity
+from ou_monitor.analyze.quality import quality_list, Severity
 from ou_monitor.recordings.samples import late_words
 from ou_monitor.records import Estimate, Flag, Recording, Status
 import pytest

@@ -1,21 +1,28 @@
 """
 Everything that is doubtful about a recording, in one list, worst first.
 
-It gathers what the estimator flags at each level, what the reader dropped or mended, and what the
-samples and stamps show by themselves.  Limits: a list without warnings says that nothing was
-found, not that there is nothing.
+The list gathers what the estimator flags at each level, what the reader dropped or mended, what
+the samples and stamps show by themselves, and what lines, a second relaxation and the settling
+after changes of throttle do to the fit of a level.
+
+Limits: a list without warnings says that nothing was found, not that there is nothing.  Settling
+is known only from relaxations that are seen after changes between levels; its share of the
+variance rests on one exponential, and is that of the fit, which holds the settling itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+import enum
 import math
 
 import numpy as np
-from ou_monitor.analyze.levels import GAP_STEPS
-from ou_monitor.criticism.quality_item import QualityItem, Severity
+from ou_monitor.analyze.levels import GAP_STEPS, SETTLE
+from ou_monitor.analyze.relaxation import Relaxation
 from ou_monitor.online.estimator.quality import examine, TAIL
 from ou_monitor.records import Estimate, Flag, Recording, Status
+from ou_monitor.text import Z95
 
 # Flags that inform; the others make numbers doubtful.
 _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
@@ -37,6 +44,40 @@ _READER = (('cannot be decoded', 'DAMAGED_FILE', True), ('damaged', 'DAMAGED_FIL
 NOISE_UNKNOWN = (
     'White noise of the sensor is not told from the supply here: where there is some, alpha '
     'and sigma come out too high (Var_inf does not).')
+# Share of a level's variance that may be left of the settling: alpha is then off by about as much.
+SHARE = 0.02
+
+
+class Severity(enum.IntEnum):
+    """How much it matters."""
+
+    ERROR = 3
+    WARNING = 2
+    INFO = 1
+
+
+@dataclass(frozen=True)
+class QualityItem:
+    """
+    One thing to know before using the numbers.
+
+    Attributes
+    ----------
+    name : str
+        Stable key in capitals.
+    severity : Severity
+        ERROR: there are no numbers; WARNING: they are doubtful; INFO: good to know.
+    text : str
+        One sentence.
+    throttles : tuple of float
+        Levels it is true of; empty when it is of the whole recording.
+
+    """
+
+    name: str
+    severity: Severity
+    text: str
+    throttles: tuple[float, ...] = ()
 
 
 def quality_list(recording: Recording, throttles: Sequence[float], estimates: Sequence[Estimate],
@@ -145,3 +186,75 @@ def _of_samples(recording: Recording) -> list[QualityItem]:
             f'In {clipped} of {len(looks)} stretches looked at the voltage piles up at one end '
             'of its range: the ADC may be at its limit.')))
     return items
+
+
+def unsettled(relaxations: Sequence[Relaxation], throttles: Sequence[float],
+              estimates: Sequence[Estimate], times: Sequence[float]) -> list[QualityItem]:
+    """
+    Return a warning for each kind of change after which levels hold the settling too.
+
+    throttles 0..1, times in s.
+    """
+    items = []
+    for fit in relaxations:
+        shares = {x: _share(fit, x, e, time)
+                  for x, e, time in zip(throttles, estimates, times) if e.usable and time > 0.0}
+        where = tuple(x for x, share in shares.items() if share > SHARE)
+        if not where:
+            continue
+        what = {'release': 'falls', 'load': 'rises'}[fit.kind]
+        start = f'After throttle {what} the voltage '
+        end = (f'only {1e3 * SETTLE:.3g} ms are left out: alpha and sigma here hold the settling '
+               'too')
+        if fit.seen:
+            most = 100.0 * min(1.0, max(shares[x] for x in where))
+            text = (f'{start}settles in tau = {1e3 * fit.tau:.3g} ms, and {end} (up to '
+                    f'{most:.0f} % of the variance).')
+        else:
+            text = f'{start}moves on for as long as it is watched, and {end}.'
+        items.append(QualityItem('NOT_SETTLED', Severity.WARNING, text, where))
+    return items
+
+
+def _share(fit: Relaxation, throttle: float, estimate: Estimate, time: float) -> float:
+    """Return the mean square of what is left of the settling, over Var_inf."""
+    changes = [change for change in fit.releases if change.throttle_after == throttle]
+    if not changes:
+        return 0.0
+    if not fit.seen:
+        return math.inf if fit.moves_on else 0.0
+    # Of A exp(-t / tau), squared, from the end of what is left out to the end of what is watched.
+    left = sum(change.amplitude ** 2 * max(0.0, math.exp(-2.0 * SETTLE / fit.tau)
+                                           - math.exp(-2.0 * change.duration / fit.tau))
+               for change in changes if math.isfinite(change.amplitude))
+    return 0.5 * fit.tau * left / (time * estimate.var_inf)
+
+
+def line_item(throttle: float, without: Estimate, with_lines: Estimate | None) -> QualityItem:
+    """Say what the lines of a level do to its fit, or would have done (throttle 0..1)."""
+    if with_lines is None:
+        worry = Severity.WARNING if without.usable else Severity.INFO
+        return QualityItem('LINES_LEFT_IN', worry, (
+            'Impulses stand beside spectral lines, which may be theirs and were left in: alpha '
+            'and sigma hold both.'), (throttle,))
+    taken = 'Spectral lines were taken out before the fit'
+    if without.usable and with_lines.usable:
+        moved = any(abs(math.log(getattr(with_lines, name) / getattr(without, name)))
+                    > Z95 * getattr(without, name + '_se') for name in ('alpha', 'sigma'))
+        text = (f'{taken}; with them, as the node sees it, alpha would be {with_lines.alpha:.3g} '
+                f'1/s and sigma {with_lines.sigma:.3g} V/sqrt(s).')
+    else:
+        moved = without.usable or with_lines.usable
+        left = ' and nothing that can be fitted is left' if not without.usable else (
+            ', and only then can it be fitted: the node, which sees them, gives no numbers')
+        text = f'{taken}{left}.'
+    return QualityItem('LINES_TAKEN_OUT', Severity.WARNING if moved else Severity.INFO, text,
+                       (throttle,))
+
+
+def second_items(throttles: Sequence[float]) -> list[QualityItem]:
+    """Say where a second relaxation was found (throttles 0..1)."""
+    return [QualityItem('SECOND_RELAXATION', Severity.WARNING, (
+        'A second relaxation, slower or faster, stands beside the one that was fitted: alpha, tau '
+        'and Var_inf are of a mixture, and their intervals hold for neither; the other levels may '
+        'hide the same. `ou-monitor discover` fits both.'), tuple(throttles))] if throttles else []

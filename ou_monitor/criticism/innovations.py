@@ -1,14 +1,8 @@
 """
-Whether a second relaxation rides on the one that was fitted: a score test.
+One-step innovations of an OU in white noise, and what their spectrum shows of another pole.
 
-Under the fitted model the ordinates of the periodogram of the innovations are independent and
-exponential.  A second OU, slower or faster by a known factor, lifts them in a known pattern; what
-the fit can absorb of it (alpha, sigma, white noise) is projected out of the pattern, and what is
-left is compared with the ordinates.  This is the most powerful test near the model, where lags of
-innovations see nothing: a wander ten times slower is correlated over hundreds of them.
-
-Limits: `FACTORS` only, each alone, one-sided (an instrument that removes slow parts is not looked
-for); straight drifts are taken out; samples count as even.
+Under the fitted model the innovations are independent and standard normal, and the ordinates of
+their periodogram independent and exponential.
 """
 
 from __future__ import annotations
@@ -17,14 +11,65 @@ from collections.abc import Sequence
 import math
 
 import numpy as np
-from ou_monitor.criticism.quality_item import QualityItem, Severity
-from ou_monitor.records import FloatArray, NAN
+from ou_monitor.records import Estimate, Flag, FloatArray, NAN
 from scipy import stats
+from scipy.signal import lfilter
 
+# Steps that differ by less than this share of the median are even.
+_EVEN = 0.2
 # Rates of the second relaxation that are looked for, in those of the first.
 FACTORS = (1.0 / 30.0, 1.0 / 10.0, 1.0 / 3.0, 3.0, 10.0)
 # Fewer ordinates than this tell nothing; segments shorter than this give none.
 _FEWEST, _SHORTEST = 64, 64
+
+
+def fresh(voltage: FloatArray, estimate: Estimate) -> np.ndarray:
+    """Return which samples were measured, not repeated by the logger (voltage in V)."""
+    if Flag.HELD_SAMPLES not in estimate.flags or voltage.size < 2:
+        return np.ones(voltage.size, dtype=np.bool_)
+    return np.append(True, voltage[1:] != voltage[:-1])
+
+
+def innovations(t: FloatArray, deviation: FloatArray, alpha: float, var_inf: float,
+                noise_var: float) -> FloatArray:
+    """
+    Return the standardised one-step innovations of a sampled OU in white noise.
+
+    t in s, deviation in V.
+    """
+    if deviation.size < 2 or not math.isfinite(alpha):
+        return deviation / math.sqrt(var_inf + noise_var)
+    dt = np.diff(t)
+    # Float64 seconds since 1970 resolve 0.24 us: an even clock looks a little uneven.
+    step = float(np.median(dt))
+    if noise_var > 0.0 or bool((np.abs(dt - step) < _EVEN * step).all()):
+        phi = math.exp(-alpha * float(dt.mean()))
+        gain, variance = _settled(phi, var_inf, noise_var)
+        # The predictor forgets with phi (1 - gain): an ARMA(1,1) turned round.
+        e = lfilter([1.0, -phi], [1.0, -phi * (1.0 - gain)], deviation)
+        scaled = np.asarray(e / math.sqrt(variance))
+        scaled[0] = deviation[0] / math.sqrt(var_inf + noise_var)
+        return scaled
+    phis = np.exp(-alpha * dt)
+    steps = (deviation[1:] - phis * deviation[:-1]) / np.sqrt(
+        -var_inf * np.expm1(-2.0 * alpha * dt))
+    return np.concatenate(([deviation[0] / math.sqrt(var_inf)], steps))
+
+
+def _settled(phi: float, var_inf: float, noise_var: float) -> tuple[float, float]:
+    """Return the steady Kalman gain and the variance of the innovations."""
+    if not noise_var > 0.0:
+        return 1.0, var_inf * (1.0 - phi * phi)
+    q = var_inf * (1.0 - phi * phi)
+    # Predicted variance p = phi^2 p r / (p + r) + q, solved for p.
+    b = noise_var * (1.0 - phi * phi) - q
+    p = 0.5 * (-b + math.sqrt(b * b + 4.0 * q * noise_var))
+    return p / (p + noise_var), p + noise_var
+
+
+def join(parts: Sequence[FloatArray]) -> FloatArray:
+    """Return the parts one after the other; empty for none."""
+    return np.concatenate(parts) if parts else np.zeros(0)
 
 
 def second_relaxation(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: float,
@@ -57,14 +102,6 @@ def second_relaxation(parts: Sequence[FloatArray], rate: float, alpha: float, va
         if p < best:
             best, share = p, score / left
     return min(1.0, len(FACTORS) * best), share
-
-
-def second_items(throttles: Sequence[float]) -> list[QualityItem]:
-    """Say where a second relaxation was found (throttles 0..1)."""
-    return [QualityItem('SECOND_RELAXATION', Severity.WARNING, (
-        'A second relaxation, slower or faster, stands beside the one that was fitted: alpha, tau '
-        'and Var_inf are of a mixture, and their intervals hold for neither; the other levels may '
-        'hide the same. `ou-monitor discover` fits both.'), tuple(throttles))] if throttles else []
 
 
 def _shape(omega: FloatArray, step: float) -> FloatArray:

@@ -5,8 +5,7 @@ import math
 from made_recordings import ALPHA, recording, without_throttle
 import numpy as np
 from ou_monitor.analyze.analyze import analyze
-from ou_monitor.analyze.by_throttle import by_throttle
-from ou_monitor.analyze.sliding import slide
+from ou_monitor.analyze.replay import by_throttle, slide
 from ou_monitor.model.ou import simulate
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings

@@ -1,0 +1,196 @@
+"""
+What the ADC and its input did to the readings: steps between codes, rails, squeezed ends.
+
+Ties have no chance in a diffusion, so steps and rails are findings without a model.  A protection
+diode before the ADC squeezes readings beyond a knee: they rise as a logarithm.  Undone, they are
+an OU again: the knee and the scale are those under which an AR(1) finds the readings likeliest,
+the density of the transformed samples counted.
+
+Leaving clipped samples out would cut the law where they were, and every statistic of the rest
+would see the cut.  So they are drawn from the law of an AR(1), given their neighbours and that
+they lie beyond the limit (Gibbs sampling; Tanner & Wong, J. Am. Stat. Assoc. 82 (1987) 528).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from ou_monitor.records import FloatArray
+from scipy.special import ndtr, ndtri
+
+# Values looked at for the step: more tell no more.
+_MOST = 200_000
+# Rounding of float32, as a share of the value, with room for two of them.
+_FLOAT32 = 2.5e-7
+# Share of the samples that must lie on the lattice, and how near, in steps.
+_SHARE, _NEAR = 0.99, 0.1
+# Samples at a rail, visits to it, and standard errors above its neighbours, at least.
+_LEAST, _VISITS, _CLEAR = 8, 3, 5.0
+# With steps above this many standard deviations of the noise the codes next to
+# each other say nothing of a density.
+_COARSE = 2.0
+# Sweeps over all samples drawn: excursions last some relaxation times at most.
+_SWEEPS = 60
+# Shares of the samples beyond the knee, and scales in standard deviations of the
+# innovations.  A larger scale is no limit but a bent characteristic.
+_SHARES = (0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.1)
+_SCALES = (0.05, 0.1, 0.15, 0.2, 0.3)
+# Evidence from which it is found, nats.
+_FOUND = 50.0
+# Falls from just below the knee, at least, and how noisy beside all; and stretches of the
+# recording of which half must have been beyond it.
+_FEWEST, _AS_NOISY, _PARTS = 30, 0.6, 10
+# Beyond so many scales a reading says nothing of what was there.
+_FAR = 8.0
+# Sums of squares that are none; far from it, their inverse is still a number.
+_TINY = 1e-280
+
+
+def find_step(voltage: FloatArray) -> float:
+    """Return the step of the lattice on which the values lie (voltage in V)."""
+    v = voltage[:_MOST]
+    if v.size > 16:
+        # A rail need not be a code.
+        inner = v[(v > v.min()) & (v < v.max())]
+        v = inner if np.unique(inner).size > 2 else v
+    values, counts = np.unique(v, return_counts=True)
+    rounding = _FLOAT32 * float(np.abs(values).max(initial=0.0))
+    begins = np.concatenate(([0], np.flatnonzero(np.diff(values) > rounding) + 1))
+    if begins.size < 2 or begins.size > 0.5 * v.size:
+        return 0.0
+    weight = np.add.reduceat(counts, begins).astype(np.float64)
+    codes = np.add.reduceat(values * counts, begins) / weight
+    gaps = np.diff(codes)
+    for first in (float(gaps.min()), float(np.median(gaps))):
+        step = _fitted(codes, gaps, weight, first)
+        if step > 8.0 * rounding:
+            return step
+    return 0.0
+
+
+def _fitted(codes: FloatArray, gaps: FloatArray, weight: FloatArray, first: float) -> float:
+    """Return the step near `first` that the codes fit; 0 when they do not."""
+    step = float(gaps[gaps < 1.5 * first].mean())
+    number = np.concatenate(([0.0], np.cumsum(np.rint(gaps / step))))
+    middle = float(weight @ number) / float(weight.sum())
+    spread = float(weight @ (number - middle) ** 2)
+    if not spread > 0.0:
+        return 0.0
+    step = float(weight @ ((number - middle) * codes)) / spread
+    level = float(weight @ codes) / float(weight.sum())
+    off = np.abs(codes - level - step * (number - middle))
+    return step if weight[off < _NEAR * step].sum() >= _SHARE * weight.sum() else 0.0
+
+
+def find_rails(voltage: FloatArray, step: float, noise: float) -> tuple[float, float]:
+    """Return the readings at which the ADC clips (voltage in V, step in V, noise in V)."""
+    if step > _COARSE * noise:
+        return -math.inf, math.inf
+    high = float(voltage.max()) if _clipped(voltage, step, 1.0) else math.inf
+    low = float(voltage.min()) if _clipped(voltage, step, -1.0) else -math.inf
+    return low, high
+
+
+def _clipped(voltage: FloatArray, step: float, side: float) -> bool:
+    """Return whether the top (or with side -1 the bottom) holds more than its neighbours say."""
+    top = float(voltage.max()) if side > 0.0 else -float(voltage.min())
+    tie = _FLOAT32 * abs(top)
+    width = step if step > 0.0 else tie
+    below = top - side * voltage
+    at = below < 0.5 * width + tie
+    count = int(at.sum())
+    # The extremes of a bell need not be tested where nothing is heaped.
+    if count < _LEAST or int((at[1:] & ~at[:-1]).sum()) < _VISITS:
+        return False
+    others = below[~at]
+    if not others.size or float(others.min()) > max(3.5 * step, 0.2 * float(others.std())):
+        # Far from all others: a code of its own, no end of a range.
+        return False
+    if step > 0.0:
+        expected = max(float((np.abs(below - k * step) < 0.5 * step).sum()) for k in (1, 2, 3))
+    else:
+        # As dense as the nearest stretch that holds some samples.
+        reach = float(np.partition(others, min(_LEAST, others.size - 1))[:_LEAST].max())
+        expected = _LEAST * 2.0 * tie / max(reach, tie)
+    return count - expected > _CLEAR * math.sqrt(count + expected)
+
+
+def redraw(voltage: FloatArray, low: float, high: float, step: float,
+           rng: np.random.Generator) -> FloatArray:
+    """
+    Return the voltage with clipped samples drawn beyond their limit.
+
+    voltage in V, low, high in V, step in V.
+    """
+    v = voltage.astype(np.float64)
+    top, bottom = voltage >= high, voltage <= low
+    sites = np.flatnonzero(top | bottom)
+    sites = sites[(sites > 0) & (sites < v.size - 1)]
+    halves = [sites[sites % 2 == parity] for parity in (0, 1)]
+    for _ in range(_SWEEPS):
+        mean = float(v.mean())
+        c = v - mean
+        phi = min(float(c[1:] @ c[:-1]) / float(c @ c), 0.9999)
+        spread = float(np.sqrt(np.mean((c[1:] - phi * c[:-1]) ** 2) / (1.0 + phi * phi)))
+        for k in halves:
+            centre = mean + phi / (1.0 + phi * phi) * (c[k - 1] + c[k + 1])
+            side = np.where(top[k], 1.0, -1.0)
+            limit = np.where(top[k], high, low)
+            # On the side of the limit: -z is below where the limit lies.
+            room = ndtr(side * (centre - limit) / spread)
+            draw = -ndtri(np.maximum(room * (1.0 - rng.random(k.size)), 1e-300))
+            c[k] = np.where(room > 1e-12, centre + side * spread * draw, limit) - mean
+        v = c + mean
+    if step > 0.0:
+        for at, end in ((top, high), (bottom, low)):
+            v[at] = end + step * np.rint((v[at] - end) / step)
+    return v
+
+
+def find_knee(voltage: FloatArray, noise: float, side: float) -> float | None:
+    """Return where readings begin to be squeezed (voltage in V, noise in V)."""
+    x = side * voltage
+    plain = _likelihood(x)
+    best, found = plain + _FOUND, None
+    for share in _SHARES:
+        knee = float(np.quantile(x, 1.0 - share))
+        over = np.maximum(x - knee, 0.0)
+        for scale in _SCALES:
+            far = over / (scale * noise)
+            if float(far.max()) > 1e3:
+                continue
+            part = np.minimum(far, _FAR)
+            # Beyond, on along the tangent.
+            stretched = np.expm1(part) + (far - part) * math.exp(_FAR)
+            value = float(part.sum()) + _likelihood(
+                np.minimum(x, knee) + scale * noise * stretched)
+            if value > best:
+                best, found = value, knee
+    return side * found if found is not None and _is_limit(x, found) else None
+
+
+def _is_limit(x: FloatArray, knee: float) -> bool:
+    """
+    Return whether noise is squeezed above a knee only, and now and then.
+
+    A rail that is quiet while nothing draws current is near its top then, too: but
+    just below as well, and for one long while.
+    """
+    step = np.diff(x)
+    near = (x[:-1] < knee) & (x[:-1] > knee - 3.0 * float(np.std(step)))
+    # What falls from just below the knee is not squeezed.
+    below, all_ = step[near & (step < 0.0)], step[step < 0.0]
+    if below.size < _FEWEST or float(np.sqrt(np.mean(below**2))) < _AS_NOISY * float(
+            np.sqrt(np.mean(all_**2))):
+        return False
+    parts = np.array_split(x > knee, _PARTS)
+    return sum(bool(part.any()) for part in parts) >= _PARTS // 2
+
+
+def _likelihood(x: FloatArray) -> float:
+    """Return the log-likelihood of an AR(1), but for a constant, nats."""
+    a, b = x[:-1] - x[:-1].mean(), x[1:] - x[1:].mean()
+    e = b - float(a @ b) / max(float(a @ a), _TINY) * a
+    count = int(e.size)
+    return -0.5 * count * math.log(max(float(e @ e), _TINY) / count)
