@@ -17,7 +17,8 @@ from ou_monitor.criticism.battery import Scene
 from ou_monitor.criticism.battery_history import large_ones, throttle_paths
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import Events, fit_gaussian, GaussianFit
-from ou_monitor.model.terms.term import LawFit, Role, Term, View
+from ou_monitor.model.terms.laws import LawFit, View
+from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray
 
 # Rounds between events and the Gaussian part.
@@ -95,7 +96,7 @@ def fit_composite(samples: Samples, terms: Sequence[Term], part: slice,
         power = np.ones(samples.n)
         for k, law in enumerate(laws):
             view = replace(view_of(samples, gaussian, z, part), variance=gaussian.variance * power)
-            fit = law.refit_law(view, law) if vars(law) else law.fit_law(view)
+            fit = law.refit_law(view) if vars(law) else law.fit_law(view)
             if fit is None:
                 return None
             laws[k] = fit.term

@@ -14,7 +14,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.terms.term import Stretch, Term
+from ou_monitor.model.terms.segment import Segment
+from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray
 from scipy.special import ndtri
 
@@ -124,10 +125,10 @@ class Samples:
         step = self.step[1:]
         return bool((step == step[0]).all()) if step.size else True
 
-    def stretch(self, alpha: float, sigma: float) -> Stretch:
+    def stretch(self, alpha: float, sigma: float) -> Segment:
         """Return the samples as terms take them, with nothing on them yet."""
         n = self.n
-        return Stretch(
+        return Segment(
             t=self.t, at=self.t, step=self.step,
             throttle=np.full(n, np.nan) if self.throttle is None else self.throttle,
             origin=float(self.t[0]), alpha=np.full(n, alpha), sigma=np.full(n, sigma),

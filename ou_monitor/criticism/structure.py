@@ -18,7 +18,8 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.model.innovations import Filter, StateSpace
 from ou_monitor.model.terms.ac_coupling import ACCoupling, bridge
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.term import Role, Stretch, Term
+from ou_monitor.model.terms.segment import Segment
+from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray
 
 # Measurement noise that stands for none, as a share of what a step adds.
@@ -32,8 +33,6 @@ _NARROW = 8
 _DEAR = 30000
 # With more states than this the part has to do.
 _MANY = 4
-# Blocks of one state.
-_SINGLE = ('second_relaxation', 'ac_coupling')
 # Samples in which the gain of a constant model has settled: the predictive
 # variance is then within some 1e-5 of its limit.
 _SETTLES = 1024
@@ -142,7 +141,7 @@ def _linear(term: Term) -> FloatArray:
     return np.array(term.linear_values() if term.ROLE is Role.MEAN else [], dtype=np.float64)
 
 
-def _columns(samples: Samples, terms: Sequence[Term], s: Stretch) -> FloatArray:
+def _columns(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
     """Return all columns of the mean, through the instrument."""
     parts = [np.ones((s.t.size, 1))]
     for term in terms:
@@ -161,7 +160,7 @@ def _columns(samples: Samples, terms: Sequence[Term], s: Stretch) -> FloatArray:
 
 
 def _filter(samples: Samples, terms: Sequence[Term], events: Events | None
-            ) -> tuple[Stretch, Filter, FloatArray, FloatArray]:
+            ) -> tuple[Segment, Filter, FloatArray, FloatArray]:
     """Return the stretch, its filter, and variances: events at their own sample not in, and in."""
     if events is not None and _states(terms) >= _MANY and not events.error.any():
         # Where noise or pushes enter the state and nothing hides them, the gains of
@@ -176,13 +175,12 @@ def _filter(samples: Samples, terms: Sequence[Term], events: Events | None
 
 
 def _states(terms: Sequence[Term]) -> int:
-    """Return about how many states a model has: flicker noise is many, other blocks one or two."""
-    return 1 + sum(_MANY if term.NAME == 'flicker_noise' else 1 if term.NAME in _SINGLE else 2
-                   for term in terms if term.ROLE is Role.BLOCK)
+    """Return about how many states a model has."""
+    return 1 + sum(term.STATES for term in terms if term.ROLE is Role.BLOCK)
 
 
 def _space(samples: Samples, terms: Sequence[Term], events: Events | None
-           ) -> tuple[Stretch, StateSpace, FloatArray | float]:
+           ) -> tuple[Segment, StateSpace, FloatArray | float]:
     """Return the stretch, the state space, and what events add to each variance predicted."""
     ou = terms[0]
     assert isinstance(ou, OU)
@@ -229,14 +227,14 @@ def _space(samples: Samples, terms: Sequence[Term], events: Events | None
     return whole, StateSpace(f_all, q_all, h_all, r), own
 
 
-def _first(s: Stretch, n: int) -> Stretch:
+def _first(s: Segment, n: int) -> Segment:
     """Return the first samples of a stretch."""
     return replace(s, **{name: getattr(s, name)[:n] for name in (
         't', 'at', 'step', 'throttle', 'alpha', 'sigma', 'power', 'push', 'x', 'level',
         'voltage')})
 
 
-def _coupled(term: ACCoupling, s: Stretch, phi: FloatArray, q: FloatArray
+def _coupled(term: ACCoupling, s: Segment, phi: FloatArray, q: FloatArray
              ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the OU and its low-pass, which the instrument subtracts."""
     rate = 2.0 * math.pi * term.corner

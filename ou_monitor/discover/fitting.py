@@ -13,9 +13,10 @@ import numpy as np
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
+from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.load_transient import LoadTransient
-from ou_monitor.model.terms.term import Role, Term, View
+from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray
 
 # Starting points that are fitted in full, and samples that tell which.

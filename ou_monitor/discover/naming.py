@@ -19,8 +19,7 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.discover.fitting import best_start, fitted, joined
 from ou_monitor.discover.gain import BLOCKS, mean_difference
 from ou_monitor.discover.trials import (
-    AGAIN, anything, criticise, is_measured, MOST_WORK, refined, ROUGH, tier_of, TIERS, Trial,
-    trials_of)
+    anything, criticise, MOST_WORK, refined, ROUGH, tier_of, TIERS, Trial, trials_of)
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.lines import lines_with_height
 from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
@@ -32,8 +31,6 @@ from ou_monitor.model.terms.tone import Tone
 ACCEPT, ACCEPT_MEAN = 6.0, 3.0
 # Causes within this of the best cannot be told from it here, nats.
 TIE = 3.0
-# Share of the largest evidence that drift needs beside it.
-_FORM = 0.02
 # Evidence from which a measured cause stays when others have come, nats.
 NEEDED = 0.0
 # Gain in its standard errors from which it is not by chance of a few stretches.
@@ -92,12 +89,12 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
         if progress is not None:
             progress(turn / MOST)
         trials, good = [], []
-        hidden = {name for name in search.accepted if not is_measured(catalogue()[name])}
+        hidden = {name for name in search.accepted if not catalogue()[name].MEASURED}
         for tier in range(TIERS if latent and len(hidden) < MOST_LATENT else 1):
             # Measured inputs first: what is latent can imitate them, and costs more.
             trials += trials_of(samples, search.composite, values, given, tier, bank, only)
             good = [trial for trial in trials if trial.evidence > _least(trial.name, search)
-                    and (not (is_measured(catalogue()[trial.name]) and _ragged(values))
+                    and (not (catalogue()[trial.name].MEASURED and _ragged(values))
                          or _throughout(trial.composite, search.composite))]
             if good:
                 break
@@ -130,7 +127,7 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
             # What is wrong here may not be in the catalogue: other terms would dress
             # it up.  Only one more of the kind may still be missing.
             search.log.append(f'{best.name} leaves most of what is wrong')
-            if best.name not in AGAIN or only:
+            if not catalogue()[best.name].RECURS or only:
                 break
             only = best.name
         values = after
@@ -143,10 +140,9 @@ def name_causes(samples: Samples, baseline: Composite, bank: NullBank, *,
 def _least(name: str, search: Search) -> float:
     """Return the evidence from which a cause is accepted."""
     kind = catalogue()[name]
-    if name == 'drift':
-        # Time mends a little of whatever the form of a larger effect leaves.
-        return max(ACCEPT, _FORM * search.largest)
-    return ACCEPT_MEAN if is_measured(kind) and kind.ROLE is Role.MEAN else ACCEPT
+    if kind.LEAST_SHARE:
+        return max(ACCEPT, kind.LEAST_SHARE * search.largest)
+    return ACCEPT_MEAN if kind.MEASURED and kind.ROLE is Role.MEAN else ACCEPT
 
 
 def _ragged(values: dict[str, float]) -> bool:
@@ -167,8 +163,8 @@ def _other_means(samples: Samples, search: Search, trials: Sequence[Trial]) -> N
     last = search.accepted[-1]
     for trial in trials:
         kind = catalogue()[trial.name]
-        if trial.name == last or kind.ROLE is not Role.MEAN or not is_measured(kind) or (
-                trial.evidence < _least(trial.name, search) or not is_measured(catalogue()[last])):
+        if trial.name == last or kind.ROLE is not Role.MEAN or not kind.MEASURED or (
+                trial.evidence < _least(trial.name, search) or not catalogue()[last].MEASURED):
             continue
         composite = search.composite
         view = view_of(samples, composite.gaussian, composite.z, samples.train)
@@ -238,7 +234,7 @@ def _prune(samples: Samples, search: Search) -> None:
     last = catalogue()[search.accepted[-1]]
     for name in search.accepted[:-1]:
         kind = catalogue()[name]
-        if last.ROLE is Role.LAW and is_measured(kind) and kind.FAMILY != last.FAMILY:
+        if last.ROLE is Role.LAW and kind.MEASURED and kind.FAMILY != last.FAMILY:
             # Another law of the noise is no reason to doubt what answers to an input, unless
             # it is the intensity that wanders: by chance with throttle.
             continue
@@ -247,7 +243,7 @@ def _prune(samples: Samples, search: Search) -> None:
         same = search.composite if search.composite.terms[index].ROLE is not Role.LAW else None
         less = fitted(samples, kept, same, rough=True)
         # What was measured stays unless it is worth less than it costs.
-        needed = NEEDED if is_measured(catalogue()[name]) else TIE
+        needed = NEEDED if catalogue()[name].MEASURED else TIE
         if less is not None and full - less.score(samples) < needed + ROUGH:
             less = fitted(samples, kept, less)
         if less is not None and full - less.score(samples) < needed:

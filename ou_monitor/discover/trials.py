@@ -27,21 +27,12 @@ ASK_DEAR = 3.2
 CLEAR, _LEFT = 30.0, 4.5
 # What a fit to some thousand samples may lack of that to all, nats.
 ROUGH = 20.0
-# Kinds of which there may be one more.
-AGAIN = frozenset({'tone', 'throttle_tone', 'resonance', 'second_relaxation', 'load_transient'})
-# Kinds that imitate each other: one beside another would only mend its form.
-_ALIKE = (frozenset({'volatility', 'regime_switching', 'heavy_tails', 'jumps'}),
-          frozenset({'glitches', 'jumps', 'heavy_tails', 'clock_jitter'}),
-          frozenset({'second_relaxation', 'flicker_noise', 'regime_switching'}),
-          frozenset({'nonlinear_restoring', 'regime_switching'}))
 # What filters may cost before no further dear kind is tried, s, about.
 MOST_WORK = 10.0
 # Turns: measured inputs, laws where there are clear outliers, the rest.
 TIERS = 3
 _SHAPE = ('kurtosis', 'tails')
 _CLEAR_SHAPE = 25.0
-# Line that follows throttle, as a score, from which on it is no chance.
-_CLEAR_LINE = 10.0
 # Correlation of small neighbours, as a score, from which on it is white noise.
 _WHITE = -8.0
 
@@ -117,14 +108,13 @@ def kinds_to_try(composite: Composite, values: dict[str, float], given: Sequence
             continue
         if tier_of(kind, values) != tier or (kind.NEEDS_THROTTLE and not throttle):
             continue
-        if composite.has(name) and name not in AGAIN:
+        if composite.has(name) and not kind.RECURS:
             continue
-        if any(name in group and any(composite.has(other) for other in group - {name})
-               for group in _ALIKE):
+        if any(imitate(kind, type(term)) for term in composite.terms):
             continue
         # What is cheap and linear in what was measured is looked at wherever something
         # was found and something is left.
-        if asks(kind, values) or (len(composite.terms) > 1 and is_measured(kind)
+        if asks(kind, values) or (len(composite.terms) > 1 and kind.MEASURED
                                   and kind.ROLE is Role.MEAN and anything(values)):
             found.append(kind)
     # The one that is asked for most may spare the others.
@@ -148,14 +138,13 @@ def _settled(trial: Trial, kind: type[Term]) -> bool:
     return (kind.DEAR and trial.left is not None and not asks(kind, trial.left)
             and not anything(trial.left)
             and catalogue()[trial.name].FAMILY != kind.FAMILY
-            and not any({trial.name, kind.NAME} <= group for group in _ALIKE))
+            and not imitate(kind, catalogue()[trial.name]))
 
 
 def tier_of(kind: type[Term], values: dict[str, float]) -> int:
     """Return when a kind has its turn: measured inputs, clear outliers, the rest."""
-    if is_measured(kind) or (
-            kind.NAME == 'throttle_tone' and values.get('order line', 0.0) > _CLEAR_LINE):
-        # A line that is clearly there would pass for sigma or alpha that follow throttle.
+    if kind.MEASURED or any(
+            values.get(name, 0.0) > clear for name, clear in kind.CLEAR_ABOVE.items()):
         return 0
     shape = max((abs(value) for name, value in values.items()
                  if name.startswith(_SHAPE)), default=0.0)
@@ -168,6 +157,6 @@ def tier_of(kind: type[Term], values: dict[str, float]) -> int:
     return 1 if kind.ROLE is Role.LAW and outliers else 2
 
 
-def is_measured(kind: type[Term]) -> bool:
-    """Return whether a kind answers to throttle or time alone."""
-    return kind.FAMILY != 'line' and (kind.NEEDS_THROTTLE or kind.NAME == 'drift')
+def imitate(one: type[Term], other: type[Term]) -> bool:
+    """Return whether two kinds imitate each other."""
+    return other.NAME in one.IMITATES or one.NAME in other.IMITATES

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from ou_monitor.criticism.battery import is_sign
 from ou_monitor.criticism.null_bank import family_chance
 from ou_monitor.discover.finding import Verdict
-from ou_monitor.model.terms.term import Role, Term
+from ou_monitor.model.terms.term import Term
 
 # Chance of the largest statistic above which nothing is wrong where no cause was found.
 NOTHING = 0.01
@@ -16,12 +16,6 @@ PASSES = 0.001
 # A statistic fails that is this far off, and by more than these shares of what it,
 # and the worst of all, was before there were any causes.
 FAILS, OWN_SHARE, SHARE = 4.8, 0.07, 0.02
-# Share of its own signs that noise, a line or the instrument (which may have two
-# corners) may leave, by family; a broad line could be the spectrum of anything.
-_SIGNS_SHARE = {'sensor': 0.3, 'line': 0.3, 'resonance': 0.1, 'instrument': 0.75}
-# What rings under noise does not come and go, and does not make three neighbours depend on
-# each other.
-_NO_RINGING = ('bursts', 'products of three')
 # Share of clustering that the form of sigma(throttle) may leave.
 _FORM_SHARE = 0.15
 
@@ -41,7 +35,7 @@ def failing(before: Mapping[str, float], after: Mapping[str, float]) -> list[str
 
 def is_latent(kind: type[Term]) -> bool:
     """Whether a cause is inferred only: neither from a measured input nor from time."""
-    return not (kind.NEEDS_THROTTLE or kind.FAMILY == 'load' or kind.NAME == 'drift')
+    return not (kind.NEEDS_THROTTLE or kind.MEASURED)
 
 
 def withdrawn(before: Mapping[str, float], after: Mapping[str, float],
@@ -57,14 +51,13 @@ def withdrawn(before: Mapping[str, float], after: Mapping[str, float],
                 or abs(after[name]) > _FORM_SHARE * abs(before.get(name, 0.0))]
 
     def fails(kind: type[Term]) -> bool:
-        if kind.ROLE is not Role.NOISE and kind.FAMILY not in ('line', 'instrument'):
+        if not kind.MAY_LEAVE:
             return bool(left)
-        if kind.NAME == 'resonance' and any(name.startswith(_NO_RINGING) for name in left):
+        if kind.REFUTED_BY and any(name.startswith(kind.REFUTED_BY) for name in left):
             return True
-        share = _SIGNS_SHARE['resonance' if kind.NAME == 'resonance' else kind.FAMILY]
         own = max((abs(value) for name, value in before.items() for sign in kind.SIGNS
                    if is_sign(sign, name, value)), default=0.0)
-        return any(is_sign(sign, name, after[name]) and abs(after[name]) > share * own
+        return any(is_sign(sign, name, after[name]) and abs(after[name]) > kind.MAY_LEAVE * own
                    for name in left for sign in kind.SIGNS)
 
     return [k for k, kind in enumerate(accepted) if is_latent(kind) and fails(kind)]

@@ -8,106 +8,10 @@ from typing import Any
 
 from ou_monitor.discover.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.discover.gain_words import gain_words, why_named
+from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Term
 from ou_monitor.text import listed, number
-
-# What it is; what to do about it; which recording shows it apart from others.
-_CAUSES: Mapping[str, tuple[str, str, str]] = {
-    'load_sag': (
-        'The mean falls with throttle: IR drop of battery, leads and regulator.',
-        'Give the estimator throttle, so that it takes the sag out; thicker or shorter leads '
-        'reduce it.',
-        'throttle held for some seconds at several levels'),
-    'load_transient': (
-        'The mean answers to changes of throttle: lag, inrush or slow polarisation recovery.',
-        'Count the dip after a throttle step into the brown-out margin; capacitance at the ESC '
-        'shortens it.',
-        'single steps of throttle, each held for ten times the time in which the answer dies out'),
-    'load_dependent_sigma': (
-        'The noise grows or shrinks with throttle.',
-        'Let the estimator run while flying, so that filters and risk follow the load.',
-        'throttle held for some seconds at several levels'),
-    'load_dependent_alpha': (
-        'The relaxation rate depends on throttle.',
-        'Fit each load level on its own (analyze); one alpha is wrong at all but one of them.',
-        'throttle held for 50 relaxation times at each of several levels'),
-    'drift': (
-        'The mean moves slowly with time: discharge or warming.',
-        'Use a window short beside the drift, or take the trend out first.',
-        'a recording several times as long'),
-    'measurement_noise': (
-        'White noise of the sensor lies on top of the rail.',
-        'Average in the ADC or use a finer range; alpha and sigma fitted without it are too '
-        'high.',
-        'the same rail at several times the sampling rate, or the input of the ADC shorted'),
-    'quantization': (
-        'The steps of the ADC are comparable to the noise.',
-        'Use a finer range of the ADC or more gain ahead of it; sigma is partly rounding.',
-        'the same rail with a finer range of the ADC'),
-    'held_samples': (
-        'The logger repeats its last value until the source has a new one.',
-        'Log at the rate of the source, or drop repeats before any fit (done here).',
-        'the raw samples of the ADC'),
-    'saturation': (
-        'The voltage is clipped at the end of the range of the ADC.',
-        'Rescale the input: the true excursions are larger, and those are the ones that matter.',
-        'the same rail with a larger range'),
-    'second_relaxation': (
-        'A second relaxation of its own rate adds to the first: a second storage element.',
-        'Keep both in the model; one alpha alone describes neither.',
-        'a recording ten times as long, throttle held still'),
-    'resonance': (
-        'The rail rings: inductance of the leads against the capacitors.',
-        'Damp it with a resistive (electrolytic) capacitor or shorter leads.',
-        'a sampling rate of ten times the ringing, throttle held still'),
-    'tone': (
-        'A line at a fixed frequency: PWM of an ESC or its alias, or a DC-DC converter.',
-        'Find the source by its frequency; sample at another rate to tell an alias.',
-        'the same at two sampling rates: an alias moves, a true line does not'),
-    'throttle_tone': (
-        'A line whose frequency follows throttle: commutation of the motors.',
-        'Capacitance at the ESC; a notch that follows throttle.',
-        'a slow sweep of throttle'),
-    'ac_coupling': (
-        'The instrument is AC-coupled: the relaxation that is seen is that of its high-pass.',
-        'Repeat with the instrument DC-coupled; alpha of the rail is the one given here, not '
-        'the one of the plain fit.',
-        'the same rail DC-coupled'),
-    'jumps': (
-        'The supply is kicked now and then and relaxes at the rate alpha: load impulses.',
-        'Look for what switches at that rate: servos, payload, radio.',
-        'a recording with each consumer off in turn'),
-    'heavy_tails': (
-        'The driving noise itself has heavy tails, without distinct events.',
-        'Take large excursions as more frequent than a normal law says.',
-        'a recording several times as long, at a higher rate'),
-    'glitches': (
-        'Single bad samples that do not enter the dynamics: bus errors or pick-up of the ADC.',
-        'Reject single outliers before the estimator; check cables and ground of the ADC.',
-        'two ADCs on one rail: a glitch is in one only'),
-    'regime_switching': (
-        'The supply switches between two states, unrelated to throttle.',
-        'Look for a consumer that goes on and off, or a loose contact.',
-        'the state of other consumers recorded beside it'),
-    'volatility': (
-        'The intensity of the noise wanders slowly, unrelated to throttle.',
-        'Keep the window of the estimator short beside that time.',
-        'a recording several times as long, temperature recorded beside it'),
-    'nonlinear_restoring': (
-        'What pulls the voltage back is not proportional to the deviation: a load of constant '
-        'power, or softening near brown-out.',
-        'Take deep excursions as longer and more frequent than the linear model says.',
-        'stronger excursions: steps of load in both directions'),
-    'flicker_noise': (
-        '1/f noise: there is no single relaxation time.',
-        'Treat alpha as a number of this window only; use windows of one length to compare.',
-        'a recording over two more decades of frequency'),
-    'clock_jitter': (
-        'Time stamps are off by a random amount.',
-        'Stamp in the interrupt of the ADC, not where the message is sent.',
-        'stamps by the clock of the ADC recorded beside the others'),
-}
 
 # An estimate whose error is so many times as large is none.
 _UNDETERMINED = 1e4
@@ -178,8 +82,7 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
 
     gain, gain_se in nats.
     """
-    what, advice, _ = _CAUSES.get(term.NAME, (term.MEANING or term.NAME, '', ''))
-    parts = [what, f'Estimate: {parameters(term, se)}.']
+    parts = [term.MEANING, f'Estimate: {parameters(term, se)}.']
     if exact:
         parts.append('Seen in the samples themselves, without a model.')
     parts.append(gain_words(gain, gain_se, why))
@@ -188,11 +91,11 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
     if not exact:
         parts.append(why_named(gain, gain_se, chance))
     if alternatives:
-        separate = [f'{_CAUSES[name][2]} (for {name})' for name in (term.NAME, *alternatives)
-                    if name in _CAUSES]
+        separate = [f'{catalogue()[name].SEPARATED_BY} (for {name})'
+                    for name in (term.NAME, *alternatives)]
         parts.append(f'This recording does not tell it from {listed(list(alternatives))}; what '
                      f'would: {"; ".join(dict.fromkeys(separate))}.')
-    parts.append(advice)
+    parts.append(term.REMEDY)
     return ' '.join(part for part in parts if part)
 
 

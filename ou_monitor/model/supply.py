@@ -14,12 +14,9 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.term import Effect, Stage, Stretch, Term
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray
-
-# Terms of which a model can have several.
-SEVERAL = frozenset({'tone', 'throttle_tone', 'second_relaxation', 'resonance', 'load_transient',
-                     'jumps', 'glitches', 'regime_switching', 'ac_coupling'})
 
 # Samples made at once by `SupplyModel.simulate`: bounds memory beside the result,
 # and what the terms touch stays in the processor's caches.
@@ -60,9 +57,10 @@ class SupplyModel:
         if not names or names[0] != 'ou':
             raise ValueError("the first term of a model must be 'ou', got "
                              + (f"'{names[0]}'" if names else 'no term at all'))
-        for name in names:
-            if names.count(name) > 1 and name not in SEVERAL:
-                raise ValueError(f"a model can have one term '{name}', got {names.count(name)}")
+        for term in self.terms:
+            count = names.count(term.NAME)
+            if count > 1 and not term.SEVERAL:
+                raise ValueError(f"a model can have one term '{term.NAME}', got {count}")
 
     @property
     def ou(self) -> OU:
@@ -176,13 +174,13 @@ class Simulation:
                              'finite')
         return load
 
-    def _stretch(self, stamps: FloatArray, step: FloatArray, throttle: FloatArray) -> Stretch:
+    def _stretch(self, stamps: FloatArray, step: FloatArray, throttle: FloatArray) -> Segment:
         ou, n = self._model.ou, stamps.size
 
         def of(value: float) -> FloatArray:
             return np.full(n, value) if self._driven else np.broadcast_to(value, n)
 
-        return Stretch(
+        return Segment(
             t=stamps, at=stamps, step=step, throttle=throttle, origin=self._origin,
             alpha=of(ou.alpha), sigma=of(ou.sigma), power=of(1.0), push=of(0.0), bend=(0.0, 0.0),
             x=np.broadcast_to(0.0, n), level=np.full(n, ou.u0), voltage=np.broadcast_to(0.0, n))
@@ -205,6 +203,6 @@ def _in_order(terms: Sequence[Term], rng: np.random.Generator) -> list[Effect]:
     return effects
 
 
-def _join(s: Stretch) -> None:
+def _join(s: Segment) -> None:
     """Put the rail together, before any instrument sees it."""
     s.voltage = s.x + s.level

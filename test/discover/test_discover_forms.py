@@ -9,11 +9,11 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import fit_gaussian
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.clock_jitter import ClockJitter
+from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import order_lines
 from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.regime_switching import RegimeSwitching
-from ou_monitor.model.terms.term import View
 import pytest
 from scipy.signal import lfilter
 

@@ -4,7 +4,8 @@ import math
 import tracemalloc
 
 import numpy as np
-from ou_monitor.model.supply import SEVERAL, Simulation, STRETCH, SupplyModel
+from ou_monitor.model.supply import Simulation, STRETCH, SupplyModel
+from ou_monitor.model.terms.catalogue import catalogue
 import pytest
 from term_examples import agrees, ALPHA, EXAMPLES, OU, SIGMA, supply, term
 
@@ -28,7 +29,7 @@ def test_how_many_of_a_term(name):
         return
     several = {'tone', 'throttle_tone', 'second_relaxation', 'resonance', 'load_transient',
                'jumps', 'glitches', 'regime_switching', 'ac_coupling'}
-    assert (name in SEVERAL) == (name in several)
+    assert catalogue()[name].SEVERAL == (name in several)
     twice = [term(name, **EXAMPLES[name])] * 2
     if name in several:
         assert supply(*twice).simulate(T, np.random.default_rng(0), 0.3).shape == T.shape

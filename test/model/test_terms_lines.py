@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
+from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import keeps_its_height
-from ou_monitor.model.terms.term import View
 import pytest
 from scipy.signal import welch
 from term_examples import agrees, clusters, has_covariance, still, term

@@ -22,13 +22,14 @@ from ou_monitor.model.passage.with_events import (
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.jumps import Jumps
 from ou_monitor.model.terms.regime_switching import RegimeSwitching
-from ou_monitor.model.terms.term import Stage, Term
+from ou_monitor.model.terms.segment import Stage
+from ou_monitor.model.terms.term import Live, Term
 from ou_monitor.model.terms.volatility import Volatility
 from ou_monitor.records import FloatArray
 from scipy.special import binom
 
-# They change alpha, sigma and u0 as throttle does; the live estimates have that.
-_IN_LIVE = frozenset({'ou', 'load_sag', 'load_dependent_sigma', 'load_dependent_alpha'})
+# Stages at which a term moves the supply, not its reading.
+_MOVES_SUPPLY = (Stage.DRIVE, Stage.STATE, Stage.LEVEL)
 # Levels of ln sigma, out to sqrt(6) standard deviations.
 _LEVELS = 7
 # States of all chains together, at most.
@@ -79,7 +80,7 @@ class ExtendedPassage:
         used: list[str] = []
         left_out: list[str] = []
         for term in model.terms:
-            if term.NAME in _IN_LIVE or term.STAGE not in (Stage.DRIVE, Stage.STATE, Stage.LEVEL):
+            if term.LIVE is Live.BY_THROTTLE or term.STAGE not in _MOVES_SUPPLY:
                 continue
             (used if self._take(term) else left_out).append(term.NAME)
         self.used, self.left_out = tuple(used), tuple(left_out)

@@ -8,8 +8,9 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.recursion import first_order
-from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.laws import View
+from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 
 # Rates nearer to each other than this are taken apart by it: the closed forms
@@ -34,6 +35,16 @@ class ACCoupling(Term):
     FREE: ClassVar[tuple[str, ...]] = ('corner',)
     DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('-band',)
+    STATES: ClassVar[int] = 1
+    SEVERAL: ClassVar[bool] = True
+    # An instrument may have two corners.
+    MAY_LEAVE: ClassVar[float] = 0.75
+    MEANING: ClassVar[str] = (
+        'The instrument is AC-coupled: the relaxation that is seen is that of its high-pass.')
+    REMEDY: ClassVar[str] = (
+        'Repeat with the instrument DC-coupled; alpha of the rail is the one given here, not the '
+        'one of the plain fit.')
+    SEPARATED_BY: ClassVar[str] = 'the same rail DC-coupled'
 
     corner: float = parameter('Hz', 'where the high-pass is down by 3 dB', 0.0, above=True)
     offset: float = parameter('V', 'level about which the instrument shows what it sees')
@@ -43,7 +54,7 @@ class ACCoupling(Term):
         low = x_before = level_before = math.nan
         rate = 2.0 * math.pi * self.corner
 
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             nonlocal low, x_before, level_before
             level = s.voltage - s.x
             draws = rng.standard_normal(s.t.size)
@@ -82,7 +93,7 @@ class ACCoupling(Term):
         """Return a slow `ou`: the relaxation seen may be all the instrument's."""
         return ou.read({**ou.values(), 'alpha': 0.3 * math.pi * self.corner})
 
-    def pass_through(self, columns: FloatArray, s: Stretch) -> FloatArray:
+    def pass_through(self, columns: FloatArray, s: Segment) -> FloatArray:
         """Return columns of the mean as the instrument shows them."""
         made = np.empty_like(columns)
         for k in range(columns.shape[1]):

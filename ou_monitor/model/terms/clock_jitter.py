@@ -8,8 +8,10 @@ from typing import ClassVar
 
 import numpy as np
 from ou_monitor.model.hidden_chain import forward
-from ou_monitor.model.terms.laws import climb, curvature_se, log_normal, mixture_cdf, normal_scores
-from ou_monitor.model.terms.term import Effect, LawFit, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.laws import (
+    climb, curvature_se, LawFit, log_normal, mixture_cdf, normal_scores, View)
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 
 
@@ -27,6 +29,10 @@ class ClockJitter(Term):
     STAGE: ClassVar[Stage] = Stage.CLOCK
     ROLE: ClassVar[Role] = Role.LAW
     SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis', 'clustering')
+    IMITATES: ClassVar[tuple[str, ...]] = ('glitches', 'heavy_tails', 'jumps')
+    MEANING: ClassVar[str] = 'Time stamps are off by a random amount.'
+    REMEDY: ClassVar[str] = 'Stamp in the interrupt of the ADC, not where the message is sent.'
+    SEPARATED_BY: ClassVar[str] = 'stamps by the clock of the ADC recorded beside the others'
 
     std: float = parameter('s', 'standard deviation of the error of a stamp', 0.0)
 
@@ -35,7 +41,7 @@ class ClockJitter(Term):
         last = -math.inf
         stamp = -math.inf
 
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             nonlocal last, stamp
             gap = np.diff(s.t, prepend=stamp)
             # The step to come is not known at the end of a stretch: that behind bounds both.
@@ -53,11 +59,9 @@ class ClockJitter(Term):
         """Fit hidden errors of the stamps: a step that is longer has more noise in it."""
         return cls._climbed(view, [math.log(0.2), 0.0], 40)
 
-    @classmethod
-    def refit_law(cls, view: View, near: Term) -> LawFit | None:
+    def refit_law(self, view: View) -> LawFit | None:
         """Fit again, from where it was."""
-        assert isinstance(near, ClockJitter)
-        return cls._climbed(view, [math.log(min(max(near.std * view.rate, 0.02), 0.44)), 0.0], 20)
+        return self._climbed(view, [math.log(min(max(self.std * view.rate, 0.02), 0.44)), 0.0], 20)
 
     @classmethod
     def _climbed(cls, view: View, start: list[float], most: int) -> LawFit | None:

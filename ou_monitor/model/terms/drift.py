@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.term import (
-    Effect, NEXT_TO_ZERO, parameter, Role, Stage, Stretch, Term, View)
+from ou_monitor.model.terms.laws import View
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import NEXT_TO_ZERO, parameter, Role, Term
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,12 @@ class Drift(Term):
     ROLE: ClassVar[Role] = Role.MEAN
     LINEAR: ClassVar[tuple[str, ...]] = ('rate', 'curvature')
     SIGNS: ClassVar[tuple[str, ...]] = ('time', 'band 0')
+    MEASURED: ClassVar[bool] = True
+    # Time mends a little of whatever the form of a larger effect leaves.
+    LEAST_SHARE: ClassVar[float] = 0.02
+    MEANING: ClassVar[str] = 'The mean moves slowly with time: discharge or warming.'
+    REMEDY: ClassVar[str] = 'Use a window short beside the drift, or take the trend out first.'
+    SEPARATED_BY: ClassVar[str] = 'a recording several times as long'
 
     rate: float = parameter('V/s', 'slope at the first sample')
     curvature: float = parameter('V/s^2', 'coefficient of t^2')
@@ -36,7 +43,7 @@ class Drift(Term):
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             t = s.at - s.origin
             s.level += (self.rate + self.curvature * t) * t
 

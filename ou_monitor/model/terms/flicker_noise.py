@@ -9,8 +9,9 @@ from typing import ClassVar
 
 import numpy as np
 from ou_monitor.model.terms.ac_coupling import bridge
-from ou_monitor.model.terms.recursion import first_order
-from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.laws import View
+from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 
 # Octaves from pole to pole: 1/f within 0.2 %, and within 6 %.
@@ -40,6 +41,13 @@ class FlickerNoise(Term):
     FREE: ClassVar[tuple[str, ...]] = ('amplitude', 'high')
     DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('band', 'autocorrelation')
+    # At least: one to every three octaves.
+    STATES: ClassVar[int] = 4
+    IMITATES: ClassVar[tuple[str, ...]] = ('regime_switching', 'second_relaxation')
+    MEANING: ClassVar[str] = '1/f noise: there is no single relaxation time.'
+    REMEDY: ClassVar[str] = (
+        'Treat alpha as a number of this window only; use windows of one length to compare.')
+    SEPARATED_BY: ClassVar[str] = 'a recording over two more decades of frequency'
 
     amplitude: float = parameter('V', 'square root of f times the PSD', 0.0)
     low: float = parameter('Hz', 'lower end', 0.0, above=True)
@@ -71,7 +79,7 @@ class FlickerNoise(Term):
         *sources, last = rng.spawn(poles.size + 1)
         before, low = np.zeros(poles.size), math.nan
 
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             nonlocal low
             first = math.isnan(low)
             step = s.step.copy()
@@ -114,7 +122,7 @@ class FlickerNoise(Term):
         """Return whether 1/f goes on for so long that it is not a relaxation."""
         return bool(_CORNER * self.high > _LEAST * self.low)
 
-    def block(self, s: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return one state a pole, and the low-pass; for a fit few poles are enough."""
         poles, variances = _sum(self.low, _LADDER * self.high, _COARSE)
         variances = self.amplitude ** 2 * variances

@@ -9,8 +9,9 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.hidden_chain import forward
-from ou_monitor.model.terms.laws import log_normal, normal_scores
-from ou_monitor.model.terms.term import Effect, LawFit, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.laws import LawFit, log_normal, normal_scores, View
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 from scipy.special import ndtr
 
@@ -24,6 +25,13 @@ class Glitches(Term):
     STAGE: ClassVar[Stage] = Stage.SENSOR
     ROLE: ClassVar[Role] = Role.LAW
     SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis', 'tails', 'pairs', 'autocorrelation')
+    IMITATES: ClassVar[tuple[str, ...]] = ('clock_jitter', 'heavy_tails', 'jumps')
+    SEVERAL: ClassVar[bool] = True
+    MEANING: ClassVar[str] = (
+        'Single bad samples that do not enter the dynamics: bus errors or pick-up of the ADC.')
+    REMEDY: ClassVar[str] = (
+        'Reject single outliers before the estimator; check cables and ground of the ADC.')
+    SEPARATED_BY: ClassVar[str] = 'two ADCs on one rail: a glitch is in one only'
 
     probability: float = parameter('', 'share of samples that are bad', 0.0, 1.0)
     std: float = parameter('V', 'standard deviation of the error', 0.0)
@@ -32,7 +40,7 @@ class Glitches(Term):
         """Begin a simulation."""
         turns, sizes = rng.spawn(2)
 
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             bad = turns.random(s.t.size) < self.probability
             s.voltage[bad] += self.std * sizes.standard_normal(int(bad.sum()))
 

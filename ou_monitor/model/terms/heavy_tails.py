@@ -7,8 +7,10 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.laws import climb, curvature_se, log_normal, normal_scores
-from ou_monitor.model.terms.term import Effect, LawFit, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.laws import (
+    climb, curvature_se, LawFit, log_normal, normal_scores, View)
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 from scipy.special import gammaln, stdtr
 
@@ -27,12 +29,17 @@ class HeavyTails(Term):
     STAGE: ClassVar[Stage] = Stage.DRIVE
     ROLE: ClassVar[Role] = Role.LAW
     SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis', 'tails')
+    IMITATES: ClassVar[tuple[str, ...]] = (
+        'clock_jitter', 'glitches', 'jumps', 'regime_switching', 'volatility')
+    MEANING: ClassVar[str] = 'The driving noise itself has heavy tails, without distinct events.'
+    REMEDY: ClassVar[str] = 'Take large excursions as more frequent than a normal law says.'
+    SEPARATED_BY: ClassVar[str] = 'a recording several times as long, at a higher rate'
 
     dof: float = parameter('', 'degrees of freedom', 2.0, above=True)
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             s.power *= (self.dof - 2.0) / (2.0 * rng.standard_gamma(0.5 * self.dof, s.t.size))
 
         return effect

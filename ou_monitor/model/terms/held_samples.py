@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 
 
 @dataclass(frozen=True)
@@ -17,6 +18,10 @@ class HeldSamples(Term):
     FAMILY: ClassVar[str] = 'sensor'
     STAGE: ClassVar[Stage] = Stage.LOGGER
     ROLE: ClassVar[Role] = Role.EXACT
+    MEANING: ClassVar[str] = 'The logger repeats its last value until the source has a new one.'
+    REMEDY: ClassVar[str] = (
+        'Log at the rate of the source, or drop repeats before any fit (done here).')
+    SEPARATED_BY: ClassVar[str] = 'the raw samples of the ADC'
 
     rate: float = parameter('Hz', 'rate at which the source has new values', 0.0, above=True)
 
@@ -25,7 +30,7 @@ class HeldSamples(Term):
         last = 0.0
         turn = -1.0
 
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             nonlocal last, turn
             # A hair more, so that a stamp at the very turn does not miss it by rounding.
             hair = 1e-6 + 2.0 * self.rate * np.spacing(np.abs(s.t))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import math
 
 import numpy as np
-from ou_monitor.model.terms.term import View
+from ou_monitor.model.terms.laws import View
 from ou_monitor.records import FloatArray
 
 # Median of the size of a normal score.

@@ -7,8 +7,9 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.laws import log_normal, normal_scores
-from ou_monitor.model.terms.term import Effect, LawFit, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.laws import LawFit, log_normal, normal_scores, View
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 from scipy.special import ndtr
 
@@ -27,6 +28,13 @@ class Jumps(Term):
     STAGE: ClassVar[Stage] = Stage.DRIVE
     ROLE: ClassVar[Role] = Role.LAW
     SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis', 'tails', 'skewness')
+    IMITATES: ClassVar[tuple[str, ...]] = (
+        'clock_jitter', 'glitches', 'heavy_tails', 'regime_switching', 'volatility')
+    SEVERAL: ClassVar[bool] = True
+    MEANING: ClassVar[str] = (
+        'The supply is kicked now and then and relaxes at the rate alpha: load impulses.')
+    REMEDY: ClassVar[str] = 'Look for what switches at that rate: servos, payload, radio.'
+    SEPARATED_BY: ClassVar[str] = 'a recording with each consumer off in turn'
 
     rate: float = parameter('1/s', 'jumps per second', 0.0)
     mean: float = parameter('V', 'mean size')
@@ -37,7 +45,7 @@ class Jumps(Term):
         waits, sizes = rng.spawn(2)
         next_at = math.nan
 
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             nonlocal next_at
             if self.rate == 0.0:
                 return

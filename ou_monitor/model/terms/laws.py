@@ -1,18 +1,109 @@
-"""What the laws of innovations share: climbing, normal scores, mixtures."""
+"""What laws of the innovations are fitted to, what a fit of one is, and what they share."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from ou_monitor.records import FloatArray
 from scipy.optimize import minimize
 from scipy.special import ndtr, ndtri
 
+if TYPE_CHECKING:
+    from ou_monitor.model.terms.term import Term
+
 LOG_2PI = math.log(2.0 * math.pi)
 # Probabilities nearer to 0 and 1 than this are cut: scores of 8 and more are one thing.
 _EDGE = 1e-15
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """
+    What a candidate may look at before it is fitted.
+
+    Attributes
+    ----------
+    z : ndarray, shape (n,)
+        Normal scores of the one-step innovations under the model so far.
+    variance : ndarray, shape (n,)
+        Predictive variance of each sample, V^2.
+    phi : ndarray, shape (n,)
+        Coefficient of the OU in the step before each sample.
+    state : ndarray, shape (n,)
+        Deviation of the sample before from its mean, V; 0 at the first.
+    residual : ndarray, shape (n,)
+        Voltage less its mean, V.
+    at : ndarray, shape (n,)
+        Time since the first sample, s.
+    step : ndarray, shape (n,)
+        Time since the sample before, s.
+    throttle : ndarray, shape (n,), or None
+        0..1.
+    train : slice
+        The part that parameters are fitted on.
+
+    """
+
+    z: FloatArray
+    variance: FloatArray
+    phi: FloatArray
+    state: FloatArray
+    residual: FloatArray
+    at: FloatArray
+    step: FloatArray
+    throttle: FloatArray | None
+    train: slice
+
+    @property
+    def rate(self) -> float:
+        """Return the usual rate, Hz."""
+        return 1.0 / float(np.median(self.step[1:]))
+
+
+@dataclass(frozen=True, eq=False)
+class LawFit:
+    """
+    A law of the innovations, fitted.
+
+    Attributes
+    ----------
+    term : Term
+        With its parameters.
+    se : dict of str to float
+        Their standard errors, where known.
+    z : ndarray, shape (n,)
+        Normal scores under the law: independent N(0, 1) when it is right.
+    gain : ndarray, shape (n,)
+        Log predictive density of each sample over that of N(0, 1) for
+        `View.z`, nats.
+    free : int
+        Parameters fitted.
+    push : ndarray, shape (n,), or None
+        Variance that events add to the state, V^2.
+    error : ndarray, shape (n,), or None
+        Variance that events add to the measurement, V^2.
+    power : ndarray, shape (n,), or None
+        Factor on the variance of what the noise adds in the step before each
+        sample, as the law believes it was: the inverse of the mean precision.
+    offset : ndarray, shape (n,), or None
+        What the law believes to be added to the level, V: the Gaussian part
+        is fitted to what is left without it.
+
+    """
+
+    term: Term
+    se: dict[str, float]
+    z: FloatArray
+    gain: FloatArray
+    free: int
+    push: FloatArray | None = None
+    error: FloatArray | None = None
+    power: FloatArray | None = None
+    offset: FloatArray | None = None
 
 
 def normal_scores(cdf: FloatArray) -> FloatArray:

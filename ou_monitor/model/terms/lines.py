@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor.model.terms.term import View
+from ou_monitor.model.terms.laws import View
 from ou_monitor.records import FloatArray
 from scipy.signal import welch
 

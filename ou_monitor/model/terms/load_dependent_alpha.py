@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.laws import View
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import Live, parameter, Role, Term
 
 
 @dataclass(frozen=True)
@@ -21,12 +23,18 @@ class LoadDependentAlpha(Term):
     ROLE: ClassVar[Role] = Role.DRIVE
     FREE: ClassVar[tuple[str, ...]] = ('slope',)
     SIGNS: ClassVar[tuple[str, ...]] = ('state throttle',)
+    MEASURED: ClassVar[bool] = True
+    LIVE: ClassVar[Live] = Live.BY_THROTTLE
+    MEANING: ClassVar[str] = 'The relaxation rate depends on throttle.'
+    REMEDY: ClassVar[str] = (
+        'Fit each load level on its own (analyze); one alpha is wrong at all but one of them.')
+    SEPARATED_BY: ClassVar[str] = 'throttle held for 50 relaxation times at each of several levels'
 
     slope: float = parameter('', 'ln of the factor at full throttle')
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             s.alpha *= np.exp(self.slope * s.throttle)
 
         return effect

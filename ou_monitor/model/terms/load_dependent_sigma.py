@@ -8,7 +8,9 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.term import Effect, parameters, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.laws import View
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import Live, parameters, Role, Term
 from ou_monitor.records import FloatArray
 
 
@@ -26,6 +28,12 @@ class LoadDependentSigma(Term):
     NEEDS_THROTTLE: ClassVar[bool] = True
     ROLE: ClassVar[Role] = Role.DRIVE
     SIGNS: ClassVar[tuple[str, ...]] = ('variance throttle',)
+    MEASURED: ClassVar[bool] = True
+    LIVE: ClassVar[Live] = Live.BY_THROTTLE
+    MEANING: ClassVar[str] = 'The noise grows or shrinks with throttle.'
+    REMEDY: ClassVar[str] = (
+        'Let the estimator run while flying, so that filters and risk follow the load.')
+    SEPARATED_BY: ClassVar[str] = 'throttle held for some seconds at several levels'
 
     throttle: tuple[float, ...] = parameters('', 'knots, rising')
     log_factor: tuple[float, ...] = parameters('', 'ln(sigma at the knot / sigma of the ou)')
@@ -44,7 +52,7 @@ class LoadDependentSigma(Term):
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             s.sigma *= np.exp(np.interp(s.throttle, self.throttle, self.log_factor))
 
         return effect

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.term import (
-    Effect, NEXT_TO_ZERO, parameter, Role, Stage, Stretch, Term, View)
+from ou_monitor.model.terms.laws import View
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import Live, NEXT_TO_ZERO, parameter, Role, Term
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,14 @@ class LoadSag(Term):
     ROLE: ClassVar[Role] = Role.MEAN
     LINEAR: ClassVar[tuple[str, ...]] = ('linear', 'square')
     SIGNS: ClassVar[tuple[str, ...]] = ('throttle',)
+    MEASURED: ClassVar[bool] = True
+    LIVE: ClassVar[Live] = Live.BY_THROTTLE
+    MEANING: ClassVar[str] = (
+        'The mean falls with throttle: IR drop of battery, leads and regulator.')
+    REMEDY: ClassVar[str] = (
+        'Give the estimator throttle, so that it takes the sag out; thicker or shorter leads '
+        'reduce it.')
+    SEPARATED_BY: ClassVar[str] = 'throttle held for some seconds at several levels'
 
     linear: float = parameter('V', 'fall at full throttle, linear part')
     square: float = parameter('V', 'fall at full throttle, square part')
@@ -37,7 +46,7 @@ class LoadSag(Term):
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             s.level -= (self.linear + self.square * s.throttle) * s.throttle
 
         return effect

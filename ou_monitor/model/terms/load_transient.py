@@ -8,8 +8,9 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.recursion import first_order
-from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.laws import View
+from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 
 # Stamps nearer than this are one, s: bags count in ns.
 _HAIR = 1e-9
@@ -33,6 +34,16 @@ class LoadTransient(Term):
     LINEAR: ClassVar[tuple[str, ...]] = ('gain',)
     SIGNS: ClassVar[tuple[str, ...]] = ('throttle',)
     SEARCH: ClassVar[float] = 3.4
+    MEASURED: ClassVar[bool] = True
+    SEVERAL: ClassVar[bool] = True
+    RECURS: ClassVar[bool] = True
+    MEANING: ClassVar[str] = (
+        'The mean answers to changes of throttle: lag, inrush or slow polarisation recovery.')
+    REMEDY: ClassVar[str] = (
+        'Count the dip after a throttle step into the brown-out margin; capacitance at the ESC '
+        'shortens it.')
+    SEPARATED_BY: ClassVar[str] = (
+        'single steps of throttle, each held for ten times the time in which the answer dies out')
 
     gain: float = parameter('V', 'answer to a step of full throttle, at once')
     tau: float = parameter('s', 'time in which it dies out', 0.0, above=True)
@@ -44,7 +55,7 @@ class LoadTransient(Term):
         times = np.empty(0)
         values = np.empty(0)
 
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             nonlocal slow, times, values
             throttle = s.throttle
             if self.delay > 0.0:

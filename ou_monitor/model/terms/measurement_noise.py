@@ -8,7 +8,9 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.laws import View
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 
 
 @dataclass(frozen=True)
@@ -21,12 +23,18 @@ class MeasurementNoise(Term):
     ROLE: ClassVar[Role] = Role.NOISE
     FREE: ClassVar[tuple[str, ...]] = ('std',)
     SIGNS: ClassVar[tuple[str, ...]] = ('-autocorrelation', '+band')
+    MAY_LEAVE: ClassVar[float] = 0.3
+    MEANING: ClassVar[str] = 'White noise of the sensor lies on top of the rail.'
+    REMEDY: ClassVar[str] = (
+        'Average in the ADC or use a finer range; alpha and sigma fitted without it are too high.')
+    SEPARATED_BY: ClassVar[str] = (
+        'the same rail at several times the sampling rate, or the input of the ADC shorted')
 
     std: float = parameter('V', 'standard deviation', 0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             s.voltage += self.std * rng.standard_normal(s.t.size)
 
         return effect

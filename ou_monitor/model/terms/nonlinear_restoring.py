@@ -8,8 +8,9 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.laws import log_normal
-from ou_monitor.model.terms.term import Effect, LawFit, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.laws import LawFit, log_normal, View
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 
 
@@ -27,6 +28,13 @@ class NonlinearRestoring(Term):
     STAGE: ClassVar[Stage] = Stage.DRIVE
     ROLE: ClassVar[Role] = Role.LAW
     SIGNS: ClassVar[tuple[str, ...]] = ('state squared', 'state cubed')
+    IMITATES: ClassVar[tuple[str, ...]] = ('regime_switching',)
+    MEANING: ClassVar[str] = (
+        'What pulls the voltage back is not proportional to the deviation: a load of constant '
+        'power, or softening near brown-out.')
+    REMEDY: ClassVar[str] = (
+        'Take deep excursions as longer and more frequent than the linear model says.')
+    SEPARATED_BY: ClassVar[str] = 'stronger excursions: steps of load in both directions'
 
     square: float = parameter('1/(V s)', 'coefficient of x^2')
     cube: float = parameter('1/(V^2 s)', 'coefficient of x^3', 0.0)
@@ -39,7 +47,7 @@ class NonlinearRestoring(Term):
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             s.bend = (s.bend[0] + self.square, s.bend[1] + self.cube)
 
         return effect

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.terms.recursion import first_order, steady
-from ou_monitor.model.terms.term import Effect, parameter, Stage, Stretch, Term
+from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage, steady
+from ou_monitor.model.terms.term import Live, parameter, Term
 from ou_monitor.records import FloatArray
 
 # With a force that is not linear, a step is cut into parts of at most this
@@ -27,12 +27,13 @@ class OU(Term):
     dU = -alpha (U - u0) dt + sigma dW, exact in law at any spacing.
 
     Uhlenbeck & Ornstein, Phys. Rev. 36 (1930) 823.  A force that is not linear
-    (`Stretch.bend`) is integrated by Strang splitting, weak order 2.
+    (`Segment.bend`) is integrated by Strang splitting, weak order 2.
     """
 
     NAME: ClassVar[str] = 'ou'
     STAGE: ClassVar[Stage] = Stage.STATE
     FREE: ClassVar[tuple[str, ...]] = ('alpha', 'sigma')
+    LIVE: ClassVar[Live] = Live.BY_THROTTLE
 
     alpha: float = parameter('1/s', 'relaxation rate', 0.0, above=True)
     sigma: float = parameter('V/sqrt(s)', 'noise intensity', 0.0)
@@ -43,7 +44,7 @@ class OU(Term):
         before = 0.0
         parts = rng.spawn(1)[0]
 
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             nonlocal before
             kicks = rng.standard_normal(s.t.size)
             if s.bend == (0.0, 0.0):
@@ -59,7 +60,7 @@ class OU(Term):
         return effect
 
 
-def _law(s: Stretch) -> tuple[FloatArray, FloatArray]:
+def _law(s: Segment) -> tuple[FloatArray, FloatArray]:
     """Return what is left of the state after each step, and the deviation of what is added, V."""
     n = s.step.size
     # Of equal steps at one alpha two will do: the first, which may come after
@@ -83,7 +84,7 @@ def _over(n: int, values: FloatArray) -> FloatArray:
     return filled
 
 
-def _bent(s: Stretch, kicks: FloatArray, before: float, rng: np.random.Generator) -> FloatArray:
+def _bent(s: Segment, kicks: FloatArray, before: float, rng: np.random.Generator) -> FloatArray:
     """Return the state under a force that is not linear; steps that are cut draw from rng."""
     square, cube = s.bend
     # Stationary from some relaxations before the first sample on.
@@ -137,7 +138,7 @@ def _bundles(parts: npt.NDArray[np.int64]) -> list[slice]:
     return [slice(first, last) for first, last in zip(edges, edges[1:])]
 
 
-def _stiffness(s: Stretch) -> FloatArray:
+def _stiffness(s: Segment) -> FloatArray:
     """Return what the bend adds to the rate at one standard deviation, 1/s, shape (n,)."""
     square, cube = s.bend
     var = s.sigma * s.sigma / (2.0 * s.alpha)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 
 
 @dataclass(frozen=True)
@@ -17,12 +18,16 @@ class Quantization(Term):
     FAMILY: ClassVar[str] = 'sensor'
     STAGE: ClassVar[Stage] = Stage.CODE
     ROLE: ClassVar[Role] = Role.NOISE
+    MEANING: ClassVar[str] = 'The steps of the ADC are comparable to the noise.'
+    REMEDY: ClassVar[str] = (
+        'Use a finer range of the ADC or more gain ahead of it; sigma is partly rounding.')
+    SEPARATED_BY: ClassVar[str] = 'the same rail with a finer range of the ADC'
 
     step: float = parameter('V', 'one code', 0.0, above=True)
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             s.voltage = self.step * np.rint(s.voltage / self.step)
 
         return effect

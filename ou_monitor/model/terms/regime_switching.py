@@ -9,9 +9,10 @@ from typing import ClassVar
 import numpy as np
 from ou_monitor.model.hidden_chain import forward, log_likelihood
 from ou_monitor.model.terms.hidden_levels import faster_by, moving, relaxing, units_of
-from ou_monitor.model.terms.laws import climb, curvature_se, log_normal, normal_scores
-from ou_monitor.model.terms.recursion import first_order
-from ou_monitor.model.terms.term import Effect, LawFit, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.laws import (
+    climb, curvature_se, LawFit, log_normal, normal_scores, View)
+from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 from scipy.linalg import expm
 from scipy.special import ndtr
@@ -38,6 +39,13 @@ class RegimeSwitching(Term):
     SIGNS: ClassVar[tuple[str, ...]] = (
         '+clustering', '+kurtosis', '+band 0', '+band 1', '+band 2', '+band 3', 'state squared',
         'state cubed')
+    IMITATES: ClassVar[tuple[str, ...]] = (
+        'flicker_noise', 'heavy_tails', 'jumps', 'nonlinear_restoring', 'second_relaxation',
+        'volatility')
+    SEVERAL: ClassVar[bool] = True
+    MEANING: ClassVar[str] = 'The supply switches between two states, unrelated to throttle.'
+    REMEDY: ClassVar[str] = 'Look for a consumer that goes on and off, or a loose contact.'
+    SEPARATED_BY: ClassVar[str] = 'the state of other consumers recorded beside it'
 
     rate_up: float = parameter('1/s', 'rate of going to each higher state', 0.0, above=True)
     rate_down: float = parameter('1/s', 'rate of going to each lower state', 0.0, above=True)
@@ -60,7 +68,7 @@ class RegimeSwitching(Term):
         now_in = 0
         next_at = math.nan
 
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             nonlocal now_in, next_at
             if math.isnan(next_at):
                 now_in = _pick(rng, _stationary(rates))
@@ -182,20 +190,18 @@ class RegimeSwitching(Term):
                 found = three
         return found
 
-    @classmethod
-    def refit_law(cls, view: View, near: Term) -> LawFit | None:
+    def refit_law(self, view: View) -> LawFit | None:
         """Fit again, from where it was."""
-        assert isinstance(near, RegimeSwitching)
         unit = math.sqrt(float(np.median(view.variance)))
-        ratio = math.log(max(near.sigma_ratio, 1e-2))
-        states = int(near.states)
-        law = _stationary(_rates(near.rate_up, near.rate_down, states))
+        ratio = math.log(max(self.sigma_ratio, 1e-2))
+        states = int(self.states)
+        law = _stationary(_rates(self.rate_up, self.rate_down, states))
         # Such that the mean square is that of the scores.
         square = float(law @ np.exp(2.0 * ratio * np.arange(states)))
         scale = 0.5 * math.log(float(np.mean(view.z[view.train] ** 2)) / square)
-        return cls._finished(view, np.array([
-            math.log(near.rate_up), math.log(near.rate_down), near.level / unit, ratio,
-            scale]), near.at_once, 40, states)
+        return self._finished(view, np.array([
+            math.log(self.rate_up), math.log(self.rate_down), self.level / unit, ratio,
+            scale]), self.at_once, 40, states)
 
     @classmethod
     def _finished(cls, view: View, start: FloatArray, at_once: float, most: int,

@@ -8,9 +8,10 @@ import math
 from typing import ClassVar
 
 import numpy as np
+from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import broad_peaks, keeps_its_height, rotation
-from ou_monitor.model.terms.recursion import first_order
-from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.model.terms.tone import SHARP, WIDEST
 from ou_monitor.records import FloatArray
 
@@ -34,6 +35,17 @@ class Resonance(Term):
     DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('line', '+band', 'autocorrelation')
     SEARCH: ClassVar[float] = 5.0
+    STATES: ClassVar[int] = 2
+    SEVERAL: ClassVar[bool] = True
+    RECURS: ClassVar[bool] = True
+    # A broad line could be the spectrum of anything.
+    MAY_LEAVE: ClassVar[float] = 0.1
+    # What rings under noise does not come and go, nor makes three neighbours depend on
+    # each other.
+    REFUTED_BY: ClassVar[tuple[str, ...]] = ('bursts', 'products of three')
+    MEANING: ClassVar[str] = 'The rail rings: inductance of the leads against the capacitors.'
+    REMEDY: ClassVar[str] = 'Damp it with a resistive (electrolytic) capacitor or shorter leads.'
+    SEPARATED_BY: ClassVar[str] = 'a sampling rate of ten times the ringing, throttle held still'
 
     frequency: float = parameter('Hz', 'of the ringing', 0.0, above=True)
     damping: float = parameter('1/s', 'rate at which ringing dies out', 0.0, above=True)
@@ -59,7 +71,7 @@ class Resonance(Term):
         """Begin a simulation."""
         before = 0.0 + 0.0j
 
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             nonlocal before
             n = s.t.size
             pairs = rng.standard_normal((n, 2))
@@ -88,7 +100,7 @@ class Resonance(Term):
                 for frequency, width in broad_peaks(view.z[view.train], view.rate)
                 for tilt in (0.0, -_STEEP, _STEEP)]
 
-    def block(self, s: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return its two states, which turn."""
         turn = 2.0 * math.pi * self.frequency * np.where(np.isfinite(s.step), s.step, 0.0)
         return rotation(turn, self.damping, s.step, self.std,

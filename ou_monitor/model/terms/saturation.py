@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 
 
 @dataclass(frozen=True)
@@ -17,6 +18,10 @@ class Saturation(Term):
     FAMILY: ClassVar[str] = 'sensor'
     STAGE: ClassVar[Stage] = Stage.CLIP
     ROLE: ClassVar[Role] = Role.EXACT
+    MEANING: ClassVar[str] = 'The voltage is clipped at the end of the range of the ADC.'
+    REMEDY: ClassVar[str] = (
+        'Rescale the input: the true excursions are larger, and those are the ones that matter.')
+    SEPARATED_BY: ClassVar[str] = 'the same rail with a larger range'
 
     low: float = parameter('V', 'lowest reading')
     high: float = parameter('V', 'highest reading')
@@ -29,7 +34,7 @@ class Saturation(Term):
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             np.clip(s.voltage, self.low, self.high, out=s.voltage)
 
         return effect

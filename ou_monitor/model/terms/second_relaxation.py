@@ -8,8 +8,9 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.recursion import first_order
-from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.laws import View
+from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 
 
@@ -24,6 +25,14 @@ class SecondRelaxation(Term):
     FREE: ClassVar[tuple[str, ...]] = ('alpha', 'sigma')
     DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('band', 'autocorrelation')
+    STATES: ClassVar[int] = 1
+    IMITATES: ClassVar[tuple[str, ...]] = ('flicker_noise', 'regime_switching')
+    SEVERAL: ClassVar[bool] = True
+    RECURS: ClassVar[bool] = True
+    MEANING: ClassVar[str] = (
+        'A second relaxation of its own rate adds to the first: a second storage element.')
+    REMEDY: ClassVar[str] = 'Keep both in the model; one alpha alone describes neither.'
+    SEPARATED_BY: ClassVar[str] = 'a recording ten times as long, throttle held still'
 
     alpha: float = parameter('1/s', 'its relaxation rate', 0.0, above=True)
     sigma: float = parameter('V/sqrt(s)', 'its noise intensity', 0.0)
@@ -32,7 +41,7 @@ class SecondRelaxation(Term):
         """Begin a simulation."""
         before = 0.0
 
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             nonlocal before
             phi = np.exp(-self.alpha * s.step)
             var = -np.expm1(-2.0 * self.alpha * s.step) / (2.0 * self.alpha)
@@ -52,7 +61,7 @@ class SecondRelaxation(Term):
                  for a in (rate / 60.0, rate / 15.0, rate / 4.0) if a > slowest]
         return [*found, cls(6.0 * rate, 0.3 * spread * math.sqrt(12.0 * rate))]
 
-    def block(self, s: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return its one state."""
         phi = np.exp(-self.alpha * s.step)
         q = self.sigma * self.sigma * -np.expm1(-2.0 * self.alpha * s.step) / (2.0 * self.alpha)

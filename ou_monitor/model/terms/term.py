@@ -1,90 +1,27 @@
 """
-What every term is: named parameters with units, and a simulator.
+What every term is: named parameters with units, a simulator, a likelihood, words.
 
-A term says what it does to a `Stretch` of samples; stretches pass through the
-terms of a model in the order of their `Stage`.  A simulator draws from its own
-generator and keeps its state from stretch to stretch, so a recording does not
-depend on the stretches it is made in, nor one term's draws on another's.
+A term says what it does to a `Segment` of samples.  A simulator draws from its own
+generator and keeps its state from segment to segment, so a recording does not
+depend on the segments it is simulated in, nor one term's draws on another's.
+
+A module in this folder that defines a `Term` is a cause: the search, its words, the
+report and the model file find it through `catalogue`, and read all that they need to
+know of it from the class.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 import enum
 import math
 from typing import Any, ClassVar, Self
 
 import numpy as np
+from ou_monitor.model.terms.laws import LawFit, View
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.records import FloatArray
-
-
-class Stage(enum.IntEnum):
-    """When a term acts on the samples, from the clock to the logger."""
-
-    CLOCK = 0
-    DRIVE = 1
-    STATE = 2
-    LEVEL = 3
-    INSTRUMENT = 4
-    SENSOR = 5
-    CLIP = 6
-    CODE = 7
-    LOGGER = 8
-
-
-@dataclass
-class Stretch:
-    """
-    Consecutive samples in the making; terms change it in place.
-
-    Attributes
-    ----------
-    t : ndarray, shape (n,)
-        Stamps, s.
-    at : ndarray, shape (n,)
-        Instants at which the samples are really taken, s.
-    step : ndarray, shape (n,)
-        Time since the sample before, s; infinite before the first one, which
-        is drawn from the stationary law.
-    throttle : ndarray, shape (n,)
-        0..1, held from the stamp before to its own stamp.
-    origin : float
-        Stamp of the first sample of all, s.
-    alpha, sigma : ndarray, shape (n,)
-        Rate, 1/s, and intensity, V/sqrt(s), over the step before each sample.
-    power : ndarray, shape (n,)
-        Factor on the variance of what the noise adds in that step.
-    push : ndarray, shape (n,)
-        Added to the state at the end of the step, V.
-    bend : tuple of float
-        Coefficients of x^2, 1/(V s), and x^3, 1/(V^2 s), in the restoring
-        force, beside alpha x.
-    x : ndarray, shape (n,)
-        OU deviation, V.
-    level : ndarray, shape (n,)
-        All else that the rail does, V.
-    voltage : ndarray, shape (n,)
-        What is logged, V.
-
-    """
-
-    t: FloatArray
-    at: FloatArray
-    step: FloatArray
-    throttle: FloatArray
-    origin: float
-    alpha: FloatArray
-    sigma: FloatArray
-    power: FloatArray
-    push: FloatArray
-    bend: tuple[float, float]
-    x: FloatArray
-    level: FloatArray
-    voltage: FloatArray
-
-
-Effect = Callable[[Stretch], None]
 
 # A coefficient to start from that is not left out as 0 is.
 NEXT_TO_ZERO = 1e-12
@@ -107,90 +44,15 @@ class Role(enum.Enum):
     LAW = enum.auto()
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """
-    What a candidate may look at before it is fitted.
+class Live(enum.Enum):
+    """How the live estimate of the node follows what a term does to alpha, sigma and u0."""
 
-    Attributes
-    ----------
-    z : ndarray, shape (n,)
-        Normal scores of the one-step innovations under the model so far.
-    variance : ndarray, shape (n,)
-        Predictive variance of each sample, V^2.
-    phi : ndarray, shape (n,)
-        Coefficient of the OU in the step before each sample.
-    state : ndarray, shape (n,)
-        Deviation of the sample before from its mean, V; 0 at the first.
-    residual : ndarray, shape (n,)
-        Voltage less its mean, V.
-    at : ndarray, shape (n,)
-        Time since the first sample, s.
-    step : ndarray, shape (n,)
-        Time since the sample before, s.
-    throttle : ndarray, shape (n,), or None
-        0..1.
-    train : slice
-        The part that parameters are fitted on.
-
-    """
-
-    z: FloatArray
-    variance: FloatArray
-    phi: FloatArray
-    state: FloatArray
-    residual: FloatArray
-    at: FloatArray
-    step: FloatArray
-    throttle: FloatArray | None
-    train: slice
-
-    @property
-    def rate(self) -> float:
-        """Return the usual rate, Hz."""
-        return 1.0 / float(np.median(self.step[1:]))
-
-
-@dataclass(frozen=True, eq=False)
-class LawFit:
-    """
-    A law of the innovations, fitted.
-
-    Attributes
-    ----------
-    term : Term
-        With its parameters.
-    se : dict of str to float
-        Their standard errors, where known.
-    z : ndarray, shape (n,)
-        Normal scores under the law: independent N(0, 1) when it is right.
-    gain : ndarray, shape (n,)
-        Log predictive density of each sample over that of N(0, 1) for
-        `View.z`, nats.
-    free : int
-        Parameters fitted.
-    push : ndarray, shape (n,), or None
-        Variance that events add to the state, V^2.
-    error : ndarray, shape (n,), or None
-        Variance that events add to the measurement, V^2.
-    power : ndarray, shape (n,), or None
-        Factor on the variance of what the noise adds in the step before each
-        sample, as the law believes it was: the inverse of the mean precision.
-    offset : ndarray, shape (n,), or None
-        What the law believes to be added to the level, V: the Gaussian part
-        is fitted to what is left without it.
-
-    """
-
-    term: Term
-    se: dict[str, float]
-    z: FloatArray
-    gain: FloatArray
-    free: int
-    push: FloatArray | None = None
-    error: FloatArray | None = None
-    power: FloatArray | None = None
-    offset: FloatArray | None = None
+    # Not: what a model file says of it is all that the risk knows.
+    NOT = enum.auto()
+    # At every throttle.
+    BY_THROTTLE = enum.auto()
+    # Because its window is short.
+    BY_TIME = enum.auto()
 
 
 def parameter(unit: str, text: str, low: float = -math.inf, high: float = math.inf, *,
@@ -214,6 +76,9 @@ class Term:
     ----------
     NAME, FAMILY : str
         As in a model file and in a finding.
+    MEANING, REMEDY, SEPARATED_BY : str
+        For people: what it is, what to do about it, which recording tells it
+        from other causes.
     STAGE : Stage
         When it acts.
     NEEDS_THROTTLE : bool
@@ -228,12 +93,33 @@ class Term:
     SIGNS : tuple of str
         Statistics that ask for this term, by the beginning of their names,
         after + or - where only one direction does.
+    MEASURED : bool
+        Whether it answers to throttle or time alone, so that the search tries
+        it before anything latent.
+    CLEAR_ABOVE : dict of str to float
+        Scores of statistics above which it is tried as early as those.
+    IMITATES : tuple of str
+        Causes that it imitates, and that imitate it: one beside the other would
+        only mend its form.  It suffices that one of the two says so.
+    SEVERAL : bool
+        Whether a model can have several.
+    RECURS : bool
+        Whether the search looks for another one.
+    LEAST_SHARE : float
+        Evidence that it needs, as a share of the largest of any cause.
+    MAY_LEAVE : float
+        Share of its signs that it may leave without being withdrawn; with 0 it is
+        withdrawn where anything at all is left.
+    REFUTED_BY : tuple of str
+        Statistics that it cannot leave.
     SEARCH : float
         Penalty for what is searched beside the free parameters, nats.
     DEAR : bool
         Whether a fit takes seconds, so that cheaper terms are tried first.
-    MEANING : str
-        One sentence for the report.
+    STATES : int
+        States that it adds to the linear system (`Role.BLOCK`).
+    LIVE : Live
+        How the live estimate follows it.
 
     Raises
     ------
@@ -250,9 +136,21 @@ class Term:
     LINEAR: ClassVar[tuple[str, ...]] = ()
     FREE: ClassVar[tuple[str, ...]] = ()
     SIGNS: ClassVar[tuple[str, ...]] = ()
+    MEASURED: ClassVar[bool] = False
+    CLEAR_ABOVE: ClassVar[Mapping[str, float]] = {}
+    IMITATES: ClassVar[tuple[str, ...]] = ()
+    SEVERAL: ClassVar[bool] = False
+    RECURS: ClassVar[bool] = False
+    LEAST_SHARE: ClassVar[float] = 0.0
+    MAY_LEAVE: ClassVar[float] = 0.0
+    REFUTED_BY: ClassVar[tuple[str, ...]] = ()
     SEARCH: ClassVar[float] = 0.0
     DEAR: ClassVar[bool] = False
+    STATES: ClassVar[int] = 0
+    LIVE: ClassVar[Live] = Live.NOT
     MEANING: ClassVar[str] = ''
+    REMEDY: ClassVar[str] = ''
+    SEPARATED_BY: ClassVar[str] = ''
 
     def __post_init__(self) -> None:
         """Check every parameter against its declaration."""
@@ -284,7 +182,7 @@ class Term:
         Returns
         -------
         callable
-            Changes one `Stretch` after the other, in order.
+            Changes one `Segment` after the other, in order.
 
         """
         raise NotImplementedError
@@ -320,13 +218,13 @@ class Term:
         """Return the `ou` that a fit with this term starts from; the default leaves it."""
         return ou
 
-    def columns(self, s: Stretch) -> FloatArray:
+    def columns(self, s: Segment) -> FloatArray:
         """
         Return what the linear parameters multiply.
 
         Parameters
         ----------
-        s : Stretch
+        s : Segment
             All samples; not changed.
 
         Returns
@@ -335,14 +233,14 @@ class Term:
             One column for each of `LINEAR`, V per unit.
 
         """
-        made = []
+        columns = []
         rng = np.random.default_rng(0)
         for name in self.LINEAR:
             unit = replace(self, **{other: float(other == name) for other in self.LINEAR})
             level = replace(s, level=np.zeros(s.t.size))
             unit.start(rng)(level)
-            made.append(level.level)
-        return np.stack(made, axis=1) if made else np.empty((s.t.size, 0))
+            columns.append(level.level)
+        return np.stack(columns, axis=1) if columns else np.empty((s.t.size, 0))
 
     def linear_values(self) -> list[float]:
         """Return the coefficients of the columns."""
@@ -364,13 +262,13 @@ class Term:
         """Return the derivative of a parameter with respect to its coordinate."""
         return float(getattr(self, name))
 
-    def block(self, s: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
         """
         Return the states that this term adds (`Role.BLOCK`).
 
         Parameters
         ----------
-        s : Stretch
+        s : Segment
             All samples.
 
         Returns
@@ -406,10 +304,9 @@ class Term:
         """
         return None
 
-    @classmethod
-    def refit_law(cls, view: View, near: Term) -> LawFit | None:
-        """Fit the law again where `near` fits nearly the same scores; the default starts anew."""
-        return cls.fit_law(view)
+    def refit_law(self, view: View) -> LawFit | None:
+        """Fit the law again to nearly the same scores; the default starts anew."""
+        return type(self).fit_law(view)
 
     @classmethod
     def parameters(cls) -> tuple[str, ...]:

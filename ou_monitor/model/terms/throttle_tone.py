@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
 from typing import ClassVar
 
 import numpy as np
+from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import order_lines, rotation
-from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 
 
@@ -31,6 +33,16 @@ class ThrottleTone(Term):
     DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('order', 'line')
     SEARCH: ClassVar[float] = 9.0
+    STATES: ClassVar[int] = 2
+    SEVERAL: ClassVar[bool] = True
+    RECURS: ClassVar[bool] = True
+    # A line that is clearly there would pass for sigma or alpha that follow throttle; by
+    # chance no score is as high.
+    CLEAR_ABOVE: ClassVar[Mapping[str, float]] = {'order line': 10.0}
+    MAY_LEAVE: ClassVar[float] = 0.3
+    MEANING: ClassVar[str] = 'A line whose frequency follows throttle: commutation of the motors.'
+    REMEDY: ClassVar[str] = 'Capacitance at the ESC; a notch that follows throttle.'
+    SEPARATED_BY: ClassVar[str] = 'a slow sweep of throttle'
 
     amplitude: float = parameter('V', 'peak', 0.0)
     idle: float = parameter('Hz', 'frequency at zero throttle, below 0 where it folds back')
@@ -42,7 +54,7 @@ class ThrottleTone(Term):
         """Begin a simulation."""
         turns = wander = 0.0
 
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             nonlocal turns, wander
             step = np.where(np.isfinite(s.step), s.step, 0.0)
             run = turns + np.cumsum((self.idle + self.slope * s.throttle) * step)
@@ -72,7 +84,7 @@ class ThrottleTone(Term):
         return view.throttle is not None and (
             abs(self.slope) * float(view.throttle[view.train].std()) > _MORE * self.linewidth)
 
-    def block(self, s: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return its two states, which turn as throttle says."""
         step = np.where(np.isfinite(s.step), s.step, 0.0)
         turn = 2.0 * math.pi * (self.idle + self.slope * s.throttle) * step

@@ -8,8 +8,10 @@ import math
 from typing import ClassVar
 
 import numpy as np
+from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import keeps_its_height, lines_at, rotation
-from ou_monitor.model.terms.term import Effect, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 
 
@@ -29,6 +31,16 @@ class Tone(Term):
     LINEAR: ClassVar[tuple[str, ...]] = ('amplitude', 'phase')
     SIGNS: ClassVar[tuple[str, ...]] = ('line',)
     SEARCH: ClassVar[float] = 10.0
+    STATES: ClassVar[int] = 2
+    SEVERAL: ClassVar[bool] = True
+    RECURS: ClassVar[bool] = True
+    MAY_LEAVE: ClassVar[float] = 0.3
+    MEANING: ClassVar[str] = (
+        'A line at a fixed frequency: PWM of an ESC or its alias, or a DC-DC converter.')
+    REMEDY: ClassVar[str] = (
+        'Find the source by its frequency; sample at another rate to tell an alias.')
+    SEPARATED_BY: ClassVar[str] = (
+        'the same at two sampling rates: an alias moves, a true line does not')
 
     amplitude: float = parameter('V', 'peak', 0.0)
     frequency: float = parameter('Hz', 'frequency', 0.0, above=True)
@@ -46,7 +58,7 @@ class Tone(Term):
         """Begin a simulation."""
         wander = 0.0
 
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             nonlocal wander
             phase = 2.0 * math.pi * ((s.at - s.origin) * self.frequency % 1.0) + self.phase
             if self.linewidth > 0.0:
@@ -72,12 +84,12 @@ class Tone(Term):
             self.linewidth < WIDEST
             or keeps_its_height(view, self.frequency, self.linewidth))
 
-    def block(self, s: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the two states of a line that wanders, which turn."""
         turn = 2.0 * math.pi * self.frequency * np.where(np.isfinite(s.step), s.step, 0.0)
         return rotation(turn, math.pi * self.linewidth, s.step, self.amplitude / math.sqrt(2.0))
 
-    def columns(self, s: Stretch) -> FloatArray:
+    def columns(self, s: Segment) -> FloatArray:
         """Return the line in phase and in quadrature."""
         made = []
         for phase in (0.0, 0.5 * math.pi):

@@ -7,9 +7,9 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.laws import climb, curvature_se, normal_scores
-from ou_monitor.model.terms.recursion import first_order
-from ou_monitor.model.terms.term import Effect, LawFit, parameter, Role, Stage, Stretch, Term, View
+from ou_monitor.model.terms.laws import climb, curvature_se, LawFit, normal_scores, View
+from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
+from ou_monitor.model.terms.term import Live, parameter, Role, Term
 from ou_monitor.records import FloatArray
 from scipy.special import ndtr
 from scipy.stats import binom
@@ -25,6 +25,12 @@ class Volatility(Term):
     ROLE: ClassVar[Role] = Role.LAW
     DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('clustering', 'kurtosis')
+    IMITATES: ClassVar[tuple[str, ...]] = ('heavy_tails', 'jumps', 'regime_switching')
+    LIVE: ClassVar[Live] = Live.BY_TIME
+    MEANING: ClassVar[str] = 'The intensity of the noise wanders slowly, unrelated to throttle.'
+    REMEDY: ClassVar[str] = 'Keep the window of the estimator short beside that time.'
+    SEPARATED_BY: ClassVar[str] = (
+        'a recording several times as long, temperature recorded beside it')
 
     std: float = parameter('', 'standard deviation of ln sigma', 0.0)
     rate: float = parameter('1/s', 'relaxation rate of ln sigma', 0.0, above=True)
@@ -33,7 +39,7 @@ class Volatility(Term):
         """Begin a simulation."""
         before = 0.0
 
-        def effect(s: Stretch) -> None:
+        def effect(s: Segment) -> None:
             nonlocal before
             phi = np.exp(-self.rate * s.step)
             e = self.std * np.sqrt(-np.expm1(-2.0 * self.rate * s.step))
@@ -48,12 +54,10 @@ class Volatility(Term):
         """Fit a log-variance that wanders, taken as constant over short stretches."""
         return cls._climbed(view, _start(view), 60)
 
-    @classmethod
-    def refit_law(cls, view: View, near: Term) -> LawFit | None:
+    def refit_law(self, view: View) -> LawFit | None:
         """Fit again, from where it was."""
-        assert isinstance(near, Volatility)
-        return cls._climbed(view, np.array([
-            math.log(max(near.std, 1e-3)), math.log(near.rate), _start(view)[2]]), 30)
+        return self._climbed(view, np.array([
+            math.log(max(self.std, 1e-3)), math.log(self.rate), _start(view)[2]]), 30)
 
     @classmethod
     def _climbed(cls, view: View, start: FloatArray, most: int) -> LawFit | None:

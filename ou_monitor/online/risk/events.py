@@ -17,13 +17,12 @@ import numpy.typing as npt
 from ou_monitor.model.passage.extended import ExtendedPassage
 from ou_monitor.model.passage.law import passage_probability
 from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.term import Live
 from ou_monitor.records import FloatArray
 
 # The live parameters may be so far from those prepared, in logarithms; further ones are
 # taken as if they were there.
 _NEAR = 0.1
-# Terms that the live estimate follows itself.
-_FOLLOWED = frozenset({'volatility'})
 _NEARLY_ONE = 1.0 - 1e-12
 
 
@@ -41,7 +40,7 @@ class EventRisk:
     """
 
     def __init__(self, model: SupplyModel, *, background: bool = True) -> None:
-        kept = SupplyModel(tuple(term for term in model.terms if term.NAME not in _FOLLOWED))
+        kept = SupplyModel(tuple(term for term in model.terms if term.LIVE is not Live.BY_TIME))
         self._passage = ExtendedPassage(kept)
         self._background = background
         self._thread: threading.Thread | None = None

@@ -1,7 +1,7 @@
 """First-order recursions against a plain loop."""
 
 import numpy as np
-from ou_monitor.model.terms.recursion import first_order, steady
+from ou_monitor.model.terms.segment import first_order, steady
 import pytest
 
 

@@ -1,0 +1,111 @@
+"""
+Consecutive samples in the making, and first-order recursions that run along them.
+
+Segments pass through the terms of a model in the order of their `Stage`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import enum
+
+import numpy as np
+from ou_monitor.records import FloatArray
+from scipy.linalg.lapack import dtbtrs
+from scipy.signal import lfilter
+
+
+class Stage(enum.IntEnum):
+    """When a term acts on the samples, from the clock to the logger."""
+
+    CLOCK = 0
+    DRIVE = 1
+    STATE = 2
+    LEVEL = 3
+    INSTRUMENT = 4
+    SENSOR = 5
+    CLIP = 6
+    CODE = 7
+    LOGGER = 8
+
+
+@dataclass
+class Segment:
+    """
+    Consecutive samples in the making; terms change it in place.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n,)
+        Stamps, s.
+    at : ndarray, shape (n,)
+        Instants at which the samples are really taken, s.
+    step : ndarray, shape (n,)
+        Time since the sample before, s; infinite before the first one, which
+        is drawn from the stationary law.
+    throttle : ndarray, shape (n,)
+        0..1, held from the stamp before to its own stamp.
+    origin : float
+        Stamp of the first sample of all, s.
+    alpha, sigma : ndarray, shape (n,)
+        Rate, 1/s, and intensity, V/sqrt(s), over the step before each sample.
+    power : ndarray, shape (n,)
+        Factor on the variance of what the noise adds in that step.
+    push : ndarray, shape (n,)
+        Added to the state at the end of the step, V.
+    bend : tuple of float
+        Coefficients of x^2, 1/(V s), and x^3, 1/(V^2 s), in the restoring
+        force, beside alpha x.
+    x : ndarray, shape (n,)
+        OU deviation, V.
+    level : ndarray, shape (n,)
+        All else that the rail does, V.
+    voltage : ndarray, shape (n,)
+        What is logged, V.
+
+    """
+
+    t: FloatArray
+    at: FloatArray
+    step: FloatArray
+    throttle: FloatArray
+    origin: float
+    alpha: FloatArray
+    sigma: FloatArray
+    power: FloatArray
+    push: FloatArray
+    bend: tuple[float, float]
+    x: FloatArray
+    level: FloatArray
+    voltage: FloatArray
+
+
+Effect = Callable[[Segment], None]
+
+
+def first_order(phi: FloatArray, e: FloatArray, before: float) -> FloatArray:
+    """Run the recursion."""
+    n = e.size
+    if not n:
+        return np.empty(0)
+    if steady(phi[1:]):
+        x: FloatArray = lfilter([1.0], [1.0, -phi[-1]], e, zi=[phi[0] * before])[0]
+        return x
+    # A lower bidiagonal system with a unit diagonal, laid out as LAPACK has it:
+    # otherwise it is copied line by line.
+    band = np.empty((2, n), order='F')
+    band[0] = 1.0
+    np.negative(phi[1:], out=band[1, :-1])
+    band[1, -1] = 0.0
+    right = np.array(e[:, None], order='F')
+    right[0] += phi[0] * before
+    solved: FloatArray = dtbtrs(band, right, uplo='L', diag='U', overwrite_b=True)[0][:, 0]
+    return solved
+
+
+def steady(values: FloatArray) -> bool:
+    """Tell whether all values are the same."""
+    # The last one first: what varies mostly differs there.
+    return not values.size or values.strides == (0,) or bool(
+        values[0] == values[-1] and (values == values[0]).all())
