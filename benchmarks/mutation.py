@@ -26,7 +26,7 @@ import time
 from typing import Any
 
 from mutants import draw, Mutant
-from mutation_runs import reach, Reach, read_lines, stop, Tree
+from mutation_runs import Reach, reach, read_lines, stop, Tree
 
 ROOT = Path(__file__).resolve().parent.parent
 SEED = 20261122

@@ -193,7 +193,7 @@ def reach(tree: Tree, test: str, out: Path) -> None:
     for old in (times, *out.parent.glob(data.name + '*')):
         old.unlink(missing_ok=True)
     code = _run([sys.executable, '-m', 'coverage', 'run', f'--rcfile={settings}', *_PYTEST, test],
-         tree.path, 3600.0, MUTATION_TIMES=str(times), COVERAGE_CORE='ctrace')
+                tree.path, 3600.0, MUTATION_TIMES=str(times), COVERAGE_CORE='ctrace')
     if code not in (0, 1):
         raise RuntimeError(f'{test} could not be run: pytest ended with {code}, '
                            f'{tree.path.with_suffix(".output").read_text()[-2000:]}')
