@@ -12,9 +12,9 @@ LOGS = {'ulog': ['pyulog'], 'dataflash': ['pymavlink'], 'blackbox': ['orangebox<
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version='0.2.0',
     packages=find_packages(include=[NAME, NAME + '.*']),
-    package_data={NAME + '.report': ['*.css', '*.js']},
+    package_data={NAME: ['py.typed'], NAME + '.report': ['*.css', '*.js']},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + NAME]),
         (SHARE, ['package.xml']),
@@ -28,6 +28,7 @@ setup(
         'fast': ['numba'],
         'fleet': ['dask', 'distributed', 'pyarrow'],
         'test': ['pytest', 'hypothesis', 'rosbags'],
+        'doc': ['sphinx', 'myst-parser'],
         **LOGS, 'logs': [package for packages in LOGS.values() for package in packages]},
     python_requires='>=3.11',
     # The message descriptions are read as files beside the package.

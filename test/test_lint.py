@@ -9,6 +9,7 @@ from ament_pep257.main import main as pep257
 from mypy import api as mypy
 from project import project_files, ROOT
 import pytest
+import yaml
 
 FOLDERS = [
     str(ROOT / name) for name in ('ou_monitor', 'test', 'scripts', 'launch', 'benchmarks')
@@ -24,6 +25,20 @@ def test_flake8():
     """Ament's flake8 finds nothing."""
     code, errors = flake8(argv=FOLDERS)
     assert code == 0, '\n'.join(errors)
+
+
+def test_ruff():
+    """The quick rules of ruff.toml, which the pre-commit hook runs, accept the tree."""
+    done = subprocess.run([sys.executable, '-m', 'ruff', 'check', '--no-cache', str(ROOT)],
+                          capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_pre_commit_runs_what_the_suite_runs():
+    """Each hook is a tool of .venv that the suite uses too, or bash."""
+    hooks = yaml.safe_load((ROOT / '.pre-commit-config.yaml').read_text(encoding='utf-8'))
+    tools = {hook['entry'].split()[0] for repo in hooks['repos'] for hook in repo['hooks']}
+    assert tools == {'bash', '.venv/bin/ruff', '.venv/bin/ament_flake8', '.venv/bin/ament_pep257'}
 
 
 @pytest.mark.filterwarnings('ignore')

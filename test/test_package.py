@@ -14,6 +14,7 @@ import time
 import venv
 import xml.etree.ElementTree as ElementTree
 
+from catkin_pkg.changelog import get_changelog_from_path
 from project import project_files, ROOT
 import pytest
 import yaml
@@ -178,6 +179,27 @@ def test_pip_installs_the_message_descriptions(offline, tmp_path):
     done = run(offline / 'python', '-c', code, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == sorted(path.stem for path in ROOT.glob('msg_config/*.yaml'))
+
+
+def test_pip_installs_the_mark_of_a_typed_package(offline, tmp_path):
+    """A type checker of a user's project reads the annotations only where py.typed is."""
+    code = 'from importlib.resources import files; print(files("ou_monitor") / "py.typed")'
+    done = run(offline / 'python', '-c', code, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    marker = Path(done.stdout.strip())
+    assert marker.is_file() and marker.is_relative_to(offline.parent)
+
+
+def test_changelog_is_of_this_version():
+    """Catkin reads the changelog; the newest released section is the package's version."""
+    released = list(get_changelog_from_path(str(ROOT)).foreach_version(reverse=True))
+    version = ElementTree.parse(ROOT / 'package.xml').getroot().findtext('version')
+    assert str(released[0][0]) == version
+    assert all(date and content for _, date, content in released)
+    # What catkin_prepare_release renames; it may be empty, and stands first.
+    titles = re.findall(r'^(.+)\n-+$', (ROOT / 'CHANGELOG.rst').read_text(encoding='utf-8'),
+                        re.MULTILINE)
+    assert titles[0] == 'Forthcoming' and titles[1].startswith(f'{version} (')
 
 
 @pytest.mark.parametrize('name', ['adaptive_filter', 'estimator', 'replay'])
