@@ -12,14 +12,21 @@ from __future__ import annotations
 from collections.abc import Iterable
 import difflib
 
+from ou_monitor.text import printable
+
 
 class InputError(Exception):
     """
     Something the user gave cannot be used; the text is one line for them.
 
     Command-line programs print it after their name and exit with status 2;
-    nodes log it at FATAL and exit with status 2.
+    nodes log it at FATAL and exit with status 2.  What came into it from a file or
+    from its name cannot command a terminal (`text.printable`).
     """
+
+    def __init__(self, text: str) -> None:
+        """Keep the line."""
+        super().__init__(printable(text))
 
 
 def refusal(error: OSError) -> str:

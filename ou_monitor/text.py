@@ -9,6 +9,25 @@ import math
 Z95 = 1.959963984540054
 
 
+def printable(text: object, most: int | None = None) -> str:
+    """
+    Return a text that may come from a file, as one line that a terminal shows as it is.
+
+    Control characters, line ends, marks that change the direction of writing and bytes
+    that are no text become escapes such as ``\\x1b``; beyond `most` characters the middle is
+    left out.
+    """
+    found = str(text)
+    if not found.isprintable():
+        found = ''.join(
+            c if c.isprintable() else c.encode('unicode_escape', 'surrogatepass').decode('ascii')
+            for c in found)
+    if most is not None and len(found) > most:
+        head = (most - 3) // 3
+        found = f'{found[:head]}...{found[len(found) - (most - 3 - head):]}'
+    return found
+
+
 def number(value: float, digits: int = 3) -> str:
     """Return a number to some significant digits, zeros at the end included."""
     if not math.isfinite(value):

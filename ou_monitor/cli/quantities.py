@@ -34,14 +34,14 @@ def quantity(where: str, text: object, unit: str) -> float:
 
 def read_network(path: str) -> dict[str, Any]:
     """Return the components that a YAML file gives (path in A)."""
-    import yaml
+    from ou_monitor.stream.files import read_yaml
 
     if not Path(path).is_file():
         raise InputError(f"--network: there is no file '{path}'")
     try:
-        data = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise InputError(f"--network: '{path}' is not readable YAML: {error}") from error
+        data = read_yaml(path, 'the network')
+    except InputError as error:
+        raise InputError(f'--network: not readable YAML: {error}') from error
     if not isinstance(data, dict):
         raise InputError(f"--network: '{path}' must be a mapping of component to value, such as "
                          'bulk_capacitance: 470uF')

@@ -22,8 +22,8 @@ import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.mcap_index import Break, Codec, McapIndex, scan, TopicRecord
 from ou_monitor.recordings.mcap_records import (
-    check_passed_over, Damage, find_by_index, find_messages, FOOTER_LENGTH, inner_records,
-    MAGIC, MESSAGE_HEAD, moment, Op, record_at, RECORD_HEAD, Span, Table)
+    check_passed_over, Damage, find_by_index, find_messages, FOOTER_LENGTH, inner_records, MAGIC,
+    MESSAGE_HEAD, moment, Op, record_at, RECORD_HEAD, Span, Table)
 
 # First bytes of the logs that `ou-monitor convert` reads; CSV is read as it is.
 _LOGS = (

@@ -16,10 +16,11 @@ from typing import Any, BinaryIO, Protocol
 import zlib
 
 import numpy as np
+from ou_monitor.errors import InputError
 from ou_monitor.recordings.mcap_records import (
     check_passed_over, Damage, find_messages, MAGIC, Op, PRIVATE, Record, record_at, Span, Table)
-from ou_monitor.recordings.rosbag2_metadata import custom_data
-import yaml
+from ou_monitor.recordings.rosbag2_metadata import custom_data, MOST_BYTES, MOST_NODES, plain_texts
+from ou_monitor.stream.files import parse_yaml
 
 # Where a channel's metadata holds the rate of the samples within a block, Hz.
 SAMPLE_RATE = 'sample_rate_hz'
@@ -167,11 +168,12 @@ class McapIndex:
         except Exception as error:
             raise Damage(offset, f'a metadata record cannot be read ({error!r})') from error
         if record.name == ABOUT:
-            self.about |= record.metadata
+            self.about |= plain_texts(record.metadata)
         elif record.name == ROSBAG2:
             try:
-                table = yaml.safe_load(record.metadata.get('serialized_metadata', ''))
-            except yaml.YAMLError:
+                table = parse_yaml(record.metadata.get('serialized_metadata', ''), ROSBAG2,
+                                   most_bytes=MOST_BYTES, most_nodes=MOST_NODES)
+            except InputError:
                 # A table nobody can read is no reason to refuse the messages.
                 return
             self.about |= custom_data(table)

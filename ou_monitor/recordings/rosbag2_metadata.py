@@ -9,21 +9,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+import itertools
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 from ou_monitor.errors import InputError
+from ou_monitor.stream.files import one_line, parse_yaml, path_words, read_yaml
+from ou_monitor.text import printable
 import yaml
 
 FILE = 'metadata.yaml'
+# A bag of 2000 topics, or of 20 000 files.
+MOST_BYTES, MOST_NODES = 8_000_000, 200_000
 _ROOT = 'rosbag2_bagfile_information'
 
 # rosbag2 writes "for ever" of the middleware as the greatest duration.
 _FOR_EVER = {'sec': 9223372036, 'nsec': 854775807}
 
 # Before version 9 policies were numbers (rmw/types.h).
-_RELIABILITY: dict[Any, str] = {1: 'reliable', 2: 'best_effort'}
-_DURABILITY: dict[Any, str] = {1: 'transient_local', 2: 'volatile'}
+_RELIABILITY: dict[int, str] = {1: 'reliable', 2: 'best_effort'}
+_DURABILITY: dict[int, str] = {1: 'transient_local', 2: 'volatile'}
 
 
 @dataclass(frozen=True)
@@ -93,22 +98,23 @@ def parse_qos(text_or_list: Any) -> tuple[str, str, int]:
     profiles = text_or_list
     if isinstance(profiles, str):
         try:
-            profiles = yaml.safe_load(profiles)
-        except yaml.YAMLError:
+            profiles = parse_yaml(profiles, 'QoS', most_bytes=100_000)
+        except InputError:
             # A QoS nobody can read is no reason to refuse the messages.
             profiles = None
     first: dict[str, Any] = {}
     if isinstance(profiles, list) and profiles and isinstance(profiles[0], dict):
         first = profiles[0]
-    reliability = first.get('reliability')
-    durability = first.get('durability')
     depth = first.get('depth')
-    reliability = _RELIABILITY.get(reliability, reliability)
-    durability = _DURABILITY.get(durability, durability)
-    return (
-        str(reliability) if reliability in _RELIABILITY.values() else 'reliable',
-        str(durability) if durability in _DURABILITY.values() else 'volatile',
-        depth if isinstance(depth, int) and depth > 0 else 10)
+    return (_policy(first.get('reliability'), _RELIABILITY, 'reliable'),
+            _policy(first.get('durability'), _DURABILITY, 'volatile'),
+            depth if isinstance(depth, int) and 0 < depth < 2**31 else 10)
+
+
+def _policy(value: Any, numbers: Mapping[int, str], default: str) -> str:
+    """Return a policy by its name or number."""
+    name = numbers.get(value) if isinstance(value, int) else value
+    return str(name) if name in list(numbers.values()) else default
 
 
 def custom_data(content: Any) -> dict[str, str]:
@@ -117,36 +123,47 @@ def custom_data(content: Any) -> dict[str, str]:
     custom = info.get('custom_data') if isinstance(info, dict) else None
     if not isinstance(custom, dict):
         return {}
-    return {str(key): str(value) for key, value in custom.items() if value is not None}
+    return plain_texts({key: value for key, value in custom.items()
+                        if isinstance(value, (str, int, float))})
+
+
+def plain_texts(found: Mapping[Any, Any]) -> dict[str, str]:
+    """Return what a bag says of itself as names and texts of one line each."""
+    return {printable(key, 100): printable(value, 1000)
+            for key, value in itertools.islice(found.items(), 1000)}
 
 
 def read_metadata(folder: Path) -> BagFiles:
     """Return the MCAP files of a rosbag2 directory, and what is said of them."""
+    with one_line():
+        return _metadata(folder)
+
+
+def _metadata(folder: Path) -> BagFiles:
     path = folder / FILE
-    try:
-        content = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f'cannot read {path}: {error}') from error
-    except yaml.YAMLError as error:
-        raise InputError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    where = path_words(path)
+    content = read_yaml(path, 'the metadata', most_bytes=MOST_BYTES, most_nodes=MOST_NODES)
     info = content.get(_ROOT) if isinstance(content, dict) else None
     if not isinstance(info, dict):
-        raise InputError(f"{path} has no '{_ROOT}': it is not the metadata of a rosbag2")
+        raise InputError(f"{where} has no '{_ROOT}': it is not the metadata of a rosbag2")
     storage = info.get('storage_identifier')
     if storage != 'mcap':
         raise InputError(
-            f"{folder}: the storage is '{storage}', only mcap is read: convert it with "
-            "'ros2 bag convert' to the storage mcap")
+            f"{path_words(folder)}: the storage is '{printable(storage, 40)}', only mcap is read: "
+            "convert it with 'ros2 bag convert' to the storage mcap")
     names = info.get('relative_file_paths')
     if not isinstance(names, list) or not names:
-        raise InputError(f"{path} names no file in 'relative_file_paths'")
+        raise InputError(f"{where} names no file in 'relative_file_paths'")
     # Old versions wrote the folder before the name.
-    files = [folder / PurePosixPath(str(name)).name for name in names]
+    files = [folder / name for name in dict.fromkeys(
+        PurePosixPath(str(name)).name for name in names)]
     for file in files:
         if not file.is_file():
-            raise InputError(f"{path} names '{file.name}', which is not in {folder}")
+            raise InputError(f"{where} names '{printable(file.name, 60)}', which is not in its "
+                             'folder')
     qos: dict[str, Any] = {}
-    for entry in info.get('topics_with_message_count') or ():
+    entries = info.get('topics_with_message_count')
+    for entry in entries if isinstance(entries, list) else ():
         topic = entry.get('topic_metadata') if isinstance(entry, dict) else None
         if isinstance(topic, dict):
             qos[str(topic.get('name'))] = topic.get('offered_qos_profiles')

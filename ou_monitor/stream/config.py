@@ -16,7 +16,8 @@ import re
 from typing import Any
 
 from ou_monitor.errors import InputError, nearest
-import yaml
+from ou_monitor.stream.files import one_line, path_words, read_yaml
+from ou_monitor.text import printable
 
 NAN_RULES = ('drop', 'unknown')
 
@@ -185,20 +186,16 @@ def _files(directory: Path | str | None) -> list[Path]:
 
 
 def _load(path: Path) -> MsgConfig:
-    try:
-        content = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f'cannot read msg config {path}: {error}') from error
-    except yaml.YAMLError as error:
-        line = ' '.join(str(error).split())
-        raise InputError(f'{path} is not YAML: {line}') from error
-    top = _checked(content, _CONFIG_KINDS, _CONFIG_NEEDED, str(path))
-    throttle = top.get('throttle')
-    return MsgConfig(
-        name=path.stem, description=' '.join(top['description'].split()),
-        package=top['package'], install=' '.join(top['install'].split()),
-        generic=top['generic'], voltage=_field_spec(top['voltage'], f'{path}: voltage'),
-        throttle=None if throttle is None else _field_spec(throttle, f'{path}: throttle'))
+    content = read_yaml(path, 'msg config')
+    where = path_words(path)
+    with one_line():
+        top = _checked(content, _CONFIG_KINDS, _CONFIG_NEEDED, where)
+        throttle = top.get('throttle')
+        return MsgConfig(
+            name=path.stem, description=' '.join(top['description'].split()),
+            package=top['package'], install=' '.join(top['install'].split()),
+            generic=top['generic'], voltage=_field_spec(top['voltage'], f'{where}: voltage'),
+            throttle=None if throttle is None else _field_spec(throttle, f'{where}: throttle'))
 
 
 def _checked(
@@ -210,7 +207,10 @@ def _checked(
         raise InputError(f"{where}: expected keys ({', '.join(kinds)}), found none")
     for key, value in content.items():
         if key not in kinds:
-            raise InputError(f"{where}: unknown key '{key}': {nearest(str(key), kinds)}")
+            hint = nearest(printable(key, 60), kinds)
+            # The keys of a file that is none of ours are not told.
+            name = f" '{printable(key, 60)}'" if hint.startswith('did') else ''
+            raise InputError(f'{where}: unknown key{name}: {hint}')
         accepted, word = kinds[key]
         # In Python true is an int; in a YAML it is never meant as a number.
         wrong_bool = isinstance(value, bool) and bool not in accepted
@@ -219,7 +219,7 @@ def _checked(
             if isinstance(value, str) and float in accepted:
                 # YAML 1.1 takes 1e-3 for text; 1.0e-3 is a number.
                 hint = ' (a number with an exponent needs a point: 1.0e-3)'
-            raise InputError(f"{where}: '{key}' must be {word}, found {value!r}{hint}")
+            raise InputError(f"{where}: '{key}' must be {word}, found {printable(repr(value), 60)}{hint}")
     for key in needed:
         if key not in content:
             raise InputError(f"{where}: key '{key}' is missing")

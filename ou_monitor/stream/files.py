@@ -1,0 +1,167 @@
+"""
+Files that users name, within limits: regular ones only, and YAML of bounded size and shape.
+
+A FIFO, a device or a file without end is refused before a byte of it is read.  What is
+said of YAML that cannot be loaded is one line of at most 300 characters, and quotes
+nothing of the file: the file may not have been meant for us.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+import os
+from pathlib import Path
+import re
+import stat
+from typing import Any, BinaryIO
+
+from ou_monitor.errors import InputError
+from ou_monitor.text import printable
+import yaml
+
+# Longest line about a file, and how much of it may be the path.
+MOST_CHARACTERS = 300
+_MOST_OF_PATH = 150
+
+# A model file has some kB, a msg config less.  PyYAML takes up to 2 s for so much.
+MOST_BYTES = 1_000_000
+# Aliases count as often as they stand for something: a mapping that is named a
+# hundred times in lists of a hundred is a bomb, whatever its size in bytes.
+MOST_NODES = 20_000
+MOST_DEPTH = 64
+MOST_ALIASES = 100
+# The greatest float64 has 309 digits before the point; a number of more is a mistake,
+# and turning digits into an integer costs their square.
+MOST_DIGITS = 400
+
+
+def path_words(path: str | Path) -> str:
+    """Return a path for a message, shortened in its middle."""
+    return printable(path, _MOST_OF_PATH)
+
+
+def open_regular(path: str | Path) -> BinaryIO:
+    """
+    Open a regular file for reading, whatever waits behind the path.
+
+    Never waits for a FIFO's writer.  Raises OSError, also for what is not a regular file.
+    """
+    file = open(path, 'rb', opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(0, 'it is not a regular file', str(path))
+    return file
+
+
+def read_yaml(path: str | Path, what: str, *, most_bytes: int = MOST_BYTES,
+              most_nodes: int = MOST_NODES) -> Any:
+    """
+    Return the content of a YAML file; `what` names it where it cannot be read.
+
+    Raises InputError: one line of at most `MOST_CHARACTERS`, without content of the file.
+    """
+    where = path_words(path)
+    try:
+        with open_regular(path) as file:
+            data = file.read(most_bytes + 1)
+    except (OSError, ValueError) as error:
+        why = (error.strerror if isinstance(error, OSError) else None) or 'it is no path'
+        raise InputError(f'cannot read {what} {where}: {why}') from error
+    if len(data) > most_bytes:
+        raise InputError(f'cannot read {what} {where}: it holds more than '
+                         f'{most_bytes / 1e6:g} MB')
+    try:
+        text = data.decode('utf-8-sig')
+    except UnicodeDecodeError as error:
+        raise InputError(f'{where} is not YAML that can be read: byte {error.start} is not '
+                         'UTF-8') from error
+    return parse_yaml(text, where, most_bytes=most_bytes, most_nodes=most_nodes)
+
+
+def parse_yaml(text: str, where: str, *, most_bytes: int = MOST_BYTES,
+               most_nodes: int = MOST_NODES) -> Any:
+    """Return the content of a YAML text; InputError as of `read_yaml`."""
+    if len(text) > most_bytes:
+        raise InputError(f'{path_words(where)} holds more than {most_bytes / 1e6:g} MB')
+    try:
+        loader = _BoundedLoader(text, most_nodes)
+        try:
+            return loader.get_single_data()
+        finally:
+            loader.dispose()
+    except yaml.reader.ReaderError as error:
+        why = f'character {error.position} is not allowed in YAML'
+    except yaml.MarkedYAMLError as error:
+        why = _without_content(error)
+    raise InputError(f'{path_words(where)} is not YAML that can be read: {why}') from None
+
+
+@contextmanager
+def one_line() -> Iterator[None]:
+    """Bound the length of what is raised about the content of a YAML file."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(printable(error, MOST_CHARACTERS)) from error
+
+
+def _without_content(error: yaml.MarkedYAMLError) -> str:
+    """Return where and why YAML is wrong; PyYAML quotes the file in what is cut off."""
+    why = re.split(r'[\'":<]|,? but found', error.problem or '')[0].strip()
+    if why in ('', 'found character', 'expected'):
+        why = 'something cannot stand there'
+    mark = error.problem_mark or error.context_mark
+    return why if mark is None else f'{why} (line {mark.line + 1}, column {mark.column + 1})'
+
+
+class _BoundedLoader(yaml.SafeLoader):
+    """PyYAML's safe loader, with limits on depth, aliases, nodes and digits."""
+
+    def __init__(self, text: str, most_nodes: int) -> None:
+        super().__init__(text)
+        self._most_nodes = most_nodes
+        self._nodes = self._depth = self._aliases = 0
+        # Anchor -> nodes that it stands for; one that is still open is not in it.
+        self._sizes: dict[str, int] = {}
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Compose a node, counting what it adds."""
+        event = self.peek_event()
+        if isinstance(event, yaml.AliasEvent):
+            self._aliases += 1
+            if self._aliases > MOST_ALIASES:
+                self._refuse(f'it has more than {MOST_ALIASES} aliases', event)
+            if event.anchor in self.anchors and event.anchor not in self._sizes:
+                self._refuse('an alias stands for what it is in itself', event)
+            self._count(self._sizes.get(event.anchor, 0), event)
+            return super().compose_node(parent, index)
+        before = self._nodes
+        self._count(1, event)
+        self._depth += 1
+        if self._depth > MOST_DEPTH:
+            self._refuse(f'it is nested more than {MOST_DEPTH} deep', event)
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        if event.anchor is not None:
+            self._sizes[event.anchor] = self._nodes - before
+        return node
+
+    def construct_object(self, node: Any, deep: bool = False) -> Any:
+        """Construct a node; a number of too many digits, or a false date, has its place named."""
+        if isinstance(node, yaml.ScalarNode) and len(node.value) > MOST_DIGITS and (
+                node.tag in ('tag:yaml.org,2002:int', 'tag:yaml.org,2002:float')):
+            self._refuse(f'a number has more than {MOST_DIGITS} digits', node)
+        try:
+            return super().construct_object(node, deep)
+        except (ValueError, OverflowError, TypeError, LookupError, AttributeError):
+            # PyYAML lets through what Python says of a value with a tag that does not fit.
+            self._refuse('a value does not exist or does not fit its tag', node)
+
+    def _count(self, nodes: int, at: Any) -> None:
+        self._nodes += nodes
+        if self._nodes > self._most_nodes:
+            self._refuse(f'it holds more than {self._most_nodes} values', at)
+
+    def _refuse(self, why: str, at: Any) -> None:
+        raise yaml.composer.ComposerError(None, None, why, at.start_mark)
