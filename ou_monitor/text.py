@@ -14,7 +14,7 @@ def printable(text: object, most: int | None = None) -> str:
     Return a text that may come from a file, as one line that a terminal shows as it is.
 
     Control characters, line ends, marks that change the direction of writing and bytes
-    that are no text become escapes such as ``\\x1b``; beyond `most` characters the middle is
+    that are no text become escapes; beyond `most` characters the middle is
     left out.
     """
     found = str(text)

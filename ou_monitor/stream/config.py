@@ -219,7 +219,8 @@ def _checked(
             if isinstance(value, str) and float in accepted:
                 # YAML 1.1 takes 1e-3 for text; 1.0e-3 is a number.
                 hint = ' (a number with an exponent needs a point: 1.0e-3)'
-            raise InputError(f"{where}: '{key}' must be {word}, found {printable(repr(value), 60)}{hint}")
+            raise InputError(f"{where}: '{key}' must be {word}, found "
+                             f'{printable(repr(value), 60)}{hint}')
     for key in needed:
         if key not in content:
             raise InputError(f"{where}: key '{key}' is missing")
