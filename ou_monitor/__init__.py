@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ou_monitor.discover.discover import discover
+    from ou_monitor.discovery.discover import discover
     from ou_monitor.errors import InputError
     from ou_monitor.online.estimator.estimator import SlidingEstimator
     from ou_monitor.online.filter.lowpass import AdaptiveLowPass
@@ -31,7 +31,7 @@ _HOMES = {
     'SlidingEstimator': 'ou_monitor.online.estimator.estimator',
     'Status': 'ou_monitor.records',
     'brownout_probability': 'ou_monitor.online.risk.first_passage',
-    'discover': 'ou_monitor.discover.discover',
+    'discover': 'ou_monitor.discovery.discover',
     'read_pieces': 'ou_monitor.recordings.read',
     'read_recording': 'ou_monitor.recordings.read',
 }

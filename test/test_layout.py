@@ -14,7 +14,7 @@ PACKAGE = 'ou_monitor'
 # A module may import only from its own part and from parts of a lower level.
 LEVEL = {
     'errors': 0, 'text': 0, 'records': 0, 'model': 1, 'online': 2, 'stream': 3, 'recordings': 4,
-    'simulate': 5, 'criticism': 5, 'analyze': 6, 'discover': 6, 'coupling': 6, 'paper': 6,
+    'simulate': 5, 'criticism': 5, 'analyze': 6, 'discovery': 6, 'coupling': 6, 'paper': 6,
     'fleet': 7, 'report': 8, 'nodes': 9, 'cli': 9,
 }
 # What users reach as `from ou_monitor import ...`: above all but the programs.
@@ -32,7 +32,7 @@ EXTRAS = {'dask': 'fleet.cluster', 'distributed': 'fleet.cluster',
 ALLOWED = {
     'errors': set(), 'text': set(), 'stream': CORE | {'yaml'}, 'recordings': CORE | {'yaml'},
     'cli': CORE | {'yaml'}, **dict.fromkeys((
-        'records', 'model', 'online', 'simulate', 'criticism', 'analyze', 'discover', 'coupling',
+        'records', 'model', 'online', 'simulate', 'criticism', 'analyze', 'discovery', 'coupling',
         'paper', 'fleet', 'report', '__init__'), CORE),
 }
 

@@ -41,3 +41,9 @@ def test_version_is_that_of_the_package():
     setup = re.search(r"version='([^']+)'", (ROOT / 'setup.py').read_text()).group(1)
     package = re.search(r'<version>([^<]+)<', (ROOT / 'package.xml').read_text()).group(1)
     assert ou_monitor.__version__ == setup == package
+
+
+def test_public_names_are_not_folders():
+    """`from ou_monitor import x` must not depend on which folder was imported before."""
+    folders = {path.name for path in (ROOT / 'ou_monitor').iterdir() if path.is_dir()}
+    assert 'discovery' in folders and not folders & set(ou_monitor.__all__)

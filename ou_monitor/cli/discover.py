@@ -15,7 +15,7 @@ from ou_monitor.cli.arguments import (
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
-    from ou_monitor.discover.finding import Finding
+    from ou_monitor.discovery.finding import Finding
 
 # Statistics and notes shown at most; all of them are in the report.
 _SHOWN = 8
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     output.check_writable(args.json)
 
     import numpy as np
-    from ou_monitor.discover.discover import discover
+    from ou_monitor.discovery.discover import discover
 
     recording = read_given(args, start, end)
     # What overflows on the way ends as not finite, which the search refuses: a user has no
@@ -107,9 +107,9 @@ def model_text(finding: Finding) -> str:
 
 def render(finding: Finding) -> str:
     """Return the finding for a terminal 100 columns wide."""
-    from ou_monitor.discover.cause_rows import cause_rows
-    from ou_monitor.discover.gain_words import MNAT, overlap_words
-    from ou_monitor.discover.words import crossing_words, plain_model_words, plain_words
+    from ou_monitor.discovery.cause_rows import cause_rows
+    from ou_monitor.discovery.gain_words import MNAT, overlap_words
+    from ou_monitor.discovery.words import crossing_words, plain_model_words, plain_words
     from ou_monitor.text import number
 
     used = '' if finding.samples is None or finding.samples.n == finding.n else (

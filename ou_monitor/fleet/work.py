@@ -152,7 +152,7 @@ def _sag(analysis: Analysis) -> tuple[float, float]:
 def _discovered(recording: Recording, options: Options) -> dict[str, Any]:
     if not options.discover:
         return {'verdict': None, 'causes': None, 'gain': NAN, 'gain_se': NAN}
-    from ou_monitor.discover.discover import discover
+    from ou_monitor.discovery.discover import discover
 
     finding = discover(recording, seed=options.seed)
     return {'verdict': finding.verdict.value, 'causes': [cause.name for cause in finding.causes],

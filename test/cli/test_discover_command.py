@@ -8,8 +8,8 @@ import numpy as np
 from ou_monitor.cli.discover import render
 from ou_monitor.cli.main import main
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discover.finding import Cause, Finding, Verdict
-from ou_monitor.discover.words import explain, parameters
+from ou_monitor.discovery.finding import Cause, Finding, Verdict
+from ou_monitor.discovery.words import explain, parameters
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.drift import Drift
 from ou_monitor.model.terms.load_sag import LoadSag

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from ou_monitor.criticism.battery import is_sign
 from ou_monitor.criticism.null_bank import family_chance
-from ou_monitor.discover.finding import Verdict
+from ou_monitor.discovery.finding import Verdict
 from ou_monitor.model.terms.term import Term
 
 # Chance of the largest statistic above which nothing is wrong where no cause was found.

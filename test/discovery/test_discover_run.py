@@ -10,7 +10,7 @@ import numpy as np
 import ou_monitor
 from ou_monitor import discover
 from ou_monitor.cli.discover import render
-from ou_monitor.discover.finding import Verdict
+from ou_monitor.discovery.finding import Verdict
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.drift import Drift

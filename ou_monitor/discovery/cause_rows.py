@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
-from ou_monitor.discover.finding import Cause
-from ou_monitor.discover.words import parameters
+from ou_monitor.discovery.finding import Cause
+from ou_monitor.discovery.words import parameters
 from ou_monitor.text import number, Z95
 
 NOT_KNOWN = 'not known'

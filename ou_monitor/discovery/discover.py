@@ -14,14 +14,14 @@ from ou_monitor.criticism.integrity import examine, Integrity
 from ou_monitor.criticism.null_bank import family_chance
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, fit_gaussian
-from ou_monitor.discover.errors import standard_errors
-from ou_monitor.discover.finding import Cause, Criticism, Finding, Verdict
-from ou_monitor.discover.gain import (
+from ou_monitor.discovery.errors import standard_errors
+from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
+from ou_monitor.discovery.gain import (
     crossing_rates, mean_difference, mean_score, Scale, told, without, worth)
-from ou_monitor.discover.gain_words import NO_OTHER, VAGUE
-from ou_monitor.discover.second_criticism import Named, named_causes, position
-from ou_monitor.discover.verdict import judge, NOTHING
-from ou_monitor.discover.words import (
+from ou_monitor.discovery.gain_words import NO_OTHER, VAGUE
+from ou_monitor.discovery.second_criticism import Named, named_causes, position
+from ou_monitor.discovery.verdict import judge, NOTHING
+from ou_monitor.discovery.words import (
     coupling_found, coupling_note, explain, left_out_note, no_relaxation_note, verdict_sentence)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU

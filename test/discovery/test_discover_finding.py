@@ -4,10 +4,10 @@ from dataclasses import replace
 import json
 import math
 
-from ou_monitor.discover.finding import Cause, Criticism, CrossingRate, Finding, Verdict
-from ou_monitor.discover.gain_words import overlap_words, why_named
-from ou_monitor.discover.verdict import failing, judge, largest_chance, withdrawn
-from ou_monitor.discover.words import (
+from ou_monitor.discovery.finding import Cause, Criticism, CrossingRate, Finding, Verdict
+from ou_monitor.discovery.gain_words import overlap_words, why_named
+from ou_monitor.discovery.verdict import failing, judge, largest_chance, withdrawn
+from ou_monitor.discovery.words import (
     coupling_note, explain, parameters, plain_words, verdict_sentence, with_error)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue

@@ -21,9 +21,9 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discover.errors import Estimation, estimations
-from ou_monitor.discover.finding import CrossingRate
-from ou_monitor.discover.gain_words import unmeasured_words
+from ou_monitor.discovery.errors import Estimation, estimations
+from ou_monitor.discovery.finding import CrossingRate
+from ou_monitor.discovery.gain_words import unmeasured_words
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray, NAN

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 import math
 from typing import Any
 
-from ou_monitor.discover.finding import Cause, Criticism, Finding, Verdict
-from ou_monitor.discover.gain_words import gain_words, why_named
+from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
+from ou_monitor.discovery.gain_words import gain_words, why_named
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Term

@@ -7,7 +7,7 @@ from ou_monitor import discover
 from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
-from ou_monitor.discover.gain import crossing_rates, crossings, mean_difference, Scale
+from ou_monitor.discovery.gain import crossing_rates, crossings, mean_difference, Scale
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.drift import Drift
 from ou_monitor.model.terms.jumps import Jumps

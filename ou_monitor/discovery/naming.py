@@ -16,9 +16,9 @@ from ou_monitor.criticism.battery import is_sign
 from ou_monitor.criticism.composite import Composite, view_of
 from ou_monitor.criticism.null_bank import NullBank
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discover.fitting import best_start, fitted, joined
-from ou_monitor.discover.gain import BLOCKS, mean_difference
-from ou_monitor.discover.trials import (
+from ou_monitor.discovery.fitting import best_start, fitted, joined
+from ou_monitor.discovery.gain import BLOCKS, mean_difference
+from ou_monitor.discovery.trials import (
     anything, criticise, MOST_WORK, refined, ROUGH, tier_of, TIERS, Trial, trials_of)
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.lines import lines_with_height

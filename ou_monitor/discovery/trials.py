@@ -14,7 +14,7 @@ from ou_monitor.criticism.battery import is_sign, statistics
 from ou_monitor.criticism.composite import Composite, scene_of, view_of
 from ou_monitor.criticism.null_bank import NullBank
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discover.fitting import best_start, fitted, sag_with_lag
+from ou_monitor.discovery.fitting import best_start, fitted, sag_with_lag
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Role, Term
 

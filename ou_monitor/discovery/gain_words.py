@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 import math
 
-from ou_monitor.discover.finding import Cause
+from ou_monitor.discovery.finding import Cause
 from ou_monitor.text import number, Z95
 
 # What a gain is counted in.

@@ -10,10 +10,10 @@ import numpy as np
 from ou_monitor.criticism.composite import Composite, fit_composite, scene_of
 from ou_monitor.criticism.null_bank import NullBank, simulate_bank, simulate_bank_of
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discover.fitting import joined
-from ou_monitor.discover.naming import ACCEPT, name_causes, Search
-from ou_monitor.discover.trials import criticise
-from ou_monitor.discover.verdict import is_latent, withdrawn
+from ou_monitor.discovery.fitting import joined
+from ou_monitor.discovery.naming import ACCEPT, name_causes, Search
+from ou_monitor.discovery.trials import criticise
+from ou_monitor.discovery.verdict import is_latent, withdrawn
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Term
 

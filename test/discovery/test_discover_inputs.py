@@ -8,8 +8,8 @@ import numpy as np
 from ou_monitor import discover
 from ou_monitor.cli.main import main
 from ou_monitor.criticism.samples import choose_samples, MOST
-import ou_monitor.discover.discover as discovering
-from ou_monitor.discover.finding import Verdict
+import ou_monitor.discovery.discover as discovering
+from ou_monitor.discovery.finding import Verdict
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.ou import OU

@@ -5,8 +5,8 @@ import math
 import numpy as np
 from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discover.errors import standard_errors
-from ou_monitor.discover.gain import (
+from ou_monitor.discovery.errors import standard_errors
+from ou_monitor.discovery.gain import (
     BLOCKS, crossing_level, crossing_rates, crossings, mean_difference, mean_score, told, without,
     worth)
 from ou_monitor.model.ou import simulate
