@@ -12,7 +12,7 @@ from ou_monitor.analyze.level_result import LevelResult
 from ou_monitor.analyze.relaxation import Relaxation
 from ou_monitor.analyze.words import headline
 from ou_monitor.criticism.level_tests import EFFECT, FAMILY_WISE, LEAST
-from ou_monitor.criticism.lines import FALSE_ALARM
+from ou_monitor.model.spectral_lines import FALSE_ALARM
 
 
 def as_data(analysis: Analysis) -> dict[str, Any]:

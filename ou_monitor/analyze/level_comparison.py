@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 import math
 
 import numpy as np
@@ -31,6 +30,7 @@ from ou_monitor.analyze.levels import Segment
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
 from ou_monitor.text import Z95
 from scipy import stats
+from scipy.special import chndtrinc
 
 # Highest power of time, and segments needed for each.
 _DEGREE, _SEGMENTS = 3, 4
@@ -234,13 +234,6 @@ def alpha_constancy(throttles: Sequence[float], estimates: Sequence[Estimate],
                      math.exp(slope - wide), math.exp(slope + wide), withheld)
 
 
-@lru_cache(maxsize=64)
 def _noncentrality(freedom: int) -> float:
     """Return the noncentrality at which chi^2 rejects with probability `POWER`."""
-    limit = float(stats.chi2.isf(LEVEL, freedom))
-    low, high = 0.0, 200.0
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        enough = float(stats.ncx2.sf(limit, freedom, middle)) >= POWER
-        low, high = (low, middle) if enough else (middle, high)
-    return high
+    return float(chndtrinc(stats.chi2.isf(LEVEL, freedom), freedom, 1.0 - POWER))

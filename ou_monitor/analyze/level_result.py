@@ -19,7 +19,7 @@ from ou_monitor.analyze.process_type import classify, ProcessType, Verdict
 from ou_monitor.analyze.spectrum import level_spectrum, segment_rate, Spectrum
 from ou_monitor.criticism.innovations import fresh
 from ou_monitor.criticism.level_tests import adjusted, examine_level, FAMILY_WISE, holm, Shape
-from ou_monitor.criticism.lines import find_lines, LineSearch, without_lines
+from ou_monitor.model.spectral_lines import find_lines, LineSearch, without_lines
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Recording, Status
 from scipy import stats

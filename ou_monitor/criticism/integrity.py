@@ -14,9 +14,9 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import find_knee, find_rails, find_step, redraw
-from ou_monitor.criticism.fast_lines import lines_lost, without_lines
 from ou_monitor.criticism.readings import counted, usable, why_nothing
-from ou_monitor.criticism.samples import choose_samples, events_between, Samples
+from ou_monitor.criticism.samples import (
+    choose_samples, events_between, lines_between, Samples, without_tones)
 from ou_monitor.criticism.stamps import judge_stamps, on_grid
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.clock_jitter import ClockJitter
@@ -98,16 +98,16 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     which, note = choose_samples(v, rate)
     if note:
         notes.append(note)
-    lines = lines_lost(t, v, which)
+    lines = lines_between(t, v, which)
     for line in lines:
         notes.append(f'The line at {line.frequency:.6g} Hz was found in all samples and taken '
                      'out of those used, which are too few to show it.')
     between = events_between(v, u, rate, which)
     origin = float(t[which.start])
-    events = (t[between], without_lines(t[between], v[between], origin, lines),
+    events = (t[between], without_tones(t[between], v[between], origin, lines),
               None if u is None else u[between])
     t, v, u = t[which], v[which], None if u is None else u[which]
-    v = without_lines(t, v, origin, lines)
+    v = without_tones(t, v, origin, lines)
     exact += lines
     tell(0.6)
     drawn = None

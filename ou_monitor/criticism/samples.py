@@ -8,14 +8,17 @@ would lose the relaxation, a segment from the middle is used instead.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 import math
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.model.spectral_lines import find_lines, fit_sinusoid, Sinusoid
 from ou_monitor.model.terms.segment import Segment
 from ou_monitor.model.terms.term import Term
+from ou_monitor.model.terms.tone import Tone
 from ou_monitor.records import FloatArray
 from scipy.special import ndtri
 
@@ -43,6 +46,11 @@ _SHARE, _CHANCE, _MORE = 1024, 0.02, 1.05
 _STEPS, _SOON = 0.01, 0.02
 # Events that are few; of more the samples used have enough.
 _FEW = 300
+# Changes larger than this many deviations are events, no part of a line; share of its power that
+# a line must have in common with one sinusoid.
+_EVENT, _COMMON = 5.0, 0.5
+# Stamps off an even grid by more than this share of a step give no phase; stamps at once.
+_EVEN, _CHUNK = 0.1, 500_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +198,58 @@ def events_between(voltage: FloatArray, throttle: FloatArray | None, rate: float
     near: npt.NDArray[np.int64] = np.unique(np.concatenate((at, at + 1, at + 2)))
     kept: npt.NDArray[np.int64] = near[(near < stop) & ((near - first) % k != 0)]
     return kept
+
+
+def lines_between(t: FloatArray, voltage: FloatArray, which: slice) -> list[Tone]:
+    """
+    Find steady lines in all samples that are above half of the rate of the samples used.
+
+    At the samples used they would show up at other frequencies, and mostly drown in what the
+    noise adds between them.
+    """
+    k = which.step or 1
+    part = slice(which.start, min(which.stop, voltage.size))
+    t, v = t[part], voltage[part]
+    n = v.size
+    dt = float(t[-1] - t[0]) / max(n - 1, 1)
+    if k == 1 or not all(_even(t[a:a + _CHUNK], t[0] + a * dt, dt)
+                         for a in range(0, n, _CHUNK)):
+        return []
+    e, keep = _whitened(v)
+    found = []
+    for line in find_lines([e], 1.0 / dt, lowest=0.5 / (k * dt)).lines:
+        wave = fit_sinusoid(e, 1.0 / dt, line.frequency, line.resolution)
+        if 0.5 * wave.amplitude ** 2 > _COMMON * line.rms ** 2:
+            turn = 2.0 * math.pi * wave.frequency * dt
+            # The first of the differences belongs to the second sample.
+            gain = 1.0 - keep * np.exp(-1j * turn)
+            found.append(Tone(wave.amplitude / abs(gain), wave.frequency,
+                              wave.phase - turn - float(np.angle(gain)), 0.0))
+    return found
+
+
+def without_tones(t: FloatArray, voltage: FloatArray, origin: float, lines: Sequence[Tone]
+                  ) -> FloatArray:
+    """Return a voltage less steady lines (origin in s, result in V)."""
+    for line in lines:
+        wave = Sinusoid(line.amplitude, line.frequency, line.phase)
+        voltage = voltage - wave.sampled(t - origin)
+    return voltage
+
+
+def _even(t: FloatArray, first: float, dt: float) -> bool:
+    """Return whether stamps are where an even grid has them."""
+    return float(np.abs(t - first - dt * np.arange(t.size)).max()) < _EVEN * dt
+
+
+def _whitened(v: FloatArray) -> tuple[FloatArray, float]:
+    """Return what the sample before does not tell, events cut, and what it tells."""
+    c = v - v.mean()
+    keep = float(c[1:] @ c[:-1]) / max(float(c @ c), 1e-300)
+    e: FloatArray = c[1:] - keep * c[:-1]
+    del c
+    limit = _EVENT * float(np.median(np.abs(e[::max(e.size // _CHUNK, 1)]))) / 0.6745
+    return (np.clip(e, -limit, limit, out=e) if limit > 0.0 else e), keep
 
 
 def _nth(k: int) -> str:

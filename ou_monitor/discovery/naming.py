@@ -21,10 +21,9 @@ from ou_monitor.discovery.gain import BLOCKS, mean_difference
 from ou_monitor.discovery.trials import (
     anything, criticise, MOST_WORK, refined, ROUGH, tier_of, TIERS, Trial, trials_of)
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.lines import lines_with_height
 from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
 from ou_monitor.model.terms.term import Role, Term
-from ou_monitor.model.terms.tone import Tone
+from ou_monitor.model.terms.tone import lines_of, Tone
 
 # Evidence from which a cause is accepted, nats; the same for a mean that answers to what
 # was measured, which every flight has some of.
@@ -184,9 +183,9 @@ def _more_lines(samples: Samples, search: Search, values: dict[str, float], bank
     view = view_of(samples, composite.gaussian, composite.z, samples.train)
     # An amplitude, a phase, and what was searched for the frequency.
     price = math.log(samples.train.stop) + Tone.SEARCH
-    lines = [Tone(0.0, frequency, 0.0, 0.0)
-             for frequency, height in lines_with_height(view, MOST_LINES)
-             if height > price + ACCEPT]
+    # A line of the scores, which have variance 1, gains n rms^2 / 2 nats.
+    lines = [Tone.at(line, view) for line in lines_of(view)[:MOST_LINES]
+             if 0.5 * samples.n * line.rms ** 2 > price + ACCEPT]
     made = joined(samples, composite, lines, rough=True) if lines else None
     if made is None or made.score(samples) - composite.score(samples) < ACCEPT * len(lines):
         return values

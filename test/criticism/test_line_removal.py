@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from ou_monitor.analyze.analyze import analyze
 from ou_monitor.analyze.quality import line_item, Severity
-from ou_monitor.criticism.lines import find_lines, without_lines
+from ou_monitor.model.spectral_lines import find_lines, without_lines
 from ou_monitor.records import Estimate, Recording, Status
 import pytest
 from scipy.signal import lfilter

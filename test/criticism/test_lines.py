@@ -4,8 +4,8 @@ import math
 
 from made_recordings import ALPHA
 import numpy as np
-from ou_monitor.criticism.lines import find_lines, tail
 from ou_monitor.model.ou import simulate
+from ou_monitor.model.spectral_lines import find_lines, tail
 import pytest
 from scipy import signal
 

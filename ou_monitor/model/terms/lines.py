@@ -1,4 +1,4 @@
-"""Where spectral lines stand in normal scores: sharp, broad, or following throttle."""
+"""What lines of a model share: their states, and where broad and moving ones stand in scores."""
 
 from __future__ import annotations
 
@@ -10,35 +10,8 @@ from ou_monitor.model.terms.laws import View
 from ou_monitor.records import FloatArray
 from scipy.signal import welch
 
-# Lines looked into.
+# Lines that follow throttle looked into.
 _MOST = 3
-
-
-def lines_at(view: View, most: int = _MOST) -> list[float]:
-    """Return the frequencies of the strongest sharp lines."""
-    return [frequency for frequency, _ in lines_with_height(view, most)]
-
-
-def lines_with_height(view: View, most: int) -> list[tuple[float, float]]:
-    """Return the frequencies of the strongest sharp lines and what each is worth."""
-    # All of them: a line may have begun late, and its frequency is no parameter of
-    # a likelihood, but pays for its search.
-    z = view.z
-    if z.size < 32:
-        return []
-    power = np.abs(np.fft.rfft(z, 2 * z.size)) ** 2 / z.size
-    power[:4] = 0.0
-    found: list[tuple[float, float]] = []
-    for _ in range(most):
-        at = int(np.argmax(power))
-        # A parabola through the logarithm of the peak.
-        shift = 0.0
-        if 0 < at < power.size - 1 and power[at - 1] > 0.0 < power[at + 1]:
-            a, b, c = np.log(power[at - 1:at + 2])
-            shift = 0.5 * (a - c) / (a - 2.0 * b + c) if a - 2.0 * b + c < 0.0 else 0.0
-        found.append(((at + shift) * view.rate / (2.0 * z.size), float(power[at])))
-        power[max(at - 8, 0):at + 9] = 0.0
-    return found
 
 
 def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,

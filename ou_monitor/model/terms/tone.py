@@ -8,8 +8,9 @@ import math
 from typing import ClassVar
 
 import numpy as np
+from ou_monitor.model.spectral_lines import find_lines, fit_sinusoid, Line
 from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.lines import keeps_its_height, lines_at, rotation
+from ou_monitor.model.terms.lines import keeps_its_height, rotation
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
@@ -74,9 +75,15 @@ class Tone(Term):
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
         """Return the strongest lines of what is left over, and the first of them wandering."""
-        found = [cls(0.0, f, 0.0, 0.0) for f in lines_at(view)]
+        found = [cls.at(line, view) for line in lines_of(view)[:_MOST]]
         spread = math.sqrt(float(np.median(view.variance)))
         return [*found, *(cls(0.3 * spread, line.frequency, 0.0, _WANDERS) for line in found[:1])]
+
+    @classmethod
+    def at(cls, line: Line, view: View) -> Tone:
+        """Return a start for a line of what is left over: where it is over the whole recording."""
+        return cls(0.0, fit_sinusoid(view.z, view.rate, line.frequency, line.resolution).frequency,
+                   0.0, 0.0)
 
     def holds(self, view: View) -> bool:
         """Return whether it is a line, not ringing."""
@@ -108,6 +115,15 @@ class Tone(Term):
         return replace(self, amplitude=math.hypot(*beta), phase=math.atan2(beta[1], beta[0]))
 
 
+def lines_of(view: View) -> tuple[Line, ...]:
+    """Return the lines of what is left over, strongest first."""
+    # In all of it: a line may have begun late, and its frequency is no parameter of a
+    # likelihood, but pays for its search.
+    return find_lines([view.z], view.rate).lines
+
+
+# Lines that are tried, one after the other.
+_MOST = 3
 # Linewidth to start from, Hz, and that from which a line is ringing that dies out, if it
 # does not keep its height.
 _WANDERS, WIDEST = 0.3, 2.0

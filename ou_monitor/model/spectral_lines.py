@@ -1,15 +1,20 @@
 """
 Spectral lines: found by a test, measured with their error, taken out.
 
+The one finder of the package: `analyze` asks it of each load level, `discover` of the scores that
+a model leaves and of samples that it leaves out.
+
 A periodogram ordinate of noise is exponential, and the sum of K of them gamma, whatever the law
 of the noise; a line stands out of its neighbours.  The level of the noise at each frequency is
 the median of neighbouring ordinates, whose law is known exactly, so the test needs no model of
-the spectrum and a second line nearby does not hide the first.
+the spectrum and a second line nearby does not hide the first.  It looks twice: in pieces of some
+seconds, which tones of motors and converters do not outlive, and in pieces as long as can be, in
+which a crystal's tone stands out furthest.
 
 A line of 4 mV beside an OU of 18 mV moves alpha by 30 % and sigma by 15 % (1 kHz, 120 Hz): the
 fit takes it for a part of the relaxation.  So each line is taken out as a sinusoid of its own
-amplitude, phase and frequency in each piece of the length that the search used, by least squares;
-a little noise of that bin goes with it.
+amplitude, phase and frequency in each piece of the length in which it was found; a little noise
+of that bin goes with it.
 
 Limits: the noise is taken as level over the neighbours (some 60 bins either side), so a resonance
 narrower than that is reported as a line; samples are taken as evenly spaced; a line may be the
@@ -21,23 +26,28 @@ that moves by more than a bin within a piece, or is modulated, leaves its sideba
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 import math
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.text import Z95
-from scipy.signal import lfilter
-from scipy.special import betaincinv, chndtr, gammaincc, gammaincinv
+from scipy.optimize import brentq
+from scipy.signal import detrend, lfilter, welch
+from scipy.special import betaincinv, chndtrinc, gammaincc, gammaincinv
 
 # Probability that a recording without lines has one reported at any of its levels.
 FALSE_ALARM = 0.01
 # Lowest frequency, in periods of a piece: below, what removing mean and trend has left.
 FIRST = 4
-# A piece is at most so long, s: tones of motors and converters are no steadier.
-_LONGEST = 4.0
+# A short piece is at most so long, s; a long one holds at most so many samples, which bounds
+# memory and time.
+_SHORT, _LONGEST = 4.0, 1 << 20
 _FEWEST = 128
+# Ordinates that are enough to tell the noise from.
+_FEWEST_TESTED = 32
 # Neighbours: every second ordinate (those next to each other are correlated by the window),
 # from this many bins away on, so many in all.
 _GUARD, _NEIGHBOURS = 4, 64
@@ -45,8 +55,8 @@ _GUARD, _NEIGHBOURS = 4, 64
 _LOBE = 2
 _QUANTILES = 0.5 * (np.polynomial.legendre.leggauss(64)[0] + 1.0)
 _WEIGHTS = 0.5 * np.polynomial.legendre.leggauss(64)[1]
-# Frequencies tried either side of the line's, in bins, and how many.
-_REACH, _TRIED = 1.0, 33
+# Parts of a piece whose phases are compared, and frequencies tried for each bin of the piece.
+_PHASES, _TRIED = 64, 32
 
 
 @dataclass(frozen=True)
@@ -107,45 +117,71 @@ class LineSearch:
 
 
 def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float = FALSE_ALARM,
-               levels: int = 1, memory: float = 0.0) -> LineSearch:
-    """Look for lines in stretches of evenly spaced samples (parts in V, rate in Hz)."""
-    length = _piece_length([part.size for part in parts], rate)
-    if length < _FEWEST or not rate > 0.0:
+               levels: int = 1, memory: float = 0.0, lowest: float = 0.0) -> LineSearch:
+    """
+    Look for lines in segments of evenly spaced samples, strongest first.
+
+    parts in V, rate in Hz; memory is what a sample keeps of the one before, lowest in Hz.
+    """
+    # A detrended constant would be roundings.
+    parts = [part - part.mean() for part in parts if part.size]
+    sizes = [part.size for part in parts]
+    short = _piece_length(sizes, max(_FEWEST, int(_SHORT * rate)))
+    if not (short and rate > 0.0):
         return LineSearch(why_not=f'no segment holds {_FEWEST} samples')
-    window = np.hanning(length + 1)[:-1]
-    pieces = [part[k * length:(k + 1) * length] for part in parts
-              for k in range(part.size // length)]
-    raw, white = np.zeros(length // 2 + 1), np.zeros(length // 2 + 1)
-    count = np.arange(length) - 0.5 * (length - 1)
-    for piece in pieces:
-        level = piece - piece.mean() - count * float(count @ piece) / float(count @ count)
-        raw += np.abs(np.fft.rfft(window * level)) ** 2
-        whitened = lfilter([1.0, -memory], [1.0], level)
-        whitened[0] = 0.0
-        white += np.abs(np.fft.rfft(window * whitened)) ** 2
-    # One-sided density; what a constant filter does to both sides of a ratio cancels.
-    df = rate / length
-    raw *= 2.0 / (rate * float(window @ window) * len(pieces))
-    where = np.arange(FIRST, length // 2 - 1)
+    tested = {length: np.arange(max(FIRST, math.ceil(lowest * length / rate)), length // 2 - 1)
+              for length in (short, _piece_length(sizes, _LONGEST))}
+    if tested[short].size < _FEWEST_TESTED:
+        return LineSearch(why_not=f'next to nothing lies above {lowest:g} Hz')
+    count = sum(where.size for where in tested.values())
+    found: list[Line] = []
+    detectable = NAN
+    for length, where in tested.items():
+        lines, least = _search(parts, rate, length, where, memory,
+                               false_alarm / (levels * count))
+        # What wanders stands in the short pieces; a line that both show is measured there.
+        found += [line for line in lines if not any(
+            abs(line.frequency - other.frequency) < 2 * _LOBE * other.resolution
+            for other in found)]
+        detectable = least if length == short else detectable
+    found = [replace(line, p_value=min(1.0, levels * count * line.p_value)) for line in found]
+    found.sort(key=lambda line: -line.rms)
+    first, last = tested[short][[0, -1]] * rate / short
+    return LineSearch(tuple(found), count, float(first), float(last), detectable)
+
+
+def _search(parts: Sequence[FloatArray], rate: float, length: int, where: np.ndarray,
+            memory: float, chance: float) -> tuple[list[Line], float]:
+    """Return lines among ordinates, each by chance so often; and the RMS that is found, V."""
+    def whiten(pieces: FloatArray) -> FloatArray:
+        e = lfilter([1.0, -memory], [1.0], detrend(pieces))
+        e[..., 0] = 0.0
+        return np.asarray(e)
+
+    raw, white, pieces = np.zeros(length // 2 + 1), np.zeros(length // 2 + 1), 0
+    for part in parts:
+        number = part.size // length
+        if number:
+            same = {'nperseg': length, 'noverlap': 0}
+            raw += number * welch(part, rate, detrend='linear', **same)[1]
+            white += number * welch(part, rate, detrend=whiten, **same)[1]
+            pieces += number
+    raw /= pieces
+    df, k = rate / length, float(pieces)
     middle = _local_median(white, where)
-    k = float(len(pieces))
     near = min(_NEIGHBOURS, _strided(where.size))
     ratio = white[where] / np.maximum(middle, 1e-300)
-    limit = threshold(k, near, false_alarm / (levels * where.size))
+    limit = threshold(k, near, chance)
     hits = np.flatnonzero(ratio > limit)
     p = np.ones(where.size)
-    p[hits] = tail(ratio[hits], k, near) * where.size * levels
+    p[hits] = tail(ratio[hits], k, near)
     background = raw[where] / np.maximum(white[where], 1e-300) * middle
     # The median of a gamma variable, in units of its mean.
     background /= float(gammaincinv(k, 0.5)) / k
-    total = float(sum(((part - part.mean()) ** 2).sum() for part in parts)
-                  / sum(part.size for part in parts))
+    total = float(sum(part @ part for part in parts) / sum(part.size for part in parts))
     lines = [_measure(raw, background, where, group, p, df, total, k)
              for group in _groups(hits)]
-    lines.sort(key=lambda line: -line.rms)
-    typical = float(np.median(background))
-    return LineSearch(tuple(lines), int(where.size), float(where[0] * df), float(where[-1] * df),
-                      _detectable(typical, df, k, limit))
+    return lines, _detectable(float(np.median(background)), df, k, limit)
 
 
 def tail(ratio: FloatArray, pieces: float, neighbours: int) -> FloatArray:
@@ -165,20 +201,18 @@ def _medians(pieces: float, neighbours: int) -> FloatArray:
 @lru_cache(maxsize=256)
 def threshold(pieces: float, neighbours: int, level: float) -> float:
     """Return the ratio that `tail` gives a probability `level` to."""
-    low, high = 0.0, 12.0
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        passes = float(tail(np.array([math.exp(middle)]), pieces, neighbours)[0]) < level
-        low, high = (low, middle) if passes else (middle, high)
-    return math.exp(high)
+    def beyond(log: float) -> float:
+        return math.log(max(float(tail(np.array([math.exp(log)]), pieces, neighbours)[0]),
+                            1e-300)) - math.log(level)
+    return math.exp(brentq(beyond, 0.0, 12.0))
 
 
-def _piece_length(sizes: Sequence[int], rate: float) -> int:
-    """Return the length of pieces for which a line of given power is found best."""
+def _piece_length(sizes: Sequence[int], most: int) -> int:
+    """Return the length of pieces, at most so long, for which a line is found best."""
     longest = max(sizes, default=0)
     if longest < _FEWEST:
         return 0
-    top = min(longest, max(_FEWEST, int(_LONGEST * rate)))
+    top = min(longest, most)
     best, score = top, 0.0
     for length in {top, *(size for size in sizes if _FEWEST <= size < top)}:
         # The power of a line adds up over the pieces, the scatter of noise with their root.
@@ -243,47 +277,74 @@ def _measure(raw: FloatArray, background: FloatArray, where: np.ndarray, group: 
     return Line(float((where[low:high] * excess).sum() / excess.sum() * df), df,
                 math.sqrt(max(power, 0.0)), math.sqrt(max(power - reach, 0.0)),
                 math.sqrt(max(power + reach, 0.0)), max(power, 0.0) / total if total else NAN,
-                float(min(p[group].min(), 1.0)))
+                float(p[group].min()))
 
 
 def _detectable(density: float, df: float, k: float, limit: float) -> float:
     """Return the RMS that passes the limit with 90 % probability, V."""
+    lift = float(chndtrinc(2.0 * limit * float(gammaincinv(k, 0.5)), 2.0 * k, 0.1))
     # A line on a bin has 2/3 of its power there; between two bins 0.48.
-    return math.sqrt(_lift(k, limit) / (2.0 * k) * density * df / 0.48)
-
-
-@lru_cache(maxsize=256)
-def _lift(k: float, limit: float) -> float:
-    """Return the noncentrality with which an ordinate passes the limit nine times in ten."""
-    least = 2.0 * limit * float(gammaincinv(k, 0.5))
-    low, high = 0.0, 10.0 * least + 100.0
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        seen = float(chndtr(least, 2.0 * k, middle)) <= 0.1
-        low, high = (low, middle) if seen else (middle, high)
-    return high
+    return math.sqrt(lift / (2.0 * k) * density * df / 0.48)
 
 
 def without_lines(voltage: FloatArray, rate: float, lines: Sequence[Line]) -> FloatArray:
-    """Return one stretch without lines (voltage in V, rate in Hz, result in V)."""
-    if not lines or not voltage.size:
-        return voltage
-    pieces = max(1, round(voltage.size * lines[0].resolution / rate))
-    return np.concatenate([_cleaned(piece, rate, lines)
-                           for piece in np.array_split(voltage, pieces)])
+    """Return one segment without lines (voltage in V, rate in Hz, result in V)."""
+    for line in lines if voltage.size else ():
+        pieces = max(1, round(voltage.size * line.resolution / rate))
+        voltage = np.concatenate([
+            piece - fit_sinusoid(piece, rate, line.frequency, line.resolution).sampled(
+                np.arange(piece.size) / rate) for piece in np.array_split(voltage, pieces)])
+    return voltage
 
 
-def _cleaned(piece: FloatArray, rate: float, lines: Sequence[Line]) -> FloatArray:
-    """Return a piece less one sinusoid a line."""
-    mean = float(piece.mean())
-    left: FloatArray = piece - mean
-    angle = 2.0 * np.pi / rate * np.arange(piece.size)
-    window = np.hanning(piece.size + 2)[1:-1]
-    for line in lines:
-        tried = line.frequency + line.resolution * np.linspace(-_REACH, _REACH, _TRIED)
-        tried = tried[(tried > 0.0) & (tried < 0.5 * rate)]
-        power = [abs(np.exp(-1j * f * angle) @ (window * left)) for f in tried]
-        best = float(tried[int(np.argmax(power))])
-        waves = np.column_stack((np.cos(best * angle), np.sin(best * angle)))
-        left = left - waves @ np.linalg.lstsq(waves, left, rcond=None)[0]
-    return left + mean
+@dataclass(frozen=True)
+class Sinusoid:
+    """
+    A line as it runs through a piece.
+
+    Attributes
+    ----------
+    amplitude : float
+        Peak, V.
+    frequency : float
+        Hz.
+    phase : float
+        Of its sine at the first sample, rad.
+
+    """
+
+    amplitude: float
+    frequency: float
+    phase: float
+
+    def sampled(self, t: FloatArray) -> FloatArray:
+        """Return its voltage, V, at times since the first sample, s."""
+        wave: FloatArray = self.amplitude * np.sin(
+            2.0 * math.pi * (t * self.frequency % 1.0) + self.phase)
+        return wave
+
+
+def fit_sinusoid(piece: FloatArray, rate: float, frequency: float, reach: float) -> Sinusoid:
+    """Return the strongest sinusoid near a frequency (piece in V; rate, reach in Hz)."""
+    v = piece - piece.mean()
+    size = max(1, v.size // _PHASES)
+    count = v.size // size
+    # Each part of the piece as one complex number, in a frame that turns along.
+    turns = frequency / rate
+    sums = v[:count * size].reshape(count, size) @ _turning(turns, size)
+    sums *= _turning(turns * size, count)
+    shifts = np.fft.fftfreq(_TRIED * count, size / rate)
+    power = np.abs(np.fft.fft(np.hanning(count + 2)[1:-1] * sums, shifts.size))
+    power[(np.abs(shifts) > reach) | (frequency + shifts <= 0.0)
+          | (frequency + shifts >= 0.5 * rate)] = 0.0
+    best = frequency + float(shifts[np.argmax(power)])
+    wave = _turning(best / rate, v.size)
+    waves = np.column_stack((-wave.imag, wave.real))
+    sine, cosine = np.linalg.solve(waves.T @ waves, waves.T @ v).tolist()
+    return Sinusoid(math.hypot(sine, cosine), best, math.atan2(cosine, sine))
+
+
+def _turning(turns: float, count: int) -> npt.NDArray[np.complex128]:
+    """Return a unit vector that turns back so many times a sample."""
+    found: npt.NDArray[np.complex128] = np.exp(-2j * math.pi * (turns * np.arange(count) % 1.0))
+    return found
