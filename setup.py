@@ -8,7 +8,8 @@ NAME = 'ou_monitor'
 SHARE = 'share/' + NAME
 # What reads the logs of autopilots.  The wheel of orangebox 0.5.0 cannot be installed: pip
 # refuses the entry point in it.
-LOGS = {'ulog': ['pyulog'], 'dataflash': ['pymavlink'], 'blackbox': ['orangebox<0.5']}
+LOGS = {'ulog': ['pyulog>=1.1,<2'], 'dataflash': ['pymavlink>=2.4.40,<3'],
+        'blackbox': ['orangebox>=0.4,<0.5']}
 
 setup(
     name=NAME,
@@ -23,12 +24,14 @@ setup(
         (SHARE + '/msg_config', glob('msg_config/*.yaml')),
         (SHARE + '/layouts', glob('layouts/*')),
     ],
-    install_requires=['numpy', 'scipy', 'PyYAML', 'mcap', 'mcap-ros2-support'],
+    # The bounds are those of scripts/requirements-*.txt; test_package.py compares them.
+    install_requires=['numpy>=1.26.4,<3', 'scipy>=1.11.4,<2', 'PyYAML>=6.0.1,<7', 'mcap>=1.1.0,<2',
+                      'mcap-ros2-support>=0.5.0,<0.7'],
     extras_require={
-        'fast': ['numba'],
-        'fleet': ['dask', 'distributed', 'pyarrow'],
-        'test': ['pytest', 'hypothesis', 'rosbags'],
-        'doc': ['sphinx', 'myst-parser'],
+        'fast': ['numba>=0.59,<1'],
+        'fleet': ['dask>=2024.8,<2027', 'distributed>=2024.8,<2027', 'pyarrow>=16,<28'],
+        'test': ['pytest>=8,<10', 'hypothesis>=6.100,<7', 'rosbags>=0.10,<0.12'],
+        'doc': ['sphinx>=7.2,<10', 'myst-parser>=3,<6'],
         **LOGS, 'logs': [package for packages in LOGS.values() for package in packages]},
     python_requires='>=3.11',
     # The message descriptions are read as files beside the package.

@@ -89,27 +89,38 @@ make_venv() {
     echo "$SOURCE" >"$VENV/.source"
 }
 
+# Wheels: the locked versions, with hashes.  A sourced ROS 2 keeps the versions of the system that it
+# was built for, NumPy's among them, and only bounds are asked for.
 lists_of() {
-    [ "$SOURCE" = sourced ] || echo scripts/requirements-ros.txt
+    if [ "$SOURCE" = wheels ]; then
+        echo "scripts/$1.lock"
+        return
+    fi
     echo scripts/requirements-run.txt
-    [ "$1" = test ] || return 0
-    [ "$SOURCE" = sourced ] || echo scripts/requirements-ros-test.txt
-    echo scripts/requirements-test.txt
+    [ "$1" = run ] || printf '%s\n' scripts/requirements-{build,test}.txt
 }
 
 hash_of() {
     local lists
     mapfile -t lists < <(lists_of "$1")
-    cat -- "${lists[@]}" | cksum
+    cat -- "${lists[@]}" scripts/build.lock | cksum
+}
+
+pip_install() {
+    "$VENV_PYTHON" -m pip install --disable-pip-version-check --no-input --retries 2 "$@" \
+        >>"$LOG" 2>&1
 }
 
 install() {
     local level="$1" list lists options=()
     mapfile -t lists < <(lists_of "$level")
     for list in "${lists[@]}"; do options+=(-r "$list"); done
+    # What builds packages comes from a lock too, so that pip fetches nothing without a hash.
+    [ "$SOURCE" = sourced ] || options+=(--require-hashes --no-build-isolation)
     echo "$ME: installing ${lists[*]} into .venv, once; this takes some minutes" >&2
-    if ! "$VENV_PYTHON" -m pip install --disable-pip-version-check --no-input --retries 2 \
-            "${options[@]}" >"$LOG" 2>&1; then
+    : >"$LOG"
+    if ! { [ "$SOURCE" = sourced ] || pip_install --require-hashes -r scripts/build.lock; } ||
+            ! pip_install "${options[@]}"; then
         stop "pip could not fetch the packages ($(reason)); is the package registry \
 reachable? Whole log: $LOG"
     fi

@@ -15,6 +15,8 @@ import venv
 import xml.etree.ElementTree as ElementTree
 
 from catkin_pkg.changelog import get_changelog_from_path
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from project import project_files, ROOT
 import pytest
 import yaml
@@ -241,6 +243,60 @@ def test_requirements_agree_with_setup_py():
               if line and not line.startswith('#')]
     declared = re.search(r'install_requires=\[(.*?)\]', setup, re.DOTALL).group(1)
     assert sorted(re.findall(r"'(.+?)'", declared)) == sorted(listed)
+    assert all('>=' in line and ',<' in line for line in listed)
+
+
+def requirements(name: str) -> list[Requirement]:
+    """Return what a list in scripts/ asks for."""
+    text = (ROOT / f'scripts/{name}').read_text(encoding='utf-8')
+    # A lock has the hashes of a package on lines of their own.
+    return [Requirement(line.rstrip('\\')) for line in text.splitlines()
+            if line and not line.startswith(('#', ' '))]
+
+
+LISTS = {'build': ['build'], 'run': ['build', 'ros', 'run'],
+         'test': ['build', 'ros', 'run', 'ros-test', 'test']}
+
+
+@pytest.mark.parametrize('python', ['3.11.0', '3.12.0'])
+@pytest.mark.parametrize('level', LISTS)
+def test_locks_are_within_the_bounds(level, python):
+    """Every requirement has lower and upper bounds, and one locked version that meets them."""
+    here = {'python_version': python[:4], 'python_full_version': python, 'sys_platform': 'linux',
+            'platform_machine': 'x86_64'}
+    locked: dict[str, str] = {}
+    for one in requirements(f'{level}.lock'):
+        (pin,) = one.specifier
+        assert pin.operator == '=='
+        if one.marker is None or one.marker.evaluate(here):
+            assert locked.setdefault(canonicalize_name(one.name), pin.version) == pin.version
+    for name in LISTS[level]:
+        for one in requirements(f'requirements-{name}.txt'):
+            assert {spec.operator for spec in one.specifier} in ({'>=', '<'}, {'=='}), one
+            assert one.specifier.contains(locked[canonicalize_name(one.name)]), one
+
+
+@pytest.mark.parametrize('level', LISTS)
+def test_locks_have_hashes_and_no_host(level):
+    """Every package of a lock has a SHA-256, and no line says where it was fetched from."""
+    text = (ROOT / f'scripts/{level}.lock').read_text(encoding='utf-8')
+    packages = re.split(r'\n(?=\S)', text.strip())[1:]
+    assert len(packages) == len(requirements(f'{level}.lock')) >= 2
+    assert all(re.search(r'--hash=sha256:[0-9a-f]{64}\b', package) for package in packages)
+    assert not re.search(r'://|index-url|find-links|trusted-host', text)
+
+
+def test_extras_have_the_bounds_of_the_test_list():
+    """What setup.py bounds as an extra the tests install within the same bounds."""
+    setup = (ROOT / 'setup.py').read_text(encoding='utf-8')
+    listed = {one.name: one.specifier for one in requirements('requirements-test.txt')}
+    declared = [Requirement(text) for text in re.findall(r"'([\w.-]+[<>=][^']*)'", setup)
+                if not text.startswith('python')]
+    found = {one.name: one.specifier for one in declared}
+    assert {'pyulog', 'orangebox', 'dask', 'distributed', 'pyarrow', 'pytest'} <= set(found)
+    assert all({s.operator for s in specifier} == {'>=', '<'} for specifier in found.values())
+    for name in set(found) & set(listed):
+        assert found[name] == listed[name], name
 
 
 def test_parameter_files_are_yaml():

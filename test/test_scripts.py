@@ -110,8 +110,9 @@ def test_no_registry_is_refused_and_the_next_run_tries_again(tree):
 
 def made_by_hand(tree: Path) -> None:
     """Make an environment as the scripts would, without what is in the lists."""
-    for name in ('ros', 'ros-test', 'run', 'test'):
-        (tree / f'scripts/requirements-{name}.txt').write_text('', encoding='utf-8')
+    for name in ('requirements-run.txt', 'requirements-test.txt', 'build.lock', 'run.lock',
+                 'test.lock'):
+        (tree / 'scripts' / name).write_text('', encoding='utf-8')
     (tree / 'scripts/run_demo.py').write_text(
         'import os, sys\nprint(sys.prefix, os.getcwd(), *sys.argv[1:], sep="|")\n',
         encoding='utf-8')
@@ -132,23 +133,36 @@ def test_nothing_is_installed_twice_and_a_broken_environment_is_mended(tree):
     assert (third.returncode, third.stdout) == (0, expected), third.stderr
     assert 'making .venv' in third.stderr
     # A list that has changed is installed; the environment stays.
-    (tree / 'scripts/requirements-run.txt').write_text('# nothing\n', encoding='utf-8')
+    (tree / 'scripts/run.lock').write_text('# nothing\n', encoding='utf-8')
     fourth = run(tree, 'demo', **offline)
     assert fourth.returncode == 0
     assert 'installing' in fourth.stderr and 'making .venv' not in fourth.stderr
 
 
+@pytest.mark.parametrize('line', [
+    'wheel', 'wheel==0.48.0', 'wheel==0.48.0 --hash=sha256:' + 64 * '0'])
+def test_a_package_without_its_hash_is_refused(tree, line):
+    """Neither without a version, nor without a hash, nor with that of another file."""
+    made_by_hand(tree)
+    (tree / 'scripts/run.lock').write_text(line + '\n', encoding='utf-8')
+    done = run(tree, 'demo', PYTHON=sys.executable)
+    assert done.returncode == 2 and 'could not fetch' in done.stderr.splitlines()[-1]
+    assert not list((tree / '.venv').glob('.installed-*'))
+    log = (tree / '.venv/install.log').read_text(encoding='utf-8').lower()
+    assert 'hash' in log
+
+
 def test_a_sourced_jazzy_is_used(tree, tmp_path):
     """Where rclpy is there already no wheel is asked for, and the machine's packages count."""
     made_by_hand(tree)
-    (tree / 'scripts/requirements-ros.txt').write_text('no-such-package\n', encoding='utf-8')
+    (tree / 'scripts/run.lock').write_text('no-such-package\n', encoding='utf-8')
     path = fake(tmp_path / 'bin', python3=f'exec "{sys.executable}" "$@"')
     done = run(tree, 'demo', PATH=path, ROS_DISTRO='jazzy', PIP_INDEX_URL=NOWHERE,
                PIP_CONFIG_FILE=os.devnull)
     assert done.returncode == 0, done.stderr
     assert 'include-system-site-packages = true' in (tree / '.venv/pyvenv.cfg').read_text()
     # In a shell without that ROS the same folder gets an environment of the other kind.
-    (tree / 'scripts/requirements-ros.txt').write_text('', encoding='utf-8')
+    (tree / 'scripts/run.lock').write_text('', encoding='utf-8')
     done = run(tree, 'demo', PYTHON=sys.executable)
     assert 'making .venv' in done.stderr
     assert 'include-system-site-packages = false' in (tree / '.venv/pyvenv.cfg').read_text()
