@@ -4,8 +4,8 @@ Throughput of `ou-monitor fleet` against the number of workers.
     python benchmarks/fleet.py --workers 1 2 --recordings 64 --markdown doc/fleet.md
 
 One run: recordings are simulated into a temporary folder, then analysed again
-and again with each number of workers in turn, and once without Dask in this
-process, which is what the workers are measured against.
+and again with each number of workers in turn, and once in this process
+alone, which is what the workers are measured against.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from ou_monitor.fleet.cluster import usable_cores, Workers  # noqa: E402, I202
-from ou_monitor.fleet.work import Options, work  # noqa: E402
+from ou_monitor.fleet.work import Options, work  # noqa: E402, I202
+from ou_monitor.fleet.workers import LocalWorkers, usable_cores  # noqa: E402
 from ou_monitor.recordings.write import write_recording  # noqa: E402
 from ou_monitor.records import Recording  # noqa: E402
 from ou_monitor.simulate.presets import PRESETS  # noqa: E402
@@ -69,7 +69,7 @@ def alone(tasks: Sequence[tuple]) -> tuple[float, float, float]:
 def on_workers(tasks: Sequence[tuple], count: int) -> tuple[float, float, float]:
     """Return the wall times of start and work, and the CPU time of both together, s."""
     used, start = cpu(), time.perf_counter()
-    with Workers(count) as pool:
+    with LocalWorkers(count) as pool:
         # Each worker imports the package at its first task, which is part of the start.
         for _, result, why in pool.each(work, [tasks[0]] * (2 * count)):
             assert not why and not result['error']

@@ -41,8 +41,10 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--workers', metavar='N',
                         help='local processes (default: one a core)')
     parser.add_argument('--scheduler', metavar='ADDRESS',
-                        help='Dask scheduler whose workers are used instead, tcp://HOST:8786; '
+                        help='Dask scheduler whose workers are used instead, tls://HOST:8786; '
                         'they see the recordings under the same paths')
+    parser.add_argument('--insecure', action='store_true',
+                        help='let the scheduler be on another machine without TLS')
     parser.add_argument('--vehicle-from', metavar='REGEX',
                         help="finds the vehicle in a recording's path (its first group) where "
                         'the metadata name none (default: the folder it lies in)')
@@ -61,7 +63,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from ou_monitor.fleet.cluster import check_extra, usable_cores
+    from ou_monitor.fleet.workers import usable_cores
 
     if not args.output:
         raise InputError('--output: the path is empty')
@@ -70,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     workers = usable_cores() if args.workers is None else _count('--workers', args.workers)
     if args.seed < 0:
         raise InputError(f'--seed must be 0 or more, got {args.seed}')
-    check_extra()
+    _check_installed(args)
     folder = Path(args.output)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--output '{folder}' is a file: name a folder")
@@ -87,7 +89,8 @@ def run(args: argparse.Namespace) -> int:
         with output.Progress('comparing') as comparing, output.Progress('analyzing') as progress:
             fleet = run_fleet(
                 found, folder, options, version, workers=workers, scheduler=args.scheduler,
-                pattern=pattern, stated_options=more, comparing=comparing, progress=progress)
+                insecure=args.insecure, pattern=pattern, stated_options=more,
+                comparing=comparing, progress=progress)
     except KeyboardInterrupt:
         print(f"stopped; what is done is kept in '{folder}', and the same command goes on from "
               'there', file=sys.stderr)
@@ -97,6 +100,22 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"none of the recordings could be analysed; why is in '{folder}', and in "
                          'the column error of the table')
     return 0
+
+
+def _check_installed(args: argparse.Namespace) -> None:
+    """Refuse to start without the packages that are needed, or with an unsafe scheduler."""
+    from importlib.util import find_spec
+
+    needed = ['pyarrow'] + ([] if args.scheduler is None else ['dask', 'distributed'])
+    missing = [name for name in needed if find_spec(name) is None]
+    if missing:
+        raise InputError(f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} not "
+                         "installed: pip install 'ou_monitor[fleet]'")
+    if args.scheduler is not None:
+        from ou_monitor.fleet.cluster import check_address
+        check_address(args.scheduler, args.insecure)
+    elif args.insecure:
+        raise InputError('--insecure is for --scheduler: local processes open no connection')
 
 
 def version() -> str:

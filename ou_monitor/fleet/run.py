@@ -8,13 +8,13 @@ from pathlib import Path
 import re
 from typing import Any
 
-from ou_monitor.fleet.cluster import Workers
 from ou_monitor.fleet.find import duplicates, Found, Source
 from ou_monitor.fleet.judge import judge, Judgement
 from ou_monitor.fleet.parts import Parts
 from ou_monitor.fleet.table import Row, rows_of
 from ou_monitor.fleet.vehicles import assign, number_flights
 from ou_monitor.fleet.work import Options, work
+from ou_monitor.fleet.workers import LocalWorkers, Workers
 from ou_monitor.records import NAN
 
 Progress = Callable[[float], None]
@@ -69,7 +69,7 @@ class Fleet:
 
 
 def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[], str], *,
-              workers: int, scheduler: str | None = None,
+              workers: int, scheduler: str | None = None, insecure: bool = False,
               pattern: re.Pattern[str] | None = None, stated_options: dict[str, Any] | None = None,
               comparing: Progress | None = None, progress: Progress | None = None) -> Fleet:
     """Analyse all recordings that are not done yet, and judge the fleet."""
@@ -87,10 +87,19 @@ def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[]
             results[source.path] = known
     kept = len(results)
     if missing:
-        with Workers(min(workers, len(missing)), scheduler, version) as pool:
+        with _workers(min(workers, len(missing)), scheduler, version, insecure) as pool:
             _work(missing, results, parts, options, pool, progress)
     rows, notes = _table(found.sources, results, twice, pattern)
     return Fleet(rows, judge(rows), (*found.notes, *notes), len(found.sources), kept)
+
+
+def _workers(count: int, scheduler: str | None, version: Callable[[], str], insecure: bool
+             ) -> Workers:
+    if scheduler is None:
+        return LocalWorkers(count)
+    from ou_monitor.fleet.cluster import ClusterWorkers
+
+    return ClusterWorkers(scheduler, version, insecure)
 
 
 def _work(missing: Sequence[Source], results: dict[Path, dict[str, Any]], parts: Parts,

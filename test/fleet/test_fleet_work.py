@@ -5,16 +5,18 @@ import json
 import os
 from pathlib import Path
 import re
+import resource
 import signal
 from types import SimpleNamespace
 
 from ou_monitor.errors import InputError
-from ou_monitor.fleet.cluster import LOST, Workers
+from ou_monitor.fleet.cluster import check_address
 from ou_monitor.fleet.find import duplicates, find_recordings
 from ou_monitor.fleet.parts import Parts, write_whole
 from ou_monitor.fleet.vehicles import assign, natural, number_flights, read_pattern
 from ou_monitor.fleet.words import failure_words
 from ou_monitor.fleet.work import Options, work
+from ou_monitor.fleet.workers import LocalWorkers, LOST, usable_memory
 import pytest
 
 
@@ -31,7 +33,7 @@ def deadly(task: int, folder: str) -> dict:
 
 def test_a_worker_that_dies_is_one_row(tmp_path):
     """What kills its worker twice is lost, after a retry alone; all the others are done."""
-    with Workers(2) as pool:
+    with LocalWorkers(2) as pool:
         done = list(pool.each(deadly, [(k, str(tmp_path)) for k in range(8)]))
     results = {k: result for k, result, why in done if not why}
     assert {k: why for k, _, why in done if why} == {3: LOST}
@@ -40,6 +42,80 @@ def test_a_worker_that_dies_is_one_row(tmp_path):
     assert len(list(tmp_path.glob('tried_3_*'))) == len(list(tmp_path.glob('tried_5_*'))) == 2
     # One thread of linear algebra in each, whatever the machine has.
     assert all(set(result['threads'].values()) == {'1'} for result in results.values())
+
+
+def sockets(process: int | str) -> set[str]:
+    """Return the sockets that a process has open."""
+    found = set()
+    for link in Path(f'/proc/{process}/fd').iterdir():
+        try:
+            target = os.readlink(link)
+        except OSError:
+            continue
+        if target.startswith('socket:'):
+            found.add(target)
+    return found
+
+
+def look(_: int) -> dict:
+    """Return what a worker has open, and its limit of memory."""
+    return {'sockets': sorted(sockets('self')), 'pid': os.getpid(),
+            'memory': resource.getrlimit(resource.RLIMIT_DATA)[0]}
+
+
+def test_nothing_listens():
+    """Neither the workers nor this process open a socket, of a network or of this machine."""
+    before = sockets('self')
+    with LocalWorkers(2) as pool:
+        done = [result for _, result, why in pool.each(look, [(k,) for k in range(4)]) if not why]
+        assert sockets('self') == before
+    assert len(done) == 4 and all(set(result['sockets']) <= before for result in done)
+    limits = {result['memory'] for result in done}
+    assert len(limits) == 1 and 2 * limits.pop() <= usable_memory()
+
+
+def fill(size: int) -> str:
+    """Ask for some memory, byte; say what became of it."""
+    try:
+        return f'{len(bytearray(size))}'
+    except MemoryError:
+        return 'refused'
+
+
+def test_a_worker_has_its_share_of_the_memory(monkeypatch):
+    """What does not fit is refused where it is asked for, and the worker goes on."""
+    monkeypatch.setattr('ou_monitor.fleet.workers.usable_memory', lambda: 2 << 30)
+    with LocalWorkers(2) as pool:
+        done = {k: result for k, result, _ in pool.each(fill, [(1 << 20,), (3 << 29,), (9,)])}
+    assert done == {0: str(1 << 20), 1: 'refused', 2: '9'}
+
+
+def unpicklable(_: int) -> object:
+    """Return what cannot come back."""
+    return lambda: None
+
+
+def test_a_result_that_cannot_come_back_is_one_row():
+    """The others are done, by the same worker."""
+    with LocalWorkers(1) as pool:
+        found = list(pool.each(unpicklable, [(0,), (1,)]))
+    assert [k for k, _, _ in found] == [0, 1]
+    assert all('The worker failed' in why and '\n' not in why for _, _, why in found)
+
+
+@pytest.mark.parametrize('address, fine', [
+    ('tls://10.0.0.2:8786', True), ('tcp://127.0.0.1:8786', True), ('tcp://[::1]:8786', True),
+    ('localhost:8786', True), ('127.9.9.9:1', True), ('tcp://10.0.0.2:8786', False),
+    ('10.0.0.2:8786', False), ('tcp://localhost.example.org:8786', False), ('x', False),
+    ('ws://10.0.0.2:8786', False), ('tcp://0.0.0.0:8786', False), ('tcp://', False)])
+def test_a_scheduler_of_another_machine_wants_tls(address, fine):
+    """Without it only this machine is spoken to, or what --insecure allows."""
+    check_address(address, insecure=True)
+    if fine:
+        check_address(address)
+    else:
+        with pytest.raises(InputError, match='not encrypted.*tls://HOST:PORT, or --insecure'):
+            check_address(address)
 
 
 def test_a_failure_names_its_path_once():
