@@ -14,8 +14,8 @@ import yaml
 FOLDERS = [
     str(ROOT / name) for name in ('ou_monitor', 'test', 'scripts', 'launch', 'benchmarks')
     if any((ROOT / name).rglob('*.py'))] + [str(ROOT / 'setup.py')]
-SHELL = [ROOT / 'scripts/demo', ROOT / 'scripts/test', ROOT / 'scripts/common.sh',
-         ROOT / '.ci/run']
+SHELL = [ROOT / name for name in (
+    'scripts/demo', 'scripts/test', 'scripts/common.sh', 'scripts/lock', '.ci/run')]
 # Folders that a machine has and another has not; written in two parts so as not to find itself.
 MACHINE_PATH = re.compile(rb'/(?:ho' rb'me|ro' rb'ot|Us' rb'ers|wo' rb'rk)/')
 

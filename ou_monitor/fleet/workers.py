@@ -75,7 +75,7 @@ class Workers(ABC):
 
     def each(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]
              ) -> Iterator[Outcome]:
-        """Call a function for each tuple of arguments; yield place, result and why there is none."""
+        """Call a function for each tuple of arguments; yield the outcomes."""
         waiting = deque(range(len(arguments)))
         alone: deque[int] = deque()
         retried: set[int] = set()
