@@ -1,7 +1,8 @@
 """
 The sliding-window estimator against what users would pick: one command.
 
-    python benchmarks/estimator.py [--windows 500] [--quick] [--json FILE] [--markdown FILE]
+    python benchmarks/estimator.py [--windows 500] [--quick] [--json FILE]
+        [--accuracy doc/estimation_accuracy.md] [--speed doc/estimation_cost.md]
 
 See README.md beside this file.
 """
@@ -31,8 +32,6 @@ import data  # noqa: E402
 import tables  # noqa: E402
 
 SEED = 20260131
-# A Markdown file that has these two lines keeps what is outside them.
-_BEGIN, _END = '<!-- benchmark begins -->', '<!-- benchmark ends -->'
 _PACKAGES = ('numpy', 'scipy', 'numba', 'statsmodels', 'celerite2', 'pymle-diffusion', 'pandas')
 
 
@@ -97,11 +96,9 @@ def measure(windows: int, slow: int, quick: bool, parts: str) -> dict[str, Any]:
     return out
 
 
-def report(results: dict[str, Any]) -> str:
-    """Return all tables as Markdown."""
-    setting = ', '.join(f'{k} {v}' for k, v in results['environment'].items())
-    parts = [f'<!-- {setting}; {results["windows"]} windows, {results["slow"]} for the slow '
-             'methods -->\n']
+def accuracy_report(results: dict[str, Any]) -> str:
+    """Return the tables of accuracy as Markdown; empty when no such part was run."""
+    parts = []
     if 'accuracy' in results:
         parts += [f'### Accuracy: {data.WINDOW:g} s windows at 1 kHz\n',
                   tables.accuracy(results['accuracy']['tables']),
@@ -113,19 +110,31 @@ def report(results: dict[str, Any]) -> str:
     if 'load' in results:
         parts += [f'### Throttle steps, sag 0.3 V ({accuracy.SMALL_SENSOR})\n',
                   tables.load(results['load'])]
+    note = f'; {results["windows"]} windows, {results["slow"]} for the slow methods'
+    return _with_setting(results, note, parts)
+
+
+def speed_report(results: dict[str, Any]) -> str:
+    """Return the tables of speed as Markdown; empty when that part was not run."""
+    parts = []
     for name, found in results.get('speed', {}).items():
         parts += [f'### Throughput, {name}\n', tables.throughput(found['throughput']),
                   f'### Latency of `estimate()` after pushes of 100 at 1 kHz, {name}\n',
                   tables.latency(found['latency'])]
-    return '\n'.join(parts)
+    return _with_setting(results, '', parts)
 
 
-def put_tables(path: Path, text: str) -> None:
-    """Write the tables, between the marks where the file has them."""
+def _with_setting(results: dict[str, Any], note: str, parts: list[str]) -> str:
+    setting = ', '.join(f'{k} {v}' for k, v in results['environment'].items())
+    return '\n'.join([f'<!-- {setting}{note} -->\n', *parts]) if parts else ''
+
+
+def put_tables(path: Path, name: str, text: str) -> None:
+    """Write the tables of that name, between its marks where the file has them."""
     if path.exists():
         old = path.read_text()
-        head, mark, rest = old.partition(_BEGIN)
-        _, end, tail = rest.partition(_END)
+        head, mark, rest = old.partition(f'<!-- {name} begins -->')
+        _, end, tail = rest.partition(f'<!-- {name} ends -->')
         if mark and end:
             text = f'{head}{mark}\n{text}\n{end}{tail}'
     path.write_text(text)
@@ -142,21 +151,24 @@ def main() -> int:
     parser.add_argument('--parts', default='awts',
                         help='a: accuracy, w: short windows, t: throttle steps, s: speed')
     parser.add_argument('--json', type=Path, help='write all numbers here')
-    parser.add_argument('--markdown', type=Path,
-                        help='write the tables here, between its marks if it has them')
+    for name in ('accuracy', 'speed'):
+        parser.add_argument(f'--{name}', type=Path,
+                            help=f'write the tables of {name} here, between its marks '
+                            f'"<!-- {name} begins -->" and "<!-- {name} ends -->" if it has them')
     given = parser.parse_args()
     windows = min(given.windows, 20) if given.quick else given.windows
     slow = given.slow_windows or max(windows // 5, min(windows, 5))
     if windows < 2 or slow < 2 or not set(given.parts) <= set('awts'):
         parser.error('--windows and --slow-windows need 2 or more; --parts is of a, w, t, s')
     results = measure(windows, min(slow, windows), given.quick, given.parts)
-    text = report(results)
     if given.json:
         given.json.write_text(json.dumps(results, indent=1) + '\n')
-    if given.markdown:
-        put_tables(given.markdown, text)
-    else:
-        print(text)
+    for name, text in (('accuracy', accuracy_report(results)), ('speed', speed_report(results))):
+        path = getattr(given, name)
+        if text and path:
+            put_tables(path, name, text)
+        elif text:
+            print(text)
     return 0
 
 

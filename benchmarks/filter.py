@@ -1,13 +1,13 @@
 """
 The adaptive low-pass against hindsight, against the truth, in a loop, as a node.
 
-    python benchmarks/filter.py error --table doc/filter.md
-    python benchmarks/filter.py bags --table doc/filter.md
-    python benchmarks/filter.py windows --table doc/filter.md
-    python benchmarks/filter.py dterm --table doc/filter.md --figure doc/filter_dterm.svg
-    python benchmarks/filter.py loop --table doc/filter.md --figure doc/filter_loop.svg
+    python benchmarks/filter.py error --table doc/filter_accuracy.md
+    python benchmarks/filter.py bags --table doc/filter_accuracy.md
+    python benchmarks/filter.py windows --table doc/filter_accuracy.md
+    python benchmarks/filter.py dterm --table doc/filter_dterm.md --figure doc/filter_dterm.svg
+    python benchmarks/filter.py loop --table doc/filter_dterm.md --figure doc/filter_loop.svg
     python benchmarks/filter.py flight --figure doc/filter_flight.svg
-    python benchmarks/filter.py node --table doc/filter.md
+    python benchmarks/filter.py node --table doc/filter_dterm.md
 """
 
 from __future__ import annotations

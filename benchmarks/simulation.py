@@ -282,7 +282,7 @@ def main() -> int:
         given.json.write_text(json.dumps(found, indent=1) + '\n')
     print(text)
     if given.markdown:
-        put_tables(given.markdown, text)
+        put_tables(given.markdown, 'benchmark', text)
     return 0
 
 

@@ -1,5 +1,7 @@
-"""README.md names only what exists: files, options, modules, keys, and an example that runs."""
+"""The documents name only what exists: files, links, options, keys, and examples that run."""
 
+import importlib.util
+from pathlib import Path
 import re
 import subprocess
 import sys
@@ -8,11 +10,28 @@ from project import ROOT
 import pytest
 
 README = (ROOT / 'README.md').read_text(encoding='utf-8')
+PAGES = sorted((ROOT / 'doc').glob('*.md'))
+# Documents with relative links: what a reader clicks through.
+LINKED = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'benchmarks/README.md', *PAGES]
+# What names a file that a reader makes or has, rather than one of the project.
+OTHERS = {'my_adc.yaml', 'flight.yaml', 'rail.yaml'}
 
 
-def blocks(language: str) -> list[str]:
+def page(name: str) -> str:
+    """Return the text of a page in doc/."""
+    return (ROOT / 'doc' / name).read_text(encoding='utf-8')
+
+
+def blocks(language: str, text: str = README) -> list[str]:
     """Return the fenced blocks in one language."""
-    return re.findall(rf'^```{language}\n(.*?)^```', README, re.MULTILINE | re.DOTALL)
+    return re.findall(rf'^```{language}\n(.*?)^```', text, re.MULTILINE | re.DOTALL)
+
+
+def anchors(path: Path) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub makes them."""
+    text = re.sub(r'^```.*?^```', '', path.read_text(encoding='utf-8'), flags=re.M | re.S)
+    return {re.sub(r'[^\w\- ]', '', title.lower()).replace(' ', '-')
+            for title in re.findall(r'^#+ (.+)$', text, re.MULTILINE)}
 
 
 def run(*command: str) -> subprocess.CompletedProcess:
@@ -28,12 +47,62 @@ def test_the_quick_start_is_the_two_commands():
     assert all((ROOT / path).stat().st_mode & 0o111 for path in first)
 
 
-@pytest.mark.parametrize('path', sorted(set(re.findall(
-    r'(?<![\w/.])((?:bags|doc|scripts|msg_config|launch|config|benchmarks|test|ou_monitor)'
-    r'/[\w./]*)', README)) | set(re.findall(r'`(\w+\.yaml)`', README)) - {'my_adc.yaml'}))
+def test_readme_is_short():
+    """The README is read in one go."""
+    assert len(README.splitlines()) <= 150
+
+
+@pytest.mark.parametrize('path', PAGES, ids=lambda path: path.name)
+def test_page_is_short(path):
+    """A page has one job, so it is short; the README or another page leads to it."""
+    assert len(path.read_text(encoding='utf-8').splitlines()) < 250
+    others = [other for other in LINKED if other != path]
+    assert any(re.search(rf'\]\([\w./]*\b{path.name}[)#]', other.read_text(encoding='utf-8'))
+               for other in others)
+
+
+@pytest.mark.parametrize('path', LINKED, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_resolve(path):
+    """Every relative link leads to a file of the project, and to a heading if it names one."""
+    text = re.sub(r'^```.*?^```', '', path.read_text(encoding='utf-8'), flags=re.M | re.S)
+    for target in re.findall(r'\]\(([^)\s]+)\)', text):
+        if re.match(r'[a-z]+:', target):
+            continue
+        name, _, anchor = target.partition('#')
+        there = (path.parent / name).resolve() if name else path
+        assert there.exists() and there.is_relative_to(ROOT), target
+        assert not anchor or anchor in anchors(there), target
+
+
+def test_links_are_seen():
+    """The patterns above see the links and the headings that there are."""
+    assert len(re.findall(r'\]\(([^)\s]+)\)', README)) > 20
+    assert 'which-capacitance' in anchors(ROOT / 'doc/theory.md')
+
+
+@pytest.mark.parametrize('path', [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *PAGES],
+                         ids=lambda path: path.name)
 def test_what_is_named_exists(path):
-    """Every file and folder named is there."""
-    assert (ROOT / path).exists() or (ROOT / 'msg_config' / path).exists()
+    """Every file and folder that a document names is there."""
+    text = path.read_text(encoding='utf-8')
+    named = set(re.findall(
+        r'(?<![\w/.])((?:bags|doc|scripts|msg_config|launch|config|benchmarks|test|ou_monitor)'
+        r'/[\w./]*\w)', text)) | set(re.findall(r'`(\w+\.yaml)`', text)) - OTHERS
+    missing = [name for name in named
+               if not (ROOT / name).exists() and not (ROOT / 'msg_config' / name).exists()]
+    assert not missing
+
+
+@pytest.mark.parametrize('mark', [
+    'accuracy', 'speed', 'blind', 'limits', 'error', 'bags', 'windows', 'dterm', 'loop', 'node',
+    'calibration', 'alarms', 'cost', 'peers', 'files', 'memory'])
+def test_tables_of_benchmarks_have_their_place(mark):
+    """The marks of a table are on one page, with numbers between them; the command names it."""
+    begin, end = f'<!-- {mark} begins -->', f'<!-- {mark} ends -->'
+    (path,) = [path for path in PAGES if begin in path.read_text(encoding='utf-8')]
+    assert '|' in path.read_text(encoding='utf-8').split(begin)[1].split(end)[0]
+    assert f'doc/{path.name}' in (ROOT / 'benchmarks/README.md').read_text(encoding='utf-8') + \
+        (ROOT / 'benchmarks/risk.py').read_text(encoding='utf-8')
 
 
 def test_launch_file_exists():
@@ -42,15 +111,16 @@ def test_launch_file_exists():
         assert (ROOT / 'launch' / name).is_file()
 
 
-@pytest.mark.parametrize('command', sorted(set(re.findall(r'ou-monitor (\w+)', README))))
+@pytest.mark.parametrize('command', sorted(set(re.findall(r'ou-monitor ([a-z]+)', README))))
 def test_commands_exist(command):
-    """Each command of ou-monitor that is named has its help, with the options named beside it."""
+    """Each command that is named has its help, with the options named beside it anywhere."""
     shown = run('-m', 'ou_monitor.cli.main', command, '--help')
     assert shown.returncode == 0, shown.stderr
-    for line in README.splitlines():
-        if f'ou-monitor {command}' in line:
-            for option in re.findall(r'--\w+', line):
-                assert option in shown.stdout
+    for path in [ROOT / 'README.md', *PAGES]:
+        for line in path.read_text(encoding='utf-8').replace('\\\n', '').splitlines():
+            if re.search(rf'ou-monitor {command}\b', line):
+                for option in re.findall(r'(?<![\w-])--[a-z][\w-]*', line):
+                    assert option in shown.stdout, (path.name, option)
 
 
 def test_no_command_is_missing():
@@ -72,12 +142,13 @@ def test_executables_exist():
 
 
 def test_brownout_parameters_are_listed():
-    """Each with its default; none is named that does not exist."""
+    """Each with its default; none is named anywhere that does not exist."""
     from ou_monitor.online.settings import ESTIMATOR_PARAMETERS
     defaults = {p.name: p.default for p in ESTIMATOR_PARAMETERS}
-    assert set(re.findall(r'`(brownout\.\w+)`', README)) <= set(defaults)
-    rows = dict(re.findall(r'^\| (`(?:brownout\.|model_file)[^|]*) \| ([^|]*) \|', README,
-                           re.MULTILINE))
+    for path in [ROOT / 'README.md', *PAGES]:
+        assert set(re.findall(r'`(brownout\.\w+)`', path.read_text('utf-8'))) <= set(defaults)
+    rows = dict(re.findall(r'^\| (`(?:brownout\.|model_file)[^|]*) \| ([^|]*) \|',
+                           page('brownout.md'), re.MULTILINE))
     listed = {}
     for names, values in rows.items():
         for name, value in zip(names.split(', '), (values + ', ').split(', ')):
@@ -89,12 +160,12 @@ def test_brownout_parameters_are_listed():
 
 
 def test_filter_parameters_are_listed():
-    """Each with its default, in the section of the filter."""
+    """Each with its default, on the page of the filter."""
     from ou_monitor.online.settings import FILTER_PARAMETERS
-    section = README.split('## Adaptive low-pass')[1].split('## ')[0]
+    section = page('filter.md').split('## Parameters')[1].split('\n## ')[0]
     listed = {}
-    for names, values in re.findall(r'^\| ((?:`[\w.]+`(?:, )?)+) \| ([^|]*) \|', section.split(
-            '| parameter |')[1], re.MULTILINE):
+    for names, values in re.findall(r'^\| ((?:`[\w.]+`(?:, )?)+) \| ([^|]*) \|', section,
+                                    re.MULTILINE):
         for name, value in zip(names.split(', '), values.split(', '), strict=True):
             listed[name.strip('`')] = value.strip()
     assert listed == {'input.type': 'auto', 'input.field': 'none', **{
@@ -105,7 +176,7 @@ def test_filter_parameters_are_listed():
 def test_filter_laws_are_listed():
     """Every law has a row, and there are no others."""
     from ou_monitor.online.settings import LAWS
-    section = README.split('| law | cutoff |')[1].split('\n\n')[0]
+    section = page('filter.md').split('| law | cutoff |')[1].split('\n\n')[0]
     assert set(re.findall(r'^\| `(\w+)` \|', section, re.MULTILINE)) == set(LAWS)
 
 
@@ -129,11 +200,38 @@ def test_filter_numbers_are_those_of_the_laws():
         assert 100.0 * (errors[0] / errors[1] - 1.0) == pytest.approx(loss, abs=0.5)
 
 
-def test_python_example_runs():
-    """The example runs and its intervals hold the values it was made with."""
+def test_python_example_of_the_readme_runs(monkeypatch):
+    """It estimates a bag of the library, whose sigma is known."""
+    monkeypatch.chdir(ROOT)
     (code,) = blocks('python')
     scope: dict[str, object] = {}
     exec(compile(code, 'README.md', 'exec'), scope)
+    low, high = scope['estimate'].interval('sigma', z=4.0)
+    assert low < 0.632 < high
+
+
+def test_log_example_is_true(tmp_path):
+    """The command of the README prints what the README shows; make_readme.py renews it."""
+    spec = importlib.util.spec_from_file_location('make_readme', ROOT / 'scripts/make_readme.py')
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    printed = module.run(module.command(README), tmp_path / 'report.html')
+    (shown,) = blocks('text', README.split('<!-- example begins -->')[1].split('<!-- ')[0])
+    assert shown.strip() == module.shortened(printed)
+    assert '[...]' in shown and 'sag mV' in shown and (tmp_path / 'report.html').stat().st_size
+
+
+def test_picture_is_a_picture():
+    """The report of the example: a PNG of some size."""
+    data = (ROOT / 'doc/report.png').read_bytes()
+    assert data.startswith(b'\x89PNG') and 20_000 < len(data) < 300_000
+
+
+def test_python_example_runs():
+    """The example runs and its intervals hold the values it was made with."""
+    (code,) = blocks('python', page('commands.md'))
+    scope: dict[str, object] = {}
+    exec(compile(code, 'commands.md', 'exec'), scope)
     e = scope['e']
     assert e.usable
     # Seeded; four standard errors instead of two leave room for another numpy's random stream.
@@ -145,7 +243,7 @@ def test_python_example_runs():
 def test_message_example_is_accepted(tmp_path):
     """The example of a message description is one that the package reads."""
     from ou_monitor.stream.config import load_msg_config
-    (text,) = blocks('yaml')
+    (text,) = blocks('yaml', page('messages.md'))
     path = tmp_path / 'my_adc.yaml'
     path.write_text(text, encoding='utf-8')
     config = load_msg_config(str(path))
@@ -155,4 +253,4 @@ def test_message_example_is_accepted(tmp_path):
 def test_options_are_seen():
     """The pattern above sees an option that is named."""
     line = next(line for line in README.splitlines() if 'ou-monitor analyze R' in line)
-    assert re.findall(r'--\w+', line) == ['--report']
+    assert re.findall(r'(?<![\w-])--[a-z][\w-]*', line) == ['--report']

@@ -1,0 +1,102 @@
+#!/usr/bin/env python3
+"""
+Write the example and the picture of README.md: `scripts/make_readme.py`.
+
+The example is what the command of README.md really prints about a recorded flight, shortened to
+the paragraphs in `_CHOSEN`; the picture is its report in a headless Chromium or Chrome, reduced to
+`_SHOWN`.  test/test_readme.py runs the same command and compares.  Without a browser the picture
+stays as it is.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+import shlex
+import subprocess
+import sys
+import tempfile
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / 'test' / 'support'))
+
+from browser import Browser, find_browser  # noqa: E402
+
+README = ROOT / 'README.md'
+PICTURE = ROOT / 'doc' / 'report.png'
+_MARKS = ('<!-- example begins -->\n', '<!-- example ends -->')
+# The first two paragraphs, and the tables with these columns.
+_CHOSEN = ('noise mV', 'sag mV')
+# Of the report: voltage and throttle with its load levels, and what lies over throttle.
+_SHOWN = """
+    const figures = [...document.querySelectorAll('figure')];
+    const wanted = new Set(figures.slice(0, 2));
+    for (const section of document.querySelectorAll('section')) {
+        const title = section.querySelector('h2');
+        if (title && title.textContent === 'Over throttle') {
+            wanted.add(section.querySelector('figure'));
+        }
+    }
+    document.body.replaceChildren(document.querySelector('h1'), ...wanted);
+    Math.ceil(Math.max(...[...wanted].map(one => one.getBoundingClientRect().bottom))) + 16
+"""
+
+
+def command(text: str) -> list[str]:
+    """Return the words of the command between the marks of README.md."""
+    part = text.split(_MARKS[0])[1].split(_MARKS[1])[0]
+    return shlex.split(part.split('```console\n')[1].split('\n```')[0].replace('\\\n', ''))
+
+
+def run(words: list[str], report: Path) -> str:
+    """Return what the command prints, its report written to `report`."""
+    words = [str(report) if word.endswith('.html') else word for word in words[1:]]
+    done = subprocess.run([sys.executable, '-m', 'ou_monitor.cli.main', *words], cwd=ROOT,
+                          capture_output=True, text=True, check=True)
+    return done.stdout
+
+
+def shortened(printed: str) -> str:
+    """Return the chosen paragraphs, with an ellipsis where others were."""
+    paragraphs = printed.strip().split('\n\n')
+    kept = [text if k < 2 or any(column in text.split('\n')[0] for column in _CHOSEN) else None
+            for k, text in enumerate(paragraphs)]
+    out: list[str] = []
+    for text in kept:
+        if text is not None or not out or out[-1] != '[...]':
+            out.append('[...]' if text is None else text)
+    return '\n\n'.join(out)
+
+
+def photograph(page: Path) -> bool:
+    """Write the picture of a report; False without a browser."""
+    program = find_browser()
+    if program is None:
+        return False
+    with tempfile.TemporaryDirectory() as folder, \
+            Browser(program, folder, width=860, height=640) as tab:
+        tab.visit(page)
+        height = tab.run(_SHOWN)
+        tab.send('Emulation.setDeviceMetricsOverride', width=860, height=height,
+                 deviceScaleFactor=1, mobile=False)
+        tab.picture(PICTURE, whole=False)
+    return True
+
+
+def main() -> int:
+    """Write both."""
+    text = README.read_text(encoding='utf-8')
+    words = command(text)
+    with tempfile.TemporaryDirectory() as folder:
+        page = Path(folder) / 'report.html'
+        printed = shortened(run(words, page))
+        if not photograph(page):
+            print('no Chromium or Chrome: the picture stays as it is', file=sys.stderr)
+    head, rest = text.split(_MARKS[0])
+    example, tail = rest.split(_MARKS[1])
+    example = example.split('```text\n')[0] + f'```text\n{printed}\n```\n'
+    README.write_text(f'{head}{_MARKS[0]}{example}{_MARKS[1]}{tail}', encoding='utf-8')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
