@@ -1,7 +1,7 @@
 """
 How the brown-out risk compares with what happens, and with the alarms that fly.
 
-    python benchmarks/risk.py calibration --table doc/risk_accuracy.md \
+    python benchmarks/risk.py calibration --table doc/risk_accuracy.md
         --figure doc/risk_reliability.svg
     python benchmarks/risk.py alarms --table doc/risk_accuracy.md --figure doc/risk_alarms.svg
     python benchmarks/risk.py cost --table doc/risk.md
