@@ -25,7 +25,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from ou_monitor.fleet.work import Options, work  # noqa: E402, I202
+from ou_monitor.fleet.analysis import Options, work  # noqa: E402, I202
 from ou_monitor.fleet.workers import LocalWorkers, usable_cores  # noqa: E402
 from ou_monitor.recordings.write import write_recording  # noqa: E402
 from ou_monitor.records import Recording  # noqa: E402

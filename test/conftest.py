@@ -52,4 +52,4 @@ def one_process(monkeypatch):
         def __exit__(self, *_: object) -> None:
             pass
 
-    monkeypatch.setattr('ou_monitor.fleet.run.LocalWorkers', Here)
+    monkeypatch.setattr('ou_monitor.fleet.fleet.LocalWorkers', Here)

@@ -157,7 +157,7 @@ def test_the_walk_sees_the_house():
     ('ou_monitor.recordings.read', 'import pyulog'),
     ('ou_monitor.recordings.importers.ulog', 'import orangebox'),
     ('ou_monitor.recordings.importers.log', 'from ou_monitor.analyze.analyze import analyze'),
-    ('ou_monitor.fleet.run', 'import dask'),
+    ('ou_monitor.fleet.fleet', 'import dask'),
     ('ou_monitor.nodes.estimator', 'from ou_monitor.cli import main'),
     ('ou_monitor.nodes.estimator', 'import matplotlib'),
     ('ou_monitor.cli.main', 'from ou_monitor.nodes import estimator'),

@@ -17,7 +17,7 @@ from ou_monitor.cli.arguments import (
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
-    from ou_monitor.fleet.run import Fleet
+    from ou_monitor.fleet.fleet import Fleet
 
 TABLE, REPORT = 'fleet.parquet', 'fleet.html'
 # What is listed at most of one kind; all of it is in the report and in the table.
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     output.check_writable(args.json)
 
     from ou_monitor.fleet.find import find_recordings
-    from ou_monitor.fleet.run import run_fleet
+    from ou_monitor.fleet.fleet import run_fleet
     from ou_monitor.fleet.vehicles import read_pattern
 
     options, more = _options(args)
@@ -124,7 +124,7 @@ def version() -> str:
 
 
 def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
-    from ou_monitor.fleet.parts import write_whole
+    from ou_monitor.fleet.results import write_whole
     from ou_monitor.fleet.table import write_table
     from ou_monitor.report.fleet_page import fleet_page
 
@@ -133,7 +133,7 @@ def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
     # A file name may hold bytes that are no text.
     write_whole(folder / REPORT, page.encode(errors='backslashreplace'))
     if args.json is not None:
-        from ou_monitor.fleet.words import as_data
+        from ou_monitor.fleet.summary import as_data
         output.write_json(as_data(fleet), args.json)
     if args.json != output.STDOUT:
         output.say(render(fleet))
@@ -149,7 +149,7 @@ def command_line(args: argparse.Namespace) -> str:
 
 def render(fleet: Fleet) -> str:
     """Return the fleet for a terminal 100 columns wide."""
-    from ou_monitor.fleet.words import (
+    from ou_monitor.fleet.summary import (
         comparison_words, failure_words, finding_words, headline, VEHICLE_HEADS, vehicle_rows)
 
     lines = [output.paragraph(headline(fleet))]
@@ -174,7 +174,7 @@ def render(fleet: Fleet) -> str:
 
 def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     """Return the options of the work, and the content of a file that they name."""
-    from ou_monitor.fleet.work import Options
+    from ou_monitor.fleet.analysis import Options
 
     config, more = args.msg_config, {}
     if config is not None:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from ou_monitor.fleet.compare import Values
+from ou_monitor.fleet.comparison import Values
 from ou_monitor.records import FloatArray, NAN
 
 # With fewer flights not even one vehicle alone can be told at 5 %: 2/4! is 0.08.

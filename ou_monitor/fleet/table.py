@@ -1,20 +1,108 @@
-"""Results -> rows of the fleet table -> Parquet; the only module that imports pyarrow."""
+"""The fleet table: columns, rows, Parquet file; the only module that imports pyarrow."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime, timezone
 import io
 import math
 from pathlib import Path
 from typing import Any
 
-from ou_monitor.fleet.columns import COLUMNS, NAMES, OF_LEVEL
 from ou_monitor.fleet.find import Source
-from ou_monitor.fleet.parts import write_whole
+from ou_monitor.fleet.results import write_whole
 from ou_monitor.fleet.vehicles import Vehicle
 
 Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Column:
+    """
+    One column.
+
+    Attributes
+    ----------
+    name : str
+        Name in the table.
+    kind : str
+        ``text``, ``texts`` (a list), ``number`` (unknown: null), ``count`` or
+        ``time`` (UTC).
+    unit : str
+        SI unit; empty where there is none.
+    meaning : str
+        One line.
+
+    """
+
+    name: str
+    kind: str
+    unit: str
+    meaning: str
+
+
+_LOG = 'standard error of its logarithm'
+
+COLUMNS = (
+    Column('vehicle', 'text', '', 'vehicle; null where it cannot be told'),
+    Column('vehicle_from', 'text', '', 'how the vehicle was told: metadata, pattern, folder'),
+    Column('flight', 'count', '', 'number of the flight of this vehicle, from 1'),
+    Column('start', 'time', '', 'first sample; null where its clock does not know the date'),
+    Column('recording', 'text', '', 'name of the recording'),
+    Column('path', 'text', '', 'file or folder'),
+    Column('level', 'text', '', "load level, such as '40 %', or 'all' for the whole recording"),
+    Column('throttle', 'number', '1', 'throttle of the level, 0..1'),
+    Column('time_s', 'number', 's', 'time spent at the level'),
+    Column('n', 'count', '', 'samples at the level'),
+    Column('mean', 'number', 'V', 'mean voltage at the level'),
+    Column('vpp', 'number', 'V', 'peak to peak of the deviation from the mean'),
+    Column('vrms', 'number', 'V', 'rms of the deviation from the mean'),
+    Column('alpha', 'number', '1/s', 'relaxation rate'),
+    Column('alpha_se', 'number', '1', _LOG),
+    Column('sigma', 'number', 'V/sqrt(s)', 'noise intensity'),
+    Column('sigma_se', 'number', '1', _LOG),
+    Column('var_inf', 'number', 'V^2', 'stationary variance'),
+    Column('var_inf_se', 'number', '1', _LOG),
+    Column('u0', 'number', 'V', 'mean level of the fit'),
+    Column('u0_se', 'number', 'V', 'standard error of u0'),
+    Column('noise_std', 'number', 'V', 'white noise of the sensor'),
+    Column('excess_kurtosis', 'number', '1', 'of the innovations; 0 for a Gaussian'),
+    Column('impulses', 'count', '', 'innovations larger than the largest normal one would be'),
+    Column('line_hz', 'number', 'Hz', 'frequency of the strongest spectral line; null: none seen'),
+    Column('line_rms', 'number', 'V', 'its rms'),
+    Column('process', 'text', '', 'type of process'),
+    Column('risk', 'number', '1', 'probability of a brown-out within the horizon, from the level; '
+           'needs --brownout-voltage'),
+    Column('status', 'text', '', 'what became of the fit: OK, SHORT_WINDOW, or why there is none'),
+    Column('flags', 'texts', '', 'cautions about the input'),
+    Column('level_notes', 'texts', '', 'what to know about the level'),
+    Column('duration_s', 'number', 's', 'length of the recording'),
+    Column('samples', 'count', '', 'samples of the recording'),
+    Column('rate_hz', 'number', 'Hz', 'mean rate of the recording'),
+    Column('sag', 'number', 'V', 'slope of the mean over throttle between the levels of the '
+           'recording (V per unit throttle; negative when the supply sags)'),
+    Column('sag_se', 'number', 'V', 'standard error of sag'),
+    Column('alpha_p', 'number', '1', 'p-value of alpha being the same at all levels'),
+    Column('quality', 'texts', '', 'what to know about the recording, worst first'),
+    Column('risk_max', 'number', '1', 'highest risk that the node would have told on the way; '
+           'needs --brownout-voltage'),
+    Column('verdict', 'text', '', 'verdict of discover; null without --discover'),
+    Column('causes', 'texts', '', 'causes that discover names; null without --discover'),
+    Column('gain', 'number', 'nat', 'gain of the extended model, per sample kept back'),
+    Column('gain_se', 'number', 'nat', 'standard error of gain'),
+    Column('notes', 'texts', '', 'what was dropped, mended or left out of the recording'),
+    Column('duplicate_of', 'text', '', 'path of the recording with the same content; this one '
+           'was not analysed again'),
+    Column('error', 'text', '', 'why there are no numbers; null when there are'),
+    Column('size_bytes', 'count', 'byte', 'size of its data'),
+)
+NAMES = tuple(column.name for column in COLUMNS)
+# Of these a recording without levels still has something to say.
+OF_LEVEL = ('level', 'throttle', 'time_s', 'n', 'mean', 'vpp', 'vrms', 'alpha', 'alpha_se',
+            'sigma', 'sigma_se', 'var_inf', 'var_inf_se', 'u0', 'u0_se', 'noise_std',
+            'excess_kurtosis', 'impulses', 'line_hz', 'line_rms', 'process', 'risk', 'status',
+            'flags', 'level_notes')
 _OF_RECORDING = ('recording', 'duration_s', 'samples', 'rate_hz', 'sag', 'sag_se', 'risk_max',
                  'verdict', 'causes', 'gain', 'gain_se', 'notes')
 

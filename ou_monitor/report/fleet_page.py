@@ -7,11 +7,11 @@ import math
 from typing import Any
 
 import numpy as np
-from ou_monitor.fleet.compare import LOGARITHMIC, QUANTITIES, USABLE, Values
+from ou_monitor.fleet.comparison import LOGARITHMIC, QUANTITIES, USABLE, Values
 from ou_monitor.fleet.drift import Trend
-from ou_monitor.fleet.judge import DRIFT_RATE
-from ou_monitor.fleet.run import Fleet
-from ou_monitor.fleet.words import (
+from ou_monitor.fleet.fleet import Fleet
+from ou_monitor.fleet.judgement import DRIFT_RATE
+from ou_monitor.fleet.summary import (
     change, comparison_words, failure_words, finding_words, headline, quality_counts, short_names,
     VEHICLE_HEADS, vehicle_rows)
 from ou_monitor.records import FloatArray

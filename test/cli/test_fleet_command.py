@@ -13,7 +13,7 @@ import time
 
 import numpy as np
 from ou_monitor.cli.main import main
-from ou_monitor.fleet.columns import COLUMNS, NAMES
+from ou_monitor.fleet.table import COLUMNS, NAMES
 from ou_monitor.model.ou import simulate
 from ou_monitor.recordings.write import write_recording
 from ou_monitor.records import Recording

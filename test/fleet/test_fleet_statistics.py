@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from ou_monitor.fleet.compare import values_of
+from ou_monitor.fleet.comparison import values_of
 from ou_monitor.fleet.drift import fewest, holm, LEAST, trends
-from ou_monitor.fleet.judge import DRIFT_RATE, judge, OUTLIER_RATE
+from ou_monitor.fleet.judgement import DRIFT_RATE, judge, OUTLIER_RATE
 from ou_monitor.fleet.outliers import outliers
 import pytest
 

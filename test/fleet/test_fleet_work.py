@@ -10,12 +10,12 @@ import signal
 from types import SimpleNamespace
 
 from ou_monitor.errors import InputError
+from ou_monitor.fleet.analysis import Options, work
 from ou_monitor.fleet.cluster import check_address
 from ou_monitor.fleet.find import duplicates, find_recordings
-from ou_monitor.fleet.parts import Parts, write_whole
+from ou_monitor.fleet.results import Parts, write_whole
+from ou_monitor.fleet.summary import failure_words
 from ou_monitor.fleet.vehicles import assign, natural, number_flights, read_pattern
-from ou_monitor.fleet.words import failure_words
-from ou_monitor.fleet.work import Options, work
 from ou_monitor.fleet.workers import LocalWorkers, LOST, usable_memory
 import pytest
 
@@ -136,7 +136,7 @@ def test_work_never_raises(tmp_path, monkeypatch):
                          (MemoryError(), 'fewer workers')):
         def broken(*_: object, error=error, **__: object) -> None:
             raise error
-        monkeypatch.setattr('ou_monitor.fleet.work.read_recording', broken)
+        monkeypatch.setattr('ou_monitor.fleet.analysis.read_recording', broken)
         assert words in work(str(bad), Options().as_data())['error']
 
 

@@ -3,11 +3,11 @@
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
-from ou_monitor.fleet.columns import NAMES
-from ou_monitor.fleet.judge import judge
-from ou_monitor.fleet.run import Fleet
-from ou_monitor.fleet.words import (
+from ou_monitor.fleet.fleet import Fleet
+from ou_monitor.fleet.judgement import judge
+from ou_monitor.fleet.summary import (
     as_data, change, finding_words, headline, short_names, vehicle_rows)
+from ou_monitor.fleet.table import NAMES
 from ou_monitor.report.fleet_page import fleet_page
 import pytest
 from test_fleet_statistics import table

@@ -9,11 +9,11 @@ import re
 from typing import Any
 
 import numpy as np
-from ou_monitor.fleet.compare import LOGARITHMIC, QUANTITIES, USABLE, Values
+from ou_monitor.fleet.comparison import LOGARITHMIC, QUANTITIES, USABLE, Values
 from ou_monitor.fleet.drift import fewest, Trend
-from ou_monitor.fleet.judge import DRIFT_RATE, Judgement, LEAST_VEHICLES, OUTLIER_RATE
+from ou_monitor.fleet.fleet import Fleet
+from ou_monitor.fleet.judgement import DRIFT_RATE, Judgement, LEAST_VEHICLES, OUTLIER_RATE
 from ou_monitor.fleet.outliers import LEAST, SIMULATIONS
-from ou_monitor.fleet.run import Fleet
 from ou_monitor.recordings.samples import counted
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.text import number

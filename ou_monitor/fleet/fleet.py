@@ -8,12 +8,12 @@ from pathlib import Path
 import re
 from typing import Any
 
+from ou_monitor.fleet.analysis import Options, work
 from ou_monitor.fleet.find import duplicates, Found, Source
-from ou_monitor.fleet.judge import judge, Judgement
-from ou_monitor.fleet.parts import Parts
+from ou_monitor.fleet.judgement import judge, Judgement
+from ou_monitor.fleet.results import Parts
 from ou_monitor.fleet.table import Row, rows_of
 from ou_monitor.fleet.vehicles import assign, number_flights
-from ou_monitor.fleet.work import Options, work
 from ou_monitor.fleet.workers import LocalWorkers, Workers
 from ou_monitor.records import NAN
 

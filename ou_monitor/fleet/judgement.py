@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.fleet.compare import QUANTITIES, Row, Values, values_of
+from ou_monitor.fleet.comparison import QUANTITIES, Row, Values, values_of
 from ou_monitor.fleet.drift import Trend, trends
 from ou_monitor.fleet.outliers import Outliers, outliers
 from ou_monitor.records import FloatArray
