@@ -1,4 +1,4 @@
-"""Arguments that several commands share: how they are announced, read, and said again."""
+"""Arguments that several commands share: how they are checked, read, and repeated."""
 
 from __future__ import annotations
 
@@ -6,61 +6,30 @@ import argparse
 import math
 from typing import Any, TYPE_CHECKING
 
+from ou_monitor.cli import output
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
     from ou_monitor.records import Recording
 
 _NAN = float('nan')
-
-
 # Options of the topics, by the names that the parser gives them.
 _TOPICS = ('msg_config', 'voltage_topic', 'throttle_topic')
 
 
-def add_recording(parser: argparse.ArgumentParser) -> None:
-    """Announce RECORDING."""
-    parser.add_argument(
-        'recording', metavar='RECORDING',
-        help='.mcap file, rosbag2 folder, or CSV with columns time_s, voltage_v[, throttle]')
-
-
-def add_part(parser: argparse.ArgumentParser) -> None:
-    """Announce ``--from`` and ``--to``."""
-    parser.add_argument('--from', metavar='S', dest='start',
-                        help='leave out what comes before, s after the first message')
-    parser.add_argument('--to', metavar='S', dest='end',
-                        help='leave out what comes from here on, s after the first message')
-
-
-def add_topics(parser: argparse.ArgumentParser) -> None:
-    """Announce what says how bags are read: the topics, and ``--partial``."""
-    parser.add_argument('--msg-config', metavar='NAME',
-                        help='msg_config that says which topic and field is the voltage')
-    parser.add_argument('--voltage-topic', metavar='TOPIC', help='topic of the voltage')
-    parser.add_argument('--throttle-topic', metavar='TOPIC', help='topic of the throttle')
-    parser.add_argument('--partial', action='store_true',
-                        help='use what a truncated file still holds')
-
-
-def add_estimate(parser: argparse.ArgumentParser, voltage: str) -> None:
-    """Announce ``--window``, ``--brownout-voltage`` and ``--brownout-horizon``."""
-    parser.add_argument('--window', metavar='S', default='2.0',
-                        help='window of the sliding estimate, s (default: 2.0)')
-    parser.add_argument('--brownout-voltage', metavar='V', help=voltage)
-    parser.add_argument('--brownout-horizon', metavar='S', default='5.0',
-                        help='horizon of that risk, s (default: 5.0)')
-
-
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Announce ``--json``."""
-    parser.add_argument('--json', metavar='FILE',
-                        help="write the result as JSON ('-': to standard output, alone)")
+def check_outputs(args: argparse.Namespace, *names: str, **inputs: Any) -> None:
+    """Refuse outputs that overwrite an input, cannot be written, or, but for JSON, are no file."""
+    targets = {f"--{name.replace('_', '-')}": getattr(args, name) for name in names}
+    for option, target in targets.items():
+        if target == output.STDOUT:
+            raise InputError(f"{option} needs a file: '-' is not supported")
+    output.check_paths(inputs, {'--json': args.json, **targets})
+    for target in (args.json, *targets.values()):
+        output.check_writable(target)
 
 
 def read_given(args: argparse.Namespace, start: float | None, end: float | None) -> Recording:
     """Read RECORDING as the arguments say, with a progress bar (start, end in s)."""
-    from ou_monitor.cli import output
     from ou_monitor.recordings.read import read_recording
 
     with output.Progress('reading') as progress:
@@ -70,7 +39,7 @@ def read_given(args: argparse.Namespace, start: float | None, end: float | None)
             progress=progress)
 
 
-def said_again(args: argparse.Namespace, *names: str) -> list[str]:
+def repeated(args: argparse.Namespace, *names: str) -> list[str]:
     """Return the words of a command line that repeat how a recording is read."""
     words: list[str] = []
     given: list[tuple[str, Any]] = [

@@ -12,69 +12,6 @@ from ou_monitor.errors import InputError
 # Endings that OUT cannot have: a folder of that name would mislead.
 LOG_ENDINGS = ('.csv', '.ulg', '.bin', '.bbl', '.bfl', '.log', '.db3', '.bag', '.txt')
 
-TYPES = ('battery_state', 'float32', 'float64', 'adc_block')
-
-READ = ('PX4 ULog (.ulg), ArduPilot dataflash (.bin, .log), Betaflight and INAV blackbox '
-        '(.bbl, .bfl), CSV with the column time_s')
-
-
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        'convert', help='a log becomes an MCAP bag',
-        description='Convert a log to a bag with the topics /voltage, /throttle and /current '
-        '(A, positive when the battery is drained). Stamps count from the start of the log, in '
-        'seconds; those of a CSV stay as they are.',
-        epilog=f'Read: {READ}; the first bytes decide, not the ending.')
-    parser.add_argument('log', metavar='LOG', type=output.path_argument, help='what to read')
-    out = parser.add_argument(
-        'out', metavar='OUT', type=output.path_argument,
-        help='what to write: NAME.mcap for one file, NAME for a rosbag2 folder')
-    parser.add_argument(
-        '--list', action=_List, nargs=0, const=out, default=False,
-        help='show what could be taken, * what would be, and write nothing (without OUT)')
-    parser.add_argument(
-        '--voltage', metavar='NAME', help='which voltage (default: the battery, if there is one)')
-    parser.add_argument(
-        '--throttle', metavar='NAME',
-        help="which throttle, or 'none' (default: motors, else what is asked of them, else the "
-        'stick)')
-    parser.add_argument(
-        '--current', metavar='NAME',
-        help="which current, or 'none' (default: that of the sensor of the voltage)")
-    parser.add_argument(
-        '--flight', metavar='N', type=_number, help='which flight of a file with several, from 1')
-    held = parser.add_mutually_exclusive_group()
-    held.add_argument(
-        '--drop-held', action='store_true',
-        help='drop voltages that a logger repeats until the ADC is read again')
-    held.add_argument(
-        '--drop-repeats', action='store_true',
-        help='as --drop-held; where no steady refresh is found, drop every repeat')
-    parser.add_argument(
-        '--type', choices=TYPES, default='battery_state',
-        help='message of the voltage (default %(default)s; adc_block needs a steady 10 kHz)')
-    parser.add_argument(
-        '--json', metavar='FILE',
-        help='write what was converted, or listed (- is standard output)')
-    parser.set_defaults(run=run)
-
-
-class _List(argparse.Action):
-    """Says that no OUT is needed; an optional positional could not follow an option."""
-
-    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
-                 values: Any, option_string: str | None = None) -> None:
-        """Set the flag."""
-        setattr(namespace, self.dest, True)
-        self.const.required = False
-
-
-def _number(text: str) -> int:
-    if not text.isascii() or not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 1 on")
-    return int(text)
-
 
 def run(args: argparse.Namespace) -> int:
     """Convert, or list."""

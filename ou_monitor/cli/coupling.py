@@ -7,40 +7,16 @@ import math
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import (
-    add_json, add_part, add_recording, add_topics, part_of_recording, read_given)
+from ou_monitor.cli.arguments import check_outputs, part_of_recording, read_given
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
     from ou_monitor.coupling.coupling import Coupling
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser(
-        'coupling', allow_abbrev=False,
-        help='gain from the supply voltage to a signal, such as a gyro axis',
-        description='Estimate how much noise of the supply is in a signal: gain with 95 % '
-                    'interval and lag, or that none was seen and what would have been.')
-    add_recording(parser)
-    add_part(parser)
-    parser.add_argument('--signal', metavar='NAME', required=True,
-                        help='TOPIC/FIELD.PATH of a bag (/imu/angular_velocity.x), or a column')
-    parser.add_argument('--band', metavar='LOW,HIGH',
-                        help='frequencies looked at, Hz (default: 5 to a quarter of the slower '
-                             'rate)')
-    parser.add_argument('--level', metavar='P', default='0.05',
-                        help='probability of a false alarm (default: 0.05)')
-    add_topics(parser)
-    add_json(parser)
-    parser.set_defaults(run=run)
-
-
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    output.check_paths({'RECORDING': args.recording, '--msg-config': args.msg_config},
-                       {'--json': args.json})
-    output.check_writable(args.json)
+    check_outputs(args, RECORDING=args.recording, **{'--msg-config': args.msg_config})
     band, level = _band(args.band), _level(args.level)
     start, end = part_of_recording(args.start, args.end)
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+from dataclasses import asdict, fields
 import math
-from typing import Any, TYPE_CHECKING
+from pathlib import Path
+import re
+from typing import Any
 
-from ou_monitor.cli.arguments import add_json
-from ou_monitor.cli.quantities import component, quantity, read_network, value_of
-from ou_monitor.errors import InputError
-
-if TYPE_CHECKING:
-    from ou_monitor.paper.network.components import PowerNetwork
-    from ou_monitor.paper.network.design import Design
+from ou_monitor.cli import output
+from ou_monitor.cli.output import paragraph, table
+from ou_monitor.errors import InputError, nearest
+from ou_monitor.paper.network.components import PowerNetwork, UNITS
+from ou_monitor.paper.network.design import default_voltage, Design, design
+from ou_monitor.paper.network.design_words import answer, as_data, effect, probability, remarks
+from ou_monitor.stream.files import read_yaml
+from ou_monitor.text import number
 
 # One row of the printed table for this many rows of the calculation.
 _EVERY = 10
@@ -21,49 +24,13 @@ _EVERY = 10
 _OPTIONS = {'risk': '', 'throttle': '', 'horizon': 's', 'capacitance_min': 'F',
             'capacitance_max': 'F'}
 
-
-def add_parser(subparsers: Any) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser(
-        'design', allow_abbrev=False,
-        help='which capacitance brings the brown-out risk under X at throttle Y',
-        description='Compute alpha, sigma, Var_inf and the brown-out risk of a rail from the '
-                    'components of its power network, over bulk capacitances, and the least one '
-                    'that meets a risk.',
-        epilog='Values are in SI units, or with prefix and unit: 470uF, 40mOhm, 24kHz.')
-    parser.add_argument('--risk', metavar='X',
-                        help='probability of a brown-out allowed within the horizon, 0..1')
-    parser.add_argument('--throttle', metavar='Y', help='throttle, 0..1')
-    parser.add_argument('--rail', choices=('bus', 'regulated'), default='bus',
-                        help='the battery bus at the ESCs, or the regulated rail '
-                             '(default: %(default)s)')
-    parser.add_argument('--voltage', metavar='V',
-                        help='brown-out level, V (default: 3.3 V a cell on the bus; 4.5 V on a '
-                             'regulated rail of 5 V, 2.88 V on one of 3.3 V)')
-    parser.add_argument('--horizon', metavar='S', default='5', help='horizon, s (default: 5)')
-    parser.add_argument('--capacitance-min', metavar='F', default='10uF',
-                        help='least capacitance to look at (default: %(default)s)')
-    parser.add_argument('--capacitance-max', metavar='F', default='22mF',
-                        help='most capacitance to look at (default: %(default)s)')
-    parser.add_argument('--esr-fixed', action='store_true',
-                        help='keep the ESR (default: ESR falls as 1/C, as of more capacitors of '
-                             'one series in parallel)')
-    parser.add_argument('--set', metavar='NAME=VALUE', action='append', default=[],
-                        help='a component, such as bulk_capacitance=1000uF; may be repeated '
-                             '(see --list)')
-    parser.add_argument('--network', metavar='FILE.yaml',
-                        help='components as a YAML mapping of name to value; --set goes first')
-    parser.add_argument('--list', action='store_true',
-                        help='list the components and their defaults')
-    add_json(parser)
-    parser.set_defaults(run=run)
+_PREFIX = {'': 1.0, 'p': 1e-12, 'n': 1e-9, 'u': 1e-6, 'µ': 1e-6, 'm': 1e-3, 'k': 1e3, 'M': 1e6}
+_QUANTITY = re.compile(r'([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([pnuµmkM]?)'
+                       r'(F|H|[Oo]hm|Ω|V|A|Hz|W|s|1/s)?')
 
 
 def _list(target: str | None) -> None:
     """Show the components with defaults and units; as JSON where that is asked for."""
-    from ou_monitor.cli import output
-    from ou_monitor.paper.network.components import PowerNetwork, UNITS
-
     network = PowerNetwork()
     values = asdict(network)
     if target is not None:
@@ -84,8 +51,6 @@ def _shown(value: object, network: PowerNetwork) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from ou_monitor.cli import output
-
     output.check_paths({'--network': args.network}, {'--json': args.json})
     if args.list:
         _list(args.json)
@@ -108,10 +73,6 @@ def run(args: argparse.Namespace) -> int:
         values[name] = value_of(f'--set {name}', name, text)
     output.check_writable(args.json)
 
-    from ou_monitor.paper.network.components import PowerNetwork
-    from ou_monitor.paper.network.design import default_voltage, design
-    from ou_monitor.paper.network.design_words import as_data
-
     try:
         network = PowerNetwork(**values)
         voltage, source = (
@@ -132,10 +93,6 @@ def run(args: argparse.Namespace) -> int:
 
 def render(result: Design, source: str) -> str:
     """Return the table and the answer for a terminal 100 columns wide."""
-    from ou_monitor.cli.output import paragraph, table
-    from ou_monitor.paper.network.design_words import answer, effect, probability, remarks
-    from ou_monitor.text import number
-
     present = result.present
     chosen = [(present, 'present')]
     if result.least is not None:
@@ -162,6 +119,55 @@ def render(result: Design, source: str) -> str:
 
 
 def _time(value: float) -> str:
-    from ou_monitor.text import number
-
     return 'never' if value > 1e100 else f'{number(value)} s'
+
+
+def quantity(where: str, text: object, unit: str) -> float:
+    """Return a number that may have an SI prefix and a unit."""
+    match = _QUANTITY.fullmatch(str(text).strip())
+    value = math.nan
+    if match and not isinstance(text, bool):
+        value = float(match[1]) * _PREFIX[match[2]]
+    if not math.isfinite(value):
+        raise InputError(f"{where}: '{text}' is not a number; write "
+                         + (f'it as 0.00047, 470u or 470u{unit}' if unit else 'it as 0.4 or 1e-3'))
+    assert match is not None
+    given = {'ohm': 'Ohm', 'Ω': 'Ohm'}.get(match[3], match[3])
+    if given is not None and given != unit:
+        raise InputError(f"{where}: '{text}' must be in {unit}" if unit else
+                         f"{where}: '{text}' must have no unit")
+    return value
+
+
+def read_network(path: str) -> dict[str, Any]:
+    """Return the components that a YAML file gives (path in A)."""
+    if not Path(path).is_file():
+        raise InputError(f"--network: there is no file '{path}'")
+    try:
+        data = read_yaml(path, 'the network')
+    except InputError as error:
+        raise InputError(f'--network: not readable YAML: {error}') from error
+    if not isinstance(data, dict):
+        raise InputError(f"--network: '{path}' must be a mapping of component to value, such as "
+                         'bulk_capacitance: 470uF')
+    return {component(str(name), path): value_of(f'{path}: {name}', str(name), value)
+            for name, value in data.items()}
+
+
+def component(name: str, where: str) -> str:
+    """Return the name of a component when there is such a one."""
+    valid = [field.name for field in fields(PowerNetwork)]
+    if name not in valid:
+        raise InputError(f"{where}: unknown component '{name}': {nearest(name, valid)}")
+    return name
+
+
+def value_of(where: str, name: str, text: object) -> Any:
+    """Return the value of a component."""
+    if name == 'constant_power':
+        word = str(text).strip().lower()
+        if word not in ('true', 'false'):
+            raise InputError(f"{where}: '{text}' is neither true nor false")
+        return word == 'true'
+    value = quantity(where, text, UNITS[name])
+    return int(value) if name in ('cells', 'escs') and value == int(value) else value

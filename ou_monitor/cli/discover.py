@@ -6,12 +6,11 @@ import argparse
 from datetime import datetime, timezone
 import math
 import shlex
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from ou_monitor import __version__
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import (
-    add_json, add_part, add_recording, add_topics, part_of_recording, read_given, said_again)
+from ou_monitor.cli.arguments import check_outputs, part_of_recording, read_given, repeated
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,39 +20,11 @@ if TYPE_CHECKING:
 _SHOWN = 8
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser(
-        'discover', allow_abbrev=False,
-        help='criticise the simulation, name the cause, extend, measure the gain',
-        description='Fit and simulate the plain OU, tell what it gets wrong, name the cause, '
-                    'extend the model, and measure the gain on samples not used for the fit.')
-    add_recording(parser)
-    add_part(parser)
-    parser.add_argument('--seed', metavar='N', type=int, default=0,
-                        help='same seed, same result (default: %(default)s)')
-    add_topics(parser)
-    add_json(parser)
-    parser.add_argument('--save-model', metavar='FILE.yaml',
-                        help='write the extended model, for simulate --model and the estimator')
-    parser.add_argument('--report', metavar='FILE.html',
-                        help='write a self-contained HTML page')
-    parser.set_defaults(run=run)
-
-
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    if args.seed < 0:
-        raise InputError(f'--seed must be 0 or more, got {args.seed}')
     start, end = part_of_recording(args.start, args.end)
-    output.check_paths(
-        {'RECORDING': args.recording, '--msg-config': args.msg_config},
-        {'--json': args.json, '--save-model': args.save_model, '--report': args.report})
-    for option, target in (('--report', args.report), ('--save-model', args.save_model)):
-        if target == output.STDOUT:
-            raise InputError(f"{option} needs a file: '-' is not supported")
-        output.check_writable(target)
-    output.check_writable(args.json)
+    check_outputs(args, 'save_model', 'report', RECORDING=args.recording,
+                  **{'--msg-config': args.msg_config})
 
     import numpy as np
     from ou_monitor.discovery.discover import discover
@@ -83,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
 
 def command_line(args: argparse.Namespace) -> str:
     """Return the command that repeats this discovery."""
-    return shlex.join(['ou-monitor', 'discover', args.recording, *said_again(args, 'seed')])
+    return shlex.join(['ou-monitor', 'discover', args.recording, *repeated(args, 'seed')])
 
 
 def model_text(finding: Finding) -> str:

@@ -12,8 +12,7 @@ from typing import Any, TYPE_CHECKING
 
 from ou_monitor import __version__
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import (
-    add_estimate, add_json, add_topics, positive_number, said_again, throttle_levels)
+from ou_monitor.cli.arguments import positive_number, repeated, throttle_levels
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,43 +21,6 @@ if TYPE_CHECKING:
 TABLE, REPORT = 'fleet.parquet', 'fleet.html'
 # What is listed at most of one kind; all of it is in the report and in the table.
 _SHOWN = 10
-
-
-def add_parser(subparsers: Any) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser(
-        'fleet', allow_abbrev=False,
-        help='many recordings -> a table (Parquet) and a report: outliers, drift of a vehicle',
-        description='Analyze many recordings on several processes: one Parquet table with a row '
-                    'for each recording and load level, and a report with outliers and with the '
-                    'drift of each vehicle over its flights. What is done is not done again: the '
-                    'same command goes on where it was stopped.')
-    parser.add_argument(
-        'recordings', metavar='RECORDING', nargs='+',
-        help='.mcap files, rosbag2 folders, .csv files, and folders to be searched for them')
-    parser.add_argument('--output', metavar='DIR', required=True,
-                        help=f'folder for {TABLE}, {REPORT} and the parts of a run')
-    parser.add_argument('--workers', metavar='N',
-                        help='local processes (default: one a core)')
-    parser.add_argument('--scheduler', metavar='ADDRESS',
-                        help='Dask scheduler whose workers are used instead, tls://HOST:8786; '
-                        'they see the recordings under the same paths')
-    parser.add_argument('--insecure', action='store_true',
-                        help='let the scheduler be on another machine without TLS')
-    parser.add_argument('--vehicle-from', metavar='REGEX',
-                        help="finds the vehicle in a recording's path (its first group) where "
-                        'the metadata name none (default: the folder it lies in)')
-    parser.add_argument('--discover', action='store_true',
-                        help='also look for causes; some seconds a recording (default: off)')
-    parser.add_argument('--seed', metavar='N', type=int, default=0,
-                        help='of discover (default: %(default)s)')
-    parser.add_argument('--levels', metavar='0,0.05,...',
-                        help='throttles 0..1 of the load levels (default: found in each '
-                        'recording)')
-    add_estimate(parser, 'also give the risk of going below this voltage, V')
-    add_topics(parser)
-    add_json(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -70,8 +32,6 @@ def run(args: argparse.Namespace) -> int:
     if args.scheduler is not None and args.workers is not None:
         raise InputError('--workers is for local processes, --scheduler for a cluster: give one')
     workers = usable_cores() if args.workers is None else _count('--workers', args.workers)
-    if args.seed < 0:
-        raise InputError(f'--seed must be 0 or more, got {args.seed}')
     _check_installed(args)
     folder = Path(args.output)
     if folder.exists() and not folder.is_dir():
@@ -142,7 +102,7 @@ def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
 
 def command_line(args: argparse.Namespace) -> str:
     """Return the command that repeats this fleet."""
-    words = ['ou-monitor', 'fleet', *args.recordings, '--output', args.output, *said_again(
+    words = ['ou-monitor', 'fleet', *args.recordings, '--output', args.output, *repeated(
         args, 'vehicle_from', 'levels', 'window', 'brownout_voltage', 'brownout_horizon')]
     return shlex.join(words + (['--discover', '--seed', str(args.seed)] if args.discover else []))
 

@@ -4,28 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from importlib import import_module
 from io import TextIOWrapper
 import os
 import sys
 from typing import NoReturn
 
 from ou_monitor import __version__
+from ou_monitor.cli.commands import COMMANDS
 from ou_monitor.errors import InputError, nearest, refusal
-
-# One module a command.  Each has ``add_parser(subparsers)``, which sets the
-# default ``run``: a function of the parsed arguments that returns the exit
-# status.  What is slow to import is imported inside ``run``.
-COMMANDS = {
-    'analyze': 'ou_monitor.cli.analyze',
-    'convert': 'ou_monitor.cli.convert',
-    'coupling': 'ou_monitor.cli.coupling',
-    'design': 'ou_monitor.cli.design',
-    'discover': 'ou_monitor.cli.discover',
-    'fleet': 'ou_monitor.cli.fleet',
-    'reproduce': 'ou_monitor.cli.reproduce',
-    'simulate': 'ou_monitor.cli.simulate',
-}
 
 PROGRAM = 'ou-monitor'
 BAD_INPUT = 2
@@ -51,7 +37,7 @@ def build_parser(commands: Sequence[str] | None = None) -> argparse.ArgumentPars
     subparsers = parser.add_subparsers(
         dest='command', metavar='COMMAND', title='commands', required=True)
     for name in COMMANDS if commands is None else commands:
-        import_module(COMMANDS[name]).add_parser(subparsers)
+        COMMANDS[name].add_to(subparsers)
     return parser
 
 

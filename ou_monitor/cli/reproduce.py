@@ -3,40 +3,18 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import add_json
-from ou_monitor.errors import InputError
+from ou_monitor.cli.arguments import check_outputs
 
 if TYPE_CHECKING:
     from ou_monitor.paper.reproduce.reproduce import Reproduction
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser(
-        'reproduce', allow_abbrev=False,
-        help='recompute every number of the paper, verdict per row',
-        description='Recompute every number of the paper: printed value, recomputed value, and '
-                    'whether it agrees, differs by rounding, or does not hold.')
-    parser.add_argument('--seed', metavar='N', type=int, default=1,
-                        help='same seed, same simulations (default: %(default)s)')
-    add_json(parser)
-    parser.add_argument('--report', metavar='FILE.html',
-                        help='write a self-contained HTML page')
-    parser.set_defaults(run=run)
-
-
 def run(args: argparse.Namespace) -> int:
     """Reproduce."""
-    if args.seed < 0:
-        raise InputError(f'--seed must be 0 or more, got {args.seed}')
-    if args.report == output.STDOUT:
-        raise InputError("--report needs a file: '-' is not supported")
-    output.check_paths({}, {'--json': args.json, '--report': args.report})
-    output.check_writable(args.json)
-    output.check_writable(args.report)
+    check_outputs(args, 'report')
 
     from ou_monitor.paper.reproduce.reproduce import reproduce
     from ou_monitor.paper.reproduce.words import as_data

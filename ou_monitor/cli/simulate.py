@@ -9,7 +9,6 @@ from typing import Any
 from ou_monitor.cli import output
 from ou_monitor.errors import InputError, nearest
 
-TYPES = ('battery_state', 'float32', 'float64', 'adc_block')
 # From this rate on samples travel in blocks unless told otherwise, Hz.
 _BLOCKS_FROM = 5000.0
 # Endings of files that are no bag: a folder of such a name would surprise.
@@ -18,38 +17,6 @@ _NO_BAG = ('.bag', '.bin', '.csv', '.db3', '.json', '.txt', '.ulg', '.yaml', '.y
 _RATE_MOST = 1e9
 # After it stamps would not fit into a bag, s.
 _DURATION_MOST = 9e9
-
-
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the parser."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        'simulate', help='a recording from a model',
-        description='Draw a recording from a model of a supply, exact in law at any rate. '
-                    '--list shows the presets and the throttle profiles.')
-    source = parser.add_mutually_exclusive_group()
-    source.add_argument('--preset', metavar='NAME',
-                        help="what to simulate (default 'flight'; --list shows all)")
-    source.add_argument('--model', metavar='FILE.yaml', type=output.path_argument,
-                        help='model file, as discover writes it')
-    parser.add_argument('--duration', metavar='S', type=float, help='length, s')
-    parser.add_argument('--rate', metavar='HZ', type=float, help='samples per second')
-    parser.add_argument('--seed', metavar='N', type=int, default=1,
-                        help='same seed, same recording (default %(default)s)')
-    parser.add_argument(
-        '--throttle', metavar='PROFILE',
-        help='name of a profile, a number 0..1, points T:U,T:U,..., or a CSV file with time_s '
-             'and throttle')
-    parser.add_argument('--output', metavar='PATH', type=output.path_argument,
-                        help='NAME.mcap for one file, NAME for a rosbag2 folder')
-    parser.add_argument(
-        '--type', choices=TYPES,
-        help='message of the voltage (default battery_state, adc_block from 5 kHz on)')
-    parser.add_argument('--save-model', metavar='FILE.yaml', type=output.path_argument,
-                        help='write the model that was simulated')
-    parser.add_argument('--list', action='store_true', help='list presets and profiles')
-    parser.add_argument('--json', metavar='FILE',
-                        help='write what was simulated (- is standard output)')
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -104,8 +71,6 @@ def run(args: argparse.Namespace) -> int:
     if rate > _RATE_MOST:
         raise InputError(f'--rate must be at most {_RATE_MOST:g} Hz, as bags count in ns; got '
                          f'{rate:g}')
-    if args.seed < 0:
-        raise InputError(f'--seed must be 0 or more, got {args.seed}')
     throttle = preset.throttle if args.throttle is None else args.throttle
     profile = read_profile(throttle)
     kind = args.type or ('adc_block' if rate >= _BLOCKS_FROM else 'battery_state')

@@ -3,8 +3,8 @@
 import json
 import re
 
+from ou_monitor.cli.design import quantity
 from ou_monitor.cli.main import main
-from ou_monitor.cli.quantities import quantity
 from ou_monitor.errors import InputError
 from ou_monitor.paper.network.components import PowerNetwork
 import pytest

@@ -1,9 +1,11 @@
 """`ou-monitor`: which command, which exit status, one line on standard error."""
 
+from dataclasses import replace
 import os
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import ou_monitor
 from ou_monitor.cli import main as cli
@@ -58,10 +60,9 @@ def test_bad_arguments_are_one_line(argv, words, capsys):
 
 def stand_in(monkeypatch, action):
     """Make the command `analyze` do something else."""
-    def add_parser(subparsers):
-        subparsers.add_parser('analyze').set_defaults(run=action)
-
-    monkeypatch.setattr('ou_monitor.cli.analyze.add_parser', add_parser)
+    command = replace(cli.COMMANDS['analyze'], module='stand_in', options=())
+    monkeypatch.setitem(cli.COMMANDS, 'analyze', command)
+    monkeypatch.setitem(sys.modules, 'stand_in', SimpleNamespace(run=action))
 
 
 def test_input_errors_are_one_line_whatever_their_text(monkeypatch, capsys):

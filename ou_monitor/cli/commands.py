@@ -1,0 +1,279 @@
+"""The table of commands: what each is for, where it is, and its options; imports none of them."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+from ou_monitor.cli.output import path_argument
+
+
+class Option:
+    """Names of an option or of an argument, and what argparse knows of it."""
+
+    def __init__(self, *names: str, **keywords: Any) -> None:
+        self.names = names
+        self.keywords = keywords
+
+
+@dataclass(frozen=True)
+class Command:
+    """
+    One command.
+
+    Attributes
+    ----------
+    name : str
+        As on the command line.
+    job : str
+        One line.
+    module : str
+        Where its function ``run(args) -> exit status`` is.
+    description : str
+        Begin of its help.
+    options : tuple
+        Options; a tuple of two or more is a choice of at most one of them.
+    epilog : str
+        End of its help.
+
+    """
+
+    name: str
+    job: str
+    module: str
+    description: str
+    options: tuple[Option | tuple[Option, ...], ...]
+    epilog: str = ''
+
+    def add_to(self, subparsers: Any) -> None:
+        """Add the parser of this command."""
+        parser: argparse.ArgumentParser = subparsers.add_parser(
+            self.name, allow_abbrev=False, help=self.job.replace('%', '%%'),
+            description=self.description, epilog=self.epilog)
+        for option in self.options:
+            choice = option if isinstance(option, tuple) else (option,)
+            group = parser.add_mutually_exclusive_group() if len(choice) > 1 else parser
+            for one in choice:
+                group.add_argument(*one.names, **one.keywords)
+        parser.set_defaults(run=self.run)
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Run the command; return the exit status."""
+        function: Callable[[argparse.Namespace], int] = import_module(self.module).run
+        return function(args)
+
+
+class _WithoutOut(argparse.Action):
+    """A flag that needs no OUT; an optional positional could not follow an option."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
+                 values: Any, option_string: str | None = None) -> None:
+        """Set the flag."""
+        setattr(namespace, self.dest, True)
+        for action in parser._actions:
+            if action.dest == 'out':
+                action.required = False
+
+
+def _flight_number(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 1 on")
+    return int(text)
+
+
+_RECORDING = Option(
+    'recording', metavar='RECORDING',
+    help='.mcap file, rosbag2 folder, or CSV with columns time_s, voltage_v[, throttle]')
+# Which part of a recording is read.
+_PART = (
+    Option('--from', metavar='S', dest='start',
+           help='leave out what comes before, s after the first message'),
+    Option('--to', metavar='S', dest='end',
+           help='leave out what comes from here on, s after the first message'))
+# How a bag is read.
+_TOPICS = (
+    Option('--msg-config', metavar='NAME',
+           help='msg_config that says which topic and field is the voltage'),
+    Option('--voltage-topic', metavar='TOPIC', help='topic of the voltage'),
+    Option('--throttle-topic', metavar='TOPIC', help='topic of the throttle'),
+    Option('--partial', action='store_true', help='use what a truncated file still holds'))
+_JSON = Option('--json', metavar='FILE',
+               help="write the result as JSON ('-': to standard output, alone)")
+_REPORT = Option('--report', metavar='FILE.html', help='write a self-contained HTML page')
+_TYPES = ('battery_state', 'float32', 'float64', 'adc_block')
+
+
+def _seed_number(text: str) -> int:
+    if not text.isascii() or not text.isdigit():
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number, 0 or more")
+    return int(text)
+
+
+def _seed(default: int, text: str = 'same seed, same result') -> Option:
+    return Option('--seed', metavar='N', type=_seed_number, default=default,
+                  help=f'{text} (default: %(default)s)')
+
+
+def _levels(found: str) -> Option:
+    return Option('--levels', metavar='0,0.05,...',
+                  help=f'throttles 0..1 of the load levels (default: {found})')
+
+
+def _estimate(voltage: str) -> tuple[Option, ...]:
+    return (
+        Option('--window', metavar='S', default='2.0',
+               help='window of the sliding estimate, s (default: %(default)s)'),
+        Option('--brownout-voltage', metavar='V', help=voltage),
+        Option('--brownout-horizon', metavar='S', default='5.0',
+               help='horizon of that risk, s (default: %(default)s)'))
+
+
+_ANALYZE = Command(
+    'analyze', 'Vpp, Vrms, alpha, tau, sigma, Var_inf with 95 % intervals per load level',
+    'ou_monitor.cli.analyze',
+    'Analyze the noise of a supply: per load level Vpp, Vrms, alpha, tau, sigma and Var_inf with '
+    '95 % intervals, and the type of process.',
+    (_RECORDING, _levels('found'), *_PART,
+     *_estimate('voltage that must not be undershot, V (default: as the node, 4.5)'),
+     *_TOPICS, _JSON, _REPORT))
+
+_CONVERT = Command(
+    'convert', 'a log becomes an MCAP bag', 'ou_monitor.cli.convert',
+    'Convert a log to a bag with the topics /voltage, /throttle and /current (A, positive when '
+    'the battery is drained). Stamps count from the start of the log, in seconds; those of a CSV '
+    'stay as they are.',
+    (Option('log', metavar='LOG', type=path_argument, help='what to read'),
+     Option('out', metavar='OUT', type=path_argument,
+            help='what to write: NAME.mcap for one file, NAME for a rosbag2 folder'),
+     Option('--list', action=_WithoutOut, nargs=0, default=False,
+            help='show what could be taken, * what would be, and write nothing (without OUT)'),
+     Option('--voltage', metavar='NAME',
+            help='which voltage (default: the battery, if there is one)'),
+     Option('--throttle', metavar='NAME',
+            help="which throttle, or 'none' (default: motors, else what is asked of them, else "
+            'the stick)'),
+     Option('--current', metavar='NAME',
+            help="which current, or 'none' (default: that of the sensor of the voltage)"),
+     Option('--flight', metavar='N', type=_flight_number,
+            help='which flight of a file with several, from 1'),
+     (Option('--drop-held', action='store_true',
+             help='drop voltages that a logger repeats until the ADC is read again'),
+      Option('--drop-repeats', action='store_true',
+             help='as --drop-held; where no steady refresh is found, drop every repeat')),
+     Option('--type', choices=_TYPES, default='battery_state',
+            help='message of the voltage (default %(default)s; adc_block needs a steady 10 kHz)'),
+     _JSON),
+    'Read: PX4 ULog (.ulg), ArduPilot dataflash (.bin, .log), Betaflight and INAV blackbox '
+    '(.bbl, .bfl), CSV with the column time_s; the first bytes decide, not the ending.')
+
+_COUPLING = Command(
+    'coupling', 'gain from the supply voltage to a signal, such as a gyro axis',
+    'ou_monitor.cli.coupling',
+    'Estimate how much noise of the supply is in a signal: gain with 95 % interval and lag, or '
+    'the gain that would have been detected.',
+    (_RECORDING, *_PART,
+     Option('--signal', metavar='NAME', required=True,
+            help='TOPIC/FIELD.PATH of a bag (/imu/angular_velocity.x), or a column'),
+     Option('--band', metavar='LOW,HIGH',
+            help='frequencies looked at, Hz (default: 5 to a quarter of the slower rate)'),
+     Option('--level', metavar='P', default='0.05',
+            help='probability of a false alarm (default: %(default)s)'),
+     *_TOPICS, _JSON))
+
+_DESIGN = Command(
+    'design', 'which capacitance brings the brown-out risk under X at throttle Y',
+    'ou_monitor.cli.design',
+    'Compute alpha, sigma, Var_inf and the brown-out risk of a rail from the components of its '
+    'power network, over bulk capacitances, and the least one that meets a risk.',
+    (Option('--risk', metavar='X',
+            help='probability of a brown-out allowed within the horizon, 0..1'),
+     Option('--throttle', metavar='Y', help='throttle, 0..1'),
+     Option('--rail', choices=('bus', 'regulated'), default='bus',
+            help='the battery bus at the ESCs, or the regulated rail (default: %(default)s)'),
+     Option('--voltage', metavar='V',
+            help='brown-out level, V (default: 3.3 V a cell on the bus; 4.5 V on a regulated rail '
+            'of 5 V, 2.88 V on one of 3.3 V)'),
+     Option('--horizon', metavar='S', default='5', help='horizon, s (default: %(default)s)'),
+     Option('--capacitance-min', metavar='F', default='10uF',
+            help='least capacitance to look at (default: %(default)s)'),
+     Option('--capacitance-max', metavar='F', default='22mF',
+            help='most capacitance to look at (default: %(default)s)'),
+     Option('--esr-fixed', action='store_true',
+            help='keep the ESR (default: ESR falls as 1/C, as of more capacitors of one series in '
+            'parallel)'),
+     Option('--set', metavar='NAME=VALUE', action='append', default=[],
+            help='a component, such as bulk_capacitance=1000uF; may be repeated (see --list)'),
+     Option('--network', metavar='FILE.yaml',
+            help='components as a YAML mapping of name to value; --set goes first'),
+     Option('--list', action='store_true', help='list the components and their defaults'),
+     _JSON),
+    'Values are in SI units, or with prefix and unit: 470uF, 40mOhm, 24kHz.')
+
+_DISCOVER = Command(
+    'discover', 'criticise the simulation, name the cause, extend, measure the gain',
+    'ou_monitor.cli.discover',
+    'Fit and simulate the plain OU, find what it gets wrong, name the cause, extend the model, '
+    'and measure the gain on samples not used for the fit.',
+    (_RECORDING, *_PART, _seed(0), *_TOPICS, _JSON,
+     Option('--save-model', metavar='FILE.yaml',
+            help='write the extended model, for simulate --model and the estimator'),
+     _REPORT))
+
+_FLEET = Command(
+    'fleet', 'many recordings -> a table (Parquet) and a report: outliers, drift of a vehicle',
+    'ou_monitor.cli.fleet',
+    'Analyze many recordings on several processes: one Parquet table with a row for each '
+    'recording and load level, and a report with outliers and with the drift of each vehicle over '
+    'its flights. A run that was stopped goes on where it was: start the same command again.',
+    (Option('recordings', metavar='RECORDING', nargs='+',
+            help='.mcap files, rosbag2 folders, .csv files, and folders to be searched for them'),
+     Option('--output', metavar='DIR', required=True,
+            help='folder for fleet.parquet, fleet.html and the parts of a run'),
+     Option('--workers', metavar='N', help='local processes (default: one a core)'),
+     Option('--scheduler', metavar='ADDRESS',
+            help='Dask scheduler whose workers are used instead, tls://HOST:8786; they need the '
+            'recordings under the same paths'),
+     Option('--insecure', action='store_true',
+            help='let the scheduler be on another machine without TLS'),
+     Option('--vehicle-from', metavar='REGEX',
+            help="finds the vehicle in a recording's path (its first group) where the metadata "
+            'name none (default: the folder it lies in)'),
+     Option('--discover', action='store_true',
+            help='also look for causes; some seconds a recording (default: off)'),
+     _seed(0, 'of discover'), _levels('found in each recording'),
+     *_estimate('also give the risk of going below this voltage, V'), *_TOPICS, _JSON))
+
+_REPRODUCE = Command(
+    'reproduce', 'recompute every number of the paper, verdict per row',
+    'ou_monitor.cli.reproduce',
+    'Recompute every number of the paper: printed value, recomputed value, and whether it agrees, '
+    'differs by rounding, or does not hold.',
+    (_seed(1, 'same seed, same simulations'), _JSON, _REPORT))
+
+_SIMULATE = Command(
+    'simulate', 'a recording from a model', 'ou_monitor.cli.simulate',
+    'Draw a recording from a model of a supply, exact in law at any rate. --list shows the '
+    'presets and the throttle profiles.',
+    ((Option('--preset', metavar='NAME',
+             help="what to simulate (default 'flight'; --list shows all)"),
+      Option('--model', metavar='FILE.yaml', type=path_argument,
+             help='model file, as discover writes it')),
+     Option('--duration', metavar='S', type=float, help='length, s'),
+     Option('--rate', metavar='HZ', type=float, help='samples per second'),
+     _seed(1, 'same seed, same recording'),
+     Option('--throttle', metavar='PROFILE',
+            help='name of a profile, a number 0..1, points T:U,T:U,..., or a CSV file with time_s '
+            'and throttle'),
+     Option('--output', metavar='PATH', type=path_argument,
+            help='NAME.mcap for one file, NAME for a rosbag2 folder'),
+     Option('--type', choices=_TYPES,
+            help='message of the voltage (default battery_state, adc_block from 5 kHz on)'),
+     Option('--save-model', metavar='FILE.yaml', type=path_argument,
+            help='write the model that was simulated'),
+     Option('--list', action='store_true', help='list presets and profiles'), _JSON))
+
+COMMANDS = {command.name: command for command in (
+    _ANALYZE, _CONVERT, _COUPLING, _DESIGN, _DISCOVER, _FLEET, _REPRODUCE, _SIMULATE)}
