@@ -23,6 +23,7 @@ setup(
         (SHARE + '/config', glob('config/*.yaml')),
         (SHARE + '/msg_config', glob('msg_config/*.yaml')),
         (SHARE + '/layouts', glob('layouts/*')),
+        (SHARE + '/security', glob('security/*.xml')),
     ],
     # The bounds are those of scripts/requirements-*.txt; test_package.py compares them.
     install_requires=['numpy>=1.26.4,<3', 'scipy>=1.11.4,<2', 'PyYAML>=6.0.1,<7', 'mcap>=1.1.0,<2',

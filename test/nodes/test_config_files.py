@@ -64,8 +64,10 @@ class Call:
 @pytest.fixture
 def described(monkeypatch):
     """Give what the launch file describes, made with stand-ins of the launch package."""
-    kinds = {'launch': ['LaunchDescription'], 'launch.actions': ['DeclareLaunchArgument'],
-             'launch.substitutions': ['LaunchConfiguration'], 'launch_ros': [],
+    kinds = {'launch': ['LaunchDescription'],
+             'launch.actions': ['DeclareLaunchArgument', 'SetEnvironmentVariable'],
+             'launch.substitutions': ['EnvironmentVariable', 'LaunchConfiguration'],
+             'launch_ros': [],
              'launch_ros.actions': ['Node']}
     for module, classes in kinds.items():
         stand_in = ModuleType(module)
@@ -86,7 +88,20 @@ def test_launch_arguments(described):
     """Namespace, parameter file, simulated time; the file is the shipped one."""
     arguments = {a.args[0]: a.kwargs['default_value']
                  for a in of_kind(described, 'DeclareLaunchArgument')}
+    network = arguments.pop('discovery_range')
     assert arguments == {'namespace': '', 'params_file': str(FILE), 'use_sim_time': 'false'}
+    assert type(network).__name__ == 'EnvironmentVariable'
+    assert network.args == ('ROS_AUTOMATIC_DISCOVERY_RANGE',)
+    assert network.kwargs == {'default_value': 'LOCALHOST'}
+
+
+def test_the_nodes_are_found_on_this_machine_alone(described):
+    """Before they start, the range is set to what the argument says."""
+    kinds = [type(entry).__name__ for entry in described]
+    (setting,) = of_kind(described, 'SetEnvironmentVariable')
+    name, value = setting.args
+    assert name == 'ROS_AUTOMATIC_DISCOVERY_RANGE' and value.args == ('discovery_range',)
+    assert kinds.index('SetEnvironmentVariable') < kinds.index('Node')
 
 
 def test_launch_nodes(described):
@@ -99,6 +114,7 @@ def test_launch_nodes(described):
         assert node.kwargs['package'] == 'ou_monitor'
         assert f'{name} = ou_monitor.nodes.{name}:main' in setup
         assert node.kwargs['namespace'].args == ('namespace',)
+        assert node.kwargs['ros_arguments'] == ['--enclave', f'/ou_monitor/{name}']
         file, extra = node.kwargs['parameters']
         assert file.args == ('params_file',)
         assert extra['use_sim_time'].args == ('use_sim_time',)

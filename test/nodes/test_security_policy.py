@@ -1,0 +1,143 @@
+"""security/ou_monitor_policy.xml: of SROS2's form, and of exactly what the nodes open."""
+
+import time
+import xml.etree.ElementTree as ElementTree
+
+from live import wait_until
+from project import ROOT
+import pytest
+
+FILE = ROOT / 'security' / 'ou_monitor_policy.xml'
+# Of SROS2's schema 0.2.0: element -> its attributes (required, optional) and its children.
+FORM = {
+    'policy': ({'version'}, set(), {'enclaves'}), 'enclaves': (set(), set(), {'enclave'}),
+    'enclave': ({'path'}, set(), {'profiles'}), 'profiles': (set(), {'type'}, {'profile'}),
+    'profile': ({'ns', 'node'}, set(), {'topics', 'services', 'actions'}),
+    'topics': (set(), {'publish', 'subscribe'}, {'topic'}),
+    'services': (set(), {'reply', 'request'}, {'service'}),
+    'topic': (set(), set(), set()), 'service': (set(), set(), set()),
+}
+# Where a node says what it has opened.
+ASK = {'publish': 'get_publisher_names_and_types_by_node',
+       'subscribe': 'get_subscriber_names_and_types_by_node',
+       'reply': 'get_service_names_and_types_by_node'}
+
+
+def complaints(element: ElementTree.Element) -> list[str]:
+    """Return where a tree leaves the form."""
+    required, optional, inside = FORM[element.tag]
+    given = set(element.attrib)
+    wrong = [f'{element.tag}: attributes {sorted(given)}'] if not (
+        required <= given <= required | optional) else []
+    if optional and element.tag != 'profiles':
+        wrong += [f'{element.tag}: {element.attrib}'] if not given or set(
+            element.attrib.values()) - {'ALLOW', 'DENY'} else []
+    if bool(inside) != bool(len(element)) or any(child.tag not in inside for child in element):
+        wrong.append(f'{element.tag}: holds {[child.tag for child in element]}')
+    if not inside and not (element.text or '').strip():
+        wrong.append(f'{element.tag}: empty')
+    return wrong + [text for child in element if child.tag in FORM for text in complaints(child)]
+
+
+def policy() -> ElementTree.Element:
+    """Return the shipped policy."""
+    return ElementTree.parse(FILE).getroot()
+
+
+def allowed(executable: str) -> dict[str, set[str]]:
+    """Return the full names that an executable may publish, subscribe, reply and request."""
+    (profile,) = policy().iterfind(f'.//enclave[@path="/ou_monitor/{executable}"]//profile')
+    names: dict[str, set[str]] = {}
+    for group in profile:
+        ((verb, rule),) = group.attrib.items()
+        assert rule == 'ALLOW' and verb not in names
+        space, node = profile.get('ns', '').rstrip('/'), profile.get('node')
+        # As SROS2's permissions.xsl makes full names.
+        listed = [item.text if item.text.startswith('/') else f'{space}/{node}{item.text[1:]}'
+                  if item.text.startswith('~') else f'{space}/{item.text}' for item in group]
+        assert len(listed) == len(set(listed))
+        names[verb] = set(listed)
+    return names
+
+
+def test_the_form_is_that_of_sros2():
+    """Elements, attributes and version are those of the schema; each enclave is there once."""
+    root = policy()
+    assert root.tag == 'policy' and root.get('version') == '0.2.0' and complaints(root) == []
+    paths = [enclave.get('path') for enclave in root.iter('enclave')]
+    assert paths == [f'/ou_monitor/{name}' for name in (
+        'estimator', 'adaptive_filter', 'replay', 'operator')]
+
+
+@pytest.mark.parametrize('change', [
+    lambda root: root.attrib.pop('version'),
+    lambda root: root.find('.//profile').attrib.pop('ns'),
+    lambda root: root.find('.//topics').set('publish', 'MAYBE'),
+    lambda root: root.find('.//topics').append(ElementTree.Element('service')),
+    lambda root: root.find('.//services').clear(),
+])
+def test_another_form_is_found(change):
+    """The check above can fail."""
+    root = policy()
+    change(root)
+    assert complaints(root)
+
+
+def opened(probe, node: str) -> dict[str, set[str]]:
+    """Return the full names that a node has opened."""
+    from rclpy.node import NodeNameNonExistentError
+    try:
+        return {verb: {name for name, _ in getattr(probe.node, method)(node, '/')}
+                for verb, method in ASK.items()}
+    except NodeNameNonExistentError:
+        return dict.fromkeys(ASK, set())
+
+
+def compare(probe, executable: str, node: str) -> None:
+    """Wait until a node has opened what the policy allows, and nothing else."""
+    wanted = allowed(executable)
+    wanted.setdefault('subscribe', set())
+    wait_until(lambda: all(wanted[verb] <= names for verb, names in opened(probe, node).items()),
+               what=f'{node} to open {wanted}; it has {opened(probe, node)}')
+    # What would come later is no part of the policy either.
+    time.sleep(0.5)
+    assert opened(probe, node) == wanted, 'change security/ou_monitor_policy.xml with the node'
+
+
+def test_the_estimator_opens_what_the_policy_allows(world):
+    """With both inputs found and time from /clock, which is all that it can open."""
+    from std_msgs.msg import Float32
+    world.start('estimator', '--ros-args', '-p', 'use_sim_time:=true')
+    probe = world.probe()
+    outputs = [probe.publisher(topic, Float32) for topic in ('/voltage', '/throttle')]
+    compare(probe, 'estimator', 'ou_estimator')
+    assert len(outputs) == 2
+
+
+def test_the_filter_opens_what_the_policy_allows(world):
+    """With its input found, and wired as the launch file does."""
+    from std_msgs.msg import Float32
+    world.start('adaptive_filter', '--ros-args', '-p', 'use_sim_time:=true', '-r',
+                'sigma:=ou_estimator/sigma', '-r', 'state:=ou_estimator/state')
+    probe = world.probe()
+    output = probe.publisher('/input', Float32)
+    compare(probe, 'adaptive_filter', 'ou_adaptive_filter')
+    assert output.topic_name == '/input'
+
+
+def test_replay_opens_what_the_policy_allows(world):
+    """A bag with voltage and throttle, and the clock."""
+    world.start('replay', str(ROOT / 'bags' / 'flight'), '--loop', '--rate', '0.5')
+    compare(world.probe(), 'replay', 'ou_replay')
+
+
+def test_only_the_operator_may_call():
+    """It may set the parameters of both nodes and clear the latch; they may call nobody."""
+    operator = allowed('operator')
+    for name in ('estimator', 'adaptive_filter', 'replay'):
+        assert 'request' not in allowed(name)
+        served = {service for service in allowed(name)['reply']
+                  if not service.endswith('get_type_description')}
+        assert served <= operator['request']
+    assert operator['subscribe'] <= {'/clock'} | allowed('estimator')['publish'] | allowed(
+        'adaptive_filter')['publish']
