@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.layout import Layout, layout_of, parse_definition, Rows, short_name
@@ -41,6 +42,8 @@ class Column:
     stamp : ndarray, shape (m,)
         Stamps of the messages (of the LAST sample of a block), s; the log
         time where a message has none.
+    stamped : ndarray of bool, shape (m,)
+        Whether the message carries its stamp.
     count : ndarray of int64, shape (m,)
         Values in each message; 0 where the field's array is too short.
     values : ndarray, shape (count.sum(),)
@@ -50,6 +53,7 @@ class Column:
 
     log_time: TimeArray
     stamp: FloatArray
+    stamped: npt.NDArray[np.bool_]
     count: IntArray
     values: FloatArray
 
@@ -65,13 +69,16 @@ class Column:
         else:
             begins = np.cumsum(self.count) - self.count
             values = self.values[_spread(begins[order], self.count[order])]
-        return Column(self.log_time[order], self.stamp[order], self.count[order], values)
+        return Column(self.log_time[order], self.stamp[order], self.stamped[order],
+                      self.count[order], values)
 
     def split(self, at: int) -> tuple[Column, Column]:
         """Return the first `at` messages, and the rest."""
         cut = int(self.count[:at].sum())
-        return (Column(self.log_time[:at], self.stamp[:at], self.count[:at], self.values[:cut]),
-                Column(self.log_time[at:], self.stamp[at:], self.count[at:], self.values[cut:]))
+        return (Column(self.log_time[:at], self.stamp[:at], self.stamped[:at], self.count[:at],
+                       self.values[:cut]),
+                Column(self.log_time[at:], self.stamp[at:], self.stamped[at:], self.count[at:],
+                       self.values[cut:]))
 
     def in_time_order(self) -> Column:
         """Return the messages by log time; those of one time as they are."""
@@ -87,6 +94,7 @@ def join(parts: Sequence[Column]) -> Column:
     return Column(
         np.concatenate([np.empty(0, np.uint64), *(part.log_time for part in parts)]),
         np.concatenate([np.empty(0), *(part.stamp for part in parts)]),
+        np.concatenate([np.empty(0, np.bool_), *(part.stamped for part in parts)]),
         np.concatenate([np.empty(0, np.int64), *(part.count for part in parts)]),
         np.concatenate([np.empty(0), *(part.values for part in parts)]))
 
@@ -154,7 +162,7 @@ class FieldReader:
     def read(self, table: Table) -> Column:
         """Return the field of the messages of a table, in its order."""
         logged = seconds(table.log_time)
-        stamp = logged.copy()
+        stamp = np.full(table.n, np.nan)
         count = np.ones(table.n, np.int64)
         bulk: list[tuple[IntArray, FloatArray]] = []
         rest: list[IntArray] = []
@@ -180,9 +188,11 @@ class FieldReader:
             if found.stamp is not None:
                 stamp[k] = found.stamp
         self.general += len(single)
+        stamped = ~np.isnan(stamp)
+        stamp = np.where(stamped, stamp, logged)
         if not single and not broken and len(bulk) == 1:
             # All alike, and in order.
-            return Column(table.log_time, stamp, count, bulk[0][1].reshape(-1))
+            return Column(table.log_time, stamp, stamped, count, bulk[0][1].reshape(-1))
         begin = np.cumsum(count) - count
         values = np.empty(int(count.sum()))
         for picked, block in bulk:
@@ -190,10 +200,10 @@ class FieldReader:
         for k, block in single.items():
             values[begin[k]:begin[k] + block.size] = block
         if not broken:
-            return Column(table.log_time, stamp, count, values)
+            return Column(table.log_time, stamp, stamped, count, values)
         kept = np.ones(table.n, dtype=bool)
         kept[broken] = False
-        return Column(table.log_time[kept], stamp[kept], count[kept], values)
+        return Column(table.log_time[kept], stamp[kept], stamped[kept], count[kept], values)
 
     def _in_bulk(
         self, table: Table, left: IntArray, length: int, stamp: FloatArray,

@@ -17,11 +17,12 @@ import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.columns import batches, Column, last_before
-from ou_monitor.recordings.mcap_records import moment
+from ou_monitor.recordings.mcap_records import IntArray, moment, TimeArray
 from ou_monitor.recordings.topic_choice import choose
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.blocks import BlockClock
 from ou_monitor.stream.config import FieldSpec
+from ou_monitor.stream.throttle import BoolArray, ThrottleHold
 
 VOLTAGE, THROTTLE = 'voltage', 'throttle'
 # Squares and cubes of what is beyond this overflow; no supply comes near it.
@@ -103,13 +104,14 @@ class _Series:
     def __init__(self, spec: FieldSpec) -> None:
         self.clock = None if spec.sample_rate is None else BlockClock(spec.sample_rate)
 
-    def samples(self, column: Column) -> tuple[FloatArray, FloatArray]:
-        """Return stamps (s) and values, NaN where a message holds none."""
+    def samples(self, column: Column) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Return stamps (s), values (NaN where a message holds none), and samples a message."""
         if self.clock is not None:
-            return self.clock.stamps_of_many(column.stamp, column.count), column.values
+            return (self.clock.stamps_of_many(column.stamp, column.count), column.values,
+                    column.count)
         values = np.full(column.n, np.nan)
         values[column.count > 0] = column.values
-        return column.stamp, values
+        return column.stamp, values, np.ones(column.n, np.int64)
 
 
 class SampleReader:
@@ -171,9 +173,7 @@ class SampleReader:
             # The bag knows better than a config that is made for many.
             spec = replace(spec, sample_rate=stated)
         self._specs = {VOLTAGE: spec}
-        # Stamps within a block are worked out, and may be a rounding short of a
-        # throttle that was meant to hold for that sample.
-        self._slack = 0.0 if spec.sample_rate is None else 0.1 / spec.sample_rate
+        self._hold = ThrottleHold(spec.sample_rate)
         self._series = {VOLTAGE: _Series(spec)}
         if choice.throttle is not None:
             self.source |= {'throttle_topic': choice.throttle.topic,
@@ -192,8 +192,8 @@ class SampleReader:
         self.held = 0
         self._newest = self._highest = self._taken = -math.inf
         self._largest = self._back = 0.0
-        self._throttle_t, self._throttle = np.empty(0), np.empty(0)
-        self._fresh: list[tuple[FloatArray, FloatArray]] = []
+        # Throttle that no voltage has followed yet: stamps, values, whether stamped, log times.
+        self._waiting: list[tuple[FloatArray, FloatArray, BoolArray, TimeArray]] = []
         self._tally = dict.fromkeys((
             'dropped', 'late', 'mixed', 'repeated', 'too_late', 'throttle', 'undecodable'), 0)
         self._undecodable = ''
@@ -229,7 +229,9 @@ class SampleReader:
             f'{error} ({moment(log_time, self._bag.start_ns)})')
 
     def _add_voltage(self, column: Column) -> None:
-        t, voltage = self._series[VOLTAGE].samples(column)
+        t, voltage, sizes = self._series[VOLTAGE].samples(column)
+        self._place_throttle(t[np.cumsum(sizes)[sizes > 0] - 1], column.stamped[sizes > 0],
+                             column.log_time[sizes > 0])
         good = usable_voltage(t, voltage)
         if not good.all():
             self._tally['dropped'] += t.size - int(good.sum())
@@ -248,14 +250,30 @@ class SampleReader:
         self.held += t.size
 
     def _add_throttle(self, column: Column) -> None:
-        t, values = self._series[THROTTLE].samples(column)
+        t, values, sizes = self._series[THROTTLE].samples(column)
         known = np.isfinite(t)
         if self._specs[THROTTLE].nan == 'drop':
             finite = np.isfinite(values)
             self._tally['throttle'] += int(np.count_nonzero(~finite))
             known &= finite
         check_throttle(self.name, values[known])
-        self._fresh.append((t[known], values[known]))
+        self._waiting.append((t[known], values[known], np.repeat(column.stamped, sizes)[known],
+                              np.repeat(column.log_time, sizes)[known]))
+
+    def _place_throttle(self, stamps: FloatArray, stamped: BoolArray, log_time: TimeArray
+                        ) -> None:
+        """Place the throttle that waits, beside voltage messages (stamps in s)."""
+        if not (self._waiting and (stamps.size or self._newest > -math.inf)):
+            # Nothing to place, or no voltage to place it beside.
+            none = np.empty(0)
+            self._hold.take(none, none, none > 0.0, stamps, stamped, none.astype(np.int64))
+            return
+        own, values, carried, logged = (
+            np.concatenate([part[k] for part in self._waiting]) for k in range(4))
+        self._waiting = []
+        # Of a voltage and a throttle logged at one time, the throttle counts as first.
+        self._hold.take(own, values, carried, stamps, stamped,
+                        np.searchsorted(log_time, logged, 'left'))
 
     def take(self, most: int | None = None) -> Recording:
         """Return the first samples held, in order, each stamp once; they are held no longer."""
@@ -278,24 +296,11 @@ class SampleReader:
         t, voltage = t[fresh], voltage[fresh]
         if t.size:
             self._taken = float(t[-1])
-        return Recording(t, voltage, self._held_throttle(t), self.name, dict(self.source))
-
-    def _held_throttle(self, t: FloatArray) -> FloatArray:
-        """Return the throttle at stamps that come after all before; forget what is older."""
-        if self._fresh:
-            stamps = np.concatenate([self._throttle_t, *(part[0] for part in self._fresh)])
-            values = np.concatenate([self._throttle, *(part[1] for part in self._fresh)])
-            order = np.argsort(stamps, kind='stable')
-            self._throttle_t, self._throttle, self._fresh = stamps[order], values[order], []
-        # From which sample on each throttle holds: both are in order, and throttles are few.
-        first = np.searchsorted(t + self._slack, self._throttle_t, 'left')
-        edges = np.concatenate([[0], first, [t.size]])
-        held = np.repeat(np.append(np.nan, self._throttle), np.diff(edges))
+        self._place_throttle(np.empty(0), np.empty(0, np.bool_), np.empty(0, np.uint64))
+        throttle = self._hold.at(t)
         if t.size:
-            past = int(np.searchsorted(self._throttle_t, t[-1] + self._slack, 'right')) - 1
-            self._throttle_t = self._throttle_t[max(past, 0):]
-            self._throttle = self._throttle[max(past, 0):]
-        return held
+            self._hold.forget_before(self._taken)
+        return Recording(t, voltage, throttle, self.name, dict(self.source))
 
     def bag_notes(self) -> tuple[str, ...]:
         """Return what is to be said before any sample is read."""

@@ -15,10 +15,7 @@ from typing import Any
 import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.records import FloatArray
-from ou_monitor.stream.blocks import BlockClock
 from ou_monitor.stream.config import FieldPath, FieldSpec, parse_field_path
-
-__all__ = ['BlockClock', 'Extracted', 'Extractor', 'FieldPath', 'parse_field_path']
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +66,7 @@ class Extractor:
         self._stamp = None if spec.stamp_field is None else self._getter(spec.stamp_field)
 
     def extract(self, msg: object) -> Extracted:
-        """Return the stamp and the values of one message (msg in A)."""
+        """Return the stamp and the values of one message."""
         stamp = None if self._stamp is None else self._read_stamp(self._stamp(msg))
         raw = self._value(msg)
         if raw is None:

@@ -1,68 +1,231 @@
-"""The throttle that held at a stamp."""
+"""The throttle that held when a sample was taken: the rule, and node and bench side by side."""
 
-from hypothesis import given, strategies as st
+import math
+from types import SimpleNamespace
+
+from hypothesis import example, given, HealthCheck, settings, strategies as st
 import numpy as np
-from ou_monitor.stream.throttle import FEW, hold_last, ThrottleHold
+from ou_monitor.recordings.bag import BagWriter
+from ou_monitor.recordings.read import read_recording
+from ou_monitor.stream.config import load_msg_config
+from ou_monitor.stream.extract import Extractor
+from ou_monitor.stream.sample_stream import SampleStream
+from ou_monitor.stream.throttle import APART, APART_MIXED, ThrottleHold
 import pytest
 
-STAMPS = st.floats(0.0, 10.0).map(lambda x: round(x, 2))
+STAMPS = st.floats(0.0, 4.0).map(lambda x: round(x, 2))
+
+
+def hold_of(pushed, newest=2.0, own=True, voltage_own=True):
+    """Return a hold with throttle (stamp, value) that came after one voltage message."""
+    hold = ThrottleHold()
+    stamps, values = np.array(pushed, dtype=float).reshape(-1, 2).T
+    hold.take(stamps, values, np.full(stamps.size, own), np.array([newest]),
+              np.array([voltage_own]), np.ones(stamps.size, int))
+    return hold
 
 
 @given(
     st.lists(st.tuples(STAMPS, st.floats(0.0, 1.0)), max_size=30),
-    st.lists(STAMPS, min_size=1, max_size=2 * FEW))
+    st.lists(STAMPS, min_size=1, max_size=60))
 def test_agrees_with_its_definition(pushed, asked):
-    """The value of the latest stamp at or before; of equal stamps the later push."""
-    hold = ThrottleHold()
-    for stamp, value in pushed:
-        hold.push(stamp, value)
+    """The value of the latest stamp at or before; of equal stamps the later message."""
+    hold = hold_of(pushed)
     expected = []
     for at in asked:
         before = [(stamp, place) for place, (stamp, _) in enumerate(pushed) if stamp <= at]
         expected.append(pushed[max(before)[1]][1] if before else np.nan)
-    np.testing.assert_array_equal(hold.at(asked), expected)
-    # Few and many stamps go different ways.
-    np.testing.assert_array_equal(hold.at(asked * FEW), expected * FEW)
+    np.testing.assert_array_equal(hold.at(np.array(asked)), expected)
+    # Stamps in order, and more of them than of throttles, go another way.
+    order = np.argsort(asked, kind='stable')
+    np.testing.assert_array_equal(hold.at(np.repeat(np.array(asked)[order], 31)),
+                                  np.repeat(np.array(expected)[order], 31))
 
 
-def test_memory_is_bounded():
-    """Only the newest are kept; what was forgotten is unknown, not wrong."""
-    hold = ThrottleHold(keep=10)
-    for k in range(1000):
-        hold.push(float(k), k / 1000.0)
-    assert len(hold) == 10
-    np.testing.assert_array_equal(hold.at([989.5, 990.0, 2000.0]), [np.nan, 0.990, 0.999])
+def test_what_no_sample_can_meet_is_forgotten():
+    """Only the value that holds at the stamp and those after it are kept."""
+    hold = hold_of([(k / 1000.0, k / 1000.0) for k in range(1000)])
+    hold.forget_before(0.9895)
+    assert len(hold) == 11
+    np.testing.assert_array_equal(hold.at(np.array([0.9885, 0.9895, 0.99, 2000.0])),
+                                  [np.nan, 0.989, 0.99, 0.999])
 
 
 def test_unknown_holds_too():
-    """A NaN says "unknown from here on"; a stamp that is none has no place."""
+    """A NaN says "unknown from here on"."""
+    hold = hold_of([(1.0, 0.5), (2.0, math.nan)])
+    np.testing.assert_array_equal(hold.at(np.array([0.5, 1.5, 2.5])), [np.nan, 0.5, np.nan])
+
+
+def test_nothing():
+    """An empty hold knows nothing, and a new time line begins with what is said to hold."""
     hold = ThrottleHold()
-    hold.push(1.0, 0.5)
-    hold.push(2.0, float('nan'))
-    hold.push(float('nan'), 0.9)
-    np.testing.assert_array_equal(hold.at([1.5, 2.5]), [0.5, np.nan])
-    assert len(hold) == 2
+    assert np.isnan(hold.at(np.array([1.0]))).all() and hold.at(np.empty(0)).shape == (0,)
+    hold = hold_of([(1.0, 0.3)])
+    hold.restart()
+    assert np.isnan(hold.at(np.array([1.0]))).all()
+    hold.restart(0.4)
+    assert hold.at(np.array([-5.0])).tolist() == [0.4]
 
 
-def test_scalars_and_nothing():
-    """A scalar is one stamp; an empty hold knows nothing."""
-    hold = ThrottleHold()
-    assert np.isnan(hold.at(1.0)).all() and hold.at(1.0).shape == (1,)
-    assert hold.at([]).shape == (0,)
-    hold.push(1.0, 0.3)
-    assert hold.at(1.0).tolist() == [0.3]
-    hold.clear()
-    assert np.isnan(hold.at(1.0)[0])
+@pytest.mark.parametrize('own, voltage_own, apart', [
+    (True, True, APART), (False, False, APART), (True, False, APART_MIXED),
+    (False, True, APART_MIXED)])
+@pytest.mark.parametrize('side', [-1.0, 1.0])
+def test_clocks_that_differ(own, voltage_own, apart, side):
+    """Beyond what two messages of one clock can differ by, a throttle holds from its arrival."""
+    at = np.array([9.0, 10.0, 10.001, 20.0])
+    near = hold_of([(10.0 + side * 0.99 * apart, 0.5)], 10.0, own, voltage_own)
+    far = hold_of([(10.0 + side * 1.01 * apart, 0.5)], 10.0, own, voltage_own)
+    np.testing.assert_array_equal(near.at(at), np.where(at >= 10.0 + side * 0.99 * apart, 0.5,
+                                                        np.nan))
+    np.testing.assert_array_equal(far.at(at), [np.nan, np.nan, 0.5, 0.5])
 
 
-def test_hold_last_on_arrays():
-    """The same rule for whole recordings."""
-    held = hold_last(np.array([1.0, 2.0]), np.array([0.1, 0.2]), [3.0, 0.5, 1.0, 1.99])
-    np.testing.assert_array_equal(held, [0.2, np.nan, 0.1, 0.1])
-    assert np.isnan(hold_last(np.empty(0), np.empty(0), [1.0])).all()
+def test_arrivals_keep_their_order():
+    """A throttle placed by its arrival does not come before one that was there already."""
+    hold = hold_of([(14.0, 0.1), (15.5, 0.2), (16.0, 0.3)], newest=10.0)
+    np.testing.assert_array_equal(hold.at(np.array([10.5, 13.9, 14.0, 20.0])),
+                                  [np.nan, np.nan, 0.3, 0.3])
 
 
-def test_keep_below_one():
-    """A caller's bug."""
-    with pytest.raises(ValueError, match='0'):
-        ThrottleHold(keep=0)
+# -- node and bench
+
+TYPES = {'x_msgs/msg/Sample': 'float64 stamp\nfloat64 data\n',
+         'x_msgs/msg/Block': 'float64 stamp\nfloat64[] data\n'}
+RATE = 200.0
+EPOCH = 1_700_000_000
+
+
+def config_of(folder, blocks, nan):
+    """Return the path of a msg config; `blocks` of (voltage, throttle)."""
+    path = folder / f'x{blocks[0]:d}{blocks[1]:d}{nan}.yaml'
+    text = ('description: test\npackage: x_msgs\ninstall: nothing\ngeneric: false\n')
+    for name, block in zip(('voltage', 'throttle'), blocks, strict=True):
+        kind = 'x_msgs/msg/Block' if block else 'x_msgs/msg/Sample'
+        text += (f'{name}:\n  topic: /{name}\n  type: {kind}\n  field: data\n  nan: {nan}\n'
+                 '  stamp_field: stamp\n')
+        text += f'  sample_rate: {RATE}\n' if block else ''
+    path.write_text(text)
+    return path
+
+
+def bench(folder, config, messages, blocks):
+    """Return {(t, voltage): throttle} as a bag of the messages is read."""
+    path = folder / 'bag.mcap'
+    path.unlink(missing_ok=True)
+    with BagWriter(path) as bag:
+        for name, block in zip(('voltage', 'throttle'), blocks, strict=True):
+            kind = 'x_msgs/msg/Block' if block else 'x_msgs/msg/Sample'
+            bag.add_topic('/' + name, kind, schema=TYPES[kind])
+        for name, logged, stamp, data in messages:
+            bag.write('/' + name, logged, {'stamp': stamp, 'data': data})
+    recording = read_recording(path, msg_config=config)
+    return dict(zip(zip(recording.t.tolist(), recording.voltage.tolist(), strict=True),
+                    recording.throttle.tolist(), strict=True))
+
+
+class Sink:
+    """Stands where the monitor stands; notes pairs, and how many messages had come by then."""
+
+    def __init__(self):
+        self.pairs, self.resets = [], 0
+        self.come = 0
+
+    def push(self, t, voltage, throttle):
+        """Note samples."""
+        self.pairs += [(self.come, *row) for row in zip(
+            t.tolist(), voltage.tolist(), throttle.tolist(), strict=True)]
+
+    def reset(self, reason):
+        """Note a reset."""
+        self.resets += 1
+
+
+def node(config, messages, flushes):
+    """Return (messages come, t, voltage, throttle) of what the node hands to its monitor."""
+    config = load_msg_config(config)
+    sink = Sink()
+    stream = SampleStream(sink)
+    stream.open_voltage(Extractor(config.voltage))
+    stream.open_throttle(Extractor(config.throttle))
+    for sink.come, (name, logged, stamp, data) in enumerate(messages, 1):
+        take = stream.take_voltage if name == 'voltage' else stream.take_throttle
+        # As `recordings` turns ns into s.
+        take(SimpleNamespace(stamp=stamp, data=data),
+             lambda at=logged: at // 10**9 + at % 10**9 * 1e-9)
+        if sink.come in flushes:
+            stream.flush()
+    stream.flush()
+    assert not sink.resets
+    return sink.pairs
+
+
+@st.composite
+def recordings(draw):
+    """Draw messages in order of arrival: any rates, late by any amount that is no step back."""
+    blocks = draw(st.tuples(st.booleans(), st.booleans()))
+    stamped = dict(voltage=draw(st.booleans()), throttle=draw(st.booleans()))
+    # Seconds between the throttle's own clock and the voltage's.
+    offset = draw(st.sampled_from([0.0, 0.0, 0.1, -2.0, 3600.0, -1.69e9]))
+    steps = dict(voltage=draw(st.sampled_from([0.01, 0.3, 7.0])),
+                 throttle=draw(st.sampled_from([0.01, 0.3, 7.0])))
+    messages = []
+    logged = EPOCH * 10**9
+    for k in range(draw(st.integers(2, 25))):
+        name = draw(st.sampled_from(['voltage', 'voltage', 'throttle']))
+        logged += 1 + draw(st.integers(0, 1000)) * round(steps[name] * 1e6)
+        late = draw(st.floats(0.0, 0.09))
+        # A stamp now and then left out is a step of the clock, unless the clocks agree.
+        own = stamped[name] and (offset != 0.0 or draw(st.integers(0, 9)) > 0)
+        stamp = logged * 1e-9 - late + (offset if name == 'throttle' else 0.0)
+        value = 1.0 + k if name == 'voltage' else round(draw(st.floats(0.0, 1.0)), 3)
+        if name == 'throttle' and draw(st.integers(0, 7)) == 0:
+            value = math.nan
+        block = blocks[name == 'throttle']
+        messages.append((name, logged, stamp if own else 0.0,
+                         [value + j * 1e-3 for j in range(draw(st.integers(0, 4)))]
+                         if block else value))
+    return messages, blocks, draw(st.sampled_from(['drop', 'unknown'])), draw(
+        st.sets(st.integers(1, 25), max_size=3))
+
+
+ONE = [('voltage', EPOCH * 10**9, EPOCH + 0.1, 1.0)]
+
+
+@settings(max_examples=60, deadline=None,
+          suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(recordings())
+@example((ONE + [('throttle', EPOCH * 10**9 + 1, EPOCH + 0.05, 0.5)], (False, False), 'drop',
+          set()))
+@example((ONE + [('throttle', EPOCH * 10**9 + 1, EPOCH + 0.05, 0.5)], (False, False), 'drop',
+          {1}))
+def test_node_and_bench_pair_alike(tmp_path, drawn):
+    """What the node knew when it handed a sample on is what the bench reads up to there."""
+    messages, blocks, nan, flushes = drawn
+    config = config_of(tmp_path, blocks, nan)
+    if blocks[0] and not any(name == 'voltage' and data for name, _, _, data in messages) or (
+            not any(name == 'voltage' for name, *_ in messages)):
+        return
+    pairs = node(config, messages, flushes)
+    for come in {pair[0] for pair in pairs}:
+        read = bench(tmp_path, config, messages[:come], blocks)
+        mine = {(t, v): u for at, t, v, u in pairs if at == come}
+        # Of samples with one stamp the bench keeps the first.
+        assert {t for t, _ in mine} <= {t for t, _ in read}
+        alike = [(mine[key], read[key]) for key in mine.keys() & read.keys()]
+        if alike:
+            np.testing.assert_array_equal(*zip(*alike, strict=True))
+
+
+def test_late_throttle(tmp_path):
+    """It changes what the bench reads, and what the node has not handed on yet; no more."""
+    messages = [('throttle', EPOCH * 10**9, EPOCH + 0.0, 0.1)]
+    messages += [('voltage', EPOCH * 10**9 + k, EPOCH + 0.01 * k, float(k)) for k in range(1, 7)]
+    messages += [('throttle', EPOCH * 10**9 + 9, EPOCH + 0.025, 0.7)]
+    config = config_of(tmp_path, (False, False), 'drop')
+    assert list(bench(tmp_path, config, messages, (False, False)).values()) == [
+        0.1, 0.1, 0.7, 0.7, 0.7, 0.7]
+    assert [u for *_, u in node(config, messages, ())] == [0.1, 0.1, 0.7, 0.7, 0.7, 0.7]
+    # Handed on after the fourth sample: only what is paired later knows.
+    assert [u for *_, u in node(config, messages, {5})] == [0.1, 0.1, 0.1, 0.1, 0.7, 0.7]

@@ -3,7 +3,8 @@
 import math
 from types import SimpleNamespace
 
-from ou_monitor.nodes.sample_stream import SampleStream
+import numpy as np
+from ou_monitor.stream.sample_stream import SampleStream
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.stream.extract import Extractor
 import pytest
@@ -61,14 +62,49 @@ def test_pairs_by_stamp_on_one_clock():
 
 
 def test_pairs_by_arrival_when_only_one_is_stamped():
-    """The source time of the throttle cannot be compared with a driver's stamp."""
+    """A source time may lie off a driver's stamps by less than two clocks usually do."""
     stream, sink = stream_of('stamp', None)
     stream.take_voltage(stamped(1.0, 5.0), None)
-    stream.take_throttle(plain(0.3), lambda: 1.0)
+    stream.take_throttle(plain(0.3), lambda: 0.5)
     stream.take_voltage(stamped(2.0, 5.0), None)
     stream.take_throttle(plain(0.4), lambda: 1.5)
     stream.flush()
     assert math.isnan(sink.u[0]) and sink.u[1] == 0.3
+
+
+def test_pairs_by_stamp_when_only_one_is_stamped_and_the_clocks_agree():
+    """As the bench does with a bag of such messages."""
+    stream, sink = stream_of('stamp', None)
+    for k in range(4):
+        stream.take_voltage(stamped(1.0 + 0.01 * k, 5.0), None)
+    stream.take_throttle(plain(0.3), lambda: 1.015)
+    stream.flush()
+    np.testing.assert_array_equal(sink.u, [math.nan, math.nan, 0.3, 0.3])
+
+
+def test_throttle_without_voltage_takes_no_more_memory_than_it_may():
+    """The newest are kept, and hold when the voltage comes."""
+    stream, sink = stream_of()
+    for k in range(5000):
+        stream.take_throttle(plain(k / 5000.0), lambda at=k: 0.001 * at)
+    stream.flush()
+    stream.take_voltage(plain(5.0), lambda: 4.9985)
+    stream.take_voltage(plain(5.0), lambda: 3.5)
+    stream.flush()
+    assert sink.u[0] == 4998 / 5000.0
+
+
+def test_a_throttle_that_goes_back_starts_anew():
+    """As in a bag that is replayed in a loop: what came before does not hold after it."""
+    stream, sink = stream_of('stamp', 'stamp')
+    stream.take_throttle(stamped(4.0, 0.9), None)
+    stream.take_voltage(stamped(4.01, 5.0), None)
+    stream.take_throttle(stamped(1.0, 0.1), None)
+    stream.take_voltage(stamped(1.01, 5.0), None)
+    stream.take_throttle(stamped(1.02, 0.2), None)
+    stream.take_voltage(stamped(4.03, 5.0), None)
+    stream.flush()
+    assert sink.u == [0.9, 0.1, 0.2] and len(sink.resets) == 1
 
 
 def test_pairs_by_arrival_when_the_clocks_differ():
