@@ -165,11 +165,11 @@ def node(config, messages, flushes):
 def recordings(draw):
     """Draw messages in order of arrival: any rates, late by any amount that is no step back."""
     blocks = draw(st.tuples(st.booleans(), st.booleans()))
-    stamped = dict(voltage=draw(st.booleans()), throttle=draw(st.booleans()))
+    stamped = {'voltage': draw(st.booleans()), 'throttle': draw(st.booleans())}
     # Seconds between the throttle's own clock and the voltage's.
     offset = draw(st.sampled_from([0.0, 0.0, 0.1, -2.0, 3600.0, -1.69e9]))
-    steps = dict(voltage=draw(st.sampled_from([0.01, 0.3, 7.0])),
-                 throttle=draw(st.sampled_from([0.01, 0.3, 7.0])))
+    steps = {'voltage': draw(st.sampled_from([0.01, 0.3, 7.0])),
+             'throttle': draw(st.sampled_from([0.01, 0.3, 7.0]))}
     messages = []
     logged = EPOCH * 10**9
     for k in range(draw(st.integers(2, 25))):
