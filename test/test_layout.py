@@ -176,7 +176,7 @@ def test_a_wrong_import_is_found(module, source):
     ('ou_monitor.model.ou', 'from . import passage\nfrom .passage import x'),
     ('ou_monitor.model.__init__', 'from .ou import x\nfrom . import ou'),
     ('ou_monitor.model.compiled_kalman', 'import numba'),
-    ('ou_monitor.online.monitor', 'from ou_monitor.model.passage.mean_time import x'),
+    ('ou_monitor.online.monitor', 'from ou_monitor.model.passage.law import x'),
     ('ou_monitor.recordings.bag', 'import mcap.reader\nfrom mcap_ros2.decoder import D'),
     ('ou_monitor.recordings.importers.ulog', 'from pyulog import ULog'),
     ('ou_monitor.report.page', 'import matplotlib'),

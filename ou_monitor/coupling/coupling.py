@@ -31,7 +31,8 @@ from ou_monitor.coupling.common_grid import Grid, on_grid
 from ou_monitor.errors import InputError
 from ou_monitor.records import FloatArray, NAN
 from scipy import stats
-from scipy.optimize import brentq
+from scipy.signal.windows import hann
+from scipy.special import chndtrinc
 
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -211,7 +212,7 @@ def _segment_length(grid: Grid, low: float) -> int:
 def _segments(grid: Grid, length: int, low: float, high: float,
               ) -> tuple[FloatArray, list[ComplexArray]]:
     """Return bins, Hz, and coefficients of each series, shape (segments, bins)."""
-    window = np.hanning(length + 1)[:-1]
+    window = hann(length, sym=False)
     frequency = np.fft.rfftfreq(length, 1.0 / grid.rate)
     # Rates come from stamps and are not round to the last bit.
     bins = (frequency >= low * (1.0 - 1e-6)) & (frequency <= high * (1.0 + 1e-6))
@@ -282,8 +283,7 @@ def _limit(vv: FloatArray, noise: FloatArray, spare: float, level: float) -> flo
     """Return the gain that the sum would have shown with probability `POWER`."""
     freedom = 2 * vv.size
     needed = float(stats.chi2.isf(0.5 * level, freedom))
-    far = float(brentq(lambda far: stats.ncx2.sf(needed, freedom, far) - POWER,
-                       1e-6, 1e3 + 10 * freedom))
+    far = float(chndtrinc(needed, freedom, 1.0 - POWER))
     per_gain = 2.0 * spare * float((vv / noise).sum())
     return math.sqrt(far / per_gain) if per_gain > 0.0 else math.inf
 

@@ -5,7 +5,7 @@ import math
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.model.passage.mean_time import mean_first_passage
+from ou_monitor.model.passage.law import mean_first_passage
 from ou_monitor.paper.network.components import PowerNetwork
 from ou_monitor.paper.network.design import (
     default_voltage, design, row_of, Verdict, with_capacitance)

@@ -5,7 +5,7 @@ import math
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.model.passage.mean_time import mean_first_passage
+from ou_monitor.model.passage.law import mean_first_passage
 from ou_monitor.paper.network.components import load_at, MAY_BE_ZERO, PowerNetwork, UNITS
 from ou_monitor.paper.network.path import discretise, simulate
 from ou_monitor.paper.network.rail import rail_at, UnstableNetworkError

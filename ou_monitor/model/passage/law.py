@@ -1,5 +1,7 @@
 """
-First passage of the OU to a level: the law within a span of time.
+First passage of the OU to a level: its mean time, and the law within a span of time.
+
+A continuous OU path has no finite crossing rate, so risk is stated as first passage.
 
 The unit OU is dX = -X ds + sqrt(2) dW: levels are in units of the stationary
 standard deviation, counted towards the barrier, and times in units of
@@ -31,9 +33,11 @@ import threading
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
+from scipy.integrate import quad
 from scipy.linalg import solve_banded
 from scipy.ndimage import map_coordinates, spline_filter
-from scipy.special import gammaln, log_ndtr, ndtr, pbdv
+from scipy.optimize import brentq
+from scipy.special import erfcx, gammaln, log_ndtr, logsumexp, pbdv
 
 # The table: barrier, w and lambda; each axis is even in a coordinate of its own,
 # b = 4 sinh(u), w = 2 sinh(v).
@@ -49,21 +53,24 @@ _LEAD = 1.0
 _PAD = 5
 
 _LOG_TWO_PI = math.log(2.0 * math.pi)
+# Beyond this level the mean time exceeds 1e150 tau: never.
+_NEVER = 26.0
 
 
-def stationary_exceedance(sd: npt.ArrayLike, delta: npt.ArrayLike) -> FloatArray:
-    """Return P(|U - u0| > delta) of the stationary OU, both sides (sd in V, delta in V)."""
-    spread, distance = np.broadcast_arrays(np.asarray(sd, np.float64),
-                                           np.asarray(delta, np.float64))
-    if (spread < 0.0).any():
-        raise ValueError('sd must be zero or positive, V')
-    with np.errstate(divide='ignore', invalid='ignore'):
-        level = np.where(spread > 0.0, distance / spread,
-                         np.inf)
-    # A supply that does not move is never off its mean.
-    chance: FloatArray = np.where(distance < 0.0, 1.0, 2.0 * ndtr(-level))
-    chance[np.isnan(spread) | np.isnan(distance)] = math.nan
-    return chance
+def mean_first_passage(start: float, barrier: float) -> float:
+    """
+    Return the mean time of a unit OU from `start` up to `barrier`.
+
+    sqrt(pi/2) * integral from start to barrier of erfcx(-z / sqrt 2) dz (Siegert,
+    Phys. Rev. 81 (1951) 617).
+    """
+    if start >= barrier:
+        return 0.0
+    if barrier > _NEVER:
+        return math.inf
+    total, _ = quad(lambda z: float(erfcx(-z / math.sqrt(2.0))), start, barrier,
+                    epsabs=0.0, epsrel=1e-10, limit=200)
+    return math.sqrt(math.pi / 2.0) * float(total)
 
 
 def passage_probability(start: npt.ArrayLike, barrier: npt.ArrayLike, span: npt.ArrayLike
@@ -254,32 +261,29 @@ def _log_rate(b: FloatArray) -> FloatArray:
     time, an asymptotic series.  Below 0 the function itself is looked at.
 
     """
-    result = np.zeros(b.size)
-    down = b <= 0.0
+    result = np.empty(b.size)
     # The first zero is above 1, and below 17 for the barriers of the table.
     trial = np.linspace(0.99, 17.0, 200)
-    first = (pbdv(trial, -b[down, None])[0] < 0.0).argmax(axis=1)
-    low, high = trial[first - 1], trial[first]
-    for _ in range(30):
-        middle = 0.5 * (low + high)
-        more = pbdv(middle, -b[down])[0] > 0.0
-        low, high = np.where(more, middle, low), np.where(more, high, middle)
-    result[down] = np.log(0.5 * (low + high))
-    near = (b > 0.0) & (b <= 8.0)
     n = np.arange(1.0, 260.0)
-    terms = n * np.log(math.sqrt(2.0) * b[near, None]) - gammaln(n + 1.0)
-    low, high = np.full(terms.shape[0], -40.0), np.zeros(terms.shape[0])
-    for _ in range(44):
-        middle = 0.5 * (low + high)
-        nu = np.exp(middle)
-        log = terms + gammaln(0.5 * (n - nu[:, None]))
-        top = log.max(axis=1)
-        total = top + np.log(np.exp(log - top[:, None]).sum(axis=1))
-        more = math.log(2.0) + gammaln(1.0 - 0.5 * nu) - total > middle
-        low, high = np.where(more, middle, low), np.where(more, high, middle)
-    result[near] = 0.5 * (low + high)
-    far = b[b > 8.0]
-    z = 1.0 / (far * far)
-    result[b > 8.0] = (np.log(far) - 0.5 * far * far - 0.5 * _LOG_TWO_PI
-                       - np.log1p(z * (1.0 + z * (3.0 + z * (15.0 + z * 105.0)))))
+    log_factorial = gammaln(n + 1.0)
+
+    def excess(log_nu: float, log_terms: FloatArray) -> float:
+        nu = math.exp(log_nu)
+        total = logsumexp(log_terms + gammaln(0.5 * (n - nu)))
+        return float(math.log(2.0) + gammaln(1.0 - 0.5 * nu) - total) - log_nu
+
+    for k, barrier in enumerate(b.tolist()):
+        if barrier <= 0.0:
+            # One barrier at a time: arrays of more than 500 elements crash pbdv in
+            # SciPy 1.11.4 to 1.12 (segmentation fault).
+            first = int((pbdv(trial, -barrier)[0] < 0.0).argmax())
+            result[k] = math.log(brentq(lambda nu, z: float(pbdv(nu, z)[0]), trial[first - 1],
+                                        trial[first], args=(-barrier,)))
+        elif barrier <= 8.0:
+            result[k] = brentq(excess, -40.0, -1e-12, args=(
+                n * math.log(math.sqrt(2.0) * barrier) - log_factorial,))
+        else:
+            z = 1.0 / (barrier * barrier)
+            result[k] = (math.log(barrier) - 0.5 * barrier * barrier - 0.5 * _LOG_TWO_PI
+                         - math.log1p(z * (1.0 + z * (3.0 + z * (15.0 + z * 105.0)))))
     return result

@@ -34,8 +34,6 @@ _SLIGHT = 0.35
 _NO_NOISE = 1e-4
 # Time, in relaxation times, after which where it began is forgotten.
 _FORGOTTEN = 25.0
-# -zeta(1/2) / sqrt(2 pi): how far a random walk oversteps, in steps.
-_OVERSTEP = 0.5825971579390107
 
 
 def sampled_passage_probability(start: float, barrier: float, step: float, count: float,

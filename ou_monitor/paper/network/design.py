@@ -24,7 +24,7 @@ import enum
 import math
 
 import numpy as np
-from ou_monitor.model.passage.mean_time import mean_first_passage
+from ou_monitor.model.passage.law import mean_first_passage
 from ou_monitor.paper.network.components import PowerNetwork
 from ou_monitor.paper.network.rail import Rail, rail_at, UnstableNetworkError
 from scipy.optimize import brentq

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 from ou_monitor.model.ou import simulate
-from ou_monitor.model.passage.mean_time import mean_first_passage
+from ou_monitor.model.passage.law import mean_first_passage
 from ou_monitor.paper.reproduce import paper
 from ou_monitor.paper.reproduce.row import Printed, Row
 from ou_monitor.paper.reproduce.table1 import over, vrms_range

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from ou_monitor.model.passage.mean_time import mean_first_passage
+from ou_monitor.model.passage.law import mean_first_passage
 import pytest
 
 

@@ -4,8 +4,7 @@ import math
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.model.passage.law import passage_probability
-from ou_monitor.model.passage.mean_time import mean_first_passage
+from ou_monitor.model.passage.law import mean_first_passage, passage_probability
 from ou_monitor.model.passage.sampled import sampled_passage_probability
 import pytest
 from scipy.special import ndtr

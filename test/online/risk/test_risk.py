@@ -5,8 +5,7 @@ import math
 
 import numpy as np
 from ou_monitor import brownout_probability
-from ou_monitor.model.passage.law import passage_probability
-from ou_monitor.model.passage.mean_time import mean_first_passage
+from ou_monitor.model.passage.law import mean_first_passage, passage_probability
 from ou_monitor.records import Estimate, Status
 import pytest
 from scipy.special import ndtr
