@@ -2,83 +2,20 @@
 
 import math
 
+from chains import THREE, vector_system
+from convergence import cycle
 import numpy as np
-from ou_monitor.paper.theory.convergence import diffusion_convergence
 from ou_monitor.paper.theory.diffusion import (
-    balance_defect, diffusion_limit, PRINTED_FACTOR, switching_drift)
-from ou_monitor.paper.theory.linear_diffusion import LinearDiffusion, step_covariance
-from ou_monitor.paper.theory.switched_ou import esc_chain, ou_of_switching, SwitchedOU
+    balance_defect, diffusion_limit, LinearDiffusion, PRINTED_FACTOR, step_covariance,
+    switching_drift)
+from ou_monitor.paper.theory.markov_chain import Generator
 from ou_monitor.paper.theory.switched_system import SwitchedSystem
-from ou_monitor.paper.theory.switching import Generator
 import pytest
-from scipy.integrate import quad, quad_vec
+from scipy.integrate import quad_vec
 from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.stats import kstest
 
-TELEGRAPH = SwitchedOU(1.0, Generator.telegraph(1.0, 1.0), np.array([1.0, -1.0]))
-# Three states, not reversible, every entry switched, in balance, and a stable drift.
-THREE = Generator(np.array([[-3.0, 2.0, 1.0], [0.5, -1.5, 1.0], [3.0, 0.2, -3.2]]))
-
-
-def vector_system() -> SwitchedSystem:
-    rng = np.random.default_rng(20)
-    centred = SwitchedSystem(
-        THREE, rng.standard_normal((3, 2, 2)), rng.standard_normal((3, 2))).balanced()
-    return SwitchedSystem(
-        THREE, 0.7 * centred.matrices, centred.offsets, np.array([[-3.0, 1.0], [0.0, -2.0]]),
-        np.array([0.5, 0.0]))
-
-
 SYSTEM = vector_system()
-
-
-@pytest.mark.parametrize('q, c', [(1.0, 1.0), (1.5, 0.2), (48e3, 138.0)])
-def test_telegraph_has_sigma_squared_c_squared_over_q(q, c):
-    """The printed formula gives half of it."""
-    limit = ou_of_switching(63.0, Generator.telegraph(q, q), [c, -c])
-    assert limit.sigma**2 == pytest.approx(c**2 / q, rel=1e-12)
-    assert limit.var_inf == pytest.approx(c**2 / q / 126.0, rel=1e-12)
-    printed = ou_of_switching(63.0, Generator.telegraph(q, q), [c, -c], PRINTED_FACTOR)
-    assert printed.sigma**2 == pytest.approx(c**2 / (2.0 * q), rel=1e-12)
-
-
-def test_the_printed_factor_is_refuted_by_simulation():
-    """
-    Stationary variance of 4000 switched paths over that of the two formulas.
-
-    The relative error of the sample variance is at most sqrt(2 / 4000) = 2.2 %
-    (a voltage between bounds has lighter tails than a Gaussian); at eps = 0.05
-    the exact variance is 0.1 % below the limit. Within 12 % of one means the
-    factor 2; the printed one puts the ratio at 2, forty errors off, so the
-    test tells them apart with power 1 to any digit.
-    """
-    u = TELEGRAPH.system().simulate(
-        [0.0, 6.0], np.zeros(1), np.random.default_rng(21), eps=0.05, paths=4000,
-        scaling='diffusion')[:, 1, 0]
-    assert abs(np.var(u) / (TELEGRAPH.sigma() ** 2 / 2.0) - 1.0) < 0.12
-    assert abs(np.var(u) / (TELEGRAPH.sigma(PRINTED_FACTOR) ** 2 / 2.0) - 2.0) < 0.24
-
-
-@pytest.mark.parametrize('frequency, duty, phases', [
-    (24e3, 0.5, 1), (24e3, 0.3, 4), (48e3, 0.9, 8), (36e3, 0.05, 3)])
-def test_esc_noise_is_that_of_the_renewal_theorem(frequency, duty, phases):
-    """
-    sigma^2 = swing^2 [(1 - d)^2 Var(on) + d^2 Var(off)] / period.
-
-    The central limit theorem of alternating renewals, without any generator.
-    """
-    chain, on = esc_chain(frequency, duty, phases)
-    assert chain.stationary[on].sum() == pytest.approx(duty, rel=1e-12)
-    starts = chain.stationary[-1] * chain.leaving[-1]
-    assert starts == pytest.approx(frequency, rel=1e-12)
-    period = 1.0 / frequency
-    swing = 600.0
-    spread = [(share * period) ** 2 / phases for share in (duty, 1.0 - duty)]
-    expected = swing**2 * ((1.0 - duty) ** 2 * spread[0] + duty**2 * spread[1]) / period
-    limit = ou_of_switching(63.0, chain, swing * on)
-    assert limit.sigma**2 == pytest.approx(expected, rel=1e-9)
-    assert limit.level == pytest.approx(swing * duty / 63.0, rel=1e-12)
-    assert limit.variance_ratio == pytest.approx(1.0, abs=3e-3)
 
 
 def test_intensity_and_drift_are_integrals_of_correlations():
@@ -121,112 +58,9 @@ def test_no_balance_no_limit(matrices, offsets, message):
         assert defect == pytest.approx(0.0, abs=1e-15)
 
 
-def test_variance_and_autocovariance_of_the_telegraph_in_closed_form():
-    """
-    Var = c^2 / (alpha (alpha + 2q)), two exponentials at a lag.
-
-    Two first-order filters in a row, one of which colours the drive.
-    """
-    alpha, q, c = 63.0, 200.0, 7.0
-    rail = SwitchedOU(alpha, Generator.telegraph(q, q), np.array([c, -c]))
-    assert rail.variance() == pytest.approx(c**2 / (alpha * (alpha + 2.0 * q)), rel=1e-12)
-    lags = np.array([0.0, 1e-3, 1e-2, 0.05])
-    expected = c**2 / ((2.0 * q) ** 2 - alpha**2) * (
-        2.0 * q / alpha * np.exp(-alpha * lags) - np.exp(-2.0 * q * lags))
-    assert rail.autocovariance(lags) == pytest.approx(expected, rel=1e-10)
-
-
-def test_eps_is_a_clock_and_a_speed():
-    """The rail at eps is the rail of a chain 1/eps^2 as fast with amplitudes 1/eps as large."""
-    amplitudes, eps, lags = np.array([1.0, -2.0, 0.5]), 0.3, [0.0, 0.05, 0.4]
-    fast = SwitchedOU(2.0, THREE.sped_up(1.0 / eps**2), amplitudes / eps)
-    assert SwitchedOU(2.0, THREE, amplitudes).autocovariance(lags, eps) == pytest.approx(
-        fast.autocovariance(lags), rel=1e-11)
-
-
-@pytest.mark.parametrize('eps', [1.0, 0.3])
-def test_variance_of_the_switched_rail_is_where_its_moments_settle(eps):
-    """The resolvent against the equation of the moments, run until it rests."""
-    rail = SwitchedOU(2.0, THREE, np.array([1.0, -2.0, 0.5]))
-    mean, covariance = rail.system().moments(
-        [0.0, 30.0], [0.0], eps=eps, scaling='diffusion')
-    assert mean[1, 0] == pytest.approx(rail.level, rel=1e-9)
-    assert covariance[1, 0, 0] == pytest.approx(rail.variance(eps), rel=1e-9)
-
-
-def test_autocovariance_tends_to_that_of_the_process():
-    """
-    With eps^2, to (sigma^2 / (2 alpha)) exp(-alpha lag); and simulated paths have it.
-
-    The covariance of n Gaussian pairs has a relative error of at most
-    sqrt(2 / n) of the variance.
-    """
-    rail = SwitchedOU(2.0, THREE, np.array([1.0, -2.0, 0.5]))
-    lags = np.array([0.0, 0.2, 1.0])
-    limit = diffusion_limit(rail.system())
-    expected = limit.autocovariance(lags)[:, 0, 0]
-    assert expected == pytest.approx(rail.sigma() ** 2 / 4.0 * np.exp(-2.0 * lags), rel=1e-12)
-    errors = [np.abs(rail.autocovariance(lags, eps) - expected).max() for eps in (0.02, 0.01)]
-    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.02)
-    n = 4000
-    u = rail.system().simulate(
-        np.concatenate([[0.0], 5.0 + lags]), [rail.level], np.random.default_rng(22), eps=0.1,
-        paths=n, scaling='diffusion')[:, 1:, 0] - rail.level
-    exact = rail.autocovariance(lags, 0.1)
-    assert np.abs((u * u[:, :1]).mean(axis=0) - exact).max() < \
-        5.0 * exact[0] * math.sqrt(2.0 / n)
-
-
-def test_switched_rail_converges_in_law_to_the_process():
-    """
-    Additive: exact variance with order 2 in eps; the laws agree by Kolmogorov-Smirnov.
-
-    At eps = 0.1 the exact variance is 1 % low: a distance below 0.003 between
-    the laws, where the test at level 1e-3 and 4000 paths starts at 0.044. The
-    printed intensity is a distance of 0.08 away: log10 of the p-value was
-    -14.6 +- 2.5 over 60 seeds, so below 1e-6 but for 1 sample in 3000.
-    """
-    t = np.linspace(0.0, 2.0, 5)
-    found = diffusion_convergence(
-        TELEGRAPH.system(), t, [0.5], [0.2, 0.1, 0.05], np.random.default_rng(23), 4000)
-    assert found.mean is None
-    assert found.covariance.order == pytest.approx(2.0, abs=0.05)
-    assert found.p_values[1:].min() > 1e-3
-    printed = diffusion_convergence(
-        TELEGRAPH.system(), t, [0.5], [0.1, 0.05], np.random.default_rng(23), 4000,
-        PRINTED_FACTOR)
-    assert printed.covariance.error == pytest.approx([1.0, 1.0], abs=0.03)
-    assert printed.p_values.max() < 1e-6
-
-
-def test_vector_system_converges_in_law_to_its_limit():
-    """
-    Multiplicative, not reversible: means and covariances with order 1 in eps.
-
-    Halving eps halves the error, so nothing is left over in the limit; with
-    the printed factor the covariance keeps an error of order 1. At eps = 0.05
-    the laws agree by the test at level 1e-3.
-    """
-    t = np.linspace(0.0, 1.0, 3)
-    eps = np.array([0.01, 0.005, 0.0025])
-    limit = diffusion_limit(SYSTEM)
-    mean, covariance = limit.moments(t, [0.5, 1.0])
-    errors = []
-    for value in eps.tolist():
-        there = SYSTEM.moments(t, [0.5, 1.0], eps=value, scaling='diffusion')
-        errors.append([np.abs(there[0] - mean).max(), np.abs(there[1] - covariance).max()])
-    assert np.all(np.abs(np.diff(np.log2(errors), axis=0) + 1.0) < 0.2)
-    assert np.max(errors[-1]) < 5e-3
-    printed = diffusion_limit(SYSTEM, PRINTED_FACTOR).moments(t, [0.5, 1.0])[1]
-    assert np.abs(printed - covariance).max() > 0.3 * np.abs(covariance).max()
-    tested = diffusion_convergence(
-        SYSTEM, [0.0, 1.0], [0.5, 1.0], [0.1, 0.05], np.random.default_rng(24), 2000)
-    assert tested.p_values[1].min() > 1e-3
-
-
 def test_the_order_of_the_jumps_matters_to_the_drift():
     """In a rotating chain A_y A_x and A_x A_y differ: only one of them is the limit."""
-    chain = Generator.cycle([1.0, 1.0, 1.0])
+    chain = cycle([1.0, 1.0, 1.0])
     turn = np.array([[[0.0, 1.0], [0.0, 0.0]], [[0.0, 0.0], [1.0, 0.0]], [[0.0, -1.0],
                     [-1.0, 0.0]]])
     system = SwitchedSystem(chain, turn)
@@ -323,30 +157,6 @@ def test_geometric_brownian_motion_is_exact():
     assert kstest(normal, 'norm').pvalue > 1e-4
 
 
-def test_stationary_moments_are_where_moments_settle():
-    """For multiplicative noise too; for additive noise it is the Lyapunov equation."""
-    limit = diffusion_limit(SYSTEM)
-    assert not limit.is_additive
-    mean, covariance = limit.stationary_moments()
-    there = limit.moments([0.0, 40.0], [5.0, -5.0])
-    assert mean == pytest.approx(there[0][1], rel=1e-9)
-    assert covariance == pytest.approx(there[1][1], rel=1e-9)
-
-
-@pytest.mark.parametrize('matrix, noise, message', [
-    ([[0.0]], [[[0.0]]], r'no equilibrium, the matrix has the eigenvalue \+?0 1/s'),
-    ([[0.25]], [[[0.0]]], r'the matrix has the eigenvalue \+0.25 1/s'),
-    ([[-1.0]], [[[2.0]]], r'second moment has the eigenvalue \+2 1/s'),
-    ([[0.1, 5.0], [-5.0, 0.1]], np.zeros((1, 2, 2)), r'eigenvalue 0.1[+-]5j 1/s'),
-])
-def test_unstable_limits_have_no_stationary_law(matrix, noise, message):
-    """Refused with the eigenvalue: of the drift, or of the second moment."""
-    d = len(matrix)
-    limit = LinearDiffusion(np.array(matrix), np.zeros(d), np.array(noise), np.ones((1, d)))
-    with pytest.raises(ValueError, match='unstable.*' + message):
-        limit.stationary_moments()
-
-
 @pytest.mark.parametrize('noise', [0.0, 0.1])
 def test_paths_that_overflow_are_refused(noise):
     """One line instead of infinities, for additive and multiplicative noise."""
@@ -356,42 +166,13 @@ def test_paths_that_overflow_are_refused(noise):
         limit.simulate([0.0, 1.0, 100.0], [1.0], np.random.default_rng(0))
 
 
-def test_sigma_of_the_rail_follows_from_the_switching():
-    """
-    A switched rail simulated as it is: 24 kHz, alpha = 63 1/s, eps = 1.
-
-    After one millisecond the variance is that of the process, sigma^2 (1 -
-    exp(-2 alpha t)) / (2 alpha), less the memory of the chain; exact moments
-    on one side, 1000 paths of 48 jumps on the other.
-    """
-    chain, on = esc_chain(24e3, 0.4, 1)
-    rail = SwitchedOU(63.0, chain, 900.0 * on)
-    t, n = [0.0, 1e-3], 1000
-    u = rail.system().simulate(t, [rail.level], np.random.default_rng(28), paths=n)[:, 1, 0]
-    _, exact = rail.system().moments(t, [rail.level])
-    process = rail.sigma() ** 2 * -math.expm1(-0.126) / 126.0
-    assert exact[1, 0, 0] == pytest.approx(process, rel=0.02)
-    assert np.var(u) == pytest.approx(exact[1, 0, 0], rel=5.0 * math.sqrt(2.0 / n))
-    power, _ = quad(lambda s: math.exp(-126.0 * s), 0.0, 1e-3)
-    assert process == pytest.approx(rail.sigma() ** 2 * power, rel=1e-9)
-
-
 @pytest.mark.parametrize('call, message', [
-    (lambda: SwitchedOU(0.0, THREE, np.zeros(3)), 'alpha must be positive'),
-    (lambda: SwitchedOU(63.0, THREE, np.zeros(2)), r'amplitudes must have shape \(3,\)'),
-    (lambda: SwitchedOU(63.0, THREE, np.full(3, np.inf)), 'amplitudes must be finite'),
-    (lambda: TELEGRAPH.variance(0.0), 'eps must be positive'),
-    (lambda: TELEGRAPH.autocovariance([-1.0]), 'lags must not be negative'),
-    (lambda: esc_chain(0.0, 0.5), 'frequency must be positive'),
-    (lambda: esc_chain(24e3, 1.0), 'duty must lie between 0 and 1, got 1.0'),
-    (lambda: esc_chain(24e3, 0.5, 0), 'phases must be a whole number, 1 or more, got 0'),
-    (lambda: esc_chain(24e3, 0.5, 1.5), 'phases must be a whole number, 1 or more, got 1.5'),
     (lambda: diffusion_limit(SYSTEM, 0.0), 'factor must be positive'),
     (lambda: diffusion_limit(SYSTEM).simulate(
         [0.0], [0.0, 0.0], np.random.default_rng(0), max_step=0.0), 'max_step must be positive'),
     (lambda: diffusion_limit(SYSTEM).simulate([0.0], [0.0], np.random.default_rng(0)),
      'u0 must have shape'),
-    (lambda: diffusion_limit(SYSTEM).autocovariance([1.0, 0.0]), 'must not decrease'),
+    (lambda: diffusion_limit(SYSTEM).moments([1.0, 0.0], [0.0, 0.0]), 'must not decrease'),
 ])
 def test_wrong_arguments_are_refused(call, message):
     with pytest.raises(ValueError, match=message):

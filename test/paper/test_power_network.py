@@ -7,8 +7,8 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.model.passage.law import mean_first_passage
 from ou_monitor.paper.network.components import load_at, MAY_BE_ZERO, PowerNetwork, UNITS
-from ou_monitor.paper.network.path import discretise, simulate
 from ou_monitor.paper.network.rail import rail_at, UnstableNetworkError
+from ou_monitor.paper.theory.diffusion import step_covariance
 import pytest
 from scipy.integrate import quad
 from scipy.linalg import expm
@@ -119,14 +119,6 @@ def test_variance_is_the_integral_of_the_density(network, rail):
     assert here.shares.sum() == pytest.approx(1.0, rel=1e-8)
 
 
-@pytest.mark.parametrize('network', [PowerNetwork(), FILTERED])
-def test_autocovariance_is_that_of_the_states(network):
-    rail = rail_at(network, 0.4, 'regulated')
-    lags = np.array([0.0, 1e-6, 2e-5, 3e-4])
-    expected = [rail.c @ expm(rail.a * lag) @ rail.covariance @ rail.c for lag in lags]
-    assert rail.autocovariance(lags) == pytest.approx(expected, rel=1e-7, abs=1e-12)
-
-
 def test_equal_poles_are_no_trouble():
     """Noise exactly as fast as the network: Var = v R^2 / 2 and that rate."""
     network = replace(RC, esc_frequency=0.24 / (0.04 * 470e-6))
@@ -180,8 +172,6 @@ def test_no_noise_is_no_rate():
     rail = rail_at(PowerNetwork(), 0.0)
     assert rail.var_inf == 0.0 and math.isnan(rail.alpha)
     assert rail.crossing_rate(19.8) == 0.0 and math.isinf(rail.crossing_rate(22.5))
-    path = simulate(PowerNetwork(), [0.0, 1.0], 0.0, np.random.default_rng(0))
-    assert path == pytest.approx(rail.mean, rel=1e-14)
 
 
 resistances = st.floats(0.005, 0.2)
@@ -272,90 +262,6 @@ def test_a_load_beyond_the_battery_is_refused():
         rail_at(PowerNetwork(), 0.4, 'motor')
 
 
-@pytest.mark.parametrize('network', [PowerNetwork(), FILTERED])
-def test_steps_compose_and_end_in_the_stationary_law(network):
-    """Two half steps are one; after 1 s, 1e5 relaxation times, nothing is remembered."""
-    rail = rail_at(network, 0.4)
-    half, q = discretise(rail.a, rail.b, 3e-5)
-    whole, q_whole = discretise(rail.a, rail.b, 6e-5)
-    size = np.sqrt(np.outer(np.diag(rail.covariance), np.diag(rail.covariance))) + 1e-30
-    assert half @ half == pytest.approx(whole, rel=1e-9, abs=1e-12)
-    assert np.max(np.abs(q + half @ q @ half.T - q_whole) / size) < 1e-9
-    late, q_late = discretise(rail.a, rail.b, 2.0)
-    assert np.abs(late).max() < 1e-25
-    assert np.max(np.abs(q_late - rail.covariance) / size) < 1e-9
-    assert discretise(rail.a, rail.b, 0.0)[0] == pytest.approx(np.eye(len(rail.a)))
-    with pytest.raises(ValueError, match='step'):
-        discretise(rail.a, rail.b, -1.0)
-
-
-@pytest.mark.parametrize('network, rail', [(PowerNetwork(), 'bus'), (FILTERED, 'regulated')])
-def test_paths_have_the_autocovariance(network, rail):
-    """
-    Blocks of four stamps, 10 ms apart, are independent draws.
-
-    The standard error of a covariance over n blocks is at most
-    Var sqrt(2/n); five bound the largest of 10.
-    """
-    here = rail_at(network, 0.4, rail)
-    n, offsets = 8_000, np.array([0.0, 4e-6, 2e-5, 1.2e-4])
-    t = (0.01 * np.arange(n)[:, None] + offsets).ravel()
-    path = simulate(network, t, 0.4, np.random.default_rng(2), rail=rail)
-    x = path.reshape(n, 4) - here.mean
-    expected = here.autocovariance(np.abs(offsets[:, None] - offsets))
-    error = np.abs(x.T @ x / n - expected)
-    assert error.max() < 5.0 * here.var_inf * math.sqrt(2.0 / n)
-    assert abs(x.mean()) < 5.0 * math.sqrt(here.var_inf / n)
-
-
-def test_a_throttle_step_relaxes_with_the_pole():
-    """V = V2 + (I2 - I1) R^2/(R + r) exp(-a t): what the ESR does not pass at once."""
-    network = replace(RC, bulk_esr=0.03, switching_scale=0.0)
-    t = np.array([0.0, 1e-5, 2e-5, 3e-5, 8e-5, 1.0])
-    throttle = np.array([0.1, 0.1, 0.4, 0.4, 0.4, 0.4])
-    path = simulate(network, t, throttle, np.random.default_rng(0))
-    low, high = load_at(network, 0.1), load_at(network, 0.4)
-    part = (high.current - low.current) * 0.04**2 / 0.07
-    decay = np.exp(-(t[2:] - 1e-5) / (0.07 * 470e-6))
-    assert path[:2] == pytest.approx(low.bus, rel=1e-14)
-    assert path[2:] == pytest.approx(high.bus + part * decay, rel=1e-12)
-
-
-def test_a_filter_carries_the_mean_of_the_regulator():
-    """Without noise a filtered path settles at the means of the new throttle."""
-    network = replace(FILTERED, switching_scale=0.0, mcu_noise=0.0)
-    path = simulate(network, [0.0, 1.0, 1.001, 2.0], [0.1, 0.1, 0.4, 0.4],
-                    np.random.default_rng(0))
-    assert path[:2] == pytest.approx(load_at(network, 0.1).bus, rel=1e-13)
-    assert path[3] == pytest.approx(load_at(network, 0.4).bus, rel=1e-13)
-
-
-def test_a_throttle_step_starts_from_the_means_of_all_states():
-    """Bulk and filter capacitors and the inductor; the regulator's input is sqrt(P/g)."""
-    network = replace(FILTERED, switching_scale=0.0, mcu_noise=0.0, mcu_current=4.0)
-    low, high = (rail_at(network, u) for u in (0.1, 0.4))
-
-    def means(rail):
-        source = math.sqrt(network.regulator_power / rail.load.input_conductance)
-        return np.array([rail.load.bus, network.regulator_power / source, source, source, 0.0,
-                         0.0, 0.0, 0.0])
-
-    t = np.array([0.0, 2e-6, 5e-5, 3e-4])
-    path = simulate(network, t, [0.1, 0.4, 0.4, 0.4], np.random.default_rng(0))
-    expected = [high.mean + high.c @ expm(high.a * at) @ (means(low) - means(high))
-                for at in t[1:]]
-    assert path[1:] == pytest.approx(expected, rel=1e-12)
-
-
-@pytest.mark.parametrize('t, throttle, words', [
-    ([0.0, -1.0], 0.4, 'not decreasing'), ([0.0, math.nan], 0.4, 'finite'),
-    ([[0.0]], 0.4, 'shape'), ([0.0, 1.0], [0.4, 1.4], 'throttle')])
-def test_bad_paths_are_refused(t, throttle, words):
-    with pytest.raises(ValueError, match=words):
-        simulate(PowerNetwork(), t, throttle, np.random.default_rng(0))
-    assert simulate(PowerNetwork(), [], 0.4, np.random.default_rng(0)).shape == (0,)
-
-
 def test_crossing_rate_of_a_rough_rail_is_that_of_its_ou():
     """
     With hardly a capacitor the bus is R times the current, an OU.
@@ -379,7 +285,8 @@ def test_crossing_rate_of_a_smooth_rail_is_counted():
     """
     rail = rail_at(RC, 0.4)
     d, dt, paths, steps = 2.0, 5e-7, 4000, 300
-    transition, covariance = discretise(rail.a, rail.b, dt)
+    transition = expm(rail.a * dt)
+    covariance = step_covariance(rail.a, rail.b @ rail.b.T, dt)
     rng = np.random.default_rng(3)
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))

@@ -179,12 +179,6 @@ class Rail:
         return Resonance(frequency=float(abs(pole)) / (2.0 * math.pi),
                          damping=float(-pole.real / abs(pole)), share=2.0 * float(self.shares[k]))
 
-    def autocovariance(self, lag: npt.ArrayLike) -> FloatArray:
-        """Return the autocovariance of the rail (lag in s)."""
-        lags = np.asarray(lag, dtype=np.float64)
-        poles, parts = self._modes
-        return np.asarray((np.exp(lags[..., None] * poles) @ parts).real)
-
     def psd(self, frequency: npt.ArrayLike) -> FloatArray:
         """Return the one-sided power spectral density (frequency in Hz)."""
         gains = self._gain(frequency, self.a, self.b, self.c)

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from ou_monitor.paper.reproduce import paper
 from ou_monitor.paper.reproduce.row import Printed, Row
+from ou_monitor.paper.theory.markov_chain import Generator
 from ou_monitor.paper.theory.matrix_model import MatrixModel
 from ou_monitor.paper.theory.switched_system import SwitchedSystem
-from ou_monitor.paper.theory.switching import Generator
 from ou_monitor.records import FloatArray
 
 # An example, since the paper gives no values but alpha: rates 1/s, rad/s; two

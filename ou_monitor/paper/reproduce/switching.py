@@ -15,8 +15,8 @@ from ou_monitor.paper.reproduce.crest import mean_and_error
 from ou_monitor.paper.reproduce.row import Printed, Row
 from ou_monitor.paper.theory.diffusion import (
     CORRECT_FACTOR, diffusion_limit, PRINTED_FACTOR, switching_drift)
+from ou_monitor.paper.theory.markov_chain import Generator
 from ou_monitor.paper.theory.switched_system import SwitchedSystem
-from ou_monitor.paper.theory.switching import Generator
 from ou_monitor.records import FloatArray
 from scipy.integrate import quad
 

@@ -173,12 +173,6 @@ class MatrixModel:
             cure.append('a carrier of frequency omega has dphi/dt = omega')
         return Stability(rates, growing, f'unstable: {said}; ' + '; '.join(cure))
 
-    def require_stable(self, t: float = 0.0) -> None:
-        """Refuse a matrix under which something grows (t in s)."""
-        found = self.stability(t)
-        if not found.stable:
-            raise ValueError(found.text)
-
     def solve(
         self, t: npt.ArrayLike, u0: npt.ArrayLike, *, rtol: float = 1e-10,
         max_step: float | None = None,

@@ -13,21 +13,19 @@ D and d are not switched and not sped up. eps = 1 is the system as given.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.paper.theory.affine import AffineSystem, check_state, check_times, flow
-from ou_monitor.paper.theory.jump_paths import IntArray
+from ou_monitor.paper.theory.affine import (
+    AffineSystem, check_state, check_times, flow, moment_matrix, propagate)
+from ou_monitor.paper.theory.markov_chain import Generator
 from ou_monitor.paper.theory.matrix_model import MatrixModel
-from ou_monitor.paper.theory.moments import moment_matrix, propagate
-from ou_monitor.paper.theory.switching import Generator
 from ou_monitor.records import FloatArray
 
 Scaling = Literal['averaging', 'diffusion']
-Move = Callable[[IntArray, FloatArray, FloatArray], FloatArray]
 
 
 def clock_and_speed(eps: float, scaling: Scaling) -> tuple[float, float]:
@@ -39,29 +37,6 @@ def clock_and_speed(eps: float, scaling: Scaling) -> tuple[float, float]:
     if scaling == 'diffusion':
         return 1.0 / eps**2, 1.0 / eps
     raise ValueError(f"scaling must be 'averaging' or 'diffusion', got {scaling!r}")
-
-
-def run_ensemble(
-    generator: Generator, move: Move, t: npt.ArrayLike, u0: npt.ArrayLike, d: int,
-    rng: np.random.Generator, paths: int, start: int | None,
-) -> FloatArray:
-    """Move an ensemble from jump to jump and keep it at the given times (t in s)."""
-    times = check_times(t)
-    state = generator.starts(paths, rng, start)
-    first = np.atleast_1d(np.asarray(u0, dtype=np.float64))
-    if first.shape not in ((d,), (paths, d)):
-        raise ValueError(f'u0 must have shape ({d},) or ({paths}, {d}), got {first.shape}')
-    u = np.array(np.broadcast_to(first, (paths, d)))
-    found = np.empty((paths, times.size, d))
-    found[:, 0] = u
-    with np.errstate(over='ignore', invalid='ignore'):
-        for k, which, at, dt in generator.segments(times, state, rng):
-            u[which] = move(at, dt, u[which])
-            if isinstance(which, slice):
-                if not np.isfinite(u).all():
-                    raise ValueError(f'unstable: a path overflows before t = {times[k + 1]:g} s')
-                found[:, k + 1] = u
-    return found
 
 
 def _left_out() -> FloatArray:
@@ -185,13 +160,23 @@ class SwitchedSystem:
         start: int | None = None,
     ) -> FloatArray:
         """Draw paths, exact between the jumps and exact in the jumps (t in s)."""
-        at_eps = self.scaled(eps, scaling)
-
-        def move(states: IntArray, dt: FloatArray, u: FloatArray) -> FloatArray:
-            return flow(at_eps.matrices[states], at_eps.offsets[states], dt, u)
-
-        return run_ensemble(
-            at_eps.generator, move, t, u0, self.dimension, rng, paths, start)
+        at_eps, times, d = self.scaled(eps, scaling), check_times(t), self.dimension
+        state = at_eps.generator.starts(paths, rng, start)
+        first = np.atleast_1d(np.asarray(u0, dtype=np.float64))
+        if first.shape not in ((d,), (paths, d)):
+            raise ValueError(f'u0 must have shape ({d},) or ({paths}, {d}), got {first.shape}')
+        u = np.array(np.broadcast_to(first, (paths, d)))
+        found = np.empty((paths, times.size, d))
+        found[:, 0] = u
+        with np.errstate(over='ignore', invalid='ignore'):
+            for k, which, at, dt in at_eps.generator.segments(times, state, rng):
+                u[which] = flow(at_eps.matrices[at], at_eps.offsets[at], dt, u[which])
+                if isinstance(which, slice):
+                    if not np.isfinite(u).all():
+                        raise ValueError(
+                            f'unstable: a path overflows before t = {times[k + 1]:g} s')
+                    found[:, k + 1] = u
+        return found
 
     def moments(
         self, t: npt.ArrayLike, u0: npt.ArrayLike, *, eps: float = 1.0,

@@ -1,0 +1,38 @@
+"""Markov chains and switched systems that several tests look at, and what a chain did."""
+
+from convergence import cycle
+import numpy as np
+from ou_monitor.paper.theory.markov_chain import Generator
+from ou_monitor.paper.theory.switched_system import SwitchedSystem
+
+# Three states, not reversible, every entry switched, in balance, and a stable drift.
+THREE = Generator(np.array([[-3.0, 2.0, 1.0], [0.5, -1.5, 1.0], [3.0, 0.2, -3.2]]))
+CYCLE = cycle([3.0, 5.0, 4.0])
+# The matrix model of the paper, all of its coefficients switched.
+PAPER = SwitchedSystem.of_matrix_model(
+    CYCLE, alpha=[1, 2, 6], omega=[3, 6, 9], beta=[1, 0, 2], alpha_p=[4, 5, 9])
+
+
+def vector_system() -> SwitchedSystem:
+    """Return a switched system of two components on `THREE`."""
+    rng = np.random.default_rng(20)
+    centred = SwitchedSystem(
+        THREE, rng.standard_normal((3, 2, 2)), rng.standard_normal((3, 2))).balanced()
+    return SwitchedSystem(
+        THREE, 0.7 * centred.matrices, centred.offsets, np.array([[-3.0, 1.0], [0.0, -2.0]]),
+        np.array([0.5, 0.0]))
+
+
+def drawn(chain, edges, paths, rng, start=None):
+    """Return states on a grid, (paths, k), and times spent between, (paths, k - 1, states)."""
+    grid = np.asarray(edges, dtype=np.float64)
+    state = chain.starts(paths, rng, start)
+    states = np.empty((paths, grid.size), dtype=np.intp)
+    states[:, 0] = state
+    spent = np.zeros((paths, grid.size - 1, chain.size))
+    everyone = np.arange(paths)
+    for k, which, at, dt in chain.segments(grid, state, rng):
+        spent[everyone[which], k, at] += dt
+        if isinstance(which, slice):
+            states[:, k + 1] = at
+    return states, spent
