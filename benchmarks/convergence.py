@@ -30,7 +30,7 @@ from scipy.stats import ks_2samp
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from ou_monitor.paper.theory.affine import check_state, check_times  # noqa: E402
+from ou_monitor.paper.theory.affine import check_state, check_times  # noqa: E402, I100
 from ou_monitor.paper.theory.diffusion import (  # noqa: E402
     CORRECT_FACTOR, diffusion_limit, PRINTED_FACTOR)
 from ou_monitor.paper.theory.markov_chain import Generator  # noqa: E402

@@ -11,7 +11,9 @@ b phi' + B phi'' / 2, where for C(u; x) = A_x u + a_x
 Equation (6) of the paper lacks the 2, which (4) as printed needs: the variance
 of the integral of C(x(t)) grows at the rate of twice the integral of its
 autocovariance over positive lags (Korolyuk & Limnios, Stochastic Systems in
-Merging Phase Space, 2005, give it with the 2). `factor=1` is the printed one. Drift and noise of the limit are affine.
+Merging Phase Space, 2005, give it with the 2). `factor=1` is the printed one.
+Drift and noise of the limit are affine: with noise that does not depend on the
+state it is an Ornstein-Uhlenbeck process.
 """
 
 from __future__ import annotations
