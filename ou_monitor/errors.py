@@ -11,8 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 import difflib
+import itertools
 
 from ou_monitor.text import printable
+
+# Words that a hint is looked for among, such as the columns of a table, and that it names.
+_MOST_CHOICES, _MOST_SHOWN = 1000, 60
 
 
 class InputError(Exception):
@@ -26,7 +30,7 @@ class InputError(Exception):
 
     def __init__(self, text: str) -> None:
         """Keep the line."""
-        super().__init__(printable(text))
+        super().__init__(printable(' '.join(str(text).splitlines())))
 
 
 def refusal(error: OSError) -> str:
@@ -37,8 +41,9 @@ def refusal(error: OSError) -> str:
 
 def nearest(word: str, valid: Iterable[str]) -> str:
     """Return a hint that names the valid word nearest to a misspelt one."""
-    choices = list(valid)
+    choices = [printable(word, 60) for word in itertools.islice(valid, _MOST_CHOICES)]
     close = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
     if close:
         return f"did you mean '{close[0]}'?"
-    return 'valid: ' + ', '.join(sorted(choices))
+    shown = sorted(choices)[:_MOST_SHOWN]
+    return 'valid: ' + ', '.join(shown) + (', ...' if len(shown) < len(choices) else '')

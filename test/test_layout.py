@@ -20,7 +20,7 @@ LEVEL = {
 # What users reach as `from ou_monitor import ...`: above all but the programs.
 FACADE_LEVEL = 8.5
 PLOTTING = {'matplotlib', 'plotly', 'seaborn', 'bokeh', 'PIL'}
-MCAP = {'mcap', 'mcap_ros2', 'rosbags', 'rosbag2_py'}
+MCAP = {'mcap', 'mcap_ros2', 'rosbags', 'rosbag2_py', 'zstandard', 'lz4'}
 MCAP_MODULES = {'ou_monitor.recordings.bag', 'ou_monitor.recordings.bag_reader'}
 # Parsers of logs: optional, each in one importer.
 PARSERS = {'pyulog': 'ulog', 'pymavlink': 'dataflash', 'orangebox': 'blackbox'}

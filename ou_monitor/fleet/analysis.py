@@ -15,6 +15,7 @@ from ou_monitor.online.estimator.compiled import kernels
 from ou_monitor.online.risk.first_passage import brownout_probability
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import NAN, Recording
+from ou_monitor.text import printable
 
 # A clock that says less than the year 2000 counts from a start-up, not from 1970; one that says
 # more than 2100 does not count seconds.
@@ -63,6 +64,19 @@ class Options:
         return asdict(self)
 
 
+_NUMBERS = frozenset((
+    'start', 'duration_s', 'samples', 'rate_hz', 'sag', 'sag_se', 'risk_max', 'alpha_p', 'gain',
+    'gain_se'))
+
+
+def is_result(found: Mapping[str, Any]) -> bool:
+    """Whether a part of an earlier run holds what `work` returns."""
+    levels, vehicle = found.get('levels'), found.get('vehicle')
+    return isinstance(vehicle, str) and isinstance(levels, list) and all(
+        isinstance(level, dict) for level in levels) and all(
+        isinstance(found.get(name), (int, float)) for name in _NUMBERS)
+
+
 def work(path: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """Analyse one recording; whatever is wrong with it is in the result."""
     # A run that is taken up again must give the same digits, and the compiled sums differ from
@@ -77,7 +91,8 @@ def work(path: str, options: Mapping[str, Any]) -> dict[str, Any]:
     except Exception as error:
         # One recording that our code cannot bear must not cost the others; the kind of error
         # is what a report about it needs.
-        why = f'The analysis failed ({type(error).__name__}: {error}): please report it.'
+        why = (f'The analysis failed ({type(error).__name__}: {printable(error, 200)}): please '
+               'report it.')
     return {'error': ' '.join(why.split()), 'levels': []}
 
 

@@ -1,7 +1,8 @@
 """
 Which recordings there are: files, bags, and folders searched for both.
 
-Limits: links to folders are not followed, and hidden folders are not entered.
+Limits: links to folders are not followed, and hidden folders are not entered.  A FIFO, a
+device or a link that leads nowhere, by the name of a recording, is one that cannot be read.
 Two recordings count as the same when every byte of their data is; a copy that
 was recompressed is another recording.
 """
@@ -13,9 +14,12 @@ from dataclasses import dataclass
 import hashlib
 import os
 from pathlib import Path
+import stat
 
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.rosbag2_metadata import FILE, is_part
+from ou_monitor.stream.files import open_regular
+from ou_monitor.text import printable
 
 # What `convert` takes and this does not.
 _LOGS = ('.ulg', '.bin', '.bbl', '.bfl', '.db3')
@@ -83,7 +87,8 @@ def find_recordings(given: Sequence[str], leave_out: Path | None = None) -> Foun
         raise InputError(f'no recording in {where}: expected .mcap files, rosbag2 folders, or '
                          '.csv files with the columns time_s, voltage_v'
                          + (f' ({" ".join(notes)})' if notes else ''))
-    return Found(tuple(_source(path) for path in sorted(search.paths)), tuple(notes))
+    return Found(tuple(_source(path) for path in sorted(search.paths)),
+                 tuple(map(printable, notes)))
 
 
 class _Search:
@@ -97,7 +102,11 @@ class _Search:
         self._closed: list[str] = []
 
     def add(self, path: Path) -> None:
-        self.paths.add(path.parent.resolve() if path.name == FILE else path.resolve())
+        path = path.parent if path.name == FILE else path
+        real = Path(os.path.realpath(path))
+        # A link that leads nowhere, or in a circle, keeps its own name.
+        self.paths.add(real if os.path.exists(real) else
+                       Path(os.path.realpath(path.parent)) / path.name)
 
     def walk(self, root: Path) -> None:
         """Search a folder; a bag in it is one recording, whatever it holds."""
@@ -148,9 +157,9 @@ def _passed(paths: Sequence[Path], what: str, why: str) -> str:
 
 def _is_bag(folder: Path) -> bool:
     """Return whether a folder is one bag: it has metadata, or is a bag that was cut off."""
-    if (folder / FILE).is_file():
-        return True
     try:
+        if (folder / FILE).is_file():
+            return True
         parts = list(folder.glob('*.mcap'))
     except OSError:
         return False
@@ -161,7 +170,7 @@ def _is_bag(folder: Path) -> bool:
 def _has_columns(path: Path) -> bool:
     """Return whether the first line of a file names time and voltage."""
     try:
-        with path.open('rb') as file:
+        with open_regular(path) as file:
             head = file.readline(4096).decode('utf-8', 'replace')
     except OSError:
         # It is a recording as far as its name says; the reader tells what is wrong with it.
@@ -172,14 +181,18 @@ def _has_columns(path: Path) -> bool:
 
 def _source(path: Path) -> Source:
     files = [path]
-    if path.is_dir():
-        files = sorted(file for file in path.rglob('*') if file.is_file())
+    if os.path.isdir(path):
+        files = sorted(Path(folder) / name for folder, _, names in os.walk(path) for name in names)
     size, stamps = 0, []
-    for file in files:
+    for file in list(files):
         try:
             found = file.stat()
         except OSError:
-            # Gone since it was found, or not to be looked at: the reader tells.
+            # Gone since it was found, a link to nowhere, or not to be looked at: the reader tells.
+            files.remove(file)
+            continue
+        if not stat.S_ISREG(found.st_mode):
+            files.remove(file)
             continue
         size += 0 if file.name == FILE else found.st_size
         stamps += [found.st_mtime_ns, found.st_size]
@@ -218,7 +231,7 @@ def _digest(source: Source) -> bytes | None:
     digest = hashlib.blake2b()
     try:
         for path in source.files:
-            with path.open('rb') as file:
+            with open_regular(path) as file:
                 while block := file.read(_BLOCK):
                     digest.update(block)
     except OSError:

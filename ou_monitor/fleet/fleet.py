@@ -8,14 +8,15 @@ from pathlib import Path
 import re
 from typing import Any
 
-from ou_monitor.fleet.analysis import Options, work
+from ou_monitor.fleet.analysis import is_result, Options, work
 from ou_monitor.fleet.find import duplicates, Found, Source
 from ou_monitor.fleet.judgement import judge, Judgement
 from ou_monitor.fleet.results import Parts
 from ou_monitor.fleet.table import Row, rows_of
-from ou_monitor.fleet.vehicles import assign, number_flights
+from ou_monitor.fleet.vehicles import assign, match_paths, number_flights
 from ou_monitor.fleet.workers import LocalWorkers, Workers
 from ou_monitor.records import NAN
+from ou_monitor.text import printable
 
 Progress = Callable[[float], None]
 
@@ -73,6 +74,8 @@ def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[]
               pattern: re.Pattern[str] | None = None, stated_options: dict[str, Any] | None = None,
               comparing: Progress | None = None, progress: Progress | None = None) -> Fleet:
     """Analyse all recordings that are not done yet, and judge the fleet."""
+    # A pattern that takes for ever is told before the work, not after it.
+    match_paths(pattern, tuple(source.path for source in found.sources))
     parts = Parts(folder, {**options.as_data(), **(stated_options or {}), 'version': version()})
     twice = duplicates(found.sources, comparing)
     results: dict[Path, dict[str, Any]] = {}
@@ -81,7 +84,7 @@ def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[]
         if source.path in twice:
             continue
         known = parts.load(source)
-        if known is None:
+        if known is None or not is_result(known):
             missing.append(source)
         else:
             results[source.path] = known
@@ -90,7 +93,8 @@ def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[]
         with _workers(min(workers, len(missing)), scheduler, version, insecure) as pool:
             _work(missing, results, parts, options, pool, progress)
     rows, notes = _table(found.sources, results, twice, pattern)
-    return Fleet(rows, judge(rows), (*found.notes, *notes), len(found.sources), kept)
+    notes = list(map(printable, (*found.notes, *notes)))
+    return Fleet(rows, judge(rows), tuple(notes), len(found.sources), kept)
 
 
 def _workers(count: int, scheduler: str | None, version: Callable[[], str], insecure: bool

@@ -17,8 +17,11 @@ from typing import Any
 
 from ou_monitor.errors import InputError
 from ou_monitor.fleet.find import Source
+from ou_monitor.stream.files import open_regular
 
 FOLDER = 'parts'
+# A result has some 10 kB.
+_MOST = 50_000_000
 
 
 class Parts:
@@ -60,11 +63,12 @@ class Parts:
     def load(self, source: Source) -> dict[str, Any] | None:
         """Return the result of a recording; None when there is none."""
         try:
-            found = json.loads(self._path(source).read_text(encoding='utf-8'))
-        except (OSError, ValueError):
-            # Not there, or cut off by a loss of power: it is made again.
+            with open_regular(self._path(source)) as file:
+                found = json.loads(file.read(_MOST + 1)[:_MOST])
+        except (OSError, ValueError, RecursionError):
+            # Not there, cut off by a loss of power, or none of ours: it is made again.
             return None
-        return found if isinstance(found, dict) else None
+        return found if isinstance(found, dict) and found.get('error') == '' else None
 
     def save(self, source: Source, result: Mapping[str, Any]) -> None:
         """Keep the result of a recording."""

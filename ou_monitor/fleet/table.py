@@ -13,6 +13,7 @@ from typing import Any
 from ou_monitor.fleet.find import Source
 from ou_monitor.fleet.results import write_whole
 from ou_monitor.fleet.vehicles import Vehicle
+from ou_monitor.text import printable
 
 Row = dict[str, Any]
 
@@ -113,9 +114,9 @@ def rows_of(source: Source, result: Mapping[str, Any], vehicle: Vehicle, flight:
     base: Row = dict.fromkeys(NAMES)
     base.update(
         vehicle=vehicle.name or None, vehicle_from=vehicle.told_by if vehicle.name else None,
-        flight=flight, path=str(source.path), recording=source.path.name,
+        flight=flight, path=printable(source.path), recording=printable(source.path.name),
         size_bytes=source.size, error=result['error'] or None,
-        duplicate_of=None if duplicate_of is None else str(duplicate_of))
+        duplicate_of=None if duplicate_of is None else printable(duplicate_of))
     if duplicate_of is not None or result['error']:
         return [base]
     base.update({name: _known(result[name]) for name in _OF_RECORDING})

@@ -11,15 +11,32 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+import json
 import math
 from pathlib import Path
 import re
+import subprocess
+import sys
 
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.samples import counted
+from ou_monitor.text import printable
 
 METADATA, PATTERN, FOLDER = 'metadata', 'pattern', 'folder'
 _SHOWN = 3
+
+_MOST_OF_PATTERN = 1000
+# Seconds for the pattern and all paths; a million paths take 2.
+_PATIENCE = 10.0
+# Run in a process of its own.
+_MATCH = """
+import json, re, sys
+text, paths = json.load(sys.stdin)
+pattern = re.compile(text)
+key = 'vehicle' if 'vehicle' in pattern.groupindex else 1 if pattern.groups else 0
+found = map(pattern.search, paths)
+json.dump([(match and match[key]) or '' for match in found], sys.stdout)
+"""
 
 
 @dataclass(frozen=True)
@@ -32,9 +49,12 @@ class Vehicle:
 
 def read_pattern(text: str) -> re.Pattern[str]:
     """Return the pattern of ``--vehicle-from``."""
+    if len(text) > _MOST_OF_PATTERN:
+        raise InputError(f'--vehicle-from has {len(text)} characters, and {_MOST_OF_PATTERN} is '
+                         'the limit')
     try:
         return re.compile(text)
-    except re.error as error:
+    except (re.error, OverflowError, RecursionError) as error:
         raise InputError(f"--vehicle-from: '{text}' is not a regular expression: {error}"
                          ) from error
 
@@ -47,8 +67,9 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
     folders = _folder_names({path.parent for path, name in stated.items() if not name})
     named = {path.parent for path, name in stated.items() if name}
     mixed = []
+    matched = match_paths(pattern, tuple(stated))
     for path, name in stated.items():
-        by_pattern = _matched(pattern, path)
+        by_pattern = matched[path]
         if name:
             found[path] = Vehicle(name, METADATA)
             if by_pattern and by_pattern != name:
@@ -82,13 +103,24 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
     return found, notes
 
 
-def _matched(pattern: re.Pattern[str] | None, path: Path) -> str:
-    match = None if pattern is None else pattern.search(str(path))
-    if match is None or pattern is None:
-        return ''
-    if 'vehicle' in pattern.groupindex:
-        return str(match['vehicle'] or '')
-    return str(match[1] or '') if pattern.groups else match[0]
+def match_paths(pattern: re.Pattern[str] | None, paths: tuple[Path, ...]) -> dict[Path, str]:
+    """
+    Return what a pattern finds in each path; InputError when it takes longer than it may.
+
+    Such as ``(a+)+$`` takes years, and nothing ends it but the end of its process.
+    """
+    if pattern is None or not paths:
+        return dict.fromkeys(paths, '')
+    given = json.dumps([pattern.pattern, [str(path) for path in paths]])
+    try:
+        done = subprocess.run([sys.executable, '-I', '-S', '-c', _MATCH], input=given, text=True,
+                              capture_output=True, timeout=_PATIENCE, check=True)
+    except subprocess.TimeoutExpired:
+        raise InputError(f"--vehicle-from: '{pattern.pattern}' takes more than "
+                         f'{_PATIENCE:g} s for {counted(len(paths), "path")}: avoid repeats of '
+                         'repeats, such as (a+)+') from None
+    return {path: printable(name) for path, name in zip(paths, json.loads(done.stdout),
+                                                        strict=True)}
 
 
 def _folder_names(folders: set[Path]) -> dict[Path, str]:
@@ -99,7 +131,7 @@ def _folder_names(folders: set[Path]) -> dict[Path, str]:
             tail = folder.parts[-depth:]
             if sum(other.parts[-depth:] == tail for other in folders) == 1:
                 break
-        names[folder] = '/'.join(part.strip('/') for part in tail) or '/'
+        names[folder] = printable('/'.join(part.strip('/') for part in tail) or '/')
     return names
 
 

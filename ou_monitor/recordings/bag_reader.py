@@ -13,18 +13,25 @@ from dataclasses import replace
 import io
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
+import zlib
 
+import lz4.frame
 from mcap.data_stream import ReadDataStream
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Metadata, Schema
-from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
+from mcap_ros2._dynamic import _for_each_msgdef
 from mcap_ros2.decoder import DecoderFactory
 from ou_monitor.errors import InputError, nearest
+from ou_monitor.recordings.layout import (
+    check_extent, DEFAULTS, Definitions, endless, Field, short_name)
+from ou_monitor.recordings.limits import over_limit
 from ou_monitor.recordings.mcap_file import (
     backwards, in_parts, in_time_order, McapFile, Part, RawMessage)
 from ou_monitor.recordings.mcap_records import Table
 from ou_monitor.recordings.rosbag2_metadata import find_files, parse_qos, TopicInfo
+from ou_monitor.text import printable
+import zstandard
 
 
 class DecodedMessage(NamedTuple):
@@ -39,16 +46,18 @@ class DecodedMessage(NamedTuple):
 class _LibraryCodec:
     """Contents of records as the MCAP library reads them."""
 
-    def unpack(self, chunk: bytes) -> bytes:
-        """Return the records in a chunk, its checksum verified."""
+    def unpack(self, chunk: bytes, limit: int) -> bytes:
+        """Return the records in a chunk, its checksum verified; at most `limit` bytes."""
         record = Chunk.read(ReadDataStream(io.BytesIO(chunk)))
-        if record.compression not in ('', 'lz4', 'zstd'):
-            # The library takes what it does not know for plain bytes.
-            raise ValueError(f"unknown compression '{record.compression}'")
-        stream, length = get_chunk_data_stream(record, validate_crc=True)
-        if length != record.uncompressed_size:
-            raise ValueError(f'{length} bytes in place of {record.uncompressed_size}')
-        return stream.read(length)
+        stated = record.uncompressed_size
+        if stated > limit:
+            raise ValueError(over_limit('it unpacks to', stated, limit))
+        data = _decompressed(record.compression, record.data, stated)
+        if len(data) != stated:
+            raise ValueError(f'{len(data)} bytes in place of {stated}')
+        if record.uncompressed_crc not in (0, zlib.crc32(data)):
+            raise ValueError('its checksum is wrong')
+        return data
 
     def schema(self, content: bytes) -> Schema:
         """Return a schema."""
@@ -70,6 +79,41 @@ class _LibraryCodec:
         return make_reader(file).get_summary()
 
 
+def _decompressed(compression: str, data: bytes, stated: int) -> bytes:
+    """Return the content of a chunk; never more memory than it states, whatever it holds."""
+    if compression == 'zstd':
+        size = zstandard.frame_content_size(data)
+        if size not in (-1, stated):
+            raise ValueError(f'{size} bytes in place of {stated}')
+        plain: bytes = zstandard.decompress(data, stated)
+    elif compression == 'lz4':
+        frame = lz4.frame.LZ4FrameDecompressor()
+        plain = frame.decompress(data, stated)
+        if not frame.eof:
+            raise ValueError(f'more than {stated} bytes, or not all of them')
+    elif compression == '':
+        plain = data
+    else:
+        # The library takes what it does not know for plain bytes.
+        raise ValueError(f"unknown compression '{compression}'")
+    return plain
+
+
+def _definitions(kind: str, text: str) -> Definitions:
+    """Return the fields of a type and of those in it, as the library understands them."""
+    found = dict(DEFAULTS)
+
+    def add(_: str, name: str, parsed: Any) -> None:
+        found[name] = tuple(
+            Field(field.name, field.type.type if field.type.is_primitive_type()
+                  else f'{field.type.pkg_name}/{field.type.type}', bool(field.type.is_array),
+                  field.type.array_size if field.type.is_fixed_size_array() else None)
+            for field in parsed.fields)
+
+    _for_each_msgdef(kind, text, add)
+    return found
+
+
 class BagReader:
     """
     Reads a bag: an .mcap file or a rosbag2 directory.
@@ -81,6 +125,10 @@ class BagReader:
     partial : bool
         Whether a damaged bag is read as far as it holds (`damage` then says
         what is wrong).
+    max_chunk : int, optional
+        Bytes that a chunk may unpack to.  Else the environment variable
+        OU_MONITOR_MAX_CHUNK_MB, or 256 times the file, at least 64 MiB and at
+        most an eighth of the memory.
 
     Attributes
     ----------
@@ -117,12 +165,13 @@ class BagReader:
 
     """
 
-    def __init__(self, path: Path | str, *, partial: bool = False) -> None:
+    def __init__(self, path: Path | str, *, partial: bool = False,
+                 max_chunk: int | None = None) -> None:
         """Index the bag; messages are read later."""
         self.path = Path(path)
         self.partial = partial
         paths, qos, about, missing = find_files(self.path, partial)
-        self._files = [McapFile(file, partial, _LibraryCodec()) for file in paths]
+        self._files = [McapFile(file, partial, _LibraryCodec(), max_chunk) for file in paths]
         # The table of the directory is what a person edits: it holds.
         self.about = {key: value for known in (*(file.about for file in self._files), about)
                       for key, value in known.items()}
@@ -210,18 +259,24 @@ class BagReader:
         """Return the function from CDR bytes to a message of one type in the bag."""
         def complain(error: Exception) -> InputError:
             return InputError(f'{self.path}: a message of type {kind} cannot be decoded '
-                              f'({type(error).__name__}: {error})')
+                              f'({type(error).__name__}: {printable(error, 200)})')
         try:
             # The library tells a definition that it cannot read on standard error as well.
             with redirect_stderr(io.StringIO()):
                 decode = DecoderFactory().decoder_for('cdr', self._schemas[kind])
+                definitions = _definitions(kind, self.definition(kind))
         except Exception as error:
             raise complain(error) from error
         if decode is None:
             raise InputError(f'{self.path}: type {kind} has no ros2msg definition')
 
+        name = short_name(kind)
+        unsafe = endless(name, definitions)
+
         def checked(data: bytes) -> Any:
             try:
+                if unsafe:
+                    check_extent(data, name, definitions)
                 return decode(data)
             except Exception as error:
                 raise complain(error) from error

@@ -12,11 +12,14 @@ from __future__ import annotations
 from array import array
 from collections.abc import Iterator, Sequence
 import csv
+import io
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.records import FloatArray
+from ou_monitor.stream.files import open_regular
 
 TIME, VOLTAGE, THROTTLE = 'time_s', 'voltage_v', 'throttle'
 
@@ -27,6 +30,8 @@ _MISSING = frozenset(('', 'nan', 'null', 'none', 'na', 'n/a'))
 _MARK = ': the decimal mark is a point'
 # Characters of a cell that are shown.
 _LONGEST = 40
+# A log of 1000 columns has lines of some 10 000 characters.
+MOST_OF_LINE = 65536
 
 
 def read_csv(path: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -46,8 +51,8 @@ def read_column(path: Path, name: str) -> tuple[FloatArray, FloatArray]:
 def column_names(path: Path, needed: str) -> list[str]:
     """Return the names of the columns of a CSV (needed in A)."""
     try:
-        with path.open(encoding='utf-8-sig', newline='') as file:
-            lines = _Lines(file)
+        with _open(path) as file:
+            lines = _Lines(path, file)
             return _header(path, lines, next(iter(lines), None), (needed,))[0]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise _unreadable(path, error) from error
@@ -60,7 +65,7 @@ def read_columns(path: Path, names: Sequence[str]) -> list[FloatArray]:
 
 def _columns(path: Path, needed: Sequence[str], optional: Sequence[str]) -> list[FloatArray]:
     try:
-        with path.open(encoding='utf-8-sig', newline='') as file:
+        with _open(path) as file:
             return _read(path, file, needed, optional)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise _unreadable(path, error) from error
@@ -74,24 +79,33 @@ def _unreadable(path: Path, error: Exception) -> InputError:
     return InputError(f'{path} is not a CSV: {error}')
 
 
+def _open(path: Path) -> TextIO:
+    return io.TextIOWrapper(open_regular(path), encoding='utf-8-sig', newline='')
+
+
 class _Lines:
     """The lines that count, and the number of the last one handed out."""
 
-    def __init__(self, file: Iterator[str]) -> None:
+    def __init__(self, path: Path, file: TextIO) -> None:
+        self._path = path
         self._file = file
         self.number = 0
 
     def __iter__(self) -> Iterator[str]:
         """Yield lines that are neither blank nor comments."""
-        for line in self._file:
+        read = self._file.readline
+        while line := read(MOST_OF_LINE + 1):
             self.number += 1
+            if len(line) > MOST_OF_LINE:
+                raise InputError(f'{self._path}:{self.number}: the line has more than '
+                                 f'{MOST_OF_LINE} characters')
             if line.strip() and not line.lstrip().startswith('#'):
                 yield line
 
 
-def _read(path: Path, file: Iterator[str], needed: Sequence[str], optional: Sequence[str],
+def _read(path: Path, file: TextIO, needed: Sequence[str], optional: Sequence[str],
           ) -> list[FloatArray]:
-    lines = _Lines(file)
+    lines = _Lines(path, file)
     texts = iter(lines)
     header, delimiter = _header(path, lines, next(texts, None), needed)
     for name in (*needed, *optional):

@@ -81,6 +81,8 @@ Definitions = dict[str, tuple[Field, ...]]
 
 # What the general decoder takes where a bag does not carry these.
 _TIME = (Field('sec', 'uint32'), Field('nanosec', 'uint32'))
+DEFAULTS: Definitions = {
+    'builtin_interfaces/Time': _TIME, 'builtin_interfaces/Duration': _TIME}
 
 
 def short_name(kind: str) -> str:
@@ -91,7 +93,7 @@ def short_name(kind: str) -> str:
 
 def parse_definition(kind: str, text: str) -> Definitions | None:
     """Return the fields of a type and of those that it uses."""
-    found: Definitions = {'builtin_interfaces/Time': _TIME, 'builtin_interfaces/Duration': _TIME}
+    found = dict(DEFAULTS)
     name = short_name(kind)
     for part in _SEPARATOR.split(text.replace('\r', '')):
         lines = [line.strip() for line in part.splitlines()]
@@ -304,3 +306,88 @@ class _Walk:
         if self._at > len(self._data):
             raise _NoLayoutError
         return begin
+
+
+# Arrays that the general decoder slices, without a look whether so many bytes are there.
+_SLICED = frozenset(('uint8', 'byte'))
+_FREE_STEPS = 1000
+
+
+def endless(kind: str, definitions: Definitions) -> bool:
+    """
+    Whether a few bytes of a type can keep the general decoder busy for ever.
+
+    It reads elements of a type that takes no bytes, or none that it checks, as often as a
+    length word says; identifiers such as ``uint8[16] uuid`` are of that kind.
+    """
+    least: dict[str, int] = {}
+
+    def bytes_checked(name: str) -> int:
+        if name not in least:
+            # A type within itself ends by its own depth.
+            least[name] = 1
+            fields = definitions.get(name, ())
+            least[name] = sum(map(of_field, fields)) if fields else 1
+        return least[name]
+
+    def of_field(field: Field) -> int:
+        one = 1 if field.type in PRIMITIVES or field.type == TEXT else bytes_checked(field.type)
+        if not field.array:
+            return one
+        if field.size is None:
+            return 4
+        return 0 if field.type in _SLICED else one * field.size
+
+    bytes_checked(kind)
+    return any(count == 0 for name, count in least.items() if name != kind)
+
+
+def check_extent(message: bytes, kind: str, definitions: Definitions) -> None:
+    """Raise ValueError where a message of a type as of `endless` goes on beyond its end."""
+    word = struct.Struct('<I' if message[1:2] in (b'\x01', b'\x03') else '>I')
+    left = len(message) + _FREE_STEPS
+    at = _HEADER
+
+    def take(size: int, align: int) -> int:
+        nonlocal at
+        begin = at + (_HEADER - at) % align
+        at = begin + size
+        if at > len(message):
+            raise ValueError('it is shorter than what it says of itself')
+        return begin
+
+    def length() -> int:
+        (value,) = word.unpack_from(message, take(4, 4))
+        return int(value)
+
+    def one(name: str) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise ValueError('it states more elements than it has bytes')
+        if name == TEXT:
+            take(length(), 1)
+        elif name in PRIMITIVES:
+            width = np.dtype(PRIMITIVES[name]).itemsize
+            take(width, width)
+        elif name not in definitions:
+            raise ValueError('a type in it is not defined')
+        elif not definitions[name]:
+            take(1, 1)
+        else:
+            for field in definitions[name]:
+                if field.array:
+                    several(field)
+                else:
+                    one(field.type)
+
+    def several(field: Field) -> None:
+        count = length() if field.size is None else field.size
+        if field.type in PRIMITIVES:
+            width = np.dtype(PRIMITIVES[field.type]).itemsize
+            take(count * width, width if count else 1)
+            return
+        for _ in range(count):
+            one(field.type)
+
+    one(kind)

@@ -15,20 +15,27 @@ import os
 from pathlib import Path
 import shlex
 from typing import Any, BinaryIO, NamedTuple
-import zlib
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.mcap_index import Break, Codec, McapIndex, scan, TopicRecord
+from ou_monitor.recordings.limits import chunk_limit, file_limit, MOST_METADATA, over_limit
+from ou_monitor.recordings.mcap_index import Break, Codec, McapIndex, MOST_BREAKS, TopicRecord
 from ou_monitor.recordings.mcap_records import (
-    check_passed_over, Damage, find_by_index, find_messages, FOOTER_LENGTH, inner_records, MAGIC,
-    MESSAGE_HEAD, moment, Op, record_at, RECORD_HEAD, Span, Table)
+    check_passed_over, crc_of, Damage, find_by_index, find_messages, FOOTER_LENGTH, inner_records,
+    MAGIC, MESSAGE_HEAD, moment, Op, record_at, RECORD_HEAD, Span, Table)
+from ou_monitor.recordings.mcap_scan import scan
+from ou_monitor.stream.files import open_regular, path_words
+from ou_monitor.text import printable
 
 # First bytes of the logs that `ou-monitor convert` reads; CSV is read as it is.
 _LOGS = (
     (b'ULog', 'a PX4 ULog'), (b'\xa3\x95\x80', 'an ArduPilot dataflash log'),
     (b'FMT,', 'an ArduPilot log'), (b'H Product:Blackbox', 'a blackbox log'))
+
+
+# Of more channels only those in a chunk are looked for.
+_FEW_CHANNELS = 8
 
 
 class RawMessage(NamedTuple):
@@ -52,6 +59,8 @@ class McapFile(McapIndex):
         Whether the whole file is walked for damage, whatever its summary says.
     codec : Codec
         Reader of the contents of records.
+    max_chunk : int, optional
+        Bytes that a chunk may unpack to; else as of `chunk_limit`.
 
     Attributes
     ----------
@@ -66,12 +75,15 @@ class McapFile(McapIndex):
 
     """
 
-    def __init__(self, path: Path, partial: bool, codec: Codec) -> None:
+    def __init__(self, path: Path, partial: bool, codec: Codec,
+                 max_chunk: int | None = None) -> None:
         """Index the file."""
         super().__init__(path, codec)
         try:
-            with path.open('rb') as file:
+            with open_regular(path) as file:
                 size = file.seek(0, os.SEEK_END)
+                self.chunk_limit = chunk_limit(size, max_chunk)
+                self.file_limit = file_limit(size, self.chunk_limit)
                 self._check_magic(file, size)
                 summary = self._read_summary(file, size)
                 # The summary is trusted when whole; a partial reading trusts nothing.
@@ -85,9 +97,14 @@ class McapFile(McapIndex):
 
     def where(self, found: Break) -> str:
         """Return the byte, the reason and the time of a damage in words."""
-        if found.after_ns is None:
-            return f'{found.why} (before the first message)'
-        return f'{found.why} ({moment(found.after_ns, self.origin_ns)})'
+        newest = max((span.end_ns for span in self.spans if span.offset <= found.offset),
+                     default=None)
+        return self._when(found.why, newest)
+
+    def _when(self, why: str, after_ns: int | None) -> str:
+        if after_ns is None:
+            return f'{why} (before the first message)'
+        return f'{why} ({moment(after_ns, self.origin_ns)})'
 
     @property
     def damage(self) -> str | None:
@@ -96,6 +113,8 @@ class McapFile(McapIndex):
             return None
         rest = len(self.breaks) - 1
         more = '' if not rest else (
+            f'; and at {rest} more places, where the search was given up'
+            if rest + 1 >= MOST_BREAKS else
             f'; and at {rest} more place{"s" * (rest > 1)}, the last at byte '
             f'{self.breaks[-1].offset}')
         return self.where(self.breaks[0]) + more
@@ -118,11 +137,11 @@ class McapFile(McapIndex):
         start = int.from_bytes(footer[9:17], 'little')
         stated = int.from_bytes(footer[25:29], 'little')
         whole = (footer.startswith(RECORD_HEAD.pack(Op.FOOTER, 20)) and footer.endswith(MAGIC)
-                 and len(MAGIC) < start < size)
+                 and len(MAGIC) < start < size and size - start <= self.chunk_limit)
         if not whole:
             return None
         file.seek(start)
-        if stated and zlib.crc32(file.read(size - start - len(MAGIC) - 4)) != stated:
+        if stated and crc_of(file, size - start - len(MAGIC) - 4) != stated:
             self.notes.append(f'The summary of {self.path.name} is damaged from byte {start}: '
                               'the whole file was scanned.')
             return None
@@ -131,8 +150,8 @@ class McapFile(McapIndex):
             return self._codec.summary(file)
         # The library lets every kind of error through; each means the same here.
         except Exception as error:
-            self.notes.append(f'The summary of {self.path.name} cannot be read ({error}): '
-                              'the whole file was scanned.')
+            self.notes.append(f'The summary of {self.path.name} cannot be read '
+                              f'({printable(error, 200)}): the whole file was scanned.')
             return None
 
     def _use_summary(self, summary: Any, size: int) -> bool:
@@ -141,9 +160,19 @@ class McapFile(McapIndex):
             return False
         if summary.statistics.message_count and not summary.chunk_indexes:
             return False
-        for index in summary.chunk_indexes:
-            if index.chunk_start_offset + index.chunk_length > size:
+        indexes = sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
+        end, unpacked = len(MAGIC), 0
+        for index in indexes:
+            # A chunk that is listed twice, or within another, would be read twice.
+            if index.chunk_start_offset < end or index.chunk_length < RECORD_HEAD.size:
                 return False
+            end = index.chunk_start_offset + index.chunk_length
+            unpacked += index.uncompressed_size
+        if end > size:
+            return False
+        if unpacked > self.file_limit:
+            raise InputError(f'{path_words(self.path)}: ' + over_limit(
+                'its chunks hold', unpacked, self.file_limit))
         self.schemas.update(summary.schemas)
         for channel in summary.channels.values():
             self.add_channel(channel)
@@ -157,8 +186,10 @@ class McapFile(McapIndex):
                  index.chunk_start_offset + RECORD_HEAD.size,
                  index.chunk_length - RECORD_HEAD.size, True,
                  frozenset(index.message_index_offsets) or None,
-                 min(index.message_index_length,
-                     size - index.chunk_start_offset - index.chunk_length))
+                 # A message of 31 bytes or more has 16 in the index, beside its head.
+                 min(index.message_index_length, index.uncompressed_size + 15 * 65536,
+                     size - index.chunk_start_offset - index.chunk_length),
+                 index.uncompressed_size)
             for index in summary.chunk_indexes if index.message_index_offsets or not indexed]
         self.start_ns = summary.statistics.message_start_time
         self.end_ns = summary.statistics.message_end_time
@@ -171,7 +202,7 @@ class McapFile(McapIndex):
                 record = record_at(file, index.offset, size, True)
                 check_passed_over(file, record)
                 file.seek(record.content)
-                self.learn_about(file.read(record.length), record.offset)
+                self.learn_about(file.read(min(record.length, MOST_METADATA + 1)), record.offset)
             except Damage as error:
                 self.notes.append(f'Metadata of {self.path.name} cannot be read ({error}).')
 
@@ -185,7 +216,7 @@ class McapFile(McapIndex):
         channels = {key: (topic.name, topic.type)
                     for key, topic in self.channels_of(wanted).items()}
         try:
-            with self.path.open('rb') as file:
+            with open_regular(self.path) as file:
                 data = self.span_data(file, span)
             for opcode, begin, end in inner_records(data):
                 if opcode == Op.MESSAGE:
@@ -203,7 +234,7 @@ class McapFile(McapIndex):
     def tables(self, span: Span, wanted: set[str]) -> dict[str, Table]:
         """Return where the messages of a span are, by topic, in file order."""
         try:
-            with self.path.open('rb') as file:
+            with open_regular(self.path) as file:
                 data = self.span_data(file, span)
                 file.seek(span.offset + span.length)
                 index = file.read(span.index_length)
@@ -215,7 +246,11 @@ class McapFile(McapIndex):
         except Damage as error:
             raise self._refusal(span, error) from error
         topics: dict[str, npt.NDArray[np.bool_]] = {}
-        for key, topic in self.channels_of(wanted).items():
+        channels = self.channels_of(wanted)
+        if len(channels) > _FEW_CHANNELS:
+            there = np.unique(table.channel).tolist()
+            channels = {key: channels[key] for key in there if key in channels}
+        for key, topic in channels.items():
             mine = table.channel == key
             # Two publishers of one topic are two channels.
             topics[topic.name] = topics.get(topic.name, False) | mine
@@ -224,10 +259,10 @@ class McapFile(McapIndex):
 
     def _refusal(self, span: Span, error: Damage) -> InputError:
         """Return the error for a chunk that turned out to be broken."""
-        found = Break(span.offset, f'at byte {span.offset}: the chunk there is broken '
-                      f'({error.why})', span.start_ns)
-        return InputError(f'{self.path} is damaged {self.where(found)}; use --partial to take '
-                          'what it still holds')
+        why = self._when(f'at byte {span.offset}: the chunk there is broken ({error.why})',
+                         span.start_ns)
+        return InputError(f'{self.path} is damaged {why}; use --partial to take what it still '
+                          'holds')
 
 
 class Part(NamedTuple):

@@ -36,6 +36,8 @@ _PAYLOAD = RECORD_HEAD.size + MESSAGE_HEAD.size
 
 # A run of equal records is looked for this far ahead at first, then twice as far.
 _FIRST_RUN = 32
+# Records of a chunk that are no messages: as many schemas and channels as have numbers.
+_MOST_OTHERS = 2 * 65536
 # Records to walk one by one after a run that was not worth looking for: twice as
 # many each time, up to this.
 _LEAST_PAUSE, _MOST_PAUSE = 16, 2048
@@ -62,6 +64,9 @@ class Op(enum.IntEnum):
 
 
 PRIVATE = 0x80
+
+# Bytes read at once where no more is needed than a checksum.
+_BLOCK = 1024 * 1024
 
 # Which records may stand before the end of the data, and which after it.  A
 # message whose opcode was hit by a wrong bit must not be skipped as something else.
@@ -124,6 +129,8 @@ class Span:
         Channels that have messages in it; None when not known.
     index_length : int
         Bytes of message indexes right after the chunk.
+    unpacked : int
+        Bytes that the chunk unpacks to, as stated; 0 where nobody states it.
 
     """
 
@@ -134,6 +141,7 @@ class Span:
     chunk: bool
     channels: frozenset[int] | None = None
     index_length: int = 0
+    unpacked: int = 0
 
 
 def record_at(file: BinaryIO, offset: int, size: int, in_data: bool) -> Record:
@@ -159,23 +167,36 @@ def record_at(file: BinaryIO, offset: int, size: int, in_data: bool) -> Record:
 
 def check_passed_over(file: BinaryIO, record: Record) -> None:
     """Check that a record that is not needed is what its opcode says (record in A)."""
-    if record.opcode not in (Op.MESSAGE_INDEX, Op.ATTACHMENT, Op.METADATA):
-        return
     file.seek(record.content)
-    content = file.read(record.length)
     if record.opcode == Op.MESSAGE_INDEX:
-        fits = len(content) >= 6 and (len(content) - 6) % 16 == 0 and (
-            int.from_bytes(content[2:6], 'little') == len(content) - 6)
+        length = int.from_bytes(file.read(6)[2:], 'little')
+        fits = record.length >= 6 and length % 16 == 0 and length == record.length - 6
     elif record.opcode == Op.ATTACHMENT:
-        stated = int.from_bytes(content[-4:], 'little')
-        fits = len(content) >= 36 and stated in (0, zlib.crc32(content[:-4]))
+        found = crc_of(file, record.length - 4)
+        fits = record.length >= 36 and int.from_bytes(file.read(4), 'little') in (0, found)
+    elif record.opcode == Op.METADATA:
+        name = int.from_bytes(file.read(4), 'little')
+        fits = record.length >= name + 8
+        if fits:
+            file.seek(record.content + 4 + name)
+            fits = int.from_bytes(file.read(4), 'little') == record.length - name - 8
     else:
-        name = int.from_bytes(content[:4], 'little')
-        rest = content[4 + name:]
-        fits = len(rest) >= 4 and int.from_bytes(rest[:4], 'little') == len(rest) - 4
+        return
     if not fits:
         raise Damage(record.offset, f'a record 0x{record.opcode:02x} of {record.length} bytes '
                      'does not hold what it should')
+
+
+def crc_of(file: BinaryIO, length: int) -> int:
+    """Return the checksum of the next bytes of a file, as many as there are."""
+    found = 0
+    while length > 0:
+        block = file.read(min(_BLOCK, length))
+        if not block:
+            break
+        found = zlib.crc32(block, found)
+        length -= len(block)
+    return found
 
 
 def inner_records(data: bytes) -> Iterator[tuple[int, int, int]]:
@@ -276,6 +297,8 @@ def find_messages(
                 raise Damage(at, 'a record within a chunk is cut off')
             if opcode == opcode_of_message:
                 raise Damage(at, 'a message is shorter than its own head')
+            if len(others) == _MOST_OTHERS:
+                raise Damage(at, f'more than {_MOST_OTHERS} records that are no messages')
             others.append((opcode, at + _HEAD, behind))
             at, last = behind, -1
             continue

@@ -24,6 +24,7 @@ from ou_monitor.recordings.samples import (
     span_words, usable_voltage)
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.config import FieldSpec
+from ou_monitor.text import printable
 
 # Samples of a piece, where the caller does not say.
 PIECE = 1_000_000
@@ -76,11 +77,12 @@ def read_recording(
     path = Path(path)
     _check_part(start, end)
     if path.suffix.lower() == '.csv' and not path.is_dir():
-        for name, value in (('--msg-config', msg_config), ('--voltage-topic', voltage_topic),
-                            ('--throttle-topic', throttle_topic)):
+        for option, value in (('--msg-config', msg_config), ('--voltage-topic', voltage_topic),
+                              ('--throttle-topic', throttle_topic)):
             if value is not None:
-                raise InputError(f'{path} is a CSV: {name} is for bags')
-        return _cut(tidy(*read_csv(path), path.name, {'file': path.name, 'format': 'csv'}, []),
+                raise InputError(f'{path} is a CSV: {option} is for bags')
+        name = printable(path.name)
+        return _cut(tidy(*read_csv(path), name, {'file': name, 'format': 'csv'}, []),
                     start, end)
     reader = SampleReader(
         BagReader(path, partial=partial), msg_config=msg_config, voltage_topic=voltage_topic,

@@ -23,6 +23,7 @@ from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.blocks import BlockClock
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.stream.throttle import BoolArray, ThrottleHold
+from ou_monitor.text import printable
 
 VOLTAGE, THROTTLE = 'voltage', 'throttle'
 # Squares and cubes of what is beyond this overflow; no supply comes near it.
@@ -160,10 +161,10 @@ class SampleReader:
                 f'The bag is damaged; what it still holds was read: {bag.damage}.')
         if start is not None or end is not None:
             self._notes.append(part_words(start, end))
-        self.name = bag.path.name
+        self.name = printable(bag.path.name)
         self.duration = (bag.end_ns - bag.start_ns) * 1e-9
         self.source = {
-            **bag.about, 'file': bag.path.name, 'format': 'mcap', 'msg_config': choice.config.name,
+            **bag.about, 'file': self.name, 'format': 'mcap', 'msg_config': choice.config.name,
             'voltage_topic': choice.voltage.topic, 'voltage_type': choice.voltage.type,
             'voltage_field': choice.voltage.field,
             **bag.origins.get(choice.voltage.topic, {})}

@@ -108,3 +108,25 @@ def test_a_wrong_field_is_told_before_any_message():
     source = find_source('voltage', values(msg_config='std_float32', voltage__field='dat'))
     with pytest.raises(InputError, match="did you mean 'data'?"):
         source.open()
+
+
+def test_a_bag_does_not_choose_what_is_imported(tmp_path, monkeypatch):
+    """Only packages of the ament index are loaded, whatever modules there are by such a name."""
+    (tmp_path / 'evil_msgs').mkdir()
+    (tmp_path / 'evil_msgs' / '__init__.py').write_text('')
+    (tmp_path / 'evil_msgs' / 'msg.py').write_text(
+        f'open({str(tmp_path / "done")!r}, "w").close()\nclass Evil:\n    pass\n')
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in ('evil_msgs/msg/Evil', 'antigravity/msg/Evil', '__main__/msg/Evil'):
+        with pytest.raises(InputError, match='not installed'):
+            message_class(name)
+    assert not (tmp_path / 'done').exists()
+    # A prefix that is sourced names its own.
+    index = tmp_path / 'share' / 'ament_index' / 'resource_index' / 'packages'
+    index.mkdir(parents=True)
+    (index / 'evil_msgs').touch()
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+    with pytest.raises(InputError, match="no message 'Evil'"):
+        message_class('evil_msgs/msg/Evil')
+    with pytest.raises(InputError, match='no message'):
+        message_class('std_msgs/msg/__loader__')

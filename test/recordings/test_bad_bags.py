@@ -253,7 +253,7 @@ def test_a_file_that_may_not_be_read(mcap, monkeypatch):
     """The reason is that of the system, in one line."""
     def refuse(*_, **__):
         raise PermissionError(13, 'Permission denied')
-    monkeypatch.setattr('pathlib.Path.open', refuse)
+    monkeypatch.setattr('os.open', refuse)
     assert 'Permission denied' in complaint(mcap)
 
 

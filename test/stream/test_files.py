@@ -125,4 +125,4 @@ def test_printable():
     assert printable('\x1b[2Ja\nb\t\x9b\u202e\u2028\udcff') == (
         '\\x1b[2Ja\\nb\\t\\x9b\\u202e\\u2028\\udcff')
     assert printable('abcdefghij' * 10, 15) == 'abcd...cdefghij'
-    assert str(InputError('a\nb\x1b')) == 'a\\nb\\x1b'
+    assert str(InputError('a\nb\x1b')) == 'a b\\x1b'

@@ -19,6 +19,9 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import Log, Progress, quiet, Request
 from ou_monitor.recordings.mcap_records import MAGIC as MCAP_MAGIC
+from ou_monitor.recordings.rosbag2_metadata import plain_texts
+from ou_monitor.stream.files import open_regular
+from ou_monitor.text import printable
 
 # Enough to tell every format; the formats of a text log come first in it.
 HEAD = 8192  # bytes
@@ -85,7 +88,7 @@ def detect(path: Path) -> Format:
     if not path.exists():
         raise InputError(f"there is no log '{path}': check the path")
     try:
-        with path.open('rb') as file:
+        with open_regular(path) as file:
             head = file.read(HEAD)
     except OSError as error:
         raise InputError(f'cannot read {path}: {error.strerror}') from error
@@ -117,7 +120,11 @@ def import_log(path: Path, request: Request) -> Log:
     # Broken bytes make numbers that no cast takes, and fields of any shape.
     with np.errstate(all='ignore'), quiet(path, form.package or 'the reader of CSV'):
         log: Log = module.read(path, request)
-    return log
+    # Names in a log reach messages, tables and bags.
+    return replace(
+        log, series=tuple(replace(one, name=printable(one.name, 200), words=printable(one.words),
+                                  scale=printable(one.scale)) for one in log.series),
+        facts=plain_texts(log.facts), notes=tuple(map(printable, log.notes)))
 
 
 def _shown(progress: Progress) -> Progress:

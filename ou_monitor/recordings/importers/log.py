@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import FloatArray
+from ou_monitor.text import printable
 
 VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
 # A column of a table that says nothing about what it is.
@@ -252,7 +253,7 @@ def quiet(path: Path, parser: str) -> Iterator[io.StringIO]:
         raise InputError(f'cannot read {path}: {error.strerror or error}') from error
     except Exception as error:
         raise InputError(f'{path} is damaged: it cannot be read with {parser} '
-                         f'({type(error).__name__}: {error})') from error
+                         f'({type(error).__name__}: {printable(error, 200)})') from error
     finally:
         logger.removeHandler(handler)
         logger.disabled, logger.propagate = before

@@ -1,0 +1,129 @@
+"""What is no recording by the name of one: a row each, and nothing hangs or ends the others."""
+
+import os
+from pathlib import Path
+import time
+
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.fleet import vehicles
+from ou_monitor.fleet.analysis import is_result, Options
+from ou_monitor.fleet.find import duplicates, find_recordings
+from ou_monitor.fleet.fleet import run_fleet
+from ou_monitor.fleet.results import Parts
+from ou_monitor.fleet.vehicles import match_paths, read_pattern
+from ou_monitor.model.ou import simulate
+import pytest
+
+
+@pytest.fixture
+def odd(tmp_path):
+    """Return a folder with a flight, and all that may lie beside it."""
+    folder = tmp_path / 'logs'
+    folder.mkdir()
+    t = np.arange(4000) * 1e-3
+    v = simulate(t, 63.0, np.full(t.size, 0.4), np.random.default_rng(1), u0=5.0)
+    (folder / 'flight.csv').write_text('time_s,voltage_v\n' + ''.join(
+        f'{a},{b}\n' for a, b in zip(t.tolist(), v.tolist())))
+    for name in ('fifo.mcap', 'fifo.csv'):
+        os.mkfifo(folder / name)
+    (folder / 'loop.mcap').symlink_to(folder / 'loop.mcap')
+    (folder / 'gone.mcap').symlink_to(folder / 'nowhere.mcap')
+    (folder / 'gone.csv').symlink_to('/nowhere/at/all.csv')
+    (folder / 'zero.mcap').symlink_to('/dev/zero')
+    (folder / 'up').symlink_to(folder)
+    (folder / 'name\x1b[2J.mcap').write_text('x')
+    bag = folder / 'bag'
+    bag.mkdir()
+    (bag / 'metadata.yaml').write_text('a: ' + '9' * 5000)
+    os.mkfifo(bag / 'bag_0.mcap')
+    (bag / 'bag_1.mcap').symlink_to(bag / 'bag_1.mcap')
+    parts = folder / 'cut'
+    parts.mkdir()
+    os.mkfifo(parts / 'cut_0.mcap')
+    return folder
+
+
+def test_a_row_each(odd, tmp_path, one_process):
+    """The flight is analysed; every other has a row that says what it is."""
+    began = time.monotonic()
+    found = find_recordings([str(odd)])
+    assert duplicates(found.sources) == {}
+    fleet = run_fleet(found, tmp_path / 'out', Options(), lambda: '1', workers=1)
+    assert time.monotonic() - began < 60.0
+    assert {row['recording'] for row in fleet.failed} == {
+        'fifo.mcap', 'fifo.csv', 'loop.mcap', 'gone.mcap', 'gone.csv', 'zero', 'bag', 'cut',
+        'name\\x1b[2J.mcap'}
+    assert fleet.analysed == 1
+    for row in fleet.failed:
+        assert row['error'].isprintable() and len(row['error']) < 500
+    errors = {row['recording']: row['error'] for row in fleet.failed}
+    assert all('not a regular file' in errors[name] for name in ('fifo.mcap', 'fifo.csv', 'zero'))
+    assert all('leads nowhere' in errors[name] for name in ('loop.mcap', 'gone.mcap'))
+    assert all(note.isprintable() for note in fleet.notes)
+
+
+def test_a_folder_that_may_be_listed_and_not_entered(odd, monkeypatch):
+    """What the system refuses about one folder is no end of the search."""
+    is_file = Path.is_file
+
+    def refuse(self):
+        if self.parent.name == 'bag':
+            raise PermissionError(13, 'Permission denied', str(self))
+        return is_file(self)
+    monkeypatch.setattr(Path, 'is_file', refuse)
+    assert len(find_recordings([str(odd)]).sources) >= 8
+
+
+@pytest.mark.parametrize('content', [
+    None, '[' * 100_000, '{}', '[]', '"x"', '{"error": 0}', '1' * 9999])
+def test_results_that_are_none(odd, tmp_path, content):
+    """A part of an earlier run that is a FIFO, or none of ours, is made again."""
+    (source,) = find_recordings([str(odd / 'flight.csv')]).sources
+    parts = Parts(tmp_path / 'out', {})
+    parts.save(source, {'error': '', 'levels': []})
+    (path,) = (tmp_path / 'out' / 'parts').glob('*.json')
+    path.unlink()
+    if content is None:
+        os.mkfifo(path)
+    else:
+        path.write_text(content)
+    assert parts.load(source) is None
+
+
+def test_a_result_is_checked():
+    """As `work` returns it, or not at all."""
+    whole = {'vehicle': '', 'levels': [{}], **dict.fromkeys((
+        'start', 'duration_s', 'samples', 'rate_hz', 'sag', 'sag_se', 'risk_max', 'alpha_p',
+        'gain', 'gain_se'), 0.0)}
+    assert is_result(whole)
+    for change in ({'levels': 5}, {'levels': [1]}, {'vehicle': None}, {'start': 'x'}):
+        assert not is_result({**whole, **change})
+    assert not is_result({})
+
+
+@pytest.mark.parametrize('text', [r'(a+)+$', r'(a|aa)+$', r'(.*)*b$', r'((x*)*)*=y'])
+def test_a_pattern_without_end(tmp_path, monkeypatch, text):
+    """It is told before the work, and ends with its process."""
+    monkeypatch.setattr(vehicles, '_PATIENCE', 1.0)
+    path = Path('/logs/' + 'a' * 60 + 'x' * 60 + '.mcap')
+    began = time.monotonic()
+    with pytest.raises(InputError, match='takes more than 1 s'):
+        match_paths(read_pattern(text), (path,))
+    assert time.monotonic() - began < 5.0
+
+
+@pytest.mark.parametrize('text', ['a' * 2000, '(' * 900, 'a{99999999999999999999}', '*'])
+def test_a_pattern_that_is_none(text):
+    """Too long, too deep, too large: one line."""
+    with pytest.raises(InputError, match='--vehicle-from') as caught:
+        read_pattern(text)
+    assert '\n' not in str(caught.value)
+
+
+def test_a_pattern_for_many_paths():
+    """Names come back in order, escapes among them; no path is lost."""
+    paths = tuple(Path(f'/f/uav{k}_\x1b\udcff.csv') for k in range(5000))
+    found = match_paths(read_pattern(r'/(uav\d+)_(.)'), paths)
+    assert list(found.values()) == [f'uav{k}' for k in range(5000)]
+    assert match_paths(read_pattern(r'_(?P<vehicle>..)'), paths[:1])[paths[0]] == '\\x1b\\udcff'

@@ -1,0 +1,371 @@
+"""Bags made to harm: what they claim is checked before anything is taken or believed."""
+
+import os
+import resource
+import struct
+import time
+import zlib
+
+import lz4.frame
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.bag import BagReader, BagWriter
+from ou_monitor.recordings.mcap_records import find_by_index, find_messages, MAGIC, Op
+from ou_monitor.recordings.read import read_recording
+from ou_monitor.recordings.standard_types import encode_scalars, FLOAT64
+import pytest
+import zstandard
+
+N = 100
+GB = 2**30
+
+
+def text(value):
+    """Return a text as a record holds it."""
+    data = value.encode() if isinstance(value, str) else value
+    return struct.pack('<I', len(data)) + data
+
+
+def record(op, *parts, length=None):
+    """Return a record."""
+    content = b''.join(parts)
+    return struct.pack('<BQ', op, len(content) if length is None else length) + content
+
+
+def schema(name=FLOAT64, definition='float64 data\n', key=1):
+    """Return a schema."""
+    return record(Op.SCHEMA, struct.pack('<H', key), text(name), text('ros2msg'),
+                  text(definition))
+
+
+def channel(topic='/voltage', key=1, of=1, **metadata):
+    """Return a channel."""
+    pairs = b''.join(text(k) + text(v) for k, v in metadata.items())
+    return record(Op.CHANNEL, struct.pack('<HH', key, of), text(topic), text('cdr'), text(pairs))
+
+
+def message(k, data, key=1):
+    """Return a message."""
+    return record(Op.MESSAGE, struct.pack('<HIQQ', key, k, 1000 * (k + 1), 0), data)
+
+
+def messages(n=N):
+    """Return messages of 5 V."""
+    return b''.join(message(k, data) for k, data in enumerate(
+        encode_scalars(FLOAT64, np.full(n, 5.0))))
+
+
+def chunk(content, *, compression='', packed=None, stated=None, crc=None):
+    """Return a chunk."""
+    return record(Op.CHUNK, struct.pack(
+        '<QQQI', 1000, 1000 * N, len(content) if stated is None else stated,
+        zlib.crc32(content) if crc is None else crc), text(compression),
+        struct.pack('<Q', len(content if packed is None else packed)),
+        content if packed is None else packed)
+
+
+def written(path, *records, summary=b''):
+    """Write a file, whose summary may be a lie."""
+    head = MAGIC + record(Op.HEADER, text('ros2'), text('')) + b''.join(records) + record(
+        Op.DATA_END, bytes(4))
+    start = len(head) if summary else 0
+    path.write_bytes(head + summary + record(Op.FOOTER, struct.pack('<QQI', start, 0, 0)) + MAGIC)
+    return path
+
+
+def complaint(call, *given, within=2.0, **options):
+    """Return the one line with which something is refused in time."""
+    began = time.monotonic()
+    with pytest.raises(InputError) as caught:
+        call(*given, **options)
+    assert time.monotonic() - began < within
+    line = str(caught.value)
+    assert line.isprintable()
+    return line
+
+
+def zeros(compressor):
+    """Return 2 GB of zeros, compressed block by block."""
+    block = bytes(2**24)
+    return b''.join(compressor.compress(block) for _ in range(128)) + compressor.flush()
+
+
+def test_a_file_made_by_hand_is_read(tmp_path):
+    """The others are refused for what is wrong with them."""
+    path = written(tmp_path / 'a.mcap', chunk(schema() + channel() + messages()))
+    assert read_recording(path).n == N
+
+
+@pytest.mark.parametrize('compression, packed', [
+    ('zstd', lambda: zeros(zstandard.ZstdCompressor(level=1).compressobj())),
+    ('zstd', lambda: zeros(zstandard.ZstdCompressor(level=1).compressobj(size=2 * GB))),
+    ('lz4', lambda: lz4.frame.LZ4FrameCompressor().begin() + b''),
+], ids=['zstd', 'zstd, size stated', 'lz4 without end'])
+@pytest.mark.parametrize('stated', [N, 2 * GB])
+def test_a_chunk_that_unpacks_to_more(tmp_path, compression, packed, stated):
+    """Neither what is stated nor what is real is believed; memory stays where it was."""
+    path = written(tmp_path / 'a.mcap', schema(), channel(), messages(), chunk(
+        b'', compression=compression, packed=packed(), stated=stated))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    line = complaint(BagReader, path, max_chunk=None if stated == N else 2**26)
+    assert ('MAX_CHUNK_MB' in line) == (stated != N) and 'the chunk there is broken' in line
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+    assert len(list(BagReader(path, partial=True, max_chunk=2**26).raw_messages())) == N
+
+
+def test_a_bomb_of_lz4(tmp_path):
+    """As of zstd."""
+    frame = lz4.frame.LZ4FrameCompressor()
+    packed = frame.begin() + zeros(frame)
+    path = written(tmp_path / 'a.mcap', chunk(b'', compression='lz4', packed=packed, stated=N))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert 'the chunk there is broken' in complaint(BagReader, path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+
+
+def test_the_limit_of_a_chunk(tmp_path, monkeypatch):
+    """By argument, by environment; a malformed one is one line."""
+    path = written(tmp_path / 'a.mcap', chunk(schema() + channel() + messages()))
+    assert BagReader(path).message_count == N
+    assert 'MAX_CHUNK_MB' in complaint(BagReader, path, max_chunk=1000)
+    monkeypatch.setenv('OU_MONITOR_MAX_CHUNK_MB', '0.001')
+    assert '0.001 MB is the limit' in complaint(BagReader, path)
+    assert BagReader(path, max_chunk=2**20).message_count == N
+    monkeypatch.setenv('OU_MONITOR_MAX_CHUNK_MB', '1')
+    assert BagReader(path).message_count == N
+    monkeypatch.setenv('OU_MONITOR_MAX_CHUNK_MB', 'much\x1b')
+    assert 'must be a number of MB' in complaint(BagReader, path)
+
+
+def test_many_bombs_are_one(tmp_path):
+    """Each chunk is within its limit; together they are not in proportion to the file."""
+    content = message(0, bytes(2**20 - 100), 1)
+    one = chunk(content, compression='zstd', packed=zstandard.compress(content))
+    path = written(tmp_path / 'a.mcap', schema(), channel(), messages(), one * 40)
+    assert 'and those before it hold' in complaint(BagReader, path, max_chunk=2**20, within=5.0)
+
+
+def test_records_that_are_no_messages(tmp_path):
+    """A chunk full of empty records is no reason for millions of objects."""
+    content = bytes(9 * 1_000_000)
+    path = written(tmp_path / 'a.mcap', schema(), channel(), messages(), chunk(content))
+    assert 'that are no messages' in complaint(BagReader, path)
+
+
+def index_of(chunk_at, chunk_length, unpacked, *, index_length=0, offset=None):
+    """Return a chunk index."""
+    behind = (chunk_at + chunk_length) % 2**64
+    offsets = struct.pack('<HQ', 1, behind if offset is None else offset)
+    return record(Op.CHUNK_INDEX, struct.pack('<QQQQ', 1000, 1000 * N, chunk_at, chunk_length),
+                  text(offsets), struct.pack('<Q', index_length), text(''),
+                  struct.pack('<QQ', unpacked, unpacked))
+
+
+def statistics():
+    """Return statistics that count the messages."""
+    return record(Op.STATISTICS, struct.pack('<QHIIIIQQ', N, 1, 1, 0, 0, 1, 1000, 1000 * N),
+                  text(struct.pack('<HQ', 1, N)))
+
+
+LIES = {
+    'sound': {}, 'short': {'chunk_length': 3}, 'none': {'chunk_length': 0},
+    'far': {'chunk_at': 2**63}, 'huge': {'chunk_length': 2**63}, 'wrap': {'chunk_at': 2**64 - 8},
+    'index': {'index_length': 2**63}, 'index_far': {'offset': 2**63},
+    'unpacked': {'unpacked': 7}, 'unpacked_huge': {'unpacked': 2**62}, 'head': {'chunk_at': 0},
+}
+
+
+@pytest.mark.parametrize('lie', LIES)
+@pytest.mark.parametrize('times', [1, 50])
+def test_an_index_that_lies(tmp_path, lie, times):
+    """What it says is read as the walk finds it, or refused; nothing is read twice."""
+    one = chunk(schema() + channel() + messages())
+    at = len(MAGIC) + len(record(Op.HEADER, text('ros2'), text('')))
+    place = {'chunk_at': at, 'chunk_length': len(one), 'unpacked': len(one) - 9 - 40,
+             **LIES[lie]}
+    summary = schema() + channel() + index_of(**place) * times + statistics()
+    path = written(tmp_path / 'a.mcap', one, summary=summary)
+    began = time.monotonic()
+    try:
+        with_tables = read_recording(path)
+        one_by_one = list(BagReader(path).raw_messages())
+    except InputError as error:
+        assert lie.startswith('unpacked') and str(error).isprintable()
+    else:
+        assert with_tables.n == len(one_by_one) == N
+        # What is listed more than once is not believed, and then the walk finds all.
+        assert times > 1 or not lie.startswith('unpacked')
+    assert time.monotonic() - began < 2.0
+
+
+def pairs(*places):
+    """Return a message index of channel 1."""
+    content = b''.join(struct.pack('<QQ', 0, place) for place in places)
+    return record(Op.MESSAGE_INDEX, struct.pack('<H', 1), text(content))
+
+
+@pytest.mark.parametrize('index', [
+    b'', b'\x07', pairs(), pairs(2**63), pairs(2**64 - 1), pairs(0, 0), pairs(1), pairs(0, 39, 78),
+    pairs(0)[:-1], record(Op.MESSAGE_INDEX, bytes(5)), record(Op.MESSAGE_INDEX, bytes(6)),
+    record(Op.MESSAGE_INDEX, bytes(6), length=2**63), record(Op.MESSAGE_INDEX, length=2**64 - 1),
+    record(Op.MESSAGE, bytes(22)), pairs(0) + b'\x00' * 9])
+def test_an_index_is_verified_or_left(index):
+    """Places outside, twice, beside messages or incomplete: the walk is asked instead."""
+    data = messages(4)
+    assert find_by_index(data, index) is None
+    assert find_by_index(b'', index) is None and find_by_index(data[:8], index) is None
+
+
+@pytest.mark.parametrize('length', [2**63 - 1, 2**63, 2**64 - 1, 2**64 - 9, 2**31, 21, 0])
+def test_a_length_within_a_chunk(length):
+    """No sum of it wraps around."""
+    data = bytearray(messages(3))
+    struct.pack_into('<Q', data, 1, length)
+    assert find_by_index(bytes(data), pairs(0, 39, 78)) is None
+    with pytest.raises(Exception, match='cut off|shorter'):
+        find_messages(bytes(data))
+
+
+NASTY = '/volt\x1b]0;title\x07\x1b[2Jage\r\n\u202e'
+
+
+def test_names_do_not_reach_the_terminal(tmp_path):
+    """Topics, types, what a bag says of itself, file names: in errors and in notes."""
+    folder = tmp_path / 'nasty\x1b[31m\n'
+    folder.mkdir()
+    path = written(folder / 'x\x1b[2J.mcap', chunk(
+        schema() + channel(NASTY) + schema('a/msg/\x1b[3m', key=2) + channel('/b\x9b', 2, 2)
+        + record(Op.SCHEMA, struct.pack('<H', 3), text('x'), text('json\x1b[1m'), text(''))
+        + channel('/c\x1b[0m', 3, 3) + messages()),
+        record(Op.METADATA, text('ou_monitor'), text(text('vehicle\x1b') + text('UAV\x1b[5m\n'))))
+    bag = BagReader(path)
+    for name in (*bag.topics, *bag.topics.values(), *bag.notes, *bag.about, *bag.about.values()):
+        assert name.isprintable(), name
+    whole = read_recording(path)
+    assert whole.n == N and whole.name.isprintable()
+    for word in (*whole.notes, *whole.source.values()):
+        assert word.isprintable()
+    line = complaint(read_recording, path, voltage_topic='/none')
+    assert 'volt' in line and '\x1b' not in line
+    complaint(BagReader, folder / 'gone\x1b[2J.mcap')
+
+
+def test_names_of_any_length(tmp_path):
+    """ROS has none beyond 256 characters; notes are not one for each of thousands."""
+    many = b''.join(channel('/' + 'x' * 300 + str(k), k + 2) for k in range(1000))
+    path = written(tmp_path / 'a.mcap', chunk(schema() + channel() + many + messages()))
+    bag = BagReader(path)
+    assert list(bag.topics) == ['/voltage'] and len(bag.notes) <= 21
+    assert all(len(note) < 400 for note in bag.notes)
+
+
+def test_definitions_of_any_length(tmp_path):
+    """One of megabytes is left out."""
+    path = written(tmp_path / 'a.mcap', chunk(
+        schema() + channel() + schema('a/msg/B', 'float64 data\n' * 100_000, 2)
+        + channel('/b', 2, 2) + messages()))
+    assert list(BagReader(path).topics) == ['/voltage']
+
+
+LONG = '=' * 80 + '\nMSG: a/T\n'
+
+
+@pytest.mark.parametrize('definition, data', [
+    (f'float64 data\na/T[] many\n{LONG}uint8[1] x\n', struct.pack('<dI', 5.0, 2**32 - 1)),
+    (f'float64 data\na/T[] many\n{LONG}uint8[0] x\n', struct.pack('<dI', 5.0, 2**32 - 1)),
+    (f'float64 data\na/T[4000000000] many\n{LONG}byte[2] x\n', struct.pack('<d', 5.0)),
+    ('float64 data\na/T0 x\n' + ''.join(
+        f'{"=" * 80}\nMSG: a/T{k}\na/T{k + 1} p\na/T{k + 1} q\n' for k in range(60))
+     + f'{"=" * 80}\nMSG: a/T60\nuint8[0] x\n', struct.pack('<d', 5.0)),
+], ids=['array', 'nothing', 'fixed', 'tree'])
+def test_a_message_without_end(tmp_path, definition, data):
+    """A few bytes that state 2^32 elements of no bytes: no decoder is busy with them for ever."""
+    path = written(tmp_path / 'a.mcap', chunk(
+        schema('a/msg/M', definition) + channel() + message(0, b'\x00\x01\x00\x00' + data)))
+    assert 'cannot be decoded' in complaint(lambda: list(BagReader(path).decoded()))
+
+
+def test_identifiers_are_decoded(tmp_path):
+    """The honest type with such an array, in the middle of others."""
+    definition = f'a/T[] many\nfloat64 data\n{LONG}uint8[16] uuid\nuint32 n\n'
+    data = struct.pack('<4xI16sI16sI4xd', 2, b'a' * 16, 1, b'b' * 16, 2, 5.0)
+    path = written(tmp_path / 'a.mcap', chunk(
+        schema('a/msg/M', definition) + channel()
+        + message(0, b'\x00\x01\x00\x00' + data[4:])))
+    (found,) = BagReader(path).decoded()
+    assert [one.n for one in found.message.many] == [1, 2] and found.message.data == 5.0
+
+
+@pytest.mark.parametrize('junk', [
+    record(0x80), record(Op.CHUNK), record(Op.METADATA, text('a'), text('')) + message(0, b'x', 9),
+    message(0, bytes(12)) + record(0x80)], ids=['private', 'broken', 'undefined', 'runs'])
+def test_much_of_it_takes_no_time(tmp_path, junk):
+    """Time and notes grow no faster than the file, whatever it is full of."""
+    path = written(tmp_path / 'a.mcap', schema(), channel(), messages(), junk * 30_000)
+    began = time.monotonic()
+    bag = BagReader(path, partial=True)
+    assert time.monotonic() - began < 20.0
+    assert len(bag.notes) < 50 and bag.damage and len(bag.damage) < 500
+
+
+def test_a_channel_many_times(tmp_path):
+    """All 65 535 numbers are of one topic: a chunk costs what is in it."""
+    many = b''.join(channel('/voltage', k) for k in range(1, 65536))
+    path = written(tmp_path / 'a.mcap', chunk(schema() + many), *[chunk(messages())] * 50)
+    began = time.monotonic()
+    assert read_recording(path).n == N
+    assert time.monotonic() - began < 15.0
+
+
+@pytest.mark.parametrize('qos', [
+    '- {reliability: [1]}', '[' * 9000, '&a [*a]', 'x' * 10**6, '\x00'])
+def test_qos_of_a_channel(tmp_path, qos):
+    """Whatever it is, the messages are read."""
+    path = written(tmp_path / 'a.mcap', schema(), channel(offered_qos_profiles=qos), messages())
+    assert BagReader(path).info['/voltage'].reliability == 'reliable'
+
+
+@pytest.mark.parametrize('content', ['[' * 9000, 'custom_data: {a: [1], b: 2}', 'x: &a [*a]'])
+def test_metadata_of_rosbag2_in_a_record(tmp_path, content):
+    """Texts and numbers are taken; what cannot be read is no reason to refuse."""
+    path = written(tmp_path / 'a.mcap', schema(), channel(), messages(), record(
+        Op.METADATA, text('rosbag2'), text(text('serialized_metadata') + text(content))))
+    assert BagReader(path).about == ({'b': '2'} if 'custom' in content else {})
+
+
+@pytest.mark.parametrize('name', ['a.mcap', 'a.csv', 'a'])
+def test_no_recording_that_never_ends(tmp_path, name):
+    """FIFO, device, loop and dangling link: one line at once."""
+    path = tmp_path / name
+    os.mkfifo(path)
+    assert 'not a regular file' in complaint(read_recording, path)
+    path.unlink()
+    path.symlink_to('/dev/zero')
+    assert 'not a regular file' in complaint(read_recording, path)
+    path.unlink()
+    path.symlink_to(path)
+    assert name in complaint(read_recording, path)
+
+
+def test_metadata_and_parts_that_are_none(tmp_path):
+    """A bag whose files are FIFOs."""
+    folder = tmp_path / 'bag'
+    with BagWriter(folder) as bag:
+        bag.add_topic('voltage', FLOAT64)
+        bag.write('voltage', 1, encode_scalars(FLOAT64, [5.0])[0])
+    (folder / 'bag_0.mcap').unlink()
+    os.mkfifo(folder / 'bag_0.mcap')
+    assert 'bag_0.mcap' in complaint(read_recording, folder)
+    (folder / 'metadata.yaml').unlink()
+    os.mkfifo(folder / 'metadata.yaml')
+    assert 'not a regular file' in complaint(read_recording, folder)
+
+
+def test_csv_lines_have_an_end(tmp_path):
+    """A line of megabytes is refused when it is met, in the header and below it."""
+    for k, content in enumerate([b'x' * 10**7, b'time_s,voltage_v\n0,5\n' + b'1' * 10**7,
+                                 b'time_s,voltage_v\n0,5\n"' + b'1\n' * 10**6]):
+        path = tmp_path / f'{k}.csv'
+        path.write_bytes(content)
+        line = complaint(read_recording, path)
+        assert len(line) < len(str(path)) + 200, line
