@@ -28,7 +28,7 @@ for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np  # noqa: E402
-from ou_monitor.model.supply import Simulation, STRETCH, SupplyModel  # noqa: E402
+from ou_monitor.model.supply import Simulation, SEGMENT, SupplyModel  # noqa: E402
 from ou_monitor.model.terms.ac_coupling import ACCoupling  # noqa: E402
 from ou_monitor.model.terms.flicker_noise import FlickerNoise  # noqa: E402
 from ou_monitor.model.terms.jumps import Jumps  # noqa: E402
@@ -79,8 +79,8 @@ def _of(model: SupplyModel) -> Draw:
 
     def draw(n: int) -> Any:
         run, drawn = Simulation(model, np.random.default_rng(SEED)), []
-        for first in range(0, n, STRETCH):
-            t = np.arange(first, min(first + STRETCH, n)) / RATE
+        for first in range(0, n, SEGMENT):
+            t = np.arange(first, min(first + SEGMENT, n)) / RATE
             drawn.append(run.advance(t, profile(t) if model.needs_throttle else None))
         return np.concatenate(drawn) - model.ou.u0
 
@@ -112,8 +112,8 @@ def filtered(n: int) -> Any:
 def normals(n: int) -> None:
     """Draw standard normal numbers and nothing else."""
     rng = np.random.default_rng(SEED)
-    for first in range(0, n, STRETCH):
-        rng.standard_normal(min(STRETCH, n - first))
+    for first in range(0, n, SEGMENT):
+        rng.standard_normal(min(SEGMENT, n - first))
 
 
 def _numba() -> Row:
@@ -225,8 +225,8 @@ def _one_run(samples: int) -> dict[str, float]:
     model = PRESETS['flight'].model
     run, profile = Simulation(model, np.random.default_rng(SEED)), PROFILES['flight'][0]
     begin = time.thread_time()
-    for first in range(0, samples, STRETCH):
-        t = np.arange(first, min(first + STRETCH, samples)) / 1e6
+    for first in range(0, samples, SEGMENT):
+        t = np.arange(first, min(first + SEGMENT, samples)) / 1e6
         run.advance(t, profile(t))
     return {'samples': samples, 'seconds': time.thread_time() - begin, 'before': before,
             'peak': _peak()}

@@ -78,9 +78,8 @@ def model_text(finding: Finding) -> str:
 
 def render(finding: Finding) -> str:
     """Return the finding for a terminal 100 columns wide."""
-    from ou_monitor.discovery.cause_rows import cause_rows
-    from ou_monitor.discovery.gain_words import MNAT, overlap_words
-    from ou_monitor.discovery.words import crossing_words, plain_model_words, plain_words
+    from ou_monitor.discovery.words import (
+        cause_rows, crossing_words, MNAT, overlap_words, plain_model_words, plain_words)
     from ou_monitor.text import number
 
     used = '' if finding.samples is None or finding.samples.n == finding.n else (

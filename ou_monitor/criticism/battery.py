@@ -4,6 +4,10 @@ Signed statistics of normal scores: what a right model leaves nothing in.
 Each is scaled to be about N(0, 1) for independent normal scores; how it really
 spreads, the throttle and the fit being what they are, is found by simulation
 (`null_bank`).  Names begin with the kind, by which terms ask for them.
+
+No term of the catalogue answers to loops of throttle, to an effect of throttle that
+grows, or to what follows large errors: those statistics tell effects that imitate a
+term by what they do over minutes, on the way up and down, or after they have begun.
 """
 
 from __future__ import annotations
@@ -13,7 +17,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor.criticism.battery_history import after_large, score
+import numpy.typing as npt
 from ou_monitor.model.terms.lines import order_power
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
@@ -25,13 +29,26 @@ _LAGS = ((1, 1), (2, 2), (3, 5), (6, 15), (16, 50))
 _BANDS = 8
 # Scores up to this are small.
 _SMALL = 2.5
+# Spans over which power is averaged, s.
 _CLUSTERS = (0.02, 0.1, 0.5, 2.5, 8.0)
+# Samples in a segment whose spectrum is taken, and lags of products of three.
+_SEGMENTS, _TRIPLES = (32, 128, 512), 10
+# Shares of the time that throttle is below and above where a relay switches.
+_RELAYS = ((0.15, 0.85), (0.28, 0.72), (0.4, 0.6))
+# Share of a regressor's power that the mean response to throttle must leave.
+_LEAST = 0.02
+# Errors this large begin something, in standard deviations; one in so many samples.
+_LARGE, _APART = 4.0, 20
+# Fewer of them tell nothing.
+_FEW = 5
+# Samples after them, in groups.
+_AFTER = (1, 4, 16, 64, 256, 1024)
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class Covariates:
     """
-    What the scores are held against.
+    What the scores of a recording are held against.
 
     Attributes
     ----------
@@ -61,9 +78,9 @@ class Scene:
     paths: tuple[tuple[str, FloatArray], ...] = ()
 
 
-def statistics(z: FloatArray, scene: Scene, *, lines: bool = True) -> dict[str, float]:
+def statistics(z: FloatArray, given: Covariates, *, lines: bool = True) -> dict[str, float]:
     """Return all statistics."""
-    return dict(_all(z, scene, lines))
+    return dict(_all(z, given, lines))
 
 
 def is_sign(sign: str, name: str, value: float) -> bool:
@@ -73,25 +90,25 @@ def is_sign(sign: str, name: str, value: float) -> bool:
     return name.startswith(sign)
 
 
-def _all(z: FloatArray, scene: Scene, lines: bool) -> Iterator[tuple[str, float]]:
+def _all(z: FloatArray, given: Covariates, lines: bool) -> Iterator[tuple[str, float]]:
     # The scores of a far outlier must not rule all that is not about outliers.
     w = np.clip(z, -5.0, 5.0)
     square = np.minimum(z * z, 25.0) - 1.0
     square -= square.mean()
     yield from _correlations(w)
     yield from _among_small(w)
-    yield from _spectrum(w, scene)
-    if lines and scene.throttle is not None:
-        yield 'order line', _order(w, scene)
+    yield from _spectrum(w, given)
+    if lines and given.throttle is not None:
+        yield 'order line', _order(w, given)
     yield from _moments(z)
-    yield from _clustering(square, scene)
-    yield from _inputs(w, square, scene)
-    yield from _state(w, square, scene)
-    for name, path in scene.paths:
+    yield from _clustering(square, given)
+    yield from _inputs(w, square, given)
+    yield from _state(w, square, given)
+    for name, path in given.paths:
         yield name, score(w, path)
-    if scene.large is not None:
-        yield from after_large(w, square, scene.large)
-    yield from _beyond_second_order(w, scene)
+    if given.large is not None:
+        yield from after_large(w, square, given.large)
+    yield from _beyond_second_order(w, given)
 
 
 def _correlations(w: FloatArray) -> Iterator[tuple[str, float]]:
@@ -113,7 +130,7 @@ def _among_small(w: FloatArray) -> Iterator[tuple[str, float]]:
         yield 'small errors lag 1', score(w[1:][small], w[:-1][small])
 
 
-def _spectrum(w: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
+def _spectrum(w: FloatArray, given: Covariates) -> Iterator[tuple[str, float]]:
     n = w.size
     power = np.abs(np.fft.rfft(w - w.mean())[1:]) ** 2
     power /= power.mean()
@@ -125,13 +142,13 @@ def _spectrum(w: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
             m = b - a
             mean = float(power[a:b].mean())
             value = (mean ** (1.0 / 3.0) - 1.0 + 1.0 / (9.0 * m)) * 3.0 * math.sqrt(m)
-            yield f'band {k}, {_hertz(a, n, scene)} to {_hertz(b, n, scene)} Hz', value
+            yield f'band {k}, {_hertz(a, n, given)} to {_hertz(b, n, given)} Hz', value
     # The highest of many exponentials: its chance, as a normal score.
     yield 'line', _gumbel(float(power[3:].max()), power.size - 3)
 
 
-def _hertz(bin_: int, n: int, scene: Scene) -> str:
-    return f'{max(bin_, 1) * scene.rate / n:.3g}'
+def _hertz(bin_: int, n: int, given: Covariates) -> str:
+    return f'{max(bin_, 1) * given.rate / n:.3g}'
 
 
 def _gumbel(top: float, count: float) -> float:
@@ -144,10 +161,10 @@ def _from_tail(chance: float) -> float:
     return -float(ndtri(min(max(chance, 1e-300), 0.999)))
 
 
-def _order(w: FloatArray, scene: Scene) -> float:
+def _order(w: FloatArray, given: Covariates) -> float:
     """Return the strongest line whose frequency follows throttle, as a normal score."""
-    assert scene.throttle is not None
-    top, count = order_power(w, scene.throttle, scene.rate)
+    assert given.throttle is not None
+    top, count = order_power(w, given.throttle, given.rate)
     return 0.0 if count == 0 else _from_tail(-math.expm1(-count * math.exp(-top)))
 
 
@@ -164,13 +181,13 @@ def _moments(z: FloatArray) -> Iterator[tuple[str, float]]:
         yield f'tails beyond {limit:g}', value
 
 
-def _clustering(square: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
+def _clustering(square: FloatArray, given: Covariates) -> Iterator[tuple[str, float]]:
     n = square.size
     yield 'clustering next sample', score(square[1:], square[:-1])
     yield 'clustering few samples', score(
         square[10:], lfilter(np.ones(9), [1.0], square)[9:-1] if n > 20 else square[10:])
     for span in _CLUSTERS:
-        m = round(span * scene.rate)
+        m = round(span * given.rate)
         count = n // m if m else 0
         if m < 4 or count < 12:
             continue
@@ -181,12 +198,12 @@ def _clustering(square: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]
         yield f'clustering spread {span:g} s', value
 
 
-def _inputs(w: FloatArray, square: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
+def _inputs(w: FloatArray, square: FloatArray, given: Covariates) -> Iterator[tuple[str, float]]:
     t = np.linspace(-1.0, 1.0, w.size)
     yield 'time', score(w, t)
     yield 'time squared', score(w, t * t)
     yield 'variance time', score(square, t)
-    u = scene.throttle
+    u = given.throttle
     if u is None:
         return
     yield 'throttle', score(w, u)
@@ -195,7 +212,7 @@ def _inputs(w: FloatArray, square: FloatArray, scene: Scene) -> Iterator[tuple[s
     yield 'throttle squared', score(w, centre * centre - slope * centre)
     change = np.diff(u, prepend=u[0])
     for span in (0.002, 0.01, 0.05, 0.3, 2.0, 12.0):
-        tau = span * scene.rate
+        tau = span * given.rate
         if 0.5 <= tau < 0.25 * w.size:
             keep = math.exp(-1.0 / tau)
             recent = lfilter([1.0], [1.0, -keep], change)
@@ -204,13 +221,13 @@ def _inputs(w: FloatArray, square: FloatArray, scene: Scene) -> Iterator[tuple[s
                 yield f'throttle direction over {span:g} s', score(w, np.abs(recent))
     yield 'variance throttle', score(square, u)
     yield 'variance throttle squared', score(square, centre * centre - slope * centre)
-    keep = math.exp(-1.0 / max(0.05 * scene.rate, 1.0))
+    keep = math.exp(-1.0 / max(0.05 * given.rate, 1.0))
     yield 'variance change of throttle', score(
         square, lfilter([1.0], [1.0, -keep], np.abs(change)))
 
 
-def _state(w: FloatArray, square: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
-    x = scene.state / max(float(scene.state.std()), 1e-12)
+def _state(w: FloatArray, square: FloatArray, given: Covariates) -> Iterator[tuple[str, float]]:
+    x = given.state / max(float(given.state.std()), 1e-12)
     x = np.clip(x, -4.0, 4.0)
     yield 'state squared', score(w, x * x - float((x**3).mean()) * x)
     yield 'state cubed', score(w, x**3 - float((x**4).mean()) * x)
@@ -222,19 +239,15 @@ def _state(w: FloatArray, square: FloatArray, scene: Scene) -> Iterator[tuple[st
     pairs = w[large] * w[large + 1]
     yield 'pairs after a large one', float(pairs.sum()) / math.sqrt(
         max(float((w[large] ** 2).sum()), 9.0))
-    if scene.throttle is not None:
-        u = scene.throttle - scene.throttle.mean()
+    if given.throttle is not None:
+        u = given.throttle - given.throttle.mean()
         yield 'state throttle', score(w, x * u - float((x * x * u).mean()) * x)
 
 
-# Samples in a stretch whose spectrum is looked at, and lags of products of three.
-_STRETCHES, _TRIPLES = (32, 128, 512), 10
-
-
-def _beyond_second_order(w: FloatArray, scene: Scene) -> Iterator[tuple[str, float]]:
+def _beyond_second_order(w: FloatArray, given: Covariates) -> Iterator[tuple[str, float]]:
     """Yield what a spectrum does not show: power that comes and goes, and products of three."""
     n = w.size
-    for length in _STRETCHES:
+    for length in _SEGMENTS:
         count = n // length
         if count < 16:
             break
@@ -243,7 +256,7 @@ def _beyond_second_order(w: FloatArray, scene: Scene) -> Iterator[tuple[str, flo
         power /= power.mean(axis=0)
         # Exponentials: mean square 2, of variance 20.
         value = (float((power * power).mean()) - 2.0) * math.sqrt(power.size / 20.0)
-        yield f'bursts within {length / scene.rate:.2g} s', value
+        yield f'bursts within {length / given.rate:.2g} s', value
     if n > 4 * _TRIPLES:
         # Hinich, J. Nonparametr. Stat. 6 (1996) 205.
         c = (w - w.mean()) / float(w.std())
@@ -261,3 +274,68 @@ def _beyond_second_order(w: FloatArray, scene: Scene) -> Iterator[tuple[str, flo
 def _mean_score(a: FloatArray) -> float:
     spread = float(a.std())
     return math.sqrt(a.size) * float(a.mean()) / spread if spread > 0.0 else 0.0
+
+
+def score(a: FloatArray, b: FloatArray) -> float:
+    """Return the correlation of two series, as a normal score; 0 for a constant one."""
+    a, b = a - a.mean(), b - b.mean()
+    norm = math.sqrt(float(a @ a) * float(b @ b))
+    return math.sqrt(a.size) * float(a @ b) / norm if norm > 0.0 else 0.0
+
+
+def throttle_paths(throttle: FloatArray, keep: float) -> Iterator[tuple[str, FloatArray]]:
+    """Yield regressors that are no function of throttle now: its growing effect, and loops."""
+    time = np.linspace(-1.0, 1.0, throttle.size)
+    spread = float(throttle.std())
+    if not spread > 0.0:
+        return
+    u = (throttle - throttle.mean()) / spread
+    cubic = np.vander(u, 4)
+    yield from _left('growing effect of throttle', u * time, np.column_stack((cubic, time)), keep)
+    for low, high in _RELAYS:
+        below, above = np.quantile(u, (low, high))
+        state = np.where(u > above, 1.0, np.where(u < below, -1.0, 0.0))
+        last = np.maximum.accumulate(np.where(state != 0.0, np.arange(u.size), 0))
+        yield from _left(f'loop of throttle {100 * low:g} to {100 * high:g} %', state[last],
+                         cubic, keep)
+
+
+def _left(name: str, wanted: FloatArray, known: FloatArray, keep: float
+          ) -> Iterator[tuple[str, FloatArray]]:
+    """Yield what other regressors leave of one, whitened, where it is not next to nothing."""
+    less = wanted - known @ np.linalg.lstsq(known, wanted, rcond=None)[0]
+    if float(less @ less) > _LEAST * float(wanted @ wanted):
+        yield name, less - keep * np.concatenate((less[:1], less[:-1]))
+
+
+def large_ones(errors: FloatArray, found: npt.NDArray[np.bool_] | None = None) -> FloatArray:
+    """Return where something begins: large errors that no other one has come shortly before."""
+    large = np.abs(errors) > _LARGE
+    if found is not None:
+        large |= found
+    where = np.flatnonzero(large)
+    first = np.concatenate((where[:1] >= 0, np.diff(where) > _APART))
+    out = np.zeros(errors.size)
+    out[where[first]] = np.sign(errors[where[first]])
+    return out
+
+
+def after_large(w: FloatArray, square: FloatArray, large: FloatArray
+                ) -> Iterator[tuple[str, float]]:
+    """Yield whether errors that follow large ones have their sign, and whether they are larger."""
+    enough = int((large != 0.0).sum()) >= _FEW
+    signs, counts = np.cumsum(large), np.cumsum(np.abs(large))
+    for low, high in zip(_AFTER[:-1], _AFTER[1:]):
+        if high > large.size // 4:
+            return
+        yield (f'after large errors {low} to {high}',
+               score(w, _window(signs, low, high)) if enough else 0.0)
+        yield (f'power after large errors {low} to {high}',
+               score(square, _window(counts, low, high)) if enough else 0.0)
+
+
+def _window(total: FloatArray, low: int, high: int) -> FloatArray:
+    """Return what a running total gained from `high` - 1 to `low` samples ago."""
+    def ago(k: int) -> FloatArray:
+        return np.concatenate((np.zeros(k), total[:-k]))
+    return ago(low) - ago(high)

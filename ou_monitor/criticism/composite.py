@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from ou_monitor.criticism.battery import Scene
-from ou_monitor.criticism.battery_history import large_ones, throttle_paths
+from ou_monitor.criticism.battery import Covariates, large_ones, throttle_paths
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import Events, fit_gaussian, GaussianFit
 from ou_monitor.model.terms.laws import LawFit, View
@@ -54,6 +53,8 @@ class Composite:
         What the laws found, as the Gaussian part was fitted with it.
     offset : ndarray, shape (n,), optional
         Likewise, V.
+    cost : float
+        Time of the processor that the fits of the Gaussian part took, s, as its filters tell.
 
     """
 
@@ -66,6 +67,7 @@ class Composite:
     search: float
     events: Events | None = None
     offset: FloatArray | None = None
+    cost: float = 0.0
 
     def score(self, samples: Samples) -> float:
         """Return evidence, nats: of the part fitted, less its price, and of the part kept."""
@@ -78,25 +80,32 @@ class Composite:
         return any(term.NAME == name for term in self.terms)
 
 
-def fit_composite(samples: Samples, terms: Sequence[Term], part: slice,
+def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: slice,
                   known: Composite | None = None, *, whole_mean: bool = False,
                   rough: bool = False) -> Composite | None:
-    """Fit a model (known in A)."""
-    structural = [term for term in terms if term.ROLE is not Role.LAW]
+    """
+    Fit a model on a part; None where a law cannot be fitted.
+
+    A law that was never fitted is given as its class; events and offset of `known`, a
+    model with the same laws, are taken over.
+    """
+    structural = [term for term in terms
+                  if isinstance(term, Term) and term.ROLE is not Role.LAW]
     laws = [term for term in terms if term.ROLE is Role.LAW]
     events = None if known is None else known.events
     offset = None if known is None else known.offset
     fits: list[LawFit] = []
+    cost = 0.0
     last = 0 if known is not None and _kinds(known.terms) == _kinds(terms) else _ROUNDS
     for turn in range(1 + last):
         gaussian = fit_gaussian(samples, structural, part, events, offset, whole_mean, rough)
-        z, density = gaussian.z, gaussian.density
+        z, density, cost = gaussian.z, gaussian.density, cost + gaussian.cost
         fits = []
         push, error, moved = np.zeros(samples.n), np.zeros(samples.n), np.zeros(samples.n)
         power = np.ones(samples.n)
         for k, law in enumerate(laws):
             view = replace(view_of(samples, gaussian, z, part), variance=gaussian.variance * power)
-            fit = law.refit_law(view) if vars(law) else law.fit_law(view)
+            fit = law.refit_law(view) if isinstance(law, Term) else law.fit_law(view)
             if fit is None:
                 return None
             laws[k] = fit.term
@@ -117,10 +126,10 @@ def fit_composite(samples: Samples, terms: Sequence[Term], part: slice,
     free = sum(len(term.free()) + len(term.LINEAR) for term in gaussian.terms) + 1
     return Composite(fitted, (*gaussian.se, *(fit.se for fit in fits)), gaussian, z, density,
                      free + sum(fit.free for fit in fits), sum(term.SEARCH for term in fitted),
-                     events, offset)
+                     events, offset, cost)
 
 
-def _kinds(terms: Sequence[Term]) -> list[str]:
+def _kinds(terms: Sequence[Term | type[Term]]) -> list[str]:
     """Return the names of the laws."""
     return [term.NAME for term in terms if term.ROLE is Role.LAW]
 
@@ -147,13 +156,14 @@ def view_of(samples: Samples, gaussian: GaussianFit, z: FloatArray, part: slice)
                 train=part)
 
 
-def scene_of(samples: Samples, composite: Composite) -> Scene:
+def covariates_of(samples: Samples, composite: Composite) -> Covariates:
     """Return what the scores of a model are held against."""
     gaussian, events = composite.gaussian, composite.events
     residual = samples.voltage - gaussian.mean
     found = None if events is None else (events.push > 0.0) | (events.error > 0.0)
     keep = float(np.median(gaussian.phi[1:]))
     paths = () if samples.throttle is None else tuple(throttle_paths(samples.throttle, keep))
-    return Scene(np.concatenate(([0.0], residual[:-1])), samples.t - samples.t[0],
-                 samples.throttle, 1.0 / float(np.median(samples.step[1:])), keep,
-                 large_ones(gaussian.z, found), paths)
+    return Covariates(
+        state=np.concatenate(([0.0], residual[:-1])), at=samples.t - samples.t[0],
+        throttle=samples.throttle, rate=1.0 / float(np.median(samples.step[1:])), keep=keep,
+        large=large_ones(gaussian.z, found), paths=paths)

@@ -2,8 +2,8 @@
 How the statistics spread when nothing is wrong, by simulation.
 
 Recordings of the fitted baseline, with the stamps and the throttle of the data,
-go through the same fit and the same statistics, but for what theory tells well
-enough: lines that follow throttle, which take longest, and what comes after large errors.
+go through the same fit and the same statistics.  Theory suffices for lines that follow
+throttle, which take longest, and for what comes after large errors.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from ou_monitor.criticism.battery import Scene, statistics
-from ou_monitor.criticism.composite import Composite, scene_of
+from ou_monitor.criticism.battery import Covariates, statistics
+from ou_monitor.criticism.composite import Composite, covariates_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.model.supply import SupplyModel
@@ -49,16 +49,20 @@ class NullBank:
                 for name, value in values.items()}
 
 
-def simulate_bank(scene: Scene, phi: float, rng: np.random.Generator, size: int = SIZE
+def criticise(samples: Samples, composite: Composite, bank: NullBank) -> dict[str, float]:
+    """Return the statistics of a model, as they would be N(0, 1) if it were right."""
+    return bank.standardised(statistics(composite.z, covariates_of(samples, composite)))
+
+
+def simulate_bank(given: Covariates, phi: float, rng: np.random.Generator, size: int = SIZE
                   ) -> NullBank:
-    """Simulate the bank."""
+    """Simulate the bank of the plain OU."""
     rows = []
-    n = scene.at.size
+    n = given.at.size
     for _ in range(size):
         y = lfilter([1.0], [1.0, -phi], rng.standard_normal(n))
         z, state = refit(y)
-        made = replace(scene, state=state, large=None)
-        rows.append(statistics(z, made, lines=False))
+        rows.append(statistics(z, replace(given, state=state, large=None), lines=False))
     return _summary(rows)
 
 
@@ -70,13 +74,12 @@ def simulate_bank_of(samples: Samples, composite: Composite, rng: np.random.Gene
     A step of the ADC that is as large as the noise leaves errors that are
     neither normal nor independent, however right the model is.
     """
-    model, rows, scene = SupplyModel(composite.terms), [], scene_of(samples, composite)
+    model, rows, given = SupplyModel(composite.terms), [], covariates_of(samples, composite)
     for _ in range(size):
         y = model.simulate(samples.t, rng, samples.throttle)
-        made = Samples(samples.t, y, samples.throttle)
-        fit = evaluate(made, composite.terms)
+        fit = evaluate(Samples(samples.t, y, samples.throttle), composite.terms)
         state = np.concatenate(([0.0], (y - fit.mean)[:-1]))
-        rows.append(statistics(fit.z, replace(scene, state=state, large=None), lines=False))
+        rows.append(statistics(fit.z, replace(given, state=state, large=None), lines=False))
     return _summary(rows)
 
 

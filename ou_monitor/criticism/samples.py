@@ -87,8 +87,8 @@ class Samples:
         return slice(round(TRAIN * self.n), self.n)
 
     @cached_property
-    def seen(self) -> npt.NDArray[np.bool_]:
-        """Return which samples of the part for scoring have throttle that the other part knows."""
+    def covered(self) -> npt.NDArray[np.bool_]:
+        """Return which samples of the part for scoring have throttle that the other covers."""
         kept = np.zeros(self.n, dtype=np.bool_)
         kept[self.test] = True
         if self.throttle is None:
@@ -98,18 +98,11 @@ class Samples:
         margin = max(_BEYOND * (high - low), _STILL)
         return kept & (self.throttle >= low - margin) & (self.throttle <= high + margin)
 
-    @cached_property
-    def work(self) -> list[float]:
-        """Return what filters over these samples and parts of them have cost, s, about."""
-        return [0.0]
-
     def part(self, part: slice, voltage: FloatArray | None = None) -> Samples:
-        """Return a part, or all with another voltage; its cost counts here."""
+        """Return a part, or all with another voltage."""
         v = self.voltage if voltage is None else voltage
-        made = Samples(self.t[part], v[part],
+        return Samples(self.t[part], v[part],
                        None if self.throttle is None else self.throttle[part])
-        made.__dict__['work'] = self.work
-        return made
 
     @cached_property
     def columns(self) -> dict[Term, FloatArray]:
@@ -133,7 +126,7 @@ class Samples:
         step = self.step[1:]
         return bool((step == step[0]).all()) if step.size else True
 
-    def stretch(self, alpha: float, sigma: float) -> Segment:
+    def segment(self, alpha: float, sigma: float) -> Segment:
         """Return the samples as terms take them, with nothing on them yet."""
         n = self.n
         return Segment(

@@ -84,6 +84,8 @@ class GaussianFit:
         Log predictive density of each sample, nats.
     phi : ndarray, shape (n,)
         Coefficient of the OU in each step.
+    cost : float
+        Time of the processor that the fit took, s, as its filters tell.
 
     """
 
@@ -94,6 +96,7 @@ class GaussianFit:
     variance: FloatArray
     density: FloatArray
     phi: FloatArray
+    cost: float
 
     @property
     def z(self) -> FloatArray:
@@ -106,27 +109,29 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
                  whole_mean: bool = False, rough: bool = False) -> GaussianFit:
     """Fit the Gaussian part by maximum likelihood on a part of the recording (offset in V)."""
     voltage = samples.voltage if offset is None else samples.voltage - offset
-    seen = samples.part(part, voltage)
+    chosen = samples.part(part, voltage)
     inside = None if events is None else events.part(part)
-    start = tuple(terms)
-    terms, se = _maximise(seen, start, inside, rough)
-    if whole_mean and seen.n < samples.n:
-        terms = _regress(samples.part(slice(None), voltage), terms, events)
-    return evaluate(samples, terms, events, se)
+    fit = _maximise(chosen, tuple(terms), inside, rough)
+    cost = fit.cost
+    if whole_mean and chosen.n < samples.n:
+        mean = _with_mean(samples.part(slice(None), voltage), fit.terms, events)
+        fit, cost = replace(fit, terms=mean.terms), cost + mean.cost
+    whole = evaluate(samples, fit.terms, events, fit.se)
+    return replace(whole, cost=cost + whole.cost)
 
 
 def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = None,
              se: Sequence[dict[str, float]] = (), inside: bool = False) -> GaussianFit:
     """Return what a model with given parameters says of a recording."""
-    s, run, plain, full = _filter(samples, terms, events)
-    columns = _columns(samples, terms, s)
+    run = _filter(samples, terms, events)
+    columns = _columns(samples, terms, run.segment)
     beta = np.concatenate([_linear(term) for term in terms])
     mean = columns @ beta
-    e = run.innovations(samples.voltage - mean)
+    e = run.filter.innovations(samples.voltage - mean)
     # An event is the law's to expect, at its own sample: not so while it is fitted around.
-    variance = full if inside else plain
+    variance = run.full if inside else run.plain
     return GaussianFit(tuple(terms), tuple(se), mean, e, variance, _log_density(e, variance),
-                       np.exp(-s.alpha * s.step))
+                       run.phi, run.cost)
 
 
 def _log_density(e: FloatArray, variance: FloatArray) -> FloatArray:
@@ -159,19 +164,56 @@ def _columns(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
     return columns
 
 
-def _filter(samples: Samples, terms: Sequence[Term], events: Events | None
-            ) -> tuple[Segment, Filter, FloatArray, FloatArray]:
-    """Return the stretch, its filter, and variances: events at their own sample not in, and in."""
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """
+    A filter over the samples, and the variances that it predicts.
+
+    Attributes
+    ----------
+    segment : Segment
+        The samples, with alpha and sigma of each step.
+    filter : Filter
+        Over all of them.
+    plain, full : ndarray, shape (n,)
+        Predictive variances, V^2: without what events add at their own sample, and with it.
+    cost : float
+        s.
+
+    """
+
+    segment: Segment
+    filter: Filter
+    plain: FloatArray
+    full: FloatArray
+    cost: float
+
+    @property
+    def phi(self) -> FloatArray:
+        """Return the coefficient of the OU in each step."""
+        phi: FloatArray = np.exp(-self.segment.alpha * self.segment.step)
+        return phi
+
+
+def _filter(samples: Samples, terms: Sequence[Term], events: Events | None) -> _Run:
+    """Return the filter of a model over the samples."""
     if events is not None and _states(terms) >= _MANY and not events.error.any():
         # Where noise or pushes enter the state and nothing hides them, the gains of
         # several states hardly change: a filter that is settled saves most of the time.
         s, space, _ = _space(samples, terms, None)
         run = Filter(space, samples.n)
         q = s.sigma * s.sigma * -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
-        return s, run, run.variance, run.variance + (events.power - 1.0) * q + events.push
+        return _Run(s, run, run.variance, run.variance + (events.power - 1.0) * q + events.push,
+                    _cost(space, samples.n))
     s, space, own = _space(samples, terms, events)
     run = Filter(space, samples.n)
-    return s, run, run.variance - own, run.variance
+    return _Run(s, run, run.variance - own, run.variance, _cost(space, samples.n))
+
+
+def _cost(space: StateSpace, n: int) -> float:
+    """Return what a filter over n samples costs, s: measured, and as the square of the states."""
+    length, states = map(int, space.f.shape[:2])
+    return 1e-7 * length * states * states + 2e-8 * n * states
 
 
 def _states(terms: Sequence[Term]) -> int:
@@ -181,10 +223,10 @@ def _states(terms: Sequence[Term]) -> int:
 
 def _space(samples: Samples, terms: Sequence[Term], events: Events | None
            ) -> tuple[Segment, StateSpace, FloatArray | float]:
-    """Return the stretch, the state space, and what events add to each variance predicted."""
+    """Return the segment, the state space, and what events add to each variance predicted."""
     ou = terms[0]
     assert isinstance(ou, OU)
-    s = samples.stretch(ou.alpha, ou.sigma)
+    s = samples.segment(ou.alpha, ou.sigma)
     for term in terms:
         if term.ROLE is Role.DRIVE:
             term.start(_RNG)(s)
@@ -219,8 +261,6 @@ def _space(samples: Samples, terms: Sequence[Term], events: Events | None
         to = at + h.size
         f_all[:, at:to, at:to], q_all[:, at:to, at:to], h_all[at:to] = f, cov, h
         at = to
-    # Measured: some 0.1 us a sample, and as the square of the states.
-    samples.work[0] += 1e-7 * n * d * d + 2e-8 * samples.n * d
     r = np.full(n, floor + sum(term.variance() for term in terms))
     if events is not None:
         r += events.error
@@ -228,7 +268,7 @@ def _space(samples: Samples, terms: Sequence[Term], events: Events | None
 
 
 def _first(s: Segment, n: int) -> Segment:
-    """Return the first samples of a stretch."""
+    """Return the first samples of a segment."""
     return replace(s, **{name: getattr(s, name)[:n] for name in (
         't', 'at', 'step', 'throttle', 'alpha', 'sigma', 'power', 'push', 'x', 'level',
         'voltage')})
@@ -253,34 +293,37 @@ def _coupled(term: ACCoupling, s: Segment, phi: FloatArray, q: FloatArray
 
 
 def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
-              rough: bool = False, only: Sequence[int] | None = None
-              ) -> tuple[tuple[Term, ...], tuple[dict[str, float], ...]]:
+              rough: bool = False, only: Sequence[int] | None = None) -> GaussianFit:
     """Fit by scoring: the outer product of numerical scores stands for the information."""
     rounds = _FEW_ROUNDS if rough else _ROUNDS
-    states = _filter(samples, terms, events)[1].shape
+    run = _filter(samples, terms, events)
+    states, cost = run.filter.shape, run.cost
     few = max(_DEAR // (2 * states[1]), 2000)
     if states[0] * (states[1] - 1) > _DEAR and few < samples.n:
         # Far from the top a part of the samples shows the way.
-        part = _telling(samples, few)
+        part = _liveliest(samples, few)
         # What was fitted to all samples before is known better than a part can tell.
-        terms, se_part = _maximise(
+        first = _maximise(
             samples.part(part), terms, None if events is None else events.part(part),
             only=(0, len(terms) - 1) if rough else None)
+        terms, cost = first.terms, cost + first.cost
         if rough or states[1] > _MANY:
             shrink = math.sqrt((part.stop - part.start) / samples.n)
-            return _regress(samples, terms, events), tuple(
-                {name: value * shrink for name, value in errors.items()} for errors in se_part)
+            fit = _with_mean(samples, terms, events)
+            return replace(fit, cost=cost + fit.cost, se=tuple(
+                {name: value * shrink for name, value in errors.items()} for errors in first.se))
         rounds = _LAST_ROUNDS
     free = [(k, name) for k, term in enumerate(terms) for name in term.free()
             if only is None or k in only]
     base = _with_mean(samples, terms, events)
-    terms = base.terms
+    terms, cost = base.terms, cost + base.cost
     value, damping, inverse = float(base.density.sum()), 0.0, np.zeros((0, 0))
     for _ in range(rounds):
         scores = np.empty((samples.n, len(free)))
         for j, (k, name) in enumerate(free):
             moved = _moved(terms, k, name, _STEP)
             there = evaluate(samples, moved, events, inside=True)
+            cost += there.cost
             scores[:, j] = (there.density - base.density) / _STEP
         information = scores.T @ scores
         gradient = scores.sum(axis=0)
@@ -295,6 +338,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
             for (k, name), by in zip(free, step.tolist(), strict=True):
                 trial = _moved(trial, k, name, by)
             new = _with_mean(samples, trial, events)
+            cost += new.cost
             if float(new.density.sum()) > value - 1e-9 * abs(value):
                 better = new
                 break
@@ -310,7 +354,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
     se: list[dict[str, float]] = [{} for _ in terms]
     for j, (k, name) in enumerate(free):
         se[k][name] = math.sqrt(max(inverse[j, j], 0.0)) * abs(terms[k].per_coordinate(name))
-    return terms, tuple(se)
+    return replace(base, se=tuple(se), cost=cost)
 
 
 def _solved(columns: FloatArray, y: FloatArray) -> FloatArray:
@@ -328,8 +372,8 @@ def _solved(columns: FloatArray, y: FloatArray) -> FloatArray:
     return many
 
 
-def _telling(samples: Samples, size: int) -> slice:
-    """Return the stretch of a size in which throttle moves most; the first without throttle."""
+def _liveliest(samples: Samples, size: int) -> slice:
+    """Return the part of a size in which throttle moves most; the first without throttle."""
     if samples.throttle is None:
         return slice(0, size)
     first = np.arange(0, samples.n - size + 1, max(size // 4, 1))
@@ -343,22 +387,15 @@ def _moved(terms: tuple[Term, ...], k: int, name: str, by: float) -> tuple[Term,
     return (*terms[:k], changed, *terms[k + 1:])
 
 
-def _regress(samples: Samples, terms: tuple[Term, ...], events: Events | None
-             ) -> tuple[Term, ...]:
-    """Fit the coefficients of the mean."""
-    return _with_mean(samples, terms, events).terms
-
-
 def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None) -> GaussianFit:
     """Fit the coefficients of the mean by generalised least squares; events count as known."""
-    s, run, _, variance = _filter(samples, terms, events)
-    columns = _columns(samples, terms, s)
+    run = _filter(samples, terms, events)
+    variance, columns = run.full, _columns(samples, terms, run.segment)
     if not (variance > 0.0).all():
         raise ArithmeticError('variances that are not above 0')
     weight = 1.0 / np.sqrt(variance)
-    through = run.innovations(np.column_stack((samples.voltage, columns))) * weight[:, None]
+    through = run.filter.innovations(np.column_stack((samples.voltage, columns))) * weight[:, None]
     beta = _solved(through[:, 1:], through[:, 0])
-    samples.work[0] += 1e-8 * samples.n * beta.size
     ou = terms[0]
     assert isinstance(ou, OU)
     result: list[Term] = [replace(ou, u0=float(beta[0]))]
@@ -371,4 +408,5 @@ def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None)
         at += size
     e = (through[:, 0] - through[:, 1:] @ beta) / weight
     return GaussianFit(tuple(result), (), columns @ beta, e, variance,
-                       _log_density(e, variance), np.exp(-s.alpha * s.step))
+                       _log_density(e, variance), run.phi,
+                       run.cost + 1e-8 * samples.n * beta.size)

@@ -1,8 +1,8 @@
-"""A recording -> what the simulation gets wrong, why, and what it is worth."""
+"""A recording -> what the simulation gets wrong, why, and what the extended model gains."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 import math
 from pathlib import Path
 from typing import Any
@@ -14,23 +14,21 @@ from ou_monitor.criticism.integrity import examine, Integrity
 from ou_monitor.criticism.null_bank import family_chance
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, fit_gaussian
+from ou_monitor.discovery.decision import judge, NOTHING
 from ou_monitor.discovery.errors import standard_errors
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.discovery.gain import (
-    crossing_rates, mean_difference, mean_score, Scale, told, without, worth)
-from ou_monitor.discovery.gain_words import NO_OTHER, VAGUE
-from ou_monitor.discovery.second_criticism import Named, named_causes, position
-from ou_monitor.discovery.verdict import judge, NOTHING
+    cause_gain, crossing_rates, if_known, mean_difference, mean_score, Scale, without)
+from ou_monitor.discovery.search import Named, named_causes, position, Progress
 from ou_monitor.discovery.words import (
-    coupling_found, coupling_note, explain, left_out_note, no_relaxation_note, verdict_sentence)
+    coupling_found, coupling_note, explain, left_out_note, NO_OTHER, no_relaxation_note, VAGUE,
+    verdict_sentence)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import FloatArray, Recording
 from scipy.special import ndtri
-
-Progress = Callable[[float], None]
 
 # Why the gain of a line is not known that was found in all samples, of which some are used.
 FAST = 'the samples that are used are too few to show a line so fast.'
@@ -69,29 +67,29 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
     """
     if not isinstance(recording, Recording):
         recording = read_recording(recording)
-    tell: Progress = progress or (lambda share: None)
-    state = examine(recording, lambda share: tell(0.05 * share))
+    done: Progress = progress or (lambda share: None)
+    state = examine(recording, lambda share: done(0.05 * share))
     samples = state.samples
     if samples is None:
         return _insufficient(recording, state, state.reason, seed)
     rng = np.random.default_rng(seed)
     try:
         plain, plain_density, start = _baseline(samples, state)
-        tell(0.1)
+        done(0.1)
         named = named_causes(samples, start, rng, state.exact,
-                             lambda share: tell(0.1 + 0.6 * share))
+                             lambda share: done(0.1 + 0.6 * share))
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return _insufficient(recording, state, 'No OU can be fitted to it and simulated: hardly '
                              'any of its samples differ, or some are far beyond all others.',
                              seed)
-    tell(0.7)
+    done(0.7)
     whole = named.whole
     se = standard_errors(samples, whole, named.part)
-    tell(0.75)
+    done(0.75)
     scored = _kept(samples, state)
     scale = Scale(samples, named.model, scored)
     causes = _causes(samples, state, named, whole, se, start, plain_density, scale,
-                     lambda share: tell(0.75 + 0.2 * share))
+                     lambda share: done(0.75 + 0.2 * share))
     gain, gain_se = scale.gain(named.model.density, plain_density)
     unknown = scale.why_unknown()
     why = unknown or ('' if math.isfinite(gain) else VAGUE)
@@ -101,11 +99,11 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
     # The rest is in the model that was fitted.
     undone = tuple(t for t in state.exact if t.NAME != 'quantization')
     crossing = crossing_rates(samples, (plain,), () if unknown else named.model.terms, rng)
-    tell(1.0)
+    done(1.0)
     return Finding(
         recording=recording.name, n=recording.n, duration=recording.duration, verdict=verdict,
         sentence=verdict_sentence(verdict, causes, left, gain, gain_se, named.dropped, why,
-                                  _unseen(samples)),
+                                  _uncovered(samples)),
         baseline=plain, baseline_score=mean_score(plain_density, scored), criticism=criticism,
         causes=causes, model=SupplyModel((*whole.terms, *undone)),
         se=(*se, *({} for _ in undone)), score=mean_score(named.model.density, scored),
@@ -121,14 +119,14 @@ def _insufficient(recording: Recording, state: Integrity, reason: str, seed: int
 
 
 def _kept(samples: Samples, state: Integrity) -> npt.NDArray[np.bool_]:
-    """Return which samples are scored: those that `seen` tells and that were measured."""
-    kept = samples.seen
+    """Return which samples are scored: those of `covered` that were measured."""
+    kept = samples.covered
     return kept if state.drawn is None else kept & ~state.drawn
 
 
-def _unseen(samples: Samples) -> int:
+def _uncovered(samples: Samples) -> int:
     """Return the number of samples kept at throttle that the part fitted never had."""
-    count: int = samples.n - samples.train.stop - int(samples.seen.sum())
+    count: int = samples.n - samples.train.stop - int(samples.covered.sum())
     return count
 
 
@@ -192,7 +190,7 @@ def _causes(samples: Samples, state: Integrity, named: Named, whole: Composite,
         else:
             clean = evaluate(samples, fit_gaussian(
                 samples, [start.terms[0]], samples.train).terms)
-            gain, error = told(*mean_difference(
+            gain, error = if_known(*mean_difference(
                 clean.density[scale.scored], plain_density[scale.scored]))
             why = '' if math.isfinite(gain) else VAGUE
         found.append(Cause(term, {}, gain, error, 0.0, (),
@@ -206,7 +204,7 @@ def _causes(samples: Samples, state: Integrity, named: Named, whole: Composite,
         if group not in groups:
             less = start if len(group) == len(named.names) else without(
                 samples, named.model, *group)
-            gain, error, chance = (math.nan,) * 3 if less is None else worth(
+            gain, error, chance = (math.nan,) * 3 if less is None else cause_gain(
                 samples, named.model, less, scale, group)
             groups[group] = gain, error, chance, _why_unknown(gain, less, scale, group)
         gain, error, chance, why = groups[group]
@@ -242,9 +240,9 @@ def _notes(state: Integrity, named: Named, samples: Samples) -> tuple[str, ...]:
     notes = [*state.notes, *([named.failure] if named.failure else [])]
     for name in dict.fromkeys(named.dropped):
         notes.append(f"'{name}' fitted, but left what it should explain: withdrawn.")
-    out = _unseen(samples)
+    out = _uncovered(samples)
     if out:
-        notes.append(left_out_note(out, int(samples.seen.sum())))
+        notes.append(left_out_note(out, int(samples.covered.sum())))
     duration = float(samples.t[-1] - samples.t[0])
     ou = named.model.terms[0]
     assert isinstance(ou, OU)

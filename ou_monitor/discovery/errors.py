@@ -32,15 +32,15 @@ def standard_errors(samples: Samples, model: Composite, part: slice) -> tuple[di
 
 def _gathered(term: Term, se: dict[str, float]) -> dict[str, Any]:
     """Return errors of single knots, named `parameter 2`, as a list."""
-    made: dict[str, Any] = {}
+    gathered: dict[str, Any] = {}
     for name, value in se.items():
         base, _, at = name.partition(' ')
         if at:
-            values = made.setdefault(base, [NAN] * len(getattr(term, base)))
+            values = gathered.setdefault(base, [NAN] * len(getattr(term, base)))
             values[int(at)] = float(value)
         else:
-            made[name] = float(value)
-    return made
+            gathered[name] = float(value)
+    return gathered
 
 
 def _of_mean(samples: Samples, model: Composite, part: slice) -> dict[int, dict[str, Any]]:
@@ -179,15 +179,15 @@ def estimations(samples: Samples, model: Composite, *parts: npt.NDArray[np.bool_
     laws = {k: (len(vars(term)) if term.ROLE is Role.LAW else 1) / size
             for k, term in enumerate(model.terms) if term.ROLE is Role.LAW or term.SEARCH > 0.0}
     known = _products(slopes[:, :, samples.train])
-    made = []
+    found = []
     for scored in parts:
         asked, count = _products(slopes[:, :, scored]), int(scored.sum())
         scale = np.sqrt(known.diagonal() + asked.diagonal())
         scale = np.where(scale > 0.0, scale, 1.0)
         both = np.outer(scale, scale)
-        made.append(Estimation(known / both, asked / both / max(count, 1), tuple(owner), count,
-                               laws))
-    return made
+        found.append(Estimation(known / both, asked / both / max(count, 1), tuple(owner), count,
+                                laws))
+    return found
 
 
 def _stepped(term: Term, name: str) -> tuple[Term, float]:

@@ -78,7 +78,7 @@ class Cause:
     gain, gain_se : float
         What is lost of the held-out score without it, nats per sample.
     p_value : float
-        See `gain.worth`; 0 for exact findings, which have no chance at all.
+        See `gain.cause_gain`; 0 for exact findings, which have no chance at all.
     alternatives : tuple of str
         Causes that this recording cannot tell from it.
     explanation : str

@@ -1,18 +1,23 @@
 """
-A candidate beside what was accepted before: its starting points, tried and fitted.
+Candidates beside what was accepted before: their starting points, tried and fitted.
 
-Most starts are told from each other on some thousand samples.
+Most starts are compared on some thousand samples.  Evidence is the gain in
+log-likelihood on the part fitted, less its price, plus that on the part kept.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from ou_monitor.criticism.composite import Composite, fit_composite
+from ou_monitor.criticism.composite import Composite, fit_composite, view_of
+from ou_monitor.criticism.null_bank import criticise, NullBank
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
+from ou_monitor.discovery import decision
+from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.load_transient import LoadTransient
@@ -25,89 +30,205 @@ _FULL, _GLANCE = 2, 8000
 _LAGS = 4
 
 
-def best_start(samples: Samples, composite: Composite, kind: type[Term], view: View
-               ) -> Composite | None:
-    """Return the best fit with one more term of a kind."""
-    if kind.ROLE is Role.LAW:
-        # A law that has no parameters yet.
-        made = fitted(samples, [*composite.terms, object.__new__(kind)], composite)
-        return made if made is not None and made.terms[-1].holds(view) else None
-    starts = list(kind.candidates(view))
-    known = [term for term in starts if term.ROLE is Role.MEAN]
-    hidden = [term for term in starts if term.ROLE is not Role.MEAN]
-    if len(known) > _FULL:
-        known = _screened(samples, known, view)
-    if len(hidden) > _FULL:
-        hidden = _likely(samples, composite, hidden)
-    best: Composite | None = None
-    for start in (*known[:_FULL], *hidden[:_FULL]):
-        made = joined(samples, composite, [start], rough=True)
-        if made is not None and made.terms[_place(made)].holds(view) and (
-                best is None or made.score(samples) > best.score(samples)):
-            best = made
-    return best
-
-
-def sag_with_lag(samples: Samples, composite: Composite, view: View) -> Composite | None:
+@dataclass(frozen=True, eq=False)
+class Trial:
     """
-    Return the best fit with a sag that comes at its own rate, or later.
+    A candidate, fitted beside what was accepted before.
 
-    Neither the sag nor its lag may be worth anything alone: a rail that relaxes to where
-    throttle puts it does not jump.
+    Attributes
+    ----------
+    name : str
+        Of the cause.
+    composite : Composite
+        The model with it.
+    evidence : float
+        nats.
+    left : dict of str to float, or None
+        Statistics of the model with it; None where its evidence is not clear.
+    beside : str
+        Name of a cause that comes with it; empty where none does.
+
     """
-    sag = LoadSag.candidates(view)[0]
-    lags = _screened(samples, list(LoadTransient.candidates(view)), view, beside=[sag])
-    # The rate of the rail is not what it seemed to be, and with it goes the lag that fits best.
-    made = [joined(samples, composite, [sag, lag], rough=True) for lag in lags[:_LAGS]]
-    return max((fit for fit in made if fit is not None), default=None,
-               key=lambda fit: fit.score(samples))
+
+    name: str
+    composite: Composite
+    evidence: float
+    left: dict[str, float] | None = None
+    beside: str = ''
 
 
-def joined(samples: Samples, composite: Composite, starts: Sequence[Term], rough: bool
-           ) -> Composite | None:
-    """Return the fit with more terms, the last before the laws."""
-    structural = [term for term in composite.terms if term.ROLE is not Role.LAW]
-    laws = [term for term in composite.terms if term.ROLE is Role.LAW]
-    structural[0] = starts[-1].beside(structural[0])
-    return fitted(samples, [*structural, *starts, *laws], composite, rough)
+@dataclass(eq=False)
+class Fitter:
+    """
+    Fits of models to one recording, and an account of what they cost.
 
+    Attributes
+    ----------
+    samples : Samples
+        The recording.
+    cost : float
+        Time of the processor that fits have taken, s, as their filters tell.
 
-def _place(composite: Composite) -> int:
-    """Return where the term is that was joined last."""
-    return sum(term.ROLE is not Role.LAW for term in composite.terms) - 1
+    """
 
+    samples: Samples
+    cost: float = 0.0
 
-def fitted(samples: Samples, terms: Sequence[Term], known: Composite | None,
-           rough: bool = False) -> Composite | None:
-    """Return a fit to the first part, its mean to everything; None where it cannot be fitted."""
-    try:
-        return fit_composite(samples, terms, samples.train, known, whole_mean=True,
-                             rough=rough)
-    except (ValueError, ArithmeticError, np.linalg.LinAlgError):
-        # Parameters have left what a term allows, or numbers can hold.
-        return None
+    def evidence(self, composite: Composite) -> float:
+        """Return the evidence for a model, nats."""
+        return composite.score(self.samples)
 
+    def view(self, composite: Composite) -> View:
+        """Return what a model leaves over."""
+        return view_of(self.samples, composite.gaussian, composite.z, self.samples.train)
 
-def _likely(samples: Samples, composite: Composite, starts: list[Term]) -> list[Term]:
-    """Return starts in the order of their likelihood as they are, on a part."""
-    part = slice(0, min(samples.train.stop, _GLANCE))
-    few = samples.part(part)
-    structural = [term for term in composite.terms if term.ROLE is not Role.LAW]
-
-    def value(start: Term) -> float:
-        terms = [start.beside(structural[0]), *structural[1:], start]
+    def fit(self, terms: Sequence[Term | type[Term]], known: Composite | None,
+            rough: bool = False) -> Composite | None:
+        """Return a fit to the first part, its mean to everything; None where there is none."""
         try:
-            return float(evaluate(few, terms).density.sum())
-        except (ValueError, ArithmeticError):
-            return -math.inf
+            found = fit_composite(self.samples, terms, self.samples.train, known,
+                                  whole_mean=True, rough=rough)
+        except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+            # Parameters have left what a term allows, or numbers can hold.
+            return None
+        self.cost += 0.0 if found is None else found.cost
+        return found
 
-    return sorted(starts, key=lambda start: -value(start))
+    def whole(self, model: Composite) -> Composite:
+        """Return a model fitted to everything; as it is where that cannot be done."""
+        # Without the levels that switching adds, the rail would seem to relax slower.
+        known = model if model.offset is not None else None
+        try:
+            again = fit_composite(self.samples, model.terms, slice(0, self.samples.n), known)
+        except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+            return model
+        self.cost += 0.0 if again is None else again.cost
+        return again if again is not None and math.isfinite(float(again.density.sum())) else model
+
+    def join(self, composite: Composite, starts: Sequence[Term], rough: bool) -> Composite | None:
+        """Return the fit with more terms, the last before the laws."""
+        structural = [term for term in composite.terms if term.ROLE is not Role.LAW]
+        laws = [term for term in composite.terms if term.ROLE is Role.LAW]
+        structural[0] = starts[-1].beside(structural[0])
+        return self.fit([*structural, *starts, *laws], composite, rough)
+
+    def trials(self, composite: Composite, values: dict[str, float], given: Collection[str],
+               tier: int, bank: NullBank, only: str = '') -> list[Trial]:
+        """Return the candidates of a tier that something asks for, fitted, the dear ones last."""
+        view = self.view(composite)
+        before = self.evidence(composite)
+        found: list[Trial] = []
+        model = [type(term) for term in composite.terms]
+        for kind in decision.kinds_to_try(catalogue().values(), model, values, given, tier,
+                                          self.samples.throttle is not None):
+            if only and kind.NAME != only or not decision.affordable(kind, self.cost):
+                continue
+            if any(decision.settled(catalogue()[trial.name], trial.left, kind)
+                   for trial in found):
+                continue
+            best = self.best_start(composite, kind, view)
+            if best is not None:
+                trial = Trial(kind.NAME, best, self.evidence(best) - before)
+                if trial.evidence > decision.CLEAR:
+                    trial = replace(trial, left=criticise(self.samples, best, bank))
+                found.append(trial)
+        if not composite.has('load_sag') and {'load_sag', 'load_transient'} <= {
+                trial.name for trial in found}:
+            both = self._sag_with_lag(composite, view)
+            if both is not None:
+                found.append(Trial('load_transient', both, self.evidence(both) - before,
+                                   beside='load_sag'))
+        return found
+
+    def refine(self, composite: Composite, trials: Sequence[Trial]) -> list[Trial]:
+        """Return trials, the best first, those near it fitted to all samples."""
+        top = max(trial.evidence for trial in trials)
+        before = self.evidence(composite)
+        refined = []
+        for trial in trials:
+            if (trial.evidence > top - decision.ROUGH
+                    and catalogue()[trial.name].ROLE is not Role.LAW):
+                start = trial.composite
+                full = self.fit(start.terms, start)
+                if full is not None and self.evidence(full) - before > trial.evidence:
+                    trial = replace(trial, composite=full,
+                                    evidence=self.evidence(full) - before)
+            refined.append(trial)
+        return sorted(refined, key=lambda trial: -trial.evidence)
+
+    def best_start(self, composite: Composite, kind: type[Term], view: View) -> Composite | None:
+        """Return the best fit with one more term of a kind."""
+        if kind.ROLE is Role.LAW:
+            found = self.fit([*composite.terms, kind], composite)
+            return found if found is not None and found.terms[-1].holds(view) else None
+        starts = list(kind.candidates(view))
+        known = [term for term in starts if term.ROLE is Role.MEAN]
+        hidden = [term for term in starts if term.ROLE is not Role.MEAN]
+        if len(known) > _FULL:
+            known = _by_scores(self.samples, known, view)
+        if len(hidden) > _FULL:
+            hidden = self._by_likelihood(composite, hidden)
+        best: Composite | None = None
+        for start in (*known[:_FULL], *hidden[:_FULL]):
+            found = self.join(composite, [start], rough=True)
+            if found is not None and _joined(found).holds(view) and (
+                    best is None or self.evidence(found) > self.evidence(best)):
+                best = found
+        return best
+
+    def simplest(self, composite: Composite, index: int) -> Composite | None:
+        """Return the fit with one term in its simplest form; None where it is that already."""
+        term = composite.terms[index]
+        forms = sorted(type(term).simplest(self.view(composite)), key=_size)
+        if not forms or _size(forms[0]) >= _size(term):
+            return None
+        return self.fit([*composite.terms[:index], forms[0], *composite.terms[index + 1:]], None)
+
+    def _sag_with_lag(self, composite: Composite, view: View) -> Composite | None:
+        """
+        Return the best fit with a sag that comes at its own rate, or later.
+
+        Neither the sag nor its lag may gain anything alone: a rail that relaxes to where
+        throttle puts it does not jump.
+        """
+        sag = LoadSag.candidates(view)[0]
+        lags = _by_scores(self.samples, list(LoadTransient.candidates(view)), view, beside=[sag])
+        # The rate of the rail is not what it seemed to be, and with it goes the lag that fits
+        # best.
+        fits = [self.join(composite, [sag, lag], rough=True) for lag in lags[:_LAGS]]
+        return max((fit for fit in fits if fit is not None), default=None, key=self.evidence)
+
+    def _by_likelihood(self, composite: Composite, starts: list[Term]) -> list[Term]:
+        """Return starts in the order of their likelihood as they are, on a part."""
+        few = self.samples.part(slice(0, min(self.samples.train.stop, _GLANCE)))
+        structural = [term for term in composite.terms if term.ROLE is not Role.LAW]
+
+        def likelihood(start: Term) -> float:
+            terms = [start.beside(structural[0]), *structural[1:], start]
+            try:
+                fit = evaluate(few, terms)
+            except (ValueError, ArithmeticError):
+                return -math.inf
+            self.cost += fit.cost
+            return float(fit.density.sum())
+
+        return sorted(starts, key=lambda start: -likelihood(start))
 
 
-def _screened(samples: Samples, starts: list[Term], view: View, beside: Sequence[Term] = ()
-              ) -> list[Term]:
+def _joined(composite: Composite) -> Term:
+    """Return the term that was joined last."""
+    return [term for term in composite.terms if term.ROLE is not Role.LAW][-1]
+
+
+def _size(term: Term) -> int:
+    """Return the number of parameters that are fitted."""
+    return len(term.free()) + len(term.LINEAR)
+
+
+def _by_scores(samples: Samples, starts: list[Term], view: View, beside: Sequence[Term] = ()
+               ) -> list[Term]:
     """Return starts in the order of how much of the scores they explain with those beside them."""
-    s = samples.stretch(1.0, 0.0)
+    s = samples.segment(1.0, 0.0)
     known = [term.columns(s) for term in beside]
     scale = np.sqrt(view.variance)
 

@@ -1,14 +1,14 @@
 """
-What a model is worth on samples that it has not seen.
+What a model gains on samples that it was not fitted on.
 
-Scores are log densities of one-step predictions.  They differ from sample to
-sample by what neighbours share, so errors come from means of blocks.  Scored
-are samples at throttle that the part fitted has been through: what a model
-says of others is extrapolated, and says nothing of what it is worth.
+Scores are log densities of one-step predictions.  Neighbours share a part of
+theirs, so errors come from means of blocks.  Only samples at throttle that the
+part fitted covers are scored: elsewhere a model extrapolates, and its score says
+nothing of it.
 
-The gain is stated as that of the true model, of which the fitted one loses
-what its parameters are off.  Its error covers both: what the samples scored
-happen to be, and that loss.
+The gain stated is that of the true model, of which the fitted one loses what
+its parameters are off.  Its error covers both: which samples happen to be
+scored, and that loss.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.errors import Estimation, estimations
 from ou_monitor.discovery.finding import CrossingRate
-from ou_monitor.discovery.gain_words import unmeasured_words
+from ou_monitor.discovery.words import unmeasured_words
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray, NAN
@@ -64,7 +64,7 @@ def mean_difference(new: FloatArray, old: FloatArray) -> tuple[float, float]:
     return mean, math.sqrt((own + shared) / BLOCKS)
 
 
-def told(gain: float, error: float) -> tuple[float, float]:
+def if_known(gain: float, error: float) -> tuple[float, float]:
     """Return a gain and its error; NaN for both where the error says that nothing is known."""
     return (NAN, NAN) if error > max(_VAGUE * abs(gain), _WIDE) else (gain, error)
 
@@ -90,14 +90,14 @@ class Scale:
     model : Composite
         Fitted on its first part.
     scored : ndarray of bool, shape (n,), optional
-        Samples that count; those of `seen` where not given.
+        Samples that count; those of `covered` where not given.
 
     """
 
     def __init__(self, samples: Samples, model: Composite,
                  scored: npt.NDArray[np.bool_] | None = None) -> None:
         self._samples, self._model = samples, model
-        self.scored = samples.seen if scored is None else scored
+        self.scored = samples.covered if scored is None else scored
 
     @property
     def estimation(self) -> Estimation:
@@ -116,8 +116,8 @@ class Scale:
         model, count = self._model, int(self.scored.sum())
         if count < BLOCKS:
             kept = self._samples.n - self._samples.test.start
-            unseen = int(self._samples.seen.sum()) < BLOCKS <= kept
-            return unmeasured_words(BLOCKS, count, unseen)
+            uncovered = int(self._samples.covered.sum()) < BLOCKS <= kept
+            return unmeasured_words(BLOCKS, count, uncovered)
         if self._estimations[1].loss(terms)[0] <= _UNKNOWN:
             return ''
         owners = range(len(model.terms)) if terms is None else terms
@@ -135,12 +135,12 @@ class Scale:
         if self.why_unknown(terms):
             return NAN, NAN
         gain, error = mean_difference(new[self.scored], old[self.scored])
-        return told(gain, math.hypot(error, self.estimation.loss(terms)[1]))
+        return if_known(gain, math.hypot(error, self.estimation.loss(terms)[1]))
 
 
-def worth(samples: Samples, full: Composite, less: Composite, scale: Scale | None = None,
-          terms: Collection[int] | None = None) -> tuple[float, float, float]:
-    """Return what the larger of two models gains."""
+def cause_gain(samples: Samples, full: Composite, less: Composite, scale: Scale | None = None,
+               terms: Collection[int] | None = None) -> tuple[float, float, float]:
+    """Return the gain of the larger of two models, its error, nats per sample, and its chance."""
     scale = Scale(samples, full) if scale is None else scale
     gain, error = scale.gain(full.density, less.density, terms)
     train = samples.train
@@ -185,7 +185,7 @@ def crossing_rates(samples: Samples, baseline: Sequence[Term], extended: Sequenc
                    rng: np.random.Generator, scored: npt.NDArray[np.bool_] | None = None
                    ) -> CrossingRate:
     """Compare how often a level is crossed, in the data and in simulations."""
-    scored = samples.seen if scored is None else scored
+    scored = samples.covered if scored is None else scored
     if int(scored.sum()) < BLOCKS:
         return CrossingRate()
     level, t = crossing_level(samples, scored), samples.t

@@ -1,18 +1,33 @@
-"""A finding in words: the verdict, each cause, what remains, what would decide."""
+"""
+A finding in words: verdict, causes, gains, what remains, what would decide.
+
+`cause_rows` are the rows of the table of causes, for the terminal and the page.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 import math
 from typing import Any
 
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
-from ou_monitor.discovery.gain_words import gain_words, why_named
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Term
-from ou_monitor.text import listed, number
+from ou_monitor.text import listed, number, Z95
 
+# What a gain is counted in.
+MNAT = ('mnat: a thousandth of a nat of log predictive density. A gain of 1 mnat per sample makes '
+        '1000 samples e = 2.7 times as likely as before.')
+# What to say where the error of a gain leaves nothing known of it.
+VAGUE = ('its error is more than ten times as large as itself, as the first 60 % hardly determine '
+         'its parameters.')
+# What to say where there is no model to compare with.
+NO_OTHER = 'the model cannot be fitted without it.'
+NOT_KNOWN = 'not known'
+# Chance from which a cause cannot be told from none by the part fitted.
+_CHANCE = 0.05
 # An estimate whose error is so many times as large is none.
 _UNDETERMINED = 1e4
 
@@ -143,13 +158,13 @@ def remaining_words(left: Sequence[Criticism]) -> str:
 
 def verdict_sentence(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism],
                      gain: float, gain_se: float, dropped: Sequence[str] = (),
-                     why: str = '', unseen: int = 0) -> str:
+                     why: str = '', uncovered: int = 0) -> str:
     """Return the verdict in a sentence or two (gain, gain_se in nats)."""
     names = _counted([cause.name for cause in causes])
     tried = (f' The nearest entries of the catalogue ({listed(list(dropped))}) fit in part only.'
              if dropped else '')
-    if left and unseen:
-        tried += (f' {unseen} samples of the last 40 % are at throttle that the first 60 %, on '
+    if left and uncovered:
+        tried += (f' {uncovered} samples of the last 40 % are at throttle that the first 60 %, on '
                   'which models are fitted, never had: what is left may be no more than that'
                   + ('.' if why else '; a recording that goes through all of its throttle in '
                      'both parts would tell.'))
@@ -191,3 +206,157 @@ def plain_model_words(baseline: OU) -> str:
     """Return the plain model on one line."""
     return (f'alpha = {number(baseline.alpha)} 1/s, sigma = {number(baseline.sigma)} V/sqrt(s), '
             f'u0 = {number(baseline.u0, 4)} V')
+
+
+def gain_words(gain: float, gain_se: float, why: str = '') -> str:
+    """Return the gain in a sentence; one that is not distinguishable from zero is none."""
+    if not math.isfinite(gain):
+        return 'Its gain cannot be measured on this recording' + (f': {why}' if why else '.')
+    size = f'{number(1e3 * gain)} +- {number(1e3 * gain_se, 2)} mnat per sample'
+    if gain > Z95 * gain_se:
+        return f'Gain on samples not used for the fit: {size}.'
+    if gain < -Z95 * gain_se:
+        return f'Worse on the part kept, which was not used for the fit: {size}.'
+    return f'No measurable gain on samples not used for the fit ({size}).'
+
+
+def why_named(gain: float, gain_se: float, chance: float) -> str:
+    """Return why a cause is named whose gain does not say so; empty where it does."""
+    if gain > Z95 * gain_se or not math.isfinite(chance):
+        return ''
+    if chance > _CHANCE:
+        return ('Named by the search, whose evidence is that of the whole recording; models '
+                f'fitted on the first 60 %, with and without it, do not show it '
+                f'(p = {chance:.2g}).')
+    return f'Named for what it explains in the first 60 % (p = {chance:.2g}).'
+
+
+def overlap_words(causes: Sequence[Cause], gain: float) -> str:
+    """
+    Return why single gains are larger than that of the whole; empty where none is.
+
+    gain in nats.
+    """
+    larger = list(dict.fromkeys(
+        c.name for c in causes if c.measurable and c.gain > max(gain, 0.0) + Z95 * c.gain_se))
+    if not larger:
+        return ''
+    return (f'Without {" or without ".join(larger)} the rest of the model predicts worse than the '
+            'plain OU, so that this gain is larger than that of the whole model: single gains '
+            'overlap and do not add up.')
+
+
+def unmeasured_words(fewest: int, scored: int, throttle: bool) -> str:
+    """Return why a gain cannot be measured, and what recording would measure it."""
+    few = f'{scored} samples are left to score it on, fewer than {fewest}'
+    if throttle:
+        return (f'{few if scored < fewest else "models are fitted on the first 60 % for this"}, '
+                'and throttle there does not go through what the rest holds. One that goes '
+                'through all of its throttle in both parts would measure it.')
+    if scored < fewest:
+        return f'{few}. A longer one would measure it.'
+    return ('the first 60 %, on which models are fitted for this, do not determine it. A longer '
+            'one would measure it.')
+
+
+@dataclass(frozen=True)
+class CauseRow:
+    """
+    One row: a cause, or several terms of one kind that share a gain.
+
+    Attributes
+    ----------
+    name : str
+        Of the cause.
+    label : str
+        The same, and how many terms there are when more than one.
+    family : str
+        Of the catalogue.
+    gain : str
+        mnat per sample with its standard error, or that it is not known.
+    remark : str
+        What to make of the gain, and why the cause is named; empty when it is one.
+    chance : str
+        p, ``exact``, or that it is not known.
+    alternatives : tuple of str
+        Causes that cannot be told from it.
+    estimates : tuple of str
+        Parameters of each term, with units and standard errors.
+    explanation : str
+        For people; lists the parameters of each term.
+
+    """
+
+    name: str
+    label: str
+    family: str
+    gain: str
+    remark: str
+    chance: str
+    alternatives: tuple[str, ...]
+    estimates: tuple[str, ...]
+    explanation: str
+
+
+def cause_rows(causes: Sequence[Cause]) -> list[CauseRow]:
+    """Return the rows of the table of causes."""
+    # By the text of the numbers: NaN is not equal to itself.
+    groups: dict[tuple[str, ...], list[Cause]] = {}
+    for cause in causes:
+        key = (cause.name, repr(cause.gain), repr(cause.gain_se), _chance(cause))
+        groups.setdefault(key, []).append(cause)
+    return [CauseRow(
+        group[0].name, group[0].name if len(group) == 1 else f'{group[0].name} x{len(group)}',
+        group[0].term.FAMILY, gain_text(group[0].gain, group[0].gain_se),
+        _remark(group[0]), _chance(group[0]),
+        tuple(dict.fromkeys(name for cause in group for name in cause.alternatives)),
+        tuple(parameters(cause.term, cause.se) for cause in group),
+        _explanation(group)) for group in groups.values()]
+
+
+def gain_text(gain: float, gain_se: float) -> str:
+    """Return a gain given in nats, in mnat, with its standard error as far as it is known."""
+    if not math.isfinite(gain):
+        return NOT_KNOWN
+    if not math.isfinite(gain_se):
+        return f'{number(1e3 * gain)}, error {NOT_KNOWN}'
+    return f'{number(1e3 * gain)} +- {number(1e3 * gain_se, 2)}'
+
+
+def gain_remark(gain: float, gain_se: float) -> str:
+    """Return what to make of a gain; nothing when it is one, or is not known."""
+    if not (math.isfinite(gain) and math.isfinite(gain_se)) or gain > Z95 * gain_se:
+        return ''
+    if gain < -Z95 * gain_se:
+        return 'worse on the part kept'
+    return 'not distinguishable from none'
+
+
+def _remark(cause: Cause) -> str:
+    """Return what to make of the gain of a cause, and why it is named all the same."""
+    remark = gain_remark(cause.gain, cause.gain_se) if math.isfinite(cause.gain) else (
+        'not measurable here')
+    if cause.exact or not remark:
+        return remark
+    first = math.isfinite(cause.p_value) and cause.p_value <= _CHANCE
+    return remark + ('; named for what it explains in the first 60 %' if first
+                     else '; named by the search on the whole recording')
+
+
+def _chance(cause: Cause) -> str:
+    if cause.exact:
+        return 'exact'
+    return f'{cause.p_value:.2g}' if math.isfinite(cause.p_value) else NOT_KNOWN
+
+
+def _explanation(group: Sequence[Cause]) -> str:
+    """Return the explanation of the first, with the estimates of all."""
+    first = group[0]
+    if len(group) == 1:
+        return first.explanation
+    own = f'Estimate: {parameters(first.term, first.se)}.'
+    every = ' '.join(f'({k}) {parameters(cause.term, cause.se)}.'
+                     for k, cause in enumerate(group, 1))
+    if own not in first.explanation:
+        return f'{first.explanation} Estimates: {every}'
+    return first.explanation.replace(own, f'Estimates: {every}', 1)

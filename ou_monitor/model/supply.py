@@ -18,12 +18,12 @@ from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray
 
-# Samples made at once by `SupplyModel.simulate`: bounds memory beside the result,
+# Samples drawn at once by `SupplyModel.simulate`: bounds memory beside the result,
 # and what the terms touch stays in the processor's caches.
-STRETCH = 15_000
+SEGMENT = 15_000
 
-# An array of that many, made and dropped, has the GNU allocator keep the memory of
-# stretches for the next ones.  Else it returns and fetches it page by page, which
+# An array of that many, allocated and dropped, has the GNU allocator keep the memory of
+# segments for the next ones.  Else it returns and fetches it page by page, which
 # can cost more than the arithmetic.
 _KEPT = 2**18
 
@@ -106,17 +106,17 @@ class SupplyModel:
             np.asarray(throttle, dtype=np.float64), stamps.shape)
         run = Simulation(self, rng)
         voltage = np.empty(stamps.size)
-        for begin in range(0, stamps.size, STRETCH):
-            part = slice(begin, begin + STRETCH)
+        for begin in range(0, stamps.size, SEGMENT):
+            part = slice(begin, begin + SEGMENT)
             voltage[part] = run.advance(stamps[part], None if load is None else load[part])
         return voltage
 
 
 class Simulation:
     """
-    A simulation that goes on from stretch to stretch.
+    A simulation that goes on from segment to segment.
 
-    The same seed gives the same samples, to rounding, whatever the stretches.
+    The same seed gives the same samples, to rounding, whatever the segments.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ class Simulation:
         np.empty(_KEPT)
         self._effects = _in_order(model.terms, rng)
         # Only then does a term change alpha, sigma, power or push: else they are
-        # one number each, seen n times.
+        # one number each, broadcast n times.
         self._driven = any(term.STAGE is Stage.DRIVE for term in model.terms)
         self._origin = math.nan
         self._last = -math.inf
@@ -152,7 +152,7 @@ class Simulation:
             later[:] = (stamps[-1] - stamps[0]) / later.size
         if math.isnan(self._origin):
             self._origin = float(stamps[0])
-        s = self._stretch(stamps, step, self._load(throttle, stamps))
+        s = self._segment(stamps, step, self._load(throttle, stamps))
         for effect in self._effects:
             effect(s)
         self._last = float(stamps[-1])
@@ -174,7 +174,7 @@ class Simulation:
                              'finite')
         return load
 
-    def _stretch(self, stamps: FloatArray, step: FloatArray, throttle: FloatArray) -> Segment:
+    def _segment(self, stamps: FloatArray, step: FloatArray, throttle: FloatArray) -> Segment:
         ou, n = self._model.ou, stamps.size
 
         def of(value: float) -> FloatArray:

@@ -7,10 +7,10 @@ from dataclasses import fields
 import math
 
 import numpy as np
-from ou_monitor.discovery.cause_rows import cause_rows, gain_remark, NOT_KNOWN
 from ou_monitor.discovery.finding import Criticism, Finding
-from ou_monitor.discovery.gain_words import MNAT, overlap_words
-from ou_monitor.discovery.words import crossing_words, plain_model_words, plain_words, with_error
+from ou_monitor.discovery.words import (
+    cause_rows, crossing_words, gain_remark, MNAT, NOT_KNOWN, overlap_words, plain_model_words,
+    plain_words, with_error)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.report import page
 from ou_monitor.report.cells import figure, UNKNOWN

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.model.supply import Simulation, STRETCH, SupplyModel
+from ou_monitor.model.supply import Simulation, SEGMENT, SupplyModel
 from ou_monitor.records import Recording
 from ou_monitor.simulate.profiles import Profile
 
@@ -19,8 +19,8 @@ def simulated(model: SupplyModel, profile: Profile, *, duration: float, rate: fl
     """Yield a recording in pieces (profile in s, duration in s, rate in Hz)."""
     total = round(duration * rate)
     run = Simulation(model, np.random.default_rng(seed))
-    for first in range(0, total, STRETCH):
-        t = np.arange(first, min(first + STRETCH, total)) / rate
+    for first in range(0, total, SEGMENT):
+        t = np.arange(first, min(first + SEGMENT, total)) / rate
         # As a bag can hold it, so that the truth is what the bag says.
         throttle = profile(t).astype(np.float32).astype(np.float64)
         try:

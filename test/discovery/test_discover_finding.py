@@ -4,11 +4,11 @@ from dataclasses import replace
 import json
 import math
 
+from ou_monitor.discovery.decision import failing, judge, largest_chance, withdrawn
 from ou_monitor.discovery.finding import Cause, Criticism, CrossingRate, Finding, Verdict
-from ou_monitor.discovery.gain_words import overlap_words, why_named
-from ou_monitor.discovery.verdict import failing, judge, largest_chance, withdrawn
 from ou_monitor.discovery.words import (
-    coupling_note, explain, parameters, plain_words, verdict_sentence, with_error)
+    coupling_note, explain, overlap_words, parameters, plain_words, verdict_sentence, why_named,
+    with_error)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_sag import LoadSag
@@ -181,7 +181,8 @@ def test_gains_that_overlap_are_told():
 def test_what_is_left_may_be_throttle_never_seen():
     """The sentence says so, and which recording would tell."""
     cause = finding().causes[0]
-    text = verdict_sentence(Verdict.PARTLY_EXPLAINED, [cause], [WORSE], 0.015, 0.002, unseen=900)
+    text = verdict_sentence(
+        Verdict.PARTLY_EXPLAINED, [cause], [WORSE], 0.015, 0.002, uncovered=900)
     assert '900 samples of the last 40 %' in text
     assert 'last 40 %' not in verdict_sentence(
-        Verdict.EXPLAINED, [cause], [], 0.015, 0.002, unseen=900)
+        Verdict.EXPLAINED, [cause], [], 0.015, 0.002, uncovered=900)

@@ -7,8 +7,8 @@ from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.errors import standard_errors
 from ou_monitor.discovery.gain import (
-    BLOCKS, crossing_level, crossing_rates, crossings, mean_difference, mean_score, told, without,
-    worth)
+    BLOCKS, cause_gain, crossing_level, crossing_rates, crossings, if_known, mean_difference,
+    mean_score, without)
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_sag import LoadSag
@@ -70,7 +70,7 @@ def test_a_true_cause_gains_what_theory_says():
     start = OU(50.0, 0.3, 4.8)
     plain = fit_composite(samples, [start], samples.train)
     full = fit_composite(samples, [start, LoadSag(0.1, 0.0)], samples.train)
-    gain, error, chance = worth(samples, full, plain)
+    gain, error, chance = cause_gain(samples, full, plain)
     phi = math.exp(-ALPHA / 1000.0)
     var = SIGMA**2 * (1.0 - phi**2) / (2.0 * ALPHA)
     x = samples.voltage - (5.0 - 0.5 * samples.throttle)
@@ -88,7 +88,7 @@ def test_a_cause_that_is_not_there_gains_nothing():
     for seed in range(20):
         samples = made(seed)
         full = fit_composite(samples, [OU(50.0, 0.3, 5.0), LoadSag(0.0, 0.0)], samples.train)
-        gain, error, chance = worth(samples, full, without(samples, full, 1))
+        gain, error, chance = cause_gain(samples, full, without(samples, full, 1))
         assert abs(gain) < 3.5 * error + 2.0 / samples.train.stop
         chances.append(chance)
     # The smallest of 20 is below 1e-3 with chance 2 %; doubling makes it rarer.
@@ -153,4 +153,5 @@ def test_a_model_that_cannot_be_simulated_has_no_rate():
     (0.1, 0.02, True)])
 def test_an_error_that_leaves_nothing_known_is_no_gain(gain, error, known):
     """Ten times as large as the gain, and large beside any; small ones are just none."""
-    assert told(gain, error) == (gain, error) if known else all(map(math.isnan, told(gain, error)))
+    found = if_known(gain, error)
+    assert found == (gain, error) if known else all(map(math.isnan, found))

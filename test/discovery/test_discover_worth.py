@@ -170,7 +170,7 @@ def test_what_discover_says_is_the_gain_of_the_true_model(name, seed):
     found = discover(Recording(made_of.t, made_of.voltage, made_of.throttle, name))
     samples = found.samples
     assert samples.n == made_of.n
-    scored = samples.seen
+    scored = samples.covered
     plain = evaluate(samples, (found.baseline,)).density
     assert found.baseline_score == pytest.approx(float(plain[scored].mean()), abs=1e-9)
     assert found.gain == pytest.approx(found.score - found.baseline_score, abs=1e-9)
@@ -191,13 +191,13 @@ def late_start(seed=1):
 def test_samples_at_throttle_never_seen_are_not_scored():
     """Throttle still in the first part: only still samples of the rest count."""
     samples = late_start()
-    scored = samples.seen
+    scored = samples.covered
     assert scored[samples.train].sum() == 0
     assert (samples.throttle[scored] <= 0.01).all()
     at = np.arange(samples.n)
     assert scored[(at >= samples.test.start) & (samples.throttle == 0.0)].all()
     without_throttle = Samples(samples.t, samples.voltage, None)
-    assert without_throttle.seen.sum() == samples.n - samples.test.start
+    assert without_throttle.covered.sum() == samples.n - samples.test.start
 
 
 def test_a_gain_that_cannot_be_measured_is_unknown():
@@ -241,7 +241,7 @@ CROSSED = {
     'load_sag': (LoadSag(0.15, 0.0), LoadSag(0.05, 0.0)),
     'load_dependent_sigma': (LoadDependentSigma((0.0, 1.0), (0.0, 1.2)),
                              LoadDependentSigma((0.0, 1.0), (0.0, 0.5))),
-    'jumps': (Jumps(2.0, -0.1, 0.03), object.__new__(Jumps))}
+    'jumps': (Jumps(2.0, -0.1, 0.03), Jumps)}
 
 
 @pytest.mark.parametrize('name', sorted(CROSSED))
@@ -263,7 +263,7 @@ def test_the_extended_model_crosses_as_often_as_the_data(name):
         rows.append((rates.observed, rates.baseline, rates.extended))
         drawn = [crossings(samples.t, SupplyModel((RAIL, true)).simulate(
             samples.t, np.random.default_rng([seed, k]), samples.throttle), rates.level,
-            samples.seen) for k in range(12)]
+            samples.covered) for k in range(12)]
         rows[-1] += (float(np.std(drawn, ddof=1)),)
     observed, baseline, extended, spread = np.array(rows).T
     # Averages of eight simulations, and parameters known from the first part.

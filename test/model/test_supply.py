@@ -4,7 +4,7 @@ import math
 import tracemalloc
 
 import numpy as np
-from ou_monitor.model.supply import Simulation, STRETCH, SupplyModel
+from ou_monitor.model.supply import Simulation, SEGMENT, SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 import pytest
 from term_examples import agrees, ALPHA, EXAMPLES, OU, SIGMA, supply, term
@@ -79,9 +79,9 @@ def test_seeds():
     assert abs(np.corrcoef(first, second)[0, 1]) < 0.8
 
 
-def test_long_recordings_are_made_in_stretches():
-    """One longer than a stretch is what `Simulation` gives in other stretches."""
-    t = np.arange(STRETCH + 1000) / 1e4
+def test_long_recordings_are_made_in_segments():
+    """One longer than a segment is what `Simulation` gives in other segments."""
+    t = np.arange(SEGMENT + 1000) / 1e4
     whole = supply().simulate(t, np.random.default_rng(6))
     run = Simulation(supply(), np.random.default_rng(6))
     parts = [run.advance(t[:4_000]), run.advance(t[4_000:])]
@@ -90,7 +90,7 @@ def test_long_recordings_are_made_in_stretches():
 
 @pytest.mark.parametrize('t', [[0.0, 0.0], [1.0, 0.5], [0.0, math.nan], [0.0, math.inf]])
 def test_stamps_that_do_not_rise(t):
-    """Refused, also when it is the next stretch that goes back."""
+    """Refused, also when it is the next segment that goes back."""
     with pytest.raises(ValueError, match='finite and rise'):
         supply().simulate(t, np.random.default_rng(0))
     run = Simulation(supply(), np.random.default_rng(0))
@@ -138,9 +138,9 @@ def test_throttle_that_nobody_asks_for_may_be_unknown():
                                   'heavy_tails'])
 def test_memory_does_not_grow(name):
     """
-    A hundred stretches of 20 000 samples take no more than the first three.
+    A hundred segments of 20 000 samples take no more than the first three.
 
-    One array of a stretch is 160 kB; all samples would be 16 MB.
+    One array of a segment is 160 kB; all samples would be 16 MB.
     """
     run = Simulation(supply(term(name, **EXAMPLES[name])), np.random.default_rng(0))
     n, load = 20_000, np.full(20_000, 0.3)
@@ -160,7 +160,7 @@ def test_memory_does_not_grow(name):
 
 
 def test_ten_million_samples():
-    """In stretches, within 10 MB; the variance holds to the end."""
+    """In segments, within 10 MB; the variance holds to the end."""
     run, squares, n = Simulation(supply(u0=0.0), np.random.default_rng(8)), 0.0, 50_000
     tracemalloc.start()
     try:

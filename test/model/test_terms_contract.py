@@ -168,7 +168,7 @@ def test_parameters_that_contradict_each_other(name, change, words):
 
 @pytest.mark.parametrize('uneven', [False, True], ids=['even', 'uneven'])
 @pytest.mark.parametrize('name', EACH)
-def test_samples_do_not_depend_on_the_stretches(name, uneven):
+def test_samples_do_not_depend_on_the_segments(name, uneven):
     """Random cuts, many of them one sample long: the same to 1e-9 V, in one piece or many."""
     t = stamps(uneven=uneven)
     model = supply() if name == 'ou' else supply(term(name, **EXAMPLES[name]))

@@ -2,7 +2,7 @@
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.model.supply import STRETCH, SupplyModel
+from ou_monitor.model.supply import SEGMENT, SupplyModel
 from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring
 from ou_monitor.model.terms.ou import OU
@@ -18,7 +18,7 @@ def test_pieces():
     pieces = list(simulated(SAGGING, read_profile('loads'), duration=3.0, rate=50_000.0, seed=1,
                             name='made'))
     assert sum(piece.n for piece in pieces) == 150_000
-    assert max(piece.n for piece in pieces) == STRETCH
+    assert max(piece.n for piece in pieces) == SEGMENT
     assert {piece.name for piece in pieces} == {'made'}
     np.testing.assert_array_equal(np.concatenate([piece.t for piece in pieces]),
                                   np.arange(150_000) / 50_000.0)

@@ -90,18 +90,18 @@ class ACCoupling(Term):
         return [cls(rate, 0.0), cls(0.25 * rate, 0.0)]
 
     def beside(self, ou: Term) -> Term:
-        """Return a slow `ou`: the relaxation seen may be all the instrument's."""
+        """Return a slow `ou`: the fitted relaxation may be all the instrument's."""
         return ou.read({**ou.values(), 'alpha': 0.3 * math.pi * self.corner})
 
     def pass_through(self, columns: FloatArray, s: Segment) -> FloatArray:
         """Return columns of the mean as the instrument shows them."""
-        made = np.empty_like(columns)
+        shown = np.empty_like(columns)
         for k in range(columns.shape[1]):
-            seen = replace(s, x=np.zeros(s.t.size), sigma=np.zeros(s.t.size),
-                           voltage=columns[:, k].copy())
-            replace(self, offset=0.0).start(np.random.default_rng(0))(seen)
-            made[:, k] = seen.voltage
-        return made
+            alone = replace(s, x=np.zeros(s.t.size), sigma=np.zeros(s.t.size),
+                            voltage=columns[:, k].copy())
+            replace(self, offset=0.0).start(np.random.default_rng(0))(alone)
+            shown[:, k] = alone.voltage
+        return shown
 
 
 def bridge(alpha: FloatArray, rate: float, step: FloatArray

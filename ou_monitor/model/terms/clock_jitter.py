@@ -44,7 +44,7 @@ class ClockJitter(Term):
         def effect(s: Segment) -> None:
             nonlocal last, stamp
             gap = np.diff(s.t, prepend=stamp)
-            # The step to come is not known at the end of a stretch: that behind bounds both.
+            # The step to come is not known at the end of a segment: that behind bounds both.
             bound = np.where(np.isfinite(gap), 0.45 * gap, 0.0)
             error = self.std * rng.standard_normal(s.t.size)
             # Uneven stamps: the sample before may have gone past this one.

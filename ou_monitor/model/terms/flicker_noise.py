@@ -103,9 +103,9 @@ class FlickerNoise(Term):
             if first:
                 driven[0] = of_first
             driven += np.sqrt(spread) * last.standard_normal(s.t.size)
-            seen = first_order(np.exp(-rate * s.step), driven, 0.0 if first else low)
-            low = float(seen[-1])
-            s.level += seen
+            filtered = first_order(np.exp(-rate * s.step), driven, 0.0 if first else low)
+            low = float(filtered[-1])
+            s.level += filtered
 
         return effect
 
@@ -128,7 +128,7 @@ class FlickerNoise(Term):
         variances = self.amplitude ** 2 * variances
         # Most recordings have but a few different steps.
         step, which = np.unique(s.step, return_inverse=True)
-        rate, last, seen = self.corner, poles.size, np.isfinite(step)
+        rate, last, finite = self.corner, poles.size, np.isfinite(step)
         f = np.zeros((step.size, last + 1, last + 1))
         q = np.zeros_like(f)
         f[:, last, last] = np.exp(-rate * step)
@@ -136,12 +136,12 @@ class FlickerNoise(Term):
         for k, (pole, variance, of_long) in enumerate(zip(poles, variances, share, strict=True)):
             phi = np.exp(-pole * step)
             added = variance * -np.expm1(-2.0 * pole * step)
-            of_old, of_new, left = _bridge(pole, rate, np.where(seen, step, 0.0))
+            of_old, of_new, left = _bridge(pole, rate, np.where(finite, step, 0.0))
             f[:, k, k], q[:, k, k] = phi, added
             f[:, last, k] = of_old + of_new * phi
-            q[:, k, last] = q[:, last, k] = np.where(seen, of_new * added, of_long * variance)
+            q[:, k, last] = q[:, last, k] = np.where(finite, of_new * added, of_long * variance)
             q[:, last, last] += np.where(
-                seen, of_new * of_new * added + 2.0 * pole * variance * left, of_long * variance)
+                finite, of_new * of_new * added + 2.0 * pole * variance * left, of_long * variance)
         return f[which], q[which], np.eye(last + 1)[last]
 
 

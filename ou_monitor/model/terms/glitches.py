@@ -60,12 +60,12 @@ class Glitches(Term):
         # out no longer disturbs the next.
         plain = (view.residual - view.phi * view.state) / np.sqrt(view.variance)
         unit = float(np.median(np.abs(plain))) / 0.6745
-        seen = replace(view, z=plain / unit, variance=view.variance * unit * unit)
-        floor = float(np.median(seen.variance))
+        scaled = replace(view, z=plain / unit, variance=view.variance * unit * unit)
+        floor = float(np.median(scaled.variance))
         share, spread = 1e-3, 6.0 * math.sqrt(floor)
         lengths = np.array([1.0, share, share * share])
         for _ in range(3):
-            bad = bad_samples(seen, share, spread, lengths)
+            bad = bad_samples(scaled, share, spread, lengths)
             count = int(bad[view.train].sum())
             if count < 3:
                 return None

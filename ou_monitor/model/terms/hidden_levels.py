@@ -14,7 +14,7 @@ _MEDIAN = 0.6745
 
 
 def moving(residual: FloatArray, size: int) -> slice:
-    """Return the stretch of a size in which the voltage moves most: there levels change."""
+    """Return the segment of a size in which the voltage moves most: there levels change."""
     starts = range(0, residual.size - size + 1, max(size // 2, 1))
     begin = max(starts, key=lambda k: float(residual[k:k + size].var()))
     return slice(begin, begin + size)

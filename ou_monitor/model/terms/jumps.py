@@ -13,7 +13,7 @@ from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 from scipy.special import ndtr
 
-# Events drawn for one stretch at most: bounds time and memory.
+# Events drawn for one segment at most: bounds time and memory.
 _MOST = 5_000_000
 # Share of samples with a jump in them from which jumps cannot be told apart.
 _OFTEN = 0.05
@@ -53,7 +53,7 @@ class Jumps(Term):
                 next_at = float(s.at[0]) + waits.standard_exponential() / self.rate
             if self.rate * (s.at[-1] - next_at) > _MOST:
                 raise ValueError(f'{self.NAME}.rate of {self.rate:g} 1/s: more than {_MOST} jumps '
-                                 'in one stretch of samples; so many are noise')
+                                 'in one segment of samples; so many are noise')
             times = []
             while next_at <= s.at[-1]:
                 times.append(next_at)

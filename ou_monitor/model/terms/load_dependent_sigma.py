@@ -83,17 +83,17 @@ class LoadDependentSigma(Term):
             return ()
         bins = _binned(view.z[view.train] ** 2, u, low, high)
         price = 0.5 * math.log(u.size)
-        made = []
+        forms = []
         inner = np.unique(np.quantile(u, np.linspace(0.05, 0.95, 91)))
         for knots in (np.array([low, high]), _greedy(bins, low, high, price + _KNOT_PRICE),
                       *(np.array([at - _EDGE, at + _EDGE]) for at in inner)):
             factors, misfit = _to_bins(bins, knots)
             found = _STEP_PRICE if knots[-1] - knots[0] < 3.0 * _EDGE else (
                 _KNOT_PRICE * (knots.size - 2))
-            made.append((misfit + price * knots.size + found, knots, factors))
-        made.sort(key=lambda form: form[0])
+            forms.append((misfit + price * knots.size + found, knots, factors))
+        forms.sort(key=lambda form: form[0])
         return [cls(tuple(knots.tolist()), tuple((factors - factors[0]).tolist()))
-                for _, knots, factors in made[:2]]
+                for _, knots, factors in forms[:2]]
 
     def relative(self, view: View) -> View:
         """Return scores as they are without this term, for candidates in its place."""

@@ -17,7 +17,7 @@ from ou_monitor.records import FloatArray
 from scipy.linalg import expm
 from scipy.special import ndtr
 
-# Events drawn for one stretch at most: bounds time and memory.
+# Events drawn for one segment at most: bounds time and memory.
 _MOST = 5_000_000
 
 
@@ -76,7 +76,7 @@ class RegimeSwitching(Term):
             changes = float(_stationary(rates) @ leave)
             if changes * (s.at[-1] - next_at) > _MOST:
                 raise ValueError(f'{self.NAME}: {changes:g} changes a second are more than '
-                                 f'{_MOST} in one stretch of samples; so many are noise')
+                                 f'{_MOST} in one segment of samples; so many are noise')
             times = []
             states = [now_in]
             while next_at <= s.at[-1]:
@@ -85,10 +85,10 @@ class RegimeSwitching(Term):
                 states.append(now_in)
                 next_at += rng.standard_exponential() / leave[now_in]
             when = np.array(times)
-            seen = np.array(states, dtype=np.float64)
+            entered = np.array(states, dtype=np.float64)
             # The state at each sample, and at the begin of each step.
-            now = seen[np.searchsorted(when, s.at, side='right')]
-            before = np.concatenate(([seen[0]], now[:-1]))
+            now = entered[np.searchsorted(when, s.at, side='right')]
+            before = np.concatenate(([entered[0]], now[:-1]))
             s.level += self.at_once * self.level * now
             # What is left of a change within a step: the share of the step's
             # pull, and of its noise, that comes after it.
@@ -96,14 +96,14 @@ class RegimeSwitching(Term):
             slow = (1.0 - self.at_once) * self.level
             if slow != 0.0:
                 push = before * -np.expm1(-s.alpha * s.step)
-                np.add.at(push, k, -np.expm1(-s.alpha[k] * (s.at[k] - when)) * np.diff(seen))
+                np.add.at(push, k, -np.expm1(-s.alpha[k] * (s.at[k] - when)) * np.diff(entered))
                 s.push += slow * push
             if self.sigma_ratio == 1.0:
                 return
             factor = self.sigma_ratio ** (2.0 * before)
             share = np.expm1(-2.0 * s.alpha[k] * (s.at[k] - when)) / np.expm1(
                 -2.0 * s.alpha[k] * s.step[k])
-            np.add.at(factor, k, share * np.diff(self.sigma_ratio ** (2.0 * seen)))
+            np.add.at(factor, k, share * np.diff(self.sigma_ratio ** (2.0 * entered)))
             s.power *= np.maximum(factor, 0.0)
 
         return effect
@@ -126,18 +126,18 @@ class RegimeSwitching(Term):
         # Coordinates: ln rates, level in innovations, ln sigma ratio, ln scale.
         shortest = math.exp(-_fastest(view))
         for faster in _FASTER:
-            seen = relaxing(view, faster)
-            unit = math.sqrt(float(np.median(seen.variance)))
-            units = units_of(seen)
+            relaxed = relaxing(view, faster)
+            unit = math.sqrt(float(np.median(relaxed.variance)))
+            units = units_of(relaxed)
             # Two levels that hide how fast the rail relaxes make most of the spread.
             height = (1.0 if faster == 1.0 else 2.0) * spread / unit
             # Densities of volts, over those without states.
-            plain = log_normal(view.z) - 0.5 * np.log(view.variance / seen.variance)
+            plain = log_normal(view.z) - 0.5 * np.log(view.variance / relaxed.variance)
 
             def value(x: FloatArray) -> float:
                 if not _inside(x, view):
                     return -math.inf
-                chain = _chain(seen.z[part], seen.phi[part], units[part], step, x, once)[0]
+                chain = _chain(relaxed.z[part], relaxed.phi[part], units[part], step, x, once)[0]
                 return log_likelihood(*chain) - float(plain[part].sum())
 
             for dwell in (5.0 * shortest, 50.0 * shortest):
@@ -149,12 +149,12 @@ class RegimeSwitching(Term):
                     rate = -math.log(dwell)
                     x, top = climb(value, [rate, rate, level, ratio, -0.3 * ratio], most=40)
                     if (level != 0.0) not in best or top > best[level != 0.0][0]:
-                        best[level != 0.0] = top, x, once, seen
+                        best[level != 0.0] = top, x, once, relaxed
         two: LawFit | None = None
         trials = list(best.values())
         while trials:
-            _, x, once, seen = trials.pop()
-            fit = cls._finished(seen, x, once, 80)
+            _, x, once, relaxed = trials.pop()
+            fit = cls._finished(relaxed, x, once, 80)
             if fit is None:
                 continue
             if x is best.get(True, (0.0, None))[1] and fit.offset is not None:
@@ -166,17 +166,17 @@ class RegimeSwitching(Term):
                 trials.append((0.0, np.array([
                     math.log(term.rate_up), math.log(term.rate_down), term.level / unit, 0.0,
                     0.0]), once, again))
-            if seen is not view:
-                fit = replace(fit, gain=fit.gain + log_normal(seen.z) - log_normal(view.z)
-                              - 0.5 * np.log(seen.variance / view.variance))
+            if relaxed is not view:
+                fit = replace(fit, gain=fit.gain + log_normal(relaxed.z) - log_normal(view.z)
+                              - 0.5 * np.log(relaxed.variance / view.variance))
             if two is None or float((fit.gain - two.gain)[view.train].sum()) > 0.0:
-                two, begin, at_once, chosen = fit, x, once, seen
+                two, begin, at_once, chosen = fit, x, once, relaxed
         if two is None or chosen is not view:
             return two
         if two.power is None:
             slow, ahead, states = _slow_levels(view)
             if slow is not None and ahead > max(float(two.gain[view.train].sum()), _SLOW_AHEAD):
-                # The relaxation seen is that of both; that of the noise alone comes with the fit.
+                # Fitted is the relaxation of both; that of the noise alone comes with the fit.
                 return cls._finished(view, slow, 0.0, 1, states) or two
         # Three states: of sigma, or of the level, whichever the two differ in.
         starts = [np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]

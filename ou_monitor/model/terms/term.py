@@ -277,7 +277,7 @@ class Term:
             Transition into each sample and covariance of what is added, V^2;
             at the first sample the stationary covariance.
         h : ndarray, shape (d,)
-            What of it is seen.
+            Shares of the states in the voltage.
 
         """
         raise NotImplementedError

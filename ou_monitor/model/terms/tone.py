@@ -98,13 +98,13 @@ class Tone(Term):
 
     def columns(self, s: Segment) -> FloatArray:
         """Return the line in phase and in quadrature."""
-        made = []
+        columns = []
         for phase in (0.0, 0.5 * math.pi):
             level = replace(s, level=np.zeros(s.t.size))
             unit = replace(self, amplitude=1.0, phase=phase, linewidth=0.0)
             unit.start(np.random.default_rng(0))(level)
-            made.append(level.level)
-        return np.stack(made, axis=1)
+            columns.append(level.level)
+        return np.stack(columns, axis=1)
 
     def linear_values(self) -> list[float]:
         """Return the coefficients of the columns."""

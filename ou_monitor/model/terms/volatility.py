@@ -51,7 +51,7 @@ class Volatility(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit a log-variance that wanders, taken as constant over short stretches."""
+        """Fit a log-variance that wanders, taken as constant over short segments."""
         return cls._climbed(view, _start(view), 60)
 
     def refit_law(self, view: View) -> LawFit | None:
@@ -62,7 +62,7 @@ class Volatility(Term):
     @classmethod
     def _climbed(cls, view: View, start: FloatArray, most: int) -> LawFit | None:
         """Return the fit near a start."""
-        size, squares, sizes = _stretches(view)
+        size, squares, sizes = _segments(view)
         span = size / view.rate
         trained = view.train.stop // size
 
@@ -79,7 +79,7 @@ class Volatility(Term):
         gain = np.repeat((density + 0.5 * squares) / sizes, size)[:view.z.size]
         e = curvature_se(value, x)
         term = cls(math.exp(x[0]), math.exp(x[1]))
-        # As known at the end of each stretch.
+        # As known at the end of each segment.
         log = np.log(np.maximum(before, 1e-300)) - sizes[:, None] * levels - 0.5 * squares[
             :, None] * np.exp(-2.0 * levels)
         weight = np.exp(log - log.max(axis=1)[:, None])
@@ -88,10 +88,10 @@ class Volatility(Term):
                       scores, gain, 3, power=np.repeat(power, size)[:view.z.size])
 
 
-def _stretches(view: View) -> tuple[int, FloatArray, FloatArray]:
-    """Return samples in a stretch, the sums of squares, and what each stretch really has."""
+def _segments(view: View) -> tuple[int, FloatArray, FloatArray]:
+    """Return samples in a segment, the sums of squares, and what each segment really has."""
     n = view.z.size
-    size = max(1, n // _STRETCHES)
+    size = max(1, n // _SEGMENTS)
     begin = np.arange(0, n, size)
     return size, np.add.reduceat(view.z * view.z, begin), np.diff(
         np.append(begin, n)).astype(np.float64)
@@ -105,7 +105,7 @@ def _start(view: View) -> FloatArray:
     not depend on its neighbours; so the covariances at two lags tell variance
     and rate.
     """
-    size, squares, sizes = _stretches(view)
+    size, squares, sizes = _segments(view)
     log = 0.5 * np.log(np.maximum(squares / sizes, 1e-12))[:max(view.train.stop // size, 2)]
     c = log - log.mean()
 
@@ -113,7 +113,7 @@ def _start(view: View) -> FloatArray:
         return float(np.mean(c[lag:] * c[:-lag]))
 
     near = max(covariance(1), 1e-3)
-    # Where a good part of it is gone: there the rate is told best.
+    # Where a good part of it is gone: there it says most of the rate.
     lags = [1 << k for k in range(1, 11) if 1 << k < c.size // 4]
     far = next((lag for lag in lags if covariance(lag) < 0.6 * near), lags[-1] if lags else 0)
     fall = math.log(near / max(covariance(far), 0.05 * near)) if far else 1.0
@@ -122,7 +122,7 @@ def _start(view: View) -> FloatArray:
 
 
 def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) -> FloatArray:
-    """Return normal scores, each given all samples before it in its stretch, too."""
+    """Return normal scores, each given all samples before it in its segment, too."""
     count = before.shape[0]
     padded = np.zeros(count * size)
     padded[:z.size] = z
@@ -135,10 +135,10 @@ def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) ->
     return normal_scores(chance.ravel())
 
 
-# Stretches that a recording is cut into, levels of ln sigma (they reach 8 standard
-# deviations: it may go beyond all that the fit has seen), products between two
-# scalings: few, for a stretch can be unlikely at all levels but one.
-_STRETCHES = 1500
+# Segments that a recording is cut into, levels of ln sigma (they reach 8 standard
+# deviations: it may go beyond the range of the fit), products between two
+# scalings: few, for a segment can be unlikely at all levels but one.
+_SEGMENTS = 1500
 _LEVELS = 65
 _EVERY = 4
 
@@ -167,7 +167,7 @@ def _rouwenhorst(keep: float) -> FloatArray:
 
 def _grid(squares: FloatArray, sizes: FloatArray, span: float, x: FloatArray
           ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the law of the level before each stretch, its log density, and the levels."""
+    """Return the law of the level before each segment, its log density, and the levels."""
     reach = math.sqrt(_LEVELS - 1.0)
     levels = x[2] + math.exp(x[0]) * np.linspace(-reach, reach, _LEVELS)
     kernel = _rouwenhorst(math.exp(-math.exp(x[1]) * span))

@@ -2,7 +2,7 @@
 
 import numpy as np
 from numpy.testing import assert_allclose
-from ou_monitor.criticism.battery_history import after_large, large_ones, score, throttle_paths
+from ou_monitor.criticism.battery import after_large, large_ones, score, throttle_paths
 import pytest
 from scipy.stats import kstest
 

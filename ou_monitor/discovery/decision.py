@@ -1,0 +1,278 @@
+"""
+What the search decides: which causes are tried, accepted, kept, withdrawn; the verdict.
+
+Pure functions of statistics (normal scores by name), evidence (nats) and what the causes
+say of themselves; nothing here is fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+
+from ou_monitor.criticism.battery import is_sign
+from ou_monitor.criticism.null_bank import family_chance
+from ou_monitor.discovery.finding import Verdict
+from ou_monitor.model.terms.term import Role, Term
+
+Statistics = Mapping[str, float]
+Kind = type[Term]
+
+# A statistic this far off asks for the terms that it is a sign of: by chance one of a
+# hundred is (P(|z| > 2.6) = 0.9 %), and a needless trial costs time only.
+ASK = 2.6
+# The same for terms that take seconds to fit: one of 700.
+ASK_DEAR = 3.2
+# Any statistic this far off means that something is wrong: of 70, by chance, once in 2000.
+OFF = 4.5
+# Evidence, nats, from which a cause that leaves nothing off (so far) spares trials of dear
+# kinds of other families: e^30, beyond what any other would gain by chance.
+CLEAR = 30.0
+# What a fit to some thousand samples may lack of that to all, nats; seen on the generator
+# of test/hidden.
+ROUGH = 20.0
+# Time that filters may take before no dear kind is tried any more, s.
+MOST_COST = 10.0
+# Turns: measured inputs, laws where there are clear outliers, the rest.
+TIERS = 3
+# Kurtosis or tails, as a score, from which outliers are clear: an excess kurtosis of 1.1 in
+# 12 000 samples (25 sqrt(24 / n)), which no wandering intensity of a usual size leaves.
+OUTLIERS = 25.0
+# Correlation of small neighbours, as a score, below which there is white noise for sure.
+WHITE = -8.0
+
+# Evidence from which a cause is accepted, nats: likelihood ratio e^6 = 403, which for 22 kinds
+# tried leaves 5 % false alarms at most.
+ACCEPT = 6.0
+# The same for a mean that answers to what was measured, which every flight has some of:
+# e^3 = 20, 5 % for one kind.
+ACCEPT_MEAN = 3.0
+# Causes within this of the best cannot be told from it here, nats: odds of less than 20.
+TIE = 3.0
+# Evidence from which a measured cause stays when others have come, nats: its price (BIC) is
+# subtracted already, and it was measured.
+NEEDED = 0.0
+# A gain of more standard errors than this is more than segments of the recording differ in:
+# by chance one of 30 000.
+STEADY = 4.0
+# Share of the segments that gain, from which a gain is throughout: of 24, 18 or more by
+# chance once in 100 (binomial: 1.1 %).
+MOSTLY = 0.75
+# Statistics of outliers and clusters, as scores, above which likelihoods count some samples
+# too much for evidence to be trusted without a look at the segments.
+RAGGED = 8.0
+# Causes accepted at most, of these latent ones at most: each round costs as much as all
+# before; no recording of test/hidden, with two effects at most, has needed more.
+MOST, MOST_LATENT = 8, 3
+# Lines that come with a tone at most: harmonics of a motor or PWM up to the 13th.
+MOST_LINES = 12
+# Statistics from which misfit counts, as scores (by chance one of 16 000), and the misfit,
+# their sum of squares, that is too little to ask for more help: four scores of 5.
+MISFIT, LITTLE = 4.0, 100.0
+# Share of the misfit that a latent cause must take away for the search to go on.
+HELPS = 0.5
+
+# Chance of the largest statistic above which nothing is wrong where no cause was found.
+NOTHING = 0.01
+# The same for a model with causes; they were chosen to please, so that failing means more.
+PASSES = 0.001
+# A statistic fails that is this far off: of 70, by chance, once in 10 000.
+FAILS = 4.8
+# Shares of what it was, and of the worst of all, before there were any causes, that a
+# statistic may keep: what the form of a cause leaves of a large effect.
+OWN_SHARE, WORST_SHARE = 0.07, 0.02
+# Share of clustering that the form of sigma(throttle) may leave.
+FORM_SHARE = 0.15
+
+
+# Which kinds are tried.
+
+def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], values: Statistics,
+                 given: Collection[str], tier: int, throttle: bool) -> list[Kind]:
+    """Return the kinds of a tier to try beside those of a model, the dear ones last."""
+    found = []
+    for kind in kinds:
+        if kind.NAME in ('ou', *given) or kind.ROLE is Role.EXACT or not kind.SIGNS:
+            continue
+        if tier_of(kind, values) != tier or (kind.NEEDS_THROTTLE and not throttle):
+            continue
+        if not kind.RECURS and any(other.NAME == kind.NAME for other in model):
+            continue
+        if any(imitate(kind, other) for other in model):
+            continue
+        # What is cheap and linear in what was measured is tried wherever something was
+        # found and something is left.
+        if asks(kind, values) or (len(model) > 1 and kind.MEASURED and kind.ROLE is Role.MEAN
+                                  and any_off(values)):
+            found.append(kind)
+    # The one that is asked for most may spare the others.
+    return sorted(found, key=lambda kind: (kind.DEAR, -asks(kind, values)))
+
+
+def asks(kind: Kind, values: Statistics) -> float:
+    """Return how far off the statistic is that asks most for a kind; 0 where none does."""
+    limit = ASK_DEAR if kind.DEAR else ASK
+    return max((abs(value) for name, value in values.items() for sign in kind.SIGNS
+                if abs(value) > limit and is_sign(sign, name, value)), default=0.0)
+
+
+def any_off(values: Statistics) -> bool:
+    """Return whether any statistic is clearly off."""
+    return max(map(abs, values.values())) > OFF
+
+
+def imitate(one: Kind, other: Kind) -> bool:
+    """Return whether two kinds imitate each other."""
+    return other.NAME in one.IMITATES or one.NAME in other.IMITATES
+
+
+def tier_of(kind: Kind, values: Statistics) -> int:
+    """Return when a kind has its turn: 0 measured inputs, 1 clear outliers, 2 the rest."""
+    if kind.MEASURED or any(values.get(name, 0.0) > clear
+                            for name, clear in kind.CLEAR_ABOVE.items()):
+        return 0
+    shape = max((abs(value) for name, value in values.items()
+                 if name.startswith(('kurtosis', 'tails'))), default=0.0)
+    # No Gaussian term makes outliers: where there are many, laws come before.
+    outliers = shape > OUTLIERS
+    if kind.ROLE is Role.NOISE:
+        # White noise is in every sensor, and hides what is slow and weak; but bad samples
+        # look like some, if not among small errors.
+        return int(outliers and values.get('small errors lag 1', 0.0) > WHITE)
+    return 1 if kind.ROLE is Role.LAW and outliers else 2
+
+
+def settled(tried: Kind, left: Statistics | None, kind: Kind) -> bool:
+    """
+    Return whether a trial spares that of a dear kind of another family.
+
+    `left` are the statistics that the trial leaves; None where its evidence is not clear.
+    """
+    return (kind.DEAR and left is not None and not asks(kind, left) and not any_off(left)
+            and tried.FAMILY != kind.FAMILY and not imitate(kind, tried))
+
+
+def affordable(kind: Kind, cost: float) -> bool:
+    """Return whether a kind may be tried when fits have taken so long (cost in s)."""
+    return not kind.DEAR or cost <= MOST_COST
+
+
+# Which trial is accepted, and what comes with it.
+
+def least_evidence(kind: Kind, largest: float) -> float:
+    """Return the evidence above which a kind is accepted (largest: of any cause; nats)."""
+    if kind.LEAST_SHARE:
+        return max(ACCEPT, kind.LEAST_SHARE * largest)
+    return ACCEPT_MEAN if kind.MEASURED and kind.ROLE is Role.MEAN else ACCEPT
+
+
+def acceptable(kind: Kind, evidence: float, largest: float, ragged: bool, throughout: bool
+               ) -> bool:
+    """Return whether a trial may be accepted (evidence, largest in nats)."""
+    # By chance a few outliers come at one throttle, and pass for an answer to it.
+    return evidence > least_evidence(kind, largest) and (
+        throughout or not (kind.MEASURED and ragged))
+
+
+def is_ragged(values: Statistics) -> bool:
+    """Return whether likelihoods count some samples too much: scores are far from normal."""
+    return any(name.startswith(('kurtosis', 'tails', 'clustering')) and value > RAGGED
+               for name, value in values.items())
+
+
+def is_throughout(mean: float, error: float, gains: Sequence[float]) -> bool:
+    """
+    Return whether a gain is more than segments differ in, or is there in most of them.
+
+    mean, error: of the gain per sample, nats; gains: of each segment, nats.
+    """
+    return not mean <= STEADY * error or (
+        sum(gain > 0.0 for gain in gains) >= MOSTLY * len(gains))
+
+
+def rivals_of(best: str, evidence: Sequence[tuple[str, float]]) -> list[str]:
+    """Return the causes of a round that do as well as the best one (evidence in nats)."""
+    top = next(value for name, value in evidence if name == best)
+    return [name for name, value in evidence if name != best and value > top - TIE]
+
+
+def helped(before: Statistics, after: Statistics, kind: Kind | None = None) -> bool:
+    """Return whether what is off has come nearer: all of it, or what asks for a kind."""
+    asking = {name for name, value in before.items()
+              if kind is None or any(is_sign(sign, name, value) for sign in kind.SIGNS)}
+
+    def misfit(values: Statistics) -> float:
+        return sum(value**2 for name, value in values.items()
+                   if name in asking and abs(value) > MISFIT)
+
+    left = misfit(after)
+    return left < LITTLE or left < (1.0 - HELPS) * misfit(before)
+
+
+# Which of those accepted stay.
+
+def in_doubt(kind: Kind, last: Kind) -> bool:
+    """Return whether a cause is put to the test again after another one was accepted."""
+    # Another law of the noise is no reason to doubt what answers to an input, unless it is
+    # the intensity that wanders: by chance with throttle.
+    return not (last.ROLE is Role.LAW and kind.MEASURED and kind.FAMILY != last.FAMILY)
+
+
+def needed_evidence(kind: Kind) -> float:
+    """Return the evidence that a cause must bring to stay, nats."""
+    # What was measured stays unless it gains less than it costs.
+    return NEEDED if kind.MEASURED else TIE
+
+
+def failing(before: Statistics, after: Statistics) -> list[str]:
+    """Return the statistics that the causes should have mended and did not."""
+    worst = max((abs(value) for value in before.values()), default=0.0)
+    return [name for name, value in after.items()
+            if abs(value) > max(FAILS, OWN_SHARE * abs(before.get(name, 0.0)),
+                                WORST_SHARE * worst)]
+
+
+def is_latent(kind: Kind) -> bool:
+    """Return whether a cause is inferred only: neither from a measured input nor from time."""
+    return not (kind.NEEDS_THROTTLE or kind.MEASURED)
+
+
+def withdrawn(before: Statistics, after: Statistics, accepted: Sequence[Kind]) -> list[int]:
+    """Return which of the accepted causes claim what they do not explain."""
+    measured = [kind for kind in accepted if not is_latent(kind)]
+    # What a measured cause is asked for and leaves is its form, which is not complete.
+    left = [name for name in failing(before, after)
+            if not any(is_sign(sign, name, after[name]) for kind in measured
+                       for sign in kind.SIGNS)]
+    if any(kind.FAMILY == 'intensity' for kind in measured):
+        left = [name for name in left if not name.startswith(('clustering', 'variance'))
+                or abs(after[name]) > FORM_SHARE * abs(before.get(name, 0.0))]
+
+    def fails(kind: Kind) -> bool:
+        if not kind.MAY_LEAVE:
+            return bool(left)
+        if kind.REFUTED_BY and any(name.startswith(kind.REFUTED_BY) for name in left):
+            return True
+        own = max((abs(value) for name, value in before.items() for sign in kind.SIGNS
+                   if is_sign(sign, name, value)), default=0.0)
+        return any(is_sign(sign, name, after[name]) and abs(after[name]) > kind.MAY_LEAVE * own
+                   for name in left for sign in kind.SIGNS)
+
+    return [k for k, kind in enumerate(accepted) if is_latent(kind) and fails(kind)]
+
+
+# What to say of the recording.
+
+def largest_chance(values: Statistics) -> float:
+    """Return the chance that the largest statistic of a right model is as large as here."""
+    largest = max((abs(value) for value in values.values()), default=0.0)
+    return family_chance(largest, max(len(values), 1))
+
+
+def judge(after: Statistics, causes: int, dropped: int) -> Verdict:
+    """Return the verdict."""
+    chance = largest_chance(after)
+    if causes == 0:
+        return Verdict.NO_EFFECT if chance > NOTHING and not dropped else Verdict.UNEXPLAINED
+    if chance > PASSES and not dropped:
+        return Verdict.EXPLAINED
+    return Verdict.PARTLY_EXPLAINED

@@ -1,0 +1,323 @@
+"""
+The search for causes: which ones a recording shows, and which a second criticism leaves.
+
+Candidates are fitted, scored and criticised again, one round after the other.  Measured
+inputs come before anything latent; a cause stays only while it is needed beside the
+others; causes that do as well are named as its alternatives.  What is tried, accepted
+and withdrawn is decided in `decision`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+import math
+
+import numpy as np
+from ou_monitor.criticism.composite import Composite, covariates_of, fit_composite, view_of
+from ou_monitor.criticism.null_bank import criticise, NullBank, simulate_bank, simulate_bank_of
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.discovery import decision
+from ou_monitor.discovery.fitting import Fitter, Trial
+from ou_monitor.discovery.gain import BLOCKS, mean_difference
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
+from ou_monitor.model.terms.term import Role, Term
+from ou_monitor.model.terms.tone import lines_of, Tone
+
+Progress = Callable[[float], None]
+
+# What to say where the search was cut short.
+STOPPED = ('The search for causes was cut short where the next ones would have taken long; there '
+           'may be more than are named.')
+
+
+@dataclass(eq=False)
+class Search:
+    """
+    What the search has come to.
+
+    Attributes
+    ----------
+    composite : Composite
+        The model so far.
+    accepted : list of str
+        Causes in the order of their acceptance.
+    rivals : dict of str to list of str
+        For each cause, those that did as well in its round.
+    log : list of str
+        What was tried and what came of it, one line each.
+    removed : list of str
+        Causes taken out again: others that came later do what they did.
+    largest : float
+        Largest evidence of an accepted cause, nats.
+    stopped : bool
+        Whether the search ended because it took too long.
+
+    """
+
+    composite: Composite
+    accepted: list[str] = field(default_factory=list)
+    rivals: dict[str, list[str]] = field(default_factory=dict)
+    log: list[str] = field(default_factory=list)
+    removed: list[str] = field(default_factory=list)
+    largest: float = 0.0
+    stopped: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Named:
+    """
+    What the search left: a model, its causes, and statistics before and after.
+
+    `model` was fitted on the first part, `whole` on `part`: everything where that could be done.
+
+    """
+
+    model: Composite
+    whole: Composite
+    part: slice
+    names: tuple[str, ...]
+    rivals: Mapping[str, list[str]]
+    dropped: tuple[str, ...]
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+    failure: str
+
+
+def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
+                 exact: tuple[Term, ...], progress: Progress) -> Named:
+    """Search for causes; withdraw those that claim what they do not explain."""
+    phi = float(np.median(start.gaussian.phi[1:]))
+    if len(start.terms) > 1:
+        bank = simulate_bank_of(samples, start, rng)
+    else:
+        bank = simulate_bank(covariates_of(samples, start), phi, rng)
+    progress(0.1)
+    before = criticise(samples, start, bank)
+    fitter = Fitter(samples, start.cost)
+    # Beside lines that were taken out there may be slower ones.
+    given = [term.NAME for term in exact if term.FAMILY != 'line']
+    try:
+        search = name_causes(fitter, start, bank, given=given,
+                             progress=lambda share: progress(0.1 + 0.9 * share))
+        failure = STOPPED if search.stopped else ''
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+        # A fit outside of what numbers can hold; the criticism still stands.
+        search, failure = Search(start), f'The search for causes broke off: {error}.'
+    # What happens once, in the part kept, is no fault of the form of a cause.
+    whole = fitter.whole(search.composite)
+    after = criticise(samples, whole, bank) if search.accepted else before
+    kinds = _kinds(search.accepted)
+    out = decision.withdrawn(before, after, kinds)
+    dropped = tuple(search.accepted[k] for k in out)
+    if dropped:
+        stays = [search.composite.terms[position(search.composite, search.accepted, k)]
+                 for k, kind in enumerate(kinds) if k not in out and decision.is_latent(kind)]
+        # They may have stood in the way of what was measured.  A trend that gave way to
+        # another slow cause is none.
+        slow = [kind.NAME for kind in _kinds(search.removed) if kind.FAMILY == 'slow']
+        search = name_causes(fitter, start, bank, latent=False, given=[*given, *slow])
+        whole, after = _kept_beside(fitter, search, stays, before, bank)
+    part = samples.train if whole is search.composite else slice(0, samples.n)
+    model = search.composite
+    if search.accepted:
+        # Named with a mean fitted to everything; measured with one that was not.
+        model = fit_composite(samples, model.terms, samples.train, model) or model
+    return Named(model, whole, part, tuple(search.accepted), search.rivals, dropped, before, after,
+                 failure)
+
+
+def name_causes(fitter: Fitter, baseline: Composite, bank: NullBank, *,
+                given: Sequence[str] = (), latent: bool = True,
+                progress: Progress | None = None) -> Search:
+    """Accept causes one after the other, the best first."""
+    samples = fitter.samples
+    search = Search(fitter.fit(baseline.terms, baseline) or baseline)
+    values = criticise(samples, search.composite, bank)
+    only, reformed = '', False
+    for turn in range(decision.MOST):
+        if progress is not None:
+            progress(turn / decision.MOST)
+        trials, good = [], []
+        hidden = {kind for kind in _kinds(search.accepted) if not kind.MEASURED}
+        deep = latent and len(hidden) < decision.MOST_LATENT
+        for tier in range(decision.TIERS if deep else 1):
+            # Measured inputs first: what is latent can imitate them, and costs more.
+            trials += fitter.trials(search.composite, values, given, tier, bank, only)
+            good = [trial for trial in trials if _acceptable(trial, search, values)]
+            if good:
+                break
+            if tier == 0 and not reformed and decision.any_off(values):
+                # Before anything latent mends what the form of a measured cause leaves.
+                reformed = True
+                if _reform(fitter, search):
+                    values = criticise(samples, search.composite, bank)
+        if not good:
+            break
+        trials = fitter.refine(search.composite, trials)
+        named = {trial.name for trial in good}
+        best = next(trial for trial in trials if trial.name in named)
+        _accept(search, best, trials)
+        _other_means(fitter, search, trials)
+        after = criticise(samples, search.composite, bank)
+        if best.name == Tone.NAME and _more_lines(fitter, search):
+            after = criticise(samples, search.composite, bank)
+        _prune(fitter, search)
+        kind = catalogue()[best.name]
+        if decision.tier_of(kind, values) > 0 and not (
+                decision.helped(values, after) or decision.helped(values, after, kind)):
+            # What is wrong here may not be in the catalogue: other terms would dress
+            # it up.  Only one more of the kind may still be missing.
+            search.log.append(f'{best.name} leaves most of what is wrong')
+            if not kind.RECURS or only:
+                break
+            only = best.name
+        values = after
+        if fitter.cost > decision.MOST_COST:
+            break
+    search.stopped = fitter.cost > decision.MOST_COST
+    return search
+
+
+def position(model: Composite, names: Sequence[str], k: int) -> int:
+    """Return where in the model the k-th cause is: the n-th of its kind is the n-th."""
+    nth = list(names[:k]).count(names[k])
+    return [i for i, term in enumerate(model.terms) if term.NAME == names[k]][nth]
+
+
+def _kinds(names: Sequence[str]) -> list[type[Term]]:
+    return [catalogue()[name] for name in names]
+
+
+def _acceptable(trial: Trial, search: Search, values: Mapping[str, float]) -> bool:
+    """Return whether a trial may be accepted."""
+    new, old = trial.composite.density, search.composite.density
+    gains = [float(part.sum()) for part in np.array_split(new - old, BLOCKS)]
+    return decision.acceptable(
+        catalogue()[trial.name], trial.evidence, search.largest, decision.is_ragged(values),
+        decision.is_throughout(*mean_difference(new, old), gains))
+
+
+def _accept(search: Search, best: Trial, trials: Sequence[Trial]) -> None:
+    """Accept a trial; what did as well is its rival."""
+    search.rivals[best.name] = decision.rivals_of(
+        best.name, [(trial.name, trial.evidence) for trial in trials])
+    search.log.append(f'{best.name}: {best.evidence:.1f} nats; '
+                      + ', '.join(f'{t.name} {t.evidence:.1f}' for t in trials[:6]
+                                  if t is not best))
+    search.composite = best.composite
+    search.accepted += [name for name in (best.beside, best.name) if name]
+    search.largest = max(search.largest, best.evidence)
+
+
+def _other_means(fitter: Fitter, search: Search, trials: Sequence[Trial]) -> None:
+    """Accept what else in the mean answers to what was measured, before alpha takes its place."""
+    last = search.accepted[-1]
+    if not catalogue()[last].MEASURED:
+        return
+    for trial in trials:
+        kind = catalogue()[trial.name]
+        least = decision.least_evidence(kind, search.largest)
+        if trial.name == last or kind.ROLE is not Role.MEAN or not kind.MEASURED or (
+                trial.evidence < least):
+            continue
+        composite = search.composite
+        fit = fitter.best_start(composite, kind, fitter.view(composite))
+        gain = -math.inf if fit is None else fitter.evidence(fit) - fitter.evidence(composite)
+        if fit is not None and gain > least:
+            search.log.append(f'{trial.name}: {gain:.1f} nats beside it')
+            search.composite = fit
+            search.accepted.append(trial.name)
+            search.rivals.setdefault(trial.name, [])
+
+
+def _more_lines(fitter: Fitter, search: Search) -> bool:
+    """Add the lines that come with the one accepted last, as harmonics do."""
+    composite, samples = search.composite, fitter.samples
+    view = fitter.view(composite)
+    # An amplitude, a phase, and what was searched for the frequency.
+    price = math.log(samples.train.stop) + Tone.SEARCH
+    # A line of the scores, which have variance 1, gains n rms^2 / 2 nats.
+    lines = [Tone.at(line, view) for line in lines_of(view)[:decision.MOST_LINES]
+             if 0.5 * samples.n * line.rms ** 2 > price + decision.ACCEPT]
+    fit = fitter.join(composite, lines, rough=True) if lines else None
+    if fit is None or (fitter.evidence(fit) - fitter.evidence(composite)
+                       < decision.ACCEPT * len(lines)):
+        return False
+    search.log.append(f'{len(lines)} more lines')
+    search.composite = fit
+    search.accepted += [Tone.NAME] * len(lines)
+    return True
+
+
+def _reform(fitter: Fitter, search: Search) -> bool:
+    """Look for better knots of sigma(throttle) beside all else; return whether there are any."""
+    composite = search.composite
+    index = next((k for k, term in enumerate(composite.terms)
+                  if isinstance(term, LoadDependentSigma)), None)
+    if index is None:
+        return False
+    term = composite.terms[index]
+    assert isinstance(term, LoadDependentSigma)
+    # Its scores before any law of the noise.
+    gaussian = composite.gaussian
+    view = view_of(fitter.samples, gaussian, gaussian.z, fitter.samples.train)
+    for start in term.candidates(term.relative(view)):
+        terms = [*composite.terms[:index], start, *composite.terms[index + 1:]]
+        fit = fitter.fit(terms, composite)
+        if fit is not None and fitter.evidence(fit) > (
+                fitter.evidence(search.composite) + decision.TIE):
+            search.composite = fit
+    return search.composite is not composite
+
+
+def _prune(fitter: Fitter, search: Search) -> None:
+    """Take out causes that are not needed beside those accepted since."""
+    full = fitter.evidence(search.composite)
+    last = catalogue()[search.accepted[-1]]
+    for name in search.accepted[:-1]:
+        kind = catalogue()[name]
+        if not decision.in_doubt(kind, last):
+            continue
+        index = next(k for k, term in enumerate(search.composite.terms) if term.NAME == name)
+        kept = [term for k, term in enumerate(search.composite.terms) if k != index]
+        same = search.composite if search.composite.terms[index].ROLE is not Role.LAW else None
+        less = fitter.fit(kept, same, rough=True)
+        needed = decision.needed_evidence(kind)
+        if less is not None and full - fitter.evidence(less) < needed + decision.ROUGH:
+            less = fitter.fit(kept, less)
+        if less is None or not full - fitter.evidence(less) < needed:
+            continue
+        plain = fitter.simplest(search.composite, index)
+        if plain is not None and fitter.evidence(plain) - fitter.evidence(less) > needed:
+            search.log.append(f'{name} in a simpler form')
+            search.composite, full = plain, fitter.evidence(plain)
+            continue
+        lost = full - fitter.evidence(less)
+        search.log.append(f'{name} is not needed any more: {lost:.1f}')
+        search.composite, full = less, fitter.evidence(less)
+        search.accepted.remove(name)
+        search.removed.append(name)
+
+
+def _kept_beside(fitter: Fitter, search: Search, stays: Sequence[Term],
+                 before: Mapping[str, float], bank: NullBank
+                 ) -> tuple[Composite, dict[str, float]]:
+    """Put latent causes that were not withdrawn beside the measured ones; return what is left."""
+    samples = fitter.samples
+    whole = fitter.whole(search.composite)
+    after = criticise(samples, whole, bank)
+    for term in stays:
+        fit = fitter.join(search.composite, [term], rough=False)
+        if fit is None or (fitter.evidence(fit) - fitter.evidence(search.composite)
+                           < decision.ACCEPT):
+            continue
+        again = fitter.whole(fit)
+        left = criticise(samples, again, bank)
+        if decision.withdrawn(before, left, _kinds([*search.accepted, term.NAME])):
+            continue
+        search.composite, whole, after = fit, again, left
+        search.accepted.append(term.NAME)
+        search.rivals.setdefault(term.NAME, [])
+    return whole, after
