@@ -37,7 +37,7 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
     return f, q, np.array([1.0, 0.0])
 
 
-# Stretches in a coherence time of a line (over pi), how many it takes, and the mean of
+# Segments in a coherence time of a line (over pi), how many it takes, and the mean of
 # the squares of their powers over the square of the mean: 2 for ringing driven by
 # noise, whose powers are exponential, and of 12 so low in 1 % only; 1 for a line.
 _FINE, _ENOUGH, _LEVEL = 4.0, 12, 1.25
@@ -77,9 +77,9 @@ def order_lines(view: View) -> list[tuple[float, float]]:
     """
     Return the lines whose frequency follows throttle.
 
-    The power of short stretches is added up along frequency = idle + slope *
+    The power of short segments is added up along frequency = idle + slope *
     throttle for many idles and slopes (a Hough transform); the best are
-    refined by adding up amplitudes over longer stretches.
+    refined by adding up amplitudes over longer segments.
     """
     if view.throttle is None:
         return []
@@ -108,12 +108,12 @@ def order_power(z: FloatArray, u: FloatArray, rate: float) -> tuple[float, float
 _INDEPENDENT = 0.02
 # Slopes looked at, in sampling rates: idle to full throttle may fold once and come back.
 _REACH = 1.0
-# By how much a stretch is shorter that shows lines which throttle moves fast.
+# By how much a segment is shorter that shows lines which throttle moves fast.
 _SHORTER = 8
 
 
 def _lengths(rate: float) -> tuple[int, ...]:
-    """Return the samples in a stretch: a quarter of a second, and an eighth of that."""
+    """Return the samples in a segment: a quarter of a second, and an eighth of that."""
     long = int(1 << max(5, round(math.log2(max(32.0, 0.25 * rate)))))
     short = max(long // _SHORTER, 32)
     return (long,) if short == long else (long, short)
@@ -125,7 +125,7 @@ class _Line:
     A line that follows throttle.
 
     `rise` is such that exp(-rise) is the chance of one trial to be beaten; `length` are the
-    samples in a stretch.
+    samples in a segment.
     """
 
     rise: float
@@ -141,7 +141,7 @@ def _hough(z: FloatArray, u: FloatArray, rate: float, length: int) -> list[_Line
         return []
     shape = z[:count * length].reshape(count, length)
     power = np.abs(np.fft.rfft(shape * np.hanning(length), 2 * length, axis=1)) ** 2
-    # What every stretch has at a frequency does not follow throttle.
+    # What every segment has at a frequency does not follow throttle.
     power = (power / power.mean(axis=0)).astype(np.float32)
     load = u[:count * length].reshape(count, length).mean(axis=1)
     width = rate / (2.0 * length)
@@ -168,7 +168,7 @@ def _hough(z: FloatArray, u: FloatArray, rate: float, length: int) -> list[_Line
 
 def _refined(z: FloatArray, u: FloatArray, rate: float, idle: float, slope: float, width: float
              ) -> tuple[float, float]:
-    """Climb to the top of the coherent power, stretches growing to the whole."""
+    """Climb to the top of the coherent power, segments growing to the whole."""
     turns = np.cumsum(u - u.mean()) / rate
     idle += slope * float(u.mean())
     at = np.arange(z.size) / rate
