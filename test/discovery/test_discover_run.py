@@ -5,6 +5,8 @@ import math
 import os
 from pathlib import Path
 import re
+import subprocess
+import sys
 
 import numpy as np
 import ou_monitor
@@ -22,6 +24,7 @@ from ou_monitor.model.terms.quantization import Quantization
 from ou_monitor.records import Recording
 from ou_monitor.report.discovery_page import discovery_page
 from pages import parsed, self_contained
+from project import ROOT
 import pytest
 
 RAIL = OU(63.0, 0.3156, 5.0)
@@ -145,6 +148,15 @@ def test_same_seed_same_finding_and_progress_to_the_end():
     first = discover(recording, seed=3, progress=shares.append)
     assert first.as_data() == discover(recording, seed=3).as_data()
     assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) > 5
+
+
+def test_discover_loads_few_modules():
+    """At most 80 of the package, in a fresh interpreter: one reads them all to understand it."""
+    code = ('import sys; from ou_monitor import discover; '
+            "print(sum(name.split('.')[0] == 'ou_monitor' for name in sys.modules))")
+    run = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True,
+                         check=True)
+    assert 20 < int(run.stdout) <= 80
 
 
 def test_a_path_is_read(tmp_path):

@@ -4,7 +4,7 @@ import math
 import tracemalloc
 
 import numpy as np
-from ou_monitor.model.supply import Simulation, SEGMENT, SupplyModel
+from ou_monitor.model.supply import SEGMENT, Simulation, SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 import pytest
 from term_examples import agrees, ALPHA, EXAMPLES, OU, SIGMA, supply, term

@@ -1,0 +1,337 @@
+"""What the search decides, by tables: each constant held from both sides, each rule by a case."""
+
+from typing import ClassVar
+
+from ou_monitor.discovery import decision
+from ou_monitor.discovery.finding import Verdict
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.term import Role, Term
+import pytest
+from scipy.stats import binom, norm
+
+KINDS = catalogue()
+
+
+class Cheap(Term):
+    """A latent cause that asks for one statistic, in one direction."""
+
+    NAME = 'cheap'
+    FAMILY = 'toys'
+    ROLE = Role.BLOCK
+    SIGNS: ClassVar[tuple[str, ...]] = ('+band', 'line')
+
+
+class Dear(Cheap):
+    """The same, whose fit takes seconds, of another family."""
+
+    NAME = 'dear'
+    FAMILY = 'dolls'
+    DEAR = True
+
+
+class Imitator(Dear):
+    """One that imitates the cheap one."""
+
+    NAME = 'imitator'
+    IMITATES: ClassVar[tuple[str, ...]] = ('cheap',)
+
+
+class Law(Cheap):
+    """Another law of the noise."""
+
+    NAME = 'law'
+    ROLE = Role.LAW
+    SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis',)
+
+
+class White(Cheap):
+    """A noise of the measurement."""
+
+    NAME = 'white'
+    ROLE = Role.NOISE
+    MAY_LEAVE = 0.3
+    SIGNS: ClassVar[tuple[str, ...]] = ('-autocorrelation',)
+
+
+class Mean(Cheap):
+    """A mean that answers to throttle."""
+
+    NAME = 'mean'
+    ROLE = Role.MEAN
+    MEASURED = True
+    NEEDS_THROTTLE = True
+    SIGNS: ClassVar[tuple[str, ...]] = ('throttle',)
+
+
+class Intensity(Mean):
+    """A sigma that answers to throttle."""
+
+    NAME = 'intensity'
+    FAMILY = 'intensity'
+    ROLE = Role.DRIVE
+    SIGNS: ClassVar[tuple[str, ...]] = ('variance throttle',)
+
+
+class Trend(Mean):
+    """A mean that answers to time, and needs a share of the largest evidence."""
+
+    NAME = 'trend'
+    NEEDS_THROTTLE = False
+    LEAST_SHARE = 0.02
+    SIGNS: ClassVar[tuple[str, ...]] = ('time',)
+
+
+class Clear(Cheap):
+    """A latent cause that has its turn early where it is clear."""
+
+    NAME = 'clear'
+    CLEAR_ABOVE: ClassVar[dict[str, float]] = {'order line': 10.0}
+
+
+class Ringing(Cheap):
+    """One that some statistics refute."""
+
+    NAME = 'ringing'
+    MAY_LEAVE = 0.1
+    REFUTED_BY: ClassVar[tuple[str, ...]] = ('bursts',)
+
+
+TOYS = [Cheap, Dear, Imitator, Law, White, Mean, Intensity, Trend, Clear, Ringing]
+
+
+@pytest.mark.parametrize('kind, values, asked', [
+    (Cheap, {'band 3': 2.61}, 2.61), (Cheap, {'band 3': 2.59}, 0.0),
+    (Dear, {'band 3': 3.21}, 3.21), (Dear, {'band 3': 3.19}, 0.0),
+    # In one direction only, or in both.
+    (Cheap, {'band 3': -9.0}, 0.0), (Cheap, {'line': -9.0}, 9.0),
+    # The largest of those that ask counts.
+    (Cheap, {'band 3': 5.0, 'line': 7.0, 'time': 20.0}, 7.0),
+    # A sign is the beginning of a name.
+    (Cheap, {'order line': 9.0}, 0.0), (Mean, {'throttle change over 2 s': -4.0}, 4.0)])
+def test_a_statistic_asks_for_the_kinds_that_it_is_a_sign_of(kind, values, asked):
+    assert decision.asks(kind, values) == asked
+
+
+@pytest.mark.parametrize('largest, off', [(4.49, False), (4.51, True), (-4.51, True)])
+def test_clearly_off(largest, off):
+    assert decision.any_off({'a': 0.0, 'b': largest}) is off
+
+
+@pytest.mark.parametrize('kind, values, tier', [
+    (Mean, {}, 0), (Trend, {}, 0), (Cheap, {'kurtosis': 99.0}, 2),
+    (Law, {'kurtosis': 24.9}, 2), (Law, {'kurtosis': 25.1}, 1), (Law, {'tails beyond 4': -26.0}, 1),
+    (Clear, {'order line': 9.9}, 2), (Clear, {'order line': 10.1}, 0),
+    (White, {'kurtosis': 24.9}, 0), (White, {'kurtosis': 25.1}, 1),
+    (White, {'kurtosis': 99.0, 'small errors lag 1': -7.9}, 1),
+    (White, {'kurtosis': 99.0, 'small errors lag 1': -8.1}, 0)])
+def test_when_a_kind_has_its_turn(kind, values, tier):
+    assert decision.tier_of(kind, values) == tier
+
+
+def tried(values, model=(), given=(), tier=2, throttle=True, kinds=TOYS):
+    """Return the names of the kinds to try."""
+    return [kind.NAME for kind in decision.kinds_to_try(
+        kinds, list(model), values, given, tier, throttle)]
+
+
+BAND = {'band 3': 5.0}
+
+
+def test_cheap_kinds_are_tried_first_and_of_these_the_most_asked_for():
+    assert tried(BAND) == ['cheap', 'clear', 'ringing', 'dear', 'imitator']
+
+    class Line(Cheap):
+        NAME = 'only lines'
+        SIGNS: ClassVar[tuple[str, ...]] = ('line',)
+
+    assert tried({**BAND, 'line': 6.0}, kinds=[White, Mean, Cheap, Line]) == [
+        'cheap', 'only lines']
+    assert tried({**BAND, 'line': 4.0}, kinds=[Line, Cheap]) == ['cheap', 'only lines']
+
+
+@pytest.mark.parametrize('changes, missing', [
+    ({'given': ['cheap']}, 'cheap'), ({'model': [Cheap]}, 'cheap'),
+    # One that imitates what is there already, whichever of the two says so.
+    ({'model': [Cheap]}, 'imitator'), ({'model': [Imitator]}, 'cheap')])
+def test_what_is_not_tried(changes, missing):
+    assert missing in tried(BAND) and missing not in tried(BAND, **changes)
+
+
+def test_a_kind_that_recurs_is_tried_again():
+    class Again(Cheap):
+        NAME = 'again'
+        RECURS = True
+
+    assert tried(BAND, [Again], kinds=[Again]) == ['again']
+    assert tried(BAND, [Cheap], kinds=[Cheap]) == []
+
+
+def test_exact_findings_and_kinds_without_signs_are_never_tried():
+    class Exact(Cheap):
+        NAME = 'exact'
+        ROLE = Role.EXACT
+
+    class Mute(Cheap):
+        NAME = 'mute'
+        SIGNS: ClassVar[tuple[str, ...]] = ()
+
+    assert tried(BAND, kinds=[Exact, Mute, KINDS['ou']]) == []
+
+
+def test_throttle_must_be_known_to_what_needs_it():
+    asked = {'throttle': 5.0, 'time': 5.0}
+    assert tried(asked, tier=0) == ['mean', 'trend']
+    assert tried(asked, tier=0, throttle=False) == ['trend']
+
+
+@pytest.mark.parametrize('values, model, also', [
+    # Once something was found, cheap means are tried wherever something is left.
+    ({'skewness': 4.6}, [KINDS['ou'], Cheap], True),
+    ({'skewness': 4.4}, [KINDS['ou'], Cheap], False), ({'skewness': 4.6}, [KINDS['ou']], False)])
+def test_measured_means_are_tried_unasked(values, model, also):
+    assert tried(values, model, tier=0) == (['mean', 'trend'] if also else [])
+
+
+@pytest.mark.parametrize('one, left, kind, spared', [
+    (Cheap, {'time': 1.0}, Dear, True), (Cheap, None, Dear, False),
+    # A cheap kind is tried in any case, as is one of the same family or an imitator.
+    (Dear, {'time': 1.0}, Cheap, False), (Imitator, {'time': 1.0}, Dear, False),
+    (Cheap, {'time': 1.0}, Imitator, False),
+    # What is left asks for it, or is off.
+    (Cheap, {'band 1': 3.3}, Dear, False), (Cheap, {'band 1': 3.1}, Dear, True),
+    (Cheap, {'time': 4.6}, Dear, False), (Cheap, {'time': 4.4}, Dear, True)])
+def test_a_clear_trial_spares_dear_ones(one, left, kind, spared):
+    assert decision.settled(one, left, kind) is spared
+
+
+@pytest.mark.parametrize('kind, cost, may', [
+    (Cheap, 1e9, True), (Dear, 9.9, True), (Dear, 10.1, False)])
+def test_dear_kinds_are_tried_while_time_is_left(kind, cost, may):
+    assert decision.affordable(kind, cost) is may
+
+
+@pytest.mark.parametrize('kind, evidence, largest, ragged, throughout, accepted', [
+    (Cheap, 6.1, 0.0, False, True, True), (Cheap, 5.9, 0.0, False, True, False),
+    (Mean, 3.1, 0.0, False, True, True), (Mean, 2.9, 0.0, False, True, False),
+    (Intensity, 5.9, 0.0, False, True, False), (Intensity, 6.1, 0.0, False, True, True),
+    # A share of the largest, but never less than of any other.
+    (Trend, 6.1, 100.0, False, True, True), (Trend, 5.9, 100.0, False, True, False),
+    (Trend, 19.9, 1000.0, False, True, False), (Trend, 20.1, 1000.0, False, True, True),
+    (Cheap, 6.1, 1000.0, False, True, True),
+    # Where scores are ragged, what was measured must gain throughout; the others need not.
+    (Mean, 9.0, 0.0, True, False, False), (Mean, 9.0, 0.0, True, True, True),
+    (Mean, 9.0, 0.0, False, False, True), (Cheap, 9.0, 0.0, True, False, True)])
+def test_what_is_accepted(kind, evidence, largest, ragged, throughout, accepted):
+    assert decision.acceptable(kind, evidence, largest, ragged, throughout) is accepted
+
+
+@pytest.mark.parametrize('name, value, ragged', [
+    ('kurtosis', 7.9, False), ('kurtosis', 8.1, True), ('tails beyond 4', 8.1, True),
+    ('clustering 0.1 s', 8.1, True), ('kurtosis', -20.0, False), ('skewness', 20.0, False)])
+def test_ragged_scores(name, value, ragged):
+    assert decision.is_ragged({'time': 50.0, name: value}) is ragged
+
+
+@pytest.mark.parametrize('mean, error, positive, throughout', [
+    (4.1, 1.0, 1, True), (3.9, 1.0, 17, False), (3.9, 1.0, 18, True), (-9.0, 1.0, 24, True)])
+def test_a_gain_is_throughout(mean, error, positive, throughout):
+    gains = [1.0] * positive + [-1.0] * (24 - positive)
+    assert decision.is_throughout(mean, error, gains) is throughout
+
+
+def test_rivals_are_those_within_a_tie_of_the_best():
+    evidence = [('a', 13.1), ('best', 10.0), ('b', 7.1), ('c', 6.9)]
+    assert decision.rivals_of('best', evidence) == ['a', 'b']
+
+
+@pytest.mark.parametrize('before, after, kind, helps', [
+    # Little is left: four times 25.
+    ({'a': 5.1}, {'a': 9.9}, None, True), ({'a': 5.1}, {'a': 10.1}, None, False),
+    # Half of the sum of squares must go.
+    ({'a': 20.0}, {'a': 14.1}, None, True), ({'a': 20.0}, {'a': 14.2}, None, False),
+    # Of scores below 4 nothing counts.
+    ({'a': 3.9, 'b': 14.2}, {'a': 3.9, 'b': 10.05}, None, False),
+    ({f'{k}': 4.1 for k in range(9)}, {f'{k}': 3.9 for k in range(9)}, None, True),
+    ({f'{k}': 4.1 for k in range(9)}, {f'{k}': 4.1 for k in range(9)}, None, False),
+    # Only what asks for the kind, or everything; what was not there before is not counted.
+    ({'band 1': 20.0, 'time': 50.0}, {'band 1': 1.0, 'time': 50.0}, Cheap, True),
+    ({'band 1': 20.0, 'time': 50.0}, {'band 1': 1.0, 'time': 50.0}, None, False),
+    ({'band 1': 20.0}, {'band 1': 1.0, 'time': 50.0}, None, True)])
+def test_what_helps(before, after, kind, helps):
+    assert decision.helped(before, after, kind) is helps
+
+
+@pytest.mark.parametrize('kind, last, doubted', [
+    (Mean, Mean, True), (Cheap, Law, True), (Mean, Cheap, True),
+    # A law of the noise does not take the place of an answer to an input...
+    (Intensity, Law, False),
+    # ... but one of the same family may.
+    (KINDS['load_dependent_sigma'], KINDS['volatility'], True),
+    (KINDS['load_dependent_sigma'], KINDS['jumps'], False)])
+def test_what_is_in_doubt_again(kind, last, doubted):
+    assert decision.in_doubt(kind, last) is doubted
+
+
+@pytest.mark.parametrize('kind, needed', [(Mean, 0.0), (Intensity, 0.0), (Cheap, 3.0), (Law, 3.0)])
+def test_what_a_cause_must_bring_to_stay(kind, needed):
+    assert decision.needed_evidence(kind) == needed
+
+
+@pytest.mark.parametrize('before, after, fails', [
+    ({'a': 0.0}, {'a': 4.79}, False), ({'a': 0.0}, {'a': -4.81}, True),
+    ({'a': 100.0}, {'a': 6.9}, False), ({'a': 100.0}, {'a': 7.1}, True),
+    ({'a': 0.0, 'b': 300.0}, {'a': 5.9}, False), ({'a': 0.0, 'b': 300.0}, {'a': 6.1}, True)])
+def test_what_fails(before, after, fails):
+    assert decision.failing(before, after) == (['a'] if fails else [])
+
+
+@pytest.mark.parametrize('before, after, accepted, out', [
+    ({}, {'time': 4.7}, [Cheap, Law], []), ({}, {'time': 4.9}, [Cheap, Law], [0, 1]),
+    # What was measured is never withdrawn; what it leaves of its own signs is its form.
+    ({}, {'throttle': 9.0}, [Mean, Law], []), ({}, {'time': 9.0}, [Mean, Law], [1]),
+    ({}, {'throttle': 9.0}, [Cheap, Law], [0, 1]),
+    # Noise and lines go only where their own signs are left, by more than their share.
+    ({}, {'time': 9.0}, [White], []),
+    ({'autocorrelation lag 1': -40.0}, {'autocorrelation lag 1': -11.9}, [White], []),
+    ({'autocorrelation lag 1': -40.0}, {'autocorrelation lag 1': -12.1}, [White], [0]),
+    ({'autocorrelation lag 1': -40.0}, {'autocorrelation lag 1': 30.0}, [White], []),
+    ({'band 1': 60.0}, {'band 1': 5.9}, [Ringing], []),
+    ({'band 1': 60.0}, {'band 1': 6.1}, [Ringing], [0]),
+    # What comes and goes does not ring.
+    ({'band 1': 60.0}, {'bursts within 1 s': 9.0}, [Ringing, White], [0]),
+    # A sigma that follows throttle may leave some clusters.
+    ({'clustering 1 s': 100.0}, {'clustering 1 s': 14.9}, [Intensity, Cheap], []),
+    ({'clustering 1 s': 100.0}, {'clustering 1 s': 15.1}, [Intensity, Cheap], [1]),
+    ({'variance time': 100.0}, {'variance time': 14.9}, [Intensity, Cheap], []),
+    ({'clustering 1 s': 100.0}, {'clustering 1 s': 14.9}, [Mean, Cheap], [1])])
+def test_what_is_withdrawn(before, after, accepted, out):
+    assert decision.withdrawn(before, after, accepted) == out
+
+
+@pytest.mark.parametrize('score, causes, dropped, verdict', [
+    # One statistic: 1 % at 2.576, 0.1 % at 3.291.
+    (2.57, 0, 0, Verdict.NO_EFFECT), (2.58, 0, 0, Verdict.UNEXPLAINED),
+    (0.0, 0, 1, Verdict.UNEXPLAINED),
+    (3.28, 1, 0, Verdict.EXPLAINED), (-3.30, 1, 0, Verdict.PARTLY_EXPLAINED),
+    (0.0, 1, 1, Verdict.PARTLY_EXPLAINED)])
+def test_the_verdict(score, causes, dropped, verdict):
+    assert decision.judge({'a': score}, causes, dropped) is verdict
+
+
+def test_the_origins_of_the_constants():
+    """What the comments say of chances is so."""
+    assert 2.0 * norm.sf(decision.ASK) == pytest.approx(0.0093, rel=0.01)
+    assert 2.0 * norm.sf(decision.ASK_DEAR) == pytest.approx(1 / 700, rel=0.05)
+    assert 70 * 2.0 * norm.sf(decision.OFF) == pytest.approx(1 / 2000, rel=0.1)
+    assert 70 * 2.0 * norm.sf(decision.FAILS) == pytest.approx(1 / 10_000, rel=0.15)
+    assert binom.sf(decision.MOSTLY * 24 - 1, 24, 0.5) == pytest.approx(0.011, rel=0.05)
+    assert norm.sf(decision.STEADY) == pytest.approx(1 / 30_000, rel=0.1)
+    assert 2.0 * norm.sf(decision.MISFIT) == pytest.approx(1 / 16_000, rel=0.05)
+
+
+@pytest.mark.parametrize('name, value', [
+    ('CLEAR', 30.0), ('ROUGH', 20.0), ('TIERS', 3), ('MOST', 8), ('MOST_LATENT', 3),
+    ('MOST_LINES', 12)])
+def test_what_only_the_search_reads(name, value):
+    """Limits of rounds and of fits: by value, as no table can reach them."""
+    assert getattr(decision, name) == value
