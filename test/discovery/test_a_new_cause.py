@@ -129,7 +129,7 @@ def test_a_toy_cause_in_a_copy_of_the_tree(tmp_path):
     text = registry.read_text()
     assert text.count('LABELS = {\n') == 1
     registry.write_text(text.replace('LABELS = {\n', "LABELS = {\n    'heartbeat': 'events',\n"))
-    path = os.pathsep.join(map(str, [tmp_path, tmp_path / 'test/hidden', tmp_path / 'test/support']))
+    path = os.pathsep.join(str(tmp_path / part) for part in ('.', 'test/hidden', 'test/support'))
     run = subprocess.run(
         [sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', str(tests)],
         cwd=tmp_path, env={**os.environ, 'PYTHONPATH': path}, capture_output=True, text=True,

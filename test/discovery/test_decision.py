@@ -119,7 +119,8 @@ def test_clearly_off(largest, off):
 
 @pytest.mark.parametrize('kind, values, tier', [
     (Mean, {}, 0), (Trend, {}, 0), (Cheap, {'kurtosis': 99.0}, 2),
-    (Law, {'kurtosis': 24.9}, 2), (Law, {'kurtosis': 25.1}, 1), (Law, {'tails beyond 4': -26.0}, 1),
+    (Law, {'kurtosis': 24.9}, 2), (Law, {'kurtosis': 25.1}, 1),
+    (Law, {'tails beyond 4': -26.0}, 1),
     (Clear, {'order line': 9.9}, 2), (Clear, {'order line': 10.1}, 0),
     (White, {'kurtosis': 24.9}, 0), (White, {'kurtosis': 25.1}, 1),
     (White, {'kurtosis': 99.0, 'small errors lag 1': -7.9}, 1),
