@@ -28,9 +28,9 @@ sys.path[:0] = [str(_ROOT), *(str(_ROOT / 'test' / name) for name in ('support',
 from discover_limits import CAUSES, DURATIONS, figure, limits_table, Point, Search  # noqa: E402
 import discover_runs as runs  # noqa: E402
 from discover_tables import heat_map, report  # noqa: E402
-from drawing import put  # noqa: E402
 from hidden_effects import causes, KINDS, pairs, unknowns, variants  # noqa: E402
 import numpy as np  # noqa: E402
+from tables import put  # noqa: E402
 
 SEED = 20260131
 

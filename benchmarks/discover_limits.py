@@ -9,12 +9,11 @@ from typing import Any
 
 from blind_scores import from_data
 from discover_runs import key_of, Results, Task
-from drawing import drawing
 import numpy as np
 from ou_monitor.records import FloatArray
 from ou_monitor.report.svg import Plot
 from scipy.special import log_expit
-from tables import table
+from tables import drawing, table
 
 CAUSES = ('load_sag', 'measurement_noise', 'tone', 'second_relaxation', 'load_dependent_sigma',
           'jumps', 'regime_switching', 'load_dependent_alpha')

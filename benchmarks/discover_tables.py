@@ -10,11 +10,10 @@ from typing import Any
 
 from blind_scores import confusion, from_data, Outcome
 from discover_runs import TIME_LIMIT
-from drawing import drawing
 from hidden_effects import labels
 import numpy as np
 from scipy.stats import binomtest
-from tables import number, table
+from tables import drawing, number, table
 
 # Seconds that a recording may take, and MB.
 SECONDS, MEMORY = 15.0, 1000.0

@@ -21,14 +21,15 @@ from pathlib import Path
 import sys
 import time
 
-import filter_dterm
-import filter_error
-import filter_loop
-import filter_methods as methods
-import filter_node
-from filter_signals import CASES, fly, RATE
-import numpy as np
-from ou_monitor.report.svg import Plot
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+import control_loop  # noqa: E402
+import filter_error  # noqa: E402
+import filter_methods as methods  # noqa: E402
+from filter_signals import CASES, fly, RATE  # noqa: E402
+import numpy as np  # noqa: E402
+from ou_monitor.report.svg import Plot  # noqa: E402
+import ros_throughput  # noqa: E402
 
 SEED = 20261121
 BAGS = Path(__file__).resolve().parent.parent / 'bags'
@@ -81,14 +82,14 @@ def windows(given: argparse.Namespace) -> tuple[str, str]:
 
 def dterm(given: argparse.Namespace) -> tuple[str, str]:
     """Noise of the D term against its lag."""
-    text, plot = filter_dterm.render(filter_dterm.run(
+    text, plot = filter_error.render_dterm(filter_error.run_dterm(
         given.flights, given.seconds, given.seed, given.window, _tell()))
     return text, _drawing([(plot, 760, 360)], 'D term: noise against lag')
 
 
 def loop(given: argparse.Namespace) -> tuple[str, str]:
     """Where the loop through the supply begins to hunt."""
-    text, plot = filter_loop.render(filter_loop.scan(given.seconds, given.seed, _tell()))
+    text, plot = control_loop.render(control_loop.scan(given.seconds, given.seed, _tell()))
     return text, _drawing([(plot, 760, 380)], 'Swing of the cutoff against coupling')
 
 
@@ -142,7 +143,7 @@ def flight(given: argparse.Namespace) -> tuple[str, str]:
 
 def node(given: argparse.Namespace) -> tuple[str, str]:
     """Cost and latency of the node at 1 kHz."""
-    return filter_node.run(given.seconds), ''
+    return ros_throughput.filter_node(given.seconds), ''
 
 
 def _write(given: argparse.Namespace, text: str, drawing: str) -> None:

@@ -9,7 +9,8 @@ Reading bags: against the libraries that decode message by message; and memory.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
@@ -21,20 +22,207 @@ import tempfile
 import time
 from typing import Any
 
-from mcap.writer import CompressionType, IndexType
-import numpy as np
-from ou_monitor.recordings.bag import BagWriter
-from ou_monitor.recordings.read import read_pieces, read_recording
-from ou_monitor.recordings.standard_types import (
-    encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY)
-from reading_bags import BLOCK, cases, messages, write
-from reading_peers import check, mcap_ros2, ours, recording, rosbags, unpacked
-from tables import table
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from mcap.reader import make_reader  # noqa: E402
+from mcap.writer import CompressionType, IndexType, Writer  # noqa: E402
+from mcap_ros2.decoder import DecoderFactory  # noqa: E402
+import numpy as np  # noqa: E402
+from ou_monitor.recordings.bag import BagReader, BagWriter  # noqa: E402
+from ou_monitor.recordings.columns import batches, join  # noqa: E402
+from ou_monitor.recordings.read import read_pieces, read_recording  # noqa: E402
+from ou_monitor.recordings.standard_types import (  # noqa: E402
+    BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, SCHEMAS)
+from ou_monitor.recordings.topic_choice import choose  # noqa: E402
+from ou_monitor.records import Recording  # noqa: E402
+from rosbags.highlevel import AnyReader  # noqa: E402
+from rosbags.typesys import get_typestore, Stores  # noqa: E402
+from tables import table  # noqa: E402
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'lz4': CompressionType.LZ4,
                 'zstd': CompressionType.ZSTD}
 # Repeats of the reader that takes milliseconds; the others take seconds.
 REPEATS = 5
+
+
+THROTTLE = '/throttle'
+IMU = 'sensor_msgs/msg/Imu'
+START = 1_704_067_200_000_000_000
+BLOCK = 100
+# Size of a chunk that rosbag2 writes.
+CHUNK = 786_432
+
+_IMU_CONFIG = f"""description: A body rate read as if it were the voltage.
+package: sensor_msgs
+install: ros-jazzy-sensor-msgs
+generic: false
+voltage:
+  topic: /imu
+  type: {IMU}
+  field: angular_velocity.x
+  stamp_field: header.stamp
+throttle:
+  topic: /throttle
+  type: std_msgs/msg/Float32
+  field: data
+"""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One type of message."""
+
+    name: str
+    type: str  # noqa: A003
+    topic: str
+    config: str
+    value: Callable[[Any], Any]
+    stamped: bool = False
+    block: bool = False
+
+
+def cases(folder: Path) -> list[Case]:
+    """Return the types; the msg config of one of them is written to a folder."""
+    config = folder / 'imu.yaml'
+    config.write_text(_IMU_CONFIG, encoding='utf-8')
+    return [
+        Case('Float32', FLOAT32, '/voltage', 'std_float32', lambda m: m.data),
+        Case('BatteryState', BATTERY_STATE, '/voltage', 'battery_state', lambda m: m.voltage,
+             stamped=True),
+        Case('Imu', IMU, '/imu', str(config), lambda m: m.angular_velocity.x, stamped=True),
+        Case(f'Float32MultiArray, {BLOCK} samples', FLOAT32_ARRAY, '/voltage', 'adc_block',
+             lambda m: m.data, block=True)]
+
+
+def _imu(stamps: np.ndarray, values: np.ndarray) -> Iterator[bytes]:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types = store.types
+    vector, quaternion = types['geometry_msgs/msg/Vector3'], types['geometry_msgs/msg/Quaternion']
+    header, time = types['std_msgs/msg/Header'], types['builtin_interfaces/msg/Time']
+    for stamp, value in zip(stamps.tolist(), values.tolist()):
+        message = types[IMU](
+            header(time(stamp // 10**9, stamp % 10**9), 'imu_link'),
+            quaternion(0.0, 0.0, 0.0, 1.0), np.zeros(9), vector(value, 0.1, -0.2), np.zeros(9),
+            vector(0.0, 0.0, 9.81), np.zeros(9))
+        yield bytes(store.serialize_cdr(message, IMU))
+
+
+def messages(case: Case, count: int) -> list[tuple[str, int, bytes]]:
+    """
+    Return (topic, log time in ns, message), a throttle with every twentieth.
+
+    Messages come at 1 kHz, blocks so that their samples are at 10 kHz.
+    """
+    rng = np.random.default_rng(7)
+    times = START + np.arange(1, count + 1) * (10_000_000 if case.block else 1_000_000)
+    values = rng.normal(5.0, 0.1, count)
+    if case.block:
+        voltage = [encode_block(row) for row in rng.normal(5.0, 0.1, (count, BLOCK))]
+    elif case.type == IMU:
+        voltage = list(_imu(times, values))
+    elif case.type == BATTERY_STATE:
+        voltage = encode_battery(times, values)
+    else:
+        voltage = encode_scalars(case.type, values)
+    throttle = encode_scalars(FLOAT32, rng.random(count // 20 + 1))
+    rows: list[tuple[str, int, bytes]] = []
+    for k, (at, data) in enumerate(zip(times.tolist(), voltage)):
+        if k % 20 == 0:
+            rows.append((THROTTLE, at, throttle[k // 20]))
+        rows.append((case.topic, at, data))
+    return rows
+
+
+def write(path: Path, case: Case, rows: list[tuple[str, int, bytes]], **options: Any) -> Path:
+    """Write a bag with the Python library of MCAP."""
+    schemas = dict(SCHEMAS)
+    if case.type not in schemas:
+        store = get_typestore(Stores.ROS2_JAZZY)
+        schemas[case.type], _ = store.generate_msgdef(case.type, ros_version=2)
+    with path.open('wb') as file:
+        writer = Writer(file, **{'chunk_size': CHUNK, **options})
+        writer.start(profile='ros2', library='benchmark')
+        channels = {}
+        for topic, kind in ((case.topic, case.type), (THROTTLE, FLOAT32)):
+            schema = writer.register_schema(kind, 'ros2msg', schemas[kind].encode())
+            channels[topic] = writer.register_channel(topic, 'cdr', schema)
+        for topic, at, data in rows:
+            writer.add_message(channels[topic], at, data, at)
+        writer.finish()
+    return path
+
+
+# Topic -> log times or stamps (s), values.
+Columns = dict[str, tuple[np.ndarray, np.ndarray]]
+
+
+def collect(case: Case, messages: Any) -> Columns:
+    """Return columns from (topic, log time in ns, message) one by one."""
+    voltage: tuple[list[float], list[Any]] = ([], [])
+    throttle: tuple[list[float], list[Any]] = ([], [])
+    value = case.value
+    for topic, at, message in messages:
+        if topic == THROTTLE:
+            throttle[0].append(at * 1e-9)
+            throttle[1].append(message.data)
+        elif case.stamped:
+            stamp = message.header.stamp
+            voltage[0].append(stamp.sec + 1e-9 * stamp.nanosec)
+            voltage[1].append(value(message))
+        else:
+            voltage[0].append(at * 1e-9)
+            voltage[1].append(value(message))
+    join: Callable[[list[Any]], np.ndarray] = np.concatenate if case.block else np.array
+    return {case.topic: (np.array(voltage[0]), join(voltage[1]).astype(float)),
+            THROTTLE: (np.array(throttle[0]), np.array(throttle[1], dtype=float))}
+
+
+def rosbags(path: Path, case: Case) -> Columns:
+    """Read with rosbags: `AnyReader`, a message an object."""
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        wanted = [c for c in reader.connections if c.topic in (case.topic, THROTTLE)]
+        return collect(case, ((c.topic, t, reader.deserialize(data, c.msgtype))
+                              for c, t, data in reader.messages(connections=wanted)))
+
+
+def mcap_ros2(path: Path, case: Case) -> Columns:
+    """Read with mcap and mcap-ros2-support, a message an object."""
+    with path.open('rb') as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        found = reader.iter_decoded_messages(topics=[case.topic, THROTTLE])
+        return collect(case, ((channel.topic, message.log_time, decoded)
+                              for _, channel, message, decoded in found))
+
+
+def unpacked(path: Path) -> int:
+    """Read and unpack the chunks, their checksums verified: what every reader has to do."""
+    file = BagReader(path)._files[0]
+    with path.open('rb') as stream:
+        return sum(len(file.span_data(stream, span)) for span in file.spans)
+
+
+def ours(path: Path, case: Case) -> Columns:
+    """Read with this package, to the same arrays as the others."""
+    bag = BagReader(path)
+    choice = choose(path, bag.topics, msg_config=case.config)
+    assert choice.throttle is not None
+    found = list(batches(bag, {case.topic: choice.voltage, THROTTLE: choice.throttle}))
+    columns = {topic: join([batch[topic] for batch in found if topic in batch])
+               for topic in (case.topic, THROTTLE)}
+    return {topic: (column.stamp, column.values) for topic, column in columns.items()}
+
+
+def recording(path: Path, case: Case) -> Recording:
+    """Read with `read_recording`: in order, each stamp once, the throttle held at each sample."""
+    return read_recording(path, msg_config=case.config)
+
+
+def check(case: Case, mine: Columns, other: Columns) -> None:
+    """Refuse to compare the time of ways that do not agree on what is in the bag."""
+    for topic in (case.topic, THROTTLE):
+        np.testing.assert_array_equal(mine[topic][1], other[topic][1])
+        # Float64 seconds since 1970 resolve 0.24 us.
+        np.testing.assert_allclose(mine[topic][0], other[topic][0], rtol=0, atol=1e-6)
 
 
 def timed(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:

@@ -1,7 +1,7 @@
 """
-Flights of a rail, simulated for the risk alone: an RC rail, current noise, fine steps.
+Flights of a rail, simulated for the risk alone; what is predicted of them, and what happened.
 
-Nothing of the package is used.  The rail is C dv/dt = (source - v)/R - i(throttle)
+The flights use nothing of the package.  The rail is C dv/dt = (source - v)/R - i(throttle)
 - noise, stepped twenty times a sample by the exponential Euler scheme; between
 two fine steps the lowest point is drawn by the Brownian bridge, so that what is
 counted is the continuous path.  sigma depends on throttle and wanders; throttle
@@ -10,14 +10,160 @@ changes in steps; the ADC adds white noise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
+from ou_monitor import brownout_probability
+from ou_monitor.online.monitor import SupplyMonitor
+from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.records import Estimate
+from scipy.special import ndtr
+from scipy.stats import beta
 
 RATE, FINE = 1000.0, 20
 # Throttle as a flight has it: what it is set to, and for how long, s.
 _THROTTLE, _DWELL = (0.15, 0.9), (2.0, 9.0)
+
+
+# Seconds before the first prediction, and between looks.
+WARM, WINDOW = 3.0, 2.0
+# Samples from one report of the monitor to the next: a slow companion computer.
+STEP = 250
+PUBLISHED = 'published risk'
+# Edges of the bins of predicted probability.
+EDGES = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """
+    One prediction, and what happened.
+
+    Attributes
+    ----------
+    flight : int
+        Number of the flight.
+    t : float
+        When it was made, s.
+    predicted : dict of str to float
+        Probability by method.
+    happened : bool
+        Whether the path went below the level within the horizon.
+    steady : bool
+        Whether throttle did not change within the horizon.
+
+    """
+
+    flight: int
+    t: float
+    predicted: dict[str, float]
+    happened: bool
+    steady: bool
+
+
+def monitor_settings(level: float, horizon: float) -> MonitorSettings:
+    """Return the defaults but for the level, the horizon and a floor that would answer for it."""
+    return MonitorSettings(window=WINDOW, brownout_voltage=level, brownout_horizon=horizon,
+                           brownout_floor=0.0)
+
+
+def stationary(e: Estimate, level: float) -> float:
+    """Return the paper's P(|U - U0| > delta): the share of time, both sides."""
+    return 2.0 * float(ndtr(-(e.u0 - level) / math.sqrt(e.var_inf)))
+
+
+def certain(e: Estimate, level: float, horizon: float) -> float:
+    """Return the first-passage risk as if the estimate had no errors."""
+    known = replace(e, alpha_se=0.0, sigma_se=0.0, var_inf_se=0.0, u0_se=0.0)
+    return brownout_probability(known, level, horizon, e.voltage)
+
+
+def predict(flights: Flights, levels: np.ndarray, horizon: float, every: float,
+            progress: Callable[[], None]) -> Iterator[Horizon]:
+    """
+    Predict, every so often, over horizons that do not overlap.
+
+    Parameters
+    ----------
+    flights : Flights
+        What is flown.
+    levels : ndarray, shape (flights,)
+        Brown-out voltage of each, V.
+    horizon : float
+        Time ahead, s.
+    every : float
+        From one prediction to the next, s; at least the horizon.
+    progress : callable
+        Called after each flight.
+
+    Yields
+    ------
+    Horizon
+        Where the estimate is usable and the rail not already below.
+
+    """
+    count, ahead = flights.t.size, round(horizon * RATE)
+    for f, level in enumerate(levels.tolist()):
+        monitor = SupplyMonitor(monitor_settings(level, horizon))
+        v, u = flights.voltage[f].astype(np.float64), flights.throttle[f]
+        for at in range(STEP, count - ahead, STEP):
+            part = slice(at - STEP, at)
+            monitor.push(flights.t[part], v[part], u[part])
+            report = monitor.report(0.0)
+            e = report.estimate
+            if at < WARM * RATE or at % round(every * RATE) or not e.usable or (
+                    v[at - 1] <= level or flights.path[f, at - 1] <= level):
+                continue
+            yield Horizon(f, float(flights.t[at - 1]), {
+                PUBLISHED: report.risk,
+                'window alone, errors averaged': brownout_probability(
+                    e, level, horizon, e.voltage),
+                'window alone, errors ignored': certain(e, level, horizon),
+                'stationary, as the paper': stationary(e, level),
+            }, bool(flights.low[f, at:at + ahead].min() < level),
+                bool((u[at:at + ahead] == u[at - 1]).all()))
+        progress()
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Predictions that are alike: how many, their mean, and how often it happened."""
+
+    low: float
+    high: float
+    count: int
+    predicted: float
+    hits: int
+
+    @property
+    def observed(self) -> float:
+        """Return the share that happened."""
+        return self.hits / self.count
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Return the 95 % interval of the share (Clopper & Pearson 1934)."""
+        k, n = self.hits, self.count
+        return (float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0,
+                float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0)
+
+
+def reliability(predicted: np.ndarray, happened: np.ndarray) -> list[Bin]:
+    """Return the reliability diagram."""
+    bins = []
+    for low, high in zip(EDGES[:-1], EDGES[1:]):
+        inside = (predicted >= low) & (predicted < (high if high < 1.0 else 2.0))
+        if inside.any():
+            bins.append(Bin(low, high, int(inside.sum()), float(predicted[inside].mean()),
+                            int(happened[inside].sum())))
+    return bins
+
+
+def brier(predicted: np.ndarray, happened: np.ndarray) -> float:
+    """Return the Brier score: mean square of probability less outcome."""
+    return float(np.mean((predicted - happened) ** 2))
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ from ou_monitor.model.terms.ou import OU  # noqa: E402
 from ou_monitor.model.terms.term import Term  # noqa: E402
 from ou_monitor.simulate.presets import PRESETS  # noqa: E402
 from ou_monitor.simulate.profiles import PROFILES  # noqa: E402
-from tables import table  # noqa: E402
+from tables import put, table  # noqa: E402
 
 ALPHA, SIGMA, RATE = 63.0, 0.632, 1000.0
 VAR_INF = SIGMA**2 / (2.0 * ALPHA)
@@ -270,7 +270,7 @@ def main() -> int:
         print(json.dumps(_one_run(given.memory)))
         return 0
     # Not at the top: it brings along what the memory of a run would count.
-    from estimator import environment, put_tables
+    from estimator import environment
     about = environment()
     found: dict[str, Any] = {'environment': {
         name: about.get(name) or _version(name) for name in (
@@ -282,7 +282,7 @@ def main() -> int:
         given.json.write_text(json.dumps(found, indent=1) + '\n')
     print(text)
     if given.markdown:
-        put_tables(given.markdown, 'benchmark', text)
+        put(given.markdown, text, 'benchmark')
     return 0
 
 

@@ -43,9 +43,9 @@ def best(work: Callable[[], None], repeats: int = REPEATS) -> float:
 def main(quick: bool) -> None:
     """Measure; print JSON."""
     sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    import data
     import numpy as np
     from ou_monitor.online.estimator.estimator import SlidingEstimator
+    import windows as simulated
 
     compiled = False
     if os.environ.get('OU_MONITOR_COMPILED', '1') != '0':
@@ -59,14 +59,14 @@ def main(quick: bool) -> None:
 
     def supply(n: int, dt: float) -> tuple[Any, Any, Any]:
         t = 1000.0 + np.arange(n) * dt
-        y = data.with_noise(5e-3)(data.simulate(rng, 1, n, dt)[0], rng)
+        y = simulated.with_noise(5e-3)(simulated.simulate(rng, 1, n, dt)[0], rng)
         moving = np.repeat(0.3 + 0.4 * rng.random(n // round(0.1 / dt) + 1), round(0.1 / dt))[:n]
         return t, y, moving
 
     def throughput(dt: float, block: int) -> dict[str, float]:
         n = SAMPLES.get(block, MOST) // scale // block * block
         t, y, moving = supply(n, dt)
-        still = np.full(n, data.LOW)
+        still = np.full(n, simulated.LOW)
         cuts = [slice(i, i + block) for i in range(0, n, block)]
         ts, ys = [t[c] for c in cuts], [y[c] for c in cuts]
         rows: dict[str, float] = {}
@@ -138,7 +138,7 @@ def main(quick: bool) -> None:
         filled = round(1.1 * window / dt)
         n = filled + rounds * BETWEEN
         t, y, moving = supply(n, dt)
-        u = moving if moves else np.full(n, data.LOW)
+        u = moving if moves else np.full(n, simulated.LOW)
         estimator = SlidingEstimator(window)
         estimator.push(t[:filled], y[:filled], u[:filled])
         begin = time.thread_time_ns()
