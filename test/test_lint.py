@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 FOLDERS = [
-    str(ROOT / name) for name in ('ou_monitor', 'test', 'scripts', 'launch', 'benchmarks')
+    str(ROOT / name) for name in ('ou_monitor', 'test', 'scripts', 'launch', 'benchmarks', 'doc')
     if any((ROOT / name).rglob('*.py'))] + [str(ROOT / 'setup.py')]
 SHELL = [ROOT / name for name in (
     'scripts/demo', 'scripts/test', 'scripts/common.sh', 'scripts/lock', '.ci/run')]
