@@ -33,6 +33,8 @@ autodoc_member_order = 'bysource'
 napoleon_google_docstring = False
 # Attributes as one list, as NumPy shows them, rather than an entry each.
 napoleon_use_ivar = True
+# Types are words for people: 'shape (n,)' is no reference to a name `n`.
+napoleon_use_param = False
 # Single backticks in the docstrings are names, mostly of the same class.
 default_role = 'code'
 # Links to headings of Markdown, as GitHub makes their anchors.

@@ -129,17 +129,24 @@ class Estimate:
     ----------
     t : float
         Stamp of the newest sample, s.
-    alpha, alpha_se : float
-        Relaxation rate, 1/s, and the standard error of ln(alpha).
-    sigma, sigma_se : float
-        Noise intensity, V/sqrt(s), and the standard error of ln(sigma).
-    var_inf, var_inf_se : float
-        Stationary variance sigma^2 / (2 alpha), V^2, and the standard error
-        of its logarithm.
-    u0, u0_se : float
-        Mean level *at the present throttle*, V, and its standard error, V.
+    alpha : float
+        Relaxation rate, 1/s.
+    sigma : float
+        Noise intensity, V/sqrt(s).
+    var_inf : float
+        Stationary variance sigma^2 / (2 alpha), V^2.
+    u0 : float
+        Mean level *at the present throttle*, V.
     noise_std : float
         White measurement noise of one sample, V (0 when none was found).
+    alpha_se : float
+        Standard error of ln(alpha), dimensionless.
+    sigma_se : float
+        Standard error of ln(sigma), dimensionless.
+    var_inf_se : float
+        Standard error of ln(var_inf), dimensionless.
+    u0_se : float
+        Standard error of u0, V.
     sag : float
         Slope of the mean against throttle at the present throttle, V per unit
         throttle (negative when the supply sags); NaN when throttle did not

@@ -37,8 +37,10 @@ _SHOWN = """
         }
     }
     document.body.replaceChildren(document.querySelector('h1'), ...wanted);
-    Math.ceil(Math.max(...[...wanted].map(one => one.getBoundingClientRect().bottom))) + 16
 """
+_BOTTOM = 'Math.ceil(document.body.lastElementChild.getBoundingClientRect().bottom)'
+# The page draws in the next frame.
+_DRAWN = 'new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))'
 
 
 def command(text: str) -> list[str]:
@@ -75,9 +77,12 @@ def photograph(page: Path) -> bool:
     with tempfile.TemporaryDirectory() as folder, \
             Browser(program, folder, width=860, height=640) as tab:
         tab.visit(page)
-        height = tab.run(_SHOWN)
-        tab.send('Emulation.setDeviceMetricsOverride', width=860, height=height,
+        tab.run(_DRAWN)
+        tab.run(_SHOWN)
+        tab.run(_DRAWN)
+        tab.send('Emulation.setDeviceMetricsOverride', width=860, height=tab.run(_BOTTOM) + 16,
                  deviceScaleFactor=1, mobile=False)
+        tab.run(_DRAWN)
         tab.picture(PICTURE, whole=False)
     return True
 
