@@ -76,9 +76,10 @@ def photograph(page: Path) -> bool:
         return False
     with tempfile.TemporaryDirectory() as folder, \
             Browser(program, folder, width=860, height=640) as tab:
-        tab.visit(page)
-        tab.run(_DRAWN)
+        # Plots come to life as they are seen; the page then adds how to use them.
+        tab.visit(page, 'document.querySelector(".live-hint")')
         tab.run(_SHOWN)
+        tab.until('!document.querySelector("figure:not(.is-live)")')
         tab.run(_DRAWN)
         tab.send('Emulation.setDeviceMetricsOverride', width=860, height=tab.run(_BOTTOM) + 16,
                  deviceScaleFactor=1, mobile=False)
