@@ -211,5 +211,17 @@ def test_made_anew_they_are_the_same(made, name):
 def test_the_library_is_small():
     """Under 5 MB, for it is cloned with the code."""
     files = [path for path in BAGS.rglob('*') if path.is_file()]
-    assert sorted({path.relative_to(BAGS).parts[0] for path in files}) == sorted(NAMES)
+    assert sorted({path.relative_to(BAGS).parts[0] for path in files}) == sorted(
+        [*NAMES, 'recorded'])
     assert sum(path.stat().st_size for path in files) < 5_000_000
+
+
+def test_recorded_files_have_a_notice():
+    """Each real recording can be read, and its source and licence are stated."""
+    notice = (BAGS / 'recorded' / 'NOTICE').read_text(encoding='utf-8')
+    files = sorted((BAGS / 'recorded').glob('*.csv'))
+    assert len(files) == 2
+    for path in files:
+        part = notice.split(f'\n{path.name}\n')[1].split('.csv\n')[0]
+        assert 'Source: https://' in part and 'Licence: ' in part
+        assert read_recording(path).has_throttle
