@@ -31,7 +31,7 @@ from ou_monitor.nodes.send_clock import SendClock
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
 from ou_monitor.online.monitor import Level, MonitorReport, SupplyMonitor
 from ou_monitor.online.settings import ESTIMATOR_PARAMETERS, monitor_settings
-from ou_monitor.stream.sample_stream import SampleStream
+from ou_monitor.stream.samples import SampleStream
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import Trigger
 

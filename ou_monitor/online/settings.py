@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 import math
 from numbers import Real
 from typing import Any
@@ -191,14 +192,14 @@ class MonitorSettings:
                 f'brownout.critical ({self.brownout_critical}): the throttle that it allows would '
                 'set the flag')
 
-    @property
+    @cached_property
     def floor(self) -> float:
         """Return the voltage floor in force, V; 0: off."""
         if self.brownout_floor < 0.0:
             return max(self.brownout_voltage - FLOOR_BELOW, 0.0)
         return self.brownout_floor
 
-    @property
+    @cached_property
     def budget_limit(self) -> float:
         """Return the risk that the throttle budget keeps under, 0..1."""
         return self.brownout_budget_limit or self.brownout_warn

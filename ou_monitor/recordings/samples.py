@@ -22,7 +22,7 @@ from ou_monitor.recordings.topic_choice import choose
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.blocks import BlockClock
 from ou_monitor.stream.config import FieldSpec
-from ou_monitor.stream.throttle import BoolArray, ThrottleHold
+from ou_monitor.stream.samples import BoolArray, ThrottleHold
 from ou_monitor.text import printable
 
 VOLTAGE, THROTTLE = 'voltage', 'throttle'

@@ -4,7 +4,7 @@ import math
 
 from dense import block_autocovariances, fisher, restricted
 import numpy as np
-from ou_monitor.model import arma, quasi_fit
+from ou_monitor.model import arma
 from ou_monitor.model.exact_fit import fit_exact
 from ou_monitor.model.ou import simulate
 import pytest
@@ -43,10 +43,10 @@ def test_gradient(log_a, theta):
     tilts = (0.7, -0.4)
 
     def value(x, y):
-        return quasi_fit.objective(c0, c, 497.0, x, y, *tilts)[0]
+        return arma.objective(c0, c, 497.0, x, y, *tilts)[0]
 
     h, k = 1e-5, 1e-5 * (1.0 - theta)
-    _, by_a, by_t = quasi_fit.objective(c0, c, 497.0, log_a, theta, *tilts)
+    _, by_a, by_t = arma.objective(c0, c, 497.0, log_a, theta, *tilts)
     scale = 1.0 + abs(by_a) + abs(by_t)
     assert by_a == pytest.approx(
         (value(log_a + h, theta) - value(log_a - h, theta)) / (2 * h), abs=1e-6 * scale)
@@ -56,7 +56,7 @@ def test_gradient(log_a, theta):
 
 def test_impossible_parameters_are_infinite():
     """A quadratic form that comes out negative cannot be a likelihood."""
-    value, by_a, by_t = quasi_fit.objective(1.0, [2.0, 2.0], 10.0, -3.0, 0.0, 0.0, 0.0)
+    value, by_a, by_t = arma.objective(1.0, [2.0, 2.0], 10.0, -3.0, 0.0, 0.0, 0.0)
     assert (value, by_a, by_t) == (math.inf, 0.0, 0.0)
 
 
@@ -74,8 +74,8 @@ def test_determinant_is_that_of_dense_matrices():
     for log_a, theta in ((-2.3, 0.3), (-1.0, -0.2), (-3.0, 0.6), (-1.5, 0.0)):
         cov = arma_covariance(log_a, theta, n)
         c = cov[0, 1:200].tolist()
-        value = quasi_fit.objective(cov[0, 0], c, n - 1.0, log_a, theta, 0.0, 0.0)[0]
-        assert quasi_fit.innovation(cov[0, 0], c, log_a, theta) == pytest.approx(1.0, rel=1e-9)
+        value = arma.objective(cov[0, 0], c, n - 1.0, log_a, theta, 0.0, 0.0)[0]
+        assert arma.innovation(cov[0, 0], c, log_a, theta) == pytest.approx(1.0, rel=1e-9)
         half = 0.5 * (np.linalg.slogdet(cov)[1]
                       + math.log(ones @ np.linalg.solve(cov, ones)))
         left.append((value - half, math.exp(log_a)))
@@ -98,7 +98,7 @@ def test_differences_of_dense_likelihoods():
         values = []
         for x in (a - step, a + step):
             dense = -restricted(arma_covariance(x, theta, n), y, np.ones((n, 1)))[0]
-            values.append(quasi_fit.objective(c0, c, n - 1.0, x, theta, 0.0, 0.0)[0] - dense)
+            values.append(arma.objective(c0, c, n - 1.0, x, theta, 0.0, 0.0)[0] - dense)
         return values[1] - values[0]
 
     small = np.sqrt(np.mean([apart(150, seed) ** 2 for seed in range(24)]))
@@ -110,7 +110,7 @@ def test_differences_of_dense_likelihoods():
 def optimum(y, m=1):
     """Return the minimiser from a poor start."""
     c0, c = variogram(y)
-    return quasi_fit.minimise(c0, c, y.size - 1.0, -1.0, 0.1, 0.0, 0.0, -20.0, 2.0, 0.0, 0.0)
+    return arma.minimise(c0, c, y.size - 1.0, -1.0, 0.1, 0.0, 0.0, -20.0, 2.0, 0.0, 0.0)
 
 
 def test_optimum_is_that_of_the_exact_likelihood():
@@ -126,7 +126,7 @@ def test_optimum_is_that_of_the_exact_likelihood():
         return np.sqrt(np.mean(np.square(differences), axis=0))
 
     small, large = apart(500), apart(2000)
-    information = quasi_fit.information(math.log(0.2), arma.theta_at(0.2, 1, 0.3))
+    information = arma.information(math.log(0.2), arma.theta_at(0.2, 1, 0.3))
     i_aa, i_at, i_tt = information
     det = i_aa * i_tt - i_at ** 2
     se = np.sqrt(np.array([i_tt, i_aa]) / det / 2000)
@@ -144,10 +144,10 @@ def test_minimiser_is_scipys(seed, a, share, floor, slope):
     y = made(seed, 800, a, share)
     c0, c = variogram(y)
     start = math.log(0.4)
-    log_a, theta, value, on_bound, steps = quasi_fit.minimise(
+    log_a, theta, value, on_bound, steps = arma.minimise(
         c0, c, 799.0, start, 0.2, floor, slope, -20.0, 2.0, 0.0, 0.0)
-    assert steps < quasi_fit.MAX_STEPS
-    again, by_a, by_t = quasi_fit.objective(c0, c, 799.0, log_a, theta, 0.0, 0.0)
+    assert steps < arma.MAX_STEPS
+    again, by_a, by_t = arma.objective(c0, c, 799.0, log_a, theta, 0.0, 0.0)
     assert value == again
     least = floor + slope * (log_a - start)
     assert theta >= least - 1e-12 and on_bound == (abs(theta - least) < 1e-12)
@@ -159,7 +159,7 @@ def test_minimiser_is_scipys(seed, a, share, floor, slope):
         if not low < phi:
             return math.inf
         at = low + (phi - low) * (1.0 - 1e-9) * math.sin(p[1]) ** 2
-        return quasi_fit.objective(c0, c, 799.0, p[0], at, 0.0, 0.0)[0]
+        return arma.objective(c0, c, 799.0, p[0], at, 0.0, 0.0)[0]
 
     best = min(minimize(cost, (x, z), method='Nelder-Mead',
                         options={'xatol': 1e-7, 'fatol': 1e-10}).fun
@@ -181,7 +181,7 @@ def test_information_is_that_of_dense_matrices():
     per_sample = (fisher(lambda p: arma_covariance(*p, 240), at, steps)
                   - fisher(lambda p: arma_covariance(*p, 120), at, steps)) / 120
     expected = (per_sample[0, 0], per_sample[0, 1], per_sample[1, 1])
-    assert quasi_fit.information(*at) == pytest.approx(expected, rel=1e-5)
+    assert arma.information(*at) == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize('m', [1, 4])
@@ -189,7 +189,7 @@ def test_exact_autocovariances_give_the_truth(m):
     """Many samples whose autocovariances are the model's: the optimum is the model."""
     a, share, lags = 0.1, 0.3, 60
     gamma = block_autocovariances(a, m, lags + 1)
-    log_a, theta, _, on_bound, _ = quasi_fit.minimise(
+    log_a, theta, _, on_bound, _ = arma.minimise(
         gamma[0] + share, gamma[1:].tolist(), 1e9, -1.0, 0.0,
         arma.noise_free_theta(a, m), 0.0, -20.0, 2.0, 0.0, 0.0)
     assert not on_bound

@@ -4,7 +4,7 @@ import math
 
 from dense import block_autocovariances
 import numpy as np
-from ou_monitor.model import arma, quasi_fit, still_fit
+from ou_monitor.model import arma
 import pytest
 from scipy.linalg import toeplitz
 
@@ -23,7 +23,7 @@ def test_exact_autocovariances_give_the_truth(a, share, m):
     scale = 0.4
     gamma = scale * block_autocovariances(a, m, LAGS + 1)
     n = 10 ** 9
-    got = still_fit.fit_still(
+    got = arma.fit_still(
         gamma[0] + scale * share, gamma[1:].tolist(), n, 0.0, [0.0] * LAGS, [float(n)] * LAGS,
         math.nan, math.nan, m)
     got_a, theta, q, got_scale, got_share, score, *variances, trend = got
@@ -41,7 +41,7 @@ def test_start_does_not_matter():
     """From no start, the truth and afar the search ends within STEADY squared."""
     gamma = block_autocovariances(0.1, 4, LAGS + 1)
     c0, c = gamma[0] + 0.2, gamma[1:].tolist()
-    ends = [still_fit.fit_still(c0, c, 2000, 0.0, [0.0] * LAGS, [2000.0] * LAGS, *start, 4)
+    ends = [arma.fit_still(c0, c, 2000, 0.0, [0.0] * LAGS, [2000.0] * LAGS, *start, 4)
             for start in ((math.nan, math.nan), (math.log(0.1), 0.1), (-6.0, 0.9), (0.5, -0.2))]
     for end in ends[1:]:
         assert end[0] == pytest.approx(ends[0][0], rel=1e-5)
@@ -57,15 +57,15 @@ def test_pull_is_a_tenth_of_a_standard_error_and_fades():
     """
     a, n = 0.1, 2000
     c = block_autocovariances(a, 1, LAGS + 1)
-    i_aa, i_at, i_tt = quasi_fit.information(math.log(a), 0.0)
+    i_aa, i_at, i_tt = arma.information(math.log(a), 0.0)
     se = math.sqrt(i_aa / (i_aa * i_tt - i_at ** 2) / n)
     moved = {}
     for score in (0.01, 1.0, 6.0):
-        end = still_fit.finish(c[0], c[1:].tolist(), n, n - 1.0, math.log(a), score * se,
+        end = arma.finish(c[0], c[1:].tolist(), n, n - 1.0, math.log(a), score * se,
                                False, 1)
         moved[score] = score - end[1] / se
         assert end[5] == pytest.approx(score, rel=0.05)
-        i_aa, i_at, _ = quasi_fit.information(math.log(a), score * se)
+        i_aa, i_at, _ = arma.information(math.log(a), score * se)
         assert math.log(end[0] / a) == pytest.approx(
             i_at / i_aa * moved[score] * se, rel=0.01, abs=1e-9)
     # Half or twice the pull lies outside; the spread differs by some percent from se.
@@ -77,7 +77,7 @@ def test_pull_is_a_tenth_of_a_standard_error_and_fades():
 def test_on_the_bound_there_is_no_noise():
     """Neither share nor score nor pull."""
     c = block_autocovariances(0.1, 1, LAGS + 1)
-    end = still_fit.finish(c[0], c[1:].tolist(), 2000, 1999.0, math.log(0.1), 0.0, True, 1)
+    end = arma.finish(c[0], c[1:].tolist(), 2000, 1999.0, math.log(0.1), 0.0, True, 1)
     assert end[1] == 0.0 and end[4] == 0.0 and end[5] == 0.0
 
 
@@ -106,7 +106,7 @@ def test_trend_score_is_that_of_generalised_least_squares(seed, slope):
     c0 = float(y.var())
     c = [c0 - float(np.mean((y[k:] - y[:-k]) ** 2)) / 2.0 for k in lags]
     place = float(np.mean((y - y.mean()) * (number / n)))
-    got = still_fit.trend_score(c0, c, n, place, [float((y[k:] - y[:-k]).sum()) for k in lags],
+    got = arma.trend_score(c0, c, n, place, [float((y[k:] - y[:-k]).sum()) for k in lags],
                                 [float(n - k) for k in lags], math.log(a),
                                 arma.theta_at(a, 1, share))
     assert got == pytest.approx(expected, rel=0.05, abs=0.3)
@@ -115,8 +115,8 @@ def test_trend_score_is_that_of_generalised_least_squares(seed, slope):
 def test_guess_sees_the_noise():
     """Straight through two lags of the variogram: right to a tenth for a fine step."""
     gamma = block_autocovariances(0.01, 1, 4)
-    log_a, theta = still_fit.guess(gamma[0] + 10.0, gamma[1:].tolist())
+    log_a, theta = arma.guess(gamma[0] + 10.0, gamma[1:].tolist())
     assert math.exp(log_a) == pytest.approx(0.01, rel=0.1)
     assert 0.0 < theta < math.exp(-math.exp(log_a))
-    log_a, theta = still_fit.guess(1.0, [-0.5, 0.2])
+    log_a, theta = arma.guess(1.0, [-0.5, 0.2])
     assert math.isfinite(log_a) and theta < math.exp(-math.exp(log_a))

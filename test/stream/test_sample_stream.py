@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.stream.extract import Extractor
-from ou_monitor.stream.sample_stream import SampleStream
+from ou_monitor.stream.samples import SampleStream
 import pytest
 
 

@@ -9,8 +9,7 @@ from ou_monitor.recordings.bag import BagWriter
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.stream.config import load_msg_config
 from ou_monitor.stream.extract import Extractor
-from ou_monitor.stream.sample_stream import SampleStream
-from ou_monitor.stream.throttle import APART, APART_MIXED, ThrottleHold
+from ou_monitor.stream.samples import APART, APART_MIXED, SampleStream, ThrottleHold
 import pytest
 
 STAMPS = st.floats(0.0, 4.0).map(lambda x: round(x, 2))

@@ -2,7 +2,7 @@
 The same arithmetic compiled with Numba, where Numba is installed.
 
 Optional: without Numba nothing here is used and nothing is missing but speed.
-The scalar fit of model/still_fit.py is compiled from its own text; the two
+The scalar fit of model/arma.py is compiled from its own text; the two
 loops over samples are written out here and tested against their NumPy twins to
 1e-9.  Compiling takes seconds (half a second from Numba's cache), so it runs
 in a thread; until it is done, and if it fails, NumPy does the work.
@@ -13,31 +13,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-import hashlib
 import importlib.util
 import logging
 import math
 import os
-from pathlib import Path
 import threading
-import types
 from typing import Any
 
 import numpy as np
-from ou_monitor.model import arma, quasi_fit, still_fit
+from ou_monitor.model import arma
 from ou_monitor.records import FloatArray
 
-# Compiled from their own text, each after those it calls.
-_SCALAR = (
-    *((arma, name) for name in (
-        'block_autocovariance', 'theta_at', 'noise_free_theta', 'noise_share',
-        'innovation_variance', 'log_covariance')),
-    *((quasi_fit, name) for name in (
-        'objective', 'innovation', 'information', 'polish', 'minimise')),
-    *((still_fit, name) for name in (
-        'guess', '_descend', 'search', 'finish', 'trend_score', 'fit_still', 'fit_sums')))
-
-
+# What the fit calls; each can be called from Python and from compiled code.
+_SCALAR: tuple[Callable[..., Any], ...] = (
+    arma.block_autocovariance, arma.theta_at, arma.noise_free_theta, arma.noise_share,
+    arma.innovation_variance, arma.log_covariance, arma.objective, arma.innovation,
+    arma.information, arma.polish, arma.minimise, arma.guess, arma.descend, arma.search,
+    arma.finish, arma.trend_score, arma.fit_still)
+# Sums may be reordered, which lets them run several at a time; NaN and infinity keep their
+# meaning.
+_REORDERED = {'reassoc', 'contract', 'nsz'}
 # The largest finite double: NaN and infinity are not below it.
 LARGEST = 1.7976931348623157e308
 
@@ -50,7 +45,7 @@ class Kernels:
     Attributes
     ----------
     fit_sums, search, finish : callable
-        Those of `still_fit`, for arrays.
+        Those of `model.arma`, for arrays.
     take_slots, add_slots, slide : callable
         Sums over slots, see the functions of these names.
     check : callable
@@ -210,33 +205,18 @@ def check(t, y, before, low, high):  # type: ignore[no-untyped-def]
 def build() -> Kernels:
     """Compile all kernels now; raises what Numba raises."""
     import numba  # type: ignore[import-not-found,unused-ignore]
+    from numba.extending import register_jitable  # type: ignore[import-not-found,unused-ignore]
 
+    for called in _SCALAR:
+        register_jitable(called)
+    register_jitable(add_slots)
+    register_jitable(fastmath=_REORDERED)(slot_sums)
+    register_jitable(fastmath=_REORDERED)(take_slots)
     compile_one = numba.njit(cache=True, nogil=True)
-    # Numba's cache looks at the file of a function, not at those of what it calls.
-    text = b''.join(Path(str(module.__file__)).read_bytes()
-                    for module in (arma, quasi_fit, still_fit))
-    mark = hashlib.sha256(text).hexdigest()[:12]
-    names: dict[str, Any] = {}
-    for module, name in _SCALAR:
-        plain = getattr(module, name)
-        own = types.FunctionType(plain.__code__, {**plain.__globals__, **names}, name,
-                                 plain.__defaults__)
-        own.__module__ = plain.__module__
-        own.__qualname__ = f'{name}_{mark}'
-        names[name] = compile_one(own)
-    # Sums may be reordered, which lets them run several at a time; NaN and
-    # infinity keep their meaning.
-    sums = numba.njit(cache=True, nogil=True, fastmath={'reassoc', 'contract', 'nsz'})
-    own = types.FunctionType(take_slots.__code__, {**globals(), 'slot_sums': sums(slot_sums)},
-                             'take_slots')
-    own.__module__ = __name__
-    take = sums(own)
-    add = compile_one(add_slots)
-    own = types.FunctionType(slide.__code__, {**globals(), 'take_slots': take, 'add_slots': add},
-                             'slide')
-    own.__module__ = __name__
-    kernels = Kernels(names['fit_sums'], names['search'], names['finish'], take, add,
-                      compile_one(own), compile_one(check))
+    kernels = Kernels(
+        compile_one(arma.fit_sums), compile_one(arma.search), compile_one(arma.finish),
+        numba.njit(cache=True, nogil=True, fastmath=_REORDERED)(take_slots),
+        compile_one(add_slots), compile_one(slide), compile_one(check))
     # One call each with the types that are used, so that no caller waits.
     c = np.array([0.9, 0.8])
     kernels.fit_sums(np.array([100.0, 0.0, 0.0, 100.0, 99.0, 98.0, 0.0, 0.0, 19.8, 39.2]), 2,
@@ -256,8 +236,16 @@ def build() -> Kernels:
     return kernels
 
 
-class _Background:
-    """Compiles once, in a thread."""
+class Compilation:
+    """
+    Compiles once, in a thread.
+
+    Attributes
+    ----------
+    ready : Kernels or None
+        The compiled functions, as soon as they are there.
+
+    """
 
     def __init__(self) -> None:
         self.ready: Kernels | None = None
@@ -280,7 +268,7 @@ class _Background:
             logging.getLogger(__name__).warning('Numba is not used: %s', error)
 
 
-_background = _Background()
+COMPILED = Compilation()
 
 
 def wanted() -> bool:
@@ -291,8 +279,8 @@ def wanted() -> bool:
 
 def kernels(wait: bool = False) -> Kernels | None:
     """Return the compiled kernels if they are ready; start compiling if not."""
-    if _background.ready is None:
-        thread = _background.start()
+    if COMPILED.ready is None:
+        thread = COMPILED.start()
         if wait and thread is not None:
             thread.join()
-    return _background.ready
+    return COMPILED.ready

@@ -18,16 +18,14 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.model import arma
 from ou_monitor.online.estimator import judgement
-from ou_monitor.online.estimator.compiled import kernels
-from ou_monitor.online.estimator.fitted import Fitted, from_window
+from ou_monitor.online.estimator.compiled import COMPILED
+from ou_monitor.online.estimator.fit import fit_window, Fitted, from_window, TREND_SCORE
 from ou_monitor.online.estimator.intake import as_column, BATCH, Batch, Intake, Thinner
 from ou_monitor.online.estimator.irregular import fit_irregular, MOST
-from ou_monitor.online.estimator.lagsums import Sums
-from ou_monitor.online.estimator.quality import examine, Quality, TAIL
-from ou_monitor.online.estimator.repeats import refresh_period, Repeats, whole
-from ou_monitor.online.estimator.resolution import FACTOR, FEWEST, LAGS, Resolution
+from ou_monitor.online.estimator.quality import (
+    examine, Quality, refresh_period, Repeats, TAIL, whole)
 from ou_monitor.online.estimator.series import T, U, Y
-from ou_monitor.online.estimator.window_fit import fit_window, TREND_SCORE
+from ou_monitor.online.estimator.window import FACTOR, FEWEST, LAGS, Resolution, Sums
 from ou_monitor.records import Estimate, FloatArray, NAN, Status
 
 # Samples from which a fit is tried.
@@ -52,7 +50,6 @@ _LOOKS = 4
 # Where repeats are looked for: a third of the samples repeat at two a refresh, or more.
 _TIED = 0.25
 _DOUBLE = np.dtype(np.float64)
-_NOTHING = Estimate()
 
 
 class SlidingEstimator:
@@ -89,7 +86,7 @@ class SlidingEstimator:
         self._start: tuple[float, float] | None = None
         self._cached: Estimate | None = None
         self._last: Estimate | None = None
-        kernels()
+        COMPILED.start()
 
     @property
     def window(self) -> float:
@@ -268,21 +265,21 @@ class SlidingEstimator:
         main, _, at, end = series.store(series.first)
         duration = main.item(T, end - 1) - main.item(T, at)
         m, n = self._thinner.m, end - at
-        base = judgement.made(
-            _NOTHING, t=intake.newest, voltage=self._tail.item(-1), throttle=series.last(U),
-            n=n * m, duration=duration, counters=counters,
-            rate=(n - 1) * m / duration if duration > 0.0 else NAN)
+        measured: dict[str, Any] = {
+            't': intake.newest, 'voltage': self._tail.item(-1), 'throttle': series.last(U),
+            'n': n * m, 'duration': duration, 'counters': counters,
+            'rate': (n - 1) * m / duration if duration > 0.0 else NAN}
         status = None
         if n < MIN_SAMPLES:
             status = Status.TOO_FEW_SAMPLES
         elif main.item(Y, at) == main.item(Y, end - 1) and not np.ptp(main[Y, at:end]) > 0.0:
             status = Status.CONSTANT
         if status is not None:
-            return judgement.made(
-                base, status=status, u0=float(main[Y, at:end].mean()),
-                flags=tuple(judgement.input_flags(counters, quality, NAN)))
+            return Estimate(status=status, u0=float(main[Y, at:end].mean()),
+                            flags=tuple(judgement.input_flags(counters, quality, NAN)),
+                            **measured)
         fit, smoothness = self._fit(quality, duration)
-        return judgement.judge(fit, base, quality, self._throttle_std(), smoothness)
+        return judgement.judge(fit, measured, quality, self._throttle_std(), smoothness)
 
     def _throttle_std(self) -> float:
         """Return the standard deviation of throttle in the window; NaN when unknown."""

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.online.estimator.compiled import kernels
+from ou_monitor.online.estimator.compiled import COMPILED
 from ou_monitor.online.estimator.series import IntArray
 from ou_monitor.records import Counters, FloatArray, NAN
 
@@ -161,7 +161,7 @@ class Intake:
         u = self._u[:n] if self._loaded else None
         self._loaded = False
         self.count(pushed=n)
-        fast = kernels()
+        fast = COMPILED.ready
         if fast is not None and (1.0 + UNEVEN) * step < window and fast.check(
                 t, y, self.newest, (1.0 - UNEVEN) * step, (1.0 + UNEVEN) * step):
             self._accept(t)

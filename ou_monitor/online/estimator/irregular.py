@@ -13,10 +13,8 @@ import math
 import numpy as np
 from ou_monitor.model import arma
 from ou_monitor.model.exact_fit import ExactFit, fit_exact
-from ou_monitor.online.estimator.fitted import Fitted, Outcome
-from ou_monitor.online.estimator.load import independent
+from ou_monitor.online.estimator.fit import Fitted, independent, Outcome, TREND_SCORE
 from ou_monitor.online.estimator.series import FAST, SLOW, T, U, Y
-from ou_monitor.online.estimator.window_fit import TREND_SCORE
 from ou_monitor.records import FloatArray
 
 # Samples up to which the exact likelihood is used (some 50 ms).

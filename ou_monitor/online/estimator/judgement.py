@@ -11,13 +11,15 @@ the other, so one correction serves both: 1.5/T, which leaves each high by
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 import math
 from typing import Any
 
-from ou_monitor.online.estimator.fitted import Fitted, Outcome
-from ou_monitor.online.estimator.load import load_at, slope_at
+import numpy as np
+from ou_monitor.online.estimator.fit import Fitted, Outcome
 from ou_monitor.online.estimator.quality import Quality
-from ou_monitor.records import Counters, Estimate, Flag, NAN, Status
+from ou_monitor.records import Counters, Estimate, Flag, FloatArray, NAN, Status
 
 # What alpha is high by, in 1/T (see above).
 _HIGH_BY = 1.5
@@ -64,19 +66,19 @@ def log_errors(fit: Fitted, duration: float) -> tuple[float, float, float]:
             math.sqrt(fit.log_var[2]) * wider)
 
 
-def judge(fit: Fitted, base: Estimate, quality: Quality, throttle_std: float,
+def judge(fit: Fitted, measured: Mapping[str, Any], quality: Quality, throttle_std: float,
           smoothness: float) -> Estimate:
-    """Return the published estimate."""
-    flags = input_flags(base.counters, quality, throttle_std)
+    """Return the published estimate; `measured`: its fields that need no fit."""
+    flags = input_flags(measured['counters'], quality, throttle_std)
     if fit.trend:
         flags.append(Flag.TREND)
     moves = bool(fit.beta.size > 1) and throttle_std > MIN_THROTTLE_STD
-    level, sag = _level(fit, base.throttle, moves)
+    level, sag = _level(fit, measured['throttle'], moves)
     noise = math.sqrt(max(fit.noise_var, 0.0))
-    known = {'u0': level, 'sag': sag, 'noise_std': noise}
+    known = {**measured, 'u0': level, 'sag': sag, 'noise_std': noise}
     if fit.outcome is Outcome.UNCORRELATED:
-        return _with(base, Status.NO_RELAXATION, flags, **known)
-    duration = base.duration
+        return Estimate(status=Status.NO_RELAXATION, flags=tuple(flags), **known)
+    duration = measured['duration']
     se = log_errors(fit, duration)
     if fit.alpha_step > 1.0:
         flags.append(Flag.SLOW_RATE)
@@ -86,11 +88,11 @@ def judge(fit: Fitted, base: Estimate, quality: Quality, throttle_std: float,
     known.update(sigma=fit.sigma, sigma_se=se[1])
     relaxations = fit.alpha * duration - _HIGH_BY
     if fit.outcome is Outcome.UNBOUND or relaxations < MIN_RELAXATIONS:
-        unbound = relaxations < 0.5
-        return _with(base, Status.UNBOUND if unbound else Status.TOO_SHORT, flags, **known)
+        status = Status.UNBOUND if relaxations < 0.5 else Status.TOO_SHORT
+        return Estimate(status=status, flags=tuple(flags), **known)
     floor = 2.0 / max(relaxations, MIN_RELAXATIONS)
     if fit.log_var[0] > max(_BURIED ** 2, _BURIED_BY ** 2 * floor):
-        return _with(base, Status.BURIED, flags, **known)
+        return Estimate(status=Status.BURIED, flags=tuple(flags), **known)
     # A short window often looks longer than it is: one standard error is granted.
     surely = relaxations * math.exp(-se[0])
     alpha = fit.alpha - _HIGH_BY / duration
@@ -98,12 +100,12 @@ def judge(fit: Fitted, base: Estimate, quality: Quality, throttle_std: float,
     # The mean of an OU over a long window has variance 2 Var_inf / (alpha T).
     level_var = 2.0 * var_inf / (alpha * duration)
     if moves:
-        x = load_at(base.throttle) - fit.level[1:5]
+        x = load_at(measured['throttle']) - fit.level[1:5]
         level_var += float(x @ fit.beta_cov[:4, :4] @ x)
-    return _with(
-        base, Status.OK if surely >= GOOD_RELAXATIONS else Status.SHORT_WINDOW, flags,
-        alpha=alpha, alpha_se=se[0], var_inf=var_inf, var_inf_se=se[2],
-        u0_se=math.sqrt(max(level_var, 0.0)), **known)
+    status = Status.OK if surely >= GOOD_RELAXATIONS else Status.SHORT_WINDOW
+    return Estimate(status=status, flags=tuple(flags), alpha=alpha, alpha_se=se[0],
+                    var_inf=var_inf, var_inf_se=se[2], u0_se=math.sqrt(max(level_var, 0.0)),
+                    **known)
 
 
 def input_flags(counters: Counters, quality: Quality, throttle_std: float) -> list[Flag]:
@@ -127,7 +129,7 @@ def recount(estimate: Estimate, counters: Counters) -> Estimate:
     flags = estimate.flags
     if (counters.late or counters.non_finite) and Flag.IRREGULAR not in flags:
         flags = (*flags, Flag.IRREGULAR)
-    return made(estimate, counters=counters, flags=flags)
+    return replace(estimate, counters=counters, flags=flags)
 
 
 def _level(fit: Fitted, throttle: float, moves: bool) -> tuple[float, float]:
@@ -138,13 +140,11 @@ def _level(fit: Fitted, throttle: float, moves: bool) -> tuple[float, float]:
     return float(fit.level[0] + shift), slope_at(throttle, fit.beta)
 
 
-def _with(base: Estimate, status: Status, flags: list[Flag], **values: Any) -> Estimate:
-    return made(base, status=status, flags=tuple(flags), **values)
+def load_at(throttle: float) -> FloatArray:
+    """Return the load variables of a throttle that has long been steady."""
+    return np.array([throttle, throttle * throttle, throttle, throttle])
 
 
-def made(base: Estimate, **values: Any) -> Estimate:
-    """Return a copy with some values changed, for a quarter of what `replace` takes."""
-    copy = object.__new__(Estimate)
-    # Frozen records set each field through a call; these are all known to be fields.
-    copy.__dict__.update(base.__dict__, **values)
-    return copy
+def slope_at(throttle: float, beta: FloatArray) -> float:
+    """Return d(mean)/d(throttle), V per unit throttle, at a steady throttle."""
+    return float(beta[0] + 2.0 * throttle * beta[1] + beta[2] + beta[3])

@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.online.risk.curve_blocks import noise_variance, Pool, Squares, STEADY
-from ou_monitor.online.risk.hat_filter import BINS, CurvePrior, HatFilter
-from ou_monitor.online.risk.wander import Wander
+from ou_monitor.online.risk.curve_filters import (
+    BINS, CurvePrior, HatFilter, noise_variance, Pool, Squares, STEADY, Wander)
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN
 from scipy.signal import lfilter
 

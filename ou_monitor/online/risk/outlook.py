@@ -7,11 +7,16 @@ window; and how fast the intensity has been seen to wander tells what may become
 it within the horizon.
 
 Limits: throttle stays as it is; a throttle not flown before has the error of the
-curves' prior; the terms of a model file count as `EventRisk` says.
+curves' prior, and is never called safe beyond the range flown; alpha is that of the
+present estimate at every throttle, as the paper assumes; the supply is taken to have
+settled, so the dip that follows a step of throttle (inrush, overshoot) is not in the
+risk, nor is further discharge; the terms of a model file count as `EventRisk` says.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, field
 import math
 
 import numpy as np
@@ -19,12 +24,147 @@ import numpy.typing as npt
 from ou_monitor.model.passage.law import prepare
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.measurement_noise import MeasurementNoise
-from ou_monitor.online.risk.budget import throttle_budget, ThrottleBudget
 from ou_monitor.online.risk.curves import LearnedCurves
 from ou_monitor.online.risk.events import EventRisk
 from ou_monitor.online.risk.first_passage import as_sampled, risk_of, Supply
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN
+
+# probability(u0, u0_se, ln_sigma, ln_sigma_se, ln_alpha, ln_alpha_se) -> risk, elementwise.
+Probability = Callable[
+    [FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
+
+# Throttles at which the risk is computed, and points between two of them.
+_STEPS = 50
+_FINE = 9
+_GRID = np.linspace(0.0, 1.0, _STEPS + 1)
+
+
+def _empty() -> FloatArray:
+    return np.empty(0)
+
+
+def _none() -> npt.NDArray[np.bool_]:
+    return np.empty(0, dtype=np.bool_)
+
+
+@dataclass(frozen=True, eq=False)
+class ThrottleBudget:
+    """
+    The highest throttle that keeps the risk under a limit.
+
+    Attributes
+    ----------
+    throttle : float
+        The budget, 0..1; NaN when unknown; 0 when even idle, flown, is above the limit.
+    lowest, highest : float
+        Range of throttles with data; NaN when there are none.
+    limit : float
+        Risk not to be exceeded, 0..1.
+    reason : str
+        What ends the budget, or why it is unknown, in words.
+    throttles : ndarray, shape (k,)
+        Throttles of the risk curve; empty when nothing could be computed.
+    risks : ndarray, shape (k,)
+        Risk at each of them, with the errors of the curves in it.
+    known : ndarray of bool, shape (k,)
+        Whether data near that throttle weigh more than the prior.
+
+    """
+
+    throttle: float
+    lowest: float
+    highest: float
+    limit: float
+    reason: str
+    throttles: FloatArray = field(default_factory=_empty)
+    risks: FloatArray = field(default_factory=_empty)
+    known: npt.NDArray[np.bool_] = field(default_factory=_none)
+
+
+def throttle_budget(estimate: Estimate, curves: LearnedCurves, *, voltage: float,
+                    horizon: float, limit: float, probability: Probability) -> ThrottleBudget:
+    """
+    Return the highest throttle up to which the risk stays within the limit.
+
+    A rail that holds at the lowest throttle flown is taken to hold below it.  Where it does not,
+    the budget lies below, and is known as far as the prior is good enough for that.
+
+    voltage in V, horizon in s.
+    """
+    if not math.isfinite(voltage):
+        raise ValueError(f'brown-out voltage must be finite, got {voltage} V')
+    if not (math.isfinite(horizon) and horizon > 0.0):
+        raise ValueError(f'horizon must be a positive number of seconds, got {horizon}')
+    if not 0.0 < limit < 1.0:
+        raise ValueError(f'limit of the risk must lie between 0 and 1, got {limit}')
+    lowest, highest = curves.extent
+    if not estimate.usable:
+        return ThrottleBudget(NAN, lowest, highest, limit,
+                              'Estimate not usable: ' + estimate.status.value)
+    if not curves.throttle_known:
+        return ThrottleBudget(NAN, lowest, highest, limit, 'No throttle is known.')
+    if math.isnan(highest):
+        return ThrottleBudget(NAN, lowest, highest, limit,
+                              'No throttle has been held long enough yet to learn from.')
+    risks = _risks(_GRID, estimate, curves, probability)
+    known = curves.seen_curve(_GRID)
+    known.setflags(write=False)
+    risks.setflags(write=False)
+    throttle, reason = _end(risks, known, lowest, highest, limit,
+                            lambda at: _risks(at, estimate, curves, probability))
+    if math.isfinite(throttle):
+        reason += f' Brown-out: below {voltage:g} V within {horizon:g} s.'
+    return ThrottleBudget(throttle, lowest, highest, limit, reason, _GRID, risks, known)
+
+
+def _risks(throttles: FloatArray, e: Estimate, curves: LearnedCurves,
+           probability: Probability) -> FloatArray:
+    """Return the risk at throttles of shape (k,)."""
+    level, level_se = curves.level_curve(throttles)
+    log_sigma, log_sigma_se = curves.sigma_curve(throttles)
+    log_alpha = np.full(throttles.shape, math.log(e.alpha))
+    alpha_se = np.full(throttles.shape, e.alpha_se if math.isfinite(e.alpha_se) else 0.0)
+    # A quadrature may round to just above 1; NaN stays.
+    return np.clip(np.asarray(
+        probability(level, level_se, log_sigma, log_sigma_se, log_alpha, alpha_se),
+        dtype=np.float64), 0.0, 1.0)
+
+
+def _end(risks: FloatArray, known: npt.NDArray[np.bool_], lowest: float, highest: float,
+         limit: float, risks_at: Callable[[FloatArray], FloatArray]) -> tuple[float, str]:
+    """Return where the budget ends, and why."""
+    first, last = round(lowest * _STEPS), round(highest * _STEPS)
+    # NaN is not within the limit.
+    within = risks <= limit
+    if not within[first]:
+        if math.isnan(risks.item(first)):
+            return NAN, f'The risk could not be computed at throttle {lowest:.2f}.'
+        if first == 0:
+            return 0.0, f'Even idle is above the limit: risk {risks.item(0):.2g}.'
+        if not within[0]:
+            return NAN, (f'Above the limit at {lowest:.2f}, the lowest throttle flown '
+                         f'(risk {risks.item(first):.2g}); no data below.')
+        first = 0
+    beyond = np.flatnonzero(~within[first:last + 1])
+    if not beyond.size:
+        if last == _STEPS:
+            return 1.0, 'Within the limit up to full throttle.'
+        return highest, f'No data above {highest:.2f}; within the limit up to there.'
+    k = first + beyond.item(0)
+    at = np.linspace(_GRID.item(k - 1), _GRID.item(k), _FINE + 2)
+    fine = np.concatenate([risks[k - 1:k], risks_at(at[1:-1]), risks[k:k + 1]])
+    j = int(np.flatnonzero(~(fine <= limit)).item(0))
+    end = at.item(j - 1)
+    low, high = fine.item(j - 1), fine.item(j)
+    if low > 0.0 and high > limit > low:
+        # The logarithm of the risk is nearly straight over so short a way.
+        end += (at.item(j) - end) * math.log(limit / low) / math.log(high / low)
+    if math.isnan(high):
+        return end, f'The risk could not be computed above {end:.2f}.'
+    if not known[k]:
+        return end, f'No data near {_GRID.item(k):.2f}: the risk there may be above the limit.'
+    return end, f'The risk passes the limit of {limit:.2g} at throttle {end:.2f}.'
 
 # Share of the walk of ln sigma within the horizon that counts: the risk is of all of it,
 # not of its end, but the largest sigma counts most.

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.online.estimator.repeats import refresh_period, Repeats, whole
+from ou_monitor.online.estimator.quality import refresh_period, Repeats, whole
 from ou_monitor.recordings.importers.log import ANY, clean, CURRENT, Log, Series, THROTTLE, VOLTAGE
 from ou_monitor.recordings.samples import check_throttle
 

@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 import numpy as np
-from ou_monitor.model import still_fit
+from ou_monitor.model import arma
 from ou_monitor.online.estimator import compiled
 import pytest
 
@@ -81,7 +81,7 @@ def test_switch(monkeypatch):
     """OU_MONITOR_COMPILED=0 keeps to NumPy, whatever is installed."""
     monkeypatch.setenv('OU_MONITOR_COMPILED', '0')
     assert compiled.wanted() is False
-    monkeypatch.setattr(compiled, '_background', compiled._Background())
+    monkeypatch.setattr(compiled, 'COMPILED', compiled.Compilation())
     assert compiled.kernels(wait=True) is None
     monkeypatch.delenv('OU_MONITOR_COMPILED')
     assert compiled.wanted() is HAVE_NUMBA
@@ -92,7 +92,7 @@ def test_a_compiler_that_fails_is_said_and_done_without(monkeypatch, caplog):
     def broken():
         raise RuntimeError('no LLVM today')
 
-    monkeypatch.setattr(compiled, '_background', compiled._Background())
+    monkeypatch.setattr(compiled, 'COMPILED', compiled.Compilation())
     monkeypatch.setattr(compiled, 'build', broken)
     monkeypatch.setattr(compiled, 'wanted', lambda: True)
     assert compiled.kernels(wait=True) is None
@@ -151,8 +151,8 @@ def test_scalar_fit_is_the_same_text():
                           2.0 * pairs * (0.011 - c)])
     for m in (1, 10):
         for start in ((math.nan, math.nan), (-2.5, 0.2)):
-            one = still_fit.fit_sums(row.tolist(), 24, *start, m)
-            two = fast.fit_sums(row, 24, *start, m) if fast else still_fit.fit_sums(
+            one = arma.fit_sums(row.tolist(), 24, *start, m)
+            two = fast.fit_sums(row, 24, *start, m) if fast else arma.fit_sums(
                 row, 24, *start, m)
             assert tuple(two) == pytest.approx(one, rel=1e-9)
             assert one[1] == pytest.approx(0.011, rel=1e-3) and one[2] > 0.0

@@ -7,9 +7,8 @@ import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.model import arma
 from ou_monitor.online.estimator import estimator as module, judgement
-from ou_monitor.online.estimator.lagsums import Sums
-from ou_monitor.online.estimator.resolution import Resolution
-from ou_monitor.online.estimator.window_fit import fit_window
+from ou_monitor.online.estimator.fit import fit_window
+from ou_monitor.online.estimator.window import Resolution, Sums
 from ou_monitor.records import Flag, Status
 import pytest
 

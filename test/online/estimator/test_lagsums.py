@@ -2,10 +2,10 @@
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.online.estimator import lagsums
-from ou_monitor.online.estimator.compiled import kernels
-from ou_monitor.online.estimator.resolution import LAGS, Resolution, SLOTS
+from ou_monitor.online.estimator import window
+from ou_monitor.online.estimator.compiled import Compilation, kernels
 from ou_monitor.online.estimator.series import Series
+from ou_monitor.online.estimator.window import LAGS, Resolution, SLOTS
 import pytest
 
 DT = 1e-3
@@ -114,7 +114,7 @@ def test_compiled_sums_are_those_of_numpy(variables, monkeypatch):
     results = []
     for compiled in (True, False):
         if not compiled:
-            monkeypatch.setattr(lagsums, 'kernels', lambda: None)
+            monkeypatch.setattr(window, 'COMPILED', Compilation())
         resolution = Resolution(1.0)
         for begin in range(0, n, 170):
             part = slice(begin, begin + 170)

@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 from ou_monitor.model import arma
-from ou_monitor.online.estimator.load import independent, load_at, Moments, slope_at
-from ou_monitor.online.estimator.resolution import Resolution
+from ou_monitor.online.estimator.fit import independent, Moments
+from ou_monitor.online.estimator.judgement import load_at, slope_at
+from ou_monitor.online.estimator.window import Resolution
 import pytest
 from scipy.linalg import toeplitz
 

@@ -7,7 +7,7 @@ from made_windows import ALPHA, DT, errors, estimate, LEVEL, paths, SIGMA, stamp
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.online.estimator.intake import Batch
-from ou_monitor.online.estimator.repeats import refresh_period, Repeats, whole
+from ou_monitor.online.estimator.quality import refresh_period, Repeats, whole
 from ou_monitor.records import Counters, Flag, Status
 import pytest
 from scipy.signal import lfilter

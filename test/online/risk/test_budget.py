@@ -1,11 +1,11 @@
-"""Throttle budget and what-if risk, against supplies whose exact answer is known."""
+"""Throttle budget, against supplies whose exact answer is known."""
 
 import math
 
 from made_flights import fly, holds, learn, level, log_sigma, passage_risk, truth
 import numpy as np
-from ou_monitor.online.risk.budget import risk_at, throttle_budget
 from ou_monitor.online.risk.curves import CurvePoint, LearnedCurves
+from ou_monitor.online.risk.outlook import throttle_budget
 from ou_monitor.records import Estimate, Status
 import pytest
 from scipy.optimize import brentq
@@ -92,20 +92,16 @@ def test_exact_curves_give_the_exact_budget(limit):
 
 def test_learned_curves_bracket_the_exact_risk():
     """
-    The true risk at 0.5 lies within the interval in 95 % of 40 flights; the budget is near.
+    The budget of 40 flights is near the exact one.
 
     The budget carries the errors, so it may lie below the exact one, by about as much as the
     level and sigma are uncertain there, and above it only by chance.
     """
-    inside, off, known = [], [], []
+    off, known = [], []
     for seed in range(40):
         curves = learned(seed)
-        what_if = risk_at(0.5, truth(alpha_se=0.0), curves, probability=RISK)
-        inside.append(what_if.low <= exact_risk(0.5) <= what_if.high)
-        known.append(what_if.known)
-        assert what_if.low < what_if.risk < what_if.high
+        known.append(curves.seen(0.5))
         off.append(budget(curves).throttle - exact_budget(1e-3))
-    assert np.mean(inside) > 0.95 - 3.0 * math.sqrt(0.95 * 0.05 / 40.0)
     assert np.mean(known) > 0.8
     # d ln(risk) / du is about 20 here: 0.05 of throttle is a factor of e.
     assert np.median(np.abs(off)) < 0.05 and np.mean(off) < 0.01
@@ -132,9 +128,6 @@ def test_the_edge_of_the_data_is_no_claim_of_safety():
     assert found.throttle == found.highest <= 0.42
     assert f'No data above {found.highest:.2f}' in found.reason
     assert not found.known[-1] and found.known[found.throttles.tolist().index(0.3)]
-    # The what-if up there has an interval that says nothing.
-    far = risk_at(0.95, truth(), curves, probability=RISK)
-    assert not far.known and far.low < 0.01 and far.high > 0.99
 
 
 def test_full_throttle_when_all_is_within():
@@ -181,27 +174,14 @@ def test_what_is_not_known_is_nan_with_the_reason():
         u0 < level(0.3), math.nan, 0.01))
     assert part.throttle == pytest.approx(0.3, abs=0.003)
     assert 'could not be computed' in part.reason
-    what_if = risk_at(0.5, Estimate(), learned(52, 2.0), probability=RISK)
-    assert all(map(math.isnan, (what_if.risk, what_if.low, what_if.high)))
-    assert math.isnan(risk_at(0.5, truth(), LearnedCurves(), probability=RISK).risk)
-
-
-def test_what_if_without_errors_has_no_width():
-    """Exact curves: risk and both ends are one number; with errors the interval holds it."""
-    sharp = risk_at(0.5, truth(alpha_se=0.0), Known(), probability=RISK)
-    assert sharp.risk == pytest.approx(exact_risk(0.5))
-    assert sharp.low == pytest.approx(sharp.risk) and sharp.high == pytest.approx(sharp.risk)
-    blunt = risk_at(0.5, truth(alpha_se=0.2), Known(), probability=RISK)
-    assert blunt.low < 0.5 * exact_risk(0.5) and blunt.high > 2.0 * exact_risk(0.5)
 
 
 def test_certain_risks_stay_probabilities():
     """Far above and far below the barrier: 0 and 1, no overflow."""
-    safe = risk_at(0.0, truth(), Known(log_sigma=lambda u: np.full(u.shape, -9.0)),
-                   probability=RISK)
-    assert 0.0 <= safe.low <= safe.high < 1e-200
-    lost = risk_at(0.0, truth(), Known(level=lambda u: np.full(u.shape, 4.0)), probability=RISK)
-    assert lost.risk == 1.0 and lost.low > 0.999 and lost.high <= 1.0
+    safe = budget(Known(log_sigma=lambda u: np.full(u.shape, -9.0)))
+    assert safe.throttle == 1.0 and 0.0 <= safe.risks.min() and safe.risks.max() < 1e-200
+    lost = budget(Known(level=lambda u: np.full(u.shape, 4.0)))
+    assert lost.throttle == 0.0 and 0.999 < lost.risks.min() and lost.risks.max() <= 1.0
 
 
 @pytest.mark.parametrize('bad', [
@@ -212,9 +192,3 @@ def test_bad_questions_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         throttle_budget(truth(), Known(), **{
             'voltage': VOLTAGE, 'horizon': HORIZON, 'limit': 0.01, **bad}, probability=RISK)
-
-
-@pytest.mark.parametrize('throttle', [-0.1, 1.1, math.nan])
-def test_what_if_outside_the_range_is_refused(throttle):
-    with pytest.raises(ValueError, match='throttle'):
-        risk_at(throttle, truth(), Known(), probability=RISK)

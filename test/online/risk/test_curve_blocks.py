@@ -4,7 +4,7 @@ import math
 
 from made_flights import fly, log_sigma, truth
 import numpy as np
-from ou_monitor.online.risk.curve_blocks import Pool, Squares
+from ou_monitor.online.risk.curve_filters import Pool, Squares
 import pytest
 
 THROTTLE = 0.4

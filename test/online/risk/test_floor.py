@@ -4,7 +4,7 @@ import math
 
 from hypothesis import given, settings as hypothesis_settings, strategies as st
 import numpy as np
-from ou_monitor.online.risk.floor import FloorWatch
+from ou_monitor.online.risk.flag import FloorWatch
 from ou_monitor.online.settings import MonitorSettings
 import pytest
 

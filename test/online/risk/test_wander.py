@@ -1,7 +1,7 @@
 """A random walk whose speed is learned: against walks of known speed."""
 
 import numpy as np
-from ou_monitor.online.risk.wander import Wander
+from ou_monitor.online.risk.curve_filters import Wander
 import pytest
 
 DT, NOISE = 0.25, 0.04

@@ -1,9 +1,16 @@
 """
-A curve over throttle, learned as it is flown: Kalman filter of a piecewise-linear curve.
+What the curves are learned with: blocks of samples, and Kalman filters.
 
-Limits: detail finer than the distance of two nodes is not resolved; observations are taken as
-independent and Gaussian; where their scatter says otherwise, the standard errors are widened by
-what the last fifty or so show.
+`HatFilter` learns a piecewise-linear curve.  Limits: detail finer than the distance of two nodes
+is not resolved; observations are taken as independent and Gaussian; where their scatter says
+otherwise, the standard errors are widened by what the last fifty or so show.  Within a block
+throttle is taken as constant; the innovations are those of an OU with white noise, with alpha
+and noise from the estimate.
+
+`Wander` follows how an intensity goes beside its curve, a random walk whose speed is learned
+with it: a bank of scalar Kalman filters, one for each speed, weighted by how well each has
+foretold what came (multiple models; Magill, IEEE Trans. Autom. Control 10 (1965) 434).  One
+speed at a time, the same for all throttles; what is seen of it is forgotten over minutes.
 """
 
 from __future__ import annotations
@@ -12,7 +19,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor.records import FloatArray
+from ou_monitor.records import Estimate, FloatArray
 
 # Throttles at which the weight of the data is kept.
 BINS = 51
@@ -232,3 +239,198 @@ class HatFilter:
     def flown(self) -> FloatArray:
         """Return the ratio of `seen` for the data at each throttle of the bins alone."""
         return self._weight / (self._unit * self._needed)
+
+# Throttles closer than this are one.
+STEADY = 0.03
+# Relative variance of sigma^2 at which its logarithm is taken, and up to which it may be.
+_SHARP = 0.1
+_BLUNT = 0.35
+# Fewest squares of one block.
+_SQUARES = 8
+
+
+def noise_variance(e: Estimate) -> float:
+    """Return the variance of the white noise of a sample, V^2; 0 when unknown."""
+    return e.noise_std ** 2 if e.noise_std > 0.0 else 0.0
+
+
+class Pool:
+    """Means of blocks at one throttle."""
+
+    def __init__(self) -> None:
+        self.n = 0
+        self.begin = self.end = self.time = 0.0
+        self.voltage = self.throttle = self.apart = 0.0
+
+    def add(self, n: int, begin: float, end: float, dt: float, voltage: float, throttle: float,
+            apart: float) -> None:
+        """Add a block of n samples."""
+        if not self.n:
+            self.begin = begin
+        self.n += n
+        self.end = end
+        self.time += n * dt
+        share = n / self.n
+        self.voltage += share * (voltage - self.voltage)
+        self.throttle += share * (throttle - self.throttle)
+        self.apart += share * (apart - self.apart)
+
+
+class Squares:
+    """Squares of innovations, until there are enough for a logarithm."""
+
+    def __init__(self) -> None:
+        self._sum = self._weight = self._throttle = self._time = 0.0
+        self._worse = 1.0
+
+    def add(self, t: FloatArray, v: FloatArray, throttle: float, dt: float, e: Estimate,
+            even: bool, sigma: float) -> None:
+        """
+        Add a block, as an estimate of sigma^2 with its relative variance; `sigma` is expected.
+
+        Innovations over k steps, e_j = v_j - phi^k v_{j-k} less their mean, have variance
+        g + N: g = sigma^2 (1 - phi^2k) / (2 alpha), N = noise^2 (1 + phi^2k).  k is 1 unless
+        noise would hide sigma.  `even` when no sample is missing between the stamps.
+        """
+        n, noise = t.size, noise_variance(e)
+        k = 1
+        if noise > 0.0:
+            k = max(1, min(math.ceil(min(2.0 * noise / (sigma ** 2 * dt), n)), n // 4,
+                           int(1.0 / (e.alpha * dt))))
+        later, earlier = v[k:], v[:-k]
+        step = k * dt
+        if not even:
+            # Samples were lost, maybe: only pairs that are k steps apart.
+            lag = t[k:] - t[:-k]
+            usual = float(np.median(lag))
+            regular = np.abs(lag - usual) < 0.5 * usual / k
+            later, earlier = later[regular], earlier[regular]
+            step = float(lag[regular].mean()) if later.size else usual
+        m = later.size
+        if m - k < _SQUARES:
+            return
+        phi = math.exp(-e.alpha * step)
+        parts = later - phi * earlier
+        total = float(parts.sum())
+        per_sigma2 = (1.0 - phi * phi) / (2.0 * e.alpha)
+        hidden = noise * (1.0 + phi * phi)
+        # The mean of overlapping innovations takes k squares of g with it.
+        g = (float(parts @ parts) - total * total / m - m * hidden
+             + noise * (1.0 - phi) ** 2) / (m - k)
+        expected = sigma ** 2 * per_sigma2
+        share = expected / (expected + hidden)
+        alike = 1.0 + share ** 2 * (k - 1) * (2 * k - 1) / (3.0 * k) + (
+            2.0 * ((1.0 - share) * phi / (1.0 + phi * phi)) ** 2)
+        weight = 0.5 * (m - k) * share ** 2 / alike
+        self._sum += weight * g / per_sigma2
+        self._throttle += weight * throttle
+        self._weight += weight
+        self._time += n * dt
+        # Noise that is wrong, or was not found, weighs more where sigma is less than in the
+        # window as a whole.
+        self._worse = max(self._worse, (e.sigma / sigma) ** 2)
+
+    def take(self, e: Estimate, throttle: float) -> tuple[float, float, float] | None:
+        """
+        Return throttle, ln(sigma) and its variance, when there are enough squares.
+
+        The logarithm of a mean of squares is too low by half its relative variance.  What the
+        estimate says of its own ln(sigma) holds here too, time for time: it has the errors of
+        alpha and of the noise in it.
+        """
+        if not self._weight:
+            return None
+        relative = 1.0 / self._weight
+        at = self._throttle / self._weight
+        away = abs(at - throttle) > STEADY
+        if relative > _SHARP and not away:
+            return None
+        mean, time, worse = self._sum / self._weight, self._time, self._worse
+        self._worse = 1.0
+        self._sum = self._weight = self._throttle = self._time = 0.0
+        if relative > _BLUNT or mean <= 0.0:
+            return None
+        variance = 0.25 * relative
+        # What was expected may be wrong, as at a throttle not flown before.
+        worse = max(worse, e.sigma ** 2 / mean)
+        if e.sigma_se > 0.0 and time > 0.0:
+            variance = max(variance, (worse * e.sigma_se) ** 2 * e.duration / time)
+        return at, 0.5 * (math.log(mean) + 0.5 * relative), variance
+
+# Speeds that are weighed: variance gained per second.  From a rail that stays as it is to
+# one whose sigma changes by a quarter within a second.
+_SPEEDS = np.array([0.0, 1e-4, 5e-4, 2e-3, 8e-3, 3e-2])
+# What is believed before any data.
+_PRIOR = np.array([0.15, 0.2, 0.2, 0.2, 0.15, 0.1])
+# Time over which what was seen is forgotten, s.
+_MEMORY = 120.0
+# An observation further off than this many standard deviations counts as that far.
+_FAR = 4.0
+# Variance before any data: twofold either way is common.
+_WIDE = 0.5
+
+
+class Wander:
+    """
+    A level that walks at random, seen through noise.
+
+    Attributes
+    ----------
+    value, variance : float
+        Where it is by all that has been seen, and how well that is known.
+    speed : float
+        Variance that it gains per second, as far as is known.
+    fast_speed : float
+        The same, the faster of what may be counted more.
+
+    """
+
+    def __init__(self) -> None:
+        self._mean = np.zeros(_SPEEDS.size)
+        self._variance = np.full(_SPEEDS.size, _WIDE)
+        self._log = np.log(_PRIOR)
+        self._weight: FloatArray = _PRIOR.copy()
+
+    def elapse(self, dt: float) -> None:
+        """Let time go by, s."""
+        self._variance += _SPEEDS * dt
+        # Towards the first belief.
+        keep = math.exp(-dt / _MEMORY)
+        self._log = keep * self._log + (1.0 - keep) * np.log(_PRIOR)
+        self._weigh()
+
+    def correct(self, seen: float, variance: float) -> None:
+        """Take an observation."""
+        total = self._variance + variance
+        away = np.clip((seen - self._mean) / np.sqrt(total), -_FAR, _FAR)
+        gain = self._variance / total
+        self._mean += gain * away * np.sqrt(total)
+        self._variance *= 1.0 - gain
+        self._log -= 0.5 * (away * away + np.log(total))
+        self._weigh()
+
+    def _weigh(self) -> None:
+        self._log -= self._log.max()
+        weight = np.exp(self._log)
+        self._weight = weight / weight.sum()
+
+    @property
+    def value(self) -> float:
+        """Where it is."""
+        return float(self._weight @ self._mean)
+
+    @property
+    def variance(self) -> float:
+        """How well `value` is known, the filters' disagreement included."""
+        return float(self._weight @ (self._variance + (self._mean - self.value) ** 2))
+
+    @property
+    def speed(self) -> float:
+        """Return the variance that it gains per second."""
+        return float(self._weight @ _SPEEDS)
+
+    @property
+    def fast_speed(self) -> float:
+        """Return the same where the faster count by their speed, as tails feel them."""
+        speed = self.speed
+        return float(self._weight @ _SPEEDS**2) / speed if speed > 0.0 else 0.0

@@ -1,0 +1,78 @@
+"""How many files of the package one voltage message passes on its way to a report."""
+
+import math
+from pathlib import Path
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import ou_monitor
+from ou_monitor.online.monitor import SupplyMonitor
+from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.records import Status
+from ou_monitor.stream.config import FieldSpec
+from ou_monitor.stream.extract import Extractor
+from ou_monitor.stream.samples import SampleStream
+import pytest
+
+ROOT = str(Path(ou_monitor.__file__).parent)
+# With the module of the node whose callback it is.
+MOST = 18
+
+
+def files_of(calls):
+    """Return the files of the package in which the calls run any line."""
+    found = set()
+
+    def note(frame, event, arg):
+        if frame.f_code.co_filename.startswith(ROOT):
+            found.add(frame.f_code.co_filename[len(ROOT) + 1:])
+
+    before = sys.getprofile()
+    sys.setprofile(note)
+    try:
+        calls()
+    finally:
+        sys.setprofile(before)
+    return found
+
+
+@pytest.mark.parametrize('moving', [False, True])
+def test_one_voltage_message_to_one_report(moving, monkeypatch):
+    """Throttle still or moving; the quality of the input is looked at four times a window."""
+    monkeypatch.setenv('OU_MONITOR_COMPILED', '0')
+    rng = np.random.default_rng(1)
+    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=4.5, brownout_horizon=1.0),
+                            background=False)
+    stream = SampleStream(monitor)
+    stream.open_voltage(Extractor(FieldSpec('voltage', 'x/msg/X', 'data')))
+    stream.open_throttle(Extractor(FieldSpec('throttle', 'x/msg/X', 'data')))
+    away, passed = 0.0, []
+    for k in range(6000):
+        t = 1e-3 * k
+        throttle = 0.5 + 0.3 * math.sin(2.0 * t) * moving
+        away = away * math.exp(-0.063) + 0.0187 * rng.standard_normal()
+        message = SimpleNamespace(data=5.0 - 0.3 * throttle + away)
+        if k % 20 == 0:
+            stream.take_throttle(SimpleNamespace(data=throttle), lambda now=t: now)
+        if k % 100 or k < 5000:
+            stream.take_voltage(message, lambda now=t: now)
+            if k % 100 == 0:
+                stream.flush()
+                monitor.report(0.0)
+            continue
+        reports = []
+
+        def pass_on(message=message, now=t, reports=reports):
+            stream.take_voltage(message, lambda: now)
+            stream.flush()
+            reports.append(monitor.report(0.0))
+
+        passed.append(files_of(pass_on))
+        # All of it is known, so that nothing was left out on the way.
+        assert reports[0].estimate.status is Status.OK
+        assert math.isfinite(reports[0].risk) and math.isfinite(reports[0].budget)
+    looked = [files for files in passed if 'online/estimator/quality.py' in files]
+    assert 0 < len(looked) < len(passed)
+    assert all(len(files) + 1 <= MOST for files in passed if files not in looked), passed
+    assert all(len(files) <= MOST for files in looked), looked
