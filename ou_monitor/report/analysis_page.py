@@ -83,7 +83,7 @@ def _over_time(analysis: Analysis) -> list[str]:
     limits = (0.0, max(recording.duration, 1e-9))
     voltage = Plot('Voltage', 'time, s', 'V', height=230).limits(x=limits)
     voltage.line(t, recording.voltage, colour=0)
-    drawn = [page.figure(voltage.svg(), _levels_caption(analysis))]
+    drawn = [page.figure(voltage, _levels_caption(analysis))]
     if recording.has_throttle:
         throttle = Plot('Throttle, and the load levels found in it', 'time, s', '%', height=150)
         throttle.limits(x=limits, y=(-5.0, 105.0)).steps(t, 100.0 * recording.throttle, colour=7)
@@ -91,8 +91,8 @@ def _over_time(analysis: Analysis) -> list[str]:
             for s in level.segments:
                 throttle.shade(float(t[s.start]), float(t[s.stop - 1]), k)
                 voltage.shade(float(t[s.start]), float(t[s.stop - 1]), k, level.label)
-        drawn = [page.figure(voltage.svg()),
-                 page.figure(throttle.svg(), _levels_caption(analysis))]
+        drawn = [page.figure(voltage),
+                 page.figure(throttle, _levels_caption(analysis))]
     if not sliding.t.size:
         return [*drawn, page.paragraph(
             f'No sliding estimate: the recording is shorter than half a window of '
@@ -110,13 +110,13 @@ def _over_time(analysis: Analysis) -> list[str]:
         plot.limits(y=span([value, value / factor, value * factor], log=True, trim=0.01))
         plot.band(sliding.t - start, value / factor, value * factor, '95 % interval')
         plot.line(sliding.t - start, value, 'estimate', style='thick')
-        drawn.append(page.figure(plot.svg()))
+        drawn.append(page.figure(plot))
     if np.isfinite(sliding.risk).any():
         plot = Plot(f'Risk of going below {sliding.brownout_voltage:g} V within '
                     f'{sliding.brownout_horizon:g} s', 'time, s', 'probability', height=170)
         plot.limits(x=limits, y=(-0.02, 1.02))
         plot.line(sliding.t - start, sliding.risk, colour=1, style='thick')
-        drawn.append(page.figure(plot.svg()))
+        drawn.append(page.figure(plot))
     lost = int((~known).sum())
     if lost:
         counts: dict[str, int] = {}
@@ -168,9 +168,9 @@ def _shape(analysis: Analysis) -> list[str]:
     histogram.limits(x=(-6.0, 6.0), y=(1e-5, 1.0))
     figures = []
     if fitted:
-        figures.append(page.figure(spectrum.svg()))
+        figures.append(page.figure(spectrum))
     if counted:
-        figures.append(page.figure(histogram.svg()))
+        figures.append(page.figure(histogram))
     if not figures:
         return [page.paragraph('No level holds enough samples for a spectrum.', soft=True)]
     text = ('An OU is flat below its corner \u03b1/(2\u03c0) and falls with the square of '

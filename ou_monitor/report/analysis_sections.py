@@ -86,7 +86,7 @@ def transients(analysis: Analysis) -> list[str]:
         if fit.releases or k == 0:
             parts.append(page.paragraph(relaxation_sentence(analysis, k)))
         if fit.seen:
-            parts += [page.figure(_relaxing(analysis, fit).svg()), _changes(analysis, fit)]
+            parts += [page.figure(_relaxing(analysis, fit)), _changes(analysis, fit)]
     return parts
 
 
@@ -168,7 +168,7 @@ def curves(analysis: Analysis) -> list[str]:
             (sigma, [*learned.sigma, *(level.estimate.sigma for level in levels)]),
             (risk, list(learned.risk)),
             (alpha, [level.estimate.alpha for level in levels])) if np.isfinite(values).any()]
-        parts += [page.pair(*(page.figure(plot.svg()) for plot in told[k:k + 2]))
+        parts += [page.pair(*(page.figure(plot) for plot in told[k:k + 2]))
                   for k in range(0, len(told), 2)]
     return [*parts, page.paragraph(brownout_sentence(analysis)),
             page.paragraph(analysis.alpha_test.sentence)]

@@ -142,7 +142,7 @@ def _pictures(finding: Finding) -> list[str]:
     named = ('plain OU', 'extended model') if finding.causes else ('plain OU',)
     made = pictures(samples, [plain, extended] if finding.causes else [plain],
                     np.random.default_rng(finding.seed))
-    drawn = [page.figure(_plot(picture, k, name).svg())
+    drawn = [page.figure(_plot(picture, k, name))
              for picture in made for k, name in enumerate(named)]
     return [*[page.pair(*drawn[k:k + 2]) for k in range(0, len(drawn), 2)], page.paragraph(
         'Line or dots: the data. Band or bars: the range of 40 simulations with the stamps and '

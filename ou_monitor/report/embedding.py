@@ -11,6 +11,7 @@ samples, so that every peak stays; the page says so.
 from __future__ import annotations
 
 import base64
+from dataclasses import replace
 import json
 import math
 import re
@@ -19,7 +20,8 @@ import zlib
 
 import numpy as np
 from ou_monitor.records import FloatArray
-from ou_monitor.report.figure import Curve, Figure
+from ou_monitor.report.scale import extremes
+from ou_monitor.report.svg import Curve, Plot
 
 # Points of a plot that are embedded as they are.
 MOST = 700_000
@@ -30,10 +32,10 @@ _UNIT = re.compile(r'(10[\u207b\u00b2\u00b3\u00b9\u2070-\u2079]+ )?'
                    r'(%|1|[mk\u00b5]?(V|A|W|s|Hz|\u03a9))([\u00b2/].*)?')
 
 
-def embed(figure: Figure, most: int = MOST) -> str:
+def embed(plot: Plot, most: int = MOST) -> str:
     """Return the data of a plot as a script element that is never run."""
     block = bytearray()
-    drawn = [_changes(c) if c.kind == 'steps' else _in_order(c) for c in figure.curves]
+    drawn = [_changes(c) if c.kind == 'steps' else _in_order(c) for c in plot.curves]
     share = most // max(len(drawn), 1)
     long = [c for c in drawn if c.kind in ('line', 'steps', 'band') and c.x.size > share]
     if sum(c.x.size for c in drawn) <= most:
@@ -49,16 +51,16 @@ def embed(figure: Figure, most: int = MOST) -> str:
         colour, *style = curve.style.split()
         curves.append({
             'kind': curve.kind, 'colour': int(colour[1:]), 'style': style, 'label': curve.label,
-            'every': every, 'x': _abscissa(curve.x, figure.log_x, block),
-            'y': _ordinate(curve.y, figure.log_y, block),
-            'high': None if curve.high is None else _ordinate(curve.high, figure.log_y, block)})
+            'every': every, 'x': _abscissa(curve.x, plot.log_x, block),
+            'y': _ordinate(curve.y, plot.log_y, block),
+            'high': None if curve.high is None else _ordinate(curve.high, plot.log_y, block)})
     found = {
-        'title': figure.title, 'x': _axis(figure.x_label, figure.x_range, figure.log_x),
-        'y': _axis(figure.y_label, figure.y_range, figure.log_y),
-        'width': figure.width, 'height': figure.height, 'curves': curves,
+        'title': plot.title, 'x': _axis(plot.x_label, plot.x_range, plot.log_x),
+        'y': _axis(plot.y_label, plot.y_range, plot.log_y),
+        'width': plot.width, 'height': plot.height, 'curves': curves,
         'shades': [[_known(a), _known(b), int(style[1:]), label]
-                   for a, b, style, label in figure.shades],
-        'marks': [[_known(x), label] for x, label in figure.marks],
+                   for a, b, style, label in plot.shades],
+        'marks': [[_known(x), label] for x, label in plot.marks],
         'block': base64.b64encode(zlib.compress(bytes(block), 6)).decode('ascii')}
     text = json.dumps(found, allow_nan=False, separators=(',', ':'))
     # Neither a tag nor an entity: the same text to a parser of HTML and to one of XML.
@@ -69,29 +71,16 @@ def embed(figure: Figure, most: int = MOST) -> str:
 
 def envelope(curve: Curve, every: int) -> Curve:
     """Reduce a curve to the lowest and the highest of each so many samples."""
-    n = curve.x.size
-    groups = -(-n // every)
-    padded = np.full((2, groups * every), np.nan)
-    high = curve.y if curve.high is None else curve.high
-    padded[0, :n] = np.where(np.isfinite(curve.y) & np.isfinite(high), curve.y, np.nan)
-    padded[1, :n] = np.where(np.isfinite(curve.y) & np.isfinite(high), high, np.nan)
-    low, top = padded.reshape(2, groups, every)
-    lowest = np.where(np.isnan(low), np.inf, low).argmin(axis=1)
-    highest = np.where(np.isnan(top), -np.inf, top).argmax(axis=1)
-    start = every * np.arange(groups)
-    row = np.arange(groups)
-    broken = np.isnan(low)
-    broken[-1, n - every * (groups - 1):] = False
-    if curve.high is not None:
-        whole = ~broken.all(axis=1)
-        return Curve(curve.x[start], np.where(whole, low[row, lowest], np.nan),
-                     np.where(whole, top[row, highest], np.nan), curve.label, curve.style,
-                     curve.kind)
-    known = ~np.isnan(low[row, lowest])
-    gap = start + every - 1 - broken[:, ::-1].argmax(axis=1)
-    index = np.unique(np.concatenate([
-        (start + lowest)[known], (start + highest)[known], gap[broken.any(axis=1)]]))
-    return Curve(curve.x[index], curve.y[index], None, curve.label, curve.style, curve.kind)
+    if curve.high is None:
+        index = extremes(curve.y, every)
+        return replace(curve, x=curve.x[index], y=curve.y[index])
+    start = np.arange(0, curve.x.size, every)
+    known = np.isfinite(curve.y) & np.isfinite(curve.high)
+    low = np.minimum.reduceat(np.where(known, curve.y, np.inf), start)
+    high = np.maximum.reduceat(np.where(known, curve.high, -np.inf), start)
+    whole = low <= high
+    return replace(curve, x=curve.x[start], y=np.where(whole, low, np.nan),
+                   high=np.where(whole, high, np.nan))
 
 
 def _changes(curve: Curve) -> Curve:
@@ -102,7 +91,7 @@ def _changes(curve: Curve) -> Curve:
     same = (y[1:] == y[:-1]) | (np.isnan(y[1:]) & np.isnan(y[:-1]))
     keep = np.concatenate(([True], ~same))
     keep[-1] = True
-    return Curve(x[keep], y[keep], None, curve.label, curve.style, curve.kind)
+    return replace(curve, x=x[keep], y=y[keep])
 
 
 def _in_order(curve: Curve) -> Curve:
@@ -111,8 +100,8 @@ def _in_order(curve: Curve) -> Curve:
         return curve
     order = np.argsort(curve.x, kind='stable')
     order = order[np.isfinite(curve.x[order])]
-    return Curve(curve.x[order], curve.y[order], None if curve.high is None else curve.high[order],
-                 curve.label, curve.style, curve.kind)
+    return replace(curve, x=curve.x[order], y=curve.y[order],
+                   high=None if curve.high is None else curve.high[order])
 
 
 def _axis(label: str, ends: tuple[float, float], log: bool) -> dict[str, Any]:

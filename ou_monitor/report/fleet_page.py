@@ -92,7 +92,7 @@ def _vehicles(fleet: Fleet) -> list[str]:
     for name in LOGARITHMIC:
         values = fleet.judgement.values[name]
         if values.value.size:
-            parts.append(page.figure(_by_vehicle(fleet, values).svg(), (
+            parts.append(page.figure(_by_vehicle(fleet, values), (
                 'Each dot is a recording, under the number of its vehicle in the table.'
                 if name == 'sigma' else '')))
     return parts
@@ -132,7 +132,7 @@ def _drift(fleet: Fleet) -> list[str]:
     if not judged.drifting:
         parts.append(page.paragraph('No drift stands at the rate of the fleet; the most likely '
                                     'ones are drawn.'))
-    parts += _pairs([page.figure(_trend_plot(judged.values[t.quantity], t).svg(), _caption(t))
+    parts += _pairs([page.figure(_trend_plot(judged.values[t.quantity], t), _caption(t))
                      for t in drawn])
     listed = [t for k, t in enumerate(judged.trends) if k < _LEAST or t.p_value < DRIFT_RATE]
     rows = [[t.vehicle, t.quantity, str(t.flights), typeset(change(t.quantity, t.slope)) + '\n'
@@ -181,10 +181,10 @@ def _distributions(fleet: Fleet) -> list[str]:
             plot = Plot(f'{_TITLES[name]}, all recordings', _UNITS[name], 'recordings', width=450,
                         height=240, log_x=name in LOGARITHMIC)
             plot.limits(y=(0.0, 1.08 * float(count.max())))
-            figures.append(page.figure(plot.line(values.shown(x), count, '', 0, 'thick').svg()))
+            figures.append(page.figure(plot.line(values.shown(x), count, '', 0, 'thick')))
     over = _over_throttle(fleet)
     if over:
-        figures.append(page.figure(over.svg()))
+        figures.append(page.figure(over))
     if not figures:
         return [page.paragraph('Fewer than five recordings have an estimate.', soft=True)]
     parts = _pairs(figures)

@@ -16,7 +16,7 @@ from html import escape
 from importlib import resources
 
 from ou_monitor.report.embedding import embed
-from ou_monitor.report.figure import Drawing
+from ou_monitor.report.svg import Plot
 
 # Hues of Okabe & Ito (2008), told apart with every common colour blindness;
 # lifted for the dark form.
@@ -136,11 +136,11 @@ def bullets(items: Sequence[str], warn: bool = False) -> str:
     return '<ul>' + ''.join(f'<li{kind}>{escape(item)}</li>' for item in items) + '</ul>'
 
 
-def figure(drawing: str, caption: str = '') -> str:
-    """Return a drawing with a caption."""
-    data = embed(drawing.figure) if isinstance(drawing, Drawing) else ''
+def figure(drawing: Plot | str, caption: str = '') -> str:
+    """Return a drawing with a caption; a plot with its data, from which it becomes interactive."""
+    drawn = drawing.svg() + embed(drawing) if isinstance(drawing, Plot) else drawing
     below = f'<figcaption>{escape(caption)}</figcaption>' if caption else ''
-    return f'<figure>{drawing}{data}{below}</figure>'
+    return f'<figure>{drawn}{below}</figure>'
 
 
 def pair(*figures: str) -> str:

@@ -92,7 +92,7 @@ def _screens(result: Reproduction) -> list[str]:
             plot.line(np.array([0.0, 1e3 * screen.t[-1]]), np.full(2, sign * half), label, 7,
                       'dash')
         drawn.append(page.figure(
-            plot.svg(), f'Vpp {1e3 * float(np.ptp(screen.u)):.4g} mV here, '
+            plot, f'Vpp {1e3 * float(np.ptp(screen.u)):.4g} mV here, '
             f'{state.vpp.text} mV printed.'))
     return [page.pair(*drawn), page.paragraph(
         'As Figs. 1 to 4: an OU with the printed alpha and Vrms (motors off: half a step), 1 MHz, '
@@ -129,7 +129,7 @@ def _transient() -> list[str]:
         for k, (y, label, style) in enumerate(curves):
             plot.line(1e3 * t, np.where(y > 0.0, y, math.nan) if log else y, label, k, style)
         plot.markers(1e3 * transient.TIME, transient.VALUE, 'points of Fig. 5', 7)
-        drawn.append(page.figure(plot.svg()))
+        drawn.append(page.figure(plot))
     return [page.pair(*drawn), page.paragraph(
         f'Dashed: a rail {rail / paper.ALPHA.value:.0f} times faster, seen through an AC coupling '
         f'of {transient.CORNER_HZ:g} Hz, comes within {100 * worst:.0f} % of the four points of '
@@ -157,7 +157,7 @@ def _spectrum(result: Reproduction) -> list[str]:
     low, high = paper.ESC_HZ
     plot.shade(low, high, 4)
     plot.mark(low, '').mark(high, 'ESC 24..48 kHz')
-    return [page.figure(plot.svg(), (
+    return [page.figure(plot, (
         f'The ESC lines that section 4.5 expects would stand at {1e-3 * low:g} to '
         f'{1e-3 * high:g} kHz, where the OU holds {100 * share_above(low):.2g} % of its variance; '
         'an OU alone has no peak there. The AC coupling has its corner where the Lorentzian has '
@@ -183,8 +183,8 @@ def _crest_and_factor(result: Reproduction) -> list[str]:
     factor.line(t, 1e6 * s.variance, '', 0)
     factor.line(t, 1e6 * s.printed * s.t, '(6) as printed', 1, 'thick')
     factor.line(t, 1e6 * s.correct * s.t, '(6) with the 2', 2, 'dash thick')
-    left = page.figure(crests.svg(), 'Vertical: Table 1. Screens of 10, 100 and 500 ms at 1 MHz.')
-    right = page.figure(factor.svg(), (
+    left = page.figure(crests, 'Vertical: Table 1. Screens of 10, 100 and 500 ms at 1 MHz.')
+    right = page.figure(factor, (
         'dU/dt = \u00b11 V/s, 1000 switches a second each way; the system itself lags (6) by the '
         'memory of the chain.'))
     return [page.pair(left, right)]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.records import FloatArray
 
 _HUGE = 1e100
@@ -107,20 +108,25 @@ def span(values: list[FloatArray], log: bool = False, pad: float = 0.05,
     return (10.0 ** low, 10.0 ** high) if log else (low, high)
 
 
+def extremes(y: FloatArray, every: int) -> npt.NDArray[np.intp]:
+    """Return where each so many samples are lowest and highest, and where they break off (NaN)."""
+    start = np.arange(0, y.size, every)
+    group = np.arange(y.size) // every
+    kept = []
+    for sign in (1.0, -1.0):
+        value = np.where(np.isfinite(y), sign * y, np.inf)
+        least = np.minimum.reduceat(value, start)
+        where = np.flatnonzero(np.isfinite(y) & (value == least[group]))
+        kept.append(where[np.unique(group[where], return_index=True)[1]])
+    broken = np.flatnonzero(~np.isfinite(y))
+    # The last one of each group.
+    kept.append(broken[::-1][np.unique(group[broken][::-1], return_index=True)[1]])
+    return np.unique(np.concatenate(kept))
+
+
 def thin(x: FloatArray, y: FloatArray, columns: int) -> tuple[FloatArray, FloatArray]:
     """Thin a long series to the extremes of each column of pixels."""
     if x.size <= 2 * columns:
         return x, y
-    edges = np.linspace(0, x.size, columns + 1).astype(np.intp)
-    keep: list[int] = []
-    for a, b in zip(edges[:-1], edges[1:]):
-        part = y[a:b]
-        finite = np.flatnonzero(np.isfinite(part))
-        if finite.size:
-            lowest = a + finite[part[finite].argmin()]
-            highest = a + finite[part[finite].argmax()]
-            keep.extend(sorted({int(lowest), int(highest)}))
-        if finite.size < part.size:
-            keep.append(int(a + np.flatnonzero(~np.isfinite(part))[-1]))
-    index = np.array(sorted(set(keep)), dtype=np.intp)
+    index = extremes(y, -(-x.size // columns))
     return x[index], y[index]

@@ -8,11 +8,11 @@ interactive; paper and browsers without scripts show what is drawn here.  Colour
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from html import escape
 
 import numpy as np
 from ou_monitor.records import FloatArray
-from ou_monitor.report.figure import Curve, Drawing, Figure
 from ou_monitor.report.scale import Scale, span, thin, tick_text
 
 SERIES = 8
@@ -24,6 +24,34 @@ _LETTER = 7.0
 _CAP = 7.0
 # Height of a legend in a row of its own, pixels.
 _LEGEND = 18
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """
+    One series.
+
+    Attributes
+    ----------
+    x, y : ndarray, shape (n,)
+        Points; the lower edge where there is an upper one.
+    high : ndarray, shape (n,), or None
+        Upper edge of a band, upper ends of bars.
+    label : str
+        Name in the legend; none when empty.
+    style : str
+        CSS classes; the first is ``s0`` .. ``s7``, the colour.
+    kind : str
+        ``line``, ``steps``, ``band``, ``markers`` or ``bars``.
+
+    """
+
+    x: FloatArray
+    y: FloatArray
+    high: FloatArray | None
+    label: str
+    style: str
+    kind: str
 
 
 class Plot:
@@ -53,59 +81,59 @@ class Plot:
                  height: int = 240, log_x: bool = False, log_y: bool = False,
                  legend_low: bool = False, legend_row: bool = False) -> None:
         self.title = title
-        self._x_label, self._y_label = x_label, y_label
-        self._width, self._height = width, height
-        self._log_x, self._log_y = log_x, log_y
+        self.x_label, self.y_label = x_label, y_label
+        self.width, self.height = width, height
+        self.log_x, self.log_y = log_x, log_y
         self._legend_low, self._legend_row = legend_low, legend_row
-        self._curves: list[Curve] = []
-        self._spans: list[tuple[float, float, str, str]] = []
-        self._marks: list[tuple[float, str]] = []
+        self.curves: list[Curve] = []
+        self.shades: list[tuple[float, float, str, str]] = []
+        self.marks: list[tuple[float, str]] = []
         self._x_range: tuple[float, float] | None = None
         self._y_range: tuple[float, float] | None = None
 
     def line(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0,
              style: str = '') -> Plot:
         """Add a line; NaN breaks it."""
-        self._curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
+        self.curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
                                   f's{colour % SERIES} {style}'.strip(), 'line'))
         return self
 
     def steps(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0) -> Plot:
         """Add a line that holds each value until the next point."""
-        self._curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
+        self.curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
                                   f's{colour % SERIES}', 'steps'))
         return self
 
     def band(self, x: FloatArray, low: FloatArray, high: FloatArray, label: str = '',
              colour: int = 0) -> Plot:
         """Add a shaded band; NaN breaks it."""
-        self._curves.append(Curve(
+        self.curves.append(Curve(
             np.asarray(x, float), np.asarray(low, float), np.asarray(high, float), label,
             f's{colour % SERIES}', 'band'))
         return self
 
     def markers(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0) -> Plot:
         """Add a dot at each point; none where it is NaN."""
-        self._curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
+        self.curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
                                   f's{colour % SERIES}', 'markers'))
         return self
 
     def bars(self, x: FloatArray, low: FloatArray, high: FloatArray, label: str = '',
              colour: int = 0) -> Plot:
         """Add a bar from `low` to `high` at each point, with caps; none where one is NaN."""
-        self._curves.append(Curve(
+        self.curves.append(Curve(
             np.asarray(x, float), np.asarray(low, float), np.asarray(high, float), label,
             f's{colour % SERIES}', 'bars'))
         return self
 
     def shade(self, start: float, stop: float, colour: int = 0, label: str = '') -> Plot:
         """Shade a stretch of the x axis; its label is drawn where there is room."""
-        self._spans.append((start, stop, f's{colour % SERIES}', label))
+        self.shades.append((start, stop, f's{colour % SERIES}', label))
         return self
 
     def mark(self, x: float, label: str) -> Plot:
         """Add a labelled vertical line."""
-        self._marks.append((x, label))
+        self.marks.append((x, label))
         return self
 
     def limits(self, x: tuple[float, float] | None = None,
@@ -115,25 +143,33 @@ class Plot:
         self._y_range = y or self._y_range
         return self
 
-    def svg(self) -> Drawing:
+    @property
+    def x_range(self) -> tuple[float, float]:
+        """Ends of the x axis."""
+        return self._x_range or span([c.x for c in self.curves], self.log_x, pad=0.0)
+
+    @property
+    def y_range(self) -> tuple[float, float]:
+        """Ends of the y axis."""
+        return self._y_range or span([c.y for c in self.curves] + [
+            c.high for c in self.curves if c.high is not None], self.log_y)
+
+    def svg(self) -> str:
         """Return the drawing."""
-        right, bottom = self._width - _RIGHT, self._height - _BOTTOM
-        ends = [c.y for c in self._curves] + [c.high for c in self._curves if c.high is not None]
-        x_low, x_high = self._x_range or span([c.x for c in self._curves], self._log_x, pad=0.0)
-        y_low, y_high = self._y_range or span(ends, self._log_y)
-        x = Scale(x_low, x_high, _LEFT, right, self._log_x)
-        y = Scale(y_low, y_high, bottom, self._top, self._log_y)
+        right, bottom = self.width - _RIGHT, self.height - _BOTTOM
+        x = Scale(*self.x_range, _LEFT, right, self.log_x)
+        y = Scale(*self.y_range, bottom, self._top, self.log_y)
         # A nested drawing clips what leaves the axes, and needs no id.
         inner = f'{_LEFT} {self._top} {right - _LEFT} {bottom - self._top}'
         parts = [
-            f'<svg viewBox="0 0 {self._width} {self._height}" role="img" '
+            f'<svg viewBox="0 0 {self.width} {self.height}" role="img" '
             f'aria-label="{escape(self.title, quote=True)}">',
             f'<text class="title" x="{_LEFT}" y="16">{escape(self.title)}</text>',
             *self._axes(x, y, right, bottom),
             f'<svg x="{_LEFT}" y="{self._top}" width="{right - _LEFT}" '
             f'height="{bottom - self._top}" '
             f'viewBox="{inner}">']
-        for start, stop, style, label in self._spans:
+        for start, stop, style, label in self.shades:
             a, b = np.clip(x(np.array([start, stop])), _LEFT, right)
             parts.append(f'<rect class="shade {style}" x="{a:.1f}" y="{self._top}" '
                          f'width="{max(b - a, 0.5):.1f}" height="{bottom - self._top}"/>')
@@ -142,30 +178,27 @@ class Plot:
                              f'x="{0.5 * (a + b):.1f}" y="{self._top + 13}">'
                              f'{escape(label)}</text>')
         # Bands and bars lie behind lines and dots.
-        for curve in sorted(self._curves, key=lambda c: c.kind not in ('band', 'bars')):
+        for curve in sorted(self.curves, key=lambda c: c.kind not in ('band', 'bars')):
             parts.append(self._draw(curve, x, y))
         parts.append('</svg>')
-        for where, label in self._marks:
+        for where, label in self.marks:
             pixel = float(x(where))
             if _LEFT <= pixel <= right:
                 parts.append(f'<line class="mark" x1="{pixel:.1f}" y1="{self._top}" '
                              f'x2="{pixel:.1f}" y2="{bottom}"/><text class="note" '
                              f'x="{pixel + 4:.1f}" y="{self._top + 12}">{escape(label)}</text>')
-        return Drawing('\n'.join([*parts, *self._legend(right, bottom), '</svg>']), Figure(
-            self.title, self._x_label, self._y_label, self._width, self._height, self._log_x,
-            self._log_y, (x_low, x_high), (y_low, y_high), tuple(self._curves),
-            tuple(self._spans), tuple(self._marks)))
+        return '\n'.join([*parts, *self._legend(right, bottom), '</svg>'])
 
     @property
     def _named(self) -> list[Curve]:
         """Return the curves of the legend."""
-        return [c for c in self._curves if c.label]
+        return [c for c in self.curves if c.label]
 
     @property
     def _legend_place(self) -> str:
         """Return where the legend fits without covering a curve, ``corner`` where nowhere."""
         size = sum(_LETTER * len(c.label) + 34.0 for c in self._named)
-        right = self._width - _RIGHT
+        right = self.width - _RIGHT
         beside = _LEFT + 1.15 * _LETTER * len(self.title) + size < right
         if beside and not self._legend_row:
             return 'title'
@@ -195,9 +228,9 @@ class Plot:
                                  f'{text}</text>')
         middle = 0.5 * (self._top + bottom)
         parts.append(f'<text class="label" text-anchor="middle" x="{0.5 * (_LEFT + right):.0f}" '
-                     f'y="{self._height - 6}">{escape(self._x_label)}</text>')
+                     f'y="{self.height - 6}">{escape(self.x_label)}</text>')
         parts.append(f'<text class="label" text-anchor="middle" transform="translate(14 '
-                     f'{middle:.0f}) rotate(-90)">{escape(self._y_label)}</text>')
+                     f'{middle:.0f}) rotate(-90)">{escape(self.y_label)}</text>')
         return parts
 
     def _draw(self, curve: Curve, x: Scale, y: Scale) -> str:
@@ -221,9 +254,9 @@ class Plot:
             return f'<path class="band {curve.style}" d="{"".join(pieces)}"/>'
         px, py = x(curve.x), y(curve.y)
         if curve.kind == 'steps':
-            px, py = thin(px, py, self._width)
+            px, py = thin(px, py, self.width)
             px, py = np.repeat(px, 2)[1:], np.repeat(py, 2)[:-1]
-        px, py = thin(px, py, self._width)
+        px, py = thin(px, py, self.width)
         pieces = [f'M{_points(px[run], py[run])}'
                   for run in _stretches(np.isfinite(px) & np.isfinite(py))]
         return f'<path class="line {curve.style}" d="{"".join(pieces)}"/>'

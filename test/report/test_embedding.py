@@ -4,8 +4,7 @@ from hypothesis import given, strategies as st
 import numpy as np
 from ou_monitor.report import page
 from ou_monitor.report.embedding import embed, envelope
-from ou_monitor.report.figure import Curve
-from ou_monitor.report.svg import Plot
+from ou_monitor.report.svg import Curve, Plot
 from pages import parsed, self_contained, unpacked
 import pytest
 
@@ -21,7 +20,7 @@ def noise(n, seed=0):
 
 def embedded(plot, **more):
     """Return the curves as a browser reads them."""
-    return unpacked(embed(plot.svg().figure, **more))['curves']
+    return unpacked(embed(plot, **more))['curves']
 
 
 def test_short_columns_are_exact():
@@ -131,8 +130,8 @@ def test_pages_stay_small(seconds, most):
     throttle = np.round(50.0 + 40.0 * np.sin(t), 0)
     voltage = Plot('Voltage', 'time, s', 'V').line(t, y)
     html = page.page('t', 's', [
-        page.figure(voltage.svg()),
-        page.figure(Plot('Throttle', 'time, s', '%').steps(t, throttle).svg())])
+        page.figure(voltage),
+        page.figure(Plot('Throttle', 'time, s', '%').steps(t, throttle))])
     assert len(html) < 1e6 * most
     assert embedded(voltage)[0]['x'].size == t.size
 
@@ -141,12 +140,12 @@ def test_hostile_names_stay_names():
     """In title, axes, curves, marks and shades: one text to parsers of HTML and of XML."""
     plot = Plot(EVIL, EVIL, EVIL).line(np.arange(3.0), np.arange(3.0), EVIL)
     plot.shade(0.0, 1.0, 2, EVIL).mark(0.5, EVIL)
-    script = embed(plot.svg().figure)
+    script = embed(plot)
     assert script.count('<') == 2 and script.count('>') == 2 and '&' not in script
     found = unpacked(script)
     assert found['title'] == found['curves'][0]['label'] == found['marks'][0][1] == EVIL
     assert found['shades'][0][3] == EVIL
-    html = page.page(EVIL, EVIL, [page.figure(plot.svg(), EVIL)])
+    html = page.page(EVIL, EVIL, [page.figure(plot, EVIL)])
     tree = self_contained(html)
     assert len(list(tree.iter('script'))) == 2 and '<img' not in html
 
@@ -164,7 +163,7 @@ def test_a_page_without_plots_has_no_script():
     ('1/s', '', '1/s'), ('rms, mV', 'rms', 'mV')])
 def test_axis_labels_hold_a_name_and_a_unit(label, name, unit):
     """A tooltip shows the unit behind the value."""
-    y = unpacked(embed(Plot('t', 'x', label).svg().figure))['y']
+    y = unpacked(embed(Plot('t', 'x', label)))['y']
     assert (y['label'], y['name'], y['unit']) == (label, name, unit)
 
 

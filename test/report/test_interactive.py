@@ -52,8 +52,8 @@ def file(data, tmp_path_factory):
     outline.bars(np.array([-0.75]), np.array([0.05]), np.array([0.2]), 'bar', 2)
     path = tmp_path_factory.mktemp('page') / 'it <b>.html'
     path.write_text(page.page(EVIL, EVIL, [
-        page.figure(voltage.svg(), EVIL), page.figure(throttle.svg()),
-        page.pair(page.figure(spectrum.svg()), page.figure(outline.svg()))]))
+        page.figure(voltage, EVIL), page.figure(throttle),
+        page.pair(page.figure(spectrum), page.figure(outline))]))
     return path
 
 
@@ -375,8 +375,7 @@ def test_envelopes_say_that_they_are(browser, tmp_path, data):
     """A curve beyond the budget is drawn with its peak, and the page says what its points are."""
     t, v = data
     plot = Plot('Voltage', 'time, s', 'V').line(t, v)
-    drawing = plot.svg()
-    html = page.page('t', 's', [f'<figure>{drawing}{embed(drawing.figure, 20_000)}</figure>'])
+    html = page.page('t', 's', [f'<figure>{plot.svg()}{embed(plot, 20_000)}</figure>'])
     path = tmp_path / 'e.html'
     path.write_text(html)
     browser.visit(path, 'document.documentElement.dataset.plots')
