@@ -8,7 +8,7 @@ NAME = 'ou_monitor'
 SHARE = 'share/' + NAME
 # What reads the logs of autopilots.  The wheel of orangebox 0.5.0 cannot be installed: pip
 # refuses the entry point in it.
-LOGS = {'ulog': ['pyulog>=1.1,<2'], 'dataflash': ['pymavlink>=2.4.40,<3'],
+LOGS = {'ulog': ['pyulog>=1.1,<2'], 'dataflash': ['pymavlink>=2.4.50,<3'],
         'blackbox': ['orangebox>=0.4,<0.5']}
 
 setup(
@@ -31,7 +31,7 @@ setup(
     extras_require={
         'fast': ['numba>=0.59,<1'],
         'fleet': ['dask>=2024.8,<2027', 'distributed>=2024.8,<2027', 'pyarrow>=16,<28'],
-        'test': ['pytest>=8,<10', 'hypothesis>=6.100,<7', 'rosbags>=0.10,<0.12'],
+        'test': ['pytest>=8,<10', 'hypothesis>=6.100,<7', 'rosbags>=0.11,<0.12'],
         'doc': ['sphinx>=7.2,<10', 'myst-parser>=3,<6'],
         **LOGS, 'logs': [package for packages in LOGS.values() for package in packages]},
     python_requires='>=3.11',

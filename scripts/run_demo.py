@@ -103,7 +103,7 @@ class Children:
     def last(self, name: str) -> str:
         """Return the last line that it wrote, and where the rest is."""
         lines = self._log(name).read_text(errors='replace').strip().splitlines()
-        return f'{lines[-1] if lines else "it said nothing"} (log: {self._log(name)})'
+        return f'{lines[-1] if lines else "no output"} (log: {self._log(name)})'
 
     def _log(self, name: str) -> Path:
         return self._logs / f'demo_{name}.log'
@@ -275,7 +275,7 @@ def interrupt(*_: object) -> None:
 def main() -> int:
     """Run the demo; return the exit status."""
     chosen = options()
-    # Not by way of SIGINT, which a shell may have told all its children to ignore.
+    # Not by way of SIGINT, which a shell may let all its children ignore.
     signal.signal(signal.SIGTERM, interrupt)
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     try:

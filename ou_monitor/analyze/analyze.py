@@ -66,6 +66,17 @@ class Analysis:
     brownout_default: bool
     notes: tuple[str, ...]
 
+    @property
+    def sag_offset(self) -> float:
+        """Sag of the levels at the throttle where the learned curve begins, V."""
+        learned = self.by_throttle
+        known = [level for level in self.levels if math.isfinite(level.sag.sag)]
+        if not known or not learned.known.any():
+            return 0.0
+        return float(np.interp(learned.throttle[int(learned.known.argmax())],
+                               [level.throttle for level in known],
+                               [level.sag.sag for level in known]))
+
 
 def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
             window: float = 2.0, brownout_voltage: float | None = None,

@@ -157,6 +157,12 @@ class AlphaTest:
     withheld: tuple[float, ...] = ()
 
     @property
+    def interval(self) -> tuple[float, float]:
+        """Return the 95 % interval of the common alpha, 1/s."""
+        reach = math.exp(Z95 * self.alpha_se) if math.isfinite(self.alpha_se) else NAN
+        return self.alpha / reach, self.alpha * reach
+
+    @property
     def sentence(self) -> str:
         """Return the verdict in words."""
         return self._verdict() + self._withheld()

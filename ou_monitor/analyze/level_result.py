@@ -17,6 +17,7 @@ from ou_monitor.analyze.level_comparison import level_sags, LevelSag
 from ou_monitor.analyze.levels import LoadLevel, Segment
 from ou_monitor.analyze.process_type import classify, ProcessType, Verdict
 from ou_monitor.analyze.spectrum import level_spectrum, segment_rate, Spectrum
+from ou_monitor.criticism.curves import bin_width
 from ou_monitor.criticism.innovations import fresh
 from ou_monitor.criticism.level_tests import adjusted, examine_level, FAMILY_WISE, holm, Shape
 from ou_monitor.model.spectral_lines import find_lines, LineSearch, without_lines
@@ -31,6 +32,8 @@ _LOG_NAMES = ('alpha', 'sigma', 'var_inf')
 _MIN_SEGMENT = 16
 # Intervals widened by more than this factor are spoken of.
 _WIDENED = 1.5
+# Fewer samples have no histogram.
+_LEAST_BINNED = 50
 
 
 def fit_stretch(recording: Recording, start: int, stop: int) -> Estimate:
@@ -145,7 +148,6 @@ def _rms(values: Sequence[float]) -> float:
 def _mean_se(weight: FloatArray, good: Sequence[Estimate]) -> float:
     return float(np.sqrt(weight ** 2 @ np.array([e.u0_se for e in good]) ** 2))
 
-
 @dataclass(frozen=True, eq=False)
 class LevelResult:
     """
@@ -233,6 +235,16 @@ class LevelResult:
     def crest(self) -> float:
         """Vpp over Vrms, dimensionless."""
         return self.vpp / self.vrms if self.vrms > 0.0 else NAN
+
+    def density(self) -> tuple[FloatArray, FloatArray]:
+        """Return edges and density of the deviation over Vrms; empty with too few samples."""
+        if self.n < _LEAST_BINNED or not self.vrms > 0.0:
+            return np.zeros(0), np.zeros(0)
+        z = self.deviation / self.vrms
+        # Within what a plot can show.
+        width = min(max(bin_width(z), 0.05), 0.5)
+        edges = np.arange(-6.0, 6.0 + width, width)
+        return edges, np.histogram(z, edges)[0] / (self.n * np.diff(edges))
 
     @property
     def label(self) -> str:

@@ -153,6 +153,10 @@ class Relaxation:
             return NAN
         return math.log(self.tau_high / self.tau_low) / (2.0 * Z95)
 
+    def decay(self, change: Release, since: FloatArray) -> FloatArray:
+        """Return the fitted voltage less the level it settles at, V, some s after a change."""
+        return change.amplitude * np.exp(-since / self.tau)
+
     @property
     def seen(self) -> bool:
         """Whether anything is seen to relax."""

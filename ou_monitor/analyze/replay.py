@@ -65,6 +65,12 @@ class Sliding:
         """Return one field of the estimates as an array."""
         return np.array([getattr(e, name) for e in self.estimates], dtype=np.float64)
 
+    def interval(self, name: str) -> tuple[FloatArray, FloatArray]:
+        """Return the ends of the 95 % intervals of a field; an error beyond e^5 counts as that."""
+        value = self.series(name)
+        factor = np.exp(Z95 * np.minimum(self.series(name + '_se'), 5.0))
+        return value / factor, value * factor
+
     @property
     def last_usable(self) -> Estimate | None:
         """Return the newest estimate that may be acted on; None when there is none."""

@@ -69,15 +69,15 @@ def render(found: Coupling, name: str, signal: str, notes: tuple[str, ...]) -> s
     if found.seen:
         a, b = found.gain_ci95
         lines += [
-            f'Coupling is seen (p = {found.p_value:.2g}, level {found.level:g}).',
+            f'Coupling detected (p = {found.p_value:.2g}, level {found.level:g}).',
             f'  gain    {found.gain:.4g} per V  [{a:.4g}, {b:.4g}] 95 %',
             f'  lag     {1e3 * found.lag:.3g} ms of the signal behind the voltage '
             f'(standard error {1e3 * found.lag_se:.2g} ms)',
             f'  share   {100.0 * found.noise_share:.3g} % of the signal in this band']
     else:
         lines += [
-            f'No coupling seen (p = {found.p_value:.2g}, level {found.level:g}).',
-            f'  limit   a gain of {found.limit:.4g} per V would have been seen with 90 % '
+            f'No coupling detected (p = {found.p_value:.2g}, level {found.level:g}).',
+            f'  limit   a gain of {found.limit:.4g} per V would have been detected with 90 % '
             'probability']
     lines.append(f'  largest squared coherence {found.coherence[peak]:.3g} at '
                  f'{found.frequency[peak]:.3g} Hz, threshold {found.threshold:.3g}')

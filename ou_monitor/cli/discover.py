@@ -1,4 +1,4 @@
-"""`ou-monitor discover RECORDING`: what the simulation gets wrong, why, and what it is worth."""
+"""`ou-monitor discover RECORDING`: what the simulation gets wrong, why, and the gain of mending it."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def render(finding: Finding) -> str:
         found = cause_rows(finding.causes)
         rows = [[row.label, row.family, row.gain, row.chance, ', '.join(row.alternatives) or '-']
                 for row in found]
-        lines += ['', output.table(['cause', 'family', 'gain mnat/sample', 'p', 'not told from'],
+        lines += ['', output.table(['cause', 'family', 'gain mnat/sample', 'p', 'alternatives'],
                                    rows, left=[0, 1, 4]), '']
         for row in found:
             lines += [output.item(f'{row.name}: {estimate}') for estimate in row.estimates]

@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return int(args.run(args))
         except SystemExit as stop:
             # From argparse: --help, --version and bad arguments.  What it printed
-            # is still in the buffer, and an error of writing it can still be told.
+            # is still in the buffer, and an error of writing it can still be reported.
             from ou_monitor.cli.output import say
 
             say('', end='')

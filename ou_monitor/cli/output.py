@@ -22,7 +22,7 @@ from ou_monitor.errors import InputError
 STDOUT = '-'
 # Lines are broken to be read at this width.
 COLUMNS = 100
-# What a rosbag2 folder is made of, beside its metadata.yaml: storage files, compressed or not.
+# Files of a rosbag2 folder, beside its metadata.yaml: storage files, compressed or not.
 _STORAGE = ('.mcap', '.db3', '.zst', '.zstd', '.lz4')
 
 
@@ -139,7 +139,7 @@ def _overwrites(target: Path, source: Path) -> bool:
 
 
 def check_writable(target: str | None) -> None:
-    """Refuse an output before the work, when it can be seen that it will fail (target in A)."""
+    """Refuse, before the work, an output that will fail."""
     if target is None or target == STDOUT:
         return
     path = Path(target)

@@ -9,7 +9,7 @@ from typing import Any
 from ou_monitor.cli import output
 from ou_monitor.errors import InputError, nearest
 
-# From this rate on samples travel in blocks unless told otherwise, Hz.
+# From this rate on samples travel in blocks by default, Hz.
 _BLOCKS_FROM = 5000.0
 # Endings of files that are no bag: a folder of such a name would surprise.
 _NO_BAG = ('.bag', '.bin', '.csv', '.db3', '.json', '.txt', '.ulg', '.yaml', '.yml')
@@ -63,8 +63,8 @@ def run(args: argparse.Namespace) -> int:
     duration = _positive('--duration', preset.duration if args.duration is None
                          else args.duration, 's')
     if not 1.0 <= duration * rate <= 1e12:
-        raise InputError(f'{duration:g} s at {rate:g} Hz are {duration * rate:.3g} samples: 1 to '
-                         '1e12 can be made')
+        raise InputError(f'{duration:g} s at {rate:g} Hz are {duration * rate:.3g} samples, outside '
+                         '1 to 1e12')
     if duration > _DURATION_MOST:
         raise InputError(f'--duration must be at most {_DURATION_MOST:g} s, as bags count in ns; '
                          f'got {duration:g}')

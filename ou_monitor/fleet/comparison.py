@@ -15,11 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.criticism.curves import bin_width
 from ou_monitor.records import FloatArray, NAN
+from ou_monitor.text import Z95
 
 Row = Mapping[str, Any]
 IntArray = npt.NDArray[np.intp]
@@ -29,6 +32,7 @@ QUANTITIES = {'sigma': 'V/sqrt(s)', 'alpha': '1/s', 'sag': 'V'}
 LOGARITHMIC = ('sigma', 'alpha')
 _HUBER = 1.345
 _ROUNDS = 30
+_MOST_BINS = 60.0
 # Pieces of the curve at most, rows that each takes, and how far apart its knots are at least.
 _PIECES, _ROWS, _APART = 8, 12, 0.03
 
@@ -73,7 +77,7 @@ class Values:
     paths : tuple of str
         Recordings.
     vehicles : tuple of str
-        Of each; empty where not told.
+        Of each; empty where unknown.
     flights : ndarray, shape (n,)
         Number of the flight; 0 where there is none.
     value, error : ndarray, shape (n,)
@@ -95,6 +99,24 @@ class Values:
         """Return values of `value` in the unit of the quantity."""
         data = np.asarray(value, dtype=np.float64)
         return np.exp(data) if self.name in LOGARITHMIC else data
+
+    def interval(self) -> tuple[FloatArray, FloatArray]:
+        """Return the ends of the 95 % intervals in the unit of the quantity."""
+        reach = Z95 * self.error
+        return self.shown(self.value - reach), self.shown(self.value + reach)
+
+    def histogram(self) -> tuple[FloatArray, npt.NDArray[np.int_]]:
+        """Return edges, on the scale of `value`, and counts; outliers do not widen the bins."""
+        value = self.value
+        width = max(bin_width(value), float(np.ptp(value)) / _MOST_BINS, 1e-9)
+        first = math.floor(float(value.min()) / width) * width
+        bins = int(math.ceil((float(value.max()) - first) / width + 1e-9)) or 1
+        counts, edges = np.histogram(value, first + width * np.arange(bins + 1))
+        return edges, counts
+
+    def common_curve(self, throttle: FloatArray) -> FloatArray:
+        """Return the common curve through the median of all, in the unit of the quantity."""
+        return self.shown(float(np.median(self.value)) + self.curve(throttle))
 
 
 def values_of(rows: Sequence[Row], name: str) -> Values:

@@ -8,7 +8,7 @@ family rate by Holm's procedure.
 
 Limits: flights in a row that share a cause (a season, a battery) look like a
 drift.  Below a certain number of flights no order of them is rare enough in a
-fleet of many tests; `fewest` tells that number.
+fleet of many tests; `fewest` returns that number.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from ou_monitor.fleet.comparison import Values
 from ou_monitor.records import FloatArray, NAN
 
-# With fewer flights not even one vehicle alone can be told at 5 %: 2/4! is 0.08.
+# With fewer flights not even one vehicle alone can reach 5 %: 2/4! is 0.08.
 LEAST = 5
 
 
@@ -107,7 +107,7 @@ def holm(p_values: FloatArray) -> FloatArray:
 
 
 def fewest(tests: int, rate: float) -> int:
-    """Return the flights below which no drift can be told among some tests."""
+    """Return the flights below which no drift can be significant among some tests."""
     n = LEAST
     while 2.0 / math.factorial(n) > rate / max(tests, 1):
         n += 1

@@ -33,7 +33,7 @@ class Fleet:
     judgement : Judgement
         What stands out.
     notes : tuple of str
-        How vehicles were told, what was passed over, and the like.
+        Where the names of the vehicles are from, what was passed over, and the like.
     recordings : int
         Recordings found.
     kept : int
@@ -49,7 +49,7 @@ class Fleet:
 
     @property
     def vehicles(self) -> list[str]:
-        """Return the vehicles that were told, in order."""
+        """Return the vehicles with a name, in order."""
         return sorted({row['vehicle'] for row in self.rows if row['vehicle'] is not None})
 
     @property
@@ -127,7 +127,7 @@ def _work(missing: Sequence[Source], results: dict[Path, dict[str, Any]], parts:
 def _table(sources: Sequence[Source], results: dict[Path, dict[str, Any]],
            twice: dict[Path, Path], pattern: re.Pattern[str] | None
            ) -> tuple[list[Row], list[str]]:
-    """Return all rows, and how vehicles and flights were told."""
+    """Return all rows, and notes on how vehicles and flights were named."""
     # A copy is of the vehicle that its content names, or of that of its own path.
     whole = {s.path: results[twice.get(s.path, s.path)] for s in sources}
     vehicles, notes = assign({path: r.get('vehicle', '') for path, r in whole.items()}, pattern)

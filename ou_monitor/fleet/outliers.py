@@ -96,13 +96,13 @@ def outliers(value: FloatArray, error: FloatArray, groups: Sequence[str], rate: 
     rng = np.random.default_rng(seed)
     size = max(1, min(simulations, _CELLS // se.size))
     # Where errors are as large as s, s may come out as zero, and the scores of the best recordings
-    # too large: the fleets are made with the largest s that the data allow.
+    # too large: fleets are simulated with the largest s that the data allow.
     share = min(0.5 + 0.5 * _UPPER / math.sqrt(se.size), 0.95)
     most = float(_scatter(rest, se, share)[0, 0])
     largest: list[FloatArray] = []
     while sum(part.size for part in largest) < simulations:
-        made = rng.standard_normal((size, se.size)) * np.hypot(most, se)
-        inner, _ = _centred(made, members)
+        drawn = rng.standard_normal((size, se.size)) * np.hypot(most, se)
+        inner, _ = _centred(drawn, members)
         largest.append(np.abs(inner / _spread(_scatter(inner, se), se)).max(axis=1))
     worst = np.sort(np.concatenate(largest)[:simulations])
     over = simulations - np.searchsorted(worst, np.abs(score[good]), side='left')

@@ -31,7 +31,7 @@ class Parts:
     Parameters
     ----------
     folder : pathlib.Path
-        Folder of the fleet; made when it is not there.
+        Folder of the fleet; created when it is missing.
     options : mapping
         What the results depend on, the version of the package among it, as
         JSON holds it.
@@ -39,7 +39,7 @@ class Parts:
     Raises
     ------
     InputError
-        When the folder cannot be made or written.
+        When the folder cannot be created or written.
 
     """
 
@@ -50,7 +50,7 @@ class Parts:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"cannot write into '{folder}': {_why(error)}") from error
-        # Whether it can be written is told before the work, not after it.
+        # An output folder that cannot be written must fail before the work, not after it.
         probe = self._folder / '.probe'
         write_whole(probe, b' ' * 4096)
         probe.unlink()
@@ -66,7 +66,7 @@ class Parts:
             with open_regular(self._path(source)) as file:
                 found = json.loads(file.read(_MOST + 1)[:_MOST])
         except (OSError, ValueError, RecursionError):
-            # Not there, cut off by a loss of power, or none of ours: it is made again.
+            # Not there, cut off by a loss of power, or none of ours: it is computed again.
             return None
         return found if isinstance(found, dict) and found.get('error') == '' else None
 
@@ -85,7 +85,7 @@ def write_whole(path: Path, content: bytes) -> None:
         try:
             draft.unlink(missing_ok=True)
         except OSError:
-            # The folder itself refuses, which is what is told below.
+            # The folder itself refuses, which is what the error below reports.
             pass
         raise InputError(f"cannot write '{path}': {_why(error)}") from error
 

@@ -160,8 +160,8 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
     """Return names as tables show them: long ones without their middle."""
     short = {name: name if len(name) <= _NAME else f'{name[:13]}\u2026{name[13 - _NAME + 1:]}'
              for name in names}
-    seen = Counter(short.values())
-    return {name: text if seen[text] == 1 else name for name, text in short.items()}
+    uses = Counter(short.values())
+    return {name: text if uses[text] == 1 else name for name, text in short.items()}
 
 
 def vehicle_rows(fleet: Fleet) -> list[list[str]]:
@@ -198,16 +198,16 @@ def _slope(judged: Judgement, name: str, vehicle: str) -> str:
 def quality_counts(fleet: Fleet) -> list[tuple[str, int]]:
     """Return statuses that are not good, flags, verdicts and causes with how often they occur."""
     counts: Counter[str] = Counter()
-    seen: set[str] = set()
+    counted_paths: set[str] = set()
     for row in fleet.rows:
         if row['status'] is not None:
             if row['status'] not in USABLE:
                 counts[f"level without estimate: {row['status']}"] += 1
             counts.update(f'level with flag {flag}' for flag in row['flags'] or ())
-        if row['path'] not in seen and row['verdict'] is not None:
+        if row['path'] not in counted_paths and row['verdict'] is not None:
             counts[f"recording with verdict {row['verdict']}"] += 1
             counts.update(f'recording with cause {cause}' for cause in set(row['causes'] or ()))
-        seen.add(row['path'])
+        counted_paths.add(row['path'])
     return counts.most_common()
 
 

@@ -46,8 +46,8 @@ class Column:
 _LOG = 'standard error of its logarithm'
 
 COLUMNS = (
-    Column('vehicle', 'text', '', 'vehicle; null where it cannot be told'),
-    Column('vehicle_from', 'text', '', 'how the vehicle was told: metadata, pattern, folder'),
+    Column('vehicle', 'text', '', 'vehicle; null where it is unknown'),
+    Column('vehicle_from', 'text', '', 'where the name of the vehicle is from: metadata, pattern, folder'),
     Column('flight', 'count', '', 'number of the flight of this vehicle, from 1'),
     Column('start', 'time', '', 'first sample; null where its clock does not know the date'),
     Column('recording', 'text', '', 'name of the recording'),
@@ -70,7 +70,7 @@ COLUMNS = (
     Column('noise_std', 'number', 'V', 'white noise of the sensor'),
     Column('excess_kurtosis', 'number', '1', 'of the innovations; 0 for a Gaussian'),
     Column('impulses', 'count', '', 'innovations larger than the largest normal one would be'),
-    Column('line_hz', 'number', 'Hz', 'frequency of the strongest spectral line; null: none seen'),
+    Column('line_hz', 'number', 'Hz', 'frequency of the strongest spectral line; null: none found'),
     Column('line_rms', 'number', 'V', 'its rms'),
     Column('process', 'text', '', 'type of process'),
     Column('risk', 'number', '1', 'probability of a brown-out within the horizon, from the level; '
@@ -86,7 +86,7 @@ COLUMNS = (
     Column('sag_se', 'number', 'V', 'standard error of sag'),
     Column('alpha_p', 'number', '1', 'p-value of alpha being the same at all levels'),
     Column('quality', 'texts', '', 'what to know about the recording, worst first'),
-    Column('risk_max', 'number', '1', 'highest risk that the node would have told on the way; '
+    Column('risk_max', 'number', '1', 'highest risk that the node would have published on the way; '
            'needs --brownout-voltage'),
     Column('verdict', 'text', '', 'verdict of discover; null without --discover'),
     Column('causes', 'texts', '', 'causes that discover names; null without --discover'),
@@ -113,7 +113,7 @@ def rows_of(source: Source, result: Mapping[str, Any], vehicle: Vehicle, flight:
     """Return the rows of one recording: one a level, or one that says why there is none."""
     base: Row = dict.fromkeys(NAMES)
     base.update(
-        vehicle=vehicle.name or None, vehicle_from=vehicle.told_by if vehicle.name else None,
+        vehicle=vehicle.name or None, vehicle_from=vehicle.named_by if vehicle.name else None,
         flight=flight, path=printable(source.path), recording=printable(source.path.name),
         size_bytes=source.size, error=result['error'] or None,
         duplicate_of=None if duplicate_of is None else printable(duplicate_of))

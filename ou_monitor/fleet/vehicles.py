@@ -3,7 +3,7 @@ Which vehicle a recording is of, and which of its flights.
 
 The rule: what the recording names itself (its metadata), else what a pattern
 finds in its path, else the folder it lies in.  Recordings are compared within
-a vehicle only; where the vehicle cannot be told there is none, and the
+a vehicle only; where the vehicle is unknown there is none, and the
 recording is compared with nothing.
 """
 
@@ -41,10 +41,10 @@ json.dump([(match and match[key]) or '' for match in found], sys.stdout)
 
 @dataclass(frozen=True)
 class Vehicle:
-    """Name of a vehicle (empty: not told), and how it was told."""
+    """Name of a vehicle (empty: unknown), and where the name is from."""
 
     name: str
-    told_by: str
+    named_by: str
 
 
 def read_pattern(text: str) -> re.Pattern[str]:
@@ -95,8 +95,8 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
         notes.append(f'{_these(mixed)}: no vehicle in the metadata, while others in the same '
                      'folder name theirs; they are compared with nothing. --vehicle-from names '
                      'them by their path.')
-    both = {v.name for v in found.values() if v.told_by == METADATA} & {
-        v.name for v in found.values() if v.told_by != METADATA and v.name}
+    both = {v.name for v in found.values() if v.named_by == METADATA} & {
+        v.name for v in found.values() if v.named_by != METADATA and v.name}
     if both:
         notes.append(f'{", ".join(sorted(both))}: some recordings name this vehicle themselves, '
                      'others were counted to it by their path; check that it is one vehicle.')
@@ -136,17 +136,17 @@ def _folder_names(folders: set[Path]) -> dict[Path, str]:
 
 
 def _rule(found: Mapping[Path, Vehicle]) -> str:
-    """Say how the vehicles were told."""
+    """Say where the names of the vehicles are from."""
     words = {METADATA: 'by their metadata', PATTERN: 'by --vehicle-from',
              FOLDER: 'by the folder they lie in'}
     parts = []
     for kind, text in words.items():
-        of_kind = [v for v in found.values() if v.told_by == kind and v.name]
+        of_kind = [v for v in found.values() if v.named_by == kind and v.name]
         if of_kind:
             count = len({v.name for v in of_kind})
             parts.append(f'{counted(len(of_kind), "recording")} to {counted(count, "vehicle")} '
                          f'{text}')
-    return 'Vehicles: ' + ('; '.join(parts) if parts else 'none could be told') + '.'
+    return 'Vehicles: ' + ('; '.join(parts) if parts else 'none identified') + '.'
 
 
 def _these(paths: Sequence[Path]) -> str:

@@ -9,12 +9,11 @@ import numpy as np
 from ou_monitor.analyze.analyze import Analysis
 from ou_monitor.analyze.level_result import LevelResult
 from ou_monitor.analyze.words import headline
-from ou_monitor.records import FloatArray
+from ou_monitor.criticism.curves import outline
 from ou_monitor.report import analysis_sections as parts, page
 from ou_monitor.report.cells import figure, UNKNOWN
 from ou_monitor.report.scale import span
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import Z95
 
 # More levels than colours would repeat colours.
 _MAX_DRAWN = 6
@@ -103,12 +102,12 @@ def _over_time(analysis: Analysis) -> list[str]:
         value = sliding.series(name)
         if not np.isfinite(value).any():
             continue
-        factor = np.exp(Z95 * np.minimum(sliding.series(name + '_se'), 5.0))
+        low, high = sliding.interval(name)
         plot = Plot(f'{title} in a sliding window of {sliding.window:g} s', 'time, s', unit,
                     height=200, log_y=True).limits(x=limits)
-        # One window that tells nothing must not flatten all the others.
-        plot.limits(y=span([value, value / factor, value * factor], log=True, trim=0.01))
-        plot.band(sliding.t - start, value / factor, value * factor, '95 % interval')
+        # One window without information must not flatten all the others.
+        plot.limits(y=span([value, low, high], log=True, trim=0.01))
+        plot.band(sliding.t - start, low, high, '95 % interval')
         plot.line(sliding.t - start, value, 'estimate', style='thick')
         drawn.append(page.figure(plot))
     if np.isfinite(sliding.risk).any():
@@ -138,7 +137,7 @@ def _drawn(analysis: Analysis) -> list[LevelResult]:
 def _levels_caption(analysis: Analysis) -> str:
     if not analysis.recording.has_throttle:
         return 'Every peak is shown: each column of pixels holds its lowest and highest sample.'
-    return ('Shaded: the stretches used for the load levels, in the colours of the plots of the '
+    return ('Shaded: the segments used for the load levels, in the colours of the plots of the '
             'shape. Every peak is shown.')
 
 
@@ -159,10 +158,12 @@ def _shape(analysis: Analysis) -> list[str]:
             spectrum.line(measured.frequency, measured.fitted, '', k, 'dash thick')
             for line in level.lines.lines[:_MAX_MARKED]:
                 spectrum.mark(line.frequency, f'{line.frequency:.4g} Hz')
-        x, y = _histogram(level)
-        if x.size:
+        edges, density = level.density()
+        if density.size:
             counted += 1
-            histogram.line(x, y, level.label, k)
+            # An empty bin has no place on a logarithmic axis.
+            histogram.line(*outline(edges, np.where(density > 0.0, density, np.nan)),
+                           level.label, k)
     z = np.linspace(-5.0, 5.0, 201)
     histogram.line(z, np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi), 'normal', 7, 'dash thick')
     histogram.limits(x=(-6.0, 6.0), y=(1e-5, 1.0))
@@ -180,21 +181,6 @@ def _shape(analysis: Analysis) -> list[str]:
     if extra > 0:
         text += f' The {extra} shortest levels are in the tables only.'
     return [page.pair(*figures), page.paragraph(text, soft=True)]
-
-
-def _histogram(level: LevelResult) -> tuple[FloatArray, FloatArray]:
-    """Return the outline of the density of the standardised deviation."""
-    if level.n < 50 or not level.vrms > 0.0:
-        return np.zeros(0), np.zeros(0)
-    z = level.deviation / level.vrms
-    # Freedman-Diaconis, within what a plot can show.
-    quarter = float(np.subtract(*np.quantile(z, [0.75, 0.25])))
-    width = min(max(2.0 * quarter / level.n ** (1.0 / 3.0), 0.05), 0.5)
-    edges = np.arange(-6.0, 6.0 + width, width)
-    counts, edges = np.histogram(z, edges)
-    density = counts / (level.n * np.diff(edges))
-    x, y = np.repeat(edges, 2)[1:-1], np.repeat(density, 2)
-    return x, np.where(y > 0.0, y, np.nan)
 
 
 def _origin(analysis: Analysis, command: str) -> str:

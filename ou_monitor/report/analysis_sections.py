@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import math
 
 import numpy as np
@@ -13,7 +14,6 @@ from ou_monitor.records import FloatArray
 from ou_monitor.report import page
 from ou_monitor.report.cells import figure, probability, UNKNOWN
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import Z95
 
 # Changes drawn in one plot, and relaxation times of them.
 _MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
@@ -57,7 +57,7 @@ def process(analysis: Analysis) -> list[str]:
 
 
 def lines(analysis: Analysis) -> list[str]:
-    """Return the spectral lines, or what would have been seen."""
+    """Return the spectral lines, and the least that would have been detected."""
     rows = [[level.label, f'{figure(line.frequency, 4)}\n\u00b1 {figure(line.resolution, 2)}',
              f'{figure(1e3 * line.rms)}\n{figure(1e3 * line.rms_low)} to '
              f'{figure(1e3 * line.rms_high)}', f'{100.0 * line.share:.2g} %',
@@ -69,7 +69,7 @@ def lines(analysis: Analysis) -> list[str]:
     detail = ', '.join(f'{level.label}: {figure(1e3 * level.lines.detectable)} mV'
                        for level in searched)
     text = (f'A recording without lines has one reported once in a hundred times. RMS of a line '
-            f'that would have been seen with 90 %: {detail}.')
+            f'that would have been detected with 90 %: {detail}.')
     if not rows:
         return [page.paragraph('No spectral line stands out of the noise at any level.'),
                 page.paragraph(text, soft=True)]
@@ -106,8 +106,7 @@ def _relaxing(analysis: Analysis, fit: Relaxation) -> Plot:
         plot.line(1e3 * since, 1e3 * (recording.voltage[here] - change.level),
                   f'{100.0 * change.throttle_before:.3g} to '
                   f'{100.0 * change.throttle_after:.3g} %', k, 'faint')
-        plot.line(1e3 * since, 1e3 * change.amplitude * np.exp(-since / fit.tau), '', k,
-                  'dash thick')
+        plot.line(1e3 * since, 1e3 * fit.decay(change, since), '', k, 'dash thick')
     return plot
 
 
@@ -140,15 +139,15 @@ def curves(analysis: Analysis) -> list[str]:
     if levels or learned.known.any():
         x = 100.0 * learned.throttle
         sag, sigma = _empty('Sag', 'mV'), _empty('Noise intensity \u03c3', 'V/\u221as')
-        shift = _sag_before(analysis)
+        shift = analysis.sag_offset
         sag.band(x, 1e3 * (learned.sag_low + shift), 1e3 * (learned.sag_high + shift), '95 %', 0)
         sag.line(x, 1e3 * (learned.sag + shift), 'learned as by the node', 0, 'thick')
         sigma.band(x, learned.sigma_low, learned.sigma_high, '95 %', 0)
         sigma.line(x, learned.sigma, 'learned as by the node', 0, 'thick')
         at = _column([100.0 * level.throttle for level in levels])
-        _with_bars(sag, at, 1e3 * _column([level.sag.sag for level in levels]),
-                   1e3 * _column([level.sag.sag_se for level in levels]))
-        _with_factors(sigma, at, levels, 'sigma')
+        _with_levels(sag, at, 1e3 * _column([level.sag.sag for level in levels]),
+                     1e3 * _column([level.sag.interval for level in levels]))
+        _with_estimates(sigma, at, levels, 'sigma')
         risk, alpha = _empty(f'Risk of going below {learned.voltage:g} V within '
                              f'{learned.horizon:g} s', 'probability', log=True), _empty(
                                  'Relaxation rate \u03b1', '1/s')
@@ -158,31 +157,18 @@ def curves(analysis: Analysis) -> list[str]:
         if math.isfinite(learned.budget):
             risk.mark(100.0 * learned.budget, f'budget {100.0 * learned.budget:.0f} %')
         test = analysis.alpha_test
-        reach = math.exp(Z95 * test.alpha_se) if math.isfinite(test.alpha_se) else math.nan
-        ends = np.array([0.0, 100.0])
-        alpha.band(ends, np.full(2, test.alpha / reach), np.full(2, test.alpha * reach),
-                   'common, 95 %', 2)
-        _with_factors(alpha, at, levels, 'alpha')
-        told = [plot for plot, values in (
+        low, high = test.interval
+        alpha.band(np.array([0.0, 100.0]), np.full(2, low), np.full(2, high), 'common, 95 %', 2)
+        _with_estimates(alpha, at, levels, 'alpha')
+        drawn = [plot for plot, values in (
             (sag, [*learned.sag, *(level.sag.sag for level in levels)]),
             (sigma, [*learned.sigma, *(level.estimate.sigma for level in levels)]),
             (risk, list(learned.risk)),
             (alpha, [level.estimate.alpha for level in levels])) if np.isfinite(values).any()]
-        parts += [page.pair(*(page.figure(plot) for plot in told[k:k + 2]))
-                  for k in range(0, len(told), 2)]
+        parts += [page.pair(*(page.figure(plot) for plot in drawn[k:k + 2]))
+                  for k in range(0, len(drawn), 2)]
     return [*parts, page.paragraph(brownout_sentence(analysis)),
             page.paragraph(analysis.alpha_test.sentence)]
-
-
-def _sag_before(analysis: Analysis) -> float:
-    """Return the sag of the levels where the learned curve begins, V."""
-    learned = analysis.by_throttle
-    told = [level for level in analysis.levels if math.isfinite(level.sag.sag)]
-    if not told or not learned.known.any():
-        return 0.0
-    return float(np.interp(learned.throttle[int(learned.known.argmax())],
-                           [level.throttle for level in told],
-                           [level.sag.sag for level in told]))
 
 
 def _empty(title: str, unit: str, log: bool = False) -> Plot:
@@ -190,16 +176,16 @@ def _empty(title: str, unit: str, log: bool = False) -> Plot:
                 legend_row=not log).limits(x=(-2.0, 102.0))
 
 
-def _column(values: list[float]) -> FloatArray:
+def _column(values: Sequence[float] | Sequence[tuple[float, float]]) -> FloatArray:
     return np.array(values, dtype=np.float64)
 
 
-def _with_bars(plot: Plot, x: FloatArray, y: FloatArray, se: FloatArray) -> None:
-    plot.bars(x, y - Z95 * se, y + Z95 * se, '', 7).markers(x, y, 'load levels', 7)
+def _with_levels(plot: Plot, x: FloatArray, y: FloatArray, ends: FloatArray) -> None:
+    """Add the load levels with their intervals, shape (n, 2)."""
+    low, high = ends.reshape(-1, 2).T
+    plot.bars(x, low, high, '', 7).markers(x, y, 'load levels', 7)
 
 
-def _with_factors(plot: Plot, x: FloatArray, levels: list[LevelResult], name: str) -> None:
-    ends = [level.estimate.interval(name) for level in levels]
-    plot.bars(x, _column([low for low, _ in ends]), _column([high for _, high in ends]), '', 7)
-    plot.markers(x, _column([getattr(level.estimate, name) for level in levels]), 'load levels',
-                 7)
+def _with_estimates(plot: Plot, x: FloatArray, levels: Sequence[LevelResult], name: str) -> None:
+    _with_levels(plot, x, _column([getattr(level.estimate, name) for level in levels]),
+                 _column([level.estimate.interval(name) for level in levels]))

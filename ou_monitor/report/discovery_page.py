@@ -1,4 +1,4 @@
-"""The report of `discover`: what the simulation gets wrong, why, and what it is worth."""
+"""The report of `discover`: what the simulation gets wrong, why, and the gain of mending it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import fields
 import math
 
 import numpy as np
+from ou_monitor.criticism.curves import compare_curves, Comparison
 from ou_monitor.discovery.finding import Criticism, Finding
 from ou_monitor.discovery.words import (
     cause_rows, crossing_words, gain_remark, MNAT, NOT_KNOWN, overlap_words, plain_model_words,
@@ -15,7 +16,6 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.report import page
 from ou_monitor.report.cells import figure, UNKNOWN
 from ou_monitor.report.dots import dot_rows
-from ou_monitor.report.pictures import Picture, pictures
 from ou_monitor.report.scale import span
 from ou_monitor.report.svg import Plot
 from ou_monitor.text import number
@@ -34,12 +34,12 @@ def discovery_page(finding: Finding, command: str = '',
     sections = [page.headline(_typeset(finding.sentence))]
     if finding.baseline is not None:
         sections += [page.section('Causes', *_causes(finding)),
-                     page.section('What it is worth' if finding.causes else 'What it predicts',
+                     page.section('Gain' if finding.causes else 'What it predicts',
                                   *_worth(finding)),
                      page.section(
                          'Statistics before and after' if finding.causes else 'Statistics',
                          *_statistics(finding)),
-                     page.section('Data beside simulations', *_pictures(finding)),
+                     page.section('Data beside simulations', *_comparisons(finding)),
                      page.section('What is left', *_left(finding)),
                      page.section('Parameters', *_parameters(finding))]
     tell(1.0)
@@ -82,7 +82,7 @@ def _causes(finding: Finding) -> list[str]:
              _minus(_typeset(row.gain)) + (f'\n{row.remark}' if row.remark else ''),
              row.chance, ', '.join(row.alternatives) or UNKNOWN] for row in found]
     return [
-        page.table(['Cause', 'Family', 'Gain, mnat per sample', 'p', 'Not told from'], rows,
+        page.table(['Cause', 'Family', 'Gain, mnat per sample', 'p', 'Alternatives'], rows,
                    left=[0, 1, 4]),
         *([page.paragraph(overlap)] if overlap else []),
         page.bullets([_typeset(f'{row.label}: {row.explanation}') for row in found]),
@@ -90,8 +90,8 @@ def _causes(finding: Finding) -> list[str]:
             'Gain: what the held-out score loses when the cause is left out and all else is '
             'fitted again, with the standard error of means of blocks and of the errors of the '
             'parameters. p: of the likelihood ratio on the part fitted, searching counted, or of '
-            'the gain, doubled. Exact findings are seen in the samples themselves; the gain of '
-            'those undone in them is shared. Terms of one kind that share a gain are one row.',
+            'the gain, doubled. Exact findings show in the samples themselves; those that '
+            'are undone there share one gain. Terms of one kind that share a gain are one row.',
             soft=True),
         page.paragraph(MNAT, soft=True)]
 
@@ -118,7 +118,7 @@ def _worth(finding: Finding) -> list[str]:
 
 
 def _shown(finding: Finding) -> list[Criticism]:
-    """Return the statistics worth a row: all that are or were off, then the largest."""
+    """Return the statistics of the rows: the largest, before or after."""
     worst = sorted(finding.criticism, key=lambda c: -max(abs(c.before), abs(c.after)))
     return worst[:_ROWS]
 
@@ -135,44 +135,44 @@ def _statistics(finding: Finding) -> list[str]:
         'with any of its statistics in one recording of a hundred.')]
 
 
-def _pictures(finding: Finding) -> list[str]:
+def _comparisons(finding: Finding) -> list[str]:
     samples, baseline, extended = finding.samples, finding.baseline, finding.simulated
     assert samples is not None and baseline is not None and extended is not None
     plain = SupplyModel((baseline,))
     named = ('plain OU', 'extended model') if finding.causes else ('plain OU',)
-    made = pictures(samples, [plain, extended] if finding.causes else [plain],
-                    np.random.default_rng(finding.seed))
-    drawn = [page.figure(_plot(picture, k, name))
-             for picture in made for k, name in enumerate(named)]
+    compared = compare_curves(samples, [plain, extended] if finding.causes else [plain],
+                              np.random.default_rng(finding.seed))
+    drawn = [page.figure(_plot(curve, k, name))
+             for curve in compared for k, name in enumerate(named)]
     return [*[page.pair(*drawn[k:k + 2]) for k in range(0, len(drawn), 2)], page.paragraph(
         'Line or dots: the data. Band or bars: the range of 40 simulations with the stamps and '
         'the throttle of the data; about one point in twenty of a right model lies outside.',
         soft=True)]
 
 
-def _plot(picture: Picture, k: int, name: str) -> Plot:
-    low, high = picture.bands[k]
-    plot = Plot(f'{picture.title}: {name}', picture.x_label, picture.y_label, width=450,
-                height=250, log_x=picture.log_x, log_y=picture.log_y, legend_row=True)
-    data = picture.data
-    if picture.log_y:
+def _plot(curve: Comparison, k: int, name: str) -> Plot:
+    low, high = curve.bands[k]
+    plot = Plot(f'{curve.title}: {name}', curve.x_label, curve.y_label, width=450,
+                height=250, log_x=curve.log_x, log_y=curve.log_y, legend_row=True)
+    data = curve.data
+    if curve.log_y:
         # A bin without samples has no place on a logarithmic axis.
         floor = 0.3 * float(np.nanmin(np.where(data > 0.0, data, np.nan)))
         low, high = np.where(high > 0.0, np.maximum(low, floor), np.nan), np.maximum(high, floor)
         data = np.where(data > 0.0, data, np.nan)
-    ends = [data, *[edge for pair in picture.bands for edge in pair]]
+    ends = [data, *[edge for pair in curve.bands for edge in pair]]
     # Both plots of a pair have one axis.
-    ends = [np.where(e > 0.0, np.maximum(e, floor), np.nan) for e in ends] if picture.log_y \
+    ends = [np.where(e > 0.0, np.maximum(e, floor), np.nan) for e in ends] if curve.log_y \
         else ends
-    bottom, top = span(ends, picture.log_y)
+    bottom, top = span(ends, curve.log_y)
     plot.limits(y=(bottom, top))
-    if picture.points:
+    if curve.points:
         # Room for the markers at both ends.
-        plot.limits(span([picture.x], pad=0.12), (bottom, top))
-        plot.bars(picture.x, low, high, 'simulated', k)
-        return plot.markers(picture.x, data, 'data', 7)
-    plot.band(picture.x, low, high, 'simulated', k)
-    return plot.line(picture.x, data, 'data', 7, 'thick')
+        plot.limits(span([curve.x], pad=0.12), (bottom, top))
+        plot.bars(curve.x, low, high, 'simulated', k)
+        return plot.markers(curve.x, data, 'data', 7)
+    plot.band(curve.x, low, high, 'simulated', k)
+    return plot.line(curve.x, data, 'data', 7, 'thick')
 
 
 def _left(finding: Finding) -> list[str]:

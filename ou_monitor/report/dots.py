@@ -65,6 +65,6 @@ def _sentence(name: str, low: float, high: float, before: float, after: float) -
 
     known = [(word, value) for word, value in (('before', before), ('after', after))
              if math.isfinite(value)]
-    # A single dot is neither before nor after anything.
+    # A single dot has no before and after.
     said = [f'{word} {text(value)}' if len(known) == 2 else text(value) for word, value in known]
     return f'{name}: {", ".join([*said, f"simulations {text(low)} to {text(high)}"])}'

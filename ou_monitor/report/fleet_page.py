@@ -7,6 +7,7 @@ import math
 from typing import Any
 
 import numpy as np
+from ou_monitor.criticism.curves import outline
 from ou_monitor.fleet.comparison import LOGARITHMIC, QUANTITIES, USABLE, Values
 from ou_monitor.fleet.drift import Trend
 from ou_monitor.fleet.fleet import Fleet
@@ -18,7 +19,7 @@ from ou_monitor.records import FloatArray
 from ou_monitor.report import page
 from ou_monitor.report.cells import typeset, UNKNOWN
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import number, Z95
+from ou_monitor.text import number
 
 _TITLES = {'sigma': 'Noise intensity \u03c3', 'alpha': 'Relaxation rate \u03b1',
            'sag': 'Sag over throttle'}
@@ -83,7 +84,7 @@ def _left_out(fleet: Fleet) -> list[str]:
 def _vehicles(fleet: Fleet) -> list[str]:
     rows = vehicle_rows(fleet)
     if not rows:
-        return [page.paragraph('No vehicle could be told.', soft=True)]
+        return [page.paragraph('No vehicle was identified.', soft=True)]
     numbered = [[str(k + 1), row[0], *[typeset(cell) for cell in row[1:]]]
                 for k, row in enumerate(rows)]
     parts = [page.table(['#', *[head for _, head in VEHICLE_HEADS]], numbered, left=[1]),
@@ -161,11 +162,12 @@ def _caption(trend: Trend) -> str:
 
 def _trend_plot(values: Values, trend: Trend) -> Plot:
     mine = np.array([v == trend.vehicle for v in values.vehicles]) & (values.flights > 0)
-    x, y, se = values.flights[mine].astype(float), values.value[mine], values.error[mine]
+    x, y = values.flights[mine].astype(float), values.value[mine]
+    low, high = values.interval()
     plot = Plot(f'{trend.vehicle}: {_TITLES[values.name]}', 'flight', _UNITS[values.name],
                 width=450, height=260, log_y=values.name in LOGARITHMIC)
     plot.limits(x=(trend.first - 0.5, trend.last + 0.5))
-    plot.bars(x, values.shown(y - Z95 * se), values.shown(y + Z95 * se), '', 7)
+    plot.bars(x, low[mine], high[mine], '', 7)
     plot.markers(x, values.shown(y), '', 0)
     at = np.linspace(trend.first, trend.last, 50)
     return plot.line(at, values.shown(trend.line(at)), '', 1, 'thick')
@@ -176,12 +178,15 @@ def _distributions(fleet: Fleet) -> list[str]:
     for name in QUANTITIES:
         values = fleet.judgement.values[name]
         if values.value.size >= 5:
-            x, count = _histogram(values.value)
+            edges, count = values.histogram()
+            x, height = outline(edges, count)
             # On a log axis the outline has its corners where the bins are even in the logarithm.
             plot = Plot(f'{_TITLES[name]}, all recordings', _UNITS[name], 'recordings', width=450,
                         height=240, log_x=name in LOGARITHMIC)
             plot.limits(y=(0.0, 1.08 * float(count.max())))
-            figures.append(page.figure(plot.line(values.shown(x), count, '', 0, 'thick')))
+            figures.append(page.figure(plot.line(
+                values.shown(np.concatenate((x[:1], x, x[-1:]))),
+                np.concatenate(([0.0], height, [0.0])), '', 0, 'thick')))
     over = _over_throttle(fleet)
     if over:
         figures.append(page.figure(over))
@@ -196,17 +201,6 @@ def _distributions(fleet: Fleet) -> list[str]:
     return parts
 
 
-def _histogram(value: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the outline of the counts; a wild value does not decide the width of a bin."""
-    low, high = np.quantile(value, [0.25, 0.75])
-    width = max(2.0 * float(high - low) / value.size ** (1.0 / 3.0),
-                float(np.ptp(value)) / 60.0, 1e-9)
-    first = math.floor(float(value.min()) / width) * width
-    bins = int(math.ceil((float(value.max()) - first) / width + 1e-9)) or 1
-    counts, edges = np.histogram(value, first + width * np.arange(bins + 1))
-    return np.repeat(edges, 2), np.concatenate(([0.0], np.repeat(counts, 2), [0.0]))
-
-
 def _over_throttle(fleet: Fleet) -> Plot | None:
     values = fleet.judgement.values['sigma']
     good = [row for row in fleet.rows if row['status'] in USABLE and row['sigma'] is not None
@@ -218,8 +212,7 @@ def _over_throttle(fleet: Fleet) -> Plot | None:
                 width=450, height=240, log_y=True)
     plot.markers(100.0 * u, np.array([row['sigma'] for row in good]), '', 7)
     at = np.linspace(float(u.min()), float(u.max()), 60)
-    middle = float(np.median(values.value))
-    return plot.line(100.0 * at, np.exp(middle + values.curve(at)), '', 1, 'thick')
+    return plot.line(100.0 * at, values.common_curve(at), '', 1, 'thick')
 
 
 def _quality(fleet: Fleet) -> list[str]:

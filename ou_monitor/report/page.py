@@ -18,7 +18,7 @@ from importlib import resources
 from ou_monitor.report.embedding import embed
 from ou_monitor.report.svg import Plot
 
-# Hues of Okabe & Ito (2008), told apart with every common colour blindness;
+# Hues of Okabe & Ito (2008), distinct with every common colour blindness;
 # lifted for the dark form.
 _LIGHT = ('#0072b2', '#d55e00', '#009e73', '#cc79a7', '#b07d00', '#3a9bd9', '#6b4fa0', '#5f6b6d')
 _DARK = ('#5cb3f0', '#ff8a45', '#35cfa0', '#ea9cc9', '#e6b84a', '#9bd2f7', '#b59cf0', '#a9b4b6')

@@ -8,6 +8,7 @@ import math
 import re
 
 import numpy as np
+from ou_monitor.criticism.curves import outline
 from ou_monitor.paper.reproduce import paper, transient
 from ou_monitor.paper.reproduce.crest import crest
 from ou_monitor.paper.reproduce.figures import lorentzian
@@ -107,20 +108,12 @@ def _transient() -> list[str]:
                       for offset in (False, True))
     t = np.linspace(0.0, 0.055, 221)
     rail = transient.TYPICAL_RAIL
-    w = 2.0 * math.pi * transient.CORNER_HZ
-    peak = math.log(rail / w) / (rail - w)
-    seen = transient.through_coupling(peak + t, rail)
-    used = slice(0, paper.FIG_5_USED)
-    misfit = np.log(transient.VALUE[used] / transient.through_coupling(
-        peak + transient.TIME[used], rail))
-    scale = math.exp(float(misfit.mean()))
-    worst = float(np.abs(np.expm1(misfit - misfit.mean())).max())
+    behind, worst = transient.fitted_through_coupling(t)
     curves = (
         (line.start * np.exp(-line.alpha * t), f'ln fit to 35 ms, {line.alpha:.1f} 1/s', 'thick'),
         (plain(t), f'exponential, {plain.parameters[1]:.1f} 1/s', ''),
         (shifted(t), f'with offset, {shifted.parameters[1]:.1f} 1/s', 'thick'),
-        (scale * seen,
-         f'rail of {rail:g} 1/s behind {transient.CORNER_HZ:g} Hz', 'dash'))
+        (behind, f'rail of {rail:g} 1/s behind {transient.CORNER_HZ:g} Hz', 'dash'))
     drawn = []
     for log in (False, True):
         plot = Plot('Fig. 5: decay after 20 %' + (', log scale' if log else ''), 'time, ms',
@@ -131,7 +124,7 @@ def _transient() -> list[str]:
         plot.markers(1e3 * transient.TIME, transient.VALUE, 'points of Fig. 5', 7)
         drawn.append(page.figure(plot))
     return [page.pair(*drawn), page.paragraph(
-        f'Dashed: a rail {rail / paper.ALPHA.value:.0f} times faster, seen through an AC coupling '
+        f'Dashed: a rail {rail / paper.ALPHA.value:.0f} times faster, behind an AC coupling '
         f'of {transient.CORNER_HZ:g} Hz, comes within {100 * worst:.0f} % of the four points of '
         f'the fit. The last point lies below it and below both exponentials.',
         soft=True)]
@@ -170,7 +163,7 @@ def _crest_and_factor(result: Reproduction) -> list[str]:
     edges = np.linspace(2.5, 10.0, 1 + _BINS)
     for k, (ms, values) in enumerate(sorted(result.crests.by_screen.items())):
         share, _ = np.histogram(values, edges, density=True)
-        crests.line(np.repeat(edges, 2)[1:-1], np.repeat(share, 2), f'{ms} ms', k)
+        crests.line(*outline(edges, share), f'{ms} ms', k)
     crests.limits(x=(2.5, 10.0), y=(0.0, 1.15))
     for state in paper.LOADED:
         crests.mark(crest(state)[0], state.label)

@@ -95,13 +95,13 @@ class Plot:
              style: str = '') -> Plot:
         """Add a line; NaN breaks it."""
         self.curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
-                                  f's{colour % SERIES} {style}'.strip(), 'line'))
+                                 f's{colour % SERIES} {style}'.strip(), 'line'))
         return self
 
     def steps(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0) -> Plot:
         """Add a line that holds each value until the next point."""
         self.curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
-                                  f's{colour % SERIES}', 'steps'))
+                                 f's{colour % SERIES}', 'steps'))
         return self
 
     def band(self, x: FloatArray, low: FloatArray, high: FloatArray, label: str = '',
@@ -115,7 +115,7 @@ class Plot:
     def markers(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0) -> Plot:
         """Add a dot at each point; none where it is NaN."""
         self.curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
-                                  f's{colour % SERIES}', 'markers'))
+                                 f's{colour % SERIES}', 'markers'))
         return self
 
     def bars(self, x: FloatArray, low: FloatArray, high: FloatArray, label: str = '',
@@ -127,7 +127,7 @@ class Plot:
         return self
 
     def shade(self, start: float, stop: float, colour: int = 0, label: str = '') -> Plot:
-        """Shade a stretch of the x axis; its label is drawn where there is room."""
+        """Shade a span of the x axis; its label is drawn where there is room."""
         self.shades.append((start, stop, f's{colour % SERIES}', label))
         return self
 
@@ -247,7 +247,7 @@ class Plot:
         if curve.high is not None:
             pieces = []
             px, low, high = x(curve.x), y(curve.y), y(curve.high)
-            for run in _stretches(np.isfinite(px) & np.isfinite(low) & np.isfinite(high)):
+            for run in _runs(np.isfinite(px) & np.isfinite(low) & np.isfinite(high)):
                 there = _points(px[run], low[run])
                 back = _points(px[run][::-1], high[run][::-1])
                 pieces.append(f'M{there}L{back}Z')
@@ -258,7 +258,7 @@ class Plot:
             px, py = np.repeat(px, 2)[1:], np.repeat(py, 2)[:-1]
         px, py = thin(px, py, self.width)
         pieces = [f'M{_points(px[run], py[run])}'
-                  for run in _stretches(np.isfinite(px) & np.isfinite(py))]
+                  for run in _runs(np.isfinite(px) & np.isfinite(py))]
         return f'<path class="line {curve.style}" d="{"".join(pieces)}"/>'
 
     def _legend(self, right: int, bottom: int) -> list[str]:
@@ -296,8 +296,8 @@ def _pixels(*columns: FloatArray) -> list[list[float]]:
     return found
 
 
-def _stretches(good: np.ndarray) -> list[slice]:
-    """Return the unbroken stretches of True."""
+def _runs(good: np.ndarray) -> list[slice]:
+    """Return the unbroken runs of True."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], good.astype(np.int8), [0]))))
     return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2])]
 

@@ -117,7 +117,7 @@ def test_none_is_said_with_the_limit(table, capsys):
     assert 0.0 < data['gain_limit_per_v'] < GAIN
     assert main(['coupling', str(table), '--signal', 'gyro_y']) == 0
     text = capsys.readouterr().out
-    assert 'No coupling seen' in text and 'would have been seen' in text
+    assert 'No coupling detected' in text and 'would have been detected' in text
     assert max(map(len, text.splitlines())) <= 100
 
 
@@ -125,7 +125,7 @@ def test_seen_is_said_in_words(table, capsys):
     """Gain, interval, lag."""
     assert main(['coupling', str(table), '--signal', 'gyro_x', '--band', '10,60']) == 0
     text = capsys.readouterr().out
-    assert 'Coupling is seen' in text and 'per V' in text and '10..60 Hz' in text
+    assert 'Coupling detected' in text and 'per V' in text and '10..60 Hz' in text
 
 
 @pytest.mark.parametrize('options, words', [

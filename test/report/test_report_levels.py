@@ -4,11 +4,11 @@ import re
 from xml.etree import ElementTree
 
 import numpy as np
+from ou_monitor.criticism.curves import compare_curves
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.report.discovery_page import _plot
-from ou_monitor.report.pictures import pictures
 from ou_monitor.report.svg import Plot
 import pytest
 
@@ -19,7 +19,7 @@ def by_throttle(throttle):
     model = SupplyModel((OU(60.0, 0.3, 5.0),))
     rng = np.random.default_rng(3)
     v = model.simulate(t, rng, throttle) - 0.5 * throttle
-    drawn = pictures(Samples(t, v, throttle), [model, model], rng, draws=5)
+    drawn = compare_curves(Samples(t, v, throttle), [model, model], rng, draws=5)
     return v, drawn[-2:]
 
 

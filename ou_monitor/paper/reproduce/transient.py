@@ -153,6 +153,21 @@ def through_coupling(time: FloatArray, rail: float, corner: float = CORNER_HZ) -
     return np.asarray(rail / (rail - w) * (np.exp(-w * time) - np.exp(-rail * time)))
 
 
+def fitted_through_coupling(time: FloatArray) -> tuple[FloatArray, float]:
+    """
+    Return the typical rail behind the coupling, scaled to the points of the paper's fit.
+
+    time in s from the turning point of the curve; mV, and the largest relative misfit.
+    """
+    pole = 2.0 * math.pi * CORNER_HZ
+    turning = math.log(TYPICAL_RAIL / pole) / (TYPICAL_RAIL - pole)
+    used = slice(0, paper.FIG_5_USED)
+    misfit = np.log(VALUE[used] / through_coupling(turning + TIME[used], TYPICAL_RAIL))
+    scale = math.exp(float(misfit.mean()))
+    return (scale * through_coupling(turning + time, TYPICAL_RAIL),
+            float(np.abs(np.expm1(misfit - misfit.mean())).max()))
+
+
 def seen_rate(rail: float, corner: float = CORNER_HZ) -> float:
     """Return the rate the paper's fit gives for a step seen through a high-pass, 1/s."""
     w = 2.0 * math.pi * corner

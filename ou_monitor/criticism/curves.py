@@ -1,4 +1,8 @@
-"""Data beside simulations of two models: the same curve of each, and the band they span."""
+"""
+Curves of the data beside those of simulations of models: spectrum, distribution, by throttle.
+
+Also the histograms that pages draw: bins after Freedman and Diaconis, and their outline.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +11,12 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.criticism.adc import find_step
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray
+from scipy.signal import welch
 
 # Simulations of each model: their range leaves out about one point in twenty.
 DRAWS = 40
@@ -24,7 +30,7 @@ _Curve = tuple[tuple[str, str, str], FloatArray, Curve, tuple[bool, bool, bool]]
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class Comparison:
     """
     A curve of the data, and what simulations make of it.
 
@@ -54,8 +60,8 @@ class Picture:
     points: bool = False
 
 
-def pictures(samples: Samples, models: Sequence[SupplyModel], rng: np.random.Generator,
-             draws: int = DRAWS) -> list[Picture]:
+def compare_curves(samples: Samples, models: Sequence[SupplyModel], rng: np.random.Generator,
+                   draws: int = DRAWS) -> list[Comparison]:
     """Simulate the models and compare curves."""
     curves = _curves(samples)
     bands: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in curves]
@@ -66,15 +72,15 @@ def pictures(samples: Samples, models: Sequence[SupplyModel], rng: np.random.Gen
             try:
                 v = model.simulate(samples.t, rng, samples.throttle)
             except ValueError:
-                # A force that runs away has no picture.
+                # A force that runs away has no simulation.
                 break
             for k, (_, _, curve, _) in enumerate(curves):
-                made = curve(v)
-                low[k], high[k] = np.fmin(low[k], made), np.fmax(high[k], made)
+                drawn = curve(v)
+                low[k], high[k] = np.fmin(low[k], drawn), np.fmax(high[k], drawn)
         for k, (a, b) in enumerate(zip(low, high)):
             bands[k].append((np.where(np.isfinite(a), a, np.nan),
                              np.where(np.isfinite(b), b, np.nan)))
-    return [Picture(title, xl, yl, x, curve(samples.voltage), tuple(bands[k]), *log)
+    return [Comparison(title, xl, yl, x, curve(samples.voltage), tuple(bands[k]), *log)
             for k, ((title, xl, yl), x, curve, log) in enumerate(curves)]
 
 
@@ -96,17 +102,9 @@ def _curves(samples: Samples) -> list[_Curve]:
     edges = np.unique(np.round(np.geomspace(1, frequency.size, _BANDS)).astype(int)) - 1
     centres = np.array([frequency[a:max(b, a + 1)].mean()
                         for a, b in zip(edges[:-1], edges[1:])])
-    window = np.hanning(length)
-    scale = 2.0 * step / float(window @ window)
 
     def spectrum(y: FloatArray) -> FloatArray:
-        y = evened(y)
-        power = np.zeros(length // 2 + 1)
-        starts = range(0, y.size - length + 1, length // 2)
-        for a in starts:
-            part = y[a:a + length]
-            power += np.abs(np.fft.rfft(window * (part - part.mean()))) ** 2
-        power = scale * power[1:] / max(len(starts), 1)
+        power = welch(evened(y), 1.0 / step, nperseg=length)[1][1:]
         return np.array([power[a:max(b, a + 1)].mean() for a, b in zip(edges[:-1], edges[1:])])
 
     lags = np.unique(np.round(np.geomspace(1, max(size // 20, 2), _LAGS)).astype(int))
@@ -190,3 +188,14 @@ def _middle(edges: FloatArray) -> FloatArray:
 def _density(y: FloatArray, edges: FloatArray) -> FloatArray:
     counts = np.histogram(y, edges)[0]
     return np.asarray(counts / (y.size * np.diff(edges)), dtype=np.float64)
+
+
+def bin_width(values: FloatArray) -> float:
+    """Return the width of the bins of a histogram after Freedman and Diaconis (1981)."""
+    low, high = np.quantile(values, [0.25, 0.75])
+    return float(2.0 * (high - low) / values.size ** (1.0 / 3.0))
+
+
+def outline(edges: FloatArray, heights: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return the corners of a histogram, from the first edge to the last."""
+    return np.repeat(edges, 2)[1:-1], np.repeat(np.asarray(heights, dtype=np.float64), 2)
