@@ -154,8 +154,8 @@ def _lines(analysis: Analysis) -> str:
         least = max(level.lines.detectable for level in searched)
         none = 'No spectral line at any level (1 % false alarms); '
         return paragraph(none + (
-            f'one of {number(1e3 * least)} mV rms would have been detected at each of those searched '
-            '(90 %).' if math.isfinite(least) else
+            f'one of {number(1e3 * least)} mV rms would have been detected at each of those '
+            'searched (90 %).' if math.isfinite(least) else
             'how large one would have to be is not known with so few samples.'))
     text = table(['throttle', 'line Hz', 'rms mV', '95 %', 'of variance', 'p'],
                  rows[:_MOST_LINES])

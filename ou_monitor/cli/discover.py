@@ -1,4 +1,4 @@
-"""`ou-monitor discover RECORDING`: what the simulation gets wrong, why, and the gain of mending it."""
+"""`ou-monitor discover RECORDING`: what the simulation gets wrong, why, and the gain."""
 
 from __future__ import annotations
 

@@ -63,8 +63,8 @@ def run(args: argparse.Namespace) -> int:
     duration = _positive('--duration', preset.duration if args.duration is None
                          else args.duration, 's')
     if not 1.0 <= duration * rate <= 1e12:
-        raise InputError(f'{duration:g} s at {rate:g} Hz are {duration * rate:.3g} samples, outside '
-                         '1 to 1e12')
+        raise InputError(f'{duration:g} s at {rate:g} Hz are {duration * rate:.3g} samples, '
+                         'outside 1 to 1e12')
     if duration > _DURATION_MOST:
         raise InputError(f'--duration must be at most {_DURATION_MOST:g} s, as bags count in ns; '
                          f'got {duration:g}')

@@ -47,7 +47,8 @@ _LOG = 'standard error of its logarithm'
 
 COLUMNS = (
     Column('vehicle', 'text', '', 'vehicle; null where it is unknown'),
-    Column('vehicle_from', 'text', '', 'where the name of the vehicle is from: metadata, pattern, folder'),
+    Column('vehicle_from', 'text', '', 'where the name of the vehicle is from: metadata, pattern, '
+           'folder'),
     Column('flight', 'count', '', 'number of the flight of this vehicle, from 1'),
     Column('start', 'time', '', 'first sample; null where its clock does not know the date'),
     Column('recording', 'text', '', 'name of the recording'),
@@ -70,7 +71,8 @@ COLUMNS = (
     Column('noise_std', 'number', 'V', 'white noise of the sensor'),
     Column('excess_kurtosis', 'number', '1', 'of the innovations; 0 for a Gaussian'),
     Column('impulses', 'count', '', 'innovations larger than the largest normal one would be'),
-    Column('line_hz', 'number', 'Hz', 'frequency of the strongest spectral line; null: none found'),
+    Column('line_hz', 'number', 'Hz', 'frequency of the strongest spectral line; null: none '
+           'found'),
     Column('line_rms', 'number', 'V', 'its rms'),
     Column('process', 'text', '', 'type of process'),
     Column('risk', 'number', '1', 'probability of a brown-out within the horizon, from the level; '
@@ -86,8 +88,8 @@ COLUMNS = (
     Column('sag_se', 'number', 'V', 'standard error of sag'),
     Column('alpha_p', 'number', '1', 'p-value of alpha being the same at all levels'),
     Column('quality', 'texts', '', 'what to know about the recording, worst first'),
-    Column('risk_max', 'number', '1', 'highest risk that the node would have published on the way; '
-           'needs --brownout-voltage'),
+    Column('risk_max', 'number', '1', 'highest risk that the node would have published on the '
+           'way; needs --brownout-voltage'),
     Column('verdict', 'text', '', 'verdict of discover; null without --discover'),
     Column('causes', 'texts', '', 'causes that discover names; null without --discover'),
     Column('gain', 'number', 'nat', 'gain of the extended model, per sample kept back'),

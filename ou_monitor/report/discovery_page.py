@@ -1,4 +1,4 @@
-"""The report of `discover`: what the simulation gets wrong, why, and the gain of mending it."""
+"""The report of `discover`: what the simulation gets wrong, why, and the gain."""
 
 from __future__ import annotations
 
