@@ -148,6 +148,7 @@ def _rms(values: Sequence[float]) -> float:
 def _mean_se(weight: FloatArray, good: Sequence[Estimate]) -> float:
     return float(np.sqrt(weight ** 2 @ np.array([e.u0_se for e in good]) ** 2))
 
+
 @dataclass(frozen=True, eq=False)
 class LevelResult:
     """
