@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import math
 
 # Half the width of a 95 % interval, in standard errors of a normal law.
@@ -26,6 +26,13 @@ def printable(text: object, most: int | None = None) -> str:
         head = (most - 3) // 3
         found = f'{found[:head]}...{found[len(found) - (most - 3 - head):]}'
     return found
+
+
+def some(names: Iterable[str], most: int = 40) -> str:
+    """Return names in one line; beyond `most` only their number."""
+    held = list(names)
+    more = len(held) - most
+    return ', '.join(held[:most]) + (f' and {more} more' if more > 0 else '')
 
 
 def number(value: float, digits: int = 3) -> str:

@@ -17,11 +17,12 @@ from contextlib import contextmanager, suppress
 import multiprocessing
 from multiprocessing.connection import Connection
 import os
-from pathlib import Path
 import resource
 import signal
 import threading
 from typing import Any
+
+from ou_monitor.recordings.limits import usable_memory
 
 # Several processes with several threads of linear algebra each are slower than with one.
 _ONE_THREAD = dict.fromkeys(
@@ -38,16 +39,6 @@ def usable_cores() -> int:
     """Return how many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else (
         os.cpu_count() or 1)
-
-
-def usable_memory() -> int:
-    """Return the memory that this process may use, byte: the machine's, or its control group's."""
-    limits = [os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')]
-    for file in ('/sys/fs/cgroup/memory.max', '/sys/fs/cgroup/memory/memory.limit_in_bytes'):
-        # Not there, or the word "max".
-        with suppress(OSError, ValueError):
-            limits.append(int(Path(file).read_text(encoding='ascii')))
-    return min(limits)
 
 
 class Workers(ABC):

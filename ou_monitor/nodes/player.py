@@ -18,6 +18,7 @@ from ou_monitor.nodes.prefetch import Prefetch
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.write import LAST_HEADER_NS
 from rclpy.duration import Duration
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -89,8 +90,9 @@ class Player(Node):
     def _advertise(self, topic: str, kind: str) -> None:
         try:
             self._outputs[topic] = self.create_publisher(message_class(kind), topic, DEPTH)
-        except InputError as error:
-            self._skipped[topic] = f"topic '{topic}' is left out: {error}"
+        except (InputError, InvalidTopicNameException) as error:
+            self._skipped[topic] = ' '.join(
+                f"topic '{topic}' is left out: {error}".split())
             self.get_logger().warning(self._skipped[topic])
 
     def going(self) -> bool:

@@ -30,7 +30,7 @@ from ou_monitor.recordings.mcap_file import (
     backwards, in_parts, in_time_order, McapFile, Part, RawMessage)
 from ou_monitor.recordings.mcap_records import Table
 from ou_monitor.recordings.rosbag2_metadata import find_files, parse_qos, TopicInfo
-from ou_monitor.text import printable
+from ou_monitor.text import printable, some
 import zstandard
 
 
@@ -211,7 +211,7 @@ class BagReader:
         self.message_count = sum(info.count for info in self.info.values())
         if self.message_count == 0:
             why = self.damage or ' '.join(self.notes) or (
-                'topics: ' + (', '.join(self.topics) or 'none'))
+                'topics: ' + (some(self.topics) or 'none'))
             raise InputError(f'{self.path} holds no messages ({why})')
 
     def __enter__(self) -> BagReader:

@@ -6,7 +6,9 @@ In proportion to the file and to the memory, so that a small file cannot take al
 
 from __future__ import annotations
 
+from contextlib import suppress
 import os
+from pathlib import Path
 import resource
 
 from ou_monitor.errors import InputError
@@ -22,6 +24,21 @@ _MOST_RATIO = 256
 _LEAST_LIMIT = 64 * 1024 * 1024
 _CHUNKS_AT_ONCE = 8
 _VARIABLE = 'OU_MONITOR_MAX_CHUNK_MB'
+
+
+def usable_memory() -> int:
+    """
+    Return the memory that this process may use, byte.
+
+    That of the machine, of its control group, or of its own limit, whatever is least.
+    """
+    limits = [os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')]
+    for file in ('/sys/fs/cgroup/memory.max', '/sys/fs/cgroup/memory/memory.limit_in_bytes'):
+        # Not there, or the word "max".
+        with suppress(OSError, ValueError):
+            limits.append(int(Path(file).read_text(encoding='ascii')))
+    allowed = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return min(limits if allowed == resource.RLIM_INFINITY else [*limits, allowed])
 
 
 def chunk_limit(size: int, stated: int | None = None) -> int:
@@ -40,12 +57,8 @@ def chunk_limit(size: int, stated: int | None = None) -> int:
         except (ValueError, OverflowError):
             raise InputError(f'{_VARIABLE} must be a number of MB, got '
                              f"'{printable(text, 40)}'") from None
-    memory = os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE')
-    allowed = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if allowed != resource.RLIM_INFINITY:
-        memory = min(memory, allowed)
     return min(max(_LEAST_LIMIT, _MOST_RATIO * size),
-               max(_LEAST_LIMIT, memory // _CHUNKS_AT_ONCE))
+               max(_LEAST_LIMIT, usable_memory() // _CHUNKS_AT_ONCE))
 
 
 def file_limit(size: int, chunk: int) -> int:

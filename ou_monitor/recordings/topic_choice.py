@@ -14,6 +14,7 @@ from pathlib import Path
 
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
+from ou_monitor.text import some
 
 
 @dataclass(frozen=True)
@@ -61,20 +62,20 @@ def choose(
         if not found:
             raise InputError(_not_there(path, config, topics))
         if len(found) > 1:
-            raise InputError(f"{path}: several topics fit: {', '.join(found)}; choose with "
+            raise InputError(f'{path}: several topics fit: {some(found)}; choose with '
                              '--voltage-topic')
         topic = found[0]
     throttle, notes = _throttle(path, config, topics, topic, throttle_topic)
     others = [name for name in _alike(config.voltage, topics) if name != topic]
     if voltage_topic is None and others:
-        notes = (*notes, f"{topic} was taken for the voltage; {', '.join(others)} would fit too: "
+        notes = (*notes, f'{topic} was taken for the voltage; {some(others)} would fit too: '
                          'choose with --voltage-topic.')
     return Choice(config, replace(config.voltage, topic=topic), throttle, notes)
 
 
 def listed(topics: Mapping[str, str]) -> str:
     """Return topics with their types in one line."""
-    return ', '.join(f'{name} ({kind})' for name, kind in sorted(topics.items()))
+    return some(f'{name} ({kind})' for name, kind in sorted(topics.items()))
 
 
 def _absolute(topic: str) -> str:
@@ -168,5 +169,5 @@ def _throttle(
     if wanted in topics and not found:
         why = f"topic '{wanted}' is {topics[wanted]}, not {spec.type}"
     else:
-        why = f"several topics fit ({', '.join(found)})" if found else f"no topic '{wanted}'"
+        why = f'several topics fit ({some(found)})' if found else f"no topic '{wanted}'"
     return None, (f'The throttle is unknown: {why}; name one with --throttle-topic.',)

@@ -25,7 +25,7 @@ NAN_RULES = ('drop', 'unknown')
 FieldPath = tuple[str | int, ...]
 
 _TYPE = re.compile(r'[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*')
-_STEP = re.compile(r'([A-Za-z_][A-Za-z0-9_]*)((?:\[\d+\])*)')
+_STEP = re.compile(r'([A-Za-z_][A-Za-z0-9_]*)((?:\[\d{1,9}\])*)')
 _TOPIC = re.compile(r'[~/]?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
 
 

@@ -10,6 +10,9 @@ import lz4.frame
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagReader, BagWriter
+from ou_monitor.recordings.importers.csv_log import MOST_COLUMNS
+from ou_monitor.recordings.importers.formats import import_log
+from ou_monitor.recordings.importers.log import Request
 from ou_monitor.recordings.mcap_records import find_by_index, find_messages, MAGIC, Op
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.recordings.standard_types import encode_scalars, FLOAT64
@@ -259,6 +262,16 @@ def test_names_of_any_length(tmp_path):
     assert all(len(note) < 400 for note in bag.notes)
 
 
+def test_topics_of_any_number(tmp_path):
+    """A refusal names some of them."""
+    many = b''.join(channel(f'/x{k}', k + 2) for k in range(3000))
+    path = written(tmp_path / 'a.mcap', chunk(
+        schema() + many + b''.join(message(k, bytes(12), 2 + k) for k in range(3000))))
+    line = complaint(read_recording, path, within=10.0)
+    assert len(line) < 5000 and 'more' in line
+    assert len(complaint(read_recording, path, voltage_topic='/none', within=10.0)) < 5000
+
+
 def test_definitions_of_any_length(tmp_path):
     """One of megabytes is left out."""
     path = written(tmp_path / 'a.mcap', chunk(
@@ -369,3 +382,22 @@ def test_csv_lines_have_an_end(tmp_path):
         path.write_bytes(content)
         line = complaint(read_recording, path)
         assert len(line) < len(str(path)) + 200, line
+
+
+def test_columns_without_end_are_listed_in_part(tmp_path):
+    """The file is not read once for each of thousands."""
+    names = [f'c{k}' for k in range(5000)]
+    path = tmp_path / 'a.csv'
+    path.write_text(','.join(['time_s', *names]) + '\n' + ','.join(['1'] * 5001) + '\n')
+    log = import_log(path, Request(everything=True))
+    assert len(log.series) == MOST_COLUMNS and '4700 more columns' in log.notes[-1]
+
+
+def test_names_in_a_csv_do_not_reach_the_terminal(tmp_path):
+    """In errors, in the list of columns, and in what is said of one that holds text."""
+    path = tmp_path / 'a.csv'
+    path.write_text('time_s,voltage_v,a\x9b2J,b\u202e\n0,5,1,x\n1,5,1,x\n')
+    log = import_log(path, Request(everything=True))
+    assert all(word.isprintable() for word in (*log.notes, *(one.name for one in log.series)))
+    path.write_text('time_s,volt\x1b[2J\n0,5\n')
+    assert 'volt' in complaint(read_recording, path)

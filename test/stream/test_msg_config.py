@@ -73,6 +73,8 @@ def test_px4_throttle_is_mapped_to_0_1():
     ('voltage', {'type': 'my_msgs/Rail'}, ["'my_msgs/Rail'", 'package/msg/Type']),
     ('voltage', {'topic': 'a b'}, ["'a b'", 'topic']),
     ('voltage', {'field': 'cells[x]'}, ["'cells[x]'"]),
+    ('voltage', {'field': f'cells[{"9" * 5000}]'}, ['field path', '...']),
+    ('voltage', {'x' * 5000: 1}, ['unknown key: valid: ']),
     ('voltage', {'stamp_field': 3}, ["'stamp_field'", 'text or null', '3']),
 ])
 def test_a_mistake_is_named(tmp_path, part, change, expected):

@@ -19,6 +19,9 @@ from ou_monitor.recordings.importers.log import ANY, Log, one_flight, Request, S
 # Column -> what it is, when nothing is said.
 KNOWN = {VOLTAGE: logs.VOLTAGE, THROTTLE: logs.THROTTLE, 'current_a': logs.CURRENT}
 
+# Columns that are looked at for a list of all; autopilots write up to some hundred.
+MOST_COLUMNS = 300
+
 
 def read(path: Path, request: Request) -> Log:
     """Read the columns that are known by name, and those asked for."""
@@ -40,9 +43,11 @@ def read(path: Path, request: Request) -> Log:
         order = np.argsort(t, kind='stable')
         series = [replace(one, t=t[order], values=one.values[order]) for one in series]
     if request.everything:
-        for name in dict.fromkeys(header):
-            if name in wanted:
-                continue
+        others = [name for name in dict.fromkeys(header) if name not in wanted]
+        if len(others) > MOST_COLUMNS:
+            notes.append(f'{len(others) - MOST_COLUMNS} more columns are not listed.')
+        # The file is read once for each, as a column of text ends its reading.
+        for name in others[:MOST_COLUMNS]:
             try:
                 values = read_columns(path, [TIME, name])[1]
             except InputError:
