@@ -1,5 +1,7 @@
 """A random walk whose speed is learned: against walks of known speed."""
 
+import math
+
 import numpy as np
 from ou_monitor.online.risk.curve_filters import Wander
 import pytest
@@ -51,3 +53,29 @@ def test_an_outlier_does_not_carry_it_away():
     before = wander.value
     wander.correct(before + 10.0, NOISE**2)
     assert abs(wander.value - before) < 5.0 * NOISE
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_what_was_seen_is_forgotten_over_two_minutes(seed):
+    """In logarithms: after t without data exp(-t / 120 s) of the odds between speeds is left."""
+    prior = np.array([0.15, 0.2, 0.2, 0.2, 0.15, 0.1])
+    speeds = np.array([0.0, 1e-4, 5e-4, 2e-3, 8e-3, 3e-2])
+
+    def faded(weight, t):
+        kept = weight ** math.exp(-t / 120.0) * prior ** (1.0 - math.exp(-t / 120.0))
+        return float(kept @ speeds / kept.sum())
+
+    for silence in (30.0, 120.0, 300.0):
+        wander = Wander()
+        # One look, by which the odds between speeds are known in closed form.
+        wander.elapse(1e-9)
+        variance = 0.5 + speeds * 1e-9
+        wander.elapse(20.0)
+        variance = variance + speeds * 20.0
+        seen = 0.3 * np.random.default_rng(seed).standard_normal()
+        wander.correct(seen, NOISE**2)
+        total = variance + NOISE**2
+        weight = prior * np.exp(-0.5 * seen**2 / total) / np.sqrt(total)
+        wander.elapse(silence)
+        assert wander.speed == pytest.approx(faded(weight, silence), rel=1e-6)
+        assert abs(faded(weight, silence) / faded(weight, 2.0 * silence) - 1.0) > 1e-3
