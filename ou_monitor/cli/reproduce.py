@@ -16,8 +16,7 @@ def run(args: argparse.Namespace) -> int:
     """Reproduce."""
     check_outputs(args, 'report')
 
-    from ou_monitor.paper.reproduce.reproduce import reproduce
-    from ou_monitor.paper.reproduce.words import as_data
+    from ou_monitor.paper.reproduce.reproduce import as_data, reproduce
 
     with output.Progress('recomputing') as progress:
         result = reproduce(args.seed, progress)
@@ -36,8 +35,7 @@ def run(args: argparse.Namespace) -> int:
 
 def render(result: Reproduction) -> str:
     """Return the rows and points for a terminal 100 columns wide."""
-    from ou_monitor.paper.reproduce.points import tally
-    from ou_monitor.paper.reproduce.words import headline, recomputed
+    from ou_monitor.paper.reproduce.reproduce import headline, recomputed, tally
 
     lines = [output.paragraph(headline(result))]
     rows = [[row.where if k == 0 or row.where != found[k - 1].where else '',

@@ -9,15 +9,13 @@ import re
 
 import numpy as np
 from ou_monitor.criticism.curves import outline
-from ou_monitor.paper.reproduce import paper, transient
+from ou_monitor.paper.reproduce import published, transient
 from ou_monitor.paper.reproduce.crest import crest
 from ou_monitor.paper.reproduce.figures import lorentzian
 from ou_monitor.paper.reproduce.network import share_above
-from ou_monitor.paper.reproduce.points import tally
-from ou_monitor.paper.reproduce.reproduce import Reproduction
+from ou_monitor.paper.reproduce.reproduce import headline, recomputed, Reproduction, tally
 from ou_monitor.paper.reproduce.row import Row
 from ou_monitor.paper.reproduce.table2 import sigma_of
-from ou_monitor.paper.reproduce.words import headline, recomputed
 from ou_monitor.report import page
 from ou_monitor.report.scale import span
 from ou_monitor.report.svg import Plot
@@ -124,8 +122,8 @@ def _transient() -> list[str]:
         plot.markers(1e3 * transient.TIME, transient.VALUE, 'points of Fig. 5', 7)
         drawn.append(page.figure(plot))
     return [page.pair(*drawn), page.paragraph(
-        f'Dashed: a rail {rail / paper.ALPHA.value:.0f} times faster, behind an AC coupling '
-        f'of {transient.CORNER_HZ:g} Hz, comes within {100 * worst:.0f} % of the four points of '
+        f'Dashed: a rail {rail / published.ALPHA.value:.0f} times faster, behind an AC '
+        f'coupling of {transient.CORNER_HZ:g} Hz, comes within {100 * worst:.0f} % of the four points of '
         f'the fit. The last point lies below it and below both exponentials.',
         soft=True)]
 
@@ -138,16 +136,16 @@ def _spectrum(result: Reproduction) -> list[str]:
     lines = []
     for k, found in enumerate(result.figures.spectra):
         state = found.state
-        curve = lorentzian(wide, paper.ALPHA.value, sigma_of(state))
+        curve = lorentzian(wide, published.ALPHA.value, sigma_of(state))
         lines += [curve, found.density]
         plot.line(found.frequency, found.density, f'{state.label}, simulated', k, 'faint')
         plot.line(wide, curve, f'{state.label}, Lorentzian', k, 'dash thick')
-        if state is paper.HIGH:
+        if state is published.HIGH:
             plot.line(found.frequency, found.coupled,
                       f'{state.label}, behind {transient.CORNER_HZ:g} Hz coupling', 2)
     plot.limits(x=(1.0, 5e5), y=span(lines, log=True))
-    plot.mark(paper.ALPHA.value / (2.0 * math.pi), 'alpha/2\u03c0 = 10.03 Hz')
-    low, high = paper.ESC_HZ
+    plot.mark(published.ALPHA.value / (2.0 * math.pi), 'alpha/2\u03c0 = 10.03 Hz')
+    low, high = published.ESC_HZ
     plot.shade(low, high, 4)
     plot.mark(low, '').mark(high, 'ESC 24..48 kHz')
     return [page.figure(plot, (
@@ -165,7 +163,7 @@ def _crest_and_factor(result: Reproduction) -> list[str]:
         share, _ = np.histogram(values, edges, density=True)
         crests.line(*outline(edges, share), f'{ms} ms', k)
     crests.limits(x=(2.5, 10.0), y=(0.0, 1.15))
-    for state in paper.LOADED:
+    for state in published.LOADED:
         crests.mark(crest(state)[0], state.label)
     s = result.spreading
     t = 1e3 * s.t

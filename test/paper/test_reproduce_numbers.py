@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 from ou_monitor.paper.reproduce import (
-    averaging, network, paper, probability, table1, table2, transient)
+    network, probability, published, switching, table1, table2, transient)
 from ou_monitor.paper.reproduce.row import Printed, Verdict
 import pytest
 from scipy.signal import lsim
@@ -67,7 +67,7 @@ def test_chance_of_a_step_is_about_right():
 @pytest.mark.parametrize('label, percent', [('5 %', 50), ('10 %', 17), ('40 %', 8)])
 def test_half_a_step_of_vrms(label, percent):
     """As THEORY has it: +-50, 17 and 8 %."""
-    state = next(s for s in paper.LOADED if s.label == label)
+    state = next(s for s in published.LOADED if s.label == label)
     low, high = table1.vrms_range(state)
     assert round(50.0 * (high - low) / state.vrms.value) == percent
 
@@ -89,8 +89,8 @@ def test_idle_reads_zero_below_one_step(first_table):
 
 def test_exponents_of_growth():
     """From the steps ln 3 / ln 2 = 1.585 and ln 2 / ln 4 = 0.5; ranges by brute force."""
-    for pair, exact in (((paper.LOW, paper.MEDIUM), math.log(3) / math.log(2)),
-                        ((paper.MEDIUM, paper.HIGH), 0.5)):
+    for pair, exact in (((published.LOW, published.MEDIUM), math.log(3) / math.log(2)),
+                        ((published.MEDIUM, published.HIGH), 0.5)):
         value, (low, high) = table1.exponent(*pair)
         assert value == pytest.approx(exact, abs=0.003)
         span = math.log(pair[1].load / pair[0].load)
@@ -281,7 +281,7 @@ def test_share_of_the_variance_at_the_esc_lines():
 
 def test_matrix_as_printed_and_averaged():
     """Growth by e; a phase that is e times faster; a power of two exponentials."""
-    rows = by_quantity(averaging.rows(np.random.default_rng(7), paths=200))
+    rows = by_quantity(switching.averaging_rows(np.random.default_rng(7), paths=200))
     assert rows['P(tau)/P(0), +gamma on the diagonal'].recomputed == pytest.approx(math.e)
     assert rows['phase: late over early advance'].recomputed == pytest.approx(math.e)
     amplitude = rows['amplitude: late over early decay']

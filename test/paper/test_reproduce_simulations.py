@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from ou_monitor.paper.reproduce import crest, jumps, paper, switching
+from ou_monitor.paper.reproduce import crest, jumps, published, switching
 from ou_monitor.paper.reproduce.row import Verdict
 import pytest
 from scipy.integrate import solve_ivp
@@ -192,9 +192,10 @@ def test_jumps_raise_the_crest_factor_of_long_screens(crests):
     best = jumps.largest(found, 500)
     assert best.mean == max(c.mean for c in found if c.screen == 500)
     assert best.mean - crests.mean(500)[0] > 5.0 * best.error
-    assert best.size(1.0) ** 2 * best.rate / (2.0 * paper.ALPHA.value) == pytest.approx(best.share)
+    share = best.size(1.0) ** 2 * best.rate / (2.0 * published.ALPHA.value)
+    assert share == pytest.approx(best.share)
     rows = jumps.rows(found, crests)
     assert len(rows) == 5
     assert rows[0].recomputed == pytest.approx((287.5 / 56.3) / (81.3 / 9.38))
-    assert jumps.impulse_height(paper.LOW, crests) == pytest.approx(
+    assert jumps.impulse_height(published.LOW, crests) == pytest.approx(
         81.3 - 9.38 * crests.mean(100)[0])

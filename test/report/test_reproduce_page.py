@@ -3,9 +3,9 @@
 from collections import Counter
 import re
 
-from ou_monitor.paper.reproduce import paper, reproduce as module
+from ou_monitor.paper.reproduce import published, reproduce as module
+from ou_monitor.paper.reproduce.reproduce import as_data, headline, recomputed
 from ou_monitor.paper.reproduce.row import Printed, Row, Verdict
-from ou_monitor.paper.reproduce.words import as_data, headline, recomputed
 from ou_monitor.report.reproduction_page import reproduction_page
 from pages import self_contained
 import pytest
@@ -33,14 +33,14 @@ def tree(result):
 def test_every_printed_number_has_its_row(result):
     """All of Table 1, Fig. 5, Table 2 and what repeats them."""
     texts = Counter((row.where, row.printed.text) for row in result.rows)
-    for state in paper.TABLE_1:
+    for state in published.TABLE_1:
         for printed in (state.vpp, state.amp, state.vrms):
             assert texts['Table 1', printed.text] >= 1, printed.text
-    for printed in [paper.TAU_MS, *paper.SIGMA.values(), *paper.VAR_INF.values()]:
+    for printed in [published.TAU_MS, *published.SIGMA.values(), *published.VAR_INF.values()]:
         assert texts['Table 2', printed.text] == 1, printed.text
     assert texts['Fig. 5', '63.0'] >= 1 and texts['Fig. 5', '368'] == 1
     assert texts['Section 5', '11.22'] == 1
-    for where, _, printed, _ in paper.RESTATED:
+    for where, _, printed, _ in published.RESTATED:
         assert texts[where, printed.text] >= 1, where
     for where in ('Section 3.1', 'Section 3.3', 'Section 4.4', 'Section 4.5', 'Section 6'):
         assert any(row.where == where for row in result.rows), where
@@ -136,7 +136,7 @@ def test_screens_are_in_steps_and_near_their_vrms(result):
     for screen in result.figures.screens:
         steps = screen.u / 6.2503e-3
         assert abs(steps - steps.round()).max() < 0.01
-        if screen.state is not paper.IDLE:
+        if screen.state is not published.IDLE:
             ratio = 1e3 * (screen.u ** 2).mean() ** 0.5 / screen.state.vrms.value
             assert 0.2 < ratio < 2.5
 

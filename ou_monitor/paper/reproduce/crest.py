@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 from ou_monitor.model.ou import transition
-from ou_monitor.paper.reproduce import paper
+from ou_monitor.paper.reproduce import published
 from ou_monitor.paper.reproduce.row import Printed, Range, Row
 from ou_monitor.paper.reproduce.table1 import over, vpp_range, vrms_range
 from ou_monitor.records import FloatArray
@@ -81,17 +81,17 @@ def simulate_crests(rng: np.random.Generator, paths: int,
         for ms, values in _draw(rng, min(_AT_ONCE, paths - begin)).items():
             found[ms].append(values)
         progress(min(1.0, (begin + _AT_ONCE) / paths))
-    points = round(1e-3 * TYPICAL_MS * paper.SAMPLING_HZ)
+    points = round(1e-3 * TYPICAL_MS * published.SAMPLING_HZ)
     white = [float(crest_of(rng.standard_normal(points))) for _ in range(_WHITE)]
     return Crests({ms: np.concatenate(rows) for ms, rows in found.items()}, np.array(white))
 
 
 def _draw(rng: np.random.Generator, paths: int) -> dict[int, FloatArray]:
     """Return the crest factors of all screens within so many stretches."""
-    dt = _SAMPLES / paper.SAMPLING_HZ
+    dt = _SAMPLES / published.SAMPLING_HZ
     # Of stationary variance 1.
-    sigma = math.sqrt(2.0 * paper.ALPHA.value)
-    phi, q = (float(v) for v in transition(paper.ALPHA.value, sigma, dt))
+    sigma = math.sqrt(2.0 * published.ALPHA.value)
+    phi, q = (float(v) for v in transition(published.ALPHA.value, sigma, dt))
     noise = rng.standard_normal((paths, 1 + round(1e-3 * max(SCREENS_MS) / dt)))
     noise[:, 1:] *= math.sqrt(q)
     path = lfilter([1.0], [1.0, -phi], noise, axis=1)
@@ -103,7 +103,7 @@ def _draw(rng: np.random.Generator, paths: int) -> dict[int, FloatArray]:
         square + 2.0 * q * rng.standard_exponential(square.shape)) for sign in (1.0, -1.0))
     # Sampling at 1 MHz sees a little less (Broadie, Glasserman & Kou, Math.
     # Finance 7 (1997) 325): 0.5826 sigma sqrt(1 us) on each side.
-    unseen = 2.0 * 0.5826 * sigma / math.sqrt(paper.SAMPLING_HZ)
+    unseen = 2.0 * 0.5826 * sigma / math.sqrt(published.SAMPLING_HZ)
     found = {}
     for ms in SCREENS_MS:
         shape = (paths, -1, round(1e-3 * ms / dt))
@@ -112,7 +112,7 @@ def _draw(rng: np.random.Generator, paths: int) -> dict[int, FloatArray]:
     return found
 
 
-def crest(state: paper.LoadState) -> tuple[float, Range]:
+def crest(state: published.LoadState) -> tuple[float, Range]:
     """Return Vpp/Vrms of a load state and its range within half a step of either."""
     return (state.vpp.value / state.vrms.value, over(vpp_range(state), vrms_range(state)))
 
@@ -128,7 +128,7 @@ def screen_for(crest_factor: float) -> float:
     result in s.
     """
     d = 0.5 * crest_factor
-    rate = paper.ALPHA.value * d * math.exp(-0.5 * d * d) / math.sqrt(2.0 * math.pi)
+    rate = published.ALPHA.value * d * math.exp(-0.5 * d * d) / math.sqrt(2.0 * math.pi)
     return math.log(2.0) / rate
 
 
@@ -137,13 +137,13 @@ def rows(crests: Crests) -> list[Row]:
     mean, error = crests.mean(TYPICAL_MS)
     count = crests.by_screen[TYPICAL_MS].shape[0]
     found = []
-    for state in paper.LOADED:
+    for state in published.LOADED:
         value, inputs = crest(state)
         beyond = ('' if inputs[0] <= crests.band[1] else
                   f'; the least would take a screen of {screen_for(inputs[0]):.2g} s')
         found.append(Row(
             'Table 1', f'Vpp/Vrms, {state.label}', '', Printed(f'{value:.1f}'), mean,
-            f'OU with tau {paper.TAU_MS.text} ms seen at 1 MHz, {count} stretches of '
+            f'OU with tau {published.TAU_MS.text} ms seen at 1 MHz, {count} stretches of '
             f'{max(SCREENS_MS)} ms',
             f'One OU shows {mean:.1f} on a {TYPICAL_MS} ms screen and lies within '
             f'{crests.band[0]:.1f} to {crests.band[1]:.1f} on screens of {min(SCREENS_MS)} to '

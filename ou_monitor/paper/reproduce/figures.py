@@ -10,7 +10,7 @@ from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.paper.reproduce import paper
+from ou_monitor.paper.reproduce import published
 from ou_monitor.paper.reproduce.table1 import vpp_step, vrms_step
 from ou_monitor.paper.reproduce.table2 import sigma_of
 from ou_monitor.paper.reproduce.transient import CORNER_HZ
@@ -37,7 +37,7 @@ class Screen:
 
     """
 
-    state: paper.LoadState
+    state: published.LoadState
     t: FloatArray
     u: FloatArray
 
@@ -58,7 +58,7 @@ class Spectrum:
 
     """
 
-    state: paper.LoadState
+    state: published.LoadState
     frequency: FloatArray
     density: FloatArray
     coupled: FloatArray
@@ -82,10 +82,10 @@ class Figures:
     spectra: tuple[Spectrum, ...]
 
 
-def sigma_shown(state: paper.LoadState) -> float:
+def sigma_shown(state: published.LoadState) -> float:
     """Return the sigma to draw, V/sqrt(s); motors off, half a step of Vrms."""
-    if state is paper.IDLE:
-        return 0.5e-3 * vrms_step().size * math.sqrt(2.0 * paper.ALPHA.value)
+    if state is published.IDLE:
+        return 0.5e-3 * vrms_step().size * math.sqrt(2.0 * published.ALPHA.value)
     return sigma_of(state)
 
 
@@ -96,26 +96,27 @@ def lorentzian(frequency: FloatArray, alpha: float, sigma: float) -> FloatArray:
 
 def draw(rng: np.random.Generator) -> Figures:
     """Simulate what the figures show."""
-    t = np.arange(round(SCREEN * paper.SAMPLING_HZ)) / paper.SAMPLING_HZ
+    t = np.arange(round(SCREEN * published.SAMPLING_HZ)) / published.SAMPLING_HZ
     step = 1e-3 * vpp_step().size
     screens = tuple(
         Screen(state, t, step * np.round(
-            simulate(t, paper.ALPHA.value, sigma_shown(state), rng) / step))
-        for state in paper.TABLE_1)
-    return Figures(screens, tuple(_spectrum(state, rng) for state in (paper.MEDIUM, paper.HIGH)))
+            simulate(t, published.ALPHA.value, sigma_shown(state), rng) / step))
+        for state in published.TABLE_1)
+    return Figures(screens, tuple(
+        _spectrum(state, rng) for state in (published.MEDIUM, published.HIGH)))
 
 
-def _spectrum(state: paper.LoadState, rng: np.random.Generator) -> Spectrum:
+def _spectrum(state: published.LoadState, rng: np.random.Generator) -> Spectrum:
     """Return the spectrum of a simulated recording at 1 MHz, even on a log axis."""
-    t = np.arange(round(_SPECTRUM * paper.SAMPLING_HZ)) / paper.SAMPLING_HZ
-    ou = OU(paper.ALPHA.value, sigma_of(state), 0.0)
+    t = np.arange(round(_SPECTRUM * published.SAMPLING_HZ)) / published.SAMPLING_HZ
+    ou = OU(published.ALPHA.value, sigma_of(state), 0.0)
     plain = _density(simulate(t, ou.alpha, ou.sigma, rng))
     coupled = _density(SupplyModel((ou, ACCoupling(CORNER_HZ, 0.0))).simulate(t, rng))
     return Spectrum(state, plain[0], plain[1], coupled[1])
 
 
 def _density(u: FloatArray) -> tuple[FloatArray, FloatArray]:
-    frequency, density = welch(u, paper.SAMPLING_HZ, nperseg=u.size // 4)
+    frequency, density = welch(u, published.SAMPLING_HZ, nperseg=u.size // 4)
     frequency, density = frequency[2:-1], density[2:-1]
     bins = np.floor(_PER_DECADE * np.log10(frequency / frequency[0])).astype(np.intp)
     count = np.bincount(bins)

@@ -11,7 +11,7 @@ from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.jumps import Jumps
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.paper.reproduce import paper
+from ou_monitor.paper.reproduce import published
 from ou_monitor.paper.reproduce.crest import crest, crest_of, Crests, TAIL, TYPICAL_MS
 from ou_monitor.paper.reproduce.row import Printed, Range, Row
 
@@ -56,7 +56,7 @@ class JumpCrest:
 
     def size(self, vrms: float) -> float:
         """Return the standard deviation of the jumps, in the unit of `vrms`."""
-        return vrms * math.sqrt(2.0 * paper.ALPHA.value * self.share / self.rate)
+        return vrms * math.sqrt(2.0 * published.ALPHA.value * self.share / self.rate)
 
 
 def excess_kurtosis(rate: float, share: float) -> float:
@@ -66,13 +66,13 @@ def excess_kurtosis(rate: float, share: float) -> float:
     The fourth cumulant of the jumps is rate E J^4 / (4 alpha), and E J^4 is
     3 (E J^2)^2, with E J^2 = 2 alpha share Var_inf / rate.
     """
-    return 3.0 * paper.ALPHA.value * share * share / rate
+    return 3.0 * published.ALPHA.value * share * share / rate
 
 
 def simulate_jumps(rng: np.random.Generator, seconds: float,
                    progress: Callable[[float], None] = lambda share: None) -> list[JumpCrest]:
     """Draw screens of OUs with jumps (seconds in s, progress 0..1)."""
-    alpha = paper.ALPHA.value
+    alpha = published.ALPHA.value
     longest = max(SCREENS_MS)
     # One screen more: in the first the jumps begin.
     t = np.arange(round((seconds + 1e-3 * longest) * _SAMPLING)) / _SAMPLING
@@ -102,21 +102,21 @@ def largest(found: list[JumpCrest], screen: int) -> JumpCrest:
     return max((c for c in found if c.screen == screen), key=lambda c: c.mean)
 
 
-def impulse_height(state: paper.LoadState, crests: Crests) -> float:
+def impulse_height(state: published.LoadState, crests: Crests) -> float:
     """Return by how much short impulses must widen an OU to its printed Vpp, mV."""
     return state.vpp.value - crests.mean(TYPICAL_MS)[0] * state.vrms.value
 
 
 def rows(found: list[JumpCrest], crests: Crests) -> list[Row]:
     """Return the rows of section 5 on jumps."""
-    (low, low_in), (high, high_in) = crest(paper.LOW), crest(paper.HIGH)
+    (low, low_in), (high, high_in) = crest(published.LOW), crest(published.HIGH)
     inputs = (high_in[0] / low_in[1], high_in[1] / low_in[0])
     result = [Row(
         WHERE, 'Vpp/Vrms, 40 % over 5 %', '', Printed('> 1'), high / low, 'quotient from Table 1',
         f'"From Gaussian noise to impulse disturbances with load" would raise it; it falls from '
         f'{low:.1f} to {high:.1f}, a quotient that half a step of each reading lets lie within '
         f'{inputs[0]:.2f} to {inputs[1]:.2f}.', inputs=inputs, point=8)]
-    for state in (paper.LOW, paper.MEDIUM):
+    for state in (published.LOW, published.MEDIUM):
         value, inputs = crest(state)
         for ms in SCREENS_MS:
             best = largest(found, ms)

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from ou_monitor.paper.network.components import PowerNetwork
 from ou_monitor.paper.network.rail import Rail, rail_at
-from ou_monitor.paper.reproduce import paper
+from ou_monitor.paper.reproduce import published
 from ou_monitor.paper.reproduce.row import Printed, Row
 from ou_monitor.paper.reproduce.table1 import exponent, over, vrms_range
 from scipy.linalg import solve_continuous_lyapunov
@@ -29,7 +29,7 @@ def doubled(network: PowerNetwork) -> tuple[Rail, Rail]:
     """Return the bus at 40 % throttle, as it is and with a second capacitor in parallel."""
     more = replace(network, bulk_capacitance=2.0 * network.bulk_capacitance,
                    bulk_esr=0.5 * network.bulk_esr)
-    return rail_at(network, paper.HIGH.load), rail_at(more, paper.HIGH.load)
+    return rail_at(network, published.HIGH.load), rail_at(more, published.HIGH.load)
 
 
 def _elasticity(before: float, after: float) -> float:
@@ -39,7 +39,7 @@ def _elasticity(before: float, after: float) -> float:
 
 def share_above(frequency: float) -> float:
     """Return the share of an OU's variance above a frequency, Hz, for the paper's alpha."""
-    return 1.0 - 2.0 / math.pi * math.atan(2.0 * math.pi * frequency / paper.ALPHA.value)
+    return 1.0 - 2.0 / math.pi * math.atan(2.0 * math.pi * frequency / published.ALPHA.value)
 
 
 def rows() -> list[Row]:
@@ -48,11 +48,11 @@ def rows() -> list[Row]:
 
 
 def _hardware() -> list[Row]:
-    low, high = paper.ESC_HZ
-    nyquist = 0.5 * paper.SAMPLING_HZ
+    low, high = published.ESC_HZ
+    nyquist = 0.5 * published.SAMPLING_HZ
     return [
-        Row('Section 4.1', 'nominal voltage of 6S', 'V', paper.BATTERY_V,
-            3.7 * paper.BATTERY_CELLS, '6 cells of 3.7 V', 'The arithmetic is right.'),
+        Row('Section 4.1', 'nominal voltage of 6S', 'V', published.BATTERY_V,
+            3.7 * published.BATTERY_CELLS, '6 cells of 3.7 V', 'The arithmetic is right.'),
         Row('Section 4.2', 'Nyquist frequency at 1 MHz', 'kHz', Printed(f'> {1e-3 * high:g}'),
             1e-3 * nyquist, 'half of the sampling frequency',
             f'ESC lines at {1e-3 * low:g} to {1e-3 * high:g} kHz are resolved with '
@@ -67,13 +67,13 @@ def _capacitance() -> list[Row]:
     net_alpha, net_var = (_elasticity(before.alpha, after.alpha),
                           _elasticity(before.var_inf, after.var_inf))
     loop = before.network.battery_resistance + before.network.bulk_esr
-    farad = 1.0 / (paper.ALPHA.value * loop)
+    farad = 1.0 / (published.ALPHA.value * loop)
     return [
         Row('Section 4.5', 'd ln alpha / d ln C', '', Printed('> 0'), alpha,
             'eigenvalue of an RC rail, C doubled',
             f'alpha = 1/(R C) falls with C ({net_alpha:+.2f} for a 6S network of typical parts '
             f'with capacitors in parallel, whose alpha is {before.alpha:.2g} 1/s; '
-            f'{paper.ALPHA.text} 1/s would take {farad:.2g} F there).', point=7),
+            f'{published.ALPHA.text} 1/s would take {farad:.2g} F there).', point=7),
         Row('Section 4.5', 'd ln Var_inf / d ln C', '', Printed('< 0'), var,
             "Lyapunov's equation of an RC rail under white current noise, C doubled",
             f'The advice is right for another reason: Var_inf = S R/(2 C) falls ({net_var:+.2f} '
@@ -81,10 +81,10 @@ def _capacitance() -> list[Row]:
 
 
 def _growth() -> list[Row]:
-    first, first_in = exponent(paper.LOW, paper.MEDIUM)
-    second, second_in = exponent(paper.MEDIUM, paper.HIGH)
-    above = sum(state.load > paper.HIGH.load for state in paper.TABLE_1)
-    ratio = paper.HIGH.vrms.value / paper.LOW.vrms.value
+    first, first_in = exponent(published.LOW, published.MEDIUM)
+    second, second_in = exponent(published.MEDIUM, published.HIGH)
+    above = sum(state.load > published.HIGH.load for state in published.TABLE_1)
+    ratio = published.HIGH.vrms.value / published.LOW.vrms.value
     return [
         Row('Section 6', 'exponent of sigma in load, 5 -> 10 %', '', Printed('> 1'), first,
             'ln(Vrms quotient) / ln(load quotient)',
@@ -100,4 +100,4 @@ def _growth() -> list[Row]:
             point=6),
         Row('Section 8', 'sigma, 40 % over 5 %', '', Printed('> 1'), ratio,
             'quotient of the Vrms', f'Noise grows with load, {ratio:.1f} times in all.',
-            inputs=over(vrms_range(paper.HIGH), vrms_range(paper.LOW)))]
+            inputs=over(vrms_range(published.HIGH), vrms_range(published.LOW)))]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.passage.law import mean_first_passage
-from ou_monitor.paper.reproduce import paper
+from ou_monitor.paper.reproduce import published
 from ou_monitor.paper.reproduce.row import Printed, Row
 from ou_monitor.paper.reproduce.table1 import over, vrms_range
 from ou_monitor.paper.reproduce.table2 import sigma_of
@@ -37,14 +37,14 @@ def beyond_by_quadrature(delta: float, var_inf: float) -> float:
 
 
 def count_beyond(
-    state: paper.LoadState, deltas: tuple[float, ...], rng: np.random.Generator, draws: int,
+    state: published.LoadState, deltas: tuple[float, ...], rng: np.random.Generator, draws: int,
 ) -> tuple[list[float], list[float]]:
     """
-    Return the share of samples of a simulated OU beyond thresholds.
+    Return the share of samples of a simulated OU beyond thresholds, and its standard error.
 
-    state in A, deltas in V.
+    deltas in V.
     """
-    alpha = paper.ALPHA.value
+    alpha = published.ALPHA.value
     u = np.abs(simulate(np.arange(draws) * (_SPACING / alpha), alpha, sigma_of(state), rng))
     share = [float(np.mean(u > delta)) for delta in deltas]
     return share, [math.sqrt(p * (1.0 - p) / draws) for p in share]
@@ -53,7 +53,8 @@ def count_beyond(
 def rows(rng: np.random.Generator, draws: int = 1_000_000) -> list[Row]:
     """Return the rows of section 4.4."""
     found = []
-    for state, deltas in ((paper.MEDIUM, (0.05, DELTA)), (paper.HIGH, (0.05, DELTA, 0.15))):
+    for state, deltas in ((published.MEDIUM, (0.05, DELTA)),
+                          (published.HIGH, (0.05, DELTA, 0.15))):
         var = (1e-3 * state.vrms.value) ** 2
         for delta, share, error in zip(deltas, *count_beyond(state, deltas, rng, draws)):
             formula = beyond_by_quadrature(delta, var)
@@ -68,15 +69,15 @@ def rows(rng: np.random.Generator, draws: int = 1_000_000) -> list[Row]:
 
 
 def _claims() -> list[Row]:
-    var = {s.label: (1e-3 * s.vrms.value) ** 2 for s in paper.LOADED}
-    high, medium, low = (var[s.label] for s in (paper.HIGH, paper.MEDIUM, paper.LOW))
+    var = {s.label: (1e-3 * s.vrms.value) ** 2 for s in published.LOADED}
+    high, medium, low = (var[s.label] for s in (published.HIGH, published.MEDIUM, published.LOW))
     ratio = beyond(DELTA, high) / beyond(DELTA, medium)
-    spread = [beyond(DELTA, (1e-3 * v) ** 2) for s in (paper.MEDIUM, paper.HIGH)
+    spread = [beyond(DELTA, (1e-3 * v) ** 2) for s in (published.MEDIUM, published.HIGH)
               for v in vrms_range(s)]
-    load = paper.HIGH.load / paper.MEDIUM.load
-    times = [mean_first_passage(0.0, DELTA / math.sqrt(v)) / paper.ALPHA.value
+    load = published.HIGH.load / published.MEDIUM.load
+    times = [mean_first_passage(0.0, DELTA / math.sqrt(v)) / published.ALPHA.value
              for v in (medium, high)]
-    wide = over(vrms_range(paper.HIGH), vrms_range(paper.LOW))
+    wide = over(vrms_range(published.HIGH), vrms_range(published.LOW))
     return [
         Row(WHERE, f'P(|U| > {1e3 * DELTA:g} mV), 40 % over 10 %', '', Printed(f'> {load:g}'),
             ratio, 'quotient of the formula',

@@ -1,18 +1,29 @@
-"""All rows, points and figures, from one seed."""
+"""
+The paper, recomputed: all rows, the eight points to read it with, figures, headline, JSON.
+
+Everything comes from one seed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+import math
+from typing import Any
 
 import numpy as np
+from ou_monitor.paper.network.components import PowerNetwork
 from ou_monitor.paper.reproduce import (
-    averaging, crest, jumps, network, probability, switching, table1, table2, transient)
-from ou_monitor.paper.reproduce.crest import Crests
+    jumps, network, probability, published, switching, table1, table2, transient)
+from ou_monitor.paper.reproduce.crest import (
+    crest, Crests, mean_and_error, rows as crest_rows, simulate_crests)
 from ou_monitor.paper.reproduce.figures import draw, Figures
-from ou_monitor.paper.reproduce.points import eight_points, Point
-from ou_monitor.paper.reproduce.row import Row
+from ou_monitor.paper.reproduce.jumps import JumpCrest
+from ou_monitor.paper.reproduce.row import Row, Verdict
 from ou_monitor.paper.reproduce.switching import Spreading
+from ou_monitor.paper.reproduce.table1 import exponent, vpp_step, vrms_step
+from ou_monitor.paper.reproduce.table2 import sigma_half_width, sigma_of
+from ou_monitor.text import number
 
 Progress = Callable[[float], None]
 # Independent stretches of half a second, so that the 95 % quantile is known to 0.03; and
@@ -21,6 +32,212 @@ CREST_PATHS, JUMP_SECONDS = 4000, 100.0
 # In the order of the paper.
 _ORDER = ('Section 3.1', 'Section 3.3', 'Section 4.1', 'Section 4.2', 'Section 4.4',
           'Section 4.5', 'Table 1', 'Fig. 5', 'Section 5', 'Table 2', 'Section 6', 'Section 8')
+
+
+@dataclass(frozen=True)
+class Point:
+    """
+    One point.
+
+    Attributes
+    ----------
+    number : int
+        1 to 8.
+    title : str
+        What it is about.
+    text : str
+        What was found, with numbers.
+    rows : tuple of Row
+        The rows it rests on.
+
+    """
+
+    number: int
+    title: str
+    text: str
+    rows: tuple[Row, ...]
+
+    @property
+    def outcome(self) -> str:
+        """How many of its rows have which verdict, in words."""
+        return tally(self.rows)
+
+
+def count(rows: Sequence[Row]) -> dict[Verdict, int]:
+    """Return how many rows have each verdict."""
+    return {verdict: sum(row.verdict is verdict for row in rows) for verdict in Verdict}
+
+
+def tally(rows: Sequence[Row]) -> str:
+    """Return the counts in words, without those that are zero."""
+    words = {Verdict.AGREES: ('agrees', 'agree'),
+             Verdict.ROUNDING: ('within rounding', 'within rounding'),
+             Verdict.DOES_NOT_HOLD: ('does not hold', 'do not hold')}
+    return ', '.join(f'{n} {words[verdict][n > 1]}' for verdict, n in count(rows).items() if n)
+
+
+def eight_points(rows: Sequence[Row], crests: Crests,
+                 found: list[JumpCrest]) -> tuple[Point, ...]:
+    """Return the eight points."""
+    texts = (
+        ('Factor 2 in formula (6)', _factor(rows)),
+        ('alpha and the AC coupling of the oscilloscope', _coupling(rows)),
+        ('Fig. 5 and one exponential', _exponential(rows)),
+        ('Steps of the readings', _steps()),
+        ('Crest factors and one OU', _crests(crests)),
+        ('Nonlinear growth above 40 %', _growth()),
+        ('More capacitance and alpha', _capacitance()),
+        ('Diffusion and jumps', _jumps(crests, found)))
+    return tuple(Point(k, title, text, tuple(row for row in rows if row.point == k))
+                 for k, (title, text) in enumerate(texts, start=1))
+
+
+def _row(rows: Sequence[Row], start: str) -> Row:
+    return next(row for row in rows if row.quantity.startswith(start))
+
+
+def _factor(rows: Sequence[Row]) -> str:
+    two, three = _row(rows, 'B of (6), telegraph'), _row(rows, 'B of (6), three')
+    log = _row(rows, 'growth of ln U')
+
+    def ratio(row: Row) -> str:
+        return (f'{row.recomputed / row.printed.value:.3f} +- '
+                f'{(row.error or 0.0) / row.printed.value:.3f}')
+
+    away = abs(two.recomputed - two.printed.value) / (two.error or math.nan)
+    return (f'With the generator as printed in (4), the variance of a switching system grows '
+            f'{ratio(two)} times as fast as (6) says for telegraph noise ({away:.0f} standard '
+            f'errors from 1), and {ratio(three)} times for a chain of three states that is not '
+            f'reversible. So B = 2 sum pi C R0 C. A second way: under multiplicative noise ln U '
+            f'must not grow; (4) to (6) as printed say {log.printed.value:g} 1/s, the simulation '
+            f'{log.recomputed:.2f} +- {log.error or 0.0:.2f} 1/s. A sigma computed from a chain '
+            'by (6) is too small by sqrt(2); a sigma measured from Vrms is not touched.')
+
+
+def _coupling(rows: Sequence[Row]) -> str:
+    line = transient.paper_fit()
+    seen = _row(rows, f'alpha seen, rail of {transient.TYPICAL_RAIL:g}')
+    slope = _row(rows, 'd ln(alpha fitted)')
+    corner = 2.0 * math.pi * transient.CORNER_HZ
+    # Variance of an OU behind a high-pass: alpha / (alpha + corner) of its own.
+    kept = math.sqrt(published.ALPHA.value / (published.ALPHA.value + corner))
+    alpha = published.ALPHA.text
+    return (f'{alpha} 1/s is 2 pi x {published.ALPHA.value / (2.0 * math.pi):.2f} Hz, and '
+            f'AC coupling is a first-order high-pass, on many oscilloscopes at 10 Hz. Behind '
+            f'it a rail of {transient.TYPICAL_RAIL:g} 1/s is read as {seen.recomputed:.1f} 1/s, '
+            f"and the reading follows the rail's own rate by {100 * slope.recomputed:.1f} +- "
+            f'{100 * (slope.error or 0.0):.1f} % only. It never exceeds the corner, and a rail '
+            f'slower than the corner is read slower: with that coupling, Fig. 5 '
+            f'({line.alpha:.1f} +- {line.half_width:.1f} 1/s) says that the rail is faster than '
+            f'about {transient.slowest_rail():.0f} 1/s, not that it is {alpha}. An OU '
+            f'of {alpha} 1/s would show {100 * kept:.0f} % of its standard deviation '
+            'through it, so Vrms would be too low as well. With DC coupling, or the corner of the '
+            'instrument measured, one can tell.')
+
+
+def _exponential(rows: Sequence[Row]) -> str:
+    rates = transient.local_rates()
+    plain, shifted = (transient.fit_curve(transient.TIME, transient.VALUE, offset)
+                      for offset in (False, True))
+    test, p = transient.offset_test(plain, shifted)
+    low, high = shifted.band(1)
+    outside = [row.quantity.partition(', ')[2] for row in rows
+               if row.quantity.startswith('rate, ') and row.verdict is Verdict.DOES_NOT_HOLD]
+    said = ('which excludes one exponential at 95 %' if p < 0.05 else
+            'so the voltages of five points do not exclude one exponential at 95 %')
+    return (f'The rates between the points are {", ".join(f"{r:.1f}" for r in rates)} 1/s, '
+            f'{"rising all the way" if (rates[1:] > rates[:-1]).all() else "not in order"}. '
+            f'An exponential plus a constant fits all five {plain.rss / shifted.rss:.1f} times '
+            f'better in residual sum of squares: alpha {shifted.parameters[1]:.1f} 1/s (95 % '
+            f'{low:.0f} to {high:.0f}), offset {shifted.parameters[2]:.1f} mV: the shape of a '
+            'baseline shifted by AC coupling, or of a second pole. The F test of the offset gives '
+            f'p = {p:.2f}, {said}. If the points scatter in proportion to their size, as a fit of '
+            f'ln|U| assumes, the rates that do: {", ".join(outside) or "none"}.')
+
+
+def _steps() -> str:
+    vpp, vrms = vpp_step(), vrms_step()
+    halves = ', '.join(f'{50.0 * vrms.size / s.vrms.value:.0f} % at {s.label}'
+                       for s in published.LOADED)
+    sigmas = ', '.join(
+        f'{sigma_of(s):.2f} +- {sigma_half_width(s, transient.paper_fit()):.2f} at {s.label}'
+        for s in published.LOADED)
+    return (f'Every Vpp is a multiple ({", ".join(map(str, vpp.multiples))}) of {vpp.low:.4g} to '
+            f'{vpp.high:.4g} mV, and every Vrms ({", ".join(map(str, vrms.multiples))}) of '
+            f'{vrms.low:.4g} to {vrms.high:.4g} mV; by chance that would be so once in '
+            f'{1 / vpp.chance:.0f} and {1 / vrms.chance:.0f} cases. Half a step of Vrms is '
+            f'{halves}. With that and the interval of alpha, sigma is {sigmas} V/sqrt(s). '
+            f'Motors off, "{published.IDLE.vrms.text}" beside Vpp = {published.IDLE.vpp.text} mV '
+            'is a reading below one step.')
+
+
+def _crests(crests: Crests) -> str:
+    means = ', '.join(f'{crests.mean(ms)[0]:.2f} +- {number(crests.mean(ms)[1], 1)} on {ms} ms'
+                      for ms in sorted(crests.by_screen))
+    longest = max(crests.by_screen)
+    limit = crests.quantile(longest, 0.95)
+    parts = []
+    for state in published.LOADED:
+        value, (low, high) = crest(state)
+        if low > limit:
+            said = f'not even half a step of each reading, which leaves {low:.2f}, brings it there'
+        elif value > limit:
+            said = f'only at the edge of its rounding ({low:.1f} to {high:.1f})'
+        else:
+            said = 'within'
+        parts.append(f'{state.label} has {value:.1f}: {said}')
+    return (f'One OU with tau = {published.TAU_MS.text} ms, sampled at 1 MHz, shows a Vpp/Vrms of '
+            f'{means} screens; 95 % of the {longest} ms screens lie below {limit:.2f}. '
+            f'{"; ".join(parts)}. Something faster rides on the OU where the crest factor is '
+            'larger: impulses, ripple, or white noise. The paper does not say how long its '
+            'screens are; longer ones show more.')
+
+
+def _growth() -> str:
+    (first, first_in), (second, second_in) = (
+        exponent(published.LOW, published.MEDIUM), exponent(published.MEDIUM, published.HIGH))
+    above = sum(state.load > published.HIGH.load for state in published.TABLE_1)
+    return (f'sigma goes as load to the power {first:.2f} ({first_in[0]:.2f} to {first_in[1]:.2f} '
+            f'within half a step of Vrms) from 5 to 10 %, then {second:.2f} ({second_in[0]:.2f} '
+            f'to {second_in[1]:.2f}) from 10 to 40 %: '
+            f'{"saturation" if second_in[1] < 1.0 else "no clear acceleration"}. Load states '
+            f'measured above 40 %: {above}.')
+
+
+def _capacitance() -> str:
+    before, after = network.doubled(PowerNetwork())
+    return (f'For an RC rail alpha = 1/(R C) and Var_inf = S R/(2 C) under white current noise: '
+            f'both are halved by a second capacitor, sigma = sqrt(S)/C too. In a 6S network of '
+            f'typical parts at 40 %, a second {1e6 * before.network.bulk_capacitance:.0f} uF in '
+            f'parallel takes alpha from {before.alpha:.3g} to {after.alpha:.3g} 1/s and the '
+            f'standard deviation from {1e3 * math.sqrt(before.var_inf):.0f} to '
+            f'{1e3 * math.sqrt(after.var_inf):.0f} mV. The advice to add low-ESR '
+            'capacitance is right, because Var_inf falls; that alpha rises is not.')
+
+
+def _jumps(crests: Crests, found: list[JumpCrest]) -> str:
+    parts = []
+    for ms in jumps.SCREENS_MS:
+        best = jumps.largest(found, ms)
+        parts.append(
+            f'{best.mean:.1f} on {ms} ms screens ({best.rate:g} a second, '
+            f'{100 * best.share:.0f} % of the variance, '
+            f'{best.size(published.LOW.vrms.value):.0f} mV rms at 5 % and '
+            f'{best.size(published.MEDIUM.vrms.value):.0f} mV at 10 %, excess kurtosis '
+            f'{best.kurtosis:.0f})')
+    heights = ', '.join(f'{jumps.impulse_height(s, crests):.0f} mV at {s.label}'
+                        for s in published.LOADED)
+    (low, low_in), (high, high_in) = crest(published.LOW), crest(published.HIGH)
+    return ('The paper says that its data justify diffusion and jump components, and fits no '
+            'jump. Of the compound Poisson jumps tried, relaxing at alpha, the best show '
+            f'a mean crest factor of {" and ".join(parts)}; {low:.1f} (5 %) and '
+            f'{crest(published.MEDIUM)[0]:.1f} (10 %) are to be reached. Impulses too short to '
+            f'count in Vrms would do with a height, peak to peak over the OU, of {heights}. '
+            f'From 5 to 40 % the crest factor goes from {low:.1f} to {high:.1f} (quotient '
+            f'{high_in[0] / low_in[1]:.2f} to {high_in[1] / low_in[0]:.2f} within half a step): '
+            'the readings do not show impulses that come with load. '
+            'Two readings a load cannot decide between these; a recording can: see '
+            'ou-monitor discover.')
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +288,9 @@ def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:
 
     # Each part has its own generator, so that none depends on what others draw.
     rngs = np.random.default_rng(seed).spawn(8)
-    crests = crest.simulate_crests(rngs[0], CREST_PATHS, within(0.0, 0.35))
+    crests = simulate_crests(rngs[0], CREST_PATHS, within(0.0, 0.35))
     found = jumps.simulate_jumps(rngs[1], JUMP_SECONDS, within(0.35, 0.6))
-    rows = [*table1.rows(*crest.mean_and_error(crests.white)), *crest.rows(crests),
+    rows = [*table1.rows(*mean_and_error(crests.white)), *crest_rows(crests),
             *table2.rows(), *network.rows(), *jumps.rows(found, crests)]
     rows += transient.rows(rngs[2])
     tell(0.76)
@@ -81,7 +298,7 @@ def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:
     tell(0.8)
     rows += switching.rows(rngs[4])
     tell(0.86)
-    rows += averaging.rows(rngs[5])
+    rows += switching.averaging_rows(rngs[5])
     spreading = switching.spreading(rngs[6], 20_000)
     tell(0.92)
     figures = draw(rngs[7])
@@ -89,3 +306,46 @@ def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:
     ordered = tuple(sorted(rows, key=lambda row: _ORDER.index(row.where)))
     return Reproduction(seed, ordered, eight_points(ordered, crests, found), crests, spreading,
                         figures)
+
+
+def headline(result: Reproduction) -> str:
+    """Return what came out, in one sentence."""
+    counts = count(result.rows)
+    return (f'Of {len(result.rows)} numbers and claims of the paper, '
+            f'{counts[Verdict.AGREES]} agree with their recomputation, '
+            f'{counts[Verdict.ROUNDING]} differ from it by no more than rounding, and '
+            f'{counts[Verdict.DOES_NOT_HOLD]} do not hold.')
+
+
+def recomputed(row: Row) -> str:
+    """Return the recomputed number with its standard error, to its digits."""
+    digits = max(4, 1 + sum(c.isdigit() for c in row.printed.text.split('e')[0].lstrip('0.')))
+    if not row.error:
+        return number(row.recomputed, digits)
+    # As many decimals as the error has to two digits.
+    decimals = max(0, 1 - math.floor(math.log10(row.error)))
+    return f'{row.recomputed:.{decimals}f} +- {row.error:.{decimals}f}'
+
+
+def as_data(result: Reproduction) -> dict[str, Any]:
+    """Return a reproduction as plain data."""
+    return {
+        'headline': headline(result),
+        'seed': result.seed,
+        'counts': {verdict.name: n for verdict, n in count(result.rows).items()},
+        'rows': [_row_data(row) for row in result.rows],
+        'points': [{'number': point.number, 'title': point.title, 'text': point.text,
+                    'counts': {v.name: n for v, n in count(point.rows).items()}}
+                   for point in result.points],
+    }
+
+
+def _row_data(row: Row) -> dict[str, Any]:
+    return {
+        'where': row.where, 'quantity': row.quantity, 'unit': row.unit,
+        'printed': row.printed.text, 'printed_value': row.printed.value,
+        'printed_half_unit': row.printed.half_unit, 'printed_inputs': row.printed_inputs,
+        'recomputed': row.recomputed, 'error': row.error, 'interval': row.interval,
+        'inputs': row.inputs, 'how': row.how, 'verdict': row.verdict.name,
+        'sentence': row.sentence, 'point': row.point or None,
+    }

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
-from ou_monitor.paper.reproduce import paper
+from ou_monitor.paper.reproduce import published
 from ou_monitor.paper.reproduce.row import Printed, Range, Row
 
 WHERE = 'Table 1'
@@ -64,21 +64,21 @@ def common_step(readings: Sequence[Printed]) -> Step:
 
 def vpp_step() -> Step:
     """Return the step of Vpp, mV."""
-    return common_step([state.vpp for state in paper.TABLE_1])
+    return common_step([state.vpp for state in published.TABLE_1])
 
 
 def vrms_step() -> Step:
     """Return the step of Vrms, mV."""
-    return common_step([state.vrms for state in paper.LOADED])
+    return common_step([state.vrms for state in published.LOADED])
 
 
-def vrms_range(state: paper.LoadState) -> Range:
+def vrms_range(state: published.LoadState) -> Range:
     """Return Vrms of a load state, mV, half a step each way."""
     half = 0.5 * vrms_step().size
     return state.vrms.value - half, state.vrms.value + half
 
 
-def vpp_range(state: paper.LoadState) -> Range:
+def vpp_range(state: published.LoadState) -> Range:
     """Return Vpp of a load state, mV, half a step each way."""
     half = 0.5 * vpp_step().size
     return state.vpp.value - half, state.vpp.value + half
@@ -100,7 +100,7 @@ def _vpp() -> list[Row]:
         WHERE, f'Vpp, {state.label}', 'mV', state.vpp, k * step.size,
         f'multiple of a common step of {step.low:.4g} to {step.high:.4g} mV',
         f'{k} steps, so it is known to half a step, {50.0 * step.size / state.vpp.value:.2g} %.',
-        point=4) for state, k in zip(paper.TABLE_1, step.multiples)]
+        point=4) for state, k in zip(published.TABLE_1, step.multiples)]
 
 
 def _vrms() -> list[Row]:
@@ -110,14 +110,14 @@ def _vrms() -> list[Row]:
         f'multiple of a common step of {step.low:.4g} to {step.high:.4g} mV',
         f'{k} step{"s" if k > 1 else ""}, so Vrms and sigma are known to half a step, '
         f'{50.0 * step.size / state.vrms.value:.2g} %.',
-        point=4) for state, k in zip(paper.LOADED, step.multiples)]
+        point=4) for state, k in zip(published.LOADED, step.multiples)]
 
 
 def _idle(crest: float, crest_se: float) -> Row:
     step = vrms_step().size
-    lowest = paper.IDLE.vpp.value / crest
+    lowest = published.IDLE.vpp.value / crest
     return Row(
-        WHERE, 'Vrms, motors off', 'mV', Printed(paper.IDLE.vrms.text, 0.5 * step), lowest,
+        WHERE, 'Vrms, motors off', 'mV', Printed(published.IDLE.vrms.text, 0.5 * step), lowest,
         'Vpp over the crest factor of white Gaussian noise, 100 ms at 1 MHz, Monte Carlo',
         f'Gaussian noise with this Vpp on 100 ms has about {lowest:.1f} mV or more, whatever '
         f'its colour; one step is {step:.2f} mV, so "~0" is a reading, not the absence of noise.',
@@ -127,7 +127,7 @@ def _idle(crest: float, crest_se: float) -> Row:
 def _amp() -> list[Row]:
     half = 0.5 * vpp_step().size
     found = []
-    for state in paper.TABLE_1:
+    for state in published.TABLE_1:
         vpp = state.vpp.value
         found.append(Row(
             WHERE, f'Amp, {state.label}', 'mV', state.amp, 0.5 * vpp,
@@ -143,14 +143,14 @@ def _amp() -> list[Row]:
 def _grades() -> list[Row]:
     step = vrms_step().size
     below = 0.5 * step
-    ratio = paper.HIGH.vrms.value / paper.MEDIUM.vrms.value
-    low, high = over(vrms_range(paper.HIGH), vrms_range(paper.MEDIUM))
+    ratio = published.HIGH.vrms.value / published.MEDIUM.vrms.value
+    low, high = over(vrms_range(published.HIGH), vrms_range(published.MEDIUM))
     found = [Row(
         WHERE, f'{name}: {state.label} over motors off', '', Printed('> 1'),
         state.vrms.value / below, 'Vrms over half a step, the most that reads as zero',
         'The order holds; the factor is a lower bound, because V0 is only known to read as zero.',
         inputs=over(vrms_range(state), (below, step)))
-        for name, state in (('V1 > V0', paper.LOW), ('V2 >> V0', paper.MEDIUM))]
+        for name, state in (('V1 > V0', published.LOW), ('V2 >> V0', published.MEDIUM))]
     found.append(Row(
         WHERE, 'V3 >> V2: 40 % over 10 %', '', Printed('> 1'), ratio, 'quotient of the Vrms',
         f'The order holds; the factor is {ratio:.1f} ({low:.1f} to {high:.1f} within half a '
@@ -158,7 +158,7 @@ def _grades() -> list[Row]:
     return found
 
 
-def exponent(low: paper.LoadState, high: paper.LoadState) -> tuple[float, Range]:
+def exponent(low: published.LoadState, high: published.LoadState) -> tuple[float, Range]:
     """Return how sigma grows with load: d ln sigma / d ln load between two states."""
     span = math.log(high.load / low.load)
     ends = over(vrms_range(high), vrms_range(low))

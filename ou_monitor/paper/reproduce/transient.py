@@ -17,7 +17,7 @@ from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.load_transient import LoadTransient
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.paper.reproduce import paper
+from ou_monitor.paper.reproduce import published
 from ou_monitor.paper.reproduce.row import Printed, Range, Row
 from ou_monitor.paper.reproduce.table1 import vrms_step
 from ou_monitor.records import FloatArray
@@ -34,8 +34,8 @@ RAILS = (500.0, 1000.0, 2000.0, 5000.0)
 TYPICAL_RAIL = 1000.0
 _RATE, _HOLD, _WATCH = 10e3, 0.3, 0.06
 
-TIME = 1e-3 * np.array(paper.FIG_5_MS)
-VALUE = np.array([p.value for p in paper.FIG_5_MV])
+TIME = 1e-3 * np.array(published.FIG_5_MS)
+VALUE = np.array([p.value for p in published.FIG_5_MV])
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ def fit_curve(time: FloatArray, value: FloatArray, offset: bool) -> Curve:
 
 def paper_fit() -> LogLine:
     """Return the paper's own fit: ln|U| over 0..35 ms."""
-    used = slice(0, paper.FIG_5_USED)
+    used = slice(0, published.FIG_5_USED)
     return fit_log_line(TIME[used], VALUE[used])
 
 
@@ -172,7 +172,7 @@ def seen_rate(rail: float, corner: float = CORNER_HZ) -> float:
     """Return the rate the paper's fit gives for a step seen through a high-pass, 1/s."""
     w = 2.0 * math.pi * corner
     peak = math.log(rail / w) / (rail - w)
-    used = TIME[:paper.FIG_5_USED]
+    used = TIME[:published.FIG_5_USED]
     return fit_log_line(used, through_coupling(peak + used, rail, corner)).alpha
 
 
@@ -194,17 +194,17 @@ def simulate_seen(rng: np.random.Generator, draws: int) -> FloatArray:
     result in 1/s.
     """
     t = np.arange(round((_HOLD + _WATCH) * _RATE)) / _RATE
-    throttle = np.where(t <= _HOLD, paper.TRANSIENT_LOAD, 0.0)
+    throttle = np.where(t <= _HOLD, published.TRANSIENT_LOAD, 0.0)
     sag = 1e-3 * VALUE[0]
     noise = 0.5e-3 * vrms_step().size
-    used = TIME[:paper.FIG_5_USED]
+    used = TIME[:published.FIG_5_USED]
     w = 2.0 * math.pi * CORNER_HZ
     found = np.empty((len(RAILS), draws))
     for row, rail in zip(found, RAILS):
         model = SupplyModel((
             OU(rail, noise * math.sqrt(2.0 * rail), 0.0),
-            LoadSag(sag / paper.TRANSIENT_LOAD, 0.0),
-            LoadTransient(sag / paper.TRANSIENT_LOAD, 1.0 / rail, 0.0),
+            LoadSag(sag / published.TRANSIENT_LOAD, 0.0),
+            LoadTransient(sag / published.TRANSIENT_LOAD, 1.0 / rail, 0.0),
             ACCoupling(CORNER_HZ, 0.0)))
         peak = _HOLD + math.log(rail / w) / (rail - w)
         at = np.round((peak + used) * _RATE).astype(np.intp)
@@ -221,17 +221,17 @@ def rows(rng: np.random.Generator, draws: int = 60) -> list[Row]:
 def _fit() -> list[Row]:
     line = paper_fit()
     return [
-        Row(WHERE, 'alpha', '1/s', paper.ALPHA, line.alpha,
+        Row(WHERE, 'alpha', '1/s', published.ALPHA, line.alpha,
             'least squares of ln|U| over 0..35 ms',
             f'The arithmetic is right; four points leave {line.alpha:.1f} +- '
             f'{line.half_width:.1f} 1/s (95 %, two degrees of freedom).',
             point=3),
         Row(WHERE, 'error implied by its digits', '1/s', Printed('0.05', 0.0),
             line.half_width, 'half of the 95 % interval of that fit',
-            f'{paper.ALPHA.text} claims a digit that four points do not give: the interval is '
+            f'{published.ALPHA.text} claims a digit that four points do not give: the interval is '
             f'{line.alpha - line.half_width:.0f} to {line.alpha + line.half_width:.0f} 1/s.',
             point=3),
-        Row(WHERE, '|U(0)|', 'mV', paper.FIG_5_MV[0], line.start, 'intercept of that fit',
+        Row(WHERE, '|U(0)|', 'mV', published.FIG_5_MV[0], line.start, 'intercept of that fit',
             f'The line starts at {line.start:.0f} mV, within its error of the first point.',
             error=line.start_se)]
 
@@ -242,13 +242,13 @@ def _shape() -> list[Row]:
     for k, rate in enumerate(local_rates().tolist()):
         step = float(TIME[k + 1] - TIME[k])
         reach = line.quantile * line.scatter * math.sqrt(2.0) / step
-        ends = f'{paper.FIG_5_MS[k]:g}..{paper.FIG_5_MS[k + 1]:g} ms'
+        ends = f'{published.FIG_5_MS[k]:g}..{published.FIG_5_MS[k + 1]:g} ms'
         said = (f'One exponential has the same rate everywhere; here it is {rate:.1f} +- '
                 f'{reach:.0f} 1/s (95 %) if every point scatters as the first four do')
-        if k >= paper.FIG_5_USED - 1:
+        if k >= published.FIG_5_USED - 1:
             said += '; the paper leaves the last point out as noise'
         found.append(Row(
-            WHERE, f'rate, {ends}', '1/s', paper.ALPHA, rate, 'two neighbouring points',
+            WHERE, f'rate, {ends}', '1/s', published.ALPHA, rate, 'two neighbouring points',
             said + '.', band=(rate - reach, rate + reach), point=3))
     plain, shifted = (fit_curve(TIME, VALUE, offset) for offset in (False, True))
     test, p = offset_test(plain, shifted)
@@ -279,16 +279,17 @@ def _instrument(seen: FloatArray) -> list[Row]:
     slopes = log @ np.log(seen) / float(log @ log)
     slope, slope_se = float(slopes.mean()), float(slopes.std(ddof=1) / math.sqrt(slopes.size))
     return [
-        Row(WHERE, f'alpha of a {CORNER_HZ:g} Hz corner', '1/s', paper.ALPHA,
+        Row(WHERE, f'alpha of a {CORNER_HZ:g} Hz corner', '1/s', published.ALPHA,
             corner, '2 pi times the corner; interval of the fit to Fig. 5',
-            f'{paper.ALPHA.text} 1/s is 2 pi times {paper.ALPHA.value / (2 * math.pi):.2f} Hz: '
-            'the AC coupling of the oscilloscope alone gives this rate.',
+            f'{published.ALPHA.text} 1/s is 2 pi times '
+            f'{published.ALPHA.value / (2 * math.pi):.2f} Hz: the AC coupling of the '
+            'oscilloscope alone gives this rate.',
             band=(corner - line.half_width, corner + line.half_width), point=2),
         Row(WHERE, f'alpha seen, rail of {TYPICAL_RAIL:g} 1/s', '1/s',
-            paper.ALPHA, mean,
+            published.ALPHA, mean,
             f"{typical.size} simulations behind that corner, fitted the paper's way",
-            f'A rail {TYPICAL_RAIL / paper.ALPHA.value:.0f} times faster is read as {mean:.1f} +- '
-            f'{spread:.1f} 1/s.',
+            f'A rail {TYPICAL_RAIL / published.ALPHA.value:.0f} times faster is read as '
+            f'{mean:.1f} +- {spread:.1f} 1/s.',
             error=spread / math.sqrt(typical.size),
             band=(mean - Z95 * spread, mean + Z95 * spread), point=2),
         Row('Section 5', 'd ln(alpha fitted) / d ln(alpha rail)', '', Printed('1', 0.0), slope,

@@ -183,7 +183,7 @@ class MatrixModel:
         Constant coefficients: the closed form. Time-varying ones: LSODA, which
         bears stiff coefficients.
 
-        t in s, u0 in A, max_step in s.
+        t in s, max_step in s.
         """
         times = check_times(t)
         state = check_state(u0, 3)
