@@ -123,8 +123,8 @@ def _transient() -> list[str]:
         drawn.append(page.figure(plot))
     return [page.pair(*drawn), page.paragraph(
         f'Dashed: a rail {rail / published.ALPHA.value:.0f} times faster, behind an AC '
-        f'coupling of {transient.CORNER_HZ:g} Hz, comes within {100 * worst:.0f} % of the four points of '
-        f'the fit. The last point lies below it and below both exponentials.',
+        f'coupling of {transient.CORNER_HZ:g} Hz, comes within {100 * worst:.0f} % of the four '
+        'points of the fit. The last point lies below it and below both exponentials.',
         soft=True)]
 
 

@@ -161,7 +161,7 @@ def fitted_through_coupling(time: FloatArray) -> tuple[FloatArray, float]:
     """
     pole = 2.0 * math.pi * CORNER_HZ
     turning = math.log(TYPICAL_RAIL / pole) / (TYPICAL_RAIL - pole)
-    used = slice(0, paper.FIG_5_USED)
+    used = slice(0, published.FIG_5_USED)
     misfit = np.log(VALUE[used] / through_coupling(turning + TIME[used], TYPICAL_RAIL))
     scale = math.exp(float(misfit.mean()))
     return (scale * through_coupling(turning + time, TYPICAL_RAIL),
