@@ -12,7 +12,7 @@ from ou_monitor.analyze.level_comparison import alpha_constancy, AlphaTest
 from ou_monitor.analyze.level_result import fit_level, judge_levels, LevelResult
 from ou_monitor.analyze.levels import find_levels, LoadLevel, without_jitter
 from ou_monitor.analyze.quality import (
-    line_item, quality_list, QualityItem, second_items, unsettled)
+    coupling_items, line_item, quality_list, QualityItem, second_items, unsettled)
 from ou_monitor.analyze.relaxation import fit_relaxation, Relaxation
 from ou_monitor.analyze.replay import by_throttle, ByThrottle, slide, Sliding
 from ou_monitor.analyze.steps import find_steps
@@ -115,7 +115,8 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
         by_throttle(sliding, recording.has_throttle), sliding,
         quality_list(recording, throttles, estimates, [level.notes for level in judged],
                      settling + lines + second_items(
-                         [level.throttle for level in judged if level.wanders])),
+                         [level.throttle for level in judged if level.wanders])
+                     + coupling_items([level.throttle for level in judged if level.coupled])),
         brownout_voltage is None, recording.notes + _left_out(recording, found))
 
 

@@ -233,6 +233,11 @@ class LevelResult:
         return self.shape['second_relaxation'].rejects
 
     @property
+    def coupled(self) -> bool:
+        """Whether the noise lacks what an AC-coupled instrument takes out."""
+        return self.shape.coupling_p < FAMILY_WISE
+
+    @property
     def crest(self) -> float:
         """Vpp over Vrms, dimensionless."""
         return self.vpp / self.vrms if self.vrms > 0.0 else NAN

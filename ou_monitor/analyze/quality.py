@@ -258,3 +258,11 @@ def second_items(throttles: Sequence[float]) -> list[QualityItem]:
         'A second relaxation, slower or faster, stands beside the one that was fitted: alpha, tau '
         'and Var_inf are of a mixture, and their intervals hold for neither; the other levels may '
         'hide the same. `ou-monitor discover` fits both.'), tuple(throttles))] if throttles else []
+
+
+def coupling_items(throttles: Sequence[float]) -> list[QualityItem]:
+    """Say where the noise shows an AC-coupled instrument (throttles 0..1)."""
+    return [QualityItem('AC_COUPLING', Severity.WARNING, (
+        'Slow noise is missing, as behind an AC-coupled instrument: alpha, tau and Var_inf are of '
+        'rail and instrument together; repeat with a DC-coupled one. `ou-monitor discover` fits '
+        'both.'), tuple(throttles))] if throttles else []

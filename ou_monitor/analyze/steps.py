@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 from ou_monitor.analyze.levels import HALF_WIDTH, half_width, stays
-from ou_monitor.model.innovations import Filter, StateSpace
+from ou_monitor.criticism.innovations import ou_filter
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
 
 # Longest way from one level to the other, s: after a slower one nothing is left to relax.
@@ -106,7 +106,7 @@ class Window:
             self.var_inf, self.noise_var = estimate.var_inf, noise * noise
             louder = np.exp(-2.0 * alpha * self.since) * max(0.0, before - self.var_inf)
             first = self.var_inf + float(louder[0])
-            self.filter = Filter(_ou(self.since, alpha, self.var_inf, self.noise_var, first))
+            self.filter = ou_filter(self.since, alpha, self.var_inf, self.noise_var, first)
             self.sd = np.sqrt(self.var_inf + self.noise_var + louder)
         e = self.whitened(np.column_stack([self.voltage, np.ones(self.n)]))
         self._one = e[:, 1]
@@ -118,7 +118,7 @@ class Window:
         if self.filter is None:
             return columns / math.sqrt(self.noise_var)
         e = self.filter.innovations(columns)
-        return np.asarray(e / np.sqrt(self.filter.variance[:self.n])[:, None])
+        return np.asarray(e / np.sqrt(self.filter.variance)[:, None])
 
     def rss(self, taus: FloatArray) -> FloatArray:
         """Return the residual sum of squares for each tau, level and amplitude fitted."""
@@ -152,16 +152,6 @@ class Window:
         jacobian = np.column_stack([x[:, 1:], bend])
         errors = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian) * scale))
         return float(found[0]), float(errors[0]), float(found[1]), float(errors[1])
-
-
-def _ou(since: FloatArray, alpha: float, var_inf: float, noise_var: float, first: float
-        ) -> StateSpace:
-    """Return the level's noise as a state-space model, with the variance it comes with."""
-    dt = np.diff(since)
-    f = np.concatenate(([0.0], np.exp(-alpha * dt)))[:, None, None]
-    q = np.concatenate(([first], -var_inf * np.expm1(-2.0 * alpha * dt)))[:, None, None]
-    r = np.full(since.size, max(noise_var, 1e-6 * float(q.min())))
-    return StateSpace(f, q, np.ones(1), r)
 
 
 def _project(direction: FloatArray, y: FloatArray) -> FloatArray:

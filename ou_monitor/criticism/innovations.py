@@ -1,26 +1,68 @@
 """
 One-step innovations of an OU in white noise, and what their spectrum shows of another pole.
 
-Under the fitted model the innovations are independent and standard normal, and the ordinates of
-their periodogram independent and exponential.
+Both verbs whiten by `ou_monitor.model.innovations.Filter`: `analyze` the samples of a load level
+by the OU and the white noise that the onboard estimator found, `discover` a whole recording by
+all terms of its model.
+
+Under the right model the innovations are independent and standard normal, and the ordinates of
+their periodogram independent and exponential.  A second OU, slower or faster by a known factor,
+lifts them in a known pattern; what the fit can absorb of it (alpha, sigma, white noise) is
+projected out of the pattern, and what is left is compared with the ordinates.  Near the model
+this score test is the most powerful one, where lags of innovations see nothing: a wander ten
+times slower is correlated over hundreds of them.  An AC-coupled instrument takes out what a
+second OU of the rate of its corner would add,
+
+    S r^2 / (w^2 + r^2) = (S - S_r) a^2 r^2 / (a^2 - r^2) up to factors,  S = 1 / (a^2 + w^2),
+
+so the same score with the other sign is the test of it.
+
+Limits: `FACTORS` only, each alone; a corner at the rate of the OU itself bends nothing that the
+fit does not absorb; straight drifts are taken out; samples of the spectrum count as even.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 import math
 
 import numpy as np
+from ou_monitor.model.innovations import Filter, StateSpace
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN
 from scipy import stats
-from scipy.signal import lfilter
+from scipy.signal import periodogram
 
-# Steps that differ by less than this share of the median are even.
-_EVEN = 0.2
-# Rates of the second relaxation that are looked for, in those of the first.
+# Probability that tests of what is as modelled reject: those of all levels of a recording
+# together in `analyze`, those of a whole recording in `discover`.  One in a hundred, as for lines.
+FAMILY_WISE = 0.01
+# Rates of the other pole that are looked for, in those of the first.
 FACTORS = (1.0 / 30.0, 1.0 / 10.0, 1.0 / 3.0, 3.0, 10.0)
 # Fewer ordinates than this tell nothing; segments shorter than this give none.
 _FEWEST, _SHORTEST = 64, 64
+# White noise that stands for none, as a share of what a step adds.
+_NO_NOISE = 1e-6
+
+
+@dataclass(frozen=True)
+class OtherPole:
+    """
+    What the spectrum of innovations shows of a pole beside the fitted one.
+
+    Attributes
+    ----------
+    second_p : float
+        Probability that noise looks as much like a second relaxation; NaN without enough samples.
+    second_share : float
+        Its variance, over Var_inf.
+    coupling_p : float
+        Probability that noise looks as much like an AC-coupled instrument.
+
+    """
+
+    second_p: float = NAN
+    second_share: float = NAN
+    coupling_p: float = NAN
 
 
 def fresh(voltage: FloatArray, estimate: Estimate) -> np.ndarray:
@@ -28,6 +70,21 @@ def fresh(voltage: FloatArray, estimate: Estimate) -> np.ndarray:
     if Flag.HELD_SAMPLES not in estimate.flags or voltage.size < 2:
         return np.ones(voltage.size, dtype=np.bool_)
     return np.append(True, voltage[1:] != voltage[:-1])
+
+
+def ou_filter(t: FloatArray, alpha: float, var_inf: float, noise_var: float,
+              first: float = NAN) -> Filter:
+    """
+    Return the filter of a sampled OU in white noise.
+
+    t in s; first is the variance of the OU at the first sample, V^2, of itself Var_inf.
+    """
+    dt = np.diff(t)
+    q = np.append(var_inf if math.isnan(first) else first,
+                  -var_inf * np.expm1(-2.0 * alpha * dt))
+    f = np.append(0.0, np.exp(-alpha * dt))
+    r = np.full(t.size, max(noise_var, _NO_NOISE * float(q.min())))
+    return Filter(StateSpace(f[:, None, None], q[:, None, None], np.ones(1), r))
 
 
 def innovations(t: FloatArray, deviation: FloatArray, alpha: float, var_inf: float,
@@ -39,32 +96,8 @@ def innovations(t: FloatArray, deviation: FloatArray, alpha: float, var_inf: flo
     """
     if deviation.size < 2 or not math.isfinite(alpha):
         return deviation / math.sqrt(var_inf + noise_var)
-    dt = np.diff(t)
-    # Float64 seconds since 1970 resolve 0.24 us: an even clock looks a little uneven.
-    step = float(np.median(dt))
-    if noise_var > 0.0 or bool((np.abs(dt - step) < _EVEN * step).all()):
-        phi = math.exp(-alpha * float(dt.mean()))
-        gain, variance = _settled(phi, var_inf, noise_var)
-        # The predictor forgets with phi (1 - gain): an ARMA(1,1) turned round.
-        e = lfilter([1.0, -phi], [1.0, -phi * (1.0 - gain)], deviation)
-        scaled = np.asarray(e / math.sqrt(variance))
-        scaled[0] = deviation[0] / math.sqrt(var_inf + noise_var)
-        return scaled
-    phis = np.exp(-alpha * dt)
-    steps = (deviation[1:] - phis * deviation[:-1]) / np.sqrt(
-        -var_inf * np.expm1(-2.0 * alpha * dt))
-    return np.concatenate(([deviation[0] / math.sqrt(var_inf)], steps))
-
-
-def _settled(phi: float, var_inf: float, noise_var: float) -> tuple[float, float]:
-    """Return the steady Kalman gain and the variance of the innovations."""
-    if not noise_var > 0.0:
-        return 1.0, var_inf * (1.0 - phi * phi)
-    q = var_inf * (1.0 - phi * phi)
-    # Predicted variance p = phi^2 p r / (p + r) + q, solved for p.
-    b = noise_var * (1.0 - phi * phi) - q
-    p = 0.5 * (-b + math.sqrt(b * b + 4.0 * q * noise_var))
-    return p / (p + noise_var), p + noise_var
+    run = ou_filter(t, alpha, var_inf, noise_var)
+    return np.asarray(run.innovations(deviation) / np.sqrt(run.variance))
 
 
 def join(parts: Sequence[FloatArray]) -> FloatArray:
@@ -72,12 +105,16 @@ def join(parts: Sequence[FloatArray]) -> FloatArray:
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
-def second_relaxation(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: float,
-                      noise_var: float) -> tuple[float, float]:
-    """Test for a second relaxation (rate in Hz)."""
-    frequency, power = _periodogram(parts, rate)
+def other_pole(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: float,
+               noise_var: float) -> OtherPole:
+    """Test innovations for a second relaxation and for an AC coupling (rate in Hz)."""
+    # The first innovation of a part has no past, and the trend is that of the rest.
+    both = [periodogram(part, rate, detrend='linear') for part in parts if part.size >= _SHORTEST]
+    # The ordinates at 0 and at half the rate are of another law.
+    frequency = join([f[1:-1] if f[-1] == 0.5 * rate else f[1:] for f, _ in both])
+    power = join([p[1:-1] if f[-1] == 0.5 * rate else p[1:] for f, p in both])
     if frequency.size < _FEWEST:
-        return NAN, NAN
+        return OtherPole()
     power = power / power.mean() - 1.0
     omega = 2.0 * np.pi * frequency / rate
     step = alpha / rate
@@ -87,7 +124,7 @@ def second_relaxation(parts: Sequence[FloatArray], rate: float, alpha: float, va
     slope = (_shape(omega, step * (1.0 + nudge)) - _shape(omega, step * (1.0 - nudge))) / nudge
     absorbed = np.linalg.qr(np.column_stack((
         np.ones(omega.size), var_inf * slope / fitted, 1.0 / fitted)))[0]
-    best, share = 1.0, NAN
+    more, share, less = 1.0, NAN, 1.0
     for factor in FACTORS:
         pattern = var_inf * _shape(omega, factor * step) / fitted
         full = float(pattern @ pattern)
@@ -97,11 +134,14 @@ def second_relaxation(parts: Sequence[FloatArray], rate: float, alpha: float, va
             continue
         score = float(pattern @ power)
         # A weighted sum of exponentials is skewed as few of them carry it.
-        skew = 2.0 * float(np.sum(pattern ** 3)) / left ** 1.5
-        p = float(stats.pearson3.sf(score / math.sqrt(left), skew))
-        if p < best:
-            best, share = p, score / left
-    return min(1.0, len(FACTORS) * best), share
+        law = stats.pearson3(2.0 * float(np.sum(pattern ** 3)) / left ** 1.5)
+        p = float(law.sf(score / math.sqrt(left)))
+        if p < more:
+            more, share = p, score / left
+        if factor < 1.0:
+            less = min(less, float(law.cdf(score / math.sqrt(left))))
+    slower = sum(factor < 1.0 for factor in FACTORS)
+    return OtherPole(min(1.0, len(FACTORS) * more), share, min(1.0, slower * less))
 
 
 def _shape(omega: FloatArray, step: float) -> FloatArray:
@@ -109,19 +149,3 @@ def _shape(omega: FloatArray, step: float) -> FloatArray:
     phi = math.exp(-step)
     found: FloatArray = -math.expm1(-2.0 * step) / (1.0 - 2.0 * phi * np.cos(omega) + phi * phi)
     return found
-
-
-def _periodogram(parts: Sequence[FloatArray], rate: float) -> tuple[FloatArray, FloatArray]:
-    """Return frequencies, Hz, and ordinates of all parts, straight drifts taken out."""
-    frequencies: list[FloatArray] = [np.zeros(0)]
-    powers: list[FloatArray] = [np.zeros(0)]
-    for part in parts:
-        n = part.size
-        if n < _SHORTEST:
-            continue
-        # Its first innovation has no past, and the trend is that of the rest.
-        count = np.arange(n) - 0.5 * (n - 1)
-        level = part - part.mean() - count * float(count @ part) / float(count @ count)
-        powers.append(np.square(np.abs(np.fft.rfft(level)[1:(n + 1) // 2])) / n)
-        frequencies.append(rate / n * np.arange(1.0, (n + 1) // 2))
-    return np.concatenate(frequencies), np.concatenate(powers)

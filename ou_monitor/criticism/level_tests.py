@@ -32,12 +32,10 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from ou_monitor.criticism.innovations import innovations, join, second_relaxation
+from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, join, other_pole, OtherPole
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Status
 from scipy import stats
 
-# Family-wise: a recording of stationary OU levels has any test reject with this probability.
-FAMILY_WISE = 0.01
 # Fewer samples than this are not tested; a block has at least as many innovations.
 FEWEST = 50
 _BLOCKS = 16
@@ -113,6 +111,9 @@ class Shape:
         Innovations beyond what the largest of as many normal ones stays under with 99 %.
     impulse_rate : tuple of float
         Their rate, 1/s, and its 95 % interval (Poisson).
+    coupling_p : float
+        Probability that noise looks as much like an AC-coupled instrument, after Holm over all
+        levels; NaN when it could not be tested.
 
     """
 
@@ -122,6 +123,7 @@ class Shape:
     kurtosis: float
     impulses: int
     impulse_rate: tuple[float, float, float]
+    coupling_p: float = NAN
 
     def __getitem__(self, name: str) -> TestResult:
         """Return a test by name."""
@@ -168,23 +170,28 @@ def examine_level(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Esti
                        max(abs(skewness), 0.5 * abs(kurtosis))),
             _impulses(local, kurtosis, count)]
     tests.append(correlated)
+    pole = OtherPole()
     if model:
-        p, share = second_relaxation(apart, (n - len(parts)) / time, alpha, var_inf, noise * noise)
+        pole = other_pole(apart, (n - len(parts)) / time, alpha, var_inf, noise * noise)
         tests += [_correlated('one_relaxation', [z], _LAGS_FITTED),
-                  TestResult('second_relaxation', p, share,
-                             why_not='' if math.isfinite(p) else 'too few samples')]
+                  TestResult('second_relaxation', pole.second_p, pole.second_share,
+                             why_not='' if math.isfinite(pole.second_p) else 'too few samples')]
     else:
         tests += [TestResult(name, why_not='there is no fitted model')
                   for name in ('one_relaxation', 'second_relaxation')]
-    return Shape(tuple(tests), n, skewness, kurtosis, count, _poisson(count, time))
+    return Shape(tuple(tests), n, skewness, kurtosis, count, _poisson(count, time),
+                 pole.coupling_p)
 
 
 def holm(shapes: Sequence[Shape]) -> tuple[Shape, ...]:
     """Adjust the p-values of all levels together (Holm 1979)."""
     flat = [test.p_value for shape in shapes for test in shape.tests]
     found = iter(adjusted(flat))
-    return tuple(replace(shape, tests=tuple(
-        replace(test, p_adjusted=next(found)) for test in shape.tests)) for shape in shapes)
+    # What the instrument does is a family of its own: it is no kind of process.
+    coupling = adjusted([shape.coupling_p for shape in shapes])
+    return tuple(replace(shape, coupling_p=p, tests=tuple(
+        replace(test, p_adjusted=next(found)) for test in shape.tests))
+        for shape, p in zip(shapes, coupling))
 
 
 def adjusted(p_values: Sequence[float]) -> tuple[float, ...]:

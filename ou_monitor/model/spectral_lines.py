@@ -49,8 +49,9 @@ _FEWEST = 128
 # Ordinates that are enough to tell the noise from.
 _FEWEST_TESTED = 32
 # Neighbours: every second ordinate (those next to each other are correlated by the window),
-# from this many bins away on, so many in all.
-_GUARD, _NEIGHBOURS = 4, 64
+# from this many bins away on, so many in all; in long pieces, whose bins are narrower, up to
+# so many times as many.
+_GUARD, _NEIGHBOURS, _MORE = 4, 64, 4
 # Bins that the window spreads a steady line over, either side.
 _LOBE = 2
 _QUANTILES = 0.5 * (np.polynomial.legendre.leggauss(64)[0] + 1.0)
@@ -168,8 +169,8 @@ def _search(parts: Sequence[FloatArray], rate: float, length: int, where: np.nda
             pieces += number
     raw /= pieces
     df, k = rate / length, float(pieces)
-    middle = _local_median(white, where)
-    near = min(_NEIGHBOURS, _strided(where.size))
+    near = _neighbours(where.size, length / (_SHORT * rate))
+    middle = _local_median(white, where, near)
     ratio = white[where] / np.maximum(middle, 1e-300)
     limit = threshold(k, near, chance)
     hits = np.flatnonzero(ratio > limit)
@@ -222,33 +223,38 @@ def _piece_length(sizes: Sequence[int], most: int) -> int:
     return best
 
 
-def _strided(n: int) -> int:
-    """Return how many neighbours n ordinates can give, even."""
-    return max(2, (n - 2 * _GUARD) // 4 * 2)
+def _neighbours(ordinates: int, share: float) -> int:
+    """Return how many neighbours are used: even, in the same band of Hz for long pieces."""
+    there = max(2, (ordinates - 2 * _GUARD) // 4 * 2)
+    return min(there, _NEIGHBOURS * min(_MORE, max(1, int(share))))
 
 
-def _local_median(density: FloatArray, where: np.ndarray) -> FloatArray:
+def _local_median(density: FloatArray, where: np.ndarray, near: int) -> FloatArray:
     """Return the upper median of the nearest neighbours on either side, shape of `where`."""
     n = where.size
-    near = min(_NEIGHBOURS, _strided(n))
-    side = np.arange(_GUARD, _GUARD + near, 2)
+    # Some ordinates share their neighbours where there are many.
+    hop = max(1, near // _NEIGHBOURS)
+    centres = np.minimum(np.arange(0, n, hop) + hop // 2, n - 1)
+    guard = _GUARD + hop // 2
+    side = np.arange(guard, guard + near, 2)
     both = np.concatenate((-side[::-1], side))
-    found = np.empty(n)
-    inner = np.arange(side[-1], n - side[-1])
-    for part in np.array_split(inner, max(1, inner.size // 4096)):
-        values = density[where[0] + part[:, None] + both[None, :]]
+    found = np.empty(centres.size)
+    inside = (centres >= side[-1]) & (centres < n - side[-1])
+    inner = np.flatnonzero(inside)
+    for part in np.array_split(inner, max(1, inner.size * near // (1 << 18))):
+        values = density[where[0] + centres[part, None] + both[None, :]]
         found[part] = np.partition(values, near // 2, axis=1)[:, near // 2]
     # Near an end there are more on one side: the nearest, wherever they lie.
-    reach = np.arange(_GUARD, _GUARD + 4 * near, 2)
+    reach = np.arange(guard, guard + 4 * near, 2)
     offsets = np.concatenate((-reach[::-1], reach))
-    edges = np.setdiff1d(np.arange(n), inner)
-    index = edges[:, None] + offsets[None, :]
-    inside = (index >= 0) & (index < n)
-    distance = np.where(inside, np.abs(offsets)[None, :], np.iinfo(np.int64).max)
+    edges = np.flatnonzero(~inside)
+    index = centres[edges, None] + offsets[None, :]
+    there = (index >= 0) & (index < n)
+    distance = np.where(there, np.abs(offsets)[None, :], np.iinfo(np.int64).max)
     chosen = np.argpartition(distance, near - 1, axis=1)[:, :near]
-    values = density[where[0] + np.take_along_axis(np.where(inside, index, 0), chosen, 1)]
+    values = density[where[0] + np.take_along_axis(np.where(there, index, 0), chosen, 1)]
     found[edges] = np.partition(values, near // 2, axis=1)[:, near // 2]
-    return found
+    return np.repeat(found, hop)[:n]
 
 
 def _groups(hits: np.ndarray) -> list[np.ndarray]:

@@ -119,11 +119,12 @@ def lines_of(view: View) -> tuple[Line, ...]:
     """Return the lines of what is left over, strongest first."""
     # In all of it: a line may have begun late, and its frequency is no parameter of a
     # likelihood, but pays for its search.
-    return find_lines([view.z], view.rate).lines
+    return find_lines([view.z], view.rate, false_alarm=_PROPOSED).lines
 
 
-# Lines that are tried, one after the other.
-_MOST = 3
+# Lines that are tried, one after the other; probability that noise proposes one, where the
+# evidence of a fit decides.
+_MOST, _PROPOSED = 3, 0.5
 # Linewidth to start from, Hz, and that from which a line is ringing that dies out, if it
 # does not keep its height.
 _WANDERS, WIDEST = 0.3, 2.0
