@@ -16,11 +16,11 @@ import numpy as np
 from ou_monitor.analyze.level_comparison import level_sags, LevelSag
 from ou_monitor.analyze.levels import LoadLevel, Segment
 from ou_monitor.analyze.process_type import classify, ProcessType, Verdict
-from ou_monitor.analyze.spectrum import level_spectrum, segment_rate, Spectrum
+from ou_monitor.analyze.spectrum import level_spectrum, Spectrum
 from ou_monitor.criticism.curves import bin_width
-from ou_monitor.criticism.innovations import fresh
+from ou_monitor.criticism.innovations import fresh, innovations
 from ou_monitor.criticism.level_tests import adjusted, examine_level, FAMILY_WISE, holm, Shape
-from ou_monitor.model.spectral_lines import find_lines, LineSearch, without_lines
+from ou_monitor.model.spectral_lines import find_lines, Grid, LineSearch, on_grid, without_lines
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Recording, Status
 from scipy import stats
@@ -271,16 +271,17 @@ def fit_level(recording: Recording, still: Recording, level: LoadLevel, levels: 
     fits = [fit_stretch(recording, s.start, s.stop) for s in segments]
     estimate, scatter = _pooled(fits)
     parts = [recording.voltage[s.start:s.stop] for s in segments]
-    rate = segment_rate(recording, segments)
-    memory = math.exp(-estimate.alpha / rate) if estimate.usable and rate > 0.0 else 0.0
-    lines = find_lines([still.voltage[s.start:s.stop] for s in segments], rate,
-                       levels=levels, memory=memory)
+    grids = [on_grid(still.t[s.start:s.stop], still.voltage[s.start:s.stop]) for s in segments]
+    even = _grid_rate(grids)
+    lines = find_lines([grid.values for grid in grids], even, levels=levels, white=[
+        _white(still.t[s.start:s.stop], still.voltage[s.start:s.stop], estimate)
+        for s in segments] if estimate.usable else ())
     shape = examine_level([_kept(still, s, estimate) for s in segments], estimate)
     with_lines = None
     # Impulses at even distances have lines, too: those are not taken out.
     if lines.lines and not holm([shape])[0]['impulses'].rejects:
         with_lines = estimate
-        clean, quiet = (_without_lines(x, segments, rate, lines) for x in (recording, still))
+        clean, quiet = (_without_lines(x, segments, even, lines) for x in (recording, still))
         fits = [fit_stretch(clean, s.start, s.stop) for s in segments]
         estimate, scatter = _pooled(fits)
         shape = examine_level([_kept(quiet, s, estimate) for s in segments], estimate)
@@ -304,12 +305,27 @@ def _pooled(fits: Sequence[Estimate]) -> tuple[Estimate, float]:
         flag for flag in estimate.flags if flag is not Flag.NO_EXCITATION)), scatter
 
 
+def _white(t: FloatArray, voltage: FloatArray, estimate: Estimate) -> FloatArray:
+    """Return the innovations of a segment on an even clock (t in s, voltage in V)."""
+    noise = estimate.noise_std if estimate.noise_std > 0.0 else 0.0
+    return on_grid(t, innovations(t, voltage - voltage.mean(), estimate.alpha, estimate.var_inf,
+                                  noise * noise)).values
+
+
+def _grid_rate(grids: Sequence[Grid]) -> float:
+    """Return the rate of the clock of segments, Hz; 0 when there is no time."""
+    steps = sum(grid.values.size - 1 for grid in grids)
+    time = sum((grid.values.size - 1) / grid.rate for grid in grids)
+    return steps / time if time > 0.0 else 0.0
+
+
 def _without_lines(recording: Recording, segments: Sequence[Segment], rate: float,
                    lines: LineSearch) -> Recording:
     """Return the recording without the spectral lines of a level, in its segments."""
     voltage = recording.voltage.copy()
     for s in segments:
-        voltage[s.start:s.stop] = without_lines(voltage[s.start:s.stop], rate, lines.lines)
+        grid = on_grid(recording.t[s.start:s.stop], voltage[s.start:s.stop])
+        voltage[s.start:s.stop] = without_lines(grid.values, rate, lines.lines)[grid.where]
     return replace(recording, voltage=voltage)
 
 

@@ -15,6 +15,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.criticism.innovations import steps_before
 from ou_monitor.model.spectral_lines import find_lines, fit_sinusoid, Sinusoid
 from ou_monitor.model.terms.segment import Segment
 from ou_monitor.model.terms.term import Term
@@ -27,8 +28,6 @@ TRAIN = 0.6
 # Samples kept count up to this far outside of the throttle that the part fitted has
 # been through: a share of its range, and what is no change of throttle at all.
 _BEYOND, _STILL = 0.05, 0.01
-# Steps that differ by less than this share count as alike.
-ALIKE = 0.3
 # Samples that are fitted at most.
 MOST = 80_000
 # Steps of up to this many relaxation times keep alpha identifiable.
@@ -112,13 +111,7 @@ class Samples:
     @cached_property
     def step(self) -> FloatArray:
         """Return the time before each sample, s; infinite before the first."""
-        step = np.diff(self.t, prepend=-np.inf)
-        usual = float(np.median(step[1:]))
-        # A step a little off moves a prediction by much less than its error, and an
-        # even spacing saves most of the time.
-        near = np.abs(step - usual) < ALIKE * usual
-        step[near] = usual
-        return step
+        return steps_before(self.t)
 
     @cached_property
     def even(self) -> bool:

@@ -35,7 +35,7 @@ import numpy.typing as npt
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.text import Z95
 from scipy.optimize import brentq
-from scipy.signal import detrend, lfilter, welch
+from scipy.signal import welch
 from scipy.special import betaincinv, chndtrinc, gammaincc, gammaincinv
 
 # Probability that a recording without lines has one reported at any of its levels.
@@ -56,6 +56,8 @@ _GUARD, _NEIGHBOURS, _MORE = 4, 64, 4
 _LOBE = 2
 _QUANTILES = 0.5 * (np.polynomial.legendre.leggauss(64)[0] + 1.0)
 _WEIGHTS = 0.5 * np.polynomial.legendre.leggauss(64)[1]
+# Missing samples are put in up to so many in all for each that is there.
+_FILLED = 4.0
 # Parts of a piece whose phases are compared, and frequencies tried for each bin of the piece.
 _PHASES, _TRIED = 64, 32
 
@@ -117,15 +119,54 @@ class LineSearch:
     why_not: str = ''
 
 
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """
+    Samples on an even clock, those that are missing put in on straight lines.
+
+    Attributes
+    ----------
+    values : ndarray
+        Samples.
+    where : ndarray of int
+        Which of them were given.
+    rate : float
+        Samples per second, Hz.
+
+    """
+
+    values: FloatArray
+    where: npt.NDArray[np.intp]
+    rate: float
+
+
+def on_grid(t: FloatArray, values: FloatArray) -> Grid:
+    """Return samples on the even clock that their stamps follow, steps rounded (t in s)."""
+    step = np.diff(t)
+    usual = float(np.median(step)) if step.size else math.inf
+    number = np.maximum(1.0, np.rint(step / usual))
+    if number.sum() > _FILLED * t.size:
+        # Pauses are most of it: the samples follow each other as if there were none.
+        number = np.ones(step.size)
+    where = np.append(0.0, np.cumsum(number)).astype(np.intp)
+    rate = float(where[-1] / (t[-1] - t[0])) if step.size else NAN
+    if where[-1] == step.size:
+        return Grid(values, where, rate)
+    return Grid(np.interp(np.arange(where[-1] + 1.0), where, values), where, rate)
+
+
 def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float = FALSE_ALARM,
-               levels: int = 1, memory: float = 0.0, lowest: float = 0.0) -> LineSearch:
+               levels: int = 1, white: Sequence[FloatArray] = (), lowest: float = 0.0
+               ) -> LineSearch:
     """
     Look for lines in segments of evenly spaced samples, strongest first.
 
-    parts in V, rate in Hz; memory is what a sample keeps of the one before, lowest in Hz.
+    parts in V, rate and lowest in Hz; white holds their innovations, in whose level spectrum
+    lines are looked for where parts are not white themselves.
     """
     # A detrended constant would be roundings.
-    parts = [part - part.mean() for part in parts if part.size]
+    parts, white = ([part - part.mean() for part in some if part.size]
+                    for some in (parts, white or parts))
     sizes = [part.size for part in parts]
     short = _piece_length(sizes, max(_FEWEST, int(_SHORT * rate)))
     if not (short and rate > 0.0):
@@ -138,12 +179,16 @@ def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float =
     found: list[Line] = []
     detectable = NAN
     for length, where in tested.items():
-        lines, least = _search(parts, rate, length, where, memory,
+        lines, least = _search(parts, white, rate, length, where,
                                false_alarm / (levels * count))
-        # What wanders stands in the short pieces; a line that both show is measured there.
-        found += [line for line in lines if not any(
-            abs(line.frequency - other.frequency) < 2 * _LOBE * other.resolution
-            for other in found)]
+        # What wanders stands in the short pieces; a line that both show is measured there,
+        # unless it is clear in the long ones alone.
+        for line in lines:
+            same = [other for other in found if abs(line.frequency - other.frequency)
+                    < 2 * _LOBE * other.resolution]
+            if all(other.p_value > max(line.p_value, FALSE_ALARM / (levels * count))
+                   for other in same):
+                found = [other for other in found if other not in same] + [line]
         detectable = least if length == short else detectable
     found = [replace(line, p_value=min(1.0, levels * count * line.p_value)) for line in found]
     found.sort(key=lambda line: -line.rms)
@@ -151,23 +196,13 @@ def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float =
     return LineSearch(tuple(found), count, float(first), float(last), detectable)
 
 
-def _search(parts: Sequence[FloatArray], rate: float, length: int, where: np.ndarray,
-            memory: float, chance: float) -> tuple[list[Line], float]:
+def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: float, length: int,
+            where: np.ndarray, chance: float) -> tuple[list[Line], float]:
     """Return lines among ordinates, each by chance so often; and the RMS that is found, V."""
-    def whiten(pieces: FloatArray) -> FloatArray:
-        e = lfilter([1.0, -memory], [1.0], detrend(pieces))
-        e[..., 0] = 0.0
-        return np.asarray(e)
-
-    raw, white, pieces = np.zeros(length // 2 + 1), np.zeros(length // 2 + 1), 0
-    for part in parts:
-        number = part.size // length
-        if number:
-            same = {'nperseg': length, 'noverlap': 0}
-            raw += number * welch(part, rate, detrend='linear', **same)[1]
-            white += number * welch(part, rate, detrend=whiten, **same)[1]
-            pieces += number
-    raw /= pieces
+    pieces = sum(part.size // length for part in parts)
+    raw, white = (sum(part.size // length * welch(
+        part, rate, nperseg=length, noverlap=0, detrend='linear')[1]
+        for part in some if part.size >= length) / pieces for some in (parts, whites))
     df, k = rate / length, float(pieces)
     near = _neighbours(where.size, length / (_SHORT * rate))
     middle = _local_median(white, where, near)
@@ -180,7 +215,7 @@ def _search(parts: Sequence[FloatArray], rate: float, length: int, where: np.nda
     # The median of a gamma variable, in units of its mean.
     background /= float(gammaincinv(k, 0.5)) / k
     total = float(sum(part @ part for part in parts) / sum(part.size for part in parts))
-    lines = [_measure(raw, background, where, group, p, df, total, k)
+    lines = [_measure(raw, background, white[where], middle, where, group, p, df, total, k)
              for group in _groups(hits)]
     return lines, _detectable(float(np.median(background)), df, k, limit)
 
@@ -264,15 +299,17 @@ def _groups(hits: np.ndarray) -> list[np.ndarray]:
     return list(np.split(hits, np.flatnonzero(np.diff(hits) > 2 * _LOBE) + 1))
 
 
-def _measure(raw: FloatArray, background: FloatArray, where: np.ndarray, group: np.ndarray,
-             p: FloatArray, df: float, total: float, k: float) -> Line:
+def _measure(raw: FloatArray, background: FloatArray, white: FloatArray, middle: FloatArray,
+             where: np.ndarray, group: np.ndarray, p: FloatArray, df: float, total: float, k: float
+             ) -> Line:
     """Return frequency and power of the line that a group of ordinates belongs to."""
     low, high = max(0, group[0] - _LOBE), min(where.size, group[-1] + _LOBE + 1)
     if group.size <= 2 * _LOBE + 1:
-        peak = int(group[np.argmax(raw[where[group]])])
+        peak = int(group[np.argmax(white[group])])
         low, high = max(0, peak - _LOBE), min(where.size, peak + _LOBE + 1)
     density, noise = raw[where[low:high]], background[low:high]
-    excess = np.maximum(density - noise, 0.0)
+    # The mean of a gamma variable, in units of its median.
+    excess = np.maximum(white[low:high] - k / float(gammaincinv(k, 0.5)) * middle[low:high], 0.0)
     power = float((density - noise).sum() * df)
     floor = float(noise.mean() * df)
     # Window of Hann: sum w^4 / (sum w^2)^2 = 1.94 / n; correlations 4/9 and 1/36 of neighbours.

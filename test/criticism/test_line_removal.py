@@ -35,7 +35,8 @@ def test_a_steady_tone_goes_and_the_rest_stays():
     the mean: 0.39 mV, in each of five pieces with an error of a third.
     """
     noisy, clean = made(0.02, 1), made(0.0, 1)
-    search = find_lines([noisy.voltage], RATE, memory=np.exp(-ALPHA / RATE))
+    search = find_lines([noisy.voltage], RATE, white=[
+        lfilter([1.0, -np.exp(-ALPHA / RATE)], [1.0], noisy.voltage - noisy.voltage.mean())])
     assert [round(line.frequency) for line in search.lines] == [120]
     left = without_lines(noisy.voltage, RATE, search.lines) - clean.voltage
     assert np.sqrt(np.mean(left ** 2)) < 7e-4

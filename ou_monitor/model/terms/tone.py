@@ -8,7 +8,7 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.spectral_lines import find_lines, fit_sinusoid, Line
+from ou_monitor.model.spectral_lines import find_lines, fit_sinusoid, Line, on_grid
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import keeps_its_height, rotation
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
@@ -82,8 +82,9 @@ class Tone(Term):
     @classmethod
     def at(cls, line: Line, view: View) -> Tone:
         """Return a start for a line of what is left over: where it is over the whole recording."""
-        return cls(0.0, fit_sinusoid(view.z, view.rate, line.frequency, line.resolution).frequency,
-                   0.0, 0.0)
+        grid = on_grid(view.at, view.z)
+        wave = fit_sinusoid(grid.values, grid.rate, line.frequency, line.resolution)
+        return cls(0.0, wave.frequency, 0.0, 0.0)
 
     def holds(self, view: View) -> bool:
         """Return whether it is a line, not ringing."""
@@ -119,7 +120,8 @@ def lines_of(view: View) -> tuple[Line, ...]:
     """Return the lines of what is left over, strongest first."""
     # In all of it: a line may have begun late, and its frequency is no parameter of a
     # likelihood, but pays for its search.
-    return find_lines([view.z], view.rate, false_alarm=_PROPOSED).lines
+    grid = on_grid(view.at, view.z)
+    return find_lines([grid.values], grid.rate, false_alarm=_PROPOSED).lines
 
 
 # Lines that are tried, one after the other; probability that noise proposes one, where the
