@@ -11,7 +11,8 @@ from ou_monitor.analyze.level_comparison import LEVEL
 from ou_monitor.analyze.level_result import LevelResult
 from ou_monitor.analyze.relaxation import Relaxation
 from ou_monitor.analyze.words import headline
-from ou_monitor.criticism.level_tests import EFFECT, FAMILY_WISE, LEAST
+from ou_monitor.criticism.innovations import FAMILY_WISE
+from ou_monitor.criticism.level_tests import EFFECT, LEAST
 from ou_monitor.model.spectral_lines import FALSE_ALARM
 
 

@@ -18,8 +18,8 @@ from ou_monitor.analyze.levels import LoadLevel, Segment
 from ou_monitor.analyze.process_type import classify, ProcessType, Verdict
 from ou_monitor.analyze.spectrum import level_spectrum, Spectrum
 from ou_monitor.criticism.curves import bin_width
-from ou_monitor.criticism.innovations import fresh, innovations
-from ou_monitor.criticism.level_tests import adjusted, examine_level, FAMILY_WISE, holm, Shape
+from ou_monitor.criticism.innovations import FAMILY_WISE, fresh, innovations
+from ou_monitor.criticism.level_tests import adjusted, examine_level, holm, Shape
 from ou_monitor.model.spectral_lines import find_lines, Grid, LineSearch, on_grid, without_lines
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Recording, Status

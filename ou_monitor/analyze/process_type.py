@@ -29,7 +29,8 @@ from dataclasses import dataclass
 import enum
 import math
 
-from ou_monitor.criticism.level_tests import FAMILY_WISE, Shape, TestResult
+from ou_monitor.criticism.innovations import FAMILY_WISE
+from ou_monitor.criticism.level_tests import Shape, TestResult
 from ou_monitor.records import Estimate, Status
 from scipy import stats
 

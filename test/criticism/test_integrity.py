@@ -5,7 +5,7 @@ import tracemalloc
 
 import numpy as np
 from ou_monitor.criticism.adc import find_rails, find_step
-from ou_monitor.criticism.integrity import examine, LEAST
+from ou_monitor.criticism.integrity import _judge_step, examine, LEAST
 from ou_monitor.criticism.samples import choose_samples, events_between, MOST
 from ou_monitor.criticism.stamps import judge_stamps
 from ou_monitor.model.ou import simulate
@@ -267,3 +267,18 @@ def test_events_that_only_neighbours_show_are_kept():
     assert found.samples.n == v[plain].size + kept.size
     assert (np.diff(found.samples.t) > 0.0).all()
     assert not events_between(rail(14, n, rate)[1], None, rate, plain).size
+
+
+@pytest.mark.parametrize('times, named', [(0.25, False), (0.297, False), (0.303, True),
+                                          (1.0, True), (2.0, True)])
+def test_a_step_is_held_against_the_noise_without_its_own_rounding(times, named):
+    """
+    Rounding adds step^2 / 12 to a sample, so step^2 / 6 to the square of an innovation.
+
+    A noise of 1 mV that was rounded is 1 mV again: steps count from 0.3 mV on, and the note
+    gives them in units of that noise.
+    """
+    exact, notes = [], []
+    _judge_step(1e-3 * times, 1e-3 * math.sqrt(1.0 + times**2 / 6.0), exact, notes)
+    assert [term.NAME for term in exact] == ['quantization'] * named
+    assert not named or f', {times:.2g} times the noise' in notes[0]

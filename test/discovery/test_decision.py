@@ -309,6 +309,14 @@ def test_what_is_withdrawn(before, after, accepted, out):
     assert decision.withdrawn(before, after, accepted) == out
 
 
+@pytest.mark.parametrize('left, withdrawn', [(-44.0, False), (-46.0, True), (46.0, False)])
+def test_an_ac_coupling_may_leave_three_quarters_of_the_slow_power_missing(left, withdrawn):
+    """An instrument may have two corners; slow power in excess is none of its signs."""
+    kinds = [catalogue()['ac_coupling']]
+    found = decision.withdrawn({'band 0': -60.0}, {'band 0': left}, kinds)
+    assert found == ([0] if withdrawn else [])
+
+
 @pytest.mark.parametrize('score, causes, dropped, verdict', [
     # One statistic: 1 % at 2.576, 0.1 % at 3.291.
     (2.57, 0, 0, Verdict.NO_EFFECT), (2.58, 0, 0, Verdict.UNEXPLAINED),
