@@ -31,10 +31,10 @@ from mutation_runs import Reach, reach, read_lines, stop, Tree
 ROOT = Path(__file__).resolve().parent.parent
 SEED = 20261122
 FOLDERS = ('ou_monitor/online', 'ou_monitor/model/terms', 'ou_monitor/criticism',
-           'ou_monitor/discover')
+           'ou_monitor/discovery')
 # Not by default: real-time runs of ROS, whose timing two runs at once spoil; what builds the
 # package or looks at the sources rather than at what they calculate.
-TESTS = ('test/online', 'test/model', 'test/criticism', 'test/discover', 'test/analyze',
+TESTS = ('test/online', 'test/model', 'test/criticism', 'test/discovery', 'test/analyze',
          'test/coupling', 'test/simulate', 'test/stream', 'test/fleet', 'test/cli')
 STATUSES = ('killed', 'timeout', 'survived', 'not covered')
 
@@ -215,6 +215,9 @@ def main() -> int:
     given = parser.parse_args()
     if given.number < 1 or given.jobs < 1:
         parser.error('--number and --jobs need 1 or more')
+    for name in (*given.folders, *given.tests):
+        if not (ROOT / name).exists():
+            parser.error(f'there is no {name}')
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:

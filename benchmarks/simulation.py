@@ -28,7 +28,7 @@ for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np  # noqa: E402
-from ou_monitor.model.supply import Simulation, SEGMENT, SupplyModel  # noqa: E402
+from ou_monitor.model.supply import SEGMENT, Simulation, SupplyModel  # noqa: E402
 from ou_monitor.model.terms.ac_coupling import ACCoupling  # noqa: E402
 from ou_monitor.model.terms.flicker_noise import FlickerNoise  # noqa: E402
 from ou_monitor.model.terms.jumps import Jumps  # noqa: E402
