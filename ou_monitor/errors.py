@@ -36,7 +36,7 @@ class InputError(Exception):
 def refusal(error: OSError) -> str:
     """Return what the system refused, in one line."""
     why = ' '.join((error.strerror or str(error)).split())
-    return why if error.filename is None else f"cannot use '{error.filename}': {why}"
+    return printable(why if error.filename is None else f"cannot use '{error.filename}': {why}")
 
 
 def nearest(word: str, valid: Iterable[str]) -> str:

@@ -9,7 +9,7 @@ was recompressed is another recording.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 import hashlib
 import os
@@ -24,6 +24,8 @@ from ou_monitor.text import printable
 # What `convert` takes and this does not.
 _LOGS = ('.ulg', '.bin', '.bbl', '.bfl', '.db3')
 _BLOCK = 1 << 20
+# Folders within folders that are searched.
+_MOST_DEPTH = 50
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ class _Search:
         def closed(error: OSError) -> None:
             self._closed.append(f"'{error.filename}' ({error.strerror})")
 
-        for folder, inner, names in os.walk(root, onerror=closed):
+        for folder, inner, names in _walk(root, closed):
             here = Path(folder)
             if self._leave_out is not None and here.resolve() == self._leave_out:
                 inner.clear()
@@ -150,6 +152,17 @@ class _Search:
         return found
 
 
+def _walk(root: Path, onerror: Callable[[OSError], None] | None = None,
+          ) -> Iterator[tuple[str, list[str], list[str]]]:
+    """Yield as os.walk does, which calls itself for each level, to a depth that ends."""
+    for folder, inner, names in os.walk(root, onerror=onerror):
+        if folder.count(os.sep) - str(root).count(os.sep) >= _MOST_DEPTH and inner:
+            inner.clear()
+            if onerror is not None:
+                onerror(OSError(0, f'what is in it lies more than {_MOST_DEPTH} deep', folder))
+        yield folder, inner, names
+
+
 def _passed(paths: Sequence[Path], what: str, why: str) -> str:
     many = '' if len(paths) == 1 else 's'
     return f"{len(paths)} {what}{many} passed over, such as '{paths[0]}': {why}."
@@ -182,7 +195,7 @@ def _has_columns(path: Path) -> bool:
 def _source(path: Path) -> Source:
     files = [path]
     if os.path.isdir(path):
-        files = sorted(Path(folder) / name for folder, _, names in os.walk(path) for name in names)
+        files = sorted(Path(folder) / name for folder, _, names in _walk(path) for name in names)
     size, stamps = 0, []
     for file in list(files):
         try:

@@ -30,7 +30,8 @@ _MOST_OF_PATTERN = 1000
 _PATIENCE = 10.0
 # Run in a process of its own.
 _MATCH = """
-import json, re, sys
+import json, re, resource, sys
+resource.setrlimit(resource.RLIMIT_AS, (2 ** 31, 2 ** 31))
 text, paths = json.load(sys.stdin)
 pattern = re.compile(text)
 key = 'vehicle' if 'vehicle' in pattern.groupindex else 1 if pattern.groups else 0
@@ -115,12 +116,16 @@ def match_paths(pattern: re.Pattern[str] | None, paths: tuple[Path, ...]) -> dic
     try:
         done = subprocess.run([sys.executable, '-I', '-S', '-c', _MATCH], input=given, text=True,
                               capture_output=True, timeout=_PATIENCE, check=True)
+    except subprocess.CalledProcessError as error:
+        why = (error.stderr.splitlines() or ['no reason'])[-1]
+        raise InputError(f"--vehicle-from: '{pattern.pattern}' cannot be used "
+                         f'({printable(why, 100)})') from None
     except subprocess.TimeoutExpired:
         raise InputError(f"--vehicle-from: '{pattern.pattern}' takes more than "
                          f'{_PATIENCE:g} s for {counted(len(paths), "path")}: avoid repeats of '
                          'repeats, such as (a+)+') from None
-    return {path: printable(name) for path, name in zip(paths, json.loads(done.stdout),
-                                                        strict=True)}
+    return {path: printable(name, 200)
+            for path, name in zip(paths, json.loads(done.stdout), strict=True)}
 
 
 def _folder_names(folders: set[Path]) -> dict[Path, str]:

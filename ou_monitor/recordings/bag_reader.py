@@ -29,7 +29,7 @@ from ou_monitor.recordings.limits import over_limit
 from ou_monitor.recordings.mcap_file import (
     backwards, in_parts, in_time_order, McapFile, Part, RawMessage)
 from ou_monitor.recordings.mcap_records import Table
-from ou_monitor.recordings.rosbag2_metadata import find_files, parse_qos, TopicInfo
+from ou_monitor.recordings.rosbag2_metadata import find_files, MOST_BYTES, parse_qos, TopicInfo
 from ou_monitor.text import printable, some
 import zstandard
 
@@ -190,6 +190,7 @@ class BagReader:
         self.sample_rates: dict[str, float] = {}
         self.origins: dict[str, dict[str, str]] = {}
         self._schemas: dict[str, Schema] = {}
+        spent = 0
         for file in self._files:
             for key, topic in file.topics.items():
                 if topic.sample_rate is not None:
@@ -198,7 +199,10 @@ class BagReader:
                     self.origins[topic.name] = topic.origin
                 known = self.info.get(topic.name)
                 if known is None:
-                    reliability, durability, depth = parse_qos(qos.get(topic.name) or topic.qos)
+                    profiles = qos.get(topic.name) or topic.qos
+                    spent += len(profiles) if isinstance(profiles, str) else 0
+                    reliability, durability, depth = parse_qos(
+                        profiles if spent < MOST_BYTES else None)
                     known = TopicInfo(topic.name, topic.type, 0, reliability, durability, depth)
                     self._schemas[topic.type] = topic.schema
                 if known.type != topic.type:

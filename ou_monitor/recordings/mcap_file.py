@@ -197,14 +197,20 @@ class McapFile(McapIndex):
 
     def _read_about(self, file: BinaryIO, summary: Any, size: int) -> None:
         """Read the metadata records that the summary lists; a broken one is noted."""
+        left = 2 * MOST_METADATA
         for index in summary.metadata_indexes:
             try:
                 record = record_at(file, index.offset, size, True)
                 check_passed_over(file, record)
+                left -= record.end - record.offset
+                if left < 0:
+                    raise Damage(record.offset, 'the metadata records before it are too many')
                 file.seek(record.content)
-                self.learn_about(file.read(min(record.length, MOST_METADATA + 1)), record.offset)
+                self.learn_about(file.read(record.length), record.offset)
             except Damage as error:
-                self.notes.append(f'Metadata of {self.path.name} cannot be read ({error}).')
+                self.notes.append(f'Metadata of {printable(self.path.name)} cannot be read '
+                                  f'({error}).')
+                break
 
     def channels_of(self, wanted: set[str]) -> dict[int, TopicRecord]:
         """Return the channels of some topics."""

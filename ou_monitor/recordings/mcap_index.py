@@ -30,6 +30,8 @@ ORIGIN = 'origin.'
 # Places of damage after which a walk is given up, and topics left out that are named.
 MOST_BREAKS = 10_000
 MOST_NOTES = 20
+# rosbag2 writes one table of contents, and another at the end.
+_MOST_TABLES = 3
 # DDS has no longer names.
 _MOST_OF_NAME = 256
 
@@ -142,6 +144,7 @@ class McapIndex:
         self.notes: list[str] = []
         self.start_ns = self.end_ns = 0
         self._codec = codec
+        self._tables = 0
 
     def note_damage(self, error: Damage) -> None:
         """Note a damage."""
@@ -168,7 +171,8 @@ class McapIndex:
             raise Damage(offset, f'a metadata record cannot be read ({error!r})') from error
         if record.name == ABOUT:
             self.about |= plain_texts(record.metadata)
-        elif record.name == ROSBAG2:
+        elif record.name == ROSBAG2 and self._tables < _MOST_TABLES:
+            self._tables += 1
             try:
                 table = parse_yaml(record.metadata.get('serialized_metadata', ''), ROSBAG2,
                                    most_bytes=MOST_BYTES, most_nodes=MOST_NODES)

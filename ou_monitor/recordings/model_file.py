@@ -53,7 +53,7 @@ def read_model(path: str | Path) -> ModelFile:
     """
     Read a model file: a regular file of at most 1 MB.
 
-    Takes up to 2 s for the largest; a node reads it beside its executor, not in a callback.
+    The largest takes 2 to 5 s: a node reads it beside its executor, not in a callback.
     """
     data = read_yaml(path, 'the model file')
     with one_line():

@@ -24,7 +24,7 @@ import yaml
 MOST_CHARACTERS = 300
 _MOST_OF_PATH = 150
 
-# A model file has some kB, a msg config less.  PyYAML takes up to 2 s for so much.
+# A model file has some kB, a msg config less.  PyYAML takes 2 to 5 s for so much.
 MOST_BYTES = 1_000_000
 # Aliases count as often as they stand for something: a mapping that is named a
 # hundred times in lists of a hundred is a bomb, whatever its size in bytes.

@@ -63,6 +63,19 @@ def test_a_row_each(odd, tmp_path, one_process):
     assert all(note.isprintable() for note in fleet.notes)
 
 
+def test_folders_in_folders_without_end(odd):
+    """A thousand levels are not searched, and what lies beside them is."""
+    before = len(find_recordings([str(odd)]).sources)
+    at = os.open(odd, os.O_RDONLY)
+    for _ in range(1200):
+        os.mkdir('d', dir_fd=at)
+        at, above = os.open('d', os.O_RDONLY, dir_fd=at), at
+        os.close(above)
+    os.close(at)
+    found = find_recordings([str(odd)])
+    assert len(found.sources) == before and 'more than 50 deep' in ' '.join(found.notes)
+
+
 def test_a_folder_that_may_be_listed_and_not_entered(odd, monkeypatch):
     """What the system refuses about one folder is no end of the search."""
     is_file = Path.is_file
@@ -111,6 +124,13 @@ def test_a_pattern_without_end(tmp_path, monkeypatch, text):
     with pytest.raises(InputError, match='takes more than 1 s'):
         match_paths(read_pattern(text), (path,))
     assert time.monotonic() - began < 5.0
+
+
+def test_a_pattern_that_takes_all_memory(monkeypatch):
+    """What its process says at its end is one line."""
+    monkeypatch.setattr(vehicles, '_MATCH', 'raise MemoryError("no\x1b room")')
+    with pytest.raises(InputError, match='cannot be used .MemoryError'):
+        match_paths(read_pattern('a'), (Path('/a'),))
 
 
 @pytest.mark.parametrize('text', ['a' * 2000, '(' * 900, 'a{99999999999999999999}', '*'])

@@ -201,6 +201,22 @@ def test_an_index_that_lies(tmp_path, lie, times):
     assert time.monotonic() - began < 2.0
 
 
+def test_metadata_that_is_listed_many_times(tmp_path):
+    """Megabytes are read a few times, not as often as an index says."""
+    head = record(Op.HEADER, text('ros2'), text(''))
+    big = record(Op.METADATA, text('rosbag2'), text(text('serialized_metadata') + text(
+        'custom_data: {vehicle: one}\n' + '#' * 900_000)))
+    one = chunk(schema() + channel() + messages())
+    at = len(MAGIC) + len(head)
+    lists = record(Op.METADATA_INDEX, struct.pack('<QQ', at, len(big)), text('rosbag2')) * 50_000
+    summary = schema() + channel() + index_of(at + len(big), len(one), len(one) - 49)
+    path = written(tmp_path / 'a.mcap', big, one, summary=summary + statistics() + lists)
+    began = time.monotonic()
+    bag = BagReader(path)
+    assert time.monotonic() - began < 15.0
+    assert bag.message_count == N and bag.about == {'vehicle': 'one'} and len(bag.notes) == 1
+
+
 def pairs(*places):
     """Return a message index of channel 1."""
     content = b''.join(struct.pack('<QQ', 0, place) for place in places)
