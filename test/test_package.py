@@ -244,6 +244,13 @@ def test_requirements_agree_with_setup_py():
     declared = re.search(r'install_requires=\[(.*?)\]', setup, re.DOTALL).group(1)
     assert sorted(re.findall(r"'(.+?)'", declared)) == sorted(listed)
     assert all('>=' in line and ',<' in line for line in listed)
+    # What apt installs for a colcon workspace has the same bounds.
+    names = {'numpy': 'numpy', 'scipy': 'scipy', 'PyYAML': 'yaml'}
+    depends = {element.text: f">={element.get('version_gte')},<{element.get('version_lt')}"
+               for element in ElementTree.parse(ROOT / 'package.xml').iter('exec_depend')}
+    for line in listed:
+        name = re.match(r'[\w-]+', line).group()
+        assert name not in names or depends[f'python3-{names[name]}'] == line[len(name):]
 
 
 def requirements(name: str) -> list[Requirement]:
