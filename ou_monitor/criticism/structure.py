@@ -125,7 +125,7 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
     """Return what a model with given parameters says of a recording."""
     run = _filter(samples, terms, events)
     columns = _columns(samples, terms, run.segment)
-    beta = np.concatenate([_linear(term) for term in terms])
+    beta = np.array([value for term in terms for value in coefficients(term)])
     mean = columns @ beta
     e = run.filter.innovations(samples.voltage - mean)
     # An event is the law's to expect, at its own sample: not so while it is fitted around.
@@ -139,11 +139,11 @@ def _log_density(e: FloatArray, variance: FloatArray) -> FloatArray:
     return density
 
 
-def _linear(term: Term) -> FloatArray:
+def coefficients(term: Term) -> list[float]:
     """Return the coefficients of a term's columns."""
     if isinstance(term, OU):
-        return np.array([term.u0])
-    return np.array(term.linear_values() if term.ROLE is Role.MEAN else [], dtype=np.float64)
+        return [term.u0]
+    return term.linear_values() if term.ROLE is Role.MEAN else []
 
 
 def _columns(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
@@ -166,21 +166,7 @@ def _columns(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """
-    A filter over the samples, and the variances that it predicts.
-
-    Attributes
-    ----------
-    segment : Segment
-        The samples, with alpha and sigma of each step.
-    filter : Filter
-        Over all of them.
-    plain, full : ndarray, shape (n,)
-        Predictive variances, V^2: without what events add at their own sample, and with it.
-    cost : float
-        s.
-
-    """
+    """A filter over the samples, variances without and with events at their own, cost in s."""
 
     segment: Segment
     filter: Filter

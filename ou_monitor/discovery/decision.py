@@ -27,8 +27,8 @@ OFF = 4.5
 # Evidence, nats, from which a cause that leaves nothing off (so far) spares trials of dear
 # kinds of other families: e^30, beyond what any other would gain by chance.
 CLEAR = 30.0
-# What a fit to some thousand samples may lack of that to all, nats; seen on the generator
-# of test/hidden.
+# What a fit to some thousand samples may lack of that to all, nats: measured on the
+# generator of test/hidden.
 ROUGH = 20.0
 # Time that filters may take before no dear kind is tried any more, s.
 MOST_COST = 10.0

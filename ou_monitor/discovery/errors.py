@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.structure import evaluate
+from ou_monitor.criticism.structure import coefficients, evaluate
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray, NAN
@@ -46,12 +46,12 @@ def _gathered(term: Term, se: dict[str, float]) -> dict[str, Any]:
 def _of_mean(samples: Samples, model: Composite, part: slice) -> dict[int, dict[str, Any]]:
     """Return errors of the level and of what multiplies known columns."""
     terms = model.gaussian.terms
-    where = [(k, j) for k, term in enumerate(terms) for j in range(len(_linear(term)))]
+    where = [(k, j) for k, term in enumerate(terms) for j in range(len(coefficients(term)))]
     base = evaluate(samples, terms)
     weight = 1.0 / np.sqrt(base.variance[part])
     through = np.empty((weight.size, len(where)))
     for column, (k, j) in enumerate(where):
-        beta = _linear(terms[k])
+        beta = coefficients(terms[k])
         # Innovations are linear in these, so any step will do.
         beta[j] += 1.0
         moved = evaluate(samples, (*terms[:k], _with(terms[k], beta), *terms[k + 1:]))
@@ -69,19 +69,13 @@ def _of_mean(samples: Samples, model: Composite, part: slice) -> dict[int, dict[
     return found
 
 
-def _linear(term: Term) -> list[float]:
-    if isinstance(term, OU):
-        return [term.u0]
-    return term.linear_values() if term.ROLE is Role.MEAN else []
-
-
 def _with(term: Term, beta: list[float]) -> Term:
     return replace(term, u0=beta[0]) if isinstance(term, OU) else term.with_linear(beta)
 
 
 def _by_parameter(term: Term, covariance: FloatArray) -> dict[str, Any]:
     """Return errors of parameters from the covariance of the coefficients."""
-    beta = _linear(term)
+    beta = coefficients(term)
     names = ('u0',) if isinstance(term, OU) else term.LINEAR
     spread = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
     slopes = np.zeros((len(names), len(beta)))
@@ -163,8 +157,8 @@ def estimations(samples: Samples, model: Composite, *parts: npt.NDArray[np.bool_
     owner, through = [], []
     for k, term in enumerate(terms):
         moved: list[tuple[Term, float]] = []
-        for j in range(len(_linear(term))):
-            beta = _linear(term)
+        for j in range(len(coefficients(term))):
+            beta = coefficients(term)
             beta[j] += 1.0
             moved.append((_with(term, beta), 1.0))
         moved += [_stepped(term, name) for name in term.free()]

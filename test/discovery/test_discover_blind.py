@@ -44,13 +44,13 @@ def drawn(kind: str, effect: str, number: int) -> tuple[Recording, object]:
     return Recording(hidden.t, hidden.voltage, hidden.throttle, 'blind'), hidden
 
 
-def seen(kind: str, effect: str, number: int = 0) -> Outcome:
+def outcome_of(kind: str, effect: str, number: int = 0) -> Outcome:
     """Return what `discover` makes of a recording; once for all tests."""
-    return _seen(kind, effect, number)
+    return _outcome_of(kind, effect, number)
 
 
 @cache
-def _seen(kind: str, effect: str, number: int) -> Outcome:
+def _outcome_of(kind: str, effect: str, number: int) -> Outcome:
     recording, hidden = drawn(kind, effect, number)
     finding = discover(recording)
     return outcome(hidden, finding.verdict.value, finding.causes)
@@ -67,7 +67,7 @@ def least(count: int, share: float) -> int:
     return int(binom.ppf(RARE, count, share))
 
 
-def told(outcomes: list[Outcome]) -> str:
+def summary(outcomes: list[Outcome]) -> str:
     """Return what was said of each, for the message of a failure."""
     return f'{SEED}: ' + '; '.join(
         f"{one.effect}: {one.verdict}, {dict(one.named) or 'nothing'}" for one in outcomes)
@@ -84,10 +84,10 @@ def test_each_cause_is_named(cause):
     """
     tried = []
     for number in range(TRIES):
-        tried.append(seen('single', cause, number))
+        tried.append(outcome_of('single', cause, number))
         if cause in tried[-1].named:
             return
-    pytest.fail(told(tried))
+    pytest.fail(summary(tried))
 
 
 def test_most_causes_are_named_alone_or_in_the_set():
@@ -96,14 +96,14 @@ def test_most_causes_are_named_alone_or_in_the_set():
 
     Fewer have chances of 0.4 % each at those levels, and of 84 % and 97 % at 60 %.
     """
-    found = [seen('single', cause) for cause in causes()]
+    found = [outcome_of('single', cause) for cause in causes()]
     for truth, row in confusion(found).items():
         print(f'{truth:>22}:', ', '.join(
             f'{name} {count}' for name, count in row.items() if name != 'of'))
     alone, in_set = sum(one.alone for one in found), sum(one.in_set for one in found)
     print(f'{SEED}: {alone} of {len(found)} alone, {in_set} in the set')
-    assert alone >= least(len(found), 0.90), told([one for one in found if not one.alone])
-    assert in_set >= least(len(found), 0.95), told([one for one in found if not one.in_set])
+    assert alone >= least(len(found), 0.90), summary([one for one in found if not one.alone])
+    assert in_set >= least(len(found), 0.95), summary([one for one in found if not one.in_set])
 
 
 def test_nothing_is_found_where_nothing_is_hidden():
@@ -112,9 +112,9 @@ def test_nothing_is_found_where_nothing_is_hidden():
 
     Three or more have a chance of 0.6 % at 5 %, and of 86 % where half are alarms.
     """
-    found = [seen('none', '', number) for number in range(8)]
+    found = [outcome_of('none', '', number) for number in range(8)]
     most = len(found) - least(len(found), 0.95)
-    assert sum(one.alarm for one in found) <= most, told(found)
+    assert sum(one.alarm for one in found) <= most, summary(found)
 
 
 def test_two_at_once_are_both_named():
@@ -123,8 +123,8 @@ def test_two_at_once_are_both_named():
 
     Fewer have a chance of 0.7 % at that level, and of 53 % at 30 %.
     """
-    found = [seen('pair', '+'.join(pair)) for pair in chosen(list(pairs()), 5, 1)]
-    assert sum(one.all_named for one in found) >= least(len(found), 0.80), told(found)
+    found = [outcome_of('pair', '+'.join(pair)) for pair in chosen(list(pairs()), 5, 1)]
+    assert sum(one.all_named for one in found) >= least(len(found), 0.80), summary(found)
 
 
 def test_what_is_not_in_the_catalogue_is_not_dressed_up():
@@ -133,9 +133,9 @@ def test_what_is_not_in_the_catalogue_is_not_dressed_up():
 
     Fewer have a chance of 0.9 % at that level, and of 84 % at 30 %.
     """
-    found = [seen('unknown', name) for name in chosen(list(unknowns()), 5, 2)]
+    found = [outcome_of('unknown', name) for name in chosen(list(unknowns()), 5, 2)]
     good = [one.left_open and not one.misnamed for one in found]
-    assert sum(good) >= least(len(found), 0.90), told(
+    assert sum(good) >= least(len(found), 0.90), summary(
         [one for one, right in zip(found, good) if not right])
 
 
@@ -150,7 +150,7 @@ def searched() -> list[str]:
                          ids=lambda cause: f'{cause}, {SEED}')
 def test_a_cause_out_of_the_catalogue_is_found_no_more(cause, monkeypatch):
     """What names a cause is its entry: with it found, without it not, nor as a rival."""
-    number = next((k for k in range(TRIES) if cause in seen('single', cause, k).named), None)
+    number = next((k for k in range(TRIES) if cause in outcome_of('single', cause, k).named), None)
     assert number is not None, f'{cause} was not named with its entry either'
     every = catalogue
     less: Mapping = {name: kind for name, kind in every().items() if name != cause}
@@ -160,7 +160,7 @@ def test_a_cause_out_of_the_catalogue_is_found_no_more(cause, monkeypatch):
     recording, hidden = drawn('single', cause, number)
     finding = discover(recording)
     without = outcome(hidden, finding.verdict.value, finding.causes)
-    assert without.verdict and cause not in without.reported, told([without])
+    assert without.verdict and cause not in without.reported, summary([without])
 
 
 SAG, NOISE = 'load_sag', 'measurement_noise'

@@ -220,9 +220,9 @@ def test_the_line_of_a_motor_is_named():
 def test_a_motor_that_starts_late_gains_nothing_absurd(name):
     """What the first part did not see is left out: gains are known within errors, or unknown."""
     found = discover(Path(os.environ['OU_MONITOR_REALDATA']) / f'{name}.csv')
-    for worth in (found, *found.causes):
-        assert math.isnan(worth.gain) == math.isnan(worth.gain_se)
-        assert math.isnan(worth.gain) or worth.gain > -3.0 * worth.gain_se - 0.05
+    for one in (found, *found.causes):
+        assert math.isnan(one.gain) == math.isnan(one.gain_se)
+        assert math.isnan(one.gain) or one.gain > -3.0 * one.gain_se - 0.05
     known = found.samples.throttle[found.samples.train]
     still = float(known.max() - known.min()) < 0.01
     assert still == (name == 'mm_bench_3')

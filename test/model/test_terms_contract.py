@@ -5,6 +5,7 @@ import math
 import numpy as np
 from ou_monitor.model.supply import Simulation, SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.term import Live
 import pytest
 from term_examples import EXAMPLES, OU, still, supply, term
 
@@ -242,3 +243,43 @@ def test_terms_of_throttle_ask_for_it(name):
         model.simulate(t, np.random.default_rng(0))
     with pytest.raises(ValueError, match=f"'{name}' needs throttle at every sample"):
         model.simulate(t, np.random.default_rng(0), np.where(t > t[4], 0.3, np.nan))
+
+
+# What the search and the live risk know of each cause, typed by hand as the families are.
+ALIKE = [{'volatility', 'regime_switching', 'heavy_tails', 'jumps'},
+         {'glitches', 'jumps', 'heavy_tails', 'clock_jitter'},
+         {'second_relaxation', 'flicker_noise', 'regime_switching'},
+         {'nonlinear_restoring', 'regime_switching'}]
+RECURS = {'tone', 'throttle_tone', 'resonance', 'second_relaxation', 'load_transient'}
+MEASURED = {'load_sag', 'load_transient', 'load_dependent_sigma', 'load_dependent_alpha', 'drift'}
+MAY_LEAVE = {'measurement_noise': 0.3, 'tone': 0.3, 'throttle_tone': 0.3, 'resonance': 0.1,
+             'ac_coupling': 0.75}
+BY_THROTTLE = {'ou', 'load_sag', 'load_dependent_sigma', 'load_dependent_alpha'}
+STATES = {'second_relaxation': 1, 'ac_coupling': 1, 'resonance': 2, 'tone': 2, 'throttle_tone': 2,
+          'flicker_noise': 4}
+
+
+def test_what_the_search_and_the_live_risk_know():
+    """Each set of names, and nothing beyond it."""
+    kinds = catalogue()
+    assert {n for n, c in kinds.items() if c.RECURS} == RECURS
+    assert all(c.SEVERAL for c in kinds.values() if c.RECURS)
+    assert {n for n, c in kinds.items() if c.MEASURED} == MEASURED
+    assert {n: c.MAY_LEAVE for n, c in kinds.items() if c.MAY_LEAVE} == MAY_LEAVE
+    assert {n: c.STATES for n, c in kinds.items() if c.STATES} == STATES
+    assert {n for n, c in kinds.items() if c.LIVE is Live.BY_THROTTLE} == BY_THROTTLE
+    assert {n for n, c in kinds.items() if c.LIVE is Live.BY_TIME} == {'volatility'}
+    assert {n: dict(c.CLEAR_ABOVE) for n, c in kinds.items() if c.CLEAR_ABOVE} == {
+        'throttle_tone': {'order line': 10.0}}
+    assert {n: c.LEAST_SHARE for n, c in kinds.items() if c.LEAST_SHARE} == {'drift': 0.02}
+    assert {n: c.REFUTED_BY for n, c in kinds.items() if c.REFUTED_BY} == {
+        'resonance': ('bursts', 'products of three')}
+
+
+@pytest.mark.parametrize('name', OTHERS)
+def test_imitators_and_words(name):
+    """Those of its groups; and what it is, what to do, what would separate it."""
+    kind = catalogue()[name]
+    alike = set().union(*(group for group in ALIKE if name in group)) - {name}
+    assert set(kind.IMITATES) == alike and len(kind.IMITATES) == len(alike)
+    assert kind.MEANING.endswith('.') and kind.REMEDY.endswith('.') and kind.SEPARATED_BY

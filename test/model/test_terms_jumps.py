@@ -67,3 +67,21 @@ def test_the_law_of_jumps_scores_and_errors():
     assert fit.se['rate'] == pytest.approx(fit.term.rate / np.sqrt(400), rel=0.1)
     assert fit.se['mean'] == pytest.approx(fit.term.std / np.sqrt(400), rel=0.1)
     assert fit.se['std'] == pytest.approx(fit.term.std / np.sqrt(800), rel=0.1)
+
+
+def test_scores_and_densities_are_those_of_the_mixture():
+    """Normal scores of its distribution function, and its density over that of N(0, 1)."""
+    z, var = jumping(3, share=0.03, n=4000)
+    n = z.size
+    ones = np.ones(n)
+    view = View(z=z, variance=var, phi=0.9 * ones, state=0.0 * ones, residual=0.0 * ones,
+                at=np.arange(n) / 500.0, step=ones / 500.0, throttle=None, train=slice(0, n))
+    fit = Jumps.fit_law(view)
+    share, mean, spread, unit = _mixture(z, var)
+    middle, wide = mean / np.sqrt(var), np.sqrt(unit**2 + spread**2 / var)
+    below = (1.0 - share) * norm.cdf(z, 0.0, unit) + share * norm.cdf(z, middle, wide)
+    density = (1.0 - share) * norm.pdf(z, 0.0, unit) + share * norm.pdf(z, middle, wide)
+    inner = (below > 1e-14) & (below < 1.0 - 1e-14)
+    assert inner.mean() > 0.97
+    assert norm.cdf(fit.z[inner]) == pytest.approx(below[inner], rel=1e-6)
+    assert fit.gain == pytest.approx(np.log(density) - norm.logpdf(z), rel=1e-9, abs=1e-9)

@@ -1,4 +1,4 @@
-"""What `discover` says a model is worth: against the gain of the true model, and crossings."""
+"""What `discover` says a model gains: against the gain of the true model, and crossings."""
 
 import math
 
