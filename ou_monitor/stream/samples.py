@@ -17,13 +17,16 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.blocks import BlockClock
 from ou_monitor.stream.extract import Extractor
+
+if TYPE_CHECKING:
+    from ou_monitor.online.monitor import SupplyMonitor
 
 BoolArray = npt.NDArray[np.bool_]
 
