@@ -22,8 +22,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from ou_monitor.errors import InputError
-from ou_monitor.nodes.base import MonitorNode, PUBLISH_RATE
-from ou_monitor.nodes.diagnostics import diagnostic
+from ou_monitor.nodes.base import diagnostic, MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of
 from ou_monitor.nodes.inputs import INPUT_QOS, Silence, Stamper, types_on
 from ou_monitor.nodes.message_types import message_class

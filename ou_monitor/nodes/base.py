@@ -13,6 +13,7 @@ import inspect
 import time
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.online.settings import Parameter
 from rcl_interfaces.msg import (
@@ -21,6 +22,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
+from rclpy.time import Time
 from rclpy.timer import Timer
 
 # rclpy's own, never declared by us.
@@ -181,3 +183,20 @@ def _descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
             descriptor.floating_point_range = [FloatingPointRange(
                 from_value=float(parameter.low), to_value=float(parameter.high), step=0.0)]
     return descriptor
+
+def diagnostic(name: str, level: int, summary: str, fields: Mapping[str, str],
+               stamp: float, hardware_id: str = '') -> DiagnosticArray:
+    """Return one status as a stamped message (stamp in s)."""
+    message = DiagnosticArray()
+    message.header.stamp = to_time(stamp)
+    message.status = [DiagnosticStatus(
+        level=bytes([level]), name=name, message=summary, hardware_id=hardware_id,
+        values=[KeyValue(key=key, value=value) for key, value in fields.items()])]
+    return message
+
+
+def to_time(stamp: float) -> object:
+    """Return builtin_interfaces/Time of a stamp in s; 0 when there is none."""
+    # The comparison is false for NaN too.
+    nanoseconds = round(stamp * 1e9) if 0.0 <= stamp < 2.0 ** 31 else 0
+    return Time(nanoseconds=nanoseconds).to_msg()

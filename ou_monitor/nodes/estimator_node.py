@@ -23,11 +23,10 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from ou_monitor.errors import InputError
-from ou_monitor.nodes.base import MonitorNode, PUBLISH_RATE
-from ou_monitor.nodes.diagnostics import diagnostic
+from ou_monitor.nodes.base import diagnostic, MonitorNode, PUBLISH_RATE
+from ou_monitor.nodes.clocks import SendClock
 from ou_monitor.nodes.inputs import INPUT_QOS, Silence, Stamper, types_on
 from ou_monitor.nodes.model_choice import ModelChoice
-from ou_monitor.nodes.send_clock import SendClock
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
 from ou_monitor.online.monitor import Level, MonitorReport, SupplyMonitor
 from ou_monitor.online.settings import ESTIMATOR_PARAMETERS, monitor_settings

@@ -12,8 +12,7 @@ import math
 from typing import Any
 
 from ou_monitor.nodes.base import MonitorNode
-from ou_monitor.nodes.send_clock import SendClock
-from ou_monitor.nodes.simclock import SimClockMap
+from ou_monitor.nodes.clocks import SendClock, SimClockMap
 from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy

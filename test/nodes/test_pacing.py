@@ -4,8 +4,7 @@ import math
 import threading
 import time
 
-from ou_monitor.nodes.pacing import SpacingError, wait_until
-from ou_monitor.nodes.prefetch import Prefetch
+from ou_monitor.nodes.pacing import Prefetch, SpacingError, wait_until
 import pytest
 
 

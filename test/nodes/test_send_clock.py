@@ -5,7 +5,7 @@ import math
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.model.ou import simulate
-from ou_monitor.nodes.send_clock import line_under, NEAR, ON_LINE, SendClock
+from ou_monitor.nodes.clocks import line_under, NEAR, ON_LINE, SendClock
 import pytest
 
 

@@ -3,7 +3,7 @@
 import math
 import random
 
-from ou_monitor.nodes.simclock import PAIRS, SimClockMap
+from ou_monitor.nodes.clocks import PAIRS, SimClockMap
 import pytest
 
 
