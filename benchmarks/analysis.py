@@ -19,8 +19,8 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from ou_monitor.analyze import analyze as module, level_result  # noqa: E402, I202
-from ou_monitor.analyze.analyze import Analysis, analyze  # noqa: E402
+from ou_monitor.analysis import analyze as module, level_result  # noqa: E402, I202
+from ou_monitor.analysis.analyze import Analysis, analyze  # noqa: E402
 from ou_monitor.model.ou import simulate  # noqa: E402, I100
 from ou_monitor.recordings.read import read_recording  # noqa: E402
 from ou_monitor.records import FloatArray, Recording  # noqa: E402

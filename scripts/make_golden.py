@@ -2,7 +2,7 @@
 """
 Write the golden tables: `scripts/make_golden.py [NAME ...]` (default: those with a truth).
 
-test/analyze/golden/NAME.json is what `ou-monitor analyze bags/NAME --json -` finds, without the
+test/analysis/golden/NAME.json is what `ou-monitor analyze bags/NAME --json -` finds, without the
 long series (of those every sixteenth value).  Run it after a change that is meant to move the
 numbers, and look at the difference before it is committed.
 """
@@ -17,13 +17,13 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from ou_monitor.analyze.analyze import analyze  # noqa: E402
-from ou_monitor.analyze.data import as_data  # noqa: E402
+from ou_monitor.analysis.analyze import analyze  # noqa: E402
+from ou_monitor.analysis.data import as_data  # noqa: E402
 from ou_monitor.cli.output import plain  # noqa: E402, I100
 from ou_monitor.recordings.read import read_recording  # noqa: E402
 
 BAGS = ROOT / 'bags'
-GOLDEN = ROOT / 'test' / 'analyze' / 'golden'
+GOLDEN = ROOT / 'test' / 'analysis' / 'golden'
 # Series longer than this are thinned.
 _LONG, _EVERY = 64, 16
 

@@ -14,7 +14,7 @@ PACKAGE = 'ou_monitor'
 # A module may import only from its own part and from parts of a lower level.
 LEVEL = {
     'errors': 0, 'text': 0, 'records': 0, 'model': 1, 'online': 2, 'stream': 3, 'recordings': 4,
-    'simulate': 5, 'criticism': 5, 'analyze': 6, 'discovery': 6, 'coupling': 6, 'paper': 6,
+    'simulation': 5, 'criticism': 5, 'analysis': 6, 'discovery': 6, 'coupling': 6, 'paper': 6,
     'fleet': 7, 'report': 8, 'nodes': 9, 'cli': 9,
 }
 # What users reach as `from ou_monitor import ...`: above all but the programs.
@@ -32,7 +32,7 @@ EXTRAS = {'dask': 'fleet.cluster', 'distributed': 'fleet.cluster',
 ALLOWED = {
     'errors': set(), 'text': set(), 'stream': CORE | {'yaml'}, 'recordings': CORE | {'yaml'},
     'cli': CORE | {'yaml'}, **dict.fromkeys((
-        'records', 'model', 'online', 'simulate', 'criticism', 'analyze', 'discovery', 'coupling',
+        'records', 'model', 'online', 'simulation', 'criticism', 'analysis', 'discovery', 'coupling',
         'paper', 'fleet', 'report', '__init__'), CORE),
 }
 
@@ -150,13 +150,13 @@ def test_the_walk_sees_the_house():
     ('ou_monitor.online.monitor', 'import importlib\nimportlib.import_module("rclpy")\n'),
     ('ou_monitor.online.monitor', 'import matplotlib.pyplot as plt'),
     ('ou_monitor.online.monitor', 'import numba'),
-    ('ou_monitor.analyze.analyze', 'import matplotlib'),
-    ('ou_monitor.analyze.analyze', 'import mcap.reader'),
-    ('ou_monitor.analyze.analyze', 'if True:\n    import ou_monitor.cli.main'),
+    ('ou_monitor.analysis.analyze', 'import matplotlib'),
+    ('ou_monitor.analysis.analyze', 'import mcap.reader'),
+    ('ou_monitor.analysis.analyze', 'if True:\n    import ou_monitor.cli.main'),
     ('ou_monitor.recordings.csv', 'from mcap.reader import make_reader'),
     ('ou_monitor.recordings.read', 'import pyulog'),
     ('ou_monitor.recordings.importers.ulog', 'import orangebox'),
-    ('ou_monitor.recordings.importers.log', 'from ou_monitor.analyze.analyze import analyze'),
+    ('ou_monitor.recordings.importers.log', 'from ou_monitor.analysis.analyze import analyze'),
     ('ou_monitor.fleet.fleet', 'import dask'),
     ('ou_monitor.nodes.estimator', 'from ou_monitor.cli import main'),
     ('ou_monitor.nodes.estimator', 'import matplotlib'),
@@ -164,7 +164,7 @@ def test_the_walk_sees_the_house():
     ('ou_monitor.cli.main', 'from ou_monitor import SlidingEstimator'),
     ('ou_monitor.__init__', 'HOMES = {"Estimator": "ou_monitor.nodes.estimator"}'),
     ('ou_monitor.__init__', 'def f():\n    from ou_monitor.nodes import estimator'),
-    ('ou_monitor.recordings.bag', 'from ou_monitor.analyze.analyze import analyze'),
+    ('ou_monitor.recordings.bag', 'from ou_monitor.analysis.analyze import analyze'),
 ])
 def test_a_wrong_import_is_found(module, source):
     """Each kind of leak is one finding: the checker can fail."""

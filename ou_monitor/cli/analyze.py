@@ -6,11 +6,11 @@ import argparse
 import math
 import shlex
 
-from ou_monitor.analyze.analyze import Analysis, analyze
-from ou_monitor.analyze.data import as_data
-from ou_monitor.analyze.level_result import LevelResult
-from ou_monitor.analyze.relaxation import Relaxation
-from ou_monitor.analyze.words import brownout_sentence, caution, headline, relaxation_sentence
+from ou_monitor.analysis.analyze import Analysis, analyze
+from ou_monitor.analysis.data import as_data
+from ou_monitor.analysis.level_result import LevelResult
+from ou_monitor.analysis.relaxation import Relaxation
+from ou_monitor.analysis.words import brownout_sentence, caution, headline, relaxation_sentence
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
     check_outputs, part_of_recording, positive_number, read_given, repeated, throttle_levels)

@@ -22,8 +22,8 @@ _DURATION_MOST = 9e9
 def run(args: argparse.Namespace) -> int:
     """Simulate."""
     from ou_monitor.recordings.model_file import as_yaml, ModelFile, read_model
-    from ou_monitor.simulate.presets import PRESETS
-    from ou_monitor.simulate.profiles import PROFILES, read_profile
+    from ou_monitor.simulation.presets import PRESETS
+    from ou_monitor.simulation.profiles import PROFILES, read_profile
 
     if args.list:
         if args.json is not None:
@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
 def _write(args: argparse.Namespace, model: Any, profile: Any, duration: float, rate: float,
            kind: str, name: str) -> dict[str, Any]:
     from ou_monitor.recordings.write import RecordingWriter
-    from ou_monitor.simulate.simulation import simulated
+    from ou_monitor.simulation.simulation import simulated
 
     total, done = round(duration * rate), 0
     with RecordingWriter(args.output, type=kind, sample_rate=rate) as writer, \

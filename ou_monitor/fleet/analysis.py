@@ -8,8 +8,8 @@ import math
 from typing import Any
 
 import numpy as np
-from ou_monitor.analyze.analyze import Analysis, analyze
-from ou_monitor.analyze.level_result import LevelResult
+from ou_monitor.analysis.analyze import Analysis, analyze
+from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.errors import InputError
 from ou_monitor.online.estimator.compiled import kernels
 from ou_monitor.online.risk.first_passage import brownout_probability

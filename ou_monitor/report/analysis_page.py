@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import math
 
 import numpy as np
-from ou_monitor.analyze.analyze import Analysis
-from ou_monitor.analyze.level_result import LevelResult
-from ou_monitor.analyze.words import headline
+from ou_monitor.analysis.analyze import Analysis
+from ou_monitor.analysis.level_result import LevelResult
+from ou_monitor.analysis.words import headline
 from ou_monitor.criticism.curves import outline
 from ou_monitor.report import analysis_sections as parts, page
 from ou_monitor.report.cells import figure, UNKNOWN

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 import math
 
 import numpy as np
-from ou_monitor.analyze.analyze import Analysis
-from ou_monitor.analyze.level_result import LevelResult
-from ou_monitor.analyze.relaxation import Relaxation
-from ou_monitor.analyze.words import brownout_sentence, caution, relaxation_sentence
+from ou_monitor.analysis.analyze import Analysis
+from ou_monitor.analysis.level_result import LevelResult
+from ou_monitor.analysis.relaxation import Relaxation
+from ou_monitor.analysis.words import brownout_sentence, caution, relaxation_sentence
 from ou_monitor.records import FloatArray
 from ou_monitor.report import page
 from ou_monitor.report.cells import figure, probability, UNKNOWN

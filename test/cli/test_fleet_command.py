@@ -167,7 +167,7 @@ def test_every_recording_has_its_rows(rows):
 
 def test_the_numbers_are_those_of_analyze(rows, logs):
     """The same recording analysed alone gives the same estimate."""
-    from ou_monitor.analyze.analyze import analyze
+    from ou_monitor.analysis.analyze import analyze
     from ou_monitor.recordings.read import read_recording
     path = logs / 'uav2' / 'flight_5.csv'
     alone = analyze(read_recording(path), brownout_voltage=4.5)

@@ -1,9 +1,9 @@
 """A second relaxation, an AC coupling: found in the innovations, and not where there is none."""
 
 import numpy as np
-from ou_monitor.analyze.analyze import analyze
-from ou_monitor.analyze.process_type import ProcessType
-from ou_monitor.analyze.quality import coupling_items, second_items
+from ou_monitor.analysis.analyze import analyze
+from ou_monitor.analysis.process_type import ProcessType
+from ou_monitor.analysis.quality import coupling_items, second_items
 from ou_monitor.criticism.innovations import FAMILY_WISE, other_pole
 from ou_monitor.records import Recording
 import pytest

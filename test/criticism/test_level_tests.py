@@ -4,7 +4,7 @@ import math
 
 from made_recordings import ALPHA
 import numpy as np
-from ou_monitor.analyze.level_result import fit_stretch
+from ou_monitor.analysis.level_result import fit_stretch
 from ou_monitor.criticism.innovations import fresh, innovations
 from ou_monitor.criticism.level_tests import (
     EFFECT, examine_level, FAMILY_WISE, holm, Shape, TestResult)

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from ou_monitor.analyze.analyze import analyze
-from ou_monitor.analyze.quality import line_item, Severity
+from ou_monitor.analysis.analyze import analyze
+from ou_monitor.analysis.quality import line_item, Severity
 from ou_monitor.model.spectral_lines import find_lines, without_lines
 from ou_monitor.records import Estimate, Recording, Status
 import pytest

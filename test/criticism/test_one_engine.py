@@ -10,8 +10,8 @@ import os
 from pathlib import Path
 
 import numpy as np
-from ou_monitor.analyze.level_result import fit_level
-from ou_monitor.analyze.levels import LoadLevel, Segment
+from ou_monitor.analysis.level_result import fit_level
+from ou_monitor.analysis.levels import LoadLevel, Segment
 from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, other_pole
 from ou_monitor.criticism.integrity import examine

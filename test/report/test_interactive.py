@@ -7,7 +7,7 @@ import time
 from browser import Browser, find_browser
 from made_recordings import recording
 import numpy as np
-from ou_monitor.analyze.analyze import analyze
+from ou_monitor.analysis.analyze import analyze
 from ou_monitor.report import page
 from ou_monitor.report.analysis_page import analysis_page
 from ou_monitor.report.embedding import embed

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 from hypothesis import given, strategies as st
 from made_recordings import recording, without_throttle
 import numpy as np
-from ou_monitor.analyze.analyze import analyze
+from ou_monitor.analysis.analyze import analyze
 from ou_monitor.records import Recording
 from ou_monitor.report import page
 from ou_monitor.report.analysis_page import analysis_page

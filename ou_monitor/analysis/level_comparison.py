@@ -1,0 +1,245 @@
+"""
+What differs from load level to load level: the sag, and whether alpha is the same.
+
+Sag is how far the mean of a level lies below that of the lowest throttle.  Weighted least squares
+of the segment means fits a mean for each level and a polynomial of time that all levels share,
+for a battery discharges while it is flown.  The errors of the segment means follow from the
+noise; where the segments scatter more than that about the fit, all errors are widened.  Limits:
+slow recovery after a load is not in a polynomial; with one stay at each level the polynomial and
+the levels cannot be told apart, and then no time is taken out.
+
+The test of alpha, which the paper takes as the same at every load, is chi^2 of ln(alpha) of the
+levels about their weighted mean, each with its standard error; that error is carried over to the
+common alpha, for it grows with 1/sqrt(alpha T) and a level whose alpha came out high by chance
+would weigh too much.  A level that one OU in white noise does not describe (more than one
+relaxation, lines beside impulses, the settling after a change of throttle) is withheld: its alpha
+stands for both, and the error of a fit knows nothing of it.  Limits: only levels with a usable
+fit count; a spectral line too faint to be found, and taken out before the fit, is not known of;
+"no change seen" is no proof that there is none, so the ratio that would have been seen stands
+beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from ou_monitor.analysis.levels import Segment
+from ou_monitor.records import Estimate, FloatArray, NAN, Recording
+from ou_monitor.text import Z95
+from scipy import stats
+from scipy.special import chndtrinc
+
+# Highest power of time, and segments needed for each.
+_DEGREE, _SEGMENTS = 3, 4
+# Probability of "differs" where alpha is the same, and of seeing `detectable_ratio`.
+LEVEL, POWER = 0.05, 0.9
+# A change by less than this factor changes no decision here: tau is known no better in most
+# recordings of a flight.
+NARROW = 1.5
+
+
+@dataclass(frozen=True)
+class LevelSag:
+    """
+    Sag of one level.
+
+    Attributes
+    ----------
+    sag, sag_se : float
+        How far the mean lies below that of the lowest throttle, and its standard error, V.
+
+    """
+
+    sag: float = NAN
+    sag_se: float = NAN
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Return the 95 % interval, V."""
+        return self.sag - Z95 * self.sag_se, self.sag + Z95 * self.sag_se
+
+
+def mean_variance(time: float, n: int, estimate: Estimate, rms: float) -> float:
+    """
+    Return the variance of the mean of a stretch of OU in white noise.
+
+    time in s, rms in V, result in V^2.
+    """
+    if not estimate.usable:
+        return rms * rms / max(n, 1)
+    at = max(estimate.alpha * time, 1e-9)
+    # Papoulis, Probability, Random Variables and Stochastic Processes, ch. 9.
+    of_ou = 2.0 * estimate.var_inf * (at + math.expm1(-at)) / (at * at)
+    noise = estimate.noise_std if estimate.noise_std > 0.0 else 0.0
+    return of_ou + noise * noise / max(n, 1)
+
+
+def level_sags(recording: Recording, throttles: Sequence[float],
+               segments: Sequence[Sequence[Segment]], estimates: Sequence[Estimate],
+               rms: Sequence[float]) -> tuple[LevelSag, ...]:
+    """Return the sag of each level (rms in V)."""
+    rows = [(k, s) for k, stays in enumerate(segments) for s in stays]
+    flown = sorted({k for k, _ in rows})
+    unknown = [LevelSag()] * len(throttles)
+    if len(flown) < 2 or not all(rms[k] > 0.0 for k in flown):
+        return tuple(unknown)
+    t = recording.t
+    y = np.array([recording.voltage[s.start:s.stop].mean() for _, s in rows])
+    when = np.array([0.5 * (t[s.start] + t[s.stop - 1]) for _, s in rows])
+    variance = np.array([mean_variance(float(t[s.stop - 1] - t[s.start]), s.stop - s.start,
+                                       estimates[k], rms[k]) for k, s in rows])
+    spare = len(rows) - len(flown)
+    degree = min(_DEGREE, spare // _SEGMENTS)
+    span = max(float(np.ptp(when)), 1e-9)
+    age = (when - when.mean()) / span
+    columns = [np.array([float(k == j) for k, _ in rows]) for j in flown]
+    columns += [age ** power for power in range(1, degree + 1)]
+    x = np.column_stack(columns) / np.sqrt(variance)[:, None]
+    values, covariance, widen = _least_squares(x, y / np.sqrt(variance))
+    for place, k in enumerate(flown):
+        contrast = np.zeros(values.size)
+        contrast[0] += 1.0
+        contrast[place] -= 1.0
+        error = math.sqrt(max(0.0, float(contrast @ covariance @ contrast)) * widen)
+        unknown[k] = LevelSag(float(contrast @ values), error)
+    return tuple(unknown)
+
+
+def _least_squares(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return coefficients, covariance, and the factor by which the residuals widen it."""
+    values = np.linalg.lstsq(x, y, rcond=None)[0]
+    covariance = np.linalg.pinv(x.T @ x)
+    freedom = y.size - values.size
+    rest = y - x @ values
+    widen = max(1.0, float(rest @ rest) / freedom) if freedom > 0 else 1.0
+    return np.asarray(values), np.asarray(covariance), widen
+
+
+@dataclass(frozen=True)
+class AlphaTest:
+    """
+    Result of the test.
+
+    Attributes
+    ----------
+    verdict : str
+        ``differs``, ``constant`` (a change by `NARROW` would have been seen) or
+        ``undetermined``.
+    levels : int
+        Levels that count.
+    alpha, alpha_se : float
+        Common alpha, 1/s, and the standard error of its logarithm.
+    statistic, p_value : float
+        chi^2 with levels - 1 degrees of freedom.
+    detectable_ratio : float
+        Ratio of alpha between the lowest and the highest level, ln(alpha) going straight with
+        throttle, that is seen with 90 % probability.
+    ratio, ratio_low, ratio_high : float
+        That ratio as fitted, highest over lowest throttle, and its 95 % interval.
+    withheld : tuple of float
+        Throttles of usable levels that one OU in white noise does not describe.
+
+    """
+
+    verdict: str
+    levels: int
+    alpha: float = NAN
+    alpha_se: float = NAN
+    statistic: float = NAN
+    p_value: float = NAN
+    detectable_ratio: float = NAN
+    ratio: float = NAN
+    ratio_low: float = NAN
+    ratio_high: float = NAN
+    withheld: tuple[float, ...] = ()
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Return the 95 % interval of the common alpha, 1/s."""
+        reach = math.exp(Z95 * self.alpha_se) if math.isfinite(self.alpha_se) else NAN
+        return self.alpha / reach, self.alpha * reach
+
+    @property
+    def sentence(self) -> str:
+        """Return the verdict in words."""
+        return self._verdict() + self._withheld()
+
+    def _withheld(self) -> str:
+        if not self.withheld:
+            return ''
+        names = ', '.join('all' if math.isnan(x) else f'{100.0 * x:.3g} %' for x in self.withheld)
+        return (f' Withheld: {names}; more than one relaxation is seen there or at another level, '
+                'lines stand beside impulses, or a change of throttle still settles.')
+
+    def _verdict(self) -> str:
+        if self.levels < 2:
+            return ('Whether alpha is the same at all loads cannot be told: '
+                    f'{"one load level has" if self.levels else "no load level has"} '
+                    f'a usable fit{" that one OU describes" if self.withheld else ""}.')
+        seen = (f'a change by a factor of {_factor(self.detectable_ratio)} from the lowest to the '
+                'highest throttle would have been seen (90 %)')
+        if self.verdict == 'differs':
+            return (f'Alpha is not the same at all loads (p = {self.p_value:.2g}): from the '
+                    f'lowest to the highest throttle it changes by a factor of '
+                    f'{_factor(self.ratio)} (95 % {_factor(self.ratio_low)} to '
+                    f'{_factor(self.ratio_high)}); '
+                    'the paper assumes that it does not.')
+        if self.verdict == 'constant':
+            return (f'Alpha is the same at all loads as far as can be seen (p = '
+                    f'{self.p_value:.2g}); {seen}.')
+        return (f'Whether alpha is the same at all loads cannot be told from this recording (p = '
+                f'{self.p_value:.2g}): only {seen}.')
+
+
+def _factor(ratio: float) -> str:
+    """Return a ratio as people say it; beyond a factor of 100 either way only that."""
+    if ratio > 100.0:
+        return 'more than 100'
+    return 'less than 0.01' if ratio < 0.01 else f'{ratio:#.3g}'.rstrip('.')
+
+
+def alpha_constancy(throttles: Sequence[float], estimates: Sequence[Estimate],
+                    doubted: Sequence[bool] | None = None) -> AlphaTest:
+    """Test whether the levels share one alpha (throttles 0..1)."""
+    usable = [k for k, e in enumerate(estimates)
+              if e.usable and e.alpha_se > 0.0 and math.isfinite(throttles[k])]
+    good = [k for k in usable if doubted is None or not doubted[k]]
+    withheld = tuple(throttles[k] for k in usable if k not in good)
+    if not good:
+        return AlphaTest('undetermined', 0, withheld=withheld)
+    x = np.array([throttles[k] for k in good])
+    logs = np.log([estimates[k].alpha for k in good])
+    own = np.array([estimates[k].alpha_se for k in good])
+    # The relative error is sqrt(2 / (alpha T)) times what the noise adds: at a common alpha
+    # that factor goes with the root.
+    se = own
+    for _ in range(20):
+        weight = 1.0 / se ** 2
+        mean = float(weight @ logs / weight.sum())
+        se = own * np.exp(0.5 * (logs - mean))
+    weight = 1.0 / se ** 2
+    mean = float(weight @ logs / weight.sum())
+    common = (math.exp(mean), float(1.0 / math.sqrt(weight.sum())))
+    if len(good) < 2:
+        return AlphaTest('undetermined', len(good), *common, withheld=withheld)
+    freedom = len(good) - 1
+    statistic = float(weight @ (logs - mean) ** 2)
+    p = float(stats.chi2.sf(statistic, freedom))
+    # Straight line of ln(alpha) over throttle, from the lowest to the highest level.
+    reach = float(np.ptp(x))
+    along = (x - float(weight @ x / weight.sum())) / reach
+    size = float(weight @ along ** 2)
+    slope = float(weight @ (along * logs)) / size
+    wide = float(stats.norm.ppf(0.975)) / math.sqrt(size)
+    seen = math.exp(math.sqrt(_noncentrality(freedom) / size))
+    verdict = 'differs' if p < LEVEL else 'constant' if seen <= NARROW else 'undetermined'
+    return AlphaTest(verdict, len(good), *common, statistic, p, seen, math.exp(slope),
+                     math.exp(slope - wide), math.exp(slope + wide), withheld)
+
+
+def _noncentrality(freedom: int) -> float:
+    """Return the noncentrality at which chi^2 rejects with probability `POWER`."""
+    return float(chndtrinc(stats.chi2.isf(LEVEL, freedom), freedom, 1.0 - POWER))

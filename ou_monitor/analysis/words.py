@@ -1,0 +1,128 @@
+"""An analysis in words: headline, cautions, sentences of its parts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+
+import numpy as np
+from ou_monitor.analysis.analyze import Analysis
+from ou_monitor.analysis.level_result import LevelResult
+from ou_monitor.analysis.quality import QualityItem, Severity
+from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.records import Estimate, NAN, Status
+from ou_monitor.text import number, Z95
+
+# What changes the meaning of the numbers in the headline itself.
+_BEWARE = {
+    'VOLTAGE_UNIT': 'Beware: the voltages seem to be millivolts or counts, not volts.',
+    'SECOND_RELAXATION': 'Beware: a second relaxation is seen, and tau is of a mixture.',
+    'NOT_SETTLED': 'Beware: levels hold the settling after changes of throttle; so does tau.'}
+
+
+def headline(analysis: Analysis) -> str:
+    """Return what the recording says, one or two sentences."""
+    good = ([level for level in analysis.levels if level.estimate.status is Status.OK]
+            or [level for level in analysis.levels if level.estimate.usable])
+    if not good:
+        return _none_fitted(analysis)
+    beware = ''.join(f' {words}' for name, words in _BEWARE.items()
+                     if any(item.name == name for item in analysis.quality))
+    return _numbers(good) + beware
+
+
+def _none_fitted(analysis: Analysis) -> str:
+    """Say why most of the time cannot be fitted."""
+    time: dict[Status, float] = {}
+    for level in analysis.levels:
+        time[level.estimate.status] = time.get(level.estimate.status, 0.0) + level.time
+    why = max(time, key=lambda status: time[status]).value if time else ''
+    return f'No load level of this recording can be fitted. {why}'.rstrip()
+
+
+def _numbers(good: Sequence[LevelResult]) -> str:
+    """Return how sigma goes with throttle, and tau."""
+    low, high = good[0], good[-1]
+    if len(good) == 1:
+        e = low.estimate
+        where = '' if math.isnan(low.throttle) else f' at {low.label} throttle'
+        return (f'The supply{where} wanders with sigma = {_ci(e)} V/sqrt(s) and '
+                f'relaxes in tau = {_tau(e)} ms: a standard deviation of '
+                f'{number(1e3 * math.sqrt(e.var_inf))} mV.')
+    growth = high.estimate.sigma / low.estimate.sigma
+    spread = Z95 * math.hypot(low.estimate.sigma_se, high.estimate.sigma_se)
+    factor = (f'factor {number(growth)}, 95 % {number(growth * math.exp(-spread))} to '
+              f'{number(growth * math.exp(spread))}')
+    if abs(math.log(growth)) <= spread:
+        change = (f'sigma does not change measurably from {low.label} to {high.label} throttle '
+                  f'({factor})')
+    else:
+        verb = 'grows' if growth > 1.0 else 'falls'
+        change = (f'sigma {verb} from {number(low.estimate.sigma)} to '
+                  f'{number(high.estimate.sigma)} V/sqrt(s) from {low.label} to {high.label} '
+                  f'throttle ({factor})')
+    return (f'{change[0].upper()}{change[1:]}. At {high.label} the supply relaxes in tau = '
+            f'{_tau(high.estimate)} ms, with a standard deviation of '
+            f'{number(1e3 * math.sqrt(high.estimate.var_inf))} mV.')
+
+
+def _ci(e: Estimate) -> str:
+    low, high = e.interval('sigma')
+    return f'{number(e.sigma)} (95 % {number(low)} to {number(high)})'
+
+
+def _tau(e: Estimate) -> str:
+    low, high = e.interval('alpha')
+    return f'{number(1e3 / e.alpha)} (95 % {number(1e3 / high)} to {number(1e3 / low)})'
+
+
+def cautions(analysis: Analysis, least: Severity = Severity.INFO) -> list[str]:
+    """Return what to know before using the numbers."""
+    return [caution(item) for item in analysis.quality if item.severity >= least]
+
+
+def caution(item: QualityItem) -> str:
+    """Return one sentence, led by the levels it is true of."""
+    labels = ['all' if math.isnan(x) else f'{100.0 * x:.3g} %' for x in item.throttles]
+    return f'{", ".join(labels)}: {item.text}' if labels else item.text
+
+
+def brownout_sentence(analysis: Analysis) -> str:
+    """Return what the risk is of, and the throttle budget."""
+    curves = analysis.by_throttle
+    if math.isnan(curves.voltage) and analysis.brownout_default:
+        middle = float(np.median(analysis.recording.voltage)) if analysis.recording.n else NAN
+        return (f"No brown-out risk: the node's default of {MonitorSettings().brownout_voltage:g} "
+                f'V is for a 5 V rail, and this supply is at {number(middle)} V; '
+                '--brownout-voltage sets another.')
+    if math.isnan(curves.voltage):
+        return 'No voltage was given that must not be undershot.'
+    which = ("the node's default for a 5 V rail; --brownout-voltage sets another"
+             if analysis.brownout_default else 'as asked for')
+    text = (f'Brown-out: going below {curves.voltage:g} V ({which}) within '
+            f'{curves.horizon:g} s, with the supply as it was at the end of the recording.')
+    if math.isnan(curves.budget):
+        return f'{text} Throttle budget unknown: {curves.budget_reason}'
+    return (f'{text} Throttle budget for a risk of {curves.limit:g}: '
+            f'{100.0 * curves.budget:.3g} %. {curves.budget_reason}')
+
+
+def relaxation_sentence(analysis: Analysis, k: int) -> str:
+    """Return what follows falls (k = 0) or rises (k = 1) of throttle."""
+    fit, cause = analysis.relaxations[k], analysis.causes[k]
+    if not fit.seen:
+        return cause.sentence
+    count = len(fit.releases)
+    what = {'release': 'fall', 'load': 'rise'}[fit.kind]
+    return (f'After {count} {what}{"s" if count > 1 else ""} of throttle the voltage relaxes in '
+            f'tau = {number(1e3 * fit.tau)} (95 % {open_end(1e3 * fit.tau_low)} to '
+            f'{open_end(1e3 * fit.tau_high)}) ms. {_led(fit.caveat)}{cause.sentence}')
+
+
+def _led(text: str) -> str:
+    return f'{text} ' if text else ''
+
+
+def open_end(value: float) -> str:
+    """Return one end of an interval; ``open`` where the data leave it so."""
+    return number(value) if 0.0 < value < math.inf else 'open'

@@ -1,0 +1,70 @@
+"""The JSON of `analyze`: keys that stay, each of them documented."""
+
+import math
+import re
+
+from made_recordings import recording
+from ou_monitor.analysis.analyze import analyze
+from ou_monitor.analysis.data import as_data
+from ou_monitor.cli.output import plain
+from ou_monitor.recordings.read import read_recording
+from project import ROOT
+import pytest
+
+KEYS = {'recording', 'n', 'duration_s', 'rate_hz', 'source', 'headline', 'levels',
+        'process_tests', 'lines', 'transients', 'alpha_constant', 'by_throttle', 'brownout',
+        'sliding', 'quality', 'notes'}
+LEVEL_KEYS = {
+    'throttle', 'segments', 'time_s', 'n', 'mean', 'vpp', 'peak', 'vrms', 'crest', 'alpha',
+    'alpha_se', 'alpha_ci95', 'tau', 'tau_se', 'tau_ci95', 'sigma', 'sigma_se', 'sigma_ci95',
+    'var_inf', 'var_inf_se', 'var_inf_ci95', 'sag', 'sag_se', 'sag_ci95', 'u0', 'u0_se',
+    'noise_std', 'process_type', 'process_within', 'process_reason', 'process_tests', 'skewness',
+    'excess_kurtosis', 'impulses', 'impulse_rate_hz', 'impulse_rate_ci95', 'lines',
+    'line_search', 'with_lines', 'psd', 'segment_scatter', 'segment_p_adjusted', 'status',
+    'status_text',
+    'flags', 'notes'}
+
+
+@pytest.fixture(scope='module')
+def analysis():
+    """Return the analysis of two levels."""
+    return analyze(recording(6, ((0.1, 0.3156), (0.4, 0.632))))
+
+
+def test_data_has_all_keys_and_the_values_of_the_levels(analysis):
+    """Keys are stable; the tau interval is that of alpha, turned over."""
+    data = as_data(analysis)
+    assert set(data) == KEYS
+    assert (data['n'], data['duration_s']) == (20000, pytest.approx(19.999))
+    assert data['rate_hz'] == pytest.approx(1000.0)
+    for level, found in zip(data['levels'], analysis.levels):
+        assert set(level) == LEVEL_KEYS
+        assert level['alpha'] == found.estimate.alpha
+        assert level['tau'] == pytest.approx(1.0 / level['alpha'])
+        assert level['tau_ci95'][0] == pytest.approx(1.0 / level['alpha_ci95'][1])
+        assert level['alpha_ci95'][1] / level['alpha'] == pytest.approx(
+            math.exp(1.96 * level['alpha_se']), rel=1e-4)
+        assert level['var_inf'] == pytest.approx(level['sigma'] ** 2 / (2 * level['alpha']))
+        assert len({len(level['psd'][name]) for name in level['psd']}) == 1
+    lengths = {len(data['sliding'][name]) for name in ('t', 'alpha', 'sigma', 'status')}
+    assert len(lengths) == 1 and lengths.pop() > 10
+
+
+def names(value):
+    """Yield every key of nested data."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield key
+            yield from names(item)
+    elif isinstance(value, list):
+        for item in value:
+            yield from names(item)
+
+
+def test_every_key_is_documented(analysis):
+    """doc/analysis.md names each in backticks; those of `source` are the reader's."""
+    text = (ROOT / 'doc' / 'analysis.md').read_text(encoding='utf-8')
+    told = set(re.findall(r'`([a-z0-9_]+)`', text))
+    data = plain(as_data(analyze(read_recording(ROOT / 'bags' / 'transient'))))
+    data['source'] = {}
+    assert sorted(set(names(data)) - told) == []

@@ -1,0 +1,210 @@
+"""A recording with known truth -> its tables."""
+
+import math
+
+from made_recordings import ALPHA, recording, without_throttle
+import numpy as np
+from ou_monitor.analysis.analyze import analyze
+from ou_monitor.analysis.process_type import ProcessType
+from ou_monitor.analysis.replay import slide
+from ou_monitor.online.estimator.estimator import SlidingEstimator
+from ou_monitor.records import Recording, Status
+import pytest
+
+TRUTH = ((0.1, 0.3156), (0.4, 0.632))
+
+
+def test_two_levels_are_recovered():
+    """
+    Throttle, mean, sigma, alpha and Var_inf of both, within 4 standard errors.
+
+    With T = 10 s: ln alpha and ln Var_inf scatter by sqrt(2/(alpha T)) =
+    5.6 %, the mean by sqrt(2 Var_inf/(alpha T)), ln sigma by about
+    1/sqrt(2n) = 0.7 % (n = 10000; a little more because alpha is unknown).
+    The two sigmas are a factor 2 apart: mixing levels would be seen.
+    """
+    found = analyze(recording(1, TRUTH)).levels
+    assert [level.throttle for level in found] == pytest.approx([0.1, 0.4])
+    for level, (throttle, sigma) in zip(found, TRUTH):
+        e = level.estimate
+        var_inf = sigma ** 2 / (2.0 * ALPHA)
+        scatter = math.sqrt(2.0 / (ALPHA * 10.0))
+        assert e.status is Status.OK and level.kind is ProcessType.DIFFUSION
+        assert abs(math.log(e.sigma / sigma)) < 4.0 * 0.008
+        assert abs(math.log(e.alpha / ALPHA)) < 4.0 * scatter
+        assert abs(math.log(e.var_inf / var_inf)) < 4.0 * scatter
+        assert level.vrms == pytest.approx(math.sqrt(var_inf), rel=2.0 * scatter)
+        assert level.mean == pytest.approx(5.0 - 0.5 * throttle, abs=4.0 * math.sqrt(
+            2.0 * var_inf / (ALPHA * 10.0)))
+        # The largest of about alpha T = 630 independent values of a normal.
+        assert 5.0 < level.crest < 9.0
+
+
+def test_the_95_percent_intervals_hold():
+    """
+    Of 40 levels, alpha and sigma lie in their interval at least 33 times.
+
+    A binomial of 40 and 0.95 falls below 33 with probability 4e-4; intervals
+    half as wide hold 67 % and reach 33 with probability 2 %.
+    """
+    inside = {'alpha': 0, 'sigma': 0}
+    for seed in range(20):
+        for level, (_, sigma) in zip(analyze(recording(100 + seed, TRUTH, seconds=4.0)).levels,
+                                     TRUTH):
+            for name, truth in (('alpha', ALPHA), ('sigma', sigma)):
+                low, high = level.estimate.interval(name)
+                inside[name] += low < truth < high
+    assert inside['alpha'] >= 33 and inside['sigma'] >= 33
+
+
+def test_amplitudes_are_those_of_the_samples():
+    """Vpp, peak and Vrms of an exact triangle, apart from its offset."""
+    t = np.arange(4000) / 1000.0
+    wave = 2.0 * np.abs((np.arange(4000) % 100) / 50.0 - 1.0) - 1.0
+    made = Recording(t, 5.0 + 0.01 * wave, np.full(t.size, 0.2))
+    (level,) = analyze(made).levels
+    assert level.vpp == pytest.approx(0.02)
+    assert level.peak == pytest.approx(0.01)
+    assert level.vrms == pytest.approx(float(0.01 * wave.std()))
+    assert (level.n, level.time) == (4000, pytest.approx(3.999))
+
+
+def test_a_level_in_two_pieces_is_one_process():
+    """A sag between the pieces moves neither Var_inf nor Vrms: each has its own mean."""
+    made = recording(4, ((0.1, 0.3), (0.4, 0.3), (0.1, 0.3)), seconds=5.0)
+    voltage = made.voltage - 0.5 * (made.t > 10.0)
+    low = analyze(Recording(made.t, voltage, made.throttle)).levels[0]
+    var_inf = 0.3 ** 2 / (2.0 * ALPHA)
+    assert len(low.segments) == 2
+    # T = 10 s in all; the offset would make Vrms 0.25 V instead of 27 mV.
+    assert abs(math.log(low.estimate.var_inf / var_inf)) < 4.0 * math.sqrt(2.0 / (ALPHA * 10.0))
+    assert low.vrms == pytest.approx(math.sqrt(var_inf), rel=0.15)
+
+
+def test_the_transient_after_a_step_is_not_noise():
+    """An exponential of 0.5 V after each step of throttle leaves Var_inf alone."""
+    made = recording(5, TRUTH, seconds=5.0)
+    since = made.t - 5.0
+    wave = np.where(since >= 0.0, 0.5 * np.exp(-ALPHA * np.maximum(since, 0.0)), 0.0)
+    var_inf = TRUTH[1][1] ** 2 / (2.0 * ALPHA)
+    high = analyze(Recording(made.t, made.voltage + wave, made.throttle)).levels[1]
+    # Unsettled it would add 0.25 V^2 tau / (2 T) = 4e-4 V^2, 12 % of Var_inf,
+    # and an offset of the peak of 0.5 V, nine standard deviations.
+    assert high.peak < 5.0 * math.sqrt(var_inf)
+
+
+def test_without_throttle_there_is_one_level_and_it_is_said():
+    """The level is called 'all'."""
+    analysis = analyze(without_throttle(recording(6, ((0.1, 0.3),))))
+    assert [level.label for level in analysis.levels] == ['all']
+    assert analysis.levels[0].estimate.status is Status.OK
+    assert any('no throttle' in note for note in analysis.notes)
+
+
+def test_too_short_is_said_and_not_invented():
+    """A voltage that only drifts never returns: a status, and NaN for the numbers."""
+    t = np.arange(500) / 1000.0
+    drift = 5.0 + 0.2 * t + np.random.default_rng(7).normal(0.0, 1e-6, t.size).cumsum()
+    (level,) = analyze(Recording(t, drift, np.full(t.size, 0.1))).levels
+    assert level.estimate.status in (Status.TOO_SHORT, Status.UNBOUND)
+    assert math.isnan(level.estimate.alpha)
+    assert level.kind is ProcessType.UNDETERMINED
+    assert level.vpp == pytest.approx(0.1, rel=0.01)
+
+
+def test_a_stuck_sensor_is_said():
+    """A constant voltage is 'constant', with amplitudes of zero."""
+    t = np.arange(2000) / 1000.0
+    (level,) = analyze(Recording(t, np.full(2000, 5.0), np.full(2000, 0.1))).levels
+    assert level.estimate.status is Status.CONSTANT and level.kind is ProcessType.CONSTANT
+    assert (level.vpp, level.vrms) == (0.0, 0.0) and math.isnan(level.crest)
+
+
+def test_white_noise_is_no_diffusion():
+    """Uncorrelated samples: no relaxation, or one faster than the sampling."""
+    t = np.arange(4000) / 1000.0
+    noise = np.random.default_rng(8).normal(0.0, 0.01, t.size)
+    (level,) = analyze(Recording(t, 5.0 + noise, np.full(t.size, 0.1))).levels
+    assert level.kind is ProcessType.GAUSSIAN
+
+
+def test_impulses_are_called_so():
+    """Steps of 0.2 V, 5 a second, that relax: heavy tails of the increments."""
+    made = recording(9, ((0.1, 0.3),), seconds=20.0)
+    kicks = np.zeros(made.n)
+    kicks[::200] = 0.2
+    relaxing = np.zeros(made.n)
+    phi = math.exp(-ALPHA / 1000.0)
+    for k in range(1, made.n):
+        relaxing[k] = phi * relaxing[k - 1] + kicks[k]
+    (level,) = analyze(Recording(made.t, made.voltage + relaxing, made.throttle)).levels
+    assert level.kind is ProcessType.IMPULSES
+
+
+def test_a_level_that_was_never_flown_stays_in_the_table():
+    """With no samples and no numbers."""
+    levels = analyze(recording(10, TRUTH), levels=(0.1, 0.9)).levels
+    assert levels[1].n == 0 and math.isnan(levels[1].vrms)
+    assert levels[1].estimate.status is Status.TOO_FEW_SAMPLES
+
+
+def test_time_between_levels_is_accounted_for():
+    """A ramp that no level holds is named in the notes."""
+    made = recording(11, TRUTH)
+    ramp = made.throttle.copy()
+    ramp[8000:12000] = np.linspace(0.1, 0.4, 4000)
+    notes = analyze(Recording(made.t, made.voltage, ramp)).notes
+    assert any('between load levels' in note for note in notes)
+
+
+def test_sliding_is_what_the_node_would_say():
+    """The last point equals the estimator fed with every sample."""
+    made = recording(12, TRUTH)
+    sliding = slide(made, window=2.0)
+    node = SlidingEstimator(window=2.0)
+    upto = made.t <= sliding.t[-1]
+    node.push(made.t[upto], made.voltage[upto], made.throttle[upto])
+    # A search started from the estimate before ends within its tolerance of this one.
+    assert sliding.series('sigma')[-1] == pytest.approx(node.estimate().sigma, rel=1e-4)
+    assert np.all(np.diff(sliding.t) > 0.0) and sliding.t[0] >= 1.9
+    assert np.isnan(sliding.risk).all()
+
+
+def test_sliding_risk_grows_with_the_threshold():
+    """A threshold far below is safe, one above the voltage is certain."""
+    made = recording(13, ((0.1, 0.3),))
+    assert slide(made, 2.0, brownout_voltage=4.0).risk.max() < 1e-6
+    assert slide(made, 2.0, brownout_voltage=6.0).risk.min() == 1.0
+
+
+def test_progress_ends_at_one():
+    """It never runs backwards."""
+    shares = []
+    analyze(recording(14, TRUTH, seconds=4.0), progress=shares.append)
+    assert shares == sorted(shares) and shares[-1] == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize('options', [{'window': 0.0}, {'window': math.nan},
+                                     {'brownout_horizon': -1.0}, {'levels': (2.0,)}])
+def test_options_out_of_range_are_a_callers_bug(options):
+    """ValueError."""
+    with pytest.raises(ValueError):
+        analyze(recording(15, TRUTH, seconds=0.5), **options)
+
+
+@pytest.mark.parametrize('t', [[0.0, 2.0, 1.0], [2.0, 1.0, 0.0], [0.0, 1.0, 1.0],
+                               [0.0, np.nan, 1.0], [np.nan, np.nan, np.nan]])
+def test_stamps_that_do_not_increase_are_a_callers_bug(t):
+    """Levels and pauses would be nonsense; a file is sorted by `read_recording`."""
+    with pytest.raises(ValueError, match='stamps must be finite and increase'):
+        analyze(Recording(np.array(t), np.full(3, 5.0), np.full(3, np.nan), 'made'))
+
+
+@pytest.mark.parametrize('n', [0, 1, 2, 3, 15])
+def test_tiny_recordings_end_in_a_status(n):
+    """Nothing raises, nothing is invented."""
+    t = np.arange(n) / 100.0
+    made = Recording(t, 5.0 + 0.01 * np.sin(np.arange(n)), np.full(n, 0.1))
+    for candidate in (made, without_throttle(made)):
+        for level in analyze(candidate).levels:
+            assert not level.estimate.usable

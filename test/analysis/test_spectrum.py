@@ -1,0 +1,58 @@
+"""Spectra: the fitted curve and the measured one are of the same kind."""
+
+import math
+
+from made_recordings import ALPHA, recording
+import numpy as np
+from ou_monitor.analysis.analyze import analyze
+from ou_monitor.analysis.spectrum import level_spectrum, ou_spectrum
+import pytest
+
+
+def test_the_curve_holds_the_whole_variance():
+    """Its integral to the Nyquist frequency is Var_inf plus the noise, aliases folded in."""
+    frequency = (np.arange(200000) + 0.5) * 500.0 / 200000
+    density = ou_spectrum(frequency, ALPHA, 0.3, 1000.0, noise_std=0.02)
+    total = density.sum() * 500.0 / 200000
+    assert total == pytest.approx(0.3 ** 2 / (2 * ALPHA) + 0.02 ** 2, rel=1e-6)
+
+
+def test_the_curve_is_the_lorentzian_where_sampling_is_fast():
+    """2 sigma^2 / (alpha^2 + (2 pi f)^2), one-sided."""
+    frequency = np.array([0.1, 1.0, 10.0, 100.0])
+    expected = 2.0 * 0.3 ** 2 / (ALPHA ** 2 + (2 * math.pi * frequency) ** 2)
+    assert ou_spectrum(frequency, ALPHA, 0.3, 1e6) == pytest.approx(expected, rel=1e-3)
+
+
+def test_unknown_noise_counts_as_none():
+    """It does not spread."""
+    frequency = np.array([1.0])
+    assert ou_spectrum(frequency, 63.0, 0.3, 1e3, math.nan) == ou_spectrum(
+        frequency, 63.0, 0.3, 1e3)
+
+
+def test_measured_and_true_spectrum_agree():
+    """
+    The mean of their ratio is 1.
+
+    About 40 points a decade over two decades; each averages >= 8 pieces
+    (relative error below 1/sqrt(8) = 35 %), and most points average several
+    bins; the mean of 60 or more is known to 35 % / sqrt(60) = 5 %.
+    A two-sided or badly scaled density is off by 2.
+    """
+    made = recording(1, ((0.1, 0.3),), seconds=60.0)
+    (level,) = analyze(made).levels
+    found = level_spectrum(made, level.segments, level.estimate)
+    frequency, density = found.frequency, found.density
+    assert frequency.size >= 60 and frequency[0] > 0.0 and frequency[-1] < 500.0
+    ratio = density / ou_spectrum(frequency, ALPHA, 0.3, 1000.0)
+    assert ratio.mean() == pytest.approx(1.0, abs=0.2)
+    # The fit itself is within its 10 % of sigma and of alpha.
+    assert (density / found.fitted).mean() == pytest.approx(1.0, abs=0.2)
+
+
+def test_short_segments_give_nothing():
+    """Fewer than 32 samples: empty arrays."""
+    made = recording(2, ((0.1, 0.3),), seconds=0.02)
+    (level,) = analyze(made).levels
+    assert level_spectrum(made, level.segments, level.estimate).frequency.size == 0
