@@ -32,8 +32,8 @@ EXTRAS = {'dask': 'fleet.cluster', 'distributed': 'fleet.cluster',
 ALLOWED = {
     'errors': set(), 'text': set(), 'stream': CORE | {'yaml'}, 'recordings': CORE | {'yaml'},
     'cli': CORE | {'yaml'}, **dict.fromkeys((
-        'records', 'model', 'online', 'simulation', 'criticism', 'analysis', 'discovery', 'coupling',
-        'paper', 'fleet', 'report', '__init__'), CORE),
+        'records', 'model', 'online', 'simulation', 'criticism', 'analysis', 'discovery',
+        'coupling', 'paper', 'fleet', 'report', '__init__'), CORE),
 }
 
 
