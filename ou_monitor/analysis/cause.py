@@ -16,13 +16,12 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor.analysis.level_comparison import AlphaTest
+from ou_monitor.analysis.level_comparison import AlphaTest, LEVEL
 from ou_monitor.analysis.relaxation import Relaxation, Release
 from ou_monitor.records import NAN
 from ou_monitor.text import Z95
 from scipy import stats
 
-LEVEL = 0.05
 # A level that is off by more than this share of the transient has settled elsewhere; by less
 # than the other, it has come back.
 _ELSEWHERE, _BACK = 0.5, 0.25

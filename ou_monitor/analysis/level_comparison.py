@@ -1,5 +1,5 @@
 """
-What differs from load level to load level: the sag, and whether alpha is the same.
+What differs from load level to load level: the sag, sigma, and whether alpha is the same.
 
 Sag is how far the mean of a level lies below that of the lowest throttle.  Weighted least squares
 of the segment means fits a mean for each level and a polynomial of time that all levels share,
@@ -17,6 +17,14 @@ stands for both, and the error of a fit knows nothing of it.  Limits: only level
 fit count; a spectral line too faint to be found, and taken out before the fit, is not known of;
 "no change seen" is no proof that there is none, so the ratio that would have been seen stands
 beside it.
+
+Alpha and sigma have one threshold, `LEVEL`, that of the intervals printed beside them.  The
+question is how much they change from level to level, each level fitted by itself.  `discover`
+fits one model to a whole recording, throttle held or not, and asks `alpha_score` and
+`sigma_score` (`ou_monitor.criticism.battery`) whether to let them go with throttle.  For alpha
+the slope over throttle that is fitted here and that score are one statistic to first order; for
+sigma the score is some 1.6 times larger, for it takes alpha and white noise as common to all
+levels, each of which has its own here.
 """
 
 from __future__ import annotations
@@ -34,7 +42,8 @@ from scipy.special import chndtrinc
 
 # Highest power of time, and segments needed for each.
 _DEGREE, _SEGMENTS = 3, 4
-# Probability of "differs" where alpha is the same, and of seeing `detectable_ratio`.
+# Probability of "differs" where alpha or sigma is the same (what intervals of 95 % leave), and of
+# seeing `detectable_ratio`.
 LEVEL, POWER = 0.05, 0.9
 # A change by less than this factor changes no decision here: tau is known no better in most
 # recordings of a flight.
@@ -213,14 +222,7 @@ def alpha_constancy(throttles: Sequence[float], estimates: Sequence[Estimate],
     x = np.array([throttles[k] for k in good])
     logs = np.log([estimates[k].alpha for k in good])
     own = np.array([estimates[k].alpha_se for k in good])
-    # The relative error is sqrt(2 / (alpha T)) times what the noise adds: at a common alpha
-    # that factor goes with the root.
-    se = own
-    for _ in range(20):
-        weight = 1.0 / se ** 2
-        mean = float(weight @ logs / weight.sum())
-        se = own * np.exp(0.5 * (logs - mean))
-    weight = 1.0 / se ** 2
+    weight = 1.0 / at_common_alpha(logs, own) ** 2
     mean = float(weight @ logs / weight.sum())
     common = (math.exp(mean), float(1.0 / math.sqrt(weight.sum())))
     if len(good) < 2:
@@ -238,6 +240,49 @@ def alpha_constancy(throttles: Sequence[float], estimates: Sequence[Estimate],
     verdict = 'differs' if p < LEVEL else 'constant' if seen <= NARROW else 'undetermined'
     return AlphaTest(verdict, len(good), *common, statistic, p, seen, math.exp(slope),
                      math.exp(slope - wide), math.exp(slope + wide), withheld)
+
+
+def at_common_alpha(logs: FloatArray, errors: FloatArray) -> FloatArray:
+    """
+    Return relative errors of alpha or Var_inf as they would be at the common alpha.
+
+    logs are those of the alphas found (1/s).  The error is sqrt(2 / (alpha T)) times what the
+    noise adds: what came out high by chance shows too small a one.
+    """
+    found = errors
+    for _ in range(20):
+        weight = 1.0 / found ** 2
+        found = errors * np.exp(0.5 * (logs - float(weight @ logs / weight.sum())))
+    return found
+
+
+@dataclass(frozen=True)
+class SigmaChange:
+    """
+    Sigma of one level over that of another.
+
+    Attributes
+    ----------
+    ratio, ratio_low, ratio_high : float
+        As fitted, and its 95 % interval.
+
+    """
+
+    ratio: float
+    ratio_low: float
+    ratio_high: float
+
+    @property
+    def differs(self) -> bool:
+        """Whether sigma is not the same, at `LEVEL`."""
+        return not self.ratio_low <= 1.0 <= self.ratio_high
+
+
+def sigma_change(low: Estimate, high: Estimate) -> SigmaChange:
+    """Compare sigma of two levels that are usable."""
+    ratio = high.sigma / low.sigma
+    reach = math.exp(Z95 * math.hypot(low.sigma_se, high.sigma_se))
+    return SigmaChange(ratio, ratio / reach, ratio * reach)
 
 
 def _noncentrality(freedom: int) -> float:

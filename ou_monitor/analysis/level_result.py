@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import math
 
 import numpy as np
-from ou_monitor.analysis.level_comparison import level_sags, LevelSag
+from ou_monitor.analysis.level_comparison import at_common_alpha, level_sags, LevelSag
 from ou_monitor.analysis.levels import LoadLevel, Segment
 from ou_monitor.analysis.process_type import classify, ProcessType, Verdict
 from ou_monitor.analysis.spectrum import level_spectrum, Spectrum
@@ -108,14 +108,9 @@ def disagreement(estimates: Sequence[Estimate]) -> float:
     for name in _LOG_NAMES:
         logs = np.log([getattr(e, name) for e in good])
         own = np.array([getattr(e, name + '_se') for e in good])
-        alphas = np.log([e.alpha for e in good])
-        se = own
-        for _ in range(20):
-            weight = 1.0 / se ** 2
-            common = float(weight @ alphas / weight.sum())
-            # A relative error goes with 1/sqrt(alpha T) for alpha and Var_inf.
-            se = own * (np.exp(0.5 * (alphas - common)) if name != 'sigma' else 1.0)
-        weight = 1.0 / se ** 2
+        if name != 'sigma':
+            own = at_common_alpha(np.log([e.alpha for e in good]), own)
+        weight = 1.0 / own ** 2
         chi2 = float(weight @ (logs - float(weight @ logs / weight.sum())) ** 2)
         least = min(least, float(stats.chi2.sf(chi2, len(good) - 1)))
     return min(1.0, len(_LOG_NAMES) * least)

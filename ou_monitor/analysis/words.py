@@ -7,11 +7,12 @@ import math
 
 import numpy as np
 from ou_monitor.analysis.analyze import Analysis
+from ou_monitor.analysis.level_comparison import sigma_change
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.quality import QualityItem, Severity
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, NAN, Status
-from ou_monitor.text import number, Z95
+from ou_monitor.text import number
 
 # What changes the meaning of the numbers in the headline itself.
 _BEWARE = {
@@ -49,15 +50,14 @@ def _numbers(good: Sequence[LevelResult]) -> str:
         return (f'The supply{where} wanders with sigma = {_ci(e)} V/sqrt(s) and '
                 f'relaxes in tau = {_tau(e)} ms: a standard deviation of '
                 f'{number(1e3 * math.sqrt(e.var_inf))} mV.')
-    growth = high.estimate.sigma / low.estimate.sigma
-    spread = Z95 * math.hypot(low.estimate.sigma_se, high.estimate.sigma_se)
-    factor = (f'factor {number(growth)}, 95 % {number(growth * math.exp(-spread))} to '
-              f'{number(growth * math.exp(spread))}')
-    if abs(math.log(growth)) <= spread:
+    found = sigma_change(low.estimate, high.estimate)
+    factor = (f'factor {number(found.ratio)}, 95 % {number(found.ratio_low)} to '
+              f'{number(found.ratio_high)}')
+    if not found.differs:
         change = (f'sigma does not change measurably from {low.label} to {high.label} throttle '
                   f'({factor})')
     else:
-        verb = 'grows' if growth > 1.0 else 'falls'
+        verb = 'grows' if found.ratio > 1.0 else 'falls'
         change = (f'sigma {verb} from {number(low.estimate.sigma)} to '
                   f'{number(high.estimate.sigma)} V/sqrt(s) from {low.label} to {high.label} '
                   f'throttle ({factor})')

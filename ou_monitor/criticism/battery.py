@@ -143,7 +143,9 @@ def _spectrum(w: FloatArray, given: Covariates) -> Iterator[tuple[str, float]]:
             mean = float(power[a:b].mean())
             value = (mean ** (1.0 / 3.0) - 1.0 + 1.0 / (9.0 * m)) * 3.0 * math.sqrt(m)
             yield f'band {k}, {_hertz(a, n, given)} to {_hertz(b, n, given)} Hz', value
-    # The highest of many exponentials: its chance, as a normal score.
+    # The highest of many exponentials: its chance, as a normal score.  Not by `find_lines`: its
+    # level, the median of neighbours, is for spectra that are not flat, and scores are flat under
+    # the null of the bank; where they are not, `find_lines` decides which lines are tried.
     yield 'line', _gumbel(float(power[3:].max()), power.size - 3)
 
 
@@ -219,7 +221,7 @@ def _inputs(w: FloatArray, square: FloatArray, given: Covariates) -> Iterator[tu
             yield f'throttle change over {span:g} s', score(w, recent)
             if span in (0.05, 2.0):
                 yield f'throttle direction over {span:g} s', score(w, np.abs(recent))
-    yield 'variance throttle', score(square, u)
+    yield 'variance throttle', sigma_score(square, u)
     yield 'variance throttle squared', score(square, centre * centre - slope * centre)
     keep = math.exp(-1.0 / max(0.05 * given.rate, 1.0))
     yield 'variance change of throttle', score(
@@ -240,8 +242,7 @@ def _state(w: FloatArray, square: FloatArray, given: Covariates) -> Iterator[tup
     yield 'pairs after a large one', float(pairs.sum()) / math.sqrt(
         max(float((w[large] ** 2).sum()), 9.0))
     if given.throttle is not None:
-        u = given.throttle - given.throttle.mean()
-        yield 'state throttle', score(w, x * u - float((x * x * u).mean()) * x)
+        yield 'state throttle', alpha_score(w, x, given.throttle)
 
 
 def _beyond_second_order(w: FloatArray, given: Covariates) -> Iterator[tuple[str, float]]:
@@ -281,6 +282,27 @@ def score(a: FloatArray, b: FloatArray) -> float:
     a, b = a - a.mean(), b - b.mean()
     norm = math.sqrt(float(a @ a) * float(b @ b))
     return math.sqrt(a.size) * float(a @ b) / norm if norm > 0.0 else 0.0
+
+
+def sigma_score(square: FloatArray, throttle: FloatArray) -> float:
+    """
+    Return the score of a slope of ln sigma over throttle (0..1).
+
+    square are squared innovations.  `analyze` asks a narrower question, how much sigma differs
+    between levels at which throttle was held (`ou_monitor.analysis.level_comparison`).
+    """
+    return score(square, throttle)
+
+
+def alpha_score(w: FloatArray, state: FloatArray, throttle: FloatArray) -> float:
+    """
+    Return the score of a slope of ln alpha over throttle (0..1), that of alpha projected out.
+
+    w are innovations, state the standardised deviation before each.  `analyze` asks whether
+    levels at which throttle was held share one alpha (`ou_monitor.analysis.level_comparison`).
+    """
+    u = throttle - throttle.mean()
+    return score(w, state * u - float((state * state * u).mean()) * state)
 
 
 def throttle_paths(throttle: FloatArray, keep: float) -> Iterator[tuple[str, FloatArray]]:

@@ -14,9 +14,11 @@ import math
 
 import numpy as np
 from ou_monitor.criticism.battery import Covariates, large_ones, throttle_paths
+from ou_monitor.criticism.innovations import other_pole, OtherPole
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import Events, fit_gaussian, GaussianFit
 from ou_monitor.model.terms.laws import LawFit, View
+from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray
 
@@ -154,6 +156,22 @@ def view_of(samples: Samples, gaussian: GaussianFit, z: FloatArray, part: slice)
                 state=np.concatenate(([0.0], residual[:-1])), residual=residual,
                 at=samples.t - samples.t[0], step=samples.step, throttle=samples.throttle,
                 train=part)
+
+
+def pole_beside(samples: Samples, composite: Composite) -> OtherPole:
+    """
+    Return the test of `analyze` for another pole, of the scores of a model.
+
+    Only where the noise is one OU in white noise, as in a load level: other states of a model
+    change the spectrum that the test is about.
+    """
+    ou, *others = composite.terms
+    if any(term.ROLE is Role.BLOCK for term in others):
+        return OtherPole()
+    assert isinstance(ou, OU)
+    rate = 1.0 / float(np.median(samples.step[1:]))
+    return other_pole([composite.z], rate, ou.alpha, ou.sigma ** 2 / (2.0 * ou.alpha),
+                      sum(term.variance() for term in others))
 
 
 def covariates_of(samples: Samples, composite: Composite) -> Covariates:

@@ -36,6 +36,8 @@ from scipy.signal import periodogram
 # Probability that tests of what is as modelled reject: those of all levels of a recording
 # together in `analyze`, those of a whole recording in `discover`.  One in a hundred, as for lines.
 FAMILY_WISE = 0.01
+# Least variance of a second relaxation that is of consequence, over Var_inf.
+LEAST_SHARE = 0.1
 # Rates of the other pole that are looked for, in those of the first.
 FACTORS = (1.0 / 30.0, 1.0 / 10.0, 1.0 / 3.0, 3.0, 10.0)
 # Fewer ordinates than this tell nothing; segments shorter than this give none.
@@ -65,6 +67,16 @@ class OtherPole:
     second_p: float = NAN
     second_share: float = NAN
     coupling_p: float = NAN
+
+    @property
+    def second(self) -> bool:
+        """Whether there is a second relaxation of consequence."""
+        return self.second_p < FAMILY_WISE and self.second_share >= LEAST_SHARE
+
+    @property
+    def coupled(self) -> bool:
+        """Whether an AC-coupled instrument has taken out slow noise."""
+        return self.coupling_p < FAMILY_WISE
 
 
 def fresh(voltage: FloatArray, estimate: Estimate) -> np.ndarray:

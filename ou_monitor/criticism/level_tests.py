@@ -32,7 +32,8 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, join, other_pole, OtherPole
+from ou_monitor.criticism.innovations import (
+    FAMILY_WISE, innovations, join, LEAST_SHARE, other_pole, OtherPole)
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Status
 from scipy import stats
 
@@ -47,8 +48,7 @@ _FAR = 10.0
 _LAGS_RAW, _LAGS_FITTED = 5, 10
 # Least effects of consequence, in the unit of each test.
 LEAST = {'mean_drift': 0.25, 'variance_drift': 0.1, 'gaussian': 0.3, 'impulses': 0.5,
-         'correlated': 0.0, 'one_relaxation': 0.1,
-         'second_relaxation': 0.1}
+         'correlated': 0.0, 'one_relaxation': 0.1, 'second_relaxation': LEAST_SHARE}
 EFFECT = {
     'mean_drift': 'standard deviation of the mean beyond sampling, over that of the voltage',
     'variance_drift': 'relative standard deviation of the intensity beyond sampling',

@@ -10,8 +10,11 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from ou_monitor.criticism.battery import is_sign
+from ou_monitor.criticism.innovations import OtherPole
 from ou_monitor.criticism.null_bank import family_chance
 from ou_monitor.discovery.finding import Verdict
+from ou_monitor.model.terms.ac_coupling import ACCoupling
+from ou_monitor.model.terms.second_relaxation import SecondRelaxation
 from ou_monitor.model.terms.term import Role, Term
 
 Statistics = Mapping[str, float]
@@ -87,8 +90,13 @@ FORM_SHARE = 0.15
 # Which kinds are tried.
 
 def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], values: Statistics,
-                 given: Collection[str], tier: int, throttle: bool) -> list[Kind]:
-    """Return the kinds of a tier to try beside those of a model, the dear ones last."""
+                 given: Collection[str], tier: int, throttle: bool,
+                 shown: Collection[str] = ()) -> list[Kind]:
+    """
+    Return the kinds of a tier to try beside those of a model, the dear ones last.
+
+    `shown` are the names of those that a test of their own shows (`poles_shown`).
+    """
     found = []
     for kind in kinds:
         if kind.NAME in ('ou', *given) or kind.ROLE is Role.EXACT or not kind.SIGNS:
@@ -101,7 +109,7 @@ def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], values: Statistic
             continue
         # What is cheap and linear in what was measured is tried wherever something was
         # found and something is left.
-        if asks(kind, values) or (len(model) > 1 and kind.MEASURED and kind.ROLE is Role.MEAN
+        if asks(kind, values) or kind.NAME in shown or (len(model) > 1 and kind.MEASURED and kind.ROLE is Role.MEAN
                                   and any_off(values)):
             found.append(kind)
     # The one that is asked for most may spare the others.
@@ -113,6 +121,12 @@ def asks(kind: Kind, values: Statistics) -> float:
     limit = ASK_DEAR if kind.DEAR else ASK
     return max((abs(value) for name, value in values.items() for sign in kind.SIGNS
                 if abs(value) > limit and is_sign(sign, name, value)), default=0.0)
+
+
+def poles_shown(pole: OtherPole) -> frozenset[str]:
+    """Return the causes that the score test of another pole shows, as `analyze` reports them."""
+    return frozenset(kind.NAME for kind, there in (
+        (SecondRelaxation, pole.second), (ACCoupling, pole.coupled)) if there)
 
 
 def any_off(values: Statistics) -> bool:
@@ -141,13 +155,16 @@ def tier_of(kind: Kind, values: Statistics) -> int:
     return 1 if kind.ROLE is Role.LAW and outliers else 2
 
 
-def settled(tried: Kind, left: Statistics | None, kind: Kind) -> bool:
+def settled(tried: Kind, left: Statistics | None, kind: Kind,
+            shown: Collection[str] = ()) -> bool:
     """
     Return whether a trial spares that of a dear kind of another family.
 
-    `left` are the statistics that the trial leaves; None where its evidence is not clear.
+    `left` are the statistics that the trial leaves, None where its evidence is not clear; `shown`
+    as `kinds_to_try` takes it, of the model with the trial.
     """
-    return (kind.DEAR and left is not None and not asks(kind, left) and not any_off(left)
+    return (kind.DEAR and left is not None and not asks(kind, left)
+            and kind.NAME not in shown and not any_off(left)
             and tried.FAMILY != kind.FAMILY and not imitate(kind, tried))
 
 

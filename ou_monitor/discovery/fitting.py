@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from ou_monitor.criticism.composite import Composite, fit_composite, view_of
+from ou_monitor.criticism.composite import Composite, fit_composite, pole_beside, view_of
 from ou_monitor.criticism.null_bank import criticise, NullBank
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
@@ -45,6 +45,8 @@ class Trial:
         nats.
     left : dict of str to float, or None
         Statistics of the model with it; None where its evidence is not clear.
+    shown : frozenset of str
+        Causes that the score test of another pole shows beside it; empty where `left` is None.
     beside : str
         Name of a cause that comes with it; empty where none does.
 
@@ -54,6 +56,7 @@ class Trial:
     composite: Composite
     evidence: float
     left: dict[str, float] | None = None
+    shown: frozenset[str] = frozenset()
     beside: str = ''
 
 
@@ -120,17 +123,19 @@ class Fitter:
         found: list[Trial] = []
         model = [type(term) for term in composite.terms]
         for kind in decision.kinds_to_try(catalogue().values(), model, values, given, tier,
-                                          self.samples.throttle is not None):
+                                          self.samples.throttle is not None,
+                                          self.poles_shown(composite)):
             if only and kind.NAME != only or not decision.affordable(kind, self.cost):
                 continue
-            if any(decision.settled(catalogue()[trial.name], trial.left, kind)
+            if any(decision.settled(catalogue()[trial.name], trial.left, kind, trial.shown)
                    for trial in found):
                 continue
             best = self.best_start(composite, kind, view)
             if best is not None:
                 trial = Trial(kind.NAME, best, self.evidence(best) - before)
                 if trial.evidence > decision.CLEAR:
-                    trial = replace(trial, left=criticise(self.samples, best, bank))
+                    trial = replace(trial, left=criticise(self.samples, best, bank),
+                                    shown=self.poles_shown(best))
                 found.append(trial)
         if not composite.has('load_sag') and {'load_sag', 'load_transient'} <= {
                 trial.name for trial in found}:
@@ -139,6 +144,10 @@ class Fitter:
                 found.append(Trial('load_transient', both, self.evidence(both) - before,
                                    beside='load_sag'))
         return found
+
+    def poles_shown(self, composite: Composite) -> frozenset[str]:
+        """Return the causes that the score test of another pole shows beside a model."""
+        return decision.poles_shown(pole_beside(self.samples, composite))
 
     def refine(self, composite: Composite, trials: Sequence[Trial]) -> list[Trial]:
         """Return trials, the best first, those near it fitted to all samples."""
