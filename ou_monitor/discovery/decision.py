@@ -109,8 +109,8 @@ def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], values: Statistic
             continue
         # What is cheap and linear in what was measured is tried wherever something was
         # found and something is left.
-        if asks(kind, values) or kind.NAME in shown or (len(model) > 1 and kind.MEASURED and kind.ROLE is Role.MEAN
-                                  and any_off(values)):
+        if asks(kind, values) or kind.NAME in shown or (
+                len(model) > 1 and kind.MEASURED and kind.ROLE is Role.MEAN and any_off(values)):
             found.append(kind)
     # The one that is asked for most may spare the others.
     return sorted(found, key=lambda kind: (kind.DEAR, -asks(kind, values)))

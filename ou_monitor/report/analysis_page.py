@@ -11,7 +11,7 @@ from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.words import headline
 from ou_monitor.criticism.curves import outline
 from ou_monitor.report import analysis_sections as parts, page
-from ou_monitor.report.cells import figure, UNKNOWN
+from ou_monitor.report.page import rounded, UNKNOWN
 from ou_monitor.report.scale import span
 from ou_monitor.report.svg import Plot
 
@@ -26,7 +26,7 @@ def analysis_page(analysis: Analysis, command: str = '') -> str:
     recording = analysis.recording
     rate = (recording.n - 1) / recording.duration if recording.duration > 0.0 else math.nan
     subtitle = (f'{recording.n} samples in {recording.duration:.4g} s, '
-                f'{figure(rate)} Hz on average')
+                f'{rounded(rate)} Hz on average')
     after = parts.transients(analysis)
     sections = [
         page.headline(headline(analysis)),
@@ -51,13 +51,13 @@ def _interval(level: LevelResult, name: str, scale: float = 1.0, invert: bool = 
     low, high = e.interval(name)
     if invert:
         value, low, high = 1.0 / value, 1.0 / high, 1.0 / low
-    return (f'{figure(scale * value)}\n{figure(scale * low)} to {figure(scale * high)}')
+    return (f'{rounded(scale * value)}\n{rounded(scale * low)} to {rounded(scale * high)}')
 
 
 def _levels_table(levels: Sequence[LevelResult]) -> str:
-    rows = [[level.label, figure(level.time), str(level.n), figure(level.mean, 4),
-             *[figure(1e3 * v) for v in (level.vpp, level.peak, level.vrms)],
-             figure(level.crest), level.kind.value] for level in levels]
+    rows = [[level.label, rounded(level.time), str(level.n), rounded(level.mean, 4),
+             *[rounded(1e3 * v) for v in (level.vpp, level.peak, level.vrms)],
+             rounded(level.crest), level.kind.value] for level in levels]
     return page.table(['Throttle', 'Time, s', 'Samples', 'Mean, V', 'Vpp, mV', 'Peak, mV',
                        'Vrms, mV', 'Vpp/Vrms', 'Process'], rows, left=[0, 8])
 
@@ -65,7 +65,7 @@ def _levels_table(levels: Sequence[LevelResult]) -> str:
 def _ou_table(levels: Sequence[LevelResult]) -> str:
     rows = [[level.label, _interval(level, 'alpha'), _interval(level, 'alpha', 1e3, invert=True),
              _interval(level, 'sigma'), _interval(level, 'var_inf'),
-             figure(1e3 * level.estimate.noise_std), level.estimate.status.name]
+             rounded(1e3 * level.estimate.noise_std), level.estimate.status.name]
             for level in levels]
     heads = ['Throttle', '\u03b1, 1/s', '\u03c4, ms', '\u03c3, V/\u221as', 'Var\u221e, V\u00b2',
              'White noise, mV', 'Status']

@@ -12,7 +12,7 @@ from ou_monitor.analysis.relaxation import Relaxation
 from ou_monitor.analysis.words import brownout_sentence, caution, relaxation_sentence
 from ou_monitor.records import FloatArray
 from ou_monitor.report import page
-from ou_monitor.report.cells import figure, probability, UNKNOWN
+from ou_monitor.report.page import probability, rounded, UNKNOWN
 from ou_monitor.report.svg import Plot
 
 # Changes drawn in one plot, and relaxation times of them.
@@ -40,7 +40,7 @@ def process(analysis: Analysis) -> list[str]:
     for level in analysis.levels:
         cells = []
         for test in level.shape.tests:
-            strength = f'\n{figure(test.effect, 2)}' if math.isfinite(test.effect) else ''
+            strength = f'\n{rounded(test.effect, 2)}' if math.isfinite(test.effect) else ''
             mark = ' *' if test.rejects else ''
             cells.append(probability(test.p_adjusted) + mark + strength)
         rows.append([level.label, level.kind.value, *cells])
@@ -58,15 +58,15 @@ def process(analysis: Analysis) -> list[str]:
 
 def lines(analysis: Analysis) -> list[str]:
     """Return the spectral lines, and the least that would have been detected."""
-    rows = [[level.label, f'{figure(line.frequency, 4)}\n\u00b1 {figure(line.resolution, 2)}',
-             f'{figure(1e3 * line.rms)}\n{figure(1e3 * line.rms_low)} to '
-             f'{figure(1e3 * line.rms_high)}', f'{100.0 * line.share:.2g} %',
+    rows = [[level.label, f'{rounded(line.frequency, 4)}\n\u00b1 {rounded(line.resolution, 2)}',
+             f'{rounded(1e3 * line.rms)}\n{rounded(1e3 * line.rms_low)} to '
+             f'{rounded(1e3 * line.rms_high)}', f'{100.0 * line.share:.2g} %',
              probability(line.p_value)]
             for level in analysis.levels for line in level.lines.lines]
     searched = [level for level in analysis.levels if not level.lines.why_not]
     if not searched:
         return []
-    detail = ', '.join(f'{level.label}: {figure(1e3 * level.lines.detectable)} mV'
+    detail = ', '.join(f'{level.label}: {rounded(1e3 * level.lines.detectable)} mV'
                        for level in searched)
     text = (f'A recording without lines has one reported once in a hundred times. RMS of a line '
             f'that would have been detected with 90 %: {detail}.')
@@ -113,12 +113,12 @@ def _relaxing(analysis: Analysis, fit: Relaxation) -> Plot:
 def _changes(analysis: Analysis, fit: Relaxation) -> str:
     start = float(analysis.recording.t[0])
     side = 'Overshoot, mV' if fit.kind == 'release' else 'Undershoot, mV'
-    rows = [[figure(change.t - start, 4),
+    rows = [[rounded(change.t - start, 4),
              f'{100.0 * change.throttle_before:.3g} to {100.0 * change.throttle_after:.3g} %',
              _with_error(change.level_before, change.level_before_se, 4, 1.0),
              _with_error(change.level, change.level_se, 4, 1.0),
              _with_error(change.amplitude, change.amplitude_se, 3, 1e3),
-             figure(1e3 * change.beyond), probability(change.beyond_p)]
+             rounded(1e3 * change.beyond), probability(change.beyond_p)]
             for change in fit.releases]
     return page.table(['At, s', 'Throttle', 'Level before, V', 'Level after, V', 'A, mV', side,
                        'p of noise'], rows, left=[1])
@@ -127,7 +127,7 @@ def _changes(analysis: Analysis, fit: Relaxation) -> str:
 def _with_error(value: float, se: float, digits: int, scale: float) -> str:
     if not math.isfinite(value):
         return UNKNOWN
-    return f'{figure(scale * value, digits)} \u00b1 {figure(scale * se, 2)}'
+    return f'{rounded(scale * value, digits)} \u00b1 {rounded(scale * se, 2)}'
 
 
 def curves(analysis: Analysis) -> list[str]:

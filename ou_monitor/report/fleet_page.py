@@ -17,7 +17,7 @@ from ou_monitor.fleet.summary import (
     VEHICLE_HEADS, vehicle_rows)
 from ou_monitor.records import FloatArray
 from ou_monitor.report import page
-from ou_monitor.report.cells import typeset, UNKNOWN
+from ou_monitor.report.page import typeset, UNKNOWN
 from ou_monitor.report.svg import Plot
 from ou_monitor.text import number
 

@@ -14,10 +14,14 @@ from functools import cache
 import hashlib
 from html import escape
 from importlib import resources
+import math
 
 from ou_monitor.report.embedding import embed
 from ou_monitor.report.svg import Plot
+from ou_monitor.text import number
 
+# What is not known, as a page sets it.
+UNKNOWN = '\u2013'
 # Hues of Okabe & Ito (2008), distinct with every common colour blindness;
 # lifted for the dark form.
 _LIGHT = ('#0072b2', '#d55e00', '#009e73', '#cc79a7', '#b07d00', '#3a9bd9', '#6b4fa0', '#5f6b6d')
@@ -161,3 +165,20 @@ def table(headers: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[
 
     return ('<div class="scroll"><table><thead>' + cells('th', headers) + '</thead><tbody>'
             + ''.join(cells('td', row) for row in rows) + '</tbody></table></div>')
+
+
+def typeset(text: str) -> str:
+    """Return a cell of a terminal's table as a page sets it."""
+    return UNKNOWN if text == '-' else text.replace('-', '\u2212')
+
+
+def rounded(value: float, digits: int = 3) -> str:
+    """Return a number to some significant digits."""
+    return typeset(number(value, digits))
+
+
+def probability(p: float) -> str:
+    """Return a probability to two digits; below 1e-6 only that."""
+    if not math.isfinite(p):
+        return UNKNOWN
+    return '< 1e\u22126' if p < 1e-6 else typeset(f'{p:.2g}')
