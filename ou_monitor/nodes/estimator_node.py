@@ -198,7 +198,7 @@ class EstimatorNode(MonitorNode):
         level, summary = report.level, report.summary
         problem = self._problems.get('voltage')
         limit = self._monitor.settings.stale_after
-        silent = report.level is Level.STALE
+        silent = not report.fresh
         if level is Level.ERROR:
             # A flag that is set comes before what is wrong with the input.
             summary = f'{summary} {problem}' if problem else summary
@@ -232,8 +232,7 @@ class EstimatorNode(MonitorNode):
                   'throttle_budget': report.budget}
         for key, output in self._outputs.items():
             # What is stale is no longer known.
-            output.publish(Float64(
-                data=math.nan if report.level is Level.STALE else values[key]))
+            output.publish(Float64(data=values[key] if report.fresh else math.nan))
         if report.brownout is not None:
             self._brownout.publish(Bool(data=report.brownout))
         self._state.publish(self._message('state', report, level, summary, report.estimate.t))

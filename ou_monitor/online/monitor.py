@@ -7,21 +7,23 @@ with a recording, so both say the same thing of the same data.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 import enum
 import math
 
+import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.online.estimator.estimator import SlidingEstimator
+from ou_monitor.online.input_health import patience, readings, Stamps, StampWatch
 from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
 from ou_monitor.online.risk.outlook import Outlook
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.records import Estimate, Flag, NAN, Status
+from ou_monitor.records import Counters, Estimate, Flag, NAN, Status
 
 # Cautions that make the numbers doubtful; the others only inform.
 _DOUBTFUL = frozenset({Flag.SLOW_RATE, Flag.QUANTIZED, Flag.LOWPASS_UPSTREAM, Flag.SATURATED,
-                       Flag.TREND})
+                       Flag.TREND, Flag.IRREGULAR})
 
 
 class Level(enum.IntEnum):
@@ -58,7 +60,17 @@ class MonitorReport:
     summary : str
         One line for the pilot.
     age : float
-        Time since the last voltage arrived, s; inf when none ever did.
+        Age of the newest voltage, s; inf when none ever came.
+    patience : float
+        Age from which the input is stale, s: `stale_after`, or less for a fast source.
+    stamps : Stamps
+        What the stamps are good for.
+    fresh : bool
+        Whether the numbers rest on samples that are not too old.
+    restarts : int
+        Times the estimator was started anew because of an error.
+    fault : str
+        The last such error, in one line; empty when there was none.
 
     """
 
@@ -71,6 +83,11 @@ class MonitorReport:
     level: Level
     summary: str
     age: float
+    patience: float
+    stamps: Stamps
+    fresh: bool
+    restarts: int
+    fault: str
 
     @property
     def brownout(self) -> bool | None:
@@ -94,6 +111,10 @@ class MonitorReport:
         values['model_left_out'] = ','.join(self.left_out)
         values['throttle_budget_reason'] = self.budget_reason
         values['age'] = self.age
+        values['patience'] = self.patience
+        values['stamps'] = self.stamps.name
+        values['restarts'] = self.restarts
+        values['fault'] = self.fault
         values['status'] = e.status.name
         values['status_text'] = e.status.value
         values['flags'] = ','.join(flag.name for flag in e.flags)
@@ -121,13 +142,24 @@ class SupplyMonitor:
     def __init__(self, settings: MonitorSettings | None = None,
                  model: SupplyModel | None = None, *, background: bool = True) -> None:
         self._settings = settings or MonitorSettings()
-        self._estimator = SlidingEstimator(self._settings.window)
-        self._flag = BrownoutFlag(self._settings)
-        self._outlook = Outlook(background=background)
-        self._outlook.set_model(model)
-        self._newest = Estimate()
+        self._background = background
         self._model = model
+        self._flag = BrownoutFlag(self._settings)
+        self._stamps = StampWatch()
         self._reset_reason = ''
+        self._restarts, self._fault, self._faulty = 0, '', False
+        # What the estimators before the present one have counted.
+        self._counted = Counters()
+        # Late and unusable samples so far, and the stamp at which there were last more of them.
+        self._odd, self._odd_at = 0, -math.inf
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin with nothing known of the supply."""
+        self._estimator = SlidingEstimator(self._settings.window)
+        self._outlook = Outlook(background=self._background)
+        self._outlook.set_model(self._model)
+        self._newest = Estimate()
 
     @property
     def settings(self) -> MonitorSettings:
@@ -157,11 +189,60 @@ class SupplyMonitor:
         self._outlook.set_model(model)
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
-             throttle: npt.ArrayLike | None = None) -> None:
-        """Add samples; see `SlidingEstimator.push`."""
-        self._estimator.push(t, voltage, throttle)
-        self._flag.push(t, voltage)
-        self._outlook.push(t, voltage, throttle, self._newest)
+             throttle: npt.ArrayLike | None = None, arrival: npt.ArrayLike | None = None,
+             *, thin: int = 1) -> None:
+        """
+        Add samples; see `SlidingEstimator.push`.
+
+        Voltages beyond 1e6 V and throttles beyond 2 are no readings, and count as NaN.
+
+        Parameters
+        ----------
+        t, voltage, throttle : array_like, shape (n,), or float
+            Stamps, s; voltage, V; throttle, 0..1 (a number for all, or left out: unknown).
+        arrival : array_like, shape (n,), optional
+            When each sample arrived, s, on the clock of `now` of `report`.  By it the floor
+            judges samples whose stamps are late.
+        thin : int
+            Of so many samples one goes to the estimator; the floor judges all.
+
+        Raises
+        ------
+        ValueError
+            When the shapes differ.
+
+        """
+        stamps = np.atleast_1d(np.asarray(t, dtype=np.float64))
+        volts = np.atleast_1d(np.asarray(voltage, dtype=np.float64))
+        load = None if throttle is None else np.broadcast_to(
+            np.asarray(throttle, dtype=np.float64), volts.shape)
+        times = None if arrival is None else np.atleast_1d(np.asarray(arrival, dtype=np.float64))
+        stamps, volts, load = readings(stamps, volts, load)
+        self._flag.push(stamps, volts, times)
+        self._stamps.push(stamps, times)
+        part = slice(None, None, thin)
+        load = None if load is None else load[part]
+        try:
+            self._estimator.push(stamps[part], volts[part], load)
+            self._outlook.push(stamps[part], volts[part], load, self._newest)
+        except Exception as error:
+            # Whatever it is: a monitor that ends with it says nothing any more.
+            self.restart(error)
+
+    def restart(self, error: BaseException) -> None:
+        """Begin with nothing known because of an error; the flag stays held, and it is told."""
+        words = ' '.join(str(error).split())[:200]
+        self._fault = f'{type(error).__name__}: {words}' if words else type(error).__name__
+        self._faulty = True
+        self._restarts += 1
+        self._counted = self._counters()
+        self._begin()
+
+    def _counters(self) -> Counters:
+        """Return the counters of all estimators so far."""
+        now = self._estimator.counters
+        return Counters(**{f.name: getattr(now, f.name) + getattr(self._counted, f.name)
+                           for f in fields(Counters)})
 
     def clear_brownout(self) -> str:
         """
@@ -181,20 +262,25 @@ class SupplyMonitor:
         """Clear the window, and remember why for the next reports; the flag stays held."""
         self._estimator.reset()
         self._flag.new_time_line()
+        self._stamps.start_anew()
         self._outlook.new_time_line()
         self._reset_reason = reason
 
-    def report(self, age: float | None, now: float | None = None) -> MonitorReport:
+    def report(self, age: float | None, now: float | None = None,
+               arrived: float | None = None) -> MonitorReport:
         """
         Return what is known now.
 
         Parameters
         ----------
         age : float or None
-            Time since the last voltage arrived, s; None when none ever did.
+            Age of the newest voltage, s; None when none ever came.
         now : float, optional
             The clock by which the flag counts hold and delay, s; when left
             out the stamp of the newest sample plus `age`.
+        arrived : float, optional
+            Time since a voltage last arrived, s, however old it was; `age` when left out.  The
+            floor holds for voltages that arrive.
 
         Returns
         -------
@@ -202,23 +288,56 @@ class SupplyMonitor:
             The report.
 
         """
-        e = self._newest = self._estimator.estimate()
         silent = math.inf if age is None else max(age, 0.0)
-        stale = silent > self._settings.stale_after or e.status is Status.NO_DATA
-        risk = NAN if stale else self._outlook.risk(e, self._settings)
-        budget = None if stale else self._outlook.budget(e, self._settings)
-        events = self._outlook.events
-        flag = self._flag.update(e.t + silent if now is None else now, risk, fresh=not stale)
-        level, summary = self._judge(e, risk, flag, self._silence(age, e) if stale else '')
-        return MonitorReport(e, risk, NAN if budget is None else budget.throttle,
-                             '' if budget is None else budget.reason,
-                             () if events is None else events.left_out, flag, level,
-                             summary, silent)
+        here = silent if arrived is None else max(arrived, 0.0)
+        try:
+            e = self._estimate()
+            limit = patience(self._settings, e.rate, e.n)
+            stamps = self._stamps.judge(limit, 1.0 / e.rate if e.rate > 0.0 else NAN)
+            fresh = silent <= limit and e.status is not Status.NO_DATA and stamps is Stamps.GOOD
+            risk = self._outlook.risk(e, self._settings) if fresh else NAN
+            budget = self._outlook.budget(e, self._settings) if fresh else None
+            left_out = () if self._outlook.events is None else self._outlook.events.left_out
+        except Exception as error:
+            # As in `push`.
+            self.restart(error)
+            e = Estimate(counters=self._counters())
+            limit, stamps, fresh, risk = self._settings.stale_after, Stamps.GOOD, False, NAN
+            budget, left_out = None, ()
+        self._newest = e
+        self._faulty = self._faulty and not e.usable
+        arriving = here <= self._settings.stale_after
+        flag = self._flag.update(e.t + silent if now is None else now, risk, fresh=fresh,
+                                 arriving=arriving)
+        silence = '' if fresh else self._silence(age, e, limit, stamps)
+        level, summary = self._judge(e, risk, flag, silence, arriving)
+        return MonitorReport(
+            e, risk, NAN if budget is None else budget.throttle,
+            '' if budget is None else budget.reason, left_out, flag, level, summary, silent,
+            limit, stamps, fresh, self._restarts, self._fault)
 
-    def _silence(self, age: float | None, e: Estimate) -> str:
-        if age is not None and age > self._settings.stale_after:
-            return (f'No voltage for {age:.1f} s (stale_after = {self._settings.stale_after:g} '
-                    's): check the publisher.')
+    def _estimate(self) -> Estimate:
+        """Return the newest estimate; IRREGULAR speaks of the window, not of all that was."""
+        e = self._estimator.estimate()
+        counters = self._counters()
+        odd = counters.late + counters.non_finite
+        if odd > self._odd:
+            self._odd, self._odd_at = odd, e.t
+        flags = e.flags
+        if e.t - self._odd_at > self._settings.window:
+            flags = tuple(flag for flag in flags if flag is not Flag.IRREGULAR)
+        if flags == e.flags and counters == e.counters:
+            return e
+        return replace(e, flags=flags, counters=counters)
+
+    def _silence(self, age: float | None, e: Estimate, limit: float, stamps: Stamps) -> str:
+        if age is not None and age > limit:
+            why = f'stale_after = {self._settings.stale_after:g} s'
+            if limit < self._settings.stale_after:
+                why = f'a source of {e.rate:.3g} Hz is stale after {limit:.2g} s'
+            return f'No voltage for {age:.1f} s ({why}): check the publisher.'
+        if stamps is not Stamps.GOOD:
+            return str(stamps.value)
         if e.counters.non_finite and not e.counters.used:
             return (f'No usable voltage: all {e.counters.non_finite} samples were NaN or '
                     'infinite; check the sensor.')
@@ -226,10 +345,17 @@ class SupplyMonitor:
             return f'The window was cleared ({self._reset_reason}) and is filling again.'
         return Status.NO_DATA.value
 
-    def _judge(self, e: Estimate, risk: float, flag: FlagState,
-               silence: str) -> tuple[Level, str]:
+    def _judge(self, e: Estimate, risk: float, flag: FlagState, silence: str, arriving: bool
+               ) -> tuple[Level, str]:
         """Return the level of the diagnostics and the line for the pilot."""
         critical = flag.level is FlagLevel.CRITICAL
+        if self._faulty:
+            still = f' The brown-out flag is set: {flag.reason}.' if critical else ''
+            return Level.ERROR, (
+                f'The estimator failed and was started anew ({self._restarts} times so far), and '
+                f'knows nothing yet: {self._fault}.{still}')
+        if silence and critical and arriving and flag.low:
+            return Level.ERROR, f'{self._of_risk(e, risk, flag)} {silence}'
         if silence:
             still = f' The brown-out flag is still set: {flag.reason}.' if critical else ''
             return Level.STALE, silence + still

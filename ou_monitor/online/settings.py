@@ -192,6 +192,12 @@ class MonitorSettings:
                 f'brownout.critical ({self.brownout_critical}): the throttle that it allows would '
                 'set the flag')
 
+        if not 0.0 < self.budget_limit < 1.0:
+            raise ValueError(
+                f'brownout.budget_limit ({self.brownout_budget_limit:g}; 0: brownout.warn, '
+                f'{self.brownout_warn:g}) must leave a limit above 0 and below 1: a risk of 0 '
+                'cannot be kept under, one of 1 is always')
+
     @cached_property
     def floor(self) -> float:
         """Return the voltage floor in force, V; 0: off."""

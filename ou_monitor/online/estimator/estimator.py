@@ -26,7 +26,7 @@ from ou_monitor.online.estimator.quality import (
     examine, Quality, refresh_period, Repeats, TAIL, whole)
 from ou_monitor.online.estimator.series import T, U, Y
 from ou_monitor.online.estimator.window import FACTOR, FEWEST, LAGS, Resolution, Sums
-from ou_monitor.records import Estimate, FloatArray, NAN, Status
+from ou_monitor.records import Counters, Estimate, FloatArray, NAN, Status
 
 # Samples from which a fit is tried.
 MIN_SAMPLES = 20
@@ -179,6 +179,11 @@ class SlidingEstimator:
                 self._last = self._estimate()
             self._cached = self._last
         return self._cached
+
+    @property
+    def counters(self) -> Counters:
+        """Return what became of the samples worked off so far."""
+        return self._intake.counters
 
     def _work_off(self) -> None:
         """Move what has been pushed into the window."""

@@ -29,6 +29,8 @@ UNEVEN = 0.5
 NEW_RATE = 1.3
 # Stamps remembered for that from batch to batch.
 MEMORY = 32
+# Samples averaged to one at most: 10 MHz; stamps that lie closer are no time.
+MOST_BLOCK = 1000.0
 _NONE = np.empty(0, dtype=np.int64)
 
 
@@ -234,6 +236,7 @@ class Intake:
         return Batch(t, y, u, float(steps.min()), float(steps.max()), restart)
 
 
+
 class Thinner:
     """
     Learns the rate of the source, and averages blocks of m samples where it is too fast.
@@ -306,7 +309,7 @@ class Thinner:
         if self.m and self.step / NEW_RATE < step < self.step * NEW_RATE:
             return False
         before, self.step = self.m, step
-        self.m = max(1, round(1.0 / (step * self._fastest)))
+        self.m = max(1, round(min(1.0 / step / self._fastest, MOST_BLOCK)))
         return before not in (0, self.m)
 
     def _even_blocks(self, t: FloatArray, y: FloatArray, u: FloatArray | None

@@ -9,7 +9,8 @@ never OK, and never a flag that says false.
 
 The voltage floor is a threshold on the samples that needs no model: the median of
 the last `brownout.floor_time` seconds decides, so that a lone bad sample does not;
-every sample is looked at, also those between two reports.  A bad value that a
+every sample is judged, also those between two reports, and also those whose stamps are
+late, frozen or irregular: these count in order of arrival.  A bad value that a
 logger repeats for more than half of that time counts.
 """
 
@@ -22,12 +23,17 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.records import NAN
+from ou_monitor.records import FloatArray, NAN
+
 
 # Samples that decide when fewer lie within the time: the median of three outvotes one.
 _FEWEST = 3
 # A whole batch older than the newest sample by more than this, s, belongs to another time line.
 _BACK = 1.0
+# Arrivals over which the usual interval is averaged.
+_USUAL = 200
+# Samples kept at most: the longest floor_time, 10 s, at 20 kHz.
+_MOST = 200_000
 
 
 class FloorWatch:
@@ -45,43 +51,99 @@ class FloorWatch:
 
     def __init__(self, settings: MonitorSettings) -> None:
         self.settings = settings
+        self._usual = math.nan
         self.reset()
 
     def reset(self) -> None:
         """Forget the samples: what follows is another time line."""
+        self._newest = self._arrived = -math.inf
+        # What is added to stamps, s: late samples move the time line on, and what follows.
+        self._shift = 0.0
         self._t = np.empty(0)
         self._v = np.empty(0)
         self._low = self._was_low = False
 
-    def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike) -> None:
-        """Look at samples (t in s, voltage in V)."""
-        s = self.settings
-        if s.floor <= 0.0:
+    def new_time_line(self) -> None:
+        """Take stamps that start anew; what is known by its arrival goes on."""
+        if self._arrived == -math.inf:
+            self.reset()
+
+    def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
+             arrival: npt.ArrayLike | None = None) -> None:
+        """
+        Judge samples (t in s, voltage in V, arrival in s on a monotonic clock).
+
+        With `arrival` they are judged in the order given; without, samples of one batch that are
+        newer than all before are put in order of their stamps.
+        """
+        if self.settings.floor <= 0.0:
             if self._t.size:
                 self.reset()
             return
-        stamps, volts = np.atleast_1d(np.asarray(t, float)), np.atleast_1d(
-            np.asarray(voltage, float))
-        if stamps.shape != volts.shape:
+        stamps, volts = _column(t), _column(voltage)
+        times = None if arrival is None else _column(arrival)
+        if stamps.shape != volts.shape or (times is not None and times.shape != volts.shape):
             raise ValueError(f't {stamps.shape} and voltage {volts.shape} differ in shape')
         good = np.isfinite(stamps) & np.isfinite(volts)
+        if times is not None:
+            good &= np.isfinite(times)
         if not good.all():
             stamps, volts = stamps[good], volts[good]
-        if not stamps.size:
-            return
-        newest = self._t[-1] if self._t.size else -math.inf
-        if stamps.max() < newest - _BACK:
-            self.reset()
-            newest = -math.inf
-        if stamps[0] <= newest or np.any(np.diff(stamps) <= 0.0):
-            stamps, first = np.unique(stamps, return_index=True)
-            volts = volts[first]
-            volts, stamps = volts[stamps > newest], stamps[stamps > newest]
+            times = None if times is None else times[good]
         if stamps.size:
-            self._judge(stamps, volts)
+            self._judge(*self._placed(stamps, volts, times))
 
-    def _judge(self, t: npt.NDArray[np.float64], v: npt.NDArray[np.float64]) -> None:
-        """Judge every new sample with those before it; `t` increases."""
+    def _placed(self, t: FloatArray, v: FloatArray, arrival: FloatArray | None
+                ) -> tuple[FloatArray, FloatArray]:
+        """Return where the samples lie on a time line that never goes back, s, and volts."""
+        if arrival is None:
+            if t.max() < self._newest - _BACK:
+                self.reset()
+            if t.min() > self._newest:
+                order = np.argsort(t, kind='stable')
+                t, v = t[order], v[order]
+        steps = np.diff(t, prepend=self._newest)
+        late = ~(steps > 0.0)
+        at = t + self._shift
+        if late.any():
+            last = float(self._t[-1]) if self._t.size else float(t[0])
+            steps = np.where(late, self._step(arrival), steps)
+            if not self._t.size:
+                steps[0] = 0.0
+            at = last + np.cumsum(steps)
+            self._shift = float(at[-1] - t[-1])
+        elif arrival is None:
+            self._learn(t, self._newest)
+        if arrival is not None:
+            self._learn(arrival, self._arrived)
+            self._arrived = float(arrival[-1])
+        self._newest = float(t[-1])
+        return at, v
+
+    def _step(self, arrival: FloatArray | None) -> FloatArray | float:
+        """Return how far late samples move the time line on, s."""
+        usual = self._usual
+        if arrival is None or self._arrived == -math.inf:
+            # Not known: two samples fill the time, and two of three decide.
+            return 0.5 * self.settings.brownout_floor_time if math.isnan(usual) else usual
+        # A link that was held up sends at once what took its time.
+        return np.maximum(np.diff(arrival, prepend=self._arrived),
+                          0.0 if math.isnan(usual) else usual)
+
+    def _learn(self, times: FloatArray, before: float) -> None:
+        """Learn the usual interval (times in s); of a pause no more than `stale_after` counts."""
+        known = before > -math.inf
+        n = times.size - 1 + known
+        if not n:
+            return
+        span = float(times[-1]) - (before if known else float(times[0]))
+        interval = min(max(span / n, 0.0), self.settings.stale_after)
+        share = 1.0 if math.isnan(self._usual) else min(1.0, n / _USUAL)
+        usual = 0.0 if math.isnan(self._usual) else self._usual
+        self._usual = usual + share * (interval - usual)
+
+    def _judge(self, t: FloatArray, v: FloatArray) -> None:
+        """Judge every new sample with those before it; `t` does not decrease."""
         s = self.settings
         old = self._t.size
         t, v = np.concatenate([self._t, t]), np.concatenate([self._v, v])
@@ -95,12 +157,22 @@ class FloorWatch:
         low = (count > 1) & (2 * count > ends + 1 - begin)
         self._low = bool(low[-1])
         self._was_low = self._was_low or bool(low.any())
-        self._t, self._v = t[begin[-1]:], v[begin[-1]:]
+        first = max(int(begin[-1]), t.size - _MOST)
+        self._t, self._v = t[first:], v[first:]
+
+    def __len__(self) -> int:
+        """Return the number of samples kept."""
+        return int(self._t.size)
 
     def take(self) -> bool:
         """Return whether the voltage is at or below the floor, or was since the last call."""
         low, self._was_low = self._low or self._was_low, False
         return low and self.settings.floor > 0.0
+
+
+def _column(values: npt.ArrayLike) -> FloatArray:
+    return np.atleast_1d(np.asarray(values, dtype=np.float64))
+
 
 class FlagLevel(enum.Enum):
     """Levels of the flag; the value orders the known ones."""
@@ -130,6 +202,8 @@ class FlagState:
         Why, in words: a clause without a full stop.
     age : float
         Time spent in the level, s; NaN when the time is not known.
+    low : bool
+        Whether the voltage is at or below the floor, or was since the last update.
 
     """
 
@@ -138,6 +212,7 @@ class FlagState:
     since: float = NAN
     reason: str = 'nothing is known yet'
     age: float = NAN
+    low: bool = False
 
 
 class BrownoutFlag:
@@ -177,13 +252,14 @@ class BrownoutFlag:
         """Change settings; level, hold and samples stay.  Latch off ends the latch."""
         self._settings = self._floor.settings = settings
 
-    def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike) -> None:
-        """Look at samples for the floor; see `FloorWatch.push`."""
-        self._floor.push(t, voltage)
+    def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
+             arrival: npt.ArrayLike | None = None) -> None:
+        """Hold samples against the floor; see `FloorWatch.push`."""
+        self._floor.push(t, voltage, arrival)
 
     def new_time_line(self) -> None:
-        """Forget the samples seen for the floor; the level stays as long as it is held."""
-        self._floor.reset()
+        """Take stamps that start anew; the level stays as long as it is held."""
+        self._floor.new_time_line()
 
     def clear(self) -> bool:
         """Drop a CRITICAL that is latched or held; the next update judges anew."""
@@ -194,12 +270,18 @@ class BrownoutFlag:
         self._state = FlagState(since=self._since, reason='cleared, not judged since')
         return True
 
-    def update(self, t: float, risk: float, *, fresh: bool = True) -> FlagState:
-        """Judge (t in s, risk 0..1)."""
+    def update(self, t: float, risk: float, *, fresh: bool = True,
+               arriving: bool | None = None) -> FlagState:
+        """
+        Judge (t in s, risk 0..1).
+
+        `fresh`: the risk rests on samples that are not too old; `arriving`: samples still come,
+        whatever their stamps say, and the floor holds for them (as `fresh` when left out).
+        """
         if risk < 0.0 or risk > 1.0:
             raise ValueError(f'a risk must lie within 0..1 or be NaN, got {risk}')
         self._go_to(t)
-        low = self._floor.take() and fresh
+        low = self._floor.take() and (fresh if arriving is None else arriving)
         known = fresh and not math.isnan(risk)
         wanted, reason = self._wanted(risk, known, low)
         level, reason = self._held(wanted, reason, known or low)
@@ -208,7 +290,7 @@ class BrownoutFlag:
         if known or low:
             self._known = self._now
         self._state = FlagState(level, self._flag(known), self._since, reason,
-                                self._now - self._since)
+                                self._now - self._since, low)
         return self._state
 
     def _go_to(self, t: float) -> None:

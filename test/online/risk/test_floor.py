@@ -101,15 +101,57 @@ def test_bad_shapes_are_refused():
 
 
 def test_time_back_is_another_time_line():
-    """A step back of more than 1 s forgets; late samples of less are left out."""
+    """A step back of more than 1 s forgets; late samples of less count in order of arrival."""
     floor = watch()
     push(floor, [5.0] * 100, start=1000.0)
     push(floor, [4.0] * 3, start=10.0)
     assert floor.take()
     floor = watch()
     push(floor, [5.0] * 100, start=1000.0)
-    push(floor, [4.0] * 50, start=999.5)
+    push(floor, [4.0] * 10, start=999.5)
     assert not floor.take()
+    push(floor, [4.0], start=999.6)
+    assert floor.take()
+
+
+@pytest.mark.parametrize('arrivals', [True, False])
+@pytest.mark.parametrize('kind', ['frozen', 'back', 'jumping', 'sawtooth'])
+def test_stamps_that_are_no_time_do_not_hide_a_dip(kind, arrivals):
+    """20 low samples of 1 kHz trip it, a lone one does not, whatever their stamps are."""
+    rng = np.random.default_rng(4)
+    n = 5000
+    arrived = 50.0 + 0.001 * np.arange(n)
+    stamps = {'frozen': np.full(n, 1000.0), 'back': 1000.0 - 0.001 * np.arange(n),
+              'jumping': 1000.0 + 0.001 * np.arange(n) + rng.uniform(-0.5, 0.5, n),
+              'sawtooth': 1000.0 + 0.001 * (np.arange(n) % 7)}[kind]
+    volts = np.full(n, 5.0)
+    volts[[100, 1700]] = 0.0
+    volts[3000:3020] = 4.0
+    floor, tripped = watch(), []
+    for k in range(0, n, 50):
+        # Without arrivals a batch is put in order: here they come one by one.
+        for j in range(k, k + 50, 50 if arrivals else 1):
+            part = slice(j, j + (50 if arrivals else 1))
+            floor.push(stamps[part], volts[part], arrived[part] if arrivals else None)
+        if floor.take():
+            tripped.append(k)
+    assert tripped and set(tripped) <= {3000, 3050}
+
+
+def test_frozen_stamps_take_no_memory():
+    floor = watch()
+    for k in range(300):
+        floor.push(np.full(100, 7.0), np.full(100, 5.0), 0.1 * k + 0.001 * np.arange(100))
+    assert len(floor) <= 21
+
+
+def test_stamps_that_start_anew_keep_what_is_known_by_its_arrival():
+    """A driver whose stamps step back at each message loses no sample of a dip."""
+    floor = watch()
+    for k in range(40):
+        floor.push([1000.0 - k], [4.0 if k > 20 else 5.0], [0.001 * k])
+        floor.new_time_line()
+    assert floor.take()
 
 
 def test_old_samples_do_not_outvote_a_new_one():
