@@ -14,7 +14,7 @@ PAGES = sorted((ROOT / 'doc').glob('*.md'))
 # Documents with relative links: what a reader clicks through.
 LINKED = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'benchmarks/README.md', *PAGES]
 # What names a file that a reader makes or has, rather than one of the project.
-OTHERS = {'my_adc.yaml', 'flight.yaml', 'rail.yaml'}
+OTHERS = {'my_adc.yaml', 'flight.yaml', 'rail.yaml', 'metadata.yaml'}
 
 
 def page(name: str) -> str:

@@ -127,7 +127,7 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
     columns = _columns(samples, terms, run.segment)
     beta = np.array([value for term in terms for value in coefficients(term)])
     mean = columns @ beta
-    e = run.filter.innovations(samples.voltage - mean)
+    e = run.kalman.innovations(samples.voltage - mean)
     # An event is the law's to expect, at its own sample: not so while it is fitted around.
     variance = run.full if inside else run.plain
     return GaussianFit(tuple(terms), tuple(se), mean, e, variance, _log_density(e, variance),
@@ -169,7 +169,7 @@ class _Run:
     """A filter over the samples, variances without and with events at their own, cost in s."""
 
     segment: Segment
-    filter: Filter
+    kalman: Filter
     plain: FloatArray
     full: FloatArray
     cost: float
@@ -283,7 +283,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
     """Fit by scoring: the outer product of numerical scores stands for the information."""
     rounds = _FEW_ROUNDS if rough else _ROUNDS
     run = _filter(samples, terms, events)
-    states, cost = run.filter.shape, run.cost
+    states, cost = run.kalman.shape, run.cost
     few = max(_DEAR // (2 * states[1]), 2000)
     if states[0] * (states[1] - 1) > _DEAR and few < samples.n:
         # Far from the top a part of the samples shows the way.
@@ -380,7 +380,7 @@ def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None)
     if not (variance > 0.0).all():
         raise ArithmeticError('variances that are not above 0')
     weight = 1.0 / np.sqrt(variance)
-    through = run.filter.innovations(np.column_stack((samples.voltage, columns))) * weight[:, None]
+    through = run.kalman.innovations(np.column_stack((samples.voltage, columns))) * weight[:, None]
     beta = _solved(through[:, 1:], through[:, 0])
     ou = terms[0]
     assert isinstance(ou, OU)

@@ -110,6 +110,7 @@ def log_covariance(a: float, theta: float, m: int, n: int) -> tuple[float, float
             (last + s_phi * s_phi * v_phi + 2.0 * s_phi * s_theta * v_cross) / 4.0,
             last + v_part * v_part * v_phi + 2.0 * v_part * s_theta * v_cross)
 
+
 # Newton-like steps settle in 5 to 12; this many means they did not.
 MAX_STEPS = 60
 # No step moves alpha by more than a factor exp(1.5).
@@ -298,6 +299,7 @@ def minimise(c0: float, c: Sequence[float], free: float, log_a: float, theta: fl
                                  floor - slope * start, slope, low, high, tilt_a, tilt_t)
     return log_a, theta, value, on_bound, steps
 
+
 # Neighbouring samples correlated by less than this many standard errors are
 # not correlated.
 CORRELATED = 4.0
@@ -327,7 +329,7 @@ def guess(c0: float, c: Sequence[float]) -> tuple[float, float]:
 
 
 def descend(c0: float, c: Sequence[float], free: float, log_a: float, theta: float, m: int,
-             tilt_a: float, tilt_t: float) -> tuple[float, float, bool, float]:
+            tilt_a: float, tilt_t: float) -> tuple[float, float, bool, float]:
     """Minimise from one start, the bound on theta following ln a; return the value, too."""
     floor = 0.0
     slope = 0.0
@@ -367,7 +369,7 @@ def search(c0: float, c: Sequence[float], free: float, log_a: float, theta: floa
             a = DOUBTFUL / free * (0.5 * free / DOUBTFUL) ** (0.2 + 0.2 * i)
             for k in range(2):
                 other = descend(c0, c, free, math.log(a), (0.5 + 0.4 * k) * math.exp(-a), m,
-                                 tilt_a, tilt_t)
+                                tilt_a, tilt_t)
                 # Sums over lags say little of the slow end: never leave for there.
                 if other[3] < value and other[0] > log_a:
                     log_a, theta, on_bound, value = other

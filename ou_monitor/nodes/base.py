@@ -184,6 +184,7 @@ def _descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
                 from_value=float(parameter.low), to_value=float(parameter.high), step=0.0)]
     return descriptor
 
+
 def diagnostic(name: str, level: int, summary: str, fields: Mapping[str, str],
                stamp: float, hardware_id: str = '') -> DiagnosticArray:
     """Return one status as a stamped message (stamp in s)."""

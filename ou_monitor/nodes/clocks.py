@@ -164,6 +164,7 @@ class SendClock:
             return source
         return expected - math.expm1(-self._period / FOLLOW) * error
 
+
 # Half a second at the usual 100 Hz: averages the jitter of single publications away, and still
 # follows a change of the replay rate within that half second.
 PAIRS = 50

@@ -80,6 +80,7 @@ class SpacingError:
             return {}
         return {'p50': self.quantile(0.5), 'p99': self.quantile(0.99), 'max': self.quantile(1.0)}
 
+
 Item = TypeVar('Item')
 
 # Messages held at most: about 20 s at 10 kHz, some 50 MB.

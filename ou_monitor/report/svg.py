@@ -145,12 +145,12 @@ class Plot:
 
     @property
     def x_range(self) -> tuple[float, float]:
-        """Ends of the x axis."""
+        """Return the ends of the x axis."""
         return self._x_range or span([c.x for c in self.curves], self.log_x, pad=0.0)
 
     @property
     def y_range(self) -> tuple[float, float]:
-        """Ends of the y axis."""
+        """Return the ends of the y axis."""
         return self._y_range or span([c.y for c in self.curves] + [
             c.high for c in self.curves if c.high is not None], self.log_y)
 

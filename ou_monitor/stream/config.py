@@ -134,7 +134,8 @@ def parse_field_path(path: str) -> FieldPath:
         match = _STEP.fullmatch(part)
         if match is None:
             raise InputError(
-                f"field path '{path}' is not of the form name.name[0].name (at '{part}')")
+                f"field path '{printable(path, 80)}' is not of the form name.name[0].name "
+                f"(at '{printable(part, 40)}')")
         steps.append(match[1])
         steps += [int(index) for index in re.findall(r'\d+', match[2])]
     return tuple(steps)

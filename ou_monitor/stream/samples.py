@@ -114,6 +114,7 @@ class ThrottleHold:
         """Return the number of values kept."""
         return int(self._places.size)
 
+
 # A stamp that is older than the newest by more than this, s, is a clock or a bag that went back.
 # One publisher's messages arrive in order; what several interleave is milliseconds.
 BACK = 0.1

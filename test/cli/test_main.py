@@ -71,7 +71,7 @@ def test_input_errors_are_one_line_whatever_their_text(monkeypatch, capsys):
         raise InputError("cannot read 'a\nb'")
 
     stand_in(monkeypatch, run)
-    assert failure(capsys, 'analyze') == "ou-monitor analyze: cannot read 'a\\nb'\n"
+    assert failure(capsys, 'analyze') == "ou-monitor analyze: cannot read 'a b'\n"
 
 
 @pytest.mark.parametrize('encoding', ['utf-8', 'ascii'])

@@ -191,9 +191,9 @@ def test_the_page_shows_it_all(sag):
 
 def test_the_mean_by_throttle_leaves_the_band_before_and_not_after(sag):
     """The picture of a sag: data outside what the plain OU produces, inside the extended."""
-    from ou_monitor.report.pictures import pictures
-    drawn = pictures(sag.samples, [SupplyModel((sag.baseline,)), sag.simulated],
-                     np.random.default_rng(0), draws=20)
+    from ou_monitor.criticism.curves import compare_curves
+    drawn = compare_curves(sag.samples, [SupplyModel((sag.baseline,)), sag.simulated],
+                           np.random.default_rng(0), draws=20)
     (mean,) = [p for p in drawn if p.title.startswith('Mean voltage')]
     out = [((mean.data < low) | (mean.data > high)).mean() for low, high in mean.bands]
     assert out[0] > 0.3 and out[1] < 0.3
@@ -246,7 +246,7 @@ def test_the_page_of_a_plain_rail_keeps_the_plain_model():
 @pytest.mark.parametrize('code, count', [(0.011, 60), (0.0007, 400), (0.05, 7)])
 def test_bins_hold_as_many_codes_each(code, count):
     """Else the distribution of a coarse ADC would show a comb that is not in the data."""
-    from ou_monitor.report.pictures import _bins
+    from ou_monitor.criticism.curves import _bins
     codes = 4.9 + code * np.arange(count)
     edges = _bins(codes, code)
     held = np.histogram(codes, edges)[0]

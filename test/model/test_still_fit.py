@@ -62,7 +62,7 @@ def test_pull_is_a_tenth_of_a_standard_error_and_fades():
     moved = {}
     for score in (0.01, 1.0, 6.0):
         end = arma.finish(c[0], c[1:].tolist(), n, n - 1.0, math.log(a), score * se,
-                               False, 1)
+                          False, 1)
         moved[score] = score - end[1] / se
         assert end[5] == pytest.approx(score, rel=0.05)
         i_aa, i_at, _ = arma.information(math.log(a), score * se)
@@ -107,8 +107,8 @@ def test_trend_score_is_that_of_generalised_least_squares(seed, slope):
     c = [c0 - float(np.mean((y[k:] - y[:-k]) ** 2)) / 2.0 for k in lags]
     place = float(np.mean((y - y.mean()) * (number / n)))
     got = arma.trend_score(c0, c, n, place, [float((y[k:] - y[:-k]).sum()) for k in lags],
-                                [float(n - k) for k in lags], math.log(a),
-                                arma.theta_at(a, 1, share))
+                           [float(n - k) for k in lags], math.log(a),
+                           arma.theta_at(a, 1, share))
     assert got == pytest.approx(expected, rel=0.05, abs=0.3)
 
 

@@ -354,6 +354,7 @@ def _functions() -> tuple[Callable[..., tuple[float, float, bool]],
     return (lambda c0, c, *rest: arma.search(c0, c.tolist(), *rest),
             lambda c0, c, *rest: arma.finish(c0, c.tolist(), *rest))
 
+
 class Outcome(enum.Enum):
     """How a fit ended."""
 

@@ -185,6 +185,7 @@ def whole(columns: FloatArray) -> Batch | None:
     return Batch(t, y, None if np.isnan(u).all() else u, float(steps.min()),
                  float(steps.max()), restart=False)
 
+
 # Raw samples looked at.
 TAIL = 1024
 # Fewest samples from which anything is told.

@@ -293,6 +293,7 @@ class LagSums:
             change=total[at_pairs:at_change].reshape(lags, c),
             spread=total[at_change:].reshape(lags, c, c))
 
+
 # Lags of the sums: enough while theta^24 is small; beyond, a coarser
 # resolution is used (doc/estimation.md).
 LAGS = 24

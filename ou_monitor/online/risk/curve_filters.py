@@ -240,6 +240,7 @@ class HatFilter:
         """Return the ratio of `seen` for the data at each throttle of the bins alone."""
         return self._weight / (self._unit * self._needed)
 
+
 # Throttles closer than this are one.
 STEADY = 0.03
 # Relative variance of sigma^2 at which its logarithm is taken, and up to which it may be.
@@ -356,6 +357,7 @@ class Squares:
         if e.sigma_se > 0.0 and time > 0.0:
             variance = max(variance, (worse * e.sigma_se) ** 2 * e.duration / time)
         return at, 0.5 * (math.log(mean) + 0.5 * relative), variance
+
 
 # Speeds that are weighed: variance gained per second.  From a rail that stays as it is to
 # one whose sigma changes by a quarter within a second.

@@ -166,6 +166,7 @@ def _end(risks: FloatArray, known: npt.NDArray[np.bool_], lowest: float, highest
         return end, f'No data near {_GRID.item(k):.2f}: the risk there may be above the limit.'
     return end, f'The risk passes the limit of {limit:.2g} at throttle {end:.2f}.'
 
+
 # Share of the walk of ln sigma within the horizon that counts: the risk is of all of it,
 # not of its end, but the largest sigma counts most.
 _SHARE = 0.8
