@@ -236,7 +236,6 @@ class Intake:
         return Batch(t, y, u, float(steps.min()), float(steps.max()), restart)
 
 
-
 class Thinner:
     """
     Learns the rate of the source, and averages blocks of m samples where it is too fast.
