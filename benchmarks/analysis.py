@@ -31,7 +31,7 @@ THROTTLES, SIGMAS = (0.1, 0.3, 0.6), (0.2, 0.4, 0.6)
 Effect = Callable[[FloatArray, FloatArray, np.random.Generator], FloatArray]
 
 
-def made(seed: int, effect: Effect | None = None, alphas: tuple[float, ...] = (ALPHA,) * 3,
+def simulated(seed: int, effect: Effect | None = None, alphas: tuple[float, ...] = (ALPHA,) * 3,
          tau: float = 0.0) -> Recording:
     """Return a recording; the sag of 0.5 V times throttle follows with tau, or at once."""
     rng = np.random.default_rng(seed)
@@ -92,10 +92,10 @@ def line(analysis: Analysis) -> bool:
     return any(level.lines.lines for level in analysis.levels)
 
 
-def share(count: int, effect: Effect | None, seen: Callable[[Analysis], bool],
+def share(count: int, effect: Effect | None, shows: Callable[[Analysis], bool],
           first: int = 0, **options: object) -> str:
     """Return how many recordings show something, in percent."""
-    found = sum(seen(analyze(made(first + k, effect, **options)))  # type: ignore[arg-type]
+    found = sum(shows(analyze(simulated(first + k, effect, **options)))  # type: ignore[arg-type]
                 for k in range(count))
     return f'{found} of {count}'
 
@@ -105,11 +105,11 @@ def false_alarms(count: int) -> None:
     alarms = {'a word other than diffusion': 0, 'a line': 0, 'alpha differs (stated 5 %)': 0,
               'a transient': 0}
     for seed in range(count):
-        found = analyze(made(seed))
+        found = analyze(simulated(seed))
         alarms['a word other than diffusion'] += kinds(found) != {'diffusion'}
         alarms['a line'] += line(found)
         alarms['alpha differs (stated 5 %)'] += found.alpha_test.verdict == 'differs'
-        alarms['a transient'] += any(fit.seen for fit in found.relaxations)
+        alarms['a transient'] += any(fit.detected for fit in found.relaxations)
     for what, number in alarms.items():
         print(f'  {what}: {number} of {count}')
 
@@ -118,14 +118,14 @@ def throttle_goes_up_and_down(count: int) -> None:
     """Print what is seen after falls and rises of throttle, where there is a sag and where not."""
     for sag in (0.0, 0.1, 0.3):
         found = [analyze(stays(20_000 + seed, sag)) for seed in range(count)]
-        seen = [fit for one in found for fit in one.relaxations if fit.seen]
-        falls, rises = (sum(one.relaxations[k].seen for one in found) for k in (0, 1))
-        told = f'  sag {sag:g} V: seen after falls in {falls}, after rises in {rises} of {count}'
+        shows = [fit for one in found for fit in one.relaxations if fit.detected]
+        falls, rises = (sum(one.relaxations[k].detected for one in found) for k in (0, 1))
+        text = f'  sag {sag:g} V: seen after falls in {falls}, after rises in {rises} of {count}'
         if sag:
-            holds = sum(fit.tau_low < 0.03 < fit.tau_high for fit in seen)
-            told += (f'; {holds} of {len(seen)} intervals hold 30 ms; '
-                     f'{sum(fit.badly_fitted for fit in seen)} called badly fitted')
-        print(told)
+            holds = sum(fit.tau_low < 0.03 < fit.tau_high for fit in shows)
+            text += (f'; {holds} of {len(shows)} intervals hold 30 ms; '
+                     f'{sum(fit.badly_fitted for fit in shows)} called badly fitted')
+        print(text)
         said = sum(level.scatter_p < 0.01 for one in found for level in one.levels)
         wide = sum(level.scatter > 1.5 for one in found for level in one.levels)
         print(f'    levels called not one process: {said} of {2 * count} (their intervals widened '
@@ -143,11 +143,11 @@ def power(count: int) -> None:
         ('alpha 40, 63, 100 1/s: differs', None, lambda a: a.alpha_test.verdict == 'differs',
          {'alphas': (40.0, 63.0, 100.0)}),
         ('sag of 0.10 and 0.15 V with tau = 30 ms: seen', None,
-         lambda a: a.relaxations[1].seen, {'tau': 0.03}),
+         lambda a: a.relaxations[1].detected, {'tau': 0.03}),
         ('... and its 95 % interval holds 30 ms', None,
          lambda a: a.relaxations[1].tau_low < 0.03 < a.relaxations[1].tau_high, {'tau': 0.03}))
-    for name, effect, seen, options in rows:
-        print(f'  {name}: {share(count, effect, seen, 10_000, **options)}')
+    for name, effect, shows, options in rows:
+        print(f'  {name}: {share(count, effect, shows, 10_000, **options)}')
 
 
 def costs() -> None:
@@ -157,7 +157,7 @@ def costs() -> None:
     throttle = np.repeat(np.tile([0.1, 0.4, 0.25, 0.6], 15), 10_000)
     long = Recording(t, simulate(t, ALPHA, 0.2 + throttle, rng, u0=5.0 - 0.3 * throttle),
                      throttle, '10 minutes at 1 kHz')
-    parts = {'fit of the levels': (level_result, 'fit_stretch'),
+    parts = {'fit of the levels': (level_result, 'fit_segment'),
              'tests': (level_result, 'examine_level'), 'lines': (level_result, 'find_lines'),
              'spectra': (level_result, 'level_spectrum'), 'transients': (module, '_relaxations'),
              'sliding window and curves': (module, 'slide')}

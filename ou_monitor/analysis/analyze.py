@@ -88,14 +88,14 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     """
     if not (np.diff(recording.t) > 0.0).all():
         raise ValueError('stamps must be finite and increase, as read_recording leaves them')
-    tell: Progress = progress or (lambda share: None)
+    report: Progress = progress or (lambda share: None)
     voltage = _default_voltage(recording) if brownout_voltage is None else brownout_voltage
     found = find_levels(recording.t, recording.throttle, levels)
     still = replace(recording, voltage=without_jitter(recording, found))
     results = []
     for k, level in enumerate(found):
         results.append(fit_level(recording, still, level, len(found)))
-        tell(0.5 * (k + 1) / len(found))
+        report(0.5 * (k + 1) / len(found))
     judged = judge_levels(recording, results)
     throttles = [level.throttle for level in judged]
     estimates = [level.estimate for level in judged]
@@ -109,7 +109,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     alpha = alpha_constancy(throttles, estimates, [
         wanders or level.doubted or level.throttle in moving for level in judged])
     sliding = slide(recording, window, voltage, brownout_horizon,
-                    lambda share: tell(0.5 + 0.5 * share))
+                    lambda share: report(0.5 + 0.5 * share))
     return Analysis(
         recording, judged, relaxations, tuple(judge_cause(r, alpha) for r in relaxations), alpha,
         by_throttle(sliding, recording.has_throttle), sliding,

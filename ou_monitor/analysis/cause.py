@@ -71,7 +71,7 @@ class Cause:
 
 def judge_cause(relaxation: Relaxation, alpha: AlphaTest) -> Cause:
     """Compare a relaxation with the noise and with an AC-coupled instrument."""
-    if not relaxation.seen:
+    if not relaxation.detected:
         return Cause('undetermined', NAN, NAN, NAN, NAN, 'undetermined', NAN, NAN, NAN,
                      _nothing(relaxation))
     noise, ratio, low, high, p = _against_noise(relaxation, alpha)

@@ -5,18 +5,17 @@ Sag is how far the mean of a level lies below that of the lowest throttle.  Weig
 of the segment means fits a mean for each level and a polynomial of time that all levels share,
 for a battery discharges while it is flown.  The errors of the segment means follow from the
 noise; where the segments scatter more than that about the fit, all errors are widened.  Limits:
-slow recovery after a load is not in a polynomial; with one stay at each level the polynomial and
-the levels cannot be told apart, and then no time is taken out.
+a polynomial does not hold slow recovery after a load; with one stay at each level the data cannot
+separate the polynomial from the levels, and the fit leaves the polynomial out.
 
 The test of alpha, which the paper takes as the same at every load, is chi^2 of ln(alpha) of the
 levels about their weighted mean, each with its standard error; that error is carried over to the
 common alpha, for it grows with 1/sqrt(alpha T) and a level whose alpha came out high by chance
-would weigh too much.  A level that one OU in white noise does not describe (more than one
-relaxation, lines beside impulses, the settling after a change of throttle) is withheld: its alpha
-stands for both, and the error of a fit knows nothing of it.  Limits: only levels with a usable
-fit count; a spectral line too faint to be found, and taken out before the fit, is not known of;
-"no change seen" is no proof that there is none, so the ratio that would have been seen stands
-beside it.
+would weigh too much.  The test withholds a level that one OU in white noise does not describe
+(more than one relaxation, lines beside impulses, the settling after a change of throttle): its
+alpha is that of a mixture, and the error of its fit does not cover that.  Limits: only levels
+with a usable fit count; a spectral line too faint for the finder stays in the fit; a test that
+does not reject proves nothing, so the ratio that it would have detected stands beside it.
 
 Alpha and sigma have one threshold, `LEVEL`, that of the intervals printed beside them.  The
 question is how much they change from level to level, each level fitted by itself.  `discover`
@@ -73,7 +72,7 @@ class LevelSag:
 
 def mean_variance(time: float, n: int, estimate: Estimate, rms: float) -> float:
     """
-    Return the variance of the mean of a stretch of OU in white noise.
+    Return the variance of the mean of a segment of OU in white noise.
 
     time in s, rms in V, result in V^2.
     """
@@ -135,7 +134,7 @@ class AlphaTest:
     Attributes
     ----------
     verdict : str
-        ``differs``, ``constant`` (a change by `NARROW` would have been seen) or
+        ``differs``, ``constant`` (the test would have detected a change by `NARROW`) or
         ``undetermined``.
     levels : int
         Levels that count.
@@ -144,8 +143,8 @@ class AlphaTest:
     statistic, p_value : float
         chi^2 with levels - 1 degrees of freedom.
     detectable_ratio : float
-        Ratio of alpha between the lowest and the highest level, ln(alpha) going straight with
-        throttle, that is seen with 90 % probability.
+        Ratio of alpha between the lowest and the highest level that the test detects with 90 %
+        probability, where ln(alpha) is a straight line over throttle.
     ratio, ratio_low, ratio_high : float
         That ratio as fitted, highest over lowest throttle, and its 95 % interval.
     withheld : tuple of float
@@ -180,31 +179,31 @@ class AlphaTest:
         if not self.withheld:
             return ''
         names = ', '.join('all' if math.isnan(x) else f'{100.0 * x:.3g} %' for x in self.withheld)
-        return (f' Withheld: {names}; more than one relaxation is seen there or at another level, '
+        return (f' Withheld: {names}; the level or another one shows more than one relaxation, '
                 'lines stand beside impulses, or a change of throttle still settles.')
 
     def _verdict(self) -> str:
         if self.levels < 2:
-            return ('Whether alpha is the same at all loads cannot be told: '
+            return ('This recording cannot decide whether alpha depends on load: '
                     f'{"one load level has" if self.levels else "no load level has"} '
                     f'a usable fit{" that one OU describes" if self.withheld else ""}.')
-        seen = (f'a change by a factor of {_factor(self.detectable_ratio)} from the lowest to the '
-                'highest throttle would have been seen (90 %)')
+        change = (f'a change by a factor of {_factor(self.detectable_ratio)} from the lowest to '
+                  'the highest throttle')
         if self.verdict == 'differs':
-            return (f'Alpha is not the same at all loads (p = {self.p_value:.2g}): from the '
-                    f'lowest to the highest throttle it changes by a factor of '
+            return (f'Alpha depends on load (p = {self.p_value:.2g}): it changes by a factor of '
                     f'{_factor(self.ratio)} (95 % {_factor(self.ratio_low)} to '
-                    f'{_factor(self.ratio_high)}); '
-                    'the paper assumes that it does not.')
+                    f'{_factor(self.ratio_high)}) from the lowest to the highest throttle; the '
+                    'paper assumes a constant alpha.')
         if self.verdict == 'constant':
-            return (f'Alpha is the same at all loads as far as can be seen (p = '
-                    f'{self.p_value:.2g}); {seen}.')
-        return (f'Whether alpha is the same at all loads cannot be told from this recording (p = '
-                f'{self.p_value:.2g}): only {seen}.')
+            return (f'Alpha shows no dependence on load (p = {self.p_value:.2g}); the test would '
+                    f'have detected {change} (90 %).')
+        return (f'This recording cannot decide whether alpha depends on load (p = '
+                f'{self.p_value:.2g}): the test would have detected only {change} or more '
+                '(90 %).')
 
 
 def _factor(ratio: float) -> str:
-    """Return a ratio as people say it; beyond a factor of 100 either way only that."""
+    """Return a ratio to three digits; beyond a factor of 100 either way only that."""
     if ratio > 100.0:
         return 'more than 100'
     return 'less than 0.01' if ratio < 0.01 else f'{ratio:#.3g}'.rstrip('.')
@@ -236,9 +235,9 @@ def alpha_constancy(throttles: Sequence[float], estimates: Sequence[Estimate],
     size = float(weight @ along ** 2)
     slope = float(weight @ (along * logs)) / size
     wide = float(stats.norm.ppf(0.975)) / math.sqrt(size)
-    seen = math.exp(math.sqrt(_noncentrality(freedom) / size))
-    verdict = 'differs' if p < LEVEL else 'constant' if seen <= NARROW else 'undetermined'
-    return AlphaTest(verdict, len(good), *common, statistic, p, seen, math.exp(slope),
+    detectable = math.exp(math.sqrt(_noncentrality(freedom) / size))
+    verdict = 'differs' if p < LEVEL else 'constant' if detectable <= NARROW else 'undetermined'
+    return AlphaTest(verdict, len(good), *common, statistic, p, detectable, math.exp(slope),
                      math.exp(slope - wide), math.exp(slope + wide), withheld)
 
 

@@ -36,7 +36,7 @@ _WIDENED = 1.5
 _LEAST_BINNED = 50
 
 
-def fit_stretch(recording: Recording, start: int, stop: int) -> Estimate:
+def fit_segment(recording: Recording, start: int, stop: int) -> Estimate:
     """Fit one stretch of samples with the estimator that flies."""
     t = recording.t[start:stop]
     # A hair longer than the stretch, so that rounding loses no sample.
@@ -263,7 +263,7 @@ def fit_level(recording: Recording, still: Recording, level: LoadLevel, levels: 
         nothing = Estimate(throttle=level.throttle, status=Status.TOO_FEW_SAMPLES)
         return LevelResult(level.throttle, (), 0.0, 0, NAN, NAN, NAN, NAN, np.zeros(0), nothing,
                            examine_level([], nothing))
-    fits = [fit_stretch(recording, s.start, s.stop) for s in segments]
+    fits = [fit_segment(recording, s.start, s.stop) for s in segments]
     estimate, scatter = _pooled(fits)
     parts = [recording.voltage[s.start:s.stop] for s in segments]
     grids = [on_grid(still.t[s.start:s.stop], still.voltage[s.start:s.stop]) for s in segments]
@@ -277,7 +277,7 @@ def fit_level(recording: Recording, still: Recording, level: LoadLevel, levels: 
     if lines.lines and not holm([shape])[0]['impulses'].rejects:
         with_lines = estimate
         clean, quiet = (_without_lines(x, segments, even, lines) for x in (recording, still))
-        fits = [fit_stretch(clean, s.start, s.stop) for s in segments]
+        fits = [fit_segment(clean, s.start, s.stop) for s in segments]
         estimate, scatter = _pooled(fits)
         shape = examine_level([_kept(quiet, s, estimate) for s in segments], estimate)
     deviation = np.concatenate([v - v.mean() for v in parts])

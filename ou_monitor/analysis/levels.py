@@ -45,7 +45,7 @@ MIN_SHARE, LONG_STAY = 0.02, 2.0
 MIN_TIME = 0.25
 # And one stretch that can be fitted by itself, s: thirty relaxation times of the
 # paper's rail.  A ramp that lingers here and there is no level where others are.
-MIN_STRETCH = 0.5
+MIN_STAY = 0.5
 MAX_LEVELS = 20
 # A stretch shorter than this, s, through which throttle goes steadily is a passage: quarters at
 # its ends differ by more than this share of its range (of a ramp 0.75), and of the half width.
@@ -134,7 +134,7 @@ def _held(t: FloatArray, level: LoadLevel) -> bool:
     whole = float(t[-1] - t[0])
     longest = max((float(t[s.stop - 1] - t[s.start]) for s in level.segments), default=0.0)
     # A short recording may be all one level.
-    return longest >= min(MIN_STRETCH, 0.25 * whole) and (
+    return longest >= min(MIN_STAY, 0.25 * whole) and (
         longest >= LONG_STAY or _time(t, level) >= MIN_SHARE * whole)
 
 

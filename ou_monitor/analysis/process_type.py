@@ -54,7 +54,7 @@ class ProcessType(enum.Enum):
     UNDETERMINED = 'undetermined'
 
 
-def seen_kurtosis(n: int) -> float:
+def detectable_kurtosis(n: int) -> float:
     """Return the excess kurtosis that n innovations show with 90 % probability."""
     if n < 1:
         return math.inf
@@ -130,7 +130,7 @@ def _apart_from_changes(estimate: Estimate, shape: Shape, line_share: float) -> 
                       f'{shape.kurtosis:.2g}, {_p(normal)}')
     if tails.why_not:
         return _plain(ProcessType.UNDETERMINED, tails.why_not)
-    visible = seen_kurtosis(shape.n)
+    visible = detectable_kurtosis(shape.n)
     if visible > VISIBLE_KURTOSIS:
         return _plain(ProcessType.UNDETERMINED, 'no test rejects, but so few samples would hide '
                       'heavy tails', f'{shape.n} samples, excess kurtosis up to {visible:.2g}')

@@ -85,9 +85,9 @@ def quality_list(recording: Recording, throttles: Sequence[float], estimates: Se
                  ) -> tuple[QualityItem, ...]:
     """Gather what is doubtful."""
     found: dict[tuple[str, Severity, str], list[float]] = {}
-    for throttle, estimate, told in zip(throttles, estimates, notes):
+    for throttle, estimate, own in zip(throttles, estimates, notes):
         for item in [*_of_estimate(estimate), *(('SEGMENTS', Severity.INFO, text)
-                                                for text in told)]:
+                                                for text in own)]:
             found.setdefault(item, []).append(throttle)
     items = [QualityItem(*key, tuple(where)) for key, where in found.items()]
     items += more
@@ -206,7 +206,7 @@ def unsettled(relaxations: Sequence[Relaxation], throttles: Sequence[float],
         start = f'After throttle {what} the voltage '
         end = (f'only {1e3 * SETTLE:.3g} ms are left out: alpha and sigma here hold the settling '
                'too')
-        if fit.seen:
+        if fit.detected:
             most = 100.0 * min(1.0, max(shares[x] for x in where))
             text = (f'{start}settles in tau = {1e3 * fit.tau:.3g} ms, and {end} (up to '
                     f'{most:.0f} % of the variance).')
@@ -221,7 +221,7 @@ def _share(fit: Relaxation, throttle: float, estimate: Estimate, time: float) ->
     changes = [change for change in fit.releases if change.throttle_after == throttle]
     if not changes:
         return 0.0
-    if not fit.seen:
+    if not fit.detected:
         return math.inf if fit.moves_on else 0.0
     # Of A exp(-t / tau), squared, from the end of what is left out to the end of what is watched.
     left = sum(change.amplitude ** 2 * max(0.0, math.exp(-2.0 * SETTLE / fit.tau)

@@ -158,14 +158,14 @@ class Relaxation:
         return change.amplitude * np.exp(-since / self.tau)
 
     @property
-    def seen(self) -> bool:
+    def detected(self) -> bool:
         """Whether anything is seen to relax."""
         return math.isfinite(self.tau)
 
     @property
     def moves_on(self) -> bool:
         """Whether the voltage moves, and does not level off while watched."""
-        return not self.seen and self.likelihood_gain > _limit(len(self.releases))
+        return not self.detected and self.likelihood_gain > _limit(len(self.releases))
 
 
 def fit_relaxation(recording: Recording, kind: str, steps: Sequence[Step],

@@ -110,7 +110,7 @@ def brownout_sentence(analysis: Analysis) -> str:
 def relaxation_sentence(analysis: Analysis, k: int) -> str:
     """Return what follows falls (k = 0) or rises (k = 1) of throttle."""
     fit, cause = analysis.relaxations[k], analysis.causes[k]
-    if not fit.seen:
+    if not fit.detected:
         return cause.sentence
     count = len(fit.releases)
     what = {'release': 'fall', 'load': 'rise'}[fit.kind]

@@ -170,7 +170,7 @@ def _transients(analysis: Analysis) -> str:
     for k, fit in enumerate(analysis.relaxations):
         if fit.releases:
             parts.append(paragraph(relaxation_sentence(analysis, k)))
-        if fit.seen:
+        if fit.detected:
             parts.append(_changes(fit, float(analysis.recording.t[0])))
     return '\n\n'.join(parts)
 

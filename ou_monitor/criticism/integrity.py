@@ -85,7 +85,7 @@ class Integrity:
 
 def examine(recording: Recording, progress: Callable[[float], None] | None = None) -> Integrity:
     """Examine a recording."""
-    tell = progress or (lambda share: None)
+    report = progress or (lambda share: None)
     notes = list(recording.notes)
     t, v, u = usable(recording, notes)
     if v.size < LEAST:
@@ -94,7 +94,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     reason = why_nothing(v)
     if reason:
         return Integrity(None, (), tuple(notes), reason)
-    tell(0.2)
+    report(0.2)
     exact: list[Term] = []
     logged = (t, v, u)
     t, v, u, period = _without_repeats(t, v, u)
@@ -103,7 +103,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
         exact.append(HeldSamples(fresh))
         notes.append(f'The logger repeats its last value: the source refreshes at {fresh:.4g} Hz; '
                      f'{logged[0].size - v.size} repeats were dropped.')
-    tell(0.4)
+    report(0.4)
     rate = (v.size - 1) / float(t[-1] - t[0])
     which, note = choose_samples(v, rate)
     if note:
@@ -119,7 +119,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     t, v, u = t[which], v[which], None if u is None else u[which]
     v = without_tones(t, v, origin, lines)
     exact += lines
-    tell(0.6)
+    report(0.6)
     drawn = None
     noise = _innovation_std(v)
     step = find_step(v)
@@ -146,7 +146,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
         samples = _joined(samples, *events)
         notes.append(f'{between.size} samples about changes that stand out between neighbours '
                      'were kept, too.')
-    tell(1.0)
+    report(1.0)
     return Integrity(samples, tuple(exact), tuple(notes), raw=_as_logged(*logged, exact),
                      drawn=drawn)
 
@@ -168,11 +168,11 @@ def _without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
     for begin in range(0, v.size, _CHUNK):
         part = slice(begin, begin + _CHUNK)
         step = np.diff(t[part])
-        made = repeats.drop(Batch(
+        kept = repeats.drop(Batch(
             t[part], v[part], None if u is None else u[part],
             float(step.min(initial=math.inf)), float(step.max(initial=0.0)), False))
-        if made is not None:
-            parts.append(made)
+        if kept is not None:
+            parts.append(kept)
     t = np.concatenate([part.t for part in parts])
     v = np.concatenate([part.y for part in parts])
     known = [part.u for part in parts if part.u is not None]

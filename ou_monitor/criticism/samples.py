@@ -247,17 +247,17 @@ def _widest(voltage: FloatArray, factor: int) -> int:
     """Return the largest whole step, up to `factor`, that keeps the relaxation."""
     first = max(0, (voltage.size - _LOOK) // 2)
     v = voltage[first:first + _LOOK]
-    lag, seen = 1, False
+    lag, risen = 1, False
     coarse = bool(np.mean(v[4:] == v[:-4]) > 0.1)
     while lag < factor and 16 * lag < v.size:
         near, mid, far = (_variogram(v, k * lag, coarse) for k in (1, 2, 4))
         # Squares of neighbours within 4 lags go together.
         error = 3.0 * far * math.sqrt(8.0 * lag / v.size)
         if far - mid > error:
-            seen = True
+            risen = True
             if (mid - near) / (far - mid) > _RATIO:
                 return lag
-        elif seen:
+        elif risen:
             # Risen and level: the relaxation lies before.
             return max(1, lag // 2)
         lag *= 2

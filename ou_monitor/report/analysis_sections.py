@@ -85,7 +85,7 @@ def transients(analysis: Analysis) -> list[str]:
     for k, fit in enumerate(analysis.relaxations):
         if fit.releases or k == 0:
             parts.append(page.paragraph(relaxation_sentence(analysis, k)))
-        if fit.seen:
+        if fit.detected:
             parts += [page.figure(_relaxing(analysis, fit)), _changes(analysis, fit)]
     return parts
 

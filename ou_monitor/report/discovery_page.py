@@ -32,7 +32,6 @@ _TICKS = (0.0, 4.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 10000.0)
 def discovery_page(finding: Finding, command: str = '',
                    progress: Callable[[float], None] | None = None) -> str:
     """Return the report of a discovery."""
-    tell = progress or (lambda share: None)
     subtitle = f'{finding.n} samples in {number(finding.duration, 4)} s'
     if finding.samples is not None and finding.samples.n != finding.n:
         subtitle += f', of which {finding.samples.n} were used'
@@ -40,14 +39,15 @@ def discovery_page(finding: Finding, command: str = '',
     if finding.baseline is not None:
         sections += [page.section('Causes', *_causes(finding)),
                      page.section('Gain' if finding.causes else 'What it predicts',
-                                  *_worth(finding)),
+                                  *_gain(finding)),
                      page.section(
                          'Statistics before and after' if finding.causes else 'Statistics',
                          *_statistics(finding)),
                      page.section('Data beside simulations', *_comparisons(finding)),
                      page.section('What is left', *_left(finding)),
                      page.section('Parameters', *_parameters(finding))]
-    tell(1.0)
+    if progress is not None:
+        progress(1.0)
     sections.append(page.section('Where it comes from', *_origin(finding, command)))
     return page.page(f'What the simulation gets wrong: {finding.recording or "recording"}',
                      subtitle, sections)
@@ -101,7 +101,7 @@ def _causes(finding: Finding) -> list[str]:
         page.paragraph(MNAT, soft=True)]
 
 
-def _worth(finding: Finding) -> list[str]:
+def _gain(finding: Finding) -> list[str]:
     c = finding.crossing
     rows = [['Score on the last 40 %, nats per sample', _value(finding.baseline_score, 4),
              _value(finding.score, 4), _total_gain(finding)]]

@@ -3,13 +3,13 @@
 import math
 import re
 
-from made_recordings import recording
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.data import as_data
 from ou_monitor.cli.output import plain
 from ou_monitor.recordings.read import read_recording
 from project import ROOT
 import pytest
+from simulated_recordings import recording
 
 KEYS = {'recording', 'n', 'duration_s', 'rate_hz', 'source', 'headline', 'levels',
         'process_tests', 'lines', 'transients', 'alpha_constant', 'by_throttle', 'brownout',
@@ -64,7 +64,7 @@ def names(value):
 def test_every_key_is_documented(analysis):
     """doc/analysis.md names each in backticks; those of `source` are the reader's."""
     text = (ROOT / 'doc' / 'analysis.md').read_text(encoding='utf-8')
-    told = set(re.findall(r'`([a-z0-9_]+)`', text))
+    documented = set(re.findall(r'`([a-z0-9_]+)`', text))
     data = plain(as_data(analyze(read_recording(ROOT / 'bags' / 'transient'))))
     data['source'] = {}
-    assert sorted(set(names(data)) - told) == []
+    assert sorted(set(names(data)) - documented) == []

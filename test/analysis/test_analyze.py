@@ -2,7 +2,6 @@
 
 import math
 
-from made_recordings import ALPHA, recording, without_throttle
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.process_type import ProcessType
@@ -10,6 +9,7 @@ from ou_monitor.analysis.replay import slide
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.records import Recording, Status
 import pytest
+from simulated_recordings import ALPHA, recording, without_throttle
 
 TRUTH = ((0.1, 0.3156), (0.4, 0.632))
 
@@ -61,8 +61,8 @@ def test_amplitudes_are_those_of_the_samples():
     """Vpp, peak and Vrms of an exact triangle, apart from its offset."""
     t = np.arange(4000) / 1000.0
     wave = 2.0 * np.abs((np.arange(4000) % 100) / 50.0 - 1.0) - 1.0
-    made = Recording(t, 5.0 + 0.01 * wave, np.full(t.size, 0.2))
-    (level,) = analyze(made).levels
+    simulated = Recording(t, 5.0 + 0.01 * wave, np.full(t.size, 0.2))
+    (level,) = analyze(simulated).levels
     assert level.vpp == pytest.approx(0.02)
     assert level.peak == pytest.approx(0.01)
     assert level.vrms == pytest.approx(float(0.01 * wave.std()))
@@ -71,9 +71,9 @@ def test_amplitudes_are_those_of_the_samples():
 
 def test_a_level_in_two_pieces_is_one_process():
     """A sag between the pieces moves neither Var_inf nor Vrms: each has its own mean."""
-    made = recording(4, ((0.1, 0.3), (0.4, 0.3), (0.1, 0.3)), seconds=5.0)
-    voltage = made.voltage - 0.5 * (made.t > 10.0)
-    low = analyze(Recording(made.t, voltage, made.throttle)).levels[0]
+    simulated = recording(4, ((0.1, 0.3), (0.4, 0.3), (0.1, 0.3)), seconds=5.0)
+    voltage = simulated.voltage - 0.5 * (simulated.t > 10.0)
+    low = analyze(Recording(simulated.t, voltage, simulated.throttle)).levels[0]
     var_inf = 0.3 ** 2 / (2.0 * ALPHA)
     assert len(low.segments) == 2
     # T = 10 s in all; the offset would make Vrms 0.25 V instead of 27 mV.
@@ -83,11 +83,11 @@ def test_a_level_in_two_pieces_is_one_process():
 
 def test_the_transient_after_a_step_is_not_noise():
     """An exponential of 0.5 V after each step of throttle leaves Var_inf alone."""
-    made = recording(5, TRUTH, seconds=5.0)
-    since = made.t - 5.0
+    simulated = recording(5, TRUTH, seconds=5.0)
+    since = simulated.t - 5.0
     wave = np.where(since >= 0.0, 0.5 * np.exp(-ALPHA * np.maximum(since, 0.0)), 0.0)
     var_inf = TRUTH[1][1] ** 2 / (2.0 * ALPHA)
-    high = analyze(Recording(made.t, made.voltage + wave, made.throttle)).levels[1]
+    high = analyze(Recording(simulated.t, simulated.voltage + wave, simulated.throttle)).levels[1]
     # Unsettled it would add 0.25 V^2 tau / (2 T) = 4e-4 V^2, 12 % of Var_inf,
     # and an offset of the peak of 0.5 V, nine standard deviations.
     assert high.peak < 5.0 * math.sqrt(var_inf)
@@ -130,14 +130,15 @@ def test_white_noise_is_no_diffusion():
 
 def test_impulses_are_called_so():
     """Steps of 0.2 V, 5 a second, that relax: heavy tails of the increments."""
-    made = recording(9, ((0.1, 0.3),), seconds=20.0)
-    kicks = np.zeros(made.n)
+    simulated = recording(9, ((0.1, 0.3),), seconds=20.0)
+    kicks = np.zeros(simulated.n)
     kicks[::200] = 0.2
-    relaxing = np.zeros(made.n)
+    relaxing = np.zeros(simulated.n)
     phi = math.exp(-ALPHA / 1000.0)
-    for k in range(1, made.n):
+    for k in range(1, simulated.n):
         relaxing[k] = phi * relaxing[k - 1] + kicks[k]
-    (level,) = analyze(Recording(made.t, made.voltage + relaxing, made.throttle)).levels
+    voltage = simulated.voltage + relaxing
+    (level,) = analyze(Recording(simulated.t, voltage, simulated.throttle)).levels
     assert level.kind is ProcessType.IMPULSES
 
 
@@ -150,20 +151,20 @@ def test_a_level_that_was_never_flown_stays_in_the_table():
 
 def test_time_between_levels_is_accounted_for():
     """A ramp that no level holds is named in the notes."""
-    made = recording(11, TRUTH)
-    ramp = made.throttle.copy()
+    simulated = recording(11, TRUTH)
+    ramp = simulated.throttle.copy()
     ramp[8000:12000] = np.linspace(0.1, 0.4, 4000)
-    notes = analyze(Recording(made.t, made.voltage, ramp)).notes
+    notes = analyze(Recording(simulated.t, simulated.voltage, ramp)).notes
     assert any('between load levels' in note for note in notes)
 
 
 def test_sliding_is_what_the_node_would_say():
     """The last point equals the estimator fed with every sample."""
-    made = recording(12, TRUTH)
-    sliding = slide(made, window=2.0)
+    simulated = recording(12, TRUTH)
+    sliding = slide(simulated, window=2.0)
     node = SlidingEstimator(window=2.0)
-    upto = made.t <= sliding.t[-1]
-    node.push(made.t[upto], made.voltage[upto], made.throttle[upto])
+    upto = simulated.t <= sliding.t[-1]
+    node.push(simulated.t[upto], simulated.voltage[upto], simulated.throttle[upto])
     # A search started from the estimate before ends within its tolerance of this one.
     assert sliding.series('sigma')[-1] == pytest.approx(node.estimate().sigma, rel=1e-4)
     assert np.all(np.diff(sliding.t) > 0.0) and sliding.t[0] >= 1.9
@@ -172,9 +173,9 @@ def test_sliding_is_what_the_node_would_say():
 
 def test_sliding_risk_grows_with_the_threshold():
     """A threshold far below is safe, one above the voltage is certain."""
-    made = recording(13, ((0.1, 0.3),))
-    assert slide(made, 2.0, brownout_voltage=4.0).risk.max() < 1e-6
-    assert slide(made, 2.0, brownout_voltage=6.0).risk.min() == 1.0
+    simulated = recording(13, ((0.1, 0.3),))
+    assert slide(simulated, 2.0, brownout_voltage=4.0).risk.max() < 1e-6
+    assert slide(simulated, 2.0, brownout_voltage=6.0).risk.min() == 1.0
 
 
 def test_progress_ends_at_one():
@@ -204,7 +205,7 @@ def test_stamps_that_do_not_increase_are_a_callers_bug(t):
 def test_tiny_recordings_end_in_a_status(n):
     """Nothing raises, nothing is invented."""
     t = np.arange(n) / 100.0
-    made = Recording(t, 5.0 + 0.01 * np.sin(np.arange(n)), np.full(n, 0.1))
-    for candidate in (made, without_throttle(made)):
+    simulated = Recording(t, 5.0 + 0.01 * np.sin(np.arange(n)), np.full(n, 0.1))
+    for candidate in (simulated, without_throttle(simulated)):
         for level in analyze(candidate).levels:
             assert not level.estimate.usable

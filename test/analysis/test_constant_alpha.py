@@ -3,14 +3,14 @@
 from dataclasses import replace
 import math
 
-from made_recordings import ALPHA, recording
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.level_comparison import alpha_constancy
-from ou_monitor.analysis.level_result import fit_stretch
+from ou_monitor.analysis.level_result import fit_segment
 from ou_monitor.records import Estimate, Status
 import pytest
 from scipy import stats
+from simulated_recordings import ALPHA, recording
 
 THROTTLES = (0.1, 0.3, 0.5, 0.7)
 
@@ -35,7 +35,7 @@ def test_false_alarms_are_five_percent():
     assert 9 <= alarms <= 51
 
 
-def test_the_detectable_ratio_is_seen_nine_times_in_ten():
+def test_the_detectable_ratio_is_detected_nine_times_in_ten():
     """
     ln(alpha) straight over throttle, by that ratio: 270 +- 5.2 of 300.
 
@@ -45,9 +45,9 @@ def test_the_detectable_ratio_is_seen_nine_times_in_ten():
     ratio = alpha_constancy(THROTTLES, [estimate(ALPHA, 0.1)] * 4).detectable_ratio
     steps = (np.array(THROTTLES) - 0.4) / 0.6
     alphas = ALPHA * np.exp(math.log(ratio) * steps)
-    seen = sum(alpha_constancy(THROTTLES, drawn(rng, alphas, 0.1)).verdict == 'differs'
+    rejected = sum(alpha_constancy(THROTTLES, drawn(rng, alphas, 0.1)).verdict == 'differs'
                for _ in range(300))
-    assert abs(seen - 270) <= 26
+    assert abs(rejected - 270) <= 26
 
 
 def test_the_numbers_are_those_of_the_textbook():
@@ -63,20 +63,20 @@ def test_the_numbers_are_those_of_the_textbook():
     assert found.alpha == pytest.approx(math.exp(4.05))
 
 
-def test_long_levels_tell_and_short_ones_do_not():
+def test_long_levels_decide_and_short_ones_do_not():
     """Errors of 3 %: constant; of 30 %: not to be told; a factor of 3: differs."""
     assert alpha_constancy(THROTTLES, [estimate(ALPHA, 0.03)] * 4).verdict == 'constant'
     vague = alpha_constancy(THROTTLES, [estimate(ALPHA, 0.3)] * 4)
     assert vague.verdict == 'undetermined' and vague.detectable_ratio > 2.0
-    assert 'cannot be told' in vague.sentence and f'{vague.detectable_ratio:.2f}' in vague.sentence
+    assert 'cannot decide' in vague.sentence and f'{vague.detectable_ratio:.2f}' in vague.sentence
     differs = alpha_constancy((0.1, 0.5), [estimate(40.0, 0.1), estimate(120.0, 0.1)])
     assert differs.verdict == 'differs' and differs.ratio_low > 1.0
-    assert 'does not' in differs.sentence
+    assert 'assumes a constant alpha' in differs.sentence
 
 
 @pytest.mark.parametrize('estimates', [
     [], [Estimate()] * 4, [estimate(63.0, 0.1), Estimate(), Estimate(), Estimate()]])
-def test_less_than_two_levels_cannot_tell(estimates):
+def test_less_than_two_levels_decide_nothing(estimates):
     """And the sentence says how many there are."""
     found = alpha_constancy(THROTTLES, estimates)
     assert found.verdict == 'undetermined' and math.isnan(found.p_value)
@@ -92,8 +92,8 @@ def test_fitted_levels_of_one_alpha_do_not_differ():
     """
     alarms = 0
     for seed in range(60):
-        made = recording(7000 + seed, ((0.1, 0.2), (0.3, 0.4), (0.6, 0.6)), seconds=2.0)
-        fits = [fit_stretch(made, 2000 * k, 2000 * k + 2000) for k in range(3)]
+        simulated = recording(7000 + seed, ((0.1, 0.2), (0.3, 0.4), (0.6, 0.6)), seconds=2.0)
+        fits = [fit_segment(simulated, 2000 * k, 2000 * k + 2000) for k in range(3)]
         alarms += alpha_constancy((0.1, 0.3, 0.6), fits).verdict == 'differs'
     assert alarms <= 9
 
@@ -105,10 +105,10 @@ def test_levels_that_one_ou_does_not_describe_are_withheld():
     found = alpha_constancy(THROTTLES, four, [False, False, False, True])
     assert (found.verdict, found.levels, found.withheld) == ('constant', 3, (0.7,))
     assert found.sentence.endswith(
-        'Withheld: 70 %; more than one relaxation is seen there or at another level, lines stand '
+        'Withheld: 70 %; the level or another one shows more than one relaxation, lines stand '
         'beside impulses, or a change of throttle still settles.')
     alone = alpha_constancy(THROTTLES, four, [False, True, True, True])
-    assert alone.verdict == 'undetermined' and 'cannot be told: one load' in alone.sentence
+    assert alone.verdict == 'undetermined' and 'depends on load: one load' in alone.sentence
     none = alpha_constancy(THROTTLES, four, [True] * 4)
     assert none.levels == 0 and math.isnan(none.alpha)
     assert 'no load level has a usable fit that one OU describes' in none.sentence
@@ -121,11 +121,11 @@ def test_a_tone_is_not_taken_for_another_alpha():
     Sigma goes from 0.1 to 0.3, so the tone bends the alpha of the quiet level more.
     """
     for seed in range(3):
-        made = recording(seed, ((0.0, 0.1), (0.2, 0.3)), seconds=5.0)
-        white = np.random.default_rng(seed).normal(0.0, 0.001, made.n)
-        made = replace(made, voltage=made.voltage + white + 0.003 * math.sqrt(2.0) * np.sin(
-            2.0 * math.pi * 180.0 * made.t))
-        analysis = analyze(made)
+        simulated = recording(seed, ((0.0, 0.1), (0.2, 0.3)), seconds=5.0)
+        white = np.random.default_rng(seed).normal(0.0, 0.001, simulated.n)
+        tone = 0.003 * math.sqrt(2.0) * np.sin(2.0 * math.pi * 180.0 * simulated.t)
+        simulated = replace(simulated, voltage=simulated.voltage + white + tone)
+        analysis = analyze(simulated)
         assert alpha_constancy([0.0, 0.2], [level.with_lines for level in analysis.levels]
                                ).verdict == 'differs'
         assert analysis.alpha_test.verdict != 'differs'

@@ -2,7 +2,6 @@
 
 import math
 
-from made_recordings import ALPHA, recording, without_throttle
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.replay import by_throttle, slide
@@ -11,6 +10,7 @@ from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Recording
 import pytest
+from simulated_recordings import ALPHA, recording, without_throttle
 
 
 def swept(seed, seconds=60.0, rate=500.0):
@@ -28,8 +28,8 @@ def test_curves_without_levels_hold_the_truth():
 
     What lies outside 0.2 .. 0.7 is not known.
     """
-    made = swept(1)
-    found = by_throttle(slide(made, 2.0, 4.5), True)
+    simulated = swept(1)
+    found = by_throttle(slide(simulated, 2.0, 4.5), True)
     at = found.throttle
     inside = (at > 0.22) & (at < 0.68)
     assert found.known[inside].all() and not found.known[(at < 0.1) | (at > 0.8)].any()
@@ -50,11 +50,11 @@ def test_the_node_says_the_same():
 
     Within a standard error: the node's estimates are newer by half a second than those here.
     """
-    made = swept(2)
-    found = by_throttle(slide(made, 2.0, 4.5), True)
+    simulated = swept(2)
+    found = by_throttle(slide(simulated, 2.0, 4.5), True)
     monitor = SupplyMonitor(MonitorSettings(), background=False)
-    for part in np.array_split(np.arange(made.n), int(10 * made.duration)):
-        monitor.push(made.t[part], made.voltage[part], made.throttle[part])
+    for part in np.array_split(np.arange(simulated.n), int(10 * simulated.duration)):
+        monitor.push(simulated.t[part], simulated.voltage[part], simulated.throttle[part])
         report = monitor.report(age=0.0)
     curves = monitor.outlook.curves
     for mine, se, theirs in (
@@ -85,10 +85,11 @@ def test_without_a_fit_the_budget_says_why():
 
 def test_the_voltage_is_the_nodes_unless_asked_for():
     """4.5 V by default; NaN switches the risk off."""
-    made = recording(3, ((0.1, 0.3), (0.4, 0.5)), seconds=4.0)
-    default = analyze(made)
+    simulated = recording(3, ((0.1, 0.3), (0.4, 0.5)), seconds=4.0)
+    default = analyze(simulated)
     assert default.by_throttle.voltage == MonitorSettings().brownout_voltage
-    assert default.brownout_default and not analyze(made, brownout_voltage=4.5).brownout_default
-    none = analyze(made, brownout_voltage=math.nan)
+    assert default.brownout_default
+    assert not analyze(simulated, brownout_voltage=4.5).brownout_default
+    none = analyze(simulated, brownout_voltage=math.nan)
     assert np.isnan(none.by_throttle.risk).all() and math.isnan(none.by_throttle.budget)
     assert default.by_throttle.at(math.nan, 'risk') != 0.0

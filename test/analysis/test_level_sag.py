@@ -3,12 +3,12 @@
 from dataclasses import replace
 import math
 
-from made_recordings import ALPHA, recording
 import numpy as np
 from ou_monitor.analysis.level_comparison import level_sags, mean_variance
 from ou_monitor.analysis.levels import Segment
 from ou_monitor.records import Estimate, Status
 import pytest
+from simulated_recordings import ALPHA, recording
 
 SIGMA = 0.3
 VAR_INF = SIGMA ** 2 / (2.0 * ALPHA)
@@ -16,12 +16,12 @@ ESTIMATE = Estimate(alpha=ALPHA, sigma=SIGMA, var_inf=VAR_INF, u0=5.0, noise_std
                     alpha_se=0.05, sigma_se=0.01, var_inf_se=0.05, status=Status.OK, rate=1000.0)
 
 
-def sags(made, orders, seconds=1.0):
+def sags(simulated, orders, seconds=1.0):
     """Return the sags of levels 10, 30 and 60 %, flown in that order for a second each."""
     stays = [[], [], []]
     for k, level in enumerate(orders):
         stays[level].append(Segment(int(1000 * seconds * k), int(1000 * seconds * (k + 1))))
-    return level_sags(made, (0.1, 0.3, 0.6), stays, [ESTIMATE] * 3, [math.sqrt(VAR_INF)] * 3)
+    return level_sags(simulated, (0.1, 0.3, 0.6), stays, [ESTIMATE] * 3, [math.sqrt(VAR_INF)] * 3)
 
 
 def flown(seed, orders):
@@ -47,8 +47,8 @@ def test_intervals_hold():
 def test_a_discharge_is_no_sag():
     """0.2 V/s over twelve stays, in an order that goes up with time: taken out."""
     orders = (0, 0, 1, 0, 1, 2, 0, 1, 2, 1, 2, 2)
-    made = flown(1, orders)
-    found = sags(replace(made, voltage=made.voltage - 0.2 * made.t), orders)
+    simulated = flown(1, orders)
+    found = sags(replace(simulated, voltage=simulated.voltage - 0.2 * simulated.t), orders)
     for sag, truth in zip(found, (0.0, 0.2, 0.5)):
         assert sag.sag == pytest.approx(truth, abs=4.0 * sag.sag_se + 1e-12)
     assert found[0].sag_se == 0.0 and found[2].sag_se < 0.05
@@ -57,10 +57,11 @@ def test_a_discharge_is_no_sag():
 def test_stays_that_scatter_widen_the_errors():
     """Each stay off by 50 mV at random, ten times more than noise moves it."""
     orders = (0, 1, 2, 1, 0, 2)
-    made = flown(2, orders)
-    plain = sags(made, orders)[2].sag_se
+    simulated = flown(2, orders)
+    plain = sags(simulated, orders)[2].sag_se
     off = np.repeat(np.random.default_rng(3).normal(0.0, 0.05, 6), 1000)
-    assert sags(replace(made, voltage=made.voltage + off), orders)[2].sag_se > 3.0 * plain
+    moved = replace(simulated, voltage=simulated.voltage + off)
+    assert sags(moved, orders)[2].sag_se > 3.0 * plain
 
 
 def test_one_level_has_nothing_to_sag_from():

@@ -14,7 +14,7 @@ def profile(*parts):
     return np.arange(throttle.size) / RATE, throttle
 
 
-def test_the_papers_levels_are_told_apart():
+def test_the_papers_levels_are_separated():
     """0, 5, 10 and 40 % with the jitter of a stick are four levels."""
     t, throttle = profile((0.0, 3), (0.05, 2), (0.10, 4), (0.40, 3), (0.05, 2))
     jitter = np.random.default_rng(1).uniform(-0.005, 0.005, t.size)
@@ -28,15 +28,15 @@ def test_every_sample_of_a_level_is_at_its_throttle():
     rng = np.random.default_rng(2)
     t = np.arange(8000) / RATE
     throttle = np.clip(0.3 + np.cumsum(rng.normal(0.0, 0.004, t.size)), 0.0, 1.0)
-    seen = np.zeros(t.size, dtype=int)
+    levels_of = np.zeros(t.size, dtype=int)
     levels = find_levels(t, throttle)
     assert levels
     for level in levels:
         for s in level.segments:
-            seen[s.start:s.stop] += 1
+            levels_of[s.start:s.stop] += 1
             # A stay ends two half widths away from the middle.
             assert np.ptp(throttle[s.start:s.stop]) <= 4.0 * half_width(t, throttle) + 1e-6
-    assert seen.max() == 1
+    assert levels_of.max() == 1
 
 
 def test_settling_is_left_out_after_a_step_only():
@@ -73,7 +73,7 @@ def test_a_nervous_stick_breaks_no_level(spread, seed):
         assert sum(t[s.stop - 1] - t[s.start] for s in level.segments) > 0.9 * long
 
 
-def test_levels_five_percent_apart_are_told_under_a_stick_of_one_percent():
+def test_levels_five_percent_apart_are_separated_under_a_stick_of_one_percent():
     """As the paper's lowest are."""
     t, throttle = profile((0.30, 10), (0.35, 10))
     levels = find_levels(t, throttle + stick(t, 0.01, 3))
@@ -171,7 +171,7 @@ def test_no_samples_no_levels():
     assert find_levels(np.zeros(0), np.zeros(0)) == ()
 
 
-def test_short_stretches_on_ramps_are_no_level():
+def test_short_segments_of_a_ramp_are_no_level():
     """
     Five passages of 0.35 s at 30 % between stays of 2 s: no level, though 1.75 s were spent there.
 

@@ -2,12 +2,12 @@
 
 import math
 
-from made_recordings import ALPHA, recording
 from ou_monitor.analysis.analyze import analyze
-from ou_monitor.analysis.level_result import disagreement, fit_stretch, pool
+from ou_monitor.analysis.level_result import disagreement, fit_segment, pool
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.records import Estimate, Status
 import pytest
+from simulated_recordings import ALPHA, recording
 
 
 def one(alpha=63.0, se=0.1, duration=1.0, **changes):
@@ -18,12 +18,12 @@ def one(alpha=63.0, se=0.1, duration=1.0, **changes):
     return Estimate(**{**values, **changes})
 
 
-def test_a_stretch_gets_the_estimator_that_flies():
+def test_a_segment_gets_the_estimator_that_flies():
     """All samples of the stretch enter, and nothing else."""
-    made = recording(1)
-    e = fit_stretch(made, 1000, 4000)
+    simulated = recording(1)
+    e = fit_segment(simulated, 1000, 4000)
     node = SlidingEstimator(window=10.0)
-    node.push(made.t[1000:4000], made.voltage[1000:4000], made.throttle[1000:4000])
+    node.push(simulated.t[1000:4000], simulated.voltage[1000:4000], simulated.throttle[1000:4000])
     other = node.estimate()
     # Two windows cut the same samples into other slots: equal to rounding.
     for name in ('alpha', 'sigma', 'var_inf', 'u0', 'alpha_se', 'duration', 'rate'):
@@ -54,8 +54,8 @@ def test_pooling_does_not_favour_what_came_out_high():
     segment's own standard error would add about se^2 = 3 % a segment, which
     this alone cannot see; the weights are pinned by the test above.
     """
-    made = recording(3, levels=((0.1, 0.3),), seconds=40.0)
-    pooled, scatter = pool([fit_stretch(made, k, k + 1000) for k in range(0, 40000, 1000)])
+    simulated = recording(3, levels=((0.1, 0.3),), seconds=40.0)
+    pooled, scatter = pool([fit_segment(simulated, k, k + 1000) for k in range(0, 40000, 1000)])
     assert abs(math.log(pooled.alpha / ALPHA)) < 4.0 * math.sqrt(2.0 / (ALPHA * 40.0))
     # The noise being unknown costs 8 %, the short segments 4 %.
     assert pooled.alpha_se == pytest.approx(1.12 * math.sqrt(2.0 / (ALPHA * 40.0)), rel=0.15)
@@ -108,8 +108,9 @@ def test_segments_of_one_process_disagree_as_often_as_stated():
     """
     p_values = []
     for seed in range(150):
-        made = recording(9000 + seed, levels=((0.1, 0.3),), seconds=3.0)
-        p_values.append(disagreement([fit_stretch(made, k, k + 1000) for k in (0, 1000, 2000)]))
+        simulated = recording(9000 + seed, levels=((0.1, 0.3),), seconds=3.0)
+        p_values.append(disagreement([fit_segment(simulated, k, k + 1000)
+                                      for k in (0, 1000, 2000)]))
     assert sum(p < 0.05 for p in p_values) <= 18 and sum(p < 0.01 for p in p_values) <= 7
     assert disagreement([one(63.0), one(250.0)]) < 1e-6
     assert math.isnan(disagreement([one()])) and disagreement([one(), one()]) == 1.0
@@ -119,18 +120,18 @@ def test_not_one_process_is_said_of_what_differs_only():
     """Two stays of one level: with equal sigma rarely a word, with twice the sigma always."""
     said = 0
     for seed in range(30):
-        made = recording(seed, ((0.1, 0.3), (0.4, 0.5), (0.1, 0.3)), seconds=2.0)
-        said += any('not one process' in note for level in analyze_levels(made)
+        simulated = recording(seed, ((0.1, 0.3), (0.4, 0.5), (0.1, 0.3)), seconds=2.0)
+        said += any('not one process' in note for level in analyze_levels(simulated)
                     for note in level.notes)
     # A binomial of 30 and 0.01 exceeds 2 with probability 3e-3; without a test it was said of
     # every third.
     assert said <= 2
-    made = recording(1, ((0.1, 0.3), (0.4, 0.5), (0.1, 0.6)), seconds=2.0)
-    first, second = analyze_levels(made)
+    simulated = recording(1, ((0.1, 0.3), (0.4, 0.5), (0.1, 0.6)), seconds=2.0)
+    first, second = analyze_levels(simulated)
     assert any('not one process' in note for note in first.notes) and first.scatter_p < 0.01
     assert not second.notes and math.isnan(second.scatter_p)
 
 
-def analyze_levels(made):
+def analyze_levels(simulated):
     """Return the levels of an analysis."""
-    return analyze(made, brownout_voltage=math.nan).levels
+    return analyze(simulated, brownout_voltage=math.nan).levels

@@ -3,7 +3,7 @@
 from dataclasses import replace
 import math
 
-from ou_monitor.analysis.process_type import classify, ProcessType, seen_kurtosis
+from ou_monitor.analysis.process_type import classify, detectable_kurtosis, ProcessType
 from ou_monitor.criticism.level_tests import EFFECT, examine_level, Shape, TestResult
 from ou_monitor.records import Estimate, Status
 import pytest
@@ -73,6 +73,6 @@ def test_a_rejection_without_consequence_does_not_count():
 
 def test_visible_kurtosis_is_what_the_test_sees():
     """From 24 (2.576 + 1.282)^2 samples on it is below 1: half of 1 %, and 90 %."""
-    assert seen_kurtosis(0) == math.inf
-    n = next(n for n in range(50, 2000) if seen_kurtosis(n) < 1.0)
+    assert detectable_kurtosis(0) == math.inf
+    n = next(n for n in range(50, 2000) if detectable_kurtosis(n) < 1.0)
     assert n == pytest.approx(24.0 * (stats.norm.isf(0.005) + stats.norm.isf(0.1)) ** 2, abs=2)

@@ -2,19 +2,19 @@
 
 from dataclasses import replace
 
-from made_recordings import recording
 import numpy as np
 from ou_monitor.analysis.quality import quality_list, Severity
 from ou_monitor.recordings.samples import late_words
 from ou_monitor.records import Estimate, Flag, Recording, Status
 import pytest
+from simulated_recordings import recording
 
 GOOD = Estimate(alpha=63.0, sigma=0.3, var_inf=7e-4, u0=5.0, noise_std=0.0, status=Status.OK)
 
 
-def listed(made, estimates=(GOOD,), notes=((),)):
+def listed(simulated, estimates=(GOOD,), notes=((),)):
     """Return the list of a recording of one level."""
-    return quality_list(made, [0.1] * len(estimates), estimates, notes)
+    return quality_list(simulated, [0.1] * len(estimates), estimates, notes)
 
 
 def names(items):
@@ -52,16 +52,16 @@ def test_worst_comes_first_and_levels_share_an_entry():
     ('Something else.', 'READER', Severity.INFO)])
 def test_what_the_reader_noted_is_in_it(note, name, severity):
     """As the reader words it."""
-    made = replace(recording(1, ((0.1, 0.3),)), notes=(note,))
-    (item,) = listed(made)
+    simulated = replace(recording(1, ((0.1, 0.3),)), notes=(note,))
+    (item,) = listed(simulated)
     assert (item.name, item.severity, item.text) == (name, severity, note)
 
 
 @pytest.mark.parametrize('factor, named', [(1.0, False), (80.0, False), (1e3, True), (3e3, True)])
 def test_millivolts_are_called_so(factor, named):
     """A rail of 5 V, a battery of 400 V; 5000 and 15000 are no volts."""
-    made = recording(3, ((0.1, 0.3),))
-    items = names(listed(replace(made, voltage=factor * made.voltage)))
+    simulated = recording(3, ((0.1, 0.3),))
+    items = names(listed(replace(simulated, voltage=factor * simulated.voltage)))
     assert (items.get('VOLTAGE_UNIT') is Severity.WARNING) == named
 
 
@@ -69,32 +69,32 @@ def test_millivolts_are_called_so(factor, named):
     (0.0, 1.0, False), (-0.04, 1.04, False), (-0.4, 1.0, True), (0.0, 1.3, True)])
 def test_a_throttle_outside_of_its_range_is_called_so(low, high, named):
     """Reverse thrust, or a stick that goes both ways; a little beyond is trim."""
-    made = recording(3, ((0.1, 0.3),))
-    items = names(listed(replace(made, throttle=np.linspace(low, high, made.n))))
+    simulated = recording(3, ((0.1, 0.3),))
+    items = names(listed(replace(simulated, throttle=np.linspace(low, high, simulated.n))))
     assert (items.get('THROTTLE_RANGE') is Severity.WARNING) == named
 
 
 def test_pauses_and_an_uneven_clock_are_measured():
     """A pause of 2 s; stamps off by 10 % of a step at random."""
-    made = recording(2, ((0.1, 0.3),))
-    (item,) = listed(replace(made, t=made.t + 2.0 * (made.t > 5.0)))
+    simulated = recording(2, ((0.1, 0.3),))
+    (item,) = listed(replace(simulated, t=simulated.t + 2.0 * (simulated.t > 5.0)))
     assert item.name == 'PAUSES' and '1 pause without' in item.text and '2 s' in item.text
-    shaken = made.t + np.random.default_rng(1).uniform(-1e-4, 1e-4, made.n)
-    (item,) = listed(replace(made, t=shaken))
+    shaken = simulated.t + np.random.default_rng(1).uniform(-1e-4, 1e-4, simulated.n)
+    (item,) = listed(replace(simulated, t=shaken))
     # Two independent uniform errors of +-10 %: 0.1 sqrt(2/3) = 8 %.
     assert item.name == 'UNEVEN_CLOCK' and ' 8 %' in item.text
 
 
-def test_the_adc_is_told_from_the_samples():
+def test_the_samples_show_the_step_of_the_adc():
     """A lattice of 5 mV, repeats of four, a rail at 5.03 V, and throttle that comes late."""
-    made = recording(3, ((0.1, 0.3),))
-    step = listed(replace(made, voltage=0.005 * np.round(made.voltage / 0.005)))
+    simulated = recording(3, ((0.1, 0.3),))
+    step = listed(replace(simulated, voltage=0.005 * np.round(simulated.voltage / 0.005)))
     assert names(step) == {'ADC_STEP': Severity.INFO} and 'of 5 mV' in step[0].text
-    held = listed(replace(made, voltage=np.repeat(made.voltage[::4], 4)))
+    held = listed(replace(simulated, voltage=np.repeat(simulated.voltage[::4], 4)))
     assert names(held) == {'REPEATS': Severity.INFO} and 'every 4' in held[0].text
-    clipped = listed(replace(made, voltage=np.minimum(made.voltage, 4.98)))
+    clipped = listed(replace(simulated, voltage=np.minimum(simulated.voltage, 4.98)))
     assert names(clipped) == {'CLIPPED': Severity.WARNING}
-    late = made.throttle.copy()
+    late = simulated.throttle.copy()
     late[:100] = np.nan
-    assert names(listed(Recording(made.t, made.voltage, late))) == {
+    assert names(listed(Recording(simulated.t, simulated.voltage, late))) == {
         'THROTTLE_UNKNOWN': Severity.INFO}

@@ -3,7 +3,6 @@
 from dataclasses import replace
 import math
 
-from made_recordings import ALPHA
 import numpy as np
 from ou_monitor.analysis.cause import judge_cause
 from ou_monitor.analysis.level_comparison import AlphaTest
@@ -14,6 +13,7 @@ from ou_monitor.records import Estimate, Recording, Status
 import pytest
 from scipy.linalg import cho_factor, cho_solve
 from scipy.signal import butter, lfilter
+from simulated_recordings import ALPHA
 
 SIGMA = 0.3
 VAR_INF = SIGMA ** 2 / (2.0 * ALPHA)
@@ -46,17 +46,17 @@ def steps_of(seed, tau=0.03, sag=0.4, changes=3, high_pass=False, rate=1000.0, r
     return Recording(t, 5.0 - sag * level + voltage, throttle)
 
 
-def fitted(made, kind='release', estimate=ESTIMATE, rms=0.04):
+def fitted(simulated, kind='release', estimate=ESTIMATE, rms=0.04):
     """Return the fit of all changes of one kind."""
-    steps = [step for step in find_steps(made, THROTTLES)
+    steps = [step for step in find_steps(simulated, THROTTLES)
              if (step.after < step.before) == (kind == 'release')]
-    return fit_relaxation(made, kind, steps, THROTTLES, [estimate] * 2, [rms] * 2)
+    return fit_relaxation(simulated, kind, steps, THROTTLES, [estimate] * 2, [rms] * 2)
 
 
 def test_steps_are_found_where_throttle_arrives():
     """Three up, three down; the sample at which it stands still, and one past the stay."""
-    made = steps_of(1)
-    steps = find_steps(made, THROTTLES)
+    simulated = steps_of(1)
+    steps = find_steps(simulated, THROTTLES)
     assert [(step.before, step.after) for step in steps] == [(0, 1), (1, 0)] * 3
     assert [step.enter for step in steps] == [1000, 2000, 3000, 4000, 5000, 6000]
     assert [step.stop for step in steps] == [2000, 3000, 4000, 5000, 6000, 7000]
@@ -64,18 +64,18 @@ def test_steps_are_found_where_throttle_arrives():
 
 def test_passing_through_a_level_is_no_stay_there():
     """A ramp over 0.4 s crosses a level at 20 %: one step, from below to above."""
-    made = steps_of(1, ramp=0.4)
-    steps = find_steps(made, (0.0, 0.2, 0.4))
+    simulated = steps_of(1, ramp=0.4)
+    steps = find_steps(simulated, (0.0, 0.2, 0.4))
     assert [(step.before, step.after) for step in steps] == [(0, 2), (2, 0)] * 3
     # It has arrived within the width of the level.
-    assert made.throttle[steps[0].enter] == pytest.approx(0.38, abs=0.002)
+    assert simulated.throttle[steps[0].enter] == pytest.approx(0.38, abs=0.002)
 
 
 def test_no_steps_without_levels():
     """An unknown throttle, one level, a pause between two."""
-    made = steps_of(1)
-    assert find_steps(made, (math.nan,)) == () == find_steps(made, (0.4,))
-    apart = replace(made, t=made.t + np.where(made.t >= 1.0, 30.0, 0.0))
+    simulated = steps_of(1)
+    assert find_steps(simulated, (math.nan,)) == () == find_steps(simulated, (0.4,))
+    apart = replace(simulated, t=simulated.t + np.where(simulated.t >= 1.0, 30.0, 0.0))
     assert len(find_steps(apart, THROTTLES)) == 5
 
 
@@ -85,12 +85,12 @@ def test_the_fit_is_that_of_dense_generalised_least_squares():
 
     With tau held where the fast fit has it; 500 samples.
     """
-    made = steps_of(2, changes=1)
-    fit = fitted(made)
+    simulated = steps_of(2, changes=1)
+    fit = fitted(simulated)
     (change,) = fit.releases
-    start = int(np.searchsorted(made.t, change.t))
-    since = made.t[start:start + change.n] - change.t
-    y = made.voltage[start:start + change.n]
+    start = int(np.searchsorted(simulated.t, change.t))
+    since = simulated.t[start:start + change.n] - change.t
+    y = simulated.voltage[start:start + change.n]
     distance = np.abs(np.subtract.outer(since, since))
     cov = cho_factor(VAR_INF * np.exp(-ALPHA * distance) + NOISE ** 2 * np.eye(y.size))
     decay = np.exp(-since / fit.tau)
@@ -128,10 +128,10 @@ def test_intervals_of_tau_hold(options):
     assert all(0.03 / reach < fit.tau_low and fit.tau_high < 0.03 * reach for fit in fits)
 
 
-def test_nothing_is_seen_where_nothing_relaxes():
+def test_nothing_is_detected_where_nothing_relaxes():
     """Noise alone; of 60 recordings none is seen (p = 1e-4 each)."""
     fits = [fitted(steps_of(seed, sag=0.0, changes=1)) for seed in range(60)]
-    assert not any(fit.seen or fit.moves_on for fit in fits)
+    assert not any(fit.detected or fit.moves_on for fit in fits)
     assert all(math.isnan(fit.tau_low) for fit in fits)
     assert judge_cause(fits[0], KNOWN).sentence.startswith('Nothing is seen to relax')
 
@@ -157,31 +157,31 @@ def test_noise_of_the_level_before_is_no_relaxation():
     seen to relax, for their first deviations have 36 times its variance.
     """
     for seed in range(40):
-        made, estimates = louder_at_load(seed)
-        steps = find_steps(made, THROTTLES)
+        simulated, estimates = louder_at_load(seed)
+        steps = find_steps(simulated, THROTTLES)
         for down in (True, False):
-            fit = fit_relaxation(made, 'release' if down else 'load',
+            fit = fit_relaxation(simulated, 'release' if down else 'load',
                                  [step for step in steps if (step.after < step.before) == down],
                                  THROTTLES, estimates, [0.009, 0.054])
             assert len(fit.releases) == (2 if down else 3)
-            assert not (fit.seen or fit.moves_on), (seed, down)
+            assert not (fit.detected or fit.moves_on), (seed, down)
             assert all(change.beyond_p > 1e-4 for change in fit.releases)
 
 
 def test_a_drift_that_goes_on_is_no_relaxation():
     """0.2 V/s over all of the second watched: it moves, and has no tau."""
-    made = steps_of(3, sag=0.0)
-    fit = fitted(replace(made, voltage=made.voltage + 0.8 * np.mod(made.t, 1.0)))
-    assert fit.moves_on and not fit.seen
+    simulated = steps_of(3, sag=0.0)
+    fit = fitted(replace(simulated, voltage=simulated.voltage + 0.8 * np.mod(simulated.t, 1.0)))
+    assert fit.moves_on and not fit.detected
     assert 'moves on' in judge_cause(fit, KNOWN).sentence
 
 
 def test_white_noise_without_a_fit_is_enough():
     """A level without a relaxation of its own: its rms stands for the noise."""
-    made = steps_of(4)
+    simulated = steps_of(4)
     rng = np.random.default_rng(4)
-    quiet = made.voltage - simulate(made.t, ALPHA, SIGMA, rng, u0=0.0)
-    fit = fitted(replace(made, voltage=quiet), estimate=Estimate(status=Status.NO_RELAXATION),
+    quiet = simulated.voltage - simulate(simulated.t, ALPHA, SIGMA, rng, u0=0.0)
+    fit = fitted(replace(simulated, voltage=quiet), estimate=Estimate(status=Status.NO_RELAXATION),
                  rms=NOISE)
     assert fit.tau_low < 0.03 < fit.tau_high and fit.tau_high / fit.tau_low < 1.2
 
@@ -213,11 +213,11 @@ def test_tau_of_the_noise_agrees_and_little_data_tells_nothing():
 
 def test_overshoot_is_measured_and_judged():
     """A hump of 0.3 V beyond the level: seen; without it the depth is that of noise."""
-    made = steps_of(9)
-    plain = fitted(made)
-    since = np.mod(made.t, 2.0)
+    simulated = steps_of(9)
+    plain = fitted(simulated)
+    since = np.mod(simulated.t, 2.0)
     hump = np.where(since < 1.0, 0.3 * np.exp(-0.5 * ((since - 0.2) / 0.01) ** 2), 0.0)
-    humped = fitted(replace(made, voltage=made.voltage + hump))
+    humped = fitted(replace(simulated, voltage=simulated.voltage + hump))
     assert all(change.beyond_p > 0.05 for change in plain.releases)
     assert all(change.beyond_p < 1e-3 and change.beyond == pytest.approx(0.3, abs=0.12)
                for change in humped.releases)
@@ -232,12 +232,12 @@ def test_rises_are_fitted_alike():
 
 def behind_a_high_pass(seed, tau):
     """Return the fit of falls of 1 V of a rail of that tau behind a high-pass of 15.9 ms."""
-    made = steps_of(11, tau=tau, sag=1.0)
-    sag = made.voltage - steps_of(11, tau=tau, sag=0.0).voltage
+    simulated = steps_of(11, tau=tau, sag=1.0)
+    sag = simulated.voltage - steps_of(11, tau=tau, sag=0.0).voltage
     rng = np.random.default_rng(seed)
-    noise = simulate(made.t, ALPHA, 0.1, rng, u0=0.0) + rng.normal(0.0, NOISE, made.n)
+    noise = simulate(simulated.t, ALPHA, 0.1, rng, u0=0.0) + rng.normal(0.0, NOISE, simulated.n)
     shape = butter(1, 10.0, 'high', fs=1000.0)
-    return fitted(replace(made, voltage=5.0 + lfilter(*shape, sag) + noise),
+    return fitted(replace(simulated, voltage=5.0 + lfilter(*shape, sag) + noise),
                   estimate=replace(ESTIMATE, sigma=0.1, var_inf=0.01 / (2.0 * ALPHA)))
 
 

@@ -2,7 +2,6 @@
 
 import math
 
-from made_recordings import ALPHA
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.quality import Severity, unsettled
@@ -11,6 +10,7 @@ from ou_monitor.model.ou import simulate
 from ou_monitor.records import Estimate, Recording, Status
 import pytest
 from scipy.signal import lfilter
+from simulated_recordings import ALPHA
 
 GOOD = Estimate(alpha=ALPHA, sigma=0.3, var_inf=7e-4, u0=5.0, alpha_se=0.05, status=Status.OK)
 

@@ -2,11 +2,11 @@
 
 import math
 
-from made_recordings import ALPHA, recording
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.spectrum import level_spectrum, ou_spectrum
 import pytest
+from simulated_recordings import ALPHA, recording
 
 
 def test_the_curve_holds_the_whole_variance():
@@ -40,9 +40,9 @@ def test_measured_and_true_spectrum_agree():
     bins; the mean of 60 or more is known to 35 % / sqrt(60) = 5 %.
     A two-sided or badly scaled density is off by 2.
     """
-    made = recording(1, ((0.1, 0.3),), seconds=60.0)
-    (level,) = analyze(made).levels
-    found = level_spectrum(made, level.segments, level.estimate)
+    simulated = recording(1, ((0.1, 0.3),), seconds=60.0)
+    (level,) = analyze(simulated).levels
+    found = level_spectrum(simulated, level.segments, level.estimate)
     frequency, density = found.frequency, found.density
     assert frequency.size >= 60 and frequency[0] > 0.0 and frequency[-1] < 500.0
     ratio = density / ou_spectrum(frequency, ALPHA, 0.3, 1000.0)
@@ -53,6 +53,6 @@ def test_measured_and_true_spectrum_agree():
 
 def test_short_segments_give_nothing():
     """Fewer than 32 samples: empty arrays."""
-    made = recording(2, ((0.1, 0.3),), seconds=0.02)
-    (level,) = analyze(made).levels
-    assert level_spectrum(made, level.segments, level.estimate).frequency.size == 0
+    simulated = recording(2, ((0.1, 0.3),), seconds=0.02)
+    (level,) = analyze(simulated).levels
+    assert level_spectrum(simulated, level.segments, level.estimate).frequency.size == 0

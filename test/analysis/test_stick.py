@@ -17,12 +17,12 @@ def recording(sag, jitter, seed=1):
 
 def test_the_sag_of_a_swaying_stick_goes_and_the_levels_stay():
     """0.5 V at full throttle and a sway of 1 %: 3.5 mV rms beside 2 mV of noise."""
-    made = recording(0.5, 0.01)
-    levels = find_levels(made.t, made.throttle)
-    voltage = without_jitter(made, levels)
+    simulated = recording(0.5, 0.01)
+    levels = find_levels(simulated.t, simulated.throttle)
+    voltage = without_jitter(simulated, levels)
     for level in levels:
         (s,) = level.segments
-        raw, left = made.voltage[s.start:s.stop], voltage[s.start:s.stop]
+        raw, left = simulated.voltage[s.start:s.stop], voltage[s.start:s.stop]
         assert raw.std() > 0.0036
         # The standard deviation of 1900 values is known to 1.6 %.
         assert abs(left.std() / 0.002 - 1.0) < 0.08
@@ -31,13 +31,14 @@ def test_the_sag_of_a_swaying_stick_goes_and_the_levels_stay():
 
 def test_a_throttle_that_stands_still_changes_nothing():
     """Not a bit of the voltage."""
-    made = recording(0.5, 0.0)
-    assert np.array_equal(without_jitter(made, find_levels(made.t, made.throttle)), made.voltage)
+    simulated = recording(0.5, 0.0)
+    levels = find_levels(simulated.t, simulated.throttle)
+    assert np.array_equal(without_jitter(simulated, levels), simulated.voltage)
 
 
 def test_without_throttle_the_voltage_is_as_it_was():
     """One level that holds everything has no stick."""
-    made = recording(0.5, 0.01)
-    blind = Recording(made.t, made.voltage, np.full(made.t.size, np.nan), 'made')
+    simulated = recording(0.5, 0.01)
+    blind = Recording(simulated.t, simulated.voltage, np.full(simulated.t.size, np.nan), 'made')
     assert np.array_equal(without_jitter(blind, find_levels(blind.t, blind.throttle)),
-                          made.voltage)
+                          simulated.voltage)

@@ -3,13 +3,13 @@
 from dataclasses import replace
 import math
 
-from made_recordings import recording, without_throttle
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.quality import NOISE_UNKNOWN, quality_list
 from ou_monitor.analysis.words import cautions, headline
 from ou_monitor.records import Flag
 from ou_monitor.text import number
 import pytest
+from simulated_recordings import recording, without_throttle
 
 TRUTH = ((0.1, 0.3156), (0.4, 0.632))
 
@@ -35,8 +35,8 @@ def test_headline_tells_growth_with_its_interval():
 
 def test_headline_of_one_level_and_of_none():
     """One level is described; without any the reader is told why."""
-    made = without_throttle(recording(4, ((0.1, 0.3),)))
-    assert headline(analyze(made)).startswith('The supply wanders with sigma = 0.')
+    simulated = without_throttle(recording(4, ((0.1, 0.3),)))
+    assert headline(analyze(simulated)).startswith('The supply wanders with sigma = 0.')
     short = recording(5, ((0.1, 0.3),), seconds=0.012)
     analysis = analyze(short)
     assert headline(analysis) == ('No load level of this recording can be fitted. '
@@ -45,10 +45,10 @@ def test_headline_of_one_level_and_of_none():
 
 def test_headline_warns_of_what_changes_its_own_numbers():
     """Millivolts; nothing where nothing is wrong."""
-    made = recording(1, TRUTH)
-    assert 'Beware' not in headline(analyze(made))
-    told = headline(analyze(replace(made, voltage=1e3 * made.voltage)))
-    assert told.endswith('Beware: the voltages seem to be millivolts or counts, not volts.')
+    simulated = recording(1, TRUTH)
+    assert 'Beware' not in headline(analyze(simulated))
+    sentence = headline(analyze(replace(simulated, voltage=1e3 * simulated.voltage)))
+    assert sentence.endswith('Beware: the voltages seem to be millivolts or counts, not volts.')
 
 
 def test_the_same_caution_of_two_levels_is_said_once():

@@ -33,7 +33,7 @@ def test_a_throttle_that_only_rises_has_no_loop_and_a_constant_one_nothing():
     assert not dict(throttle_paths(np.full(N, 0.5), KEEP))
 
 
-def test_a_relay_in_the_mean_is_seen_by_its_loop_and_not_by_growth():
+def test_the_loop_statistic_detects_a_relay_in_the_mean_and_growth_does_not():
     rng = np.random.default_rng(2)
     u = throttle(rng)
     state, out = 1.0, np.empty(N)
@@ -42,18 +42,18 @@ def test_a_relay_in_the_mean_is_seen_by_its_loop_and_not_by_growth():
         out[k] = state
     mean = 2.0 * out
     errors = rng.standard_normal(N) + mean - KEEP * np.concatenate((mean[:1], mean[:-1]))
-    seen = {name: score(errors, path) for name, path in throttle_paths(u, KEEP)}
-    assert seen['loop of throttle 28 to 72 %'] > 4.8
-    assert abs(seen['growing effect of throttle']) < 4.0
+    statistics_of = {name: score(errors, path) for name, path in throttle_paths(u, KEEP)}
+    assert statistics_of['loop of throttle 28 to 72 %'] > 4.8
+    assert abs(statistics_of['growing effect of throttle']) < 4.0
 
 
-def test_an_effect_of_throttle_that_grows_is_seen():
+def test_an_effect_of_throttle_that_grows_is_detected():
     rng = np.random.default_rng(3)
     u = throttle(rng)
     mean = 12.0 * np.linspace(-1.0, 1.0, N) * (u - u.mean())
     errors = rng.standard_normal(N) + mean - KEEP * np.concatenate((mean[:1], mean[:-1]))
-    seen = {name: score(errors, path) for name, path in throttle_paths(u, KEEP)}
-    assert seen['growing effect of throttle'] > 5.0
+    statistics_of = {name: score(errors, path) for name, path in throttle_paths(u, KEEP)}
+    assert statistics_of['growing effect of throttle'] > 5.0
 
 
 def test_large_ones_are_the_first_of_each_group_and_what_laws_have_found():
@@ -86,21 +86,21 @@ def test_after_large_errors_of_independent_scores_nothing_follows():
 
 
 @pytest.mark.parametrize('sign', (1.0, -1.0))
-def test_a_ramp_after_each_large_error_is_seen_with_its_sign(sign):
+def test_a_ramp_after_each_large_error_is_detected_with_its_sign(sign):
     rng = np.random.default_rng(5)
     w = rng.standard_normal(N)
     for at in range(300, N - 300, 400):
         w[at] = 6.0 * sign
         w[at + 16:at + 64] += 0.5 * sign
-    seen = dict(after_large(w, w * w - np.mean(w * w), large_ones(w)))
+    statistics_of = dict(after_large(w, w * w - np.mean(w * w), large_ones(w)))
     # 19 windows of 48 samples: 0.5 sqrt(912) = 15 standard deviations.
-    assert seen['after large errors 16 to 64'] == pytest.approx(15.1, abs=4.0)
-    assert abs(seen['after large errors 256 to 1024']) < 5.0
+    assert statistics_of['after large errors 16 to 64'] == pytest.approx(15.1, abs=4.0)
+    assert abs(statistics_of['after large errors 256 to 1024']) < 5.0
 
 
-def test_few_large_errors_tell_nothing_and_short_recordings_have_no_long_windows():
+def test_few_large_errors_are_not_tested_and_short_recordings_have_no_long_windows():
     w = np.random.default_rng(6).standard_normal(300)
-    seen = dict(after_large(w, w * w - 1.0, np.zeros(300)))
-    assert set(seen.values()) == {0.0}
-    assert 'after large errors 16 to 64' in seen
-    assert 'after large errors 64 to 256' not in seen
+    statistics_of = dict(after_large(w, w * w - 1.0, np.zeros(300)))
+    assert set(statistics_of.values()) == {0.0}
+    assert 'after large errors 16 to 64' in statistics_of
+    assert 'after large errors 64 to 256' not in statistics_of

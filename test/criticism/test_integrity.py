@@ -22,7 +22,7 @@ def rail(seed, n=20_000, rate=RATE, alpha=ALPHA, u0=5.0):
     return t, simulate(t, alpha, SIGMA, np.random.default_rng(seed), u0=u0)
 
 
-def seen(t, v, u=None):
+def examined(t, v, u=None):
     """Examine a recording."""
     return examine(Recording(t, v, np.full(t.size, np.nan) if u is None else u, 'made'))
 
@@ -37,7 +37,7 @@ def names(found):
 def test_a_plain_rail_has_nothing(seed, rounded):
     """Neither in float64 nor after float32; no sample is lost."""
     t, v = rail(seed, u0=16.0)
-    found = seen(t, v.astype(np.float32).astype(float) if rounded else v)
+    found = examined(t, v.astype(np.float32).astype(float) if rounded else v)
     assert names(found) == [] and found.samples.n == t.size and found.samples.even
     assert found.raw is None
 
@@ -47,7 +47,7 @@ def test_repeats_are_dropped(factor):
     """The source's own rate and stamps come back, whole ratio or not."""
     t, v = rail(1)
     begun = np.floor(np.floor(np.arange(t.size) / factor) * factor).astype(int)
-    found = seen(t, v[begun])
+    found = examined(t, v[begun])
     assert names(found) == ['held_samples']
     assert found.exact[0].rate == pytest.approx(RATE / factor, rel=1e-3)
     assert abs(found.samples.n - t.size / factor) <= 3
@@ -62,7 +62,7 @@ def test_lost_conversions_are_repeats():
     fresh = np.random.default_rng(5).random(t.size) > 0.3
     fresh[0] = True
     held = v[np.maximum.accumulate(np.where(fresh, np.arange(t.size), 0))]
-    found = seen(t, held)
+    found = examined(t, held)
     assert names(found) == ['held_samples'] and found.samples.n == fresh.sum()
     assert np.array_equal(found.samples.t, t[fresh])
 
@@ -76,7 +76,7 @@ def test_steps_are_found_and_named_where_they_matter(share, offset):
     coded = offset + step * np.rint(v / step)
     coded = coded.astype(np.float32).astype(float)
     assert find_step(coded) == pytest.approx(step, rel=1e-3)
-    found = seen(t, coded)
+    found = examined(t, coded)
     assert names(found) == (['quantization'] if share > 0.3 else [])
     assert found.samples.n == t.size
     assert any('ADC counts' in note for note in found.notes)
@@ -85,7 +85,7 @@ def test_steps_are_found_and_named_where_they_matter(share, offset):
 def test_no_lattice_in_what_is_rounded_to_text():
     """Six digits of a continuous voltage are no ADC that matters."""
     t, v = rail(4)
-    assert names(seen(t, np.round(v, 5))) == []
+    assert names(examined(t, np.round(v, 5))) == []
 
 
 @pytest.mark.parametrize('step', [0.0, 0.3 * STEP_STD])
@@ -96,7 +96,7 @@ def test_rails_are_found(step, sides):
     v = step * np.rint(v / step) if step else v
     low, high = np.quantile(v, [0.04, 0.96])
     clipped = np.clip(v, low if sides != 'high' else -np.inf, high if sides != 'low' else np.inf)
-    found = seen(t, clipped)
+    found = examined(t, clipped)
     (term,) = [term for term in found.exact if term.NAME == 'saturation']
     s = found.samples.voltage
     assert (term.low == low) == (sides != 'high') and (term.high == high) == (sides != 'low')
@@ -122,7 +122,7 @@ def test_a_rail_at_rest_is_no_clipping():
     assert find_rails(v, 0.1, 0.01) == (-math.inf, math.inf)
 
 
-def test_wrong_stamps_are_told_from_uneven_sampling():
+def test_wrong_stamps_differ_from_uneven_sampling():
     """The same stamps: wrong over an even sampling, true where the samples were taken there."""
     rng = np.random.default_rng(7)
     t, v = rail(7)
@@ -130,7 +130,7 @@ def test_wrong_stamps_are_told_from_uneven_sampling():
     wrong = judge_stamps(stamps, v)
     assert wrong.error == pytest.approx((stamps - t).std(), rel=0.01)
     assert np.abs(wrong.t - t).max() < 0.02 / RATE
-    assert names(seen(stamps, v)) == ['clock_jitter']
+    assert names(examined(stamps, v)) == ['clock_jitter']
     true = simulate(stamps, ALPHA, SIGMA, rng, u0=5.0)
     right = judge_stamps(stamps, true)
     assert right.error == 0.0 and np.array_equal(right.t, stamps)
@@ -141,7 +141,7 @@ def test_gaps_stay():
     t, v = rail(8)
     keep = np.ones(t.size, bool)
     keep[5000:5400] = keep[9000:9003] = False
-    found = seen(t[keep], v[keep])
+    found = examined(t[keep], v[keep])
     assert np.array_equal(found.samples.t, t[keep])
     assert any('2 gaps' in note and '0.401 s' in note for note in found.notes)
 
@@ -156,7 +156,7 @@ def test_what_is_not_finite_or_not_in_order():
     order = np.arange(t.size)
     order[[700, 701]] = 701, 700
     t2 = np.append(t[order], t[300])
-    found = seen(t2, np.append(v[order], v[300]), np.append(u[order], u[300]))
+    found = examined(t2, np.append(v[order], v[300]), np.append(u[order], u[300]))
     assert np.allclose(found.samples.t, expected, atol=1e-9)
     assert found.samples.throttle[0] == u[1] and np.isfinite(found.samples.throttle).all()
     assert found.samples.throttle[499] == u[499]
@@ -169,7 +169,7 @@ def test_too_little(n, value):
     """Two samples, a constant, none at all: a reason, no exception."""
     t = np.arange(n) / RATE
     v = rail(1, n)[1] if value is None and n else np.full(n, value or 0.0)
-    found = seen(t, v)
+    found = examined(t, v)
     assert found.samples is None and found.reason.endswith('.')
 
 
@@ -177,7 +177,7 @@ def test_too_little(n, value):
 def test_throttle_that_says_nothing(u, word):
     """It is left out, and the causes that need it are said to be untestable."""
     t, v = rail(1, 2000)
-    found = seen(t, v, None if u is None else np.full(t.size, u))
+    found = examined(t, v, None if u is None else np.full(t.size, u))
     assert found.samples.throttle is None
     (note,) = [note for note in found.notes if 'cannot be tested' in note]
     assert word in note and 'load_sag' in note and 'throttle_tone' in note
@@ -237,14 +237,14 @@ def test_a_line_faster_than_the_samples_used_is_found_in_all():
     turn = 2.0 * math.pi * 31_234.5 / rate
     amplitude = math.sqrt(60.0 * 4.0 * step**2 / n) / abs(1.0 - np.exp(-1j * turn))
     line = amplitude * np.sin(2.0 * math.pi * 31_234.5 * (t - t[0]) + 1.0)
-    assert not names(seen(t, v))
-    found = seen(t, v + line)
+    assert not names(examined(t, v))
+    found = examined(t, v + line)
     (tone,) = [term for term in found.exact if term.NAME == 'tone']
     assert tone.frequency == pytest.approx(31_234.5, abs=0.1)
     assert tone.amplitude == pytest.approx(amplitude, rel=4.0 * math.sqrt(1.0 / 120.0))
     assert any('31234.5 Hz' in note for note in found.notes)
     # What is left of it at the samples used.
-    plain = seen(t, v).samples
+    plain = examined(t, v).samples
     rest = found.samples.voltage - plain.voltage
     assert np.abs(rest).max() < 6.0 * math.sqrt(2.0 / 120.0) * amplitude
 
@@ -262,7 +262,7 @@ def test_events_that_only_neighbours_show_are_kept():
     assert kept.size <= 3 * where.size
     u = np.where(np.arange(n) < where[1], 0.2, 0.6)
     assert not {where[1] - 1, where[1]} & {*events_between(v, u, rate, plain)}
-    found = seen(t, v)
+    found = examined(t, v)
     assert found.samples.n == v[plain].size + kept.size
     assert (np.diff(found.samples.t) > 0.0).all()
     assert not events_between(rail(14, n, rate)[1], None, rate, plain).size

@@ -2,9 +2,8 @@
 
 import math
 
-from made_recordings import ALPHA
 import numpy as np
-from ou_monitor.analysis.level_result import fit_stretch
+from ou_monitor.analysis.level_result import fit_segment
 from ou_monitor.criticism.innovations import fresh, innovations
 from ou_monitor.criticism.level_tests import (
     EFFECT, examine_level, FAMILY_WISE, holm, Shape, TestResult)
@@ -12,6 +11,7 @@ from ou_monitor.model.ou import simulate
 from ou_monitor.records import Estimate, Flag, Recording, Status
 import pytest
 from scipy import stats
+from simulated_recordings import ALPHA
 
 SIGMA = 0.3156
 VAR_INF = SIGMA ** 2 / (2.0 * ALPHA)
@@ -66,7 +66,7 @@ def test_false_alarms_of_a_whole_recording():
     for seed in range(200):
         rng = np.random.default_rng(5000 + seed)
         voltage = ou(seed) + rng.normal(0.0, 0.003, T.size)
-        estimate = fit_stretch(Recording(T, voltage, np.full(T.size, 0.1)), 0, T.size)
+        estimate = fit_segment(Recording(T, voltage, np.full(T.size, 0.1)), 0, T.size)
         found = examined(voltage, estimate)
         alarms += any(test.rejects for test in found.tests if test.name != 'correlated')
     assert alarms <= 7
@@ -180,11 +180,11 @@ def test_few_samples_are_not_tested(n):
 
 def test_holm_is_that_of_the_textbook():
     """Sorted p-values times what is left, never falling; NaN takes no part."""
-    def made(*p):
+    def simulated(*p):
         return Shape(tuple(TestResult('gaussian', value, 1.0) for value in p), 100, 0.0, 0.0, 0,
                      (0.0, 0.0, 0.0))
 
-    first, second = holm([made(0.01, math.nan, 0.03), made(0.02, 0.5)])
+    first, second = holm([simulated(0.01, math.nan, 0.03), simulated(0.02, 0.5)])
     assert [test.p_adjusted for test in first.tests] == pytest.approx(
         [0.04, math.nan, 0.06], nan_ok=True)
     assert [test.p_adjusted for test in second.tests] == pytest.approx([0.06, 0.5])

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 RATE, ALPHA, SIGMA = 1000.0, 63.0, 0.3
 
 
-def made(tone, seed, seconds=20.0, frequency=120.3):
+def simulated(tone, seed, seconds=20.0, frequency=120.3):
     """Return 20 s of an OU of 27 mV, 3 mV of white noise and a tone of that rms, V."""
     rng = np.random.default_rng(seed)
     n = int(seconds * RATE)
@@ -34,7 +34,7 @@ def test_a_steady_tone_goes_and_the_rest_stays():
     The noise has 3.3e-7 V^2/Hz at 120 Hz; the largest of three bins of 0.25 Hz has some 1.8 times
     the mean: 0.39 mV, in each of five pieces with an error of a third.
     """
-    noisy, clean = made(0.02, 1), made(0.0, 1)
+    noisy, clean = simulated(0.02, 1), simulated(0.0, 1)
     search = find_lines([noisy.voltage], RATE, white=[
         lfilter([1.0, -np.exp(-ALPHA / RATE)], [1.0], noisy.voltage - noisy.voltage.mean())])
     assert [round(line.frequency) for line in search.lines] == [120]
@@ -52,7 +52,7 @@ def test_a_faint_tone_does_not_bias_alpha_and_sigma():
     """
     holds = {'alpha': 0, 'sigma': 0}
     for seed in range(20):
-        (level,) = analyze(made(0.004, seed)).levels
+        (level,) = analyze(simulated(0.004, seed)).levels
         assert level.lines.lines
         assert level.with_lines.sigma > level.estimate.sigma
         for name, truth in (('alpha', ALPHA), ('sigma', SIGMA)):
@@ -63,7 +63,7 @@ def test_a_faint_tone_does_not_bias_alpha_and_sigma():
 
 def test_what_the_line_would_have_done_is_said():
     """The quality list names the level's alpha and sigma with the line."""
-    analysis = analyze(made(0.02, 3))
+    analysis = analyze(simulated(0.02, 3))
     (level,) = analysis.levels
     (item,) = [one for one in analysis.quality if one.name == 'LINES_TAKEN_OUT']
     assert item.severity is Severity.WARNING

@@ -2,13 +2,13 @@
 
 import math
 
-from made_recordings import ALPHA
 import numpy as np
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.spectral_lines import find_lines, tail
 import pytest
 from scipy import signal
 from scipy.signal import lfilter
+from simulated_recordings import ALPHA
 
 RATE = 1000.0
 MEMORY = math.exp(-ALPHA / RATE)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
-from ou_monitor.analysis.level_result import fit_level, fit_stretch
+from ou_monitor.analysis.level_result import fit_level, fit_segment
 from ou_monitor.analysis.levels import LoadLevel, Segment
 from ou_monitor.criticism.battery import statistics
 from ou_monitor.criticism.composite import (
@@ -52,26 +52,26 @@ def both(request):
     recording = Recording(samples.t, samples.voltage, np.full(samples.n, NAN), 'same')
     level = fit_level(recording, recording, LoadLevel(NAN, (Segment(0, samples.n),)), 1)
     # Lines were found before they were taken out of the fit.
-    seen = level.with_lines or level.estimate
-    if seen.usable:
-        terms = [OU(seen.alpha, seen.sigma, float(samples.voltage.mean()))]
-        if seen.noise_std > 0.0:
-            terms.append(MeasurementNoise(seen.noise_std))
+    fit = level.with_lines or level.estimate
+    if fit.usable:
+        terms = [OU(fit.alpha, fit.sigma, float(samples.voltage.mean()))]
+        if fit.noise_std > 0.0:
+            terms.append(MeasurementNoise(fit.noise_std))
         gaussian = evaluate(samples, terms)
     else:
         start = OU(1.0 / float(np.median(samples.step[1:])), 1.0, float(samples.voltage.mean()))
         gaussian = fit_composite(samples, [start], slice(0, samples.n)).gaussian
-    return samples, level, seen, view_of(samples, gaussian, gaussian.z, slice(0, samples.n))
+    return samples, level, fit, view_of(samples, gaussian, gaussian.z, slice(0, samples.n))
 
 
 def test_the_scores_are_the_same(both):
     """To 5e-3 of a standard deviation, on an even clock: one of the two takes a settled gain."""
-    samples, _, seen, view = both
-    if not seen.usable or np.ptp(np.diff(samples.t)) > 1e-3 * samples.step[1]:
+    samples, _, fit, view = both
+    if not fit.usable or np.ptp(np.diff(samples.t)) > 1e-3 * samples.step[1]:
         pytest.skip('no OU in white noise, or an uneven clock')
-    noise = seen.noise_std ** 2 if seen.noise_std > 0.0 else 0.0
-    z = innovations(samples.t, samples.voltage - samples.voltage.mean(), seen.alpha,
-                    seen.sigma ** 2 / (2.0 * seen.alpha), noise)
+    noise = fit.noise_std ** 2 if fit.noise_std > 0.0 else 0.0
+    z = innovations(samples.t, samples.voltage - samples.voltage.mean(), fit.alpha,
+                    fit.sigma ** 2 / (2.0 * fit.alpha), noise)
     assert z == pytest.approx(view.z, abs=5e-3)
 
 
@@ -89,14 +89,14 @@ def test_the_lines_are_the_same(both):
 
 def test_another_pole_is_the_same(both):
     """A second relaxation and an AC coupling, from the scores of either."""
-    samples, _, seen, view = both
-    if not seen.usable:
+    samples, _, fit, view = both
+    if not fit.usable:
         pytest.skip('no OU in white noise')
-    noise = seen.noise_std ** 2 if seen.noise_std > 0.0 else 0.0
-    var_inf = seen.sigma ** 2 / (2.0 * seen.alpha)
-    z = innovations(samples.t, samples.voltage - samples.voltage.mean(), seen.alpha, var_inf,
+    noise = fit.noise_std ** 2 if fit.noise_std > 0.0 else 0.0
+    var_inf = fit.sigma ** 2 / (2.0 * fit.alpha)
+    z = innovations(samples.t, samples.voltage - samples.voltage.mean(), fit.alpha, var_inf,
                     noise)
-    found = [other_pole([scores], view.rate, seen.alpha, var_inf, noise)
+    found = [other_pole([scores], view.rate, fit.alpha, var_inf, noise)
              for scores in (z, view.z)]
     for name in ('second_p', 'coupling_p'):
         ours, theirs = (getattr(pole, name) for pole in found)
@@ -164,7 +164,7 @@ def over_throttle(*terms, seed):
     samples, composite = fitted(*terms, throttle=throttle, seed=seed)
     found = statistics(composite.z, covariates_of(samples, composite))
     recording = Recording(samples.t, samples.voltage, throttle, 'levels')
-    low, high = (fit_stretch(recording, *ends) for ends in ((0, N // 2), (N // 2, N)))
+    low, high = (fit_segment(recording, *ends) for ends in ((0, N // 2), (N // 2, N)))
     alpha, sigma = alpha_constancy((0.2, 0.6), (low, high)), sigma_change(low, high)
     reach = math.log(sigma.ratio_high / sigma.ratio)
     return ((math.copysign(math.sqrt(alpha.statistic), math.log(alpha.ratio)),

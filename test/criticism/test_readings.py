@@ -154,7 +154,7 @@ def test_millivolts_are_said_to_be_taken_as_volts():
     assert any('millivolts' in note for note in notes)
 
 
-def test_unknown_throttle_is_told_with_its_length():
+def test_a_note_gives_the_length_of_unknown_throttle():
     """Two holes: all of it, and the longest."""
     u = np.linspace(0.0, 1.0, N)
     u[100:300] = u[1000:1900] = math.nan

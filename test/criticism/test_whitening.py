@@ -62,7 +62,7 @@ def test_a_single_relaxation_is_called_a_diffusion():
     assert sum(analyze(recording(seed)).levels[0].wanders for seed in range(10)) <= 1
 
 
-def test_too_few_samples_tell_nothing():
+def test_too_few_samples_are_not_tested():
     """NaN, not 0 and not 1."""
     pole = other_pole([np.ones(40)], RATE, ALPHA, 4e-4, 0.0)
     assert np.isnan([pole.second_p, pole.second_share, pole.coupling_p]).all()

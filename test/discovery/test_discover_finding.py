@@ -26,14 +26,14 @@ def finding(**changes):
     sag, tone = LoadSag(0.5, 0.0), Tone(0.01, 50.0, 0.0, 0.0)
     cause = Cause(sag, {'linear': 0.02}, 0.015, 0.002, 1e-9, ('load_transient',), 'It sags.',
                   False)
-    made = {
+    simulated = {
         'recording': 'x', 'n': 10, 'duration': 1.0, 'verdict': Verdict.PARTLY_EXPLAINED,
         'sentence': 's', 'baseline': OU(60.0, 0.3, 5.0), 'baseline_score': 2.0,
         'criticism': (FINE, OFF, WORSE), 'causes': (cause,),
         'model': SupplyModel((OU(61.0, 0.3, 5.0), sag, tone, tone)),
         'se': ({'alpha': 1.0}, {'linear': 0.02}, {}, {}), 'score': 2.015, 'gain': 0.015,
         'gain_se': 0.002, 'crossing': CrossingRate(4.8, 10.0, 20.0, 11.0)}
-    return Finding(**{**made, **changes})
+    return Finding(**{**simulated, **changes})
 
 
 def test_json_is_that_of_the_contract():
@@ -169,7 +169,7 @@ def test_why_a_cause_without_a_gain_is_named():
     assert 'p = ' not in explain(term, {}, 0.001, 0.005, [], True, chance=0.0)
 
 
-def test_gains_that_overlap_are_told():
+def test_gains_that_overlap_are_noted():
     """Where one is larger than that of the whole by more than its error; by name."""
     cause = replace(finding().causes[0], gain=0.7, gain_se=0.1)
     assert 'Without load_sag' in overlap_words([cause], 0.2)
@@ -178,7 +178,7 @@ def test_gains_that_overlap_are_told():
     assert overlap_words([vague], 0.2) == ''
 
 
-def test_what_is_left_may_be_throttle_never_seen():
+def test_what_is_left_may_be_throttle_never_flown():
     """The sentence says so, and which recording would tell."""
     cause = finding().causes[0]
     text = verdict_sentence(

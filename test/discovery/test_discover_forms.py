@@ -72,8 +72,8 @@ def test_levels_that_hide_how_fast_the_rail_relaxes():
     samples = Samples(np.arange(n) / rate, voltage, None)
     plain = fit_gaussian(samples, [OU(60.0, 0.8, 5.0)], samples.train).terms[0]
     assert plain.alpha < 0.3 * alpha
-    made = fit_composite(samples, [plain, RegimeSwitching], samples.train)
-    ou, switching = made.terms
+    simulated = fit_composite(samples, [plain, RegimeSwitching], samples.train)
+    ou, switching = simulated.terms
     # Of 12 s, alpha is known to sqrt(2 / (alpha T)) = 3 %.
     assert ou.alpha == pytest.approx(alpha, rel=0.12)
     assert abs(switching.level) == pytest.approx(0.26, rel=0.05)
@@ -90,9 +90,9 @@ def test_laws_where_a_step_is_long(law, alpha):
     samples = Samples(t, SupplyModel(terms).simulate(t, np.random.default_rng(4)), None)
     whole = slice(0, n)
     plain = fit_gaussian(samples, [terms[0]], whole)
-    made = fit_composite(samples, [plain.terms[0], type(law)], whole)
+    simulated = fit_composite(samples, [plain.terms[0], type(law)], whole)
     state = view_of(samples, plain, plain.z, whole).state
     square = np.clip(state / state.std(), -4.0, 4.0)**2
     assert abs(score(plain.z[1:]**2, square[1:])) > 1.5 * FAR
-    assert abs(score(made.z[1:]**2, square[1:])) < FAR
-    assert abs(score(made.z[1:], state[1:]**3)) < FAR
+    assert abs(score(simulated.z[1:]**2, square[1:])) < FAR
+    assert abs(score(simulated.z[1:], state[1:]**3)) < FAR

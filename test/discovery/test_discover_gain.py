@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 ALPHA, SIGMA = 63.0, 0.3156
 
 
-def made(seed, n=4000, sag=0.0):
+def simulated(seed, n=4000, sag=0.0):
     """Return samples of an OU with a sag, at 1 kHz, throttle of 50 ms steps."""
     rng = np.random.default_rng(seed)
     t = np.arange(n) / 1000.0
@@ -66,7 +66,7 @@ def test_a_true_cause_gains_what_theory_says():
     True model: the densities of the innovations at the true parameters.  The
     fitted one may lose k / (2 n) nats for each of its five parameters.
     """
-    samples = made(1, 20_000, 0.5)
+    samples = simulated(1, 20_000, 0.5)
     start = OU(50.0, 0.3, 4.8)
     plain = fit_composite(samples, [start], samples.train)
     full = fit_composite(samples, [start, LoadSag(0.1, 0.0)], samples.train)
@@ -86,7 +86,7 @@ def test_a_cause_that_is_not_there_gains_nothing():
     """Throttle without sag: within 3.5 errors of 0, p not small, in 20 recordings."""
     chances = []
     for seed in range(20):
-        samples = made(seed)
+        samples = simulated(seed)
         full = fit_composite(samples, [OU(50.0, 0.3, 5.0), LoadSag(0.0, 0.0)], samples.train)
         gain, error, chance = cause_gain(samples, full, without(samples, full, 1))
         assert abs(gain) < 3.5 * error + 2.0 / samples.train.stop
@@ -99,7 +99,7 @@ def test_errors_of_the_mean_are_its_scatter():
     """Sag and level over 40 recordings: scatter known to 11 %, tolerance three times that."""
     found, stated = [], []
     for seed in range(40):
-        samples = made(seed, 2000, 0.4)
+        samples = simulated(seed, 2000, 0.4)
         model = fit_composite(samples, [OU(63.0, 0.3, 5.0), LoadSag(0.4, 0.01)],
                               slice(0, samples.n))
         se = standard_errors(samples, model, slice(0, samples.n))
@@ -118,7 +118,7 @@ def test_crossings_are_counted_downward():
 
 def test_the_level_is_crossed_in_both_parts_and_lies_between_codes():
     """Some crossings on either side; half-way between neighbouring codes."""
-    samples = made(2, 20_000)
+    samples = simulated(2, 20_000)
     step = 0.01
     coded = Samples(samples.t, step * np.rint(samples.voltage / step), None)
     level = crossing_level(coded)
@@ -142,7 +142,7 @@ def test_crossing_rates_of_the_true_model_and_of_a_wrong_one():
 
 def test_a_model_that_cannot_be_simulated_has_no_rate():
     """Sag without throttle: NaN, no exception."""
-    samples = Samples(made(5).t, made(5).voltage, None)
+    samples = Samples(simulated(5).t, simulated(5).voltage, None)
     rates = crossing_rates(samples, (OU(ALPHA, SIGMA, 5.0),),
                            (OU(ALPHA, SIGMA, 5.0), LoadSag(0.5, 0.0)), np.random.default_rng(0))
     assert math.isnan(rates.extended) and math.isfinite(rates.baseline)

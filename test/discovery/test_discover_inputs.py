@@ -21,7 +21,7 @@ RAIL = OU(63.0, 0.3156, 5.0)
 N = 3000
 
 
-def made(n=N, rate=1000.0, terms=(), ou=RAIL, seed=2):
+def simulated(n=N, rate=1000.0, terms=(), ou=RAIL, seed=2):
     """Return stamps, voltage and throttle in steps of 0.4 s."""
     rng = np.random.default_rng(seed)
     t = np.arange(n) / rate
@@ -32,7 +32,7 @@ def made(n=N, rate=1000.0, terms=(), ou=RAIL, seed=2):
 
 def changed(what):
     """Return arrays with something wrong in them."""
-    t, v, u = made()
+    t, v, u = simulated()
     if what == 'no throttle':
         u = np.full(N, math.nan)
     elif what == 'constant throttle':
@@ -75,7 +75,7 @@ QUIET = {
 
 
 @pytest.mark.parametrize('what', sorted(QUIET))
-def test_what_is_wrong_is_told_and_nothing_made_up(what):
+def test_what_is_wrong_is_reported_and_nothing_invented(what):
     """
     A plain rail stays one; what was dropped is a note; numbers are finite or null.
 
@@ -105,7 +105,7 @@ def test_a_rail_is_the_same_in_any_unit_and_era():
 
 def short(what):
     """Return arrays of which nothing can be said."""
-    t, v, u = made()
+    t, v, u = simulated()
     if what == 'two':
         return t[:2], v[:2], u[:2]
     if what == '99':
@@ -136,7 +136,7 @@ def test_too_little_is_insufficient_and_says_why(what):
 @pytest.mark.parametrize('n', [N, 8000])
 def test_one_sample_that_differs_is_no_rail(n):
     """Constant but for one sample: a verdict, never that the plain OU is right."""
-    t, v, u = made(n)
+    t, v, u = simulated(n)
     found = discover(Recording(t, np.where(np.arange(n) == n // 2, 5.1, 5.0), u, 'one'))
     assert found.verdict is not Verdict.NO_EFFECT
     assert not found.gain > 1.96 * found.gain_se
@@ -146,7 +146,7 @@ def test_one_sample_that_differs_is_no_rail(n):
 @pytest.mark.parametrize('n', [100, 101])
 def test_a_hundred_samples_are_enough_to_try(n):
     """A fit, and a gain whose error says how little it is."""
-    found = discover(Recording(*made(n), 'few'))
+    found = discover(Recording(*simulated(n), 'few'))
     assert found.verdict is Verdict.NO_EFFECT and found.baseline is not None
     assert found.gain_se > 0.01
 
@@ -160,20 +160,20 @@ def test_a_user_gets_a_line_and_no_traceback(what, tmp_path, capsys):
     np.savetxt(path, np.column_stack(columns), '%.9g', ',', comments='',
                header='time_s,voltage_v' + ('' if what == 'no throttle' else ',throttle'))
     status = main(['discover', str(path), '--json', str(target)])
-    told = capsys.readouterr()
-    assert 'Traceback' not in told.out + told.err
+    text = capsys.readouterr()
+    assert 'Traceback' not in text.out + text.err
     if status == 2:
-        assert len(told.err.strip().splitlines()) == 1 and str(path) in told.err
+        assert len(text.err.strip().splitlines()) == 1 and str(path) in text.err
         return
     assert status == 0
     data = json.loads(target.read_text())
     assert data['verdict'] == ('insufficient_data' if what in SHORT else 'no_effect')
-    assert ' '.join(data['sentence'].split()) in ' '.join(told.out.split())
+    assert ' '.join(data['sentence'].split()) in ' '.join(text.out.split())
 
 
 def test_ten_hertz_for_ten_minutes():
     """A slow rail with a sag, at the rate of telemetry."""
-    t, v, u = made(6000, 10.0, (LoadSag(0.3, 0.0),), OU(1.0, 0.1, 5.0))
+    t, v, u = simulated(6000, 10.0, (LoadSag(0.3, 0.0),), OU(1.0, 0.1, 5.0))
     found = discover(Recording(t, v, u, 'slow'))
     assert [cause.name for cause in found.causes] == ['load_sag']
     assert found.gain > 3.0 * found.gain_se
@@ -182,7 +182,7 @@ def test_ten_hertz_for_ten_minutes():
 @pytest.mark.parametrize('terms', [(), (LoadSag(1.0, 0.0),)])
 def test_a_long_recording_keeps_the_relaxation_of_the_rail(terms):
     """Steps of a load each 0.4 s, or none: samples 16 ms apart at most, 1/alpha."""
-    _, v, _ = made(3_000_000, 1000.0, terms)
+    _, v, _ = simulated(3_000_000, 1000.0, terms)
     which, note = choose_samples(v, 1000.0)
     assert which.step <= 16 and 'used' in note
     assert len(range(*which.indices(v.size))) <= MOST
@@ -191,7 +191,7 @@ def test_a_long_recording_keeps_the_relaxation_of_the_rail(terms):
 def test_lines_of_one_kind_are_measured_together(monkeypatch):
     """Five lines: one fit without them, the gain of all, and that is said."""
     lines = [Tone(0.01, f, 0.3, 0.0) for f in (31.0, 67.0, 101.0, 149.0, 211.0)]
-    t, v, u = made(8000, 1000.0, lines)
+    t, v, u = simulated(8000, 1000.0, lines)
     fits = []
 
     def counted(*args):

@@ -32,7 +32,7 @@ RAIL = OU(63.0, 0.3156, 5.0)
 STEP_STD = RAIL.sigma * math.sqrt(-math.expm1(-0.126) / 126.0)
 
 
-def made(*terms, seed=1, n=20_000, throttle=True, name='made'):
+def drawn_from(*terms, seed=1, n=20_000, throttle=True, name='made'):
     """Return a recording at 1 kHz, throttle in steps of 0.4 s."""
     rng = np.random.default_rng(seed)
     t = np.arange(n) / 1000.0
@@ -44,7 +44,7 @@ def made(*terms, seed=1, n=20_000, throttle=True, name='made'):
 @pytest.fixture(scope='module')
 def sag():
     """Return what is found of a sag."""
-    return discover(made(LoadSag(0.5, 0.0), n=12_000, name='sag <b>'))
+    return discover(drawn_from(LoadSag(0.5, 0.0), n=12_000, name='sag <b>'))
 
 
 def names(finding):
@@ -59,11 +59,11 @@ def test_nothing_is_found_where_nothing_is():
     At 1 % for the statistics and 5 % for causes, three or more of eight have a chance of
     1 %.
     """
-    verdicts = [discover(made(seed=seed, n=5000)).verdict for seed in range(8)]
+    verdicts = [discover(drawn_from(seed=seed, n=5000)).verdict for seed in range(8)]
     assert verdicts.count(Verdict.NO_EFFECT) >= 6
 
 
-def test_a_sag_is_found_measured_and_worth_its_gain(sag):
+def test_a_sag_is_found_and_its_gain_measured(sag):
     """0.5 V: named alone, within four errors, gain above zero, rail as it is without."""
     assert sag.verdict is Verdict.EXPLAINED and names(sag) == ['load_sag']
     (cause,) = sag.causes
@@ -87,19 +87,19 @@ def test_crossings_come_nearer_to_the_data(sag):
 
 def test_strong_noise_of_the_sensor_is_named():
     """White noise as large as what a step of the rail adds."""
-    found = discover(made(MeasurementNoise(STEP_STD), n=6000))
+    found = discover(drawn_from(MeasurementNoise(STEP_STD), n=6000))
     assert 'measurement_noise' in names(found)
     assert found.gain > 3.0 * found.gain_se
 
 
 def test_a_discharge_is_named():
     """0.4 V in 10 s, fourteen standard deviations of the rail."""
-    assert 'drift' in names(discover(made(Drift(-0.04, 0.0), n=10_000)))
+    assert 'drift' in names(discover(drawn_from(Drift(-0.04, 0.0), n=10_000)))
 
 
 def test_repeats_are_undone_and_the_rail_found_behind():
     """Each value four times: an exact finding; alpha is that of the rail."""
-    found = discover(made(HeldSamples(250.0)))
+    found = discover(drawn_from(HeldSamples(250.0)))
     assert 'held_samples' in names(found)
     cause = found.causes[0]
     assert cause.exact and cause.p_value == 0.0 and cause.gain > 0.0
@@ -112,7 +112,7 @@ def test_repeats_are_undone_and_the_rail_found_behind():
 def test_steps_of_the_adc_are_named_and_in_the_model():
     """A step of 0.7 times the noise: sigma without it is too large."""
     step = 0.7 * STEP_STD
-    found = discover(made(Quantization(step), n=8000))
+    found = discover(drawn_from(Quantization(step), n=8000))
     assert 'quantization' in names(found)
     term = next(term for term in found.model.terms if term.NAME == 'quantization')
     assert term.step == pytest.approx(step, rel=1e-6)
@@ -136,7 +136,7 @@ def test_too_little_is_said_so(recording):
 
 def test_without_throttle_its_causes_are_untestable():
     """They are said to be so, and never named."""
-    found = discover(made(throttle=False, n=4000))
+    found = discover(drawn_from(throttle=False, n=4000))
     assert any('load_sag' in note and 'cannot be tested' in note for note in found.notes)
     assert not any(cause.term.NEEDS_THROTTLE for cause in found.causes)
 
@@ -144,7 +144,7 @@ def test_without_throttle_its_causes_are_untestable():
 def test_same_seed_same_finding_and_progress_to_the_end():
     """Bit for bit; the share done rises to 1."""
     shares = []
-    recording = made(n=4000)
+    recording = drawn_from(n=4000)
     first = discover(recording, seed=3, progress=shares.append)
     assert first.as_data() == discover(recording, seed=3).as_data()
     assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) > 5
@@ -161,7 +161,7 @@ def test_discover_loads_few_modules():
 
 def test_a_path_is_read(tmp_path):
     """A CSV by its name, as a string or a path; a missing one is bad input."""
-    recording = made(n=1500)
+    recording = drawn_from(n=1500)
     path = tmp_path / 'x.csv'
     np.savetxt(path, np.column_stack([recording.t, recording.voltage]), '%.9g', ',', comments='',
                header='time_s,voltage_v')
@@ -234,7 +234,7 @@ def test_a_motor_that_starts_late_gains_nothing_absurd(name):
 
 def test_the_page_of_a_plain_rail_keeps_the_plain_model():
     """No extended model is shown where nothing was added: one picture each, and it is said so."""
-    found = discover(made(seed=2, n=5000))
+    found = discover(drawn_from(seed=2, n=5000))
     assert found.verdict is Verdict.NO_EFFECT
     root = parsed(discovery_page(found))
     text = ' '.join(''.join(root.itertext()).split())

@@ -36,7 +36,7 @@ KINDS = {
     'tone': (Tone(0.006, 37.0, 0.3, 0.0), None)}
 
 
-def made(seed, *terms, seconds=SECONDS):
+def simulated(seed, *terms, seconds=SECONDS):
     """Return stamps, throttle in steps of 0.4 s, and a model's voltage."""
     rng = np.random.default_rng(seed)
     t = np.arange(round(seconds * RATE)) / RATE
@@ -66,7 +66,7 @@ def measured():
     for name, (true, start) in KINDS.items():
         rows = []
         for seed in range(10):
-            samples = made(1000 + seed, true)
+            samples = simulated(1000 + seed, true)
             plain, full = fitted(samples, start)
             scale = Scale(samples, full)
             gain, error = scale.gain(full.density, plain.density)
@@ -109,7 +109,7 @@ def test_the_loss_by_parameters_is_as_large_as_stated():
     true, start = KINDS['load_sag']
     losses, stated, spread = [], [], []
     for seed in range(60):
-        samples = made(seed, true)
+        samples = simulated(seed, true)
         plain, full = fitted(samples, start)
         scale = Scale(samples, full)
         mean, rms = scale.estimation.loss()
@@ -136,7 +136,7 @@ def test_the_error_is_the_scatter_over_recordings_like_this():
     for name in ('measurement_noise', 'load_dependent_sigma'):
         true, start = KINDS[name]
         for seed in range(24):
-            samples = made(3000 + seed, true)
+            samples = simulated(3000 + seed, true)
             plain, full = fitted(samples, start)
             scale = Scale(samples, full)
             gain, error = scale.gain(full.density, plain.density)
@@ -166,10 +166,10 @@ def test_what_discover_says_is_the_gain_of_the_true_model(name, seed):
     that `discover` made; see above for the chance.
     """
     true, _ = KINDS[name]
-    made_of = made(2000 + seed, true, seconds=30.0)
-    found = discover(Recording(made_of.t, made_of.voltage, made_of.throttle, name))
+    simulated_of = simulated(2000 + seed, true, seconds=30.0)
+    found = discover(Recording(simulated_of.t, simulated_of.voltage, simulated_of.throttle, name))
     samples = found.samples
-    assert samples.n == made_of.n
+    assert samples.n == simulated_of.n
     scored = samples.covered
     plain = evaluate(samples, (found.baseline,)).density
     assert found.baseline_score == pytest.approx(float(plain[scored].mean()), abs=1e-9)
@@ -180,7 +180,7 @@ def test_what_discover_says_is_the_gain_of_the_true_model(name, seed):
 
 def late_start(seed=1):
     """Return a recording whose throttle is still until 70 % of it, and then moves."""
-    samples = made(seed, LoadSag(0.3, 0.0))
+    samples = simulated(seed, LoadSag(0.3, 0.0))
     still = round(0.7 * samples.n)
     u = samples.throttle.copy()
     u[:still] = 0.0
@@ -188,7 +188,7 @@ def late_start(seed=1):
     return Samples(samples.t, v, u)
 
 
-def test_samples_at_throttle_never_seen_are_not_scored():
+def test_samples_at_throttle_never_fitted_are_not_scored():
     """Throttle still in the first part: only still samples of the rest count."""
     samples = late_start()
     scored = samples.covered
@@ -223,7 +223,7 @@ def test_a_part_determined_by_a_moment_is_uncertain_and_not_absurd():
 
     The gain is unknown, or its error says so: within three of the true one.
     """
-    samples = made(7, LoadSag(0.3, 0.0))
+    samples = simulated(7, LoadSag(0.3, 0.0))
     u = samples.throttle.copy()
     first = samples.train.stop
     u[:first - 2] = 0.5
@@ -257,7 +257,7 @@ def test_the_extended_model_crosses_as_often_as_the_data(name):
     true, start = CROSSED[name]
     rows = []
     for seed in range(8):
-        samples = made(500 + seed, true)
+        samples = simulated(500 + seed, true)
         plain, full = fitted(samples, start)
         rates = crossing_rates(samples, plain.terms, full.terms, np.random.default_rng(seed))
         rows.append((rates.observed, rates.baseline, rates.extended))

@@ -114,7 +114,7 @@ def throttle():
     return np.repeat(np.random.default_rng(4).uniform(0.2, 0.9, LENGTH // 50), 50)
 
 
-def made(name, params, seed, **ou):
+def simulated(name, params, seed, **ou):
     """Return samples of the OU with one term, and both."""
     terms = (catalogue()['ou'](**{**OU, **ou}), catalogue()[name](**params))
     t = np.arange(LENGTH) / RATE
@@ -135,7 +135,7 @@ def filtered(samples, terms):
 
 def law_fitted(name, params, seed):
     """Return a law fitted at the true OU, the scores without it, and states."""
-    samples, terms = made(name, params, seed)
+    samples, terms = simulated(name, params, seed)
     events = None
     for _ in range(3):
         gaussian = evaluate(samples, terms[:1], events)
@@ -168,7 +168,7 @@ def test_the_statistics_are_standard(seed):
 @pytest.mark.parametrize('name', GAUSSIAN)
 def test_scores_of_the_right_model_are_white(name):
     """With the true parameters, independent N(0, 1)."""
-    statistic, value = filtered(*made(name, GAUSSIAN[name][0], 11))
+    statistic, value = filtered(*simulated(name, GAUSSIAN[name][0], 11))
     assert abs(value) < LIMIT, statistic
 
 
@@ -176,7 +176,7 @@ def test_scores_of_the_right_model_are_white(name):
     (name, wrong) for name, (_, *changes) in GAUSSIAN.items() for wrong in changes])
 def test_a_wrong_parameter_shows(name, wrong):
     """With one parameter wrong, so far from that that nearly every recording shows it."""
-    samples, (ou, term) = made(name, GAUSSIAN[name][0], 11)
+    samples, (ou, term) = simulated(name, GAUSSIAN[name][0], 11)
     assert abs(filtered(samples, (ou, replace(term, **wrong)))[1]) > LIMIT + 3.0
 
 
@@ -213,7 +213,7 @@ def test_a_law_with_a_wrong_parameter_shows(monkeypatch, name, coordinate, by):
 @pytest.mark.parametrize('name', ['volatility', 'clock_jitter'])
 def test_a_law_fitted_again_is_as_good(name):
     """From where the first fit ended, the second comes to the same top, within a nat."""
-    samples, terms = made(name, LAWS[name], 11)
+    samples, terms = simulated(name, LAWS[name], 11)
     gaussian = evaluate(samples, terms[:1])
     view = view_of(samples, gaussian, gaussian.z, slice(0, samples.n))
     first = catalogue()[name].fit_law(view)
@@ -221,13 +221,13 @@ def test_a_law_fitted_again_is_as_good(name):
     assert abs(float((again.gain - first.gain).sum())) < 1.0
 
 
-def test_sigma_may_go_where_the_fit_has_not_seen_it():
+def test_sigma_may_go_where_the_fit_has_not_been():
     """A random walk of ln sigma in the part kept, quiet in the part fitted."""
     rng = np.random.default_rng(5)
     part = LENGTH * 6 // 10
     steps = rng.standard_normal(LENGTH) * np.where(np.arange(LENGTH) < part, 0.07, 0.12)
     log = np.cumsum(steps / math.sqrt(RATE))
-    samples, (ou, _) = made('volatility', {'std': 0.0, 'rate': 1.0}, 11)
+    samples, (ou, _) = simulated('volatility', {'std': 0.0, 'rate': 1.0}, 11)
     x = samples.voltage - ou.u0
     kicks = x[1:] - math.exp(-ou.alpha / RATE) * x[:-1]
     z = np.concatenate(([x[0] / x.std()], kicks / kicks.std()))
@@ -249,7 +249,7 @@ def test_bad_samples_are_found_and_not_their_neighbours(run):
     degree is above twice 7.8 nats (price of its prior and size): 8e-5 of them.
     """
     rng = np.random.default_rng(run)
-    samples, (ou, _) = made('glitches', {'probability': 0.0, 'std': 0.1}, 11)
+    samples, (ou, _) = simulated('glitches', {'probability': 0.0, 'std': 0.1}, 11)
     first = np.flatnonzero(rng.random(LENGTH) < 0.005)
     first = first[(np.diff(first, prepend=-99) > run + 2) & (first > 9) & (first < LENGTH - 9)]
     where = np.concatenate([first + k for k in range(run)])
@@ -275,7 +275,7 @@ def test_bad_samples_are_found_and_not_their_neighbours(run):
 @pytest.mark.parametrize('dof', [3.0, 5.0])
 def test_noise_that_is_heavy_tailed_throughout_has_no_jumps(dof):
     """A tenth of all samples with a jump in them would be no events any more."""
-    samples, terms = made('heavy_tails', {'dof': dof}, 11)
+    samples, terms = simulated('heavy_tails', {'dof': dof}, 11)
     gaussian = evaluate(samples, terms[:1])
     view = view_of(samples, gaussian, gaussian.z, slice(0, samples.n))
     assert catalogue()['jumps'].fit_law(view) is None

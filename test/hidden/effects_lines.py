@@ -96,13 +96,13 @@ def resonance_rail(bench: Bench, gain: float) -> dict[str, object]:
 def tone(bench: Bench, gain: float) -> dict[str, object]:
     """Let the PWM of an ESC, 8..48 kHz, through to the ADC: its alias is a line."""
     pwm = _visible(bench, 8e3, 48e3)
-    seen = _alias(pwm, bench.rate)
-    volts = bench.draw.uniform(3.0, 6.0) * gain * _floor(bench, seen)
+    alias = _alias(pwm, bench.rate)
+    volts = bench.draw.uniform(3.0, 6.0) * gain * _floor(bench, alias)
     phase = bench.draw.uniform(0, 2 * np.pi)
     bench.stage('sampled', lambda v: v + volts * np.sin(
         2 * np.pi * pwm * bench.sample_time + phase))
-    whitened = volts * _shape(bench, seen) / bench.innovation
-    return {'pwm_hz': pwm, 'frequency_hz': seen, 'amplitude_v': volts,
+    whitened = volts * _shape(bench, alias) / bench.innovation
+    return {'pwm_hz': pwm, 'frequency_hz': alias, 'amplitude_v': volts,
             'nats': bench.n * whitened**2 / 4}
 
 

@@ -119,7 +119,7 @@ def largest(z: dict[str, float]) -> tuple[float, str]:
     return max((abs(value), name) for name, value in z.items())
 
 
-def made(cause: str, seed: int = 0, **options: float) -> Hidden:
+def simulated(cause: str, seed: int = 0, **options: float) -> Hidden:
     """Draw by seed; names with a shape are variants."""
     kind = 'variant' if '/' in cause else 'single'
     return draw(kind, np.random.default_rng(seed), cause=cause, **options)
@@ -129,7 +129,7 @@ def each(cause: str, count: int = 8,
          **options: float) -> Iterator[tuple[Hidden, dict, dict]]:
     """Yield recordings, their claimed parameters, and those of their rails."""
     for seed in range(count):
-        h = made(cause, seed, **options)
+        h = simulated(cause, seed, **options)
         yield h, h.detail[cause], h.detail['rail']
 
 

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 QUIET = 5.0
 
 
-def made(kind, cause=None, seed=0, **options):
+def simulated(kind, cause=None, seed=0, **options):
     """Draw by seed."""
     return draw(kind, np.random.default_rng(seed), cause=cause, **options)
 
@@ -35,7 +35,7 @@ ALL = ([('none', None)] + [('single', c) for c in causes()] + [('variant', c) fo
 @pytest.mark.parametrize('kind, cause', ALL)
 def test_every_effect_is_a_sound_recording(kind, cause):
     """Shapes, order and range hold; names and families are those of the catalogue."""
-    h = made(kind, cause, duration=5.0, rate=500.0)
+    h = simulated(kind, cause, duration=5.0, rate=500.0)
     assert h.kind == kind and h.name == (cause or 'none')
     assert h.t.shape == h.voltage.shape == h.throttle.shape == (2500,)
     assert np.all(np.isfinite(h.voltage)) and np.all(np.diff(h.t) > 0)
@@ -52,10 +52,10 @@ def test_every_effect_is_a_sound_recording(kind, cause):
         assert cause.partition('/')[0] in h.truth
 
 
-def test_every_pair_can_be_made():
+def test_every_pair_can_be_drawn():
     """Two effects do not overwrite each other's part of the bench."""
     for first, second in pairs():
-        h = made('pair', (first, second), duration=2.0, rate=200.0)
+        h = simulated('pair', (first, second), duration=2.0, rate=200.0)
         assert {first, second} <= set(h.truth) and np.all(np.isfinite(h.voltage))
         assert {first, second, 'rail'} == set(h.detail)
         assert json.loads(json.dumps(h.detail)) == h.detail
@@ -63,7 +63,7 @@ def test_every_pair_can_be_made():
 
 def test_a_pair_holds_both():
     """Noise in the sensor and throttle in sigma are both there, at their sizes."""
-    h = made('pair', ('load_dependent_sigma', 'measurement_noise'), seed=4)
+    h = simulated('pair', ('load_dependent_sigma', 'measurement_noise'), seed=4)
     e, std = whitened(h), h.detail['measurement_noise']['std_v']
     phi = np.exp(-h.detail['rail']['alpha'] / rate(h))
     expected = -phi * (std / h.detail['rail']['innovation_v'])**2
@@ -78,7 +78,8 @@ def test_a_pair_holds_both():
 def test_seeds_reproduce_and_draws_differ(kind, cause):
     """One seed is one recording; the next draw is another rail, flight and effect."""
     rng = np.random.default_rng(7)
-    first, again = made(kind, cause, 7, duration=3.0), draw(kind, rng, cause=cause, duration=3.0)
+    first = simulated(kind, cause, 7, duration=3.0)
+    again = draw(kind, rng, cause=cause, duration=3.0)
     assert np.array_equal(first.voltage, again.voltage)
     assert np.array_equal(first.t, again.t) and np.array_equal(first.throttle, again.throttle)
     assert first.detail == again.detail and first.name == again.name
@@ -90,7 +91,7 @@ def test_seeds_reproduce_and_draws_differ(kind, cause):
 
 def test_what_is_drawn_fills_its_ranges():
     """Rails span the decade and more that real ones do, and flights always move."""
-    many = [made('none', seed=s, duration=20.0, rate=100.0) for s in range(60)]
+    many = [simulated('none', seed=s, duration=20.0, rate=100.0) for s in range(60)]
     for key, low, high in (('alpha', 20, 120), ('level_v', 3.3, 25)):
         values = np.array([h.detail['rail'][key] for h in many])
         assert low <= values.min() < low * (high / low)**0.15
@@ -110,7 +111,7 @@ def test_what_is_drawn_fills_its_ranges():
 def test_none_is_a_clean_relaxation():
     """A plain rail has alpha = 1/(RC), its sigma, and residuals white, normal and unmoved."""
     for seed in range(3):
-        h = made('none', seed=seed)
+        h = simulated('none', seed=seed)
         rail, n = h.detail['rail'], h.t.size - 1
         x = h.voltage - h.voltage.mean()
         phi = (x[1:] @ x[:-1]) / (x[:-1] @ x[:-1])
@@ -137,7 +138,7 @@ FINER = ('throttle_tone', 'nonlinear_restoring/cubic', 'load_dependent_alpha')
     (k, c) for k, c in ALL if k in ('variant', 'unknown') and not c.startswith(FINER)])
 def test_other_shapes_and_unknowns_show(kind, cause):
     """Each leaves a sign beyond what a plain rail ever shows, in some simple average."""
-    z = signs(made(kind, cause, seed=1))
+    z = signs(simulated(kind, cause, seed=1))
     assert any(abs(value) > WEAKEST.get(name, QUIET) for name, value in z.items()), z
 
 
@@ -146,7 +147,7 @@ def test_strength_scales(cause):
     """Half the strength is half the volts, with all else the same."""
     key = {'load_sag': 'sag_v_per_unit', 'tone': 'amplitude_v', 'measurement_noise': 'std_v',
            'glitches': 'mean_size_v'}[cause]
-    full, half = (made('single', cause, 3, duration=5.0, strength=s).detail[cause][key]
+    full, half = (simulated('single', cause, 3, duration=5.0, strength=s).detail[cause][key]
                   for s in (1.0, 0.5))
     assert half == pytest.approx(full / 2)
 
@@ -170,9 +171,9 @@ def test_the_fine_grid_has_converged(cause, one_step_is_too_coarse):
     kind = 'single' if cause else 'none'
 
     def moments(substeps):
-        return np.array([_moments(made(kind, cause, seed, duration=10.0, substeps=substeps))
+        return np.array([_moments(simulated(kind, cause, seed, duration=10.0, substeps=substeps))
                          for seed in range(12)])
-    used = made(kind, cause, duration=1.0).detail['rail']['substeps']
+    used = simulated(kind, cause, duration=1.0).detail['rail']['substeps']
     base = moments(used)
 
     def shift(substeps):
@@ -189,7 +190,7 @@ def test_the_fine_grid_has_converged(cause, one_step_is_too_coarse):
 def test_grids_share_their_components():
     """Another sub-step changes the noise only, never what was drawn."""
     for cause in ('resonance', 'load_transient', 'tone'):
-        a, b = (made('single', cause, 5, duration=2.0, substeps=m) for m in (8, 16))
+        a, b = (simulated('single', cause, 5, duration=2.0, substeps=m) for m in (8, 16))
         assert a.detail[cause].keys() == b.detail[cause].keys()
         for key, value in a.detail[cause].items():
             if isinstance(value, float) and not key.startswith('nats'):
@@ -206,12 +207,12 @@ def test_grids_share_their_components():
 def test_what_cannot_be_drawn_is_refused(kind, options, words):
     """Say what was wrong."""
     with pytest.raises(ValueError, match=words):
-        made(kind, **options)
+        simulated(kind, **options)
 
 
 def test_a_cause_stands_for_its_shapes():
     """Asking a variant or unknown by cause, shape or full name gives one of those."""
-    assert made('variant', 'drift', duration=2.0).truth == ('drift',)
-    assert made('variant', 'lc_rail', duration=2.0).name == 'resonance/lc_rail'
-    assert made('unknown', 'sawtooth', duration=2.0).name == 'unknown/sawtooth'
+    assert simulated('variant', 'drift', duration=2.0).truth == ('drift',)
+    assert simulated('variant', 'lc_rail', duration=2.0).name == 'resonance/lc_rail'
+    assert simulated('unknown', 'sawtooth', duration=2.0).name == 'unknown/sawtooth'
     assert {'single', 'pair', 'none', 'variant', 'unknown'} == set(KINDS)

@@ -7,8 +7,8 @@ of several draws over what was claimed, and its error is that of the draws.
 """
 
 from hidden_measures import (
-    assert_as_claimed, band, correlation, density, each, late, local_std, made, plain_density,
-    rate, regress, whitened)
+    assert_as_claimed, band, correlation, density, each, late, local_std, plain_density, rate,
+    regress, simulated, whitened)
 import numpy as np
 import pytest
 from scipy.stats import kstest, t as student
@@ -295,7 +295,7 @@ def test_clock_jitter():
 
 def test_irregular_stamps():
     """In the other shape the stamps are wrong and the samples on time."""
-    h = made('clock_jitter/stamps')
+    h = simulated('clock_jitter/stamps')
     spread = np.std(h.t * rate(h) - np.arange(h.t.size))
     assert spread == pytest.approx(h.detail['clock_jitter/stamps']['std_steps'], rel=0.02)
     assert abs(np.mean(whitened(h)**4) - 3) < 4.5 * np.sqrt(96 / h.t.size)

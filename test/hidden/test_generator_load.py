@@ -7,7 +7,7 @@ of several draws over what was claimed, and its error is that of the draws.
 """
 
 from hidden_measures import (
-    assert_as_claimed, assert_regression, correlation, each, late, made, whitened)
+    assert_as_claimed, assert_regression, correlation, each, late, simulated, whitened)
 import numpy as np
 import pytest
 
@@ -52,18 +52,18 @@ def test_transients():
 def test_transients_of_other_shapes():
     """A regulator cures the step, a delay moves it, two poles follow each other."""
     for seed in range(3):
-        h = made('load_transient/regulator', seed)
+        h = simulated('load_transient/regulator', seed)
         claimed = h.detail['load_transient/regulator']
         volts = claimed['battery_ohm'] * claimed['full_current_a']
         assert h.truth == ('load_transient',)
         assert_regression(h, [h.throttle, late(h, h.throttle, claimed['loop_time_s'])],
                           [-volts, volts])
-        h = made('load_transient/delay', seed)
+        h = simulated('load_transient/delay', seed)
         claimed = h.detail['load_transient/delay']
         # The command changes at samples; the delay is a whole number of the eight fine steps.
         back = np.floor(np.arange(h.t.size) - np.round(claimed['delay_s'] * 8000) / 8).astype(int)
         assert_regression(h, [h.throttle[np.maximum(back, 0)]], -claimed['sag_v_per_unit'])
-        h = made('load_transient/two_pole', seed)
+        h = simulated('load_transient/two_pole', seed)
         claimed = h.detail['load_transient/two_pole']
         twice = late(h, late(h, h.throttle, claimed['esc_time_s']), claimed['motor_time_s'])
         # `late` answers one sample late; the second time this is not exact.

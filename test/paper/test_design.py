@@ -121,7 +121,7 @@ def test_a_capacitor_may_undo_the_damping_of_a_filter():
         design(replace(network, bulk_capacitance=1e-3), 0.4, **question)
 
 
-def test_slow_noise_is_told():
+def test_slow_noise_is_noted():
     result = design(PowerNetwork(flutter=0.05), 0.4, **QUESTION)
     assert any('rate of the noise' in text for text in remarks(result))
     assert 'alpha stays at 33.3' in effect(result)

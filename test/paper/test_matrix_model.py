@@ -92,7 +92,7 @@ def test_integration_of_constant_functions_is_the_closed_form():
     assert varying.solve(T, U0) == pytest.approx(constant.solve(T, U0), rel=1e-7, abs=1e-9)
 
 
-def test_a_short_event_is_seen_with_a_short_step():
+def test_a_short_step_resolves_a_short_event():
     """A load of 1 ms in 10 s: beta acts for 1 ms, so P gains 1 mV (alpha, alpha_p small)."""
     model = MatrixModel(0.0, 0.0, lambda t: 1.0 if 5.0037 <= t < 5.0047 else 0.0, 1e-6)
     found = model.solve([0.0, 10.0], [1.0, 0.0, 0.0], max_step=2e-4)[1, 2]

@@ -80,9 +80,9 @@ def test_constant_power_is_a_negative_resistance():
     power = 5.0 * 3.0 / 0.9
     current = network.current_at(0.4)
     assert rail.mean == pytest.approx(22.2 - 0.04 * (current + power / rail.mean), rel=1e-13)
-    seen = 0.04 / (1.0 - 0.04 * power / rail.mean**2)
-    assert rail.alpha == pytest.approx(1.0 / ((seen + 0.03) * 470e-6), rel=1e-10)
-    assert rail.impedance(0.0).real == pytest.approx(seen, rel=1e-12)
+    through = 0.04 / (1.0 - 0.04 * power / rail.mean**2)
+    assert rail.alpha == pytest.approx(1.0 / ((through + 0.03) * 470e-6), rel=1e-10)
+    assert rail.impedance(0.0).real == pytest.approx(through, rel=1e-12)
 
 
 def test_the_regulated_rail_in_its_own_noise():

@@ -39,7 +39,7 @@ def test_steps_of_the_oscilloscope():
     assert vpp.multiples == (10, 13, 36, 46) and vrms.multiples == (1, 3, 6)
 
 
-def test_step_of_readings_made_with_a_known_one():
+def test_step_of_readings_drawn_with_a_known_one():
     """Multiples of 0.8 rounded to two digits give it back, and chance is small."""
     step = table1.common_step([Printed(f'{0.8 * k:.2f}') for k in (7, 12, 31)])
     assert step.low <= 0.8 <= step.high and step.multiples == (7, 12, 31)
@@ -167,11 +167,11 @@ def test_step_through_a_coupling(rail):
 def test_coupling_hides_the_rail():
     """Without noise: never above the corner, and near it for every fast rail."""
     w = 2.0 * math.pi * 10.0
-    seen = [transient.seen_rate(rail) for rail in (20.0, 100.0, 300.0, 1e3, 1e4, 1e6)]
-    assert seen == sorted(seen) and seen[-1] < w
-    assert seen[-1] == pytest.approx(w, rel=1e-3) and seen[0] < 25.0
+    rates = [transient.fitted_rate(rail) for rail in (20.0, 100.0, 300.0, 1e3, 1e4, 1e6)]
+    assert rates == sorted(rates) and rates[-1] < w
+    assert rates[-1] == pytest.approx(w, rel=1e-3) and rates[0] < 25.0
     line = transient.paper_fit()
-    assert transient.seen_rate(transient.slowest_rail()) == pytest.approx(
+    assert transient.fitted_rate(transient.slowest_rail()) == pytest.approx(
         line.alpha - line.half_width)
 
 
@@ -182,12 +182,12 @@ def test_coupling_by_simulation(fig5):
     ln|U| at 40 mV with 4.7 mV of noise scatters by 12 % and, by Jensen, falls by 0.7 %:
     alpha moves by 0.2 1/s, well within 4 standard errors.
     """
-    row = fig5['alpha seen, rail of 1000 1/s']
-    assert abs(row.recomputed - transient.seen_rate(1000.0)) < 4.0 * row.error + 0.2
+    row = fig5['alpha fitted, rail of 1000 1/s']
+    assert abs(row.recomputed - transient.fitted_rate(1000.0)) < 4.0 * row.error + 0.2
     assert row.error < 1.5
     slope = fig5['d ln(alpha fitted) / d ln(alpha rail)']
     rails = np.log(transient.RAILS)
-    exact = np.polyfit(rails, np.log([transient.seen_rate(r) for r in transient.RAILS]), 1)[0]
+    exact = np.polyfit(rails, np.log([transient.fitted_rate(r) for r in transient.RAILS]), 1)[0]
     assert abs(slope.recomputed - exact) < 4.0 * slope.error
     assert slope.verdict is Verdict.DOES_NOT_HOLD
     assert slope.error < 0.05, 'so that 1 would be seen'

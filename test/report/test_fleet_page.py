@@ -31,9 +31,9 @@ def odd() -> Fleet:
                   {'path': '/f/copy', 'duplicate_of': '/f/uav1/1'}])
 
 
-def page_text(made: Fleet) -> str:
+def page_text(simulated: Fleet) -> str:
     """Return the text of the report, which is well-formed."""
-    page = fleet_page(made, "ou-monitor fleet 'a <b>'")
+    page = fleet_page(simulated, "ou-monitor fleet 'a <b>'")
     root = ElementTree.fromstring(page.split('\n', 1)[1])
     return ' '.join(' '.join(root.itertext()).split())
 
@@ -77,11 +77,11 @@ def test_plain_data_agrees(odd):
 ])
 def test_little_is_known(rows, words):
     """A fleet of failures, of one recording, without estimates or vehicles has its report."""
-    made = fleet(rows)
-    assert words in headline(made) and words in page_text(made)
+    simulated = fleet(rows)
+    assert words in headline(simulated) and words in page_text(simulated)
 
 
-def test_changes_are_told_in_their_unit():
+def test_changes_have_their_unit():
     """Percent of what has a logarithm, a factor where it is large, mV of sag."""
     assert [change('sigma', value) for value in (0.0296, -0.4, 1.2, float('nan'))] == [
         '+3 %', '-33 %', 'x 3.32', '-']

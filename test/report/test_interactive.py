@@ -5,7 +5,6 @@ import re
 import time
 
 from browser import Browser, find_browser
-from made_recordings import recording
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.report import page
@@ -13,6 +12,7 @@ from ou_monitor.report.analysis_page import analysis_page
 from ou_monitor.report.embedding import embed
 from ou_monitor.report.svg import Plot
 import pytest
+from simulated_recordings import recording
 
 PROGRAM = find_browser()
 pytestmark = pytest.mark.skipif(
@@ -363,7 +363,7 @@ def test_the_policy_forbids_the_network_and_other_scripts(browser, file):
     tries = ['fetch("http://127.0.0.1:9/").then(() => 1, () => 0)',
              'new Promise((done) => { const i = new Image(); i.onload = () => done(1); '
              'i.onerror = () => done(0); i.src = "http://127.0.0.1:9/i.png"; })']
-    assert [browser.run(made) for made in tries] == [0, 0]
+    assert [browser.run(simulated) for simulated in tries] == [0, 0]
     browser.run('(() => { const s = document.createElement("script"); '
                 's.textContent = "window.broken = 1"; document.body.append(s); })()')
     assert browser.run('window.broken') is None

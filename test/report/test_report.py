@@ -6,7 +6,6 @@ import re
 from xml.etree import ElementTree
 
 from hypothesis import given, strategies as st
-from made_recordings import recording, without_throttle
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.records import Recording
@@ -16,6 +15,7 @@ from ou_monitor.report.scale import linear_ticks, log_ticks, Scale, span, thin, 
 from ou_monitor.report.svg import Plot
 from pages import parsed, self_contained
 import pytest
+from simulated_recordings import recording, without_throttle
 
 ends = st.floats(-1e6, 1e6)
 
@@ -86,9 +86,9 @@ def test_a_line_goes_through_its_points_and_breaks_at_nan():
     plot = Plot('t', 'x', 'y').limits((0.0, 4.0), (0.0, 1.0))
     plot.line(np.arange(5.0), np.array([0.0, 1.0, math.nan, 0.5, 0.5]))
     path = re.search(r'class="line s0" d="([^"]+)"', plot.svg()).group(1)
-    stretches = path.split('M')[1:]
-    assert len(stretches) == 2
-    first = [tuple(map(float, p.split(','))) for p in stretches[0].split('L')]
+    segments = path.split('M')[1:]
+    assert len(segments) == 2
+    first = [tuple(map(float, p.split(','))) for p in segments[0].split('L')]
     assert first[0][1] > first[1][1], 'up is up'
     assert first[1][0] - first[0][0] == pytest.approx((860 - 62 - 14) / 4.0, abs=0.1)
 
@@ -119,7 +119,7 @@ def test_page_escapes_everything():
     assert sum(evil in ''.join(e.itertext()) for e in tree.iter()) > 5
 
 
-def made_analysis(**changes):
+def analysis_of(**changes):
     """Return the analysis of a recording with a hostile name."""
     return analyze(replace(recording(1, seconds=3.0, name='<b>.csv'), notes=('2 <dropped>.',),
                            source={'file': '<b>.csv'}), **changes)
@@ -127,7 +127,7 @@ def made_analysis(**changes):
 
 def test_report_is_self_contained_and_well_formed():
     """No address, one script, nothing to fetch; the name is shown as it is."""
-    html = analysis_page(made_analysis(brownout_voltage=4.5), "ou-monitor analyze '<b>.csv'")
+    html = analysis_page(analysis_of(brownout_voltage=4.5), "ou-monitor analyze '<b>.csv'")
     tree = self_contained(html)
     assert '<b>' not in html
     text = ' '.join(tree.itertext())
@@ -140,22 +140,22 @@ def test_report_is_self_contained_and_well_formed():
 
 def test_report_holds_the_numbers_of_the_levels():
     """The second table shows sigma of each level as the estimate has it."""
-    analysis = made_analysis()
+    analysis = analysis_of()
     rows = list(list(parsed(analysis_page(analysis)).iter('table'))[1].iter('tr'))[1:]
     shown = [float(next(list(row)[3].itertext())) for row in rows]
     assert shown == pytest.approx([v.estimate.sigma for v in analysis.levels], rel=5e-3)
 
 
-@pytest.mark.parametrize('made', [
+@pytest.mark.parametrize('simulated', [
     without_throttle(recording(2, seconds=1.0)),
     recording(3, seconds=0.02),
     Recording(np.arange(500) / 100.0, np.full(500, 5.0), np.full(500, 0.1), 'stuck'),
     Recording(np.zeros(0), np.zeros(0), np.zeros(0), 'empty'),
     Recording(np.array([1e9]), np.array([5.0]), np.array([math.nan]), 'one'),
-], ids=lambda made: made.name)
-def test_report_of_a_recording_that_tells_nothing(made):
+], ids=lambda simulated: simulated.name)
+def test_report_of_a_recording_that_tells_nothing(simulated):
     """Still a page, without nan in a drawing."""
-    html = analysis_page(analyze(made))
+    html = analysis_page(analyze(simulated))
     parsed(html)
     assert not re.search(r'[ ",]nan\b', html)
 

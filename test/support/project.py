@@ -5,7 +5,7 @@ import subprocess
 
 ROOT = Path(__file__).resolve().parents[2]
 # What running the project makes; in an unpacked archive there is no git to say so.
-MADE = {'.venv', 'build', 'install', 'log', 'out', '__pycache__', '.git', '.hypothesis',
+GENERATED = {'.venv', 'build', 'install', 'log', 'out', '__pycache__', '.git', '.hypothesis',
         '.pytest_cache', '.mypy_cache', 'ou_monitor.egg-info'}
 
 
@@ -18,4 +18,4 @@ def project_files() -> list[Path]:
         names = listed.stdout.decode().split('\0')
         return [ROOT / name for name in names if name and (ROOT / name).is_file()]
     return [path for path in ROOT.rglob('*')
-            if path.is_file() and not MADE & set(path.relative_to(ROOT).parts)]
+            if path.is_file() and not GENERATED & set(path.relative_to(ROOT).parts)]

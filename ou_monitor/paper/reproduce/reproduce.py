@@ -116,7 +116,7 @@ def _factor(rows: Sequence[Row]) -> str:
 
 def _coupling(rows: Sequence[Row]) -> str:
     line = transient.paper_fit()
-    seen = _row(rows, f'alpha seen, rail of {transient.TYPICAL_RAIL:g}')
+    fitted = _row(rows, f'alpha fitted, rail of {transient.TYPICAL_RAIL:g}')
     slope = _row(rows, 'd ln(alpha fitted)')
     corner = 2.0 * math.pi * transient.CORNER_HZ
     # Variance of an OU behind a high-pass: alpha / (alpha + corner) of its own.
@@ -124,7 +124,7 @@ def _coupling(rows: Sequence[Row]) -> str:
     alpha = published.ALPHA.text
     return (f'{alpha} 1/s is 2 pi x {published.ALPHA.value / (2.0 * math.pi):.2f} Hz, and '
             f'AC coupling is a first-order high-pass, on many oscilloscopes at 10 Hz. Behind '
-            f'it a rail of {transient.TYPICAL_RAIL:g} 1/s is read as {seen.recomputed:.1f} 1/s, '
+            f'it a rail of {transient.TYPICAL_RAIL:g} 1/s is read as {fitted.recomputed:.1f} 1/s, '
             f"and the reading follows the rail's own rate by {100 * slope.recomputed:.1f} +- "
             f'{100 * (slope.error or 0.0):.1f} % only. It never exceeds the corner, and a rail '
             f'slower than the corner is read slower: with that coupling, Fig. 5 '
@@ -281,10 +281,10 @@ class Reproduction:
 
 def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:
     """Recompute the paper (progress 0..1)."""
-    tell: Progress = progress or (lambda share: None)
+    report: Progress = progress or (lambda share: None)
 
     def within(start: float, stop: float) -> Progress:
-        return lambda share: tell(start + share * (stop - start))
+        return lambda share: report(start + share * (stop - start))
 
     # Each part has its own generator, so that none depends on what others draw.
     rngs = np.random.default_rng(seed).spawn(8)
@@ -293,16 +293,16 @@ def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:
     rows = [*table1.rows(*mean_and_error(crests.white)), *crest_rows(crests),
             *table2.rows(), *network.rows(), *jumps.rows(found, crests)]
     rows += transient.rows(rngs[2])
-    tell(0.76)
+    report(0.76)
     rows += probability.rows(rngs[3])
-    tell(0.8)
+    report(0.8)
     rows += switching.rows(rngs[4])
-    tell(0.86)
+    report(0.86)
     rows += switching.averaging_rows(rngs[5])
     spreading = switching.spreading(rngs[6], 20_000)
-    tell(0.92)
+    report(0.92)
     figures = draw(rngs[7])
-    tell(1.0)
+    report(1.0)
     ordered = tuple(sorted(rows, key=lambda row: _ORDER.index(row.where)))
     return Reproduction(seed, ordered, eight_points(ordered, crests, found), crests, spreading,
                         figures)

@@ -168,7 +168,7 @@ def fitted_through_coupling(time: FloatArray) -> tuple[FloatArray, float]:
             float(np.abs(np.expm1(misfit - misfit.mean())).max()))
 
 
-def seen_rate(rail: float, corner: float = CORNER_HZ) -> float:
+def fitted_rate(rail: float, corner: float = CORNER_HZ) -> float:
     """Return the rate the paper's fit gives for a step seen through a high-pass, 1/s."""
     w = 2.0 * math.pi * corner
     peak = math.log(rail / w) / (rail - w)
@@ -180,10 +180,10 @@ def slowest_rail() -> float:
     """Return the least rate of a rail that Fig. 5 allows behind a 10 Hz coupling, 1/s."""
     line = paper_fit()
     least = line.alpha - line.half_width
-    return float(brentq(lambda rail: seen_rate(rail) - least, 70.0, 1e5))
+    return float(brentq(lambda rail: fitted_rate(rail) - least, 70.0, 1e5))
 
 
-def simulate_seen(rng: np.random.Generator, draws: int) -> FloatArray:
+def simulate_fitted(rng: np.random.Generator, draws: int) -> FloatArray:
     """
     Release a load behind an AC-coupled oscilloscope and fit it as the paper does.
 
@@ -215,7 +215,7 @@ def simulate_seen(rng: np.random.Generator, draws: int) -> FloatArray:
 
 def rows(rng: np.random.Generator, draws: int = 60) -> list[Row]:
     """Return the rows of Fig. 5."""
-    return [*_fit(), *_shape(), *_instrument(simulate_seen(rng, draws))]
+    return [*_fit(), *_shape(), *_instrument(simulate_fitted(rng, draws))]
 
 
 def _fit() -> list[Row]:
@@ -269,14 +269,14 @@ def offset_test(plain: Curve, shifted: Curve) -> tuple[float, float]:
     return test, float(stats.f.sf(test, 1, free))
 
 
-def _instrument(seen: FloatArray) -> list[Row]:
+def _instrument(fitted: FloatArray) -> list[Row]:
     line = paper_fit()
     corner = 2.0 * math.pi * CORNER_HZ
-    typical = seen[RAILS.index(TYPICAL_RAIL)]
+    typical = fitted[RAILS.index(TYPICAL_RAIL)]
     mean, spread = float(typical.mean()), float(typical.std(ddof=1))
     # Elasticity: slope of ln(fitted) over ln(rail), one value a draw.
     log = np.log(RAILS) - np.mean(np.log(RAILS))
-    slopes = log @ np.log(seen) / float(log @ log)
+    slopes = log @ np.log(fitted) / float(log @ log)
     slope, slope_se = float(slopes.mean()), float(slopes.std(ddof=1) / math.sqrt(slopes.size))
     return [
         Row(WHERE, f'alpha of a {CORNER_HZ:g} Hz corner', '1/s', published.ALPHA,
@@ -285,7 +285,7 @@ def _instrument(seen: FloatArray) -> list[Row]:
             f'{published.ALPHA.value / (2 * math.pi):.2f} Hz: the AC coupling of the '
             'oscilloscope alone gives this rate.',
             band=(corner - line.half_width, corner + line.half_width), point=2),
-        Row(WHERE, f'alpha seen, rail of {TYPICAL_RAIL:g} 1/s', '1/s',
+        Row(WHERE, f'alpha fitted, rail of {TYPICAL_RAIL:g} 1/s', '1/s',
             published.ALPHA, mean,
             f"{typical.size} simulations behind that corner, fitted the paper's way",
             f'A rail {TYPICAL_RAIL / published.ALPHA.value:.0f} times faster is read as '
@@ -293,7 +293,7 @@ def _instrument(seen: FloatArray) -> list[Row]:
             error=spread / math.sqrt(typical.size),
             band=(mean - Z95 * spread, mean + Z95 * spread), point=2),
         Row('Section 5', 'd ln(alpha fitted) / d ln(alpha rail)', '', Printed('1', 0.0), slope,
-            f'{seen.size} simulated recordings, rails of {RAILS[0]:g} to {RAILS[-1]:g} 1/s, '
+            f'{fitted.size} simulated recordings, rails of {RAILS[0]:g} to {RAILS[-1]:g} 1/s, '
             f'{CORNER_HZ:g} Hz coupling',
             'The paper calls alpha a structural constant of the power network; behind an AC '
             f'coupling it changes by {100.0 * slope:.1f} % of what the network does.',

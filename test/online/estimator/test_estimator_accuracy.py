@@ -8,12 +8,12 @@ of the bias, so that a constant wrong by a fifth is found thirty times over.
 
 import math
 
-from made_windows import (
-    ALPHA, covered, DT, errors, estimate, NAMES, paths, SIGMA, stamps, TRUTH, VAR_INF)
 import numpy as np
 from ou_monitor.model.exact_fit import fit_exact
 from ou_monitor.records import Flag, Status
 import pytest
+from simulated_windows import (
+    ALPHA, covered, DT, errors, estimate, NAMES, paths, SIGMA, stamps, TRUTH, VAR_INF)
 
 N = 2000
 T = stamps(N)

@@ -3,11 +3,11 @@
 from dataclasses import astuple
 
 from hypothesis import given, settings, strategies as st
-from made_windows import DT, paths, stamps
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.records import Counters, Status
 import pytest
+from simulated_windows import DT, paths, stamps
 
 N = 1000
 T = stamps(N)

@@ -2,7 +2,6 @@
 
 import math
 
-from made_windows import ALPHA, DT, LEVEL, paths, SIGMA, stamps
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.model import arma
@@ -11,6 +10,7 @@ from ou_monitor.online.estimator.fit import fit_window
 from ou_monitor.online.estimator.window import Resolution, Sums
 from ou_monitor.records import Flag, Status
 import pytest
+from simulated_windows import ALPHA, DT, LEVEL, paths, SIGMA, stamps
 
 LAGS = 24
 

@@ -2,12 +2,12 @@
 
 import math
 
-from made_windows import ALPHA, DT, errors, estimate, LEVEL, paths, SIGMA, stamps, VAR_INF
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Flag, Status
 import pytest
+from simulated_windows import ALPHA, DT, errors, estimate, LEVEL, paths, SIGMA, stamps, VAR_INF
 
 N = 2000
 T = stamps(N)

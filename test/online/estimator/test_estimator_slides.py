@@ -3,11 +3,11 @@
 import tracemalloc
 
 from hypothesis import given, settings, strategies as st
-from made_windows import DT, estimate, paths, stamps
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.records import Counters, Status
 import pytest
+from simulated_windows import DT, estimate, paths, stamps
 
 NAMES = ('alpha', 'sigma', 'var_inf', 'u0', 'alpha_se', 'sigma_se', 'var_inf_se', 'u0_se', 'sag')
 Y = paths(np.random.default_rng(51), 1, 6000)[0]

@@ -2,13 +2,13 @@
 
 import math
 
-from made_windows import ALPHA, DT, estimate, LEVEL, paths, stamps
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Flag, Status
 import pytest
 from scipy.signal import lfilter
+from simulated_windows import ALPHA, DT, estimate, LEVEL, paths, stamps
 
 N = 2000
 T = stamps(N)

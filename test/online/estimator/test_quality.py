@@ -1,10 +1,10 @@
 """Findings about raw samples: lattices, repeats, piles at an extreme."""
 
 from hypothesis import given, settings, strategies as st
-from made_windows import DT, paths
 import numpy as np
 from ou_monitor.online.estimator.quality import examine, lattice, Quality
 import pytest
+from simulated_windows import DT, paths
 
 
 def path(seed=1, n=1024, dt=DT):

@@ -2,11 +2,11 @@
 
 import math
 
-from made_windows import DT, estimate, LEVEL, paths, stamps
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.records import Flag, Status
 import pytest
+from simulated_windows import DT, estimate, LEVEL, paths, stamps
 
 N = 2000
 T = stamps(N)

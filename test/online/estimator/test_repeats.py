@@ -3,7 +3,6 @@
 import math
 
 from hypothesis import given, settings, strategies as st
-from made_windows import ALPHA, DT, errors, estimate, LEVEL, paths, SIGMA, stamps
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.online.estimator.intake import Batch
@@ -11,6 +10,7 @@ from ou_monitor.online.estimator.quality import refresh_period, Repeats, whole
 from ou_monitor.records import Counters, Flag, Status
 import pytest
 from scipy.signal import lfilter
+from simulated_windows import ALPHA, DT, errors, estimate, LEVEL, paths, SIGMA, stamps
 
 # Standard deviation of the increments of the OU over DT, V.
 INCREMENT = SIGMA * math.sqrt(DT)

@@ -2,13 +2,13 @@
 
 import math
 
-from made_flights import fly, holds, learn, level, log_sigma, passage_risk, truth
 import numpy as np
 from ou_monitor.online.risk.curves import CurvePoint, LearnedCurves
 from ou_monitor.online.risk.outlook import throttle_budget
 from ou_monitor.records import Estimate, Status
 import pytest
 from scipy.optimize import brentq
+from simulated_flights import fly, holds, learn, level, log_sigma, passage_risk, truth
 
 VOLTAGE, HORIZON = 4.5, 5.0
 RISK = passage_risk(VOLTAGE, HORIZON)

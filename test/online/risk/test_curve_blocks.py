@@ -2,10 +2,10 @@
 
 import math
 
-from made_flights import fly, log_sigma, truth
 import numpy as np
 from ou_monitor.online.risk.curve_filters import Pool, Squares
 import pytest
+from simulated_flights import fly, log_sigma, truth
 
 THROTTLE = 0.4
 COUNT = 3000

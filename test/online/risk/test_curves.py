@@ -2,13 +2,13 @@
 
 import math
 
-from made_flights import (
-    ALPHA, DrawnSupply, DT, fly, holds, learn, level, log_sigma, truth, wandering)
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.online.risk.curves import LearnedCurves
 from ou_monitor.records import Estimate, Flag, Status
 import pytest
+from simulated_flights import (
+    ALPHA, DrawnSupply, DT, fly, holds, learn, level, log_sigma, truth, wandering)
 
 AT = np.array([0.15, 0.3, 0.45, 0.6, 0.75])
 

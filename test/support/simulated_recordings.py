@@ -18,6 +18,6 @@ def recording(seed: int, levels=((0.1, 0.3156), (0.4, 0.632)), seconds: float = 
     return Recording(t, voltage, throttle, name)
 
 
-def without_throttle(made: Recording) -> Recording:
+def without_throttle(simulated: Recording) -> Recording:
     """Return the same recording with its throttle unknown."""
-    return Recording(made.t, made.voltage, np.full(made.n, np.nan), made.name)
+    return Recording(simulated.t, simulated.voltage, np.full(simulated.n, np.nan), simulated.name)
