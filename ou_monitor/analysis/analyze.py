@@ -104,7 +104,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     moving = {x for item in settling for x in item.throttles}
     lines = [line_item(level.throttle, level.estimate, level.with_lines) for level in judged
              if level.lines.lines]
-    # A second relaxation is the supply's: where it is too faint to be seen it still bends alpha.
+    # A second relaxation is the supply's: where it is too faint to detect it still biases alpha.
     wanders = any(level.wanders for level in judged)
     alpha = alpha_constancy(throttles, estimates, [
         wanders or level.doubted or level.throttle in moving for level in judged])

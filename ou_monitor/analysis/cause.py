@@ -3,10 +3,10 @@ What relaxes after a change of load: the rail as its noise shows it, or the inst
 
 An AC-coupled input is a high-pass: whatever the rail does, a step comes out of it as a decay to
 the level before, at its own corner, and the noise shows the same corner.  So a supply that comes
-back to the level that it had under the other load tells nothing of the rail.  One that settles at
-another level excludes the high-pass, for a high-pass keeps no level.
+back to the level that it had under the other load says nothing about the rail.  One that settles
+at another level excludes the high-pass, for a high-pass keeps no level.
 
-Limits: a regulator that makes good a change of load looks like a high-pass; the stay before has
+Limits: a regulator that compensates a change of load looks like a high-pass; the stay before has
 to last some time constants, or its level is not known.
 """
 
@@ -51,7 +51,7 @@ class Cause:
         Of the high-pass that would explain it, 1/(2 pi tau), Hz.
     step, step_se : float
         Level after less level before in the direction of the transient, mean of the changes
-        that tell, V; NaN when none does.
+        that have an amplitude, V; NaN when none has.
     sentence : str
         Both verdicts in words.
 
@@ -80,19 +80,19 @@ def judge_cause(relaxation: Relaxation, alpha: AlphaTest) -> Cause:
     of_noise = {
         'agrees': 'tau agrees with 1/alpha of the noise',
         'differs': f'tau is not 1/alpha of the noise (p {_small(p)})',
-        'undetermined': 'tau and 1/alpha of the noise cannot be told apart or held equal'}[noise]
+        'undetermined': 'the data neither separate tau from 1/alpha of the noise nor show '
+                        'them equal'}[noise]
     if math.isfinite(low):
         of_noise += f' (tau alpha = {ratio:.2f}, 95 % {low:.2f} to {high:.2f})'
     of_instrument = {
         'excluded': f'the level changes with the load by {1e3 * step:.3g} mV and stays, so '
                     'this is not the high-pass of an AC-coupled instrument',
-        'possible': 'the voltage comes back to the level before although the load has changed: a '
+        'possible': 'the voltage returns to the level before although the load has changed: a '
                     f'high-pass of {corner:.2g} Hz (AC coupling) would do the same to the '
-                    'transient and to the noise, and a regulator to the transient; they cannot '
-                    'be told apart here',
-        'undetermined': 'whether a high-pass of the instrument '
-                        f'({corner:.2g} Hz) explains it cannot be told, for the level before is '
-                        'not known well enough'}[instrument]
+                    'transient and to the noise, a regulator to the transient; this recording '
+                    'cannot separate them',
+        'undetermined': 'the level before is not known well enough to decide whether a high-pass '
+                        f'of the instrument ({corner:.2g} Hz) explains it'}[instrument]
     return Cause(noise, ratio, low, high, p, instrument, corner, step, step_se,
                  f'{of_noise[0].upper()}{of_noise[1:]}; {of_instrument}.')
 
@@ -106,9 +106,9 @@ def _nothing(relaxation: Relaxation) -> str:
     if not relaxation.releases:
         return f'Throttle never {what} from one load level to another and stays there.'
     if relaxation.moves_on:
-        return (f'After throttle {what}, the voltage moves on over all of the time watched: '
-                'nothing levels off that could be fitted.')
-    return f'Nothing is seen to relax after throttle {what}.'
+        return (f'After throttle {what}, the voltage keeps moving for the whole time observed '
+                'and settles at no level that could be fitted.')
+    return f'No relaxation is detected after throttle {what}.'
 
 
 def _against_noise(relaxation: Relaxation, alpha: AlphaTest

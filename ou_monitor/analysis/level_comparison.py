@@ -185,21 +185,19 @@ class AlphaTest:
     def _verdict(self) -> str:
         if self.levels < 2:
             return ('This recording cannot decide whether alpha depends on load: '
-                    f'{"one load level has" if self.levels else "no load level has"} '
+                    f'{"only one load level has" if self.levels else "no load level has"} '
                     f'a usable fit{" that one OU describes" if self.withheld else ""}.')
-        change = (f'a change by a factor of {_factor(self.detectable_ratio)} from the lowest to '
-                  'the highest throttle')
+        least, ends = _factor(self.detectable_ratio), 'from the lowest to the highest throttle'
         if self.verdict == 'differs':
             return (f'Alpha depends on load (p = {self.p_value:.2g}): it changes by a factor of '
                     f'{_factor(self.ratio)} (95 % {_factor(self.ratio_low)} to '
-                    f'{_factor(self.ratio_high)}) from the lowest to the highest throttle; the '
-                    'paper assumes a constant alpha.')
+                    f'{_factor(self.ratio_high)}) {ends}; the paper assumes a constant alpha.')
         if self.verdict == 'constant':
             return (f'Alpha shows no dependence on load (p = {self.p_value:.2g}); the test would '
-                    f'have detected {change} (90 %).')
+                    f'have detected a change by a factor of {least} {ends} (90 %).')
         return (f'This recording cannot decide whether alpha depends on load (p = '
-                f'{self.p_value:.2g}): the test would have detected only {change} or more '
-                '(90 %).')
+                f'{self.p_value:.2g}): the test would have detected only a change by a factor of '
+                f'{least} {ends} (90 %).')
 
 
 def _factor(ratio: float) -> str:

@@ -25,21 +25,21 @@ from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Recording, Status
 from scipy import stats
 
-# Standard error of ln(alpha) beyond which a segment has no say.
+# Standard error of ln(alpha) beyond which a segment does not count.
 _MAX_SE = 1.0
 _LOG_NAMES = ('alpha', 'sigma', 'var_inf')
 # Fewer samples than this are not even offered to the estimator.
 _MIN_SEGMENT = 16
-# Intervals widened by more than this factor are spoken of.
+# Intervals widened by more than this factor have a note.
 _WIDENED = 1.5
 # Fewer samples have no histogram.
 _LEAST_BINNED = 50
 
 
 def fit_segment(recording: Recording, start: int, stop: int) -> Estimate:
-    """Fit one stretch of samples with the estimator that flies."""
+    """Fit one segment of samples with the estimator that flies."""
     t = recording.t[start:stop]
-    # A hair longer than the stretch, so that rounding loses no sample.
+    # A hair longer than the segment, so that rounding loses no sample.
     estimator = SlidingEstimator(window=1.001 * float(t[-1] - t[0]) + 1e-6)
     throttle = recording.throttle[start:stop]
     known = bool(np.isfinite(throttle).any())
@@ -154,7 +154,7 @@ class LevelResult:
     throttle : float
         Throttle, 0..1; NaN for a level that holds the whole recording.
     segments : tuple of Segment
-        Stretches of samples that were used.
+        Segments of samples that were used.
     time : float
         Time in them, s.
     n : int
@@ -224,7 +224,7 @@ class LevelResult:
 
     @property
     def wanders(self) -> bool:
-        """Whether a second relaxation is seen."""
+        """Whether a second relaxation is detected."""
         return self.shape['second_relaxation'].rejects
 
     @property

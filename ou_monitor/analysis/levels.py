@@ -31,7 +31,7 @@ BoolArray = npt.NDArray[np.bool_]
 HALF_WIDTH = 0.02
 # Of a stick that moves more it is this many of its standard deviations, and this at most.
 _SPREADS, _WIDEST = 2.5, 0.03
-# Stretches over which the jitter is looked at, s, and the share of them that it holds for:
+# Blocks over which the jitter is measured, s, and the share of them that it holds for:
 # many a stick is still at idle and jitters only in flight.
 _LOOK, _QUIETER = 1.0, 0.75
 # Left out after throttle came from more than two half widths away: six
@@ -43,11 +43,11 @@ SETTLE = 0.1
 MIN_SHARE, LONG_STAY = 0.02, 2.0
 # Time at a throttle, s, from which it is looked at.
 MIN_TIME = 0.25
-# And one stretch that can be fitted by itself, s: thirty relaxation times of the
+# And one segment that can be fitted by itself, s: thirty relaxation times of the
 # paper's rail.  A ramp that lingers here and there is no level where others are.
 MIN_STAY = 0.5
 MAX_LEVELS = 20
-# A stretch shorter than this, s, through which throttle goes steadily is a passage: quarters at
+# A segment shorter than this, s, through which throttle goes steadily is a passage: quarters at
 # its ends differ by more than this share of its range (of a ramp 0.75), and of the half width.
 _PASSAGE, _STEADY, _CROSSED = 3.0, 0.65, 0.75
 # A pause of more than this many median steps breaks a segment.
@@ -60,7 +60,7 @@ _VALLEY = 0.7
 
 @dataclass(frozen=True)
 class Segment:
-    """A stretch of samples: indices ``start <= k < stop`` of the recording."""
+    """A segment of samples: indices ``start <= k < stop`` of the recording."""
 
     start: int
     stop: int
@@ -76,7 +76,7 @@ class LoadLevel:
     throttle : float
         Throttle of the level, 0..1; NaN for a level that holds everything.
     segments : tuple of Segment
-        Stretches at this throttle, settling left out.
+        Segments at this throttle, settling left out.
     settling : float
         Time left out after changes of throttle, s.
 
@@ -103,7 +103,7 @@ def find_levels(t: FloatArray, throttle: FloatArray,
         if all(held):
             return _most(t, found)
         if not any(held):
-            # Where every stay is short, short stays are all there is to tell from.
+            # Where every stay is short, only short stays can decide.
             enough = 0.5 * float(t[-1] - t[0]) <= sum(_time(t, level) for level in found)
             return _most(t, found) if enough else whole
         # What was taken for a level may be its neighbours'.
@@ -130,7 +130,7 @@ def _time(t: FloatArray, level: LoadLevel) -> float:
 
 
 def _held(t: FloatArray, level: LoadLevel) -> bool:
-    """Tell whether a level was held: a long stretch, or one of some length and a share of time."""
+    """Return whether a level was held: a long segment, or one of some length and a share."""
     whole = float(t[-1] - t[0])
     longest = max((float(t[s.stop - 1] - t[s.start]) for s in level.segments), default=0.0)
     # A short recording may be all one level.
@@ -146,7 +146,7 @@ def _most(t: FloatArray, found: tuple[LoadLevel, ...]) -> tuple[LoadLevel, ...]:
 
 def _split(t: FloatArray, throttle: FloatArray, centres: list[float], width: float,
            named: bool) -> tuple[LoadLevel, ...]:
-    """Give each level its stretches; passages through a level that nobody named are left out."""
+    """Give each level its segments, without passages through a level that nobody named."""
     broken = _gaps(t)
     runs: list[list[Segment]] = [[] for _ in centres]
     for run, k in stays(throttle, centres, width):
@@ -271,7 +271,7 @@ def _inner(centres: Sequence[float], width: float) -> FloatArray:
 
 
 def _cut(run: Segment, broken: BoolArray) -> list[Segment]:
-    """Return the pieces of a stretch between pauses."""
+    """Return the pieces of a segment between pauses."""
     cuts = run.start + 1 + np.flatnonzero(broken[run.start + 1:run.stop])
     ends = [run.start, *cuts.tolist(), run.stop]
     return [Segment(a, b) for a, b in zip(ends, ends[1:])]

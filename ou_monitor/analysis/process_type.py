@@ -6,15 +6,15 @@ here each has tests (`ou_monitor.criticism.level_tests`), adjusted so
 that a recording of stationary OU levels has any of them reject once in a
 hundred times.  The first that applies names the level:
 
-1. mean or intensity changes from block to block: 'quasi-stationary' (what
-   the level is apart from that is told, too);
+1. mean or intensity changes from block to block: 'quasi-stationary' (the
+   verdict also names what the level is apart from that);
 2. single innovations far out, or heavy tails: 'with impulses';
 3. another shape than the normal law: 'not Gaussian';
-4. too few samples to have seen heavy tails: 'undetermined';
+4. too few samples to detect heavy tails: 'undetermined';
 5. neighbours uncorrelated, or more white noise than relaxation, or relaxation
    faster than the sampling: 'Gaussian';
 6. lines carry most of the variance, or one relaxation does not leave
-   independent innovations, or a second one is seen: 'stationary stochastic'; if it does:
+   independent innovations, or a second one is detected: 'stationary stochastic'; if it does:
    'diffusion';
    without a usable fit 'undetermined'.
 
@@ -34,7 +34,7 @@ from ou_monitor.criticism.level_tests import Shape, TestResult
 from ou_monitor.records import Estimate, Status
 from scipy import stats
 
-# A level is called Gaussian only when an excess kurtosis of this size would have been seen.
+# A level is called Gaussian only when the tests would have detected this excess kurtosis.
 VISIBLE_KURTOSIS = 1.0
 _POWER = 0.9
 # More of the variance than this in spectral lines is most of it.
@@ -55,7 +55,7 @@ class ProcessType(enum.Enum):
 
 
 def detectable_kurtosis(n: int) -> float:
-    """Return the excess kurtosis that n innovations show with 90 % probability."""
+    """Return the excess kurtosis that n innovations reveal with 90 % probability."""
     if n < 1:
         return math.inf
     # Half of the level goes to the largest innovation.
@@ -120,25 +120,26 @@ def _apart_from_changes(estimate: Estimate, shape: Shape, line_share: float) -> 
     """Return the kind of a level as if nothing moved from block to block."""
     tails, normal = shape['impulses'], shape['gaussian']
     if tails.rejects:
-        return _plain(ProcessType.IMPULSES, 'single innovations lie further out than noise '
-                      'reaches, or the tails are heavy',
+        return _plain(ProcessType.IMPULSES, 'single innovations lie beyond the range of '
+                      'the noise, or the tails are heavy',
                       f'{shape.impulses} of {shape.n}, excess kurtosis {shape.kurtosis:.2g}, '
                       f'{_p(tails)}')
     if normal.rejects:
-        return _plain(ProcessType.NOT_GAUSSIAN, 'the innovations have another shape than the '
-                      'normal law', f'skewness {shape.skewness:.2g}, excess kurtosis '
+        return _plain(ProcessType.NOT_GAUSSIAN, 'the innovations do not follow the normal '
+                      'law', f'skewness {shape.skewness:.2g}, excess kurtosis '
                       f'{shape.kurtosis:.2g}, {_p(normal)}')
     if tails.why_not:
         return _plain(ProcessType.UNDETERMINED, tails.why_not)
     visible = detectable_kurtosis(shape.n)
     if visible > VISIBLE_KURTOSIS:
-        return _plain(ProcessType.UNDETERMINED, 'no test rejects, but so few samples would hide '
-                      'heavy tails', f'{shape.n} samples, excess kurtosis up to {visible:.2g}')
+        return _plain(ProcessType.UNDETERMINED, 'no test rejects, but so few samples cannot '
+                      'reveal heavy tails',
+                      f'{shape.n} samples, excess kurtosis up to {visible:.2g}')
     return _gaussian(estimate, shape, line_share, f'no excess kurtosis above {visible:.2g}')
 
 
 def _gaussian(estimate: Estimate, shape: Shape, line_share: float, normal: str) -> Verdict:
-    """Return the kind of a level that is Gaussian as far as can be seen."""
+    """Return the kind of a level whose shape no test rejects as Gaussian."""
     correlated = shape['correlated']
     if not correlated.rejects:
         return _plain(ProcessType.GAUSSIAN, 'neighbouring samples are uncorrelated', normal)
@@ -147,7 +148,7 @@ def _gaussian(estimate: Estimate, shape: Shape, line_share: float, normal: str) 
                       f'{100.0 * line_share:.0f} %; {normal}')
     if estimate.status is Status.NO_RELAXATION:
         return _plain(ProcessType.STATIONARY, 'neighbouring samples are correlated, but not as '
-                      'by a relaxation', f'{_p(correlated)}; {normal}')
+                      'a relaxation would correlate them', f'{_p(correlated)}; {normal}')
     if not estimate.usable:
         return _plain(ProcessType.UNDETERMINED, estimate.status.value)
     step = estimate.alpha / estimate.rate
@@ -164,8 +165,8 @@ def _gaussian(estimate: Estimate, shape: Shape, line_share: float, normal: str) 
                       f'{_p(rest)}; {normal}')
     second = shape['second_relaxation']
     if second.rejects:
-        return _plain(ProcessType.STATIONARY, 'a second relaxation, slower or faster, stands '
-                      'beside the one that was fitted: alpha is neither of them',
+        return _plain(ProcessType.STATIONARY, 'the innovations show a second relaxation, '
+                      'slower or faster than the fitted one: alpha is that of neither',
                       f'{_share(second.effect)}, {_p(second)}; {normal}')
     beside = f'; beside lines of {100.0 * line_share:.2g} % of the variance' if line_share else ''
     return _plain(ProcessType.DIFFUSION, 'one relaxation, slower than the sampling, leaves '

@@ -1,13 +1,13 @@
 """
-Everything that is doubtful about a recording, in one list, worst first.
+The list of what is doubtful about a recording, worst first.
 
 The list gathers what the estimator flags at each level, what the reader dropped or mended, what
 the samples and stamps show by themselves, and what lines, a second relaxation and the settling
 after changes of throttle do to the fit of a level.
 
 Limits: a list without warnings says that nothing was found, not that there is nothing.  Settling
-is known only from relaxations that are seen after changes between levels; its share of the
-variance rests on one exponential, and is that of the fit, which holds the settling itself.
+is known only from relaxations detected after changes between levels; its share of the variance
+assumes one exponential and is relative to a fit that includes the settling itself.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _MOST_VOLTS = 1000.0
 # Throttle may go beyond 0..1 by so much, as sticks out of trim do, and by more for so small a
 # share of the samples.
 _TRIM, _RARE = 0.05, 0.01
-# Stretches of samples looked at for ADC steps.
+# Segments of samples examined for ADC steps.
 _LOOKS = 8
 # What the reader's sentences are about: a word in them, the name, and whether numbers suffer.
 _READER = (('cannot be decoded', 'DAMAGED_FILE', True), ('damaged', 'DAMAGED_FILE', True),
@@ -42,8 +42,8 @@ _READER = (('cannot be decoded', 'DAMAGED_FILE', True), ('damaged', 'DAMAGED_FIL
            ('not a finite', 'NON_FINITE', True))
 
 NOISE_UNKNOWN = (
-    'White noise of the sensor is not told from the supply here: where there is some, alpha '
-    'and sigma come out too high (Var_inf does not).')
+    'The fit cannot separate white noise of the sensor from the supply here: if there is any, '
+    'alpha and sigma come out too high (Var_inf does not).')
 # Share of a level's variance that may be left of the settling: alpha is then off by about as much.
 SHARE = 0.02
 
@@ -122,18 +122,17 @@ def _of_units(recording: Recording) -> list[QualityItem]:
     middle = float(np.median(np.abs(recording.voltage))) if recording.n else 0.0
     if middle > _MOST_VOLTS:
         items.append(QualityItem('VOLTAGE_UNIT', Severity.WARNING, (
-            f'Half of the voltages are beyond {middle:.4g}, as no supply of a UAV is in volts: '
-            'millivolts, or counts of an ADC? Alpha and tau hold all the same; what is given in V '
-            'is in that unit instead, and there is no risk: divide millivolts by 1000 (of a bag: '
-            'unit_factor of a msg config).')))
+            f'Half of the voltages exceed {middle:.4g}, more than any supply of a UAV in volts: '
+            'are they millivolts, or counts of an ADC? Alpha and tau hold; figures in V are in '
+            'that unit instead, and no risk is computed. Divide millivolts by 1000 (for a bag: '
+            'unit_factor in a msg config).')))
     known = recording.throttle[np.isfinite(recording.throttle)]
     low, high = np.quantile(known, (_RARE, 1.0 - _RARE)) if known.size else (0.0, 1.0)
     if low < -_TRIM or high > 1.0 + _TRIM:
         items.append(QualityItem('THROTTLE_RANGE', Severity.WARNING, (
-            f'Throttle runs from {low:.3g} to {high:.3g}, and 0 to 1 is expected: the curves, the '
-            'risk and the throttle budget know nothing outside, and sag counts from the lowest '
-            'throttle. Of a stick from -1 to 1 take (x + 1) / 2; of reverse thrust the absolute '
-            'value.')))
+            f'Throttle runs from {low:.3g} to {high:.3g} instead of 0 to 1: curves, risk and '
+            'throttle budget end at 0 and 1, and sag counts from the lowest throttle. Use '
+            '(x + 1) / 2 for a stick from -1 to 1, the absolute value for reverse thrust.')))
     return items
 
 
@@ -149,12 +148,12 @@ def _of_stamps(recording: Recording) -> list[QualityItem]:
         items.append(QualityItem('PAUSES', Severity.WARNING, (
             f'{int(pauses.sum())} pause{"s" if pauses.sum() > 1 else ""} without samples, '
             f'{float(steps[pauses].sum()):.3g} s in all, the longest '
-            f'{float(steps.max()):.3g} s; no level reaches across one.')))
+            f'{float(steps.max()):.3g} s; no level spans a pause.')))
     jitter = float(np.sqrt(np.mean((steps[~pauses] / median - 1.0) ** 2)))
     if jitter > _UNEVEN:
         items.append(QualityItem('UNEVEN_CLOCK', Severity.INFO, (
             f'The steps between stamps scatter by {100.0 * jitter:.0f} % of their median '
-            f'({1e3 * median:.3g} ms): spectra take them as even.')))
+            f'({1e3 * median:.3g} ms): the spectra assume even steps.')))
     unknown = int(np.isnan(recording.throttle).sum())
     if unknown and recording.has_throttle:
         items.append(QualityItem('THROTTLE_UNKNOWN', Severity.INFO, (
@@ -183,8 +182,8 @@ def _of_samples(recording: Recording) -> list[QualityItem]:
     clipped = sum(look.saturated for look in looks)
     if clipped:
         items.append(QualityItem('CLIPPED', Severity.WARNING, (
-            f'In {clipped} of {len(looks)} stretches looked at the voltage piles up at one end '
-            'of its range: the ADC may be at its limit.')))
+            f'In {clipped} of {len(looks)} segments examined the voltage piles up at one end of '
+            'its range: the ADC may be saturated.')))
     return items
 
 
@@ -204,14 +203,14 @@ def unsettled(relaxations: Sequence[Relaxation], throttles: Sequence[float],
             continue
         what = {'release': 'falls', 'load': 'rises'}[fit.kind]
         start = f'After throttle {what} the voltage '
-        end = (f'only {1e3 * SETTLE:.3g} ms are left out: alpha and sigma here hold the settling '
-               'too')
+        end = (f'the levels leave out only {1e3 * SETTLE:.3g} ms: alpha and sigma here include '
+               'the settling')
         if fit.detected:
             most = 100.0 * min(1.0, max(shares[x] for x in where))
             text = (f'{start}settles in tau = {1e3 * fit.tau:.3g} ms, and {end} (up to '
                     f'{most:.0f} % of the variance).')
         else:
-            text = f'{start}moves on for as long as it is watched, and {end}.'
+            text = f'{start}keeps moving for the whole time observed, and {end}.'
         items.append(QualityItem('NOT_SETTLED', Severity.WARNING, text, where))
     return items
 
@@ -235,18 +234,18 @@ def line_item(throttle: float, without: Estimate, with_lines: Estimate | None) -
     if with_lines is None:
         worry = Severity.WARNING if without.usable else Severity.INFO
         return QualityItem('LINES_LEFT_IN', worry, (
-            'Impulses stand beside spectral lines, which may be theirs and were left in: alpha '
-            'and sigma hold both.'), (throttle,))
+            'The level shows impulses beside spectral lines; the lines may come from the impulses '
+            'and were left in: alpha and sigma include both.'), (throttle,))
     taken = 'Spectral lines were taken out before the fit'
     if without.usable and with_lines.usable:
         moved = any(abs(math.log(getattr(with_lines, name) / getattr(without, name)))
                     > Z95 * getattr(without, name + '_se') for name in ('alpha', 'sigma'))
-        text = (f'{taken}; with them, as the node sees it, alpha would be {with_lines.alpha:.3g} '
+        text = (f'{taken}; with them, as in the node, alpha would be {with_lines.alpha:.3g} '
                 f'1/s and sigma {with_lines.sigma:.3g} V/sqrt(s).')
     else:
         moved = without.usable or with_lines.usable
-        left = ' and nothing that can be fitted is left' if not without.usable else (
-            ', and only then can it be fitted: the node, which sees them, gives no numbers')
+        left = ', and the remainder cannot be fitted' if not without.usable else (
+            ', and only then does the fit succeed: the node, which keeps them, gives no numbers')
         text = f'{taken}{left}.'
     return QualityItem('LINES_TAKEN_OUT', Severity.WARNING if moved else Severity.INFO, text,
                        (throttle,))
@@ -255,14 +254,15 @@ def line_item(throttle: float, without: Estimate, with_lines: Estimate | None) -
 def second_items(throttles: Sequence[float]) -> list[QualityItem]:
     """Say where a second relaxation was found (throttles 0..1)."""
     return [QualityItem('SECOND_RELAXATION', Severity.WARNING, (
-        'A second relaxation, slower or faster, stands beside the one that was fitted: alpha, tau '
-        'and Var_inf are of a mixture, and their intervals hold for neither; the other levels may '
-        'hide the same. `ou-monitor discover` fits both.'), tuple(throttles))] if throttles else []
+        'The noise shows a second relaxation, slower or faster than the fitted one: alpha, tau '
+        'and Var_inf are those of a mixture, and their intervals hold for neither; the other '
+        'levels may hide the same. `ou-monitor discover` fits both.'), tuple(throttles))
+        ] if throttles else []
 
 
 def coupling_items(throttles: Sequence[float]) -> list[QualityItem]:
     """Say where the noise shows an AC-coupled instrument (throttles 0..1)."""
     return [QualityItem('AC_COUPLING', Severity.WARNING, (
-        'Slow noise is missing, as behind an AC-coupled instrument: alpha, tau and Var_inf are of '
-        'rail and instrument together; repeat with a DC-coupled one. `ou-monitor discover` fits '
-        'both.'), tuple(throttles))] if throttles else []
+        'Slow noise is missing, as behind an AC-coupled instrument: alpha, tau and Var_inf '
+        'describe rail and instrument together; repeat with a DC-coupled instrument. '
+        '`ou-monitor discover` fits both.'), tuple(throttles))] if throttles else []

@@ -36,7 +36,7 @@ _COARSE, _FINE = 41, 61
 # Of the voltage before a change the last so many seconds give its level.
 _BEFORE_S, _SETTLED_S = 0.5, 0.1
 _HALF_95 = 1.920729410347062
-# Probability that noise alone is seen to relax; an amplitude for each change, and tau.
+# Probability that a relaxation is detected in noise alone; an amplitude a change, and tau.
 _CHANCE = 1e-4
 # Probability that one exponential is said not to be enough where it is.
 BADLY_FITTED = 1e-3
@@ -102,20 +102,20 @@ class Relaxation:
     releases : tuple of Release
         Those fitted.
     tau, tau_low, tau_high : float
-        s, and 95 % interval; an end that the data leave open is 0 or inf; all NaN when nothing
-        is seen to relax.
+        s, and 95 % interval; an end that the data leave open is 0 or inf; all NaN when no
+        relaxation is detected.
     misfit : float
         Mean square of the standardised innovations: 1 when one exponential in the level's noise
         describes it.
     misfit_p : float
         Probability that further exponentials take as much out of the residuals where one is all
-        there is; NaN when nothing is seen to relax.
+        there is; NaN when no relaxation is detected.
     likelihood_gain : float
         Twice the gain of log likelihood over no relaxation at all; large without a tau when the
         voltage moves on over the whole time watched.
     left_out : float
-        Of the time after throttle arrived so much was left out, s: one exponential describes what
-        follows, and not that.
+        Time after throttle arrived that the fit leaves out, s: one exponential describes only
+        what follows.
 
     """
 
@@ -138,13 +138,13 @@ class Relaxation:
     def caveat(self) -> str:
         """Return what to say next to tau when one exponential is not enough; else empty."""
         if not self.badly_fitted:
-            return (f'The first {1e3 * self.left_out:.2g} ms after throttle had arrived are left '
-                    'out: with them one exponential does not describe it, and a second one nearly '
-                    'as slow would still bend tau.' if self.left_out > 0.0 else '')
+            return (f'The fit leaves out the first {1e3 * self.left_out:.2g} ms after the change '
+                    'of throttle, which one exponential does not describe; a second exponential '
+                    'nearly as slow would still bias tau.' if self.left_out > 0.0 else '')
         p = '< 1e-6' if self.misfit_p < 1e-6 else f'= {self.misfit_p:.1g}'
         return (f'One exponential does not describe it (p {p}; mean square of the residuals '
-                f'{self.misfit:.2f} of what the noise has): neither tau nor its interval is to be '
-                'trusted, nor what rests on them.')
+                f'{self.misfit:.2f} of what the noise has): do not rely on tau, on its interval, '
+                'or on what follows from them.')
 
     @property
     def log_se(self) -> float:
@@ -159,7 +159,7 @@ class Relaxation:
 
     @property
     def detected(self) -> bool:
-        """Whether anything is seen to relax."""
+        """Whether a relaxation is detected."""
         return math.isfinite(self.tau)
 
     @property

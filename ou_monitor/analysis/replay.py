@@ -1,5 +1,5 @@
 """
-What the node would have published while a recording was made, and what it had learned by its end.
+What the node would have published during a recording, and what it had learned by its end.
 
 The curves over throttle (level, sag, noise intensity, brown-out risk) are those of the node
 (`ou_monitor.online.risk.outlook`), learned from the recording as in flight, so that both say the

@@ -13,7 +13,7 @@ from scipy.signal import welch
 
 _MIN_LENGTH = 32
 # About this many averages: the estimate scatters by 1/sqrt(8), and there is
-# still a decade below the corner in a stretch of 25 relaxation times.
+# still a decade below the corner in a segment of 25 relaxation times.
 _AVERAGES = 8
 # Enough to show a tone as a line of its own.
 _PER_DECADE = 40

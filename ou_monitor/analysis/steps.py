@@ -1,5 +1,5 @@
 """
-Where throttle goes from one load level to another, and the samples after it, made independent.
+Where throttle goes from one load level to another, and the samples after it, whitened.
 
 Limits: throttle is a command; motors follow it some 5 to 20 ms later, which a relaxation watched
 from the end of the step does not know; alpha, sigma and noise of the level count as known.
@@ -83,7 +83,7 @@ def find_steps(recording: Recording, throttles: Sequence[float]) -> tuple[Step, 
 
 
 class Window:
-    """The samples after one change, made independent."""
+    """The samples after one change, whitened."""
 
     def __init__(self, recording: Recording, step: Step, estimate: Estimate, rms: float,
                  before: float, later: float = 0.0) -> None:
@@ -140,7 +140,7 @@ class Window:
         return max(0.0, float(alone @ alone - rest @ rest)), int(rank) - 1
 
     def solve(self, tau: float, scale: float) -> tuple[float, float, float, float]:
-        """Return U0 and A with their standard errors; of U0 alone without a tau to be seen."""
+        """Return U0 and A with their standard errors; of U0 alone without a tau."""
         x = self.whitened(np.column_stack([self.voltage, np.ones(self.n)]))
         if not tau < self.since[-1]:
             size = float(x[:, 1] @ x[:, 1])

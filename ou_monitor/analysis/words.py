@@ -17,8 +17,10 @@ from ou_monitor.text import number
 # What changes the meaning of the numbers in the headline itself.
 _BEWARE = {
     'VOLTAGE_UNIT': 'Beware: the voltages seem to be millivolts or counts, not volts.',
-    'SECOND_RELAXATION': 'Beware: a second relaxation is seen, and tau is of a mixture.',
-    'NOT_SETTLED': 'Beware: levels hold the settling after changes of throttle; so does tau.'}
+    'SECOND_RELAXATION': ('Beware: the noise shows a second relaxation, so tau is that of a '
+                          'mixture.'),
+    'NOT_SETTLED': ('Beware: the levels, and so tau, include the settling after changes of '
+                    'throttle.')}
 
 
 def headline(analysis: Analysis) -> str:
@@ -96,7 +98,7 @@ def brownout_sentence(analysis: Analysis) -> str:
                 f'V is for a 5 V rail, and this supply is at {number(middle)} V; '
                 '--brownout-voltage sets another.')
     if math.isnan(curves.voltage):
-        return 'No voltage was given that must not be undershot.'
+        return 'No brown-out voltage was given.'
     which = ("the node's default for a 5 V rail; --brownout-voltage sets another"
              if analysis.brownout_default else 'as asked for')
     text = (f'Brown-out: going below {curves.voltage:g} V ({which}) within '

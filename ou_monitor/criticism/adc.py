@@ -19,7 +19,7 @@ import numpy as np
 from ou_monitor.records import FloatArray
 from scipy.special import ndtr, ndtri
 
-# Values looked at for the step: more tell no more.
+# Values looked at for the step: more would not change it.
 _MOST = 200_000
 # Rounding of float32, as a share of the value, with room for two of them.
 _FLOAT32 = 2.5e-7
@@ -38,7 +38,7 @@ _SHARES = (0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.1)
 _SCALES = (0.05, 0.1, 0.15, 0.2, 0.3)
 # Evidence from which it is found, nats.
 _FOUND = 50.0
-# Falls from just below the knee, at least, and how noisy beside all; and stretches of the
+# Falls from just below the knee, at least, and how noisy beside all; and parts of the
 # recording of which half must have been beyond it.
 _FEWEST, _AS_NOISY, _PARTS = 30, 0.6, 10
 # Beyond so many scales a reading says nothing of what was there.
@@ -110,7 +110,7 @@ def _clipped(voltage: FloatArray, step: float, side: float) -> bool:
     if step > 0.0:
         expected = max(float((np.abs(below - k * step) < 0.5 * step).sum()) for k in (1, 2, 3))
     else:
-        # As dense as the nearest stretch that holds some samples.
+        # As dense as the nearest interval that holds some samples.
         reach = float(np.partition(others, min(_LEAST, others.size - 1))[:_LEAST].max())
         expected = _LEAST * 2.0 * tie / max(reach, tie)
     return count - expected > _CLEAR * math.sqrt(count + expected)

@@ -1,13 +1,13 @@
 """
-Signed statistics of normal scores: what a right model leaves nothing in.
+Signed statistics of normal scores: standard normal under a right model.
 
-Each is scaled to be about N(0, 1) for independent normal scores; how it really
-spreads, the throttle and the fit being what they are, is found by simulation
-(`null_bank`).  Names begin with the kind, by which terms ask for them.
+Each is scaled to be about N(0, 1) for independent normal scores; simulation finds the true
+spread for the given throttle and fit (`null_bank`).  A name begins with its kind, to which the
+`SIGNS` of terms refer.
 
-No term of the catalogue answers to loops of throttle, to an effect of throttle that
-grows, or to what follows large errors: those statistics tell effects that imitate a
-term by what they do over minutes, on the way up and down, or after they have begun.
+No term of the catalogue answers to loops of throttle, to an effect of throttle that grows, or to
+the errors after large ones: those statistics expose effects that imitate a term, by their course
+over minutes, on the way up and down, or after their onset.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _RELAYS = ((0.15, 0.85), (0.28, 0.72), (0.4, 0.6))
 _LEAST = 0.02
 # Errors this large begin something, in standard deviations; one in so many samples.
 _LARGE, _APART = 4.0, 20
-# Fewer of them tell nothing.
+# Fewer of them are not tested.
 _FEW = 5
 # Samples after them, in groups.
 _AFTER = (1, 4, 16, 64, 256, 1024)
@@ -48,7 +48,7 @@ _AFTER = (1, 4, 16, 64, 256, 1024)
 @dataclass(frozen=True, eq=False)
 class Covariates:
     """
-    What the scores of a recording are held against.
+    The series that the scores of a recording are correlated with.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Covariates:
     rate : float
         Samples per second, Hz.
     keep : float
-        What the state keeps from one sample to the next.
+        Share of the state that remains from one sample to the next.
     large : ndarray, shape (n,), or None
         Where large errors begin, as `large_ones` returns them.
     paths : tuple of (str, ndarray of shape (n,))
@@ -84,14 +84,14 @@ def statistics(z: FloatArray, given: Covariates, *, lines: bool = True) -> dict[
 
 
 def is_sign(sign: str, name: str, value: float) -> bool:
-    """Return whether a statistic is what a sign means."""
+    """Return whether a statistic matches a sign."""
     if sign[0] in '+-':
         return name.startswith(sign[1:]) and (value > 0.0) == (sign[0] == '+')
     return name.startswith(sign)
 
 
 def _all(z: FloatArray, given: Covariates, lines: bool) -> Iterator[tuple[str, float]]:
-    # The scores of a far outlier must not rule all that is not about outliers.
+    # One far outlier must not dominate the statistics that are not about outliers.
     w = np.clip(z, -5.0, 5.0)
     square = np.minimum(z * z, 25.0) - 1.0
     square -= square.mean()
@@ -124,7 +124,7 @@ def _correlations(w: FloatArray) -> Iterator[tuple[str, float]]:
 
 
 def _among_small(w: FloatArray) -> Iterator[tuple[str, float]]:
-    """Yield the correlation of neighbours that are both small: outliers have no part in it."""
+    """Yield the correlation of neighbours that are both small, without outliers."""
     small = (np.abs(w[1:]) < _SMALL) & (np.abs(w[:-1]) < _SMALL)
     if int(small.sum()) > 30:
         yield 'small errors lag 1', score(w[1:][small], w[:-1][small])
@@ -246,7 +246,7 @@ def _state(w: FloatArray, square: FloatArray, given: Covariates) -> Iterator[tup
 
 
 def _beyond_second_order(w: FloatArray, given: Covariates) -> Iterator[tuple[str, float]]:
-    """Yield what a spectrum does not show: power that comes and goes, and products of three."""
+    """Yield statistics beyond second order: power that comes and goes, and products of three."""
     n = w.size
     for length in _SEGMENTS:
         count = n // length
@@ -324,14 +324,14 @@ def throttle_paths(throttle: FloatArray, keep: float) -> Iterator[tuple[str, Flo
 
 def _left(name: str, wanted: FloatArray, known: FloatArray, keep: float
           ) -> Iterator[tuple[str, FloatArray]]:
-    """Yield what other regressors leave of one, whitened, where it is not next to nothing."""
+    """Yield a regressor less its fit by others, whitened, if a share of its power is left."""
     less = wanted - known @ np.linalg.lstsq(known, wanted, rcond=None)[0]
     if float(less @ less) > _LEAST * float(wanted @ wanted):
         yield name, less - keep * np.concatenate((less[:1], less[:-1]))
 
 
 def large_ones(errors: FloatArray, found: npt.NDArray[np.bool_] | None = None) -> FloatArray:
-    """Return where something begins: large errors that no other one has come shortly before."""
+    """Return the signs of large errors that do not follow another one shortly before."""
     large = np.abs(errors) > _LARGE
     if found is not None:
         large |= found
@@ -357,7 +357,7 @@ def after_large(w: FloatArray, square: FloatArray, large: FloatArray
 
 
 def _window(total: FloatArray, low: int, high: int) -> FloatArray:
-    """Return what a running total gained from `high` - 1 to `low` samples ago."""
+    """Return the increase of a running total from `high` - 1 to `low` samples ago."""
     def ago(k: int) -> FloatArray:
         return np.concatenate((np.zeros(k), total[:-k]))
     return ago(low) - ago(high)

@@ -1,9 +1,9 @@
 """
 A whole model, fitted: the Gaussian part, then laws of its innovations in turn.
 
-Each law turns normal scores into better ones and tells the ratio of densities,
-so laws compose; events that a law finds go back into the Gaussian part as
-extra variance, and both are fitted again.
+Each law maps normal scores to new ones and returns the ratio of densities, so that laws
+compose; events that a law finds go back into the Gaussian part as extra variance, and both are
+fitted again.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Composite:
     offset : ndarray, shape (n,), optional
         Likewise, V.
     cost : float
-        Time of the processor that the fits of the Gaussian part took, s, as its filters tell.
+        Processor time of the fits of the Gaussian part, s, estimated from its filters.
 
     """
 
@@ -175,7 +175,7 @@ def pole_beside(samples: Samples, composite: Composite) -> OtherPole:
 
 
 def covariates_of(samples: Samples, composite: Composite) -> Covariates:
-    """Return what the scores of a model are held against."""
+    """Return the series that the scores of a model are correlated with."""
     gaussian, events = composite.gaussian, composite.events
     residual = samples.voltage - gaussian.mean
     found = None if events is None else (events.push > 0.0) | (events.error > 0.0)

@@ -40,7 +40,7 @@ FAMILY_WISE = 0.01
 LEAST_SHARE = 0.1
 # Rates of the other pole that are looked for, in those of the first.
 FACTORS = (1.0 / 30.0, 1.0 / 10.0, 1.0 / 3.0, 3.0, 10.0)
-# Fewer ordinates than this tell nothing; segments shorter than this give none.
+# Fewer ordinates than this are not tested; shorter segments give none.
 _FEWEST, _SHORTEST = 64, 64
 # Steps that differ by less than this share count as alike.
 ALIKE = 0.3

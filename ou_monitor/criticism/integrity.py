@@ -1,5 +1,5 @@
 """
-What can be said of a recording without any model, and the samples left for one.
+What a recording shows without any model, and the samples left for one.
 
 Not-a-number, stamps, repeated values, codes and rails: exact findings, for in a
 diffusion ties have probability zero.  Stamps that scatter about an even grid are either true,
@@ -35,7 +35,7 @@ NAMED_STEP = 0.3
 # Throttle that moves less than this says nothing.
 MOVES = 0.01
 # Repeats that are called so, at least; and the share of ties by chance up to which
-# an ADC is fine enough to tell them.
+# an ADC is fine enough to detect them.
 _FEWEST_TIES, _FINE = 20, 0.15
 _FLOAT32 = 1.2e-7
 # Samples looked at for repeats, and passed at once.
@@ -132,8 +132,8 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     if math.isfinite(low) or math.isfinite(high):
         drawn = (v <= low) | (v >= high)
         exact.append(_saturation(v, low, high))
-        notes.append(f'{int(drawn.sum())} {soft} were drawn anew from '
-                     'what an OU does beyond it, given their neighbours.')
+        notes.append(f'{int(drawn.sum())} {soft} were redrawn from the '
+                     'law of an OU beyond it, given their neighbours.')
         v = redraw(v, low, high, step, np.random.default_rng(0))
     _judge_step(step, _innovation_std(v), exact, notes)
     stamps = judge_stamps(t, v)
@@ -144,8 +144,8 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     samples = Samples(stamps.t, v, useful)
     if between.size and drawn is None and stamps.error == 0.0:
         samples = _joined(samples, *events)
-        notes.append(f'{between.size} samples about changes that stand out between neighbours '
-                     'were kept, too.')
+        notes.append(f'{between.size} samples around changes that stand out between neighbours '
+                     'were kept as well.')
     report(1.0)
     return Integrity(samples, tuple(exact), tuple(notes), raw=_as_logged(*logged, exact),
                      drawn=drawn)
@@ -218,7 +218,7 @@ def _joined(samples: Samples, t: FloatArray, v: FloatArray, u: FloatArray | None
 
 
 def _innovation_std(v: FloatArray) -> float:
-    """Return the standard deviation of what the sample before does not tell, V."""
+    """Return the standard deviation of the error of predicting from the sample before, V."""
     a, b = v[:-1] - v[:-1].mean(), v[1:] - v[1:].mean()
     e = b - float(a @ b) / max(float(a @ a), 1e-300) * a
     # Events and load steps are no noise.

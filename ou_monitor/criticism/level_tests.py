@@ -1,5 +1,5 @@
 """
-Tests of what kind of process a load level shows, with p-values that hold.
+Tests of the kind of process at a load level, with calibrated p-values.
 
 Each test works on the one-step innovations of the level's fitted model, which are independent
 and standard normal when the level is a stationary OU in white noise:
@@ -145,7 +145,7 @@ def examine_level(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Esti
         return _untested(n, 'the voltage never changes')
     correlated = _correlated('correlated', own, _LAGS_RAW)
     if model is None and estimate.status is not Status.NO_RELAXATION:
-        why = 'without a usable fit the samples cannot be made independent'
+        why = 'without a usable fit the samples cannot be whitened'
         return replace(_untested(n, why), tests=tuple(
             correlated if name == 'correlated' else TestResult(name, why_not=why)
             for name in EFFECT))

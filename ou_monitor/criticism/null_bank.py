@@ -1,5 +1,5 @@
 """
-How the statistics spread when nothing is wrong, by simulation.
+Null distribution of the statistics, by simulation.
 
 Recordings of the fitted baseline, with the stamps and the throttle of the data,
 go through the same fit and the same statistics.  Theory suffices for lines that follow

@@ -1,7 +1,7 @@
 """
-What of a recording is a reading at all: codes and bad samples out, throttle as 0..1.
+The readings of a recording: codes and bad samples left out, throttle as 0..1.
 
-What is left out or taken otherwise is a note each.
+Each correction leaves a note.
 """
 
 from __future__ import annotations
@@ -198,8 +198,8 @@ def _as_share(u: FloatArray, notes: list[str]) -> FloatArray:
                      'throttle = value / 100. All results, and the model file, are for throttle '
                      '0 to 1.')
     else:
-        notes.append(f'Throttle lies within {number(low)} to {number(high)}, of no unit that is '
-                     'known here: not used. Give it as 0 to 1.')
+        notes.append(f'Throttle lies within {number(low)} to {number(high)}, in no unit known '
+                     'here: not used. Give it as 0 to 1.')
         return np.full(u.size, np.nan)
     with np.errstate(invalid='ignore'):
         wild = np.isfinite(u) & ((u < within[0]) | (u > within[1]))
@@ -226,8 +226,8 @@ def _held(t: FloatArray, u: FloatArray, notes: list[str]) -> FloatArray | None:
     longest = float(np.diff(ends, prepend=0.0).max())
     notes.append(
         f'Throttle is unknown at {counted(u.size - known.size, "sample")} ({number(total)} of '
-        f'{number(float(t[-1] - t[0]))} s, the longest stretch {number(longest)} s): the last '
-        'value known is held there' + ('' if there[0] else ', and the first one before it')
-        + '. Where throttle moved meanwhile, what is said of it is wrong.')
+        f'{number(float(t[-1] - t[0]))} s, the longest gap {number(longest)} s): the last '
+        'known value is held there' + ('' if there[0] else ', and the first one before it')
+        + '. Where throttle moved meanwhile, findings about throttle are wrong.')
     at = np.searchsorted(known, np.arange(u.size), side='right') - 1
     return u[known[np.maximum(at, 0)]]

@@ -105,7 +105,7 @@ class Samples:
 
     @cached_property
     def columns(self) -> dict[Term, FloatArray]:
-        """Return columns of the mean that were made before, by term with coefficients 1."""
+        """Return columns of the mean that were computed before, by term with coefficients 1."""
         return {}
 
     @cached_property
@@ -146,7 +146,8 @@ def choose_samples(voltage: FloatArray, rate: float) -> tuple[slice, str]:
     what = f'every {_nth(widest)} was used' if widest > 1 else 'all were used'
     return slice(first, first + size, widest), (
         f'{n} samples: {what} of the {size / rate:.4g} s in the middle ({rate / widest:.4g} Hz), '
-        'for the rail relaxes too fast for fewer; what is slower than that stretch is not seen.')
+        'because the rail relaxes too fast for sparser samples; effects slower than that segment '
+        'go undetected.')
 
 
 def events_between(voltage: FloatArray, throttle: FloatArray | None, rate: float, which: slice
@@ -180,7 +181,7 @@ def events_between(voltage: FloatArray, throttle: FloatArray | None, rate: float
         at = at[since > _SOON * rate]
     if not 0 < at.size <= _FEW:
         return none
-    # Before it and after it, and the next, by which a bad sample is told from a jump.
+    # Before it and after it, and the next, which separates a bad sample from a jump.
     near: npt.NDArray[np.int64] = np.unique(np.concatenate((at, at + 1, at + 2)))
     kept: npt.NDArray[np.int64] = near[(near < stop) & ((near - first) % k != 0)]
     return kept
@@ -229,7 +230,7 @@ def _even(t: FloatArray, first: float, dt: float) -> bool:
 
 
 def _whitened(v: FloatArray) -> tuple[FloatArray, float]:
-    """Return what the sample before does not tell, events cut, and what it tells."""
+    """Return the error of predicting from the sample before, events cut, and the coefficient."""
     c = v - v.mean()
     keep = float(c[1:] @ c[:-1]) / max(float(c @ c), 1e-300)
     e: FloatArray = c[1:] - keep * c[:-1]

@@ -85,7 +85,7 @@ class GaussianFit:
     phi : ndarray, shape (n,)
         Coefficient of the OU in each step.
     cost : float
-        Time of the processor that the fit took, s, as its filters tell.
+        Processor time of the fit, s, estimated from its filters.
 
     """
 
@@ -288,7 +288,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
     if states[0] * (states[1] - 1) > _DEAR and few < samples.n:
         # Far from the top a part of the samples shows the way.
         part = _liveliest(samples, few)
-        # What was fitted to all samples before is known better than a part can tell.
+        # A part determines parameters that were fitted to all samples less well than those did.
         first = _maximise(
             samples.part(part), terms, None if events is None else events.part(part),
             only=(0, len(terms) - 1) if rough else None)

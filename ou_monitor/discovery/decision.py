@@ -1,8 +1,8 @@
 """
 What the search decides: which causes are tried, accepted, kept, withdrawn; the verdict.
 
-Pure functions of statistics (normal scores by name), evidence (nats) and what the causes
-say of themselves; nothing here is fitted.
+Pure functions of statistics (normal scores by name), evidence (nats) and the attributes of the
+causes; this module fits nothing.
 """
 
 from __future__ import annotations
@@ -20,68 +20,68 @@ from ou_monitor.model.terms.term import Role, Term
 Statistics = Mapping[str, float]
 Kind = type[Term]
 
-# A statistic this far off asks for the terms that it is a sign of: by chance one of a
-# hundred is (P(|z| > 2.6) = 0.9 %), and a needless trial costs time only.
+# A statistic beyond this asks for the terms that it is a sign of: by chance one of a hundred
+# does (P(|z| > 2.6) = 0.9 %, as `FAMILY_WISE`), and a needless trial costs only time.
 ASK = 2.6
 # The same for terms that take seconds to fit: one of 700.
 ASK_DEAR = 3.2
-# Any statistic this far off means that something is wrong: of 70, by chance, once in 2000.
+# A statistic beyond this shows that the model is wrong: of 70, one by chance in 2000 recordings.
 OFF = 4.5
-# Evidence, nats, from which a cause that leaves nothing off (so far) spares trials of dear
-# kinds of other families: e^30, beyond what any other would gain by chance.
+# Evidence, nats, from which a cause that leaves no statistic beyond OFF spares the trials of dear
+# kinds of other families: e^30 is more than another kind would gain by chance.
 CLEAR = 30.0
-# What a fit to some thousand samples may lack of that to all, nats: measured on the
-# generator of test/hidden.
+# Evidence that a fit to some thousand samples may lack against a fit to all, nats: measured on
+# the generator of test/hidden.
 ROUGH = 20.0
-# Time that filters may take before no dear kind is tried any more, s.
+# Time of the filters after which the search tries no more dear kinds, s.
 MOST_COST = 10.0
 # Turns: measured inputs, laws where there are clear outliers, the rest.
 TIERS = 3
 # Kurtosis or tails, as a score, from which outliers are clear: an excess kurtosis of 1.1 in
 # 12 000 samples (25 sqrt(24 / n)), which no wandering intensity of a usual size leaves.
 OUTLIERS = 25.0
-# Correlation of small neighbours, as a score, below which there is white noise for sure.
+# Correlation of small neighbours, as a score, below which white noise is certain.
 WHITE = -8.0
 
 # Evidence from which a cause is accepted, nats: likelihood ratio e^6 = 403, which for 22 kinds
 # tried leaves 5 % false alarms at most.
 ACCEPT = 6.0
-# The same for a mean that answers to what was measured, which every flight has some of:
-# e^3 = 20, 5 % for one kind.
+# The same for a mean that answers to a measured input, which every flight has: e^3 = 20, 5 % for
+# one kind.
 ACCEPT_MEAN = 3.0
-# Causes within this of the best cannot be told from it here, nats: odds of less than 20.
+# The recording cannot separate causes within this of the best from it, nats: odds below 20.
 TIE = 3.0
-# Evidence from which a measured cause stays when others have come, nats: its price (BIC) is
-# subtracted already, and it was measured.
+# Evidence from which a measured cause stays after others were accepted, nats: its price (BIC) is
+# already subtracted, and its input was measured.
 NEEDED = 0.0
-# A gain of more standard errors than this is more than segments of the recording differ in:
-# by chance one of 30 000.
+# A gain beyond this many standard errors exceeds the scatter of the segments of the recording: by
+# chance one in 30 000 does.
 STEADY = 4.0
-# Share of the segments that gain, from which a gain is throughout: of 24, 18 or more by
-# chance once in 100 (binomial: 1.1 %).
+# Share of segments with a gain from which it holds throughout: by chance 18 or more of 24 gain
+# once in 100 (binomial: 1.1 %).
 MOSTLY = 0.75
-# Statistics of outliers and clusters, as scores, above which likelihoods count some samples
-# too much for evidence to be trusted without a look at the segments.
+# Statistics of outliers and clusters, as scores, above which single samples dominate the
+# likelihood, so that the evidence must hold in most segments.
 RAGGED = 8.0
-# Causes accepted at most, of these latent ones at most: each round costs as much as all
-# before; no recording of test/hidden, with two effects at most, has needed more.
+# Most causes accepted, and most latent ones among them: each round costs as much as all before;
+# no recording of test/hidden, with two effects at most, needed more.
 MOST, MOST_LATENT = 8, 3
 # Lines that come with a tone at most: harmonics of a motor or PWM up to the 13th.
 MOST_LINES = 12
-# Statistics from which misfit counts, as scores (by chance one of 16 000), and the misfit,
-# their sum of squares, that is too little to ask for more help: four scores of 5.
+# Score from which a statistic counts as misfit (by chance one of 16 000 does), and the sum of
+# their squares below which the search asks no further: four scores of 5.
 MISFIT, LITTLE = 4.0, 100.0
-# Share of the misfit that a latent cause must take away for the search to go on.
+# Share of the misfit that a latent cause must remove for the search to go on.
 HELPS = 0.5
 
-# Chance of the largest statistic above which nothing is wrong where no cause was found.
+# Chance of the largest statistic above which a model without causes passes.
 NOTHING = 0.01
-# The same for a model with causes; they were chosen to please, so that failing means more.
+# The same for a model with causes: they were chosen to pass, so that a failure means more.
 PASSES = 0.001
-# A statistic fails that is this far off: of 70, by chance, once in 10 000.
+# A statistic beyond this fails: of 70, one by chance in 10 000 recordings.
 FAILS = 4.8
-# Shares of what it was, and of the worst of all, before there were any causes, that a
-# statistic may keep: what the form of a cause leaves of a large effect.
+# Shares that a statistic may keep of its own value and of the largest value, both before any cause
+# was accepted: the form of a cause leaves as much of a large effect.
 OWN_SHARE, WORST_SHARE = 0.07, 0.02
 # Share of clustering that the form of sigma(throttle) may leave.
 FORM_SHARE = 0.15
@@ -107,17 +107,17 @@ def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], values: Statistic
             continue
         if any(imitate(kind, other) for other in model):
             continue
-        # What is cheap and linear in what was measured is tried wherever something was
-        # found and something is left.
+        # Cheap terms, linear in measured inputs, are tried wherever a cause was found and a
+        # statistic is still off.
         if asks(kind, values) or kind.NAME in shown or (
                 len(model) > 1 and kind.MEASURED and kind.ROLE is Role.MEAN and any_off(values)):
             found.append(kind)
-    # The one that is asked for most may spare the others.
+    # The kind with the largest statistic may spare the others.
     return sorted(found, key=lambda kind: (kind.DEAR, -asks(kind, values)))
 
 
 def asks(kind: Kind, values: Statistics) -> float:
-    """Return how far off the statistic is that asks most for a kind; 0 where none does."""
+    """Return the largest statistic that asks for a kind; 0 where none does."""
     limit = ASK_DEAR if kind.DEAR else ASK
     return max((abs(value) for name, value in values.items() for sign in kind.SIGNS
                 if abs(value) > limit and is_sign(sign, name, value)), default=0.0)
@@ -146,11 +146,11 @@ def tier_of(kind: Kind, values: Statistics) -> int:
         return 0
     shape = max((abs(value) for name, value in values.items()
                  if name.startswith(('kurtosis', 'tails'))), default=0.0)
-    # No Gaussian term makes outliers: where there are many, laws come before.
+    # No Gaussian term produces outliers: where there are many, laws come first.
     outliers = shape > OUTLIERS
     if kind.ROLE is Role.NOISE:
-        # White noise is in every sensor, and hides what is slow and weak; but bad samples
-        # look like some, if not among small errors.
+        # Every sensor has white noise, which hides slow and weak effects; but bad samples
+        # imitate it, except among small errors.
         return int(outliers and values.get('small errors lag 1', 0.0) > WHITE)
     return 1 if kind.ROLE is Role.LAW and outliers else 2
 
@@ -169,7 +169,7 @@ def settled(tried: Kind, left: Statistics | None, kind: Kind,
 
 
 def affordable(kind: Kind, cost: float) -> bool:
-    """Return whether a kind may be tried when fits have taken so long (cost in s)."""
+    """Return whether the search may still try a kind after fits of this cost (s)."""
     return not kind.DEAR or cost <= MOST_COST
 
 
@@ -185,20 +185,20 @@ def least_evidence(kind: Kind, largest: float) -> float:
 def acceptable(kind: Kind, evidence: float, largest: float, ragged: bool, throughout: bool
                ) -> bool:
     """Return whether a trial may be accepted (evidence, largest in nats)."""
-    # By chance a few outliers come at one throttle, and pass for an answer to it.
+    # A few outliers that coincide with one throttle by chance imitate an answer to throttle.
     return evidence > least_evidence(kind, largest) and (
         throughout or not (kind.MEASURED and ragged))
 
 
 def is_ragged(values: Statistics) -> bool:
-    """Return whether likelihoods count some samples too much: scores are far from normal."""
+    """Return whether single samples dominate the likelihood: scores are far from normal."""
     return any(name.startswith(('kurtosis', 'tails', 'clustering')) and value > RAGGED
                for name, value in values.items())
 
 
 def is_throughout(mean: float, error: float, gains: Sequence[float]) -> bool:
     """
-    Return whether a gain is more than segments differ in, or is there in most of them.
+    Return whether a gain exceeds the scatter of the segments, or holds in most of them.
 
     mean, error: of the gain per sample, nats; gains: of each segment, nats.
     """
@@ -213,7 +213,7 @@ def rivals_of(best: str, evidence: Sequence[tuple[str, float]]) -> list[str]:
 
 
 def helped(before: Statistics, after: Statistics, kind: Kind | None = None) -> bool:
-    """Return whether what is off has come nearer: all of it, or what asks for a kind."""
+    """Return whether the misfit has shrunk: of all statistics, or of those that ask for a kind."""
     asking = {name for name, value in before.items()
               if kind is None or any(is_sign(sign, name, value) for sign in kind.SIGNS)}
 
@@ -228,20 +228,20 @@ def helped(before: Statistics, after: Statistics, kind: Kind | None = None) -> b
 # Which of those accepted stay.
 
 def in_doubt(kind: Kind, last: Kind) -> bool:
-    """Return whether a cause is put to the test again after another one was accepted."""
-    # Another law of the noise is no reason to doubt what answers to an input, unless it is
-    # the intensity that wanders: by chance with throttle.
+    """Return whether a cause is tested again after another one was accepted."""
+    # Another law of the noise casts no doubt on an answer to an input, unless the intensity
+    # wanders: then it may follow throttle by chance.
     return not (last.ROLE is Role.LAW and kind.MEASURED and kind.FAMILY != last.FAMILY)
 
 
 def needed_evidence(kind: Kind) -> float:
     """Return the evidence that a cause must bring to stay, nats."""
-    # What was measured stays unless it gains less than it costs.
+    # A measured cause stays unless it gains less than it costs.
     return NEEDED if kind.MEASURED else TIE
 
 
 def failing(before: Statistics, after: Statistics) -> list[str]:
-    """Return the statistics that the causes should have mended and did not."""
+    """Return the statistics that the causes should have brought into their band and did not."""
     worst = max((abs(value) for value in before.values()), default=0.0)
     return [name for name, value in after.items()
             if abs(value) > max(FAILS, OWN_SHARE * abs(before.get(name, 0.0)),
@@ -256,7 +256,7 @@ def is_latent(kind: Kind) -> bool:
 def withdrawn(before: Statistics, after: Statistics, accepted: Sequence[Kind]) -> list[int]:
     """Return which of the accepted causes claim what they do not explain."""
     measured = [kind for kind in accepted if not is_latent(kind)]
-    # What a measured cause is asked for and leaves is its form, which is not complete.
+    # What a measured cause leaves of its own signs is due to its form, which is not complete.
     left = [name for name in failing(before, after)
             if not any(is_sign(sign, name, after[name]) for kind in measured
                        for sign in kind.SIGNS)]
@@ -277,10 +277,10 @@ def withdrawn(before: Statistics, after: Statistics, accepted: Sequence[Kind]) -
     return [k for k, kind in enumerate(accepted) if is_latent(kind) and fails(kind)]
 
 
-# What to say of the recording.
+# The verdict on the recording.
 
 def largest_chance(values: Statistics) -> float:
-    """Return the chance that the largest statistic of a right model is as large as here."""
+    """Return the chance that the largest statistic of a right model is as large as this one."""
     largest = max((abs(value) for value in values.values()), default=0.0)
     return family_chance(largest, max(len(values), 1))
 

@@ -32,7 +32,7 @@ from scipy.special import ndtri
 
 # Why the gain of a line is not known that was found in all samples, of which some are used.
 FAST = 'the samples that are used are too few to show a line so fast.'
-# Steps of more relaxation times than this leave no relaxation to be seen.
+# Steps of more relaxation times than this hide the relaxation.
 _BLIND = 1.0
 # Relaxation times in a recording from which its rate is one, and no trend.
 _RELAXES = 20.0
@@ -96,7 +96,7 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
     verdict = judge(named.after, len(causes), len(named.dropped))
     criticism = _criticism(named.before, named.after)
     left = sorted((c for c in criticism if c.is_off), key=lambda c: -abs(c.after))
-    # The rest is in the model that was fitted.
+    # The other exact terms were undone in the samples; the model needs them again.
     undone = tuple(t for t in state.exact if t.NAME != 'quantization')
     crossing = crossing_rates(samples, (plain,), () if unknown else named.model.terms, rng)
     done(1.0)

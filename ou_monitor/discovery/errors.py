@@ -151,7 +151,7 @@ class Estimation:
 
 def estimations(samples: Samples, model: Composite, *parts: npt.NDArray[np.bool_]
                 ) -> list[Estimation]:
-    """Return what the first part tells of a model's parameters, and what others ask of them."""
+    """Return the information of the first part on the parameters, and what other parts need."""
     terms = model.gaussian.terms
     base = evaluate(samples, terms, model.events)
     owner, through = [], []

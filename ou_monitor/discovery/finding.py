@@ -80,7 +80,7 @@ class Cause:
     p_value : float
         See `gain.cause_gain`; 0 for exact findings, which have no chance at all.
     alternatives : tuple of str
-        Causes that this recording cannot tell from it.
+        Causes that this recording cannot separate from it.
     explanation : str
         For people.
     exact : bool
@@ -104,7 +104,7 @@ class Cause:
 
     @property
     def measurable(self) -> bool:
-        """Whether the gain can be told from zero."""
+        """Whether the gain is distinguishable from zero."""
         return self.gain > Z95 * self.gain_se
 
 

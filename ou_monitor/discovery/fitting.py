@@ -24,7 +24,7 @@ from ou_monitor.model.terms.load_transient import LoadTransient
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray
 
-# Starting points that are fitted in full, and samples that tell which.
+# Starting points that are fitted in full, and samples that decide which.
 _FULL, _GLANCE = 2, 8000
 # Lags of a sag that are fitted in full.
 _LAGS = 4
@@ -70,7 +70,7 @@ class Fitter:
     samples : Samples
         The recording.
     cost : float
-        Time of the processor that fits have taken, s, as their filters tell.
+        Processor time of the fits, s, estimated from their filters.
 
     """
 
@@ -197,13 +197,12 @@ class Fitter:
         """
         Return the best fit with a sag that comes at its own rate, or later.
 
-        Neither the sag nor its lag may gain anything alone: a rail that relaxes to where
-        throttle puts it does not jump.
+        Alone, neither the sag nor its lag may gain: a rail that relaxes to a level set by
+        throttle does not jump.
         """
         sag = LoadSag.candidates(view)[0]
         lags = _by_scores(self.samples, list(LoadTransient.candidates(view)), view, beside=[sag])
-        # The rate of the rail is not what it seemed to be, and with it goes the lag that fits
-        # best.
+        # Beside a sag the rate of the rail changes, and with it the lag that fits best.
         fits = [self.join(composite, [sag, lag], rough=True) for lag in lags[:_LAGS]]
         return max((fit for fit in fits if fit is not None), default=None, key=self.evidence)
 

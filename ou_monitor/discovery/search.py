@@ -27,7 +27,7 @@ from ou_monitor.model.terms.tone import lines_of, Tone
 
 Progress = Callable[[float], None]
 
-# What to say where the search was cut short.
+# Note where the search was cut short.
 STOPPED = ('The search for causes was cut short where the next ones would have taken long; there '
            'may be more than are named.')
 
@@ -35,7 +35,7 @@ STOPPED = ('The search for causes was cut short where the next ones would have t
 @dataclass(eq=False)
 class Search:
     """
-    What the search has come to.
+    State of the search.
 
     Attributes
     ----------
@@ -46,9 +46,9 @@ class Search:
     rivals : dict of str to list of str
         For each cause, those that did as well in its round.
     log : list of str
-        What was tried and what came of it, one line each.
+        Trials and their results, one line each.
     removed : list of str
-        Causes taken out again: others that came later do what they did.
+        Causes taken out again, because later ones made them needless.
     largest : float
         Largest evidence of an accepted cause, nats.
     stopped : bool
@@ -105,7 +105,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         # A fit outside of what numbers can hold; the criticism still stands.
         search, failure = Search(start), f'The search for causes broke off: {error}.'
-    # What happens once, in the part kept, is no fault of the form of a cause.
+    # Fitted to everything, so that an event in the part kept does not count against a cause.
     whole = fitter.whole(search.composite)
     after = criticise(samples, whole, bank) if search.accepted else before
     kinds = _kinds(search.accepted)
@@ -114,15 +114,15 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     if dropped:
         stays = [search.composite.terms[position(search.composite, search.accepted, k)]
                  for k, kind in enumerate(kinds) if k not in out and decision.is_latent(kind)]
-        # They may have stood in the way of what was measured.  A trend that gave way to
-        # another slow cause is none.
+        # The causes withdrawn may have hidden measured ones.  A trend that another slow cause
+        # replaced is not tried again.
         slow = [kind.NAME for kind in _kinds(search.removed) if kind.FAMILY == 'slow']
         search = name_causes(fitter, start, bank, latent=False, given=[*given, *slow])
         whole, after = _kept_beside(fitter, search, stays, before, bank)
     part = samples.train if whole is search.composite else slice(0, samples.n)
     model = search.composite
     if search.accepted:
-        # Named with a mean fitted to everything; measured with one that was not.
+        # The search fits the mean to everything; the gain needs one fitted to the first part.
         model = fit_composite(samples, model.terms, samples.train, model) or model
     return Named(model, whole, part, tuple(search.accepted), search.rivals, dropped, before, after,
                  failure)
@@ -143,13 +143,13 @@ def name_causes(fitter: Fitter, baseline: Composite, bank: NullBank, *,
         hidden = {kind for kind in _kinds(search.accepted) if not kind.MEASURED}
         deep = latent and len(hidden) < decision.MOST_LATENT
         for tier in range(decision.TIERS if deep else 1):
-            # Measured inputs first: what is latent can imitate them, and costs more.
+            # Measured inputs first: latent causes can imitate them, and cost more.
             trials += fitter.trials(search.composite, values, given, tier, bank, only)
             good = [trial for trial in trials if _acceptable(trial, search, values)]
             if good:
                 break
             if tier == 0 and not reformed and decision.any_off(values):
-                # Before anything latent mends what the form of a measured cause leaves.
+                # Before a latent cause imitates what the form of a measured one leaves.
                 reformed = True
                 if _reform(fitter, search):
                     values = criticise(samples, search.composite, bank)
@@ -167,8 +167,8 @@ def name_causes(fitter: Fitter, baseline: Composite, bank: NullBank, *,
         kind = catalogue()[best.name]
         if decision.tier_of(kind, values) > 0 and not (
                 decision.helped(values, after) or decision.helped(values, after, kind)):
-            # What is wrong here may not be in the catalogue: other terms would dress
-            # it up.  Only one more of the kind may still be missing.
+            # The effect may not be in the catalogue; other terms would only imitate it.  One
+            # more term of the same kind may still be missing.
             search.log.append(f'{best.name} leaves most of what is wrong')
             if not kind.RECURS or only:
                 break
@@ -212,7 +212,7 @@ def _accept(search: Search, best: Trial, trials: Sequence[Trial]) -> None:
 
 
 def _other_means(fitter: Fitter, search: Search, trials: Sequence[Trial]) -> None:
-    """Accept what else in the mean answers to what was measured, before alpha takes its place."""
+    """Accept the other measured causes of the mean, before alpha takes their place."""
     last = search.accepted[-1]
     if not catalogue()[last].MEASURED:
         return

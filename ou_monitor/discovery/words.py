@@ -21,12 +21,12 @@ from ou_monitor.text import listed, number, Z95
 MNAT = ('mnat: a thousandth of a nat of log predictive density. A gain of 1 mnat per sample makes '
         '1000 samples e = 2.7 times as likely as before.')
 # What to say where the error of a gain leaves nothing known of it.
-VAGUE = ('its error is more than ten times as large as itself, as the first 60 % hardly determine '
-         'its parameters.')
+VAGUE = ('its error is more than ten times the gain, because the first 60 % hardly determine its '
+         'parameters.')
 # What to say where there is no model to compare with.
 NO_OTHER = 'the model cannot be fitted without it.'
 NOT_KNOWN = 'not known'
-# Chance from which a cause cannot be told from none by the part fitted.
+# Chance from which the part fitted does not show a cause.
 _CHANCE = 0.05
 # An estimate whose error is so many times as large is none.
 _UNDETERMINED = 1e4
@@ -50,7 +50,7 @@ _PLAIN = ((
     ('state', 'the relaxation is not proportional to the deviation'),
     ('growing effect', 'what throttle does to the mean changes with time'),
     ('loop of throttle', 'the mean depends on whether throttle has come from above or below'),
-    ('after large', 'what follows a large error is not what the relaxation says'),
+    ('after large', 'what follows a large error is not what the relaxation predicts'),
     ('power after large', 'a large error is followed by more noise, or by less'),
     ('irreversibility', 'it looks different backwards in time'),
     ('small errors', 'neighbouring small errors are correlated'),
@@ -99,7 +99,7 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
     """
     parts = [term.MEANING, f'Estimate: {parameters(term, se)}.']
     if exact:
-        parts.append('Seen in the samples themselves, without a model.')
+        parts.append('The samples themselves show it, without a model.')
     parts.append(gain_words(gain, gain_se, why))
     if together > 1 and math.isfinite(gain):
         parts.append(f'That is the gain of all {together} terms {term.NAME} together.')
@@ -108,16 +108,16 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
     if alternatives:
         separate = [f'{catalogue()[name].SEPARATED_BY} (for {name})'
                     for name in (term.NAME, *alternatives)]
-        parts.append(f'This recording does not tell it from {listed(list(alternatives))}; what '
+        parts.append(f'This recording cannot separate it from {listed(list(alternatives))}; what '
                      f'would: {"; ".join(dict.fromkeys(separate))}.')
     parts.append(term.REMEDY)
     return ' '.join(part for part in parts if part)
 
 
 def left_out_note(count: int, scored: int) -> str:
-    """Return that samples at throttle which the part fitted has not seen are not scored."""
-    return (f'{count} samples of the last 40 % are at throttle that the first 60 % never had: a '
-            f'model fitted there says nothing of them. Only the other {scored} are scored.')
+    """Return that samples at throttle which the part fitted does not cover are not scored."""
+    return (f'{count} samples of the last 40 % are at throttle that the first 60 % do not cover: '
+            f'a model fitted there does not apply to them. Only the other {scored} are scored.')
 
 
 def coupling_note(alpha: float, duration: float) -> str:
@@ -132,13 +132,13 @@ def coupling_note(alpha: float, duration: float) -> str:
     slowest = 6.0 / (0.24 * duration)
     corner = alpha / (2.0 * math.pi)
     return (f'An AC-coupled instrument with a corner at {number(corner)} Hz would show '
-            f'the same relaxation. {number(duration)} s exclude that only for rails of '
-            f'their own rate above {number(slowest)} 1/s (one of 1 1/s takes 25 s, of 0.1 1/s 250 '
-            's): where in doubt, repeat with the instrument DC-coupled.')
+            f'the same relaxation. {number(duration)} s exclude that only for rails whose own '
+            f'rate exceeds {number(slowest)} 1/s (a rate of 1 1/s takes 25 s, of 0.1 1/s 250 s): '
+            'in case of doubt, repeat with the instrument DC-coupled.')
 
 
 def no_relaxation_note(alpha: float, step: float) -> str:
-    """Return what it means that samples are farther apart than the rail remembers."""
+    """Return the note for samples that are farther apart than the rail remembers."""
     return (f'Samples {number(1e3 * step)} ms apart are nearly uncorrelated: the rail is faster '
             f'than the sampling, or the noise is that of the sensor, and alpha = {number(alpha)} '
             '1/s, fitted on the first 60 %, is only a lower bound.')
@@ -165,23 +165,24 @@ def verdict_sentence(verdict: Verdict, causes: Sequence[Cause], left: Sequence[C
              if dropped else '')
     if left and uncovered:
         tried += (f' {uncovered} samples of the last 40 % are at throttle that the first 60 %, on '
-                  'which models are fitted, never had: what is left may be no more than that'
-                  + ('.' if why else '; a recording that goes through all of its throttle in '
-                     'both parts would tell.'))
+                  'which models are fitted, do not cover: that alone may be what is left'
+                  + ('.' if why else '; a recording that covers its whole range of throttle in '
+                     'both parts would decide.'))
     if verdict is Verdict.NO_EFFECT:
-        return ('The plain OU simulates this recording: nothing is wrong with it that this length '
-                'could show.')
+        return ('The plain OU simulates this recording: no statistic that a recording of this '
+                'length supports deviates.')
     if verdict is Verdict.UNEXPLAINED:
         if not left:
-            return f'Something is wrong with the simulation that no known cause explains.{tried}'
-        return ('The simulation is wrong, and no known cause explains it: '
+            return ('The simulation deviates from the recording, and no known cause explains '
+                    f'it.{tried}')
+        return ('The simulation deviates from the recording, and no known cause explains it: '
                 f'{remaining_words(left)}.{tried}')
     if verdict is Verdict.EXPLAINED:
         return (f'What the plain OU gets wrong is explained by {listed(names)}. '
                 + gain_words(gain, gain_se, why))
     rest = f': {remaining_words(left)}' if left else ''
     return (f'{listed(names)} explain{"s" if len(names) == 1 else ""} a part of what the plain OU '
-            f'gets wrong; something else is left{rest}.{tried} ' + gain_words(gain, gain_se, why))
+            f'gets wrong; another part remains{rest}.{tried} ' + gain_words(gain, gain_se, why))
 
 
 def _counted(names: Sequence[str]) -> list[str]:
@@ -199,7 +200,7 @@ def crossing_words(finding: Finding) -> str:
                 if finding.causes and math.isfinite(c.extended) else '')
     return (f'The voltage fell through {number(c.level, 4)} V '
             f'{number(c.observed)} +- {number(c.observed_se, 2)} times a minute; the plain OU '
-            f'says {number(c.baseline)} +- {number(c.baseline_se, 2)}{extended}.')
+            f'predicts {number(c.baseline)} +- {number(c.baseline_se, 2)}{extended}.')
 
 
 def plain_model_words(baseline: OU) -> str:
@@ -251,12 +252,12 @@ def unmeasured_words(fewest: int, scored: int, throttle: bool) -> str:
     few = f'{scored} samples are left to score it on, fewer than {fewest}'
     if throttle:
         return (f'{few if scored < fewest else "models are fitted on the first 60 % for this"}, '
-                'and throttle there does not go through what the rest holds. One that goes '
-                'through all of its throttle in both parts would measure it.')
+                'and throttle there does not cover that of the rest. A recording that covers its '
+                'whole range of throttle in both parts would measure it.')
     if scored < fewest:
-        return f'{few}. A longer one would measure it.'
+        return f'{few}. A longer recording would measure it.'
     return ('the first 60 %, on which models are fitted for this, do not determine it. A longer '
-            'one would measure it.')
+            'recording would measure it.')
 
 
 @dataclass(frozen=True)
@@ -279,7 +280,7 @@ class CauseRow:
     chance : str
         p, ``exact``, or that it is not known.
     alternatives : tuple of str
-        Causes that cannot be told from it.
+        Causes that the recording cannot separate from it.
     estimates : tuple of str
         Parameters of each term, with units and standard errors.
     explanation : str

@@ -49,10 +49,10 @@ def process(analysis: Analysis) -> list[str]:
     return [
         page.table(['Throttle', 'Process', *_TESTS.values()], rows, left=[0, 1]),
         page.paragraph(
-            'p-values after Holm over all tests of all levels, small the effect; * rejects: p '
-            'below 0.01 and an effect of consequence. A recording of stationary OU levels has '
-            'any of them reject once in a hundred times; that "Correlated" rejects is what a '
-            'relaxation does.', soft=True),
+            'p-values, adjusted by Holm over all tests of all levels, and below each the effect; '
+            '* rejects: p below 0.01 and an effect of consequence. In one of a hundred recordings '
+            'of stationary OU levels any test but "Correlated" rejects; "Correlated" rejects '
+            'wherever the supply relaxes.', soft=True),
         page.bullets(reasons)]
 
 
@@ -68,7 +68,7 @@ def lines(analysis: Analysis) -> list[str]:
         return []
     detail = ', '.join(f'{level.label}: {rounded(1e3 * level.lines.detectable)} mV'
                        for level in searched)
-    text = (f'A recording without lines has one reported once in a hundred times. RMS of a line '
+    text = (f'One in a hundred recordings without lines has one reported. RMS of a line '
             f'that would have been detected with 90 %: {detail}.')
     if not rows:
         return [page.paragraph('No spectral line stands out of the noise at any level.'),

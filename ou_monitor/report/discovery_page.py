@@ -80,7 +80,7 @@ def _total_gain(finding: Finding) -> str:
 
 def _causes(finding: Finding) -> list[str]:
     if not finding.causes:
-        return [page.paragraph('None was named.')]
+        return [page.paragraph('No cause was named.')]
     found = cause_rows(finding.causes)
     overlap = overlap_words(finding.causes, finding.gain)
     rows = [[row.label, row.family,
@@ -92,11 +92,12 @@ def _causes(finding: Finding) -> list[str]:
         *([page.paragraph(overlap)] if overlap else []),
         page.bullets([_typeset(f'{row.label}: {row.explanation}') for row in found]),
         page.paragraph(
-            'Gain: what the held-out score loses when the cause is left out and all else is '
-            'fitted again, with the standard error of means of blocks and of the errors of the '
-            'parameters. p: of the likelihood ratio on the part fitted, searching counted, or of '
-            'the gain, doubled. Exact findings show in the samples themselves; those that '
-            'are undone there share one gain. Terms of one kind that share a gain are one row.',
+            'Gain: the loss of held-out score when the cause is left out and the rest is fitted '
+            'again; its standard error comes from means of blocks and from the errors of the '
+            'parameters. p: twice the smaller of two chances, that of the likelihood ratio on the '
+            'part fitted (its search counted) and that of the gain. The samples themselves show '
+            'exact findings; those undone in the samples share one gain. Terms of one kind that '
+            'share a gain are one row.',
             soft=True),
         page.paragraph(MNAT, soft=True)]
 
@@ -136,8 +137,8 @@ def _statistics(finding: Finding) -> list[str]:
     dots = 'Hollow: plain OU. Full: extended model' if finding.causes else 'Dot: plain OU'
     return [page.figure(
         _dot_rows(f'{dots}. Band: what simulations produce', 'standard scores', rows),
-        text + 'The band is that of simulations through the same fit: a right model leaves it '
-        'with any of its statistics in one recording of a hundred.')]
+        text + 'The band comes from simulations that pass through the same fit: under a right '
+        'model one recording in a hundred has a statistic outside it.')]
 
 
 def _comparisons(finding: Finding) -> list[str]:
@@ -202,8 +203,8 @@ def _parameters(finding: Finding) -> list[str]:
                          _typeset(with_error(value, se.get(spec.name))),
                          spec.metadata['unit'] or UNKNOWN, spec.metadata['text']])
     about = ('Extended model: all terms fitted together on the whole recording. Its alpha and '
-             'sigma are what is left of the relaxation and the noise beside all causes; those of '
-             'the plain OU above, fitted on the first 60 %, hold the causes as well.'
+             'sigma describe what remains of relaxation and noise beside all causes; those of the '
+             'plain OU above, fitted on the first 60 %, include the causes.'
              if finding.causes else
              'The plain OU is kept, as no cause was named: the same model as above, fitted on the '
              'whole recording instead of its first 60 %, so that its numbers differ a little.')

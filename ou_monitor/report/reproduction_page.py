@@ -32,8 +32,8 @@ def reproduction_page(result: Reproduction, command: str = '') -> str:
         page.section('Figures, simulated from the numbers printed', *_figures(result)),
         page.section('Every number', page.paragraph(
             'Agrees: the recomputed number rounds to the printed one, or its interval (3 standard '
-            'errors, or the range given) reaches it. Rounding: it does once the readings it rests '
-            'on move within their own rounding. Claims are written as bounds: "> 0" is a claim '
+            'errors, or the range given) reaches it. Rounding: it agrees once the underlying '
+            'readings move within their own rounding. Claims are written as bounds: "> 0" claims '
             'that something rises.', soft=True)),
         *[page.section(f'{where}: {tally(rows)}', _table(rows), page.bullets(
             [_typeset(f'{row.quantity}: {row.sentence} How: {row.how}.') for row in rows]))

@@ -64,7 +64,7 @@ def test_the_numbers_are_those_of_the_textbook():
 
 
 def test_long_levels_decide_and_short_ones_do_not():
-    """Errors of 3 %: constant; of 30 %: not to be told; a factor of 3: differs."""
+    """Errors of 3 %: constant; of 30 %: undecided; a factor of 3: differs."""
     assert alpha_constancy(THROTTLES, [estimate(ALPHA, 0.03)] * 4).verdict == 'constant'
     vague = alpha_constancy(THROTTLES, [estimate(ALPHA, 0.3)] * 4)
     assert vague.verdict == 'undetermined' and vague.detectable_ratio > 2.0
@@ -99,7 +99,7 @@ def test_fitted_levels_of_one_alpha_do_not_differ():
 
 
 def test_levels_that_one_ou_does_not_describe_are_withheld():
-    """They have no say, and are named; with one left nothing can be told."""
+    """They have no say, and are named; with one left the test decides nothing."""
     four = [estimate(v, 0.05) for v in (ALPHA, ALPHA, ALPHA, 3.0 * ALPHA)]
     assert alpha_constancy(THROTTLES, four).verdict == 'differs'
     found = alpha_constancy(THROTTLES, four, [False, False, False, True])
@@ -108,7 +108,7 @@ def test_levels_that_one_ou_does_not_describe_are_withheld():
         'Withheld: 70 %; the level or another one shows more than one relaxation, lines stand '
         'beside impulses, or a change of throttle still settles.')
     alone = alpha_constancy(THROTTLES, four, [False, True, True, True])
-    assert alone.verdict == 'undetermined' and 'depends on load: one load' in alone.sentence
+    assert alone.verdict == 'undetermined' and 'depends on load: only one load' in alone.sentence
     none = alpha_constancy(THROTTLES, four, [True] * 4)
     assert none.levels == 0 and math.isnan(none.alpha)
     assert 'no load level has a usable fit that one OU describes' in none.sentence

@@ -110,7 +110,7 @@ def test_a_staircase_of_twelve_is_twelve_levels():
 
 
 def test_a_pause_breaks_a_segment():
-    """Samples on both sides of a gap are not one stretch."""
+    """Samples on both sides of a gap are not one segment."""
     t, throttle = profile((0.1, 4))
     t[400:] += 1.0
     (level,) = find_levels(t, throttle)

@@ -19,7 +19,7 @@ def one(alpha=63.0, se=0.1, duration=1.0, **changes):
 
 
 def test_a_segment_gets_the_estimator_that_flies():
-    """All samples of the stretch enter, and nothing else."""
+    """All samples of the segment enter, and nothing else."""
     simulated = recording(1)
     e = fit_segment(simulated, 1000, 4000)
     node = SlidingEstimator(window=10.0)

@@ -133,7 +133,7 @@ def test_nothing_is_detected_where_nothing_relaxes():
     fits = [fitted(steps_of(seed, sag=0.0, changes=1)) for seed in range(60)]
     assert not any(fit.detected or fit.moves_on for fit in fits)
     assert all(math.isnan(fit.tau_low) for fit in fits)
-    assert judge_cause(fits[0], KNOWN).sentence.startswith('Nothing is seen to relax')
+    assert judge_cause(fits[0], KNOWN).sentence.startswith('No relaxation is detected')
 
 
 def louder_at_load(seed):
@@ -173,7 +173,7 @@ def test_a_drift_that_goes_on_is_no_relaxation():
     simulated = steps_of(3, sag=0.0)
     fit = fitted(replace(simulated, voltage=simulated.voltage + 0.8 * np.mod(simulated.t, 1.0)))
     assert fit.moves_on and not fit.detected
-    assert 'moves on' in judge_cause(fit, KNOWN).sentence
+    assert 'keeps moving' in judge_cause(fit, KNOWN).sentence
 
 
 def test_white_noise_without_a_fit_is_enough():
@@ -196,11 +196,12 @@ def test_a_level_that_stays_excludes_the_instrument():
 
 
 def test_a_level_that_comes_back_may_be_the_instrument():
-    """Through a high-pass of 5.3 Hz the voltage comes back: it cannot be told apart."""
+    """Through a high-pass of 5.3 Hz the voltage comes back: the recording cannot separate them."""
     cause = judge_cause(fitted(steps_of(6, high_pass=True)), KNOWN)
     assert cause.instrument == 'possible'
     assert cause.corner == pytest.approx(1.0 / (2.0 * math.pi * 0.03), rel=0.2)
-    assert 'cannot be told apart' in cause.sentence and 'AC coupling' in cause.sentence
+    assert 'this recording cannot separate them' in cause.sentence
+    assert 'AC coupling' in cause.sentence
 
 
 def test_tau_of_the_noise_agrees_and_little_data_tells_nothing():
@@ -251,13 +252,13 @@ def test_a_rail_much_faster_than_the_instrument_is_left_out():
     fits = [behind_a_high_pass(seed, 0.001) for seed in range(12)]
     mended = [fit for fit in fits if fit.left_out > 0.0]
     assert len(mended) >= 9
-    assert all('are left out' in fit.caveat and not fit.badly_fitted for fit in mended)
+    assert all('The fit leaves out' in fit.caveat and not fit.badly_fitted for fit in mended)
     assert sum(fit.tau_low < 1.0 / (20.0 * math.pi) < fit.tau_high for fit in mended) >= 9
 
 
 def test_a_step_that_is_not_one_exponential_is_said_so():
     """
-    A rail of 10 ms behind a high-pass of 16 ms: tau is not to be trusted, and the words say so.
+    A rail of 10 ms behind a high-pass of 16 ms: the words warn of tau.
 
     Of twelve at least seven (17 of 20 were measured; binomial: 5e-3 below seven); the others say
     what they left out.
@@ -271,7 +272,7 @@ def test_a_step_that_is_not_one_exponential_is_said_so():
     assert fit.misfit_p < 1e-3
     # The interval excludes both time constants.
     assert fit.tau_low > 1.0 / (2.0 * math.pi * 10.0)
-    assert 'not describe it' in fit.caveat and 'trusted' in fit.caveat
+    assert 'not describe it' in fit.caveat and 'do not rely on tau' in fit.caveat
     cause = judge_cause(fit, KNOWN)
     assert cause.noise == 'undetermined' and math.isnan(cause.p_value)
     plain = [fitted(steps_of(seed)) for seed in range(40)]

@@ -1,4 +1,4 @@
-"""Levels that hold the settling after a change of throttle: named, and only those."""
+"""Levels that include the settling after a change of throttle: named, and only those."""
 
 import math
 
@@ -27,7 +27,7 @@ def stays(tau, seed=1, seconds=2.5):
 
 
 def warned(analysis):
-    """Return throttle of the levels that are said to hold the settling."""
+    """Return throttle of the levels that are said to include the settling."""
     return {x for item in analysis.quality if item.name == 'NOT_SETTLED' for x in item.throttles}
 
 
@@ -40,7 +40,7 @@ def test_a_slow_sag_is_named_where_alpha_holds_it(tau, levels):
     if tau == 0.2:
         assert max(alphas) < 0.5 * ALPHA
         text = next(item.text for item in analysis.quality if item.name == 'NOT_SETTLED')
-        assert 'hold the settling too' in text and 'only 100 ms are left out' in text
+        assert 'include the settling' in text and 'leave out only 100 ms' in text
     elif not levels:
         assert all(abs(math.log(alpha / ALPHA)) < 4.0 * level.estimate.alpha_se
                    for alpha, level in zip(alphas, analysis.levels))
@@ -65,6 +65,6 @@ def test_what_moves_on_is_named_and_what_has_no_numbers_is_not():
     fit = analyze(stays(0.2)).relaxations[1]
     moving = Relaxation('load', fit.releases, likelihood_gain=1e4)
     (item,) = unsettled([moving], [0.2, 0.5], [GOOD, GOOD], [7.0, 7.0])
-    assert item.throttles == (0.5,) and 'moves on' in item.text
+    assert item.throttles == (0.5,) and 'keeps moving' in item.text
     assert not unsettled([moving], [0.2, 0.5], [GOOD, Estimate()], [7.0, 7.0])
     assert not unsettled([Relaxation('load', ())], [0.2, 0.5], [GOOD, GOOD], [7.0, 7.0])

@@ -34,7 +34,7 @@ def test_headline_tells_growth_with_its_interval():
 
 
 def test_headline_of_one_level_and_of_none():
-    """One level is described; without any the reader is told why."""
+    """One level is described; without any a sentence says why."""
     simulated = without_throttle(recording(4, ((0.1, 0.3),)))
     assert headline(analyze(simulated)).startswith('The supply wanders with sigma = 0.')
     short = recording(5, ((0.1, 0.3),), seconds=0.012)

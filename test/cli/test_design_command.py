@@ -31,7 +31,7 @@ def told(capsys, *more):
 def test_answer_table_and_effect(capsys):
     """The table has both ends, the present capacitor and the answer, in order of capacitance."""
     out = said(capsys)
-    assert '2305 uF is the least that brings the risk under 0.001.' in out
+    assert '2305 uF is the least capacitance that brings the risk under 0.001.' in out
     words = ' '.join(out.split())
     assert ('From 470 uF to 2305 uF: alpha falls from 30391 to 9406 1/s, Var_inf falls from 0.161 '
             'to 0.0341 V^2') in words
@@ -83,7 +83,7 @@ def test_filter_and_sag_in_words(capsys):
     assert 'LC filter: corner 5033 Hz' in said(
         capsys, '--rail', 'regulated', '--set', 'filter_inductance=10uH')
     assert 'No capacitor helps' in said(capsys, '--set', 'current_max=400')
-    assert 'No more is needed' in said(capsys, '--set', 'current_max=10')
+    assert 'No more capacitance is needed' in said(capsys, '--set', 'current_max=10')
 
 
 def test_list(capsys):

@@ -228,7 +228,7 @@ def test_a_line_faster_than_the_samples_used_is_found_in_all():
     """
     Half a million samples at 100 kHz of which every 7th is used: a line at 31 kHz.
 
-    Whitened, it is worth n amplitude^2 |1 - phi exp(-iw)|^2 / (4 step^2) = 60 nats; phase
+    Whitened, it gains n amplitude^2 |1 - phi exp(-iw)|^2 / (4 step^2) = 60 nats; phase
     and amplitude then have standard errors of sqrt(1 / 120) and that share of the amplitude.
     """
     n, rate = 500_000, 1e5

@@ -161,4 +161,4 @@ def test_a_note_gives_the_length_of_unknown_throttle():
     notes = []
     held = usable(Recording(T, rail(), u, 'holes'), notes)[2]
     assert held[1500] == u[999] and 'unknown at 1100 samples (11.0 of 60.0 s' in notes[0]
-    assert 'longest stretch 9.00 s' in notes[0]
+    assert 'longest gap 9.00 s' in notes[0]

@@ -64,7 +64,7 @@ def changed(what):
     return t, v, u
 
 
-# What must be told beside the verdict.
+# Notes that must stand beside the verdict.
 QUIET = {
     'nothing': '', 'no throttle': 'Throttle is not recorded', 'gaps': '2 gaps',
     'constant throttle': 'Throttle is constant', 'NaN voltage': '429 samples dropped',

@@ -228,7 +228,7 @@ def test_a_motor_that_starts_late_gains_nothing_absurd(name):
     assert still == (name == 'mm_bench_3')
     if still:
         # A motor that stops in the last part only.
-        assert any('the first 60 % never had' in note for note in found.notes)
+        assert any('the first 60 % do not cover' in note for note in found.notes)
         assert all(math.isnan(cause.gain) for cause in found.causes if cause.term.NEEDS_THROTTLE)
 
 

@@ -211,7 +211,7 @@ def test_a_gain_that_cannot_be_measured_is_unknown():
     assert abs(cause.term.linear - 0.3) < 4.0 * cause.se['linear']
     for text in (found.sentence, cause.explanation):
         assert 'cannot be measured' in text and 'goes through all of its throttle' in text
-    assert any('the first 60 % never had' in note for note in found.notes)
+    assert any('the first 60 % do not cover' in note for note in found.notes)
     data = found.as_data()['extended']
     assert data['gain'] is None and data['gain_se'] is None
     assert data['crossing_rate']['extended'] is None

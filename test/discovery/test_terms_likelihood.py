@@ -187,7 +187,7 @@ def test_scores_of_the_right_law_are_white(name, seed):
     fit, plain, state = law_fitted(name, LAWS[name], seed)
     statistic, value = worst(fit.z, state)
     assert abs(value) < LIMIT, statistic
-    # Without it they are not, and the law that makes them so is worth its parameters.
+    # Without it they are not, and the law that makes them so gains more than its parameters cost.
     assert abs(worst(plain, state)[1]) > LIMIT
     assert float(fit.gain.sum()) > 20.0
 

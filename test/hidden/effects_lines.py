@@ -36,7 +36,7 @@ def _visible(bench: Bench, low: float, high: float) -> float:
 
 
 def _in_series(bench: Bench, volts: np.ndarray, found: dict[str, object]) -> dict[str, object]:
-    """Add a source in series and note what knowing it is worth."""
+    """Add a source in series and note the log-likelihood that knowing it gains."""
     bench.series.append(volts)
     return {**found, 'nats': bench.nats(volts)}
 

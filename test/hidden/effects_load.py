@@ -29,7 +29,7 @@ def _battery(bench: Bench, gain: float) -> tuple[float, float, dict[str, float]]
 
 
 def _drop(bench: Bench, drop: np.ndarray, found: dict[str, float]) -> None:
-    """Put a voltage drop (V, fine grid) in series with the rail and note what it is worth."""
+    """Put a voltage drop (V, fine grid) in series with the rail and note its log-likelihood."""
     bench.series.append(-drop)
     found['nats'] = bench.nats(drop)
     found['nats_beyond_sag'] = bench.nats(drop, bench.throttle)
@@ -225,7 +225,7 @@ def _alpha_ratio(bench: Bench, gain: float) -> float:
     Draw the ratio of alpha at full load to that at the lowest; up or down.
 
     1.8..2.4, and up to 4 on a slow rail, of which a minute holds few relaxations: a relative
-    change c(t) of the rate is worth T alpha <c^2>/4 nats.
+    change c(t) of the rate gains T alpha <c^2>/4 nats.
 
     """
     ratio, sense = float(bench.draw.uniform(1.8, 2.4)), float(bench.draw.choice([-1.0, 1.0]))
@@ -285,7 +285,7 @@ def _discharge(bench: Bench, volts: np.ndarray, found: dict[str, object]) -> dic
 
 @effect('drift')
 def drift(bench: Bench, gain: float) -> dict[str, object]:
-    """Discharge the battery at a constant current along a straight stretch of its curve."""
+    """Discharge the battery at a constant current along a straight part of its curve."""
     slope, found = _slope(bench, gain)
     return _discharge(bench, slope * bench.time, found)
 

@@ -146,7 +146,7 @@ def _impulses(bench: Bench, gain: float, exponential: bool) -> dict[str, object]
 
 @effect('jumps')
 def jumps(bench: Bench, gain: float) -> dict[str, object]:
-    """Dump charges worth 5..8 innovations, 0.3..2 times a second, down only or either way."""
+    """Dump charges of 5..8 innovations, 0.3..2 times a second, down only or either way."""
     return _impulses(bench, gain, False)
 
 

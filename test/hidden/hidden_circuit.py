@@ -116,7 +116,7 @@ class Bench:
 
     def nats(self, signal: np.ndarray, *known: np.ndarray) -> float:
         """
-        Return what knowing an additive signal is worth in log-likelihood.
+        Return the log-likelihood that knowing an additive signal gains, nats.
 
         Parameters
         ----------

@@ -62,7 +62,7 @@ def test_enough():
     result = design(PowerNetwork(), 0.1, **QUESTION)
     assert result.verdict is Verdict.ENOUGH
     assert result.least.capacitance == pytest.approx(10e-6)
-    assert 'No more is needed' in answer(result)
+    assert 'No more capacitance is needed' in answer(result)
 
 
 def test_a_fixed_esr_may_leave_no_capacitance():
@@ -74,7 +74,7 @@ def test_a_fixed_esr_may_leave_no_capacitance():
 
 
 def test_no_capacitor_helps_below_the_level_and_the_resistance_that_would_is_named():
-    """At the resistance told the mean of the bus is the level."""
+    """At the resistance named the mean of the bus is the level."""
     for network in (PowerNetwork(), PowerNetwork(filter_inductance=10e-6)):
         result = design(network, 0.9, **QUESTION)
         assert result.verdict is Verdict.LEVEL and result.least is None

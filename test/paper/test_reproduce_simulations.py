@@ -20,7 +20,7 @@ def formulas():
 
 @pytest.fixture(scope='module')
 def crests():
-    """Return simulated crest factors; 600 stretches."""
+    """Return simulated crest factors; 600 segments."""
     return crest.simulate_crests(np.random.default_rng(12), 600)
 
 

@@ -82,7 +82,7 @@ def test_thinning_keeps_every_extreme_and_break():
 
 
 def test_a_line_goes_through_its_points_and_breaks_at_nan():
-    """Two stretches, the first from corner to corner of the axes."""
+    """Two segments, the first from corner to corner of the axes."""
     plot = Plot('t', 'x', 'y').limits((0.0, 4.0), (0.0, 1.0))
     plot.line(np.arange(5.0), np.array([0.0, 1.0, math.nan, 0.5, 0.5]))
     path = re.search(r'class="line s0" d="([^"]+)"', plot.svg()).group(1)

@@ -40,14 +40,14 @@ class ACCoupling(Term):
     # An instrument may have two corners.
     MAY_LEAVE: ClassVar[float] = 0.75
     MEANING: ClassVar[str] = (
-        'The instrument is AC-coupled: the relaxation that is seen is that of its high-pass.')
+        'The instrument is AC-coupled: the observed relaxation is that of its high-pass.')
     REMEDY: ClassVar[str] = (
         'Repeat with the instrument DC-coupled; alpha of the rail is the one given here, not the '
         'one of the plain fit.')
     SEPARATED_BY: ClassVar[str] = 'the same rail DC-coupled'
 
     corner: float = parameter('Hz', 'where the high-pass is down by 3 dB', 0.0, above=True)
-    offset: float = parameter('V', 'level about which the instrument shows what it sees')
+    offset: float = parameter('V', 'level about which the instrument shows its input')
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""

@@ -32,7 +32,7 @@ class HeavyTails(Term):
     IMITATES: ClassVar[tuple[str, ...]] = (
         'clock_jitter', 'glitches', 'jumps', 'regime_switching', 'volatility')
     MEANING: ClassVar[str] = 'The driving noise itself has heavy tails, without distinct events.'
-    REMEDY: ClassVar[str] = 'Take large excursions as more frequent than a normal law says.'
+    REMEDY: ClassVar[str] = 'Expect large excursions more often than a normal law predicts.'
     SEPARATED_BY: ClassVar[str] = 'a recording several times as long, at a higher rate'
 
     dof: float = parameter('', 'degrees of freedom', 2.0, above=True)

@@ -15,7 +15,7 @@ from scipy.special import ndtr
 
 # Events drawn for one segment at most: bounds time and memory.
 _MOST = 5_000_000
-# Share of samples with a jump in them from which jumps cannot be told apart.
+# Share of samples with a jump in them from which jumps overlap.
 _OFTEN = 0.05
 
 

@@ -27,7 +27,7 @@ class LoadDependentAlpha(Term):
     LIVE: ClassVar[Live] = Live.BY_THROTTLE
     MEANING: ClassVar[str] = 'The relaxation rate depends on throttle.'
     REMEDY: ClassVar[str] = (
-        'Fit each load level on its own (analyze); one alpha is wrong at all but one of them.')
+        'Fit each load level on its own (analyze); a single alpha is wrong at all levels but one.')
     SEPARATED_BY: ClassVar[str] = 'throttle held for 50 relaxation times at each of several levels'
 
     slope: float = parameter('', 'ln of the factor at full throttle')

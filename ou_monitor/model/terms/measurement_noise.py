@@ -24,7 +24,7 @@ class MeasurementNoise(Term):
     FREE: ClassVar[tuple[str, ...]] = ('std',)
     SIGNS: ClassVar[tuple[str, ...]] = ('-autocorrelation', '+band')
     MAY_LEAVE: ClassVar[float] = 0.3
-    MEANING: ClassVar[str] = 'White noise of the sensor lies on top of the rail.'
+    MEANING: ClassVar[str] = 'White noise of the sensor adds to the voltage of the rail.'
     REMEDY: ClassVar[str] = (
         'Average in the ADC or use a finer range; alpha and sigma fitted without it are too high.')
     SEPARATED_BY: ClassVar[str] = (

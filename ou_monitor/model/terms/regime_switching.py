@@ -158,7 +158,7 @@ class RegimeSwitching(Term):
             if fit is None:
                 continue
             if x is best.get(True, (0.0, None))[1] and fit.offset is not None:
-                # What is left without the levels tells how fast the rail relaxes.
+                # The residual without the levels shows how fast the rail relaxes.
                 again = relaxing(view, faster_by(view, fit.offset))
                 unit = math.sqrt(float(np.median(again.variance)))
                 term = fit.term

@@ -38,7 +38,7 @@ class Resonance(Term):
     STATES: ClassVar[int] = 2
     SEVERAL: ClassVar[bool] = True
     RECURS: ClassVar[bool] = True
-    # A broad line could be the spectrum of anything.
+    # A broad line fits almost any spectrum.
     MAY_LEAVE: ClassVar[float] = 0.1
     # What rings under noise does not come and go, nor makes three neighbours depend on
     # each other.

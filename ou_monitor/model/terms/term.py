@@ -77,12 +77,12 @@ class Term:
     NAME, FAMILY : str
         As in a model file and in a finding.
     MEANING, REMEDY, SEPARATED_BY : str
-        For people: what it is, what to do about it, which recording tells it
+        For people: what it is, what to do about it, which recording separates it
         from other causes.
     STAGE : Stage
         When it acts.
     NEEDS_THROTTLE : bool
-        Whether it says nothing without throttle.
+        Whether it needs throttle to act.
     ROLE : Role
         How it enters a likelihood.
     LINEAR : tuple of str
@@ -95,12 +95,12 @@ class Term:
         after + or - where only one direction does.
     MEASURED : bool
         Whether it answers to throttle or time alone, so that the search tries
-        it before anything latent.
+        it before latent causes.
     CLEAR_ABOVE : dict of str to float
         Scores of statistics above which it is tried as early as those.
     IMITATES : tuple of str
         Causes that it imitates, and that imitate it: one beside the other would
-        only mend its form.  It suffices that one of the two says so.
+        only refine its form.  It suffices that one of the two names the other.
     SEVERAL : bool
         Whether a model can have several.
     RECURS : bool
@@ -109,7 +109,7 @@ class Term:
         Evidence that it needs, as a share of the largest of any cause.
     MAY_LEAVE : float
         Share of its signs that it may leave without being withdrawn; with 0 it is
-        withdrawn where anything at all is left.
+        withdrawn where any statistic fails.
     REFUTED_BY : tuple of str
         Statistics that it cannot leave.
     SEARCH : float

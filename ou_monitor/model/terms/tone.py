@@ -39,7 +39,7 @@ class Tone(Term):
     MEANING: ClassVar[str] = (
         'A line at a fixed frequency: PWM of an ESC or its alias, or a DC-DC converter.')
     REMEDY: ClassVar[str] = (
-        'Find the source by its frequency; sample at another rate to tell an alias.')
+        'Find the source by its frequency; sample at another rate to identify an alias.')
     SEPARATED_BY: ClassVar[str] = (
         'the same at two sampling rates: an alias moves, a true line does not')
 

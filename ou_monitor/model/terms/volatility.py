@@ -102,7 +102,7 @@ def _start(view: View) -> FloatArray:
     Return std, rate and mean of ln sigma, as `_grid` has them, by moments.
 
     The logarithm of the mean of m squares is 2 ln sigma and an error that does
-    not depend on its neighbours; so the covariances at two lags tell variance
+    not depend on its neighbours; so the covariances at two lags give variance
     and rate.
     """
     size, squares, sizes = _segments(view)

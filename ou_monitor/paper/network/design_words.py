@@ -32,14 +32,15 @@ def answer(result: Design) -> str:
     present, least = result.present, result.least
     if result.verdict is Verdict.ENOUGH:
         also = '' if least is None else f' From {_uf(least)} on the target is met.'
-        return (f'No more is needed: with the present {_uf(present)} the risk is '
+        return (f'No more capacitance is needed: with the present {_uf(present)} the risk is '
                 f'{probability(present.risk)}.{also}')
     if result.verdict is Verdict.FOUND:
         assert least is not None
-        return f'{_uf(least)} is the least that brings the risk under {result.target:g}.'
+        return (f'{_uf(least)} is the least capacitance that brings the risk under '
+                f'{result.target:g}.')
     if result.verdict is Verdict.OUT_OF_RANGE:
         return (f'No capacitance between {_uf(result.rows[0])} and {_uf(result.rows[-1])} brings '
-                f'the risk under {result.target:g}: with the most it is still '
+                f'the risk under {result.target:g}: with the largest it is still '
                 f'{probability(result.rows[-1].risk)}. A lower ESR, a lower battery resistance '
                 'or less throttle would.')
     text = (f'No capacitor helps: the mean, {present.mean:.4g} V, is at or below '
@@ -109,7 +110,7 @@ def remarks(result: Design) -> list[str]:
             notes.append('Some capacitances make the network unstable: the regulator as a '
                          'constant-power load undoes the damping of the filter.')
         notes.append('The risk does not fall at each step of the capacitance here (resonance or '
-                     'ESR): take a value from the table, not simply more.')
+                     'ESR): take a value from the table instead of simply more.')
     if result.network.filter_inductance > 0.0:
         text = f'LC filter: corner {result.network.lc_corner:.4g} Hz'
         if rail.resonance is None:

@@ -6,7 +6,7 @@ rail's deviation is c x.  Noise enters coloured, as one state a source, so that
 the variance is finite where the ESR of a capacitor passes current straight to
 voltage.
 
-What adding bulk capacitance does.  Without LC filter the bus sees the ESC
+What adding bulk capacitance does.  Without LC filter the bus carries the ESC
 current through |Z(f)|^2 = R^2 (1 + (w r C)^2) / (1 + (w (R + r) C)^2), which
 falls with C at every frequency: Var_inf falls for noise of any colour, on both
 rails, and so does the pole 1/((R + r) C): the paper's section 4.5 has alpha
@@ -79,7 +79,7 @@ class Resonance:
 @dataclass(frozen=True)
 class Rail:
     """
-    One rail at one throttle; made by `rail_at`.
+    One rail at one throttle, as `rail_at` returns it.
 
     Parameters
     ----------

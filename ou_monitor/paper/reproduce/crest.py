@@ -26,7 +26,7 @@ SCREENS_MS = (10, 100, 500)
 TYPICAL_MS = 100
 # Share of screens left out at either end.
 TAIL = 0.05
-# Samples of the oscilloscope to a step of the simulation; stretches held in
+# Samples of the oscilloscope to a step of the simulation; segments held in
 # memory; screens of white noise.
 _SAMPLES, _AT_ONCE, _WHITE = 100, 100, 200
 
@@ -75,7 +75,7 @@ def crest_of(screens: FloatArray) -> FloatArray:
 
 def simulate_crests(rng: np.random.Generator, paths: int,
                     progress: Callable[[float], None] = lambda share: None) -> Crests:
-    """Draw screens of an OU with the paper's alpha, as seen at 1 MHz (progress 0..1)."""
+    """Draw screens of an OU with the paper's alpha, sampled at 1 MHz (progress 0..1)."""
     found: dict[int, list[FloatArray]] = {ms: [] for ms in SCREENS_MS}
     for begin in range(0, paths, _AT_ONCE):
         for ms, values in _draw(rng, min(_AT_ONCE, paths - begin)).items():
@@ -87,7 +87,7 @@ def simulate_crests(rng: np.random.Generator, paths: int,
 
 
 def _draw(rng: np.random.Generator, paths: int) -> dict[int, FloatArray]:
-    """Return the crest factors of all screens within so many stretches."""
+    """Return the crest factors of all screens within so many segments."""
     dt = _SAMPLES / published.SAMPLING_HZ
     # Of stationary variance 1.
     sigma = math.sqrt(2.0 * published.ALPHA.value)
@@ -101,7 +101,7 @@ def _draw(rng: np.random.Generator, paths: int) -> dict[int, FloatArray]:
     middle, square = left + right, (right - left) ** 2
     top, bottom = (middle + sign * np.sqrt(
         square + 2.0 * q * rng.standard_exponential(square.shape)) for sign in (1.0, -1.0))
-    # Sampling at 1 MHz sees a little less (Broadie, Glasserman & Kou, Math.
+    # Sampling at 1 MHz gives a little less (Broadie, Glasserman & Kou, Math.
     # Finance 7 (1997) 325): 0.5826 sigma sqrt(1 us) on each side.
     unseen = 2.0 * 0.5826 * sigma / math.sqrt(published.SAMPLING_HZ)
     found = {}
@@ -143,7 +143,7 @@ def rows(crests: Crests) -> list[Row]:
                   f'; the least would take a screen of {screen_for(inputs[0]):.2g} s')
         found.append(Row(
             'Table 1', f'Vpp/Vrms, {state.label}', '', Printed(f'{value:.1f}'), mean,
-            f'OU with tau {published.TAU_MS.text} ms seen at 1 MHz, {count} stretches of '
+            f'OU with tau {published.TAU_MS.text} ms sampled at 1 MHz, {count} segments of '
             f'{max(SCREENS_MS)} ms',
             f'One OU shows {mean:.1f} on a {TYPICAL_MS} ms screen and lies within '
             f'{crests.band[0]:.1f} to {crests.band[1]:.1f} on screens of {min(SCREENS_MS)} to '

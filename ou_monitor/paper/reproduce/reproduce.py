@@ -26,7 +26,7 @@ from ou_monitor.paper.reproduce.table2 import sigma_half_width, sigma_of
 from ou_monitor.text import number
 
 Progress = Callable[[float], None]
-# Independent stretches of half a second, so that the 95 % quantile is known to 0.03; and
+# Independent segments of half a second, so that the 95 % quantile is known to 0.03; and
 # seconds with jumps.
 CREST_PATHS, JUMP_SECONDS = 4000, 100.0
 # In the order of the paper.
@@ -131,8 +131,8 @@ def _coupling(rows: Sequence[Row]) -> str:
             f'({line.alpha:.1f} +- {line.half_width:.1f} 1/s) says that the rail is faster than '
             f'about {transient.slowest_rail():.0f} 1/s, not that it is {alpha}. An OU '
             f'of {alpha} 1/s would show {100 * kept:.0f} % of its standard deviation '
-            'through it, so Vrms would be too low as well. With DC coupling, or the corner of the '
-            'instrument measured, one can tell.')
+            'through it, so Vrms would be too low as well. DC coupling, or a measured corner of '
+            'the instrument, would decide.')
 
 
 def _exponential(rows: Sequence[Row]) -> str:
@@ -231,8 +231,9 @@ def _jumps(crests: Crests, found: list[JumpCrest]) -> str:
     return ('The paper says that its data justify diffusion and jump components, and fits no '
             'jump. Of the compound Poisson jumps tried, relaxing at alpha, the best show '
             f'a mean crest factor of {" and ".join(parts)}; {low:.1f} (5 %) and '
-            f'{crest(published.MEDIUM)[0]:.1f} (10 %) are to be reached. Impulses too short to '
-            f'count in Vrms would do with a height, peak to peak over the OU, of {heights}. '
+            f'{crest(published.MEDIUM)[0]:.1f} (10 %) are what the readings require. Impulses '
+            f'too short to count in Vrms would need a height, peak to peak over the OU, of '
+            f'{heights}. '
             f'From 5 to 40 % the crest factor goes from {low:.1f} to {high:.1f} (quotient '
             f'{high_in[0] / low_in[1]:.2f} to {high_in[1] / low_in[0]:.2f} within half a step): '
             'the readings do not show impulses that come with load. '

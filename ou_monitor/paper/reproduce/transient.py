@@ -169,7 +169,7 @@ def fitted_through_coupling(time: FloatArray) -> tuple[FloatArray, float]:
 
 
 def fitted_rate(rail: float, corner: float = CORNER_HZ) -> float:
-    """Return the rate the paper's fit gives for a step seen through a high-pass, 1/s."""
+    """Return the rate the paper's fit gives for a step behind a high-pass, 1/s."""
     w = 2.0 * math.pi * corner
     peak = math.log(rail / w) / (rail - w)
     used = TIME[:published.FIG_5_USED]
