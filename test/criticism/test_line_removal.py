@@ -80,8 +80,8 @@ BAD = Estimate(status=Status.NO_RELAXATION)
     (GOOD, replace(GOOD, sigma=0.305), Severity.INFO, 'sigma 0.305'),
     (GOOD, replace(GOOD, sigma=0.32), Severity.WARNING, 'sigma 0.32'),
     (GOOD, BAD, Severity.WARNING, 'only then'),
-    (BAD, GOOD, Severity.WARNING, 'nothing that can be fitted'),
-    (BAD, BAD, Severity.INFO, 'nothing that can be fitted'),
+    (BAD, GOOD, Severity.WARNING, 'the remainder cannot be fitted'),
+    (BAD, BAD, Severity.INFO, 'the remainder cannot be fitted'),
     (GOOD, None, Severity.WARNING, 'left in'), (BAD, None, Severity.INFO, 'left in')])
 def test_it_warns_where_the_numbers_hang_on_it(without, with_lines, severity, words):
     """Out of the 95 % interval, or a fit with and none without."""

@@ -137,7 +137,7 @@ def test_throttle_of_no_known_unit_and_wild_values_are_not_used():
     u = np.linspace(0.0, 1.0, N)
     notes = []
     assert usable(Recording(T, rail(), 65535.0 * u, 'counts'), notes)[2] is None
-    assert 'no unit that is known' in ' '.join(notes)
+    assert 'no unit known here' in ' '.join(notes)
     said = discover(Recording(T, rail(), 65535.0 * u, 'counts')).notes
     assert any('Throttle is not usable: load_dependent_alpha' in note for note in said)
     notes = []
