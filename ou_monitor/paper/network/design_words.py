@@ -110,7 +110,7 @@ def remarks(result: Design) -> list[str]:
             notes.append('Some capacitances make the network unstable: the regulator as a '
                          'constant-power load undoes the damping of the filter.')
         notes.append('The risk does not fall at each step of the capacitance here (resonance or '
-                     'ESR): take a value from the table instead of simply more.')
+                     'ESR): more is not simply better; choose a value from the table.')
     if result.network.filter_inductance > 0.0:
         text = f'LC filter: corner {result.network.lc_corner:.4g} Hz'
         if rail.resonance is None:
