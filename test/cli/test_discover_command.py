@@ -171,7 +171,7 @@ def test_what_is_not_known_is_said_and_what_is_worse_too():
     assert 'Gain not measurable here; named by the search' in ' '.join(text.split())
     assert 'worse' in rows['tone'][2] and 'not distinguishable from none' in rows['drift'][2]
     assert re.search(r'load_sag +load +not known +not known', text)
-    assert 'of means of blocks and of the errors of the parameters' in html
+    assert 'from means of blocks and from the errors of the parameters' in html
 
 
 def test_terms_that_share_a_gain_are_one_row():

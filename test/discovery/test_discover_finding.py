@@ -155,7 +155,7 @@ def test_sentences():
     assert plain_words('throttle change over 2 s') == plain_words('throttle')
     assert plain_words('order line') != plain_words('line')
     # 0.24 alpha T = 6 nats.
-    assert 'above 0.250 1/s' in coupling_note(63.0, 100.0)
+    assert 'exceeds 0.250 1/s' in coupling_note(63.0, 100.0)
 
 
 def test_why_a_cause_without_a_gain_is_named():

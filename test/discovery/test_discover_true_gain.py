@@ -210,7 +210,7 @@ def test_a_gain_that_cannot_be_measured_is_unknown():
     assert math.isnan(found.crossing.extended) and math.isfinite(found.crossing.baseline)
     assert abs(cause.term.linear - 0.3) < 4.0 * cause.se['linear']
     for text in (found.sentence, cause.explanation):
-        assert 'cannot be measured' in text and 'goes through all of its throttle' in text
+        assert 'cannot be measured' in text and 'covers its whole range of throttle' in text
     assert any('the first 60 % do not cover' in note for note in found.notes)
     data = found.as_data()['extended']
     assert data['gain'] is None and data['gain_se'] is None
