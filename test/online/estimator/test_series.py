@@ -123,3 +123,20 @@ def test_clear_goes_on_counting():
     series.append(np.arange(3.0), np.ones(3), None, START)
     assert series.column(Y).tolist() == [1.0, 1.0, 1.0]
     assert series.runs(10, 13).tolist() == [0, 1, 2]
+
+
+def test_throttle_is_known_from_behind_its_last_gap_on():
+    """NaN in samples 5 to 7 and 15 of a throttle: known once the window begins at 16."""
+    u = np.full(30, 0.4)
+    u[[5, 6, 7, 15]] = np.nan
+    series = Series(24)
+    series.append(np.arange(30) * 0.01, np.zeros(30), u, START)
+    for begin, known in ((0, False), (8, False), (15, False), (16, True), (25, True)):
+        series.drop_before(begin)
+        assert series.first == begin and series.known is known
+    u = np.full(4, 0.4)
+    u[2] = np.nan
+    series.append(0.3 + np.arange(4) * 0.01, np.zeros(4), u, NONE)
+    for begin, known in ((25, False), (32, False), (33, True)):
+        series.drop_before(begin)
+        assert series.known is known

@@ -184,3 +184,31 @@ def test_always_within_the_limits_and_the_slew(wanted, steps, error):
         if before is not None:
             assert abs(math.log2(now / before)) <= 4.0 * dt + 2e-6
         before = now
+
+
+@pytest.mark.parametrize('intervals, mean', [
+    # The mean of all up to 100; from then on each counts 1/100.
+    ((1.0,) * 98 + (2.0,), 1.0 + 1.0 / 99.0),
+    ((1.0,) * 99 + (2.0,), 1.01),
+    ((1.0,) * 250 + (2.0,), 1.01),
+    # Up to five means, or down to a fifth, it is an interval as others; beyond, it is odd.
+    ((1.0,) * 9 + (5.0,), 1.4),
+    ((1.0,) * 9 + (5.001,), 1.0),
+    ((1.0,) * 9 + (0.2,), 0.92),
+    # Four odd ones in a row are gaps (or repeats), five are a new rate.
+    ((1.0,) * 9 + (6.0,) * 4, 1.0),
+    ((1.0,) * 9 + (6.0,) * 5, 6.0),
+    ((1.0,) * 200 + (0.1,) * 5, 0.1),
+    # Gaps are left out if they are a third of all, and not if they are half.
+    ((1.0, 1.0) * 5 + (6.0, 1.0, 1.0) * 50, 1.0),
+    ((1.0, 1.0) * 5 + (6.0, 1.0) * 8 + (6.0,), 6.0),
+    ((1.0, 1.0) * 5 + (6.0, 1.0) * 8, 1.0),
+    # One that is not odd in between, and they are not in a row.
+    ((1.0,) * 9 + (6.0,) * 4 + (1.0,) * 8 + (6.0,) * 4, 1.0),
+])
+def test_the_sample_interval_by_a_table(intervals, mean):
+    """Means worked out by hand; odd is five times off, and five odd ones are a new rate."""
+    interval = SampleInterval()
+    for dt in intervals:
+        got = interval.add(dt)
+    assert got == interval.mean == pytest.approx(mean, rel=1e-12)

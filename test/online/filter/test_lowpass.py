@@ -325,3 +325,18 @@ def test_limits_alone_are_enough():
 def test_shapes_must_agree(arguments, more, words):
     with pytest.raises(ValueError, match=words):
         AdaptiveLowPass().filter(*arguments, **more)
+
+
+@pytest.mark.parametrize('alpha, used', [
+    (1e-6, True), (1e9, True), (7.0, True), (math.nextafter(1e-6, 0.0), False),
+    (math.nextafter(1e9, math.inf), False), (0.0, False), (-7.0, False), (NAN, False)])
+def test_a_relaxation_rate_is_used_within_the_range_of_the_parameter(alpha, used):
+    """Within 1e-6..1e9 1/s the filter is that of the parameter alpha; else alpha is not known."""
+    x = np.random.default_rng(2).standard_normal(50)
+    t = np.arange(50) * 1e-3
+    options = {'law': 'kalman', 'coupling': 1.0, 'signal_bandwidth': 30.0, 'signal_rms': 1.0}
+    got = AdaptiveLowPass(**options).filter(t, x, 0.3, alpha=alpha)
+    at_default = AdaptiveLowPass(**options).filter(t, x, 0.3)
+    assert (got.tolist() == at_default.tolist()) is not used
+    if used:
+        assert got.tolist() == AdaptiveLowPass(**options, alpha=alpha).filter(t, x, 0.3).tolist()
