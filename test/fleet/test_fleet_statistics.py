@@ -8,34 +8,7 @@ from ou_monitor.fleet.drift import fewest, holm, LEAST, trends
 from ou_monitor.fleet.judgement import DRIFT_RATE, judge, OUTLIER_RATE
 from ou_monitor.fleet.outliers import outliers
 import pytest
-
-LEVELS = ((0.1, 20.0), (0.3, 30.0), (0.5, 10.0))
-# ln sigma over throttle, a curve like the paper's.
-SLOPE, BEND = 2.4, -1.5
-
-
-def table(rng: np.random.Generator, vehicles: int, flights: int, *, scatter: float = 0.08,
-          drift: dict | None = None, odd_flights: dict | None = None,
-          odd_vehicles: dict | None = None, levels=LEVELS) -> list[dict]:
-    """Return a fleet table: a row a level; effects are on ln sigma."""
-    rows = []
-    for v in range(vehicles):
-        vehicle = 0.15 * rng.standard_normal() + (odd_vehicles or {}).get(v, 0.0)
-        for f in range(1, flights + 1):
-            sigma = math.log(0.4) + vehicle + scatter * rng.standard_normal()
-            sigma += (drift or {}).get(v, 0.0) * f + (odd_flights or {}).get((v, f), 0.0)
-            alpha = math.log(63.0) + scatter * rng.standard_normal()
-            sag = -0.5 + 0.05 * rng.standard_normal()
-            for u, time in levels:
-                se = 0.2 / math.sqrt(time)
-                rows.append({
-                    'path': f'/f/uav{v}/{f}', 'vehicle': f'uav{v}', 'flight': f, 'throttle': u,
-                    'time_s': time, 'status': 'OK', 'sag': sag, 'sag_se': 0.02,
-                    'sigma': math.exp(sigma + (0.0 if u is None else SLOPE * u + BEND * u * u)
-                                      + se * rng.standard_normal()), 'sigma_se': se,
-                    'alpha': math.exp(alpha + 2 * se * rng.standard_normal()),
-                    'alpha_se': 2 * se})
-    return rows
+from simulated_fleets import BEND, LEVELS, SLOPE, table
 
 
 def test_the_curve_over_throttle_is_taken_out():

@@ -10,7 +10,7 @@ from ou_monitor.fleet.summary import (
 from ou_monitor.fleet.table import NAMES
 from ou_monitor.report.fleet_page import fleet_page
 import pytest
-from test_fleet_statistics import table
+from simulated_fleets import table
 
 
 def fleet(rows: list[dict]) -> Fleet:
