@@ -1,0 +1,195 @@
+"""
+The load model of a recording: a maximum a posteriori fit.
+
+Limits first: the priors are narrow, so that no parameter can run away where the recording does
+not decide it; a parameter at three prior deviations says that the form does not hold.
+Residuals are white noise and an Ornstein-Uhlenbeck process of 20 s and of a few mV.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+from ou_monitor.model.load import CELL, cells_in_series, charge_at, LoadModel
+from ou_monitor.records import FloatArray, NAN
+from ou_monitor.text import Z95
+from scipy.linalg import solve_banded
+from scipy.optimize import least_squares
+
+# Centre and deviation of each parameter; of its logarithm, but for those of _LINEAR.  Usual
+# figures of lithium-polymer packs with two RC pairs, tightened on the recordings (doc/load.md).
+_PRIOR = {
+    'size': (math.log(0.12), 0.7), 'power': (math.log(1.8), 0.1),
+    'fast_share': (math.log(0.2), 0.3), 'fast_time': (math.log(1.0), 0.7),
+    'slow_share': (math.log(0.3), 0.3), 'slow_time': (math.log(20.0), 0.3),
+    'inrush': (math.log(0.5), 1.0), 'lag': (math.log(0.01), 0.7),
+    'endurance': (math.log(350.0), 0.4), 'charge': (0.7, 0.3), 'before': (0.3, 0.4),
+}
+_NAMES = tuple(_PRIOR)
+_LINEAR = {'charge': (0.0, 1.05), 'before': (0.0, 1.5)}
+# Bounds of the others: prior deviations from the centre.
+_REACH = 3.0
+# Mean of the data over this time, s, before the fit: OU and polarisation are slower.
+_BIN = 0.05
+# Time constant of the residual OU, s, and the deviations tried, V a cell (cap: doc/load.md).
+_SLOW_TIME = 20.0
+_SLOW_STDS = np.geomspace(0.001, 0.00464, 5)
+# White and slow noise at the start, V a cell: the order of the recordings.
+_WHITE_START, _SLOW_START = 0.02, 0.01
+# Rounds of fit and noise; evaluations of the model in each.
+_ROUNDS, _EVALUATIONS = 4, 30
+
+
+@dataclass(frozen=True)
+class LoadFit:
+    """
+    A fitted load model, and how well it is known.
+
+    Attributes
+    ----------
+    model : LoadModel
+        The parameters.
+    covariance : ndarray, shape (11, 11)
+        Covariance of the parameters as fitted (logarithms, but for charge and before).
+    condition : float
+        Condition number of the Jacobian in prior deviations.
+    noise_std : float
+        White noise of a 50 ms mean, V.
+    slow_std : float
+        Standard deviation of the OU of 20 s, V.
+
+    """
+
+    model: LoadModel
+    covariance: FloatArray
+    condition: float
+    noise_std: float
+    slow_std: float
+
+    @property
+    def at_bounds(self) -> tuple[str, ...]:
+        """Return the parameters that stand at a bound."""
+        low, high, centre, deviation = _bounds(self.model.charge)
+        theta = np.array([getattr(self.model, name) if name in _LINEAR
+                          else math.log(getattr(self.model, name)) for name in _NAMES])
+        edge = np.minimum(theta - low, high - theta) < 1e-3 * deviation
+        return tuple(name for name, there in zip(_NAMES, edge) if there)
+
+    @property
+    def resistance(self) -> tuple[float, float, float]:
+        """Return the resistance, Ohm, and its 95 % interval, statistical only; NaN without I."""
+        if not self.model.full_current:
+            return NAN, NAN, NAN
+        value = self.model.size * self.model.cells * CELL / self.model.full_current
+        factor = math.exp(Z95 * math.sqrt(self.covariance[0, 0]))
+        return value, value / factor, value * factor
+
+
+def _bounds(charge: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return lower and upper bounds, prior centre and deviation; charge centred as given."""
+    centre = np.array([charge if name == 'charge' else _PRIOR[name][0] for name in _NAMES])
+    deviation = np.array([_PRIOR[name][1] for name in _NAMES])
+    low, high = centre - _REACH * deviation, centre + _REACH * deviation
+    for name, (least, most) in _LINEAR.items():
+        low[_NAMES.index(name)], high[_NAMES.index(name)] = least, most
+    return low, high, centre, deviation
+
+
+class _Noise:
+    """White noise and OU: whitens residuals of binned data; stamps in s."""
+
+    def __init__(self, t: FloatArray, cells: int) -> None:
+        self._keep = np.exp(-np.diff(t) / _SLOW_TIME)
+        self._tried = (_SLOW_STDS * cells) ** 2
+        self.white = (_WHITE_START * cells) ** 2
+        self.slow = (_SLOW_START * cells) ** 2
+
+    def whiten(self, residuals: FloatArray, slow: float | None = None,
+               ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return standardised innovations, their variances, V^2, and the innovations, V."""
+        q = self.slow if slow is None else slow
+        variance = np.empty(residuals.size)
+        p = q
+        for k in range(residuals.size):
+            variance[k] = p + self.white
+            if k < self._keep.size:
+                p = self._keep[k] ** 2 * p * self.white / variance[k] + q * (
+                    1.0 - self._keep[k] ** 2)
+        gain = 1.0 - self.white / variance
+        bands = np.ones((2, residuals.size))
+        bands[1, :-1] = -self._keep * (1.0 - gain[:-1])
+        bands[1, -1] = 0.0
+        right = np.zeros(residuals.size)
+        right[1:] = self._keep * gain[:-1] * residuals[:-1]
+        innovations = residuals - solve_banded((1, 0), bands, right, check_finite=False)
+        return innovations / np.sqrt(variance), variance, innovations
+
+    def learn(self, residuals: FloatArray) -> None:
+        """Fit both variances to residuals, V, of the model."""
+        for _ in range(2):
+            self.white = float(np.mean(self.whiten(residuals)[2] ** 2))
+            scores = []
+            for slow in self._tried:
+                z, variance, _ = self.whiten(residuals, slow)
+                scores.append(np.log(variance).sum() + z @ z)
+            self.slow = float(self._tried[int(np.argmin(scores))])
+
+
+def _model(theta: FloatArray, fixed: dict[str, Any]) -> LoadModel:
+    values: dict[str, Any] = {name: float(x) if name in _LINEAR else math.exp(x)
+                              for name, x in zip(_NAMES, theta)}
+    return LoadModel(**values, **fixed)
+
+
+def fit_load(t: FloatArray, voltage: FloatArray, throttle: FloatArray,
+             current: FloatArray | None = None) -> LoadFit:
+    """
+    Fit the load model; with current, A, that is the load instead of throttle.
+
+    t in s, voltage in V, throttle in 0..1; all finite, stamps rising.
+    """
+    if t.size < 2 or not t[-1] - t[0] > 20 * _BIN:
+        raise ValueError(f'a fit of the load needs more than {20 * _BIN:g} s')
+    if not (np.isfinite(voltage).all() and (np.diff(t) > 0.0).all()):
+        raise ValueError('voltage must be finite, V, and stamps must rise, s')
+    top = float(np.quantile(voltage, 0.99))
+    fixed: dict[str, Any] = {'cells': cells_in_series(top)}
+    # 1.6: below the prior's exponent, as the level takes a part; a scale of `endurance`.
+    moving = throttle > 0.05
+    fixed['mean_load'] = float((throttle[moving] ** 1.6).mean()) if moving.any() else 0.1
+    if current is not None:
+        fixed['full_current'] = max(float(np.quantile(current, 0.99)), 1e-9)
+        fixed['mean_load'] = max(
+            1e-3, float(np.maximum(current, 0.0).mean()) / fixed['full_current'])
+    low, high, centre, deviation = _bounds(
+        charge_at(float(np.quantile(voltage, 0.98)) / fixed['cells']))
+    index = np.floor((t - t[0]) / _BIN + 1e-9).astype(int)
+    starts = np.concatenate(([0], np.flatnonzero(np.diff(index)) + 1))
+    counts = np.diff(np.append(starts, t.size))
+
+    def mean(x: FloatArray) -> FloatArray:
+        return np.asarray(np.add.reduceat(x, starts) / counts, dtype=np.float64)
+
+    noise = _Noise(mean(t), fixed['cells'])
+    binned = mean(voltage)
+
+    def residuals(theta: FloatArray) -> FloatArray:
+        return binned - mean(_model(theta, fixed).path(t, throttle, current))
+
+    def cost(theta: FloatArray) -> FloatArray:
+        return np.concatenate((noise.whiten(residuals(theta))[0], (theta - centre) / deviation))
+
+    theta = np.clip(centre, low + 1e-6, high - 1e-6)
+    for _ in range(_ROUNDS):
+        found = least_squares(cost, theta, bounds=(low, high), x_scale=deviation,
+                              max_nfev=_EVALUATIONS)
+        theta = np.clip(found.x, low + 1e-6, high - 1e-6)
+        noise.learn(residuals(theta))
+    scaled = found.jac * deviation
+    sizes = np.linalg.svd(scaled, compute_uv=False)
+    covariance = np.linalg.inv(scaled.T @ scaled) * np.outer(deviation, deviation)
+    return LoadFit(_model(theta, fixed), covariance, float(sizes[0] / sizes[-1]),
+                   math.sqrt(noise.white), math.sqrt(noise.slow))

@@ -1,0 +1,174 @@
+"""The load in flight: closed forms, recovery, bad input, and the recorded flight."""
+
+import dataclasses
+
+import numpy as np
+from ou_monitor.model.load import LoadModel
+from ou_monitor.online.load_filter import LAGS, LoadFilter, LoadStatus, SupplyLoad
+from ou_monitor.recordings.read import read_recording
+from project import ROOT
+import pytest
+
+TRUE = LoadModel(4, 0.25, charge=0.85, size=0.15, power=1.8)
+
+
+def throttle_of_a_flight(t, rng):
+    """Return throttle that steps twice a second."""
+    steps = np.clip(0.35 + 0.25 * rng.standard_normal(int(2 * t[-1]) + 2), 0.0, 1.0)
+    return steps[(2 * t).astype(int)]
+
+
+def flight(seconds=40.0, noise=0.05, seed=3):
+    """Return stamps, voltage and throttle of a simulated pack at 50 Hz."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, seconds, 0.02)
+    u = throttle_of_a_flight(t, rng)
+    return t, TRUE.path(t, u) + noise * rng.standard_normal(t.size), u
+
+
+def loaded(t, v, u):
+    """Return what the filter knows after these samples."""
+    loads = LoadFilter()
+    loads.push(t, v, u)
+    return loads.load()
+
+
+def test_a_simulated_pack_is_recovered():
+    """Sag at once, level and noise; scalar by scalar gives the same as arrays."""
+    t, v, u = flight()
+    load = loaded(t, v, u)
+    assert load.known and load.status is LoadStatus.KNOWN
+    for throttle in (0.2, 0.4, 0.6):
+        expected = 0.15 * 15.2 * throttle ** 1.8
+        assert abs(float(load.sag(throttle)) - expected) < 3.0 * float(load.sag_se(throttle))
+    assert float(load.noise(0.35)) == pytest.approx(0.05, rel=0.3)
+    assert load.level == pytest.approx(4 * 4.0, abs=0.4)
+    assert load.time_constants == LAGS and np.isnan(load.resistance)
+    loads = LoadFilter()
+    for one in zip(t.tolist(), v.tolist(), u.tolist()):
+        loads.push(*one)
+    assert loads.load() == load
+
+
+def test_the_sag_rises_and_its_error_has_a_floor():
+    """Monotone in throttle; never known better than to a tenth."""
+    load = loaded(*flight(noise=0.005))
+    u = np.linspace(0.0, 1.0, 33)
+    assert (np.diff(load.sag(u)) >= 0.0).all()
+    assert (load.sag_se(u) >= 0.1 * load.sag(u) - 1e-12).all()
+
+
+def test_a_held_throttle_ends_at_a_steady_answer():
+    """The path ahead forgets its start: a minute later only discharge is left."""
+    loads = LoadFilter()
+    loads.push(*flight())
+    ahead = 40.0 + np.arange(1.0, 120.0)
+    path = loads.path(ahead, np.full(ahead.size, 0.4))
+    fall = np.diff(path)[80:]
+    assert (fall < 0.0).all() and (fall > -0.05).all()
+    rested = loads.path(ahead, np.zeros(ahead.size))
+    assert np.ptp(rested[90:]) < 1e-3
+    assert rested[-1] == pytest.approx(loads.load().level, abs=2e-3)
+
+
+@pytest.mark.parametrize('throttle, tolerance', [(0.0, 1e-9), (0.5, 5e-3)])
+def test_two_half_steps_are_one_in_a_gap(throttle, tolerance):
+    """The lags are exact over a gap; discharge takes the slope at its start, 1 mV a second."""
+    t, v, u = flight()
+    u[-25:] = throttle
+    loads = LoadFilter()
+    loads.push(t, v, u)
+    once = loads.path(np.array([t[-1] + 7.0]), np.array([throttle]))
+    twice = loads.path(t[-1] + np.array([3.5, 7.0]), np.array([throttle, throttle]))
+    assert once[-1] == pytest.approx(twice[-1], abs=tolerance)
+
+
+def test_looking_changes_nothing():
+    """What is asked of the filter leaves it as it was."""
+    t, v, u = flight()
+    loads = LoadFilter()
+    loads.push(t, v, u)
+    before = loads.load()
+    loads.path(t[-1] + np.arange(1.0, 9.0), np.linspace(0.0, 1.0, 8))
+    assert loads.load() == before
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        before.level = 0.0
+
+
+def test_a_throttle_that_never_moved_says_nothing_of_the_sag():
+    """Level and noise are known, the sag is not."""
+    t, v, u = flight()
+    load = loaded(t, 16.0 + 0.05 * np.random.default_rng(1).standard_normal(t.size), 0.0 * u + 0.3)
+    assert load.status is LoadStatus.STILL and not load.known
+    assert np.isnan(load.sag(0.5)) and np.isnan(load.sag_se(0.5))
+    assert float(load.noise(0.3)) == pytest.approx(0.05, rel=0.3) and np.isfinite(load.level)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_throttle_of_another_vehicle_is_no_relation(seed):
+    """Noise that does not know of throttle has no sag to be known."""
+    t, _, u = flight(60.0)
+    v = 16.0 + 0.05 * np.random.default_rng(seed + 10).standard_normal(t.size)
+    assert not loaded(t, v, u).known
+
+
+def test_throttle_of_the_wrong_sign_is_no_relation():
+    """A voltage that rises with throttle is said, not fitted."""
+    t, v, u = flight(60.0)
+    assert loaded(t, v, 1.0 - u).status is LoadStatus.NO_RELATION
+
+
+def test_holes_and_late_stamps_are_left_out():
+    """Holes in voltage and stamps that do not rise change nothing; throttle holds over its own."""
+    t, v, u = flight()
+    expected = loaded(t, v, u)
+    k = t.size // 2
+    holed = (np.insert(t, [k, k], [t[k] - 0.001, t[k - 1]]),
+             np.insert(v, [k, k], [np.nan, 3.0]), np.insert(u, [k, k], [0.9, 0.9]))
+    assert loaded(*holed) == expected
+    gap = u.copy()
+    gap[1:][np.diff(u) == 0.0] = np.nan
+    assert loaded(t, v, gap) == expected
+
+
+def test_a_clock_that_jumps_back_begins_anew():
+    """A new flight knows nothing of the last one."""
+    t, v, u = flight()
+    loads = LoadFilter()
+    loads.push(t + 1000.0, v + 3.0, u)
+    loads.push(t, v, u)
+    assert loads.load() == loaded(t, v, u)
+
+
+def test_another_battery_in_flight():
+    """A level that jumps is found again, and the sag stays."""
+    t, v, u = flight(80.0)
+    load = loaded(t, np.where(t > 40.0, v - 1.5, v), u)
+    plain = loaded(t, v, u)
+    assert plain.level - load.level == pytest.approx(1.5, abs=0.2)
+    assert float(load.sag(0.5)) == pytest.approx(float(plain.sag(0.5)), rel=0.2)
+
+
+def test_nothing_is_known_of_nothing():
+    """Before the first sample all is NaN."""
+    load = LoadFilter().load()
+    assert load == SupplyLoad() and load.status is LoadStatus.NO_DATA and not load.known
+    assert np.isnan([load.level, load.sag(0.5), load.sag_se(0.5), load.noise(0.5)]).all()
+    with pytest.raises(ValueError, match='no voltage'):
+        LoadFilter().path(np.arange(3.0), np.zeros(3))
+
+
+def test_the_recorded_flight():
+    """Known after 20 s and from then on; the path of the last 30 s follows from throttle."""
+    recording = read_recording(ROOT / 'bags/recorded/gecko.csv')
+    t, v, u = recording.t - recording.t[0], recording.voltage, recording.throttle
+    loads = LoadFilter()
+    known = []
+    for second in range(100):
+        piece = (t >= second) & (t < second + 1)
+        loads.push(t[piece], v[piece], u[piece])
+        known.append(loads.load().known)
+    assert all(known[20:])
+    ahead = (t >= 100.0) & (t < 110.0)
+    path = loads.path(t[ahead], np.clip(u[ahead], 0.0, 1.0))
+    assert np.sum((v[ahead] - path) ** 2) < 0.25 * np.sum((v[ahead] - v[ahead].mean()) ** 2)
