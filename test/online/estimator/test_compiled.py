@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+import types
 
 import numpy as np
 from ou_monitor.model import arma
@@ -156,3 +157,38 @@ def test_scalar_fit_is_the_same_text():
                 row, 24, *start, m)
             assert tuple(two) == pytest.approx(one, rel=1e-9)
             assert one[1] == pytest.approx(0.011, rel=1e-3) and one[2] > 0.0
+
+
+@pytest.mark.parametrize('size', [1, 5])
+def test_the_first_calls_have_rows_of_the_width_that_is_used(monkeypatch, size):
+    """
+    Compiled code writes past a row that is too narrow, unnoticed; as Python it would raise.
+
+    A row over two lags of c columns: count, sums, places, products of columns, and for each
+    lag pairs, changes and products of changes.
+    """
+    calls = []
+
+    def recorded(function):
+        def call(*arguments):
+            calls.append((function.__name__, arguments))
+            return function(*arguments)
+        return call
+
+    numba, extending = types.ModuleType('numba'), types.ModuleType('numba.extending')
+    numba.njit = lambda function=None, **_: recorded(function) if function else recorded
+    extending.register_jitable = lambda function=None, **_: function or (lambda given: given)
+    numba.extending = extending
+    monkeypatch.setitem(sys.modules, 'numba', numba)
+    monkeypatch.setitem(sys.modules, 'numba.extending', extending)
+    compiled.build()
+    # Once each, and the sums once for the voltage alone and once with the throttle.
+    assert sorted(name for name, _ in calls) == [
+        'add_slots', 'add_slots', 'check', 'finish', 'fit_sums', 'search', 'slide', 'take_slots',
+        'take_slots']
+    width = sum((1, size, size, size * size, 2, 2 * size, 2 * size * size))
+    taken = {given[0].shape[0]: given for name, given in calls if name == 'take_slots'}
+    assert taken[size][7] == 2 and taken[size][8].shape[1] == width
+    assert width in {given[0].shape[1] for name, given in calls if name == 'add_slots'}
+    (slid,) = [given for name, given in calls if name == 'slide']
+    assert slid[10] == 2 and slid[11].shape[1] == 10
