@@ -1,0 +1,121 @@
+"""Rules and words of a discovery: tables of what is tried, when, and what is written."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+from numpy.testing import assert_allclose
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.discovery import decision
+from ou_monitor.discovery.finding import Cause, Criticism, Verdict
+from ou_monitor.discovery.fitting import Fitter
+from ou_monitor.discovery.gain import crossings
+from ou_monitor.discovery.words import cause_rows, coupling_note, verdict_sentence
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.term import Role
+from ou_monitor.model.terms.tone import Tone
+import pytest
+from scipy.signal import lfilter
+
+
+def tone_cause(frequency, explanation):
+    """Return a cause with a gain that all lines share."""
+    return Cause(Tone(0.01, frequency, 0.3, 0.0), {}, 0.02, 0.003, 1e-6, (), explanation, False)
+
+
+def test_terms_that_share_a_gain_are_one_row_with_the_estimates_of_all():
+    """The explanation is that of the first; its estimate gives way to those of all."""
+    first, other = tone_cause(31.0, ''), tone_cause(67.0, 'The second.')
+    (single,) = cause_rows([first])
+    estimate = single.estimates[0]
+    assert '31.00 Hz' in estimate
+    first = replace(first, explanation=f'The first. Estimate: {estimate}. Mend it.')
+    (row,) = cause_rows([first, other])
+    assert row.label == f'{first.name} x2' and len(row.estimates) == 2
+    assert row.explanation == (f'The first. Estimates: (1) {row.estimates[0]}. '
+                               f'(2) {row.estimates[1]}. Mend it.')
+    # One that holds no estimate has them added.
+    (added,) = cause_rows([replace(first, explanation='Bare.'), other])
+    assert added.explanation == (f'Bare. Estimates: (1) {row.estimates[0]}. '
+                                 f'(2) {row.estimates[1]}.')
+    assert single.label == first.name and cause_rows([other])[0].explanation == 'The second.'
+
+
+@pytest.mark.parametrize('rate, corner', ((2.0 * math.pi, '1.00'), (62.83185307, '10.0')))
+def test_a_corner_is_a_rate_over_a_turn(rate, corner):
+    assert f'corner at {corner} Hz' in coupling_note(rate, 100.0)
+
+
+@pytest.mark.parametrize('verdict, begin, gain', (
+    (Verdict.NO_EFFECT, 'The plain OU simulates this recording', False),
+    (Verdict.UNEXPLAINED, 'The simulation deviates from the recording', False),
+    (Verdict.EXPLAINED, 'What the plain OU gets wrong is explained by tone', True),
+    (Verdict.PARTLY_EXPLAINED, 'tone explains a part of what the plain OU gets wrong', True)))
+@pytest.mark.parametrize('left', (False, True))
+def test_each_verdict_has_its_sentence(verdict, begin, gain, left):
+    some = [Criticism('skewness', 9.0, 8.0, -3.7, 3.7, 0.0, 0.0)] if left else []
+    text = verdict_sentence(verdict, [tone_cause(31.0, '')], some, 0.02, 0.003)
+    assert text.startswith(begin) and ('mnat' in text) == gain
+    assert ('lopsided' in text) == (left and verdict in (Verdict.UNEXPLAINED,
+                                                         Verdict.PARTLY_EXPLAINED))
+
+
+QUIET = {'kurtosis': 0.0, 'small errors lag 1': 0.0}
+SHAPED = {'kurtosis': decision.OUTLIERS + 0.1, 'small errors lag 1': 0.0}
+HISS = {**SHAPED, 'small errors lag 1': decision.WHITE - 0.1}
+
+
+@pytest.mark.parametrize('kind', [kind for kind in catalogue().values()
+                                  if kind.NAME != 'ou' and kind.SIGNS], ids=lambda k: k.NAME)
+def test_a_kind_has_its_turn(kind):
+    """Measured inputs and certain white noise first; laws before the rest where outliers are."""
+    turns = [decision.tier_of(kind, values) for values in (QUIET, SHAPED, HISS)]
+    wanted = ([0, 0, 0] if kind.MEASURED else [0, 1, 0] if kind.ROLE is Role.NOISE else
+              [2, 1, 1] if kind.ROLE is Role.LAW else [2, 2, 2])
+    assert turns == wanted
+    for name, clear in kind.CLEAR_ABOVE.items():
+        assert decision.tier_of(kind, {**QUIET, name: clear + 0.1}) == 0
+
+
+def test_a_clear_trial_spares_a_dear_kind_of_another_family():
+    """Only where the statistics that it leaves are known, calm, and ask for nothing."""
+    dear = [kind for kind in catalogue().values() if kind.DEAR and kind.SIGNS]
+    assert dear
+    for kind in dear:
+        tried = next(one for one in catalogue().values() if one.FAMILY != kind.FAMILY
+                     and not decision.imitate(kind, one) and one.NAME != 'ou' and not one.DEAR)
+        calm = {'skewness': 0.0}
+        sign = kind.SIGNS[0]
+        asking = {sign.lstrip('+-'): (-1.0 if sign[0] == '-' else 1.0) * (decision.ASK_DEAR + 9.0)}
+        assert decision.settled(tried, calm, kind)
+        assert not decision.settled(tried, None, kind)
+        assert not decision.settled(tried, asking, kind)
+        assert not decision.settled(tried, calm, kind, {kind.NAME})
+        assert not decision.settled(tried, {'x': decision.OFF + 0.1}, kind)
+        assert not decision.settled(kind, calm, kind)
+        assert not decision.settled(kind, calm, tried)
+
+
+def test_crossings_count_falls_between_scored_neighbours():
+    """Falls through 0 at 1, 3 and 6 s; a level reached counts as above."""
+    t = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 6.0])
+    v = np.array([1.0, -1.0, 0.0, -1.0, 1.0, -2.0])
+    assert crossings(t, v, 0.0) == pytest.approx(60.0 * 3.0 / 6.0)
+    scored = np.array([True, True, True, True, False, True])
+    assert crossings(t, v, 0.0, scored) == pytest.approx(60.0 * 2.0 / 3.0)
+    assert math.isnan(crossings(t, v, 0.0, np.arange(6) % 2 == 0))
+
+
+def test_fits_add_up_their_cost():
+    """Each counts, of the first part or of everything; a fit that fails costs nothing."""
+    rng = np.random.default_rng(1)
+    keep = math.exp(-0.05)
+    v = 5.0 + lfilter([0.01 * math.sqrt(1.0 - keep**2)], [1.0, -keep],
+                      rng.standard_normal(2000))
+    fitter = Fitter(Samples(np.arange(2000) * 1e-3, v, None))
+    start = [OU(50.0, 0.1, 5.0)]
+    one = fitter.fit(start, None)
+    assert one.cost > 0.0 and fitter.cost == one.cost
+    two = fitter.whole(one)
+    assert_allclose(fitter.cost, one.cost + two.cost)
