@@ -340,3 +340,22 @@ def test_a_relaxation_rate_is_used_within_the_range_of_the_parameter(alpha, used
     assert (got.tolist() == at_default.tolist()) is not used
     if used:
         assert got.tolist() == AdaptiveLowPass(**options, alpha=alpha).filter(t, x, 0.3).tolist()
+
+
+@pytest.mark.parametrize('options, good', [
+    ({'fmin': 0.001, 'fmax': 0.0015, 'fallback': 0.001}, True),
+    ({'fmin': 0.00099, 'fmax': 1.0, 'fallback': 1.0}, False),
+    ({'fmin': 9e5, 'fmax': 1e6, 'fallback': 1e6}, True),
+    ({'fmin': 9e5, 'fmax': 1.001e6, 'fallback': 1e6}, False),
+    ({'lag_frequency': 0.001}, True), ({'lag_frequency': 0.00099}, False),
+    ({'lag_frequency': 1e6}, True), ({'lag_frequency': 1.001e6}, False),
+    ({'alpha': 1e-6}, True), ({'alpha': 0.99e-6}, False),
+    ({'alpha': 1e9}, True), ({'alpha': 1.001e9}, False),
+    ({'sigma_ref': 1e-9}, True), ({'sigma_ref': 0.99e-9}, False)])
+def test_frequencies_and_rates_may_be_within_their_ranges(options, good):
+    """1 mHz to 1 MHz; 1e-6 to 1e9 1/s; fmin below fmax."""
+    if good:
+        assert AdaptiveLowPass(**options).settings == FilterSettings(**options)
+    else:
+        with pytest.raises(ValueError, match=next(iter(options)) + '|fmax'):
+            AdaptiveLowPass(**options)

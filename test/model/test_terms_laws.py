@@ -1,0 +1,65 @@
+"""What terms share when they are fitted: standard errors, mixtures, runs, the view."""
+
+from itertools import combinations
+import math
+
+import numpy as np
+from ou_monitor.model.terms.glitches import _best_runs
+from ou_monitor.model.terms.laws import climb, curvature_se, mixture_cdf
+import pytest
+from scipy.stats import norm
+
+
+def test_standard_errors_are_those_of_a_parabola():
+    """A log-likelihood of 3 - sum (x/s)^2/2 has the errors s; one that is not curved has none."""
+    s = np.array([0.02, 1.0, 7.0])
+    at = np.array([0.3, -2.0, 0.0])
+
+    def value(x):
+        return 3.0 - 0.5 * float((((x - at) / s) ** 2).sum())
+
+    assert curvature_se(value, at) == pytest.approx(s, rel=1e-6)
+    # The second difference of a parabola is exact whatever the step, and off the top too.
+    assert curvature_se(value, at + 1.0, step=0.5) == pytest.approx(s, rel=1e-6)
+    # The step of a cosine: (2 cos(h) - 2)/h^2.
+    assert curvature_se(lambda x: math.cos(x[0]), np.zeros(1)) == pytest.approx(
+        [0.05 / math.sqrt(2.0 - 2.0 * math.cos(0.05))], rel=1e-9)
+    for flat in (lambda x: 4.0, lambda x: x[0], lambda x: x[0] ** 2):
+        assert math.isnan(curvature_se(flat, np.zeros(1))[0])
+
+
+def test_the_climb_finds_the_top_of_a_parabola():
+    """Top 5 at (0.4, -1)."""
+    at, top = climb(lambda x: 5.0 - (x[0] - 0.4) ** 2 - 3.0 * (x[1] + 1.0) ** 2, np.zeros(2), 0.5,
+                    most=400)
+    assert at == pytest.approx([0.4, -1.0], abs=0.02) and top == pytest.approx(5.0, abs=0.01)
+
+
+def test_a_mixture_has_the_weighted_chance():
+    """Two normals, by the distribution of SciPy."""
+    z = np.linspace(-4.0, 5.0, 19)
+    weight, mean, std = np.array([0.3, 0.7]), np.array([-1.0, 2.0]), np.array([0.5, 3.0])
+    assert mixture_cdf(z, weight, mean, std) == pytest.approx(
+        0.3 * norm.cdf(z, -1.0, 0.5) + 0.7 * norm.cdf(z, 2.0, 3.0), rel=1e-12)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_best_runs_are_the_best_of_all_choices(seed):
+    """
+    Seven runs, all 128 choices of them: the largest sum of gains of runs that are apart.
+
+    A run needs the innovation at its end, so the next begins behind that.
+    """
+    rng = np.random.default_rng(seed)
+    begin = rng.integers(0, 20, 7)
+    end, gain = begin + rng.integers(1, 6, 7), rng.random(7)
+
+    def apart(some):
+        return all(end[i] < begin[j] or end[j] < begin[i] for i, j in combinations(some, 2))
+
+    choices = [some for k in range(8) for some in combinations(range(7), k) if apart(some)]
+    best = max(choices, key=lambda some: sum(gain[k] for k in some))
+    expected = np.zeros(30, dtype=bool)
+    for k in best:
+        expected[begin[k]:end[k]] = True
+    assert _best_runs(begin, end, gain, 30).tolist() == expected.tolist()
