@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from ou_monitor.errors import InputError
     from ou_monitor.online.estimator.estimator import SlidingEstimator
     from ou_monitor.online.filter.lowpass import AdaptiveLowPass
+    from ou_monitor.online.monitor import SupplyMonitor
     from ou_monitor.online.risk.first_passage import brownout_probability
+    from ou_monitor.online.settings import MonitorSettings
     from ou_monitor.recordings.read import read_pieces, read_recording
     from ou_monitor.records import Estimate, Flag, Recording, Status
 
@@ -27,9 +29,11 @@ _HOMES = {
     'Estimate': 'ou_monitor.records',
     'Flag': 'ou_monitor.records',
     'InputError': 'ou_monitor.errors',
+    'MonitorSettings': 'ou_monitor.online.settings',
     'Recording': 'ou_monitor.records',
     'SlidingEstimator': 'ou_monitor.online.estimator.estimator',
     'Status': 'ou_monitor.records',
+    'SupplyMonitor': 'ou_monitor.online.monitor',
     'brownout_probability': 'ou_monitor.online.risk.first_passage',
     'discover': 'ou_monitor.discovery.discover',
     'read_pieces': 'ou_monitor.recordings.read',
@@ -37,9 +41,9 @@ _HOMES = {
 }
 
 __all__ = [
-    'AdaptiveLowPass', 'Estimate', 'Flag', 'InputError', 'Recording', 'SlidingEstimator',
-    'Status', '__version__', 'brownout_probability', 'discover', 'read_pieces',
-    'read_recording',
+    'AdaptiveLowPass', 'Estimate', 'Flag', 'InputError', 'MonitorSettings', 'Recording',
+    'SlidingEstimator', 'Status', 'SupplyMonitor', '__version__', 'brownout_probability',
+    'discover', 'read_pieces', 'read_recording',
 ]
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import enum
 import math
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -77,6 +78,8 @@ def _prior() -> tuple[FloatArray, FloatArray, float]:
 _MEAN, _COV, _SIZE = _prior()
 _STATES = 2 + _MEAN.size
 
+_Number = TypeVar('_Number', float, FloatArray)
+
 
 def _static(throttle: npt.ArrayLike) -> FloatArray:
     """Return the regressors of a steady sag without polarisation, shape (n, 4)."""
@@ -85,7 +88,7 @@ def _static(throttle: npt.ArrayLike) -> FloatArray:
     return np.stack([x, u, u ** 3, x], axis=-1)
 
 
-def _ripple(u: float) -> float:
+def _ripple(u: _Number) -> _Number:
     """Return the ripple of an ESC over throttle: largest, 1, at 0.7."""
     return u * (1.4 - u) / 0.49
 
@@ -148,7 +151,7 @@ class SupplyLoad:
         """Return the deviation of one sample, V; beyond the throttles flown that of the edge."""
         u = np.clip(np.asarray(throttle, dtype=np.float64), *self._range)
         b = self._log_variance
-        return np.asarray(np.exp(0.5 * (b[0] + b[1] * (u * (1.4 - u) / 0.49))))
+        return np.asarray(np.exp(0.5 * (b[0] + b[1] * _ripple(u))))
 
     def _read(self, throttle: npt.ArrayLike, table: tuple[float, ...]) -> FloatArray:
         u = np.asarray(throttle, dtype=np.float64)

@@ -153,7 +153,40 @@ FILTER_PARAMETERS: tuple[Parameter, ...] = (
 
 @dataclass(frozen=True)
 class MonitorSettings:
-    """Settings of `SupplyMonitor`; see `ESTIMATOR_PARAMETERS` for units."""
+    """
+    Settings of `SupplyMonitor`: the parameters of the node `estimator`.
+
+    Attributes
+    ----------
+    window : float
+        Length of the sliding window, s.
+    stale_after : float
+        Silence after which the input counts as stale, s.
+    brownout_voltage : float
+        Supply voltage that must not be undershot, V.
+    brownout_horizon : float
+        Time ahead of the risk, s.
+    brownout_warn, brownout_critical : float
+        Risks from which the diagnostics warn and the flag is set, 0..1.
+    brownout_leave : float
+        Share of these risks below which a level is left, less than 1.
+    brownout_hold, brownout_delay : float
+        Time for which a level stays at least, and for which a risk lasts before it, s.
+    brownout_latch : bool
+        Whether CRITICAL stays until it is cleared.
+    brownout_floor : float
+        Voltage at or below which the flag is CRITICAL, V; 0: off; negative: 0.2 V below
+        `brownout_voltage`.
+    brownout_floor_time : float
+        Time over which the median of the voltage is held against the floor, s.
+    brownout_watch : str
+        ``continuous`` or ``sampled``: the risk at all times, or at the samples only.
+    brownout_budget_limit : float
+        Risk that the throttle budget keeps under, 0..1; 0: `brownout_warn`.
+    model_file : str
+        Model file of the supply; empty: none.
+
+    """
 
     window: float = 2.0
     stale_after: float = 1.0
