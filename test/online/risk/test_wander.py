@@ -79,3 +79,54 @@ def test_what_was_seen_is_forgotten_over_two_minutes(seed):
         wander.elapse(silence)
         assert wander.speed == pytest.approx(faded(weight, silence), rel=1e-6)
         assert abs(faded(weight, silence) / faded(weight, 2.0 * silence) - 1.0) > 1e-3
+
+
+# Variance gained per second, and what is believed of it before any data.
+SPEEDS = np.array([0.0, 1e-4, 5e-4, 2e-3, 8e-3, 3e-2])
+BELIEF = np.array([0.15, 0.2, 0.2, 0.2, 0.15, 0.1])
+
+
+def test_before_any_data_it_is_the_belief():
+    """Mean speed 0.00472 per second, and a variance of 0.5 that grows by it."""
+    wander = Wander()
+    assert wander.value == 0.0 and wander.variance == pytest.approx(0.5, rel=1e-12)
+    assert BELIEF.sum() == pytest.approx(1.0) and wander.speed == pytest.approx(0.00472, rel=1e-12)
+    assert wander.fast_speed == pytest.approx(BELIEF @ SPEEDS**2 / 0.00472, rel=1e-12)
+    wander.elapse(10.0)
+    assert wander.variance == pytest.approx(0.5472, rel=1e-12)
+    assert wander.speed == pytest.approx(0.00472, rel=1e-12)
+
+
+@pytest.mark.parametrize('seen, noise', [(0.3, 0.04), (-1.4, 0.5), (2.0, 0.01)])
+def test_one_observation_is_the_rule_of_bayes(seen, noise):
+    """After 100 s, by integration over where it may be at each speed; no more is forgotten."""
+    wander = Wander()
+    wander.elapse(100.0)
+    wander.correct(seen, noise)
+    x = np.linspace(-15.0, 15.0, 60_001)
+    spread = 0.5 + 100.0 * SPEEDS[:, None]
+    joint = (BELIEF[:, None] * np.exp(-0.5 * x * x / spread) / np.sqrt(spread)
+             * np.exp(-0.5 * (seen - x) ** 2 / noise))
+    joint /= joint.sum()
+    mean = float(joint.sum(axis=0) @ x)
+    assert wander.value == pytest.approx(mean, rel=1e-6)
+    assert wander.variance == pytest.approx(float(joint.sum(axis=0) @ (x - mean) ** 2), rel=1e-6)
+    weight = joint.sum(axis=1)
+    assert wander.speed == pytest.approx(float(weight @ SPEEDS), rel=1e-6)
+    # A time of 120 s leaves 1/e of what was learned, in logarithms.
+    wander.elapse(120.0)
+    kept = BELIEF * (weight / BELIEF) ** math.exp(-1.0)
+    assert wander.speed == pytest.approx(float(kept @ SPEEDS / kept.sum()), rel=1e-6)
+
+
+def test_an_observation_far_away_counts_as_four_deviations():
+    """Whatever it is beyond that; the variance before is 0.5, that of the observation 0.5."""
+    found = []
+    for seen in (4.0, 4.1, 1e3):
+        wander = Wander()
+        wander.correct(seen, 0.5)
+        found.append(wander.value)
+    assert found == pytest.approx([2.0, 2.0, 2.0], rel=1e-12)
+    wander = Wander()
+    wander.correct(3.9, 0.5)
+    assert wander.value == pytest.approx(1.95, rel=1e-12)
