@@ -1,14 +1,18 @@
 """Where terms start a fit: closed forms of their candidates from what is left over."""
 
+from dataclasses import replace
 import math
 
 import numpy as np
 from ou_monitor.model.terms.flicker_noise import FlickerNoise
+from ou_monitor.model.terms.hidden_levels import relaxing
+from ou_monitor.model.terms.jumps import _mixture, Jumps
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import order_power
 from ou_monitor.model.terms.second_relaxation import SecondRelaxation
 import pytest
 from scipy.linalg import dft
+from scipy.stats import median_abs_deviation, norm
 from term_examples import still, term
 
 
@@ -104,3 +108,61 @@ def test_the_phase_of_a_line_with_a_width_is_a_random_walk():
     found = still(line).simulate(np.arange(n) / rate, np.random.default_rng(6), 0.25)
     steps = np.diff(np.arcsin(found / 0.1))
     assert np.mean(steps ** 2) * rate / (2.0 * math.pi * width) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize('width, expected', [(0.999, True), (1.001, False)])
+def test_a_line_follows_throttle_that_moves_it_by_more_than_its_width(width, expected):
+    """Throttle of 0.1 about 0.5 moves a line of slope -300 Hz by 30 Hz."""
+    view = view_of(1000, 500.0)
+    line = term('throttle_tone', amplitude=0.1, idle=20.0, slope=-300.0, phase=0.0,
+                linewidth=30.0 * width)
+    assert line.holds(view) is False
+    throttle = 0.5 + 0.1 * np.where(np.arange(1000) % 2, 1.0, -1.0)
+    assert line.holds(replace(view, throttle=throttle)) is expected
+
+
+def test_jumps_and_the_rest_are_scored_by_their_mixture():
+    """Most are of half the expected spread: the chance of each, by the normals of SciPy."""
+    rng = np.random.default_rng(8)
+    n = 4000
+    variance = np.where(np.arange(n) % 2, 0.01, 0.04)
+    volts = 0.5 * np.sqrt(variance) * rng.standard_normal(n)
+    volts[::100] += 0.6 + 0.2 * rng.standard_normal(n // 100)
+    view = replace(view_of(n, 1000.0), z=volts / np.sqrt(variance), variance=variance)
+    share, mean, spread, unit = _mixture(view.z, variance)
+    assert unit == pytest.approx(0.5, rel=0.05) and share == pytest.approx(0.01, rel=0.2)
+    assert mean == pytest.approx(0.6, abs=0.15) and spread == pytest.approx(0.2, rel=0.5)
+    wide = np.hypot(unit * np.sqrt(variance), spread)
+    chance = (1.0 - share) * norm.cdf(view.z / unit) + share * norm.cdf((volts - mean) / wide)
+    found = Jumps.fit_law(view)
+    middle = np.abs(found.z) < 3.0
+    assert found.z[middle] == pytest.approx(norm.ppf(chance[middle]), abs=1e-6)
+    assert found.term.rate == pytest.approx(1000.0 * share, rel=1e-9)
+    assert (found.term.mean, found.term.std) == (mean, spread)
+    count = n * share
+    assert found.se == pytest.approx({
+        'rate': found.term.rate / math.sqrt(count), 'mean': spread / math.sqrt(count),
+        'std': spread / math.sqrt(2.0 * count)}, rel=1e-9)
+
+
+def test_what_a_faster_rail_leaves_over():
+    """
+    Residuals less phi^2 times the state before, over what noise of that phi makes of a step.
+
+    Its spread is that of the middle half of the errors, at a usual step.
+    """
+    rng = np.random.default_rng(9)
+    phi = np.tile([0.9, 0.8, 0.9], 400)
+    state, z, variance = rng.standard_normal(1200), rng.standard_normal(1200), np.tile(
+        [0.3, 0.4, 0.3], 400)
+    view = replace(view_of(1200, 100.0), phi=phi, state=state, z=z, variance=variance)
+    assert relaxing(view, 1.0) is view
+    found = relaxing(view, 2.0)
+    error = z * np.sqrt(variance) + phi * state - phi ** 2 * state
+    middle = np.median(error)
+    # The usual step is that of phi 0.9; the middle half of a normal reaches to 0.6745.
+    std = median_abs_deviation(error) / 0.6745
+    expected = std ** 2 * (1.0 - phi ** 4) / (1.0 - 0.9 ** 4)
+    assert found.phi == pytest.approx(phi ** 2, rel=1e-12)
+    assert found.variance == pytest.approx(expected, rel=1e-4)
+    assert found.z == pytest.approx((error - middle) / np.sqrt(expected), rel=1e-4, abs=1e-9)
