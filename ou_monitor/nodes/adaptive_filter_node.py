@@ -161,6 +161,9 @@ class AdaptiveFilterNode(MonitorNode):
         supply, low_pass = self._known(), self.low_pass
         settings = low_pass.settings
         level, summary = self._judge(supply)
+        if self.faulty:
+            level = Level.ERROR
+            summary = f'A callback failed ({self.faults} times so far): {self.fault}. {summary}'
         counters: FilterCounters = low_pass.counters
         values: dict[str, object] = {
             'input_type': self._type, 'law': settings.law, 'mode': settings.mode,
@@ -173,7 +176,7 @@ class AdaptiveFilterNode(MonitorNode):
             'passed': self._passed, 'dropped': self._dropped,
             'repeated': counters.repeated, 'back': counters.back, 'gaps': counters.gaps,
             'sigma_age': self._supply.age, 'state_age': self._supply.state_age,
-            'input_age': self._input_silence.age}
+            'input_age': self._input_silence.age, 'callback_errors': self.faults}
         fields = {key: repr(value) if isinstance(value, float) else str(value)
                   for key, value in values.items()}
         self._diagnostics.publish(diagnostic(

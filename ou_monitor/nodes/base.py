@@ -1,5 +1,5 @@
 """
-What both nodes share: parameters from a table, and callbacks that end the node cleanly.
+What both nodes share: parameters from a table, and callbacks that no error ends.
 
 `estimator` and `adaptive_filter` declare what the tables of
 `ou_monitor.online.settings` say, so a name or a default exists once.
@@ -7,9 +7,10 @@ What both nodes share: parameters from a table, and callbacks that end the node 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import functools
 import inspect
+import math
 import time
 from typing import Any
 
@@ -22,12 +23,19 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 from rclpy.time import Time
 from rclpy.timer import Timer
 
 # rclpy's own, never declared by us.
 _BUILT_IN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 
+LOCK = Parameter(
+    'lock_parameters', False,
+    'Whether parameters that can disarm the node (all but publish_rate) are refused at run time.')
+# How long an error of a callback is told in the diagnostics, s.
+TELL = 10.0
 PUBLISH_RATE = Parameter('publish_rate', 10.0, 'How often the outputs are published, Hz.',
                          0.01, 1000.0)
 
@@ -54,11 +62,14 @@ class MonitorNode(Node):
     def __init__(self, name: str, table: Sequence[Parameter],
                  fixed: Sequence[Parameter] = ()) -> None:
         super().__init__(name)
-        self.failure: BaseException | None = None
+        self.faults, self.fault = 0, ''
+        self._faulted = -math.inf
         self._publishing: Timer | None = None
+        self._outputs_callback: Callable[[], None] | None = None
+        self._polled: list[Subscription] = []
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._table = {parameter.name: parameter for parameter in table}
-        declared = [*table, *fixed]
+        declared = [*table, *fixed, LOCK]
         self._widen_overrides(declared)
         for parameter in declared:
             self.declare_parameter(parameter.name, parameter.default, _descriptor(
@@ -68,6 +79,7 @@ class MonitorNode(Node):
             self.check(self.values())
         except ValueError as error:
             raise InputError(str(error)) from error
+        self._locked = bool(self.get_parameter(LOCK.name).value)
         self.add_pre_set_parameters_callback(self._widen)
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self.guarded(self._after_set))
@@ -81,9 +93,11 @@ class MonitorNode(Node):
 
     def apply(self, values: Mapping[str, Any]) -> None:
         """Bring checked parameters into force without losing state."""
-        period = round(1e9 / values[PUBLISH_RATE.name])
-        if self._publishing is not None and self._publishing.timer_period_ns != period:
-            self._publishing.timer_period_ns = period
+        if self._publishing is not None and self._outputs_callback is not None and (
+                self._publishing.timer_period_ns != round(1e9 / values[PUBLISH_RATE.name])):
+            # A new period of an old timer begins only when the old one has ended.
+            self.destroy_timer(self._publishing)
+            self.publish_every(self._outputs_callback)
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
         """Call back every `period` s of real time: silence is told on simulated time too."""
@@ -91,11 +105,12 @@ class MonitorNode(Node):
 
     def publish_every(self, callback: Callable[[], None]) -> None:
         """Call back at `publish_rate`, which may change."""
+        self._outputs_callback = callback
         self._publishing = self.every(1.0 / self.values()[PUBLISH_RATE.name], callback)
 
     def guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         """
-        Return the callback such that what it raises ends the node, and is raised by `spin`.
+        Return the callback such that what it raises is told, and ends nothing.
 
         Left to itself an exception becomes a SystemError in the EventsExecutor.
         """
@@ -106,8 +121,40 @@ class MonitorNode(Node):
             except Exception as error:
                 # After a shutdown by signal the publishers are gone: that is no failure.
                 if self.context.ok():
-                    self.failure = self.failure or error
+                    self._take_fault(error)
         return call
+
+    def _take_fault(self, error: Exception) -> None:
+        """Count and log what a callback raised, and begin anew."""
+        words = ' '.join(str(error).split())[:200]
+        self.fault = f'{type(error).__name__}: {words}' if words else type(error).__name__
+        self.faults += 1
+        self._faulted = self.steady_now()
+        self.get_logger().error(self.fault, throttle_duration_sec=10.0)
+        self.recover(error)
+
+    def recover(self, error: Exception) -> None:
+        """Begin anew after a callback has raised."""
+
+    @property
+    def faulty(self) -> bool:
+        """Whether a callback has raised a short time ago."""
+        return self.steady_now() - self._faulted < TELL
+
+    @property
+    def subscriptions(self) -> Iterator[Subscription]:
+        """Return the subscriptions that an executor serves: all but those that are polled."""
+        return (s for s in super().subscriptions if s not in self._polled)
+
+    def create_polled(self, kind: Any, topic: str, qos: QoSProfile) -> Subscription:
+        """
+        Return a subscription whose messages wait in the middleware until they are taken.
+
+        The queue of the EventsExecutor has no bound, and messages in it delay every timer.
+        """
+        polled = self.create_subscription(kind, topic, _never, qos, raw=True)
+        self._polled.append(polled)
+        return polled
 
     def with_info(self, callback: Callable[[Any, Any], None]) -> Callable[..., Any]:
         """
@@ -152,6 +199,11 @@ class MonitorNode(Node):
 
     def _on_set(self, parameters: list[RosParameter]) -> SetParametersResult:
         changed = {p.name: p.value for p in parameters if p.name in self._table}
+        if self._locked and (set(changed) - {PUBLISH_RATE.name}
+                             or any(p.name == 'use_sim_time' for p in parameters)):
+            return SetParametersResult(
+                successful=False, reason='lock_parameters is set: of the parameters only '
+                'publish_rate can be changed until the node is started anew without it')
         try:
             if changed:
                 self.check({**self.values(), **changed})
@@ -162,6 +214,10 @@ class MonitorNode(Node):
     def _after_set(self, parameters: list[RosParameter]) -> None:
         if any(p.name in self._table for p in parameters):
             self.apply(self.values())
+
+
+def _never(message: Any) -> None:
+    """Stand for the callback of a subscription that is polled."""
 
 
 def _as_double(parameter: RosParameter) -> RosParameter:

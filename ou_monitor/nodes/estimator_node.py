@@ -7,7 +7,9 @@ default), best effort.  Outputs at `publish_rate` of real time, reliable:
 (std_msgs/Float64, NaN when not known), `~/brownout` (std_msgs/Bool, published
 only while it is known, so that it is never silently false), `~/state`
 (DiagnosticArray, every field of one estimate, stamped with the estimate's
-newest sample), and `/diagnostics` at 1 Hz.  Service `~/clear_brownout`
+newest sample), and `/diagnostics` at 1 Hz.  Messages wait in the middleware, which keeps the
+newest 2000, and are fetched 50 times a second and before each report, so that no flood of them
+delays an output.  Service `~/clear_brownout`
 (std_srvs/Trigger): drops a flag that is latched or held.  Hold, delay and
 latch count real time, under `use_sim_time` too.
 
@@ -19,37 +21,70 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import math
+from pathlib import Path
+import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import diagnostic, MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.clocks import SendClock
-from ou_monitor.nodes.inputs import INPUT_QOS, Silence, Stamper, types_on
-from ou_monitor.nodes.model_choice import ModelChoice
+from ou_monitor.nodes.inputs import Arrivals, PolledInput, Silence, Stamper, types_on
+from ou_monitor.nodes.latch_file import LatchFile
+from ou_monitor.nodes.model_choice import ModelChoice, PATIENCE
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
 from ou_monitor.online.monitor import Level, MonitorReport, SupplyMonitor
-from ou_monitor.online.settings import ESTIMATOR_PARAMETERS, monitor_settings
+from ou_monitor.online.risk.flag import FlagLevel
+from ou_monitor.online.settings import ESTIMATOR_PARAMETERS, monitor_settings, Parameter
+from ou_monitor.records import FloatArray
+from ou_monitor.stream.arrival import Publishers, SourceClock
 from ou_monitor.stream.samples import SampleStream
+from rclpy.logging import get_logging_directory
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import Trigger
 
-# How often the samples collected go to the monitor, s, whatever `publish_rate` is: bounds memory.
-FLUSH = 0.05
+# How often the messages that wait are fetched, s, whatever `publish_rate` is.
+POLL = 0.02
+# Share of the time that estimating may take: where the estimates of a second take more, they
+# come more rarely; where the samples do, they are thinned.
+SHARE = 0.25
+# An estimate that takes longer than this, s of CPU, is not made at each report.
+HEAVY = 0.02
+# Samples are thinned to one of so many at most.
+MOST_THIN = 1024
+# Throttle messages placed among the voltages at each poll; of more, evenly many of them.
+MOST_THROTTLES = 20
+STATE_FILE = Parameter(
+    'state_file', '',
+    'File that keeps a latched flag over a restart of the node (a folder: a file in it, named '
+    "after the node; relative: under ROS's log directory); empty: off.")
 OUTPUTS = ('alpha', 'sigma', 'var_inf', 'brownout_risk', 'throttle_budget')
 
 
 class EstimatorNode(MonitorNode):
     """Sliding OU estimate of one supply, as a node."""
 
+    # Asked by `check` from the beginning on.
+    _started = False
+
     def __init__(self, name: str) -> None:
         self._models = ModelChoice()
-        super().__init__(name, (*ESTIMATOR_PARAMETERS, PUBLISH_RATE), SOURCE_PARAMETERS)
+        super().__init__(name, (*ESTIMATOR_PARAMETERS, PUBLISH_RATE),
+                         (*SOURCE_PARAMETERS, STATE_FILE))
         settings = monitor_settings(_of_monitor(self.values()))
         self._monitor = SupplyMonitor(settings, self._models.use(settings.model_file))
         self._stream = SampleStream(self._monitor)
+        self._inputs: dict[str, PolledInput] = {}
         self._arrived = Silence(self.steady_now)
         self._usable = Silence(self.steady_now)
+        self._source_clock = SourceClock()
+        self._names: tuple[str, ...] = ()
+        self._lost = self._lost_of_late = 0
+        self._looked = -math.inf
+        # When the next estimate is due, and the load of pushing samples as a share of the time.
+        self._due = -math.inf
+        self._load, self._loaded = 0.0, self.steady_now()
         self._throttle_heard = Silence(self.steady_now)
         self._problems: dict[str, str] = {}
         self._opened: dict[str, Source] = {}
@@ -60,15 +95,46 @@ class EstimatorNode(MonitorNode):
         self.create_service(Trigger, '~/clear_brownout', self.guarded(self._clear))
         self._stamper = Stamper(self, self._jumped)
         self._send_clock = SendClock() if self.get_parameter('smooth_stamps').value else None
+        self._latch = self._open_latch()
         self._sources = self._find_sources()
         self.every(0.2, self._watch)
-        self.every(FLUSH, self._stream.flush)
+        self.every(POLL, self._poll)
         self.every(1.0, self._diagnose)
-        self.publish_every(self._publish)
+        self.publish_every(self._report_all)
+        self._started = True
+
+    def _open_latch(self) -> LatchFile | None:
+        """Open the file of the latch; what was latched is latched again."""
+        name = self.get_parameter(STATE_FILE.name).value
+        if not name:
+            return None
+        path = Path(name).expanduser()
+        if not path.is_absolute():
+            path = Path(get_logging_directory()) / path
+        latch = LatchFile(path, self.get_fully_qualified_name())
+        reason = latch.read()
+        if latch.problem:
+            self.get_logger().warning(latch.problem)
+        if reason and self._monitor.settings.brownout_latch:
+            self._monitor.set_brownout(reason)
+            self.get_logger().warning(f'The brown-out flag is CRITICAL: {reason}')
+        return latch
+
+    def destroy_node(self) -> None:
+        """End the node; what is being written is written."""
+        if self._latch is not None:
+            self._latch.close()
+        super().destroy_node()
+
+    def recover(self, error: Exception) -> None:
+        """Begin anew after a callback has raised: nothing is known of the supply."""
+        self._monitor.restart(error)
 
     def check(self, values: Mapping[str, Any]) -> None:
         """Raise `ValueError` when the parameters contradict each other."""
-        self._models.check(monitor_settings(_of_monitor(values)).model_file)
+        path = monitor_settings(_of_monitor(values)).model_file
+        # At the start there is nothing to be kept waiting.
+        self._models.check(path, PATIENCE if self._started else None)
 
     def apply(self, values: Mapping[str, Any]) -> None:
         """Bring checked parameters into force; no sample in the window is lost."""
@@ -103,6 +169,7 @@ class EstimatorNode(MonitorNode):
     def _watch(self) -> None:
         """Look at who publishes, 5 times a second."""
         self._stamper.follow()
+        self._look_at_publishers()
         for source in self._sources.values():
             if source.quantity in self._opened:
                 self._compare(self._opened[source.quantity])
@@ -117,7 +184,10 @@ class EstimatorNode(MonitorNode):
         chosen = source.choose(types)
         if chosen is not None:
             self._problems.pop(source.quantity, None)
-            self._open(chosen)
+            try:
+                self._open(chosen)
+            except InputError as error:
+                self._problem(source.quantity, f'{topic} is not used: {error}')
         elif types:
             self._problem(source.quantity, (
                 f"{topic} carries {', '.join(types)}, which no generic msg_config describes "
@@ -147,11 +217,10 @@ class EstimatorNode(MonitorNode):
             if extractor.spec.sample_rate is not None:
                 # Blocks have a time line of their own.
                 self._send_clock = None
-            take = self._take_voltage
         else:
             self._stream.open_throttle(extractor)
-            take = self._take_throttle
-        self.create_subscription(message, source.topic, self.with_info(take), INPUT_QOS)
+        self._inputs[source.quantity] = PolledInput(
+            self, message, source.topic, extractor.spec)
         self._opened[source.quantity] = source
         self.get_logger().info(
             f'{source.quantity} from {topic}: {extractor.spec.type} field '
@@ -159,15 +228,66 @@ class EstimatorNode(MonitorNode):
 
     # -- messages in
 
-    def _take_voltage(self, message: Any, info: Any) -> None:
-        self._arrived.heard()
-        if self._stream.take_voltage(
-                message, lambda: self._stamper.source_time(info, self._send_clock)):
-            self._usable.heard()
+    def _poll(self) -> None:
+        """Fetch what has arrived, and hand it to the monitor."""
+        voltage = self._inputs['voltage'].take() if 'voltage' in self._inputs else None
+        throttle = self._inputs['throttle'].take() if 'throttle' in self._inputs else None
+        if throttle is not None:
+            voltage = self._merge(voltage, throttle)
+        if voltage is not None:
+            self._take_voltages(voltage)
+        pushing = time.thread_time()
+        self._stream.flush()
+        self._balance(time.thread_time() - pushing)
 
-    def _take_throttle(self, message: Any, info: Any) -> None:
-        if self._stream.take_throttle(message, lambda: self._stamper.source_time(info)):
-            self._throttle_heard.heard()
+    def _merge(self, voltage: Arrivals | None, throttle: Arrivals) -> Arrivals | None:
+        """Place throttle messages among voltages, by arrival; return the voltages left."""
+        times = self._times(throttle)
+        values = np.split(throttle.values, np.cumsum(throttle.counts)[:-1])
+        for k in range(0, throttle.size, -(-throttle.size // MOST_THROTTLES)):
+            if voltage is not None:
+                first, voltage = voltage.split(int(np.searchsorted(
+                    voltage.arrived, throttle.arrived[k], 'left')))
+                self._take_voltages(first)
+            if self._stream.take_throttles(times.item(k), bool(throttle.own[k]), values[k]):
+                self._throttle_heard.heard(throttle.arrived.item(k))
+        return voltage
+
+    def _take_voltages(self, messages: Arrivals) -> None:
+        if not messages.size:
+            return
+        self._arrived.heard(messages.arrived.item(-1))
+        ends = self._times(messages, self._send_clock)
+        held = self._stream.take_voltages(
+            ends, messages.own, messages.counts, messages.values, messages.arrived)
+        if held.any():
+            # On simulated time they were received at some time between two polls: now.
+            received = (np.full(ends.size, self.stamp_now()) if self._stamper.simulated
+                        else messages.received)
+            self._usable.heard(messages.arrived[held].item(-1))
+            self._source_clock.take(ends[held], received[held], messages.arrived[held].item(-1))
+
+    def _times(self, messages: Arrivals, smooth: SendClock | None = None) -> FloatArray:
+        """Return the times of messages, s: of those without a stamp when they were sent."""
+        if messages.own.all():
+            return messages.ends
+        return np.array([
+            end if own else self._stamper.source_time(end, smooth)
+            for end, own in zip(messages.ends.tolist(), messages.own.tolist())])
+
+    def _balance(self, pushed: float) -> None:
+        """Thin the samples where estimating from them takes too long (s of CPU)."""
+        self._load += pushed
+        now = self.steady_now()
+        if now - self._loaded < 1.0:
+            return
+        share = self._load / (now - self._loaded)
+        self._load, self._loaded = 0.0, now
+        stream = self._stream
+        if share > SHARE and stream.thin < MOST_THIN:
+            stream.thin *= 2
+        elif share < 0.25 * SHARE and stream.thin > 1:
+            stream.thin //= 2
 
     def _watch_throttle(self) -> None:
         """Stop believing a throttle that has fallen silent."""
@@ -181,6 +301,7 @@ class EstimatorNode(MonitorNode):
         return 3.0 * max(self._monitor.settings.stale_after, self._throttle_heard.interval)
 
     def _jumped(self, reason: str) -> None:
+        self._source_clock = SourceClock()
         self._stream.reset(reason)
 
     def _clear(self, request: Any, response: Any) -> Any:
@@ -193,8 +314,19 @@ class EstimatorNode(MonitorNode):
 
     def _report(self) -> tuple[MonitorReport, Level, str]:
         """Return the monitor's report, with what only the node can know put first."""
-        self._stream.flush()
-        report = self._monitor.report(self._usable.age, self.steady_now())
+        self._poll()
+        self._monitor_model()
+        now = self.steady_now()
+        again, begin = now >= self._due, time.thread_time()
+        report = self._monitor.report(
+            self._source_clock.age(now), now, self._usable.age, again=again)
+        if again:
+            # An estimate of 1 ms at 10 Hz is no load; of 100 ms the next one waits.
+            took = time.thread_time() - begin
+            self._due = now + (took / SHARE if took > HEAVY else 0.0)
+        if self._latch is not None:
+            self._latch.keep(report.flag.level is FlagLevel.CRITICAL
+                             and self._monitor.settings.brownout_latch, report.flag.reason)
         level, summary = report.level, report.summary
         problem = self._problems.get('voltage')
         limit = self._monitor.settings.stale_after
@@ -207,11 +339,55 @@ class EstimatorNode(MonitorNode):
         elif 'voltage' not in self._opened:
             topic = self.resolve_topic_name(self._sources['voltage'].topic)
             summary = f'Waiting for a publisher on {topic}.'
-        elif silent and self._arrived.age is not None and self._arrived.age <= limit:
+        elif silent and within(self._arrived.age, limit) and not within(self._usable.age, limit):
             summary = self._useless()
         elif silent and not self.count_publishers(self._topic('voltage')):
             summary = f"No publisher on {self._topic('voltage')}: {report.summary}"
+        notes = self._notes()
+        if notes:
+            summary = ' '.join((summary, *notes))
+            level = max(level, Level.WARN) if level is not Level.STALE else level
         return report, level, summary
+
+    def _notes(self) -> list[str]:
+        """Return what is to be said of the input whatever else is."""
+        notes = [text for text in (
+            self._models.problem, '' if self._latch is None else self._latch.problem) if text]
+        if self._stream.thin > 1:
+            notes.append(f'Overload: one of {self._stream.thin} samples is estimated from; the '
+                         'floor judges all.')
+        if self._lost_of_late:
+            notes.append(f'{self._lost_of_late} messages were lost within the last second.')
+        if self.faulty:
+            notes.append(f'A callback failed ({self.faults} times so far): {self.fault}.')
+        if len(self._names) > 1:
+            followed = ('the first is followed, the others are left out'
+                        if self._inputs['voltage'].publishers.numbered else
+                        'the middleware does not number messages, so they are mixed')
+            notes.append(f"{len(self._names)} publishers on {self._topic('voltage')} "
+                         f"({', '.join(self._names)}): {followed}.")
+        return notes
+
+    def _look_at_publishers(self) -> None:
+        """Note who publishes the voltage, and what was lost within the last second."""
+        voltage = self._inputs.get('voltage')
+        if voltage is None:
+            return
+        ends = self.get_publishers_info_by_topic(self._topic('voltage'))
+        self._names = tuple(
+            f"{end.node_namespace.rstrip('/')}/{end.node_name} "
+            f"[{bytes(end.endpoint_gid).hex()[-8:]}]" for end in ends)
+        now = self.steady_now()
+        if now - self._looked >= 1.0:
+            self._lost_of_late, self._lost = voltage.publishers.lost - self._lost, (
+                voltage.publishers.lost)
+            self._looked = now
+
+    def _monitor_model(self) -> None:
+        """Bring a model file into force that has been read meanwhile."""
+        model = self._models.now()
+        if model is not self._monitor.model:
+            self._monitor.set_model(model)
 
     def _useless(self) -> str:
         """Say why messages that arrive do not count as a voltage."""
@@ -225,7 +401,7 @@ class EstimatorNode(MonitorNode):
     def _topic(self, quantity: str) -> str:
         return self.resolve_topic_name(self._opened[quantity].topic)
 
-    def _publish(self) -> None:
+    def _report_all(self) -> None:
         report, level, summary = self._report()
         values = {'alpha': report.estimate.alpha, 'sigma': report.estimate.sigma,
                   'var_inf': report.estimate.var_inf, 'brownout_risk': report.risk,
@@ -244,6 +420,9 @@ class EstimatorNode(MonitorNode):
     def _message(self, part: str, report: MonitorReport, level: Level, summary: str,
                  stamp: float) -> DiagnosticArray:
         throttle_age = self._throttle_heard.age
+        arrived = self._arrived.age
+        voltage = self._inputs.get('voltage')
+        publishers = Publishers() if voltage is None else voltage.publishers
         source = self._opened.get('voltage', self._sources['voltage'])
         fields = {**report.fields,
                   'msg_config': source.config,
@@ -251,9 +430,21 @@ class EstimatorNode(MonitorNode):
                   'smoothed_rate': repr(self._send_clock.rate if self._send_clock else math.nan),
                   'throttle_age': repr(math.inf if throttle_age is None else throttle_age),
                   'throttle_problem': self._problems.get('throttle', ''),
-                  'model_terms': self._models.terms}
+                  'model_terms': self._models.terms,
+                  'clock': self._source_clock.name,
+                  'arrival_age': repr(math.inf if arrived is None else arrived),
+                  'messages_lost': str(publishers.lost),
+                  'messages_lost_by': 'sequence numbers' if publishers.numbered else 'not known',
+                  'foreign_messages': str(publishers.foreign),
+                  'publishers': ', '.join(self._names),
+                  'callback_errors': str(self.faults)}
         return diagnostic(f'{self.get_fully_qualified_name()[1:]}: {part}', level, summary,
                           fields, stamp, hardware_id=self.resolve_topic_name(source.topic))
+
+
+def within(age: float | None, limit: float) -> bool:
+    """Return whether something came within the limit, s."""
+    return age is not None and age <= limit
 
 
 def _of_monitor(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,14 +8,26 @@ timestamp, under `use_sim_time` mapped to simulated time through `/clock`.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 import math
+import time
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode
 from ou_monitor.nodes.clocks import SendClock, SimClockMap
+from ou_monitor.nodes.message_types import definition_of
+from ou_monitor.recordings.columns import FieldReader
+from ou_monitor.recordings.mcap_records import Table
+from ou_monitor.records import FloatArray
+from ou_monitor.stream.arrival import Publishers
+from ou_monitor.stream.config import FieldSpec
 from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock as ClockMessage
 
@@ -23,6 +35,10 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 # deep enough for 0.2 s at 10 kHz while the estimator fits.
 INPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
+# Messages taken at a time: all that can wait.
+MOST_TAKEN = 2000
+# No message waits longer in the middleware, s: it keeps 2000.
+MOST_WAIT = 60.0
 CLOCK_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -72,9 +88,8 @@ class Stamper:
             self._node.destroy_subscription(self._clock_input)
             self._clock_input = None
 
-    def source_time(self, info: Any, smooth: SendClock | None = None) -> float:
-        """Return the time, s, of a message without a stamp; NaN when not known yet."""
-        source = float(info['source_timestamp']) * 1e-9
+    def source_time(self, source: float, smooth: SendClock | None = None) -> float:
+        """Return the time, s, of a message without a stamp, sent at `source`; NaN: not known."""
         if smooth is not None:
             source = smooth(source)
         return self._map(source) if self.simulated else source
@@ -84,7 +99,7 @@ class Stamper:
         header = getattr(message, 'header', None)
         if header is not None and (header.stamp.sec or header.stamp.nanosec):
             return float(header.stamp.sec + header.stamp.nanosec * 1e-9)
-        return self.source_time(info)
+        return self.source_time(float(info['source_timestamp']) * 1e-9)
 
     def _clock(self, message: Any, info: Any) -> None:
         clock = message.clock.sec + message.clock.nanosec * 1e-9
@@ -98,6 +113,131 @@ class Stamper:
             self._on_jump('use_sim_time was switched')
 
 
+@dataclass(frozen=True, eq=False)
+class Arrivals:
+    """
+    Messages of one publisher, in order of arrival.
+
+    Attributes
+    ----------
+    ends : ndarray, shape (m,)
+        Stamps (of the last sample of a block), s; the time of sending where a message has none.
+    own : ndarray of bool, shape (m,)
+        Whether the stamp is the message's own.
+    counts : ndarray of int64, shape (m,)
+        Values in each.
+    values : ndarray, shape (counts.sum(),)
+        Values in SI units; NaN where one is not finite.
+    received : ndarray, shape (m,)
+        When the middleware received each, by the wall clock, s.
+    arrived : ndarray, shape (m,)
+        The same by the monotonic clock, s.
+
+    """
+
+    ends: FloatArray
+    own: npt.NDArray[np.bool_]
+    counts: npt.NDArray[np.int64]
+    values: FloatArray
+    received: FloatArray
+    arrived: FloatArray
+
+    @property
+    def size(self) -> int:
+        """Return the number of messages."""
+        return int(self.ends.size)
+
+    def split(self, at: int) -> tuple[Arrivals, Arrivals]:
+        """Return the first `at` messages, and the rest."""
+        cut = int(self.counts[:at].sum())
+        return tuple(Arrivals(  # type: ignore[return-value]
+            self.ends[part], self.own[part], self.counts[part], self.values[values],
+            self.received[part], self.arrived[part]) for part, values in (
+                (slice(None, at), slice(None, cut)), (slice(at, None), slice(cut, None))))
+
+
+class PolledInput:
+    """
+    One field of the messages of a topic, fetched when it is asked for, many at a time.
+
+    Parameters
+    ----------
+    node : MonitorNode
+        Who subscribes.
+    kind : type
+        Message class.
+    topic : str
+        Topic.
+    spec : FieldSpec
+        Which field, which stamp.
+
+    Attributes
+    ----------
+    publishers : Publishers
+        Who sends, and what was lost.
+    unreadable : int
+        Messages that could not be decoded.
+
+    """
+
+    def __init__(self, node: MonitorNode, kind: Any, topic: str, spec: FieldSpec) -> None:
+        self._node = node
+        self._topic = node.resolve_topic_name(topic)
+        self._input = node.create_polled(kind, topic, INPUT_QOS)
+        self._reader = FieldReader(spec, definition_of(kind), lambda: self._decode, self._broken)
+        self._kind = kind
+        self.publishers = Publishers()
+        self.unreadable = 0
+
+    def _decode(self, data: bytes) -> Any:
+        try:
+            return deserialize_message(data, self._kind)
+        except Exception as error:
+            # Of the middleware: it has no type of its own.
+            raise InputError(f'a message on {self._topic} cannot be read: {error}') from error
+
+    def _broken(self, index: int, error: InputError) -> None:
+        """Leave out a message that cannot be read."""
+        self.unreadable += 1
+
+    def take(self, most: int = MOST_TAKEN) -> Arrivals | None:
+        """Return what waits, of the publisher followed; None when nothing does."""
+        taken: list[tuple[bytes, dict[str, Any]]] = []
+        handle = self._input.handle
+        with handle:
+            while len(taken) < most:
+                found = handle.take_message(self._input.msg_type, True)
+                if found is None:
+                    break
+                taken.append(found)
+        if not taken:
+            return None
+        infos = [info for _, info in taken]
+        sent = np.array([info['source_timestamp'] for info in infos], dtype=np.uint64)
+        wall = time.time()
+        received = np.array([info['received_timestamp'] for info in infos]) * 1e-9
+        received = np.where(received > 0.0, np.minimum(received, wall), wall)
+        # What waited in the middleware arrived before now; the wall clock may have been set.
+        arrived: FloatArray = np.maximum.accumulate(self._node.steady_now() - np.clip(
+            wall - received, 0.0, MOST_WAIT))
+        times: FloatArray = sent.astype(np.float64) * 1e-9
+        kept = self.publishers.follow(
+            [info['publication_sequence_number'] for info in infos], times, arrived,
+            self._node.count_publishers(self._topic))
+        data = [bytes(message) for (message, _), keep in zip(taken, kept.tolist()) if keep]
+        if not data:
+            return None
+        ends = np.cumsum([len(message) for message in data])
+        begins = np.concatenate(([0], ends[:-1]))
+        column = self._reader.read(Table(
+            b''.join(data), np.zeros(ends.size, np.uint16),
+            np.arange(ends.size, dtype=np.uint64), begins, ends))
+        # In the place of log times: the number of each that could be read.
+        read = np.flatnonzero(kept)[column.log_time.astype(np.int64)]
+        return Arrivals(np.where(column.stamped, column.stamp, times[read]), column.stamped,
+                        column.count, column.values, received[read], arrived[read])
+
+
 class Silence:
     """Time since something last arrived, by the monotonic clock."""
 
@@ -106,9 +246,9 @@ class Silence:
         self._last = -math.inf
         self.interval = 0.0
 
-    def heard(self) -> None:
-        """Take an arrival; `interval` is the time since the one before, s."""
-        now = self._now()
+    def heard(self, at: float | None = None) -> None:
+        """Take an arrival (at in s; now when left out); `interval`: since the one before, s."""
+        now = self._now() if at is None else at
         if self._last > -math.inf:
             self.interval = now - self._last
         self._last = now

@@ -112,15 +112,13 @@ def spin(node: Any) -> int:
     executor.add_node(node)
     try:
         # Not spin(): in rclpy 7.1.6 the EventsExecutor's goes on for ever after a signal.
-        while node.context.ok() and node.failure is None:
+        while node.context.ok():
             executor.spin_once(timeout_sec=NAP)
     except ExternalShutdownException:
         node.context.try_shutdown()
     finally:
         executor.remove_node(node)
         node.destroy_node()
-    if node.failure is not None:
-        raise node.failure
     return 0
 
 

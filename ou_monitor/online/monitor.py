@@ -17,7 +17,7 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.input_health import patience, readings, Stamps, StampWatch
 from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
-from ou_monitor.online.risk.outlook import Outlook
+from ou_monitor.online.risk.outlook import Outlook, ThrottleBudget
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Counters, Estimate, Flag, NAN, Status
 
@@ -67,6 +67,9 @@ class MonitorReport:
         What the stamps are good for.
     fresh : bool
         Whether the numbers rest on samples that are not too old.
+    thinned : int
+        Samples that only the floor has judged, because there were more than could be estimated
+        from.
     restarts : int
         Times the estimator was started anew because of an error.
     fault : str
@@ -86,6 +89,7 @@ class MonitorReport:
     patience: float
     stamps: Stamps
     fresh: bool
+    thinned: int
     restarts: int
     fault: str
 
@@ -113,6 +117,7 @@ class MonitorReport:
         values['age'] = self.age
         values['patience'] = self.patience
         values['stamps'] = self.stamps.name
+        values['samples_thinned'] = self.thinned
         values['restarts'] = self.restarts
         values['fault'] = self.fault
         values['status'] = e.status.name
@@ -148,6 +153,8 @@ class SupplyMonitor:
         self._stamps = StampWatch()
         self._reset_reason = ''
         self._restarts, self._fault, self._faulty = 0, '', False
+        # Of samples that are thinned: how many were left out, and where the next one is.
+        self._thinned = self._phase = 0
         # What the estimators before the present one have counted.
         self._counted = Counters()
         # Late and unusable samples so far, and the stamp at which there were last more of them.
@@ -160,6 +167,8 @@ class SupplyMonitor:
         self._outlook = Outlook(background=self._background)
         self._outlook.set_model(self._model)
         self._newest = Estimate()
+        # Risk and budget of the last report.
+        self._ahead: tuple[float, ThrottleBudget | None] = NAN, None
 
     @property
     def settings(self) -> MonitorSettings:
@@ -220,7 +229,9 @@ class SupplyMonitor:
         stamps, volts, load = readings(stamps, volts, load)
         self._flag.push(stamps, volts, times)
         self._stamps.push(stamps, times)
-        part = slice(None, None, thin)
+        part = slice(-self._phase % thin, None, thin)
+        self._phase = (self._phase + stamps.size) % thin
+        self._thinned += stamps.size - stamps[part].size
         load = None if load is None else load[part]
         try:
             self._estimator.push(stamps[part], volts[part], load)
@@ -258,6 +269,10 @@ class SupplyMonitor:
         return (f'CRITICAL of {old.age:.1f} s is cleared; the flag is judged anew.'
                 if self._flag.clear() else '')
 
+    def set_brownout(self, reason: str) -> None:
+        """Set the flag CRITICAL, as before a restart; latch, hold and clearing act as ever."""
+        self._flag.set_critical(reason)
+
     def reset(self, reason: str) -> None:
         """Clear the window, and remember why for the next reports; the flag stays held."""
         self._estimator.reset()
@@ -267,7 +282,7 @@ class SupplyMonitor:
         self._reset_reason = reason
 
     def report(self, age: float | None, now: float | None = None,
-               arrived: float | None = None) -> MonitorReport:
+               arrived: float | None = None, *, again: bool = True) -> MonitorReport:
         """
         Return what is known now.
 
@@ -281,6 +296,9 @@ class SupplyMonitor:
         arrived : float, optional
             Time since a voltage last arrived, s, however old it was; `age` when left out.  The
             floor holds for voltages that arrive.
+        again : bool
+            Whether the window is estimated again; if not, the numbers are those of the last
+            report, and only floor, flag and ages are new.
 
         Returns
         -------
@@ -291,12 +309,14 @@ class SupplyMonitor:
         silent = math.inf if age is None else max(age, 0.0)
         here = silent if arrived is None else max(arrived, 0.0)
         try:
-            e = self._estimate()
+            e = self._estimate() if again else self._newest
             limit = patience(self._settings, e.rate, e.n)
             stamps = self._stamps.judge(limit, 1.0 / e.rate if e.rate > 0.0 else NAN)
             fresh = silent <= limit and e.status is not Status.NO_DATA and stamps is Stamps.GOOD
-            risk = self._outlook.risk(e, self._settings) if fresh else NAN
-            budget = self._outlook.budget(e, self._settings) if fresh else None
+            if again or not fresh:
+                self._ahead = (self._outlook.risk(e, self._settings),
+                               self._outlook.budget(e, self._settings)) if fresh else (NAN, None)
+            risk, budget = self._ahead
             left_out = () if self._outlook.events is None else self._outlook.events.left_out
         except Exception as error:
             # As in `push`.
@@ -309,12 +329,13 @@ class SupplyMonitor:
         arriving = here <= self._settings.stale_after
         flag = self._flag.update(e.t + silent if now is None else now, risk, fresh=fresh,
                                  arriving=arriving)
-        silence = '' if fresh else self._silence(age, e, limit, stamps)
+        silence = '' if fresh else self._silence(
+            age, e, limit, stamps, arriving, late=silent - here > limit)
         level, summary = self._judge(e, risk, flag, silence, arriving)
         return MonitorReport(
             e, risk, NAN if budget is None else budget.throttle,
             '' if budget is None else budget.reason, left_out, flag, level, summary, silent,
-            limit, stamps, fresh, self._restarts, self._fault)
+            limit, stamps, fresh, self._thinned, self._restarts, self._fault)
 
     def _estimate(self) -> Estimate:
         """Return the newest estimate; IRREGULAR speaks of the window, not of all that was."""
@@ -330,14 +351,18 @@ class SupplyMonitor:
             return e
         return replace(e, flags=flags, counters=counters)
 
-    def _silence(self, age: float | None, e: Estimate, limit: float, stamps: Stamps) -> str:
+    def _silence(self, age: float | None, e: Estimate, limit: float, stamps: Stamps,
+                 arriving: bool, late: bool) -> str:
+        if arriving and stamps is not Stamps.GOOD:
+            return str(stamps.value)
         if age is not None and age > limit:
             why = f'stale_after = {self._settings.stale_after:g} s'
             if limit < self._settings.stale_after:
                 why = f'a source of {e.rate:.3g} Hz is stale after {limit:.2g} s'
+            if late:
+                return (f'Voltages arrive late: the newest is {age:.1f} s old by its stamp '
+                        f'({why}); the publisher, the link or this machine cannot keep up.')
             return f'No voltage for {age:.1f} s ({why}): check the publisher.'
-        if stamps is not Stamps.GOOD:
-            return str(stamps.value)
         if e.counters.non_finite and not e.counters.used:
             return (f'No usable voltage: all {e.counters.non_finite} samples were NaN or '
                     'infinite; check the sensor.')

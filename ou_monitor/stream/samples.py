@@ -139,6 +139,8 @@ class SampleStream:
         Voltage messages taken.
     unplaced : int
         Messages that could not be placed in time (`/clock` not there yet).
+    thin : int
+        Of so many samples one is estimated from; see `SupplyMonitor.push`.
 
     """
 
@@ -147,25 +149,28 @@ class SampleStream:
         self._voltage: Extractor | None = None
         self._throttle: Extractor | None = None
         self._block: BlockClock | None = None
+        self._block_rate: float | None = None
         self._throttle_block: BlockClock | None = None
         self._hold = ThrottleHold()
-        self._t: list[float] = []
-        self._v: list[float] = []
-        # Of each voltage message since the last flush: stamp, and whether it carries that itself.
-        self._ends: list[float] = []
-        self._own: list[bool] = []
+        # Stamps, voltages and arrivals (NaN: not known) since the last flush.
+        self._samples: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+        # Of each voltage message since then: stamp, and whether it carries that itself.
+        self._ends: list[FloatArray] = []
+        self._own: list[BoolArray] = []
+        self._count = 0
         # Throttle since then: stamp, value, whether it carries its stamp, voltage messages ahead.
         self._loads: deque[tuple[float, float, bool, int]] = deque(maxlen=KEEP)
         self._empty = True
         self._newest = self._newest_throttle = -math.inf
         self._last_throttle = math.nan
+        self.thin = 1
         self.messages = self.unplaced = 0
 
     def open_voltage(self, extractor: Extractor) -> None:
         """Set where the voltage is in its messages."""
         self._voltage = extractor
         rate = extractor.spec.sample_rate
-        self._block = None if rate is None else BlockClock(rate)
+        self._block, self._block_rate = None if rate is None else BlockClock(rate), rate
         self._hold = ThrottleHold(rate)
 
     def open_throttle(self, extractor: Extractor) -> None:
@@ -180,45 +185,91 @@ class SampleStream:
         return self._last_throttle
 
     def take_voltage(self, message: object, source_time: Callable[[], float]) -> bool:
-        """Take one voltage message (source_time in s)."""
+        """Take one voltage message (source_time in s); return whether it held a voltage."""
         if self._voltage is None:
             raise ValueError('take_voltage before open_voltage')
-        self.messages += 1
         found = self._voltage.extract(message)
         end = source_time() if found.stamp is None else found.stamp
-        if not math.isfinite(end):
-            self.unplaced += 1
-            return False
-        # What the extractor dropped goes on as NaN: the monitor counts it.
-        values = found.values.tolist()
+        return bool(self.take_voltages(
+            np.array([end]), np.array([found.stamp is not None]),
+            np.array([found.values.size]), found.values)[0])
+
+    def take_voltages(self, ends: FloatArray, own: BoolArray, counts: npt.NDArray[np.int64],
+                      values: FloatArray, arrived: FloatArray | None = None) -> BoolArray:
+        """
+        Take voltage messages in order of arrival; return which held a voltage.
+
+        Of each: stamp (of the last sample of a block), s, NaN when not known yet; whether it
+        carries that itself; and how many of the values, V, are its own; and when it arrived, s,
+        on a monotonic clock.
+        """
+        self.messages += ends.size
+        arrived = np.full(ends.size, math.nan) if arrived is None else arrived
+        placed = np.isfinite(ends)
+        self.unplaced += ends.size - int(np.count_nonzero(placed))
         if self._block is None:
-            values = values or [math.nan]
-            stamps = [end]
+            # What the extractor dropped goes on as NaN: the monitor counts it.
+            values = _one_each(counts, values)
+            counts = np.ones(ends.size, dtype=np.int64)
+            firsts = ends
         else:
-            stamps = self._block.stamps(end, len(values)).tolist()
-            if not stamps:
-                return False
-        if stamps[0] < self._newest - BACK:
-            self.reset(f'stamps went back by {self._newest - stamps[0]:.3g} s')
-        self._newest = max(self._newest, stamps[-1])
-        self._ends.append(stamps[-1])
-        self._own.append(found.stamp is not None)
-        self._t += stamps
-        self._v += values
-        return found.missing < len(values) or len(values) > 1 and any(map(math.isfinite, values))
+            placed &= counts > 0
+            firsts = ends - (counts - 1) / (self._block_rate or 1.0)
+        held = placed & (np.add.reduceat(np.append(np.isfinite(values), False).astype(np.int64),
+                                         np.cumsum(counts) - counts) * (counts > 0) > 0)
+        if not placed.all():
+            values = values[np.repeat(placed, counts)]
+            ends, own, counts = ends[placed], own[placed], counts[placed]
+            arrived, firsts = arrived[placed], firsts[placed]
+        if not ends.size:
+            return held
+        highest = np.maximum.accumulate(np.concatenate(([self._newest], ends)))[:-1]
+        back = np.flatnonzero(firsts < highest - BACK)
+        begin = 0
+        if back.size:
+            # Of several steps back within so short a time the last counts.
+            begin = int(back[-1])
+            at = int(counts[:begin].sum())
+            self._add(ends[:begin], own[:begin], counts[:begin], values[:at], arrived[:begin])
+            self.reset(f'stamps went back by {highest[begin] - firsts[begin]:.3g} s')
+            values = values[at:]
+        self._add(ends[begin:], own[begin:], counts[begin:], values, arrived[begin:])
+        return held
+
+    def _add(self, ends: FloatArray, own: BoolArray, counts: npt.NDArray[np.int64],
+             values: FloatArray, arrived: FloatArray) -> None:
+        """Add messages whose stamps do not go back."""
+        if not ends.size:
+            return
+        stamps = ends if self._block is None else self._block.stamps_of_many(ends, counts)
+        if self._block is not None:
+            ends = stamps[np.cumsum(counts) - 1]
+        self._samples.append((stamps, values, np.repeat(arrived, counts)))
+        self._ends.append(ends)
+        self._own.append(own)
+        self._count += ends.size
+        self._newest = max(self._newest, float(ends.max()))
 
     def take_throttle(self, message: object, source_time: Callable[[], float]) -> bool:
-        """Take one throttle message; return whether it held a throttle."""
+        """Take one throttle message (source_time in s); return whether it held a throttle."""
         if self._throttle is None:
             raise ValueError('take_throttle before open_throttle')
         found = self._throttle.extract(message)
         if not found.values.size:
             return False
         end = source_time() if found.stamp is None else found.stamp
-        values = found.values.tolist()
+        return self.take_throttles(end, found.stamp is not None, found.values)
+
+    def take_throttles(self, end: float, own: bool, found: FloatArray) -> bool:
+        """Take the values of one throttle message; its stamp in s, of the last value."""
+        if self._throttle is None:
+            raise ValueError('take_throttles before open_throttle')
+        values = found.tolist()
         stamps = [end]
         if self._throttle_block is not None and math.isfinite(end):
             stamps = self._throttle_block.stamps(end, len(values)).tolist()
+        if not values or not stamps:
+            return False
         if stamps[0] < self._newest_throttle - BACK:
             self.flush()
             self._hold.restart(self._last_throttle)
@@ -227,28 +278,30 @@ class SampleStream:
         drop = self._throttle.spec.nan == 'drop'
         for stamp, value in zip(stamps, values[-len(stamps):], strict=True):
             if math.isfinite(value) or not drop:
-                self._loads.append((stamp, value, found.stamp is not None, len(self._ends)))
+                self._loads.append((stamp, value, own, self._count))
                 self._last_throttle = value
         return math.isfinite(self._last_throttle)
 
     def lose_throttle(self) -> None:
         """Take the throttle for unknown from here on: its source has fallen silent."""
         self._last_throttle = math.nan
-        self._loads.append((math.nan, math.nan, False, len(self._ends)))
+        self._loads.append((math.nan, math.nan, False, self._count))
 
     def flush(self) -> None:
         """Hand the samples collected to the monitor."""
-        if not self._t:
+        if not self._samples:
             return
-        t = np.array(self._t)
+        t, v, arrived = (np.concatenate(column) for column in zip(*self._samples))
+        ends, owns = np.concatenate(self._ends), np.concatenate(self._own)
         stamps, values, own, before = np.array(self._loads, dtype=np.float64).reshape(-1, 4).T
-        self._hold.take(stamps, values, own > 0.0, np.array(self._ends), np.array(self._own),
-                        before.astype(np.int64))
-        self._monitor.push(t, np.array(self._v), self._hold.at(t))
-        self._hold.forget_before(self._newest - BACK)
-        self._t, self._v, self._ends, self._own = [], [], [], []
+        # First, so that no error of the monitor meets these samples twice.
+        self._samples, self._ends, self._own, self._count = [], [], [], 0
         self._loads.clear()
         self._empty = False
+        self._hold.take(stamps, values, own > 0.0, ends, owns, before.astype(np.int64))
+        self._monitor.push(t, v, self._hold.at(t), None if np.isnan(arrived).any() else arrived,
+                           thin=self.thin)
+        self._hold.forget_before(self._newest - BACK)
 
     def reset(self, reason: str) -> None:
         """Clear the window: what came before belongs to another time line."""
@@ -260,3 +313,12 @@ class SampleStream:
         self._hold.restart(self._last_throttle)
         if self._block is not None:
             self._block.reset()
+
+
+def _one_each(counts: npt.NDArray[np.int64], values: FloatArray) -> FloatArray:
+    """Return one value a message; NaN where there is none."""
+    if (counts == 1).all():
+        return values
+    single = np.full(counts.size, math.nan)
+    single[counts > 0] = values
+    return single

@@ -37,7 +37,7 @@ def chain(shared_world):
     wait_until(lambda: heard['sigma'] and heard['cutoff'] and statuses(heard), what='both nodes')
     heard['fallback'] = heard['cutoff'][0].data
     replay = shared_world.start('replay', str(BAG), '--clock', '0')
-    wait_until(lambda: len(heard['output']) > ENOUGH, 60.0, '5000 filtered messages')
+    wait_until(lambda: len(heard['output']) > ENOUGH, what='5000 filtered messages')
     heard['endpoints'] = {
         topic: probe.node.get_publishers_info_by_topic(topic) for topic in (
             '/ou_adaptive_filter/output', '/ou_adaptive_filter/cutoff', '/ou_estimator/sigma',

@@ -7,15 +7,17 @@ from types import ModuleType
 
 from live import ROOT
 from ou_monitor.nodes.adaptive_filter_node import FIXED, RUN_TIME
-from ou_monitor.nodes.base import PUBLISH_RATE
+from ou_monitor.nodes.base import LOCK, PUBLISH_RATE
+from ou_monitor.nodes.estimator_node import STATE_FILE
 from ou_monitor.nodes.sources import SOURCE_PARAMETERS
 from ou_monitor.online.settings import ESTIMATOR_PARAMETERS
 import pytest
 import yaml
 
 DECLARED = {
-    'ou_estimator': (*ESTIMATOR_PARAMETERS, PUBLISH_RATE, *SOURCE_PARAMETERS),
-    'ou_adaptive_filter': (*RUN_TIME, PUBLISH_RATE, *FIXED),
+    'ou_estimator': (
+        *ESTIMATOR_PARAMETERS, PUBLISH_RATE, *SOURCE_PARAMETERS, STATE_FILE, LOCK),
+    'ou_adaptive_filter': (*RUN_TIME, PUBLISH_RATE, *FIXED, LOCK),
 }
 FILE = ROOT / 'config' / 'ou_monitor.yaml'
 LAUNCH = ROOT / 'launch' / 'ou_monitor_launch.py'

@@ -32,7 +32,7 @@ def test_signals_end_the_nodes(world, number):
     assert all('Traceback' not in p.err and 'rror' not in p.err for p in processes)
     # A node that was destroyed says goodbye; that is one datagram, which a busy machine may lose,
     # and then it is missed after 20 s.
-    wait_until(lambda: not expected & set(names(probe)), 30.0, 'the nodes to be gone')
+    wait_until(lambda: not expected & set(names(probe)), what='the nodes to be gone')
 
 
 @pytest.mark.parametrize('name', NODES)

@@ -31,7 +31,7 @@ def test_loop_on_simulated_time(world):
 
     def passes():
         return sum(b < a for a, b in zip(stamps(), stamps()[1:]))
-    wait_until(lambda: passes() >= 3, 40.0, 'three passes')
+    wait_until(lambda: passes() >= 3, what='three passes')
     assert [replay.stop(), estimator.stop()] == [0, 0]
     seen = [values_of(message.status[0]) for message in states]
     assert passes() <= int(seen[-1]['resets']) <= 2 * (passes() + 1)

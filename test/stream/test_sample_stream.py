@@ -16,7 +16,7 @@ class Sink:
     def __init__(self):
         self.t, self.v, self.u, self.resets = [], [], [], []
 
-    def push(self, t, voltage, throttle):
+    def push(self, t, voltage, throttle, arrival=None, *, thin=1):
         """Note samples."""
         self.t += t.tolist()
         self.v += voltage.tolist()

@@ -25,7 +25,6 @@ import numpy.typing as npt
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import FloatArray, NAN
 
-
 # Samples that decide when fewer lie within the time: the median of three outvotes one.
 _FEWEST = 3
 # A whole batch older than the newest sample by more than this, s, belongs to another time line.
@@ -269,6 +268,11 @@ class BrownoutFlag:
         self._above.clear()
         self._state = FlagState(since=self._since, reason='cleared, not judged since')
         return True
+
+    def set_critical(self, reason: str) -> None:
+        """Set CRITICAL for a reason from outside: a latch that outlasts a restart."""
+        self._enter(FlagLevel.CRITICAL)
+        self._state = FlagState(FlagLevel.CRITICAL, True, self._since, reason)
 
     def update(self, t: float, risk: float, *, fresh: bool = True,
                arriving: bool | None = None) -> FlagState:

@@ -1,0 +1,270 @@
+"""A real estimator under load, and attacked: it speaks on, says what is wrong, sees every dip."""
+
+import json
+import os
+from pathlib import Path
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from live import ou_path, values_of, wait_until
+import pytest
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import BatteryState
+from std_msgs.msg import Bool, Float64
+from std_srvs.srv import Trigger
+
+ERROR, STALE = b'\x02', b'\x03'
+# A process of its own that sends Float64 at a rate, Hz, in bursts each ms, with a dip each 2 s.
+FLOOD = """
+import sys, time
+import rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Float64
+rate, dip = float(sys.argv[1]), float(sys.argv[2])
+rclpy.init()
+node = rclpy.create_node('flood')
+output = node.create_publisher(Float64, '/load/voltage', QoSProfile(
+    depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT))
+while not output.get_subscription_count():
+    time.sleep(0.01)
+start, sent = time.monotonic(), 0
+good, low = [Float64(data=5.0 + 0.01 * (k * 7919 % 13 - 6)) for k in range(13)], Float64(data=3.0)
+while True:
+    now = time.monotonic() - start
+    due = int(now * rate)
+    sent = max(sent, due - 2000)
+    while sent < due:
+        output.publish(low if 1.0 <= sent / rate % 2.0 < 1.0 + dip else good[sent % 13])
+        sent += 1
+    time.sleep(0.001)
+"""
+
+
+class Rig:
+    """An estimator in a namespace; stamps are what the test says."""
+
+    def __init__(self, world, namespace, *arguments, kind=BatteryState):
+        self.probe, self.node = world.probe(), f'/{namespace}/ou_estimator'
+        self.times = []
+        self.states = self.probe.listen(f'{self.node}/state', DiagnosticArray)
+        self.probe.node.create_subscription(
+            DiagnosticArray, f'{self.node}/state',
+            lambda message: self.times.append(time.monotonic()), 100)
+        self.flags = self.probe.listen(f'{self.node}/brownout', Bool)
+        self.process = world.start(
+            'estimator', '--ros-args', '-r', f'__ns:=/{namespace}', *arguments)
+        self.output = self.probe.publisher(f'/{namespace}/voltage', kind, 1000)
+        wait_until(lambda: self.output.get_subscription_count() or namespace == 'load',
+                   what='its input')
+        wait_until(lambda: self.states, what='a state')
+
+    def send(self, voltage, stamp, output=None):
+        """Send one sample with a stamp, s."""
+        whole = int(stamp)
+        message = BatteryState(voltage=voltage)
+        message.header.stamp = Time(sec=whole, nanosec=int((stamp - whole) * 1e9))
+        (output or self.output).publish(message)
+
+    def live(self, voltages, dt=0.002, stamp=time.time):
+        """Send samples as they are taken, in real time."""
+        start = time.monotonic()
+        for k, voltage in enumerate(voltages):
+            time.sleep(max(start + dt * k - time.monotonic(), 0.0))
+            self.send(voltage, stamp())
+
+    @property
+    def status(self):
+        """Return the newest status."""
+        return self.states[-1].status[0]
+
+    def field(self, name):
+        """Return a field of the newest state."""
+        return values_of(self.status)[name]
+
+
+@pytest.fixture(scope='module')
+def rig(shared_world):
+    """Give one estimator."""
+    return Rig(shared_world, 'attack', '-p', 'brownout.hold:=0.0')
+
+
+def test_stamps_that_stop_are_named_and_hide_no_dip(rig):
+    """No false flag and no OK while they stand still; dips are seen all the same."""
+    rig.live(ou_path(1500, 0.002, seed=1))
+    assert rig.field('clock') == 'ros'
+    still = time.time()
+    stop = threading.Event()
+    dip = threading.Event()
+
+    def feed():
+        k, path = 0, ou_path(5000, 0.002, seed=2)
+        while not stop.is_set():
+            rig.send(3.0 if dip.is_set() else path[k % 5000], still)
+            k += 1
+            time.sleep(0.002)
+    thread = threading.Thread(target=feed)
+    thread.start()
+    try:
+        wait_until(lambda: rig.field('stamps') == 'FROZEN', what='FROZEN')
+        assert rig.status.level == STALE and 'header.stamp' in rig.status.message
+        flags = len(rig.flags)
+        dip.set()
+        wait_until(lambda: rig.field('brownout_level') == 'CRITICAL', what='the dip')
+        assert rig.status.level == ERROR
+        dip.clear()
+        wait_until(lambda: rig.field('brownout_level') == 'UNKNOWN', what='the end of the dip')
+        assert all(message.data for message in rig.flags[flags:])
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_old_data_that_arrive_now_are_old(rig):
+    """A backlog of 8 s: late, not fresh, and said so."""
+    wait_until(lambda: (rig.live([5.0] * 10), rig.field('stamps'))[1] == 'GOOD', what='life')
+
+    def late():
+        rig.live(ou_path(100, 0.002, seed=3), stamp=lambda: time.time() - 8.0)
+        return 'arrive late' in rig.status.message
+    # First the stamps step back, which clears the window.
+    wait_until(late, what='the words')
+    assert float(rig.field('age')) > 7.0 and rig.field('brownout') == 'unknown'
+
+
+def test_a_second_publisher_is_named_and_left_out(rig, world):
+    """Its samples are counted and not used."""
+    other = rig.probe.publisher('/attack/voltage', BatteryState, 100)
+    wait_until(lambda: (rig.live(ou_path(200, 0.002, seed=4)), rig.field('stamps'))[1] == 'GOOD')
+    wait_until(lambda: '2 publishers' in rig.status.message, what='two publishers')
+    assert 'probe' in rig.field('publishers')
+    foreign, used = int(rig.field('foreign_messages')), int(rig.field('used'))
+    for _ in range(100):
+        rig.live([5.0] * 5)
+        rig.send(3.0, time.time() - 500.0, other)
+    wait_until(lambda: int(rig.field('foreign_messages')) >= foreign + 80, what='foreign ones')
+    assert int(rig.field('used')) > used and rig.field('brownout_level') != 'CRITICAL'
+    rig.probe.node.destroy_publisher(other)
+
+
+def test_model_files_that_are_none_hang_nothing(rig, tmp_path):
+    """A FIFO, a device: refused at once, and states go on."""
+    fifo = tmp_path / 'fifo'
+    os.mkfifo(fifo)
+    for path in (str(fifo), '/dev/zero'):
+        states = len(rig.states)
+        result = rig.probe.set_parameter(rig.node, 'model_file', path)
+        assert not result.successful and 'model_file' in result.reason
+        wait_until(lambda n=states: len(rig.states) > n + 2, what='states')
+
+
+def test_what_comes_as_a_parameter_kills_nothing(rig):
+    """Limits that no budget can keep are refused together, with their range."""
+    request = SetParameters.Request(parameters=[
+        Parameter('brownout.warn', value=0.0).to_parameter_msg()])
+    answer = rig.probe.call(SetParameters, f'{rig.node}/set_parameters', request)
+    assert 'above 0 and below 1' in answer.results[0].reason
+    rig.live([1e30] * 14 + [1e-30] * 100 + [5.0] * 100)
+    states = len(rig.states)
+    wait_until(lambda: len(rig.states) > states + 3, what='states')
+    assert rig.field('restarts') == '0' and rig.process.popen.poll() is None
+
+
+def test_locked_parameters(world):
+    """What can disarm is refused with the reason, at run time only."""
+    rig = Rig(world, 'locked', '-p', 'lock_parameters:=true', '-p', 'brownout.voltage:=4.6')
+    for name, value in (('brownout.voltage', 1.0), ('stale_after', 100.0), ('model_file', ''),
+                        ('window', 9.0), ('use_sim_time', True)):
+        result = rig.probe.set_parameter(rig.node, name, value)
+        assert not result.successful and 'lock_parameters' in result.reason
+    assert not rig.probe.set_parameter(rig.node, 'lock_parameters', False).successful
+    assert rig.probe.set_parameter(rig.node, 'publish_rate', 20.0).successful
+
+
+def test_the_latch_survives_a_restart(world, tmp_path):
+    """Killed, started anew, still CRITICAL with the reason; cleared, it stays cleared."""
+    path = tmp_path / 'latch'
+    arguments = ('-p', 'brownout.latch:=true', '-p', f'state_file:={path}')
+    rig = Rig(world, 'keep', *arguments)
+    rig.live([5.0] * 50 + [4.0] * 200)
+    wait_until(lambda: rig.field('brownout_level') == 'CRITICAL', what='the flag')
+    wait_until(path.exists, what='the file')
+    assert json.loads(path.read_text())['level'] == 'CRITICAL'
+    rig.process.kill()
+    again = Rig(world, 'keep', *arguments)
+    wait_until(lambda: again.field('brownout_level') == 'CRITICAL', what='the latch')
+    assert 'latched' in again.field('brownout_reason')
+    assert 'before the node was started anew' in again.process.err
+    wait_until(lambda: again.flags and again.flags[-1].data, what='the flag itself')
+    answer = again.probe.call(Trigger, f'{again.node}/clear_brownout', Trigger.Request())
+    assert answer.success
+    wait_until(lambda: not path.exists(), what='no file')
+    assert again.process.stop() == 0
+
+
+@pytest.mark.parametrize('rate', [5000.0, 20000.0])
+def test_overload_mutes_nothing(world, rate):
+    """
+    A flood, and a node that is stopped two thirds of the time.
+
+    States keep coming, two dips of 50 ms are flagged, losses are counted, memory is bounded, and
+    SIGINT ends it.  The longest silence allowed: 2 s, and what this machine itself pauses.
+    """
+    rig = Rig(world, 'load', '-p', 'brownout.hold:=1.0', kind=Float64)
+    pid = rig.process.popen.pid
+    stop = threading.Event()
+    pauses = []
+
+    def starve():
+        while not stop.is_set():
+            begin = time.monotonic()
+            os.kill(pid, signal.SIGSTOP)
+            time.sleep(0.02)
+            os.kill(pid, signal.SIGCONT)
+            time.sleep(0.01)
+            pauses.append(time.monotonic() - begin)
+
+    env = {**os.environ, 'ROS_DOMAIN_ID': str(world.domain)}
+    flood = subprocess.Popen([sys.executable, '-c', FLOOD, str(rate), '0.05'], env=env)
+    starver = threading.Thread(target=starve)
+    try:
+        wait_until(lambda: int(rig.field('messages')) > 1000, what='messages')
+        starver.start()
+        seen = len(rig.flags)
+        begin, first = time.monotonic(), len(rig.times)
+
+        def dips():
+            said = [False, *(message.data for message in rig.flags[seen:])]
+            states = [values_of(message.status[0])['brownout_level'] for message in rig.states]
+            return any(said) and sum(
+                a != 'CRITICAL' and b == 'CRITICAL' for a, b in zip(states, states[1:])) >= 2
+        wait_until(dips, what='two dips')
+        wait_until(lambda: time.monotonic() - begin > 6.0)
+        times = rig.times[first:]
+        silence = max(b - a for a, b in zip(times, times[1:]))
+        assert silence < 2.0 + 10.0 * max(pauses), silence
+        taken, lost = int(rig.field('messages')), int(rig.field('messages_lost'))
+        assert taken > 1000 and lost >= 0 and rig.field('messages_lost_by') == 'sequence numbers'
+        rss = 1024 * int(re.search(r'VmRSS:\s+(\d+)', Path(
+            f'/proc/{pid}/status').read_text())[1])
+        assert rss < 500e6
+    finally:
+        stop.set()
+        if starver.is_alive():
+            starver.join()
+        if rig.process.popen.poll() is None:
+            os.kill(pid, signal.SIGCONT)
+        ended = time.monotonic()
+        status = rig.process.stop()
+        took = time.monotonic() - ended
+        flood.kill()
+        flood.wait()
+    print(f'{rate:g} Hz: silence {silence:.2f} s, {taken} taken, {lost} lost, '
+          f'{rss / 1e6:.0f} MB, end {took:.2f} s')
+    assert status == 0 and took < 10.0 + 10.0 * max(pauses)

@@ -1,0 +1,93 @@
+"""Who sent a message, what was lost, and how old the newest sample is."""
+
+import numpy as np
+from ou_monitor.stream.arrival import Publishers, SourceClock
+import pytest
+
+
+def sent(first, n, rate, start, lost=()):
+    """Return (number, time) of a publisher's messages, less those that are lost."""
+    return [(first + k, start + k / rate) for k in range(n) if k not in lost]
+
+
+def follow(publishers, *streams, count, batch=20):
+    """Feed messages of publishers as they arrive; return whose were kept: {stream: number}."""
+    merged = sorted((time, number, who) for who, stream in enumerate(streams)
+                    for number, time in stream)
+    kept = dict.fromkeys(range(len(streams)), 0)
+    for k in range(0, len(merged), batch):
+        part = merged[k:k + batch]
+        times = np.array([time for time, _, _ in part])
+        mask = publishers.follow([number for _, number, _ in part], times, times, count)
+        for (_, _, who), keep in zip(part, mask.tolist()):
+            kept[who] += keep
+    return kept
+
+
+def test_one_publisher():
+    """Every tenth is lost, and all are counted; a start anew is no loss."""
+    publishers = Publishers()
+    assert follow(publishers, sent(1, 1000, 1e3, 0.0, set(range(5, 1000, 10))),
+                  count=1) == {0: 900}
+    assert publishers.lost == 100 and publishers.foreign == 0
+    follow(publishers, sent(1, 100, 1e3, 5.0), count=1)
+    assert publishers.lost == 100 and publishers.numbered
+
+
+@pytest.mark.parametrize('offset', [0, 3, 700])
+@pytest.mark.parametrize('rate', [1000.0, 137.0])
+def test_of_two_the_first_is_followed(offset, rate):
+    """Whatever their numbers, with a pause that loses the messages of both."""
+    publishers = Publishers()
+    gap = set(range(1000, 1030))
+    first = sent(1 + offset, 3000, 1000.0, 0.0, gap)
+    other = sent(1, int(3 * rate), rate, 0.0004, {k for k in range(int(3 * rate))
+                                                  if 1.0 <= k / rate < 1.03})
+    kept = follow(publishers, first, other, count=2)
+    assert kept[0] >= 2960 and kept[1] <= 10
+    assert publishers.foreign >= len(other) - 10 and abs(publishers.lost - 30) <= 10
+
+
+def test_a_second_one_that_comes_later():
+    publishers = Publishers()
+    kept = follow(publishers, sent(1, 1000, 1e3, 0.0), count=1)
+    kept = follow(publishers, sent(1001, 1000, 1e3, 1.0), sent(1, 900, 1e3, 1.1003), count=2)
+    assert kept == {0: 1000, 1: 0} and publishers.foreign == 900
+
+
+def test_when_the_first_ends_the_other_is_followed():
+    publishers = Publishers()
+    follow(publishers, sent(1, 1000, 1e3, 0.0), sent(1, 100, 100.0, 0.0004), count=2)
+    kept = follow(publishers, sent(101, 500, 100.0, 1.0004), count=2)
+    assert 380 <= kept[0] <= 420
+
+
+def test_without_numbers_nothing_is_known():
+    publishers = Publishers()
+    assert publishers.follow([None] * 3, np.arange(3.0), np.arange(3.0), 2).all()
+    assert not publishers.numbered
+
+
+def test_age_counts_from_the_stamp_where_the_clock_is_ours():
+    clock = SourceClock()
+    assert clock.name == 'unknown' and clock.age(5.0) is None
+    clock.take(np.array([100.0, 100.1]), np.array([100.11, 100.11]), 5.0)
+    assert clock.name == 'ros' and clock.age(5.0) == pytest.approx(0.01)
+    assert clock.age(6.0) == pytest.approx(1.01)
+    # A backlog: data 8 s old that have just arrived.
+    clock.take(np.array([103.0]), np.array([111.0]), 16.0)
+    assert clock.name == 'ros' and clock.age(16.0) == pytest.approx(8.0)
+
+
+@pytest.mark.parametrize('stamp', [12.0, 1.7e9 + 3.0, 1.7e9 - 20.0])
+def test_of_a_foreign_clock_only_the_arrival_counts(stamp):
+    clock = SourceClock()
+    clock.take(np.array([stamp]), np.array([1.7e9]), 5.0)
+    assert clock.name == 'foreign' and clock.age(5.5) == pytest.approx(0.5)
+
+
+def test_a_clock_that_is_set_meanwhile_is_ours():
+    clock = SourceClock()
+    clock.take(np.array([12.0]), np.array([1.7e9]), 5.0)
+    clock.take(np.array([1.7e9]), np.array([1.7e9 + 0.01]), 6.0)
+    assert clock.name == 'ros'
