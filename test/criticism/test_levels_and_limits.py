@@ -1,0 +1,187 @@
+"""Tests of a level, limits of an ADC, bins and events: against formulas and dense algebra."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+from numpy.testing import assert_allclose
+from ou_monitor.criticism.adc import find_rails, redraw
+from ou_monitor.criticism.composite import _same
+from ou_monitor.criticism.curves import _bins, compare_curves
+from ou_monitor.criticism.level_tests import _correlated, _mean_drift
+from ou_monitor.criticism.readings import why_nothing
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.structure import _solved, Events
+from ou_monitor.records import Estimate, Status
+import pytest
+from scipy import stats
+from scipy.signal import lfilter
+
+
+def estimate(alpha_se, sigma_se):
+    return Estimate(alpha=50.0, sigma=0.3, var_inf=1e-3, u0=5.0, noise_std=0.0, alpha_se=alpha_se,
+                    sigma_se=sigma_se, var_inf_se=0.0, status=Status.OK, rate=1000.0)
+
+
+@pytest.mark.parametrize('n, steps, blocks', ((3000, (1,), 16), (350, (1,), 6),
+                                              (350, (1, 2, 4), 14)))
+@pytest.mark.parametrize('alpha_se, sigma_se', ((0.3, 0.4), (0.06, 0.08)))
+def test_drift_of_the_mean_is_an_f_test_of_blocks(n, steps, blocks, alpha_se, sigma_se):
+    """
+    Innovations of an OU about the mean of all, without the first of each part.
+
+    Blocks of at least 5 relaxation times and 50 samples, 16 at most.  The variance is known as
+    well as alpha and sigma: 2 / (2 error)^2 degrees of freedom.
+    """
+    alpha, var = 50.0, 1e-3
+    rng = np.random.default_rng(1)
+    t = 1e-3 * np.cumsum(rng.choice(steps, n))
+    keep = np.exp(-alpha * np.diff(t))
+    unit = math.exp(-alpha * 1e-3)
+    noise = lfilter([math.sqrt(var * (1.0 - unit**2))], [1.0, -unit],
+                    rng.standard_normal((2, n)))
+    parts = [(t, 5.0 + noise[0]), (t + 9.0, 5.01 + noise[1])]
+    found = _mean_drift(parts, estimate(alpha_se, sigma_se), alpha, var, 0.0, math.sqrt(var))
+    centre = np.concatenate([v for _, v in parts]).mean()
+    z = np.concatenate([(v[1:] - centre - keep * (v[:-1] - centre))
+                        / np.sqrt(var * (1.0 - keep**2)) for _, v in parts])
+    q = sum(piece.size * (piece.mean() - z.mean())**2 for piece in np.array_split(z, blocks))
+    freedom = max(2.0 / (2.0 * math.hypot(alpha_se, sigma_se))**2, 1.0)
+    assert found.p_value == pytest.approx(
+        stats.f.sf(q / (blocks - 1), blocks - 1, freedom), rel=1e-3)
+
+
+@pytest.mark.parametrize('name, shift, freedom', (
+    ('correlated', 1.0, 3.0), ('one_relaxation', 0.0, 2.0), ('other', 0.0, 3.0)))
+def test_portmanteau_is_a_sum_of_squared_scores(name, shift, freedom):
+    rng = np.random.default_rng(2)
+    parts = [rng.standard_normal(200), rng.standard_normal(150)]
+    total, n, q, effect = sum((d**2).sum() for d in parts), 350, 0.0, 0.0
+    for lag in (1, 2, 3):
+        products = np.concatenate([d[lag:] * d[:-lag] for d in parts])
+        r = products.sum() / total + shift * len(parts) / n
+        se = math.sqrt((products**2).sum()) / total
+        q += (r / se)**2
+        effect += max(0.0, r * r - se * se)
+    found = _correlated(name, parts, 3)
+    assert found.p_value == pytest.approx(stats.chi2.sf(q, freedom))
+    assert found.effect == pytest.approx(math.sqrt(effect))
+
+
+@pytest.mark.parametrize('code, low, high', ((0.0, 0.0, 1.0), (0.001, 0.0, 1.0),
+                                             (0.5, 3.0, 9.0), (0.5, -4.0, -1.0)))
+def test_bins_hold_the_range_and_a_margin_beside_it(code, low, high):
+    """15 % on either side and not much more; with codes, edges half-way between them."""
+    edges = _bins(np.array([low, high]), code)
+    width = edges[1] - edges[0]
+    assert_allclose(np.diff(edges), width)
+    room = 0.15 * (high - low)
+    for beside in (low - edges[0], edges[-1] - high):
+        assert room - 1e-9 <= beside <= room + 2.0 * width + code
+    if code:
+        assert (low - edges[0]) / code % 1.0 == pytest.approx(0.5)
+        assert width / code == pytest.approx(round(width / code))
+
+
+def test_uneven_samples_are_compared_on_a_grid_to_their_end():
+    """4000 points of the grid, the last included: lags up to a 20th, of its step."""
+    rng = np.random.default_rng(3)
+    k = np.cumsum(rng.choice([1, 1, 2], 4000))
+    t = 1e-3 * np.append(k[k < 3999], 3999)
+    t -= t[0]
+    t = np.append(t[:-1], 3.999)
+    v = np.sin(2.0 * np.pi * 50.0 * t) + 0.1 * rng.standard_normal(t.size)
+    spectrum, correlation = compare_curves(Samples(t, v, None), (), rng, 1)[:2]
+    assert abs(math.log(spectrum.x[np.argmax(spectrum.data)] / 50.0)) < 0.15
+    assert_allclose(correlation.x[[0, -1]], [1e-3, 0.2])
+    # Of a line the correlation is that of its cosine, over the tapering number of pairs.
+    pure = 0.5 / (0.5 + 0.01) * np.cos(2.0 * np.pi * 50.0 * correlation.x)
+    assert_allclose(correlation.data, pure * (1.0 - correlation.x / 4.0), atol=0.05)
+
+
+@pytest.mark.parametrize('side', (1.0, -1.0))
+@pytest.mark.parametrize('step', (0.0, 0.02))
+def test_samples_beyond_a_limit_are_drawn_from_the_bridge(side, step):
+    """
+    Clipped at one deviation: variance and lag-1 correlation of the AR(1) come back.
+
+    Their standard errors by Bartlett, of n / 8 independent ones, and the rest by what is known.
+    """
+    n, keep = 40_000, 0.8
+    rng = np.random.default_rng(4)
+    x = np.zeros(n)
+    noise = rng.standard_normal(n) * math.sqrt(1.0 - keep * keep)
+    for k in range(1, n):
+        x[k] = keep * x[k - 1] + noise[k]
+    if step:
+        x = step * np.rint(x / step)
+    x *= side
+    low, high = (-math.inf, 1.0) if side > 0.0 else (-1.0, math.inf)
+    clipped = np.clip(x, low, high)
+    found = redraw(clipped, low, high, step, np.random.default_rng(5))
+    inside = (clipped > low) & (clipped < high)
+    assert_allclose(found[inside], x[inside])
+    assert (side * found[~inside] >= 1.0 - 1e-9).all()
+    assert found.std() == pytest.approx(x.std(), abs=0.05)
+    assert np.corrcoef(found[1:], found[:-1])[0, 1] == pytest.approx(keep, abs=0.02)
+    if step:
+        assert_allclose(found / step, np.rint(found / step), atol=1e-6)
+
+
+@pytest.mark.parametrize('offset', (50.0, -50.0))
+@pytest.mark.parametrize('side', (1.0, -1.0))
+def test_a_limit_is_found_in_single_precision(offset, side):
+    """Continuous readings that float32 rounds, clipped on one side only."""
+    rng = np.random.default_rng(6)
+    x = side * np.minimum(rng.standard_normal(20_000), 1.0)
+    v = (offset + 0.1 * x).astype(np.float32).astype(np.float64)
+    low, high = find_rails(v, 0.0, 0.1)
+    assert (low == v.min()) == (side < 0.0) and (high == v.max()) == (side > 0.0)
+    # The same where later arithmetic has spread the limit over a part of a rounding.
+    v = (offset + 0.1 * x) * (1.0 + rng.uniform(-3e-8, 3e-8, x.size))
+    low, high = find_rails(v, 0.0, 0.1)
+    assert (low == v.min()) == (side < 0.0) and (high == v.max()) == (side > 0.0)
+
+
+def test_the_same_events_are_found_again_where_push_and_error_begin_at_the_same_samples():
+    """A tenth of the power apart in the mean logarithm and 1 % of a variance of the mean."""
+    one, zero = np.array([0.0, 1.0, 0.0]), np.zeros(3)
+    fit = SimpleNamespace(variance=np.full(3, 4.0))
+
+    def same(push, error, before, power=1.0, moved=0.0, offset=None):
+        found = Events(push, error, np.full(3, power))
+        return _same(before, offset, found, np.full(3, moved), fit)
+    none = Events(zero, zero, np.ones(3))
+    assert same(zero, zero, None) and same(zero, zero, none)
+    for push, error in ((one, zero), (zero, one)):
+        assert not same(push, error, None) and not same(push, error, none)
+        assert same(9.0 * push, 9.0 * error, Events(push, error, np.ones(3)))
+        assert not same(zero, zero, Events(push, error, np.ones(3)))
+    assert same(zero, zero, None, moved=0.199) and not same(zero, zero, None, moved=0.201)
+    assert same(zero, zero, None, moved=5.1, offset=np.full(3, 5.0))
+    assert not same(zero, zero, None, power=4.0)
+
+
+@pytest.mark.parametrize('width', (3, 400))
+def test_least_squares_of_few_and_of_many_columns(width):
+    """That of the pseudo-inverse, also where a column is empty."""
+    rng = np.random.default_rng(7)
+    columns, y = rng.standard_normal((1000, width)), rng.standard_normal(1000)
+    columns[:, 1] = 0.0
+    columns *= np.geomspace(1.0, 1e3, width)
+    assert_allclose(_solved(columns, y), np.linalg.pinv(columns) @ y, atol=1e-9)
+
+
+def test_why_nothing_can_be_fitted():
+    rng = np.random.default_rng(8)
+    v = 5.0 + 0.01 * rng.standard_normal(1000)
+    stuck = np.full(1000, 5.0)
+    stuck[500] = 5.1
+    assert why_nothing(v) == ''
+    assert why_nothing(np.full(9, 5.0)).startswith('The voltage does not change')
+    assert why_nothing(stuck).startswith('All but 1 of its 1000 samples read 5 V')
+    assert why_nothing(1e31 * v).startswith('The voltage reaches')
+    assert why_nothing(1e-31 * v).startswith('The voltage moves by')
+    stuck[:3] = 5.2
+    assert why_nothing(stuck) == ''
+    assert 'straight line' in why_nothing(np.linspace(4.0, 5.0, 1000))
