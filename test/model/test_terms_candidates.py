@@ -6,13 +6,12 @@ import math
 import numpy as np
 from ou_monitor.model.terms.flicker_noise import FlickerNoise
 from ou_monitor.model.terms.hidden_levels import relaxing
-from ou_monitor.model.terms.jumps import _mixture, Jumps
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import order_power
 from ou_monitor.model.terms.second_relaxation import SecondRelaxation
 import pytest
 from scipy.linalg import dft
-from scipy.stats import median_abs_deviation, norm
+from scipy.stats import median_abs_deviation
 from term_examples import still, term
 
 
@@ -119,30 +118,6 @@ def test_a_line_follows_throttle_that_moves_it_by_more_than_its_width(width, exp
     assert line.holds(view) is False
     throttle = 0.5 + 0.1 * np.where(np.arange(1000) % 2, 1.0, -1.0)
     assert line.holds(replace(view, throttle=throttle)) is expected
-
-
-def test_jumps_and_the_rest_are_scored_by_their_mixture():
-    """Most are of half the expected spread: the chance of each, by the normals of SciPy."""
-    rng = np.random.default_rng(8)
-    n = 4000
-    variance = np.where(np.arange(n) % 2, 0.01, 0.04)
-    volts = 0.5 * np.sqrt(variance) * rng.standard_normal(n)
-    volts[::100] += 0.6 + 0.2 * rng.standard_normal(n // 100)
-    view = replace(view_of(n, 1000.0), z=volts / np.sqrt(variance), variance=variance)
-    share, mean, spread, unit = _mixture(view.z, variance)
-    assert unit == pytest.approx(0.5, rel=0.05) and share == pytest.approx(0.01, rel=0.2)
-    assert mean == pytest.approx(0.6, abs=0.15) and spread == pytest.approx(0.2, rel=0.5)
-    wide = np.hypot(unit * np.sqrt(variance), spread)
-    chance = (1.0 - share) * norm.cdf(view.z / unit) + share * norm.cdf((volts - mean) / wide)
-    found = Jumps.fit_law(view)
-    middle = np.abs(found.z) < 3.0
-    assert found.z[middle] == pytest.approx(norm.ppf(chance[middle]), abs=1e-6)
-    assert found.term.rate == pytest.approx(1000.0 * share, rel=1e-9)
-    assert (found.term.mean, found.term.std) == (mean, spread)
-    count = n * share
-    assert found.se == pytest.approx({
-        'rate': found.term.rate / math.sqrt(count), 'mean': spread / math.sqrt(count),
-        'std': spread / math.sqrt(2.0 * count)}, rel=1e-9)
 
 
 def test_what_a_faster_rail_leaves_over():

@@ -2,7 +2,7 @@
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.online.estimator.quality import examine, lattice, Quality
+from ou_monitor.online.estimator.quality import examine, lattice, Quality, refresh_period
 import pytest
 from simulated_windows import DT, paths
 
@@ -110,3 +110,10 @@ def test_too_little_to_tell(y):
 def test_from_sixty_four_samples_on():
     y = 0.0125 * np.round(path(6) / 0.0125)
     assert examine(y[:64]).step == pytest.approx(0.0125) and examine(y[:63]).step == 0.0
+
+
+@pytest.mark.parametrize('gaps, kept', [(0, True), (7, True), (8, False), (20, False)])
+def test_eight_gaps_are_needed_to_give_up_a_known_period(gaps, kept):
+    """Every third sample changes where every 40th was known to."""
+    y = np.repeat(np.random.default_rng(1).permutation(np.arange(gaps + 2.0)), 3)
+    assert (refresh_period(y, 40.0) == 40.0) is kept
