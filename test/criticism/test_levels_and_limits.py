@@ -11,7 +11,8 @@ from ou_monitor.criticism.curves import _bins, compare_curves
 from ou_monitor.criticism.level_tests import _correlated, _mean_drift
 from ou_monitor.criticism.readings import why_nothing
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.structure import _solved, Events
+from ou_monitor.criticism.structure import _solved, evaluate, Events
+from ou_monitor.model.terms.ou import OU
 from ou_monitor.records import Estimate, Status
 import pytest
 from scipy import stats
@@ -185,3 +186,26 @@ def test_why_nothing_can_be_fitted():
     stuck[:3] = 5.2
     assert why_nothing(stuck) == ''
     assert 'straight line' in why_nothing(np.linspace(4.0, 5.0, 1000))
+
+
+def test_events_add_to_the_joint_normal_law():
+    """Power of the diffusion, pushes of the state, errors of the sensor: dense covariance."""
+    rng = np.random.default_rng(9)
+    n, alpha, sigma, u0 = 40, 1.3, 0.5, 5.0
+    t = np.cumsum(rng.choice([0.1, 0.2, 0.5], n))
+    v = u0 + 0.4 * rng.standard_normal(n)
+    push, error, power = np.zeros(n), np.zeros(n), np.ones(n)
+    push[9], error[20], power[30:33] = 0.7, 0.9, 3.0
+    found = evaluate(Samples(t, v, None), [OU(alpha, sigma, u0)], Events(push, error, power))
+    keep = np.append(0.0, np.exp(-alpha * np.diff(t)))
+    added = power * sigma**2 / (2.0 * alpha) * (1.0 - keep**2) + push
+    spread = np.zeros(n)
+    for k in range(n):
+        spread[k] = (keep[k]**2 * spread[k - 1] if k else 0.0) + added[k]
+    decay = np.exp(-alpha * np.abs(t[:, None] - t))
+    covariance = decay * spread[np.minimum.outer(np.arange(n), np.arange(n))] + np.diag(error)
+    known = np.linalg.cholesky(covariance)
+    assert_allclose(found.innovation, np.diag(known) * np.linalg.solve(known, v - u0), atol=1e-4)
+    # What an event adds at its own sample is not in the variance there.
+    own = (power - 1.0) / power * (added - push) + push + error
+    assert_allclose(found.variance, np.diag(known)**2 - own, rtol=1e-3)
