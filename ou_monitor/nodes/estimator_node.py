@@ -339,7 +339,8 @@ class EstimatorNode(MonitorNode):
         elif 'voltage' not in self._opened:
             topic = self.resolve_topic_name(self._sources['voltage'].topic)
             summary = f'Waiting for a publisher on {topic}.'
-        elif silent and within(self._arrived.age, limit) and not within(self._usable.age, limit):
+        elif silent and within(self._arrived.age, limit) and not within(
+                self._usable.age, report.patience):
             summary = self._useless()
         elif silent and not self.count_publishers(self._topic('voltage')):
             summary = f"No publisher on {self._topic('voltage')}: {report.summary}"

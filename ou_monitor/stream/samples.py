@@ -223,15 +223,15 @@ class SampleStream:
             arrived, firsts = arrived[placed], firsts[placed]
         if not ends.size:
             return held
-        highest = np.maximum.accumulate(np.concatenate(([self._newest], ends)))[:-1]
-        back = np.flatnonzero(firsts < highest - BACK)
+        before = np.concatenate(([self._newest], ends[:-1]))
+        back = np.flatnonzero(firsts < before - BACK)
         begin = 0
         if back.size:
             # Of several steps back within so short a time the last counts.
             begin = int(back[-1])
             at = int(counts[:begin].sum())
             self._add(ends[:begin], own[:begin], counts[:begin], values[:at], arrived[:begin])
-            self.reset(f'stamps went back by {highest[begin] - firsts[begin]:.3g} s')
+            self.reset(f'stamps went back by {before[begin] - firsts[begin]:.3g} s')
             values = values[at:]
         self._add(ends[begin:], own[begin:], counts[begin:], values, arrived[begin:])
         return held

@@ -147,6 +147,16 @@ def test_stamps_that_go_back_clear_the_window_once():
     assert sink.resets[1:] == ['twice']
 
 
+def test_a_step_back_within_what_came_at_once_clears_the_window_once():
+    """All that follows the step stays."""
+    stream, sink = stream_of()
+    t = np.concatenate([10.0 + 0.001 * np.arange(50), 3.0 + 0.001 * np.arange(300)])
+    held = stream.take_voltages(t, np.ones(350, bool), np.ones(350, int), np.full(350, 5.0))
+    assert held.all() and len(sink.resets) == 1 and sink.t == t[:50].tolist()
+    stream.flush()
+    assert sink.t == t.tolist() and len(sink.resets) == 1
+
+
 def test_blocks_are_spread_over_the_time_line():
     """The stamp is that of the last sample."""
     stream, sink = stream_of(sample_rate=100.0)
