@@ -32,7 +32,7 @@ Effect = Callable[[FloatArray, FloatArray, np.random.Generator], FloatArray]
 
 
 def simulated(seed: int, effect: Effect | None = None, alphas: tuple[float, ...] = (ALPHA,) * 3,
-         tau: float = 0.0) -> Recording:
+              tau: float = 0.0) -> Recording:
     """Return a recording; the sag of 0.5 V times throttle follows with tau, or at once."""
     rng = np.random.default_rng(seed)
     n = int(SECONDS * RATE)

@@ -376,8 +376,8 @@ class EstimatorNode(MonitorNode):
             return
         ends = self.get_publishers_info_by_topic(self._topic('voltage'))
         self._names = tuple(
-            f"{end.node_namespace.rstrip('/')}/{end.node_name} "
-            f"[{bytes(end.endpoint_gid).hex()[-8:]}]" for end in ends)
+            f'{end.node_namespace.rstrip("/")}/{end.node_name} '
+            f'[{bytes(end.endpoint_gid).hex()[-8:]}]' for end in ends)
         now = self.steady_now()
         if now - self._looked >= 1.0:
             self._lost_of_late, self._lost = voltage.publishers.lost - self._lost, (

@@ -46,7 +46,7 @@ def test_the_detectable_ratio_is_detected_nine_times_in_ten():
     steps = (np.array(THROTTLES) - 0.4) / 0.6
     alphas = ALPHA * np.exp(math.log(ratio) * steps)
     rejected = sum(alpha_constancy(THROTTLES, drawn(rng, alphas, 0.1)).verdict == 'differs'
-               for _ in range(300))
+                   for _ in range(300))
     assert abs(rejected - 270) <= 26
 
 

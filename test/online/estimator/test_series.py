@@ -126,7 +126,7 @@ def test_clear_goes_on_counting():
 
 
 def test_throttle_is_known_from_behind_its_last_gap_on():
-    """NaN in samples 5 to 7 and 15 of a throttle: known once the window begins at 16."""
+    """Throttle is NaN in samples 5 to 7 and 15: it is known once the window begins at 16."""
     u = np.full(30, 0.4)
     u[[5, 6, 7, 15]] = np.nan
     series = Series(24)
