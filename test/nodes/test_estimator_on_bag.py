@@ -45,6 +45,9 @@ def run(shared_world):
     heard['inputs'] = probe.node.get_subscriptions_info_by_topic('/voltage')
     assert replay.wait(40.0) == 0, replay.err
     wait_until(lambda: heard['state'][-1].status[0].level == b'\x03', what='STALE at the end')
+    # Diagnostics come once a second: one that was sent after the last sample.
+    before = len(heard['diagnostics'])
+    wait_until(lambda: len(heard['diagnostics']) > before, what='diagnostics at the end')
     assert estimator.stop() == 0, estimator.err
     heard['log'] = estimator.err
     return heard
