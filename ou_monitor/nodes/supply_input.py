@@ -86,8 +86,9 @@ class SupplyInput:
             if 'sigma_se' in values:
                 self._state_heard.heard()
                 self._state = values
-                sigma, error = _number(values, 'sigma'), _number(values, 'sigma_se')
-                self._error = error / sigma if sigma > 0.0 and error >= 0.0 else NAN
+                # Of ln sigma, so relative already: what `AdaptiveLowPass` takes is in V/sqrt(s).
+                error = _number(values, 'sigma_se')
+                self._error = error if error >= 0.0 else NAN
                 self._known = [_number(values, key) for key in _FIELDS]
                 return
 

@@ -100,7 +100,11 @@ class MonitorReport:
 
     @property
     def fields(self) -> dict[str, str]:
-        """Return every field as text, for diagnostics; numbers round-trip."""
+        """
+        Return every field as text, for diagnostics; numbers round-trip.
+
+        SI units; `alpha_se`, `sigma_se` and `var_inf_se` are of the logarithm, `u0_se` in V.
+        """
         e = self.estimate
         values: dict[str, object] = {
             name: getattr(e, name) for name in (
