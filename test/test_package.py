@@ -283,7 +283,19 @@ def test_locks_are_within_the_bounds(level, python):
             assert one.specifier.contains(locked[canonicalize_name(one.name)]), one
 
 
-@pytest.mark.parametrize('level', LISTS)
+def test_noble_is_the_lowest_of_the_bounds():
+    """The versions of Ubuntu 24.04 are the lower bounds, and the lock has them."""
+    lowest = {one.name: spec.version for one in requirements('requirements-run.txt')
+              for spec in one.specifier if spec.operator == '>='}
+    wanted = {one.name: next(iter(one.specifier)).version
+              for one in requirements('requirements-noble.txt')}
+    assert len(wanted) == 3 and wanted.items() <= lowest.items()
+    assert {canonicalize_name(one.name): next(iter(one.specifier)).version
+            for one in requirements('noble.lock')} == {
+                canonicalize_name(name): version for name, version in wanted.items()}
+
+
+@pytest.mark.parametrize('level', [*LISTS, 'noble'])
 def test_locks_have_hashes_and_no_host(level):
     """Every package of a lock has a SHA-256, and no line says where it was fetched from."""
     text = (ROOT / f'scripts/{level}.lock').read_text(encoding='utf-8')

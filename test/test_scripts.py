@@ -168,6 +168,14 @@ def test_a_sourced_jazzy_is_used(tree, tmp_path):
     assert 'include-system-site-packages = false' in (tree / '.venv/pyvenv.cfg').read_text()
 
 
+def test_versions_other_than_noble_are_refused(tree, tmp_path):
+    """What is not known is refused, and Ubuntu's versions want Ubuntu's Python."""
+    refused(run(tree, 'test', '--versions', 'jammy'), 'noble', "'jammy'")
+    old = 'echo 3.11'
+    path = fake(tmp_path / 'bin', python3_12=old, python3_11=old, python3=old)
+    refused(run(tree, 'test', '--versions', 'noble', PATH=path), 'no Python 3.12', 'tried')
+
+
 def test_demo_refuses_a_missing_bag():
     """The driver says which bag there is not."""
     done = subprocess.run([sys.executable, 'scripts/run_demo.py', '--bag', 'bags/none'],

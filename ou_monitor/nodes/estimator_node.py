@@ -59,6 +59,9 @@ STATE_FILE = Parameter(
     'state_file', '',
     'File that keeps a latched flag over a restart of the node (a folder: a file in it, named '
     "after the node; relative: under ROS's log directory); empty: off.")
+BURSTS = ('The messages come in bursts and carry no stamps, and no steady source is seen behind '
+          'them (yet): no estimate can be made of them; stamp them in the driver, or send blocks '
+          'of samples with adc.sample_rate.')
 OUTPUTS = ('alpha', 'sigma', 'var_inf', 'brownout_risk', 'throttle_budget')
 
 
@@ -80,7 +83,7 @@ class EstimatorNode(MonitorNode):
         self._usable = Silence(self.steady_now)
         self._source_clock = SourceClock()
         self._names: tuple[str, ...] = ()
-        self._lost = self._lost_of_late = 0
+        self._lost = self._lost_of_late = self._settled = 0
         self._looked = -math.inf
         # When the next estimate is due, and the load of pushing samples as a share of the time.
         self._due = -math.inf
@@ -258,6 +261,11 @@ class EstimatorNode(MonitorNode):
             return
         self._arrived.heard(messages.arrived.item(-1))
         ends = self._times(messages, self._send_clock)
+        if self._send_clock is not None and self._send_clock.settled > self._settled:
+            # What came before lies on another time line; of this poll it is not known which.
+            self._settled = self._send_clock.settled
+            self._stream.reset('a steady source was found behind messages in bursts')
+            ends = np.full(ends.size, math.nan)
         held = self._stream.take_voltages(
             ends, messages.own, messages.counts, messages.values, messages.arrived)
         if held.any():
@@ -317,6 +325,8 @@ class EstimatorNode(MonitorNode):
         self._poll()
         self._monitor_model()
         now = self.steady_now()
+        bursts = self._send_clock is not None and self._send_clock.in_bursts
+        self._monitor.distrust(BURSTS if bursts else '')
         again, begin = now >= self._due, time.thread_time()
         report = self._monitor.report(
             self._source_clock.age(now), now, self._usable.age, again=again)

@@ -155,6 +155,7 @@ class SupplyMonitor:
         self._model = model
         self._flag = BrownoutFlag(self._settings)
         self._stamps = StampWatch()
+        self._distrusted = ''
         self._reset_reason = ''
         self._restarts, self._fault, self._faulty = 0, '', False
         # Of samples that are thinned: how many were left out, and where the next one is.
@@ -259,6 +260,14 @@ class SupplyMonitor:
         return Counters(**{f.name: getattr(now, f.name) + getattr(self._counted, f.name)
                            for f in fields(Counters)})
 
+    def distrust(self, reason: str) -> None:
+        """
+        Report nothing that rests on the stamps, and say why, until called with an empty reason.
+
+        The floor holds all the same.
+        """
+        self._distrusted = reason
+
     def clear_brownout(self) -> str:
         """
         Drop a CRITICAL that is latched or held; the next report judges anew.
@@ -316,7 +325,8 @@ class SupplyMonitor:
             e = self._estimate() if again else self._newest
             limit = patience(self._settings, e.rate, e.n)
             stamps = self._stamps.judge(limit, 1.0 / e.rate if e.rate > 0.0 else NAN)
-            fresh = silent <= limit and e.status is not Status.NO_DATA and stamps is Stamps.GOOD
+            fresh = (silent <= limit and e.status is not Status.NO_DATA
+                     and stamps is Stamps.GOOD and not self._distrusted)
             if again or not fresh:
                 self._ahead = (self._outlook.risk(e, self._settings),
                                self._outlook.budget(e, self._settings)) if fresh else (NAN, None)
@@ -357,6 +367,8 @@ class SupplyMonitor:
 
     def _silence(self, age: float | None, e: Estimate, limit: float, stamps: Stamps,
                  arriving: bool, late: bool) -> str:
+        if arriving and self._distrusted:
+            return self._distrusted
         if arriving and stamps is not Stamps.GOOD:
             return str(stamps.value)
         if age is not None and age > limit:

@@ -103,3 +103,16 @@ def test_the_table_and_the_settings_agree(table, settings, build):
 def test_bad_settings_are_refused_by_name(values, words):
     with pytest.raises(ValueError, match=words):
         monitor_settings(values)
+
+
+def test_distrusted_stamps_leave_the_floor():
+    """What rests on the stamps is unknown, with the reason; the floor needs none."""
+    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=4.5, brownout_floor=4.3))
+    t = 0.001 * np.arange(2000)
+    monitor.distrust('They come in bursts.')
+    monitor.push(t, np.full(t.size, 4.0))
+    report = monitor.report(0.0)
+    assert not report.fresh and math.isnan(report.risk) and report.brownout is True
+    assert 'They come in bursts.' in report.summary
+    monitor.distrust('')
+    assert monitor.report(0.0).fresh

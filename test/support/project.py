@@ -5,8 +5,8 @@ import subprocess
 
 ROOT = Path(__file__).resolve().parents[2]
 # What running the project makes; in an unpacked archive there is no git to say so.
-GENERATED = {'.venv', 'build', 'install', 'log', 'out', '__pycache__', '.git', '.hypothesis',
-             '.pytest_cache', '.mypy_cache', 'ou_monitor.egg-info'}
+GENERATED = {'.venv', '.venv-noble', 'build', 'install', 'log', 'out', '__pycache__', '.git',
+             '.hypothesis', '.pytest_cache', '.mypy_cache', 'ou_monitor.egg-info'}
 
 
 def project_files() -> list[Path]:
