@@ -8,32 +8,29 @@ within minutes.  doc/load.md has the equations and the figures.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-import enum
+from dataclasses import replace
 import math
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import CELL, cells_in_series, INRUSH_TIME, LEVELS, SLOPES
+from ou_monitor.online.load_blocks import Block, LoadBlocks
+from ou_monitor.online.load_noise import CLIP, LoadNoise
+from ou_monitor.online.supply_load import (
+    LAGS, LoadStatus, POWER, static, SupplyLoad, TABLE)
 from ou_monitor.records import FloatArray, NAN
 
-# Exponent of the load over throttle, and of the load over the level: the batch's prior.
-_POWER = 1.8
-# Lags, s, of the load: of the motors, and of polarisation (the batch's medians, rounded).
-LAGS = (0.06, 2.0, 15.0)
 # Lag, s, of all: half of what an ESC takes to follow.
 _LAG = 0.004
-# Samples within that time, s, are one correction.
-_STEP = 0.02
 # Level: V per sqrt(s) and cell, an OU of 4.6 mV and 20 s; the batch found it.
 _WALK = 0.0015
 # The load's size may change by 25 % in 100 s; each coefficient by 2 % of full sag by itself.
 _WARMING, _CHANGE = 0.25 ** 2 / 100.0, 0.02 ** 2 / 100.0
-# Standard scores beyond this are weighed down; they score this much, squared, in the noise.
-_CLIP, _OUTLIER = 4.0, 16.0
-# Corrections after which the noise is forgotten, and s after which the throttle flown is.
-_NOISE_MEMORY, _FLOWN_MEMORY = 2000.0, 120.0
+# Time, s, in which the load's scale follows the level: faster, the regressors of a held throttle
+# would move with every correction, and the filter would learn from that.
+_RESIZE = 30.0
+# Time, s, after which the throttle flown is forgotten.
+_FLOWN_MEMORY = 120.0
 # Known: the error of the sag over the throttle flown is below that share of it, or of the noise.
 # The share was widened from 0.25 so that one recording reached 95 %.
 _SAG_SHARE, _NOISE_SHARE = 0.33, 0.5
@@ -42,10 +39,14 @@ _MOVED = 0.02
 # Least relative error of the sag: that of the filter does not count change over a flight, and
 # was up to 9 of its own too small.
 _LEAST_ERROR = 0.1
-# A stamp so much earlier, s, is a new flight.
-_BACKWARDS = 1.0
-# Throttle at which the sag is tabled, and the bins of the throttle flown.
-_TABLE = np.linspace(0.0, 1.0, 101)
+# A stamp earlier by the first, s, or later by the second, begins a new time line: a battery may
+# have been changed in it.
+_BACKWARDS, _PAUSE = 1.0, 60.0
+# A level that is so many times the last one, or less by that, is no battery of this craft.
+_OTHER_CRAFT = 1.6
+# Throttle that was unknown for so long, s, holds no more; beyond the second it is none.
+_HOLD, _MOST_THROTTLE = 1.0, 2.0
+# Bins of the throttle flown.
 _BINS = 50
 # dE/ds, V, of a cell at each 10 mV of open-circuit voltage from 3.4 V.
 _LOWEST, _PER_VOLT = 3.4, 100.0
@@ -78,88 +79,6 @@ def _prior() -> tuple[FloatArray, FloatArray, float]:
 _MEAN, _COV, _SIZE = _prior()
 _STATES = 2 + _MEAN.size
 
-_Number = TypeVar('_Number', float, FloatArray)
-
-
-def _static(throttle: npt.ArrayLike) -> FloatArray:
-    """Return the regressors of a steady sag without polarisation, shape (n, 4)."""
-    u = np.asarray(throttle, dtype=np.float64)
-    x = u ** _POWER
-    return np.stack([x, u, u ** 3, x], axis=-1)
-
-
-def _ripple(u: _Number) -> _Number:
-    """Return the ripple of an ESC over throttle: largest, 1, at 0.7."""
-    return u * (1.4 - u) / 0.49
-
-
-class LoadStatus(enum.Enum):
-    """What is known of the answer to throttle; the value is the sentence for the pilot."""
-
-    KNOWN = 'The sag is known over the throttles flown.'
-    NO_DATA = 'No voltage has arrived.'
-    STILL = 'Throttle has not moved: the sag is unknown.'
-    UNCERTAIN = 'The sag is still uncertain: fly on.'
-    NO_RELATION = ('The voltage does not fall with throttle: check the topic, the unit and the '
-                   'sign of throttle.')
-
-
-@dataclass(frozen=True)
-class SupplyLoad:
-    """
-    What is known of the voltage under load.
-
-    Attributes
-    ----------
-    status : LoadStatus
-        Whether the sag is known, and why not.
-    level : float
-        Open-circuit voltage, V; NaN without voltage.
-    resistance : float
-        Resistance, Ohm; NaN, as this filter does not use current.
-    time_constants : tuple of float
-        Time constants of the answer, s; fixed.
-    flown : tuple of float
-        Throttles between which 80 % of the last two minutes were flown.
-
-    """
-
-    status: LoadStatus = LoadStatus.NO_DATA
-    level: float = NAN
-    resistance: float = NAN
-    time_constants: tuple[float, ...] = LAGS
-    flown: tuple[float, float] = (0.0, 1.0)
-    _sag: tuple[float, ...] = ()
-    _sag_se: tuple[float, ...] = ()
-    _log_variance: tuple[float, float, float] = (NAN, NAN, NAN)
-    _range: tuple[float, float] = (0.0, 1.0)
-
-    @property
-    def known(self) -> bool:
-        """Return whether the sag is known."""
-        return self.status is LoadStatus.KNOWN
-
-    def sag(self, throttle: npt.ArrayLike) -> FloatArray:
-        """Return the sag, V, positive, of a held throttle before polarisation; NaN: unknown."""
-        return self._read(throttle, self._sag)
-
-    def sag_se(self, throttle: npt.ArrayLike) -> FloatArray:
-        """Return the standard error of the sag, V."""
-        return self._read(throttle, self._sag_se)
-
-    def noise(self, throttle: npt.ArrayLike) -> FloatArray:
-        """Return the deviation of one sample, V; beyond the throttles flown that of the edge."""
-        u = np.clip(np.asarray(throttle, dtype=np.float64), *self._range)
-        b = self._log_variance
-        return np.asarray(np.exp(0.5 * (b[0] + b[1] * _ripple(u))))
-
-    def _read(self, throttle: npt.ArrayLike, table: tuple[float, ...]) -> FloatArray:
-        u = np.asarray(throttle, dtype=np.float64)
-        if not table or self.status is LoadStatus.STILL:
-            return np.full(u.shape, NAN)
-        return np.asarray(np.interp(u, _TABLE, table))
-
-
 class LoadFilter:
     """
     Level, sag and noise of a supply, sample by sample.
@@ -169,68 +88,130 @@ class LoadFilter:
     """
 
     def __init__(self) -> None:
-        self._t, self._throttle = NAN, 0.0
+        self._t, self._throttle = NAN, NAN
+        self._blocks = LoadBlocks()
+        self._newest = -math.inf
+        self._opening = False
 
-    def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike, throttle: npt.ArrayLike) -> None:
-        """Add samples, s, V, 0..1; NaN throttle holds the last one, NaN voltage is no sample."""
-        stamps, volts, throttles = np.broadcast_arrays(*np.atleast_1d(t, voltage, throttle))
-        for one in zip(stamps.tolist(), volts.tolist(), throttles.tolist()):
-            self._push(*one)
+    def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
+             throttle: npt.ArrayLike | None = None,
+             current: npt.ArrayLike | None = None) -> None:
+        """
+        Add samples, s, V, 0..1, A.
 
-    def _push(self, t: float, v: float, u: float) -> None:
-        if not (math.isfinite(v) and math.isfinite(t)):
-            return
-        u = min(max(u, 0.0), 1.0) if math.isfinite(u) else self._throttle
-        if not math.isfinite(self._t) or t < self._t - _BACKWARDS:
-            self._begin(t, v, u)
-        elif t > self._t:
-            self._predict(t, u)
-            self._pending.append((self._regressors(), v, u, abs(u - self._throttle), t))
-            spacing, self._t, self._throttle = t - self._t, t, u
-            if t - self._pending[0][4] + 0.5 * spacing >= _STEP:
-                self._correct()
+        NaN voltage is no sample, and a stamp that does not rise is late; both are left out.
+        NaN throttle, or one beyond 2, is unknown: the last one holds for a second.  A stamp that
+        is earlier by more than 1 s, or later by more than a minute, begins a new time line.
+        """
+        columns = np.stack(np.broadcast_arrays(*np.atleast_1d(*(
+            np.asarray(NAN if x is None else x, dtype=np.float64)
+            for x in (t, voltage, throttle, current)))))
+        columns = columns[:, np.isfinite(columns[0]) & np.isfinite(columns[1])]
+        u = columns[2]
+        columns[2] = np.where(np.abs(u) <= _MOST_THROTTLE, np.clip(u, 0.0, 1.0), NAN)
+        while columns.size:
+            stamps = columns[0]
+            highest = np.maximum.accumulate(np.concatenate(([self._newest], stamps)))
+            back = np.flatnonzero(stamps < highest[:-1] - _BACKWARDS)
+            end = int(back[0]) if back.size else stamps.size
+            keep = (stamps > highest[:-1])[:end]
+            for block in self._blocks.push(columns[:, :end][:, keep]):
+                self._take(block)
+            self._newest = float(highest[end])
+            if back.size:
+                self.new_time_line()
+            columns = columns[:, end:]
 
-    def _begin(self, t: float, v: float, u: float) -> None:
+    def new_time_line(self) -> None:
+        """Let the next stamp be anything: coefficients and noise are kept, the level is open."""
+        self._newest = -math.inf
+        self._blocks.forget()
+        self._opening = math.isfinite(self._t)
+
+    def _take(self, block: Block) -> None:
+        """Take one block: the first of all, of a new time line, or what follows."""
+        u = block.throttle
+        if not math.isfinite(self._t):
+            self._begin(block.voltage, u)
+        else:
+            self._opening = self._opening or block.t - self._t > _PAUSE
+            if math.isfinite(u):
+                self._heard = block.last
+            elif not self._opening and block.t - self._heard <= _HOLD:
+                u = self._throttle
+            if self._opening or math.isfinite(u) is not math.isfinite(self._throttle):
+                self._open(block.voltage, u)
+            else:
+                if u != self._throttle and self._last > self._t:
+                    # The last throttle held to the end of its block.
+                    self._predict(self._last)
+                du = abs(u - self._throttle)
+                self._throttle = u
+                self._predict(block.t)
+                self._correct(block, du)
+        self._t, self._last, self._throttle = block.t, block.last, u
+        self._heard = block.last if math.isfinite(block.throttle) else self._heard
+
+    def _begin(self, v: float, u: float) -> None:
         """Begin a flight with the prior, scaled by the first voltage."""
-        self._t, self._throttle = t, u
         self._volts = max(v, 1e-3)
         # Below 2.5 V no lithium cell: the curve is scaled.
         self._cells = float(cells_in_series(self._volts)) if self._volts > 2.5 else \
             self._volts / CELL
-        self._lagged = self._settled = u
-        x = u ** _POWER
-        # The slow lag may be anywhere between rest and a steady load.
-        self._lags = [x, x, 0.5 * x]
-        self._factor = 1.0
+        # Noise under a known throttle, and under an unknown one, which is what throttle does.
+        self._noise, self._other = LoadNoise(self._volts), LoadNoise(self._volts)
+        # Whether the coefficients have met a throttle.
+        self._loaded = math.isfinite(u)
+        self._heard = -math.inf
+        self._flown = np.zeros(_BINS + 1)
         m, P = np.zeros(_STATES), np.zeros((_STATES, _STATES))
         m[2:], P[2:, 2:] = _MEAN * self._volts, _COV * self._volts ** 2
         # 350 s at a mean load of 0.23, known to a factor of two.
         m[1] = 1.0 / 80.0
         P[1, 1] = m[1] ** 2
+        self._m, self._P = m, P
+        self._factor = 1.0
+        self._settle(v, u)
+
+    def _open(self, v: float, u: float) -> None:
+        """Open the level: a pause, a new time line, or throttle that came or went."""
+        here = float(self._m[0])
+        other = self._opening and not 1.0 / _OTHER_CRAFT < v / here < _OTHER_CRAFT
+        if other or (math.isfinite(u) and not self._loaded):
+            self._begin(v, u)
+            return
+        if math.isfinite(u) is not math.isfinite(self._throttle):
+            self._noise, self._other = self._other, self._noise
+        self._settle(v, u)
+
+    def _settle(self, v: float, u: float) -> None:
+        """Take the level from one voltage, V, and the coefficients."""
+        self._opening, self._bias, self._throttle = False, 0.0, u
+        held = u if math.isfinite(u) else 0.0
+        self._lagged = self._settled = held
+        x = held ** POWER
+        # The slow lag may be anywhere between rest and a steady load.
+        self._lags = [x, x, 0.5 * x]
+        m, P = self._m, self._P
         h = self._regressors()
         m[0] = v - h[2:] @ m[2:]
         # The level follows from the voltage: it shares the errors of the coefficients.
+        P[0] = P[:, 0] = 0.0
         P[0, 2:] = P[2:, 0] = -P[2:, 2:] @ h[2:]
         P[0, 0] = (0.02 * self._volts) ** 2 + h[2:] @ P[2:, 2:] @ h[2:]
-        self._m, self._P = m, P
-        # Noise: 0.4 % of the voltage, and what ripple and changes of throttle usually add.
-        self._b = np.array([math.log((0.004 * self._volts) ** 2), 2.0, 4.0])
-        self._B = np.diag([4.0, 4.0, 9.0])
-        # Of the standard scores: mean square, correlation from one to the next, recent mean.
-        self._scale, self._correlation, self._last, self._bias = 1.0, 0.0, 0.0, 0.0
-        self._pending: list[tuple[FloatArray, float, float, float, float]] = []
-        self._flown = np.zeros(_BINS + 1)
-        self._n = 0
-        self._resize()
 
-    def _resize(self) -> None:
-        """Scale the load: a propeller draws the less the lower the level."""
+    def _resize(self, dt: float) -> None:
+        """Scale the load over dt, s: a propeller draws the less the lower the level."""
         level = min(4.3, max(3.2, float(self._m[0]) / self._cells))
-        self._factor = (level / CELL) ** (_POWER - 1.0)
+        self._factor += ((level / CELL) ** (POWER - 1.0) - self._factor) * (
+            -math.expm1(-dt / _RESIZE))
 
     def _regressors(self) -> FloatArray:
         u, g = self._lagged, -self._factor
-        return np.array([1.0, 0.0, g * u ** _POWER, g * u, g * u ** 3,
+        if math.isnan(self._throttle):
+            # The level is then that under the load of the moment.
+            g = 0.0
+        return np.array([1.0, 0.0, g * u ** POWER, g * u, g * u ** 3,
                          *(g * x for x in self._lags), g * max(u - self._settled, 0.0)])
 
     def _advance(self, dt: float, u: float) -> float:
@@ -238,7 +219,7 @@ class LoadFilter:
         self._lagged = u + (self._lagged - u) * math.exp(-dt / _LAG)
         self._settled = self._lagged + (self._settled - self._lagged) * math.exp(
             -dt / INRUSH_TIME)
-        x = self._lagged ** _POWER
+        x = self._lagged ** POWER
         self._lags = [x + (low - x) * math.exp(-dt / tau) for low, tau in zip(self._lags, LAGS)]
         return float(x)
 
@@ -247,15 +228,20 @@ class LoadFilter:
         place = int((level / self._cells - _LOWEST) * _PER_VOLT + 0.5)
         return self._cells * float(_SLOPE_AT[min(len(_SLOPE_AT) - 1, max(0, place))])
 
-    def _predict(self, t: float, u: float) -> None:
-        dt = t - self._t
-        x = self._advance(dt, u)
+    def _predict(self, t: float) -> None:
+        dt, u = t - self._t, self._throttle
+        self._t = t
         m, P = self._m, self._P
+        if math.isnan(u):
+            P[0, 0] += (_WALK * self._cells) ** 2 * dt
+            return
+        x = self._advance(dt, u)
         used = x * dt * self._fall(float(m[0]))
         m[0] -= used * m[1]
         P[0] -= P[1] * used
         P[:, 0] -= P[:, 1] * used
         # A pack recovers in a gap by more than it walks: up to 2 % in a minute.
+        self._resize(dt)
         P[0, 0] += (_WALK * self._cells) ** 2 * dt + (0.02 * self._volts) ** 2 * min(
             max(0.0, dt - 2.0), 60.0) / 60.0
         P[2:, 2:] += (_WARMING * dt) * np.outer(m[2:], m[2:])
@@ -263,29 +249,23 @@ class LoadFilter:
         self._flown *= 1.0 - min(dt / _FLOWN_MEMORY, 1.0)
         self._flown[int(u * _BINS + 0.5)] += dt
 
-    def _correct(self) -> None:
-        """Take the pending samples as one, weighted by their noise."""
-        pending, self._pending = self._pending, []
-        m, P, b = self._m, self._P, self._b
-        precision = np.array([math.exp(-(b[0] + b[1] * _ripple(u) + b[2] * math.sqrt(du)))
-                              for _, _, u, du, _ in pending])
-        R = 1.0 / float(precision.sum())
-        h = np.asarray((precision * R) @ np.array([one[0] for one in pending]))
-        e = float((precision * R) @ np.array([one[1] for one in pending])) - float(h @ m)
+    def _correct(self, block: Block, du: float) -> None:
+        """Take a block, V, whose throttle differs by du from the last one's."""
+        m, P, noise = self._m, self._P, self._noise
+        u = 0.0 if math.isnan(self._throttle) else self._throttle
+        du = 0.0 if math.isnan(du) else du
+        R = noise.variance(u, du, block.n)
+        h = self._regressors()
+        e = block.voltage - float(h @ m)
         g = P @ h
         s = float(h @ g)
-        scale = max(1.0, self._scale)
+        scale = max(1.0, noise.scale)
         score = e / math.sqrt(s + R * scale)
         # Innovations that follow one another (ADC steps, errors of the form) tell less.
-        total = s + R * scale * (1.0 + self._correlation) / (1.0 - self._correlation)
-        for row, v, u, du, _ in pending:
-            self._learn_noise(v - float(row @ m), float(row @ P @ row), u, du)
-        total *= max(1.0, abs(e) / math.sqrt(total) / _CLIP)
-        clipped = max(-_CLIP, min(_CLIP, score))
-        self._correlation += max(0.002, 1.0 / (self._n + 50.0)) * (
-            clipped * self._last - self._correlation)
-        self._correlation = max(0.0, min(0.9, self._correlation))
-        self._last = clipped
+        total = s + R * scale * (1.0 + noise.correlation) / (1.0 - noise.correlation)
+        total *= max(1.0, abs(e) / math.sqrt(total) / CLIP)
+        noise.learn(e, s, u, du, block.n, block.within)
+        noise.follow(max(-CLIP, min(CLIP, score)))
         # Far out on one side for half a second: another battery, so the level is open again.
         self._bias += 0.1 * (max(-6.0, min(6.0, score)) - self._bias)
         if abs(self._bias) > 3.0:
@@ -293,25 +273,6 @@ class LoadFilter:
             self._bias = 0.0
         m += g * (e / total)
         P -= np.outer(g, g) / total
-        self._resize()
-        self._n += 1
-
-    def _learn_noise(self, e: float, s: float, u: float, du: float) -> None:
-        """Score the log variance (Fisher) by an innovation, V, and the state's variance, V^2."""
-        f = np.array([1.0, _ripple(u), math.sqrt(du)])
-        R = math.exp(float(f @ self._b))
-        square = min(e * e / (s + R), _OUTLIER)
-        # What the state does not know is not noise.
-        share = max(R / (s + R), 0.05)
-        self._B *= 1.0 + 1.0 / _NOISE_MEMORY
-        g = self._B @ f
-        own = float(f @ g)
-        # The square of a standard normal has the variance 2.
-        total = own + 2.0 / share ** 2
-        self._b += g * min((square - 1.0) / share / total, 0.7 / own)
-        self._B -= np.outer(g, g) / total
-        self._B *= min(1.0, 9.0 / float(self._B.diagonal().max()))
-        self._scale += max(0.002, 1.0 / (self._n + 20.0)) * (square - self._scale)
 
     def _between(self, share: float) -> tuple[float, float]:
         """Return the throttles flown, but for that share at each end."""
@@ -324,18 +285,20 @@ class LoadFilter:
         if not math.isfinite(self._t):
             return SupplyLoad()
         a, C = self._m[2:6] * self._factor, self._P[2:6, 2:6] * self._factor ** 2
-        C = C * max(1.0, self._scale)
-        H = _static(_TABLE)
+        C = C * max(1.0, (self._noise if math.isfinite(self._throttle) else self._other).scale)
+        H = static(TABLE)
         sag = np.maximum.accumulate(np.maximum(H @ a, 0.0))
         error = np.sqrt(np.maximum(np.einsum('ij,jk,ik->i', H, C, H), 0.0))
         low, high = self._between(0.1)
-        b = (float(self._b[0]), float(self._b[1]), float(self._b[2]))
         load = SupplyLoad(
             LoadStatus.STILL, float(self._m[0]), flown=(low, high), _sag=tuple(sag.tolist()),
-            _sag_se=tuple(np.maximum(error, _LEAST_ERROR * sag).tolist()), _log_variance=b,
-            _range=self._between(0.02))
+            _sag_se=tuple(np.maximum(error, _LEAST_ERROR * sag).tolist()),
+            _log_variance=self._noise.log_variance, _range=self._between(0.02))
+        if math.isnan(self._throttle):
+            load = replace(load, status=LoadStatus.NO_THROTTLE)
+            return load if self._loaded else replace(load, _sag=(), _sag_se=())
         if high - low >= _MOVED:
-            d = _static(high) - _static(low)
+            d = static(high) - static(low)
             swing, swing_se = float(d @ a), math.sqrt(max(0.0, float(d @ C @ d)))
             limit = max(_SAG_SHARE * swing, _NOISE_SHARE * float(load.noise(0.5 * (low + high))))
             status = LoadStatus.UNCERTAIN
@@ -347,9 +310,15 @@ class LoadFilter:
         return load
 
     def path(self, t: FloatArray, throttle: FloatArray) -> FloatArray:
-        """Return the mean voltage, V, ahead of the last sample, from throttle; changes nothing."""
+        """
+        Return the mean voltage, V, ahead of the last sample, from throttle; changes nothing.
+
+        NaN while throttle is unknown: the level is then one under load.
+        """
         if not math.isfinite(self._t):
             raise ValueError('no voltage has arrived: there is nothing to start from')
+        if math.isnan(self._throttle):
+            return np.full(t.size, NAN)
         kept = self._lagged, self._settled, self._lags
         now, level = self._t, float(self._m[0])
         out = np.empty(t.size)

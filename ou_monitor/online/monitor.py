@@ -16,9 +16,11 @@ import numpy.typing as npt
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.input_health import patience, readings, Stamps, StampWatch
+from ou_monitor.online.load_filter import LoadFilter
 from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
 from ou_monitor.online.risk.outlook import Outlook, ThrottleBudget
 from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.online.supply_load import SupplyLoad
 from ou_monitor.records import Counters, Estimate, Flag, NAN, Status
 
 # Cautions that make the numbers doubtful; the others only inform.
@@ -74,6 +76,8 @@ class MonitorReport:
         Times the estimator was started anew because of an error.
     fault : str
         The last such error, in one line; empty when there was none.
+    load : SupplyLoad
+        Level, sag and noise under load, as far as they are known; needs no relaxation.
 
     """
 
@@ -92,6 +96,7 @@ class MonitorReport:
     thinned: int
     restarts: int
     fault: str
+    load: SupplyLoad = SupplyLoad()
 
     @property
     def brownout(self) -> bool | None:
@@ -169,6 +174,7 @@ class SupplyMonitor:
     def _begin(self) -> None:
         """Begin with nothing known of the supply."""
         self._estimator = SlidingEstimator(self._settings.window)
+        self._load_filter, self._load = LoadFilter(), SupplyLoad()
         self._outlook = Outlook(background=self._background)
         self._outlook.set_model(self._model)
         self._newest = Estimate()
@@ -193,6 +199,11 @@ class SupplyMonitor:
         return self._outlook
 
     @property
+    def load_filter(self) -> LoadFilter:
+        """Return the voltage under load; a parameter never resets it, an error begins anew."""
+        return self._load_filter
+
+    @property
     def model(self) -> SupplyModel | None:
         """Return the terms of the supply in force."""
         return self._model
@@ -204,7 +215,7 @@ class SupplyMonitor:
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
              throttle: npt.ArrayLike | None = None, arrival: npt.ArrayLike | None = None,
-             *, thin: int = 1) -> None:
+             *, current: npt.ArrayLike | None = None, thin: int = 1) -> None:
         """
         Add samples; see `SlidingEstimator.push`.
 
@@ -217,6 +228,8 @@ class SupplyMonitor:
         arrival : array_like, shape (n,), optional
             When each sample arrived, s, on the clock of `now` of `report`.  By it the floor
             judges samples whose stamps are late.
+        current : array_like, shape (n,), or float, optional
+            Current drawn from the supply, A, positive; NaN where unknown.
         thin : int
             Of so many samples one goes to the estimator; the floor judges all.
 
@@ -238,7 +251,10 @@ class SupplyMonitor:
         self._phase = (self._phase + stamps.size) % thin
         self._thinned += stamps.size - stamps[part].size
         load = None if load is None else load[part]
+        drawn = None if current is None else np.broadcast_to(
+            np.asarray(current, dtype=np.float64), stamps.shape)[part]
         try:
+            self._load_filter.push(stamps[part], volts[part], load, drawn)
             self._estimator.push(stamps[part], volts[part], load)
             self._outlook.push(stamps[part], volts[part], load, self._newest)
         except Exception as error:
@@ -292,6 +308,7 @@ class SupplyMonitor:
         self._flag.new_time_line()
         self._stamps.start_anew()
         self._outlook.new_time_line()
+        self._load_filter.new_time_line()
         self._reset_reason = reason
 
     def report(self, age: float | None, now: float | None = None,
@@ -330,6 +347,8 @@ class SupplyMonitor:
             if again or not fresh:
                 self._ahead = (self._outlook.risk(e, self._settings),
                                self._outlook.budget(e, self._settings)) if fresh else (NAN, None)
+            if again:
+                self._load = self._load_filter.load()
             risk, budget = self._ahead
             left_out = () if self._outlook.events is None else self._outlook.events.left_out
         except Exception as error:
@@ -349,7 +368,8 @@ class SupplyMonitor:
         return MonitorReport(
             e, risk, NAN if budget is None else budget.throttle,
             '' if budget is None else budget.reason, left_out, flag, level, summary, silent,
-            limit, stamps, fresh, self._thinned, self._restarts, self._fault)
+            limit, stamps, fresh, self._thinned, self._restarts, self._fault,
+            self._load)
 
     def _estimate(self) -> Estimate:
         """Return the newest estimate; IRREGULAR speaks of the window, not of all that was."""

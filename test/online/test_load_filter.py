@@ -4,7 +4,8 @@ import dataclasses
 
 import numpy as np
 from ou_monitor.model.load import LoadModel
-from ou_monitor.online.load_filter import LAGS, LoadFilter, LoadStatus, SupplyLoad
+from ou_monitor.online.load_filter import LoadFilter
+from ou_monitor.online.supply_load import LAGS, LoadStatus, SupplyLoad
 from ou_monitor.recordings.read import read_recording
 from project import ROOT
 import pytest
@@ -131,13 +132,88 @@ def test_holes_and_late_stamps_are_left_out():
     assert loaded(t, v, gap) == expected
 
 
-def test_a_clock_that_jumps_back_begins_anew():
-    """A new flight knows nothing of the last one."""
+@pytest.mark.parametrize('jump', [-1000.0, 1000.0])
+def test_a_clock_that_jumps_keeps_the_sag_and_opens_the_level(jump):
+    """Another pack, 1 V lower: the sag is known at once, the level within seconds."""
     t, v, u = flight()
     loads = LoadFilter()
-    loads.push(t + 1000.0, v + 3.0, u)
+    loads.push(t, v, u)
+    before = loads.load()
+    n = 300
+    loads.push(t[:n] + jump, v[:n] - 1.0, u[:n])
+    after = loads.load()
+    assert after.known and float(after.sag(0.5)) == pytest.approx(before.sag(0.5), rel=0.2)
+    assert after.level == pytest.approx(4 * 4.0 - 1.0, abs=0.3)
+
+
+def test_a_pack_of_another_size_begins_anew():
+    """After a new time line 6 cells for 4 are another craft."""
+    t, v, u = flight()
+    loads = LoadFilter()
+    loads.push(t + 1000.0, v * 1.7, u)
     loads.push(t, v, u)
     assert loads.load() == loaded(t, v, u)
+
+
+def test_throttle_that_was_never_heard():
+    """Level and noise are known, the sag is not; percent counts as none."""
+    t, v, u = flight()
+    v = 16.0 + 0.05 * np.random.default_rng(1).standard_normal(t.size)
+    for throttle in (None, np.full(t.size, np.nan), 100.0 * u + 3.0):
+        load = loaded(t, v, throttle)
+        assert load.status is LoadStatus.NO_THROTTLE and not load.known
+        assert load.level == pytest.approx(16.0, abs=0.02)
+        assert float(load.noise(0.7)) == pytest.approx(0.05, rel=0.15)
+        assert np.isnan(load.sag(0.5))
+
+
+def test_throttle_lost_in_flight_and_found_again():
+    """What it did is kept; when it is back the sag is known at once."""
+    t, v, u = flight(60.0)
+    gone = (t > 30.0) & (t < 45.0)
+    loads = LoadFilter()
+    loads.push(t[t <= 30.0], v[t <= 30.0], u[t <= 30.0])
+    before = loads.load()
+    loads.push(t[gone], v[gone])
+    lost = loads.load()
+    assert lost.status is LoadStatus.NO_THROTTLE and not lost.known
+    assert np.isnan(loads.path(t[-1:] + 1.0, np.ones(1))).all()
+    np.testing.assert_allclose(lost.sag(0.5), before.sag(0.5), rtol=0.1)
+    loads.push(t[t >= 45.0], v[t >= 45.0], u[t >= 45.0])
+    after = loads.load()
+    assert after.known and float(after.sag(0.5)) == pytest.approx(before.sag(0.5), rel=0.1)
+    assert float(after.noise(0.35)) == pytest.approx(0.05, rel=0.3)
+
+
+def test_a_fast_source_is_averaged():
+    """1 kHz in pieces of any size: the same as at once, the noise is that of one sample."""
+    rng = np.random.default_rng(3)
+    t = np.arange(0.0, 25.0, 0.001)
+    u = throttle_of_a_flight(t, rng)
+    v = TRUE.path(t, u) + 0.05 * rng.standard_normal(t.size)
+    load = loaded(t, v, u)
+    assert load.known and float(load.noise(0.35)) == pytest.approx(0.05, rel=0.3)
+    assert float(load.sag(0.5)) == pytest.approx(0.15 * 15.2 * 0.5 ** 1.8, rel=0.2)
+    loads = LoadFilter()
+    start = 0
+    while start < t.size:
+        piece = slice(start, start + int(rng.integers(1, 60)))
+        loads.push(t[piece], v[piece], u[piece])
+        start = piece.stop
+    other = loads.load()
+    np.testing.assert_allclose(other.sag(0.5), load.sag(0.5), rtol=1e-6)
+
+
+def test_one_sample_a_second():
+    """Each counts at once; as throttle between them is not seen, the sag comes out low."""
+    t, v, u = flight(300.0)
+    t, v, u = t[::50], v[::50], u[::50]
+    loads = LoadFilter()
+    loads.push(t[0], v[0], u[0])
+    assert np.isfinite(loads.load().level)
+    loads.push(t, v, u)
+    load = loads.load()
+    assert load.known and float(load.sag(0.5)) == pytest.approx(0.15 * 15.2 * 0.5 ** 1.8, rel=0.4)
 
 
 def test_another_battery_in_flight():

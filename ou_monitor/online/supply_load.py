@@ -1,0 +1,111 @@
+"""
+What is known of the voltage under load: level, sag, noise, and whether the sag is known.
+
+Limits first: outside the throttles that were flown the sag is a guess; its error does not count
+how the sag changes over a flight, and is at least a tenth of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import enum
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.records import FloatArray, NAN
+
+# Lags, s, of the load: of the motors, and of polarisation (the batch's medians, rounded).
+LAGS = (0.06, 2.0, 15.0)
+# Exponent of the load over throttle, and of the load over the level: the batch's prior.
+POWER = 1.8
+# Throttle at which the sag is tabled.
+TABLE = np.linspace(0.0, 1.0, 101)
+
+_Number = TypeVar('_Number', float, FloatArray)
+
+
+def static(throttle: npt.ArrayLike) -> FloatArray:
+    """Return the regressors of a steady sag without polarisation, shape (n, 4)."""
+    u = np.asarray(throttle, dtype=np.float64)
+    x = u ** POWER
+    return np.stack([x, u, u ** 3, x], axis=-1)
+
+
+def ripple(u: _Number) -> _Number:
+    """Return the ripple of an ESC over throttle: largest, 1, at 0.7."""
+    return u * (1.4 - u) / 0.49
+
+
+class LoadStatus(enum.Enum):
+    """What is known of the answer to throttle; the value is the sentence for the pilot."""
+
+    KNOWN = 'The sag is known over the throttles flown.'
+    NO_DATA = 'No voltage has arrived.'
+    NO_THROTTLE = 'Throttle is not known: the level is that under load, the sag is not known.'
+    STILL = 'Throttle has not moved: the sag is unknown.'
+    UNCERTAIN = 'The sag is still uncertain: fly on.'
+    NO_RELATION = ('The voltage does not fall with throttle: check the topic, the unit and the '
+                   'sign of throttle.')
+
+
+@dataclass(frozen=True)
+class SupplyLoad:
+    """
+    What is known of the voltage under load.
+
+    Attributes
+    ----------
+    status : LoadStatus
+        Whether the sag is known, and why not.
+    level : float
+        Open-circuit voltage, V, or without throttle that under load; NaN without voltage.
+    resistance : float
+        Resistance, Ohm; NaN, as this filter does not use current.
+    time_constants : tuple of float
+        Time constants of the answer, s; fixed.
+    flown : tuple of float
+        Throttles between which 80 % of the last two minutes were flown.
+
+    """
+
+    status: LoadStatus = LoadStatus.NO_DATA
+    level: float = NAN
+    resistance: float = NAN
+    time_constants: tuple[float, ...] = LAGS
+    flown: tuple[float, float] = (0.0, 1.0)
+    _sag: tuple[float, ...] = ()
+    _sag_se: tuple[float, ...] = ()
+    _log_variance: tuple[float, float, float] = (NAN, NAN, NAN)
+    _range: tuple[float, float] = (0.0, 1.0)
+
+    @property
+    def known(self) -> bool:
+        """Return whether the sag is known."""
+        return self.status is LoadStatus.KNOWN
+
+    def sag(self, throttle: npt.ArrayLike) -> FloatArray:
+        """
+        Return the sag, V, positive, of a held throttle before polarisation; NaN: unknown.
+
+        Without `known` a number is a guess: that of the prior, or of before throttle was lost.
+        """
+        return self._read(throttle, self._sag)
+
+    def sag_se(self, throttle: npt.ArrayLike) -> FloatArray:
+        """Return the standard error of the sag, V."""
+        return self._read(throttle, self._sag_se)
+
+    def noise(self, throttle: npt.ArrayLike) -> FloatArray:
+        """Return the deviation of one sample, V; beyond the throttles flown that of the edge."""
+        u = np.clip(np.asarray(throttle, dtype=np.float64), *self._range)
+        if self.status is LoadStatus.NO_THROTTLE:
+            u = 0.0 * np.asarray(throttle, dtype=np.float64)
+        b = self._log_variance
+        return np.asarray(np.exp(0.5 * (b[0] + b[1] * ripple(u))))
+
+    def _read(self, throttle: npt.ArrayLike, table: tuple[float, ...]) -> FloatArray:
+        u = np.asarray(throttle, dtype=np.float64)
+        if not table or self.status is LoadStatus.STILL:
+            return np.full(u.shape, NAN)
+        return np.asarray(np.interp(u, TABLE, table))

@@ -1,0 +1,72 @@
+"""The load inside the monitor: what feeds it, what resets it, what never does."""
+
+import math
+
+import numpy as np
+from ou_monitor.model.load import LoadModel
+from ou_monitor.online.load_filter import LoadFilter
+from ou_monitor.online.monitor import SupplyMonitor
+from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.online.supply_load import LoadStatus
+import pytest
+
+TRUE = LoadModel(4, 0.25, charge=0.85, size=0.15, power=1.8)
+
+
+@pytest.fixture(scope='module')
+def flight():
+    """Return stamps, voltage and throttle of 25 s at 50 Hz."""
+    rng = np.random.default_rng(3)
+    t = np.arange(0.0, 25.0, 0.02)
+    u = np.clip(0.35 + 0.25 * rng.standard_normal(51), 0.0, 1.0)[(2 * t).astype(int)]
+    return t, TRUE.path(t, u) + 0.05 * rng.standard_normal(t.size), u
+
+
+def test_the_report_tells_the_load_where_no_relaxation_is_visible(flight):
+    """White noise and sag at 50 Hz: alpha is unknown, the load is that of the filter alone."""
+    monitor = SupplyMonitor()
+    monitor.push(*flight)
+    report = monitor.report(0.0)
+    alone = LoadFilter()
+    alone.push(*flight)
+    assert not report.estimate.usable and report.load.known
+    assert report.load == alone.load() == monitor.load_filter.load()
+
+
+def test_parameters_never_reset_the_load_and_errors_do(flight):
+    """A shorter window and another limit change nothing; a restart begins anew."""
+    monitor = SupplyMonitor()
+    monitor.push(*flight)
+    before = monitor.report(0.0).load
+    monitor.configure(MonitorSettings(window=0.5, brownout_voltage=13.0))
+    monitor.set_model(None)
+    assert monitor.report(0.0).load == before
+    monitor.restart(RuntimeError('a fault'))
+    assert monitor.report(0.0).load.status is LoadStatus.NO_DATA
+
+
+def test_a_reset_of_time_keeps_the_sag(flight):
+    """The same stamps again, another pack: known with the first seconds."""
+    t, v, u = flight
+    monitor = SupplyMonitor()
+    monitor.push(t, v, u)
+    before = monitor.report(0.0).load
+    monitor.reset('a loop of a bag')
+    monitor.push(t[:200], v[:200] - 1.0, u[:200])
+    after = monitor.report(0.0).load
+    assert after.known and after.level == pytest.approx(before.level - 1.0, abs=0.4)
+    assert float(after.sag(0.5)) == pytest.approx(float(before.sag(0.5)), rel=0.2)
+
+
+def test_without_throttle_the_rest_is_known():
+    """Level and noise; NaN, huge values and current do no harm."""
+    rng = np.random.default_rng(2)
+    t = np.arange(0.0, 10.0, 0.02)
+    v = 5.0 + 0.01 * rng.standard_normal(t.size)
+    v[::50], v[7::50] = math.nan, 1e30
+    monitor = SupplyMonitor()
+    monitor.push(t, v, current=math.nan)
+    load = monitor.report(0.0).load
+    assert load.status is LoadStatus.NO_THROTTLE
+    assert load.level == pytest.approx(5.0, abs=0.01)
+    assert float(load.noise(0.0)) == pytest.approx(0.01, rel=0.2)
