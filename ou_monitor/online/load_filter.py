@@ -79,6 +79,7 @@ def _prior() -> tuple[FloatArray, FloatArray, float]:
 _MEAN, _COV, _SIZE = _prior()
 _STATES = 2 + _MEAN.size
 
+
 class LoadFilter:
     """
     Level, sag and noise of a supply, sample by sample.
@@ -88,7 +89,7 @@ class LoadFilter:
     """
 
     def __init__(self) -> None:
-        self._t, self._throttle = NAN, NAN
+        self._t = self._last = self._throttle = NAN
         self._blocks = LoadBlocks()
         self._newest = -math.inf
         self._opening = False

@@ -15,6 +15,8 @@ from ou_monitor.records import FloatArray
 
 # Standard scores beyond this are weighed down; they score this much, squared, in the noise.
 CLIP, _OUTLIER = 4.0, 16.0
+# A change of throttle below that is none.
+_HELD = 1e-3
 # Corrections after which the noise is forgotten; at first sooner, by a third of all so far, as the
 # coefficients are wrong then.
 _MEMORY, _FIRST, _SHARE = 2000.0, 50.0, 1.0 / 3.0
@@ -78,6 +80,6 @@ class LoadNoise:
         weight = max(0.002, 1.0 / (self._n + 20.0))
         self.scale += weight * (square - self.scale)
         self._size += weight * (n - self._size)
-        if n > 1:
+        if n > 1 and du < _HELD:
             self._within += weight * (within - self._within)
             self._between += weight * (math.exp(float(f @ self.b)) - self._between)
