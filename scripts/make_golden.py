@@ -46,6 +46,8 @@ def golden(name: str) -> Any:
     data = as_data(analyze(read_recording(BAGS / name)))
     # Where it was read from is the reader's to say.
     del data['source']
+    # Told by the load filter, which has tests of its own.
+    del data['headline'], data['overview']
     return thinned(plain(data))
 
 

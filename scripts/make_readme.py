@@ -24,8 +24,8 @@ from browser import Browser, find_browser  # noqa: E402
 README = ROOT / 'README.md'
 PICTURE = ROOT / 'doc' / 'report.png'
 _MARKS = ('<!-- example begins -->\n', '<!-- example ends -->')
-# The first two paragraphs, and the tables with these columns.
-_CHOSEN = ('noise mV', 'sag mV')
+# The first paragraphs, and the tables with these columns.
+_FIRST, _CHOSEN = 3, ('noise mV',)
 # Of the report: voltage and throttle with its load levels, and what lies over throttle.
 _SHOWN = """
     const figures = [...document.querySelectorAll('figure')];
@@ -60,8 +60,8 @@ def run(words: list[str], report: Path) -> str:
 def shortened(printed: str) -> str:
     """Return the chosen paragraphs, with an ellipsis where others were."""
     paragraphs = printed.strip().split('\n\n')
-    kept = [text if k < 2 or any(column in text.split('\n')[0] for column in _CHOSEN) else None
-            for k, text in enumerate(paragraphs)]
+    kept = [text if k < _FIRST or any(column in text.split('\n')[0] for column in _CHOSEN)
+            else None for k, text in enumerate(paragraphs)]
     out: list[str] = []
     for text in kept:
         if text is not None or not out or out[-1] != '[...]':

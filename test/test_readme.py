@@ -218,7 +218,7 @@ def test_log_example_is_true(tmp_path):
     printed = module.run(module.command(README), tmp_path / 'report.html')
     (shown,) = blocks('text', README.split('<!-- example begins -->')[1].split('<!-- ')[0])
     assert shown.strip() == module.shortened(printed)
-    assert '[...]' in shown and 'sag mV' in shown and (tmp_path / 'report.html').stat().st_size
+    assert '[...]' in shown and '\nSag ' in shown and (tmp_path / 'report.html').stat().st_size
 
 
 def test_picture_is_a_picture():

@@ -11,6 +11,7 @@ from ou_monitor.analysis.cause import Cause, judge_cause
 from ou_monitor.analysis.level_comparison import alpha_constancy, AlphaTest
 from ou_monitor.analysis.level_result import fit_level, judge_levels, LevelResult
 from ou_monitor.analysis.levels import find_levels, LoadLevel, without_jitter
+from ou_monitor.analysis.overview import Overview, overview
 from ou_monitor.analysis.quality import (
     coupling_items, line_item, quality_list, QualityItem, second_items, unsettled)
 from ou_monitor.analysis.relaxation import fit_relaxation, Relaxation
@@ -52,6 +53,8 @@ class Analysis:
         Whether the voltage of the risk is the node's default, not one that was asked for.
     notes : tuple of str
         What was dropped or left out, one sentence each.
+    overview : Overview
+        Lowest voltage, dips, sag and noise: what is known of every recording.
 
     """
 
@@ -65,17 +68,7 @@ class Analysis:
     quality: tuple[QualityItem, ...]
     brownout_default: bool
     notes: tuple[str, ...]
-
-    @property
-    def sag_offset(self) -> float:
-        """Sag of the levels at the throttle where the learned curve begins, V."""
-        learned = self.by_throttle
-        known = [level for level in self.levels if math.isfinite(level.sag.sag)]
-        if not known or not learned.known.any():
-            return 0.0
-        return float(np.interp(learned.throttle[int(learned.known.argmax())],
-                               [level.throttle for level in known],
-                               [level.sag.sag for level in known]))
+    overview: Overview
 
 
 def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
@@ -117,7 +110,8 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
                      settling + lines + second_items(
                          [level.throttle for level in judged if level.wanders])
                      + coupling_items([level.throttle for level in judged if level.coupled])),
-        brownout_voltage is None, recording.notes + _left_out(recording, found))
+        brownout_voltage is None, recording.notes + _left_out(recording, found),
+        overview(recording, voltage, judged))
 
 
 def _default_voltage(recording: Recording) -> float:

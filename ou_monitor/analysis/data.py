@@ -9,6 +9,7 @@ from ou_monitor.analysis.analyze import Analysis
 from ou_monitor.analysis.cause import Cause
 from ou_monitor.analysis.level_comparison import LEVEL
 from ou_monitor.analysis.level_result import LevelResult
+from ou_monitor.analysis.overview import Overview
 from ou_monitor.analysis.relaxation import Relaxation
 from ou_monitor.analysis.words import headline
 from ou_monitor.criticism.innovations import FAMILY_WISE
@@ -28,6 +29,7 @@ def as_data(analysis: Analysis) -> dict[str, Any]:
         'rate_hz': (recording.n - 1) / duration if duration > 0.0 else math.nan,
         'source': dict(recording.source),
         'headline': headline(analysis),
+        'overview': _overview(analysis.overview),
         'levels': [_level(level) for level in analysis.levels],
         'process_tests': {'family_wise_error': FAMILY_WISE, 'adjusted': 'Holm',
                           'effects': {name: {'meaning': EFFECT[name], 'least': LEAST[name]}
@@ -52,6 +54,25 @@ def as_data(analysis: Analysis) -> dict[str, Any]:
                      'text': item.text, 'throttles': list(item.throttles)}
                     for item in analysis.quality],
         'notes': list(analysis.notes),
+    }
+
+
+def _overview(found: Overview) -> dict[str, Any]:
+    at, sag, sag_se = found.sag
+    low, high = found.noise
+    line = found.line
+    return {
+        'lowest_v': found.lowest, 'lowest_at_s': found.lowest_at,
+        'lowest_throttle': found.lowest_throttle,
+        'limit_v': found.limit, 'dips': found.dips, 'below_s': found.below,
+        'load_known': found.load.known, 'load_status': found.load.status.name,
+        'level_v': found.load.level, 'highest_throttle': at, 'sag_v': sag, 'sag_se_v': sag_se,
+        'sag_full_v': float(found.load.sag(1.0)), 'sag_full_se_v': float(found.load.sag_se(1.0)),
+        'resistance_ohm': found.load.resistance,
+        'flown_throttle': list(found.flown), 'noise_v': [low, high],
+        'strongest_line': None if line is None else {
+            'frequency_hz': line.frequency, 'rms_v': line.rms, 'share_of_variance': line.share,
+            'level': line.level},
     }
 
 

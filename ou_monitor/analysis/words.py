@@ -9,6 +9,7 @@ import numpy as np
 from ou_monitor.analysis.analyze import Analysis
 from ou_monitor.analysis.level_comparison import sigma_change
 from ou_monitor.analysis.level_result import LevelResult
+from ou_monitor.analysis.overview import headline as answer, known_lines
 from ou_monitor.analysis.quality import QualityItem, Severity
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, NAN, Status
@@ -24,23 +25,30 @@ _BEWARE = {
 
 
 def headline(analysis: Analysis) -> str:
-    """Return what the recording says, one or two sentences."""
-    good = ([level for level in analysis.levels if level.estimate.status is Status.OK]
-            or [level for level in analysis.levels if level.estimate.usable])
-    if not good:
-        return _none_fitted(analysis)
+    """Return what the recording says: what was seen, then sigma and tau where they are known."""
+    good = _fitted(analysis)
     beware = ''.join(f' {words}' for name, words in _BEWARE.items()
                      if any(item.name == name for item in analysis.quality))
-    return _numbers(good) + beware
+    numbers = f' {_numbers(good)}' if good else ''
+    return answer(analysis.overview) + numbers + beware
 
 
-def _none_fitted(analysis: Analysis) -> str:
-    """Say why most of the time cannot be fitted."""
+def _fitted(analysis: Analysis) -> list[LevelResult]:
+    """Return the levels whose sigma and tau may be quoted."""
+    return ([level for level in analysis.levels if level.estimate.status is Status.OK]
+            or [level for level in analysis.levels if level.estimate.usable])
+
+
+def facts(analysis: Analysis) -> list[tuple[str, str]]:
+    """Return what is always known, and why sigma and tau are not, as names and words."""
+    found = known_lines(analysis.overview)
     time: dict[Status, float] = {}
     for level in analysis.levels:
         time[level.estimate.status] = time.get(level.estimate.status, 0.0) + level.time
-    why = max(time, key=lambda status: time[status]).value if time else ''
-    return f'No load level of this recording can be fitted. {why}'.rstrip()
+    if time and not _fitted(analysis):
+        why = max(time, key=lambda status: time[status]).value
+        found.append(('Sigma, tau', f'not given. {why}'))
+    return found
 
 
 def _numbers(good: Sequence[LevelResult]) -> str:

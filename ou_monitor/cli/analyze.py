@@ -10,11 +10,12 @@ from ou_monitor.analysis.analyze import Analysis, analyze
 from ou_monitor.analysis.data import as_data
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.relaxation import Relaxation
-from ou_monitor.analysis.words import brownout_sentence, caution, headline, relaxation_sentence
+from ou_monitor.analysis.words import (
+    brownout_sentence, caution, facts, headline, relaxation_sentence)
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
     check_outputs, part_of_recording, positive_number, read_given, repeated, throttle_levels)
-from ou_monitor.cli.output import item, paragraph, table
+from ou_monitor.cli.output import facts_table, item, paragraph, table
 from ou_monitor.errors import InputError
 from ou_monitor.records import Recording
 from ou_monitor.text import number
@@ -83,7 +84,7 @@ def render(analysis: Analysis) -> str:
     parts = [
         f'{recording.name}: {recording.n} samples in {recording.duration:.4g} s '
         f'({number(rate)} Hz)\n{_origin(recording)}', paragraph(headline(analysis)),
-        _levels(analysis),
+        facts_table(facts(analysis)), _levels(analysis),
         _parameters(analysis), _kinds(analysis), _lines(analysis), _transients(analysis),
         paragraph(analysis.alpha_test.sentence), _by_throttle(analysis), _remarks(analysis)]
     return '\n\n'.join(part for part in parts if part)

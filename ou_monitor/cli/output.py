@@ -160,6 +160,14 @@ def item(text: str) -> str:
     return paragraph(text, '- ')
 
 
+def facts_table(facts: Sequence[tuple[str, str]]) -> str:
+    """Lay out names and what is known of each, the words broken beside the names."""
+    width = max((len(name) for name, _ in facts), default=0) + 2
+    return '\n'.join(fill(words, COLUMNS, initial_indent=name.ljust(width),
+                          subsequent_indent=' ' * width, break_long_words=False,
+                          break_on_hyphens=False) for name, words in facts)
+
+
 def table(headers: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:
     """Lay out an aligned table in plain text."""
     grid = [list(headers), *[list(row) for row in rows]]

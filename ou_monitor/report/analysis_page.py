@@ -8,7 +8,7 @@ import math
 import numpy as np
 from ou_monitor.analysis.analyze import Analysis
 from ou_monitor.analysis.level_result import LevelResult
-from ou_monitor.analysis.words import headline
+from ou_monitor.analysis.words import facts, headline
 from ou_monitor.criticism.curves import outline
 from ou_monitor.report import analysis_sections as parts, page
 from ou_monitor.report.page import rounded, UNKNOWN
@@ -28,16 +28,16 @@ def analysis_page(analysis: Analysis, command: str = '') -> str:
     subtitle = (f'{recording.n} samples in {recording.duration:.4g} s, '
                 f'{rounded(rate)} Hz on average')
     after = parts.transients(analysis)
+    first, *others = _over_time(analysis)
     sections = [
-        page.headline(headline(analysis)),
+        page.headline(headline(analysis)), first, page.facts(typeset_facts(analysis)), *others,
         page.section('Load levels', _levels_table(analysis.levels), _ou_table(analysis.levels)),
         page.section('What to know before using these numbers', parts.quality(analysis)),
-        page.section('Over time', *_over_time(analysis)),
         page.section('Over throttle', *parts.curves(analysis)),
-        *([page.section('After changes of throttle', *after)] if after else []),
-        page.section('Shape', *_shape(analysis), *parts.lines(analysis)),
-        page.section('Type of process', *parts.process(analysis)),
-        page.section('Where it comes from', _origin(analysis, command)),
+        *([page.section('After changes of throttle', *after, folded=True)] if after else []),
+        page.section('Shape', *_shape(analysis), *parts.lines(analysis), folded=True),
+        page.section('Type of process', *parts.process(analysis), folded=True),
+        page.section('Where it comes from', _origin(analysis, command), folded=True),
     ]
     return page.page(f'Supply noise: {recording.name or "recording"}', subtitle, sections)
 
@@ -75,13 +75,23 @@ def _ou_table(levels: Sequence[LevelResult]) -> str:
         'from the mean of each segment.', soft=True)
 
 
+def typeset_facts(analysis: Analysis) -> list[tuple[str, str]]:
+    """Return what is known, set for a page."""
+    return [(name, words.replace('+-', '\u00b1')) for name, words in facts(analysis)]
+
+
 def _over_time(analysis: Analysis) -> list[str]:
+    """Return the plots over time; the voltage, with the limit, is the first."""
     recording, sliding = analysis.recording, analysis.sliding
     start = float(recording.t[0]) if recording.n else 0.0
     t = recording.t - start
     limits = (0.0, max(recording.duration, 1e-9))
     voltage = Plot('Voltage', 'time, s', 'V', height=230).limits(x=limits)
     voltage.line(t, recording.voltage, colour=0)
+    limit = analysis.overview.limit
+    if math.isfinite(limit):
+        ends = np.array(limits)
+        voltage.line(ends, np.full(2, limit), f'limit {limit:g} V', 1, 'dash thick')
     drawn = [page.figure(voltage, _levels_caption(analysis))]
     if recording.has_throttle:
         throttle = Plot('Throttle, and the load levels found in it', 'time, s', '%', height=150)

@@ -48,6 +48,13 @@ th { text-align: right; font-weight: 600; color: var(--soft); vertical-align: bo
 td { text-align: right; padding: 4px 10px 4px 0; border-bottom: 1px solid var(--rule);
   white-space: nowrap; } td.left, th.left { text-align: left; }
 td small { color: var(--soft); }
+details.section { border-top: 1px solid var(--rule); margin: 10px 0; }
+details.section > summary { cursor: pointer; padding: 8px 0 4px; }
+details.section > summary h2 { display: inline; }
+dl.facts { display: grid; grid-template-columns: max-content 1fr; gap: 3px 16px; margin: 10px 0; }
+dl.facts dt { color: var(--soft); } dl.facts dd { margin: 0; }
+@media (max-width: 560px) { dl.facts { grid-template-columns: 1fr; gap: 0; }
+  dl.facts dd { margin: 0 0 6px; } }
 li { margin: 3px 0; } li.warn::marker { color: var(--warn); }
 code { font: 13px/1.5 ui-monospace, Menlo, Consolas, monospace; background: var(--panel);
   padding: 2px 5px; border-radius: 3px; overflow-wrap: anywhere; }
@@ -116,9 +123,19 @@ def headline(text: str) -> str:
     return f'<p class="headline">{escape(text)}</p>'
 
 
-def section(heading: str, *content: str) -> str:
-    """Return a headed section; `content` is HTML."""
-    return f'<section><h2>{escape(heading)}</h2>\n' + '\n'.join(content) + '\n</section>'
+def section(heading: str, *content: str, folded: bool = False) -> str:
+    """Return a headed section; `content` is HTML.  A folded one opens at a click."""
+    inside = '\n'.join(content)
+    if folded:
+        return (f'<details class="section"><summary><h2>{escape(heading)}</h2></summary>\n'
+                f'{inside}\n</details>')
+    return f'<section><h2>{escape(heading)}</h2>\n{inside}\n</section>'
+
+
+def facts(pairs: Sequence[tuple[str, str]]) -> str:
+    """Return names and what is known of each, as a list."""
+    return '<dl class="facts">' + ''.join(
+        f'<dt>{escape(name)}</dt><dd>{escape(words)}</dd>' for name, words in pairs) + '</dl>'
 
 
 def paragraph(text: str, soft: bool = False) -> str:

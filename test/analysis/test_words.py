@@ -5,7 +5,7 @@ import math
 
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.quality import NOISE_UNKNOWN, quality_list
-from ou_monitor.analysis.words import cautions, headline
+from ou_monitor.analysis.words import cautions, facts, headline
 from ou_monitor.records import Flag
 from ou_monitor.text import number
 import pytest
@@ -26,21 +26,22 @@ def test_number(value, digits, text):
 def test_headline_tells_growth_with_its_interval():
     """A doubled sigma grows; an equal one does not change measurably."""
     grown = headline(analyze(recording(1, TRUTH)))
-    assert grown.startswith('Sigma grows from') and '10 % to 40 % throttle' in grown
+    assert ' Sigma grows from' in grown and '10 % to 40 % throttle' in grown
     same = headline(analyze(recording(2, ((0.1, 0.3), (0.4, 0.3)))))
     assert 'does not change measurably' in same
     fallen = headline(analyze(recording(3, ((0.1, 0.6), (0.4, 0.3)))))
-    assert fallen.startswith('Sigma falls from')
+    assert ' Sigma falls from' in fallen
 
 
 def test_headline_of_one_level_and_of_none():
-    """One level is described; without any a sentence says why."""
+    """One level is described; without any the facts say why."""
     simulated = without_throttle(recording(4, ((0.1, 0.3),)))
-    assert headline(analyze(simulated)).startswith('The supply wanders with sigma = 0.')
+    assert ' The supply wanders with sigma = 0.' in headline(analyze(simulated))
     short = recording(5, ((0.1, 0.3),), seconds=0.012)
     analysis = analyze(short)
-    assert headline(analysis) == ('No load level of this recording can be fitted. '
-                                  + analysis.levels[0].estimate.status.value)
+    assert headline(analysis).startswith('The voltage stayed above 4.5 V')
+    assert facts(analysis)[-1] == (
+        'Sigma, tau', f'not given. {analysis.levels[0].estimate.status.value}')
 
 
 def test_headline_warns_of_what_changes_its_own_numbers():
