@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from ou_monitor.online.estimator.estimator import SlidingEstimator
     from ou_monitor.online.filter.lowpass import AdaptiveLowPass
     from ou_monitor.online.monitor import SupplyMonitor
+    from ou_monitor.online.notch.notch import AdaptiveNotch
     from ou_monitor.online.risk.first_passage import brownout_probability
     from ou_monitor.online.settings import MonitorSettings
     from ou_monitor.recordings.read import read_pieces, read_recording
@@ -26,6 +27,7 @@ __version__ = '0.2.0'
 
 _HOMES = {
     'AdaptiveLowPass': 'ou_monitor.online.filter.lowpass',
+    'AdaptiveNotch': 'ou_monitor.online.notch.notch',
     'Estimate': 'ou_monitor.records',
     'Flag': 'ou_monitor.records',
     'InputError': 'ou_monitor.errors',
@@ -41,9 +43,9 @@ _HOMES = {
 }
 
 __all__ = [
-    'AdaptiveLowPass', 'Estimate', 'Flag', 'InputError', 'MonitorSettings', 'Recording',
-    'SlidingEstimator', 'Status', 'SupplyMonitor', '__version__', 'brownout_probability',
-    'discover', 'read_pieces', 'read_recording',
+    'AdaptiveLowPass', 'AdaptiveNotch', 'Estimate', 'Flag', 'InputError', 'MonitorSettings',
+    'Recording', 'SlidingEstimator', 'Status', 'SupplyMonitor', '__version__',
+    'brownout_probability', 'discover', 'read_pieces', 'read_recording',
 ]
 
 

@@ -207,7 +207,7 @@ class MonitorSettings:
 
     def __post_init__(self) -> None:
         """Refuse values out of range and contradictions."""
-        _check(ESTIMATOR_PARAMETERS, self)
+        check_values(ESTIMATOR_PARAMETERS, self)
         if not self.brownout_warn < self.brownout_critical:
             raise ValueError(
                 f'brownout.warn ({self.brownout_warn}) must be less than brownout.critical '
@@ -276,7 +276,7 @@ class FilterSettings:
 
     def __post_init__(self) -> None:
         """Refuse values out of range and contradictions."""
-        _check(FILTER_PARAMETERS, self)
+        check_values(FILTER_PARAMETERS, self)
         self._check_limits()
         self._check_law()
 
@@ -386,9 +386,10 @@ def _is_number(value: object) -> bool:
         return False
 
 
-def _check(table: tuple[Parameter, ...], settings: object) -> None:
+def check_values(table: tuple[Parameter, ...], settings: object, prefix: str = '') -> None:
+    """Raise `ValueError` for a field that its parameter does not allow."""
     for parameter in table:
-        value = getattr(settings, parameter.name.replace('.', '_'))
+        value = getattr(settings, parameter.name.removeprefix(prefix).replace('.', '_'))
         if parameter.choices:
             if value not in parameter.choices:
                 raise ValueError(

@@ -1,0 +1,1 @@
+"""Notches that follow the motors, and whether they pay."""

@@ -1,0 +1,225 @@
+"""Notches that follow the motors: what they follow, when they are off, and bad input."""
+
+import math
+
+import numpy as np
+from ou_monitor import AdaptiveNotch
+from ou_monitor.online.notch.biquads import phase_lag
+import pytest
+
+RATE = 1000.0
+A, B = -40.0, 420.0
+
+
+def flight(seconds=6.0, line=30.0, seed=0, rate=RATE):
+    """Throttle that moves, a line that follows it as motors do, white noise, a manoeuvre."""
+    rng = np.random.default_rng(seed)
+    n = int(seconds * rate)
+    t = np.arange(n) / rate
+    throttle = 0.45 + 0.2 * np.sin(2 * np.pi * 0.4 * t) + 0.1 * np.sin(2 * np.pi * 0.93 * t)
+    root = np.sqrt(throttle)
+    for k in range(1, n):
+        root[k] = root[k - 1] + (root[k] - root[k - 1]) * -math.expm1(-1 / (0.03 * rate))
+    f = A + B * root
+    x = 100.0 * np.sin(2 * np.pi * 1.5 * t) + rng.standard_normal(n)
+    return t, x + line * np.sin(2 * np.pi * np.cumsum(f) / rate), throttle, f
+
+
+def high(x):
+    """Rms of the second differences: what is fast."""
+    return math.sqrt(np.mean(np.diff(x, 2)**2))
+
+
+def test_learns_the_law_and_takes_the_line_away():
+    """The law is found within the width of the notch, and what is left is near the noise."""
+    t, x, throttle, f = flight()
+    notch = AdaptiveNotch()
+    y = notch.filter(t, x, throttle)
+    late = t > 3.0
+    a, b = notch.law
+    assert np.max(np.abs(a + b * np.sqrt(throttle) - (A + B * np.sqrt(throttle)))) < 12.0
+    assert notch.active and notch.source == 'throttle'
+    assert notch.frequencies == pytest.approx(f[-1], abs=12.0)
+    clean = flight(line=0.0)[1]
+    # 4 to 5 % off in frequency a notch of width 0.3 or more leaves a quarter of the line at most.
+    assert high(y[late]) < high(clean[late]) + 0.25 * (high(x[late]) - high(clean[late]))
+
+
+def test_follows_the_rpm():
+    """With the speed of each motor there is a notch on each, at once where it is."""
+    t, x, throttle, f = flight()
+    two = x + 30.0 * np.sin(2 * np.pi * np.cumsum(1.12 * f) / RATE)
+    rpm = 60.0 * np.column_stack((f, 1.12 * f))
+    notch = AdaptiveNotch()
+    y = notch.filter(t, two, throttle, rpm)
+    assert notch.source == 'rpm'
+    assert notch.frequencies == pytest.approx([f[-1], 1.12 * f[-1]], rel=0.01)
+    late = t > 3.0
+    assert high(y[late]) < 1.5 * high(flight(line=0.0)[1][late])
+
+
+def test_erpm_needs_the_poles():
+    """With poles eRPM is what rpm is; without, one line says what is missing."""
+    t, x, _, f = flight(3.0)
+    notch = AdaptiveNotch(rpm_unit='erpm', poles=14)
+    notch.filter(t, x, rpm=60.0 * 7.0 * f)
+    assert notch.frequencies == pytest.approx(f[-1], rel=0.01)
+    with pytest.raises(ValueError, match=r"notch.rpm_unit 'erpm' needs notch.poles.*got 0"):
+        AdaptiveNotch(rpm_unit='erpm')
+    with pytest.raises(ValueError, match='even number of magnets.*got 7'):
+        notch.configure(poles=7)
+    assert notch.settings.poles == 14
+
+
+def test_off_where_it_does_not_pay():
+    """In white noise a notch takes less than it costs: the output is the input, bit for bit."""
+    t, x, throttle, _ = flight(12.0, line=0.0)
+    notch = AdaptiveNotch()
+    assert np.array_equal(notch.filter(t, x, throttle), x)
+    assert not notch.active and notch.delay == 0.0 and notch.frequencies.size == 0
+
+
+def test_gives_up_a_line_that_ends_and_fades():
+    """On and off come within seconds, and in between no sample steps."""
+    t, x, throttle, _ = flight(26.0)
+    x = np.where(t < 6.0, x, flight(26.0, line=0.0)[1])
+    notch = AdaptiveNotch()
+    y = notch.filter(t[t < 6.0], x[t < 6.0], throttle[t < 6.0])
+    assert notch.active
+    rest = notch.filter(t[t >= 6.0], x[t >= 6.0], throttle[t >= 6.0])
+    assert not notch.active
+    taken = x - np.concatenate((y, rest))
+    # What is taken away is at most a line of 30 at 330 Hz and noise of 1; a step would stand out
+    # of its slope, which is 2 sin(pi 0.33) 30 = 52.
+    assert np.max(np.abs(np.diff(taken))) < 60.0
+
+
+def test_causal_and_carried_over():
+    """In pieces it is what it is in one; what comes later changes nothing of what was."""
+    t, x, throttle, f = flight(4.0)
+    rpm = 60.0 * f
+    whole = AdaptiveNotch().filter(t, x, throttle, rpm)
+    notch = AdaptiveNotch()
+    edges = [0, 1, 700, 701, 2500, 4000]
+    pieces = [notch.filter(t[a:b], x[a:b], throttle[a:b], rpm[a:b])
+              for a, b in zip(edges, edges[1:])]
+    assert np.array_equal(np.concatenate(pieces), whole)
+    one = AdaptiveNotch()
+    assert [one.filter(*map(float, row)) for row in zip(
+        t[:50], x[:50], throttle[:50], rpm[:50])] == whole[:50].tolist()
+
+
+def test_channels_are_judged_apart():
+    """A quiet axis beside a loud one stays as it is, and may change its mind alone."""
+    t, x, throttle, _ = flight()
+    quiet = flight(line=0.0, seed=1)[1]
+    both = np.column_stack((x, quiet))
+    y = AdaptiveNotch().filter(t, both, throttle)
+    assert y.shape == both.shape
+    assert np.array_equal(y[:, 1], quiet) and high(y[t > 3.0, 0]) < 0.4 * high(x[t > 3.0])
+
+
+def test_rpm_that_stops():
+    """Motor speeds that stop give way to throttle, throttle that stops to nothing."""
+    t, x, throttle, f = flight(8.0)
+    rpm = np.where(t < 4.0, 60.0 * f, np.nan)
+    throttle = np.where(t < 6.0, throttle, np.nan)
+    notch = AdaptiveNotch()
+    sources = [(notch.filter(t[k:k + 500], x[k:k + 500], throttle[k:k + 500], rpm[k:k + 500]),
+                notch.source)[1] for k in range(0, 8000, 500)]
+    assert sources[6:8] == ['rpm', 'rpm'] and sources[9:12] == ['throttle'] * 3
+    assert sources[14:] == ['none', 'none'] and not notch.active
+
+
+def test_rpm_that_freezes():
+    """A speed that changed and now stands still to the last digit is gone; a constant is not."""
+    t, x, throttle, f = flight(8.0)
+    rpm = 60.0 * f
+    rpm[4000:] = rpm[4000]
+    notch = AdaptiveNotch()
+    notch.filter(t, x, throttle, rpm)
+    assert notch.source == 'throttle'
+    steady = AdaptiveNotch()
+    noise = np.random.default_rng(0).standard_normal(t.size)
+    tone = np.sin(2 * np.pi * 200.0 * t) + 0.01 * noise
+    steady.filter(t, tone, rpm=12000.0)
+    assert steady.frequencies == pytest.approx(200.0)
+
+
+def test_delay_is_what_the_output_shows():
+    """A slow tone comes out as much later as the delay says."""
+    t, x, throttle, f = flight(8.0)
+    rpm = np.full(t.size, 60.0 * 250.0)
+    slow = 1e3 * np.sin(2 * np.pi * 10.0 * t)
+    tone = 1e3 * np.sin(2 * np.pi * 250.0 * t)
+    notch = AdaptiveNotch()
+    y = notch.filter(t, slow + tone, rpm=rpm)
+    late = slice(7000, 8000)
+    turned = np.mean(y[late] * np.exp(-2j * np.pi * 10.0 * t[late])) / np.mean(
+        slow[late] * np.exp(-2j * np.pi * 10.0 * t[late]))
+    assert notch.active
+    # What the fade of half a second ago left is below 1e-6.
+    assert notch.delay == pytest.approx(-np.angle(turned) / (2 * np.pi * 10.0), rel=1e-3)
+    assert notch.delay == pytest.approx(
+        max(phase_lag(bank, 0.01) for bank in notch._banks) / (2 * np.pi * 10.0))
+
+
+def test_what_is_above_half_the_sample_rate():
+    """A motor that is too fast for the samples has no notch; the others keep theirs."""
+    t, x, throttle, f = flight(4.0)
+    rpm = 60.0 * np.column_stack((f, np.full(t.size, 700.0)))
+    notch = AdaptiveNotch()
+    notch.filter(t, x, throttle, rpm)
+    assert notch.source == 'rpm'
+    assert np.allclose(notch.frequencies, f[-1], rtol=0.01)
+
+
+def test_bad_samples():
+    """NaN, repeats, steps back and gaps are counted; the output stays near the input."""
+    t, x, throttle, f = flight(4.0)
+    t, x = t.copy(), x.copy()
+    x[1500], x[1600], t[1700], t[1800] = np.nan, np.inf, t[1699], t[1790]
+    t[2500:] += 3.0
+    throttle[3000:3010] = np.nan
+    notch = AdaptiveNotch()
+    y = notch.filter(t, x, throttle)
+    assert (notch.counters.non_finite, notch.counters.repeated) == (2, 1)
+    # After the step back the stamps go on 11 ms later: one gap more than that of 3 s.
+    assert (notch.counters.back, notch.counters.gaps) == (1, 2)
+    assert np.all(np.isfinite(y)) and np.max(np.abs(y)) < 160.0
+    assert notch.active
+
+
+def test_a_new_rate_begins_anew():
+    """After a jump of the rate it learns again, at the frequency in Hz that it has then."""
+    t, x, throttle, f = flight(4.0)
+    t2, x2, throttle2, f2 = flight(6.0, rate=2000.0)
+    notch = AdaptiveNotch()
+    notch.filter(t, x, throttle)
+    notch.filter(t[-1] + 1e-3 + t2, x2, throttle2)
+    assert notch.rate == pytest.approx(2000.0, rel=1e-6)
+    assert notch.frequencies == pytest.approx(f2[-1], abs=12.0)
+
+
+@pytest.mark.parametrize('options, words', [
+    ({'count': 0}, 'count must be 1 to 4'), ({'count': 5}, 'within 0..4'),
+    ({'fmin': math.nan}, 'finite number'), ({'fmn': 60.0}, "unknown notch option 'fmn'"),
+    ({'rpm_unit': 'rps'}, "unknown 'rps'")])
+def test_options_are_checked(options, words):
+    """What cannot be used is refused in one line."""
+    with pytest.raises(ValueError, match=words):
+        AdaptiveNotch(**options)
+
+
+def test_shapes_are_checked():
+    """Shapes that do not fit are refused, and so is another number of channels."""
+    notch = AdaptiveNotch()
+    with pytest.raises(ValueError, match='t must be'):
+        notch.filter([0.0, 1.0], [0.0])
+    with pytest.raises(ValueError, match='throttle must be'):
+        notch.filter([0.0, 1.0], [0.0, 1.0], [0.5])
+    with pytest.raises(ValueError, match='rpm must be'):
+        notch.filter([0.0, 1.0], [0.0, 1.0], rpm=[[1.0]])
+    notch.filter(0.0, [1.0, 2.0])
+    with pytest.raises(ValueError, match='channels changed from 2 to 1'):
+        notch.filter(1.0, 1.0)
