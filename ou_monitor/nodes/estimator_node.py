@@ -350,7 +350,7 @@ class EstimatorNode(MonitorNode):
             topic = self.resolve_topic_name(self._sources['voltage'].topic)
             summary = f'Waiting for a publisher on {topic}.'
         elif silent and within(self._arrived.age, limit) and not within(
-                self._usable.age, report.patience):
+                self._usable.age, max(report.patience, self._arrived.age or 0.0)):
             summary = self._useless()
         elif silent and not self.count_publishers(self._topic('voltage')):
             summary = f"No publisher on {self._topic('voltage')}: {report.summary}"

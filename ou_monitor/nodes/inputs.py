@@ -35,8 +35,12 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 # deep enough for 0.2 s at 10 kHz while the estimator fits.
 INPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
-# Messages taken at a time: all that can wait.
-MOST_TAKEN = 2000
+# Of blocks so many, or 2000 of 10 000 samples would wait in 80 MB.
+BLOCK_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200,
+                       reliability=ReliabilityPolicy.BEST_EFFORT)
+# Messages taken at a time: all that can wait, but no more than so many bytes of them, which take
+# some 50 ms and 50 MB until they are estimated from.
+MOST_TAKEN, MOST_BYTES = 2000, 2_000_000
 # No message waits longer in the middleware, s: it keeps 2000.
 MOST_WAIT = 60.0
 CLOCK_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -183,7 +187,8 @@ class PolledInput:
     def __init__(self, node: MonitorNode, kind: Any, topic: str, spec: FieldSpec) -> None:
         self._node = node
         self._topic = node.resolve_topic_name(topic)
-        self._input = node.create_polled(kind, topic, INPUT_QOS)
+        self._input = node.create_polled(
+            kind, topic, INPUT_QOS if spec.sample_rate is None else BLOCK_QOS)
         self._reader = FieldReader(spec, definition_of(kind), lambda: self._decode, self._broken)
         self._kind = kind
         self.publishers = Publishers()
@@ -204,12 +209,14 @@ class PolledInput:
         """Return what waits, of the publisher followed; None when nothing does."""
         taken: list[tuple[bytes, dict[str, Any]]] = []
         handle = self._input.handle
+        left = MOST_BYTES
         with handle:
-            while len(taken) < most:
+            while len(taken) < most and left > 0:
                 found = handle.take_message(self._input.msg_type, True)
                 if found is None:
                     break
                 taken.append(found)
+                left -= len(found[0])
         if not taken:
             return None
         infos = [info for _, info in taken]
