@@ -33,7 +33,8 @@ _BUILT_IN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 
 LOCK = Parameter(
     'lock_parameters', False,
-    'Whether parameters that can disarm the node (all but publish_rate) are refused at run time.')
+    'Whether all that can disarm the node is refused at run time: every parameter but '
+    'publish_rate, and ~/clear_brownout.')
 # How long an error of a callback is told in the diagnostics, s.
 TELL = 10.0
 PUBLISH_RATE = Parameter('publish_rate', 10.0, 'How often the outputs are published, Hz.',
@@ -79,7 +80,7 @@ class MonitorNode(Node):
             self.check(self.values())
         except ValueError as error:
             raise InputError(str(error)) from error
-        self._locked = bool(self.get_parameter(LOCK.name).value)
+        self.locked = bool(self.get_parameter(LOCK.name).value)
         self.add_pre_set_parameters_callback(self._widen)
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self.guarded(self._after_set))
@@ -199,7 +200,7 @@ class MonitorNode(Node):
 
     def _on_set(self, parameters: list[RosParameter]) -> SetParametersResult:
         changed = {p.name: p.value for p in parameters if p.name in self._table}
-        if self._locked and (set(changed) - {PUBLISH_RATE.name}
+        if self.locked and (set(changed) - {PUBLISH_RATE.name}
                              or any(p.name == 'use_sim_time' for p in parameters)):
             return SetParametersResult(
                 successful=False, reason='lock_parameters is set: of the parameters only '

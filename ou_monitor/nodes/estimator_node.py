@@ -9,9 +9,9 @@ only while it is known, so that it is never silently false), `~/state`
 (DiagnosticArray, every field of one estimate, stamped with the estimate's
 newest sample), and `/diagnostics` at 1 Hz.  Messages wait in the middleware, which keeps the
 newest 2000, and are fetched 50 times a second and before each report, so that no flood of them
-delays an output.  Service `~/clear_brownout`
-(std_srvs/Trigger): drops a flag that is latched or held.  Hold, delay and
-latch count real time, under `use_sim_time` too.
+delays an output.  Service `~/clear_brownout` (std_srvs/Trigger): drops a flag that is
+latched or held, unless `lock_parameters` is set.  Hold, delay and latch count real time, under
+`use_sim_time` too.
 
 Limits: one voltage; an estimate older than `stale_after` is not published as
 a number, though `~/state` still shows its fields.
@@ -28,17 +28,18 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.nodes.base import diagnostic, MonitorNode, PUBLISH_RATE
+from ou_monitor.nodes.base import diagnostic, LOCK, MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.clocks import SendClock
 from ou_monitor.nodes.inputs import Arrivals, PolledInput, Silence, Stamper, types_on
 from ou_monitor.nodes.latch_file import LatchFile
 from ou_monitor.nodes.model_choice import ModelChoice, PATIENCE
+from ou_monitor.nodes.publisher_watch import PublisherWatch
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
 from ou_monitor.online.monitor import Level, MonitorReport, SupplyMonitor
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.settings import ESTIMATOR_PARAMETERS, monitor_settings, Parameter
 from ou_monitor.records import FloatArray
-from ou_monitor.stream.arrival import Publishers, SourceClock
+from ou_monitor.stream.arrival import SourceClock
 from ou_monitor.stream.samples import SampleStream
 from rclpy.logging import get_logging_directory
 from std_msgs.msg import Bool, Float64
@@ -82,9 +83,8 @@ class EstimatorNode(MonitorNode):
         self._arrived = Silence(self.steady_now)
         self._usable = Silence(self.steady_now)
         self._source_clock = SourceClock()
-        self._names: tuple[str, ...] = ()
-        self._lost = self._lost_of_late = self._settled = 0
-        self._looked = -math.inf
+        self._watched = PublisherWatch()
+        self._settled = 0
         # When the next estimate is due, and the load of pushing samples as a share of the time.
         self._due = -math.inf
         self._load, self._loaded = 0.0, self.steady_now()
@@ -313,6 +313,11 @@ class EstimatorNode(MonitorNode):
         self._stream.reset(reason)
 
     def _clear(self, request: Any, response: Any) -> Any:
+        if self.locked:
+            response.success, response.message = False, (
+                f'{LOCK.name} is set: the flag is cleared only by starting the node anew without '
+                'it' + (', and without the file of state_file.' if self._latch else '.'))
+            return response
         done = self._monitor.clear_brownout()
         response.success, response.message = bool(done), done or (
             'Nothing to clear: the brown-out flag is not CRITICAL.')
@@ -367,32 +372,18 @@ class EstimatorNode(MonitorNode):
         if self._stream.thin > 1:
             notes.append(f'Overload: one of {self._stream.thin} samples is estimated from; the '
                          'floor judges all.')
-        if self._lost_of_late:
-            notes.append(f'{self._lost_of_late} messages were lost within the last second.')
         if self.faulty:
             notes.append(f'A callback failed ({self.faults} times so far): {self.fault}.')
-        if len(self._names) > 1:
-            followed = ('the first is followed, the others are left out'
-                        if self._inputs['voltage'].publishers.numbered else
-                        'the middleware does not number messages, so they are mixed')
-            notes.append(f"{len(self._names)} publishers on {self._topic('voltage')} "
-                         f"({', '.join(self._names)}): {followed}.")
+        if 'voltage' in self._opened:
+            notes += self._watched.notes(self._topic('voltage'))
         return notes
 
     def _look_at_publishers(self) -> None:
-        """Note who publishes the voltage, and what was lost within the last second."""
+        """Note who publishes the voltage, and what was lost."""
         voltage = self._inputs.get('voltage')
-        if voltage is None:
-            return
-        ends = self.get_publishers_info_by_topic(self._topic('voltage'))
-        self._names = tuple(
-            f'{end.node_namespace.rstrip("/")}/{end.node_name} '
-            f'[{bytes(end.endpoint_gid).hex()[-8:]}]' for end in ends)
-        now = self.steady_now()
-        if now - self._looked >= 1.0:
-            self._lost_of_late, self._lost = voltage.publishers.lost - self._lost, (
-                voltage.publishers.lost)
-            self._looked = now
+        if voltage is not None:
+            self._watched.look(self.get_publishers_info_by_topic(self._topic('voltage')),
+                                  voltage.publishers, self.steady_now())
 
     def _monitor_model(self) -> None:
         """Bring a model file into force that has been read meanwhile."""
@@ -413,7 +404,10 @@ class EstimatorNode(MonitorNode):
         return self.resolve_topic_name(self._opened[quantity].topic)
 
     def _report_all(self) -> None:
-        report, level, summary = self._report()
+        self._publish(*self._report())
+
+    def _publish(self, report: MonitorReport, level: Level, summary: str) -> None:
+        """Publish a report on every topic but the diagnostics."""
         values = {'alpha': report.estimate.alpha, 'sigma': report.estimate.sigma,
                   'var_inf': report.estimate.var_inf, 'brownout_risk': report.risk,
                   'throttle_budget': report.budget}
@@ -425,15 +419,16 @@ class EstimatorNode(MonitorNode):
         self._state.publish(self._message('state', report, level, summary, report.estimate.t))
 
     def _diagnose(self) -> None:
-        self._diagnostics.publish(
-            self._message('supply', *self._report(), self.stamp_now()))
+        found = self._report()
+        if found[0].flag.low:
+            # A dip is told in one report; without a hold the next one knows nothing of it.
+            self._publish(*found)
+        self._diagnostics.publish(self._message('supply', *found, self.stamp_now()))
 
     def _message(self, part: str, report: MonitorReport, level: Level, summary: str,
                  stamp: float) -> DiagnosticArray:
         throttle_age = self._throttle_heard.age
         arrived = self._arrived.age
-        voltage = self._inputs.get('voltage')
-        publishers = Publishers() if voltage is None else voltage.publishers
         source = self._opened.get('voltage', self._sources['voltage'])
         fields = {**report.fields,
                   'msg_config': source.config,
@@ -444,10 +439,7 @@ class EstimatorNode(MonitorNode):
                   'model_terms': self._models.terms,
                   'clock': self._source_clock.name,
                   'arrival_age': repr(math.inf if arrived is None else arrived),
-                  'messages_lost': str(publishers.lost),
-                  'messages_lost_by': 'sequence numbers' if publishers.numbered else 'not known',
-                  'foreign_messages': str(publishers.foreign),
-                  'publishers': ', '.join(self._names),
+                  **self._watched.fields(),
                   'callback_errors': str(self.faults)}
         return diagnostic(f'{self.get_fully_qualified_name()[1:]}: {part}', level, summary,
                           fields, stamp, hardware_id=self.resolve_topic_name(source.topic))

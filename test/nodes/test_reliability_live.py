@@ -2,9 +2,6 @@
 
 import json
 import os
-from pathlib import Path
-import re
-import signal
 import subprocess
 import sys
 import threading
@@ -12,7 +9,7 @@ import time
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from live import ou_path, values_of, wait_until
+from live import memory_of, ou_path, ROOT, Starved, values_of, wait_until
 import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
@@ -21,30 +18,7 @@ from std_msgs.msg import Bool, Float64
 from std_srvs.srv import Trigger
 
 ERROR, STALE = b'\x02', b'\x03'
-# A process of its own that sends Float64 at a rate, Hz, in bursts each ms, with a dip each 2 s.
-FLOOD = """
-import sys, time
-import rclpy
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from std_msgs.msg import Float64
-rate, dip = float(sys.argv[1]), float(sys.argv[2])
-rclpy.init()
-node = rclpy.create_node('flood')
-output = node.create_publisher(Float64, '/load/voltage', QoSProfile(
-    depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT))
-while not output.get_subscription_count():
-    time.sleep(0.01)
-start, sent = time.monotonic(), 0
-good, low = [Float64(data=5.0 + 0.01 * (k * 7919 % 13 - 6)) for k in range(13)], Float64(data=3.0)
-while True:
-    now = time.monotonic() - start
-    due = int(now * rate)
-    sent = max(sent, due - 2000)
-    while sent < due:
-        output.publish(low if 1.0 <= sent / rate % 2.0 < 1.0 + dip else good[sent % 13])
-        sent += 1
-    time.sleep(0.001)
-"""
+FLOOD = ROOT / 'test/support/flood.py'
 
 
 class Rig:
@@ -185,6 +159,24 @@ def test_locked_parameters(world):
         assert not result.successful and 'lock_parameters' in result.reason
     assert not rig.probe.set_parameter(rig.node, 'lock_parameters', False).successful
     assert rig.probe.set_parameter(rig.node, 'publish_rate', 20.0).successful
+    rig.live([4.0] * 200)
+    wait_until(lambda: rig.field('brownout_level') == 'CRITICAL', what='the flag')
+    answer = rig.probe.call(Trigger, f'{rig.node}/clear_brownout', Trigger.Request())
+    assert not answer.success and 'lock_parameters' in answer.message
+
+
+def test_a_dip_that_the_diagnostics_find_is_told_by_all(rig):
+    """Without a hold the flag falls at once; only the diagnostics report within this time."""
+    assert rig.probe.set_parameter(rig.node, 'publish_rate', 0.01).successful
+    try:
+        rig.live(ou_path(250, 0.002, seed=5))
+        flags, states = len(rig.flags), len(rig.states)
+        rig.live([3.0] * 25)
+        wait_until(lambda: any(flag.data for flag in rig.flags[flags:]), what='the flag')
+        wait_until(lambda: len(rig.states) > states, what='the state')
+        assert 'brownout.floor (' in rig.field('brownout_reason')
+    finally:
+        assert rig.probe.set_parameter(rig.node, 'publish_rate', 10.0).successful
 
 
 def test_the_latch_survives_a_restart(world, tmp_path):
@@ -218,24 +210,12 @@ def test_overload_mutes_nothing(world, rate):
     """
     rig = Rig(world, 'load', '-p', 'brownout.hold:=1.0', kind=Float64)
     pid = rig.process.popen.pid
-    stop = threading.Event()
-    pauses = []
-
-    def starve():
-        while not stop.is_set():
-            begin = time.monotonic()
-            os.kill(pid, signal.SIGSTOP)
-            time.sleep(0.02)
-            os.kill(pid, signal.SIGCONT)
-            time.sleep(0.01)
-            pauses.append(time.monotonic() - begin)
-
+    starved = Starved(pid)
     env = {**os.environ, 'ROS_DOMAIN_ID': str(world.domain)}
-    flood = subprocess.Popen([sys.executable, '-c', FLOOD, str(rate), '0.05'], env=env)
-    starver = threading.Thread(target=starve)
+    flood = subprocess.Popen([sys.executable, FLOOD, str(rate), '0.05'], env=env)
     try:
         wait_until(lambda: int(rig.field('messages')) > 1000, what='messages')
-        starver.start()
+        starved.start()
         seen = len(rig.flags)
         begin, first = time.monotonic(), len(rig.times)
 
@@ -251,18 +231,13 @@ def test_overload_mutes_nothing(world, rate):
         wait_until(lambda: time.monotonic() - begin > 6.0)
         times = rig.times[first:]
         silence = max(b - a for a, b in zip(times, times[1:]))
-        assert silence < 2.0 + 10.0 * max(pauses), silence
+        assert silence < 2.0 + 10.0 * starved.longest, silence
         taken, lost = int(rig.field('messages')), int(rig.field('messages_lost'))
         assert taken > 1000 and lost >= 0 and rig.field('messages_lost_by') == 'sequence numbers'
-        rss = 1024 * int(re.search(r'VmRSS:\s+(\d+)', Path(
-            f'/proc/{pid}/status').read_text())[1])
+        rss = memory_of(pid)
         assert rss < 500e6
     finally:
-        stop.set()
-        if starver.is_alive():
-            starver.join()
-        if rig.process.popen.poll() is None:
-            os.kill(pid, signal.SIGCONT)
+        starved.stop()
         ended = time.monotonic()
         status = rig.process.stop()
         took = time.monotonic() - ended
@@ -270,4 +245,4 @@ def test_overload_mutes_nothing(world, rate):
         flood.wait()
     print(f'{rate:g} Hz: silence {silence:.2f} s, {taken} taken, {lost} lost, '
           f'{rss / 1e6:.0f} MB, end {took:.2f} s')
-    assert status == 0 and took < 10.0 + 10.0 * max(pauses)
+    assert status == 0 and took < 10.0 + 10.0 * starved.longest

@@ -92,6 +92,58 @@ class Process:
             self.popen.wait()
 
 
+class Starved:
+    """
+    A process that has the CPU in slices only: stopped and continued in turn, s.
+
+    Attributes
+    ----------
+    stops : list of tuple of float
+        When it was stopped, and when it went on, by the monotonic clock, s.
+
+    """
+
+    def __init__(self, pid: int, stopped: float = 0.02, running: float = 0.01) -> None:
+        self._pid, self._stopped, self._running = pid, stopped, running
+        self._end = threading.Event()
+        self.stops: list[tuple[float, float]] = []
+        self._thread = threading.Thread(target=self._slice, daemon=True)
+
+    def _slice(self) -> None:
+        while not self._end.is_set():
+            begin = time.monotonic()
+            try:
+                os.kill(self._pid, signal.SIGSTOP)
+                time.sleep(self._stopped)
+                os.kill(self._pid, signal.SIGCONT)
+            except ProcessLookupError:
+                return
+            self.stops.append((begin, time.monotonic()))
+            time.sleep(self._running)
+
+    def start(self) -> Starved:
+        """Begin."""
+        self._thread.start()
+        return self
+
+    def stop(self) -> None:
+        """Let it go on."""
+        self._end.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    @property
+    def longest(self) -> float:
+        """Return the longest stop, s: as asked, and what this machine itself pauses."""
+        return max(end - begin for begin, end in self.stops)
+
+
+def memory_of(pid: int) -> float:
+    """Return the resident memory of a process, bytes."""
+    status = Path(f'/proc/{pid}/status').read_text()
+    return 1024.0 * int(re.findall(r'VmRSS:\s+(\d+)', status)[0])
+
+
 class Probe:
     """A node in this process: it listens, publishes and sets parameters of others."""
 

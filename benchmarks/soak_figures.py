@@ -1,0 +1,211 @@
+"""What a soak found: dips told in time, silence of the outputs, memory."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+import math
+from typing import Any
+
+import numpy as np
+from scipy import stats
+from soak_schedule import NEVER_FALSE
+from tables import table
+
+Span = tuple[float, float]
+# A dip is told in time within so long, s, of its begin; times that the node was stopped by us
+# do not count.
+IN_TIME = 1.0
+# A dip of fewer low samples that reached the wire is no dip of 40 ms.
+SAMPLES = 40
+# Memory is looked at after the warm-up, s at most, or a fifth of the time; in so many blocks.
+WARM_UP, BLOCKS = 600.0, 20
+# What the node may still say of what came before a phase, s.
+LINGER = 1.5
+
+
+@dataclass
+class Heard:
+    """
+    All that was heard and noted, times by the monotonic clock, s.
+
+    Attributes
+    ----------
+    states : list of (time, level of the flag, reason, brownout, messages lost so far)
+    outputs : dict of str to list of float
+        Times of the messages of each output.
+    flags : list of (time, bool)
+        Messages of `~/brownout`.
+    memory : list of (time, bytes)
+    stops : list of (begin, end)
+        When the node was stopped.
+    deaths : list of float
+    source : list of dict
+        Lines of the source's log.
+
+    """
+
+    states: list[tuple[float, str, str, str, int]] = field(default_factory=list)
+    outputs: dict[str, list[float]] = field(default_factory=dict)
+    flags: list[tuple[float, bool]] = field(default_factory=list)
+    memory: list[tuple[float, float]] = field(default_factory=list)
+    stops: list[Span] = field(default_factory=list)
+    deaths: list[float] = field(default_factory=list)
+    source: list[dict[str, Any]] = field(default_factory=list)
+
+
+def overlap(begin: float, end: float, spans: Sequence[Span]) -> float:
+    """Return how much of a time lies in the spans, which are in order, s."""
+    first = max(bisect_right(spans, (begin, math.inf)) - 1, 0)
+    total = 0.0
+    for a, b in spans[first:]:
+        if a >= end:
+            break
+        total += max(0.0, min(b, end) - max(a, begin))
+    return total
+
+
+def silence(times: Sequence[float], stops: Sequence[Span]) -> tuple[float, float]:
+    """Return the longest gap, s: as it was, and without the time that the node was stopped."""
+    gaps = list(zip(times, times[1:]))
+    if not gaps:
+        return math.nan, math.nan
+    return (max(b - a for a, b in gaps),
+            max(b - a - overlap(a, b, stops) for a, b in gaps))
+
+
+def told(dip: Mapping[str, Any], heard: Heard) -> tuple[float, float, bool]:
+    """
+    Return when a dip was told, s from its begin, without stops, and whether it was lost.
+
+    Told: a state says CRITICAL because of the floor, and `~/brownout` is true; inf where not.
+    Lost: more than half of the dip's samples may be among the messages that the node missed.
+    """
+    begin = dip['begin']
+    first = bisect_right(heard.states, (begin,))
+    when = math.inf
+    for t, level, reason, _, _ in heard.states[first:]:
+        # A later dip must not stand for this one.
+        if t - begin - overlap(begin, t, heard.stops) > IN_TIME:
+            break
+        if level == 'CRITICAL' and 'brownout.floor (' in reason:
+            when = t
+            break
+    flag = next((t for t, value in heard.flags[bisect_right(heard.flags, (begin,)):] if value),
+                math.inf)
+    when = max(when, flag)
+    net = when - begin - overlap(begin, when, heard.stops) if when < math.inf else when
+    before = heard.states[first - 1][4] if first else 0
+    after = next((lost for t, _, _, _, lost in heard.states[first:] if t > dip['end'] + IN_TIME),
+                 before)
+    return when - begin, net, 2 * (after - before) > dip['samples']
+
+
+def dips_of(heard: Heard) -> dict[str, Any]:
+    """Return what became of the dips."""
+    all_dips = [line for line in heard.source if line['kind'] == 'dip']
+    asked = [dip for dip in all_dips if not dip['unseen'] and dip['samples'] >= SAMPLES]
+    last = heard.states[-1][0] if heard.states else -math.inf
+    asked = [dip for dip in asked if dip['end'] + IN_TIME < last]
+    missed, lost, late = [], [], []
+    for dip in asked:
+        after, net, gone = told(dip, heard)
+        if net <= IN_TIME:
+            late.append(net)
+        else:
+            (lost if gone else missed).append({**dip, 'told': after, 'net': net})
+    return {'sent': len(all_dips), 'asked': len(asked), 'in_time': len(late),
+            'lost': lost, 'missed': missed,
+            'median': float(np.median(late)) if late else math.nan,
+            'longest': max(late, default=math.nan)}
+
+
+def false_of(heard: Heard) -> tuple[int, list[tuple[float, str]]]:
+    """Return how many seconds nothing could be known, and when `~/brownout` was false then."""
+    marks = [line for line in heard.source if line['kind'] == 'phase']
+    spent, found = 0.0, []
+    for now, then in zip(marks, marks[1:]):
+        if now['name'] not in NEVER_FALSE:
+            continue
+        begin, end = now['at'] + LINGER, then['at']
+        spent += max(end - begin, 0.0)
+        found += [(t, now['name']) for t, value in heard.flags
+                  if begin + overlap(now['at'], begin, heard.stops) < t < end and not value]
+    return round(spent), found
+
+
+def unmatched(heard: Heard) -> float:
+    """Return the longest time between a state that knows the flag and a `~/brownout`, s."""
+    times = [t for t, _ in heard.flags]
+    worst = 0.0
+    for t, _, _, brownout, _ in heard.states:
+        if brownout != 'unknown':
+            at = bisect_right(times, t)
+            worst = max(worst, min((abs(t - times[k]) for k in (at - 1, at)
+                                    if 0 <= k < len(times)), default=math.inf))
+    return worst
+
+
+def growth(memory: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """
+    Return the slope of memory and its standard error, bytes/h, after the warm-up.
+
+    Of the means of blocks, since neighbouring values are not independent.
+    """
+    if len(memory) < 2 * BLOCKS:
+        return math.nan, math.nan
+    t, size = np.array(memory).T
+    kept = t - t[0] > min(WARM_UP, 0.2 * (t[-1] - t[0]))
+    means = [(np.mean(a), np.mean(b)) for a, b in zip(
+        np.array_split(t[kept], BLOCKS), np.array_split(size[kept], BLOCKS))]
+    fit = stats.linregress(*np.array(means).T)
+    return 3600.0 * float(fit.slope), 3600.0 * float(fit.stderr)
+
+
+def figures(heard: Heard, counters: Mapping[str, int], end: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all figures (counters: added up; end: status and time of the exit, and more)."""
+    slope, error = growth(heard.memory)
+    spent, false = false_of(heard)
+    sizes = [size for _, size in heard.memory]
+    return {
+        **end, 'deaths': len(heard.deaths),
+        'silence': {name: silence(times, heard.stops) for name, times in heard.outputs.items()},
+        'unmatched': unmatched(heard), 'dips': dips_of(heard),
+        'false': len(false), 'false_in': sorted({name for _, name in false}),
+        'unknowable': spent, 'memory': sizes[-1] if sizes else math.nan,
+        'most_memory': max(sizes, default=math.nan), 'slope': slope, 'slope_error': error,
+        'stopped': sum(b - a for a, b in heard.stops), 'counters': dict(counters)}
+
+
+def as_table(found: Mapping[str, Any]) -> str:
+    """Return the figures as a Markdown table."""
+    dips = found['dips']
+    rows = [
+        ['length', f"{found['minutes']:.1f} min"],
+        ['deaths of the node', str(found['deaths'])],
+        *([f'longest silence of `{name}` (without the time it was stopped)',
+           f'{gap:.2f} s ({net:.2f} s)'] for name, (gap, net) in found['silence'].items()),
+        ['longest time from a state that knows the flag to the next `~/brownout`',
+         f"{found['unmatched']:.2f} s"],
+        ['dips of 40 to 80 ms that the node must see', str(dips['asked'])],
+        ['of these CRITICAL by the floor, and `~/brownout` true, within 1 s',
+         str(dips['in_time'])],
+        ['of these lost on the way, by the numbers of the messages', str(len(dips['lost']))],
+        ['**missed**', str(len(dips['missed']))],
+        ['from the begin of a dip to both, median, longest',
+         f"{dips['median']:.2f} s, {dips['longest']:.2f} s"],
+        [f"`~/brownout` false in {found['unknowable']} s when nothing could be known",
+         str(found['false'])],
+        ['resident memory at the end, at most',
+         f"{found['memory'] / 1e6:.1f} MB, {found['most_memory'] / 1e6:.1f} MB"],
+        ['its slope after the warm-up',
+         f"{found['slope'] / 1e6:+.2f} ± {found['slope_error'] / 1e6:.2f} MB/h"],
+        ['parameters set, refused as they must be, answered wrongly, not answered',
+         f"{found['set']}, {found['refused']}, {found['wrong']}, {found['unanswered']}"],
+        ['longest answer of the parameter service', f"{found['answer']:.2f} s"],
+        ['time stopped by SIGSTOP, in slices', f"{found['stopped']:.0f} s"],
+        *([f'`{name}`', str(value)] for name, value in found['counters'].items()),
+        ['exit status after SIGINT, time', f"{found['status']}, {found['took']:.2f} s"],
+        ['longest pause of the listener itself', f"{found['pause']:.2f} s"]]
+    return table(['what', 'found'], rows)
