@@ -79,6 +79,8 @@ def write_whole(path: Path, content: bytes) -> None:
     """Write a file so that it is there whole or not at all."""
     draft = path.with_name(path.name + '.draft')
     try:
+        # What is there may be a FIFO, which would wait for its reader, or a link to elsewhere.
+        draft.unlink(missing_ok=True)
         draft.write_bytes(content)
         os.replace(draft, path)
     except OSError as error:

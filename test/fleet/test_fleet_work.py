@@ -214,6 +214,22 @@ def test_a_disk_that_fills_up_leaves_the_old_file(tmp_path, monkeypatch):
     assert target.read_bytes() == b'old' and [p.name for p in tmp_path.iterdir()] == [target.name]
 
 
+def test_a_fifo_in_the_place_of_a_draft_hangs_nothing(tmp_path):
+    """It and a link are removed, not opened; what the link leads to stays."""
+    target, elsewhere = tmp_path / 'report.html', tmp_path / 'elsewhere'
+    draft = tmp_path / 'report.html.draft'
+    os.mkfifo(draft)
+    write_whole(target, b'new')
+    elsewhere.write_bytes(b'kept')
+    draft.symlink_to(elsewhere)
+    write_whole(target, b'newer')
+    assert (target.read_bytes(), elsewhere.read_bytes()) == (b'newer', b'kept')
+    os.remove(target)
+    os.mkfifo(target)
+    write_whole(target, b'newest')
+    assert target.read_bytes() == b'newest' and not draft.exists()
+
+
 def paths(*names: str) -> dict[Path, str]:
     """Return recordings without a stated vehicle."""
     return {Path(name): '' for name in names}

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -67,6 +68,15 @@ class Rig:
 def rig(shared_world):
     """Give one estimator."""
     return Rig(shared_world, 'attack', '-p', 'brownout.hold:=0.0')
+
+
+def test_the_page_lists_every_field(rig):
+    """Each field of a state, once, and no other."""
+    page = (ROOT / 'doc/messages.md').read_text(encoding='utf-8')
+    table = page.split('## Fields of')[1].split('\n## ')[0]
+    firsts = re.findall(r'^\| (`.*?) \|', table, re.MULTILINE)
+    listed = [name for first in firsts for name in re.findall(r'`(\w+)`', first)]
+    assert sorted(listed) == sorted(values_of(rig.status))
 
 
 def test_stamps_that_stop_are_named_and_hide_no_dip(rig):
