@@ -164,7 +164,7 @@ def growth(memory: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 
 def figures(heard: Heard, counters: Mapping[str, int], end: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all figures (counters: added up; end: status and time of the exit, and more)."""
+    """Return all figures, given counters that are added up, and status and time of the exit."""
     slope, error = growth(heard.memory)
     spent, false = false_of(heard)
     sizes = [size for _, size in heard.memory]

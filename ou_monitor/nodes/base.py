@@ -201,7 +201,7 @@ class MonitorNode(Node):
     def _on_set(self, parameters: list[RosParameter]) -> SetParametersResult:
         changed = {p.name: p.value for p in parameters if p.name in self._table}
         if self.locked and (set(changed) - {PUBLISH_RATE.name}
-                             or any(p.name == 'use_sim_time' for p in parameters)):
+                            or any(p.name == 'use_sim_time' for p in parameters)):
             return SetParametersResult(
                 successful=False, reason='lock_parameters is set: of the parameters only '
                 'publish_rate can be changed until the node is started anew without it')

@@ -383,7 +383,7 @@ class EstimatorNode(MonitorNode):
         voltage = self._inputs.get('voltage')
         if voltage is not None:
             self._watched.look(self.get_publishers_info_by_topic(self._topic('voltage')),
-                                  voltage.publishers, self.steady_now())
+                               voltage.publishers, self.steady_now())
 
     def _monitor_model(self) -> None:
         """Bring a model file into force that has been read meanwhile."""
