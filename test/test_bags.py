@@ -220,7 +220,7 @@ def test_recorded_files_have_a_notice():
     """Each real recording can be read, and its source and licence are stated."""
     notice = (BAGS / 'recorded' / 'NOTICE').read_text(encoding='utf-8')
     files = sorted((BAGS / 'recorded').glob('*.csv'))
-    assert len(files) == 2
+    assert len(files) == 3
     for path in files:
         part = notice.split(f'\n{path.name}\n')[1].split('.csv\n')[0]
         assert 'Source: https://' in part and 'Licence: ' in part

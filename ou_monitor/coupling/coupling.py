@@ -9,15 +9,14 @@ supply is a cause of both that throttle does not carry, and is told apart by
 being narrow only.  A signal that *leads* the voltage is rather its cause, by
 way of the motors.  Both are said, neither is corrected.
 
-Method: Fourier coefficients of half-overlapping Hann segments.  In every
-frequency bin the signal's are regressed on those of the voltage, of throttle
-and of its square, each segment weighted by the signal's power in it: the noise
-of a gyro grows with throttle as that of the supply does, and unweighted a few
-loud segments would decide.  Given the voltage the squared partial coherence of
-a bin then exceeds c by chance with probability (1 - c)^(K - 1 - p), K segments
-and p causes taken out (Halliday et al., 1995).  Two tests at half the level
-each (Bonferroni): the sum of -(K - 1 - p) ln(1 - c), Gamma-distributed over
-bins, and the largest one.
+Method: Fourier coefficients of half-overlapping Hann segments.  `coherence.py`
+says whether there is coupling.  If there is, the signal's coefficients are
+regressed on those of the voltage, of throttle and of its square, each segment
+weighted by the noise of the signal in it, which grows with throttle as that
+of the supply does: unweighted a few loud segments would decide.
+
+A voltage that a logger repeats until the ADC is read again is taken where it
+was read: the steps between would be a signal of the logger's.
 """
 
 from __future__ import annotations
@@ -26,29 +25,22 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-import numpy.typing as npt
+from ou_monitor.coupling.coherence import (
+    basis_of, ComplexArray, measure_coherence, STRIDE, without)
 from ou_monitor.coupling.common_grid import Grid, on_grid
 from ou_monitor.errors import InputError
+from ou_monitor.online.estimator.quality import refreshes
 from ou_monitor.records import FloatArray, NAN
 from scipy import stats
 from scipy.signal.windows import hann
-from scipy.special import chndtrinc
-
-ComplexArray = npt.NDArray[np.complex128]
 
 # Pilot and discharge lie below, Hz.
 LOWEST = 5.0
 # Longest and shortest segment, s, and how many the recording is cut into.
 _LONGEST, _SHORTEST, _PIECES = 1.0, 0.1, 40
 FEWEST = 16
-# Neighbouring bins of the Hann window are correlated by 2/3, every second by 1/6.
-_STRIDE = 2
-# Power correlation of half-overlapping Hann segments: (1/6)^2.
-_OVERLAP = 1.0 / 36.0
 LONGEST_LAG = 0.05
 _BLOCKS = 12
-# Family-wise level of the bins that may be a line: surely not chance.
-_LINE = 1e-4
 # With which probability a coupling of the limiting gain would have been seen.
 POWER = 0.9
 
@@ -118,13 +110,13 @@ class Coupling:
 def estimate_coupling(
     t: FloatArray, voltage: FloatArray, signal_t: FloatArray, signal: FloatArray, *,
     throttle: FloatArray | None = None, band: tuple[float, float] | None = None,
-    level: float = 0.05,
+    level: float = 0.05, rng: np.random.Generator | None = None,
 ) -> Coupling:
     """Estimate the gain from the supply voltage to a signal (band in Hz, level 0..1)."""
     if not 0.0 < level < 1.0:
         raise InputError(f'the level must lie between 0 and 1, got {level:g}')
-    series = {'the voltage': (t, voltage), 'the signal': (signal_t, signal)}
-    notes = []
+    notes: list[str] = []
+    series = {'the voltage': _as_read(t, voltage, notes), 'the signal': (signal_t, signal)}
     known = throttle is not None and np.isfinite(throttle).sum() > 0.9 * throttle.size
     if known and throttle is not None and np.nanmax(throttle) > np.nanmin(throttle):
         series['the throttle'] = (t, throttle)
@@ -134,36 +126,26 @@ def estimate_coupling(
     low, high = _band(band, grid)
     length = _segment_length(grid, low)
     frequency, pieces = _segments(grid, length, low, high)
-    weight = np.sqrt(np.mean(np.abs(pieces[1])**2, axis=1))
     for name, one in zip(series, pieces[:2]):
         if not (np.abs(one)**2).sum() > 0.0:
             raise InputError(f'{name} does not change within {low:g}..{high:g} Hz')
-    weight[weight == 0.0] = weight[weight > 0.0].min()
-    scaled = [one / weight[:, None] for one in pieces]
-    count = scaled[0].shape[0]
+    count = len(pieces[0])
     if count < FEWEST:
         raise InputError(
             f'the series share {grid.duration:.3g} s in {count} segments without a gap: at least '
             f'{FEWEST} segments of {length / grid.rate:.2g} s are needed')
-    v, x = _without(scaled[0], scaled[2:]), _without(scaled[1], scaled[2:])
-    causes = len(scaled) - 2
-    segments = count / (1.0 + 2.0 * _OVERLAP * (count - 1) / count)
-    spare = segments - 1.0 - causes
+    # The same recording is always judged alike.
+    found = measure_coherence(pieces[0], pieces[1], pieces[2:], level,
+                              np.random.default_rng(0) if rng is None else rng)
+    seen = found.p_value <= level
 
-    vv, xx = (np.abs(v)**2).sum(0), (np.abs(x)**2).sum(0)
-    response = (np.conj(v) * x).sum(0) / vv
-    coherence = np.clip(np.abs(response)**2 * vv / xx, 0.0, 1.0 - 1e-12)
-    tested = slice(0, None, _STRIDE)
-    p_sum, p_max, threshold = _tests(coherence[tested], spare, level)
-    p_value = min(1.0, 2.0 * min(p_sum, p_max))
-    seen = p_value <= level
-
-    rest = np.maximum(xx - np.abs(response)**2 * vv, 1e-12 * xx)
-    limit = _limit(vv[tested], rest[tested], spare, level)
-    narrow = seen and _narrow(coherence, response, vv / rest, spare)
+    v, x, rest = _weighted(pieces)
+    response = (np.conj(v) * x).sum(0) / (np.abs(v)**2).sum(0)
     gain = lag = lag_se = NAN
+    share = 0.0
     interval = (NAN, NAN)
     if seen:
+        share = 1.0 - float(rest.sum() / (np.abs(x)**2).sum())
         gain, lag = _fit(frequency, v, x, rest / count)
         # Weights by the whole signal lean to segments in which its noise
         # opposes the voltage; those by the noise alone do not.
@@ -176,19 +158,44 @@ def estimate_coupling(
         vv = (np.abs(v)**2).sum(0)
         omega = 2.0 * math.pi * frequency
         # Every second bin counts, as in the tests.
-        known_by = 2.0 * gain**2 * (omega**2 * vv / density)[tested].sum() * segments / count
+        known_by = (2.0 * gain**2 * (omega**2 * vv / density)[::STRIDE].sum()
+                    * found.segments / count)
         lag_se = 1.0 / math.sqrt(known_by) if known_by > 0.0 else NAN
     leads = bool(seen and lag < -3.0 * lag_se and lag < -0.25 / grid.rate)
-    if narrow:
+    if found.narrow:
         notes.append('What was seen is in a few frequencies only: a line that both share, such as '
                      'the rotation of the motors, rather than coupling.')
     if leads:
         notes.append('The signal is ahead of the voltage: it is rather the load, by way of the '
                      'motors, that answers to the signal than the other way round.')
-    raw_share = float(np.sum(coherence * xx) / np.sum(xx)) if seen else 0.0
     return Coupling(
-        seen, p_value, gain, interval, lag, lag_se, limit, narrow, leads, raw_share, frequency,
-        coherence, response, threshold, level, segments, bool(causes), grid, tuple(notes))
+        seen, found.p_value, gain, interval, lag, lag_se, found.limit(level, POWER),
+        found.narrow, leads, share, frequency, found.squared, response, found.threshold, level,
+        found.segments, len(pieces) > 2, grid, tuple(notes))
+
+
+def _as_read(t: FloatArray, voltage: FloatArray, notes: list[str],
+             ) -> tuple[FloatArray, FloatArray]:
+    """Return the voltage where its ADC was read, and say so in the notes."""
+    good = np.isfinite(t) & np.isfinite(voltage)
+    at, values, period = refreshes(t[good], voltage[good])
+    if period > 1.0:
+        notes.append(f'The voltage was refreshed every {period:.4g} samples: the '
+                     f'{int(good.sum()) - at.size} repeats between were left out.')
+        return at, values
+    return t, voltage
+
+
+def _weighted(pieces: list[ComplexArray]) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    """Return voltage and signal, causes out and segments weighted, and the rest of the signal."""
+    weight = np.sqrt(np.mean(np.abs(pieces[1])**2, axis=1))
+    weight[weight == 0.0] = weight[weight > 0.0].min()
+    scaled = [one / weight[:, None] for one in pieces]
+    basis = basis_of(scaled[2:])
+    v, x = without(scaled[0], basis), without(scaled[1], basis)
+    vv, xx = (np.abs(v)**2).sum(0), (np.abs(x)**2).sum(0)
+    shared = np.abs((np.conj(v) * x).sum(0))**2 / vv
+    return v, x, np.maximum(xx - shared, 1e-12 * xx)
 
 
 def _band(band: tuple[float, float] | None, grid: Grid) -> tuple[float, float]:
@@ -233,59 +240,6 @@ def _segments(grid: Grid, length: int, low: float, high: float,
                 out.append(np.fft.rfft(window * (part - part.mean()))[bins])
     band = np.asarray(frequency[bins], dtype=np.float64)
     return band, [np.array(out, dtype=np.complex128).reshape(-1, band.size) for out in found]
-
-
-def _without(y: ComplexArray, causes: list[ComplexArray]) -> ComplexArray:
-    """Return what a regression on the causes, bin by bin, leaves of y."""
-    rest = y.copy()
-    basis: list[ComplexArray] = []
-    for cause in causes:
-        part = cause.copy()
-        size = (np.abs(part)**2).sum(0)
-        for one in basis:
-            part -= (np.conj(one) * part).sum(0) * one
-        norm = np.sqrt((np.abs(part)**2).sum(0))
-        # What is left of a cause that says the same as another is rounding
-        # (of float32, relative 1e-7).
-        part = np.where(norm**2 > 1e-10 * size, part / np.where(norm > 0.0, norm, 1.0), 0.0)
-        basis.append(part)
-    for one in basis:
-        rest -= (np.conj(one) * rest).sum(0) * one
-    return rest
-
-
-def _tests(coherence: FloatArray, spare: float, level: float) -> tuple[float, float, float]:
-    """Return the p-values of the sum and of the largest bin, and its threshold."""
-    information = -spare * np.log1p(-coherence)
-    p_sum = float(stats.gamma.sf(information.sum(), coherence.size))
-    p_max = -math.expm1(coherence.size * math.log1p(-math.exp(-float(information.max()))))
-    alone = -math.expm1(math.log1p(-0.5 * level) / coherence.size)
-    return p_sum, p_max, -math.expm1(math.log(alone) / spare)
-
-
-def _narrow(coherence: FloatArray, response: ComplexArray, ratio: FloatArray, spare: float,
-            ) -> bool:
-    """Return whether a few bins make the finding, and the others contradict their gain."""
-    loud = coherence > _tests(coherence[::_STRIDE], spare, _LINE)[2]
-    # A line spreads over the main lobe of the window and its first side lobes.
-    near = np.convolve(loud, np.ones(9), 'same') > 0
-    left = np.flatnonzero(~near)[::_STRIDE]
-    if not loud.any() or left.size < 0.25 * coherence.size:
-        return False
-    gain = float(np.median(np.abs(response[loud])))
-    far = 2.0 * spare * gain**2 * float(ratio[left].sum())
-    needed = stats.chi2.isf(0.02, 2 * left.size)
-    return bool(stats.ncx2.sf(needed, 2 * left.size, far) > 0.95
-                and _tests(coherence[left], spare, _LINE)[0] > 0.02)
-
-
-def _limit(vv: FloatArray, noise: FloatArray, spare: float, level: float) -> float:
-    """Return the gain that the sum would have shown with probability `POWER`."""
-    freedom = 2 * vv.size
-    needed = float(stats.chi2.isf(0.5 * level, freedom))
-    far = float(chndtrinc(needed, freedom, 1.0 - POWER))
-    per_gain = 2.0 * spare * float((vv / noise).sum())
-    return math.sqrt(far / per_gain) if per_gain > 0.0 else math.inf
 
 
 def _fit(frequency: FloatArray, v: ComplexArray, x: ComplexArray, density: FloatArray,

@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 RATE, SECONDS, ALPHA = 500.0, 20.0, 63.0
-DRAWS = 150
+DRAWS = 80
 
 
 def noise(rng, n, alpha, deviation):

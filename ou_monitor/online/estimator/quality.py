@@ -186,6 +186,19 @@ def whole(columns: FloatArray) -> Batch | None:
                  float(steps.max()), restart=False)
 
 
+def refreshes(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return a series where its source was read, and samples per reading (t in s)."""
+    period = refresh_period(y) if y.size > 1 else 1.0
+    batch = whole(np.stack([t, y, np.full(t.size, NAN)]))
+    if period > 1.0 and batch is not None:
+        repeats = Repeats()
+        repeats.period = period
+        batch = repeats.drop(batch)
+    if period > 1.0 and batch is not None:
+        return batch.t, batch.y, period
+    return t, y, 1.0
+
+
 # Raw samples looked at.
 TAIL = 1024
 # Fewest samples from which anything is told.

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.online.estimator.quality import refresh_period, Repeats, whole
+from ou_monitor.online.estimator.quality import refreshes
 from ou_monitor.recordings.importers.log import ANY, clean, CURRENT, Log, Series, THROTTLE, VOLTAGE
 from ou_monitor.recordings.samples import check_throttle
 
@@ -168,14 +168,9 @@ def _also(log: Log, chosen: tuple[Series, Series | None]) -> list[str]:
 def drop_held(series: Series, *, every: bool = False) -> tuple[Series, str]:
     """Return a series without repeats, and one sentence on what was done."""
     share = series.repeats
-    period = refresh_period(series.values) if series.n > 1 else 1.0
-    batch = whole(np.stack([series.t, series.values, np.full(series.n, np.nan)]))
-    if period > 1.0 and batch is not None:
-        repeats = Repeats()
-        repeats.period = period
-        batch = repeats.drop(batch)
-    if period > 1.0 and batch is not None:
-        kept = replace(series, t=batch.t, values=batch.y)
+    t, values, period = refreshes(series.t, series.values)
+    if period > 1.0:
+        kept = replace(series, t=t, values=values)
         words = (f'refreshed every {period:.4g} samples: {series.n - kept.n} of {series.n} '
                  'held samples dropped')
     elif every and share > 0.0:
