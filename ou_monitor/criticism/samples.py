@@ -127,7 +127,7 @@ class Samples:
             throttle=np.full(n, np.nan) if self.throttle is None else self.throttle,
             origin=float(self.t[0]), alpha=np.full(n, alpha), sigma=np.full(n, sigma),
             power=np.ones(n), push=np.zeros(n), bend=(0.0, 0.0), x=np.zeros(n),
-            level=np.zeros(n), voltage=np.zeros(n))
+            level=np.zeros(n), noise=np.ones(n), voltage=np.zeros(n))
 
 
 def choose_samples(voltage: FloatArray, rate: float) -> tuple[slice, str]:

@@ -27,8 +27,6 @@ NO_NOISE = 1e-6
 # Steps of the numerical scores, in the logarithm of a parameter.
 _STEP = 1e-4
 _ROUNDS, _FEW_ROUNDS, _LAST_ROUNDS = 12, 6, 2
-# Columns up to which least squares are solved without the normal equations.
-_NARROW = 8
 # Samples times further states that are too dear to begin with.
 _DEAR = 30000
 # With more states than this the part has to do.
@@ -132,6 +130,31 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
     variance = run.full if inside else run.plain
     return GaussianFit(tuple(terms), tuple(se), mean, e, variance, _log_density(e, variance),
                        run.phi, run.cost)
+
+
+def whitened(samples: Samples, terms: Sequence[Term], more: Sequence[Term],
+             events: Events | None = None, offset: FloatArray | None = None) -> FloatArray:
+    """
+    Return voltage, level and columns of more terms as the noise of a model leaves them white.
+
+    offset in V; the columns of the model's own mean are left out.
+    """
+    run = _filter(samples, terms, events)
+    kept = [term for term in terms if term.ROLE is not Role.MEAN]
+    columns = _columns(samples, (*kept, *more), run.segment)
+    own = _columns(samples, terms, run.segment)
+    fixed = [k for k, term in enumerate(_owners(terms)) if term is not None and not term.MEASURED]
+    beta = np.array([value for term in terms for value in coefficients(term)])
+    voltage = samples.voltage - own[:, fixed] @ beta[fixed]
+    voltage = voltage if offset is None else voltage - offset
+    through = run.kalman.innovations(np.column_stack((voltage, columns)))
+    return np.asarray(through / np.sqrt(run.full)[:, None], dtype=np.float64)
+
+
+def _owners(terms: Sequence[Term]) -> list[Term | None]:
+    """Return the term of each column of the mean; None for the level."""
+    return [None, *(term for term in terms if term.ROLE is Role.MEAN and term.NAME != 'ou'
+                    for _ in term.LINEAR)]
 
 
 def _log_density(e: FloatArray, variance: FloatArray) -> FloatArray:
@@ -247,7 +270,7 @@ def _space(samples: Samples, terms: Sequence[Term], events: Events | None
         to = at + h.size
         f_all[:, at:to, at:to], q_all[:, at:to, at:to], h_all[at:to] = f, cov, h
         at = to
-    r = np.full(n, floor + sum(term.variance() for term in terms))
+    r = np.full(n, floor) + sum(term.variances(s) for term in terms)
     if events is not None:
         r += events.error
     return whole, StateSpace(f_all, q_all, h_all, r), own
@@ -257,7 +280,7 @@ def _first(s: Segment, n: int) -> Segment:
     """Return the first samples of a segment."""
     return replace(s, **{name: getattr(s, name)[:n] for name in (
         't', 'at', 'step', 'throttle', 'alpha', 'sigma', 'power', 'push', 'x', 'level',
-        'voltage')})
+        'noise', 'voltage')})
 
 
 def _coupled(term: ACCoupling, s: Segment, phi: FloatArray, q: FloatArray
@@ -345,10 +368,8 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
 
 def _solved(columns: FloatArray, y: FloatArray) -> FloatArray:
     """Return least squares; coefficients that nothing determines come out as small as may be."""
-    if columns.shape[1] <= _NARROW:
-        few: FloatArray = np.asarray(np.linalg.lstsq(columns, y, rcond=1e-10)[0])
-        return few
-    # Of many columns, lines mostly and so nearly at right angles, the normal equations.
+    # By the normal equations: scaled, columns here are never so alike that it matters, and
+    # least squares by orthogonal factors take ten times as long.
     scale = np.sqrt(np.einsum('ij,ij->j', columns, columns))
     scale[scale == 0.0] = 1.0
     gram = columns.T @ columns / np.outer(scale, scale)

@@ -8,7 +8,10 @@ causes; this module fits nothing.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+import math
 
+import numpy as np
+import numpy.typing as npt
 from ou_monitor.criticism.battery import is_sign
 from ou_monitor.criticism.innovations import OtherPole
 from ou_monitor.criticism.null_bank import family_chance
@@ -49,6 +52,12 @@ ACCEPT = 6.0
 # The same for a mean that answers to a measured input, which every flight has: e^3 = 20, 5 % for
 # one kind.
 ACCEPT_MEAN = 3.0
+# Share of the largest evidence that another term of a kind needs that is there: less mends its form,
+# which is right to some per cent of the effect, and so to its square of the evidence: (7 %)^2.
+AGAIN_SHARE = 0.005
+# The same for one intensity over throttle beside another: curves of the recordings here leave a
+# tenth of what the first explains.
+FORM = 0.1
 # The recording cannot separate causes within this of the best from it, nats: odds below 20.
 TIE = 3.0
 # Evidence from which a measured cause stays after others were accepted, nats: its price (BIC) is
@@ -60,6 +69,8 @@ STEADY = 4.0
 # Share of segments with a gain from which it holds throughout: by chance 18 or more of 24 gain
 # once in 100 (binomial: 1.1 %).
 MOSTLY = 0.75
+# Standard errors by which the sum of the gains of all parts must exceed zero: see `is_shared`.
+SHARED = 1.0
 # Statistics of outliers and clusters, as scores, above which single samples dominate the
 # likelihood, so that the evidence must hold in most segments.
 RAGGED = 8.0
@@ -99,7 +110,9 @@ def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], values: Statistic
     """
     found = []
     for kind in kinds:
-        if kind.NAME in ('ou', *given) or kind.ROLE is Role.EXACT or not kind.SIGNS:
+        if kind.NAME in ('ou', *given) or kind.ROLE is Role.EXACT or not kind.SIGNS or (
+                is_answer(kind)):
+            # On answers of the mean to what is measured the regression decides.
             continue
         if tier_of(kind, values) != tier or (kind.NEEDS_THROTTLE and not throttle):
             continue
@@ -107,10 +120,7 @@ def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], values: Statistic
             continue
         if any(imitate(kind, other) for other in model):
             continue
-        # Cheap terms, linear in measured inputs, are tried wherever a cause was found and a
-        # statistic is still off.
-        if asks(kind, values) or kind.NAME in shown or (
-                len(model) > 1 and kind.MEASURED and kind.ROLE is Role.MEAN and any_off(values)):
+        if asks(kind, values) or kind.NAME in shown:
             found.append(kind)
     # The kind with the largest statistic may spare the others.
     return sorted(found, key=lambda kind: (kind.DEAR, -asks(kind, values)))
@@ -175,11 +185,21 @@ def affordable(kind: Kind, cost: float) -> bool:
 
 # Which trial is accepted, and what comes with it.
 
-def least_evidence(kind: Kind, largest: float) -> float:
-    """Return the evidence above which a kind is accepted (largest: of any cause; nats)."""
+def least_evidence(kind: Kind, largest: float, again: bool = False) -> float:
+    """
+    Return the evidence above which a kind is accepted (largest: of any cause; nats).
+
+    again: whether there is one of this kind already, whose form it may only mend.
+    """
     if kind.LEAST_SHARE:
         return max(ACCEPT, kind.LEAST_SHARE * largest)
-    return ACCEPT_MEAN if kind.MEASURED and kind.ROLE is Role.MEAN else ACCEPT
+    least = ACCEPT_MEAN if is_answer(kind) else ACCEPT
+    return max(least, AGAIN_SHARE * largest) if again and is_answer(kind) else least
+
+
+def is_answer(kind: Kind) -> bool:
+    """Return whether a cause is an answer of the mean to what is measured."""
+    return kind.MEASURED and kind.ROLE is Role.MEAN
 
 
 def acceptable(kind: Kind, evidence: float, largest: float, ragged: bool, throughout: bool
@@ -204,6 +224,18 @@ def is_throughout(mean: float, error: float, gains: Sequence[float]) -> bool:
     """
     return not mean <= STEADY * error or (
         sum(gain > 0.0 for gain in gains) >= MOSTLY * len(gains))
+
+
+def is_shared(gains: npt.ArrayLike) -> bool:
+    """
+    Return whether more than one part of a recording gains (gains of each part, nats).
+
+    Of k parts of which one alone gains, the standard error of the sum is that gain itself; of an
+    effect that gains g nats throughout, it is sqrt(2 g).
+    """
+    parts = np.asarray(gains, dtype=np.float64)
+    error = math.sqrt(parts.size) * float(parts.std(ddof=1))
+    return float(parts.sum()) > SHARED * error
 
 
 def rivals_of(best: str, evidence: Sequence[tuple[str, float]]) -> list[str]:

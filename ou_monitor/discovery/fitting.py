@@ -19,15 +19,11 @@ from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import decision
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.load_transient import LoadTransient
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray
 
 # Starting points that are fitted in full, and samples that decide which.
 _FULL, _GLANCE = 2, 8000
-# Lags of a sag that are fitted in full.
-_LAGS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,17 +128,13 @@ class Fitter:
                 continue
             best = self.best_start(composite, kind, view)
             if best is not None:
-                trial = Trial(kind.NAME, best, self.evidence(best) - before)
+                with_it = kind.CHANGES is not None and not composite.has(kind.CHANGES.NAME)
+                trial = Trial(kind.NAME, best, self.evidence(best) - before,
+                              beside=kind.CHANGES.NAME if kind.CHANGES and with_it else '')
                 if trial.evidence > decision.CLEAR:
                     trial = replace(trial, left=criticise(self.samples, best, bank),
                                     shown=self.poles_shown(best))
                 found.append(trial)
-        if not composite.has('load_sag') and {'load_sag', 'load_transient'} <= {
-                trial.name for trial in found}:
-            both = self._sag_with_lag(composite, view)
-            if both is not None:
-                found.append(Trial('load_transient', both, self.evidence(both) - before,
-                                   beside='load_sag'))
         return found
 
     def poles_shown(self, composite: Composite) -> frozenset[str]:
@@ -178,8 +170,10 @@ class Fitter:
         if len(hidden) > _FULL:
             hidden = self._by_likelihood(composite, hidden)
         best: Composite | None = None
+        changed = [] if kind.CHANGES is None or composite.has(kind.CHANGES.NAME) else list(
+            kind.CHANGES.candidates(view))[-1:]
         for start in (*known[:_FULL], *hidden[:_FULL]):
-            found = self.join(composite, [start], rough=True)
+            found = self.join(composite, [*changed, start], rough=True)
             if found is not None and _joined(found).holds(view) and (
                     best is None or self.evidence(found) > self.evidence(best)):
                 best = found
@@ -192,19 +186,6 @@ class Fitter:
         if not forms or _size(forms[0]) >= _size(term):
             return None
         return self.fit([*composite.terms[:index], forms[0], *composite.terms[index + 1:]], None)
-
-    def _sag_with_lag(self, composite: Composite, view: View) -> Composite | None:
-        """
-        Return the best fit with a sag that comes at its own rate, or later.
-
-        Alone, neither the sag nor its lag may gain: a rail that relaxes to a level set by
-        throttle does not jump.
-        """
-        sag = LoadSag.candidates(view)[0]
-        lags = _by_scores(self.samples, list(LoadTransient.candidates(view)), view, beside=[sag])
-        # Beside a sag the rate of the rail changes, and with it the lag that fits best.
-        fits = [self.join(composite, [sag, lag], rough=True) for lag in lags[:_LAGS]]
-        return max((fit for fit in fits if fit is not None), default=None, key=self.evidence)
 
     def _by_likelihood(self, composite: Composite, starts: list[Term]) -> list[Term]:
         """Return starts in the order of their likelihood as they are, on a part."""
@@ -233,15 +214,13 @@ def _size(term: Term) -> int:
     return len(term.free()) + len(term.LINEAR)
 
 
-def _by_scores(samples: Samples, starts: list[Term], view: View, beside: Sequence[Term] = ()
-               ) -> list[Term]:
-    """Return starts in the order of how much of the scores they explain with those beside them."""
+def _by_scores(samples: Samples, starts: list[Term], view: View) -> list[Term]:
+    """Return starts in the order of how much of the scores they explain."""
     s = samples.segment(1.0, 0.0)
-    known = [term.columns(s) for term in beside]
     scale = np.sqrt(view.variance)
 
     def explained(term: Term) -> float:
-        columns = np.concatenate([*known, term.columns(s)], axis=1)
+        columns = term.columns(s)
         through = columns.copy()
         through[1:] -= view.phi[1:, None] * columns[:-1]
         through = (through / scale[:, None])[view.train]

@@ -10,7 +10,7 @@ and withdrawn is decided in `decision`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import math
 
 import numpy as np
@@ -20,12 +20,23 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import Fitter, Trial
 from ou_monitor.discovery.gain import BLOCKS, mean_difference
+from ou_monitor.discovery.regression import load_terms, mean_answer
 from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.load_dependent_noise import LoadDependentNoise
 from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
+from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.model.terms.tone import lines_of, Tone
 
 Progress = Callable[[float], None]
+
+# Rate, 1/s, from which a fit finds what the load leaves: minutes and tenths of a second are both
+# within reach of it.
+_SLOW = 1.0
+# Time of one fit, s, up to which the mean is chosen anew after each cause.
+_SOON = 1.0
 
 # Note where the search was cut short.
 STOPPED = ('The search for causes was cut short where the next ones would have taken long; there '
@@ -98,13 +109,15 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     fitter = Fitter(samples, start.cost)
     # Beside lines that were taken out there may be slower ones.
     given = [term.NAME for term in exact if term.FAMILY != 'line']
+    begun = Search(fitter.fit(start.terms, start) or start)
     try:
-        search = name_causes(fitter, start, bank, given=given,
+        _under_load(fitter, begun)
+        search = name_causes(fitter, begun, bank, given=given,
                              progress=lambda share: progress(0.1 + 0.9 * share))
         failure = STOPPED if search.stopped else ''
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         # A fit outside of what numbers can hold; the criticism still stands.
-        search, failure = Search(start), f'The search for causes broke off: {error}.'
+        search, failure = begun, f'The search for causes broke off: {error}.'
     # Fitted to everything, so that an event in the part kept does not count against a cause.
     whole = fitter.whole(search.composite)
     after = criticise(samples, whole, bank) if search.accepted else before
@@ -117,7 +130,8 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         # The causes withdrawn may have hidden measured ones.  A trend that another slow cause
         # replaced is not tried again.
         slow = [kind.NAME for kind in _kinds(search.removed) if kind.FAMILY == 'slow']
-        search = name_causes(fitter, start, bank, latent=False, given=[*given, *slow])
+        search = name_causes(fitter, begun, bank, latent=False, given=[*given, *slow])
+        dropped = tuple(name for name in dropped if name not in search.accepted)
         whole, after = _kept_beside(fitter, search, stays, before, bank)
     part = samples.train if whole is search.composite else slice(0, samples.n)
     model = search.composite
@@ -128,12 +142,13 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
                  failure)
 
 
-def name_causes(fitter: Fitter, baseline: Composite, bank: NullBank, *,
+def name_causes(fitter: Fitter, begun: Search, bank: NullBank, *,
                 given: Sequence[str] = (), latent: bool = True,
                 progress: Progress | None = None) -> Search:
-    """Accept causes one after the other, the best first."""
+    """Accept causes one after the other, the best first, beside those of a search begun."""
     samples = fitter.samples
-    search = Search(fitter.fit(baseline.terms, baseline) or baseline)
+    search = replace(begun, accepted=list(begun.accepted), rivals=dict(begun.rivals),
+                     log=list(begun.log), removed=list(begun.removed))
     values = criticise(samples, search.composite, bank)
     only, reformed = '', False
     for turn in range(decision.MOST):
@@ -159,7 +174,8 @@ def name_causes(fitter: Fitter, baseline: Composite, bank: NullBank, *,
         named = {trial.name for trial in good}
         best = next(trial for trial in trials if trial.name in named)
         _accept(search, best, trials)
-        _other_means(fitter, search, trials)
+        if best.composite.gaussian.cost < _SOON:
+            _answer(fitter, search, ())
         after = criticise(samples, search.composite, bank)
         if best.name == Tone.NAME and _more_lines(fitter, search):
             after = criticise(samples, search.composite, bank)
@@ -211,25 +227,105 @@ def _accept(search: Search, best: Trial, trials: Sequence[Trial]) -> None:
     search.largest = max(search.largest, best.evidence)
 
 
-def _other_means(fitter: Fitter, search: Search, trials: Sequence[Trial]) -> None:
-    """Accept the other measured causes of the mean, before alpha takes their place."""
-    last = search.accepted[-1]
-    if not catalogue()[last].MEASURED:
+def _under_load(fitter: Fitter, search: Search) -> None:
+    """
+    Start from the load model: the answer to throttle, and noise that follows it, at once.
+
+    In a flight they are nearly all of the variance: one by one, each would be fitted to what the
+    others leave.  Nothing is accepted that the mean without them does not need.
+    """
+    load, plain = load_terms(fitter.samples), search.composite
+    full = fitter.fit([*plain.terms, *load], plain, rough=True) if load else None
+    if full is None:
+        _answer(fitter, search, ())
         return
-    for trial in trials:
-        kind = catalogue()[trial.name]
-        least = decision.least_evidence(kind, search.largest)
-        if trial.name == last or kind.ROLE is not Role.MEAN or not kind.MEASURED or (
-                trial.evidence < least):
-            continue
-        composite = search.composite
-        fit = fitter.best_start(composite, kind, fitter.view(composite))
-        gain = -math.inf if fit is None else fitter.evidence(fit) - fitter.evidence(composite)
-        if fit is not None and gain > least:
-            search.log.append(f'{trial.name}: {gain:.1f} nats beside it')
-            search.composite = fit
-            search.accepted.append(trial.name)
-            search.rivals.setdefault(trial.name, [])
+    noisy = _noise_beside(fitter, full)
+    search.composite = noisy
+    _answer(fitter, search, load)
+    if not any(catalogue()[name].FAMILY == LoadSag.FAMILY for name in search.accepted):
+        # Throttle does not move the mean: what the noise is, the search asks one by one.
+        search.composite, search.accepted = plain, []
+        _answer(fitter, search, ())
+        return
+    means = [term for term in search.composite.terms if decision.is_answer(type(term))]
+    bare = fitter.fit([*plain.terms, *means], plain)
+    if bare is None:
+        return
+    # Again beside the mean as it is now, each for its own evidence.
+    known = [term.NAME for term in plain.terms]
+    best = _noise_beside(fitter, bare)
+    if fitter.evidence(search.composite) > fitter.evidence(best):
+        best = fitter.fit(search.composite.terms, search.composite) or search.composite
+    search.composite = best
+    for term in best.terms:
+        if term.NAME not in known and not decision.is_answer(type(term)):
+            search.accepted.append(term.NAME)
+            search.rivals.setdefault(term.NAME, [])
+            search.log.append(f'{term.NAME}: with the load')
+    _answer(fitter, search, ())
+
+
+def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:
+    """Return a model with the noise that a recording under load shows beside its mean."""
+    best = composite
+    ou = composite.terms[0]
+    assert isinstance(ou, OU)
+    error = math.sqrt(float(np.median(composite.gaussian.variance)))
+    # What the load leaves is slow, and small beside the white noise; or it is the noise itself.
+    slow = replace(ou, alpha=_SLOW, sigma=0.3 * error * math.sqrt(2.0 * _SLOW))
+    largest = 0.0
+    while True:
+        view = fitter.view(best)
+        tried: list[Composite] = []
+        for kind in (LoadDependentSigma, LoadDependentNoise, MeasurementNoise):
+            if best.has(kind.NAME):
+                continue
+            found = fitter.best_start(best, kind, view)
+            # Two intensities that follow throttle: one may only mend the form of the other.
+            again = kind.FAMILY == LoadDependentSigma.FAMILY and largest > 0.0 and any(
+                best.has(other.NAME) for other in (LoadDependentSigma, LoadDependentNoise))
+            if found is not None and not (
+                    again and fitter.evidence(found) - fitter.evidence(best)
+                    < decision.FORM * largest):
+                tried.append(found)
+            if not best.has(MeasurementNoise.NAME) and kind is not LoadDependentSigma:
+                more = [MeasurementNoise(0.8 * error)]
+                if kind is LoadDependentNoise:
+                    more = [*more, *LoadDependentNoise.candidates(view)]
+                found = fitter.fit([slow, *best.terms[1:], *more], best, rough=True)
+                if found is not None:
+                    tried.append(found)
+        top = max(tried, default=None, key=fitter.evidence)
+        gain = -math.inf if top is None else fitter.evidence(top) - fitter.evidence(best)
+        if top is None or gain < decision.ACCEPT:
+            return best
+        largest = max(largest, gain)
+        best = top
+
+
+def _answer(fitter: Fitter, search: Search, start: Sequence[Term]) -> None:
+    """Choose the answers of the mean to what is measured anew, beside the noise found so far."""
+    composite = search.composite
+    answer = mean_answer(fitter.samples, composite, fitter.view(composite), start)
+    own = [term for term in composite.terms if decision.is_answer(type(term))]
+    shape = [replace(term, **dict.fromkeys(term.LINEAR, 0.0)) for term in own]
+    if not start and len(own) == len(answer.terms) and all(
+            replace(term, **dict.fromkeys(term.LINEAR, 0.0)) in shape for term in answer.terms):
+        return
+    structural = [term for term in composite.terms
+                  if term.ROLE is not Role.LAW and not decision.is_answer(type(term))]
+    laws = [term for term in composite.terms if term.ROLE is Role.LAW]
+    fit = fitter.fit([*structural, *answer.terms, *laws], composite)
+    if fit is None or (not start and fitter.evidence(fit) < fitter.evidence(composite)):
+        return
+    search.composite = fit
+    before = [name for name in search.accepted if decision.is_answer(catalogue()[name])]
+    names = [term.NAME for term in answer.terms]
+    search.accepted = [*names, *(name for name in search.accepted if name not in before)]
+    for term, worth, rivals in zip(answer.terms, answer.worth, answer.rivals, strict=True):
+        search.rivals[term.NAME] = list(rivals)
+        search.largest = max(search.largest, worth)
+        search.log.append(f'{term.NAME}: {worth:.1f} nats')
 
 
 def _more_lines(fitter: Fitter, search: Search) -> bool:

@@ -12,11 +12,14 @@ with LP(x, tau) a first-order low-pass of time constant tau.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
 from scipy.linalg import solve_banded
+
+Number = TypeVar('Number', float, FloatArray)
 
 # Voltage, V, at which the size of the sag is counted: the plateau of a lithium-polymer cell.
 CELL = 3.8
@@ -59,6 +62,11 @@ def charge_at(cell: float) -> float:
 def cells_in_series(voltage: float) -> int:
     """Return the least number of cells that can show that voltage, V."""
     return max(1, int(np.ceil(voltage / FULL_CELL)))
+
+
+def ripple(throttle: Number) -> Number:
+    """Return the ripple current of an ESC over throttle: largest, 1, at 0.7."""
+    return throttle * (1.4 - throttle) / 0.49
 
 
 def lowpass(x: FloatArray, t: FloatArray, tau: float, start: float | None = None) -> FloatArray:

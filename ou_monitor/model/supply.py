@@ -183,7 +183,8 @@ class Simulation:
         return Segment(
             t=stamps, at=stamps, step=step, throttle=throttle, origin=self._origin,
             alpha=of(ou.alpha), sigma=of(ou.sigma), power=of(1.0), push=of(0.0), bend=(0.0, 0.0),
-            x=np.broadcast_to(0.0, n), level=np.full(n, ou.u0), voltage=np.broadcast_to(0.0, n))
+            x=np.broadcast_to(0.0, n), level=np.full(n, ou.u0),
+            noise=np.broadcast_to(1.0, n), voltage=np.broadcast_to(0.0, n))
 
 
 def _in_order(terms: Sequence[Term], rng: np.random.Generator) -> list[Effect]:

@@ -11,6 +11,7 @@ import numpy as np
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import parameter, Role, Term
+from ou_monitor.records import FloatArray
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class MeasurementNoise(Term):
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
         def effect(s: Segment) -> None:
-            s.voltage += self.std * rng.standard_normal(s.t.size)
+            s.voltage += self.std * s.noise * rng.standard_normal(s.t.size)
 
         return effect
 
@@ -48,3 +49,7 @@ class MeasurementNoise(Term):
     def variance(self) -> float:
         """Return the variance that this term adds to each measurement, V^2."""
         return self.std * self.std
+
+    def variances(self, s: Segment) -> FloatArray | float:
+        """Return the same at each sample."""
+        return self.variance() * np.square(s.noise)

@@ -61,6 +61,8 @@ class Segment:
         OU deviation, V.
     level : ndarray, shape (n,)
         All else that the rail does, V.
+    noise : ndarray, shape (n,)
+        Factor on the deviation of the white noise of the measurement.
     voltage : ndarray, shape (n,)
         What is logged, V.
 
@@ -78,6 +80,7 @@ class Segment:
     bend: tuple[float, float]
     x: FloatArray
     level: FloatArray
+    noise: FloatArray
     voltage: FloatArray
 
 

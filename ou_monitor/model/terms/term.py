@@ -118,6 +118,8 @@ class Term:
         Whether a fit takes seconds, so that cheaper terms are tried first.
     STATES : int
         States that it adds to the linear system (`Role.BLOCK`).
+    CHANGES : type of Term, or None
+        The term that it changes and that a model needs beside it; None for the `ou`.
     LIVE : Live
         How the live estimate follows it.
 
@@ -147,6 +149,7 @@ class Term:
     SEARCH: ClassVar[float] = 0.0
     DEAR: ClassVar[bool] = False
     STATES: ClassVar[int] = 0
+    CHANGES: ClassVar[type[Term] | None] = None
     LIVE: ClassVar[Live] = Live.NOT
     MEANING: ClassVar[str] = ''
     REMEDY: ClassVar[str] = ''
@@ -285,6 +288,10 @@ class Term:
     def variance(self) -> float:
         """Return the variance that this term adds to each measurement, V^2 (`Role.NOISE`)."""
         return 0.0
+
+    def variances(self, s: Segment) -> FloatArray | float:
+        """Return the same at each sample of a segment, where what is measured changes it."""
+        return self.variance()
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:

@@ -1,0 +1,240 @@
+"""
+What the mean answers to: throttle, its lags, time; by regression on whitened samples.
+
+The recording and the columns of all candidates go through the filter of the noise found so far;
+then any set of terms is a small linear system.  Its evidence is the less of two: the likelihood
+less its price (BIC), and what the set gains on blocks that were kept back one after the other.
+The first guards against noise, the second against a form that only mends one part of the
+recording.  Terms come and go one at a time, from the load model on.
+
+Limits: time constants and delays are those of the list; what noise the rest has is taken as found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.criticism.composite import Composite
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.structure import whitened
+from ou_monitor.discovery import decision
+from ou_monitor.model.load import INRUSH_TIME
+from ou_monitor.model.load_fit import fit_load
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.drift import Drift
+from ou_monitor.model.terms.laws import View
+from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.load_transient import LoadTransient
+from ou_monitor.model.terms.term import NEXT_TO_ZERO, Role, Term
+from ou_monitor.records import FloatArray
+
+# Blocks kept back in turn.
+FOLDS = 10
+# Means that the load model is fitted to at most: its time constants are 20 ms and more.
+_MOST = 2000
+# Time constants nearer than this factor are one: half an octave, as the list has them.
+_ALIKE = 1.5
+# Terms that come and go at most.
+_ROUNDS = 40
+
+
+def load_terms(samples: Samples) -> tuple[Term, ...]:
+    """Return the terms of the load model of a recording; none without throttle."""
+    if samples.throttle is None:
+        return ()
+    size = math.ceil(samples.n / _MOST)
+    count = samples.n // size
+
+    def mean(x: FloatArray) -> FloatArray:
+        return np.asarray(x[:count * size].reshape(count, size).mean(axis=1), dtype=np.float64)
+
+    u = np.clip(samples.throttle, 0.0, 1.0)
+    try:
+        model = fit_load(mean(samples.t - samples.t[0]), mean(samples.voltage), mean(u)).model
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+        return ()
+    longest = 0.25 * float(samples.t[-1] - samples.t[0])
+    shortest = float(np.median(samples.step[1:]))
+    times = [tau for tau in (INRUSH_TIME, model.fast_time, model.slow_time)
+             if 0.5 * shortest <= tau <= longest]
+    return (LoadSag(0.0, NEXT_TO_ZERO), *(LoadTransient(0.0, tau, 0.0) for tau in times),
+            Drift(0.0, NEXT_TO_ZERO))
+
+
+@dataclass(frozen=True)
+class Answer:
+    """
+    Terms of the mean, and what each is worth.
+
+    Attributes
+    ----------
+    terms : tuple of Term
+        In the order of what is lost without them, the largest first.
+    worth : tuple of float
+        Evidence lost without each, nats.
+    rivals : tuple of tuple of str
+        For each, the other causes that do as well in its place.
+
+    """
+
+    terms: tuple[Term, ...]
+    worth: tuple[float, ...]
+    rivals: tuple[tuple[str, ...], ...]
+
+
+def mean_answer(samples: Samples, composite: Composite, view: View,
+                start: Sequence[Term] = ()) -> Answer:
+    """Return the terms of the mean that a recording shows beside the others of a model."""
+    own = [term for term in composite.terms if _measured(term)]
+    pool = [*(term for term in start if not _there(term, own)), *own]
+    pool += [term for term in _candidates(view) if not _there(term, pool)]
+    if not pool:
+        return Answer((), (), ())
+    return _Regression(samples, composite, pool).search([
+        k for k, term in enumerate(pool) if term in own or term in start])
+
+
+def _measured(term: Term) -> bool:
+    return term.ROLE is Role.MEAN and term.MEASURED
+
+
+def _there(term: Term, others: Sequence[Term]) -> bool:
+    """Return whether a term, or one that is nearly the same, is among others."""
+    for other in others:
+        if type(other) is not type(term) or len(other.LINEAR) != len(term.LINEAR):
+            continue
+        if not isinstance(term, LoadTransient) or not isinstance(other, LoadTransient):
+            return True
+        ratio = term.tau / other.tau
+        if term.delay == other.delay and 1.0 / _ALIKE < ratio < _ALIKE:
+            return True
+    return False
+
+
+def _candidates(view: View) -> Iterator[Term]:
+    """Yield the candidates of all measured causes of the mean."""
+    for kind in catalogue().values():
+        if kind.ROLE is Role.MEAN and kind.MEASURED and (
+                view.throttle is not None or not kind.NEEDS_THROTTLE):
+            yield from kind.candidates(view)
+
+
+class _Regression:
+    """Sums of products of whitened columns, block by block."""
+
+    def __init__(self, samples: Samples, composite: Composite, pool: Sequence[Term]) -> None:
+        self._pool = list(pool)
+        through = whitened(samples, composite.terms, self._pool, composite.events,
+                           composite.offset)
+        sizes = [len(term.LINEAR) for term in self._pool]
+        ends = np.cumsum([2, *sizes])
+        self._at = [np.arange(a, b) for a, b in zip(ends[:-1], ends[1:])]
+        through[:, 1:] /= np.maximum(np.sqrt(np.mean(through[:, 1:]**2, axis=0)), 1e-300)
+        self._blocks = np.array([part.T @ part for part in np.array_split(through, FOLDS)])
+        self._all = self._blocks.sum(axis=0)
+        self._price = 0.5 * math.log(samples.n)
+        self._known: dict[tuple[int, ...], tuple[float, FloatArray]] = {}
+
+    def search(self, start: Sequence[int]) -> Answer:
+        """Let terms come and go until none of them makes it better."""
+        chosen = self._one_of_a_kind(start)
+        for _ in range(_ROUNDS):
+            better = self._best_move(chosen)
+            if better is None:
+                break
+            chosen = better
+        worth = [self._value(chosen) - self._value(self._less(chosen, k)) for k in chosen]
+        order = np.argsort(-np.array(worth)) if worth else np.zeros(0, dtype=int)
+        found = [chosen[k] for k in order.tolist()]
+        return Answer(tuple(self._pool[k] for k in found),
+                      tuple(worth[k] for k in order.tolist()),
+                      tuple(self._rivals(chosen, k) for k in found))
+
+    def _best_move(self, chosen: tuple[int, ...]) -> tuple[int, ...] | None:
+        """Return the set after the best change; None where none helps."""
+        value = self._value(chosen)
+        largest = value - self._value(())
+        best, most = None, 0.0
+        for k in chosen:
+            less = self._less(chosen, k)
+            # What goes spares its price: it has to be worth it.
+            gain = self._least(less, k, largest) - (value - self._value(less))
+            if not self._steady(less, chosen):
+                gain = max(gain, 1e-6)
+            if gain > most:
+                best, most = less, gain
+        if best is not None:
+            return best
+        for k in range(len(self._pool)):
+            if k in chosen:
+                continue
+            more = self._with(chosen, k)
+            swapped = len(more) == len(chosen)
+            gain = self._value(more) - value - (
+                0.0 if swapped else self._least(chosen, k, largest))
+            if gain > max(most, 0.1) and (swapped or self._steady(chosen, more)):
+                best, most = more, gain
+        return best
+
+    def _least(self, beside: tuple[int, ...], k: int, largest: float) -> float:
+        """Return the evidence that a term must bring beside others, nats."""
+        kind = type(self._pool[k])
+        again = any(type(self._pool[j]) is kind for j in beside)
+        return decision.least_evidence(kind, max(largest, 0.0), again)
+
+    def _less(self, chosen: tuple[int, ...], k: int) -> tuple[int, ...]:
+        return tuple(j for j in chosen if j != k)
+
+    def _with(self, chosen: tuple[int, ...], k: int) -> tuple[int, ...]:
+        """Return a set with one more term, in the place of another one of its kind if need be."""
+        kind = type(self._pool[k])
+        kept = chosen if kind.SEVERAL else tuple(
+            j for j in chosen if type(self._pool[j]) is not kind)
+        return tuple(sorted((*kept, k)))
+
+    def _one_of_a_kind(self, start: Sequence[int]) -> tuple[int, ...]:
+        chosen: tuple[int, ...] = ()
+        for k in start:
+            chosen = self._with(chosen, k)
+        return chosen
+
+    def _value(self, chosen: tuple[int, ...]) -> float:
+        """Return the evidence for a set of terms, nats."""
+        return self._evaluated(chosen)[0]
+
+    def _evaluated(self, chosen: tuple[int, ...]) -> tuple[float, FloatArray]:
+        """Return evidence, and what each block kept back costs, nats."""
+        if chosen not in self._known:
+            at = np.concatenate([[1], *(self._at[k] for k in chosen)]).astype(int)
+            lost = np.array([_lost(self._all - block, block, at) for block in self._blocks])
+            inside = _lost(self._all, self._all, at)
+            search = sum(self._pool[k].SEARCH for k in chosen)
+            value = -max(inside + self._price * at.size, float(lost.sum())) - search
+            self._known[chosen] = value, lost
+        return self._known[chosen]
+
+    def _steady(self, less: tuple[int, ...], more: tuple[int, ...]) -> bool:
+        """Return whether the larger set gains in more than one of the blocks."""
+        return decision.is_shared(self._evaluated(less)[1] - self._evaluated(more)[1])
+
+    def _rivals(self, chosen: tuple[int, ...], k: int) -> tuple[str, ...]:
+        """Return the causes that do as well in the place of one."""
+        value, less = self._value(chosen), self._less(chosen, k)
+        names = [term.NAME for j, term in enumerate(self._pool)
+                 if type(term) is not type(self._pool[k]) and j not in chosen
+                 and len(self._with(less, j)) == len(chosen)
+                 and self._value(self._with(less, j)) > value - decision.TIE]
+        return tuple(dict.fromkeys(names))
+
+
+def _lost(fitted: FloatArray, scored: FloatArray, at: npt.NDArray[np.int64]) -> float:
+    """Return half the squares that a fit to some blocks leaves on others."""
+    gram = fitted[np.ix_(at, at)]
+    # The columns have one scale: a millionth of a millionth keeps what is the same from division.
+    beta = np.linalg.solve(gram + 1e-10 * np.trace(gram) * np.eye(at.size), fitted[at, 0])
+    inside = scored[np.ix_(at, at)]
+    return 0.5 * float(scored[0, 0] - 2.0 * beta @ scored[at, 0] + beta @ inside @ beta)
