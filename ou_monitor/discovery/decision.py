@@ -52,8 +52,8 @@ ACCEPT = 6.0
 # The same for a mean that answers to a measured input, which every flight has: e^3 = 20, 5 % for
 # one kind.
 ACCEPT_MEAN = 3.0
-# Share of the largest evidence that another term of a kind needs that is there: less mends its form,
-# which is right to some per cent of the effect, and so to its square of the evidence: (7 %)^2.
+# Share of the largest evidence that another term needs of a kind that is there: less mends its
+# form, which is right to some per cent of the effect, and so to the square of it: (7 %)^2.
 AGAIN_SHARE = 0.005
 # The same for one intensity over throttle beside another: curves of the recordings here leave a
 # tenth of what the first explains.
@@ -235,7 +235,8 @@ def is_shared(gains: npt.ArrayLike) -> bool:
     """
     parts = np.asarray(gains, dtype=np.float64)
     error = math.sqrt(parts.size) * float(parts.std(ddof=1))
-    return float(parts.sum()) > SHARED * error
+    # A hair more: one part alone is on the edge.
+    return bool(float(parts.sum()) > SHARED * error * (1.0 + 1e-9))
 
 
 def rivals_of(best: str, evidence: Sequence[tuple[str, float]]) -> list[str]:

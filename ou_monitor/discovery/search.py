@@ -289,7 +289,7 @@ def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:
                     < decision.FORM * largest):
                 tried.append(found)
             if not best.has(MeasurementNoise.NAME) and kind is not LoadDependentSigma:
-                more = [MeasurementNoise(0.8 * error)]
+                more: list[Term] = [MeasurementNoise(0.8 * error)]
                 if kind is LoadDependentNoise:
                     more = [*more, *LoadDependentNoise.candidates(view)]
                 found = fitter.fit([slow, *best.terms[1:], *more], best, rough=True)

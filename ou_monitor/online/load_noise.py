@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from ou_monitor.online.supply_load import ripple
+from ou_monitor.model.load import ripple
 from ou_monitor.records import FloatArray
 
 # Standard scores beyond this are weighed down; they score this much, squared, in the noise.

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import enum
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.model.load import ripple
 from ou_monitor.records import FloatArray, NAN
 
 # Lags, s, of the load: of the motors, and of polarisation (the batch's medians, rounded).
@@ -22,19 +22,12 @@ POWER = 1.8
 # Throttle at which the sag is tabled.
 TABLE = np.linspace(0.0, 1.0, 101)
 
-_Number = TypeVar('_Number', float, FloatArray)
-
 
 def static(throttle: npt.ArrayLike) -> FloatArray:
     """Return the regressors of a steady sag without polarisation, shape (n, 4)."""
     u = np.asarray(throttle, dtype=np.float64)
     x = u ** POWER
     return np.stack([x, u, u ** 3, x], axis=-1)
-
-
-def ripple(u: _Number) -> _Number:
-    """Return the ripple of an ESC over throttle: largest, 1, at 0.7."""
-    return u * (1.4 - u) / 0.49
 
 
 class LoadStatus(enum.Enum):

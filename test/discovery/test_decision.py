@@ -180,17 +180,30 @@ def test_exact_findings_and_kinds_without_signs_are_never_tried():
 
 
 def test_throttle_must_be_known_to_what_needs_it():
-    asked = {'throttle': 5.0, 'time': 5.0}
-    assert tried(asked, tier=0) == ['mean', 'trend']
-    assert tried(asked, tier=0, throttle=False) == ['trend']
+    asked = {'variance throttle': 5.0}
+    assert tried(asked, tier=0) == ['intensity']
+    assert tried(asked, tier=0, throttle=False) == []
 
 
-@pytest.mark.parametrize('values, model, also', [
-    # Once something was found, cheap means are tried wherever something is left.
-    ({'skewness': 4.6}, [KINDS['ou'], Cheap], True),
-    ({'skewness': 4.4}, [KINDS['ou'], Cheap], False), ({'skewness': 4.6}, [KINDS['ou']], False)])
-def test_measured_means_are_tried_unasked(values, model, also):
-    assert tried(values, model, tier=0) == (['mean', 'trend'] if also else [])
+def test_answers_of_the_mean_to_what_is_measured_are_left_to_the_regression():
+    assert tried({'throttle': 50.0, 'time': 50.0}, tier=0) == []
+    assert [kind for kind in TOYS if decision.is_answer(kind)] == [Mean, Trend]
+
+
+@pytest.mark.parametrize('kind, largest, again, least', [
+    (Mean, 0.0, False, 3.0), (Mean, 1e4, False, 3.0), (Mean, 1e4, True, 50.0),
+    (Mean, 100.0, True, 3.0), (Cheap, 1e4, True, 6.0)])
+def test_one_more_answer_needs_a_share_of_the_largest(kind, largest, again, least):
+    """A form that is right to 7 % leaves (7 %)^2 = 0.5 % of what it explains."""
+    assert decision.least_evidence(kind, largest, again) == pytest.approx(least)
+
+
+@pytest.mark.parametrize('gains, shared', [
+    ([5.0, 0.0, 0.0, 0.0], False), ([5.0, 1.0, 0.0, 0.0], True), ([3.0, 2.0, -6.0, 3.0], False),
+    ([1.0, 1.0, 1.0, 1.0], True), ([-1.0, -1.0, -1.0, -1.0], False)])
+def test_more_than_one_part_must_gain(gains, shared):
+    """Of one part alone the error of the sum is the sum."""
+    assert decision.is_shared(gains) is shared
 
 
 @pytest.mark.parametrize('one, left, kind, spared', [

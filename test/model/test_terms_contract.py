@@ -12,6 +12,7 @@ from term_examples import EXAMPLES, OU, still, supply, term
 # Typed by hand from the table of causes, so that a renamed term is a broken promise.
 FAMILIES = {
     'load_sag': 'load', 'load_transient': 'load', 'load_dependent_sigma': 'intensity',
+    'load_dependent_noise': 'intensity',
     'load_dependent_alpha': 'restoring', 'drift': 'slow', 'measurement_noise': 'sensor',
     'quantization': 'sensor', 'held_samples': 'sensor', 'saturation': 'sensor',
     'second_relaxation': 'slow', 'resonance': 'line', 'tone': 'line', 'throttle_tone': 'line',
@@ -20,7 +21,7 @@ FAMILIES = {
     'nonlinear_restoring': 'restoring', 'flicker_noise': 'slow', 'clock_jitter': 'sensor',
 }
 THROTTLED = {'load_sag', 'load_transient', 'load_dependent_sigma', 'load_dependent_alpha',
-             'throttle_tone'}
+             'load_dependent_noise', 'throttle_tone'}
 # What is out of range, and what the message must say.
 OUT_OF_RANGE = [
     ('ou', 'alpha', 0.0, 'above 0 1/s'), ('ou', 'alpha', -1.0, 'above 0 1/s'),
@@ -52,6 +53,7 @@ NEUTRAL = {
     'load_sag': {'linear': 0.0, 'square': 0.0},
     'load_transient': {'gain': 0.0, 'tau': 0.03, 'delay': 0.01},
     'load_dependent_sigma': {'throttle': [0.3], 'log_factor': [0.0]},
+    'load_dependent_noise': {'ripple': 0.0, 'change': 0.0},
     'load_dependent_alpha': {'slope': 0.0}, 'drift': {'rate': 0.0, 'curvature': 0.0},
     'measurement_noise': {'std': 0.0}, 'quantization': {'step': 1e-12},
     'held_samples': {'rate': 1000.0}, 'saturation': {'low': -100.0, 'high': 100.0},
@@ -88,8 +90,8 @@ def throttle(t):
 
 
 def test_catalogue():
-    """The 22 causes of the contract, and the `ou` ahead of them; nothing else."""
-    assert len(FAMILIES) == 22
+    """The 23 causes of the contract, and the `ou` ahead of them; nothing else."""
+    assert len(FAMILIES) == 23
     assert list(catalogue())[0] == 'ou' and set(catalogue()) == {'ou', *FAMILIES}
     assert {n: c.FAMILY for n, c in catalogue().items() if n != 'ou'} == FAMILIES
     assert {n for n, c in catalogue().items() if c.NEEDS_THROTTLE} == THROTTLED
@@ -190,8 +192,10 @@ def test_samples_do_not_depend_on_the_segments(name, uneven):
 def test_it_does_something(name):
     """The ordinary parameters change the samples, so that the test of neutral ones can fail."""
     t = stamps()
-    plain = supply().simulate(t, np.random.default_rng(4), throttle(t))
-    changed = supply(term(name, **EXAMPLES[name])).simulate(
+    needed = catalogue()[name].CHANGES
+    beside = () if needed is None else (term(needed.NAME, **EXAMPLES[needed.NAME]),)
+    plain = supply(*beside).simulate(t, np.random.default_rng(4), throttle(t))
+    changed = supply(*beside, term(name, **EXAMPLES[name])).simulate(
         t, np.random.default_rng(4), throttle(t))
     assert np.abs(changed - plain).max() > 1e-3
 
@@ -251,7 +255,8 @@ ALIKE = [{'volatility', 'regime_switching', 'heavy_tails', 'jumps'},
          {'second_relaxation', 'flicker_noise', 'regime_switching'},
          {'nonlinear_restoring', 'regime_switching'}]
 RECURS = {'tone', 'throttle_tone', 'resonance', 'second_relaxation', 'load_transient'}
-MEASURED = {'load_sag', 'load_transient', 'load_dependent_sigma', 'load_dependent_alpha', 'drift'}
+MEASURED = {'load_sag', 'load_transient', 'load_dependent_sigma', 'load_dependent_noise',
+            'load_dependent_alpha', 'drift'}
 MAY_LEAVE = {'measurement_noise': 0.3, 'tone': 0.3, 'throttle_tone': 0.3, 'resonance': 0.1,
              'ac_coupling': 0.75}
 BY_THROTTLE = {'ou', 'load_sag', 'load_dependent_sigma', 'load_dependent_alpha'}
