@@ -93,6 +93,8 @@ def render(analysis: Analysis) -> str:
 def _origin(recording: Recording) -> str:
     """Say which topics or columns voltage and throttle came from."""
     source, origins = recording.source, []
+    if 'voltage' in source:
+        return f"voltage: {source['voltage']}; throttle: {source.get('throttle', 'none')}"
     if 'voltage_topic' not in source:
         throttle = 'column throttle' if recording.has_throttle else 'none'
         return f'voltage: column voltage_v; throttle: {throttle}'

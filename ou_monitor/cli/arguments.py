@@ -10,11 +10,16 @@ from ou_monitor.cli import output
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
+    from ou_monitor.recordings.csv_table import CsvColumns
     from ou_monitor.records import Recording
 
 _NAN = float('nan')
 # Options of the topics, by the names that the parser gives them.
-_TOPICS = ('msg_config', 'voltage_topic', 'throttle_topic')
+_TOPICS = ('msg_config', 'voltage_topic', 'throttle_topic', 'flight', 'time_column',
+           'voltage_column', 'throttle_column', 'unit', 'time_unit')
+# Fields of `CsvColumns`, and the options that give them.
+_COLUMNS = {'time': 'time_column', 'voltage': 'voltage_column', 'throttle': 'throttle_column',
+            'unit': 'unit', 'time_unit': 'time_unit'}
 
 
 def check_outputs(args: argparse.Namespace, *names: str, **inputs: Any) -> None:
@@ -36,7 +41,16 @@ def read_given(args: argparse.Namespace, start: float | None, end: float | None)
         return read_recording(
             args.recording, msg_config=args.msg_config, voltage_topic=args.voltage_topic,
             throttle_topic=args.throttle_topic, partial=args.partial, start=start, end=end,
-            progress=progress)
+            flight=args.flight, columns=_columns(args), progress=progress)
+
+
+def _columns(args: argparse.Namespace) -> CsvColumns | None:
+    """Return the columns of a CSV that were named; None when nothing was."""
+    from ou_monitor.recordings.csv_table import CsvColumns
+
+    given = {name: getattr(args, option) for name, option in _COLUMNS.items()
+             if getattr(args, option) is not None}
+    return CsvColumns(**given) if given else None
 
 
 def repeated(args: argparse.Namespace, *names: str) -> list[str]:
@@ -44,7 +58,8 @@ def repeated(args: argparse.Namespace, *names: str) -> list[str]:
     words: list[str] = []
     given: list[tuple[str, Any]] = [
         ('--from', getattr(args, 'start', None)), ('--to', getattr(args, 'end', None))]
-    given += [('--' + name.replace('_', '-'), getattr(args, name)) for name in (*names, *_TOPICS)]
+    given += [('--' + name.replace('_', '-'), getattr(args, name, None))
+              for name in (*names, *_TOPICS)]
     for option, value in given:
         if value is not None:
             words += [option, str(value)]

@@ -86,7 +86,8 @@ def _flight_number(text: str) -> int:
 
 _RECORDING = Option(
     'recording', metavar='RECORDING',
-    help='.mcap file, rosbag2 folder, or CSV with columns time_s, voltage_v[, throttle]')
+    help='.mcap file, rosbag2 folder, CSV with columns time_s, voltage_v[, throttle], or a log '
+    'that convert reads (.bbl, .bin, .ulg)')
 # Which part of a recording is read.
 _PART = (
     Option('--from', metavar='S', dest='start',
@@ -100,6 +101,19 @@ _TOPICS = (
     Option('--voltage-topic', metavar='TOPIC', help='topic of the voltage'),
     Option('--throttle-topic', metavar='TOPIC', help='topic of the throttle'),
     Option('--partial', action='store_true', help='use what a truncated file still holds'))
+# How a log or a CSV is read.
+_FILES = (
+    Option('--flight', metavar='N', type=_flight_number,
+           help='which flight of a log with several, from 1 (default: the largest)'),
+    Option('--time-column', metavar='NAME', help='column of a CSV (default: time_s)'),
+    Option('--voltage-column', metavar='NAME',
+           help='column of a CSV (default: voltage_v), or series of a log (default: the battery)'),
+    Option('--throttle-column', metavar='NAME',
+           help='column of a CSV, 0..1 (default: throttle, if it is there), or series of a '
+           'log'),
+    Option('--unit', choices=('V', 'mV'), help='of the voltage in a CSV (default: V)'),
+    Option('--time-unit', choices=('s', 'ms', 'us', 'ns'),
+           help='of the time in a CSV (default: s)'))
 _JSON = Option('--json', metavar='FILE',
                help="write the result as JSON ('-': to standard output, alone)")
 _REPORT = Option('--report', metavar='FILE.html', help='write a self-contained HTML page')
@@ -138,7 +152,7 @@ _ANALYZE = Command(
     '95 % intervals, and the type of process.',
     (_RECORDING, _levels('found'), *_PART,
      *_estimate('voltage that must not be undershot, V (default: as the node, 4.5)'),
-     *_TOPICS, _JSON, _REPORT))
+     *_TOPICS, *_FILES, _JSON, _REPORT))
 
 _CONVERT = Command(
     'convert', 'a log becomes an MCAP bag', 'ou_monitor.cli.convert',
@@ -158,7 +172,7 @@ _CONVERT = Command(
      Option('--current', metavar='NAME',
             help="which current, or 'none' (default: that of the sensor of the voltage)"),
      Option('--flight', metavar='N', type=_flight_number,
-            help='which flight of a file with several, from 1'),
+            help='which flight of a file with several, from 1 (default: the largest)'),
      (Option('--drop-held', action='store_true',
              help='drop voltages that a logger repeats until the ADC is read again'),
       Option('--drop-repeats', action='store_true',
@@ -181,7 +195,7 @@ _COUPLING = Command(
             help='frequencies looked at, Hz (default: 5 to a quarter of the slower rate)'),
      Option('--level', metavar='P', default='0.05',
             help='probability of a false alarm (default: %(default)s)'),
-     *_TOPICS, _JSON))
+     *_TOPICS, *_FILES, _JSON))
 
 _DESIGN = Command(
     'design', 'which capacitance brings the brown-out risk under X at throttle Y',
@@ -217,7 +231,7 @@ _DISCOVER = Command(
     'ou_monitor.cli.discover',
     'Fit and simulate the plain OU, find what it gets wrong, name the cause, extend the model, '
     'and measure the gain on samples not used for the fit.',
-    (_RECORDING, *_PART, _seed(0), *_TOPICS, _JSON,
+    (_RECORDING, *_PART, _seed(0), *_TOPICS, *_FILES, _JSON,
      Option('--save-model', metavar='FILE.yaml',
             help='write the extended model, for simulate --model and the estimator'),
      _REPORT))

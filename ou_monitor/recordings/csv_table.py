@@ -12,6 +12,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Iterator, Sequence
 import csv
+from dataclasses import dataclass
 import io
 from pathlib import Path
 from typing import TextIO
@@ -34,10 +35,48 @@ _LONGEST = 40
 MOST_OF_LINE = 65536
 
 
-def read_csv(path: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the columns of a CSV as they stand, unsorted and with NaN kept."""
-    columns = _columns(path, (TIME, VOLTAGE), (THROTTLE,))
-    return columns[0], columns[1], columns[2]
+@dataclass(frozen=True)
+class CsvColumns:
+    """
+    Which columns of a CSV are meant, and what their numbers are.
+
+    Attributes
+    ----------
+    time, voltage, throttle : str or None
+        Names of columns; None: ``time_s``, ``voltage_v`` and ``throttle``, if it is there.
+    unit : str
+        Unit of the voltage: V or mV.
+    time_unit : str
+        Unit of the time: s, ms, us or ns.
+
+    """
+
+    time: str | None = None
+    voltage: str | None = None
+    throttle: str | None = None
+    unit: str = 'V'
+    time_unit: str = 's'
+
+
+# What to say of a column that is not there.
+_OPTIONS = {TIME: '--time-column', VOLTAGE: '--voltage-column'}
+VOLTAGE_UNITS = {'V': 1.0, 'mV': 1e-3}
+TIME_UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
+
+
+def read_csv(path: Path, columns: CsvColumns | None = None,
+             ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return time, s, voltage, V, and throttle as they stand, unsorted and with NaN kept."""
+    wanted = columns or CsvColumns()
+    time, voltage = wanted.time or TIME, wanted.voltage or VOLTAGE
+    # A column that was named must be there.
+    throttle = ((), (THROTTLE,)) if wanted.throttle is None else ((wanted.throttle,), ())
+    named = [time, voltage, *throttle[0]]
+    if len(set(named)) < len(named):
+        raise InputError(f'{path}: one column cannot be two of time, voltage and throttle: '
+                         f"{', '.join(named)}")
+    t, v, u = _columns(path, (time, voltage, *throttle[0]), throttle[1])
+    return t * TIME_UNITS[wanted.time_unit], v * VOLTAGE_UNITS[wanted.unit], u
 
 
 def read_column(path: Path, name: str) -> tuple[FloatArray, FloatArray]:
@@ -136,7 +175,8 @@ def _header(path: Path, lines: _Lines, first: str | None, needed: Sequence[str],
     for name in needed:
         if name not in header:
             raise InputError(
-                f"{path}:{lines.number}: no column '{name}': {_hint(name, header)}")
+                f"{path}:{lines.number}: no column '{name}': {_hint(name, header)}"
+                + (f' ({_OPTIONS[name]} names another)' if name in _OPTIONS else ''))
     return header, delimiter
 
 

@@ -18,7 +18,9 @@ import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.columns import batches, join
-from ou_monitor.recordings.csv_table import read_column, read_csv
+from ou_monitor.recordings.csv_table import CsvColumns, read_column, read_csv
+from ou_monitor.recordings.importers.formats import is_log
+from ou_monitor.recordings.log_bag import log_as_bag
 from ou_monitor.recordings.samples import (
     check_throttle, dropped_words, late_words, overlap, part_words, repeated_words, SampleReader,
     span_words, usable_voltage)
@@ -29,6 +31,9 @@ from ou_monitor.text import printable
 # Samples of a piece, where the caller does not say.
 PIECE = 1_000_000
 
+# Samples further apart, s, are more likely of another unit of time than of a slow logger.
+_SPARSE = 5.0
+
 # Types whose only number need not be named.
 _SCALARS = ('std_msgs/msg/Float32', 'std_msgs/msg/Float64')
 
@@ -36,7 +41,8 @@ _SCALARS = ('std_msgs/msg/Float32', 'std_msgs/msg/Float64')
 def read_recording(
     path: str | Path, *, msg_config: str | Path | None = None, voltage_topic: str | None = None,
     throttle_topic: str | None = None, partial: bool = False, start: float | None = None,
-    end: float | None = None, progress: Callable[[float], None] | None = None,
+    end: float | None = None, flight: int | None = None, columns: CsvColumns | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Recording:
     """
     Read a recording of a supply.
@@ -44,8 +50,9 @@ def read_recording(
     Parameters
     ----------
     path : str or path
-        An .mcap file, a rosbag2 directory, or a CSV with the columns
-        ``time_s, voltage_v[, throttle]``.
+        An .mcap file, a rosbag2 directory, a CSV with the columns
+        ``time_s, voltage_v[, throttle]``, or a log of an autopilot that
+        `convert` reads (its extra installed).
     msg_config : str or path, optional
         Name of a msg config, or a YAML file; found out when the bag leaves
         one choice.
@@ -58,6 +65,10 @@ def read_recording(
         the first sample of the CSV: start <= t < end.  Of a bag only the
         chunks in it are read, and those before it back to the last throttle,
         which is held.
+    flight : int, optional
+        Which flight of a log with several, from 1; the largest when left out.
+    columns : CsvColumns, optional
+        Names and units of the columns of a CSV; names of the series of a log.
     progress : callable, optional
         Called with the share done, 0..1.
 
@@ -81,9 +92,26 @@ def read_recording(
                               ('--throttle-topic', throttle_topic)):
             if value is not None:
                 raise InputError(f'{path} is a CSV: {option} is for bags')
+        if flight is not None:
+            raise InputError(f'{path} is a CSV: --flight is for logs')
         name = printable(path.name)
-        return _cut(tidy(*read_csv(path), name, {'file': name, 'format': 'csv'}, []),
+        return _cut(tidy(*read_csv(path, columns), name, {'file': name, 'format': 'csv'}, []),
                     start, end)
+    if is_log(path):
+        if columns is not None and columns != CsvColumns(None, columns.voltage, columns.throttle):
+            raise InputError(f'{path} is a log: its time and units are known')
+        for option, value in (('--msg-config', msg_config), ('--voltage-topic', voltage_topic),
+                              ('--throttle-topic', throttle_topic)):
+            if value is not None:
+                raise InputError(f'{path} is a log: {option} is for bags; convert chooses among '
+                                 'the series of a log')
+        named_series = columns or CsvColumns()
+        with log_as_bag(path, flight=flight, voltage=named_series.voltage,
+                        throttle=named_series.throttle, progress=progress) as (bag, named):
+            return named(read_recording(bag, start=start, end=end))
+    if flight is not None or columns is not None:
+        raise InputError(f'{path} is a bag: --flight is for logs, names and units of columns are '
+                         'for logs and CSVs')
     reader = SampleReader(
         BagReader(path, partial=partial), msg_config=msg_config, voltage_topic=voltage_topic,
         throttle_topic=throttle_topic, start=start, end=end)
@@ -180,7 +208,7 @@ def tidy(
     source: dict[str, str], notes: list[str],
 ) -> Recording:
     """Return a `Recording`: finite, in order, each stamp once; notes say what that took."""
-    check_throttle(name, throttle)
+    check_throttle(name, throttle, voltage)
     good = usable_voltage(t, voltage)
     if not good.all():
         notes.append(dropped_words(t.size - int(good.sum()), voltage[~good]))
@@ -198,6 +226,9 @@ def tidy(
     throttle = np.where(np.isfinite(throttle), throttle, np.nan)
     if not t.size:
         raise InputError(_unusable(name, notes))
+    if t.size > 2 and (spacing := float(np.median(np.diff(t)))) >= _SPARSE:
+        notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '
+                     '--time-unit says so of a CSV.')
     return Recording(t, voltage, throttle, name, source, tuple(notes))
 
 

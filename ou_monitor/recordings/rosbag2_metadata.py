@@ -192,7 +192,8 @@ def find_files(path: Path, partial: bool) -> BagFiles:
     if not files:
         raise InputError(f'{path} is not a bag: it holds neither {FILE} nor an .mcap file'
                          + ("; name one of the bags in it, or give all to 'ou-monitor fleet'"
-                            if any(path.glob(f'*/{FILE}')) else ''))
+                            if any(path.glob(f'*/{FILE}')) else
+                            "; 'ou-monitor fleet' takes folders of recordings"))
     missing = f'{FILE} is missing: the recording was cut off'
     if not partial:
         if not all(is_part(file, path) for file in files):

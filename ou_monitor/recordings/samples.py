@@ -52,10 +52,15 @@ def dropped_words(count: int, voltage: FloatArray) -> str:
             + (f', or beyond {LARGEST:g} V.' if beyond else '.'))
 
 
-def check_throttle(name: str, throttle: FloatArray) -> None:
-    """Refuse a throttle in percent, microseconds or counts."""
+def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None = None) -> None:
+    """Refuse a throttle in percent, microseconds or counts, or one that is the voltage."""
     known = throttle[np.isfinite(throttle)]
     if known.size and float(np.abs(known).max()) > MOST_THROTTLE:
+        if voltage is not None and float(np.nanmax(np.abs(voltage), initial=0.0)) <= 1.0 \
+                and float(np.median(known)) < 100.0:
+            raise InputError(
+                f'{name}: the voltage stays within 0 to 1 and throttle runs from '
+                f'{known.min():g} to {known.max():g}: are the two columns swapped?')
         raise InputError(
             f'{name}: throttle runs from {known.min():g} to {known.max():g}, and 0 to 1 is '
             'expected: divide a percentage by 100 (of a bag: unit_factor of a msg config), turn '

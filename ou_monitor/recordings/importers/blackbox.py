@@ -40,22 +40,15 @@ def flights(path: Path) -> tuple[Flight, ...]:
     with quiet(path, 'orangebox'):
         pointers = Reader(str(path), None, True).log_pointers
     ends = [*pointers[1:], path.stat().st_size]
-    return tuple(Flight(k + 1, f'{end - begin} bytes from byte {begin}')
+    return tuple(Flight(k + 1, end - begin)
                  for k, (begin, end) in enumerate(zip(pointers, ends)))
 
 
 def read(path: Path, request: Request) -> Log:
-    """Read one flight of a blackbox file."""
+    """Read one flight of a blackbox file; the largest when none is named."""
     held = flights(path)
-    wanted = request.flight or 1
+    wanted = request.flight or max(held, key=lambda one: one.size, default=Flight(1, 0)).number
     notes = []
-    if request.flight is None and len(held) > 1:
-        several = f'{len(held)} flights (' + '; '.join(
-            f'{one.number}: {one.words}' for one in held) + ')'
-        if not request.everything:
-            raise InputError(f'{path} holds {several}: choose with --flight N, see what is in '
-                             'one with --flight N --list')
-        notes.append(f'The file holds {several}; this is flight 1, choose with --flight N.')
     if not 1 <= wanted <= len(held):
         raise InputError(f'{path} has no flight {wanted}: it holds {len(held)}')
     with quiet(path, 'orangebox'):
@@ -95,6 +88,11 @@ def read(path: Path, request: Request) -> Log:
     if len(held) > 1:
         facts['flight'] = f'{wanted} of {len(held)}'
     t = columns['time'] * 1e-6
+    if request.flight is None and len(held) > 1:
+        sizes = '; '.join(f'{one.number}: {one.size} bytes' for one in held)
+        length = f'{t[-1] - t[0]:.0f} s' if t.size else 'empty'
+        notes.insert(0, f'The file holds {len(held)} flights ({sizes}); this is flight {wanted}, '
+                     f'the largest ({length}): --flight N chooses another.')
     series = [*_battery(t, columns, headers, notes), *_throttles(t, columns, headers)]
     return Log('blackbox', from_start(series), facts, tuple(notes))
 

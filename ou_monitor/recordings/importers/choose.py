@@ -51,17 +51,17 @@ class Chosen:
 
 
 def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | None = None,
-           current: str | None = None) -> Chosen:
-    """Choose, and drop what cannot be a sample."""
-    volts = _pick(path, log, VOLTAGE, voltage)
+           current: str | None = None, option: str = '--{}') -> Chosen:
+    """Choose, and drop what cannot be a sample (option: what chooses a quantity by name)."""
+    volts = _pick(path, log, VOLTAGE, voltage, option)
     if volts is None:
         raise InputError(_no_voltage(path, log))
-    first = _pick(path, log, THROTTLE, throttle)
+    first = _pick(path, log, THROTTLE, throttle, option)
     if first is not None and log.format == 'csv':
         # Readers of autopilot logs know the scale of theirs; a column says nothing of it.
         check_throttle(f'{path}: {first.name}', first.values)
     if current is not None:
-        second = _pick(path, log, CURRENT, current)
+        second = _pick(path, log, CURRENT, current, option)
     else:
         second = _current(log, volts)
     notes = []
@@ -86,7 +86,7 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
     if chosen[0] is None:
         raise InputError(f'{path}: {volts.name} has no usable sample'
                          + ''.join(f' ({note})' for note in notes))
-    notes += _also(log, (volts, first))
+    notes += _also(log, (volts, first), option)
     return Chosen(chosen[0], chosen[1], chosen[2], tuple(notes))
 
 
@@ -106,14 +106,15 @@ def _listed(series: list[Series]) -> str:
     return shown + (f' and {len(series) - MOST} more, see --list' if len(series) > MOST else '')
 
 
-def _pick(path: Path, log: Log, quantity: str, name: str | None) -> Series | None:
+def _pick(path: Path, log: Log, quantity: str, name: str | None, option: str
+          ) -> Series | None:
     if name == NONE and quantity != VOLTAGE:
         return None
     if name is None:
         found = default(log, quantity)
         if len(found) > 1:
-            raise InputError(f'{path} has several: {_listed(found)}; choose with --{quantity} '
-                             'NAME, see all with --list')
+            raise InputError(f'{path} has several: {_listed(found)}; choose with '
+                             f'{option.format(quantity)} NAME, see all with --list')
         return found[0] if found else None
     held = [one for one in log.series if one.quantity in (quantity, ANY)]
     for one in held:
@@ -151,7 +152,7 @@ def _no_voltage(path: Path, log: Log) -> str:
     return f'{path} holds no voltage{why}: there is nothing to convert'
 
 
-def _also(log: Log, chosen: tuple[Series, Series | None]) -> list[str]:
+def _also(log: Log, chosen: tuple[Series, Series | None], option: str) -> list[str]:
     """Say what else could have been taken."""
     notes = []
     for quantity, one in zip((VOLTAGE, THROTTLE), chosen):
@@ -161,7 +162,8 @@ def _also(log: Log, chosen: tuple[Series, Series | None]) -> list[str]:
         ranked = [other for other in others if other.rank is not None]
         others = ranked or others if quantity == THROTTLE else others
         if others:
-            notes.append(f'Also in the log: {_listed(others)} (--{quantity} NAME).')
+            notes.append(f'Also in the log: {_listed(others)} '
+                         f'({option.format(quantity)} NAME).')
     return notes
 
 

@@ -103,6 +103,19 @@ def detect(path: Path) -> Format:
                      'today: ' + '; '.join(one.words for one in FORMATS))
 
 
+def is_log(path: Path) -> bool:
+    """Return whether a file is a log of an autopilot, by its first bytes."""
+    if not path.is_file():
+        return False
+    try:
+        with open_regular(path) as file:
+            head = file.read(HEAD)
+    except OSError:
+        # Whoever reads it says why it cannot be read.
+        return False
+    return bool(head) and any(one.fits(head) for one in FORMATS if one.package)
+
+
 def import_log(path: Path, request: Request) -> Log:
     """Read a log."""
     form = detect(path)

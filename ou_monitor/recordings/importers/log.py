@@ -99,10 +99,10 @@ class Series:
 
 @dataclass(frozen=True)
 class Flight:
-    """One of several flights in a file: number from 1, and what is known without decoding."""
+    """One of several flights in a file: number from 1, and its size in bytes."""
 
     number: int
-    words: str
+    size: int
 
 
 @dataclass(frozen=True, eq=False)

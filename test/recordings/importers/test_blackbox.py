@@ -69,18 +69,19 @@ def test_no_sensor(tmp_path):
 
 
 def test_several_flights(tmp_path):
-    """They are put to the user, and each is read on its own."""
+    """The largest is read, and a note says so; each is read on its own when it is named."""
     first, second = quad(100), quad(160, start_us=1000)
     second[:, VOLTS] += 50
     content = b''.join(blackbox(first)) + b''.join(blackbox(second))
-    with pytest.raises(InputError, match='holds 2 flights .*--flight N'):
-        load(tmp_path, content)
+    path, log = load(tmp_path, content)
+    assert log.facts['flight'] == '2 of 2'
+    assert log.notes[0].startswith('The file holds 2 flights') and '--flight N' in log.notes[0]
     for number, rows in ((1, first), (2, second)):
         path, log = load(tmp_path, content, number)
         np.testing.assert_allclose(choose(path, log).voltage.values, rows[:, VOLTS] / 100)
         assert log.facts['flight'] == f'{number} of 2' and log.notes == ()
     listed = import_log(path, Request(everything=True))
-    assert listed.series[0].n == 100 and 'holds 2 flights' in listed.notes[0]
+    assert listed.series[0].n == 160 and 'holds 2 flights' in listed.notes[0]
     with pytest.raises(InputError, match='no flight 3'):
         load(tmp_path, content, 3)
 

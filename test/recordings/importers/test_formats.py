@@ -5,9 +5,9 @@ import sys
 
 from made_logs import blackbox, copter, px4_flight, quad, ulog
 from ou_monitor.errors import InputError
+from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.importers.formats import detect, FORMATS, import_log
 from ou_monitor.recordings.importers.log import Request
-from ou_monitor.recordings.read import read_recording
 from project import ROOT
 import pytest
 
@@ -48,11 +48,11 @@ def test_what_is_no_log(tmp_path, content, words):
 
 @pytest.mark.parametrize('name', [one.name for one in FORMATS if one.extra])
 def test_a_log_given_as_a_recording(tmp_path, name):
-    """Who analyzes a log is told to convert it first."""
+    """`analyze` reads it; who replays it as a bag is told to convert it first."""
     path = tmp_path / 'flight.log'
     path.write_bytes(made(name))
     with pytest.raises(InputError, match='not a recording: convert it first') as refused:
-        read_recording(path)
+        BagReader(path)
     assert f'with ou-monitor convert {path} flight' in str(refused.value)
 
 

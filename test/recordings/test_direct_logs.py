@@ -1,0 +1,79 @@
+"""Logs and any CSV are read without a detour: as `convert` and a bag would have it."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+from ou_monitor.cli.main import main
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.csv_table import CsvColumns
+from ou_monitor.recordings.read import read_recording
+import pytest
+
+REAL = os.environ.get('OU_MONITOR_REALDATA')
+
+
+@pytest.mark.skipif(REAL is None, reason='OU_MONITOR_REALDATA names no folder of recordings')
+@pytest.mark.parametrize('file,package,voltage', [
+    ('bf_3s_erpm2.bbl', 'orangebox', None), ('ac_erle_althold2.BIN', 'pymavlink', None),
+    ('px_sample_log_small.ulg', 'pyulog', 'battery_status[1].voltage_v')])
+def test_a_log_is_what_its_bag_would_be(file, package, voltage, tmp_path):
+    """Samples, throttle, and the notes of the conversion; the name is that of the log."""
+    pytest.importorskip(package)
+    log = Path(REAL) / 'raw' / file
+    assert main(['convert', str(log), str(tmp_path / 'bag'), '--drop-held',
+                 *(() if voltage is None else ('--voltage', voltage))]) == 0
+    columns = None if voltage is None else CsvColumns(voltage=voltage)
+    wanted = read_recording(tmp_path / 'bag')
+    found = read_recording(log, columns=columns)
+    np.testing.assert_array_equal(found.t, wanted.t)
+    np.testing.assert_array_equal(found.voltage, wanted.voltage)
+    np.testing.assert_array_equal(found.throttle, wanted.throttle)
+    assert found.name == file and found.source['format'] in ('blackbox', 'dataflash', 'ulog')
+    assert any('held' in note or 'dropped' in note for note in found.notes)
+    part = read_recording(log, start=1.0, end=2.0, columns=columns)
+    assert 0 < part.n < found.n and part.duration < 1.0
+
+
+def test_columns_and_units_of_a_csv(tmp_path):
+    """Any names, mV, ms; a throttle that was named must be there, one column is one thing."""
+    path = tmp_path / 'own.csv'
+    path.write_text('when,mv,stick,throttle\n0,5000,0.25,9\n20,4900,0.5,9\n40,4950,0.75,9\n')
+    found = read_recording(path, columns=CsvColumns('when', 'mv', 'stick', 'mV', 'ms'))
+    np.testing.assert_allclose(found.t, [0.0, 0.02, 0.04])
+    np.testing.assert_allclose(found.voltage, [5.0, 4.9, 4.95])
+    np.testing.assert_allclose(found.throttle, [0.25, 0.5, 0.75])
+    for columns, words in (
+            (CsvColumns('when', 'mv', 'gas'), "no column 'gas'"),
+            (CsvColumns('when', 'mv', 'mv'), 'cannot be two of'),
+            (CsvColumns(voltage='mv'), r"no column 'time_s'.*--time-column")):
+        with pytest.raises(InputError, match=words):
+            read_recording(path, columns=columns)
+
+
+@pytest.mark.parametrize('options,words', [
+    (['--flight', '2'], 'is a CSV: --flight is for logs'),
+    (['--unit', 'kV'], 'invalid choice'),
+    (['--voltage-column', 'volts'], "no column 'volts'")])
+def test_options_that_do_not_fit_are_refused(options, words, tmp_path, capsys):
+    """One line, and status 2."""
+    path = tmp_path / 'a.csv'
+    path.write_text('time_s,voltage_v\n0,5\n1,5\n')
+    try:
+        status = main(['analyze', str(path), *options])
+    except SystemExit as stop:
+        status = stop.code
+    assert status == 2 and words in capsys.readouterr().err
+
+
+def test_what_looks_like_another_unit_or_column_is_said(tmp_path):
+    """Swapped columns are refused; stamps seconds apart are noted; a folder names fleet."""
+    path = tmp_path / 'odd.csv'
+    path.write_text('time_s,voltage_v,throttle\n0,0.1,16.1\n1,0.2,16.0\n2,0.2,15.9\n')
+    with pytest.raises(InputError, match='are the two columns swapped'):
+        read_recording(path)
+    path.write_text('time_s,voltage_v\n0,16.1\n20,16.0\n40,15.9\n')
+    assert any('20 s apart' in note and '--time-unit' in note
+               for note in read_recording(path).notes)
+    with pytest.raises(InputError, match="fleet' takes folders"):
+        read_recording(tmp_path)
