@@ -4,9 +4,12 @@ Which notches pay: the noise of a D term at equal lag, by the signal's own spect
 The noise of a candidate is the power that its notches and a low-pass of order 2 leave of the
 derivative above `fmin`, the cutoff of the low-pass so much higher that both lag as much as the
 low-pass alone.  Running means of it, of frames that the law had not seen yet, tell what
-each candidate would have come to; "no notch" is one of them.  A channel takes its best where that
-leaves less than `_ON` of the rms of none, changes for one that is better by a tenth in power,
-and gives up where it leaves more than `_OFF`.
+each candidate would have come to behind a slower and a faster low-pass too; "no notch" is one of
+them.  A channel takes the best where that leaves less than `_ON` of the rms of none, and harms
+behind none of the low-passes; it changes for one that is better by a tenth in power, and gives
+up where `_OFF` or more is left or harm is done.
+
+Limits: the past decides; what was worth a notch for the last seconds has it in the next.
 """
 
 from __future__ import annotations
@@ -14,21 +17,44 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.online.notch.biquads import HIGHEST
 from ou_monitor.records import FloatArray
 
 # Bandwidths over frequency that are tried, of one notch and of one notch for each motor.
 WIDTHS: FloatArray = np.array([1.0, 0.66, 0.45, 0.3, 0.2, 0.13, 0.085])
-_ON, _OFF, _BETTER = 0.9, 0.97, 0.9
+# Low-passes behind, over `cutoff`; none is faster than that share of the sample rate.
+_BEHIND, _FASTEST = (0.5, 1.0, 1.5), 0.25
+_ON, _OFF, _HARM, _BETTER = 0.9, 0.97, 0.99, 0.9
 # s over which the noise is averaged, and the loudest is forgotten; frames before anything is
 # decided.
 _MEMORY, _LEVEL, _FEWEST = 5.0, 2.0, 6
-
-# Share of the lag that notches may take.
-_SHARE = 0.6
+# Least share of the lag that is left to the low-pass in a frame (one ten times as fast hardly
+# filters), and in the mean of frames.
+_LEAST, _LEAST_MEAN = 0.1, 0.4
 # Frames count by their amplitude: by power one crash would be all that is remembered.
 _BY_AMPLITUDE = 0.5
 _TINY = 1e-300
+
+
+class Family(NamedTuple):
+    """
+    Notches but for their width.
+
+    Attributes
+    ----------
+    source : str
+        'rpm' or 'throttle'.
+    many : bool
+        Whether each motor has its own.
+    times : int
+        How often the same notch.
+
+    """
+
+    source: str
+    many: bool
+    times: int
 
 
 class Candidate(NamedTuple):
@@ -37,30 +63,22 @@ class Candidate(NamedTuple):
 
     Attributes
     ----------
-    source : str
-        'rpm' or 'throttle'.
-    many : bool
-        Whether each motor has its own.
+    family : Family
+        Which.
     width : float
         Bandwidth over frequency.
-    times : int
-        How often the same notch.
 
     """
 
-    source: str
-    many: bool
+    family: Family
     width: float
-    times: int = 1
 
 
-def candidates(count: int) -> tuple[Candidate, ...]:
+def families(count: int) -> tuple[Family, ...]:
     """Return what is tried with at most so many notches."""
-    found = [Candidate(source, False, float(width), times) for source in ('throttle', 'rpm')
-             for times in range(1, min(count, 2) + 1) for width in WIDTHS]
-    if count > 1:
-        found += [Candidate('rpm', True, float(width)) for width in WIDTHS]
-    return tuple(found)
+    found = [Family(source, False, times) for source in ('throttle', 'rpm')
+             for times in range(1, min(count, 2) + 1)]
+    return (*found, Family('rpm', True, 1)) if count > 1 else tuple(found)
 
 
 class Choice:
@@ -73,6 +91,8 @@ class Choice:
         Of the bins, Hz.
     settings : tuple of float
         `fmin` and `cutoff`, Hz.
+    rate : float
+        Sample rate, Hz.
     channels, count : int
         Channels; most notches.
 
@@ -85,16 +105,22 @@ class Choice:
 
     def __init__(self, frequencies: FloatArray, settings: tuple[float, float], rate: float,
                  channels: int, count: int) -> None:
-        self._fmin, self._cutoff = settings
+        self._fmin, cutoff = settings
         self._rate = rate
         self._used = frequencies >= self._fmin
-        self._f = frequencies[self._used]
-        self._warped = np.tan(np.pi * np.minimum(self._f / rate, 0.499))
-        self._fourth = self._f**4
-        self.all = candidates(count)
-        self._noise: FloatArray = np.full((channels, len(self.all)), np.nan)
-        self._frames: FloatArray = np.zeros(len(self.all))
-        self._none: FloatArray = np.full((channels, len(self.all)), np.nan)
+        self._warped: FloatArray = np.tan(
+            np.pi * np.minimum(frequencies[self._used] / rate, 0.499))
+        # Low-passes by the bilinear rule, as most are.
+        at = np.tan(np.pi * np.minimum(cutoff / rate * np.array(_BEHIND), _FASTEST))
+        self._fourth: FloatArray = (self._warped[None, :] / at[:, None])**4
+        self._lag: FloatArray = np.sqrt(2.0) / (2.0 * rate * at)
+        self._low: FloatArray = 1.0 / (1.0 + self._fourth)
+        self.families = families(count)
+        shape = (len(self.families), WIDTHS.size, channels, len(_BEHIND))
+        self._noise: FloatArray = np.zeros(shape)
+        self._none: FloatArray = np.zeros((shape[0], 1, *shape[2:]))
+        self._left: FloatArray = np.ones((*shape[:2], len(_BEHIND)))
+        self._frames = [0] * len(self.families)
         self._loudest: FloatArray = np.zeros(channels)
         self.chosen: list[Candidate | None] = [None] * channels
 
@@ -105,9 +131,8 @@ class Choice:
         Quiet frames count once the loud ones are past; a louder one makes those before it count
         for less, by the factor that is returned beside it.
         """
-        low = 1.0 / (1.0 + self._fourth / self._cutoff**4)
         before = self._loudest * np.exp(-passed / _LEVEL)
-        self._loudest = np.maximum(power[:, self._used] @ low, before)
+        self._loudest = np.maximum(power[:, self._used] @ self._low[1], before)
         lost = (before / np.maximum(self._loudest, _TINY))**_BY_AMPLITUDE
         self._noise *= lost[:, None]
         self._none *= lost[:, None]
@@ -115,9 +140,8 @@ class Choice:
 
     def low_passed(self, power: FloatArray) -> FloatArray:
         """Return the power behind the low-pass, mean of the channels, shape (K,)."""
-        seen = np.zeros(self._used.size)
-        seen[self._used] = power[:, self._used].mean(axis=0) / (
-            1.0 + self._fourth / self._cutoff**4)
+        seen: FloatArray = np.zeros(self._used.size)
+        seen[self._used] = power[:, self._used].mean(axis=0) * self._low[1]
         return seen
 
     def take(self, power: FloatArray, throttle: float, motors: FloatArray,
@@ -128,54 +152,51 @@ class Choice:
         throttle: NaN while not known; motors: empty while not known.
         """
         power = power[:, self._used]
-        none = power @ (1.0 / (1.0 + self._fourth / self._cutoff**4))
-        sets = {('throttle', False): np.array([throttle]), ('rpm', True): motors,
-                ('rpm', False): motors.mean(keepdims=True) if motors.size else motors}
-        squares: dict[tuple[str, bool], tuple[FloatArray, FloatArray]] = {}
-        for key, f in sets.items():
-            good = f[(f >= self._fmin) & (f <= HIGHEST * self._rate)]
-            if good.size:
-                squares[key] = self._cascade(good)
-        for j, one in enumerate(self.all):
-            found = squares.get((one.source, one.many))
-            if found is None:
+        none = power @ self._low.T
+        mean = motors.mean(keepdims=True) if motors.size else motors
+        for j, family in enumerate(self.families):
+            f = (np.array([throttle]) if family.source == 'throttle' else
+                 motors if family.many else mean)
+            f = f[(f >= self._fmin) & (f <= HIGHEST * self._rate)]
+            if not f.size:
                 continue
-            w = int(np.argmin(np.abs(WIDTHS - one.width)))
-            passes, delay = found[0][w]**one.times, one.times * float(found[1][w])
-            left = 1.0 - delay * self._cutoff * 2.0 * np.pi / np.sqrt(2.0)
-            if left < 1.0 - _SHARE:
-                noise = none * 1e6
-            else:
-                noise = power @ (passes / (1.0 + self._fourth * (left / self._cutoff)**4))
-            self._frames[j] += 1.0
+            passes, delay = self._cascade(f, family.times)
+            left = np.maximum(1.0 - delay[:, None] / self._lag, _LEAST)
+            noise = np.einsum('ck,wk,wrk->wcr', power, passes,
+                              1.0 / (1.0 + self._fourth * left[..., None]**4))
+            self._frames[j] += 1
             weight = max(1.0 / self._frames[j], passed / _MEMORY)
-            first = self._frames[j] == 1.0
-            self._noise[:, j] = noise if first else (
-                self._noise[:, j] + weight * (noise - self._noise[:, j]))
-            self._none[:, j] = none if first else (
-                self._none[:, j] + weight * (none - self._none[:, j]))
+            self._noise[j] += weight * (noise - self._noise[j])
+            self._none[j] += weight * (none - self._none[j])
+            self._left[j] += weight * (left - self._left[j])
 
-    def _cascade(self, f: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the power that notches pass for each width, shape (widths, K), and delays, s."""
-        p = self._warped[None, :] / np.tan(np.pi * f / self._rate)[:, None]
+    def _cascade(self, f: FloatArray, times: int) -> tuple[FloatArray, FloatArray]:
+        """Return the power that notches pass for each width, shape (W, K), and delays, s."""
+        at = np.tan(np.pi * f / self._rate)
+        p = self._warped / at[:, None]
         off = (1.0 - p * p)**2
-        cut = (WIDTHS[:, None, None] * p[None])**2
-        passes = np.prod(off[None] / (off[None] + cut), axis=1)
-        return passes, WIDTHS * float(np.sum(0.5 / (self._rate * np.tan(np.pi * f / self._rate))))
+        passes = np.prod(off / (off + (WIDTHS[:, None, None] * p)**2), axis=1)
+        return passes**times, times * WIDTHS * float(np.sum(0.5 / (self._rate * at)))
 
     def decide(self, sources: set[str]) -> None:
         """Choose for each channel among the candidates whose source is known now."""
-        open_ = np.array([one.source in sources for one in self.all]) & (
-            self._frames >= _FEWEST)
+        known = np.array([one.source in sources and frames >= _FEWEST for one, frames in
+                          zip(self.families, self._frames, strict=True)])
+        left = self._noise / np.maximum(self._none, _TINY)
+        harms: npt.NDArray[np.bool_] = (np.max(left, axis=3) > _HARM**2) | (
+            np.min(self._left, axis=2) < _LEAST_MEAN)[..., None]
+        gain = np.where(known[:, None, None], np.mean(left, axis=3), np.inf)
         for c, old in enumerate(self.chosen):
-            gain = np.where(open_, self._noise[c] / np.maximum(self._none[c], _TINY), np.inf)
-            best = int(np.argmin(gain))
-            at = self.all.index(old) if old in self.all else -1
-            if at < 0 or not open_[at]:
-                # After a loss of the source the other one is held to what the first one was.
-                limit = (_ON if old is None else _OFF)**2
-                self.chosen[c] = self.all[best] if gain[best] < limit else None
-            elif gain[at] > _OFF**2 and gain[best] > _ON**2:
+            able = np.where(harms[..., c], np.inf, gain[..., c])
+            j, w = np.unravel_index(int(np.argmin(able)), able.shape)
+            best, found = float(able[j, w]), Candidate(self.families[j], float(WIDTHS[w]))
+            now = np.inf
+            if old is not None:
+                k = self.families.index(old.family)
+                now = float(able[k, int(np.argmin(np.abs(WIDTHS - old.width)))])
+            # After a loss of the source the other one is held to what the first one was.
+            limit = _ON if old is None else _OFF
+            if best < limit**2 and best < _BETTER * now:
+                self.chosen[c] = found
+            elif now > _OFF**2:
                 self.chosen[c] = None
-            elif gain[best] < _BETTER * gain[at]:
-                self.chosen[c] = self.all[best]

@@ -107,21 +107,24 @@ class AdaptiveNotch:
     def source(self) -> str:
         """What the notches follow: 'rpm', 'throttle' or 'none'."""
         chosen = [] if self._choice is None else self._choice.chosen
-        found = {one.source for one in chosen if one is not None}
+        found = {one.family.source for one in chosen if one is not None}
         return 'rpm' if 'rpm' in found else 'throttle' if found else 'none'
 
     @property
     def delay(self) -> float:
         """Phase delay of the notches in force at 10 Hz, s, in the channel where it is largest."""
-        return self.delay_at(_LAG_FREQUENCY)
+        return max(self.delays(_LAG_FREQUENCY), default=0.0)
 
-    def delay_at(self, frequency: float) -> float:
-        """Return the phase delay at a frequency, s (frequency in Hz)."""
+    def delays(self, frequency: float) -> list[float]:
+        """
+        Return the phase delay of the notches in force in each channel, s.
+
+        frequency in Hz.
+        """
         ratio = frequency * self._interval.mean
         if not 0.0 < ratio < 0.5:
-            return 0.0
-        return max((phase_lag(bank, ratio) for bank in self._banks), default=0.0) / (
-            2.0 * math.pi * frequency)
+            return [0.0] * len(self._banks)
+        return [phase_lag(bank, ratio) / (2.0 * math.pi * frequency) for bank in self._banks]
 
     def configure(self, **options: object) -> None:
         """
@@ -286,11 +289,11 @@ class AdaptiveNotch:
         """Return the frequencies that a candidate has now, Hz; NaN: none."""
         if chosen is None or self._law is None:
             return []
-        if chosen.source == 'throttle':
-            return [self._law.frequency(self._root)] * chosen.times
-        if chosen.many or not self._motors:
+        if chosen.family.source == 'throttle':
+            return [self._law.frequency(self._root)] * chosen.family.times
+        if chosen.family.many or not self._motors:
             return self._motors
-        return [sum(self._motors) / len(self._motors)] * chosen.times
+        return [sum(self._motors) / len(self._motors)] * chosen.family.times
 
     def _filtered(self, c: int, x: float, dt: float) -> float:
         chosen = None if self._choice is None else self._choice.chosen[c]
