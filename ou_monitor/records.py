@@ -249,6 +249,8 @@ class Recording:
         Topics, types, units and files it was read from.
     notes : tuple of str
         What was dropped or mended on the way in, one sentence each.
+    current : ndarray, shape (n,), or None
+        Current drawn, A, the last value known at each stamp, NaN where unknown; None without.
 
     """
 
@@ -258,6 +260,7 @@ class Recording:
     name: str = ''
     source: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    current: FloatArray | None = None
 
     def __post_init__(self) -> None:
         """Refuse arrays that cannot be one recording."""
@@ -265,6 +268,9 @@ class Recording:
             raise ValueError(
                 'a recording needs t, voltage and throttle of one shape (n,); got '
                 f'{self.t.shape}, {self.voltage.shape}, {self.throttle.shape}')
+        if self.current is not None and self.current.shape != self.t.shape:
+            raise ValueError(f'the current must have the shape {self.t.shape} of the stamps, got '
+                             f'{self.current.shape}')
 
     @property
     def n(self) -> int:

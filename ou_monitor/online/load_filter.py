@@ -15,9 +15,10 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import CELL, cells_in_series, INRUSH_TIME, LEVELS, SLOPES
 from ou_monitor.online.load_blocks import Block, LoadBlocks
+from ou_monitor.online.load_current import CurrentFilter, scored
 from ou_monitor.online.load_noise import CLIP, LoadNoise
 from ou_monitor.online.supply_load import (
-    LAGS, LoadStatus, POWER, static, SupplyLoad, TABLE)
+    Basis, LAGS, LoadStatus, POWER, static, SupplyLoad, TABLE)
 from ou_monitor.records import FloatArray, NAN
 
 # Lag, s, of all: half of what an ESC takes to follow.
@@ -93,6 +94,9 @@ class LoadFilter:
         self._blocks = LoadBlocks()
         self._newest = -math.inf
         self._opening = False
+        self._current = CurrentFilter()
+        # Running log density of what throttle predicts.
+        self._score = NAN
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
              throttle: npt.ArrayLike | None = None,
@@ -132,6 +136,7 @@ class LoadFilter:
     def _take(self, block: Block) -> None:
         """Take one block: the first of all, of a new time line, or what follows."""
         u = block.throttle
+        fresh = self._opening or not block.t - self._t <= _PAUSE
         if not math.isfinite(self._t):
             self._begin(block.voltage, u)
         else:
@@ -146,10 +151,11 @@ class LoadFilter:
                 if u != self._throttle and self._last > self._t:
                     # The last throttle held to the end of its block.
                     self._predict(self._last)
-                du = abs(u - self._throttle)
+                du, since = abs(u - self._throttle), block.t - self._t
                 self._throttle = u
                 self._predict(block.t)
-                self._correct(block, du)
+                self._correct(block, du, since)
+        self._current.take(block, self._cells, fresh=fresh)
         self._t, self._last, self._throttle = block.t, block.last, u
         self._heard = block.last if math.isfinite(block.throttle) else self._heard
 
@@ -197,9 +203,8 @@ class LoadFilter:
         h = self._regressors()
         m[0] = v - h[2:] @ m[2:]
         # The level follows from the voltage: it shares the errors of the coefficients.
-        P[0] = P[:, 0] = 0.0
-        P[0, 2:] = P[2:, 0] = -P[2:, 2:] @ h[2:]
-        P[0, 0] = (0.02 * self._volts) ** 2 + h[2:] @ P[2:, 2:] @ h[2:]
+        P[0, 1:] = P[1:, 0] = -P[1:, 1:] @ h[1:]
+        P[0, 0] = (0.02 * self._volts) ** 2 + h[1:] @ P[1:, 1:] @ h[1:]
 
     def _resize(self, dt: float) -> None:
         """Scale the load over dt, s: a propeller draws the less the lower the level."""
@@ -250,8 +255,8 @@ class LoadFilter:
         self._flown *= 1.0 - min(dt / _FLOWN_MEMORY, 1.0)
         self._flown[int(u * _BINS + 0.5)] += dt
 
-    def _correct(self, block: Block, du: float) -> None:
-        """Take a block, V, whose throttle differs by du from the last one's."""
+    def _correct(self, block: Block, du: float, since: float) -> None:
+        """Take a block, V, `since` s after the last one, whose throttle differs by du."""
         m, P, noise = self._m, self._P, self._noise
         u = 0.0 if math.isnan(self._throttle) else self._throttle
         du = 0.0 if math.isnan(du) else du
@@ -266,7 +271,9 @@ class LoadFilter:
         total = s + R * scale * (1.0 + noise.correlation) / (1.0 - noise.correlation)
         total *= max(1.0, abs(e) / math.sqrt(total) / CLIP)
         noise.learn(e, s, u, du, block.n, block.within)
-        noise.follow(max(-CLIP, min(CLIP, score)))
+        clipped = max(-CLIP, min(CLIP, score))
+        noise.follow(clipped)
+        self._score = scored(self._score, clipped, s + R * scale, since)
         # Far out on one side for half a second: another battery, so the level is open again.
         self._bias += 0.1 * (max(-6.0, min(6.0, score)) - self._bias)
         if abs(self._bias) > 3.0:
@@ -291,12 +298,18 @@ class LoadFilter:
         sag = np.maximum.accumulate(np.maximum(H @ a, 0.0))
         error = np.sqrt(np.maximum(np.einsum('ij,jk,ik->i', H, C, H), 0.0))
         low, high = self._between(0.1)
+        resistance, resistance_se = self._current.resistance
+        basis, level = Basis.THROTTLE, float(self._m[0])
+        if math.isfinite(resistance) and self._current.score > self._score:
+            basis, level = Basis.CURRENT, self._current.level
         load = SupplyLoad(
-            LoadStatus.STILL, float(self._m[0]), flown=(low, high), _sag=tuple(sag.tolist()),
+            LoadStatus.STILL, level, resistance, resistance_se, basis=basis, flown=(low, high),
+            _sag=tuple(sag.tolist()),
             _sag_se=tuple(np.maximum(error, _LEAST_ERROR * sag).tolist()),
             _log_variance=self._noise.log_variance, _range=self._between(0.02))
         if math.isnan(self._throttle):
-            load = replace(load, status=LoadStatus.NO_THROTTLE)
+            load = replace(load, status=LoadStatus.NO_THROTTLE,
+                           basis=basis if basis is Basis.CURRENT else Basis.NONE)
             return load if self._loaded else replace(load, _sag=(), _sag_se=())
         if high - low >= _MOVED:
             d = static(high) - static(low)

@@ -42,6 +42,14 @@ class LoadStatus(enum.Enum):
                    'sign of throttle.')
 
 
+class Basis(enum.Enum):
+    """From what the level follows: whichever predicted the last half minute better."""
+
+    NONE = 'neither throttle nor current'
+    THROTTLE = 'throttle'
+    CURRENT = 'current'
+
+
 @dataclass(frozen=True)
 class SupplyLoad:
     """
@@ -54,9 +62,13 @@ class SupplyLoad:
     level : float
         Open-circuit voltage, V, or without throttle that under load; NaN without voltage.
     resistance : float
-        Resistance, Ohm; NaN, as this filter does not use current.
+        Resistance at once, Ohm; NaN without a current that moves the voltage.
+    resistance_se : float
+        Its standard error, Ohm.
     time_constants : tuple of float
         Time constants of the answer, s; fixed.
+    basis : Basis
+        From what the level follows; the sag is always that of throttle.
     flown : tuple of float
         Throttles between which 80 % of the last two minutes were flown.
 
@@ -65,7 +77,9 @@ class SupplyLoad:
     status: LoadStatus = LoadStatus.NO_DATA
     level: float = NAN
     resistance: float = NAN
+    resistance_se: float = NAN
     time_constants: tuple[float, ...] = LAGS
+    basis: Basis = Basis.NONE
     flown: tuple[float, float] = (0.0, 1.0)
     _sag: tuple[float, ...] = ()
     _sag_se: tuple[float, ...] = ()

@@ -1,5 +1,5 @@
 """
-Read a CSV with the columns `time_s`, `voltage_v` and, if there is one, `throttle`.
+Read a CSV: `time_s`, `voltage_v` and, where there are such, `throttle` and `current_a`.
 
 Limits first: one header line is required; the decimal mark is a point.  Other
 columns are ignored, as are blank lines and lines that begin with '#'; commas,
@@ -22,7 +22,7 @@ from ou_monitor.errors import InputError, nearest
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.files import open_regular
 
-TIME, VOLTAGE, THROTTLE = 'time_s', 'voltage_v', 'throttle'
+TIME, VOLTAGE, THROTTLE, CURRENT = 'time_s', 'voltage_v', 'throttle', 'current_a'
 
 _DELIMITERS = ',;\t'
 # What loggers write for a number they do not have.
@@ -65,8 +65,8 @@ TIME_UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 
 
 def read_csv(path: Path, columns: CsvColumns | None = None,
-             ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return time, s, voltage, V, and throttle as they stand, unsorted and with NaN kept."""
+             ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return time, s, voltage, V, throttle and current, A, unsorted and with NaN kept."""
     wanted = columns or CsvColumns()
     time, voltage = wanted.time or TIME, wanted.voltage or VOLTAGE
     # A column that was named must be there.
@@ -75,8 +75,10 @@ def read_csv(path: Path, columns: CsvColumns | None = None,
     if len(set(named)) < len(named):
         raise InputError(f'{path}: one column cannot be two of time, voltage and throttle: '
                          f"{', '.join(named)}")
-    t, v, u = _columns(path, (time, voltage, *throttle[0]), throttle[1])
-    return t * TIME_UNITS[wanted.time_unit], v * VOLTAGE_UNITS[wanted.unit], u
+    optional = throttle[1] if CURRENT in named else (*throttle[1], CURRENT)
+    t, v, u, *current = _columns(path, (time, voltage, *throttle[0]), optional)
+    return (t * TIME_UNITS[wanted.time_unit], v * VOLTAGE_UNITS[wanted.unit], u,
+            current[0] if current else np.full(t.shape, np.nan))
 
 
 def read_column(path: Path, name: str) -> tuple[FloatArray, FloatArray]:
@@ -160,9 +162,9 @@ def _read(path: Path, file: TextIO, needed: Sequence[str], optional: Sequence[st
                 'columns: mend the line; the decimal mark is a point')
         for name, place, column in zip(names, places, columns):
             column.append(_cell(row, place, name, path, lines.number))
-    arrays = [np.array(column, dtype=np.float64) for column in columns]
-    arrays += [np.full(arrays[0].shape, np.nan) for name in optional if name not in names]
-    return arrays
+    found = {name: np.array(column, dtype=np.float64) for name, column in zip(names, columns)}
+    missing = np.full(found[names[0]].shape, np.nan)
+    return [found.get(name, missing) for name in (*needed, *optional)]
 
 
 def _header(path: Path, lines: _Lines, first: str | None, needed: Sequence[str],

@@ -22,8 +22,8 @@ from ou_monitor.recordings.csv_table import CsvColumns, read_column, read_csv
 from ou_monitor.recordings.importers.formats import is_log
 from ou_monitor.recordings.log_bag import log_as_bag
 from ou_monitor.recordings.samples import (
-    check_throttle, dropped_words, late_words, overlap, part_words, repeated_words, SampleReader,
-    span_words, usable_voltage)
+    check_throttle, dropped_words, known_current, late_words, overlap, part_words,
+    repeated_words, SampleReader, span_words, usable_voltage)
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.text import printable
@@ -51,7 +51,7 @@ def read_recording(
     ----------
     path : str or path
         An .mcap file, a rosbag2 directory, a CSV with the columns
-        ``time_s, voltage_v[, throttle]``, or a log of an autopilot that
+        ``time_s, voltage_v[, throttle][, current_a]``, or a log of an autopilot that
         `convert` reads (its extra installed).
     msg_config : str or path, optional
         Name of a msg config, or a YAML file; found out when the bag leaves
@@ -75,8 +75,8 @@ def read_recording(
     Returns
     -------
     Recording
-        Stamps (s), voltage (V) and throttle (0..1), each of shape (n,),
-        n >= 1; what was dropped or mended is in `notes`.
+        Stamps (s), voltage (V), throttle (0..1) and, where there is one, current (A), each of
+        shape (n,), n >= 1; what was dropped or mended is in `notes`.
 
     Raises
     ------
@@ -167,8 +167,9 @@ def read_pieces(
                                throttle_topic=throttle_topic, start=start, end=end)
         for first in range(0, whole.n, samples):
             part = slice(first, first + samples)
-            yield Recording(whole.t[part], whole.voltage[part], whole.throttle[part], whole.name,
-                            whole.source, whole.notes if first == 0 else ())
+            yield replace(whole, t=whole.t[part], voltage=whole.voltage[part],
+                          throttle=whole.throttle[part], notes=whole.notes if first == 0 else (),
+                          current=None if whole.current is None else whole.current[part])
         return
     _check_part(start, end)
     reader = SampleReader(
@@ -204,7 +205,7 @@ def _taken(
 
 
 def tidy(
-    t: FloatArray, voltage: FloatArray, throttle: FloatArray, name: str,
+    t: FloatArray, voltage: FloatArray, throttle: FloatArray, current: FloatArray, name: str,
     source: dict[str, str], notes: list[str],
 ) -> Recording:
     """Return a `Recording`: finite, in order, each stamp once; notes say what that took."""
@@ -212,24 +213,24 @@ def tidy(
     good = usable_voltage(t, voltage)
     if not good.all():
         notes.append(dropped_words(t.size - int(good.sum()), voltage[~good]))
-        t, voltage, throttle = t[good], voltage[good], throttle[good]
+        t, voltage, throttle, current = t[good], voltage[good], throttle[good], current[good]
     late = int(np.count_nonzero(np.diff(t) < 0.0))
     if late:
         notes.append(late_words(late, *overlap(t)))
         order = np.argsort(t, kind='stable')
-        t, voltage, throttle = t[order], voltage[order], throttle[order]
+        t, voltage, throttle, current = t[order], voltage[order], throttle[order], current[order]
     fresh = np.ones(t.size, dtype=bool)
     fresh[1:] = np.diff(t) > 0.0
     if not fresh.all():
         notes.append(repeated_words(t.size - int(fresh.sum())))
-        t, voltage, throttle = t[fresh], voltage[fresh], throttle[fresh]
+        t, voltage, throttle, current = t[fresh], voltage[fresh], throttle[fresh], current[fresh]
     throttle = np.where(np.isfinite(throttle), throttle, np.nan)
     if not t.size:
         raise InputError(_unusable(name, notes))
     if t.size > 2 and (spacing := float(np.median(np.diff(t)))) >= _SPARSE:
         notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '
                      '--time-unit says so of a CSV.')
-    return Recording(t, voltage, throttle, name, source, tuple(notes))
+    return Recording(t, voltage, throttle, name, source, tuple(notes), known_current(current))
 
 
 def _unusable(name: str, notes: Sequence[str]) -> str:
@@ -265,6 +266,7 @@ def _cut(recording: Recording, start: float | None, end: float | None) -> Record
         raise InputError(_outside(recording.name, start, end, float(t[-1])))
     return replace(recording, t=recording.t[part], voltage=recording.voltage[part],
                    throttle=recording.throttle[part],
+                   current=None if recording.current is None else recording.current[part],
                    notes=(*recording.notes, part_words(start, end)))
 
 

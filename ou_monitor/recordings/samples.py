@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 import math
 from pathlib import Path
+import re
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +26,7 @@ from ou_monitor.stream.config import FieldSpec
 from ou_monitor.stream.samples import BoolArray, ThrottleHold
 from ou_monitor.text import printable
 
-VOLTAGE, THROTTLE = 'voltage', 'throttle'
+VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
 # Squares and cubes of what is beyond this overflow; no supply comes near it.
 LARGEST = 1e9  # V
 # So many samples behind for each step back are not a few that came late.
@@ -65,6 +66,12 @@ def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None =
             f'{name}: throttle runs from {known.min():g} to {known.max():g}, and 0 to 1 is '
             'expected: divide a percentage by 100 (of a bag: unit_factor of a msg config), turn '
             'a pulse of w microseconds into (w - 1000) / 1000')
+
+
+def known_current(current: FloatArray) -> FloatArray | None:
+    """Return a current with NaN for what is not finite; None where none is known."""
+    known = np.abs(current) <= LARGEST
+    return np.where(known, current, np.nan) if known.any() else None
 
 
 def overlap(t: FloatArray, highest: float = -math.inf) -> tuple[int, float]:
@@ -118,6 +125,12 @@ class _Series:
         values = np.full(column.n, np.nan)
         values[column.count > 0] = column.values
         return column.stamp, values, np.ones(column.n, np.int64)
+
+
+def _has_field(bag: BagReader, spec: FieldSpec) -> bool:
+    """Whether messages of a type, as the bag defines it, have a field of that name."""
+    own = re.split(r'^=+$', bag.definition(spec.type), maxsplit=1, flags=re.M)[0]
+    return re.search(rf'^\s*\S+\s+{re.escape(spec.field)}\b', own, re.M) is not None
 
 
 class SampleReader:
@@ -179,7 +192,8 @@ class SampleReader:
             # The bag knows better than a config that is made for many.
             spec = replace(spec, sample_rate=stated)
         self._specs = {VOLTAGE: spec}
-        self._hold = ThrottleHold(spec.sample_rate)
+        # Throttle and current hold until the next value.
+        self._holds = {THROTTLE: ThrottleHold(spec.sample_rate)}
         self._series = {VOLTAGE: _Series(spec)}
         if choice.throttle is not None:
             self.source |= {'throttle_topic': choice.throttle.topic,
@@ -188,6 +202,10 @@ class SampleReader:
                             **bag.origins.get(choice.throttle.topic, {})}
             self._specs[THROTTLE] = choice.throttle
             self._series[THROTTLE] = _Series(choice.throttle)
+        if choice.current is not None and _has_field(bag, choice.current):
+            self._specs[CURRENT] = choice.current
+            self._holds[CURRENT] = ThrottleHold(spec.sample_rate)
+            self._series[CURRENT] = _Series(choice.current)
         # `ou-monitor convert` keeps what the log says apart from what people say of the bag.
         vehicle = self.source.get('vehicle') or self.source.get('log_vehicle')
         if vehicle:
@@ -198,16 +216,21 @@ class SampleReader:
         self.held = 0
         self._newest = self._highest = self._taken = -math.inf
         self._largest = self._back = 0.0
-        # Throttle that no voltage has followed yet: stamps, values, whether stamped, log times.
-        self._waiting: list[tuple[FloatArray, FloatArray, BoolArray, TimeArray]] = []
+        # What no voltage has followed yet: stamps, values, whether stamped, log times.
+        self._waiting: dict[str, list[tuple[FloatArray, FloatArray, BoolArray, TimeArray]]] = {
+            name: [] for name in self._holds}
         self._tally = dict.fromkeys((
             'dropped', 'late', 'mixed', 'repeated', 'too_late', 'throttle', 'undecodable'), 0)
         self._undecodable = ''
         self._broken = self._leave_out if bag.partial else None
-        if self._start_ns is not None and choice.throttle is not None:
-            self._add_throttle(last_before(bag, choice.throttle, self._start_ns, self._broken))
+        if self._start_ns is not None:
+            for name in self._holds:
+                # The current of a message of the voltage comes with it.
+                if name in self._specs and self._specs[name].topic != spec.topic:
+                    self._add_held(name, last_before(bag, self._specs[name], self._start_ns,
+                                                     self._broken))
+                    self._series[name] = _Series(self._specs[name])
             self._tally['throttle'] = 0
-            self._series[THROTTLE] = _Series(choice.throttle)
 
     def _limits(self, at: float | None) -> int | None:
         """Return a time of the recording as log time, ns."""
@@ -222,8 +245,9 @@ class SampleReader:
         for batch in batches(self._bag, self._specs, start_ns=self._start_ns,
                              end_ns=self._end_ns, progress=progress,
                              broken=self._broken):
-            if THROTTLE in batch:
-                self._add_throttle(batch[THROTTLE])
+            for name in self._holds:
+                if name in batch:
+                    self._add_held(name, batch[name])
             if VOLTAGE in batch:
                 self._add_voltage(batch[VOLTAGE])
             yield self.held
@@ -236,8 +260,9 @@ class SampleReader:
 
     def _add_voltage(self, column: Column) -> None:
         t, voltage, sizes = self._series[VOLTAGE].samples(column)
-        self._place_throttle(t[np.cumsum(sizes)[sizes > 0] - 1], column.stamped[sizes > 0],
-                             column.log_time[sizes > 0])
+        for name in self._holds:
+            self._place(name, t[np.cumsum(sizes)[sizes > 0] - 1], column.stamped[sizes > 0],
+                        column.log_time[sizes > 0])
         good = usable_voltage(t, voltage)
         if not good.all():
             self._tally['dropped'] += t.size - int(good.sum())
@@ -255,31 +280,34 @@ class SampleReader:
         self._voltage.append(voltage)
         self.held += t.size
 
-    def _add_throttle(self, column: Column) -> None:
-        t, values, sizes = self._series[THROTTLE].samples(column)
+    def _add_held(self, name: str, column: Column) -> None:
+        t, values, sizes = self._series[name].samples(column)
         known = np.isfinite(t)
-        if self._specs[THROTTLE].nan == 'drop':
+        if self._specs[name].nan == 'drop':
             finite = np.isfinite(values)
-            self._tally['throttle'] += int(np.count_nonzero(~finite))
             known &= finite
-        check_throttle(self.name, values[known])
-        self._waiting.append((t[known], values[known], np.repeat(column.stamped, sizes)[known],
+            if name == THROTTLE:
+                self._tally['throttle'] += int(np.count_nonzero(~finite))
+        if name == THROTTLE:
+            check_throttle(self.name, values[known])
+        self._waiting[name].append((t[known], values[known], np.repeat(column.stamped, sizes)[known],
                               np.repeat(column.log_time, sizes)[known]))
 
-    def _place_throttle(self, stamps: FloatArray, stamped: BoolArray, log_time: TimeArray
-                        ) -> None:
-        """Place the throttle that waits, beside voltage messages (stamps in s)."""
-        if not (self._waiting and (stamps.size or self._newest > -math.inf)):
+    def _place(self, name: str, stamps: FloatArray, stamped: BoolArray, log_time: TimeArray
+               ) -> None:
+        """Place what waits beside voltage messages (stamps in s)."""
+        waiting, hold = self._waiting[name], self._holds[name]
+        if not (waiting and (stamps.size or self._newest > -math.inf)):
             # Nothing to place, or no voltage to place it beside.
             none = np.empty(0)
-            self._hold.take(none, none, none > 0.0, stamps, stamped, none.astype(np.int64))
+            hold.take(none, none, none > 0.0, stamps, stamped, none.astype(np.int64))
             return
         own, values, carried, logged = (
-            np.concatenate([part[k] for part in self._waiting]) for k in range(4))
-        self._waiting = []
+            np.concatenate([part[k] for part in waiting]) for k in range(4))
+        self._waiting[name] = []
         # Of a voltage and a throttle logged at one time, the throttle counts as first.
-        self._hold.take(own, values, carried, stamps, stamped,
-                        np.searchsorted(log_time, logged, 'left'))
+        hold.take(own, values, carried, stamps, stamped,
+                  np.searchsorted(log_time, logged, 'left'))
 
     def take(self, most: int | None = None) -> Recording:
         """Return the first samples held, in order, each stamp once; they are held no longer."""
@@ -302,11 +330,15 @@ class SampleReader:
         t, voltage = t[fresh], voltage[fresh]
         if t.size:
             self._taken = float(t[-1])
-        self._place_throttle(np.empty(0), np.empty(0, np.bool_), np.empty(0, np.uint64))
-        throttle = self._hold.at(t)
-        if t.size:
-            self._hold.forget_before(self._taken)
-        return Recording(t, voltage, throttle, self.name, dict(self.source))
+        held = {}
+        for name, hold in self._holds.items():
+            self._place(name, np.empty(0), np.empty(0, np.bool_), np.empty(0, np.uint64))
+            held[name] = hold.at(t)
+            if t.size:
+                hold.forget_before(self._taken)
+        current = known_current(held[CURRENT]) if CURRENT in held else None
+        return Recording(t, voltage, held[THROTTLE], self.name, dict(self.source),
+                         current=current)
 
     def bag_notes(self) -> tuple[str, ...]:
         """Return what is to be said before any sample is read."""

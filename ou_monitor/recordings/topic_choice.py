@@ -26,8 +26,8 @@ class Choice:
     ----------
     config : MsgConfig
         The source.
-    voltage, throttle : FieldSpec
-        With the topics of this bag; `throttle` is None where there is none.
+    voltage, throttle, current : FieldSpec
+        With the topics of this bag; throttle and current are None where there is none.
     notes : tuple of str
         One sentence for each thing that was not as expected.
 
@@ -36,6 +36,7 @@ class Choice:
     config: MsgConfig
     voltage: FieldSpec
     throttle: FieldSpec | None
+    current: FieldSpec | None
     notes: tuple[str, ...]
 
 
@@ -70,7 +71,8 @@ def choose(
     if voltage_topic is None and others:
         notes = (*notes, f'{topic} was taken for the voltage; {some(others)} would fit too: '
                          'choose with --voltage-topic.')
-    return Choice(config, replace(config.voltage, topic=topic), throttle, notes)
+    return Choice(config, replace(config.voltage, topic=topic), throttle,
+                  _current(config, topics, topic), notes)
 
 
 def listed(topics: Mapping[str, str]) -> str:
@@ -133,6 +135,17 @@ def _not_there(path: Path, config: MsgConfig, topics: Mapping[str, str]) -> str:
                 f'{config.voltage.type}: choose another with --msg-config')
     return (f"{path}: msg config '{config.name}' needs topic '{wanted}' "
             f'({config.voltage.type}), which is not in the bag; topics: {listed(topics)}')
+
+
+def _current(config: MsgConfig, topics: Mapping[str, str], voltage: str) -> FieldSpec | None:
+    """Return where the current is: a topic of that name beside the voltage, or as configured."""
+    beside = voltage.rsplit('/', 1)[0] + '/current'
+    if topics.get(beside) in ('std_msgs/msg/Float32', 'std_msgs/msg/Float64'):
+        return FieldSpec(beside, topics[beside], 'data', nan='unknown')
+    spec = config.current
+    if spec is None or spec.topic != config.voltage.topic:
+        return None
+    return replace(spec, topic=voltage)
 
 
 def _throttle(

@@ -96,6 +96,8 @@ class MsgConfig:
         Where the voltage is, V.
     throttle : FieldSpec or None
         Where the throttle is, 0..1.
+    current : FieldSpec or None
+        Where in the messages of the voltage the current drawn is, A.
 
     """
 
@@ -106,6 +108,7 @@ class MsgConfig:
     generic: bool
     voltage: FieldSpec
     throttle: FieldSpec | None
+    current: FieldSpec | None = None
 
 
 # What each key holds, as (accepted YAML types, word for it); the kinds of
@@ -122,6 +125,7 @@ _CONFIG_KINDS: dict[str, tuple[tuple[type, ...], str]] = {
     'description': _TEXT, 'package': _TEXT, 'install': _TEXT,
     'generic': ((bool,), 'true or false'), 'voltage': ((dict,), 'a group of keys'),
     'throttle': ((dict, type(None)), 'a group of keys or null'),
+    'current': ((dict, type(None)), 'a group of keys or null'),
 }
 _FIELD_NEEDED = ('topic', 'type', 'field')
 _CONFIG_NEEDED = ('description', 'package', 'install', 'generic', 'voltage')
@@ -191,12 +195,18 @@ def _load(path: Path) -> MsgConfig:
     where = path_words(path)
     with one_line():
         top = _checked(content, _CONFIG_KINDS, _CONFIG_NEEDED, where)
-        throttle = top.get('throttle')
+        throttle, current = top.get('throttle'), top.get('current')
+        if current is not None:
+            # It is read from the messages of the voltage, with their stamps.
+            shared = ('topic', 'type', 'stamp_field', 'stamp_factor')
+            current = {**{key: top['voltage'][key] for key in shared if key in top['voltage']},
+                       'nan': 'unknown', **current}
         return MsgConfig(
             name=path.stem, description=' '.join(top['description'].split()),
             package=top['package'], install=' '.join(top['install'].split()),
             generic=top['generic'], voltage=_field_spec(top['voltage'], f'{where}: voltage'),
-            throttle=None if throttle is None else _field_spec(throttle, f'{where}: throttle'))
+            throttle=None if throttle is None else _field_spec(throttle, f'{where}: throttle'),
+            current=None if current is None else _field_spec(current, f'{where}: current'))
 
 
 def _checked(

@@ -25,7 +25,7 @@ def written(tmp_path, text, encoding='utf-8'):
 ])
 def test_good_ones(tmp_path, text):
     """Delimiters, order, extra columns, comments, blank lines and quotes."""
-    t, voltage, throttle = read_csv(written(tmp_path, text))
+    t, voltage, throttle, _ = read_csv(written(tmp_path, text))
     assert t.tolist() == [0.0, 1.0]
     assert voltage.tolist() == [5.0, 5.5]
     assert throttle.tolist() == [0.1, 0.2]

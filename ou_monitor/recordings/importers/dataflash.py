@@ -39,6 +39,10 @@ PLAIN = (
     ('ESC', 'Volt', VOLTAGE, None, 'at the ESC'),
     ('ESC', 'Curr', CURRENT, None, 'at the ESC'),
     ('CTUN', 'ThO', THROTTLE, 0, 'throttle output'),
+    # Until 2015, in thousandths.
+    ('CTUN', 'ThrOut', THROTTLE, 0, 'throttle output'),
+    ('CURR', 'ThrOut', THROTTLE, 5, 'throttle output'),
+    ('CURR', 'Throttle', THROTTLE, 5, 'throttle output'),
     ('QTUN', 'ThO', THROTTLE, 1, 'throttle output, lift motors'),
     ('MOTB', 'ThrOut', THROTTLE, 3, 'throttle output of the mixer'),
     ('RATE', 'AOut', THROTTLE, 4, 'throttle output'),

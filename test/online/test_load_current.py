@@ -1,0 +1,83 @@
+"""Current in the load filter: resistance, level without throttle, and no harm by a wrong one."""
+
+import numpy as np
+from ou_monitor.model.load import LoadModel
+from ou_monitor.online.load_filter import LoadFilter
+from ou_monitor.online.supply_load import Basis, LoadStatus
+import pytest
+
+FULL = 60.0
+TRUE = LoadModel(4, 0.25, charge=0.85, size=0.1, full_current=FULL, fast_share=0.1, slow_share=0.2,
+                 inrush=1e-9, lag=1e-4)
+OHM = 0.1 * 4 * 3.8 / FULL
+
+
+@pytest.fixture(scope='module')
+def flight():
+    """Return stamps, voltage, throttle and current of 40 s whose current wanders under throttle."""
+    rng = np.random.default_rng(3)
+    t = np.arange(0.0, 40.0, 0.02)
+    step = (2 * t).astype(int)
+    u = np.clip(0.35 + 0.25 * rng.standard_normal(81), 0.0, 1.0)[step]
+    wind = np.repeat(np.clip(1.0 + 0.4 * rng.standard_normal(20), 0.2, 2.0), 100)
+    current = FULL * u ** 1.8 * wind
+    return t, TRUE.path(t, u, current) + 0.02 * rng.standard_normal(t.size), u, current
+
+
+def loaded(t, v, u, current):
+    """Return what the filter knows after these samples."""
+    loads = LoadFilter()
+    loads.push(t, v, u, current)
+    return loads.load()
+
+
+@pytest.mark.parametrize('scale', [1.0, -1.0, 1000.0, 0.01])
+def test_resistance_in_the_unit_of_the_current(flight, scale):
+    """Within two errors, scale and sign as they come; the better predictor gives the level."""
+    t, v, u, current = flight
+    load = loaded(t, v, u, scale * current)
+    ohm = load.resistance * abs(scale)
+    assert abs(ohm - OHM) < 2.0 * load.resistance_se * abs(scale)
+    assert ohm == pytest.approx(OHM, rel=0.1)
+    # Wind is in the current and not in throttle.
+    assert load.basis is Basis.CURRENT and load.known
+    assert load.level == pytest.approx(15.7, abs=0.3)
+
+
+@pytest.mark.parametrize('current', [np.nan, 0.0, 1e-4, 12.0])
+def test_a_current_that_says_nothing_does_no_harm(flight, current):
+    """NaN, zero or a stuck sensor: no resistance, and all else as without it."""
+    t, v, u, _ = flight
+    load, plain = loaded(t, v, u, current), loaded(t, v, u, None)
+    assert np.isnan(load.resistance) and load.basis is Basis.THROTTLE
+    assert load.level == plain.level and float(load.sag(0.5)) == float(plain.sag(0.5))
+
+
+def test_a_current_of_another_vehicle_is_no_resistance(flight):
+    """What does not move the voltage has none, and the level stays that of throttle."""
+    t, v, u, current = flight
+    load = loaded(t, v, u, np.roll(current, 777))
+    assert load.basis is Basis.THROTTLE
+    assert np.isnan(load.resistance) or load.resistance_se > 0.1 * load.resistance
+
+
+def test_level_from_current_without_throttle(flight):
+    """The open-circuit voltage is known, the sag over throttle is not."""
+    t, v, _, current = flight
+    load = loaded(t, v, None, current)
+    assert load.status is LoadStatus.NO_THROTTLE and load.basis is Basis.CURRENT
+    assert load.level == pytest.approx(loaded(*flight).level, abs=0.1)
+    assert load.resistance == pytest.approx(OHM, rel=0.1)
+
+
+def test_a_current_that_pauses(flight):
+    """Holes of a second and of ten; the resistance is kept over both."""
+    t, v, u, current = flight
+    holed = current.copy()
+    holed[(t > 10.0) & (t < 10.5) | (t > 20.0) & (t < 30.0)] = np.nan
+    loads = LoadFilter()
+    part = t < 25.0
+    loads.push(t[part], v[part], u[part], holed[part])
+    assert loads.load().basis is Basis.THROTTLE
+    loads.push(t[~part], v[~part], u[~part], holed[~part])
+    assert loads.load().resistance == pytest.approx(OHM, rel=0.1)
