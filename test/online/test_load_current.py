@@ -14,7 +14,7 @@ OHM = 0.1 * 4 * 3.8 / FULL
 
 @pytest.fixture(scope='module')
 def flight():
-    """Return stamps, voltage, throttle and current of 40 s whose current wanders under throttle."""
+    """Return stamps, voltage, throttle and current of 40 s with wind in the current."""
     rng = np.random.default_rng(3)
     t = np.arange(0.0, 40.0, 0.02)
     step = (2 * t).astype(int)
