@@ -290,8 +290,9 @@ class SampleReader:
                 self._tally['throttle'] += int(np.count_nonzero(~finite))
         if name == THROTTLE:
             check_throttle(self.name, values[known])
-        self._waiting[name].append((t[known], values[known], np.repeat(column.stamped, sizes)[known],
-                              np.repeat(column.log_time, sizes)[known]))
+        self._waiting[name].append((
+            t[known], values[known], np.repeat(column.stamped, sizes)[known],
+            np.repeat(column.log_time, sizes)[known]))
 
     def _place(self, name: str, stamps: FloatArray, stamped: BoolArray, log_time: TimeArray
                ) -> None:
