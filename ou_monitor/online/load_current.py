@@ -140,5 +140,3 @@ def scored(before: float, z: float, variance: float, dt: float) -> float:
     """Return the running mean of the log density of one block, nat; a clipped z counts less."""
     now = -0.5 * (z * z + math.log(variance))
     return now if math.isnan(before) else before - math.expm1(-dt / _COMPARED) * (now - before)
-
-

@@ -30,7 +30,7 @@ def bag(path, battery_current, currents=None):
 
 
 def test_the_current_of_a_battery_is_drawn_when_negative(tmp_path):
-    """BatteryState counts discharge as negative, and NaN as not measured."""
+    """Discharge is negative in a BatteryState, and NaN as not measured."""
     path = bag(tmp_path / 'a.mcap', [-1.0, np.nan, -3.0, -4.0, 5.0])
     np.testing.assert_array_equal(read_recording(path).current, [1.0, np.nan, 3.0, 4.0, -5.0])
     pieces = list(read_pieces(path, samples=2))
