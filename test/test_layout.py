@@ -14,8 +14,8 @@ PACKAGE = 'ou_monitor'
 # A module may import only from its own part and from parts of a lower level.
 LEVEL = {
     'errors': 0, 'text': 0, 'records': 0, 'model': 1, 'online': 2, 'stream': 3, 'recordings': 4,
-    'simulation': 5, 'criticism': 5, 'analysis': 6, 'discovery': 6, 'coupling': 6, 'paper': 6,
-    'fleet': 7, 'report': 8, 'nodes': 9, 'cli': 9,
+    'simulation': 5, 'criticism': 5, 'analysis': 6, 'comparison': 6, 'discovery': 6, 'coupling': 6,
+    'paper': 6, 'fleet': 7, 'report': 8, 'nodes': 9, 'cli': 9,
 }
 # What users reach as `from ou_monitor import ...`: above all but the programs.
 FACADE_LEVEL = 8.5
@@ -32,8 +32,8 @@ EXTRAS = {'dask': 'fleet.cluster', 'distributed': 'fleet.cluster',
 ALLOWED = {
     'errors': set(), 'text': set(), 'stream': CORE | {'yaml'}, 'recordings': CORE | {'yaml'},
     'cli': CORE | {'yaml'}, **dict.fromkeys((
-        'records', 'model', 'online', 'simulation', 'criticism', 'analysis', 'discovery',
-        'coupling', 'paper', 'fleet', 'report', '__init__'), CORE),
+        'records', 'model', 'online', 'simulation', 'criticism', 'analysis', 'comparison',
+        'discovery', 'coupling', 'paper', 'fleet', 'report', '__init__'), CORE),
 }
 
 

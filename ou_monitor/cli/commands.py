@@ -154,6 +154,28 @@ _ANALYZE = Command(
      *_estimate('voltage that must not be undershot, V (default: as the node, 4.5)'),
      *_TOPICS, *_FILES, _JSON, _REPORT))
 
+_COMPARE = Command(
+    'compare', 'a recording beside simulations of it: what the simulation gets wrong most',
+    'ou_monitor.cli.compare',
+    "Simulate a recording over its own throttle many times, and show both side by side: mean path, "
+    'lowest voltage, falls through low levels, spectrum, answer to throttle, distribution. Without '
+    '--model, a model is fitted to the part before S and the rest is simulated.',
+    (_RECORDING, *_PART,
+     Option('--model', metavar='FILE.yaml', type=path_argument,
+            help='simulate this model, as discover --save-model writes it; its level is moved to '
+            'that of the first seconds'),
+     Option('--fit-until', metavar='S',
+            help='begin of what is simulated, s after the first sample (default: half of the '
+            'recording; with --model its begin)'),
+     Option('--seeds', metavar='N', default='50', help='simulations (default: %(default)s)'),
+     _seed(0, 'same seed, same simulations'),
+     Option('--brownout-voltage', metavar='V',
+            help='also count falls through this voltage, V (default: two low levels that the '
+            'recording shows)'),
+     *_TOPICS, _JSON, _REPORT),
+    'Examples: ou-monitor compare flight.mcap --report flight.html; ou-monitor compare flight.mcap '
+    '--fit-until 60 --brownout-voltage 14; ou-monitor compare flight.mcap --model other_day.yaml')
+
 _CONVERT = Command(
     'convert', 'a log becomes an MCAP bag', 'ou_monitor.cli.convert',
     'Convert a log to a bag with the topics /voltage, /throttle and /current (A, positive when '
@@ -290,4 +312,4 @@ _SIMULATE = Command(
      Option('--list', action='store_true', help='list presets and profiles'), _JSON))
 
 COMMANDS = {command.name: command for command in (
-    _ANALYZE, _CONVERT, _COUPLING, _DESIGN, _DISCOVER, _FLEET, _REPRODUCE, _SIMULATE)}
+    _ANALYZE, _COMPARE, _CONVERT, _COUPLING, _DESIGN, _DISCOVER, _FLEET, _REPRODUCE, _SIMULATE)}

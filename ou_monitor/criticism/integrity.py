@@ -97,7 +97,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     report(0.2)
     exact: list[Term] = []
     logged = (t, v, u)
-    t, v, u, period = _without_repeats(t, v, u)
+    t, v, u, period = without_repeats(t, v, u)
     if period > 1.0:
         fresh = (v.size - 1) / float(t[-1] - t[0])
         exact.append(HeldSamples(fresh))
@@ -151,7 +151,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
                      drawn=drawn)
 
 
-def _without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
+def without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
                      ) -> tuple[FloatArray, FloatArray, FloatArray | None, float]:
     """Return the refreshes, and the samples a refresh: 1 where none repeats."""
     first = max(0, (v.size - _LOOK) // 2)

@@ -69,13 +69,25 @@ class LoadFit:
     noise_std: float
     slow_std: float
 
+    def draw(self, rng: np.random.Generator, spread: float = 1.0) -> LoadModel:
+        """Return a model within the errors of this one, their variances times `spread`."""
+        low, high, _, _ = _bounds(self.model.charge)
+        moved = rng.multivariate_normal(self._theta, spread * self.covariance)
+        fixed = {'cells': self.model.cells, 'mean_load': self.model.mean_load,
+                 'full_current': self.model.full_current}
+        return _model(np.clip(moved, low, high), fixed)
+
+    @property
+    def _theta(self) -> FloatArray:
+        """Return the parameters as fitted."""
+        return np.array([getattr(self.model, name) if name in _LINEAR
+                         else math.log(getattr(self.model, name)) for name in _NAMES])
+
     @property
     def at_bounds(self) -> tuple[str, ...]:
         """Return the parameters that stand at a bound."""
         low, high, centre, deviation = _bounds(self.model.charge)
-        theta = np.array([getattr(self.model, name) if name in _LINEAR
-                          else math.log(getattr(self.model, name)) for name in _NAMES])
-        edge = np.minimum(theta - low, high - theta) < 1e-3 * deviation
+        edge = np.minimum(self._theta - low, high - self._theta) < 1e-3 * deviation
         return tuple(name for name, there in zip(_NAMES, edge) if there)
 
     @property
@@ -145,17 +157,23 @@ def _model(theta: FloatArray, fixed: dict[str, Any]) -> LoadModel:
 
 
 def fit_load(t: FloatArray, voltage: FloatArray, throttle: FloatArray,
-             current: FloatArray | None = None) -> LoadFit:
+             current: FloatArray | None = None,
+             left_out: tuple[float, float] | None = None) -> LoadFit:
     """
     Fit the load model; with current, A, that is the load instead of throttle.
 
-    t in s, voltage in V, throttle in 0..1; all finite, stamps rising.
+    t in s, voltage in V, throttle in 0..1; all finite, stamps rising.  Voltage between the stamps
+    left_out, s, is not looked at.
     """
     if t.size < 2 or not t[-1] - t[0] > 20 * _BIN:
         raise ValueError(f'a fit of the load needs more than {20 * _BIN:g} s')
     if not (np.isfinite(voltage).all() and (np.diff(t) > 0.0).all()):
         raise ValueError('voltage must be finite, V, and stamps must rise, s')
-    top = float(np.quantile(voltage, 0.99))
+    seen = np.ones(t.size, dtype=np.bool_) if left_out is None else (
+        (t < left_out[0]) | (t > left_out[1]))
+    if not seen.any():
+        raise ValueError('no voltage is left for the fit')
+    top = float(np.quantile(voltage[seen], 0.99))
     fixed: dict[str, Any] = {'cells': cells_in_series(top)}
     # 1.6: below the prior's exponent, as the level takes a part; a scale of `endurance`.
     moving = throttle > 0.05
@@ -165,7 +183,7 @@ def fit_load(t: FloatArray, voltage: FloatArray, throttle: FloatArray,
         fixed['mean_load'] = max(
             1e-3, float(np.maximum(current, 0.0).mean()) / fixed['full_current'])
     low, high, centre, deviation = _bounds(
-        charge_at(float(np.quantile(voltage, 0.98)) / fixed['cells']))
+        charge_at(float(np.quantile(voltage[seen], 0.98)) / fixed['cells']))
     index = np.floor((t - t[0]) / _BIN + 1e-9).astype(int)
     starts = np.concatenate(([0], np.flatnonzero(np.diff(index)) + 1))
     counts = np.diff(np.append(starts, t.size))
@@ -173,11 +191,12 @@ def fit_load(t: FloatArray, voltage: FloatArray, throttle: FloatArray,
     def mean(x: FloatArray) -> FloatArray:
         return np.asarray(np.add.reduceat(x, starts) / counts, dtype=np.float64)
 
-    noise = _Noise(mean(t), fixed['cells'])
-    binned = mean(voltage)
+    used = seen[starts]
+    noise = _Noise(mean(t)[used], fixed['cells'])
+    binned = mean(voltage)[used]
 
     def residuals(theta: FloatArray) -> FloatArray:
-        return binned - mean(_model(theta, fixed).path(t, throttle, current))
+        return binned - mean(_model(theta, fixed).path(t, throttle, current))[used]
 
     def cost(theta: FloatArray) -> FloatArray:
         return np.concatenate((noise.whiten(residuals(theta))[0], (theta - centre) / deviation))

@@ -1,0 +1,180 @@
+"""What a simulation gets right and wrong of a recording: the record, and its data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import enum
+from typing import Any
+
+from ou_monitor.records import FloatArray
+
+
+class Verdict(enum.Enum):
+    """Whether the recording could be one of its simulations; the value is said to people."""
+
+    LOOKS_LIKE_IT = 'The simulation looks like the recording'
+    DIFFERS = 'The simulation differs from the recording'
+
+
+@dataclass(frozen=True)
+class Band:
+    """
+    A number of the recording beside those of the simulations.
+
+    Attributes
+    ----------
+    measured : float
+        Of the recording.
+    low, median, high : float
+        2.5 %, 50 % and 97.5 % of the simulations.
+
+    """
+
+    measured: float
+    low: float
+    median: float
+    high: float
+
+    @property
+    def inside(self) -> bool:
+        """Return whether the recording lies in the band."""
+        return self.low <= self.measured <= self.high
+
+
+@dataclass(frozen=True)
+class SpectrumBand:
+    """Power, V^2, between two frequencies, Hz."""
+
+    low_hz: float
+    high_hz: float
+    power: Band
+
+
+@dataclass(frozen=True, eq=False)
+class Traces:
+    """
+    What a page draws: the part compared, and simulations of it.
+
+    Attributes
+    ----------
+    t, voltage, throttle : ndarray
+        The recording, s, V, 0..1 (NaN: not recorded).
+    simulated : ndarray
+        One simulation, V.
+    at, low, high : ndarray
+        Stamps, s, and 95 % of the simulations there, V.
+    after, answer, answer_low, answer_high : ndarray
+        Seconds about a rise of throttle, and the mean answer to it, V.
+    edges, distribution, simulated_distribution : ndarray
+        Voltages, V, and the share of the samples below.
+
+    """
+
+    t: FloatArray
+    voltage: FloatArray
+    throttle: FloatArray
+    simulated: FloatArray
+    at: FloatArray
+    low: FloatArray
+    high: FloatArray
+    after: FloatArray
+    answer: FloatArray
+    answer_low: FloatArray
+    answer_high: FloatArray
+    edges: FloatArray
+    distribution: FloatArray
+    simulated_distribution: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """
+    A recording beside its simulations.
+
+    Attributes
+    ----------
+    recording : str
+        Its name.
+    fitted, simulated : tuple of float
+        Parts, s after the first sample; (0, 0) where nothing was fitted.
+    model : tuple of str
+        Names of the terms.
+    explained, rmse, bias : float
+        Of the mean path: share of the variance explained, V, V.
+    bias_by_third : tuple of float
+        V.
+    lowest : Band
+        Least voltage, V.
+    levels : tuple of float
+        Levels, V.
+    falls : tuple of Band
+        Falls through each per minute.
+    spectrum : tuple of SpectrumBand
+        By band of frequency.
+    dip, recovery : Band or None
+        Deepest point of the mean answer to rises of throttle, and its value 1 s after, V.
+    rises : int
+        Rises of throttle.
+    ks_distance : float
+        Largest difference of the two distributions.
+    seeds : int
+        Simulations.
+    p_value : float
+        Share of the simulations that are as odd among the others.
+    verdict : Verdict
+        The verdict.
+    worst : str
+        One sentence: what the simulation gets wrong most.
+    notes : tuple of str
+        What was left out or assumed.
+    traces : Traces
+        For a page.
+
+    """
+
+    recording: str
+    fitted: tuple[float, float]
+    simulated: tuple[float, float]
+    model: tuple[str, ...]
+    explained: float
+    rmse: float
+    bias: float
+    bias_by_third: tuple[float, float, float]
+    lowest: Band
+    levels: tuple[float, ...]
+    falls: tuple[Band, ...]
+    spectrum: tuple[SpectrumBand, ...]
+    dip: Band | None
+    recovery: Band | None
+    rises: int
+    ks_distance: float
+    seeds: int
+    p_value: float
+    verdict: Verdict
+    worst: str
+    notes: tuple[str, ...]
+    traces: Traces
+
+    def as_data(self) -> dict[str, Any]:
+        """Return what `--json` writes."""
+        def band(of: Band) -> dict[str, float]:
+            return {'measured': of.measured, 'simulated_low': of.low,
+                    'simulated_median': of.median, 'simulated_high': of.high}
+
+        return {
+            'recording': self.recording, 'fitted_s': list(self.fitted),
+            'simulated_s': list(self.simulated), 'model': list(self.model),
+            'mean_path': {'variance_explained': self.explained, 'rmse_v': self.rmse,
+                          'bias_v': self.bias, 'bias_by_third_v': list(self.bias_by_third)},
+            'lowest_v': band(self.lowest),
+            'crossings_per_min': [{'level_v': level, **band(falls)}
+                                  for level, falls in zip(self.levels, self.falls)],
+            'spectrum': [{'from_hz': one.low_hz, 'to_hz': one.high_hz,
+                          'simulated_over_measured': _ratio(one.power)}
+                         for one in self.spectrum],
+            'ks_distance': self.ks_distance, 'worst': self.worst,
+            'verdict': self.verdict.name.lower()}
+
+
+def _ratio(power: Band) -> float:
+    return power.median / power.measured if power.measured > 0.0 else float('nan')

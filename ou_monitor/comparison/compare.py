@@ -1,0 +1,234 @@
+"""
+A recording beside simulations of it over its own throttle.
+
+Limits first: the model fitted here is told throttle, or current, alone; the bands hold the errors
+of its parameters as parts left out of the fit showed them, no change of the craft after that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import math
+
+import numpy as np
+from ou_monitor.comparison.agreement import Agreement, SpectrumBand, Traces, Verdict
+from ou_monitor.comparison.flight_fit import fit_flight, MOVES
+from ou_monitor.comparison.flight_model import Drawn, FiledModel, FlightModel, Readings
+from ou_monitor.comparison.judgement import (
+    band, differences, distance, judge, LEVEL)
+from ou_monitor.comparison.yardstick import Measures, Yardstick
+from ou_monitor.criticism.integrity import without_repeats
+from ou_monitor.criticism.level_range import stray
+from ou_monitor.criticism.readings import counted, usable, why_nothing
+from ou_monitor.errors import InputError
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.records import FloatArray, Recording
+from ou_monitor.text import number
+
+# Readings that a part needs, and seconds; simulations for a verdict at 5 %.
+_LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 1.0, 20, 10_000
+# Points of the band that a page draws, at most.
+_POINTS = 2000
+# Seconds whose level a model from a file takes from the recording.
+_ALIGNED = 2.0
+
+
+def compare(recording: Recording, model: SupplyModel | None = None, *,
+            fit_until: float | None = None, seeds: int = 50, seed: int = 0,
+            levels: tuple[float, ...] = (),
+            progress: Callable[[float], None] | None = None) -> Agreement:
+    """
+    Compare a recording with simulations of it.
+
+    Parameters
+    ----------
+    recording : Recording
+        Voltage, V, and throttle, 0..1.
+    model : SupplyModel, optional
+        What is simulated; without it, a model is fitted to the part before fit_until.
+    fit_until : float, optional
+        Begin of the part that is simulated, s after the first sample; half of the recording, or
+        with a model its begin, where left out.
+    seeds : int
+        Simulations, 20 to 10000.
+    seed : int
+        The same one gives the same simulations.
+    levels : tuple of float
+        Further voltages, V, whose crossings are counted.
+    progress : callable, optional
+        Takes the share that is done, 0..1.
+
+    Returns
+    -------
+    Agreement
+        What the simulations get right and wrong.
+
+    Raises
+    ------
+    InputError
+        When the recording is too short, does not change, or lacks throttle that the model needs;
+        when fit_until lies outside it.
+    ValueError
+        When seeds is out of its range.
+
+    """
+    report = progress or (lambda share: None)
+    if not _FEWEST_SEEDS <= seeds <= _MOST_SEEDS:
+        raise ValueError(f'seeds must lie within {_FEWEST_SEEDS} to {_MOST_SEEDS}, got {seeds}')
+    notes = list(recording.notes)
+    samples, offset = _samples(recording, notes)
+    duration = float(samples.t[-1])
+    begin = _begin(samples, fit_until, fitted=model is None)
+    if model is None:
+        fitted = fit_flight(samples.part(slice(0, begin)), lambda share: report(0.6 * share))
+        drawn: Drawn = fitted
+        notes += _fit_notes(fitted, samples)
+    else:
+        _check_throttle(model, samples)
+        drawn = FiledModel(model)
+        notes.append('The errors of the parameters in the model file are not simulated: the '
+                     'bands hold the noise alone.')
+    part = slice(begin, samples.t.size)
+    own = samples.part(part)
+    lsb = samples.lsb
+    yardstick = Yardstick(own, lsb, levels)
+    rng = np.random.default_rng(seed)
+    shift = 0.0 if drawn.alone else _shift(drawn, samples, part, rng, notes)
+    stride = max(1, -(-own.t.size // _POINTS))
+    measured: list[Measures] = []
+    traces = np.empty((seeds, -(-own.t.size // stride)), dtype=np.float32)
+    total, first = np.zeros(own.t.size), own.voltage
+    strays = 0
+    for k in range(seeds):
+        v = drawn.draw(samples, rng)[part] + shift
+        if not np.isfinite(v).all():
+            raise InputError('the model runs away over this throttle: its voltage is not finite')
+        total += v
+        v = lsb * np.rint(v / lsb) if lsb > 0.0 else v
+        first = v if k == 0 else first
+        strays += stray(v, samples.voltage) > 0.0
+        measured.append(yardstick.measure(v))
+        traces[k] = v[::stride]
+        report(0.6 + 0.4 * (k + 1.0) / seeds if model is None else (k + 1.0) / seeds)
+    if strays:
+        notes.append(f'{strays} of {seeds} simulations leave the range of the recording by more '
+                     'than half of it.')
+    path = fitted.path(samples)[part] if model is None else total / seeds
+    return _agreement(recording, samples, own, yardstick, drawn, measured, path, traces, first,
+                      notes, (0.0, float(own.t[0]) if model is None else 0.0), seeds, offset,
+                      (float(own.t[0]), duration))
+
+
+def _samples(recording: Recording, notes: list[str]) -> tuple[Readings, float]:
+    """Return each reading once, from 0 s on, and the stamp of the first, s."""
+    t, v, u = usable(recording, notes)
+    if v.size < 2 * _LEAST:
+        raise InputError(f"'{recording.name}' holds {counted(v.size, 'usable sample')}; a "
+                         f'comparison needs at least {2 * _LEAST}')
+    reason = why_nothing(v)
+    if reason:
+        raise InputError(f"'{recording.name}': {reason}")
+    t, v, u, period = without_repeats(t, v, u)
+    if period > 1.0:
+        notes.append(f'The logger repeats its last value, {number(period, 3)} samples a reading: '
+                     'each reading is simulated and counted once.')
+    if u is not None:
+        u = np.clip(u, 0.0, 1.0)
+    return Readings(t - t[0], v, u), float(t[0])
+
+
+def _begin(samples: Readings, fit_until: float | None, fitted: bool) -> int:
+    """Return the first sample that is simulated."""
+    duration = float(samples.t[-1])
+    until = (0.5 * duration if fitted else 0.0) if fit_until is None else fit_until
+    if not 0.0 <= until < duration or (fitted and not until > 0.0):
+        raise InputError(f'the fit must end within the recording, 0 to {number(duration, 4)} s, '
+                         f'got {until:g} s')
+    begin = int(np.searchsorted(samples.t, until))
+    for what, n, seconds in (
+            ('fitted', begin, until), ('simulated', samples.t.size - begin, duration - until)):
+        if (what == 'simulated' or fitted) and (n < _LEAST or not seconds > _SHORTEST):
+            raise InputError(
+                f'the part that is {what} holds {counted(n, "reading")} in {number(seconds, 3)} '
+                f's; it needs {_LEAST} in more than {_SHORTEST:g} s')
+    return begin
+
+
+def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
+    if samples.throttle is None:
+        return ['Throttle is not recorded: only level and noise are simulated.']
+    if model.load is None and not np.ptp(samples.throttle) >= MOVES:
+        return ['Throttle does not move: only level and noise are simulated.']
+    if model.load is None:
+        return ['Throttle does not predict the voltage of parts that were left out of the fit: '
+                'only level and noise are simulated.']
+    found = []
+    if model.load.model.full_current:
+        found.append('Current predicts the voltage better than throttle: it is the load.')
+    return found
+
+
+def _check_throttle(model: SupplyModel, samples: Readings) -> None:
+    needs = model.needs_throttle
+    if needs and samples.throttle is None:
+        raise InputError(f"the model's term '{needs[0]}' needs throttle, and the recording has "
+                         'none')
+
+
+def _shift(drawn: Drawn, samples: Readings, part: slice, rng: np.random.Generator,
+           notes: list[str]) -> float:
+    """Return what brings the level of a model to that of the first seconds simulated, V."""
+    first = (samples.t >= samples.t[part][0]) & (
+        samples.t <= max(samples.t[part][0] + _ALIGNED, samples.t[part][min(9, _LEAST - 1)]))
+    means = [float(drawn.draw(samples, rng)[first].mean()) for _ in range(_FEWEST_SEEDS)]
+    shift = float(samples.voltage[first].mean()) - float(np.mean(means))
+    if not math.isfinite(shift):
+        raise InputError('the model runs away over this throttle: its voltage is not finite')
+    notes.append(f'The level of the model is moved by {number(shift, 3)} V, so that its first '
+                 f'{_ALIGNED:g} s are those of the recording.')
+    return shift
+
+
+def _agreement(recording: Recording, samples: Readings, own: Readings, yardstick: Yardstick,
+               drawn: Drawn, measured: list[Measures], path: FloatArray,
+               traces: np.ndarray, first: FloatArray, notes: list[str],
+               fitted: tuple[float, float], seeds: int, offset: float,
+               simulated: tuple[float, float]) -> Agreement:
+    """Put the numbers together."""
+    real = yardstick.measure(own.voltage)
+    spread = float(np.ptp(own.voltage))
+    found = differences(yardstick, real, measured, spread)
+    p, worst = judge(found)
+    verdict = Verdict.DIFFERS if p < LEVEL else Verdict.LOOKS_LIKE_IT
+    error = path - own.voltage
+    pooled = np.mean([m.distribution for m in measured], axis=0)
+    answers = np.array([m.answer for m in measured])
+    dips = [one.band for one in found if one.kind == 'answer']
+    stride = -(-own.t.size // traces.shape[1])
+    low, high = np.percentile(traces, [2.5, 97.5], axis=0)
+    empty = np.empty(0)
+    answer_low, answer_high = (np.percentile(answers, [2.5, 97.5], axis=0) if answers.size
+                               else (empty, empty))
+    return Agreement(
+        recording.name, fitted, simulated, tuple(drawn.names),
+        1.0 - float(error @ error) / float(np.sum((own.voltage - own.voltage.mean()) ** 2)),
+        math.sqrt(float(np.mean(error ** 2))), float(error.mean()),
+        tuple(float(part.mean()) for part in np.array_split(error, 3)),  # type: ignore[arg-type]
+        band(real.lowest, np.array([m.lowest for m in measured])), tuple(yardstick.levels),
+        tuple(one.band for one in found if one.kind == 'falls'),
+        tuple(SpectrumBand(float(a), float(b), band(
+            float(real.power[k]), np.array([m.power[k] for m in measured])))
+            for k, (a, b) in enumerate(zip(yardstick.bands, yardstick.bands[1:]))),
+        dips[0] if dips else None, dips[1] if dips else None, int(yardstick.rises.size),
+        distance(real, pooled), seeds, p, verdict, _sentence(worst.words(worst.band), verdict),
+        tuple(notes),
+        Traces(own.t + offset, own.voltage,
+               np.full(own.t.size, np.nan) if own.throttle is None else own.throttle, first,
+               own.t[::stride] + offset, low, high, yardstick.after if answers.size else empty,
+               real.answer, answer_low, answer_high, yardstick.edges,
+               real.distribution, pooled))
+
+
+def _sentence(words: str, verdict: Verdict) -> str:
+    begin = 'Most wrong' if verdict is Verdict.DIFFERS else 'Farthest, though within chance'
+    return f'{begin}: in the simulation, {words}.'

@@ -1,0 +1,188 @@
+"""A model of one flight, fitted to a part of it, that can be drawn over any throttle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import Protocol
+
+import numpy as np
+from ou_monitor.criticism.adc import find_step
+from ou_monitor.model.load_fit import LoadFit
+from ou_monitor.model.load_noise import NoiseLaw
+from ou_monitor.model.residual_ou import ResidualOU, SLOW_TIME
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.quantization import Quantization
+from ou_monitor.records import FloatArray
+from scipy.signal import lfilter
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """
+    What a comparison is about: each reading of the ADC once.
+
+    Attributes
+    ----------
+    t, voltage : ndarray, shape (n,)
+        Stamps, s, and readings, V.
+    throttle, current : ndarray, shape (n,), or None
+        0..1, and A; None where not recorded.
+
+    """
+
+    t: FloatArray
+    voltage: FloatArray
+    throttle: FloatArray | None
+    current: FloatArray | None = None
+
+    def part(self, which: slice) -> Readings:
+        """Return some of the samples."""
+        def of(x: FloatArray | None) -> FloatArray | None:
+            return None if x is None else x[which]
+
+        return Readings(self.t[which], self.voltage[which], of(self.throttle), of(self.current))
+
+    @property
+    def spacing(self) -> float:
+        """Return the usual time from one sample to the next, s."""
+        return float(np.median(np.diff(self.t)))
+
+    @property
+    def lsb(self) -> float:
+        """Return the step of the ADC, V; 0 where none is seen."""
+        return find_step(self.voltage)
+
+
+class Drawn(Protocol):
+    """What can be simulated over the stamps, throttle and current of a recording."""
+
+    @property
+    def names(self) -> list[str]:
+        """Return the names of its terms."""
+
+    @property
+    def alone(self) -> bool:
+        """Return whether it tells its own level, so that none is taken from the recording."""
+
+    def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:
+        """Return one simulated voltage, V, before the ADC."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlightModel:
+    """
+    Load model, slow process, OU and white noise, as fitted to a part of a recording.
+
+    Attributes
+    ----------
+    load : LoadFit or None
+        The answer to the load; None where the level is all there is.
+    level, level_se : float
+        Level, V, without a load model, and its standard error.
+    spread : float
+        Factor on the variance of the load's errors: how much farther parts that were left out lay
+        from their prediction than those errors say.
+    noise : NoiseLaw
+        White noise.
+    ou : ResidualOU
+        What has memory in the residuals.
+    spacing : float
+        Time from sample to sample in the fit, s.
+    explained : float
+        Share of variance explained of parts that were left out of the fit.
+
+    """
+
+    load: LoadFit | None
+    level: float
+    level_se: float
+    spread: float
+    noise: NoiseLaw
+    ou: ResidualOU
+    spacing: float
+    explained: float
+
+    @property
+    def names(self) -> list[str]:
+        """Return the names of its terms, as in a model file."""
+        found = ['ou']
+        if self.load is not None:
+            found += ['load_sag', 'load_transient', 'drift']
+        follows = self.noise.limits[0] < self.noise.limits[1]
+        return [*found, 'measurement_noise', *(['load_dependent_noise'] if follows else [])]
+
+    @property
+    def alone(self) -> bool:
+        """Return that it tells its own level."""
+        return True
+
+    def path(self, samples: Readings) -> FloatArray:
+        """Return the mean voltage, V."""
+        if self.load is None or samples.throttle is None:
+            return np.full(samples.t.size, self.level)
+        return self.load.model.path(samples.t, samples.throttle, samples.current)
+
+    def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:
+        """Return one simulated voltage, V; the errors of the parameters are drawn too."""
+        n = samples.t.size
+        throttle = np.zeros(n) if samples.throttle is None else samples.throttle
+        slow = 0.0
+        if self.load is None or samples.throttle is None:
+            voltage = np.full(n, self.level + self.level_se * rng.standard_normal())
+        else:
+            voltage = self.load.draw(rng, self.spread).path(samples.t, throttle, samples.current)
+            slow = self.spread * self.load.slow_std ** 2
+        dt = np.diff(samples.t, prepend=samples.t[0])
+        for variance, tau in ((slow, SLOW_TIME), (self.ou.variance, self.ou.tau)):
+            if variance > 0.0:
+                voltage = voltage + math.sqrt(variance) * _ou(dt, tau, rng)
+        return np.asarray(voltage + self.noise.draw(samples.t, throttle, rng))
+
+
+def _ou(dt: FloatArray, tau: float, rng: np.random.Generator) -> FloatArray:
+    """Return an OU of variance 1; steps are taken as even, but for gaps."""
+    usual = float(np.median(dt))
+    keep = math.exp(-usual / tau)
+    kicks = math.sqrt(1.0 - keep * keep) * rng.standard_normal(dt.size)
+    begins = [0, *np.flatnonzero(dt > 3.0 * usual).tolist(), dt.size]
+    out, state = np.empty(dt.size), float(rng.standard_normal())
+    for first, last in zip(begins, begins[1:]):
+        over = math.exp(-float(dt[first]) / tau) if first else 1.0
+        state = over * state + math.sqrt(1.0 - over * over) * float(rng.standard_normal())
+        kicks[first] = state
+        out[first:last] = lfilter([1.0], [1.0, -keep], kicks[first:last])
+        state = float(out[last - 1])
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class FiledModel:
+    """
+    A model from a file; its terms are drawn at each reading of the ADC, so none is held twice.
+
+    Attributes
+    ----------
+    model : SupplyModel
+        As in the file.
+
+    """
+
+    model: SupplyModel
+
+    @property
+    def names(self) -> list[str]:
+        """Return the names of its terms."""
+        return [term.NAME for term in self.model.terms]
+
+    @property
+    def alone(self) -> bool:
+        """Return that its level is that of another day."""
+        return False
+
+    def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:
+        """Return one simulated voltage, V."""
+        analogue = SupplyModel(tuple(
+            term for term in self.model.terms
+            if term.NAME not in ('held_samples', Quantization.NAME)))
+        return analogue.simulate(samples.t, rng, samples.throttle)

@@ -1,0 +1,62 @@
+"""A comparison in words and rows, for a terminal and a page alike."""
+
+from __future__ import annotations
+
+from ou_monitor.comparison.agreement import Agreement, Band, Verdict
+from ou_monitor.text import number
+
+# What a model can be fitted to.
+_NOTHING_FITTED = (0.0, 0.0)
+
+
+def headline(found: Agreement) -> str:
+    """Return the sentence that a pilot reads first."""
+    what = (f'{found.verdict.value}: lowest {number(found.lowest.median, 4)} V simulated '
+            f'({number(found.lowest.low, 4)} to {number(found.lowest.high, 4)} in '
+            f'{found.seeds} simulations), {number(found.lowest.measured, 4)} V measured; its mean '
+            f'path explains {share(found.explained)} of the variance.')
+    return what if found.verdict is Verdict.LOOKS_LIKE_IT else f'{what} {found.worst}'
+
+
+def share(value: float) -> str:
+    """Return a share of variance in percent."""
+    return 'nothing' if value <= 0.0 else f'{100.0 * value:.0f} %'
+
+
+def parts(found: Agreement) -> str:
+    """Return which parts were fitted and simulated."""
+    first, last = found.simulated
+    simulated = f'simulated {number(first, 4)} to {number(last, 4)} s'
+    if found.fitted == _NOTHING_FITTED:
+        return f'{simulated} with the model given'
+    return f'fitted 0 to {number(found.fitted[1], 4)} s, {simulated}'
+
+
+def rows(found: Agreement) -> list[tuple[str, str, str, str]]:
+    """Return quantity, measured, simulated with its 95 % band, and a remark."""
+    def row(name: str, of: Band, digits: int, factor: float = 1.0) -> tuple[str, str, str, str]:
+        low, high = sorted((factor * of.low, factor * of.high))
+        return (name, number(factor * of.measured, digits),
+                f'{number(factor * of.median, digits)} [{number(low, digits)}, '
+                f'{number(high, digits)}]', '' if of.inside else 'outside')
+
+    out = [row('lowest voltage, V', found.lowest, 4)]
+    out += [row(f'falls through {number(level, 4)} V, 1/min', falls, 3)
+            for level, falls in zip(found.levels, found.falls)]
+    if found.dip is not None and found.recovery is not None:
+        out += [row(f'dip after {found.rises} rises of throttle, mV', found.dip, 3, -1e3),
+                row('the same 1 s after the rise, mV', found.recovery, 3, -1e3)]
+    out += [row(f'rms {number(one.low_hz, 2)} to {number(one.high_hz, 2)} Hz, mV',
+                Band(*(max(x, 0.0) ** 0.5 for x in (
+                    one.power.measured, one.power.low, one.power.median, one.power.high))), 3,
+                1e3) for one in found.spectrum]
+    return out
+
+
+def path_rows(found: Agreement) -> list[tuple[str, str]]:
+    """Return what is said of the mean path and of the distribution."""
+    thirds = ', '.join(number(1e3 * b, 2) for b in found.bias_by_third)
+    return [('variance explained by the mean path', number(found.explained, 3)),
+            ('its rms error, mV', number(1e3 * found.rmse, 3)),
+            ('its bias, mV (by thirds)', f'{number(1e3 * found.bias, 2)} ({thirds})'),
+            ('KS distance of the distributions', number(found.ks_distance, 2))]
