@@ -157,9 +157,9 @@ _ANALYZE = Command(
 _COMPARE = Command(
     'compare', 'a recording beside simulations of it: what the simulation gets wrong most',
     'ou_monitor.cli.compare',
-    "Simulate a recording over its own throttle many times, and show both side by side: mean path, "
-    'lowest voltage, falls through low levels, spectrum, answer to throttle, distribution. Without '
-    '--model, a model is fitted to the part before S and the rest is simulated.',
+    'Simulate a recording over its own throttle many times, and show both side by side: mean '
+    'path, lowest voltage, falls through low levels, spectrum, answer to throttle, distribution. '
+    'Without --model, a model is fitted to the part before S, and the rest is simulated.',
     (_RECORDING, *_PART,
      Option('--model', metavar='FILE.yaml', type=path_argument,
             help='simulate this model, as discover --save-model writes it; its level is moved to '
@@ -173,8 +173,9 @@ _COMPARE = Command(
             help='also count falls through this voltage, V (default: two low levels that the '
             'recording shows)'),
      *_TOPICS, _JSON, _REPORT),
-    'Examples: ou-monitor compare flight.mcap --report flight.html; ou-monitor compare flight.mcap '
-    '--fit-until 60 --brownout-voltage 14; ou-monitor compare flight.mcap --model other_day.yaml')
+    'Examples: ou-monitor compare flight.mcap --report flight.html; ou-monitor compare '
+    'flight.mcap --fit-until 60 --brownout-voltage 14; ou-monitor compare flight.mcap --model '
+    'other_day.yaml')
 
 _CONVERT = Command(
     'convert', 'a log becomes an MCAP bag', 'ou_monitor.cli.convert',

@@ -38,7 +38,8 @@ class Band:
     @property
     def inside(self) -> bool:
         """Return whether the recording lies in the band."""
-        return self.low <= self.measured <= self.high
+        hair = 1e-9 * abs(self.measured)
+        return self.low - hair <= self.measured <= self.high + hair
 
 
 @dataclass(frozen=True)

@@ -134,10 +134,12 @@ class FlightModel:
             voltage = self.load.draw(rng, self.spread).path(samples.t, throttle, samples.current)
             slow = self.spread * self.load.slow_std ** 2
         dt = np.diff(samples.t, prepend=samples.t[0])
-        for variance, tau in ((slow, SLOW_TIME), (self.ou.variance, self.ou.tau)):
-            if variance > 0.0:
-                voltage = voltage + math.sqrt(variance) * _ou(dt, tau, rng)
-        return np.asarray(voltage + self.noise.draw(samples.t, throttle, rng))
+        white, variance, tau = self.ou.draw(rng)
+        for var, time in ((slow, SLOW_TIME), (variance, tau)):
+            if var > 0.0:
+                voltage = voltage + math.sqrt(var) * _ou(dt, time, rng)
+        factor = math.sqrt(white / self.ou.white) if self.ou.white > 0.0 else 1.0
+        return np.asarray(voltage + factor * self.noise.draw(samples.t, throttle, rng))
 
 
 def _ou(dt: FloatArray, tau: float, rng: np.random.Generator) -> FloatArray:

@@ -152,7 +152,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
 
 
 def without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
-                     ) -> tuple[FloatArray, FloatArray, FloatArray | None, float]:
+                    ) -> tuple[FloatArray, FloatArray, FloatArray | None, float]:
     """Return the refreshes, and the samples a refresh: 1 where none repeats."""
     first = max(0, (v.size - _LOOK) // 2)
     look = v[first:first + _LOOK]

@@ -28,6 +28,7 @@ _ALIKE, _FEWEST = 0.02, 50
 # a hair, for the rounding of stamps.
 _SPAN, _HAIR = 0.02, 1e-6
 
+
 def changes(t: FloatArray, throttle: FloatArray) -> FloatArray:
     """Return how much throttle changed within `_SPAN` before each stamp, s; 0 at the first."""
     then = np.searchsorted(t, t - _SPAN + _HAIR, side='right') - 1
@@ -68,9 +69,14 @@ class NoiseLaw:
     def draw(self, t: FloatArray, throttle: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Return noise, V, of samples with that throttle; the coefficients' errors are drawn."""
         features = self.features(t, throttle)
-        at = np.searchsorted(self.intensities, features @ self.b)
-        reach = max(_FEWEST, int(_ALIKE * self.scores.size))
-        near = np.clip(at + rng.integers(-reach, reach + 1, at.size), 0, self.scores.size - 1)
+        wanted = features @ self.b
+        # Any of those that are as intense, and its neighbours: as many at the ends as between.
+        first = np.searchsorted(self.intensities, wanted, side='left')
+        last = np.searchsorted(self.intensities, wanted, side='right')
+        at = first + (rng.random(wanted.size) * (last - first)).astype(np.int64)
+        most = self.scores.size - 1
+        reach = min(max(_FEWEST, int(_ALIKE * self.scores.size)), most // 2)
+        near = np.clip(at, reach, most - reach) + rng.integers(-reach, reach + 1, at.size)
         b = rng.multivariate_normal(self.b, self.covariance)
         return np.asarray(self.scores[near] * np.exp(0.5 * features @ b))
 
@@ -120,4 +126,4 @@ def fit_noise_law(t: FloatArray, errors: FloatArray, throttle: FloatArray,
     order = np.argsort(own, kind='stable')
     scores = errors / np.sqrt(own + other)
     return NoiseLaw(np.asarray(found.x), np.linalg.inv(information), limits,
-                     np.log(own[order]), scores[order])
+                    np.log(own[order]), scores[order])

@@ -22,9 +22,13 @@ _FASTEST, _LONGEST = 2.0, 0.1
 # Relaxation times tried, bins of frequency, and parts for cross-validation.
 _TRIED, _BINS, _PARTS = 12, 120, 4
 _TINY = 1e-12
+# A Hann window makes neighbouring ordinates alike: so many count as one (Percival & Walden 1993).
+_ALIKE = 35.0 / 18.0
+# Logarithms are not drawn farther than this from their estimates.
+_FARTHEST = 2.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ResidualOU:
     """
     What is in a series beside a slow process that is given.
@@ -39,6 +43,8 @@ class ResidualOU:
         Its relaxation time, s.
     gain : float
         What it adds to the log-likelihood of parts left out, nats a sample.
+    covariance : ndarray, shape (3, 3)
+        Covariance of the logarithms of white, variance and tau.
 
     """
 
@@ -46,6 +52,14 @@ class ResidualOU:
     variance: float
     tau: float
     gain: float
+    covariance: FloatArray
+
+    def draw(self, rng: np.random.Generator) -> tuple[float, float, float]:
+        """Return white, variance and tau within their errors."""
+        off = np.clip(rng.multivariate_normal(np.zeros(3), self.covariance), -_FARTHEST, _FARTHEST)
+        white, variance, tau = (x * math.exp(d) for x, d in zip(
+            (self.white, self.variance, self.tau), off))
+        return white, variance, tau
 
 
 def _spectrum(f: FloatArray, dt: float, tau: float) -> FloatArray:
@@ -119,10 +133,30 @@ def fit_residual_ou(x: FloatArray, dt: float, slow: float) -> ResidualOU:
         with_ou = 2.0 * dt * white + variance * _spectrum(f, dt, tau) + base
         gain += _cost(2.0 * dt * alone + base, power, count) - _cost(with_ou, power, count)
     gain /= 2.0 * x.size
-    white, variance, tau, alone = _fit(*_binned(x, dt), dt, slow, taus)
+    f, power, count = _binned(x, dt)
+    white, variance, tau, alone = _fit(f, power, count, dt, slow, taus)
     if not gain > 0.0:
-        return ResidualOU(alone, 0.0, longest, gain)
-    return ResidualOU(white, variance, tau, gain)
+        white, variance, tau = alone, 0.0, longest
+    return ResidualOU(white, variance, tau, gain,
+                      _covariance(f, count, dt, slow, (white, variance, tau)))
+
+
+def _covariance(f: FloatArray, count: FloatArray, dt: float, slow: float,
+                at: tuple[float, float, float]) -> FloatArray:
+    """Return the inverse of the Fisher information of the logarithms; 0 for an OU not there."""
+    white, variance, tau = at
+    shape = _spectrum(f, dt, tau)
+    flat = np.full(f.size, 2.0 * dt * white)
+    density = flat + variance * shape + slow * _spectrum(f, dt, SLOW_TIME) + 1e-300
+    hair = 1e-3
+    moved = (_spectrum(f, dt, tau * math.exp(hair)) - shape) / hair
+    slopes = np.stack([flat, variance * shape, variance * moved]) / density
+    # A factor of e where the series does not decide.
+    information = (slopes * count) @ slopes.T / _ALIKE + np.eye(3)
+    covariance = np.linalg.inv(information)
+    if not variance > 0.0:
+        covariance[1:] = covariance[:, 1:] = 0.0
+    return np.asarray(covariance)
 
 
 def innovations(x: FloatArray, dt: float, ou: ResidualOU, slow: float

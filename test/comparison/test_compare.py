@@ -1,0 +1,152 @@
+"""A recording beside its simulations: what is like it, what differs, and which is worst."""
+
+import numpy as np
+from ou_monitor.comparison.agreement import Verdict
+from ou_monitor.comparison.compare import compare
+from ou_monitor.errors import InputError
+from ou_monitor.model.load import LoadModel
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.records import Recording
+import pytest
+
+ALPHA, SIGMA, LEVEL, SAG = 20.0, 0.3, 15.0, 1.5
+
+
+def throttle(t: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Return throttle that is held for a second and a half at a time."""
+    rng = np.random.default_rng(seed)
+    return rng.random(int(t[-1] / 1.5) + 2)[(t / 1.5).astype(int)]
+
+
+def drawn(seed: int, n: int = 4000, rate: float = 100.0) -> Recording:
+    """Return a recording of the model below."""
+    t = np.arange(n) / rate
+    u = throttle(t)
+    return Recording(t, model().simulate(t, np.random.default_rng(seed), u), u, 'made')
+
+
+def model(sigma: float = SIGMA, sag: float = SAG) -> SupplyModel:
+    """Return an OU that sags."""
+    return SupplyModel((OU(ALPHA, sigma, LEVEL), LoadSag(sag, 0.0)))
+
+
+def test_a_recording_of_the_model_looks_like_it():
+    """One in twenty may differ by chance: of twelve at most two, but for 2 % of such tests."""
+    found = [compare(drawn(seed), model(), seeds=20, seed=seed) for seed in range(12)]
+    assert sum(one.verdict is Verdict.DIFFERS for one in found) <= 2
+    assert np.mean([one.p_value for one in found]) > 0.2
+
+
+def test_the_mean_path_explains_all_but_the_noise():
+    """1 - var(OU)/var(v), and no bias beyond that of the first two seconds."""
+    recording = drawn(1)
+    found = compare(recording, model(), seeds=40)
+    noise = SIGMA ** 2 / (2.0 * ALPHA)
+    # 4000 samples hold 400 independent ones (two relaxation times each).  The mean over 40
+    # simulations adds 1/40 of the noise, the alignment that of two seconds: 2/(alpha 2 s).
+    expected = noise * (1.0 + 1.0 / 40.0 + 1.0 / ALPHA) / recording.voltage.var()
+    assert 1.0 - found.explained == pytest.approx(expected, rel=4.0 * np.sqrt(2.0 / 400.0))
+    assert abs(found.bias) < 4.0 * np.sqrt(noise / ALPHA)
+
+
+def test_a_doubled_sigma_differs():
+    """Twice the intensity: the spectrum above the corner has four times the power."""
+    t = np.arange(4000) / 100.0
+    v = SupplyModel((OU(ALPHA, SIGMA, LEVEL),)).simulate(t, np.random.default_rng(2))
+    found = compare(Recording(t, v, np.full(t.size, np.nan), 'bench'),
+                    SupplyModel((OU(ALPHA, 2.0 * SIGMA, LEVEL),)), seeds=40)
+    assert found.verdict is Verdict.DIFFERS
+    assert found.worst.startswith('Most wrong')
+    top = found.spectrum[-1].power
+    # 2000 ordinates: 2 % each for the recording and for the median.
+    assert top.median / top.measured == pytest.approx(4.0, rel=0.15)
+
+
+@pytest.mark.parametrize('sag', [0.5 * SAG, 2.0 * SAG])
+def test_a_wrong_sag_is_the_worst(sag):
+    """A sag that is wrong by a factor is told by levels and answers, not by noise."""
+    found = compare(drawn(3), model(sag=sag), seeds=40)
+    assert found.verdict is Verdict.DIFFERS
+    assert any(word in found.worst for word in ('rises of throttle', 'lowest', 'falls through'))
+
+
+def test_only_what_follows_s_is_simulated():
+    """--fit-until with a model: the part after it, aligned there."""
+    found = compare(drawn(4), model(), fit_until=30.0, seeds=20)
+    assert found.simulated == (30.0, pytest.approx(39.99))
+    assert found.fitted == (0.0, 0.0)
+    assert found.traces.t[0] == 30.0
+
+
+def flight(seed: int, n: int = 2000, rate: float = 50.0) -> Recording:
+    """Return a flight of a pack whose noise follows throttle, in steps of 10 mV."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) / rate
+    u = 0.2 + 0.6 * throttle(t, seed)
+    pack = LoadModel(4, 0.3, charge=0.8, endurance=400.0)
+    noise = 0.05 * np.exp(u * (1.4 - u) / 0.49 - 1.0) * rng.standard_normal(n)
+    return Recording(t, 0.01 * np.rint(100.0 * (pack.path(t, u) + noise)), u, 'pack')
+
+
+def test_the_second_half_follows_from_the_first():
+    """The model that is fitted explains what is not noise, and its bands hold the recording."""
+    found = compare(flight(1), seeds=40)
+    assert found.fitted == (0.0, pytest.approx(19.99, abs=0.03))
+    assert found.verdict is Verdict.LOOKS_LIKE_IT
+    assert 'load_sag' in found.model and 'load_dependent_noise' in found.model
+    assert found.explained > 0.9
+    assert found.lowest.inside and all(falls.inside for falls in found.falls)
+
+
+def test_without_throttle_there_is_level_and_noise():
+    """An OU and white noise, and the note says so; of four at most one differs by chance."""
+    t = np.arange(6000) / 200.0
+    supply = SupplyModel((OU(ALPHA, SIGMA, 5.0), MeasurementNoise(0.02)))
+    differ = 0
+    for seed, held in enumerate((np.nan, 0.4, np.nan, 0.4)):
+        v = supply.simulate(t, np.random.default_rng(seed), np.full(t.size, 0.4))
+        found = compare(Recording(t, v, np.full(t.size, held), 'bench'), seeds=40)
+        assert found.model == ('ou', 'measurement_noise')
+        assert any('only level and noise' in note for note in found.notes)
+        differ += found.verdict is Verdict.DIFFERS
+    assert differ <= 1
+
+
+def test_held_samples_count_once():
+    """A logger five times as fast as its source tells the same."""
+    slow = flight(2, 800)
+    fast = Recording(np.arange(4000) / 250.0, np.repeat(slow.voltage, 5),
+                     np.repeat(slow.throttle, 5), 'held')
+    one, other = compare(slow, seeds=20), compare(fast, seeds=20)
+    assert any('repeats its last value' in note for note in other.notes)
+    # But for the first reading, whose begin is not in the recording.
+    assert other.falls[1].measured == pytest.approx(one.falls[1].measured, rel=0.1)
+    assert other.falls[1].median == pytest.approx(one.falls[1].median, rel=0.4)
+
+
+@pytest.mark.parametrize('change, words', [
+    ({'fit_until': 60.0}, 'must end within the recording'),
+    ({'fit_until': 0.0}, 'must end within the recording'),
+    ({'fit_until': 0.2}, 'the part that is fitted holds'),
+    ({'fit_until': 39.9}, 'the part that is simulated holds')])
+def test_parts_that_are_too_short(change, words):
+    """One line that says which part."""
+    with pytest.raises(InputError, match=words):
+        compare(drawn(6), **change)
+
+
+def test_what_cannot_be_compared():
+    """Too few samples, no voltage that changes, no throttle for a model that needs it."""
+    t = np.arange(400) / 100.0
+    none = np.full(t.size, np.nan)
+    with pytest.raises(InputError, match='needs at least 100'):
+        compare(Recording(t[:60], np.sin(t[:60]), none[:60], 'short'))
+    with pytest.raises(InputError, match='constant|change'):
+        compare(Recording(t, np.full(t.size, 5.0), none, 'flat'))
+    with pytest.raises(InputError, match="'load_sag' needs throttle"):
+        compare(Recording(t, np.sin(t), none, 'bench'), model())
+    with pytest.raises(ValueError, match='20 to 10000, got 3'):
+        compare(drawn(7), seeds=3)

@@ -1,0 +1,81 @@
+"""What is measured of a voltage, against closed forms; and which difference is the worst."""
+
+import numpy as np
+from ou_monitor.comparison.flight_model import Readings
+from ou_monitor.comparison.judgement import band, Difference, judge
+from ou_monitor.comparison.yardstick import between_codes, Yardstick
+import pytest
+
+RATE, N = 100.0, 20_000
+
+
+def white(seed: int) -> Readings:
+    """Return white noise of 0.1 V about 5 V."""
+    t = np.arange(N) / RATE
+    return Readings(t, 5.0 + 0.1 * np.random.default_rng(seed).standard_normal(N), None)
+
+
+def test_falls_of_white_noise():
+    """A share p of the samples below a level: p (1 - p) falls a sample."""
+    noise = white(1)
+    found = Yardstick(noise, 0.0).measure(noise.voltage)
+    for share, falls in zip((0.01, 0.05), found.falls):
+        expected = share * (1.0 - share) * RATE * 60.0
+        # The count is nearly Poisson; the level is the sample's own quantile, which helps.
+        assert falls == pytest.approx(expected, abs=4.0 * np.sqrt(expected * 60.0 * RATE / N))
+
+
+def test_power_of_white_noise():
+    """A flat spectrum: each band has its share of the variance."""
+    noise = white(2)
+    yardstick = Yardstick(noise, 0.0)
+    power = yardstick.measure(noise.voltage).power
+    widths = np.diff(yardstick.bands)
+    assert power[2:] == pytest.approx(0.01 * widths[2:] / (0.5 * RATE), rel=0.15)
+
+
+def test_levels_lie_between_codes():
+    """No reading is on a level, and the level is not below what was asked for by a step."""
+    assert between_codes(14.15, 0.01) == pytest.approx(14.155)
+    assert between_codes(14.153, 0.0) == 14.153
+    coarse = white(3)
+    coarse = Readings(coarse.t, 0.1 * np.rint(coarse.voltage / 0.1), None)
+    levels = Yardstick(coarse, 0.1).levels
+    assert np.allclose(np.mod(np.array(levels) / 0.1, 1.0), 0.5)
+
+
+def test_the_answer_to_rises():
+    """A step answer of -1 V for each unit of throttle, which decays to half of it."""
+    t = np.arange(6000) / RATE
+    u = np.where((t % 4.0) < 2.0, 0.2, 0.6)
+    since = np.where(u > 0.4, t % 4.0 - 2.0, np.inf)
+    v = 15.0 - 0.4 * (u > 0.4) * (0.5 + 0.5 * np.exp(-since / 0.3))
+    yardstick = Yardstick(Readings(t, v, u), 0.0)
+    answer = yardstick.measure(v).answer
+    assert yardstick.rises.size == 15
+    assert answer.min() == pytest.approx(-0.4, abs=0.02)
+    late = np.searchsorted(yardstick.after, 1.0)
+    assert answer[late] == pytest.approx(-0.2 - 0.2 * np.exp(-1.0 / 0.3), abs=0.005)
+    assert not Yardstick(Readings(t, v, None), 0.0).measure(v).answer.size
+
+
+def test_the_worst_is_the_farthest_in_half_bands():
+    """Scores are distances in half-bands, weighted; the p-value is a rank."""
+    seeds = np.random.default_rng(4).standard_normal(400)
+
+    def of(kind: str, measured: float, least: float = 1e-9) -> Difference:
+        return Difference(kind, measured, seeds, least, lambda b: kind)
+
+    p, worst = judge([of('lowest', 4.0), of('spectrum', 6.0)])
+    # 6 at half the weight is less than 4.
+    assert worst.kind == 'lowest'
+    assert p == pytest.approx(1.0 / 401.0)
+    p, _ = judge([of('lowest', 0.0)])
+    assert p > 0.9
+    # A band that is wide by what a pilot would not notice.
+    p, _ = judge([of('lowest', 4.0, least=100.0)])
+    assert 1.0 / 401.0 == pytest.approx(p)
+    assert judge([of('lowest', 4.0, least=100.0)])[1].scores()[0] == pytest.approx(0.04, rel=0.1)
+    found = band(2.5, seeds)
+    assert (found.low, found.high) == pytest.approx((-1.96, 1.96), abs=0.35)
+    assert not found.inside
