@@ -16,7 +16,6 @@ import math
 import numpy as np
 from ou_monitor.records import FloatArray
 from scipy.linalg.lapack import dpttrf, dpttrs
-from scipy.optimize import minimize
 
 # Search range of the noise share nu / mean step: ten thousand times the
 # diffusion of one step hides any OU.
@@ -111,6 +110,8 @@ def fit_exact(t: FloatArray, y: FloatArray, regressors: FloatArray) -> ExactFit:
     # lam = x^2 keeps the noise share positive and smooth at zero.
     starts = [(a, x) for a in np.linspace(low, high, 7)[1:-1] for x in (0.1, 1.0)]
     values = [likelihood.solve(a, x * x)[0] for a, x in starts]
+    # Here, for most sources are even: it costs the nodes 25 MB.
+    from scipy.optimize import minimize
     found = minimize(lambda z: likelihood.solve(z[0], z[1] * z[1])[0],
                      starts[int(np.argmin(values))], method='L-BFGS-B',
                      bounds=[(low, high), (0.0, math.sqrt(_MOST_NOISE))],

@@ -18,7 +18,7 @@ NAME = 'ou_adaptive_filter'
 
 def _work() -> int:
     from ou_monitor.nodes.adaptive_filter_node import AdaptiveFilterNode
-    return spin(AdaptiveFilterNode(NAME))
+    return spin(lambda: AdaptiveFilterNode(NAME))
 
 
 def main() -> int:

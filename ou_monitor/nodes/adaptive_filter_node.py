@@ -29,7 +29,7 @@ from ou_monitor.nodes.message_types import message_class
 from ou_monitor.nodes.supply_input import Supply, SupplyInput
 from ou_monitor.online.filter.cutoff_control import Bound
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass, FilterCounters
-from ou_monitor.online.monitor import Level
+from ou_monitor.online.level import Level
 from ou_monitor.online.settings import (
     FILTER_PARAMETERS, filter_settings, FilterSettings, Parameter)
 from std_msgs.msg import Float64

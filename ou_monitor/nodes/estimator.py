@@ -17,7 +17,7 @@ NAME = 'ou_estimator'
 
 def _work() -> int:
     from ou_monitor.nodes.estimator_node import EstimatorNode
-    return spin(EstimatorNode(NAME))
+    return spin(lambda: EstimatorNode(NAME))
 
 
 def main() -> int:

@@ -7,10 +7,12 @@ No ROS here: the nodes hand over the parameter.
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor, TimeoutError as NotReadyError
+from typing import TYPE_CHECKING
 
 from ou_monitor.errors import InputError
-from ou_monitor.model.supply import SupplyModel
-from ou_monitor.recordings.model_file import read_model
+
+if TYPE_CHECKING:
+    from ou_monitor.model.supply import SupplyModel
 
 # How long a callback waits for a file, s: most take 10 ms, the largest 5 s.
 PATIENCE = 0.25
@@ -45,7 +47,7 @@ class ModelChoice:
         if not path:
             self._checked = path, None
             return
-        future = self._reader.submit(lambda: read_model(path).model)
+        future = self._reader.submit(_read, path)
         self._checked = path, future
         try:
             future.result(wait)
@@ -81,3 +83,9 @@ class ModelChoice:
         """Return the names of the terms in force, separated by commas; empty without a model."""
         model = self._used[1]
         return '' if model is None else ','.join(term.NAME for term in model.terms)
+
+
+def _read(path: str) -> SupplyModel:
+    """Read a model file; the terms and their fits are loaded only where there is one."""
+    from ou_monitor.recordings.model_file import read_model
+    return read_model(path).model

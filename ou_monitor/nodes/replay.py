@@ -14,7 +14,7 @@ import sys
 from typing import Any
 
 from ou_monitor.errors import InputError
-from ou_monitor.nodes.run import run
+from ou_monitor.nodes.run import loaded, run
 from ou_monitor.recordings.bag import BagReader
 
 NAME = 'ou_replay'
@@ -66,6 +66,7 @@ def _work() -> int:
     from ou_monitor.nodes.player import Player
     from rclpy.utilities import remove_ros_args
     chosen = options(remove_ros_args(sys.argv)[1:])
+    loaded()
     player = Player(NAME, BagReader(chosen.bag, partial=chosen.partial), chosen)
     try:
         summary = player.play()

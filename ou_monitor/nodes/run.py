@@ -10,8 +10,10 @@ imported where ROS 2 is not installed, so that the executables can say so.
 from __future__ import annotations
 
 from collections.abc import Callable
+import os
 import signal
 import sys
+import threading
 from typing import Any
 
 from ou_monitor.errors import InputError, refusal
@@ -19,6 +21,8 @@ from ou_monitor.errors import InputError, refusal
 BAD_INPUT = 2
 # Longest wait inside the executor, s; a signal wakes it anyway.
 NAP = 1.0
+# Set while a signal may end the process at once.
+_loading = threading.Event()
 
 
 def one_line(text: object) -> str:
@@ -30,15 +34,29 @@ def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> in
     """Initialise ROS 2, do the work, shut down; return the exit status."""
     # rclpy ends the context on SIGINT and SIGTERM and then calls the handler that was there
     # before.  Python's own would raise KeyboardInterrupt inside whatever callback runs, and the
-    # EventsExecutor turns that into SystemError: so ours only notes the signal, from the start.
+    # EventsExecutor turns that into SystemError: so ours only notes the signal.  While modules
+    # are still being loaded there is nothing to be ended in order: the process ends at once.
     stopped: list[int] = []
+    _loading.set()
+
+    def note(number: int, frame: object) -> None:
+        if _loading.is_set():
+            os._exit(0)
+        stopped.append(number)
+
     numbers = (signal.SIGINT, signal.SIGTERM)
-    previous = [signal.signal(n, lambda number, frame: stopped.append(number)) for n in numbers]
+    previous = [signal.signal(n, note) for n in numbers]
     try:
         return _run(name, work, args, stopped)
     finally:
+        _loading.clear()
         for number, handler in zip(numbers, previous, strict=True):
             signal.signal(number, handler)
+
+
+def loaded() -> None:
+    """Have signals only noted from here on: there is a node, or something else to be ended."""
+    _loading.clear()
 
 
 def run_node(name: str, about: str, work: Callable[[], int]) -> int:
@@ -100,15 +118,17 @@ def _init(rclpy: Any, binding: Any, args: list[str] | None) -> None:
         raise InputError(f'cannot read the ROS arguments: {one_line(error)}') from error
 
 
-def spin(node: Any) -> int:
+def spin(make: Callable[[], Any]) -> int:
     """
-    Spin one node until its context ends, then destroy it.
+    Make one node and spin it until its context ends, then destroy it.
 
     The EventsExecutor takes 10 000 messages/s where the SingleThreadedExecutor
     loses most of them; it is used where this rclpy has it.
     """
     from rclpy.executors import ExternalShutdownException
     executor = make_executor()
+    loaded()
+    node = make()
     executor.add_node(node)
     try:
         # Not spin(): in rclpy 7.1.6 the EventsExecutor's goes on for ever after a signal.

@@ -8,14 +8,14 @@ with a recording, so both say the same thing of the same data.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-import enum
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.supply import SupplyModel
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.input_health import patience, readings, Stamps, StampWatch
+from ou_monitor.online.level import Level
 from ou_monitor.online.load_filter import LoadFilter
 from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
 from ou_monitor.online.risk.outlook import Outlook, ThrottleBudget
@@ -23,18 +23,12 @@ from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.online.supply_load import SupplyLoad
 from ou_monitor.records import Counters, Estimate, Flag, NAN, Status
 
+if TYPE_CHECKING:
+    from ou_monitor.model.supply import SupplyModel
+
 # Cautions that make the numbers doubtful; the others only inform.
 _DOUBTFUL = frozenset({Flag.SLOW_RATE, Flag.QUANTIZED, Flag.LOWPASS_UPSTREAM, Flag.SATURATED,
                        Flag.TREND, Flag.IRREGULAR})
-
-
-class Level(enum.IntEnum):
-    """Levels of diagnostic_msgs/DiagnosticStatus."""
-
-    OK = 0
-    WARN = 1
-    ERROR = 2
-    STALE = 3
 
 
 @dataclass(frozen=True)

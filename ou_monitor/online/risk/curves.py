@@ -19,7 +19,6 @@ import numpy.typing as npt
 from ou_monitor.online.risk.curve_filters import (
     BINS, CurvePrior, HatFilter, noise_variance, Pool, Squares, STEADY, Wander)
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN
-from scipy.signal import lfilter
 
 # Samples are looked at in blocks of this length, s, and of this many samples or more.
 _BLOCK, _FEWEST = 0.05, 32
@@ -367,9 +366,16 @@ def _follow(u: FloatArray, before: float, a: float) -> FloatArray:
     """Return throttle as the rail has followed it at each sample, at a rate a per sample."""
     phi = math.exp(-a)
     if a * u.size > _FAST:
-        follow, _ = lfilter([1.0 - phi], [1.0, -phi], u, zi=[phi * before])
-        return np.asarray(follow)
-    # Closed form: for short blocks cheaper than the recursion.
+        if a > _FAST:
+            # It has forgotten all but the sample itself.
+            return u
+        # In parts whose growth is a number.
+        follow, length = np.empty(u.size), max(int(_FAST / a), 1)
+        for begin in range(0, u.size, length):
+            part = _follow(u[begin:begin + length], before, a)
+            follow[begin:begin + length], before = part, float(part[-1])
+        return follow
+    # Closed form of the recursion.
     growth = np.exp(a * np.arange(1.0, u.size + 1.0))
     total = (u * growth).cumsum()
     total *= 1.0 - phi

@@ -18,17 +18,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.passage.law import prepare
-from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.measurement_noise import MeasurementNoise
 from ou_monitor.online.risk.curves import LearnedCurves
-from ou_monitor.online.risk.events import EventRisk
 from ou_monitor.online.risk.first_passage import as_sampled, risk_of, Supply
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN
+
+if TYPE_CHECKING:
+    from ou_monitor.model.supply import SupplyModel
+    from ou_monitor.online.risk.events import EventRisk
 
 # probability(u0, u0_se, ln_sigma, ln_sigma_se, ln_alpha, ln_alpha_se) -> risk, elementwise.
 Probability = Callable[
@@ -201,8 +203,14 @@ class Outlook:
 
     def set_model(self, model: SupplyModel | None) -> None:
         """Change the terms that ride along with the OU; nothing learned is lost."""
-        self._events = None if model is None else EventRisk(model, background=self._background)
-        self._noise = 0.0 if model is None else math.sqrt(sum(
+        self._events, self._noise = None, 0.0
+        if model is None:
+            return
+        # Here, for without a model the nodes need none of it: it costs them 60 MB.
+        from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+        from ou_monitor.online.risk.events import EventRisk
+        self._events = EventRisk(model, background=self._background)
+        self._noise = math.sqrt(sum(
             term.std**2 for term in model.terms if isinstance(term, MeasurementNoise)))
 
     @property
