@@ -37,6 +37,9 @@ setup(
     python_requires='>=3.11',
     # The message descriptions are read as files beside the package.
     zip_safe=False,
+    url='https://ou-monitor.example.org',
+    author='ou_monitor maintainers',
+    author_email='maintainers@ou-monitor.example.org',
     maintainer='ou_monitor maintainers',
     maintainer_email='maintainers@ou-monitor.example.org',
     description='Onboard noise-aware state estimation for UAV supply rails.',

@@ -1,7 +1,7 @@
 """
 Start the estimator and the adaptive filter, the one's sigma driving the other.
 
-ros2 launch ou_monitor ou_monitor_launch.py namespace:=uav1 params_file:=my.yaml
+ros2 launch ou_monitor ou_monitor_launch.py namespace:=uav1 params_file:=my.yaml voltage:=/rail
 
 They are heard on this machine alone, unless discovery_range:=SUBNET or the
 environment says otherwise: ROS 2 asks nobody who he is (doc/security.md).
@@ -11,13 +11,34 @@ environment says otherwise: ROS 2 asks nobody who he is (doc/security.md).
 from pathlib import Path
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
+from launch.conditions import IfCondition
 from launch.substitutions import EnvironmentVariable, LaunchConfiguration
 from launch_ros.actions import Node
 
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 # Installed and in a source tree alike, config/ lies beside launch/.
 PARAMS = Path(__file__).resolve().parents[1] / 'config' / 'ou_monitor.yaml'
+# Name, default, description.
+ARGUMENTS = (
+    ('namespace', '', 'Namespace of both.'),
+    ('params_file', str(PARAMS), 'Parameters of both nodes.'),
+    ('use_sim_time', 'false', 'Whether time comes from /clock.'),
+    ('voltage', 'voltage', 'Topic of the voltage (of a driver with a msg_config of its own: as '
+                           'that says).'),
+    ('throttle', 'throttle', 'Topic of the throttle (likewise).'),
+    ('input', 'input', 'Topic of the signal that is filtered.'),
+    ('filter', 'true', 'Whether the adaptive filter is started.'),
+    ('respawn', 'false', 'Whether a node that has ended is started again, 2 s later.'),
+    ('log_level', 'info', 'debug, info, warn, error, fatal.'),
+)
+
+
+def refuse_missing_file(context):
+    """Raise an error when there is no parameter file; ROS 2 would start with the defaults."""
+    path = LaunchConfiguration('params_file').perform(context)
+    if not Path(path).is_file():
+        raise RuntimeError(f'params_file: there is no file {path}')
 
 
 def generate_launch_description():
@@ -28,23 +49,27 @@ def generate_launch_description():
         'parameters': [LaunchConfiguration('params_file'),
                        {'use_sim_time': LaunchConfiguration('use_sim_time')}],
         'output': 'screen',
+        'respawn': LaunchConfiguration('respawn'),
+        'respawn_delay': 2.0,
     }
+    level = ['--log-level', LaunchConfiguration('log_level')]
     return LaunchDescription([
-        DeclareLaunchArgument('namespace', default_value='', description='Namespace of both.'),
-        DeclareLaunchArgument('params_file', default_value=str(PARAMS),
-                              description='Parameters of both nodes.'),
-        DeclareLaunchArgument('use_sim_time', default_value='false',
-                              description='Whether time comes from /clock.'),
+        *(DeclareLaunchArgument(name, default_value=default, description=text)
+          for name, default, text in ARGUMENTS),
         DeclareLaunchArgument('discovery_range',
                               default_value=EnvironmentVariable(RANGE, default_value='LOCALHOST'),
                               description='Who may find the nodes: LOCALHOST, SUBNET, OFF, '
                                           'SYSTEM_DEFAULT.'),
+        OpaqueFunction(function=refuse_missing_file),
         SetEnvironmentVariable(RANGE, LaunchConfiguration('discovery_range')),
         # The enclaves of security/ou_monitor_policy.xml; without SROS2 they are names only.
         Node(executable='estimator', name='ou_estimator',
-             ros_arguments=['--enclave', '/ou_monitor/estimator'], **common),
+             ros_arguments=['--enclave', '/ou_monitor/estimator', *level],
+             remappings=[('voltage', LaunchConfiguration('voltage')),
+                         ('throttle', LaunchConfiguration('throttle'))], **common),
         Node(executable='adaptive_filter', name='ou_adaptive_filter',
-             ros_arguments=['--enclave', '/ou_monitor/adaptive_filter'],
-             remappings=[('sigma', 'ou_estimator/sigma'),
-                         ('state', 'ou_estimator/state')], **common),
+             ros_arguments=['--enclave', '/ou_monitor/adaptive_filter', *level],
+             condition=IfCondition(LaunchConfiguration('filter')),
+             remappings=[('sigma', 'ou_estimator/sigma'), ('state', 'ou_estimator/state'),
+                         ('input', LaunchConfiguration('input'))], **common),
     ])

@@ -23,6 +23,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import diagnostic, MonitorNode, PUBLISH_RATE
+from ou_monitor.nodes.console import Console
 from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of
 from ou_monitor.nodes.inputs import INPUT_QOS, Silence, Stamper, types_on
 from ou_monitor.nodes.message_types import message_class
@@ -45,6 +46,8 @@ FIXED = (
               'an IMU.'),
     _MODE)
 
+OWN_TOPICS = ('input', 'sigma', 'state', '~/output', '~/cutoff', '~/lag', '/diagnostics', '/clock')
+
 
 class AdaptiveFilterNode(MonitorNode):
     """Low-pass with a cutoff driven by sigma, as a node."""
@@ -64,6 +67,8 @@ class AdaptiveFilterNode(MonitorNode):
         self._input_silence = Silence(self.steady_now)
         self._dropped = self._passed = 0
         self._found: list[str] = []
+        self._unplaced = False
+        self._console = Console(self)
         self._type, self._field = (self.get_parameter(f'input.{key}').value
                                    for key in ('type', 'field'))
         self._topic = self.resolve_topic_name('input')
@@ -75,6 +80,7 @@ class AdaptiveFilterNode(MonitorNode):
             lambda message: self._supply.take_sigma(message.data)), INPUT_QOS)
         self.create_subscription(DiagnosticArray, 'state', self.guarded(
             self._supply.take_state), INPUT_QOS)
+        self.refuse_other_overrides(OWN_TOPICS)
         if self._type != AUTO:
             self._open(self._type)
         self.every(0.2, self._watch)
@@ -112,6 +118,8 @@ class AdaptiveFilterNode(MonitorNode):
         self._stamper.follow()
         if self._channels is None:
             self._found = types_on(self, self._topic)
+            if not self._found:
+                self._console.waiting(self._topic)
             known = [kind for kind in self._found if self._field or kind in CHANNELS]
             if known:
                 self._open(known[0])
@@ -133,6 +141,7 @@ class AdaptiveFilterNode(MonitorNode):
             raise InputError('a message came before its type was known')
         values = self._channels.take(message)
         stamp = self._stamper.time_of(message, info)
+        self._unplaced = math.isnan(stamp)
         if not values or not all(map(math.isfinite, (stamp, *values))):
             self._dropped += 1
             return
@@ -219,8 +228,8 @@ class AdaptiveFilterNode(MonitorNode):
         if age is None or age > s.stale_after:
             return Level.STALE, f'No message on {self._topic}' + (
                 ' yet.' if age is None else f' for {age:.1f} s.')
-        if self._stamper.waiting and not self._passed:
-            return Level.WARN, 'use_sim_time is set, but nothing comes on /clock.'
+        if self._stamper.waiting and self._unplaced:
+            return Level.WARN, 'use_sim_time is set, but nothing comes on /clock (any more).'
         if _not_a_voltage(self._type, s):
             return Level.WARN, (
                 f'Law {s.law} without signal_bandwidth takes {self._topic} of type {self._type} '

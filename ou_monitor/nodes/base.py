@@ -7,7 +7,8 @@ What both nodes share: parameters from a table, and callbacks that no error ends
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 import functools
 import inspect
 import math
@@ -23,13 +24,16 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.time import Time
 from rclpy.timer import Timer
 
+QOS = 'qos_overrides.'
 # rclpy's own, never declared by us.
-_BUILT_IN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
+_BUILT_IN = ('use_sim_time', 'start_type_description_service', QOS)
 
 LOCK = Parameter(
     'lock_parameters', False,
@@ -147,6 +151,35 @@ class MonitorNode(Node):
         """Return the subscriptions that an executor serves: all but those that are polled."""
         return (s for s in super().subscriptions if s not in self._polled)
 
+    def create_publisher(self, kind: Any, topic: str, qos: Any, **options: Any) -> Publisher:
+        """Return a publisher; `qos_overrides` are honoured."""
+        with _readable_overrides(topic):
+            return super().create_publisher(
+                kind, topic, qos, **self._overriding(topic), **options)
+
+    def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any,
+                            **options: Any) -> Subscription:
+        """Return a subscription; `qos_overrides` are honoured."""
+        with _readable_overrides(topic):
+            return super().create_subscription(
+                kind, topic, callback, qos, **self._overriding(topic), **options)
+
+    def _overriding(self, topic: str) -> dict[str, Any]:
+        """Return the option by which a topic takes `qos_overrides`, where there are any for it."""
+        prefix = f'qos_overrides.{self.resolve_topic_name(topic)}.'
+        wanted = any(name.startswith(prefix) for name in getattr(self, '_parameter_overrides', ()))
+        return {'qos_overriding_options': QoSOverridingOptions.with_default_policies()
+                } if wanted else {}
+
+    def refuse_other_overrides(self, topics: Iterable[str]) -> None:
+        """Refuse `qos_overrides` of topics that are none of ours."""
+        known = [self.resolve_topic_name(topic) for topic in topics]
+        for name in self._parameter_overrides:
+            if name.startswith(QOS) and not any(
+                    name.startswith(f'{QOS}{topic}.') for topic in known):
+                raise InputError(f"parameter '{name}' is of no topic of this node: "
+                                 f"{', '.join(known)}")
+
     def create_polled(self, kind: Any, topic: str, qos: QoSProfile) -> Subscription:
         """
         Return a subscription whose messages wait in the middleware until they are taken.
@@ -215,6 +248,15 @@ class MonitorNode(Node):
     def _after_set(self, parameters: list[RosParameter]) -> None:
         if any(p.name in self._table for p in parameters):
             self.apply(self.values())
+
+
+@contextmanager
+def _readable_overrides(topic: str) -> Iterator[None]:
+    """Make bad input of `qos_overrides` that cannot be used."""
+    try:
+        yield
+    except (InvalidQosOverridesError, RuntimeError, ValueError) as error:
+        raise InputError(f'qos_overrides of {topic}: {error}') from error
 
 
 def _never(message: Any) -> None:

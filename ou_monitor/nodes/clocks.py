@@ -66,6 +66,10 @@ SHORT, APART = 0.25, 1.5
 BURSTS, NEAR_BURST, ON_BURST_LINE = 20, 0.3, 0.5
 # Messages of a burst behind which there is a gap.
 LUMP = 8
+IN_BURSTS = (
+    'The messages come in bursts and carry no stamps, and no steady source is seen behind them '
+    '(yet): no estimate can be made of them; stamp them in the driver, or send blocks of samples '
+    'with adc.sample_rate.')
 # The line follows the source with this time constant, s: 50 ms of delay, made up within 50 ms,
 # move it by 1.2 ms.
 FOLLOW = 1.0
@@ -254,14 +258,17 @@ PAIRS = 50
 # A clock off the line by more than this, s of the sender's time, was stepped (next pass, seek):
 # no publication is that late.
 STEP = 0.25
+# A clock of which nothing has come for so many s of the sender's time, and so many of its own
+# intervals, has stopped: what is sent after that has no simulated time.
+STOPPED, MISSED = 1.0, 5.0
 
 
 class SimClockMap:
     """
     Straight line through the last pairs (source time, clock), by least squares.
 
-    Limits: nothing is known before two pairs have come; between pairs and
-    after the last one the line is continued.
+    Limits: nothing is known before two pairs have come, and nothing `STOPPED` after the last
+    one; between pairs and shortly after the last the line is continued.
     """
 
     def __init__(self) -> None:
@@ -276,6 +283,12 @@ class SimClockMap:
         return len(self._pairs) >= 2
 
     @property
+    def patience(self) -> float:
+        """Return the silence of the clock, s, after which it has stopped."""
+        span = self._pairs[-1][0] - self._pairs[0][0] if self.ready else 0.0
+        return max(STOPPED, MISSED * span / max(len(self._pairs) - 1, 1))
+
+    @property
     def rate(self) -> float:
         """Seconds of simulated time per second of the sender's clock."""
         return self._rate
@@ -285,7 +298,7 @@ class SimClockMap:
         stepped = False
         if self._pairs:
             last_source, last_clock = self._pairs[-1]
-            expected = self(source) if self.ready else clock
+            expected = self._line(source) if self.ready else clock
             off = abs(clock - expected) > STEP * max(1.0, self._rate)
             if off or clock < last_clock or source < last_source:
                 self._pairs.clear()
@@ -313,6 +326,9 @@ class SimClockMap:
 
     def __call__(self, source: float) -> float:
         """Return the simulated time, s, at which a message was sent; NaN when not known yet."""
-        if not self.ready:
-            return float('nan')
+        if not self.ready or source - self._pairs[-1][0] > self.patience:
+            return math.nan
+        return self._line(source)
+
+    def _line(self, source: float) -> float:
         return self._zero + self._rate * (source - self._origin)

@@ -29,8 +29,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import diagnostic, LOCK, MonitorNode, PUBLISH_RATE
-from ou_monitor.nodes.clocks import SendClock
-from ou_monitor.nodes.inputs import Arrivals, PolledInput, Silence, Stamper, types_on
+from ou_monitor.nodes.clocks import IN_BURSTS, SendClock
+from ou_monitor.nodes.console import Console
+from ou_monitor.nodes.inputs import Arrivals, PolledInput, Silence, Stamper, types_on, within
 from ou_monitor.nodes.latch_file import LatchFile
 from ou_monitor.nodes.model_choice import ModelChoice, PATIENCE
 from ou_monitor.nodes.publisher_watch import PublisherWatch
@@ -61,10 +62,8 @@ STATE_FILE = Parameter(
     'state_file', '',
     'File that keeps a latched flag over a restart of the node (a folder: a file in it, named '
     "after the node; relative: under ROS's log directory); empty: off.")
-BURSTS = ('The messages come in bursts and carry no stamps, and no steady source is seen behind '
-          'them (yet): no estimate can be made of them; stamp them in the driver, or send blocks '
-          'of samples with adc.sample_rate.')
 OUTPUTS = ('alpha', 'sigma', 'var_inf', 'brownout_risk', 'throttle_budget')
+OWN_TOPICS = (*('~/' + key for key in OUTPUTS), '~/brownout', '~/state', '/diagnostics', '/clock')
 
 
 class EstimatorNode(MonitorNode):
@@ -86,6 +85,7 @@ class EstimatorNode(MonitorNode):
         self._source_clock = SourceClock()
         self._watched = PublisherWatch()
         self._settled = 0
+        self._console = Console(self)
         # When the next estimate is due, and the load of pushing samples as a share of the time.
         self._due = -math.inf
         self._load, self._loaded = 0.0, self.steady_now()
@@ -104,7 +104,8 @@ class EstimatorNode(MonitorNode):
         self.every(0.2, self._watch)
         self.every(POLL, self._poll)
         self.every(1.0, self._diagnose)
-        self.publish_every(self._report_all)
+        self.publish_every(lambda: self._publish(*self._report()))
+        self.refuse_other_overrides([*OWN_TOPICS, *(s.topic for s in self._sources.values())])
         self._started = True
 
     def _open_latch(self) -> LatchFile | None:
@@ -112,10 +113,8 @@ class EstimatorNode(MonitorNode):
         name = self.get_parameter(STATE_FILE.name).value
         if not name:
             return None
-        path = Path(name).expanduser()
-        if not path.is_absolute():
-            path = Path(get_logging_directory()) / path
-        latch = LatchFile(path, self.get_fully_qualified_name())
+        latch = LatchFile(Path(get_logging_directory()) / Path(name).expanduser(),
+                          self.get_fully_qualified_name())
         reason = latch.read()
         if latch.problem:
             self.get_logger().warning(latch.problem)
@@ -174,6 +173,8 @@ class EstimatorNode(MonitorNode):
         """Look at who publishes, 5 times a second."""
         self._stamper.follow()
         self._look_at_publishers()
+        if self._arrived.age is None:
+            self._console.waiting(self._sources['voltage'].topic)
         for source in self._sources.values():
             if source.quantity in self._opened:
                 self._compare(self._opened[source.quantity])
@@ -332,7 +333,7 @@ class EstimatorNode(MonitorNode):
         self._monitor_model()
         now = self.steady_now()
         bursts = self._send_clock is not None and self._send_clock.in_bursts
-        self._monitor.distrust(BURSTS if bursts else '')
+        self._monitor.distrust(IN_BURSTS if bursts else '')
         again, begin = now >= self._due, time.thread_time()
         report = self._monitor.report(
             self._source_clock.age(now), now, self._usable.age, again=again)
@@ -340,6 +341,7 @@ class EstimatorNode(MonitorNode):
             # An estimate of 1 ms at 10 Hz is no load; of 100 ms the next one waits.
             took = time.thread_time() - begin
             self._due = now + (took / SHARE if took > HEAVY else 0.0)
+        self._console.flag(report.flag)
         if self._latch is not None:
             self._latch.keep(report.flag.level is FlagLevel.CRITICAL
                              and self._monitor.settings.brownout_latch, report.flag.reason)
@@ -396,16 +398,13 @@ class EstimatorNode(MonitorNode):
         """Say why messages that arrive do not count as a voltage."""
         if self._stamper.waiting and self._stream.unplaced:
             return ('Messages without a stamp cannot be placed in time: use_sim_time is set, but '
-                    'nothing comes on /clock.')
+                    'nothing comes on /clock (any more).')
         spec = self._opened['voltage'].spec
         return (f"Messages arrive on {self._topic('voltage')}, but their field "
                 f"'{spec.field if spec else ''}' holds no finite voltage.")
 
     def _topic(self, quantity: str) -> str:
         return self.resolve_topic_name(self._opened[quantity].topic)
-
-    def _report_all(self) -> None:
-        self._publish(*self._report())
 
     def _publish(self, report: MonitorReport, level: Level, summary: str) -> None:
         """Publish a report on every topic but the diagnostics."""
@@ -444,11 +443,6 @@ class EstimatorNode(MonitorNode):
                   'callback_errors': str(self.faults)}
         return diagnostic(f'{self.get_fully_qualified_name()[1:]}: {part}', level, summary,
                           fields, stamp, hardware_id=self.resolve_topic_name(source.topic))
-
-
-def within(age: float | None, limit: float) -> bool:
-    """Return whether something came within the limit, s."""
-    return age is not None and age <= limit
 
 
 def _of_monitor(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -65,6 +65,7 @@ class Stamper:
         self._on_jump = on_jump
         self._map = SimClockMap()
         self._clock_input: Subscription | None = None
+        self._clock_heard = Silence(node.steady_now)
         self._jumps = node.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
                           on_clock_change=True),
@@ -79,13 +80,14 @@ class Stamper:
     @property
     def waiting(self) -> bool:
         """Whether messages without a stamp cannot be placed in time yet."""
-        return self.simulated and not self._map.ready
+        age = self._clock_heard.age
+        return self.simulated and (age is None or not self._map.ready or age > self._map.patience)
 
     def follow(self) -> None:
         """Follow `use_sim_time`, which may change at run time."""
         wanted = self._node.get_clock().ros_time_is_active
         if wanted and self._clock_input is None:
-            self._map = SimClockMap()
+            self._map, self._clock_heard = SimClockMap(), Silence(self._node.steady_now)
             self._clock_input = self._node.create_subscription(
                 ClockMessage, '/clock', self._node.with_info(self._clock), CLOCK_QOS)
         elif not wanted and self._clock_input is not None:
@@ -106,6 +108,7 @@ class Stamper:
         return self.source_time(float(info['source_timestamp']) * 1e-9)
 
     def _clock(self, message: Any, info: Any) -> None:
+        self._clock_heard.heard()
         clock = message.clock.sec + message.clock.nanosec * 1e-9
         if self._map.add(float(info['source_timestamp']) * 1e-9, clock):
             self._on_jump('/clock stepped')
@@ -264,6 +267,11 @@ class Silence:
     def age(self) -> float | None:
         """Seconds since the last arrival; None when there was none."""
         return None if self._last == -math.inf else self._now() - self._last
+
+
+def within(age: float | None, limit: float) -> bool:
+    """Return whether something came within the limit, s."""
+    return age is not None and age <= limit
 
 
 def types_on(node: MonitorNode, topic: str) -> list[str]:

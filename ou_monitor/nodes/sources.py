@@ -15,7 +15,7 @@ from typing import Any
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.message_types import message_class
 from ou_monitor.online.settings import Parameter
-from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config
+from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
 from ou_monitor.stream.extract import Extractor
 
 AUTO = 'auto'
@@ -100,7 +100,7 @@ def find_source(quantity: str, values: Mapping[str, Any]) -> Source | None:
         config = load_msg_config(values['msg_config'])
         spec = getattr(config, quantity)
         offered = [] if spec is None else [
-            Source(quantity, spec.topic, spec, config.name, config.install)]
+            Source(quantity, spec.topic, spec, config.name, _install(config, spec))]
     if kind:
         offered = [s for s in offered if s.spec is not None and s.spec.type == kind] or [
             _by_hand(quantity, topic or _topic_of(offered, quantity), kind, field)]
@@ -117,16 +117,21 @@ def find_source(quantity: str, values: Mapping[str, Any]) -> Source | None:
 def _generic(quantity: str) -> list[Source]:
     """Return what the generic msg_configs say of a quantity, one of a type."""
     found: dict[str, Source] = {}
+    if quantity == 'throttle':
+        # They look alike in all msg_configs, so none of them is named.
+        for kind in _SCALARS:
+            found[kind] = Source(quantity, quantity, FieldSpec(quantity, kind, 'data'), AUTO)
     for config in list_msg_configs().values():
         spec: FieldSpec | None = getattr(config, quantity)
         if config.generic and spec is not None:
             found.setdefault(
-                spec.type, Source(quantity, spec.topic, spec, config.name, config.install))
-    if quantity == 'throttle':
-        for kind in _SCALARS:
-            found.setdefault(kind, Source(
-                quantity, quantity, FieldSpec(quantity, kind, 'data'), AUTO))
+                spec.type, Source(quantity, spec.topic, spec, config.name, _install(config, spec)))
     return list(found.values())
+
+
+def _install(config: MsgConfig, spec: FieldSpec) -> str:
+    """Return how to install the package of a type, where the msg_config says it of that one."""
+    return config.install if spec.type.partition('/')[0] == config.package else ''
 
 
 def _topic_of(offered: Sequence[Source], quantity: str) -> str:

@@ -21,7 +21,7 @@ from ou_monitor.recordings.layout import Layout, layout_of, parse_definition, Ro
 from ou_monitor.recordings.mcap_records import IntArray, moment, Table, TimeArray
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.config import FieldPath, FieldSpec, parse_field_path
-from ou_monitor.stream.extract import Extracted, Extractor
+from ou_monitor.stream.extract import Extracted, Extractor, ZeroRule
 
 # Layouts that are tried for messages of one length; a topic with more of them
 # is not one whose messages are alike.
@@ -144,7 +144,8 @@ class FieldReader:
         """Parse the definition; layouts are learned from messages."""
         self.spec = spec
         self.general = 0
-        self._extractor = Extractor(replace(spec, nan='unknown'))
+        self._extractor = Extractor(replace(spec, nan='unknown', zero='value'))
+        self._zero = ZeroRule(spec.zero)
         self._decoder = decoder
         self._broken = broken
         self._decode: Callable[[bytes], Any] | None = None
@@ -161,6 +162,11 @@ class FieldReader:
 
     def read(self, table: Table) -> Column:
         """Return the field of the messages of a table, in its order."""
+        column = self._read(table)
+        return replace(column, values=self._zero.apply(column.values))
+
+    def _read(self, table: Table) -> Column:
+        """Return the field with zeros as they are."""
         logged = seconds(table.log_time)
         stamp = np.full(table.n, np.nan)
         count = np.ones(table.n, np.int64)

@@ -20,6 +20,7 @@ from ou_monitor.stream.files import one_line, path_words, read_yaml
 from ou_monitor.text import printable
 
 NAN_RULES = ('drop', 'unknown')
+ZERO_RULES = ('value', 'unknown', 'unknown_at_first')
 
 # Names and indices: 'channels[0].value' is ('channels', 0, 'value').
 FieldPath = tuple[str | int, ...]
@@ -51,6 +52,9 @@ class FieldSpec:
     nan : {'drop', 'unknown'}
         What NaN or infinity in the field means: noise of the transmission, to
         be ignored and counted, or the driver saying "not measured".
+    zero : {'value', 'unknown', 'unknown_at_first'}
+        What an exact 0 means: a value; the driver saying "not measured"; or
+        that, as long as there was nothing else.
     sample_rate : float or None
         Hz; when given the field is an array, a block of samples at this rate,
         and the stamp is that of the LAST sample of the block.
@@ -69,6 +73,7 @@ class FieldSpec:
     sign: int = 1
     offset: float = 0.0
     nan: str = 'drop'
+    zero: str = 'value'
     sample_rate: float | None = None
     stamp_field: str | None = None
     stamp_factor: float = 1.0
@@ -117,7 +122,7 @@ _NUMBER = ((int, float), 'a number')
 _TEXT = ((str,), 'text')
 _FIELD_KINDS: dict[str, tuple[tuple[type, ...], str]] = {
     'topic': _TEXT, 'type': _TEXT, 'field': _TEXT, 'unit_factor': _NUMBER,
-    'sign': ((int,), '1 or -1'), 'offset': _NUMBER, 'nan': _TEXT,
+    'sign': ((int,), '1 or -1'), 'offset': _NUMBER, 'nan': _TEXT, 'zero': _TEXT,
     'sample_rate': ((int, float, type(None)), 'a number or null'),
     'stamp_field': ((str, type(None)), 'text or null'), 'stamp_factor': _NUMBER,
 }
@@ -256,6 +261,9 @@ def _field_spec(content: Any, where: str) -> FieldSpec:
     if spec.nan not in NAN_RULES:
         raise InputError(
             f"{where}: unknown nan rule '{spec.nan}': {nearest(spec.nan, NAN_RULES)}")
+    if spec.zero not in ZERO_RULES:
+        raise InputError(
+            f"{where}: unknown zero rule '{spec.zero}': {nearest(spec.zero, ZERO_RULES)}")
     if spec.sample_rate is not None and spec.sample_rate <= 0.0:
         raise InputError(
             f'{where}: sample_rate must be above 0 Hz, found {spec.sample_rate}')

@@ -18,6 +18,25 @@ from ou_monitor.records import FloatArray
 from ou_monitor.stream.config import FieldPath, FieldSpec, parse_field_path
 
 
+class ZeroRule:
+    """Makes NaN of zeros that are none, as a msg_config's `zero` says."""
+
+    def __init__(self, rule: str) -> None:
+        self._rule = rule
+
+    def apply(self, values: FloatArray) -> FloatArray:
+        """Return values in order of arrival, zeros that are none as NaN."""
+        if self._rule == 'value':
+            return values
+        nothing = values == 0.0
+        if self._rule == 'unknown_at_first':
+            something = np.flatnonzero(np.isfinite(values) & ~nothing)
+            if something.size:
+                self._rule = 'value'
+                nothing[int(something[0]):] = False
+        return np.where(nothing, np.nan, values) if nothing.any() else values
+
+
 @dataclass(frozen=True, eq=False)
 class Extracted:
     """
@@ -61,6 +80,7 @@ class Extractor:
     def __init__(self, spec: FieldSpec) -> None:
         """Prepare the paths once; messages arrive at kHz."""
         self.spec = spec
+        self._zero = ZeroRule(spec.zero)
         self._scale = spec.sign * spec.unit_factor
         self._value = self._getter(spec.field)
         self._stamp = None if spec.stamp_field is None else self._getter(spec.stamp_field)
@@ -71,7 +91,7 @@ class Extractor:
         raw = self._value(msg)
         if raw is None:
             return Extracted(stamp, np.empty(0), 1)
-        values = self._numbers(raw) * self._scale + self.spec.offset
+        values = self._zero.apply(self._numbers(raw) * self._scale + self.spec.offset)
         finite = np.isfinite(values)
         missing = values.size - int(np.count_nonzero(finite))
         if missing:

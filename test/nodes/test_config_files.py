@@ -21,6 +21,7 @@ DECLARED = {
 }
 FILE = ROOT / 'config' / 'ou_monitor.yaml'
 LAUNCH = ROOT / 'launch' / 'ou_monitor_launch.py'
+TWO = ROOT / 'launch' / 'ou_monitor_two_batteries_launch.py'
 
 
 def flat(group, prefix=''):
@@ -63,11 +64,14 @@ class Call:
         return (self.args, self.kwargs) == (other.args, other.kwargs)
 
 
-@pytest.fixture
-def described(monkeypatch):
+@pytest.fixture(params=[LAUNCH])
+def described(request, monkeypatch):
     """Give what the launch file describes, made with stand-ins of the launch package."""
     kinds = {'launch': ['LaunchDescription'],
-             'launch.actions': ['DeclareLaunchArgument', 'SetEnvironmentVariable'],
+             'launch.actions': ['DeclareLaunchArgument', 'SetEnvironmentVariable',
+                                'OpaqueFunction', 'GroupAction', 'IncludeLaunchDescription'],
+             'launch.conditions': ['IfCondition'],
+             'launch.launch_description_sources': ['PythonLaunchDescriptionSource'],
              'launch.substitutions': ['EnvironmentVariable', 'LaunchConfiguration'],
              'launch_ros': [],
              'launch_ros.actions': ['Node']}
@@ -76,8 +80,9 @@ def described(monkeypatch):
         for name in classes:
             setattr(stand_in, name, type(name, (Call,), {}))
         monkeypatch.setitem(sys.modules, module, stand_in)
-    space = {'__file__': str(LAUNCH), '__name__': 'launch_file'}
-    exec(compile(LAUNCH.read_text(), str(LAUNCH), 'exec'), space)
+    path = request.param
+    space = {'__file__': str(path), '__name__': 'launch_file'}
+    exec(compile(path.read_text(), str(path), 'exec'), space)
     return space['generate_launch_description']().args[0]
 
 
@@ -91,7 +96,10 @@ def test_launch_arguments(described):
     arguments = {a.args[0]: a.kwargs['default_value']
                  for a in of_kind(described, 'DeclareLaunchArgument')}
     network = arguments.pop('discovery_range')
-    assert arguments == {'namespace': '', 'params_file': str(FILE), 'use_sim_time': 'false'}
+    assert arguments == {
+        'namespace': '', 'params_file': str(FILE), 'use_sim_time': 'false', 'voltage': 'voltage',
+        'throttle': 'throttle', 'input': 'input', 'filter': 'true', 'respawn': 'false',
+        'log_level': 'info'}
     assert type(network).__name__ == 'EnvironmentVariable'
     assert network.args == ('ROS_AUTOMATIC_DISCOVERY_RANGE',)
     assert network.kwargs == {'default_value': 'LOCALHOST'}
@@ -116,12 +124,57 @@ def test_launch_nodes(described):
         assert node.kwargs['package'] == 'ou_monitor'
         assert f'{name} = ou_monitor.nodes.{name}:main' in setup
         assert node.kwargs['namespace'].args == ('namespace',)
-        assert node.kwargs['ros_arguments'] == ['--enclave', f'/ou_monitor/{name}']
+        assert node.kwargs['ros_arguments'][:3] == [
+            '--enclave', f'/ou_monitor/{name}', '--log-level']
+        assert node.kwargs['ros_arguments'][3].args == ('log_level',)
+        assert node.kwargs['respawn'].args == ('respawn',)
         file, extra = node.kwargs['parameters']
         assert file.args == ('params_file',)
         assert extra['use_sim_time'].args == ('use_sim_time',)
-    assert nodes[1].kwargs['remappings'] == [
+    assert nodes[1].kwargs['remappings'][:2] == [
         ('sigma', 'ou_estimator/sigma'), ('state', 'ou_estimator/state')]
+    mapped = [(name, value.args[0]) for node in nodes for name, value in node.kwargs['remappings']
+              if not isinstance(value, str)]
+    assert mapped == [('voltage', 'voltage'), ('throttle', 'throttle'), ('input', 'input')]
+    assert nodes[1].kwargs['condition'].args[0].args == ('filter',)
+
+
+def test_a_parameter_file_that_is_not_there_is_an_error(described, tmp_path):
+    """Before any node starts; ROS 2 would take the defaults."""
+    kinds = [type(entry).__name__ for entry in described]
+    assert kinds.index('OpaqueFunction') < kinds.index('Node')
+    refuse = described[kinds.index('OpaqueFunction')].kwargs['function']
+    given = {'params_file': str(tmp_path / 'none.yaml')}
+    configuration = refuse.__globals__['LaunchConfiguration']
+    configuration.perform = lambda self, context: context[self.args[0]]
+    with pytest.raises(RuntimeError, match='there is no file .*none.yaml'):
+        refuse(given)
+    refuse({'params_file': str(FILE)})
+
+
+@pytest.mark.parametrize('described', [TWO], indirect=True)
+def test_two_batteries(described):
+    """Each by the other launch file, with arguments that it has, in a scope of its own."""
+    known = {name for name, _, _ in _arguments_of(LAUNCH)}
+    declared = {a.args[0] for a in of_kind(described, 'DeclareLaunchArgument')}
+    groups = of_kind(described, 'GroupAction')
+    assert len(groups) == 2
+    for number, group in zip('12', groups, strict=True):
+        assert group.kwargs == {'scoped': True}
+        (include,) = group.args[0]
+        assert include.args[0].args == (str(LAUNCH),)
+        given = dict(include.kwargs['launch_arguments'])
+        assert set(given) <= known and given.pop('filter') == 'false'
+        used = {value.args[0] for value in given.values()}
+        assert used <= declared and f'voltage_{number}' in used
+
+
+def _arguments_of(path):
+    """Return the table of arguments of a launch file."""
+    tree = ast.parse(path.read_text())
+    (value,) = [node.value for node in tree.body if isinstance(node, ast.Assign)
+                and node.targets[0].id == 'ARGUMENTS']
+    return [(entry.elts[0].value, None, None) for entry in value.elts]
 
 
 def test_the_file_is_taken_in_any_namespace(world):

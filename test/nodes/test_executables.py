@@ -122,3 +122,23 @@ def test_without_ros_one_line_says_so(tmp_path, name):
         capture_output=True, env={**os.environ, 'PYTHONPATH': path}, check=False)
     assert done.returncode == 2
     assert done.stderr.count('\n') == 1 and 'ROS 2 is not installed' in done.stderr
+
+
+def test_qos_overrides_are_taken_or_refused(world):
+    """Of an input: the subscription has it; of a topic that is none of the node's: refused."""
+    from rclpy.qos import ReliabilityPolicy
+    probe = world.probe()
+    process = world.start(
+        'estimator', '--ros-args', '-p', 'msg_config:=std_float64',
+        '-p', 'qos_overrides./voltage.subscription.reliability:=reliable')
+    (end,) = wait_until(lambda: probe.node.get_subscriptions_info_by_topic('/voltage'))
+    assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+    wait_until(lambda: 'Waiting for a publisher on /voltage' in process.err)
+    assert process.stop() == 0
+    for name, words in (('/rail.subscription.depth:=5', 'is of no topic of this node'),
+                        ('/voltage.subscription.reliability:=somehow', 'qos_overrides of')):
+        refused = world.start('estimator', '--ros-args', '-p', 'msg_config:=std_float64',
+                              '-p', f'qos_overrides.{name}')
+        assert refused.wait() == 2
+        (line,) = [line for line in refused.err.splitlines() if 'FATAL' in line]
+        assert words in line

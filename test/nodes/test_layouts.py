@@ -15,6 +15,7 @@ PLOTJUGGLER = ROOT / 'layouts' / 'ou_monitor_plotjuggler.xml'
 # Foxglove: /topic.field; PlotJuggler: /topic/field.
 SUPPLY = {'alpha', 'sigma', 'var_inf', 'brownout_risk', 'brownout', 'throttle_budget'}
 FILTER = {'cutoff', 'lag'}
+FLAG = '/ou_estimator/state.status[0].values[:]{key=="brownout"}.value'
 
 
 @pytest.fixture(scope='module')
@@ -51,6 +52,8 @@ def foxglove_paths() -> dict[str, str]:
     for panel in foxglove()['configById'].values():
         found += [path['value'] for path in panel.get('paths', [])]
         found += [panel[key] for key in ('path', 'topicPath', 'topicToRender') if key in panel]
+    # The indicator picks the flag's value in the state by its key.
+    found = ['/ou_estimator/brownout.data' if path == FLAG else path for path in found]
     return split(re.fullmatch(r'(/[\w/]+)(?:\.([\w.]+))?', path).groups('') for path in found)
 
 
@@ -119,7 +122,8 @@ def test_foxglove_panels_are_placed():
     whole = {topic for topic, field in foxglove_paths() if not field}
     assert whole == {'/ou_estimator/state', '/diagnostics'}
     (flag,) = (p for key, p in layout['configById'].items() if key.startswith('Indicator!'))
-    assert flag['path'] == '/ou_estimator/brownout.data'
+    # The state says 'unknown' where the topic of the flag is silent, and would keep its colour.
+    assert flag['path'] == FLAG
     # Neither colour of a known flag is that of an unknown one.
     assert {rule['rawValue'] for rule in flag['rules']} == {'true', 'false'}
     assert flag['fallbackColor'] not in {rule['color'] for rule in flag['rules']}

@@ -1,11 +1,14 @@
 """Replay in a loop, three times as fast, without header stamps: all time comes from /clock."""
 
 import math
+import time
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from live import ou_path, values_of, wait_until
 from ou_monitor.recordings.bag import BagWriter
 import pytest
+from rosgraph_msgs.msg import Clock
 
 T0 = 1_700_000_000_000_000_000
 SECONDS, RATE = 6, 3
@@ -56,5 +59,17 @@ def test_without_a_clock_it_says_so(world):
         output.publish(Float32(data=5.0))
         return states and 'nothing comes on /clock' in states[-1].status[0].message
     wait_until(said, what='complaint')
+    assert states[-1].status[0].level == b'\x03'
+    # A clock that runs, and then stops.
+    ticks = probe.publisher('/clock', Clock)
+    begin = time.monotonic()
+
+    def heard():
+        now = time.monotonic() - begin
+        ticks.publish(Clock(clock=Time(sec=int(now), nanosec=int(now % 1.0 * 1e9))))
+        said()
+        return float(values_of(states[-1].status[0])['t']) > 0.0
+    wait_until(heard, what='samples on simulated time')
+    wait_until(said, what='complaint of the clock that stopped')
     assert states[-1].status[0].level == b'\x03'
     assert estimator.stop() == 0

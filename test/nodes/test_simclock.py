@@ -29,6 +29,18 @@ def test_nothing_is_known_before_two_pairs():
     assert mapped.ready and mapped(5.0) == pytest.approx(18.0)
 
 
+def test_a_clock_that_stops_is_not_run_on():
+    """For 1 s, or five of its intervals, the line is continued; then nothing is known."""
+    quick, slow = SimClockMap(), SimClockMap()
+    for k in range(10):
+        quick.add(0.01 * k, 0.02 * k)
+        slow.add(1.0 * k, 2.0 * k)
+    assert quick(0.09 + 0.99) == pytest.approx(2.16) and math.isnan(quick(0.09 + 1.01))
+    assert slow(13.9) == pytest.approx(27.8) and math.isnan(slow(14.1))
+    # It goes on where it stopped: a step, for the line had run on.
+    assert quick.add(5.0, 0.2) and not quick.ready
+
+
 def test_jitter_of_single_ticks_is_averaged():
     """The standard deviation at the end of a fitted line of n points is s 2 / sqrt(n)."""
     rng = random.Random(1)

@@ -170,11 +170,11 @@ def test_a_gap_between_blocks_is_noted(tmp_path):
     assert np.diff(recording.t).max() == pytest.approx(0.9901, abs=1e-6)
 
 
-def px4(tmp_path):
+def px4(tmp_path, version=''):
     """Write a bag as PX4 gives it: stamps in microseconds, the stick -1..1."""
     return make(
         tmp_path / 'px4.mcap',
-        ('/fmu/out/battery_status', PX4_BATTERY, [
+        ('/fmu/out/battery_status' + version, PX4_BATTERY, [
             (k * MS, {'timestamp': 1000 * k, 'connected': True, 'voltage_v': 16.0 + k})
             for k in range(1, 4)]),
         ('/fmu/out/manual_control_setpoint', PX4_STICK, [
@@ -182,10 +182,11 @@ def px4(tmp_path):
             for k in range(1, 4)]))
 
 
-def test_px4(tmp_path):
+@pytest.mark.parametrize('version, config', [('_v1', 'px4'), ('', 'px4_1_16')])
+def test_px4(tmp_path, version, config):
     """A type nobody has installed here is read by the definition in the bag."""
-    recording = read_recording(px4(tmp_path))
-    assert recording.source['msg_config'] == 'px4'
+    recording = read_recording(px4(tmp_path, version))
+    assert recording.source['msg_config'] == config
     np.testing.assert_allclose(recording.t, [1e-3, 2e-3, 3e-3], rtol=0, atol=1e-12)
     assert recording.voltage.tolist() == [17.0, 18.0, 19.0]
     assert recording.throttle.tolist() == [0.0, 0.5, 1.0]
@@ -232,7 +233,7 @@ def test_topics_that_are_not_there(tmp_path):
     text = complaint(path)
     assert 'no topic looks like' in text and '/camera (std_msgs/msg/String)' in text
     text = complaint(path, msg_config='px4')
-    assert "'/fmu/out/battery_status'" in text and '/camera (std_msgs/msg/String)' in text
+    assert "'/fmu/out/battery_status_v1'" in text and '/camera (std_msgs/msg/String)' in text
     assert "did you mean '/camera'" in complaint(path, voltage_topic='camer')
     assert "did you mean '/camera'" in complaint(path, throttle_topic='camer')
     assert "no msg config 'px5'" in complaint(path, msg_config='px5')

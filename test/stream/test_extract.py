@@ -132,3 +132,16 @@ def test_hints_for_rclpy_messages():
     """The fields are those of the message, not its private slots."""
     with pytest.raises(InputError, match="'percentage'"):
         extractor('percentag').extract(Described())
+
+
+@pytest.mark.parametrize('rule, expected', [
+    ('value', [0.0, 5.0, 0.0]), ('unknown', [np.nan, 5.0, np.nan]),
+    ('unknown_at_first', [np.nan, 5.0, 0.0])])
+def test_what_a_zero_means(rule, expected):
+    """A value, never one, or none as long as there was nothing else."""
+    one = extractor(zero=rule, nan='unknown')
+    np.testing.assert_array_equal(
+        [one.extract(Message(data=value)).values[0] for value in (0.0, 5.0, 0.0)], expected)
+    block = extractor(zero=rule, nan='unknown', sample_rate=10.0)
+    np.testing.assert_array_equal(
+        block.extract(Message(data=[0.0, 5.0, 0.0])).values, expected)

@@ -30,6 +30,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 import math
 import threading
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -51,6 +52,7 @@ _LEAD = 1.0
 # Nodes added at each end of each axis, so that the splines do not feel the ends.
 _PAD = 5
 
+T = TypeVar('T')
 _LOG_TWO_PI = math.log(2.0 * math.pi)
 # Beyond this level the mean time exceeds 1e150 tau: never.
 _NEVER = 26.0
@@ -278,11 +280,11 @@ def _log_rate(b: FloatArray) -> FloatArray:
             # One barrier at a time: arrays of more than 500 elements crash pbdv in
             # SciPy 1.11.4 to 1.12 (segmentation fault).
             first = int((pbdv(trial, -barrier)[0] < 0.0).argmax())
-            result[k] = math.log(_root(lambda nu, z=-barrier: float(pbdv(nu, z)[0]),
+            result[k] = math.log(_root(lambda nu, z: float(pbdv(nu, z)[0]), -barrier,
                                        float(trial[first - 1]), float(trial[first])))
         elif barrier <= 8.0:
-            terms = n * math.log(math.sqrt(2.0) * barrier) - log_factorial
-            result[k] = _root(lambda log_nu, terms=terms: excess(log_nu, terms), -40.0, -1e-12)
+            result[k] = _root(excess, n * math.log(math.sqrt(2.0) * barrier) - log_factorial,
+                              -40.0, -1e-12)
         else:
             z = 1.0 / (barrier * barrier)
             result[k] = (math.log(barrier) - 0.5 * barrier * barrier - 0.5 * _LOG_TWO_PI
@@ -290,18 +292,18 @@ def _log_rate(b: FloatArray) -> FloatArray:
     return result
 
 
-def _root(f: Callable[[float], float], low: float, high: float) -> float:
+def _root(f: Callable[[float, T], float], argument: T, low: float, high: float) -> float:
     """
-    Return the zero between two ends where `f` has different signs, to 1e-12.
+    Return the zero between two ends where f(x, argument) has different signs, to 1e-12.
 
     False position, the weight of an end that stays halved (Illinois).  SciPy's costs the nodes
     25 MB.
     """
-    f_low, f_high = f(low), f(high)
+    f_low, f_high = f(low, argument), f(high, argument)
     side = 0
     while True:
         middle = (f_high * low - f_low * high) / (f_high - f_low)
-        value = f(middle)
+        value = f(middle, argument)
         if value * f_high > 0.0:
             moved, high, f_high = high - middle, middle, value
             f_low *= 0.5 if side == 1 else 1.0
