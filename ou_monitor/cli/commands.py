@@ -84,6 +84,12 @@ def _flight_number(text: str) -> int:
     return int(text)
 
 
+def _pole_count(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or int(text) < 2 or int(text) % 2:
+        raise argparse.ArgumentTypeError(f"'{text}' is not an even number from 2 on")
+    return int(text)
+
+
 _RECORDING = Option(
     'recording', metavar='RECORDING',
     help='.mcap file, rosbag2 folder, CSV with columns time_s, voltage_v[, throttle], or a log '
@@ -180,7 +186,8 @@ _COMPARE = Command(
 _CONVERT = Command(
     'convert', 'a log becomes an MCAP bag', 'ou_monitor.cli.convert',
     'Convert a log to a bag with the topics /voltage, /throttle and /current (A, positive when '
-    'the battery is drained). Stamps count from the start of the log, in seconds; those of a CSV '
+    'the battery is drained), and of an autopilot /imu and, from eRPM or ESCs, /motor_speed. '
+    'Stamps count from the start of the log, in seconds; those of a CSV '
     'stay as they are.',
     (Option('log', metavar='LOG', type=path_argument, help='what to read'),
      Option('out', metavar='OUT', type=path_argument,
@@ -194,6 +201,13 @@ _CONVERT = Command(
             'the stick)'),
      Option('--current', metavar='NAME',
             help="which current, or 'none' (default: that of the sensor of the voltage)"),
+     Option('--signal', metavar='NAME', action='append', default=[],
+            help='any other series, as a topic of its own; may be given several times'),
+     Option('--imu', metavar='NAME', action='append', default=[],
+            help="which gyro becomes /imu, or 'none'; may be given several times (default: the "
+            'first of the list)'),
+     Option('--poles', metavar='N', type=_pole_count,
+            help='magnets of a rotor, for eRPM (default: as the log says)'),
      Option('--flight', metavar='N', type=_flight_number,
             help='which flight of a file with several, from 1 (default: the largest)'),
      (Option('--drop-held', action='store_true',
@@ -213,7 +227,8 @@ _COUPLING = Command(
     'the gain that would have been detected.',
     (_RECORDING, *_PART,
      Option('--signal', metavar='NAME', required=True,
-            help='TOPIC/FIELD.PATH of a bag (/imu/angular_velocity.x), or a column'),
+            help='TOPIC/FIELD.PATH (/imu/angular_velocity.x), a column, or a series of a log '
+            '(gyroUnfilt[0], IMU.GyrX)'),
      Option('--band', metavar='LOW,HIGH',
             help='frequencies looked at, Hz (default: 5 to a quarter of the slower rate)'),
      Option('--level', metavar='P', default='0.05',

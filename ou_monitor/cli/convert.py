@@ -28,10 +28,10 @@ def run(args: argparse.Namespace) -> int:
     from ou_monitor.recordings.importers.formats import import_log
     from ou_monitor.recordings.importers.log import Request
 
-    names = frozenset(name for name in (args.voltage, args.throttle, args.current)
+    names = frozenset(name for name in (args.voltage, args.throttle, args.current, *args.signal)
                       if name is not None)
     with output.Progress('reading') as progress:
-        log = import_log(args.log, Request(args.flight, names, args.list, progress))
+        log = import_log(args.log, Request(args.flight, names, args.poles, args.list, progress))
     return _list(args, log) if args.list else _convert(args, log)
 
 
@@ -47,10 +47,12 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
     from dataclasses import replace
 
     from ou_monitor.recordings.importers.choose import choose, drop_held
-    from ou_monitor.recordings.write import write_log
+    from ou_monitor.recordings.importers.extras import choose_extras
+    from ou_monitor.recordings.write_log import write_log
 
     chosen = choose(args.log, log, voltage=args.voltage, throttle=args.throttle,
                     current=args.current)
+    extras = choose_extras(args.log, log, imus=args.imu, signals=args.signal)
     held: tuple[str, ...] = ()
     if args.drop_held or args.drop_repeats:
         voltage, sentence = drop_held(chosen.voltage, every=args.drop_repeats)
@@ -62,23 +64,22 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
     if held:
         about['held_samples'] = held[0]
     with output.Progress('writing') as progress:
-        topics, moved = write_log(chosen, args.out, about, kind=args.type, progress=progress)
-    notes = (*log.notes, *chosen.notes, *held, *moved)
+        topics, moved = write_log(chosen, args.out, about, kind=args.type, extras=extras,
+                                  progress=progress)
+    notes = (*log.notes, *chosen.notes, *extras.notes, *held, *moved)
     volts = chosen.voltage
     duration = float(volts.t[-1] - volts.t[0])
-    series = {topic: getattr(chosen, topic[1:]) for topic in topics}
+    taken = _taken(chosen, extras)
     if args.json is not None:
         output.write_json({
             'log': str(args.log), 'out': str(args.out), 'n': volts.n, 'duration_s': duration,
-            'topics': topics, 'source': {**about, **{
-                topic: {'field': one.name, 'scale': one.scale, 'what': one.words, 'n': one.n}
-                for topic, one in series.items()}}, 'notes': notes}, args.json)
+            'topics': topics, 'source': {**about, **taken}, 'notes': notes}, args.json)
     if args.json == output.STDOUT:
         return 0
     output.say(f'{args.out}: {volts.n} samples, {duration:.3f} s'
                + (f', {volts.rate:.6g} Hz' if volts.n > 1 else ''))
-    output.say('\n'.join(f'  {topic}: {one.name} ({one.words}), {one.n} samples, '
-                         f'{topics[topic]}' for topic, one in series.items()))
+    output.say('\n'.join(f"  {topic}: {one['field']} ({one['what']}), {one['n']} samples, "
+                         f"{one['unit']}, {topics[topic]}" for topic, one in taken.items()))
     for name, value in log.facts.items():
         output.say(f'  {name}: {value}')
     for note in notes:
@@ -86,15 +87,32 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
     return 0
 
 
+def _taken(chosen: Any, extras: Any) -> dict[str, dict[str, Any]]:
+    """Return what each topic holds."""
+    found = {'/voltage': chosen.voltage, '/throttle': chosen.throttle,
+             '/current': chosen.current, **{f'/{k}': one for k, one in extras.signals.items()}}
+    rows = {topic: {'field': one.name, 'scale': one.scale, 'what': one.words, 'unit': one.unit,
+                    'n': one.n} for topic, one in found.items() if one is not None}
+    for topic, one in extras.inertial.items():
+        rows[f'/{topic}'] = {'field': one.name, 'scale': one.scale, 'what': one.words,
+                             'unit': 'rad/s, m/s^2', 'n': int(one.t.size)}
+    if extras.speeds is not None:
+        rows['/motor_speed'] = {
+            'field': ', '.join(extras.speeds.names), 'scale': extras.speeds.scale,
+            'what': extras.speeds.words, 'unit': 'rad/s', 'n': int(extras.speeds.t.size)}
+    return rows
+
+
 def _list(args: argparse.Namespace, log: Any) -> int:
     import numpy as np
     from ou_monitor.recordings.importers.choose import default
-    from ou_monitor.recordings.importers.log import CURRENT, THROTTLE, UNITS, VOLTAGE
+    from ou_monitor.recordings.importers.extras import default_inertial
+    from ou_monitor.recordings.importers.log import CURRENT, SIGNAL, THROTTLE, VOLTAGE
 
     taken = {quantity: [one.name for one in default(log, quantity)]
              for quantity in (VOLTAGE, THROTTLE, CURRENT)}
     rows = []
-    order = (VOLTAGE, THROTTLE, CURRENT)
+    order = (VOLTAGE, THROTTLE, CURRENT, 'any', SIGNAL)
     for one in sorted(log.series, key=lambda one: (
             one.quantity not in order, order.index(one.quantity) if one.quantity in order else 0,
             one.rank is None, one.rank or 0)):
@@ -103,11 +121,13 @@ def _list(args: argparse.Namespace, log: Any) -> int:
         rows.append({
             'quantity': one.quantity, 'name': one.name, 'what': one.words,
             'default': one.name in taken.get(one.quantity, ()), 'n': one.n,
-            'rate_hz': one.rate, 'min': low, 'max': high, 'unit': UNITS[one.quantity],
+            'rate_hz': one.rate, 'min': low, 'max': high, 'unit': one.unit,
             'repeats': one.repeats, 'scale': one.scale})
+    gyros = _gyros(log, {one.name for one in default_inertial(log)})
     if args.json is not None:
         output.write_json({'log': str(args.log), 'format': log.format, 'facts': log.facts,
-                           'series': rows, 'notes': log.notes}, args.json)
+                           'series': rows, 'imu': gyros, 'motor_speed': [] if log.speeds is None
+                           else list(log.speeds.names), 'notes': log.notes}, args.json)
     if args.json == output.STDOUT:
         return 0
     output.say(f'{args.log}: {log.format}' + ''.join(
@@ -117,9 +137,24 @@ def _list(args: argparse.Namespace, log: Any) -> int:
         [('*' if row['default'] else '', row['quantity'], row['name'], str(row['n']),
           *(f'{row[key]:.4g}' for key in ('rate_hz', 'min', 'max')), row['unit'],
           f'{row["repeats"]:.0%}', row['what']) for row in rows], left=(0, 1, 2, 7, 9)))
+    for row in gyros:
+        output.say(f"{'*' if row['default'] else ' '} --imu {row['name']}: {row['what']}, "
+                   f"{row['n']} samples"
+                   + ('' if row['acceleration'] else ', no accelerometer'))
+    if log.speeds is not None:
+        output.say(f'* /motor_speed: {log.speeds.words}, {log.speeds.t.size} samples, '
+                   f"{', '.join(log.speeds.names)}")
     for quantity in (VOLTAGE, THROTTLE):
         if len(taken[quantity]) > 1:
             output.say(f'Several would be taken as {quantity}: choose with --{quantity} NAME.')
     for note in log.notes:
         output.say(f'note: {note}')
     return 0
+
+
+def _gyros(log: Any, taken: set[str]) -> list[dict[str, Any]]:
+    """Return what could become sensor_msgs/Imu."""
+    return [{'name': one.name, 'what': one.words, 'n': int(one.t.size), 'scale': one.scale,
+             'angular_velocity': one.angular_velocity is not None,
+             'acceleration': one.acceleration is not None, 'default': one.name in taken}
+            for one in log.inertial]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor.cli import output
@@ -12,6 +13,7 @@ from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
     from ou_monitor.coupling.coupling import Coupling
+    from ou_monitor.records import FloatArray, Recording
 
 
 def run(args: argparse.Namespace) -> int:
@@ -21,10 +23,12 @@ def run(args: argparse.Namespace) -> int:
     start, end = part_of_recording(args.start, args.end)
 
     from ou_monitor.coupling.coupling import estimate_coupling
-    from ou_monitor.recordings.read import read_signal
+    from ou_monitor.recordings.importers.formats import is_log
 
-    recording = read_given(args, start, end)
-    t, values = read_signal(args.recording, args.signal, partial=args.partial)
+    if is_log(Path(args.recording)):
+        recording, t, values, unit = _of_log(args, start, end)
+    else:
+        recording, t, values, unit = _of_bag(args, start, end)
     if start is not None or end is not None:
         # What lies outside the part has no voltage beside it, and is not counted as dropped.
         part = (t >= recording.t[0]) & (t <= recording.t[-1])
@@ -35,17 +39,50 @@ def run(args: argparse.Namespace) -> int:
     except InputError as error:
         raise InputError(f"'{args.recording}', signal '{args.signal}': {error}") from error
     if args.json is not None:
-        output.write_json(as_data(found, recording.name, args.signal, recording.notes), args.json)
+        output.write_json(as_data(found, recording.name, args.signal, unit, recording.notes),
+                          args.json)
     if args.json != output.STDOUT:
-        output.say(render(found, recording.name, args.signal, recording.notes))
+        output.say(render(found, recording.name, args.signal, unit, recording.notes))
     return 0
 
 
-def as_data(found: Coupling, name: str, signal: str, notes: tuple[str, ...]) -> dict[str, Any]:
+def _of_log(args: argparse.Namespace, start: float | None, end: float | None,
+            ) -> tuple[Recording, FloatArray, FloatArray, str]:
+    """Return supply, stamps and values of the signal, and its unit, of a log."""
+    from ou_monitor.recordings.log_signal import read_log_signal
+
+    for option, value in (('--msg-config', args.msg_config),
+                          ('--voltage-topic', args.voltage_topic),
+                          ('--throttle-topic', args.throttle_topic)):
+        if value is not None:
+            raise InputError(f'{args.recording} is a log: {option} is for bags')
+    if any(value is not None for value in (args.time_column, args.unit, args.time_unit)):
+        raise InputError(f'{args.recording} is a log: its time and units are known')
+    with output.Progress('reading') as progress:
+        recording, series = read_log_signal(
+            Path(args.recording), args.signal, voltage=args.voltage_column,
+            throttle=args.throttle_column, flight=args.flight, start=start, end=end,
+            progress=progress)
+    return recording, series.t, series.values, '' if series.unit == '?' else series.unit
+
+
+def _of_bag(args: argparse.Namespace, start: float | None, end: float | None,
+            ) -> tuple[Recording, FloatArray, FloatArray, str]:
+    """Return supply, stamps and values of the signal, and its unit, of a bag or a CSV."""
+    from ou_monitor.recordings.read import read_signal, signal_unit
+
+    recording = read_given(args, start, end)
+    t, values = read_signal(args.recording, args.signal, partial=args.partial)
+    return recording, t, values, signal_unit(args.recording, args.signal, partial=args.partial)
+
+
+def as_data(found: Coupling, name: str, signal: str, unit: str, notes: tuple[str, ...],
+            ) -> dict[str, Any]:
     """Return the result for JSON."""
     return {
-        'recording': name, 'signal': signal, 'seen': found.seen, 'p_value': found.p_value,
-        'level': found.level, 'gain_per_v': found.gain, 'gain_ci95': found.gain_ci95,
+        'recording': name, 'signal': signal, 'signal_unit': unit or None, 'seen': found.seen,
+        'p_value': found.p_value, 'level': found.level,
+        'gain_per_v': found.gain, 'gain_ci95': found.gain_ci95,
         'gain_limit_per_v': found.limit, 'lag_s': found.lag, 'lag_se_s': found.lag_se,
         'share_of_signal': found.noise_share, 'narrow': found.narrow,
         'signal_leads': found.signal_leads, 'throttle_taken_out': found.partial,
@@ -58,8 +95,9 @@ def as_data(found: Coupling, name: str, signal: str, notes: tuple[str, ...]) -> 
         'notes': [*notes, *found.notes]}
 
 
-def render(found: Coupling, name: str, signal: str, notes: tuple[str, ...]) -> str:
+def render(found: Coupling, name: str, signal: str, unit: str, notes: tuple[str, ...]) -> str:
     """Return the finding for a terminal 100 columns wide."""
+    per = f'{unit} per V'.lstrip()
     grid = found.grid
     low, high = found.frequency[0], found.frequency[-1]
     peak = int(found.coherence.argmax())
@@ -70,15 +108,15 @@ def render(found: Coupling, name: str, signal: str, notes: tuple[str, ...]) -> s
         a, b = found.gain_ci95
         lines += [
             f'Coupling detected (p = {found.p_value:.2g}, level {found.level:g}).',
-            f'  gain    {found.gain:.4g} per V  [{a:.4g}, {b:.4g}] 95 %',
+            f'  gain    {found.gain:.4g} {per}  [{a:.4g}, {b:.4g}] 95 %',
             f'  lag     {1e3 * found.lag:.3g} ms of the signal behind the voltage '
             f'(standard error {1e3 * found.lag_se:.2g} ms)',
             f'  share   {100.0 * found.noise_share:.3g} % of the signal in this band']
     else:
         lines += [
             f'No coupling detected (p = {found.p_value:.2g}, level {found.level:g}).',
-            f'  limit   a gain of {found.limit:.4g} per V would have been detected with 90 % '
-            'probability']
+            f'  limit   a gain of {found.limit:.4g} {per} would have been detected with '
+            '90 % probability']
     lines.append(f'  largest squared coherence {found.coherence[peak]:.3g} at '
                  f'{found.frequency[peak]:.3g} Hz, threshold {found.threshold:.3g}')
     extra = [f'{lost} samples of the {what} dropped.' for lost, what in

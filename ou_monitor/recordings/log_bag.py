@@ -16,7 +16,7 @@ import tempfile
 from ou_monitor.recordings.importers.choose import choose, drop_held
 from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import Request
-from ou_monitor.recordings.write import write_log
+from ou_monitor.recordings.write_log import write_log
 from ou_monitor.records import Recording
 
 
@@ -27,7 +27,7 @@ def log_as_bag(path: Path, *, flight: int | None = None, voltage: str | None = N
                ) -> Iterator[tuple[Path, Callable[[Recording], Recording]]]:
     """Yield the bag of a log, and what gives a recording of it the name and notes of the log."""
     log = import_log(path, Request(
-        flight, frozenset(one for one in (voltage, throttle) if one), False, progress))
+        flight, frozenset(one for one in (voltage, throttle) if one), progress=progress))
     chosen = choose(path, log, voltage=voltage, throttle=throttle, option='--{}-column')
     volts, held = drop_held(chosen.voltage)
     chosen = replace(chosen, voltage=volts)

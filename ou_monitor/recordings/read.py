@@ -20,10 +20,12 @@ from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.columns import batches, join
 from ou_monitor.recordings.csv_table import CsvColumns, read_column, read_csv
 from ou_monitor.recordings.importers.formats import is_log
+from ou_monitor.recordings.importers.log import UNKNOWN
 from ou_monitor.recordings.log_bag import log_as_bag
 from ou_monitor.recordings.samples import (
     check_throttle, dropped_words, known_current, late_words, overlap, part_words,
     repeated_words, SampleReader, span_words, usable_voltage)
+from ou_monitor.recordings.standard_types import IMU
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.text import printable
@@ -294,6 +296,20 @@ def read_signal(path: str | Path, signal: str, *, partial: bool = False,
     values = np.full(column.n, np.nan)
     values[column.count > 0] = column.values
     return column.stamp, values
+
+
+def signal_unit(path: str | Path, signal: str, *, partial: bool = False) -> str:
+    """Return the unit of a scalar of a bag; empty where nothing states it."""
+    path = Path(path)
+    if path.suffix.lower() == '.csv' and not path.is_dir():
+        return ''
+    bag = BagReader(path, partial=partial)
+    topic, field = _split(path, signal, bag.topics)
+    if bag.topics[topic] == IMU:
+        return {'angular_velocity': 'rad/s', 'linear_acceleration': 'm/s^2'}.get(
+            field.partition('.')[0], '')
+    unit = bag.origins.get(topic, {}).get(f'{topic[1:]}_unit', '')
+    return '' if unit == UNKNOWN else unit
 
 
 def _has_header(bag: BagReader, topic: str) -> bool:

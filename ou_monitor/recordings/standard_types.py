@@ -11,6 +11,7 @@ from after the 4-byte header.  `layout.py` is the way back, for any type.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import struct
 
 import numpy as np
@@ -88,6 +89,33 @@ float32[] cell_temperature
 string location
 string serial_number
 """ + _STD_HEADER,
+    'sensor_msgs/msg/Imu': f"""\
+std_msgs/Header header
+geometry_msgs/Quaternion orientation
+float64[9] orientation_covariance
+geometry_msgs/Vector3 angular_velocity
+float64[9] angular_velocity_covariance
+geometry_msgs/Vector3 linear_acceleration
+float64[9] linear_acceleration_covariance
+{_STD_HEADER}{_SEPARATOR}
+MSG: geometry_msgs/Quaternion
+float64 x 0
+float64 y 0
+float64 z 0
+float64 w 1
+{_SEPARATOR}
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+""",
+    'sensor_msgs/msg/JointState': """\
+std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+""" + _STD_HEADER,
 }
 
 # package/msg/Type -> its RIHS01 hash.
@@ -100,12 +128,18 @@ TYPE_HASHES: dict[str, str] = {
         'RIHS01_0599f6f85b4bfca379873a0b4375a0aca022156bd2d7021275d116ed1fa8bfe0',
     'sensor_msgs/msg/BatteryState':
         'RIHS01_4bee5dfce981c98faa6828b868307a0a73f992ed0789f374ee96c8f840e69741',
+    'sensor_msgs/msg/Imu':
+        'RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b',
+    'sensor_msgs/msg/JointState':
+        'RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e',
 }
 
 
 # Representation identifier CDR_LE, no options.
 HEADER = b'\x00\x01\x00\x00'
 
+IMU = 'sensor_msgs/msg/Imu'
+JOINT_STATE = 'sensor_msgs/msg/JointState'
 FLOAT32 = 'std_msgs/msg/Float32'
 FLOAT64 = 'std_msgs/msg/Float64'
 FLOAT32_ARRAY = 'std_msgs/msg/Float32MultiArray'
@@ -120,6 +154,13 @@ _BATTERY = np.dtype([
     ('frame', 'V4'), ('voltage', '<f4'), ('unmeasured', '<f4', (6,)), ('status', 'u1', (3,)),
     ('present', 'u1'), ('cells', '<u4', (2,)), ('location_length', '<u4'), ('location', 'V4'),
     ('serial_length', '<u4'), ('serial', 'V1')])
+
+_IMU = np.dtype([
+    ('head', 'V4'), ('sec', '<i4'), ('nanosec', '<u4'), ('frame_length', '<u4'), ('frame', 'V12'),
+    *((name, '<f8', (size,)) for name, size in (
+        ('orientation', 4), ('orientation_covariance', 9), ('angular_velocity', 3),
+        ('angular_velocity_covariance', 9), ('linear_acceleration', 3),
+        ('linear_acceleration_covariance', 9)))])
 
 
 def encode_scalars(kind: str, values: npt.ArrayLike) -> list[bytes]:
@@ -147,6 +188,54 @@ def encode_battery(stamps_ns: npt.NDArray[np.int64], voltage: npt.ArrayLike) -> 
     rows['voltage'] = voltage
     rows['unmeasured'] = np.nan
     rows['present'] = 1
+    return _split(rows)
+
+
+def encode_imu(stamps_ns: npt.NDArray[np.int64], angular_velocity: npt.NDArray[np.float64] | None,
+               acceleration: npt.NDArray[np.float64] | None) -> list[bytes]:
+    """
+    Return one sensor_msgs/Imu in `base_link` for each stamp; None: not measured.
+
+    stamps_ns in ns, angular_velocity of shape (n, 3) in rad/s, acceleration in m/s^2.
+    """
+    rows = np.zeros(stamps_ns.size, _IMU)
+    rows['head'] = np.void(HEADER)
+    rows['sec'], rows['nanosec'] = stamps_ns // 1_000_000_000, stamps_ns % 1_000_000_000
+    rows['frame_length'], rows['frame'] = 10, np.void(b'base_link\0\0\0')
+    rows['orientation'][:, 3] = 1.0
+    # The message says -1 of what is not measured, and 0 of a covariance not known.
+    rows['orientation_covariance'][:, 0] = -1.0
+    for name, values in (('angular_velocity', angular_velocity),
+                         ('linear_acceleration', acceleration)):
+        if values is None:
+            rows[f'{name}_covariance'][:, 0] = -1.0
+        else:
+            rows[name] = values
+    return _split(rows)
+
+
+def encode_joints(stamps_ns: npt.NDArray[np.int64], names: Sequence[str],
+                  velocity: npt.NDArray[np.float64]) -> list[bytes]:
+    """
+    Return one sensor_msgs/JointState for each stamp, velocities only.
+
+    stamps_ns in ns, velocity of shape (n, m) in rad/s.
+    """
+    # From the frame, which is empty, to the number of velocities: the same in all.
+    texts = struct.pack('<I4sI', 1, b'', len(names))
+    for name in names:
+        data = name.encode() + b'\0'
+        texts += b'\0' * (-len(texts) % 4) + struct.pack('<I', len(data)) + data
+    texts += b'\0' * (-len(texts) % 4) + struct.pack('<II', 0, len(names))
+    # Counted from the stamp, of 8 bytes.
+    texts += b'\0' * (-len(texts) % 8)
+    layout = np.dtype([('head', 'V4'), ('sec', '<i4'), ('nanosec', '<u4'),
+                       ('texts', f'V{len(texts)}'), ('velocity', '<f8', (len(names),)),
+                       ('effort', '<u4')])
+    rows = np.zeros(stamps_ns.size, layout)
+    rows['head'] = np.void(HEADER)
+    rows['sec'], rows['nanosec'] = stamps_ns // 1_000_000_000, stamps_ns % 1_000_000_000
+    rows['texts'], rows['velocity'] = np.void(texts), velocity
     return _split(rows)
 
 

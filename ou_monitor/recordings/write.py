@@ -1,14 +1,13 @@
 """
-Write a `Recording`, or what was taken from a log, as a bag.
+Write a `Recording` as a bag.
 
 `replay`, `ros2 bag play` and `analyze` take it.  Limits: messages hold float32 (but
-std_msgs/Float64), 0.5 uV at 5 V.  Every series of a log keeps its own stamps, counted
-from the start of the log, to 10 ns of a day.
+std_msgs/Float64), 0.5 uV at 5 V.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 import heapq
 import math
 from pathlib import Path
@@ -18,8 +17,6 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagWriter
-from ou_monitor.recordings.importers.choose import Chosen
-from ou_monitor.recordings.importers.log import Series, UNITS
 from ou_monitor.recordings.standard_types import (
     BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, FLOAT64)
 from ou_monitor.records import FloatArray, Recording
@@ -152,7 +149,7 @@ class RecordingWriter:
             raise InputError(f"'{piece.name}' has stamps after 2^31 s, which a header cannot "
                              'hold: use another type')
         if self._type == 'adc_block':
-            _check_steady(piece.name, stamps - self._first, self._written, self._rate)
+            check_steady(piece.name, stamps - self._first, self._written, self._rate)
         if THROTTLE not in self._names and piece.has_throttle:
             self._names[THROTTLE] = self._add('throttle', FLOAT32)
         self._written += piece.n
@@ -219,7 +216,7 @@ class RecordingWriter:
             yield t, THROTTLE, message
 
 
-def _check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
+def check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
                   sample_rate: float) -> None:
     """Refuse what blocks without stamps cannot hold: any spacing but the stated one."""
     grid = (before + np.arange(since_first.size)) * (1e9 / sample_rate)
@@ -227,65 +224,3 @@ def _check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
         raise InputError(
             f"'{name}' is not sampled at a steady {sample_rate:g} Hz, as blocks of samples "
             'need it: use another type')
-
-
-def write_log(
-    chosen: Chosen, path: Path, about: Mapping[str, str], *, kind: str = 'battery_state',
-    progress: Callable[[float], None] | None = None,
-) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Write a bag (progress 0..1)."""
-    # At one instant what holds for the sample goes before it, the voltage last.
-    held = [(name, series) for name, series in (
-        ('throttle', chosen.throttle), ('current', chosen.current)) if series is not None]
-    held.append(('voltage', chosen.voltage))
-    first = min(float(series.t[0]) for _, series in held)
-    shift = max(0, -round(first * 1e9))
-    notes = (f'Stamps were moved by {shift * 1e-9:.9f} s: a bag cannot hold negative ones.',
-             ) if shift else ()
-    total = sum(series.n for _, series in held)
-    topics: dict[str, str] = {}
-    # Refused before anything is on disk.
-    stamps = [as_nanoseconds(series.t, series.name) + shift for _, series in held]
-    if kind == 'adc_block':
-        _check_steady(chosen.voltage.name, stamps[-1] - stamps[-1][0], 0, BLOCK_RATE)
-    elif kind == 'battery_state' and stamps[-1][-1] > LAST_HEADER_NS:
-        raise InputError(f"'{chosen.voltage.name}' has stamps after 2^31 s, which a header "
-                         'cannot hold: use another type')
-    whole = {**about}
-    for name, series in held:
-        whole |= _origin(name, series)
-    with BagWriter(path, about=whole) as bag:
-        # The order of the table of contents: the voltage first.
-        for name, series in reversed(held):
-            message = TYPES[kind] if name == 'voltage' else FLOAT32
-            rate = BLOCK_RATE if message == FLOAT32_ARRAY else None
-            topics[bag.add_topic(name, message, sample_rate=rate,
-                                 origin={**about, **_origin(name, series)})] = message
-        streams = [_messages(k, stamps[k], series.values, topics['/' + name])
-                   for k, (name, series) in enumerate(held)]
-        for done, (t, k, data) in enumerate(heapq.merge(*streams)):
-            bag.write('/' + held[k][0], t, data)
-            if progress is not None and done % SLICE == 0:
-                progress(done / total)
-    return topics, notes
-
-
-def _origin(name: str, series: Series) -> dict[str, str]:
-    """Return where a series came from, by keys that are its own."""
-    return {f'{name}_field': series.name, f'{name}_unit': UNITS[name],
-            f'{name}_scale': series.scale, f'{name}_what': series.words}
-
-
-def _messages(place: int, stamps: npt.NDArray[np.int64], values: npt.NDArray[np.float64],
-              kind: str) -> Iterator[Timed]:
-    if kind == FLOAT32_ARRAY:
-        for first in range(0, stamps.size, BLOCK):
-            part = slice(first, first + BLOCK)
-            yield int(stamps[part][-1]), place, encode_block(values[part])
-        return
-    for first in range(0, stamps.size, SLICE):
-        part = slice(first, first + SLICE)
-        data = (encode_battery(stamps[part], values[part]) if kind == BATTERY_STATE
-                else encode_scalars(kind, values[part]))
-        for t, message in zip(stamps[part].tolist(), data, strict=True):
-            yield t, place, message

@@ -1,6 +1,7 @@
 """`ou-monitor coupling`: columns and topics in, table and JSON out, bad input one line."""
 
 import json
+from pathlib import Path
 import re
 
 import numpy as np
@@ -153,3 +154,43 @@ def test_bad_input_is_one_line(table, options, words, capsys):
 def test_a_signal_that_a_bag_lacks_is_one_line(bag, signal, words, capsys):
     """Topic, field and path."""
     assert words in failure(capsys, bag, '--signal', signal)
+
+
+@pytest.fixture
+def logs(monkeypatch):
+    """Let the writers of logs be imported."""
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[1] / 'recordings/importers'))
+
+
+def test_a_log_is_taken_as_it_is(logs, tmp_path, capsys):
+    """Series and topics of a blackbox, its refresh of the voltage, its part; what is missing."""
+    from made_logs import blackbox
+    rng = np.random.default_rng(4)
+    n, held = 10_000, 4
+    t = 0.002 * np.arange(n)
+    supply = 100 * simulate(t, 20.0, 1.5, rng)
+    volts = np.repeat(np.rint(1600 + supply[::held]), held)[:n]
+    gyro = np.rint(1000 + 0.2 * supply + 2 * rng.standard_normal((3, n)))
+    fields = ('loopIteration', 'time', 'vbatLatest', 'motor[0]',
+              *(f'gyroADC[{k}]' for k in range(3)))
+    rows = np.column_stack([np.arange(n), 10**6 + 2000 * np.arange(n), volts,
+                            rng.integers(100, 2100, n), gyro.T])
+    path = tmp_path / 'a.bbl'
+    path.write_bytes(b''.join(blackbox(rows, fields, {'gyro_scale': '0x3f800000'})))
+    expected = 20.0 * np.pi / 180.0
+    for signal in ('gyroADC[1]', '/imu/angular_velocity.y', 'gyroADC/angular_velocity.y'):
+        data = found(capsys, path, '--signal', signal, '--from', '2')
+        # Against the steps of the held voltage the gain were less, and the signal 3 ms ahead.
+        assert data['seen'] and data['gain_per_v'] == pytest.approx(expected, rel=0.03)
+        assert abs(data['lag_s']) < 0.5e-3 and data['signal_unit'] == 'rad/s'
+        assert data['voltage_rate_hz'] == pytest.approx(125.0, rel=0.01)
+        assert data['duration_s'] < 18.1
+    for arguments, words in (
+            (['--signal', 'gyroADC[9]'], "did you mean 'gyroADC["),
+            (['--signal', '/imu/linear_acceleration.x'], 'no linear acceleration'),
+            (['--signal', '/motor_speed/velocity[0]'], 'no motor speeds'),
+            (['--signal', 'debug/angular_velocity.x'], "no gyro 'debug'"),
+            (['--signal', 'motor[0]', '--msg-config', 'x'], 'is for bags'),
+            (['--signal', 'motor[0]', '--flight', '2'], 'no flight 2'),
+            (['--signal', 'motor[0]', '--from', '90'], 'holds no voltage')):
+        assert words in failure(capsys, path, *arguments)

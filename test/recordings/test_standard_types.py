@@ -63,3 +63,38 @@ def test_block(n):
     assert bytes(STORE.serialize_cdr(theirs, cdr.FLOAT32_ARRAY)) == data
     np.testing.assert_array_equal(theirs.data, samples)
     assert [(d.label, d.size) for d in theirs.layout.dim] == [('samples', n)]
+
+
+@pytest.mark.parametrize('absent', [None, 'angular_velocity', 'linear_acceleration'])
+def test_imu(absent):
+    """In base_link, -1 for what is not measured, 0 for a covariance not known."""
+    values = {'angular_velocity': np.arange(9.0).reshape(3, 3),
+              'linear_acceleration': -np.arange(9.0).reshape(3, 3)}
+    messages = cdr.encode_imu(STAMPS, *(None if name == absent else rows
+                                        for name, rows in values.items()))
+    for k, (data, ns) in enumerate(zip(messages, STAMPS.tolist(), strict=True)):
+        theirs = STORE.deserialize_cdr(data, cdr.IMU)
+        assert bytes(STORE.serialize_cdr(theirs, cdr.IMU)) == data
+        assert theirs.header.frame_id == 'base_link'
+        assert theirs.header.stamp.sec * 1_000_000_000 + theirs.header.stamp.nanosec == ns
+        assert (theirs.orientation.w, theirs.orientation_covariance[0]) == (1.0, -1.0)
+        for name, rows in values.items():
+            held = getattr(theirs, name)
+            expected = np.zeros(3) if name == absent else rows[k]
+            assert [held.x, held.y, held.z] == expected.tolist()
+            covariance = getattr(theirs, f'{name}_covariance')
+            assert covariance[0] == (-1.0 if name == absent else 0.0)
+            assert not covariance[1:].any()
+
+
+@pytest.mark.parametrize('names', [('motor_0',), ('motor_0', 'b', 'motor_10'), ('',)])
+def test_joints(names):
+    """Names of any length before the velocities; no positions, no efforts."""
+    speeds = np.arange(3.0 * len(names)).reshape(3, -1)
+    for data, ns, row in zip(cdr.encode_joints(STAMPS, names, speeds), STAMPS.tolist(), speeds,
+                             strict=True):
+        theirs = STORE.deserialize_cdr(data, cdr.JOINT_STATE)
+        assert bytes(STORE.serialize_cdr(theirs, cdr.JOINT_STATE)) == data
+        assert theirs.name == list(names) and theirs.velocity.tolist() == row.tolist()
+        assert (len(theirs.position), len(theirs.effort)) == (0, 0)
+        assert theirs.header.stamp.sec * 1_000_000_000 + theirs.header.stamp.nanosec == ns

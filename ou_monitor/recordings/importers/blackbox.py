@@ -20,8 +20,9 @@ from orangebox import Parser
 from orangebox.reader import Reader
 from orangebox.types import FrameType
 from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers import blackbox_motion
 from ou_monitor.recordings.importers.log import (
-    CURRENT, Flight, from_start, Log, quiet, Request, Series, THROTTLE, VOLTAGE)
+    CURRENT, Flight, from_start, Log, quiet, Request, Series, start_of, THROTTLE, VOLTAGE)
 from ou_monitor.records import FloatArray
 
 # The clock counts us in 32 bits.
@@ -59,7 +60,7 @@ def read(path: Path, request: Request) -> Log:
             raise InputError(f'{path}: the header of flight {wanted} does not say which fields '
                              'are logged: it is damaged')
         names = [one.name for one in main[FrameType.INTRA]]
-        fields = _wanted(names)
+        fields = _wanted(names, request)
         if 'time' not in names:
             raise InputError(f'{path}: flight {wanted} has no field time: it is damaged')
         table, dropped = _frames(parser, [names.index(name) for name in fields], request)
@@ -94,15 +95,26 @@ def read(path: Path, request: Request) -> Log:
         notes.insert(0, f'The file holds {len(held)} flights ({sizes}); this is flight {wanted}, '
                      f'the largest ({length}): --flight N chooses another.')
     series = [*_battery(t, columns, headers, notes), *_throttles(t, columns, headers)]
-    return Log('blackbox', from_start(series), facts, tuple(notes))
+    known = {one.name for one in series}
+    shows_gyro = blackbox_motion.shows_gyro(headers, *_version(headers))
+    series += blackbox_motion.signals(t, columns, headers, known, debug_gyro=shows_gyro)
+    inertial, speeds = blackbox_motion.motion(t, columns, headers, notes, debug_gyro=shows_gyro,
+                                              poles=request.poles)
+    start = start_of(series)
+    return Log('blackbox', from_start(series, start), facts, tuple(notes),
+               from_start(inertial, start),
+               None if speeds is None else from_start([speeds], start)[0],
+               tuple(name for name in names if name != 'time'))
 
 
-def _wanted(names: list[str]) -> list[str]:
+def _wanted(names: list[str], request: Request) -> list[str]:
     """Return the fields that carry what is looked for, the time first."""
     kinds = ('vbatLatest', 'vbat', 'sagCompensatedVBat', 'amperageLatest', 'amperage',
              'rcCommand[3]', 'setpoint[3]')
-    return ['time', *[name for name in names
-                      if name in kinds or re.fullmatch(r'motor\[\d+\]', name)]]
+    arrays = r'(motor|gyroADC|gyroUnfilt|accSmooth|eRPM|debug)\[\d+\]'
+    return ['time', *[name for name in names if name != 'time' and (
+        request.everything or name in kinds or name in request.names
+        or re.fullmatch(arrays, name))]]
 
 
 def _frames(parser: Any, places: list[int], request: Request) -> tuple[FloatArray, int]:
@@ -235,8 +247,11 @@ def _throttles(t: FloatArray, columns: dict[str, FloatArray],
                      f'(mean of {len(motors)} motors - {low:g}) / {high - low:g}',
                      f'mean of {len(motors)} motors', 0)
     if 'rcCommand[3]' in columns:
-        yield Series('rcCommand[3]', THROTTLE, t, (columns['rcCommand[3]'] - 1000.0) / 1000.0,
-                     '(x - 1000) / 1000', 'stick', 1)
+        finer = blackbox_motion.high_resolution(headers)
+        yield Series('rcCommand[3]', THROTTLE, t,
+                     (columns['rcCommand[3]'] / finer - 1000.0) / 1000.0,
+                     f'(x / {finer:g} - 1000) / 1000' if finer > 1.0 else '(x - 1000) / 1000',
+                     'stick', 1)
     if 'setpoint[3]' in columns:
         yield Series('setpoint[3]', THROTTLE, t, columns['setpoint[3]'] / 1000.0, '0.001',
                      'throttle asked for', 2)

@@ -54,4 +54,4 @@ def read(path: Path, request: Request) -> Log:
                 notes.append(f"Column '{name}' does not hold numbers.")
                 continue
             series.append(Series(name, ANY, t, values, '1', 'column'))
-    return Log('csv', tuple(series), {}, tuple(notes))
+    return Log('csv', tuple(series), {}, tuple(notes), names=tuple(header))

@@ -18,7 +18,9 @@ from typing import Any
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, from_start, Log, one_flight, quiet, quiet_process, Request, Series, THROTTLE, VOLTAGE)
+    CURRENT, from_start, Log, one_flight, quiet, quiet_process, Request, Series, SIGNAL, start_of,
+    THROTTLE, UNKNOWN, VOLTAGE)
+from ou_monitor.recordings.importers.motion import FRD_TO_FLU, Inertial, MotorSpeeds, RPM
 from ou_monitor.records import FloatArray
 from pymavlink import DFReader
 
@@ -47,6 +49,12 @@ PLAIN = (
     ('MOTB', 'ThrOut', THROTTLE, 3, 'throttle output of the mixer'),
     ('RATE', 'AOut', THROTTLE, 4, 'throttle output'),
 )
+# Message -> rank; of several instances the first.  Axes are front, right, down.
+GYROS = {'IMU': 0, 'GYR': 1, 'IMU2': None, 'IMU3': None}
+RATES, FORCES = ('GyrX', 'GyrY', 'GyrZ'), ('AccX', 'AccY', 'AccZ')
+# What the fields are where the log does not say (before 2018).
+KNOWN_UNITS = {**dict.fromkeys(RATES, 'rad/s'), **dict.fromkeys(FORCES, 'm/s^2')}
+SPEED = ('ESC', 'RPM')
 OUTPUTS = ('RCOU', 'RCO2', 'RCO3')
 ALSO = ('PARM', 'MSG', 'VER')
 INSTANCES = ('Inst', 'Instance', 'I')
@@ -74,6 +82,9 @@ def read(path: Path, request: Request) -> Log:
             notes = mended + (_lost_text(log) if text else _lost_binary(log))
             parameters: dict[str, float] = dict(log.params)
             whole = {kind: _whole_numbers(log, kind) for kind, _ in table}
+            units = {kind: _units(log, kind) for kind, _ in table}
+            names = tuple(f'{one.name}.{field}' for one in log.formats.values()
+                          for field in _numbers(one))
         finally:
             _close(log)
     if bad:
@@ -83,12 +94,20 @@ def read(path: Path, request: Request) -> Log:
         name = f'{kind}[{instance}]' if instance else kind
         series += _plain(name, kind, columns, whole[kind])
     series += _outputs(table, parameters)
+    known = {one.name for one in series}
+    for (kind, instance), columns in sorted(table.items()):
+        name = f'{kind}[{instance}]' if instance else kind
+        series += _others(name, columns, units[kind], known)
     if not series:
         raise InputError(f'{path} holds none of the messages that carry a voltage or a throttle '
                          f'({", ".join(dict.fromkeys(row[0] for row in PLAIN))})'
                          + ''.join(f': {note}' for note in notes))
-    return Log('dataflash_text' if text else 'dataflash', from_start(series), _facts(banner),
-               tuple(notes))
+    start = start_of(series)
+    speeds = _speeds(table)
+    return Log('dataflash_text' if text else 'dataflash', from_start(series, start),
+               _facts(banner), tuple(notes), from_start(_gyros(table), start),
+               None if speeds is None else from_start([speeds], start)[0],
+               tuple(dict.fromkeys((*(one.name for one in series), *names))))
 
 
 @contextmanager
@@ -115,10 +134,13 @@ def _close(log: Any) -> None:
 
 def _collect(log: Any, request: Request) -> tuple[Table, list[str], int]:
     """Return the wanted fields of all messages, what the log says in words, and bad messages."""
-    fields: dict[str, list[str]] = {}
-    for kind, field, *_ in PLAIN:
+    fields: dict[str, list[str]] = {kind: [*RATES, *FORCES] for kind in GYROS}
+    for kind, field, *_ in (*PLAIN, SPEED):
         fields.setdefault(kind, []).append(field)
-    wanted = {*fields, *OUTPUTS, *ALSO}
+    for name in request.names:
+        kind, _, field = name.partition('.')
+        fields.setdefault(kind.partition('[')[0], []).append(field)
+    wanted = None if request.everything else {*fields, *OUTPUTS, *ALSO}
     table: Table = {}
     banner: list[str] = []
     bad = count = 0
@@ -136,8 +158,12 @@ def _collect(log: Any, request: Request) -> tuple[Table, list[str], int]:
             instance = next((str(int(getattr(message, name))) for name in INSTANCES
                              if name in columns), '')
             t = message.TimeUS * 1e-6 if 'TimeUS' in columns else message.TimeMS * 1e-3
-            names = ([name for name in columns if re.fullmatch(r'C\d+', name)]
-                     if kind in OUTPUTS else [n for n in fields[kind] if n in columns])
+            if kind in OUTPUTS:
+                names = [name for name in columns if re.fullmatch(r'C\d+', name)]
+            elif request.everything:
+                names = _numbers(message.fmt)
+            else:
+                names = [name for name in columns if name in fields[kind]]
             row = [float(getattr(message, name)) for name in names]
         except (AttributeError, ValueError, TypeError, IndexError):
             bad += 1
@@ -156,6 +182,19 @@ def _whole_numbers(log: Any, kind: str) -> frozenset[str]:
     form = next(one for one in log.formats.values() if one.name == kind)
     return frozenset(name for name, letter in zip(form.columns, form.format)
                      if letter in 'bBhHiI')
+
+
+def _numbers(form: Any) -> list[str]:
+    """Return the fields of a message that hold a number over time."""
+    return [name for name, letter in zip(form.columns, form.format)
+            if letter not in 'nNZa' and name not in ('TimeUS', 'TimeMS', *INSTANCES)]
+
+
+def _units(log: Any, kind: str) -> dict[str, str]:
+    """Return what the log states of units (since 2018)."""
+    form = next(one for one in log.formats.values() if one.name == kind)
+    stated = zip(form.columns, form.units or ())
+    return {name: unit.replace('/s/s', '/s^2') for name, unit in stated if unit}
 
 
 def _lost_binary(log: Any) -> list[str]:
@@ -230,6 +269,53 @@ def _plain(name: str, kind: str, columns: dict[str, list[float]],
             one = Series(one.name, quantity, t, one.values, one.scale,
                          f'{words}, not connected', None, name)
         yield one
+
+
+def _others(name: str, columns: dict[str, list[float]], units: dict[str, str],
+            known: set[str]) -> Iterator[Series]:
+    """Yield the fields that are nothing else, as logged."""
+    t = np.array(columns['t'])
+    for field, values in columns.items():
+        if field != 't' and f'{name}.{field}' not in known:
+            unit = units.get(field) or KNOWN_UNITS.get(field, UNKNOWN)
+            yield Series(f'{name}.{field}', SIGNAL, t, np.array(values), '1', 'as logged',
+                         group=name, own_unit=unit)
+
+
+def _gyros(table: Table) -> Iterator[Inertial]:
+    """Yield each gyro, with the accelerometer of its message, along front, left and up."""
+    first: set[str] = set()
+    for (kind, instance), columns in sorted(table.items()):
+        if kind not in GYROS or not all(field in columns for field in RATES):
+            continue
+        rates = np.column_stack([columns[field] for field in RATES])
+        forces = (np.column_stack([columns[field] for field in FORCES])
+                  if all(field in columns for field in FORCES) else None)
+        rank = None if kind in first else GYROS[kind]
+        first.add(kind)
+        yield Inertial(f'{kind}[{instance}]' if instance else kind, np.array(columns['t']),
+                       rates * FRD_TO_FLU, None if forces is None else forces * FRD_TO_FLU,
+                       'front, right, down turned to front, left, up',
+                       'gyro and accelerometer' if forces is not None else 'gyro', rank)
+
+
+def _speeds(table: Table) -> MotorSpeeds | None:
+    """Return the speeds that ESCs reported, at the stamps of the first one."""
+    kind, field = SPEED
+    found = {instance: columns for (name, instance), columns in sorted(table.items())
+             if name == kind and any(columns.get(field, ()))}
+    if not found:
+        return None
+    t = np.array(next(iter(found.values()))['t'])
+    values = []
+    for columns in found.values():
+        own = np.array(columns['t'])
+        # Each ESC reports in its turn: the last report holds.
+        last = np.maximum(np.searchsorted(own, t, 'right') - 1, 0)
+        values.append(np.array(columns[field])[last] * RPM)
+    return MotorSpeeds(tuple(f'motor_{instance or 0}' for instance in found), t,
+                       np.column_stack(values), f'rpm {RPM:.6g}',
+                       'speed as the ESC reports it, the last report held')
 
 
 def _throttle_scale(values: FloatArray) -> float:

@@ -136,8 +136,11 @@ def import_log(path: Path, request: Request) -> Log:
     # Names in a log reach messages, tables and bags.
     return replace(
         log, series=tuple(replace(one, name=printable(one.name, 200), words=printable(one.words),
-                                  scale=printable(one.scale)) for one in log.series),
-        facts=plain_texts(log.facts), notes=tuple(map(printable, log.notes)))
+                                  scale=printable(one.scale), own_unit=printable(one.own_unit))
+                          for one in log.series),
+        facts=plain_texts(log.facts), notes=tuple(map(printable, log.notes)),
+        inertial=tuple(replace(one, name=printable(one.name, 200)) for one in log.inertial),
+        names=tuple(printable(name, 200) for name in log.names))
 
 
 def _shown(progress: Progress) -> Progress:

@@ -18,17 +18,22 @@ import math
 import os
 from pathlib import Path
 import sys
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.motion import Inertial, MotorSpeeds
 from ou_monitor.records import FloatArray
 from ou_monitor.text import printable
 
 VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
 # A column of a table that says nothing about what it is.
 ANY = 'any'
-UNITS = {VOLTAGE: 'V', THROTTLE: '0..1', CURRENT: 'A', ANY: '?'}
+# What is none of these, such as a gyro axis: taken by name only.
+SIGNAL = 'signal'
+UNITS = {VOLTAGE: 'V', THROTTLE: '0..1', CURRENT: 'A'}
+UNKNOWN = '?'
 
 # Values that only broken bytes make; a message could not hold them.
 LARGEST = 1e9
@@ -48,7 +53,7 @@ class Series:
     ----------
     name : str
         How the user names it, unique in the log: ``BAT[0].Volt``.
-    quantity : {'voltage', 'throttle', 'current', 'any'}
+    quantity : {'voltage', 'throttle', 'current', 'signal', 'any'}
         What it is.
     t : ndarray, shape (n,)
         Stamps, s from the start of the log.
@@ -63,6 +68,8 @@ class Series:
         Taken when nothing of a smaller rank is there; None: only by name.
     group : str
         The sensor; a voltage and a current of one sensor share it.
+    own_unit : str
+        Unit of a signal, ``?`` when the log does not state it.
 
     """
 
@@ -74,6 +81,12 @@ class Series:
     words: str = ''
     rank: int | None = None
     group: str = ''
+    own_unit: str = UNKNOWN
+
+    @property
+    def unit(self) -> str:
+        """Return the unit of the values, ``?`` when unknown."""
+        return UNITS.get(self.quantity, self.own_unit)
 
     @property
     def n(self) -> int:
@@ -89,7 +102,9 @@ class Series:
     @property
     def repeats(self) -> float:
         """Return the share of increments that are exactly zero; NaN when unknown."""
-        return float((np.diff(self.values) == 0.0).mean()) if self.n > 1 else math.nan
+        if self.n < 2:
+            return math.nan
+        return float((self.values[1:] == self.values[:-1]).mean())
 
     @property
     def silent(self) -> bool:
@@ -120,6 +135,12 @@ class Log:
         Vehicle, firmware, number of the flight: what is known.
     notes : tuple of str
         What was dropped or could not be read, one sentence each.
+    inertial : tuple of Inertial
+        Gyros and accelerometers.
+    speeds : MotorSpeeds or None
+        Of the motors.
+    names : tuple of str
+        Of all series of the file, those that were not read included.
 
     """
 
@@ -127,6 +148,9 @@ class Log:
     series: tuple[Series, ...]
     facts: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    inertial: tuple[Inertial, ...] = ()
+    speeds: MotorSpeeds | None = None
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -140,6 +164,8 @@ class Request:
         Which flight of a file with several.
     names : frozenset of str
         Series the user named, for formats that read only what is asked for.
+    poles : int or None
+        Magnets of a motor's rotor, where the log does not say; eRPM needs it.
     everything : bool
         Whether all candidates are wanted (``--list``).
     progress : callable or None
@@ -149,6 +175,7 @@ class Request:
 
     flight: int | None = None
     names: frozenset[str] = frozenset()
+    poles: int | None = None
     everything: bool = False
     progress: Progress | None = None
 
@@ -173,11 +200,11 @@ def clean(series: Series) -> tuple[Series, tuple[str, ...]]:
 
     keep(np.isfinite(t) & np.isfinite(values), 'not a finite number')
     keep(np.abs(values) <= LARGEST, f'beyond {LARGEST:g}')
-    keep(_near(t), f'the stamp is over {_FAR:g} s away from all others')
+    keep(near(t), f'the stamp is over {_FAR:g} s away from all others')
     fresh = np.ones(t.size, dtype=bool)
     fresh[1:] = np.diff(t) != 0.0
     keep(fresh, 'the stamp was there before; the first of each was kept')
-    keep(_rising(t), 'the stamp goes back')
+    keep(rising(t), 'the stamp goes back')
     if series.quantity == THROTTLE:
         outside = int(((values < -0.01) | (values > 1.01)).sum())
         if outside:
@@ -186,7 +213,7 @@ def clean(series: Series) -> tuple[Series, tuple[str, ...]]:
     return replace(series, t=t, values=values), tuple(notes)
 
 
-def _near(t: FloatArray) -> npt.NDArray[np.bool_]:
+def near(t: FloatArray) -> npt.NDArray[np.bool_]:
     """Return which stamps are not a few on the far side of a pause over an hour."""
     order = np.argsort(t, kind='stable')
     good = np.ones(t.size, dtype=bool)
@@ -200,7 +227,7 @@ def _near(t: FloatArray) -> npt.NDArray[np.bool_]:
     return good
 
 
-def _rising(t: FloatArray) -> npt.NDArray[np.bool_]:
+def rising(t: FloatArray) -> npt.NDArray[np.bool_]:
     """Return a longest part of the stamps that increases."""
     good = np.ones(t.size, dtype=bool)
     if t.size < 2 or (np.diff(t) > 0.0).all():
@@ -224,15 +251,18 @@ def _rising(t: FloatArray) -> npt.NDArray[np.bool_]:
     return good
 
 
-def from_start(series: Iterable[Series], start: float = math.inf) -> tuple[Series, ...]:
-    """Return series with stamps counted from the start of the log (series in s, start in s)."""
-    held = tuple(series)
+_Timed = TypeVar('_Timed', bound=Any)
+
+
+def start_of(series: Iterable[_Timed], start: float = math.inf) -> float:
+    """Return the first moment of a log, s: of its series, or `start` where that is earlier."""
     # Broken bytes make stamps near zero: a first sample counts when another is near it.
-    firsts = [float(one.t[_near(one.t)].min()) for one in held if one.n]
-    zero = min([start, *firsts])
-    if not math.isfinite(zero):
-        return held
-    return tuple(replace(one, t=one.t - zero) for one in held)
+    return min([start, *(float(one.t[near(one.t)].min()) for one in series if one.t.size)])
+
+
+def from_start(series: Iterable[_Timed], start: float) -> tuple[_Timed, ...]:
+    """Return what has stamps `t` with these counted from the start of the log (start in s)."""
+    return tuple(replace(one, t=one.t - start) if math.isfinite(start) else one for one in series)
 
 
 @contextmanager

@@ -12,17 +12,32 @@ from __future__ import annotations
 from collections.abc import Iterator
 import io
 from pathlib import Path
+import re
 from typing import Any
 
 import numpy as np
 from ou_monitor.recordings.importers.log import (
-    CURRENT, from_start, Log, one_flight, Progress, quiet, Request, Series, THROTTLE, VOLTAGE)
+    CURRENT, from_start, Log, one_flight, Progress, quiet, Request, Series, SIGNAL, start_of,
+    THROTTLE, UNKNOWN, VOLTAGE)
+from ou_monitor.recordings.importers.motion import FRD_TO_FLU, Inertial, MotorSpeeds, RPM
 from ou_monitor.records import FloatArray
 from pyulog import ULog
 
 TOPICS = ('battery_status', 'system_power', 'power_monitor', 'esc_status', 'actuator_motors',
           'vehicle_thrust_setpoint', 'actuator_controls_0', 'actuator_outputs',
-          'manual_control_setpoint')
+          'manual_control_setpoint', 'sensor_combined', 'vehicle_angular_velocity', 'sensor_gyro')
+
+# Topic, field of the gyro, field of the accelerometer, rank, words.  Axes are front, right,
+# down; an element is named [k] or by its axis.
+GYROS = (
+    ('sensor_combined', 'gyro_rad', 'accelerometer_m_s2', 0, 'gyro and accelerometer'),
+    ('vehicle_angular_velocity', 'xyz', '', 1, "gyro after the autopilot's filters"),
+    ('sensor_gyro', '', '', 2, 'one gyro, along the axes of its board'),
+)
+# Ends of the names of fields that state a unit.
+ENDINGS = (('_m_s2', 'm/s^2'), ('_rad', 'rad/s'), ('_m_s', 'm/s'), ('_v', 'V'), ('_a', 'A'),
+           ('_rpm', 'rpm'), ('_pa', 'Pa'), ('_celsius', 'deg C'), ('_celcius', 'deg C'),
+           ('_us', 'us'), ('_ms', 'ms'), ('_hz', 'Hz'), ('_meter', 'm'))
 
 # Topic, field, quantity, rank, words.  The battery comes first; rails only by name.
 PLAIN = (
@@ -80,7 +95,7 @@ def read(path: Path, request: Request) -> Log:
     with quiet(path, 'pyulog') as said:
         with _Watched(io.FileIO(path)) as file:
             file.size, file.progress = size, request.progress
-            ulog = ULog(file, list(TOPICS))
+            ulog = ULog(file, None if request.everything else _topics(request.names))
     notes = []
     if file.cut_at is not None:
         notes.append(f'The log was cut off within its last message, at byte {file.cut_at} of '
@@ -96,12 +111,85 @@ def read(path: Path, request: Request) -> Log:
         notes.append(f'The logger lost data {len(ulog.dropouts)} '
                      f'time{"s" * (len(ulog.dropouts) != 1)}, {lost:.3f} s in all.')
     series: list[Series] = []
+    inertial: list[Inertial] = []
+    speeds: MotorSpeeds | None = None
     for data in ulog.data_list:
         columns: dict[str, Any] = data.data
         if 'timestamp' in columns:
-            series += _series(f'{data.name}[{data.multi_id}]', data.name, columns)
-    facts = _facts(ulog)
-    return Log('ulog', from_start(series, ulog.start_timestamp * 1e-6), facts, tuple(notes))
+            name = f'{data.name}[{data.multi_id}]'
+            found = list(_series(name, data.name, columns))
+            series += [*found, *_others(name, data.name, columns, {one.name for one in found})]
+            inertial += _gyros(name, data.name, columns)
+            speeds = speeds or _speeds(data.name, columns)
+    start = start_of(series, ulog.start_timestamp * 1e-6)
+    return Log('ulog', from_start(series, start), _facts(ulog), tuple(notes),
+               from_start(inertial, start),
+               None if speeds is None else from_start([speeds], start)[0],
+               tuple(dict.fromkeys((*(one.name for one in series), *_declared(ulog)))))
+
+
+def _topics(names: frozenset[str]) -> list[str]:
+    """Return the topics read unasked, and those of the series named."""
+    return list(dict.fromkeys((*TOPICS, *(re.split(r'[.\[]', name)[0] for name in names))))
+
+
+def _declared(ulog: Any) -> Iterator[str]:
+    """Yield names of fields by the formats of the log, instance 0."""
+    for topic, form in ulog.message_formats.items():
+        for _, size, field in form.fields:
+            if field != 'timestamp' and not field.startswith('_padding'):
+                yield f'{topic}[0].{field}' + ('[0]' if size else '')
+
+
+def _others(name: str, topic: str, columns: dict[str, Any], known: set[str]) -> Iterator[Series]:
+    """Yield the fields that are nothing else, as logged."""
+    t = np.asarray(columns['timestamp'], dtype=np.float64) * 1e-6
+    rates = ('vehicle_angular_velocity', 'sensor_gyro')
+    for field, values in columns.items():
+        if field == 'timestamp' or field.startswith('_padding') or f'{name}.{field}' in known:
+            continue
+        stem = field.split('[')[0].split('.')[-1]
+        unit = next((unit for ending, unit in ENDINGS if stem.endswith(ending)), UNKNOWN)
+        if topic in rates and stem in ('xyz', 'x', 'y', 'z'):
+            unit = 'rad/s'
+        elif unit == 'rad/s' and not stem.startswith('gyro'):
+            unit = 'rad'
+        yield Series(f'{name}.{field}', SIGNAL, t, np.asarray(values, dtype=np.float64), '1',
+                     'as logged', group=name, own_unit=unit)
+
+
+def _gyros(name: str, topic: str, columns: dict[str, Any]) -> Iterator[Inertial]:
+    """Yield gyro and accelerometer of a topic along front, left and up."""
+    for source, gyro, acc, rank, words in GYROS:
+        if source != topic:
+            continue
+        rates, forces = _axes(columns, gyro), _axes(columns, acc) if acc else None
+        if rates is not None:
+            t = np.asarray(columns['timestamp'], dtype=np.float64) * 1e-6
+            yield Inertial(name, t, rates * FRD_TO_FLU,
+                           None if forces is None else forces * FRD_TO_FLU,
+                           'front, right, down turned to front, left, up', words, rank)
+
+
+def _axes(columns: dict[str, Any], stem: str) -> FloatArray | None:
+    """Return three axes as rows of (n, 3); None when one is missing."""
+    names = [f'{stem}[{axis}]' for axis in range(3)] if stem else ['x', 'y', 'z']
+    if not all(name in columns for name in names):
+        return None
+    return np.column_stack([np.asarray(columns[name], dtype=np.float64) for name in names])
+
+
+def _speeds(topic: str, columns: dict[str, Any]) -> MotorSpeeds | None:
+    """Return the speeds that ESCs reported; None when there are none."""
+    fields = [f'esc[{k}].esc_rpm' for k in range(16) if f'esc[{k}].esc_rpm' in columns]
+    fields = [name for name in fields if np.any(columns[name])]
+    if topic != 'esc_status' or not fields:
+        return None
+    values = np.column_stack([np.asarray(columns[name], dtype=np.float64) for name in fields])
+    return MotorSpeeds(
+        tuple(f'motor_{name[4:name.index("]")]}' for name in fields),
+        np.asarray(columns['timestamp'], dtype=np.float64) * 1e-6, np.abs(values) * RPM,
+        f'rpm {RPM:.6g}', 'speed as the ESC reports it')
 
 
 def _facts(ulog: Any) -> dict[str, str]:

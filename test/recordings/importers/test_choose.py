@@ -6,7 +6,7 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.choose import choose, drop_held
 from ou_monitor.recordings.importers.log import (
-    clean, CURRENT, from_start, Log, Series, THROTTLE, VOLTAGE)
+    clean, CURRENT, from_start, Log, Series, start_of, THROTTLE, VOLTAGE)
 import pytest
 
 PATH = Path('a.ulg')
@@ -122,10 +122,12 @@ def test_nothing_left():
 def test_from_start():
     """The start is that of the log, or an earlier sample; not one of broken bytes."""
     one, two = series(t=(100.0, 101.0, 102.0)), series(t=(99.0, 101.0, 102.0))
-    assert [x.t[0] for x in from_start([one, two], 99.5)] == [1.0, 0.0]
-    assert [x.t[0] for x in from_start([one, two], 90.0)] == [10.0, 9.0]
+    for given, firsts in ((99.5, [1.0, 0.0]), (90.0, [10.0, 9.0])):
+        start = start_of([one, two], given)
+        assert [x.t[0] for x in from_start([one, two], start)] == firsts
     t = np.concatenate(([0.0], 1e5 + np.arange(100.0)))
-    assert from_start([series(t=t, values=t)])[0].t[1] == 0.0
+    broken = series(t=t, values=t)
+    assert from_start([broken], start_of([broken]))[0].t[1] == 0.0
 
 
 @pytest.mark.parametrize('period', [2, 2.5, 3.3, 10])
