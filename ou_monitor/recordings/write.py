@@ -217,7 +217,7 @@ class RecordingWriter:
 
 
 def check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
-                  sample_rate: float) -> None:
+                 sample_rate: float) -> None:
     """Refuse what blocks without stamps cannot hold: any spacing but the stated one."""
     grid = (before + np.arange(since_first.size)) * (1e9 / sample_rate)
     if np.abs(since_first - grid).max() > 0.5e9 / sample_rate:

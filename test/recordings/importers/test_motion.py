@@ -202,7 +202,7 @@ def test_what_is_not_there_is_one_line(tmp_path, capsys, arguments, words):
 
 
 def test_bad_rows_gaps_and_jumps_of_rate():
-    """NaN and stamps that go back are dropped whole; pauses and a new rate are told."""
+    """Rows with NaN and stamps that go back are dropped whole; pauses and a new rate are told."""
     t = np.concatenate([np.arange(100) * 0.001, 0.5 + np.arange(100) * 0.004])
     gyro = np.ones((200, 3))
     gyro[5, 1], t[50] = np.nan, 0.02
