@@ -178,7 +178,7 @@ _COMPARE = Command(
      Option('--brownout-voltage', metavar='V',
             help='also count falls through this voltage, V (default: two low levels that the '
             'recording shows)'),
-     *_TOPICS, _JSON, _REPORT),
+     *_TOPICS, *_FILES, _JSON, _REPORT),
     'Examples: ou-monitor compare flight.mcap --report flight.html; ou-monitor compare '
     'flight.mcap --fit-until 60 --brownout-voltage 14; ou-monitor compare flight.mcap --model '
     'other_day.yaml')

@@ -31,6 +31,8 @@ _LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 1.0, 20, 10_000
 _POINTS = 2000
 # Seconds whose level a model from a file takes from the recording.
 _ALIGNED = 2.0
+# Current that is missing for longer, s, is no load to simulate with.
+_GAP = 1.0
 
 
 def compare(recording: Recording, model: SupplyModel | None = None, *,
@@ -134,7 +136,21 @@ def _samples(recording: Recording, notes: list[str]) -> tuple[Readings, float]:
                      'each reading is simulated and counted once.')
     if u is not None:
         u = np.clip(u, 0.0, 1.0)
-    return Readings(t - t[0], v, u), float(t[0])
+    return Readings(t - t[0], v, u, _current(recording, t)), float(t[0])
+
+
+def _current(recording: Recording, t: FloatArray) -> FloatArray | None:
+    """Return the current at some stamps, A; None where it is not known throughout."""
+    if recording.current is None:
+        return None
+    known = np.isfinite(recording.current) & np.isfinite(recording.t)
+    if not known.any() or recording.t[known].max() < t[-1] - _GAP:
+        return None
+    order = np.argsort(recording.t[known], kind='stable')
+    stamps, current = recording.t[known][order], recording.current[known][order]
+    if np.diff(stamps, prepend=stamps[0]).max() > _GAP or stamps[0] > t[0] + _GAP:
+        return None
+    return np.asarray(np.interp(t, stamps, current), dtype=np.float64)
 
 
 def _begin(samples: Readings, fit_until: float | None, fitted: bool) -> int:
@@ -157,14 +173,15 @@ def _begin(samples: Readings, fit_until: float | None, fitted: bool) -> int:
 def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
     if samples.throttle is None:
         return ['Throttle is not recorded: only level and noise are simulated.']
-    if model.load is None and not np.ptp(samples.throttle) >= MOVES:
+    if not np.ptp(samples.throttle) >= MOVES:
         return ['Throttle does not move: only level and noise are simulated.']
     if model.load is None:
         return ['Throttle does not predict the voltage of parts that were left out of the fit: '
                 'only level and noise are simulated.']
     found = []
     if model.load.model.full_current:
-        found.append('Current predicts the voltage better than throttle: it is the load.')
+        found.append('Current predicts the voltage better than throttle: it is the load that is '
+                     'simulated.')
     return found
 
 

@@ -39,14 +39,15 @@ def fit_flight(samples: Readings, progress: Callable[[float], None] | None = Non
     load = None
     for k, current in enumerate(candidates):
         parts = []
+        whole = _fit(samples, current, None)
         for j, part in enumerate(_parts(samples)):
-            fit = _fit(samples, current, part)
+            fit = _fit(samples, current, part, whole)
             errors = samples.voltage[part] - _path(samples, fit, current)[part]
             parts.append((fit, part, errors))
             report((k + (j + 1.0) / (_PARTS + 1.0)) / (len(candidates) + 0.3))
         found = _sum_of_squares([errors for _, _, errors in parts])
         if found < best[0]:
-            best, load = (found, current, parts), _fit(samples, current, None)
+            best, load = (found, current, parts), whole
     path = np.full(samples.t.size, mean) if load is None else _path(samples, load, best[1])
     slow = 0.0 if load is None else load.slow_std ** 2
     left = samples.voltage - path
@@ -91,7 +92,8 @@ def _sum_of_squares(errors: list[FloatArray]) -> float:
     return float(sum(float(e @ e) for e in errors))
 
 
-def _fit(samples: Readings, current: FloatArray | None, without: slice | None) -> LoadFit:
+def _fit(samples: Readings, current: FloatArray | None, without: slice | None,
+         near: LoadFit | None = None) -> LoadFit:
     """Fit the load, to means of neighbours where there are very many."""
     width = -(-samples.t.size // _MOST)
     n = samples.t.size // width * width
@@ -104,7 +106,7 @@ def _fit(samples: Readings, current: FloatArray | None, without: slice | None) -
     t, v, u = mean(samples.t), mean(samples.voltage), mean(samples.throttle)
     if t is None or v is None or u is None:
         raise ValueError('a fit of the load needs throttle')
-    return fit_load(t, v, u, mean(current), left_out)
+    return fit_load(t, v, u, mean(current), left_out, near)
 
 
 def _path(samples: Readings, fit: LoadFit, current: FloatArray | None) -> FloatArray:

@@ -118,26 +118,34 @@ class _Noise:
         self._tried = (_SLOW_STDS * cells) ** 2
         self.white = (_WHITE_START * cells) ** 2
         self.slow = (_SLOW_START * cells) ** 2
+        # What the last two variances gave: a fit asks for them hundreds of times.
+        self._found: tuple[tuple[float, float], tuple[FloatArray, FloatArray, FloatArray]] | None
+        self._found = None
 
     def whiten(self, residuals: FloatArray, slow: float | None = None,
                ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return standardised innovations, their variances, V^2, and the innovations, V."""
-        q = self.slow if slow is None else slow
-        variance = np.empty(residuals.size)
-        p = q
-        for k in range(residuals.size):
-            variance[k] = p + self.white
-            if k < self._keep.size:
-                p = self._keep[k] ** 2 * p * self.white / variance[k] + q * (
-                    1.0 - self._keep[k] ** 2)
-        gain = 1.0 - self.white / variance
-        bands = np.ones((2, residuals.size))
-        bands[1, :-1] = -self._keep * (1.0 - gain[:-1])
-        bands[1, -1] = 0.0
+        variance, bands, passed = self._predictor(self.slow if slow is None else slow)
         right = np.zeros(residuals.size)
-        right[1:] = self._keep * gain[:-1] * residuals[:-1]
+        right[1:] = passed * residuals[:-1]
         innovations = residuals - solve_banded((1, 0), bands, right, check_finite=False)
         return innovations / np.sqrt(variance), variance, innovations
+
+    def _predictor(self, q: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return variances of innovations, V^2, the recursion, and what passes to the next."""
+        if self._found is None or self._found[0] != (self.white, q):
+            n = self._keep.size + 1
+            keep, values, p, white = self._keep.tolist(), [], q, self.white
+            for a in keep:
+                values.append(p + white)
+                p = a * a * p * white / (p + white) + q * (1.0 - a * a)
+            variance = np.array([*values, p + white])
+            gain = 1.0 - white / variance
+            bands = np.ones((2, n))
+            bands[1, :-1] = -self._keep * (1.0 - gain[:-1])
+            bands[1, -1] = 0.0
+            self._found = (white, q), (variance, bands, self._keep * gain[:-1])
+        return self._found[1]
 
     def learn(self, residuals: FloatArray) -> None:
         """Fit both variances to residuals, V, of the model."""
@@ -158,12 +166,13 @@ def _model(theta: FloatArray, fixed: dict[str, Any]) -> LoadModel:
 
 def fit_load(t: FloatArray, voltage: FloatArray, throttle: FloatArray,
              current: FloatArray | None = None,
-             left_out: tuple[float, float] | None = None) -> LoadFit:
+             left_out: tuple[float, float] | None = None, near: LoadFit | None = None) -> LoadFit:
     """
     Fit the load model; with current, A, that is the load instead of throttle.
 
     t in s, voltage in V, throttle in 0..1; all finite, stamps rising.  Voltage between the stamps
-    left_out, s, is not looked at.
+    left_out, s, is not looked at.  A fit that is near by, as of all the voltage, saves most of the
+    work.
     """
     if t.size < 2 or not t[-1] - t[0] > 20 * _BIN:
         raise ValueError(f'a fit of the load needs more than {20 * _BIN:g} s')
@@ -201,8 +210,11 @@ def fit_load(t: FloatArray, voltage: FloatArray, throttle: FloatArray,
     def cost(theta: FloatArray) -> FloatArray:
         return np.concatenate((noise.whiten(residuals(theta))[0], (theta - centre) / deviation))
 
-    theta = np.clip(centre, low + 1e-6, high - 1e-6)
-    for _ in range(_ROUNDS):
+    start = centre if near is None else near._theta
+    theta = np.clip(start, low + 1e-6, high - 1e-6)
+    if near is not None:
+        noise.white, noise.slow = near.noise_std ** 2, near.slow_std ** 2
+    for _ in range(_ROUNDS if near is None else 1):
         found = least_squares(cost, theta, bounds=(low, high), x_scale=deviation,
                               max_nfev=_EVALUATIONS)
         theta = np.clip(found.x, low + 1e-6, high - 1e-6)
