@@ -58,10 +58,18 @@ PLAIN = (
 # Bytes before the content of a message: its length and its kind.
 HEAD = 3
 KINDS = frozenset(b'BFIMPQARDLCSO')
+# Messages of no known kind that are larger are broken bytes to pyulog, which begins anew one byte
+# behind their first.
+LARGEST = 10_000
 
 
 class _Watched(io.BufferedReader):
-    """A file that remembers what its reader passes over without a word."""
+    """
+    A file that remembers what its reader passes over without a word.
+
+    pyulog steps back by the length that a message claims, also where the file ended before: for
+    ever.  And it reads all of it, at each byte of a damaged part.
+    """
 
     progress: Progress | None = None
     size = 1
@@ -69,10 +77,17 @@ class _Watched(io.BufferedReader):
     cut_at: int | None = None
     unknown_at: int | None = None
     end = 0
+    # Of the last read: bytes read, and bytes short of what was asked for.
+    had = missing = 0
+    broken = False
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Read, and note the first message of no known kind, and one that is cut off."""
+        if self.broken and size is not None and size > LARGEST:
+            self.had, self.missing, self.broken = 0, size, False
+            return bytes(size)
         data = super().read(size)
+        self.had, self.missing = len(data), max(size or 0, len(data)) - len(data)
         at = self.tell()
         self.end = max(self.end, at)
         self.reads += 1
@@ -83,9 +98,16 @@ class _Watched(io.BufferedReader):
             self.cut_at = at - len(data)
         elif data:
             self.cut_at = None
-        if size == HEAD == len(data) and data[2] not in KINDS and self.unknown_at is None:
+        self.broken = size == HEAD == len(data) and data[2] not in KINDS
+        if self.broken and self.unknown_at is None:
             self.unknown_at = at - HEAD
         return data
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        """Move; a step back over more than was read counts from where the reader thinks it is."""
+        if whence == io.SEEK_CUR and -offset > self.had:
+            offset += self.missing
+        return super().seek(offset, whence)
 
 
 def read(path: Path, request: Request) -> Log:

@@ -6,6 +6,9 @@ from pathlib import Path
 
 import numpy as np
 from ou_monitor.cli.main import main
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.formats import import_log
+from ou_monitor.recordings.importers.log import Request
 from ou_monitor.recordings.read import read_recording, read_signal
 import pytest
 
@@ -89,3 +92,31 @@ def test_cut_at_random(folder, tmp_path, capsys, name):
             assert read_recording(out).n > 0
         else:
             assert status == 2 and said.err.count('\n') == 1 and not out.exists()
+
+
+def test_broken_at_random(folder, tmp_path):
+    """Whatever is broken in whatever log: a read, or one line."""
+    rng = np.random.default_rng(17)
+    read = refused = 0
+    for path in sorted((folder / 'raw').iterdir()):
+        # The head holds what the rest is read by.
+        head = path.read_bytes()[:250_000 if path.suffix == '.ulg' else 40_000]
+        for _ in range(5):
+            broken = bytearray(head)
+            for at in rng.integers(0, 6000, rng.integers(1, 4)).tolist():
+                size = int(rng.choice([1, 8, 64]))
+                filling = rng.bytes(size) if rng.random() < 0.7 else b'\xff' * size
+                if rng.random() < 0.3:
+                    del broken[at:at + size]
+                else:
+                    broken[at:at + size] = filling
+            log = tmp_path / f'log{path.suffix}'
+            log.write_bytes(broken)
+            try:
+                import_log(log, Request(flight=1 if path.suffix == '.bbl' else None,
+                                        everything=True))
+                read += 1
+            except InputError as error:
+                assert '\n' not in str(error) and len(str(error)) < 1000
+                refused += 1
+    assert read and refused

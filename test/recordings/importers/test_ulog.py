@@ -1,5 +1,7 @@
 """PX4 ULog: what is found, how it is scaled, and logs that are cut or broken."""
 
+import signal
+
 from made_logs import BATTERY, px4_flight, ulog, ulog_message
 import numpy as np
 from ou_monitor.errors import InputError
@@ -169,3 +171,24 @@ def test_only_a_header(tmp_path):
         with pytest.raises(InputError) as caught:
             choose(path, import_log(path, Request()))
         assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize('tail', [b'\xff\xff\x00' + b'x' * 50, b'\xff' * 3000,
+                                  b'\x40\x9c\xff' + b'\xff' * 500])
+def test_a_message_longer_than_the_file_ends(tmp_path, tail):
+    """pyulog steps back by the length claimed, and once read the same bytes for ever."""
+    def late(number, frame):
+        raise TimeoutError
+    before = signal.signal(signal.SIGVTALRM, late)
+    signal.setitimer(signal.ITIMER_VIRTUAL, 20.0)
+    try:
+        topics, _, volts, *_ = px4_flight(40)
+        whole = b''.join(ulog(topics))
+        with pytest.raises(InputError, match='holds no|voltage'):
+            choose(*load(tmp_path, whole[:16] + tail))
+        _, log = load(tmp_path, whole + tail)
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+        signal.signal(signal.SIGVTALRM, before)
+    np.testing.assert_array_equal(named(log)['battery_status[0].voltage_v'].values, volts)
+    assert any('damaged' in note and f'byte {len(whole)} ' in note for note in log.notes)
