@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
+from contextlib import suppress
 import json
 import multiprocessing
 import os
@@ -41,11 +42,15 @@ model:
 - term: measurement_noise
   params: {std: 0.002}
 """
+# A node that says nothing is asked where it is.
+ASKED = 'import faulthandler, signal; faulthandler.register(signal.SIGUSR1)'
 COUNTERS = ('messages', 'messages_lost', 'foreign_messages', 'pushed', 'used', 'non_finite',
             'late', 'resets', 'samples_thinned', 'restarts', 'callback_errors')
 # s: between looks at the memory, and at what is reported of the progress; patience with a
 # service, with the start of a node, and with its end.
 LOOK, PROGRESS, ANSWER, START, END = 2.0, 60.0, 20.0, 60.0, 20.0
+# Silence after which it is asked, s.
+SILENT = 1.2
 
 
 def busy(core: int) -> None:
@@ -84,6 +89,7 @@ class Soak:
         self._busy: tuple[float, multiprocessing.Process] | None = None
         self._begin = self._start = time.monotonic()
         self._told: set[float] = set()
+        self._asked = 0.0
 
     def _start_node(self) -> Process:
         return Process('estimator', [
@@ -132,6 +138,7 @@ class Soak:
         while self._source.poll() is None:
             now = time.monotonic()
             self.pause = max(self.pause, now - before)
+            self._ask(now)
             if now - looked >= LOOK:
                 looked = now
                 self._look(now)
@@ -158,6 +165,18 @@ class Soak:
         whole = self._log.read_text().rpartition('\n')[0]
         lines = [json.loads(line) for line in whole.splitlines()]
         return [line for line in lines if not kind or line['kind'] == kind]
+
+    def _ask(self, now: float) -> None:
+        """Have a node that is silent write where its threads are, once a second."""
+        silent = now - max(self.heard.outputs['~/state'][-1], self._asked)
+        if self._starved is not None or silent < SILENT or self._node.popen.poll() is not None:
+            return
+        self._asked = now
+        threads = [f"{(task / 'comm').read_text().strip()} {(task / 'wchan').read_text()} "
+                   f"{(task / 'stat').read_text().split(')')[-1].split()[0]}"
+                   for task in Path(f'/proc/{self._node.popen.pid}/task').iterdir()]
+        self._node.popen.send_signal(signal.SIGUSR1)
+        print(f'silent for {silent:.1f} s at {now - self._start:.2f} s: {threads}', flush=True)
 
     def _look(self, now: float) -> None:
         """Look at the node's memory; start it anew where it is dead."""
@@ -187,8 +206,15 @@ class Soak:
         if self._busy is not None:
             self._busy[1].kill()
             self._busy[1].join()
-            os.sched_setaffinity(self._node.popen.pid, os.sched_getaffinity(0))
+            self._pin(os.sched_getaffinity(0))
             self._busy = None
+
+    def _pin(self, cores: set[int]) -> None:
+        """Put every thread of the node on cores."""
+        for task in Path(f'/proc/{self._node.popen.pid}/task').iterdir():
+            # A thread may end meanwhile.
+            with suppress(OSError):
+                os.sched_setaffinity(int(task.name), cores)
 
     def _do(self, event: Event) -> None:
         if event.kind in ('set', 'refused'):
@@ -202,9 +228,7 @@ class Soak:
                              Starved(self._node.popen.pid, stopped, running).start())
         else:
             core = min(os.sched_getaffinity(0))
-            # Every thread of the node, beside the loop.
-            for task in Path(f'/proc/{self._node.popen.pid}/task').iterdir():
-                os.sched_setaffinity(int(task.name), {core})
+            self._pin({core})
             process = multiprocessing.Process(target=busy, args=(core,), daemon=True)
             process.start()
             self._busy = event.begin + event.about[0], process
@@ -239,9 +263,10 @@ class Soak:
     def _report(self, now: float) -> None:
         found = self.figures(now, {'status': '-', 'took': 0.0})
         dips = found['dips']
+        silent = ', '.join(f'{name} {net:.2f}' for name, (_, net) in found['silence'].items())
         print(f"{now / 60.0:5.1f} min: {dips['in_time']} of {dips['asked']} dips, longest "
-              f"silence {max(net for _, net in found['silence'].values()):.2f} s, "
-              f"{found['memory'] / 1e6:.1f} MB, false {found['false']}", flush=True)
+              f"silence, s: {silent}, {found['memory'] / 1e6:.1f} MB, false {found['false']}",
+              flush=True)
         for what in ('lost', 'missed'):
             for dip in dips[what]:
                 if dip['begin'] not in self._told:
@@ -276,8 +301,8 @@ class Soak:
         self._source.wait()
         self._probe.close()
         found = self.figures(length, end)
-        if 'Traceback' in self._node.err:
-            print(self._node.err[-4000:], file=sys.stderr)
+        if 'Traceback' in self._node.err or 'Current thread' in self._node.err:
+            print(self._node.err[-20000:], file=sys.stderr)
         return found
 
 
@@ -291,15 +316,19 @@ def main() -> None:
     parser.add_argument('--markdown', type=Path, help='page for the table')
     options = parser.parse_args()
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    # A shell has it ignored by what it starts in the background.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    # A shell has SIGINT ignored by what it starts in the background.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     with tempfile.TemporaryDirectory() as folder:
         os.environ['ROS_LOG_DIR'] = folder
+        (Path(folder) / 'sitecustomize.py').write_text(ASKED)
+        os.environ['PYTHONPATH'] = os.pathsep.join(
+            [folder, *filter(None, [os.environ.get('PYTHONPATH')])])
         soak = Soak(options.seed, 60.0 * options.minutes, Path(folder), options.domain)
         try:
             soak.run()
         except KeyboardInterrupt:
-            print('ended by Ctrl-C: the figures so far', file=sys.stderr)
+            print('ended by a signal: the figures so far', file=sys.stderr)
         finally:
             found = soak.close()
     text = as_table(found)

@@ -87,7 +87,7 @@ def phases(seed: int, seconds: float) -> list[Phase]:
         length = rng.uniform(*(LONG if kind in SEEN else SHORT))
         if kind == 'second':
             length = max(length, 8.0)
-        made.append(Phase(kind, now, now + length))
+        made.append(Phase(kind, now, min(now + length, seconds)))
         now += length
     return made
 

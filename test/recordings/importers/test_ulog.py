@@ -176,7 +176,7 @@ def test_only_a_header(tmp_path):
 @pytest.mark.parametrize('tail', [b'\xff\xff\x00' + b'x' * 50, b'\xff' * 3000,
                                   b'\x40\x9c\xff' + b'\xff' * 500])
 def test_a_message_longer_than_the_file_ends(tmp_path, tail):
-    """pyulog steps back by the length claimed, and once read the same bytes for ever."""
+    """A step back by the length that is claimed: once pyulog read the same bytes for ever."""
     def late(number, frame):
         raise TimeoutError
     before = signal.signal(signal.SIGVTALRM, late)

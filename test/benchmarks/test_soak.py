@@ -1,0 +1,114 @@
+"""What a soak counts: dips in time, missed or lost, silence, memory, and false flags."""
+
+import math
+
+import numpy as np
+import pytest
+from soak_figures import dips_of, false_of, growth, Heard, overlap, silence, unmatched
+from soak_schedule import (
+    bad_parameters, DEPTH, Dip, dips, events, Phase, phases, SEEN, SETTLE, UNSEEN)
+
+FLOOR = 'the voltage is at or below brownout.floor (4.3 V)'
+
+
+def heard(critical=(), lost=0, flags=None, stops=(), reason=FLOOR):
+    """Return 20 s of states at 10 Hz; CRITICAL at some of them; one dip from 10 to 10.05 s."""
+    times = np.arange(0.0, 20.0, 0.1).round(3).tolist()
+    states = [(t, 'CRITICAL' if t in critical else 'OK', reason if t in critical else '',
+               'true' if t in critical else 'false', lost if t > 10.0 else 0) for t in times]
+    said = [(t, t in (critical if flags is None else flags)) for t in times]
+    return Heard(states=states, flags=said, stops=list(stops), source=[
+        {'kind': 'dip', 'begin': 10.0, 'end': 10.05, 'samples': 50, 'phase': 'good',
+         'unseen': '', 'voltage': 3.0}])
+
+
+@pytest.mark.parametrize('made, in_time, missed, lost', [
+    (heard([10.1]), 1, 0, 0),
+    (heard(), 0, 1, 0),
+    # For another reason; said before the dip; not said on the other topic; too late.
+    (heard([10.1], reason='risk 0.5'), 0, 1, 0),
+    (heard([9.9]), 0, 1, 0),
+    (heard([10.1], flags=[]), 0, 1, 0),
+    (heard([11.2]), 0, 1, 0),
+    # Stopped by us meanwhile.
+    (heard([11.2], stops=[(10.1, 10.6)]), 1, 0, 0),
+    # Gone: more than half of its samples, or fewer.
+    (heard(lost=26), 0, 0, 1),
+    (heard(lost=25), 0, 1, 0),
+])
+def test_dips(made, in_time, missed, lost):
+    """Told by the floor on both topics within a second of the node's own time, or not."""
+    found = dips_of(made)
+    assert (found['asked'], found['in_time']) == (1, in_time)
+    assert (len(found['missed']), len(found['lost'])) == (missed, lost)
+
+
+@pytest.mark.parametrize('change', [{'unseen': 'silent'}, {'samples': 39}])
+def test_dips_that_nobody_could_see_do_not_count(change):
+    """Nor those of which too few samples were sent."""
+    made = heard()
+    made.source[0].update(change)
+    assert dips_of(made)['asked'] == 0
+
+
+def test_silence_without_the_time_of_stops():
+    """The longest of each, which need not be the same gap."""
+    stops = [(1.0, 1.9), (1.95, 2.0)]
+    assert overlap(0.5, 1.97, stops) == pytest.approx(0.92)
+    assert overlap(2.0, 3.0, stops) == 0.0
+    gap, net = silence([0.0, 0.5, 2.0, 3.2], stops)
+    assert (gap, net) == (pytest.approx(1.5), pytest.approx(1.2))
+
+
+def test_false_flags_and_flags_that_are_not_sent():
+    """False where nothing can be known counts once it has lingered; each state has its flag."""
+    made = heard([10.1])
+    assert unmatched(made) == 0.0
+    made.source = [{'kind': 'phase', 'name': 'silent', 'at': 5.0},
+                   {'kind': 'phase', 'name': 'good', 'at': 8.05}]
+    spent, found = false_of(made)
+    assert spent == 2 and len(found) == 15 and found[0] == (pytest.approx(6.6), 'silent')
+    made.flags = [flag for flag in made.flags if not 5.05 < flag[0] < 7.05]
+    assert unmatched(made) == pytest.approx(1.0)
+    assert len(false_of(made)[1]) == 10
+
+
+def test_growth_is_within_its_error():
+    """Correlated noise of 1 MB on 3 MB/h: 95 of 100 hours within two errors, and 0 outside."""
+    rng = np.random.default_rng(3)
+    t = np.arange(0.0, 3600.0, 2.0)
+    scores = []
+    for _ in range(100):
+        noise = np.repeat(rng.standard_normal(t.size // 20), 20) * 1e6
+        slope, error = growth(list(zip(t, 170e6 + 3e6 / 3600.0 * t + noise)))
+        scores.append((slope - 3e6) / error)
+        assert abs(slope - 3e6) < 2e6
+    # Of t with 18 degrees of freedom: 1.06 expected, 3 standard errors of a standard deviation.
+    assert np.std(scores) == pytest.approx(1.06, abs=3.0 * 1.1 / math.sqrt(200.0))
+    assert math.isnan(growth([(0.0, 1.0)])[0])
+
+
+def test_the_schedule_is_drawn_from_its_seed():
+    """All that can happen does within an hour; dips lie apart, at or below every floor."""
+    sent = phases(4, 3600.0)
+    assert sent == phases(4, 3600.0) != phases(5, 3600.0)
+    assert {phase.kind for phase in sent} == SEEN.keys() | UNSEEN.keys()
+    assert all(a.end == b.begin for a, b in zip(sent, sent[1:]))
+    found = dips(4, sent)
+    assert found == dips(4, sent) and len(found) > 900
+    assert all(0.04 <= dip.length <= 0.08 and DEPTH[0] <= dip.voltage <= DEPTH[1] < 4.15
+               for dip in found)
+    assert 0.75 < sum(not dip.unseen for dip in found) / len(found) < 0.98
+    done = events(4, 3600.0, 'fifo', 'model')
+    assert {event.kind for event in done} == {'set', 'refused', 'clear', 'slices', 'busy'}
+    assert {event.about[0][0] for event in done if event.kind == 'refused'} == {
+        name for name, _ in bad_parameters('fifo')}
+
+
+def test_a_dip_is_unseen_where_nothing_is_sent():
+    """And until a new publisher is found."""
+    sent = [Phase('good', 0.0, 100.0), Phase('restart', 100.0, 102.0), Phase('good', 102.0, 200.0)]
+    for dip in dips(1, sent):
+        near = dip.begin + dip.length > 99.9 and dip.begin < 102.0 + SETTLE
+        assert dip.unseen == ('restart' if near else 'start' if dip.begin < 3.0 else '')
+    assert isinstance(dips(1, sent)[0], Dip)

@@ -1,0 +1,28 @@
+"""The soak runs: six seconds of it."""
+
+import json
+import os
+import subprocess
+import sys
+
+from live import DEADLINE, new_domain, ROOT
+
+
+def test_six_seconds(tmp_path):
+    """All processes come and go; the figures are written, and the table between its marks."""
+    page = tmp_path / 'page.md'
+    page.write_text('before\n<!-- soak begins -->\nold\n<!-- soak ends -->\nafter\n')
+    env = {key: value for key, value in os.environ.items()
+           if key != '_ROS_WHEELS_BOOTSTRAP_COMPLETE'}
+    done = subprocess.run(
+        [sys.executable, ROOT / 'benchmarks/soak.py', '--minutes', '0.1', '--seed', '6',
+         '--domain', str(new_domain()), '--json', tmp_path / 'all.json', '--markdown', page],
+        env=env, capture_output=True, text=True, timeout=DEADLINE)
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / 'all.json').read_text())
+    assert found['deaths'] == 0 and found['status'] == 0 and found['counters']['messages'] > 1000
+    dips = found['dips']
+    assert dips['asked'] == dips['in_time'] + len(dips['lost']) >= 1
+    text = page.read_text()
+    assert text.startswith('before\n') and text.endswith('after\n') and 'old' not in text
+    assert '| exit status after SIGINT, time | 0' in text
