@@ -162,6 +162,7 @@ def test_brownout_parameters_are_listed():
 
 def test_filter_parameters_are_listed():
     """Each with its default, on the page of the filter."""
+    from ou_monitor.online.notch.settings import NOTCH_PARAMETERS
     from ou_monitor.online.settings import FILTER_PARAMETERS
     section = page('filter.md').split('## Parameters')[1].split('\n## ')[0]
     listed = {}
@@ -169,9 +170,13 @@ def test_filter_parameters_are_listed():
                                     re.MULTILINE):
         for name, value in zip(names.split(', '), values.split(', '), strict=True):
             listed[name.strip('`')] = value.strip()
-    assert listed == {'input.type': 'auto', 'input.field': 'none', **{
-        p.name: f'{p.default:g}' if isinstance(p.default, float) else str(p.default).lower()
-        for p in FILTER_PARAMETERS}}
+    where = [f'{quantity}.{key}' for quantity in ('throttle', 'rpm')
+             for key in ('topic', 'type', 'field')]
+    assert listed == {
+        'input.type': 'auto', 'input.field': 'none', 'msg_config': 'auto',
+        **dict.fromkeys(where, 'none'), **{
+            p.name: f'{p.default:g}' if isinstance(p.default, float) else str(p.default).lower()
+            for p in (*FILTER_PARAMETERS, *NOTCH_PARAMETERS)}}
 
 
 def test_filter_laws_are_listed():

@@ -5,8 +5,11 @@ Inputs (relative names): `input` (a type of `filter_channels.CHANNELS`, or any
 installed type with `input.field`), `sigma` (std_msgs/Float64), and `state`
 (the estimator's `~/state`, DiagnosticArray), which is used while it is
 published: error of sigma, alpha, throttle, level, and whether the estimate is usable.
+With `notch.count` above 0 also `throttle` and `rpm` (by msg_config or `rpm.type` and
+`rpm.field`) for the notches, which stand before the low-pass; without `throttle` that of the
+state is taken.
 Outputs: `~/output` (type and stamp of the input), `~/cutoff` (Hz) and `~/lag`
-(ms, phase delay at `lag_frequency`) as std_msgs/Float64 at `publish_rate`,
+(ms, phase delay at `lag_frequency`, notches included) as std_msgs/Float64 at `publish_rate`,
 `/diagnostics` at 1 Hz.
 
 Limits: of an IMU the angular velocity is filtered and of a BatteryState the
@@ -16,7 +19,7 @@ with a non-finite signal is counted and not passed on.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import math
 from typing import Any
 
@@ -27,10 +30,14 @@ from ou_monitor.nodes.console import Console
 from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of
 from ou_monitor.nodes.inputs import INPUT_QOS, Silence, Stamper, types_on
 from ou_monitor.nodes.message_types import message_class
+from ou_monitor.nodes.motor_inputs import MotorInputs
+from ou_monitor.nodes.sources import MOTOR_PARAMETERS
 from ou_monitor.nodes.supply_input import Supply, SupplyInput
 from ou_monitor.online.filter.cutoff_control import Bound
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass, FilterCounters
 from ou_monitor.online.level import Level
+from ou_monitor.online.notch.notch import AdaptiveNotch
+from ou_monitor.online.notch.settings import notch_options, NOTCH_PARAMETERS, NotchSettings
 from ou_monitor.online.settings import (
     FILTER_PARAMETERS, filter_settings, FilterSettings, Parameter)
 from std_msgs.msg import Float64
@@ -38,13 +45,13 @@ from std_msgs.msg import Float64
 AUTO = 'auto'
 # The mode gives the output its unit, so it is not for changing in flight.
 _MODE = next(p for p in FILTER_PARAMETERS if p.name == 'mode')
-RUN_TIME = tuple(p for p in FILTER_PARAMETERS if p is not _MODE)
+RUN_TIME = (*(p for p in FILTER_PARAMETERS if p is not _MODE), *NOTCH_PARAMETERS)
 FIXED = (
     Parameter('input.type', AUTO, 'Message type of `input`; auto: that of its publisher.'),
     Parameter('input.field', '',
               'Field path of the signal; empty: data, voltage of a battery, angular velocity of '
               'an IMU.'),
-    _MODE)
+    _MODE, *MOTOR_PARAMETERS)
 
 OWN_TOPICS = ('input', 'sigma', 'state', '~/output', '~/cutoff', '~/lag', '/diagnostics', '/clock')
 
@@ -62,6 +69,10 @@ class AdaptiveFilterNode(MonitorNode):
         self._filters: list[AdaptiveLowPass] = []
         # Stands for them until there are any, and for what they would say.
         self._idle = AdaptiveLowPass(**self._of_filter(self.values()))
+        self._notch = AdaptiveNotch(**notch_options(self.values()))
+        self._motors = MotorInputs(
+            self, {p.name: self.get_parameter(p.name).value for p in MOTOR_PARAMETERS},
+            self.steady_now)
         self._supply = SupplyInput(self.steady_now, (
             self.resolve_topic_name('sigma'), self.resolve_topic_name('state')))
         self._input_silence = Silence(self.steady_now)
@@ -80,7 +91,7 @@ class AdaptiveFilterNode(MonitorNode):
             lambda message: self._supply.take_sigma(message.data)), INPUT_QOS)
         self.create_subscription(DiagnosticArray, 'state', self.guarded(
             self._supply.take_state), INPUT_QOS)
-        self.refuse_other_overrides(OWN_TOPICS)
+        self.refuse_other_overrides([*OWN_TOPICS, *self._motors.topics])
         if self._type != AUTO:
             self._open(self._type)
         self.every(0.2, self._watch)
@@ -90,6 +101,7 @@ class AdaptiveFilterNode(MonitorNode):
     def check(self, values: Mapping[str, Any]) -> None:
         """Raise `ValueError` when the parameters contradict each other or the signal."""
         settings = filter_settings(self._of_filter(values))
+        NotchSettings.from_options(notch_options(values))
         if self._channels is not None and _not_a_voltage(self._type, settings):
             raise ValueError(
                 f'law {settings.law} without signal_bandwidth is for a voltage, and {self._topic} '
@@ -100,6 +112,7 @@ class AdaptiveFilterNode(MonitorNode):
         super().apply(values)
         for channel in (self._idle, *self._filters):
             channel.configure(**self._of_filter(values))
+        self._notch.configure(**notch_options(values))
 
     @property
     def low_pass(self) -> AdaptiveLowPass:
@@ -108,7 +121,7 @@ class AdaptiveFilterNode(MonitorNode):
 
     def _of_filter(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the parameters that belong to the filter itself."""
-        own = {name: value for name, value in values.items() if name != PUBLISH_RATE.name}
+        own = {p.name: values[p.name] for p in FILTER_PARAMETERS if p is not _MODE}
         return {**own, _MODE.name: self.get_parameter(_MODE.name).value}
 
     # -- messages in
@@ -116,6 +129,8 @@ class AdaptiveFilterNode(MonitorNode):
     def _watch(self) -> None:
         """Subscribe as soon as a publisher shows the type."""
         self._stamper.follow()
+        if self._notch.settings.count:
+            self._motors.watch()
         if self._channels is None:
             self._found = types_on(self, self._topic)
             if not self._found:
@@ -146,12 +161,30 @@ class AdaptiveFilterNode(MonitorNode):
             self._dropped += 1
             return
         supply = self._known()
+        values = self._notched(stamp, values, supply)
         self._channels.put(message, [
             channel.step(stamp, value, supply.sigma, supply.sigma_se, supply.alpha,
                          supply.throttle, supply.level, supply.level_se)
             for channel, value in zip(self._filters, values, strict=True)])
         self._output.publish(message)
         self._passed += 1
+
+    def _notched(self, stamp: float, values: Sequence[float], supply: Supply) -> Sequence[float]:
+        """Return the signals behind the notches; of a shadow they are as they were."""
+        if not self._notch.settings.count and not self._notch.active:
+            return values
+        throttle = self._motors.throttle(self.low_pass.settings.stale_after)
+        if math.isnan(throttle):
+            throttle = supply.throttle
+        out = self._notch.step(stamp, values, throttle, self._motors.take_speeds())
+        return values if self.low_pass.settings.shadow else out
+
+    @property
+    def _delay(self) -> float:
+        """Phase delay of low-pass and notches at `lag_frequency`, s."""
+        s = self.low_pass.settings
+        notched = 0.0 if s.shadow else max(self._notch.delays(s.lag_frequency), default=0.0)
+        return self.low_pass.delay + notched
 
     def _known(self) -> Supply:
         return self._supply.now(self.low_pass.settings.stale_after)
@@ -164,7 +197,7 @@ class AdaptiveFilterNode(MonitorNode):
 
     def _publish(self) -> None:
         self._cutoff_output.publish(Float64(data=self.low_pass.cutoff))
-        self._lag_output.publish(Float64(data=1e3 * self.low_pass.delay))
+        self._lag_output.publish(Float64(data=1e3 * self._delay))
 
     def _diagnose(self) -> None:
         supply, low_pass = self._known(), self.low_pass
@@ -179,9 +212,14 @@ class AdaptiveFilterNode(MonitorNode):
             'order': settings.order, 'shadow': settings.shadow,
             'cutoff': low_pass.cutoff, 'cutoff_wanted': low_pass.wanted,
             'decided_by': self._decided_by(supply), 'lag': low_pass.phase_lag,
-            'delay': low_pass.delay, 'lag_frequency': settings.lag_frequency,
+            'delay': self._delay, 'lag_frequency': settings.lag_frequency,
             'sigma': supply.sigma, 'sigma_se': supply.sigma_se, 'alpha': supply.alpha,
             'throttle': supply.throttle, 'level': supply.level,
+            'notch_active': self._notch.active, 'notch_source': self._notch.source,
+            'notch_frequencies': ', '.join(f'{f:.4g}' for f in self._notch.frequencies),
+            'notch_law_a': self._notch.law[0], 'notch_law_b': self._notch.law[1],
+            'notch_problem': ' '.join(self._motors.problems.values()),
+            'throttle_age': self._motors.age('throttle'), 'rpm_age': self._motors.age('rpm'),
             'passed': self._passed, 'dropped': self._dropped,
             'repeated': counters.repeated, 'back': counters.back, 'gaps': counters.gaps,
             'sigma_age': self._supply.age, 'state_age': self._supply.state_age,
@@ -248,8 +286,18 @@ class AdaptiveFilterNode(MonitorNode):
             f'sigma {supply.sigma:.4g} V/sqrt(s)')
         return Level.OK, (
             f'{shadow}Cutoff {self.low_pass.cutoff:.4g} Hz by law {s.law} at {of}; decided by '
-            f'{self._decided_by(supply)}; lag {self.low_pass.phase_lag:.3g} degrees '
-            f'({1e3 * self.low_pass.delay:.3g} ms) at {s.lag_frequency:g} Hz.')
+            f'{self._decided_by(supply)}; lag {360.0 * s.lag_frequency * self._delay:.3g} degrees '
+            f'({1e3 * self._delay:.3g} ms) at {s.lag_frequency:g} Hz{self._of_notches()}.')
+
+    def _of_notches(self) -> str:
+        """Say what the notches do."""
+        notch = self._notch
+        if not notch.settings.count:
+            return ''
+        if not notch.active:
+            return '; notches off, they would not pay' if notch.source == 'none' else ''
+        at = ', '.join(f'{f:.0f}' for f in notch.frequencies)
+        return f'; notches at {at} Hz by {notch.source}'
 
 
 def _not_a_voltage(kind: str, settings: FilterSettings) -> bool:

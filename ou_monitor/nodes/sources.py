@@ -16,27 +16,39 @@ from ou_monitor.errors import InputError
 from ou_monitor.nodes.message_types import message_class
 from ou_monitor.online.settings import Parameter
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
-from ou_monitor.stream.extract import Extractor
+from ou_monitor.stream.extract import Extractor, ManyExtractor
 
 AUTO = 'auto'
 
+_CONFIG = Parameter('msg_config', AUTO,
+                    'Name or path of a msg_config; auto: chosen by the type of the publisher.')
+
+
+def _where(quantity: str, words: str) -> tuple[Parameter, ...]:
+    """Return the parameters that say where a quantity is."""
+    return (
+        Parameter(f'{quantity}.topic', '',
+                  f'Topic of the {words}; empty: as the msg_config says.'),
+        Parameter(f'{quantity}.type', '',
+                  f'Message type of the {words}; empty: as the msg_config says.'),
+        Parameter(f'{quantity}.field', '',
+                  f'Field path of the {words}; empty: as the msg_config says.'))
+
+
 SOURCE_PARAMETERS: tuple[Parameter, ...] = (
-    Parameter('msg_config', AUTO,
-              'Name or path of a msg_config; auto: chosen by the type of the publisher.'),
-    Parameter('voltage.topic', '', 'Topic of the voltage; empty: as the msg_config says.'),
-    Parameter('voltage.type', '', 'Message type of the voltage; empty: as the msg_config says.'),
-    Parameter('voltage.field', '', 'Field path of the voltage; empty: as the msg_config says.'),
-    Parameter('throttle.topic', '', 'Topic of the throttle; empty: as the msg_config says.'),
-    Parameter('throttle.type', '', 'Message type of the throttle; empty: as the msg_config says.'),
-    Parameter('throttle.field', '', 'Field path of the throttle; empty: as the msg_config says.'),
+    _CONFIG, *_where('voltage', 'voltage'), *_where('throttle', 'throttle'),
     Parameter('adc.sample_rate', 0.0,
               'True rate of the samples in a block, Hz; 0: as the msg_config says.', 0.0, 1.0e9),
     Parameter('smooth_stamps', True,
               'Whether unstamped samples of a steady source are put on an even time line.'),
 )
+# Of the node that follows the motors.
+MOTOR_PARAMETERS: tuple[Parameter, ...] = (
+    _CONFIG, *_where('throttle', 'throttle'), *_where('rpm', 'motor speeds'))
 
 # In auto mode a bare scalar needs no msg_config of its own to be a throttle.
 _SCALARS = ('std_msgs/msg/Float32', 'std_msgs/msg/Float64')
+_ARRAYS = ('std_msgs/msg/Float32MultiArray', 'std_msgs/msg/Float64MultiArray')
 
 
 @dataclass(frozen=True)
@@ -47,7 +59,7 @@ class Source:
     Attributes
     ----------
     quantity : str
-        'voltage' or 'throttle'.
+        'voltage', 'throttle' or 'rpm'.
     topic : str
         Topic, relative or absolute.
     spec : FieldSpec or None
@@ -79,6 +91,15 @@ class Source:
     def known_types(self) -> list[str]:
         """Return the types that can be chosen from."""
         return list(dict.fromkeys(c.spec.type for c in self.candidates if c.spec is not None))
+
+    def open_many(self) -> tuple[Any, ManyExtractor]:
+        """Return the message class and what takes several numbers out of it."""
+        if self.spec is None:
+            raise InputError(f'the type of the {self.quantity} is not known yet')
+        message = message_class(self.spec.type, self.install)
+        extractor = ManyExtractor(self.spec)
+        extractor.extract(message())
+        return message, extractor
 
     def open(self) -> tuple[Any, Extractor]:  # noqa: A003
         """Return the message class and the extractor, tried on an empty message."""
@@ -117,9 +138,9 @@ def find_source(quantity: str, values: Mapping[str, Any]) -> Source | None:
 def _generic(quantity: str) -> list[Source]:
     """Return what the generic msg_configs say of a quantity, one of a type."""
     found: dict[str, Source] = {}
-    if quantity == 'throttle':
+    if quantity != 'voltage':
         # They look alike in all msg_configs, so none of them is named.
-        for kind in _SCALARS:
+        for kind in (*_SCALARS, *(_ARRAYS if quantity == 'rpm' else ())):
             found[kind] = Source(quantity, quantity, FieldSpec(quantity, kind, 'data'), AUTO)
     for config in list_msg_configs().values():
         spec: FieldSpec | None = getattr(config, quantity)

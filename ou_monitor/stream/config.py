@@ -8,7 +8,7 @@ that names the file, the key and the nearest valid key.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import math
 from pathlib import Path
@@ -103,6 +103,10 @@ class MsgConfig:
         Where the throttle is, 0..1.
     current : FieldSpec or None
         Where in the messages of the voltage the current drawn is, A.
+    rpm : FieldSpec or None
+        Where the speeds of the motors are, 1/min of the shaft unless
+        `notch.rpm_unit` says otherwise; the field may be an array, or name
+        each element of one, 'esc[].esc_rpm'.
 
     """
 
@@ -114,6 +118,7 @@ class MsgConfig:
     voltage: FieldSpec
     throttle: FieldSpec | None
     current: FieldSpec | None = None
+    rpm: FieldSpec | None = None
 
 
 # What each key holds, as (accepted YAML types, word for it); the kinds of
@@ -131,6 +136,7 @@ _CONFIG_KINDS: dict[str, tuple[tuple[type, ...], str]] = {
     'generic': ((bool,), 'true or false'), 'voltage': ((dict,), 'a group of keys'),
     'throttle': ((dict, type(None)), 'a group of keys or null'),
     'current': ((dict, type(None)), 'a group of keys or null'),
+    'rpm': ((dict, type(None)), 'a group of keys or null'),
 }
 _FIELD_NEEDED = ('topic', 'type', 'field')
 _CONFIG_NEEDED = ('description', 'package', 'install', 'generic', 'voltage')
@@ -148,6 +154,15 @@ def parse_field_path(path: str) -> FieldPath:
         steps.append(match[1])
         steps += [int(index) for index in re.findall(r'\d+', match[2])]
     return tuple(steps)
+
+
+def parse_each_path(path: str) -> tuple[FieldPath, FieldPath | None]:
+    """Split 'esc[].rpm' into the path of an array and that in each element; else with None."""
+    array, each, rest = path.partition('[]')
+    if not each:
+        return parse_field_path(path), None
+    rest = rest.removeprefix('.')
+    return parse_field_path(array), parse_field_path(rest) if rest else ()
 
 
 def msg_config_dir() -> Path:
@@ -200,7 +215,7 @@ def _load(path: Path) -> MsgConfig:
     where = path_words(path)
     with one_line():
         top = _checked(content, _CONFIG_KINDS, _CONFIG_NEEDED, where)
-        throttle, current = top.get('throttle'), top.get('current')
+        throttle, current, rpm = (top.get(key) for key in ('throttle', 'current', 'rpm'))
         if current is not None:
             # It is read from the messages of the voltage, with their stamps.
             shared = ('topic', 'type', 'stamp_field', 'stamp_factor')
@@ -211,7 +226,8 @@ def _load(path: Path) -> MsgConfig:
             package=top['package'], install=' '.join(top['install'].split()),
             generic=top['generic'], voltage=_field_spec(top['voltage'], f'{where}: voltage'),
             throttle=None if throttle is None else _field_spec(throttle, f'{where}: throttle'),
-            current=None if current is None else _field_spec(current, f'{where}: current'))
+            current=None if current is None else _field_spec(current, f'{where}: current'),
+            rpm=None if rpm is None else _field_spec(rpm, f'{where}: rpm', parse_each_path))
 
 
 def _checked(
@@ -243,7 +259,8 @@ def _checked(
     return content
 
 
-def _field_spec(content: Any, where: str) -> FieldSpec:
+def _field_spec(content: Any, where: str,
+                parse: Callable[[str], object] = parse_field_path) -> FieldSpec:
     group = _checked(content, _FIELD_KINDS, _FIELD_NEEDED, where)
     for key in ('unit_factor', 'offset', 'sample_rate', 'stamp_factor'):
         if group.get(key) is not None:
@@ -274,11 +291,11 @@ def _field_spec(content: Any, where: str) -> FieldSpec:
                 f'found {getattr(spec, key)}')
     # A malformed path is better told now, with the file's name, than at the
     # first message.
-    for key in ('field', 'stamp_field'):
+    for key, parsed in (('field', parse), ('stamp_field', parse_field_path)):
         path = getattr(spec, key)
         if path is not None:
             try:
-                parse_field_path(path)
+                parsed(path)
             except InputError as error:
                 raise InputError(f'{where}: {error}') from error
     return spec

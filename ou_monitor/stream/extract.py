@@ -7,7 +7,7 @@ Works on any object with attributes: rclpy messages and decoded MCAP messages.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 import operator
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.records import FloatArray
-from ou_monitor.stream.config import FieldPath, FieldSpec, parse_field_path
+from ou_monitor.stream.config import FieldPath, FieldSpec, parse_each_path, parse_field_path
 
 
 class ZeroRule:
@@ -145,11 +145,11 @@ class Extractor:
                 try:
                     return get(msg)
                 except AttributeError:
-                    return self._walk(msg, steps, path)
+                    return self.walk(msg, steps, path)
             return plain
-        return lambda msg: self._walk(msg, steps, path)
+        return lambda msg: self.walk(msg, steps, path)
 
-    def _walk(self, msg: object, steps: FieldPath, path: str) -> Any:
+    def walk(self, msg: object, steps: FieldPath, path: str) -> Any:
         """Follow a path step by step; None where an array is too short."""
         at: Any = msg
         for step in steps:
@@ -169,6 +169,46 @@ class Extractor:
                         'of something that is not an array') from error
                 at = at[step]
         return at
+
+
+class ManyExtractor:
+    """
+    Takes several numbers out of messages of one type: a number, an array, or a field of each.
+
+    Parameters
+    ----------
+    spec : FieldSpec
+        Which; 'esc[].esc_rpm' is that field of each element of `esc`.
+
+    Raises
+    ------
+    InputError
+        When the path is malformed.
+
+    """
+
+    def __init__(self, spec: FieldSpec) -> None:
+        self.spec = spec
+        self._array, self._each = parse_each_path(spec.field)
+        self._walker = Extractor(replace(spec, field=spec.field.partition('[]')[0]))
+
+    def extract(self, msg: object) -> FloatArray:
+        """Return the values of one message in SI units, shape (n,); NaN: not known."""
+        path = self.spec.field
+        raw = self._walker.walk(msg, self._array, path)
+        if raw is None:
+            return np.empty(0)
+        try:
+            if self._each is not None:
+                raw = [self._walker.walk(one, self._each, path) for one in raw]
+            if isinstance(raw, (str, bytes)):
+                raise TypeError('text')
+            values = np.array(raw, dtype=np.float64).ravel()
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"field '{self.spec.field}' of {self.spec.type} holds no numbers: name a numeric "
+                "field, an array of them, or one of each element, 'name[].field'") from error
+        return np.asarray(values * (self.spec.sign * self.spec.unit_factor) + self.spec.offset)
 
 
 def _fields_of(msg: object) -> Iterable[str]:

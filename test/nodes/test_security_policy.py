@@ -115,14 +115,15 @@ def test_the_estimator_opens_what_the_policy_allows(world):
 
 
 def test_the_filter_opens_what_the_policy_allows(world):
-    """With its input found, and wired as the launch file does."""
+    """With all inputs found, and wired as the launch file does."""
     from std_msgs.msg import Float32
-    world.start('adaptive_filter', '--ros-args', '-p', 'use_sim_time:=true', '-r',
-                'sigma:=ou_estimator/sigma', '-r', 'state:=ou_estimator/state')
+    world.start('adaptive_filter', '--ros-args', '-p', 'use_sim_time:=true', '-p',
+                'notch.count:=4', '-r', 'sigma:=ou_estimator/sigma', '-r',
+                'state:=ou_estimator/state')
     probe = world.probe()
-    output = probe.publisher('/input', Float32)
+    outputs = [probe.publisher(topic, Float32) for topic in ('/input', '/throttle', '/rpm')]
     compare(probe, 'adaptive_filter', 'ou_adaptive_filter')
-    assert output.topic_name == '/input'
+    assert len(outputs) == 3
 
 
 def test_replay_opens_what_the_policy_allows(world):

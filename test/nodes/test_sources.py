@@ -130,3 +130,15 @@ def test_a_bag_does_not_choose_what_is_imported(tmp_path, monkeypatch):
         message_class('evil_msgs/msg/Evil')
     with pytest.raises(InputError, match='no message'):
         message_class('std_msgs/msg/__loader__')
+
+
+def test_motor_speeds():
+    """By msg_config, by type, by hand; a scalar, an array, and a field of each element."""
+    from ou_monitor.nodes.sources import MOTOR_PARAMETERS
+    from std_msgs.msg import Float64MultiArray
+    found = {p.name: p.default for p in MOTOR_PARAMETERS}
+    assert find_source('rpm', {**found, 'msg_config': 'px4'}).spec.field == 'esc[].esc_rpm'
+    source = find_source('rpm', found).choose(['std_msgs/msg/Float64MultiArray'])
+    _, extractor = source.open_many()
+    assert extractor.extract(Float64MultiArray(data=[1.0, 2.0])).tolist() == [1.0, 2.0]
+    assert find_source('rpm', {**found, 'msg_config': 'ardupilot_dds'}) is None

@@ -6,7 +6,7 @@ from types import SimpleNamespace as Message
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.stream.config import FieldSpec, parse_field_path
-from ou_monitor.stream.extract import Extractor
+from ou_monitor.stream.extract import Extractor, ManyExtractor
 import pytest
 
 
@@ -145,3 +145,38 @@ def test_what_a_zero_means(rule, expected):
     block = extractor(zero=rule, nan='unknown', sample_rate=10.0)
     np.testing.assert_array_equal(
         block.extract(Message(data=[0.0, 5.0, 0.0])).values, expected)
+
+
+class Esc:
+    """An element of an array."""
+
+    def __init__(self, rpm):
+        self.rpm = rpm
+
+
+class Escs:
+    """Speeds in an array of elements, in an array of numbers, and alone."""
+
+    def __init__(self):
+        self.esc = [Esc(1000), Esc(2000.5)]
+        self.all = [1.0, 2.0, 3.0]
+        self.one = 4
+        self.name = 'x'
+
+
+@pytest.mark.parametrize('field, values', [
+    ('esc[].rpm', [100.0, 200.05]), ('all', [0.1, 0.2, 0.3]), ('all[]', [0.1, 0.2, 0.3]),
+    ('esc[1].rpm', [200.05]), ('one', [0.4]), ('esc[7].rpm', [])])
+def test_several_numbers(field, values):
+    """A field of each element, an array, an element, a number; none where there is none."""
+    extractor = ManyExtractor(FieldSpec('rpm', 'my_msgs/msg/Escs', field, unit_factor=0.1))
+    assert extractor.extract(Escs()).tolist() == pytest.approx(values)
+
+
+@pytest.mark.parametrize('field, words', [
+    ('esc[].rp', "did you mean 'rpm'"), ('name', 'holds no numbers'), ('esc', 'holds no numbers'),
+    ('esc[]]', 'not of the form'), ('one[]', 'holds no numbers')])
+def test_what_is_no_list_of_numbers(field, words):
+    """Refused in one line."""
+    with pytest.raises(InputError, match=words):
+        ManyExtractor(FieldSpec('rpm', 'my_msgs/msg/Escs', field)).extract(Escs())

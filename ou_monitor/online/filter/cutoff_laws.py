@@ -145,8 +145,7 @@ def cutoff_for_noise(mode: str, order: int, rms: float, intensity: float,
     if intensity <= 1e-12 * rms:
         return math.inf
     v = (rms / intensity) ** 2
-    if v < 1e-200:
-        # The cube of the cutoff would be no number.
+    if v == 0.0:
         return 0.0
     if mode == 'lowpass':
         q = 2.0 * alpha * v

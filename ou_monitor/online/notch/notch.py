@@ -261,7 +261,7 @@ class AdaptiveNotch:
         """Learn from the signal."""
         s, channels = self._settings, len(values)
         if self._frames is None:
-            if self._since < _KNOWN or HIGHEST / self._interval.mean < 1.2 * s.fmin:
+            if not s.count or self._since < _KNOWN or HIGHEST / self._interval.mean < 1.2 * s.fmin:
                 return
             self._frames = frames = Frames(self._interval.mean)
             rate = 1.0 / frames.interval

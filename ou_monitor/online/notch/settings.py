@@ -41,7 +41,7 @@ class NotchSettings:
     Attributes
     ----------
     count : int
-        Most notches, 1 to 4.
+        Most notches, up to 4; 0: none, what is in force fades.
     fmin : float
         Lowest frequency of a notch, Hz.
     cutoff : float
@@ -65,8 +65,6 @@ class NotchSettings:
     def __post_init__(self) -> None:
         """Refuse values out of range and contradictions."""
         check_values(NOTCH_PARAMETERS, self, 'notch.')
-        if self.count < 1:
-            raise ValueError('notch.count must be 1 to 4: leave the notch out for none')
         if RPM_UNITS[self.rpm_unit][1] and (self.poles < 2 or self.poles % 2):
             raise ValueError(
                 f"notch.rpm_unit '{self.rpm_unit}' needs notch.poles, an even number of magnets "
@@ -88,3 +86,9 @@ class NotchSettings:
                 raise ValueError(f"unknown notch option '{name}': {nearest(name, known)}")
         values: dict[str, Any] = dict(options)
         return replace(base, **values) if base else cls(**values)
+
+
+def notch_options(values: Mapping[str, object]) -> dict[str, object]:
+    """Return the options that parameters of the node stand for."""
+    return {parameter.name.removeprefix('notch.'): values[parameter.name]
+            for parameter in NOTCH_PARAMETERS}

@@ -52,7 +52,7 @@ class MotorSpeeds:
 
     def now(self, t: float, most: int) -> list[float]:
         """Return the speeds of at most so many groups of motors, Hz; empty: not known."""
-        if not t - self._heard <= self._stale_after:
+        if not most or not t - self._heard <= self._stale_after:
             return []
         if self._changes >= _CHANGES:
             usual = (self._changed - self._first) / self._changes
@@ -60,7 +60,8 @@ class MotorSpeeds:
                 return []
         if len(self._speeds) <= most:
             return self._speeds
-        known = sorted(one for one in self._speeds if one == one)
+        # Places of motors that are not there stay 0.
+        known = sorted(one for one in self._speeds if one > 0.0)
         if len(known) <= most:
             return known
         # Neighbours in speed share a notch.

@@ -202,7 +202,7 @@ def test_a_new_rate_begins_anew():
 
 
 @pytest.mark.parametrize('options, words', [
-    ({'count': 0}, 'count must be 1 to 4'), ({'count': 5}, 'within 0..4'),
+    ({'count': -1}, 'within 0..4'), ({'count': 5}, 'within 0..4'),
     ({'fmin': math.nan}, 'finite number'), ({'fmn': 60.0}, "unknown notch option 'fmn'"),
     ({'rpm_unit': 'rps'}, "unknown 'rps'")])
 def test_options_are_checked(options, words):
@@ -223,3 +223,25 @@ def test_shapes_are_checked():
     notch.filter(0.0, [1.0, 2.0])
     with pytest.raises(ValueError, match='channels changed from 2 to 1'):
         notch.filter(1.0, 1.0)
+
+
+def test_none_at_all():
+    """With count 0 what is in force fades, and nothing is learned."""
+    t, x, throttle, f = flight()
+    rpm = 60.0 * np.column_stack((f, f))
+    notch = AdaptiveNotch()
+    notch.filter(t, x, throttle, rpm)
+    assert notch.active
+    notch.configure(count=0)
+    y = notch.filter(t + 6.0, x, throttle, rpm)
+    assert not notch.active and np.array_equal(y[300:], x[300:]) and y[0] != x[0]
+
+
+def test_places_of_motors_that_are_not_there():
+    """Zeros of an array that holds more motors than there are share no notch with the others."""
+    t, x, throttle, f = flight(3.0)
+    rpm = np.zeros((t.size, 8))
+    rpm[:, 2], rpm[:, 5] = 60.0 * f, 60.0 * 1.1 * f
+    notch = AdaptiveNotch()
+    notch.filter(t, x, throttle, rpm)
+    assert notch._motors == pytest.approx([f[-1], 1.1 * f[-1]])

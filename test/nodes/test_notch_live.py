@@ -1,0 +1,98 @@
+"""The notches in the node: rpm of any field, throttle, lag, and how they are switched off."""
+
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray
+from live import diagnosis, values_of, wait_until
+import numpy as np
+from ou_monitor.online.filter.lag import delay, phase_lag
+import pytest
+from sensor_msgs.msg import Imu, JointState
+from std_msgs.msg import Float32, Float64
+
+NODE = '/ou_adaptive_filter'
+NAME = 'ou_adaptive_filter: adaptive low-pass'
+LINE = 250.0
+
+
+class Rig:
+    """The filter with four notches, a gyro with a line, and eRPM in a field of an odd type."""
+
+    def __init__(self, world):
+        self.probe = world.probe()
+        self.output = self.probe.listen(f'{NODE}/output', Imu)
+        self.cutoff = self.probe.listen(f'{NODE}/cutoff', Float64)
+        self.lag = self.probe.listen(f'{NODE}/lag', Float64)
+        self.diagnostics = self.probe.listen('/diagnostics', DiagnosticArray)
+        self.input = self.probe.publisher('/input', Imu, 1000)
+        self.rpm = self.probe.publisher('/rpm', JointState)
+        self.throttle = self.probe.publisher('/throttle', Float32)
+        self.process = world.start(
+            'adaptive_filter', '--ros-args', '-p', 'notch.count:=4', '-p',
+            'notch.rpm_unit:=erpm', '-p', 'notch.poles:=14', '-p',
+            'rpm.type:=sensor_msgs/msg/JointState', '-p', 'rpm.field:=velocity[]')
+        wait_until(lambda: self.input.get_subscription_count()
+                   and self.rpm.get_subscription_count()
+                   and self.throttle.get_subscription_count(), what='subscriptions')
+        wait_until(lambda: self.probe.node.count_publishers(f'{NODE}/output'))
+        time.sleep(0.3)
+        self.rng = np.random.default_rng(1)
+        self.sent = 0
+
+    def fly(self, samples, rpm=True):
+        """Send samples of a line in noise, 1 kHz by their stamps, faster than they are flown."""
+        for _ in range(samples):
+            t = 100.0 + 1e-3 * self.sent
+            if self.sent % 20 == 0:
+                self.throttle.publish(Float32(data=0.5))
+                if rpm:
+                    self.rpm.publish(JointState(velocity=[60.0 * 7.0 * LINE] * 2))
+                time.sleep(0.008)
+            message = Imu()
+            message.header.stamp.sec = int(t)
+            message.header.stamp.nanosec = round(t % 1.0 * 1e9) % 10**9
+            gyro = message.angular_velocity
+            gyro.x = 5.0 * np.sin(2 * np.pi * LINE * t) + 0.1 * self.rng.standard_normal()
+            self.input.publish(message)
+            self.sent += 1
+
+    @property
+    def said(self):
+        """Return what it said last on /diagnostics."""
+        status = diagnosis(self.diagnostics, NAME)
+        return {} if status is None else values_of(status)
+
+
+@pytest.fixture(scope='module')
+def rig(shared_world):
+    """Give the filter."""
+    return Rig(shared_world)
+
+
+def test_rpm_of_any_field_sets_the_notches(rig):
+    """They stand where the motors are, and their lag is told with that of the low-pass."""
+    def there():
+        rig.fly(200)
+        said = rig.said
+        words = said.get('notch_frequencies', '').split(', ')
+        if said.get('notch_source') != 'rpm' or words == ['']:
+            return False
+        assert [float(word) for word in words] == pytest.approx([LINE] * len(words), rel=0.01)
+        alone = delay(phase_lag(2, rig.cutoff[-1].data, 10.0), 10.0)
+        return (said['notch_active'] == 'True' and float(said['rpm_age']) < 1.0
+                and rig.lag[-1].data > 1e3 * alone + 0.05
+                and rig.lag[-1].data == pytest.approx(1e3 * float(said['delay']), rel=0.05))
+    wait_until(there, what='notches by rpm, and their lag')
+
+
+def test_a_bad_unit_is_refused_and_none_is_accepted(rig):
+    """Ask for eRPM without poles: one line; for no notch: they fade, the lag is the low-pass's."""
+    refused = rig.probe.set_parameter(NODE, 'notch.poles', 0)
+    assert not refused.successful and 'notch.poles' in refused.reason
+    assert rig.probe.set_parameter(NODE, 'notch.count', 0).successful
+
+    def faded():
+        rig.fly(200)
+        alone = delay(phase_lag(2, rig.cutoff[-1].data, 10.0), 10.0)
+        return rig.lag[-1].data == pytest.approx(1e3 * alone, rel=1e-3)
+    wait_until(faded, what='the lag of the low-pass alone')
