@@ -8,6 +8,7 @@ within minutes.  doc/load.md has the equations and the figures.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
 import math
 
@@ -16,6 +17,7 @@ import numpy.typing as npt
 from ou_monitor.model.load import CELL, cells_in_series, INRUSH_TIME, LEVELS, SLOPES
 from ou_monitor.online.load_blocks import Block, LoadBlocks
 from ou_monitor.online.load_current import CurrentFilter, scored
+from ou_monitor.online.load_delay import LoadDelay
 from ou_monitor.online.load_noise import CLIP, LoadNoise
 from ou_monitor.online.supply_load import (
     Basis, LAGS, LoadStatus, POWER, static, SupplyLoad, TABLE)
@@ -95,6 +97,10 @@ class LoadFilter:
         self._newest = -math.inf
         self._opening = False
         self._current = CurrentFilter()
+        self._delay = LoadDelay()
+        # Blocks that wait for their throttle, and throttle as it was heard: stamp and value.
+        self._waiting: deque[Block] = deque()
+        self._sticks: deque[tuple[float, float]] = deque()
         # Running log density of what throttle predicts.
         self._score = NAN
 
@@ -121,7 +127,7 @@ class LoadFilter:
             end = int(back[0]) if back.size else stamps.size
             keep = (stamps > highest[:-1])[:end]
             for block in self._blocks.push(columns[:, :end][:, keep]):
-                self._take(block)
+                self._arrive(block)
             self._newest = float(highest[end])
             if back.size:
                 self.new_time_line()
@@ -131,7 +137,28 @@ class LoadFilter:
         """Let the next stamp be anything: coefficients and noise are kept, the level is open."""
         self._newest = -math.inf
         self._blocks.forget()
+        self._waiting.clear()
+        self._sticks.clear()
+        self._delay.forget()
         self._opening = math.isfinite(self._t)
+
+    def _arrive(self, block: Block) -> None:
+        """Give each block the throttle that is heard `delay` after it."""
+        if math.isfinite(block.throttle) and self._delay.take(
+                block.t, block.voltage, block.throttle):
+            # What was learned from another delay is wrong, and certain of it.
+            self._forget()
+        late = self._delay.delay
+        if not late and not self._waiting:
+            self._take(block)
+            return
+        self._waiting.append(block)
+        self._sticks.append((block.last, block.throttle))
+        while self._waiting and self._waiting[0].t + late <= block.last:
+            first = self._waiting.popleft()
+            while len(self._sticks) > 1 and self._sticks[1][0] <= first.t + late:
+                self._sticks.popleft()
+            self._take(replace(first, throttle=self._sticks[0][1]))
 
     def _take(self, block: Block) -> None:
         """Take one block: the first of all, of a new time line, or what follows."""
@@ -165,20 +192,27 @@ class LoadFilter:
         # Below 2.5 V no lithium cell: the curve is scaled.
         self._cells = float(cells_in_series(self._volts)) if self._volts > 2.5 else \
             self._volts / CELL
-        # Noise under a known throttle, and under an unknown one, which is what throttle does.
-        self._noise, self._other = LoadNoise(self._volts), LoadNoise(self._volts)
         # Whether the coefficients have met a throttle.
         self._loaded = math.isfinite(u)
         self._heard = -math.inf
         self._flown = np.zeros(_BINS + 1)
+        self._m = np.zeros(_STATES)
+        self._factor = 1.0
+        self._forget()
+        self._settle(v, u)
+
+    def _forget(self) -> None:
+        """Take coefficients and noise back to the prior; the next block opens the level."""
+        # Noise under a known throttle, and under an unknown one, which is what throttle does.
+        self._noise, self._other = LoadNoise(self._volts), LoadNoise(self._volts)
+        self._opening = True
         m, P = np.zeros(_STATES), np.zeros((_STATES, _STATES))
         m[2:], P[2:, 2:] = _MEAN * self._volts, _COV * self._volts ** 2
         # 350 s at a mean load of 0.23, known to a factor of two.
         m[1] = 1.0 / 80.0
         P[1, 1] = m[1] ** 2
+        m[0] = self._m[0]
         self._m, self._P = m, P
-        self._factor = 1.0
-        self._settle(v, u)
 
     def _open(self, v: float, u: float) -> None:
         """Open the level: a pause, a new time line, or throttle that came or went."""
@@ -269,6 +303,8 @@ class LoadFilter:
         score = e / math.sqrt(s + R * scale)
         # Innovations that follow one another (ADC steps, errors of the form) tell less.
         total = s + R * scale * (1.0 + noise.correlation) / (1.0 - noise.correlation)
+        noise.see(block.voltage)
+        total += noise.rounding
         total *= max(1.0, abs(e) / math.sqrt(total) / CLIP)
         noise.learn(e, s, u, du, block.n, block.within)
         clipped = max(-CLIP, min(CLIP, score))
@@ -306,7 +342,8 @@ class LoadFilter:
             LoadStatus.STILL, level, resistance, resistance_se, basis=basis, flown=(low, high),
             _sag=tuple(sag.tolist()),
             _sag_se=tuple(np.maximum(error, _LEAST_ERROR * sag).tolist()),
-            _log_variance=self._noise.log_variance, _range=self._between(0.02))
+            _log_variance=self._noise.log_variance, _range=self._between(0.02),
+            delay=self._delay.delay)
         if math.isnan(self._throttle):
             load = replace(load, status=LoadStatus.NO_THROTTLE,
                            basis=basis if basis is Basis.CURRENT else Basis.NONE)
@@ -319,7 +356,7 @@ class LoadFilter:
             if swing < -2.0 * swing_se or swing_se < limit and swing < 2.0 * swing_se:
                 status = LoadStatus.NO_RELATION
             elif swing_se < limit:
-                status = LoadStatus.KNOWN
+                status = LoadStatus.NO_RELATION if self._delay.unrelated else LoadStatus.KNOWN
             load = replace(load, status=status)
         return load
 
@@ -333,6 +370,9 @@ class LoadFilter:
             raise ValueError('no voltage has arrived: there is nothing to start from')
         if math.isnan(self._throttle):
             return np.full(t.size, NAN)
+        if self._delay.delay:
+            # At each time works what is heard later; of the last ones what was heard last.
+            throttle = throttle[np.searchsorted(t, t + self._delay.delay, 'right') - 1]
         kept = self._lagged, self._settled, self._lags
         now, level = self._t, float(self._m[0])
         out = np.empty(t.size)

@@ -15,6 +15,8 @@ from ou_monitor.records import FloatArray
 
 # Standard scores beyond this are weighed down; they score this much, squared, in the noise.
 CLIP, _OUTLIER = 4.0, 16.0
+# Voltages that differ by less, V, are one reading of an ADC.
+_SAME = 1e-6
 # A change of throttle below that is none.
 _HELD = 1e-3
 # Corrections after which the noise is forgotten; at first sooner, by a third of all so far, as the
@@ -32,6 +34,9 @@ class LoadNoise:
         # Of the standard scores: mean square, and correlation from one to the next.
         self.scale, self.correlation = 1.0, 0.0
         self._last, self._n = 0.0, 0
+        # Step of the ADC, V, and share of the blocks that are another value than the one before.
+        self._step, self._changing, self._held = math.inf, 1.0, math.nan
+        self._unseen = (0.05 * volts) ** 2
         # Samples in a block, the variance within one, and that of its mean, V^2.
         self._size, self._within, self._between = 1.0, 0.0, 0.0
 
@@ -46,7 +51,25 @@ class LoadNoise:
         own = 1.0
         if self._between > 0.0:
             own += self._within * (1.0 - 1.0 / self._size) / self._between
-        return float(self.b[0]) + math.log(own), float(self.b[1]), float(self.b[2])
+        least = 0.0 if math.isinf(self._step) else self._step ** 2 / 12.0
+        return math.log(math.exp(float(self.b[0])) * own + least), float(self.b[1]), float(self.b[2])
+
+    def see(self, voltage: float) -> None:
+        """Look at the steps of the ADC in the means of blocks, V."""
+        step = abs(voltage - self._held)
+        self._held = voltage
+        changed = step > _SAME
+        if changed:
+            self._step = min(self._step, step)
+        self._changing += max(0.002, 1.0 / (self._n + 20.0)) * (changed - self._changing)
+
+    @property
+    def rounding(self) -> float:
+        """Return the variance of rounding, V^2; of a value that is held all is one rounding."""
+        if math.isinf(self._step):
+            # It has never changed: the step may be anything.
+            return self._unseen
+        return self._step ** 2 / 12.0 / max(self._changing, 0.002)
 
     def follow(self, score: float) -> None:
         """Take a clipped standard score: innovations in a row on one side are no news."""

@@ -67,6 +67,8 @@ class SupplyLoad:
         Its standard error, Ohm.
     time_constants : tuple of float
         Time constants of the answer, s; fixed.
+    delay : float
+        How late throttle is heard behind the voltage that answers to it, s.
     basis : Basis
         From what the level follows; the sag is always that of throttle.
     flown : tuple of float
@@ -79,6 +81,7 @@ class SupplyLoad:
     resistance: float = NAN
     resistance_se: float = NAN
     time_constants: tuple[float, ...] = LAGS
+    delay: float = 0.0
     basis: Basis = Basis.NONE
     flown: tuple[float, float] = (0.0, 1.0)
     _sag: tuple[float, ...] = ()
