@@ -52,7 +52,8 @@ class LoadNoise:
         if self._between > 0.0:
             own += self._within * (1.0 - 1.0 / self._size) / self._between
         least = 0.0 if math.isinf(self._step) else self._step ** 2 / 12.0
-        return math.log(math.exp(float(self.b[0])) * own + least), float(self.b[1]), float(self.b[2])
+        whole = math.exp(float(self.b[0])) * own + least
+        return math.log(whole), float(self.b[1]), float(self.b[2])
 
     def see(self, voltage: float) -> None:
         """Look at the steps of the ADC in the means of blocks, V."""
