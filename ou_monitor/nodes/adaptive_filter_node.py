@@ -8,11 +8,13 @@ published: error of sigma, alpha, throttle, level, and whether the estimate is u
 With `notch.count` above 0 also `throttle` and `rpm` (by msg_config or `rpm.type` and
 `rpm.field`) for the notches, which stand before the low-pass; without `throttle` that of the
 state is taken.
-Outputs: `~/output` (type and stamp of the input), `~/cutoff` (Hz) and `~/lag`
+Outputs: `~/output` (type, stamp and frame of the input; a derivative as
+geometry_msgs/AccelStamped or Vector3Stamped), `~/cutoff` (Hz) and `~/lag`
 (ms, phase delay at `lag_frequency`, notches included) as std_msgs/Float64 at `publish_rate`,
 `/diagnostics` at 1 Hz.
 
-Limits: of an IMU the angular velocity is filtered and of a BatteryState the
+Limits: of an IMU the angular velocity is filtered, with `input.acceleration` the
+linear acceleration too, and the covariances as those of white noise; of a BatteryState the
 voltage, unless `input.field` names another; the rest passes through; a message
 with a non-finite signal is counted and not passed on.
 """
@@ -27,7 +29,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import diagnostic, MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.console import Console
-from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of
+from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of, IMU
 from ou_monitor.nodes.inputs import INPUT_QOS, Silence, Stamper, types_on
 from ou_monitor.nodes.message_types import message_class
 from ou_monitor.nodes.motor_inputs import MotorInputs
@@ -51,6 +53,8 @@ FIXED = (
     Parameter('input.field', '',
               'Field path of the signal; empty: data, voltage of a battery, angular velocity of '
               'an IMU.'),
+    Parameter('input.acceleration', False,
+              'Filter the linear acceleration of an IMU beside its angular velocity.'),
     _MODE, *MOTOR_PARAMETERS)
 
 OWN_TOPICS = ('input', 'sigma', 'state', '~/output', '~/cutoff', '~/lag', '/diagnostics', '/clock')
@@ -80,8 +84,11 @@ class AdaptiveFilterNode(MonitorNode):
         self._found: list[str] = []
         self._unplaced = False
         self._console = Console(self)
-        self._type, self._field = (self.get_parameter(f'input.{key}').value
-                                   for key in ('type', 'field'))
+        self._type, self._field, self._acceleration = (
+            self.get_parameter(f'input.{key}').value for key in ('type', 'field', 'acceleration'))
+        if self._acceleration:
+            # What it contradicts is said at the start, whatever comes.
+            self._channels_of(IMU)
         self._topic = self.resolve_topic_name('input')
         self._stamper = Stamper(self, self._jumped)
         self._cutoff_output = self.create_publisher(Float64, '~/cutoff', 10)
@@ -139,13 +146,18 @@ class AdaptiveFilterNode(MonitorNode):
             if known:
                 self._open(known[0])
 
+    def _channels_of(self, kind: str) -> Channels:
+        return channels_of(kind, self._field, mode=self.get_parameter(_MODE.name).value,
+                           acceleration=self._acceleration)
+
     def _open(self, kind: str) -> None:
-        channels = channels_of(kind, self._field)
+        channels = self._channels_of(kind)
         message = message_class(kind)
         self._type, self._channels = kind, channels
         self._filters = [AdaptiveLowPass(**self._of_filter(self.values()))
                          for _ in channels.names]
-        self._output = self.create_publisher(message, '~/output', 10)
+        self._output = self.create_publisher(
+            message_class(channels.output or kind), '~/output', 10)
         self.create_subscription(message, 'input', self.with_info(self._take_input), INPUT_QOS)
         self.get_logger().info(
             f"filtering {self._topic} ({kind}, {', '.join(channels.names)})")
@@ -162,11 +174,11 @@ class AdaptiveFilterNode(MonitorNode):
             return
         supply = self._known()
         values = self._notched(stamp, values, supply)
-        self._channels.put(message, [
+        self._output.publish(self._channels.put(message, [
             channel.step(stamp, value, supply.sigma, supply.sigma_se, supply.alpha,
                          supply.throttle, supply.level, supply.level_se)
-            for channel, value in zip(self._filters, values, strict=True)])
-        self._output.publish(message)
+            for channel, value in zip(self._filters, values, strict=True)],
+            self.low_pass.noise_left))
         self._passed += 1
 
     def _notched(self, stamp: float, values: Sequence[float], supply: Supply) -> Sequence[float]:

@@ -3,13 +3,14 @@
 import math
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseWithCovariance
+from geometry_msgs.msg import Point, PoseWithCovariance, Vector3Stamped
 from live import wait_until
+import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.filter_channels import CHANNELS, channels_of
 from ou_monitor.nodes.supply_input import SupplyInput
 import pytest
-from sensor_msgs.msg import Imu, JointState, Temperature
+from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 
 
 @pytest.mark.parametrize('message, field', [
@@ -21,7 +22,7 @@ def test_one_field_is_taken_and_put_back(message, field):
     channel = channels_of(f'{package}/msg/{type(message).__name__}', field)
     assert channel.names == (field,)
     before = str(message)
-    channel.put(message, (3.25,))
+    assert channel.put(message, (3.25,), 1.0) is message
     assert list(channel.take(message)) == [3.25]
     assert str(message) != before
 
@@ -96,9 +97,9 @@ def test_time_line_of_the_supply():
 
 
 def test_a_field_of_any_type_is_differentiated_by_the_node(world):
-    """`input.field` alone: the type is the publisher's; a ramp of 2 per s comes out as 2."""
+    """The type is the publisher's; a ramp of 2 per s comes out as 2, and not as a temperature."""
     probe = world.probe()
-    output = probe.listen('/ou_adaptive_filter/output', Temperature)
+    output = probe.listen('/ou_adaptive_filter/output', Vector3Stamped)
     sender = probe.publisher('/input', Temperature)
     process = world.start('adaptive_filter', '--ros-args', '-p', 'input.field:=temperature',
                           '-p', 'mode:=derivative')
@@ -110,9 +111,96 @@ def test_a_field_of_any_type_is_differentiated_by_the_node(world):
         for _ in range(20):
             k = next(stamps)
             message = Temperature(temperature=0.002 * k, variance=7.0)
+            message.header.frame_id = 'probe'
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(k * 10**6, 10**9)
             sender.publish(message)
-        return output and output[-1].temperature == pytest.approx(2.0, abs=1e-6)
+        return output and output[-1].vector.x == pytest.approx(2.0, abs=1e-6)
     wait_until(settled, what='a slope of 2 1/s')
-    assert output[-1].variance == 7.0
+    last = output[-1]
+    assert math.isnan(last.vector.y) and last.header.frame_id == 'probe'
+    assert (last.header.stamp.sec, last.header.stamp.nanosec) < divmod(next(stamps) * 10**6, 10**9)
     assert process.stop() == 0
+
+
+def imu(**covariances):
+    """Return an Imu with a stamp, a frame and different numbers in all vectors."""
+    message = Imu()
+    message.header.frame_id, message.header.stamp.sec = 'base_link', 7
+    for k, name in enumerate(('angular_velocity', 'linear_acceleration')):
+        vector = getattr(message, name)
+        vector.x, vector.y, vector.z = (10.0 * k + axis for axis in (1.0, 2.0, 3.0))
+        getattr(message, f'{name}_covariance')[:] = covariances.get(name, [0.0] * 9)
+    return message
+
+
+KNOWN = [4.0, 1.0, 0.0, 1.0, 9.0, 0.0, 0.0, 0.0, 1.0]
+ABSENT = [-1.0, *[0.0] * 8]
+IMU = 'sensor_msgs/msg/Imu'
+
+
+@pytest.mark.parametrize('acceleration', [False, True])
+def test_an_imu_keeps_what_is_not_filtered(acceleration):
+    """Rates, and if asked forces, with the covariance stated times what is left of the noise."""
+    channels = channels_of(IMU, '', acceleration=acceleration)
+    message = imu(angular_velocity=KNOWN, linear_acceleration=KNOWN)
+    values = channels.take(message)
+    assert values == ((1.0, 2.0, 3.0, 11.0, 12.0, 13.0) if acceleration else (1.0, 2.0, 3.0))
+    out = channels.put(message, [-x for x in values], 0.25)
+    assert (out.header.frame_id, out.header.stamp.sec) == ('base_link', 7)
+    assert (out.angular_velocity.x, out.angular_velocity.z) == (-1.0, -3.0)
+    assert out.linear_acceleration.y == (-12.0 if acceleration else 12.0)
+    np.testing.assert_allclose(out.angular_velocity_covariance, [x / 4.0 for x in KNOWN])
+    np.testing.assert_allclose(out.linear_acceleration_covariance,
+                               [x / (4.0 if acceleration else 1.0) for x in KNOWN])
+    assert channels.output == ''
+
+
+def test_what_an_imu_does_not_hold_stays_so():
+    """An unknown covariance stays 0, an absent acceleration -1; no gyro, no output."""
+    channels = channels_of(IMU, '', acceleration=True)
+    message = imu(linear_acceleration=ABSENT)
+    message.linear_acceleration.x = math.nan
+    values = channels.take(message)
+    assert values == (1.0, 2.0, 3.0, 0.0, 0.0, 0.0)
+    out = channels.put(message, values, 0.5)
+    assert not any(out.angular_velocity_covariance)
+    assert list(out.linear_acceleration_covariance) == ABSENT
+    assert math.isnan(out.linear_acceleration.x)
+    assert channels.take(imu(angular_velocity=ABSENT)) == ()
+
+
+@pytest.mark.parametrize('kind, field, message, output', [
+    (IMU, '', imu(), 'geometry_msgs/msg/AccelStamped'),
+    (IMU, 'angular_velocity.x', imu(), 'geometry_msgs/msg/Vector3Stamped'),
+    ('sensor_msgs/msg/BatteryState', '', BatteryState(), 'geometry_msgs/msg/Vector3Stamped'),
+    ('geometry_msgs/msg/Point', 'x', Point(x=1.0), 'std_msgs/msg/Float64'),
+])
+def test_a_derivative_is_no_rate(kind, field, message, output):
+    """It leaves in a message of its own, with the header; the input is not touched."""
+    channels = channels_of(kind, field, mode='derivative')
+    before = str(message)
+    values = channels.take(message)
+    out = channels.put(message, [float(k) for k in range(5, 5 + len(values))], 0.5)
+    assert channels.output == output and type(out).__name__ == output.rsplit('/', 1)[1]
+    assert str(message) == before
+    if kind == IMU:
+        assert (out.header.frame_id, out.header.stamp.sec) == ('base_link', 7)
+    if output.endswith('AccelStamped'):
+        assert (out.accel.angular.x, out.accel.angular.z) == (5.0, 7.0)
+        assert math.isnan(out.accel.linear.x)
+    else:
+        assert (out.data if hasattr(out, 'data') else out.vector.x) == 5.0
+
+
+def test_a_derivative_without_unit_stays_a_number():
+    """Float64 in, Float64 out."""
+    assert channels_of('std_msgs/msg/Float64', '', mode='derivative').output == ''
+
+
+@pytest.mark.parametrize('kind, field, mode', [
+    ('std_msgs/msg/Float64', '', 'lowpass'), (IMU, 'orientation.x', 'lowpass'),
+    (IMU, '', 'derivative')])
+def test_acceleration_is_refused_where_there_is_none(kind, field, mode):
+    """One line at the start."""
+    with pytest.raises(InputError, match='input.acceleration'):
+        channels_of(kind, field, mode=mode, acceleration=True)

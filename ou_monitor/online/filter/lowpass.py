@@ -28,6 +28,7 @@ from ou_monitor.online.filter.cutoff_laws import wanted_cutoff
 from ou_monitor.online.filter.filter_state import LowPassState
 from ou_monitor.online.filter.lag import cutoff_for_lag, delay, most_lag, phase_lag
 from ou_monitor.online.filter.signal_kalman import SignalKalman
+from ou_monitor.online.filter.white_noise import noise_left
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray
 
@@ -143,6 +144,19 @@ class AdaptiveLowPass:
     def delay(self) -> float:
         """Phase delay of what is in force at `lag_frequency`, s."""
         return delay(self.phase_lag, self._settings.lag_frequency)
+
+    @property
+    def noise_left(self) -> float:
+        """
+        Share of the variance of white noise that the low-pass leaves, to 1 %.
+
+        Of the law `kalman` that of the low-pass of its lag; 1 for a shadow and until the
+        sample rate is known.
+        """
+        angle = _TWO_PI * self.cutoff * self._interval.mean
+        if self._settings.shadow or not angle > 0.0:
+            return 1.0
+        return noise_left(self._settings.order, round(100.0 * math.log(angle)))
 
     def configure(self, **options: object) -> None:
         """

@@ -47,6 +47,12 @@ def white_noise(mode: str, order: int, angle: float) -> float:
     return float(np.linalg.solve(turned, drive)[0])
 
 
+@lru_cache(maxsize=256)
+def noise_left(order: int, angle: int) -> float:
+    """Return what a low-pass leaves of the variance of white samples (log of w dt, in 1 %)."""
+    return white_noise('lowpass', order, math.exp(angle / 100.0))
+
+
 def _step(order: int, angle: float, y: float, slope: float, start: float, end: float,
           ) -> tuple[float, float]:
     state = LowPassState(y)
