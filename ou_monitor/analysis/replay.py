@@ -119,7 +119,9 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
             continue
         stamps.append(float(t[stop - 1]))
         estimates.append(newest)
-        risk.append(outlook.risk(newest, settings) if asked else NAN)
+        risk.append(outlook.risk(
+            newest, settings.brownout_voltage, settings.brownout_horizon,
+            settings.brownout_watch) if asked else NAN)
         if progress is not None:
             progress(k / count)
     if done < t.size and estimates:

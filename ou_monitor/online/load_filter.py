@@ -20,7 +20,7 @@ from ou_monitor.online.load_current import CurrentFilter, scored
 from ou_monitor.online.load_delay import LoadDelay
 from ou_monitor.online.load_noise import CLIP, LoadNoise
 from ou_monitor.online.supply_load import (
-    Basis, LAGS, LoadStatus, POWER, static, SupplyLoad, TABLE)
+    Basis, LAGS, LoadState, LoadStatus, POWER, static, SupplyLoad, TABLE)
 from ou_monitor.records import FloatArray, NAN
 
 # Lag, s, of all: half of what an ESC takes to follow.
@@ -359,6 +359,15 @@ class LoadFilter:
                 status = LoadStatus.NO_RELATION if self._delay.unrelated else LoadStatus.KNOWN
             load = replace(load, status=status)
         return load
+
+    def state(self) -> LoadState | None:
+        """Return what there is to look ahead from; None before any voltage or any throttle."""
+        if not (math.isfinite(self._t) and math.isfinite(self._throttle)):
+            return None
+        return LoadState(
+            self._t, self._throttle, self._m.copy(), self._P * max(1.0, self._noise.scale),
+            tuple(self._lags), self._factor, self._fall(float(self._m[0])),
+            self._noise.log_variance, self._between(0.02))
 
     def path(self, t: FloatArray, throttle: FloatArray) -> FloatArray:
         """

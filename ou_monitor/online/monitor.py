@@ -7,7 +7,7 @@ with a recording, so both say the same thing of the same data.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 import math
 from typing import TYPE_CHECKING
 
@@ -17,8 +17,11 @@ from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.input_health import patience, readings, Stamps, StampWatch
 from ou_monitor.online.level import Level
 from ou_monitor.online.load_filter import LoadFilter
+from ou_monitor.online.monitor_report import MonitorReport
+from ou_monitor.online.risk.ahead import Ahead, look_ahead, risk_of_all
 from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
-from ou_monitor.online.risk.outlook import Outlook, ThrottleBudget
+from ou_monitor.online.risk.forecast import Forecast
+from ou_monitor.online.risk.outlook import Outlook
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.online.supply_load import SupplyLoad
 from ou_monitor.records import Counters, Estimate, Flag, NAN, Status
@@ -29,106 +32,6 @@ if TYPE_CHECKING:
 # Cautions that make the numbers doubtful; the others only inform.
 _DOUBTFUL = frozenset({Flag.SLOW_RATE, Flag.QUANTIZED, Flag.LOWPASS_UPSTREAM, Flag.SATURATED,
                        Flag.TREND, Flag.IRREGULAR})
-
-
-@dataclass(frozen=True)
-class MonitorReport:
-    """
-    What is known at one instant.
-
-    Attributes
-    ----------
-    estimate : Estimate
-        Newest estimate.
-    risk : float
-        Probability of a brown-out within the horizon; NaN when not known.
-    budget : float
-        Highest throttle, 0..1, that keeps the risk under
-        `brownout.budget_limit`; NaN when not known.
-    budget_reason : str
-        What ends the budget, or why it is not known.
-    left_out : tuple of str
-        Terms of the model file that move the supply and that the risk does not know of.
-    flag : FlagState
-        The brown-out flag, and why.
-    level : Level
-        Level for the diagnostics.
-    summary : str
-        One line for the pilot.
-    age : float
-        Age of the newest voltage, s; inf when none ever came.
-    patience : float
-        Age from which the input is stale, s: `stale_after`, or less for a fast source.
-    stamps : Stamps
-        What the stamps are good for.
-    fresh : bool
-        Whether the numbers rest on samples that are not too old.
-    thinned : int
-        Samples that only the floor has judged, because there were more than could be estimated
-        from.
-    restarts : int
-        Times the estimator was started anew because of an error.
-    fault : str
-        The last such error, in one line; empty when there was none.
-    load : SupplyLoad
-        Level, sag and noise under load, as far as they are known; needs no relaxation.
-
-    """
-
-    estimate: Estimate
-    risk: float
-    budget: float
-    budget_reason: str
-    left_out: tuple[str, ...]
-    flag: FlagState
-    level: Level
-    summary: str
-    age: float
-    patience: float
-    stamps: Stamps
-    fresh: bool
-    thinned: int
-    restarts: int
-    fault: str
-    load: SupplyLoad = SupplyLoad()
-
-    @property
-    def brownout(self) -> bool | None:
-        """Return the flag; None when not known."""
-        return self.flag.brownout
-
-    @property
-    def fields(self) -> dict[str, str]:
-        """
-        Return every field as text, for diagnostics; numbers round-trip.
-
-        SI units; `alpha_se`, `sigma_se` and `var_inf_se` are of the logarithm, `u0_se` in V.
-        """
-        e = self.estimate
-        values: dict[str, object] = {
-            name: getattr(e, name) for name in (
-                't', 'alpha', 'alpha_se', 'sigma', 'sigma_se', 'var_inf', 'var_inf_se', 'tau',
-                'u0', 'u0_se', 'noise_std', 'sag', 'voltage', 'throttle', 'n', 'duration', 'rate')}
-        values['brownout_risk'] = self.risk
-        values['brownout'] = 'unknown' if self.brownout is None else str(self.brownout).lower()
-        values['brownout_level'] = self.flag.level.name
-        values['brownout_level_age'] = self.flag.age
-        values['brownout_reason'] = self.flag.reason
-        values['throttle_budget'] = self.budget
-        values['model_left_out'] = ','.join(self.left_out)
-        values['throttle_budget_reason'] = self.budget_reason
-        values['age'] = self.age
-        values['patience'] = self.patience
-        values['stamps'] = self.stamps.name
-        values['samples_thinned'] = self.thinned
-        values['restarts'] = self.restarts
-        values['fault'] = self.fault
-        values['status'] = e.status.name
-        values['status_text'] = e.status.value
-        values['flags'] = ','.join(flag.name for flag in e.flags)
-        for name in ('pushed', 'used', 'non_finite', 'late', 'held', 'resets'):
-            values[name] = getattr(e.counters, name)
-        return {name: repr(v) if isinstance(v, float) else str(v) for name, v in values.items()}
 
 
 class SupplyMonitor:
@@ -172,8 +75,10 @@ class SupplyMonitor:
         self._outlook = Outlook(background=self._background)
         self._outlook.set_model(self._model)
         self._newest = Estimate()
+        self._forecast = Forecast(
+            self._load_filter, lambda horizon: self._outlook.passage(self._newest, horizon))
         # Risk and budget of the last report.
-        self._ahead: tuple[float, ThrottleBudget | None] = NAN, None
+        self._ahead = Ahead()
 
     @property
     def settings(self) -> MonitorSettings:
@@ -248,7 +153,7 @@ class SupplyMonitor:
         drawn = None if current is None else np.broadcast_to(
             np.asarray(current, dtype=np.float64), stamps.shape)[part]
         try:
-            self._load_filter.push(stamps[part], volts[part], load, drawn)
+            self._forecast.push(stamps[part], volts[part], load, drawn)
             self._estimator.push(stamps[part], volts[part], load)
             self._outlook.push(stamps[part], volts[part], load, self._newest)
         except Exception as error:
@@ -303,6 +208,7 @@ class SupplyMonitor:
         self._stamps.start_anew()
         self._outlook.new_time_line()
         self._load_filter.new_time_line()
+        self._forecast.new_time_line()
         self._reset_reason = reason
 
     def report(self, age: float | None, now: float | None = None,
@@ -339,19 +245,19 @@ class SupplyMonitor:
             fresh = (silent <= limit and e.status is not Status.NO_DATA
                      and stamps is Stamps.GOOD and not self._distrusted)
             if again or not fresh:
-                self._ahead = (self._outlook.risk(e, self._settings),
-                               self._outlook.budget(e, self._settings)) if fresh else (NAN, None)
-            if again:
                 self._load = self._load_filter.load()
-            risk, budget = self._ahead
+                self._ahead = look_ahead(self._outlook, self._forecast, e, self._load,
+                                         self._settings) if fresh else Ahead()
             left_out = () if self._outlook.events is None else self._outlook.events.left_out
         except Exception as error:
             # As in `push`.
             self.restart(error)
             e = Estimate(counters=self._counters())
-            limit, stamps, fresh, risk = self._settings.stale_after, Stamps.GOOD, False, NAN
-            budget, left_out = None, ()
+            limit, stamps, fresh = self._settings.stale_after, Stamps.GOOD, False
+            self._ahead, left_out = Ahead(), ()
         self._newest = e
+        ahead = self._ahead
+        risk = ahead.outcome.risk
         self._faulty = self._faulty and not e.usable
         arriving = here <= self._settings.stale_after
         flag = self._flag.update(e.t + silent if now is None else now, risk, fresh=fresh,
@@ -360,10 +266,53 @@ class SupplyMonitor:
             age, e, limit, stamps, arriving, late=silent - here > limit)
         level, summary = self._judge(e, risk, flag, silence, arriving)
         return MonitorReport(
-            e, risk, NAN if budget is None else budget.throttle,
-            '' if budget is None else budget.reason, left_out, flag, level, summary, silent,
-            limit, stamps, fresh, self._thinned, self._restarts, self._fault,
-            self._load)
+            e, risk, ahead.budget, ahead.budget_reason, left_out, flag, level, summary, silent,
+            limit, stamps, fresh, self._thinned, self._restarts, self._fault, self._load,
+            ahead.outcome.basis, ahead.outcome.cause, ahead.curve)
+
+    def risk(self, voltage: float | None = None, horizon: float | None = None) -> float:
+        """
+        Return P(below `voltage` within `horizon`) from the newest sample on; changes nothing.
+
+        Parameters
+        ----------
+        voltage : float, optional
+            V; `brownout_voltage` when left out.
+        horizon : float, optional
+            Time ahead, s; `brownout_horizon` when left out.
+
+        Returns
+        -------
+        float
+            Probability, the pilot's throttle to come included; NaN without voltage and in the
+            first second.
+
+        """
+        return risk_of_all(self._outlook, self._forecast, self._newest, self._settings,
+                           *self._asked(voltage, horizon)).risk
+
+    def risk_if(self, throttle: float, dwell: float, voltage: float | None = None,
+                horizon: float | None = None) -> float:
+        """
+        Return the same risk, if throttle goes to `throttle`, stays `dwell` s, and comes back.
+
+        NaN where the load is not known.
+        """
+        level, ahead = self._asked(voltage, horizon)
+        if not (math.isfinite(throttle) and 0.0 <= throttle <= 1.0):
+            raise ValueError(f'throttle must lie within 0..1, got {throttle}')
+        if not (math.isfinite(dwell) and dwell >= 0.0):
+            raise ValueError(f'dwell must be a number of seconds, not negative, got {dwell}')
+        return float(self._forecast.risk_if(throttle, dwell, level, ahead)[0])
+
+    def _asked(self, voltage: float | None, horizon: float | None) -> tuple[float, float]:
+        level = self._settings.brownout_voltage if voltage is None else voltage
+        ahead = self._settings.brownout_horizon if horizon is None else horizon
+        if not math.isfinite(level):
+            raise ValueError(f'voltage must be finite, got {level} V')
+        if not (math.isfinite(ahead) and ahead > 0.0):
+            raise ValueError(f'horizon must be a positive number of seconds, got {ahead}')
+        return level, ahead
 
     def _estimate(self) -> Estimate:
         """Return the newest estimate; IRREGULAR speaks of the window, not of all that was."""

@@ -119,3 +119,39 @@ class SupplyLoad:
         if not table or self.status is LoadStatus.STILL:
             return np.full(u.shape, NAN)
         return np.asarray(np.interp(u, TABLE, table))
+
+
+@dataclass(frozen=True, eq=False)
+class LoadState:
+    """
+    What the load filter knows now, to look ahead from.
+
+    Attributes
+    ----------
+    t, throttle : float
+        Stamp, s, and throttle now.
+    mean, covariance : ndarray, shape (9,) and (9, 9)
+        Of level, V, discharge per load, and the coefficients, V, of x, u, u^3, x after three
+        lags, and inrush; the covariance with what the scores of the innovations say of it.
+    lags : tuple of float
+        x after the three lags.
+    size : float
+        Load at this level over that at 3.8 V a cell.
+    fall : float
+        Fall of the level, V per unit of charge.
+    log_variance : tuple of float
+        Coefficients of ln variance, V^2, of a sample: 1, ripple, sqrt|du|.
+    flown : tuple of float
+        Throttles between which the noise is known.
+
+    """
+
+    t: float
+    throttle: float
+    mean: FloatArray
+    covariance: FloatArray
+    lags: tuple[float, ...]
+    size: float
+    fall: float
+    log_variance: tuple[float, float, float]
+    flown: tuple[float, float]

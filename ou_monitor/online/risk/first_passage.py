@@ -146,6 +146,25 @@ def risk_of(supply: Supply, voltage: float, horizon: float, now: float | None = 
     return _averaged(start, barrier, span, weight, 1)
 
 
+@dataclass(frozen=True)
+class Passage:
+    """The law of the lowest voltage within a horizon, from one instant on; V."""
+
+    supply: Supply
+    now: float
+    noise_std: float
+
+    def density(self, low: float, horizon: float) -> float:
+        """Return the density, 1/V, at a lowest voltage, over what noise or a tenth of it hides."""
+        sd = math.exp(float(np.asarray(self.supply.ln_sigma)) - 0.5 * float(
+            np.asarray(self.supply.ln_alpha))) / math.sqrt(2.0)
+        half = max(self.noise_std, 0.1 * sd)
+        above, below = (1.0 if at >= self.now else float(risk_of(
+            self.supply, at, horizon, self.now, self.noise_std, coarse=True))
+            for at in (low + half, low - half))
+        return (above - below) / (2.0 * half)
+
+
 def as_sampled(e: Estimate, supply: Supply, voltage: float, horizon: float,
                now: float | None, risk: float) -> float:
     """Return the risk of being seen below, errors counted as for the continuous path."""

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.passage.law import prepare
 from ou_monitor.online.risk.curves import LearnedCurves
-from ou_monitor.online.risk.first_passage import as_sampled, risk_of, Supply
+from ou_monitor.online.risk.first_passage import as_sampled, Passage, risk_of, Supply
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN
 
@@ -267,24 +267,34 @@ class Outlook:
         variance = error**2 + wander.variance + _SHARE * wander.fast_speed * horizon
         return ln_sigma + wander.value, np.minimum(np.sqrt(variance), _LARGEST)
 
-    def risk(self, e: Estimate, settings: MonitorSettings) -> float:
-        """Return the probability of a brown-out within the horizon; NaN when not known."""
-        s, now = settings, self.voltage
-        if now <= s.brownout_voltage:
+    def passage(self, e: Estimate, horizon: float) -> Passage | None:
+        """Return the law of the lowest voltage within a horizon, s; None when not known."""
+        now = self.voltage
+        if not e.usable or math.isnan(now):
+            return None
+        return Passage(self.supply(e, horizon), now, self._noise_of(e))
+
+    def _noise_of(self, e: Estimate) -> float:
+        return e.noise_std if e.noise_std > 0.0 else self._noise
+
+    def risk(self, e: Estimate, voltage: float, horizon: float, watch: str = 'continuous'
+             ) -> float:
+        """Return P(below `voltage`, V, within `horizon`, s); NaN when not known."""
+        now = self.voltage
+        if now <= voltage:
             return 1.0
         if not e.usable:
             return NAN
         here = None if math.isnan(now) else now
-        supply = self.supply(e, s.brownout_horizon)
-        noise = e.noise_std if e.noise_std > 0.0 else self._noise
-        risk = float(risk_of(supply, s.brownout_voltage, s.brownout_horizon, here, noise))
-        if s.brownout_watch == 'sampled':
-            risk = as_sampled(e, supply, s.brownout_voltage, s.brownout_horizon, here, risk)
+        supply = self.supply(e, horizon)
+        risk = float(risk_of(supply, voltage, horizon, here, self._noise_of(e)))
+        if watch == 'sampled':
+            risk = as_sampled(e, supply, voltage, horizon, here, risk)
         if self._events is None:
             return risk
         self._events.follow(float(np.asarray(supply.ln_alpha)), float(np.asarray(supply.ln_sigma)))
         added = self._events.survival(
-            supply.u0 if here is None else here, s.brownout_voltage, s.brownout_horizon,
+            supply.u0 if here is None else here, voltage, horizon,
             ln_alpha=supply.ln_alpha, ln_sigma=supply.ln_sigma, u0=supply.u0)
         return _with_events(np.array(risk), added).item()
 

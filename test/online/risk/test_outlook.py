@@ -97,7 +97,8 @@ def test_jumps_change_the_odds_by_orders_of_magnitude():
     plain, jumpy = SupplyMonitor(SETTINGS), SupplyMonitor(
         SETTINGS, model(Jumps(10.0 / 60.0, -0.5, 0.02)), background=False)
     before, after = (flown(m, [(0.2, 3.0)]).risk for m in (plain, jumpy))
-    assert before < 1e-8
+    # The excursions have their say.
+    assert before < 1e-5
     assert after == pytest.approx(-math.expm1(-10.0 / 60.0), rel=0.03)
 
 

@@ -1,0 +1,309 @@
+"""
+Risk of a brown-out on the leg that predicts this flight best, and what a throttle would do.
+
+Legs: `first_passage` (the OU that the window sees, throttle as it is), `load` (the answer to
+throttle, with the pilot's throttle to come), and `excursions` (the flight's own drops, where
+the load is not known).  The first two are averaged by how well they have predicted the lowest
+voltages of horizons that are complete (Bayes, with forgetting), and each gives a share to the
+excursions, as often as it was wrong; the conditional risk gives such a share to a law as wide
+as they are.
+
+Limits: below is meant of the middle one of three samples, except in the first-passage leg;
+nothing is known in the first second.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.online.load_filter import LoadFilter
+from ou_monitor.online.risk.calibration import (
+    below, Calibrator, density, FarShare, LowestLaw, MEMORY)
+from ou_monitor.online.risk.excursions import excursion_risk, excursions
+from ou_monitor.online.risk.first_passage import Passage
+from ou_monitor.online.risk.load_law import Futures, held, lowest, mean_now, Sampling
+from ou_monitor.online.risk.past import BLOCK, Past
+from ou_monitor.online.risk.pilot import Flown, flown, pilot
+from ou_monitor.online.supply_load import LoadState
+from ou_monitor.records import FloatArray, NAN
+from scipy.special import expit
+
+# Horizons, s, from which the flight learns; those between are interpolated in ln h.
+RUNGS = (0.5, 1.0, 2.0, 5.0, 15.0)
+_LN_RUNGS = np.log(RUNGS)
+# Time from one look to the next, s, and as a share of the horizon.
+LOOK, _LOOK_SHARE = 0.2, 0.2
+# The window's own tests have found the OU: odds, and horizons that it counts as right.
+_ODDS = 20.0
+# A voltage so late, s, begins a new time line.
+_BACKWARDS = 1.0
+# What may make most of a risk.
+DOMINANT = ('noise', 'load now', 'throttle to come')
+
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """
+    A risk and what it stands on.
+
+    Attributes
+    ----------
+    risk : float
+        Probability, 0..1; NaN when not known.
+    basis : str
+        ``first_passage``, ``load``, ``excursions`` or ``none``.
+    cause : str
+        What makes most of it: noise, load now, or throttle to come; empty when not known.
+
+    """
+
+    risk: float = NAN
+    basis: str = 'none'
+    cause: str = ''
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What was known at one time, until a horizon from there on is complete."""
+
+    t: float
+    voltage: float
+    mean: float
+    deviation: float
+    state: LoadState | None
+    futures: tuple[Futures, FloatArray] | None
+    passage: Passage | None
+
+
+class _Rung:
+    """What completed horizons of one length have taught."""
+
+    def __init__(self, horizon: float) -> None:
+        self.horizon = horizon
+        self.looks: deque[_Look] = deque()
+        self.next = self.learned = -math.inf
+        self.calibrator = Calibrator()
+        self.held, self.pilot, self.passage = FarShare(), FarShare(), FarShare(_ODDS - 1.0)
+        # Log likelihood of first passage less that of the other leg.
+        self.evidence = 0.0
+
+    @property
+    def values(self) -> FloatArray:
+        """Return all that is interpolated between horizons."""
+        return np.append(self.calibrator.law.values, (
+            self.held.value, self.pilot.value, self.passage.value, self.evidence))
+
+    def learn(self, look: _Look, low: float, peak: float, dwell: float, sampling: Sampling
+              ) -> None:
+        """Take what a horizon became: lowest voltage, V, highest throttle, time there, s."""
+        weight = min(1.0, (look.t - self.learned) / self.horizon) if math.isfinite(
+            self.learned) else 1.0
+        elapsed = max(look.t - self.learned, 0.0) if math.isfinite(self.learned) else 0.0
+        self.learned = look.t
+        y = np.array([low])
+        far = float(density(y, y * 0.0 + look.voltage - look.mean, y * 0.0 + look.deviation)[0])
+        other = far
+        if look.state is not None and look.futures is not None and math.isfinite(peak):
+            start, law = mean_now(look.state), self.calibrator.law
+            once = held(peak, dwell, look.state.throttle)
+            mean, deviation = lowest(look.state, once, self.horizon, sampling)
+            middle, spread = law.moments(mean, deviation, start)
+            self.held.add(float(density(y, middle, spread)[0]), float(density(
+                y, middle, np.hypot(spread, look.deviation))[0]), weight, elapsed)
+            futures, shares = look.futures
+            several = law.moments(*lowest(look.state, futures, self.horizon, sampling), start)
+            other = self.pilot.add(float(shares @ density(y, *several)), far, weight, elapsed)
+            self.calibrator.add(low, float(mean[0]), float(deviation[0]), start, weight, elapsed)
+        self.evidence *= math.exp(-elapsed / MEMORY)
+        if look.passage is not None:
+            first = self.passage.add(look.passage.density(low, self.horizon), far, weight, elapsed)
+            self.evidence += weight * math.log(max(first, 1e-300) / max(other, 1e-300))
+
+
+class Forecast:
+    """
+    Risk with throttle to come, and what a throttle would do.
+
+    Parameters
+    ----------
+    loads : LoadFilter
+        The voltage under load; fed by `push`.
+    passage : callable
+        Gives the first-passage leg as it is now for a horizon, s; None when not known.
+
+    """
+
+    def __init__(self, loads: LoadFilter, passage: Callable[[float], Passage | None]) -> None:
+        self._loads, self._passage = loads, passage
+        self._rungs = tuple(_Rung(horizon) for horizon in RUNGS)
+        self.new_time_line()
+        self._known = False
+        self._sampling = Sampling(0.02, 0.1)
+
+    def new_time_line(self) -> None:
+        """Begin a past; what has been learned stays."""
+        self._past = Past()
+        self._newest = -math.inf
+        self._last: FloatArray = np.empty(0)
+        self._samples = 0
+        self._begun = NAN
+        self._next = -math.inf
+        self._kept: dict[float, tuple[float, float, Flown]] = {}
+        for rung in self._rungs:
+            rung.looks.clear()
+            rung.next = rung.learned = -math.inf
+
+    def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike, throttle: npt.ArrayLike | None,
+             current: npt.ArrayLike | None = None) -> None:
+        """Add samples, s, V, 0..1, A; NaN is unknown."""
+        stamps, volts = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in (t, voltage))
+        u, drawn = (np.broadcast_to(np.asarray(NAN if x is None else x, dtype=np.float64),
+                                    stamps.shape) for x in (throttle, current))
+        begin, n = 0, stamps.size
+        while begin < n:
+            # As far as the next look; stamps that go back are looked at one by one.
+            ahead = np.flatnonzero(stamps[begin:] >= self._next)
+            back = np.flatnonzero(np.diff(stamps[begin:]) < -_BACKWARDS)
+            end = min([begin + int(ahead[0]) + 1] if ahead.size else [n],
+                      [begin + int(back[0]) + 1] if back.size else [n])[0]
+            part = slice(begin, end)
+            self._loads.push(stamps[part], volts[part], u[part], drawn[part])
+            self._take(stamps[part], volts[part], u[part])
+            begin = end
+
+    def _take(self, t: FloatArray, v: FloatArray, u: FloatArray) -> None:
+        """Take samples up to a look."""
+        good = np.isfinite(t) & np.isfinite(v)
+        t, v, u = t[good], v[good], np.clip(u[good], 0.0, 1.0)
+        if t.size and t[0] < self._newest - _BACKWARDS:
+            self.new_time_line()
+        rises = t > np.maximum.accumulate(np.concatenate(([self._newest], t)))[:-1]
+        t, v, u = t[rises], v[rises], u[rises]
+        if not t.size:
+            return
+        self._begun = t.item(0) if math.isnan(self._begun) else self._begun
+        self._samples += t.size
+        self._newest = t.item(-1)
+        self._last = np.concatenate((self._last, v))[-3:]
+        self._past.push(t, v, u)
+        if self._newest >= self._next:
+            self._next = self._newest + LOOK
+            self._look()
+
+    @property
+    def flown(self) -> tuple[float, float]:
+        """Return the lowest and the highest throttle of the last minutes; NaN without any."""
+        return self._past.flown()
+
+    @property
+    def voltage(self) -> float:
+        """Where the supply is now, V: the middle one of the last three samples; NaN of one."""
+        return float(np.median(self._last)) if self._last.size > 1 else NAN
+
+    def _look(self) -> None:
+        """Complete horizons, and begin new ones."""
+        self._kept.clear()
+        self._known = self._loads.load().known
+        if self._samples > 1:
+            interval = (self._newest - self._begun) / (self._samples - 1)
+            self._sampling = Sampling(interval, self._past.activity())
+        state = self._loads.state() if self._known else None
+        for rung in self._rungs:
+            while rung.looks and self._past.end >= rung.looks[0].t + rung.horizon + BLOCK:
+                look = rung.looks.popleft()
+                became = self._past.became(look.t, rung.horizon)
+                if became is not None:
+                    rung.learn(look, *became, self._sampling)
+            if self._newest < rung.next:
+                continue
+            rung.next = self._newest + max(LOOK, _LOOK_SHARE * rung.horizon) - 0.5 * BLOCK
+            mean, deviation, done = self._flight(rung.horizon)
+            if math.isnan(deviation) or math.isnan(self.voltage):
+                continue
+            rung.looks.append(_Look(
+                self._newest, self.voltage, mean, deviation, state,
+                None if state is None else pilot(done, state.throttle, rung.horizon),
+                self._passage(rung.horizon)))
+
+    def _flight(self, horizon: float) -> tuple[float, float, Flown]:
+        """Return excursions and futures of the flight, found once between two looks."""
+        if horizon not in self._kept:
+            self._kept[horizon] = *excursions(self._past, horizon), flown(self._past, horizon)
+        return self._kept[horizon]
+
+    def _learned(self, horizon: float) -> tuple[LowestLaw, float, float, float, float]:
+        """Return law, shares of held, pilot and first passage, and evidence, for a horizon."""
+        values = np.array([rung.values for rung in self._rungs])
+        at = math.log(horizon)
+        between = np.array([np.interp(at, _LN_RUNGS, column) for column in values.T])
+        return LowestLaw(between[:6]), *between[6:].tolist()
+
+    def risk(self, voltage: float, horizon: float, passage: float = NAN, *,
+             alone: bool = False) -> Outcome:
+        """
+        Return P(below `voltage`, V, within `horizon`, s), the throttle to come included.
+
+        passage: the risk of the first-passage leg; NaN when not known.  alone: where it is known
+        nothing else counts, as where a model file names events that no other leg knows of.
+        """
+        now = self.voltage
+        state = self._state()
+        law, _, wrong, missed, evidence = self._learned(horizon)
+        mean, deviation, done = self._flight(horizon)
+        level = np.array([voltage])
+        far = NAN if math.isnan(deviation) or math.isnan(now) else float(
+            excursion_risk(now, level, horizon, mean, deviation)[0])
+        risk, basis, cause = far, 'excursions', ''
+        if state is not None and not math.isnan(far):
+            futures, shares = pilot(done, state.throttle, horizon)
+            # Idle, throttle as it is, and what the pilot may do.
+            every = futures.after(held([0.0, state.throttle], horizon, state.throttle))
+            each = below(voltage, *law.moments(*lowest(state, every, horizon, self._sampling),
+                                               mean_now(state)))
+            parts = each.item(0), each.item(1), float(shares @ each[2:])
+            risk, basis = wrong * far + (1.0 - wrong) * parts[2], 'load'
+            cause = DOMINANT[int(np.argmax(np.diff(np.maximum.accumulate(
+                np.array([0.0, *parts])))))]
+        if now <= voltage:
+            return Outcome(1.0, basis if not math.isnan(far) else 'none', cause or 'load now')
+        if not math.isnan(passage):
+            if alone or math.isnan(far):
+                return Outcome(passage, 'first_passage', DOMINANT[0])
+            share = float(expit(math.log(_ODDS - 1.0) + evidence))
+            first = missed * far + (1.0 - missed) * passage
+            risk = share * first + (1.0 - share) * risk
+            if share > 0.5:
+                basis, cause = 'first_passage', DOMINANT[0]
+        return Outcome(min(max(risk, 0.0), 1.0), 'none' if math.isnan(risk) else basis, cause)
+
+    def risk_if(self, throttle: npt.ArrayLike, dwell: float, voltage: float, horizon: float
+                ) -> FloatArray:
+        """
+        Return the risk if throttle goes to each of `throttle` and stays `dwell`, s; shape (k,).
+
+        NaN where the load is not known.
+        """
+        u = np.clip(np.atleast_1d(np.asarray(throttle, dtype=np.float64)), 0.0, 1.0)
+        state = self._state()
+        _, deviation, _ = self._flight(horizon)
+        now = self.voltage
+        if now <= voltage:
+            return np.ones(u.shape)
+        if state is None or math.isnan(deviation) or math.isnan(now):
+            return np.full(u.shape, NAN)
+        law, wrong, *_ = self._learned(horizon)
+        futures = held(u, dwell, state.throttle)
+        middle, spread = law.moments(*lowest(state, futures, horizon, self._sampling),
+                                     mean_now(state))
+        return np.asarray(wrong * below(voltage, middle, np.hypot(spread, deviation))
+                          + (1.0 - wrong) * below(voltage, middle, spread))
+
+    def _state(self) -> LoadState | None:
+        """Return what there is to look ahead from; None where the load is not known."""
+        return self._loads.state() if self._known else None
