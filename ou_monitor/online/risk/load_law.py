@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.load import INRUSH_TIME
-from ou_monitor.online.supply_load import LAGS, LoadState, POWER, ripple
+from ou_monitor.model.load import INRUSH_TIME, ripple
+from ou_monitor.online.supply_load import LAGS, LoadState, POWER
 from ou_monitor.records import FloatArray
 from scipy.special import ndtr
 
