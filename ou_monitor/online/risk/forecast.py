@@ -46,7 +46,6 @@ _BACKWARDS = 1.0
 DOMINANT = ('noise', 'load now', 'throttle to come')
 
 
-
 @dataclass(frozen=True)
 class Outcome:
     """
