@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+import math
 from typing import Any
 
 from ou_monitor.errors import nearest
@@ -11,7 +12,8 @@ from ou_monitor.online.settings import check_values, Parameter
 
 # Revolutions per second for one of the unit, and whether the poles of the motors divide it.
 RPM_UNITS: dict[str, tuple[float, bool]] = {
-    'rpm': (1.0 / 60.0, False), 'erpm': (1.0 / 60.0, True), 'hz': (1.0, False)}
+    'rpm': (1.0 / 60.0, False), 'erpm': (1.0 / 60.0, True), 'hz': (1.0, False),
+    'rad_s': (0.5 / math.pi, False)}
 
 NOTCH_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('notch.count', 0, 'Most notches that follow the motors; 0: none.', 0, 4),
@@ -22,7 +24,7 @@ NOTCH_PARAMETERS: tuple[Parameter, ...] = (
               'Cutoff of the low-pass of order 2 behind the notches for whose derivative and lag '
               'they must pay, Hz.', 1.0, 1.0e5),
     Parameter('notch.rpm_unit', 'rpm',
-              'Unit of the motor speeds: rpm or hz of the shaft, erpm of the field (needs '
+              'Unit of the motor speeds: rpm, hz or rad_s of the shaft, erpm of the field (needs '
               'notch.poles).', choices=tuple(RPM_UNITS)),
     Parameter('notch.poles', 0,
               'Magnets of a motor, for erpm: 14 on most motors for 5 inch propellers; 0: not '
@@ -46,7 +48,7 @@ class NotchSettings:
         Lowest frequency of a notch, Hz.
     cutoff : float
         Cutoff of the low-pass behind, Hz.
-    rpm_unit : {'rpm', 'erpm', 'hz'}
+    rpm_unit : {'rpm', 'erpm', 'hz', 'rad_s'}
         Unit of the motor speeds.
     poles : int
         Magnets of a motor, for erpm.

@@ -64,6 +64,9 @@ def test_erpm_needs_the_poles():
     notch = AdaptiveNotch(rpm_unit='erpm', poles=14)
     notch.filter(t, x, rpm=60.0 * 7.0 * f)
     assert notch.frequencies == pytest.approx(f[-1], rel=0.01)
+    turns = AdaptiveNotch(rpm_unit='rad_s')
+    turns.filter(t, x, rpm=2.0 * np.pi * f)
+    assert turns.frequencies == pytest.approx(f[-1], rel=0.01)
     with pytest.raises(ValueError, match=r"notch.rpm_unit 'erpm' needs notch.poles.*got 0"):
         AdaptiveNotch(rpm_unit='erpm')
     with pytest.raises(ValueError, match='even number of magnets.*got 7'):
