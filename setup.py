@@ -15,7 +15,8 @@ setup(
     name=NAME,
     version='0.2.0',
     packages=find_packages(include=[NAME, NAME + '.*']),
-    package_data={NAME: ['py.typed'], NAME + '.report': ['*.css', '*.js']},
+    package_data={NAME: ['py.typed'], NAME + '.report': ['*.css', '*.js'],
+                  NAME + '.nodes': ['*.html']},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + NAME]),
         (SHARE, ['package.xml']),
@@ -31,6 +32,7 @@ setup(
     extras_require={
         'fast': ['numba>=0.59,<1'],
         'fleet': ['dask>=2024.8,<2027', 'distributed>=2024.8,<2027', 'pyarrow>=16,<28'],
+        'live': ['tornado>=6.4,<7'],
         'test': ['pytest>=8,<10', 'hypothesis>=6.100,<7', 'rosbags>=0.11,<0.12'],
         'doc': ['sphinx>=7.2,<10', 'myst-parser>=3,<6'],
         **LOGS, 'logs': [package for packages in LOGS.values() for package in packages]},

@@ -102,7 +102,7 @@ lists_of() {
         echo "scripts/${1/noble/test}.lock"
         return
     fi
-    echo scripts/requirements-run.txt
+    printf '%s\n' scripts/requirements-{run,live}.txt
     [ "$1" = run ] || printf '%s\n' scripts/requirements-{build,test}.txt
 }
 

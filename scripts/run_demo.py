@@ -75,7 +75,8 @@ class Children:
         with self._log(name).open('wb') as log:
             # A session of its own: Ctrl-C reaches this program, which ends the others in order.
             self._running[name] = subprocess.Popen(
-                [sys.executable, '-u', '-m', f'ou_monitor.nodes.{name}', *arguments],
+                [sys.executable, '-u', '-m', name if '.' in name else f'ou_monitor.nodes.{name}',
+                 *arguments],
                 cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
                 start_new_session=True)
 
@@ -104,6 +105,10 @@ class Children:
         """Return the last line that it wrote, and where the rest is."""
         lines = self._log(name).read_text(errors='replace').strip().splitlines()
         return f'{lines[-1] if lines else "no output"} (log: {self._log(name)})'
+
+    def said(self, name: str) -> str:
+        """Return all that it wrote."""
+        return self._log(name).read_text(errors='replace').strip()
 
     def _log(self, name: str) -> Path:
         return self._logs / f'demo_{name}.log'
@@ -202,6 +207,18 @@ def signal_of(bag: str) -> tuple[str, str]:
     return best.name, best.type
 
 
+def live_page(children: Children) -> str:
+    """Start the live page; return the line with its address, empty where it cannot be served."""
+    children.start('ou_monitor.cli.main', 'live', '--port', '0')
+    deadline = time.monotonic() + START_TIMEOUT
+    while children.status('ou_monitor.cli.main') is None and time.monotonic() < deadline:
+        line = children.said('ou_monitor.cli.main')
+        if 'http://' in line:
+            return line
+        time.sleep(0.05)
+    return ''
+
+
 def watch(bag: str, seconds: float, logs: Path) -> Listener:
     """Run the nodes, replay the bag into them and show what they publish."""
     from ou_monitor.nodes.run import make_executor
@@ -222,16 +239,19 @@ def watch(bag: str, seconds: float, logs: Path) -> Listener:
             listener.hear_filter(kind)
             deadline = time.monotonic() + START_TIMEOUT
             while not listener.ready():
-                executor.spin_once(timeout_sec=0.1)
+                Interrupt.spin(executor, 0.1)
                 children.check('estimator', 'adaptive_filter')
                 if time.monotonic() > deadline:
                     raise DemoError(f'the nodes did not appear within {START_TIMEOUT:.0f} s '
                                     f'(logs: {logs})')
+            address = live_page(children)
+            if address:
+                print(address, flush=True)
             children.start('replay', bag)
             table = Table()
             end = time.monotonic() + seconds
             while children.status('replay') is None and time.monotonic() < end:
-                executor.spin_once(timeout_sec=0.05)
+                Interrupt.spin(executor, 0.05)
                 children.check('estimator', 'adaptive_filter')
                 table.show(listener)
             table.close()
@@ -267,16 +287,36 @@ def options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def interrupt(*_: object) -> None:
-    """End the demo as Ctrl-C does."""
-    raise KeyboardInterrupt
+class Interrupt:
+    """Ends the demo on SIGINT and SIGTERM, but not inside the executor, which cannot bear it."""
+
+    inside = came = False
+
+    @classmethod
+    def handle(cls, *_: object) -> None:
+        """Raise KeyboardInterrupt, now or when the executor has returned."""
+        cls.came = True
+        if not cls.inside:
+            raise KeyboardInterrupt
+
+    @classmethod
+    def spin(cls, executor: Any, timeout: float) -> None:
+        """Spin once (timeout in s)."""
+        cls.inside = True
+        try:
+            executor.spin_once(timeout_sec=timeout)
+        finally:
+            cls.inside = False
+        if cls.came:
+            raise KeyboardInterrupt
 
 
 def main() -> int:
     """Run the demo; return the exit status."""
     chosen = options()
     # Not by way of SIGINT, which a shell may let all its children ignore.
-    signal.signal(signal.SIGTERM, interrupt)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, Interrupt.handle)
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     try:
         if not Path(chosen.bag).exists():

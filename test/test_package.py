@@ -261,8 +261,8 @@ def requirements(name: str) -> list[Requirement]:
             if line and not line.startswith(('#', ' '))]
 
 
-LISTS = {'build': ['build'], 'run': ['build', 'ros', 'run'],
-         'test': ['build', 'ros', 'run', 'ros-test', 'test']}
+LISTS = {'build': ['build'], 'run': ['build', 'ros', 'run', 'live'],
+         'test': ['build', 'ros', 'run', 'live', 'ros-test', 'test']}
 
 
 @pytest.mark.parametrize('python', ['3.11.0', '3.12.0'])

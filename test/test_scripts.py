@@ -110,8 +110,8 @@ def test_no_registry_is_refused_and_the_next_run_tries_again(tree):
 
 def made_by_hand(tree: Path) -> None:
     """Make an environment as the scripts would, without what is in the lists."""
-    for name in ('requirements-run.txt', 'requirements-test.txt', 'build.lock', 'run.lock',
-                 'test.lock'):
+    for name in ('requirements-run.txt', 'requirements-live.txt', 'requirements-test.txt',
+                 'build.lock', 'run.lock', 'test.lock'):
         (tree / 'scripts' / name).write_text('', encoding='utf-8')
     (tree / 'scripts/run_demo.py').write_text(
         'import os, sys\nprint(sys.prefix, os.getcwd(), *sys.argv[1:], sep="|")\n',

@@ -298,6 +298,21 @@ _FLEET = Command(
      _seed(0, 'of discover'), _levels('found in each recording'),
      *_estimate('also give the risk of going below this voltage, V'), *_TOPICS, _JSON))
 
+_LIVE = Command(
+    'live', 'a page to watch while flying, from the topics of the nodes',
+    'ou_monitor.nodes.live',
+    'Serve one read-only page: voltage and its limit, throttle and its budget, risk, sigma, the '
+    'filter, and an alarm lamp, from the topics of the running nodes. Needs ROS 2.',
+    (Option('--host', metavar='ADDRESS', default='127.0.0.1',
+            help='address to listen on (default: %(default)s); any other wants the token that is '
+            'printed'),
+     Option('--port', metavar='N', default='8765',
+            help='port; 0: any that is free (default: %(default)s)'),
+     Option('--estimator', metavar='NODE', default='/ou_estimator',
+            help='name of the estimator (default: %(default)s)'),
+     Option('--filter', metavar='NODE', default='/ou_adaptive_filter',
+            help='name of the adaptive filter (default: %(default)s)')))
+
 _REPRODUCE = Command(
     'reproduce', 'recompute every number of the paper, verdict per row',
     'ou_monitor.cli.reproduce',
@@ -328,4 +343,5 @@ _SIMULATE = Command(
      Option('--list', action='store_true', help='list presets and profiles'), _JSON))
 
 COMMANDS = {command.name: command for command in (
-    _ANALYZE, _COMPARE, _CONVERT, _COUPLING, _DESIGN, _DISCOVER, _FLEET, _REPRODUCE, _SIMULATE)}
+    _ANALYZE, _COMPARE, _CONVERT, _COUPLING, _DESIGN, _DISCOVER, _FLEET, _LIVE, _REPRODUCE,
+    _SIMULATE)}

@@ -66,7 +66,7 @@ def test_the_form_is_that_of_sros2():
     assert root.tag == 'policy' and root.get('version') == '0.2.0' and complaints(root) == []
     paths = [enclave.get('path') for enclave in root.iter('enclave')]
     assert paths == [f'/ou_monitor/{name}' for name in (
-        'estimator', 'adaptive_filter', 'replay', 'operator')]
+        'estimator', 'adaptive_filter', 'replay', 'live', 'operator')]
 
 
 @pytest.mark.parametrize('change', [

@@ -45,7 +45,7 @@ def wait_until(predicate: Callable[[], Any], timeout: float = DEADLINE, what: st
 
 
 class Process:
-    """One executable of the package, its output in files."""
+    """One executable of the package, or any other module of it, its output in files."""
 
     def __init__(self, name: str, arguments: list[str], domain: int, folder: Path) -> None:
         self.name = name
@@ -60,7 +60,8 @@ class Process:
                    [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])])}
         with self._out.open('w') as out, self._err.open('w') as err:
             self.popen = subprocess.Popen(
-                [sys.executable, '-m', f'ou_monitor.nodes.{name}', *arguments],
+                [sys.executable, '-m', name if '.' in name else f'ou_monitor.nodes.{name}',
+                 *arguments],
                 stdout=out, stderr=err, env=env, cwd=folder)
 
     @property

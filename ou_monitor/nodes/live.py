@@ -1,0 +1,178 @@
+"""
+`ou-monitor live`: a page to watch while flying, served from the topics of the nodes.
+
+Limits first: read-only, and on 127.0.0.1 unless another address is given, which then wants the
+token that is printed; it speaks HTTP without encryption.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import base64
+import hashlib
+import hmac
+from importlib import resources
+import ipaddress
+import json
+import secrets
+from threading import Thread
+from typing import Any
+
+from ou_monitor.errors import InputError
+from ou_monitor.nodes.run import make_executor, NAP, run as run_ros
+
+NAME = 'ou_live'
+# Time between looks for new rows and at the context, s.
+_STEP = 0.1
+# A line that keeps the connection open, s, when there is nothing to say.
+_ALIVE = 5.0
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command."""
+    port = _port(args.port)
+    try:
+        import tornado.web  # noqa: F401
+    except ImportError as error:
+        raise InputError("live needs tornado: pip install 'ou_monitor[live]'") from error
+    # A name of a node, as ROS writes it.
+    names = [f"/{name.strip('/')}" for name in (args.estimator, args.filter)]
+    return run_ros(NAME, lambda: _serve(args.host, port, *names), [])
+
+
+def _port(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or int(text) > 65535:
+        raise InputError(f"--port: '{text}' is not a port, 0 to 65535 (0: any that is free)")
+    return int(text)
+
+
+def _serve(host: str, port: int, estimator: str, low_pass: str) -> int:
+    from ou_monitor.nodes.live_node import LiveNode
+
+    node = LiveNode(estimator, low_pass)
+    executor = make_executor()
+    executor.add_node(node)
+
+    def spin() -> None:
+        from rclpy.executors import ExternalShutdownException
+        try:
+            while node.context.ok():
+                executor.spin_once(timeout_sec=NAP)
+        except ExternalShutdownException:
+            # The page ends with the context.
+            return
+
+    thread = Thread(target=spin)
+    thread.start()
+    try:
+        asyncio.run(_page(node, host, port))
+    finally:
+        node.context.try_shutdown()
+        thread.join()
+        executor.remove_node(node)
+        node.destroy_node()
+    return 0
+
+
+def _local(host: str) -> bool:
+    """Return whether an address is of this machine alone."""
+    try:
+        return host == 'localhost' or ipaddress.ip_address(host.strip('[]')).is_loopback
+    except ValueError:
+        return False
+
+
+async def _page(node: Any, host: str, port: int) -> None:
+    """Serve until the context of the node ends."""
+    token = '' if _local(host) else secrets.token_urlsafe(16)
+    app = application(node, token)
+    try:
+        server = app.listen(port, address=host)
+    except OSError as error:
+        raise InputError(f'cannot listen on {host}:{port}: {error.strerror or error}; '
+                         'give another --port or --host') from error
+    held = next(iter(server._sockets.values())).getsockname()[1]
+    shown = f'[{host}]' if ':' in host else host
+    print(f'Live page: http://{shown}:{held}/' + (f'?token={token}' if token else '')
+          + '  (Ctrl-C ends it)', flush=True)
+    try:
+        while node.context.ok():
+            await asyncio.sleep(_STEP)
+    finally:
+        server.stop()
+
+
+def application(node: Any, token: str) -> Any:
+    """Return the page and its stream of rows; with a token only for who knows it."""
+    from tornado.iostream import StreamClosedError
+    from tornado.web import Application, HTTPError, RequestHandler
+
+    html, policy = _html()
+
+    class Guarded(RequestHandler):
+        """Refuses who does not know the token, and pages of other names that resolve to here."""
+
+        def prepare(self) -> None:
+            """Check the request."""
+            if token:
+                given = self.get_query_argument('token', '')
+                if not hmac.compare_digest(given.encode(), token.encode()):
+                    raise HTTPError(403)
+            elif not _local(self.request.host_name):
+                raise HTTPError(403)
+
+        def set_default_headers(self) -> None:
+            """Allow nothing but the page itself."""
+            self.set_header('Content-Security-Policy', policy)
+            self.set_header('X-Content-Type-Options', 'nosniff')
+            self.set_header('Referrer-Policy', 'no-referrer')
+            self.set_header('Cache-Control', 'no-store')
+
+    class Page(Guarded):
+        def get(self) -> None:
+            self.finish(html)
+
+    class Rows(Guarded):
+        async def get(self) -> None:
+            self.set_header('Content-Type', 'text/event-stream')
+            # A browser that comes back says which row it had last.
+            last = self.request.headers.get('Last-Event-ID', '')
+            sent = int(last) if last.isascii() and last.isdigit() else 0
+            newest = node.rows(0)
+            if newest and sent > newest[-1]['k']:
+                # Of another process: from the beginning.
+                sent = 0
+            quiet = 0.0
+            try:
+                while node.context.ok():
+                    rows = node.rows(sent)
+                    if rows:
+                        sent, quiet = rows[-1]['k'], 0.0
+                        text = json.dumps(rows, allow_nan=False)
+                        self.write(f'id: {sent}\nretry: 1000\ndata: {text}\n\n')
+                        await self.flush()
+                    elif quiet > _ALIVE:
+                        quiet = 0.0
+                        self.write(': alive\n\n')
+                        await self.flush()
+                    quiet += _STEP
+                    await asyncio.sleep(_STEP)
+            except StreamClosedError:
+                return
+
+    return Application([('/', Page), ('/rows', Rows)])
+
+
+def _html() -> tuple[str, str]:
+    """Return the page, and the policy that names its script and style by their hashes."""
+    html = resources.files(__package__).joinpath('live.html').read_text(encoding='utf-8')
+
+    def source(tag: str) -> str:
+        text = html.split(f'<{tag}>')[1].split(f'</{tag}>')[0]
+        digest = hashlib.sha256(text.encode()).digest()
+        return f"'sha256-{base64.b64encode(digest).decode()}'"
+
+    return html, (f"default-src 'none'; connect-src 'self'; script-src {source('script')}; "
+                  f"style-src {source('style')}; base-uri 'none'; form-action 'none'; "
+                  "frame-ancestors 'none'")

@@ -1,0 +1,162 @@
+"""
+The node behind the live page: listens to estimator and filter, and keeps the last minute.
+
+Limits first: a row five times a second, so a dip between two of them shows in the flag and not
+in the line; of the filter's signals the lowest and highest value of each row are kept.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+import math
+from threading import Lock
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from ou_monitor.errors import InputError
+from ou_monitor.nodes.filter_channels import channels_of
+from ou_monitor.nodes.inputs import INPUT_QOS
+from ou_monitor.nodes.message_types import message_class
+from rcl_interfaces.srv import GetParameters
+from rclpy.node import Node
+from std_msgs.msg import Float64
+
+# Time between rows, s, and how many are kept.
+PERIOD, KEPT = 0.2, 300
+# Between looks at the graph and at the parameters, s.
+_LOOK = 1.0
+# A state that is older, s, is no longer shown as the present one.
+_STALE = 2.0
+# Parameters of the estimator that the page shows.
+_SHOWN = ('brownout.voltage', 'brownout.horizon')
+# Fields of the state that the page shows as numbers, and as words.
+_NUMBERS = ('voltage', 'throttle', 'sigma', 'noise_std', 'brownout_risk', 'throttle_budget', 'age')
+_WORDS = ('brownout', 'brownout_level', 'risk_basis', 'status')
+# What a filter subscribes to beside its signal.
+_BESIDE = ('sigma', 'state', 'rpm', 'throttle', 'clock')
+
+
+class LiveNode(Node):
+    """
+    Listens, and makes rows for the page.
+
+    Parameters
+    ----------
+    estimator, low_pass : str
+        Names of the nodes that are listened to.
+
+    """
+
+    def __init__(self, estimator: str, low_pass: str) -> None:
+        super().__init__('ou_live')
+        self._lock = Lock()
+        self._rows: deque[dict[str, Any]] = deque(maxlen=KEPT)
+        self._count = 0
+        self._begin = time.monotonic()
+        self._state: dict[str, str] = {}
+        self._level, self._summary, self._heard = 0, '', -math.inf
+        self._cutoff, self._lag = math.nan, math.nan
+        self._limits: dict[str, float] = {}
+        self._signals: dict[str, list[float]] = {'raw': [], 'filtered': []}
+        self._open: dict[str, str] = {}
+        self._estimator, self._filter = estimator, low_pass
+        self.create_subscription(DiagnosticArray, f'{estimator}/state', self._take_state, 10)
+        self.create_subscription(Float64, f'{low_pass}/cutoff', self._take_cutoff, 10)
+        self.create_subscription(Float64, f'{low_pass}/lag', self._take_lag, 10)
+        self._ask = self.create_client(GetParameters, f'{estimator}/get_parameters')
+        self._answer: Any = None
+        self.create_timer(PERIOD, self._add_row)
+        self.create_timer(_LOOK, self._look)
+
+    def rows(self, after: int) -> list[dict[str, Any]]:
+        """Return the rows whose number is larger."""
+        with self._lock:
+            return [row for row in self._rows if row['k'] > after]
+
+    # -- messages in
+
+    def _take_state(self, message: Any) -> None:
+        status = message.status[0]
+        self._state = {item.key: item.value for item in status.values}
+        self._level, self._summary = status.level[0], status.message
+        self._heard = time.monotonic()
+
+    def _take_cutoff(self, message: Any) -> None:
+        self._cutoff = message.data
+
+    def _take_lag(self, message: Any) -> None:
+        self._lag = message.data
+
+    def _look(self) -> None:
+        """Find the filter's signals as soon as they are there; ask for the limit."""
+        if self._answer is not None and self._answer.done():
+            values = self._answer.result().values
+            self._limits = {name: value.double_value for name, value in zip(_SHOWN, values)}
+            self._answer = None
+        if self._answer is None and self._ask.service_is_ready():
+            self._answer = self._ask.call_async(GetParameters.Request(names=list(_SHOWN)))
+        self._listen('filtered', f'{self._filter}/output')
+        source = self._input()
+        if source:
+            self._listen('raw', source)
+
+    def _input(self) -> str:
+        """Return the topic that the filter filters; empty when it is not there."""
+        space, _, name = self._filter.rpartition('/')
+        try:
+            topics = self.get_subscriber_names_and_types_by_node(name, space or '/')
+        except Exception:
+            # There is no such node yet; rclpy has an error of its own for that in each version.
+            return ''
+        return next((topic for topic, _ in topics
+                     if topic.rpartition('/')[2] not in _BESIDE), '')
+
+    def _listen(self, name: str, topic: str) -> None:
+        kinds = [end.topic_type for end in self.get_publishers_info_by_topic(topic)]
+        if not kinds or self._open.get(name) == topic:
+            return
+        try:
+            take = channels_of(kinds[0], '').take
+            kind = message_class(kinds[0])
+        except InputError:
+            return
+        self._open[name] = topic
+        self.create_subscription(kind, topic, self._keeper(name, take), INPUT_QOS)
+
+    def _keeper(self, name: str, take: Callable[[Any], Any]) -> Callable[[Any], None]:
+        def keep(message: Any) -> None:
+            values = take(message)
+            if len(values) and math.isfinite(values[0]):
+                self._signals[name].append(float(values[0]))
+        return keep
+
+    # -- rows out
+
+    def _add_row(self) -> None:
+        now = time.monotonic()
+        silent = now - self._heard
+        row: dict[str, Any] = {
+            't': now - self._begin, 'silent': None if math.isinf(silent) else silent,
+            'limit': self._limits.get(_SHOWN[0]), 'horizon': self._limits.get(_SHOWN[1])}
+        if silent < _STALE:
+            row.update({name: known(self._state.get(name)) for name in _NUMBERS})
+            row.update({name: self._state.get(name, '') for name in _WORDS})
+            row.update(level=self._level, summary=self._summary)
+        row.update(cutoff=known(self._cutoff), lag=known(self._lag))
+        for name, values in self._signals.items():
+            row[name] = [min(values), max(values)] if values else None
+            values.clear()
+        with self._lock:
+            self._count += 1
+            self._rows.append({'k': self._count, **row})
+
+
+def known(value: str | float | None) -> float | None:
+    """Return a number, as JSON can hold it; None for what is not known."""
+    try:
+        number = math.nan if value is None else float(value)
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None

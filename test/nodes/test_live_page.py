@@ -1,0 +1,136 @@
+"""The live page: in a real browser while a bag plays, and who is let in."""
+
+import re
+
+from browser import Browser, find_browser
+from live import BAGS, wait_until
+import pytest
+
+pytest.importorskip('tornado')
+from ou_monitor.nodes.live import application  # noqa: E402
+from ou_monitor.nodes.live_node import known  # noqa: E402
+from tornado.testing import AsyncHTTPTestCase  # noqa: E402
+
+BROWSER = find_browser()
+LAMP = "document.getElementById('lamp').textContent"
+
+
+def address(process):
+    """Return where the page is, once it says so."""
+    found = wait_until(lambda: re.search(r'http://\S+', process.out) or process.popen.poll(),
+                       what='an address')
+    assert not isinstance(found, int), process.err
+    return found.group()
+
+
+@pytest.mark.skipif(BROWSER is None, reason='no Chromium or Chrome')
+def test_a_browser_shows_a_flight_and_outlives_both_ends(world, tmp_path):
+    """OK with numbers; a low limit is a brown-out; silence and reconnection are said."""
+    estimator = world.start('estimator')
+    world.start('adaptive_filter', '--ros-args', '-r', 'sigma:=ou_estimator/sigma',
+                '-r', 'state:=ou_estimator/state', '-r', 'input:=voltage')
+    world.start('replay', str(BAGS / 'load_10'), '--loop')
+    page = world.start('ou_monitor.cli.main', 'live', '--port', '0')
+    where = address(page)
+    with Browser(BROWSER, tmp_path) as tab:
+        tab.send('Page.navigate', url=where)
+        tab.until(f'document.getElementById("lamp") && {LAMP} === "OK"')
+        tab.until('rows.some(row => row.raw && row.filtered && row.limit === 4.5)')
+        # Raw noise is wider than the filtered one, in the rows and so in the picture.
+        tab.until("""(() => { const wide = name => rows.filter(row => row[name]).map(
+            row => row[name][1] - row[name][0]).reduce((a, b) => a + b, 0);
+            return wide('raw') > wide('filtered') && wide('filtered') > 0; })()""")
+        numbers = tab.run("document.getElementById('numbers').textContent")
+        assert ' V' in numbers and 'limit 4.5 V' in numbers and ' Hz' in numbers
+        assert tab.run("""[...document.querySelectorAll('canvas')].every(one => {
+            const ink = one.getContext('2d').getImageData(0, 0, one.width, one.height).data;
+            return ink.some(value => value > 0); })""")
+        probe = world.probe()
+        assert probe.set_parameter('ou_estimator', 'brownout.voltage', 5.2).successful
+        tab.until(f'{LAMP} === "BROWN-OUT"')
+        tab.until('rows.some(row => row.limit === 5.2)')
+        estimator.stop()
+        tab.until(f'{LAMP} === "NO DATA"')
+        assert 'silent for' in tab.run("document.getElementById('words').textContent")
+        # The server goes and comes back at its address: the page finds it again by itself.
+        assert page.stop() == 0
+        tab.until("document.getElementById('words').textContent.includes('lost')")
+        before = tab.run('rows[rows.length - 1].k')
+        world.start('ou_monitor.cli.main', 'live', '--port', where.rstrip('/').rpartition(':')[2])
+        world.start('estimator')
+        tab.until(f'rows.length && rows[0].k < {before} && {LAMP} === "OK"')
+        assert not [error for error in tab.errors if 'Content' in error], tab.errors
+
+
+class Rows:
+    """What the page asks of the node, without ROS."""
+
+    class context:  # noqa: N801
+        """Ended: the stream closes after what is there."""
+
+        left = 2
+
+        @classmethod
+        def ok(cls):
+            """Allow one round."""
+            cls.left -= 1
+            return cls.left > 0
+
+    def rows(self, after):
+        """Return the newer of two rows."""
+        return [row for row in ({'k': 1, 'voltage': 5.0}, {'k': 2, 'voltage': None})
+                if row['k'] > after]
+
+
+class TestLocal(AsyncHTTPTestCase):
+    """On this machine alone."""
+
+    token = ''
+
+    def get_app(self):
+        """Return the page."""
+        Rows.context.left = 2
+        return application(Rows(), self.token)
+
+    def test_page_and_rows(self):
+        """The policy names script and style; rows follow the last one seen; there is nothing else."""
+        found = self.fetch('/')
+        policy = found.headers['Content-Security-Policy']
+        assert found.code == 200 and policy.count("'sha256-") == 2 and 'unsafe' not in policy
+        text = self.fetch('/rows', headers={'Last-Event-ID': '1'}).body.decode()
+        assert 'id: 2' in text and '"voltage": null' in text and '"k": 1' not in text
+        assert self.fetch('/etc/passwd').code == 404
+        assert self.fetch('/', method='POST', body='').code == 405
+
+    def test_another_name_that_resolves_to_here_is_refused(self):
+        """A page of elsewhere cannot read it by way of its own name."""
+        assert self.fetch('/', headers={'Host': 'evil.example:80'}).code == 403
+        assert self.fetch('/rows', headers={'Host': 'evil.example'}).code == 403
+
+
+class TestOpen(TestLocal):
+    """On another address: with the token alone."""
+
+    token = 'secret'
+    test_page_and_rows = test_another_name_that_resolves_to_here_is_refused = None
+
+    def test_the_token_is_wanted(self):
+        """Without it, and with a wrong one, nothing; by any name with it."""
+        for path in ('/', '/rows', '/?token=', '/?token=secre', '/rows?token=secret2'):
+            assert self.fetch(path).code == 403, path
+        assert self.fetch('/?token=secret', headers={'Host': 'drone.local'}).code == 200
+
+
+@pytest.mark.parametrize('arguments,words', [
+    (['--port', '70000'], 'is not a port'), (['--port', 'x'], 'is not a port'),
+    (['--host', 'no.such.host.invalid'], 'cannot listen on no.such.host.invalid')])
+def test_bad_options(world, arguments, words):
+    """One line that says what is wrong; status 2."""
+    process = world.start('ou_monitor.cli.main', 'live', *arguments)
+    assert process.wait() == 2 and words in process.err
+    assert len(process.err.strip().splitlines()) == 1
+
+
+def test_what_is_not_known_is_null():
+    """JSON has no NaN."""
+    assert [known(x) for x in ('nan', 'inf', None, '', 'x', '0.5', 2)] == [None] * 5 + [0.5, 2.0]
