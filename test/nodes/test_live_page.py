@@ -93,7 +93,7 @@ class TestLocal(AsyncHTTPTestCase):
         return application(Rows(), self.token)
 
     def test_page_and_rows(self):
-        """The policy names script and style; rows follow the last one seen; there is nothing else."""
+        """The policy names script and style; rows follow the last one seen; no other path."""
         found = self.fetch('/')
         policy = found.headers['Content-Security-Policy']
         assert found.code == 200 and policy.count("'sha256-") == 2 and 'unsafe' not in policy
