@@ -130,11 +130,17 @@ def application(node: Any, token: str) -> Any:
             self.set_header('Cache-Control', 'no-store')
 
     class Page(Guarded):
+        """The page."""
+
         def get(self) -> None:
+            """Send it."""
             self.finish(html)
 
     class Rows(Guarded):
+        """The stream of rows."""
+
         async def get(self) -> None:
+            """Send rows as they come, from the last one that the browser has."""
             self.set_header('Content-Type', 'text/event-stream')
             # A browser that comes back says which row it had last.
             last = self.request.headers.get('Last-Event-ID', '')

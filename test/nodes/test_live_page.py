@@ -4,12 +4,10 @@ import re
 
 from browser import Browser, find_browser
 from live import BAGS, wait_until
+from ou_monitor.nodes.live import application
+from ou_monitor.nodes.live_node import known
 import pytest
-
-pytest.importorskip('tornado')
-from ou_monitor.nodes.live import application  # noqa: E402
-from ou_monitor.nodes.live_node import known  # noqa: E402
-from tornado.testing import AsyncHTTPTestCase  # noqa: E402
+from tornado.testing import AsyncHTTPTestCase
 
 BROWSER = find_browser()
 LAMP = "document.getElementById('lamp').textContent"
