@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
 import json
 import multiprocessing
@@ -23,6 +24,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from typing import Any
 
@@ -30,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test/support')]
 
 from live import memory_of, Probe, Process, Starved, values_of  # noqa: E402
-from soak_figures import as_table, figures, Heard, IN_TIME  # noqa: E402
+from soak_figures import as_table, figures, Heard, IN_TIME, Span  # noqa: E402
 from soak_schedule import Event, events  # noqa: E402
 from tables import put  # noqa: E402
 
@@ -53,6 +55,44 @@ LOOK, PROGRESS, ANSWER, START, END = 2.0, 60.0, 20.0, 60.0, 20.0
 SILENT = 1.2
 
 
+class Machine(threading.Thread):
+    """
+    What the machine itself withholds, looked at 50 times a second.
+
+    Attributes
+    ----------
+    node, here : list of tuple of float
+        When the node's main thread was ready and had no CPU for more than PAUSE s, by the
+        kernel's account, and when this process had none; by the monotonic clock, s.
+
+    """
+
+    PAUSE = 0.1
+
+    def __init__(self, pid: Callable[[], int]) -> None:
+        super().__init__(daemon=True)
+        self._pid = pid
+        self.node: list[Span] = []
+        self.here: list[Span] = []
+
+    def run(self) -> None:
+        """Look until the process ends."""
+        before, last, waited = time.monotonic(), 0, 0.0
+        while True:
+            time.sleep(0.02)
+            now, pid = time.monotonic(), self._pid()
+            if now - before > self.PAUSE:
+                self.here.append((before, now))
+            before = now
+            with suppress(OSError):
+                # ns on the CPU, ns ready without it, since the thread began.
+                account = Path(f'/proc/{pid}/task/{pid}/schedstat').read_text()
+                total = 1e-9 * int(account.split()[1])
+                if pid == last and total - waited > self.PAUSE:
+                    self.node.append((now - (total - waited), now))
+                last, waited = pid, total
+
+
 def busy(core: int) -> None:
     """Keep one core busy."""
     os.sched_setaffinity(0, {core})
@@ -69,7 +109,7 @@ class Soak:
         self.counters: Counter[str] = Counter()
         self.found: Counter[str] = Counter(set=0, refused=0, wrong=0, unanswered=0)
         self.wrong: list[str] = []
-        self.answer = self.pause = 0.0
+        self.answer = 0.0
         self._newest: dict[str, str] = {}
         self._folder, self._domain = folder, domain
         self._log = folder / 'source.jsonl'
@@ -78,6 +118,8 @@ class Soak:
         model.write_text(MODEL)
         self._events = events(seed, seconds, str(fifo), str(model))
         self._node = self._start_node()
+        self._machine = Machine(lambda: self._node.popen.pid)
+        self._machine.start()
         self._probe = Probe(domain)
         self._listen()
         env = {**os.environ, 'ROS_DOMAIN_ID': str(domain),
@@ -133,11 +175,9 @@ class Soak:
             time.sleep(0.01)
         start = self._start = self._lines('start')[0]['at']
         looked = told = -1e9
-        before = time.monotonic()
         pending = list(self._events)
         while self._source.poll() is None:
             now = time.monotonic()
-            self.pause = max(self.pause, now - before)
             self._ask(now)
             if now - looked >= LOOK:
                 looked = now
@@ -148,7 +188,6 @@ class Soak:
             self._release(now - start)
             if pending and now - start >= pending[0].begin:
                 self._do(pending.pop(0))
-            before = time.monotonic()
             time.sleep(0.02)
 
     def _wait_for_start(self) -> None:
@@ -279,11 +318,12 @@ class Soak:
     def figures(self, seconds: float, end: dict[str, Any]) -> dict[str, Any]:
         """Return the figures so far."""
         self.heard.source = self._lines()
+        self.heard.withheld = list(self._machine.node)
+        self.heard.deaf = list(self._machine.here)
         counters = {name: self.counters[name] + int(self._newest.get(name, 0))
                     for name in COUNTERS}
         return figures(self.heard, counters, {
-            'minutes': seconds / 60.0, 'answer': self.answer, 'pause': self.pause,
-            **self.found, **end})
+            'minutes': seconds / 60.0, 'answer': self.answer, **self.found, **end})
 
     def close(self) -> dict[str, Any]:
         """End all processes; return the figures."""

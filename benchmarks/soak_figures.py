@@ -14,8 +14,8 @@ from soak_schedule import NEVER_FALSE
 from tables import table
 
 Span = tuple[float, float]
-# A dip is told in time within so long, s, of its begin; times that the node was stopped by us
-# do not count.
+# A dip is told in time within so long, s, of its begin.  Not counted, there and in silences: time
+# that the node was stopped by us or had no CPU though it was ready, or that the listener had none.
 IN_TIME = 1.0
 # A dip of fewer low samples that reached the wire is no dip of 40 ms.
 SAMPLES = 40
@@ -38,8 +38,9 @@ class Heard:
     flags : list of (time, bool)
         Messages of `~/brownout`.
     memory : list of (time, bytes)
-    stops : list of (begin, end)
-        When the node was stopped.
+    stops, withheld, deaf : list of (begin, end)
+        When the node was stopped, when it was ready and had no CPU, and when the listener had
+        none.
     deaths : list of float
     source : list of dict
         Lines of the source's log.
@@ -51,8 +52,20 @@ class Heard:
     flags: list[tuple[float, bool]] = field(default_factory=list)
     memory: list[tuple[float, float]] = field(default_factory=list)
     stops: list[Span] = field(default_factory=list)
+    withheld: list[Span] = field(default_factory=list)
+    deaf: list[Span] = field(default_factory=list)
     deaths: list[float] = field(default_factory=list)
     source: list[dict[str, Any]] = field(default_factory=list)
+
+    def pauses(self) -> list[Span]:
+        """Return the time that is not the node's: the union of all of it, in order."""
+        made: list[Span] = []
+        for begin, end in sorted([*self.stops, *self.withheld, *self.deaf]):
+            if made and begin <= made[-1][1]:
+                made[-1] = made[-1][0], max(end, made[-1][1])
+            else:
+                made.append((begin, end))
+        return made
 
 
 def overlap(begin: float, end: float, spans: Sequence[Span]) -> float:
@@ -75,9 +88,10 @@ def silence(times: Sequence[float], stops: Sequence[Span]) -> tuple[float, float
             max(b - a - overlap(a, b, stops) for a, b in gaps))
 
 
-def told(dip: Mapping[str, Any], heard: Heard) -> tuple[float, float, bool]:
+def told(dip: Mapping[str, Any], heard: Heard, pauses: Sequence[Span]
+         ) -> tuple[float, float, bool]:
     """
-    Return when a dip was told, s from its begin, without stops, and whether it was lost.
+    Return when a dip was told, s from its begin, without pauses, and whether it was lost.
 
     Told: a state says CRITICAL because of the floor, and `~/brownout` is true; inf where not.
     Lost: more than half of the dip's samples may be among the messages that the node missed.
@@ -87,7 +101,7 @@ def told(dip: Mapping[str, Any], heard: Heard) -> tuple[float, float, bool]:
     when = math.inf
     for t, level, reason, _, _ in heard.states[first:]:
         # A later dip must not stand for this one.
-        if t - begin - overlap(begin, t, heard.stops) > IN_TIME:
+        if t - begin - overlap(begin, t, pauses) > IN_TIME:
             break
         if level == 'CRITICAL' and 'brownout.floor (' in reason:
             when = t
@@ -95,7 +109,7 @@ def told(dip: Mapping[str, Any], heard: Heard) -> tuple[float, float, bool]:
     flag = next((t for t, value in heard.flags[bisect_right(heard.flags, (begin,)):] if value),
                 math.inf)
     when = max(when, flag)
-    net = when - begin - overlap(begin, when, heard.stops) if when < math.inf else when
+    net = when - begin - overlap(begin, when, pauses) if when < math.inf else when
     before = heard.states[first - 1][4] if first else 0
     after = next((lost for t, _, _, _, lost in heard.states[first:] if t > dip['end'] + IN_TIME),
                  before)
@@ -108,9 +122,10 @@ def dips_of(heard: Heard) -> dict[str, Any]:
     asked = [dip for dip in all_dips if not dip['unseen'] and dip['samples'] >= SAMPLES]
     last = heard.states[-1][0] if heard.states else -math.inf
     asked = [dip for dip in asked if dip['end'] + IN_TIME < last]
+    pauses = heard.pauses()
     missed, lost, late = [], [], []
     for dip in asked:
-        after, net, gone = told(dip, heard)
+        after, net, gone = told(dip, heard, pauses)
         if net <= IN_TIME:
             late.append(net)
         else:
@@ -124,6 +139,7 @@ def dips_of(heard: Heard) -> dict[str, Any]:
 def false_of(heard: Heard) -> tuple[int, list[tuple[float, str]]]:
     """Return how many seconds nothing could be known, and when `~/brownout` was false then."""
     marks = [line for line in heard.source if line['kind'] == 'phase']
+    pauses = heard.pauses()
     spent, found = 0.0, []
     for now, then in zip(marks, marks[1:]):
         if now['name'] not in NEVER_FALSE:
@@ -131,7 +147,7 @@ def false_of(heard: Heard) -> tuple[int, list[tuple[float, str]]]:
         begin, end = now['at'] + LINGER, then['at']
         spent += max(end - begin, 0.0)
         found += [(t, now['name']) for t, value in heard.flags
-                  if begin + overlap(now['at'], begin, heard.stops) < t < end and not value]
+                  if begin + overlap(now['at'], begin, pauses) < t < end and not value]
     return round(spent), found
 
 
@@ -167,15 +183,19 @@ def figures(heard: Heard, counters: Mapping[str, int], end: Mapping[str, Any]) -
     """Return all figures, given counters that are added up, and status and time of the exit."""
     slope, error = growth(heard.memory)
     spent, false = false_of(heard)
+    pauses = heard.pauses()
     sizes = [size for _, size in heard.memory]
     return {
         **end, 'deaths': len(heard.deaths),
-        'silence': {name: silence(times, heard.stops) for name, times in heard.outputs.items()},
+        'silence': {name: silence(times, pauses) for name, times in heard.outputs.items()},
         'unmatched': unmatched(heard), 'dips': dips_of(heard),
         'false': len(false), 'false_in': sorted({name for _, name in false}),
         'unknowable': spent, 'memory': sizes[-1] if sizes else math.nan,
         'most_memory': max(sizes, default=math.nan), 'slope': slope, 'slope_error': error,
-        'stopped': sum(b - a for a, b in heard.stops), 'counters': dict(counters)}
+        **{f'{name}{what}': function([b - a for a, b in spans] or [0.0])
+           for name, spans in (('stopped', heard.stops), ('withheld', heard.withheld),
+                               ('deaf', heard.deaf))
+           for what, function in (('', sum), ('_most', max))}, 'counters': dict(counters)}
 
 
 def as_table(found: Mapping[str, Any]) -> str:
@@ -184,7 +204,7 @@ def as_table(found: Mapping[str, Any]) -> str:
     rows = [
         ['length', f"{found['minutes']:.1f} min"],
         ['deaths of the node', str(found['deaths'])],
-        *([f'longest silence of `{name}` (without the time it was stopped)',
+        *([f'longest silence of `{name}` (without the pauses below)',
            f'{gap:.2f} s ({net:.2f} s)'] for name, (gap, net) in found['silence'].items()),
         ['longest time from a state that knows the flag to the next `~/brownout`',
          f"{found['unmatched']:.2f} s"],
@@ -204,8 +224,10 @@ def as_table(found: Mapping[str, Any]) -> str:
         ['parameters set, refused as they must be, answered wrongly, not answered',
          f"{found['set']}, {found['refused']}, {found['wrong']}, {found['unanswered']}"],
         ['longest answer of the parameter service', f"{found['answer']:.2f} s"],
-        ['time stopped by SIGSTOP, in slices', f"{found['stopped']:.0f} s"],
+        *([words, f"{found[name]:.0f} s, {found[f'{name}_most']:.2f} s"] for name, words in (
+            ('stopped', 'pauses: the node stopped by SIGSTOP, in all, longest'),
+            ('withheld', 'the node ready, but no CPU for it, by the kernel (above 0.1 s)'),
+            ('deaf', 'the listener without CPU (above 0.1 s)'))),
         *([f'`{name}`', str(value)] for name, value in found['counters'].items()),
-        ['exit status after SIGINT, time', f"{found['status']}, {found['took']:.2f} s"],
-        ['longest pause of the listener itself', f"{found['pause']:.2f} s"]]
+        ['exit status after SIGINT, time', f"{found['status']}, {found['took']:.2f} s"]]
     return table(['what', 'found'], rows)

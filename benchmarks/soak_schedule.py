@@ -163,7 +163,7 @@ def bad_parameters(fifo: str) -> list[tuple[str, Any]]:
     return [
         ('window', -1.0), ('window', math.nan), ('window', 'long'), ('window', 1e9),
         ('publish_rate', 0.0), ('publish_rate', 1e9), ('publish_rate', math.inf),
-        ('brownout.warn', 0.6), ('brownout.warn', 0.0), ('brownout.critical', 0.001),
+        ('brownout.warn', 0.6), ('brownout.warn', -0.1), ('brownout.critical', 0.001),
         ('brownout.leave', 1.0), ('brownout.floor', 100.0), ('brownout.floor', math.nan),
         ('brownout.watch', 'perhaps'), ('brownout.latch', 1), ('brownout.hold', -1.0),
         ('model_file', fifo), ('model_file', '/dev/zero'), ('model_file', '/no/such.yaml'),

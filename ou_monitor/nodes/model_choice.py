@@ -10,6 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, TimeoutError as NotRe
 from typing import TYPE_CHECKING
 
 from ou_monitor.errors import InputError
+from ou_monitor.stream.files import open_regular, path_words
 
 if TYPE_CHECKING:
     from ou_monitor.model.supply import SupplyModel
@@ -87,5 +88,11 @@ class ModelChoice:
 
 def _read(path: str) -> SupplyModel:
     """Read a model file; the terms and their fits are loaded only where there is one."""
+    try:
+        # Loading those takes longer than a callback waits on a busy machine; this does not.
+        open_regular(path).close()
+    except (OSError, ValueError) as error:
+        why = (error.strerror if isinstance(error, OSError) else None) or 'it is no path'
+        raise InputError(f'cannot read the model file {path_words(path)}: {why}') from error
     from ou_monitor.recordings.model_file import read_model
     return read_model(path).model

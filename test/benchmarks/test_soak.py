@@ -60,6 +60,16 @@ def test_silence_without_the_time_of_stops():
     assert (gap, net) == (pytest.approx(1.5), pytest.approx(1.2))
 
 
+def test_pauses_are_one_account():
+    """Stopped, without CPU, not heard: their union, so that no time counts twice."""
+    made = heard([11.4], stops=[(10.1, 10.3)])
+    made.withheld, made.deaf = [(10.2, 10.6)], [(5.0, 6.0), (10.55, 10.6)]
+    assert made.pauses() == [(5.0, 6.0), (10.1, 10.6)]
+    assert dips_of(made)['in_time'] == 1
+    made.withheld = []
+    assert dips_of(made)['in_time'] == 0
+
+
 def test_false_flags_and_flags_that_are_not_sent():
     """False where nothing can be known counts once it has lingered; each state has its flag."""
     made = heard([10.1])
