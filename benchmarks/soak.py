@@ -109,7 +109,7 @@ class Soak:
         self.counters: Counter[str] = Counter()
         self.found: Counter[str] = Counter(set=0, refused=0, wrong=0, unanswered=0)
         self.wrong: list[str] = []
-        self.answer = 0.0
+        self.answer, self.run_by = 0.0, ''
         self._newest: dict[str, str] = {}
         self._folder, self._domain = folder, domain
         self._log = folder / 'source.jsonl'
@@ -152,7 +152,7 @@ class Soak:
             values = self._newest = values_of(message.status[0])
             self.heard.states.append((
                 now, values['brownout_level'], values['brownout_reason'], values['brownout'],
-                self.counters['messages_lost'] + int(values['messages_lost'])))
+                self.counters['messages'] + int(values['messages'])))
 
         node.create_subscription(DiagnosticArray, f'{NODE}/state', state, 100)
         node.create_subscription(
@@ -323,7 +323,8 @@ class Soak:
         counters = {name: self.counters[name] + int(self._newest.get(name, 0))
                     for name in COUNTERS}
         return figures(self.heard, counters, {
-            'minutes': seconds / 60.0, 'answer': self.answer, **self.found, **end})
+            'run': self.run_by, 'minutes': seconds / 60.0,
+            'answer': self.answer, **self.found, **end})
 
     def close(self) -> dict[str, Any]:
         """End all processes; return the figures."""
@@ -352,10 +353,13 @@ def main() -> None:
     parser.add_argument('--minutes', type=float, default=60.0)
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--domain', type=int, default=91, help='ROS_DOMAIN_ID')
+    parser.add_argument('--transport', default='DEFAULT', choices=('DEFAULT', 'UDPv4'),
+                        help='of Fast DDS; DEFAULT: shared memory, and UDP beside it')
     parser.add_argument('--json', type=Path, help='file for all figures')
     parser.add_argument('--markdown', type=Path, help='page for the table')
     options = parser.parse_args()
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    os.environ['FASTDDS_BUILTIN_TRANSPORTS'] = options.transport
     # A shell has SIGINT ignored by what it starts in the background.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
@@ -365,6 +369,7 @@ def main() -> None:
         os.environ['PYTHONPATH'] = os.pathsep.join(
             [folder, *filter(None, [os.environ.get('PYTHONPATH')])])
         soak = Soak(options.seed, 60.0 * options.minutes, Path(folder), options.domain)
+        soak.run_by = f'seed {options.seed}, {options.transport}'
         try:
             soak.run()
         except KeyboardInterrupt:

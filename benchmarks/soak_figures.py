@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from scipy import stats
-from soak_schedule import NEVER_FALSE
+from soak_schedule import NEVER_FALSE, RATE
 from tables import table
 
 Span = tuple[float, float]
@@ -32,7 +32,7 @@ class Heard:
 
     Attributes
     ----------
-    states : list of (time, level of the flag, reason, brownout, messages lost so far)
+    states : list of (time, level of the flag, reason, brownout, messages taken so far)
     outputs : dict of str to list of float
         Times of the messages of each output.
     flags : list of (time, bool)
@@ -94,7 +94,8 @@ def told(dip: Mapping[str, Any], heard: Heard, pauses: Sequence[Span]
     Return when a dip was told, s from its begin, without pauses, and whether it was lost.
 
     Told: a state says CRITICAL because of the floor, and `~/brownout` is true; inf where not.
-    Lost: more than half of the dip's samples may be among the messages that the node missed.
+    Lost: of the messages sent from the state before it to that a second after it, so many did not
+    come that more than half of the dip's samples may be among them.
     """
     begin = dip['begin']
     first = bisect_right(heard.states, (begin,))
@@ -110,10 +111,12 @@ def told(dip: Mapping[str, Any], heard: Heard, pauses: Sequence[Span]
                 math.inf)
     when = max(when, flag)
     net = when - begin - overlap(begin, when, pauses) if when < math.inf else when
-    before = heard.states[first - 1][4] if first else 0
-    after = next((lost for t, _, _, _, lost in heard.states[first:] if t > dip['end'] + IN_TIME),
+    before = heard.states[max(first - 1, 0)]
+    after = next((state for state in heard.states[first:] if state[0] > dip['end'] + IN_TIME),
                  before)
-    return when - begin, net, 2 * (after - before) > dip['samples']
+    # A fiftieth of a second may wait for the next poll.
+    sent = RATE * (after[0] - before[0] - 0.02)
+    return when - begin, net, sent - (after[4] - before[4]) > 0.5 * dip['samples']
 
 
 def dips_of(heard: Heard) -> dict[str, Any]:
@@ -202,7 +205,7 @@ def as_table(found: Mapping[str, Any]) -> str:
     """Return the figures as a Markdown table."""
     dips = found['dips']
     rows = [
-        ['length', f"{found['minutes']:.1f} min"],
+        ['seed, transport, length', f"{found['run']}, {found['minutes']:.1f} min"],
         ['deaths of the node', str(found['deaths'])],
         *([f'longest silence of `{name}` (without the pauses below)',
            f'{gap:.2f} s ({net:.2f} s)'] for name, (gap, net) in found['silence'].items()),
@@ -211,8 +214,8 @@ def as_table(found: Mapping[str, Any]) -> str:
         ['dips of 40 to 80 ms that the node must see', str(dips['asked'])],
         ['of these CRITICAL by the floor, and `~/brownout` true, within 1 s',
          str(dips['in_time'])],
-        ['of these lost on the way, by the numbers of the messages', str(len(dips['lost']))],
-        ['**missed**', str(len(dips['missed']))],
+        ['of these not told, their messages not delivered', str(len(dips['lost']))],
+        ['**delivered, and missed**', str(len(dips['missed']))],
         ['from the begin of a dip to both, median, longest',
          f"{dips['median']:.2f} s, {dips['longest']:.2f} s"],
         [f"`~/brownout` false in {found['unknowable']} s when nothing could be known",

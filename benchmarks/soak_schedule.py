@@ -110,8 +110,10 @@ def _unseen(begin: float, end: float, sent: list[Phase]) -> str:
         return 'start'
     for phase in sent:
         if phase.kind in UNSEEN:
+            # What is delivered is counted until a second after a dip.
+            before = 0.1 if phase.kind in ('only_nan', 'millivolts') else 1.1
             after = SETTLE if phase.kind in ('type', 'restart') else 0.1
-            if end > phase.begin - 0.1 and begin < phase.end + after:
+            if end > phase.begin - before and begin < phase.end + after:
                 return phase.kind
     return ''
 

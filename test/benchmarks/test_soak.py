@@ -15,7 +15,8 @@ def heard(critical=(), lost=0, flags=None, stops=(), reason=FLOOR):
     """Return 20 s of states at 10 Hz; CRITICAL at some of them; one dip from 10 to 10.05 s."""
     times = np.arange(0.0, 20.0, 0.1).round(3).tolist()
     states = [(t, 'CRITICAL' if t in critical else 'OK', reason if t in critical else '',
-               'true' if t in critical else 'false', lost if t > 10.0 else 0) for t in times]
+               'true' if t in critical else 'false', round(1000.0 * t) - lost * (t > 10.0))
+              for t in times]
     said = [(t, t in (critical if flags is None else flags)) for t in times]
     return Heard(states=states, flags=said, stops=list(stops), source=[
         {'kind': 'dip', 'begin': 10.0, 'end': 10.05, 'samples': 50, 'phase': 'good',
@@ -33,8 +34,9 @@ def heard(critical=(), lost=0, flags=None, stops=(), reason=FLOOR):
     # Stopped by us meanwhile.
     (heard([11.2], stops=[(10.1, 10.6)]), 1, 0, 0),
     # Gone: more than half of its samples, or fewer.
-    (heard(lost=26), 0, 0, 1),
-    (heard(lost=25), 0, 1, 0),
+    # (20 ms are left to the poll.)
+    (heard(lost=46), 0, 0, 1),
+    (heard(lost=44), 0, 1, 0),
 ])
 def test_dips(made, in_time, missed, lost):
     """Told by the floor on both topics within a second of the node's own time, or not."""
@@ -119,6 +121,6 @@ def test_a_dip_is_unseen_where_nothing_is_sent():
     """And until a new publisher is found."""
     sent = [Phase('good', 0.0, 100.0), Phase('restart', 100.0, 102.0), Phase('good', 102.0, 200.0)]
     for dip in dips(1, sent):
-        near = dip.begin + dip.length > 99.9 and dip.begin < 102.0 + SETTLE
+        near = dip.begin + dip.length > 98.9 and dip.begin < 102.0 + SETTLE
         assert dip.unseen == ('restart' if near else 'start' if dip.begin < 3.0 else '')
     assert isinstance(dips(1, sent)[0], Dip)
