@@ -62,12 +62,12 @@ class Machine(threading.Thread):
     Attributes
     ----------
     node, here : list of tuple of float
-        When the node's main thread was ready and had no CPU for more than PAUSE s, by the
-        kernel's account, and when this process had none; by the monotonic clock, s.
+        When the node's main thread was ready and had no CPU for more than WAIT s, by the
+        kernel's account, and when this process had none for PAUSE s; by the monotonic clock, s.
 
     """
 
-    PAUSE = 0.1
+    WAIT, PAUSE = 0.05, 0.1
 
     def __init__(self, pid: Callable[[], int]) -> None:
         super().__init__(daemon=True)
@@ -88,7 +88,7 @@ class Machine(threading.Thread):
                 # ns on the CPU, ns ready without it, since the thread began.
                 account = Path(f'/proc/{pid}/task/{pid}/schedstat').read_text()
                 total = 1e-9 * int(account.split()[1])
-                if pid == last and total - waited > self.PAUSE:
+                if pid == last and total - waited > self.WAIT:
                     self.node.append((now - (total - waited), now))
                 last, waited = pid, total
 

@@ -229,7 +229,7 @@ def as_table(found: Mapping[str, Any]) -> str:
         ['longest answer of the parameter service', f"{found['answer']:.2f} s"],
         *([words, f"{found[name]:.0f} s, {found[f'{name}_most']:.2f} s"] for name, words in (
             ('stopped', 'pauses: the node stopped by SIGSTOP, in all, longest'),
-            ('withheld', 'the node ready, but no CPU for it, by the kernel (above 0.1 s)'),
+            ('withheld', 'the node ready, but no CPU for it, by the kernel (above 0.05 s)'),
             ('deaf', 'the listener without CPU (above 0.1 s)'))),
         *([f'`{name}`', str(value)] for name, value in found['counters'].items()),
         ['exit status after SIGINT, time', f"{found['status']}, {found['took']:.2f} s"]]

@@ -136,7 +136,19 @@ class Publishers:
         for k, (number, time, at) in enumerate(
                 zip(whole.tolist(), times.tolist(), arrived.tolist())):
             kept[k] = self._one(number, time, at, publishers)
+        self._give_up()
         return kept
+
+    def _give_up(self) -> None:
+        """
+        Follow the publisher heard last where the one followed sends nothing.
+
+        Only after all that came: behind a stall, when nobody was heard, the first message may be
+        anybody's.
+        """
+        last = max(range(len(self._tracks)), key=lambda k: self._tracks[k].arrived)
+        if self._tracks[last].arrived - self._tracks[0].arrived > GIVE_UP:
+            self._tracks[0] = self._tracks.pop(last)
 
     def _alone(self, numbers: npt.NDArray[np.int64], times: FloatArray, arrived: FloatArray
                ) -> None:
@@ -179,8 +191,5 @@ class Publishers:
             self.lost += number - self._tracks[0].number - 1
         track = self._tracks[best]
         track.take(number, time, arrived)
-        if best and arrived - self._tracks[0].arrived > GIVE_UP:
-            self._tracks[0] = self._tracks.pop(best)
-            best = 0
         self.foreign += best > 0
         return best == 0

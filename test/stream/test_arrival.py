@@ -91,3 +91,13 @@ def test_a_clock_that_is_set_meanwhile_is_ours():
     clock.take(np.array([12.0]), np.array([1.7e9]), 5.0)
     clock.take(np.array([1.7e9]), np.array([1.7e9 + 0.01]), 6.0)
     assert clock.name == 'ros'
+
+
+@pytest.mark.parametrize('first', [0, 1])
+def test_after_a_stall_the_first_is_followed_still(first):
+    """Both were silent for 1.5 s, as everything was; whose message comes first decides nothing."""
+    publishers = Publishers()
+    follow(publishers, sent(1, 1000, 1e3, 0.0), sent(1, 200, 200.0, 0.0004), count=2)
+    kept = follow(publishers, sent(2500 + first, 1000, 1e3, 2.5 + 1e-3 * first),
+                  sent(500, 200, 200.0, 2.4994 + 1e-3), count=2, batch=50)
+    assert kept[0] >= 990 and kept[1] <= 10
