@@ -31,7 +31,7 @@ _LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 1.0, 20, 10_000
 _POINTS = 2000
 # Seconds whose level a model from a file takes from the recording.
 _ALIGNED = 2.0
-# Current that is missing for longer, s, is no load to simulate with.
+# Current that is missing for longer, s, or for some samples, is no load to simulate with.
 _GAP = 1.0
 
 
@@ -144,11 +144,12 @@ def _current(recording: Recording, t: FloatArray) -> FloatArray | None:
     if recording.current is None:
         return None
     known = np.isfinite(recording.current) & np.isfinite(recording.t)
-    if not known.any() or recording.t[known].max() < t[-1] - _GAP:
+    gap = max(_GAP, 3.0 * float(np.median(np.diff(t))))
+    if not known.any() or recording.t[known].max() < t[-1] - gap:
         return None
     order = np.argsort(recording.t[known], kind='stable')
     stamps, current = recording.t[known][order], recording.current[known][order]
-    if np.diff(stamps, prepend=stamps[0]).max() > _GAP or stamps[0] > t[0] + _GAP:
+    if np.diff(stamps, prepend=stamps[0]).max() > gap or stamps[0] > t[0] + gap:
         return None
     return np.asarray(np.interp(t, stamps, current), dtype=np.float64)
 

@@ -8,10 +8,12 @@ the part fitted is not foreseen; what has memory is one OU, whatever made it.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor.comparison.flight_model import FlightModel, Readings
+from ou_monitor.comparison.flight_model import Damping, FlightModel, Readings
+from ou_monitor.model.load import lowpass
 from ou_monitor.model.load_fit import fit_load, LoadFit
 from ou_monitor.model.load_noise import fit_noise_law
 from ou_monitor.model.residual_ou import fit_residual_ou, innovations, SLOW_TIME
@@ -23,6 +25,8 @@ _PARTS = 4
 MOVES = 0.01
 # Readings that a fit of the load looks at: means of neighbours beyond it.
 _MOST = 40_000
+# Time constants below which changes of the path may be damped, s.
+_FAST = (0.01, 0.02, 0.04, 0.08, 0.16)
 # Models drawn for the error of a mean.
 _DRAWN = 16
 
@@ -30,27 +34,27 @@ _DRAWN = 16
 def fit_flight(samples: Readings, progress: Callable[[float], None] | None = None) -> FlightModel:
     """Fit a model to samples: at least 100, over more than some seconds."""
     report = progress or (lambda share: None)
-    mean = float(samples.voltage.mean())
-    lsb = samples.lsb
-    candidates = _loads(samples)
-    best: tuple[float, FloatArray | None, list[tuple[LoadFit, slice, FloatArray]]] = (
-        _sum_of_squares(_left_out_means(samples)), None, [])
+    mean, lsb = float(samples.voltage.mean()), samples.lsb
     total = float(np.sum((samples.voltage - mean) ** 2))
-    load = None
+    candidates = _loads(samples)
+    tried: list[_Load] = []
     for k, current in enumerate(candidates):
-        parts = []
-        whole = _fit(samples, current, None)
+        whole, parts = _fit(samples, current, None), []
         for j, part in enumerate(_parts(samples)):
             fit = _fit(samples, current, part, whole)
-            errors = samples.voltage[part] - _path(samples, fit, current)[part]
-            parts.append((fit, part, errors))
-            report((k + (j + 1.0) / (_PARTS + 1.0)) / (len(candidates) + 0.3))
-        found = _sum_of_squares([errors for _, _, errors in parts])
-        if found < best[0]:
-            best, load = (found, current, parts), whole
-    path = np.full(samples.t.size, mean) if load is None else _path(samples, load, best[1])
+            parts.append((fit, samples.voltage[part] - _path(samples, fit, current)[part]))
+            report((k + (j + 2.0) / (_PARTS + 1.0)) / (len(candidates) + 0.3))
+        tried.append(_Load(whole, current, tuple(parts)))
+    level = _sum_of_squares(_left_out_means(samples))
+    best = _better(tried)
+    if best is not None and not best.left < level:
+        best = None
+    load = None if best is None else best.fit
+    path = np.full(samples.t.size, mean) if best is None else _path(
+        samples, best.fit, best.current)
+    damping = Damping() if load is None else _damping(samples, path)
     slow = 0.0 if load is None else load.slow_std ** 2
-    left = samples.voltage - path
+    left = samples.voltage - damping.of(path, samples.t)
     dt = samples.spacing
     ou = fit_residual_ou(left, dt, slow)
     errors, state = innovations(left, dt, ou, slow)
@@ -59,9 +63,36 @@ def fit_flight(samples: Readings, progress: Callable[[float], None] | None = Non
     duration = float(samples.t[-1] - samples.t[0])
     level_var = (ou.white * dt + 2.0 * ou.variance * ou.tau) / duration
     report(1.0)
-    return FlightModel(load, mean, math.sqrt(level_var),
-                       1.0 if load is None else _spread(samples, best[2]), noise, ou, dt,
-                       1.0 - best[0] / total if total > 0.0 else 0.0)
+    return FlightModel(
+        load, mean, math.sqrt(level_var), damping, 1.0 if best is None else _spread(samples, best),
+        noise, ou, dt, 1.0 - (level if best is None else best.left) / max(total, 1e-300))
+
+
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """A load, its fit, and the fits without each part with their errors there, V."""
+
+    fit: LoadFit
+    current: FloatArray | None
+    parts: tuple[tuple[LoadFit, FloatArray], ...]
+
+    @property
+    def left(self) -> float:
+        """Return the sum of squares of all parts, V^2."""
+        return _sum_of_squares([errors for _, errors in self.parts])
+
+
+def _better(tried: list[_Load]) -> _Load | None:
+    """Return throttle, or current where that predicts better by more than a standard error."""
+    if not tried:
+        return None
+    for other in tried[1:]:
+        # Relative, so that the part that moves most does not decide alone.
+        ratios = np.array([math.log(float(e @ e) / float(own @ own)) for (_, e), (_, own) in zip(
+            other.parts, tried[0].parts)])
+        if ratios.mean() < -float(ratios.std(ddof=1)) / math.sqrt(ratios.size):
+            return other
+    return tried[0]
 
 
 def _loads(samples: Readings) -> list[FloatArray | None]:
@@ -115,17 +146,31 @@ def _path(samples: Readings, fit: LoadFit, current: FloatArray | None) -> FloatA
     return fit.model.path(samples.t, samples.throttle, current)
 
 
-def _spread(samples: Readings, parts: list[tuple[LoadFit, slice, FloatArray]]) -> float:
-    """Return how much larger the squared mean errors of parts left out are than foreseen."""
+def _damping(samples: Readings, path: FloatArray) -> Damping:
+    """Return what is missing of the fast changes of the path, V, by least squares."""
+    left = samples.voltage - path
+    best, most = Damping(), 0.0
+    for time in _FAST:
+        fast = path - lowpass(path, samples.t, time)
+        square = float(fast @ fast)
+        share = min(1.0, max(0.0, -float(left @ fast) / max(square, 1e-300)))
+        saved = share * (-2.0 * float(left @ fast) - share * square)
+        if saved > most:
+            best, most = Damping(share, time), saved
+    return best
+
+
+def _spread(samples: Readings, load: _Load) -> float:
+    """Return how much larger the variance of slow errors is than the fit says."""
+    if samples.throttle is None:
+        return 1.0
     rng = np.random.default_rng(0)
     ratios = []
-    for fit, part, errors in parts:
-        if samples.throttle is None:
-            continue
-        means = [fit.draw(rng).path(samples.t, samples.throttle, samples.current)[part].mean()
+    for (fit, errors), part in zip(load.parts, _parts(samples)):
+        means = [fit.draw(rng).path(samples.t, samples.throttle, load.current)[part].mean()
                  for _ in range(_DRAWN)]
         # The mean of an OU over so many relaxation times.
         times = float(samples.t[part.stop - 1] - samples.t[part.start]) / SLOW_TIME
         slow = fit.slow_std ** 2 * 2.0 / times * (1.0 + math.expm1(-times) / times)
-        ratios.append(float(errors.mean()) ** 2 / (float(np.var(means, ddof=1)) + slow))
+        ratios.append((float(errors.mean()) ** 2 - float(np.var(means, ddof=1))) / slow)
     return max(1.0, float(np.mean(ratios)))

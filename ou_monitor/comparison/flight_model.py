@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 from ou_monitor.criticism.adc import find_step
+from ou_monitor.model.load import lowpass
 from ou_monitor.model.load_fit import LoadFit
 from ou_monitor.model.load_noise import NoiseLaw
 from ou_monitor.model.residual_ou import ResidualOU, SLOW_TIME
@@ -69,6 +70,33 @@ class Drawn(Protocol):
         """Return one simulated voltage, V, before the ADC."""
 
 
+@dataclass(frozen=True)
+class Damping:
+    """
+    How much of the fast changes of a path the voltage does not follow.
+
+    Throttle jitters, arrives at other moments than the voltage, and is no current: what is fast in
+    the path is partly not in the voltage, and would be counted twice, in the path and as noise.
+
+    Attributes
+    ----------
+    share : float
+        Share of the fast part that is missing, 0..1.
+    time : float
+        What is faster than this time constant, s.
+
+    """
+
+    share: float = 0.0
+    time: float = 0.02
+
+    def of(self, path: FloatArray, t: FloatArray) -> FloatArray:
+        """Return a path, V, at stamps, s, damped."""
+        if not self.share > 0.0:
+            return path
+        return np.asarray(path - self.share * (path - lowpass(path, t, self.time)))
+
+
 @dataclass(frozen=True, eq=False)
 class FlightModel:
     """
@@ -80,9 +108,11 @@ class FlightModel:
         The answer to the load; None where the level is all there is.
     level, level_se : float
         Level, V, without a load model, and its standard error.
+    damping : Damping
+        Of its path.
     spread : float
-        Factor on the variance of the load's errors: how much farther parts that were left out lay
-        from their prediction than those errors say.
+        Factor on the variance of the slow process: how much farther parts that were left out lay
+        from their prediction than the fit says.
     noise : NoiseLaw
         White noise.
     ou : ResidualOU
@@ -97,6 +127,7 @@ class FlightModel:
     load: LoadFit | None
     level: float
     level_se: float
+    damping: Damping
     spread: float
     noise: NoiseLaw
     ou: ResidualOU
@@ -121,7 +152,8 @@ class FlightModel:
         """Return the mean voltage, V."""
         if self.load is None or samples.throttle is None:
             return np.full(samples.t.size, self.level)
-        return self.load.model.path(samples.t, samples.throttle, samples.current)
+        return self.damping.of(
+            self.load.model.path(samples.t, samples.throttle, samples.current), samples.t)
 
     def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:
         """Return one simulated voltage, V; the errors of the parameters are drawn too."""
@@ -131,7 +163,8 @@ class FlightModel:
         if self.load is None or samples.throttle is None:
             voltage = np.full(n, self.level + self.level_se * rng.standard_normal())
         else:
-            voltage = self.load.draw(rng, self.spread).path(samples.t, throttle, samples.current)
+            path = self.load.draw(rng).path(samples.t, throttle, samples.current)
+            voltage = self.damping.of(path, samples.t)
             slow = self.spread * self.load.slow_std ** 2
         dt = np.diff(samples.t, prepend=samples.t[0])
         white, variance, tau = self.ou.draw(rng)

@@ -69,10 +69,10 @@ class LoadFit:
     noise_std: float
     slow_std: float
 
-    def draw(self, rng: np.random.Generator, spread: float = 1.0) -> LoadModel:
-        """Return a model within the errors of this one, their variances times `spread`."""
+    def draw(self, rng: np.random.Generator) -> LoadModel:
+        """Return a model within the errors of this one."""
         low, high, _, _ = _bounds(self.model.charge)
-        moved = rng.multivariate_normal(self._theta, spread * self.covariance)
+        moved = rng.multivariate_normal(self._theta, self.covariance)
         fixed = {'cells': self.model.cells, 'mean_load': self.model.mean_load,
                  'full_current': self.model.full_current}
         return _model(np.clip(moved, low, high), fixed)

@@ -21,9 +21,9 @@ USUAL = ((2.0, 2.0), (4.0, 3.0))
 # Shares of the samples at each end of throttle, and at the top of its changes, that the law does
 # not go beyond.
 _EDGE, _TOP = 0.01, 0.001
-# Scores are drawn from those whose intensity is alike: this share of all to either side, and at
-# least so many.
-_ALIKE, _FEWEST = 0.02, 50
+# Errors are drawn from those whose intensity is alike: this share of all to either side, and at
+# least so many.  And how far ln variance is drawn from its estimate.
+_ALIKE, _FEWEST, _FARTHEST = 0.02, 50, 1.0
 # Time within which a change of throttle counts, s: what the filter onboard takes as one step; and
 # a hair, for the rounding of stamps.
 _SPAN, _HAIR = 0.02, 1e-6
@@ -51,8 +51,8 @@ class NoiseLaw:
         Least and most throttle, and most change of it, in the fit.
     intensities : ndarray, shape (n,)
         ln variance at the samples of the fit, rising.
-    scores : ndarray, shape (n,)
-        Standard scores of the errors there: the shape of the law, tails included.
+    errors : ndarray, shape (n,)
+        Errors there, V, less what is not the noise's: the shape of the law, tails included.
 
     """
 
@@ -60,7 +60,7 @@ class NoiseLaw:
     covariance: FloatArray
     limits: tuple[float, float, float]
     intensities: FloatArray
-    scores: FloatArray
+    errors: FloatArray
 
     def features(self, t: FloatArray, throttle: FloatArray) -> FloatArray:
         """Return what the coefficients multiply, shape (n, 3)."""
@@ -74,11 +74,12 @@ class NoiseLaw:
         first = np.searchsorted(self.intensities, wanted, side='left')
         last = np.searchsorted(self.intensities, wanted, side='right')
         at = first + (rng.random(wanted.size) * (last - first)).astype(np.int64)
-        most = self.scores.size - 1
-        reach = min(max(_FEWEST, int(_ALIKE * self.scores.size)), most // 2)
+        most = self.errors.size - 1
+        reach = min(max(_FEWEST, int(_ALIKE * self.errors.size)), most // 2)
         near = np.clip(at, reach, most - reach) + rng.integers(-reach, reach + 1, at.size)
-        b = rng.multivariate_normal(self.b, self.covariance)
-        return np.asarray(self.scores[near] * np.exp(0.5 * features @ b))
+        off = features @ rng.multivariate_normal(np.zeros(3), self.covariance)
+        # As they were, not scaled: an outlier in a calm does not become a larger one in a storm.
+        return np.asarray(self.errors[near] * np.exp(0.5 * np.clip(off, -_FARTHEST, _FARTHEST)))
 
 
 def _features(u: FloatArray, du: FloatArray, limits: tuple[float, float, float]) -> FloatArray:
@@ -124,6 +125,5 @@ def fit_noise_law(t: FloatArray, errors: FloatArray, throttle: FloatArray,
     # A factor of e where there is none, as of noise far below the rounding.
     information += np.diag([1.0, *(deviation ** -2)])
     order = np.argsort(own, kind='stable')
-    scores = errors / np.sqrt(own + other)
     return NoiseLaw(np.asarray(found.x), np.linalg.inv(information), limits,
-                    np.log(own[order]), scores[order])
+                    np.log(own[order]), (errors * np.sqrt(share))[order])
