@@ -102,6 +102,7 @@ class MonitorReport:
             name: getattr(e, name) for name in (
                 't', 'alpha', 'alpha_se', 'sigma', 'sigma_se', 'var_inf', 'var_inf_se', 'tau',
                 'u0', 'u0_se', 'noise_std', 'sag', 'voltage', 'throttle', 'n', 'duration', 'rate')}
+        values |= self.load.fields(e.throttle)
         values['brownout_risk'] = self.risk
         values['risk_basis'] = self.risk_basis
         values['risk_cause'] = self.risk_cause

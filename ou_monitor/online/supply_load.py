@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import enum
+import math
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import ripple
-from ou_monitor.records import FloatArray, NAN
+from ou_monitor.records import Estimate, FloatArray, NAN, Status
 
 # Lags, s, of the load: of the motors, and of polarisation (the batch's medians, rounded).
 LAGS = (0.06, 2.0, 15.0)
@@ -21,6 +22,11 @@ LAGS = (0.06, 2.0, 15.0)
 POWER = 1.8
 # Throttle at which the sag is tabled.
 TABLE = np.linspace(0.0, 1.0, 101)
+# Where level, sag and noise are known all the same: what to say of the relaxation.
+_NO_ALPHA = {Status.NO_RELAXATION: 'The relaxation is not visible',
+             Status.BURIED: 'The relaxation is buried in noise',
+             Status.UNBOUND: 'No relaxation is visible in the window',
+             Status.TOO_SHORT: 'The window is too short for the relaxation'}
 
 
 def static(throttle: npt.ArrayLike) -> FloatArray:
@@ -113,6 +119,31 @@ class SupplyLoad:
             u = 0.0 * np.asarray(throttle, dtype=np.float64)
         b = self._log_variance
         return np.asarray(np.exp(0.5 * (b[0] + b[1] * ripple(u))))
+
+    def fields(self, throttle: float) -> dict[str, object]:
+        """Return what is published, noise at a throttle; V, Ohm, s."""
+        return {
+            'load_status': self.status.name, 'load_status_text': self.status.value,
+            'load_level': self.level, 'load_sag': float(self.sag(1.0)),
+            'load_sag_se': float(self.sag_se(1.0)), 'load_noise': self._noise_at(throttle),
+            'load_resistance': self.resistance, 'load_resistance_se': self.resistance_se,
+            'load_delay': self.delay, 'load_basis': self.basis.name}
+
+    def words(self, e: Estimate) -> str:
+        """Return what needs no alpha, and why that is unknown; empty: there is no such case."""
+        if math.isnan(self.level) or e.status not in _NO_ALPHA:
+            return ''
+        why = _NO_ALPHA[e.status] + (f' at {e.rate:.3g} Hz.' if e.rate > 0.0 else '.')
+        noise = f'noise {self._noise_at(e.throttle):.2g} V'
+        if not self.known:
+            return f'Level {self.level:.2f} V, {noise}. {self.status.value} {why}'
+        error = max(float(self.sag_se(1.0)), 1e-3)
+        digits = max(0, 1 - math.floor(math.log10(error)) - 1)
+        return (f'Sag {float(self.sag(1.0)):.{digits}f} V at full throttle \u00b1 '
+                f'{error:.{digits}f}, level {self.level:.2f} V, {noise}. {why}')
+
+    def _noise_at(self, throttle: float) -> float:
+        return float(self.noise(throttle if math.isfinite(throttle) else 0.0))
 
     def _read(self, throttle: npt.ArrayLike, table: tuple[float, ...]) -> FloatArray:
         u = np.asarray(throttle, dtype=np.float64)

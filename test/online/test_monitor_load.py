@@ -70,3 +70,29 @@ def test_without_throttle_the_rest_is_known():
     assert load.status is LoadStatus.NO_THROTTLE
     assert load.level == pytest.approx(5.0, abs=0.01)
     assert float(load.noise(0.0)) == pytest.approx(0.01, rel=0.2)
+
+
+def test_what_needs_no_alpha_is_told_first(flight):
+    """Sag with its error, then why alpha is unknown; every number is a field."""
+    monitor = SupplyMonitor()
+    monitor.push(*flight)
+    report = monitor.report(0.0)
+    sag, error = float(report.load.sag(1.0)), float(report.load.sag_se(1.0))
+    assert report.summary.startswith(f'Sag {sag:.1f} V at full throttle \u00b1 {error:.1f}, level')
+    assert report.summary.endswith('The relaxation is not visible at 50 Hz.')
+    fields = report.fields
+    assert fields['load_status'] == 'KNOWN' and fields['load_basis'] == 'THROTTLE'
+    assert float(fields['load_sag']) == sag and float(fields['load_sag_se']) == error
+    assert float(fields['load_level']) == report.load.level
+    assert float(fields['load_noise']) == float(report.load.noise(report.estimate.throttle))
+    assert fields['load_resistance'] == 'nan' and fields['load_delay'] == '0.0'
+
+
+def test_what_is_known_without_throttle_is_told():
+    """Level and noise first, then why the sag is not known."""
+    t = np.arange(0.0, 10.0, 0.02)
+    monitor = SupplyMonitor()
+    monitor.push(t, 16.0 + 0.05 * np.random.default_rng(1).standard_normal(t.size))
+    summary = monitor.report(0.0).summary
+    assert summary.startswith('Level 16.0') and 'Throttle is not known' in summary
+    assert float(monitor.report(0.0).fields['load_noise']) == pytest.approx(0.05, rel=0.15)
