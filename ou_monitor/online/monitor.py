@@ -370,7 +370,7 @@ class SupplyMonitor:
         if not e.usable:
             rate = f' Input: {e.n} samples at {e.rate:.3g} Hz.' if e.rate > 0.0 else ''
             if without_alpha := self._load.words(e):
-                good = self._load.known and math.isfinite(risk)
+                good = self._load.known and math.isfinite(risk) and flag.level is FlagLevel.OK
                 return Level.OK if good else Level.WARN, without_alpha
             return Level.WARN, e.status.value + rate
         if flag.level is not FlagLevel.OK:
