@@ -272,6 +272,9 @@ _DISCOVER = Command(
     (_RECORDING, *_PART, _seed(0), *_TOPICS, *_FILES, _JSON,
      Option('--save-model', metavar='FILE.yaml',
             help='write the extended model, for simulate --model and the estimator'),
+     Option('--force', action='store_true',
+            help='write it even where it predicts worse than the plain OU or its simulations '
+                 'leave the range that was seen'),
      _REPORT))
 
 _FLEET = Command(

@@ -41,14 +41,18 @@ def run(args: argparse.Namespace) -> int:
         output.write_text(text, args.report)
     if args.json is not None:
         output.write_json(finding.as_data(), args.json)
-    if args.save_model is not None:
-        # Last: that there is none must not keep the others from being written.
-        output.write_text(model_text(finding), args.save_model)
     if args.json != output.STDOUT:
         output.say(render(finding))
-        for name, target in (('Report', args.report), ('Model', args.save_model)):
-            if target is not None:
-                output.say(f'\n{name}: {target}')
+        if args.report is not None:
+            output.say(f'\nReport: {args.report}')
+    if args.save_model is not None:
+        # Last: that there is none must not keep the others from being written.
+        if finding.refused and not args.force:
+            raise InputError(f'no model saved: {finding.refused[0].lower()}{finding.refused[1:]}; '
+                             '--force saves it all the same')
+        output.write_text(model_text(finding), args.save_model)
+        if args.json != output.STDOUT:
+            output.say(f'\nModel: {args.save_model}')
     return 0
 
 
@@ -101,7 +105,7 @@ def render(finding: Finding) -> str:
                 f'{row.label} ({row.gain})' for row in found if row.remark == remark)))
     if finding.baseline is not None:
         lines += ['', output.paragraph(
-            f'Plain OU, fitted on the first 60 %: {plain_model_words(finding.baseline)}.')]
+            f'Plain OU: {plain_model_words(finding.baseline)}.')]
         felt = crossing_words(finding)
         lines += [output.paragraph(felt)] if felt else []
     left = finding.remaining

@@ -25,6 +25,10 @@ _MOST = 200_000
 _FLOAT32 = 2.5e-7
 # Share of the samples that must lie on the lattice, and how near, in steps.
 _SHARE, _NEAR = 0.99, 0.1
+# Printed steps to one of the ADC from which it is looked for: below two, any value is within half
+# a printed step of one code or the next.  Gaps between codes that show it, at least; decimals.
+_SPARSE, _FEWEST_CODES = 2.0, 4
+_DECIMALS = range(7)
 # Samples at a rail, visits to it, and standard errors above its neighbours, at least.
 _LEAST, _VISITS, _CLEAR = 8, 3, 5.0
 # With steps above this many standard deviations of the noise the codes next to
@@ -66,11 +70,28 @@ def find_step(voltage: FloatArray) -> float:
         step = _fitted(codes, gaps, weight, first)
         if step > 8.0 * rounding:
             return step
-    return 0.0
+    return _unprinted(codes, gaps, weight)
 
 
-def _fitted(codes: FloatArray, gaps: FloatArray, weight: FloatArray, first: float) -> float:
-    """Return the step near `first` that the codes fit; 0 when they do not."""
+def _unprinted(codes: FloatArray, gaps: FloatArray, weight: FloatArray) -> float:
+    """Return the step of an ADC whose codes were printed with few decimals, V; 0 for none."""
+    printed = next((10.0 ** -k for k in _DECIMALS if float(np.abs(
+        codes * 10.0 ** k - np.rint(codes * 10.0 ** k)).max()) < 1e-3), 0.0)
+    # Where most values are, every code is taken.
+    middle = np.cumsum(weight) / weight.sum()
+    dense = (middle[:-1] > 0.1) & (middle[1:] < 0.9)
+    if not printed or int(dense.sum()) < _FEWEST_CODES:
+        return 0.0
+    first = float(gaps[dense].mean())
+    if first < _SPARSE * printed:
+        return 0.0
+    step = _fitted(codes, gaps, weight, first, 0.55 * printed)
+    return step if step >= _SPARSE * printed else 0.0
+
+
+def _fitted(codes: FloatArray, gaps: FloatArray, weight: FloatArray, first: float,
+            near: float = 0.0) -> float:
+    """Return the step near `first` that the codes fit (to `near`, V); 0 when they do not."""
     step = float(gaps[gaps < 1.5 * first].mean())
     number = np.concatenate(([0.0], np.cumsum(np.rint(gaps / step))))
     middle = float(weight @ number) / float(weight.sum())
@@ -80,7 +101,7 @@ def _fitted(codes: FloatArray, gaps: FloatArray, weight: FloatArray, first: floa
     step = float(weight @ ((number - middle) * codes)) / spread
     level = float(weight @ codes) / float(weight.sum())
     off = np.abs(codes - level - step * (number - middle))
-    return step if weight[off < _NEAR * step].sum() >= _SHARE * weight.sum() else 0.0
+    return step if weight[off < max(near, _NEAR * step)].sum() >= _SHARE * weight.sum() else 0.0
 
 
 def find_rails(voltage: FloatArray, step: float, noise: float) -> tuple[float, float]:

@@ -196,8 +196,26 @@ def _ties(v: FloatArray) -> bool:
         return False
     # Chance of two normal values one code apart or less, on average over their codes.
     chance = min(1.0, code / (math.sqrt(2.0 * math.pi) * float(np.sqrt(np.mean(moved**2)))))
-    expected = 1.5 * count * chance
-    return chance < _FINE and equal - expected > 6.0 * math.sqrt(equal) + 0.01 * count
+    if chance >= _FINE:
+        return False
+    expected = count * max(chance, _ties_without_holds(v, inner))
+    return equal - 1.5 * expected > 6.0 * math.sqrt(max(expected, 1.0))
+
+
+def _ties_without_holds(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
+    """
+    Return the share of ties to neighbours that values alike without any hold explain.
+
+    Values two apart are alike by chance of their codes, whatever the intensity does over the
+    recording; neighbours are the more so as they lie nearer to each other: sqrt(2) for a
+    diffusion, 1 for white noise.  Of a share h held, h^2 are alike two apart, too: ten per cent
+    held count as one.
+    """
+    apart = v[2:] - v[:-2]
+    usual = float(np.median(np.abs(apart)))
+    near = float(np.median(np.abs(v[1:] - v[:-1])))
+    nearer = min(max(usual / near, 1.0), math.sqrt(2.0)) if near > 0.0 else math.sqrt(2.0)
+    return nearer * float(np.mean(apart[inner[1:]] == 0.0)) if inner[1:].any() else 0.0
 
 
 def _refreshed(t: FloatArray, period: float) -> FloatArray:

@@ -25,9 +25,6 @@ from scipy.special import ndtri
 
 # Share of the samples that models are fitted on; the rest is kept to score them.
 TRAIN = 0.6
-# Samples kept count up to this far outside of the throttle that the part fitted has
-# been through: a share of its range, and what is no change of throttle at all.
-_BEYOND, _STILL = 0.05, 0.01
 # Samples that are fitted at most.
 MOST = 80_000
 # Steps of up to this many relaxation times keep alpha identifiable.
@@ -84,18 +81,6 @@ class Samples:
     def test(self) -> slice:
         """Return the part for scoring."""
         return slice(round(TRAIN * self.n), self.n)
-
-    @cached_property
-    def covered(self) -> npt.NDArray[np.bool_]:
-        """Return which samples of the part for scoring have throttle that the other covers."""
-        kept = np.zeros(self.n, dtype=np.bool_)
-        kept[self.test] = True
-        if self.throttle is None:
-            return kept
-        known = self.throttle[self.train]
-        low, high = float(known.min()), float(known.max())
-        margin = max(_BEYOND * (high - low), _STILL)
-        return kept & (self.throttle >= low - margin) & (self.throttle <= high + margin)
 
     def part(self, part: slice, voltage: FloatArray | None = None) -> Samples:
         """Return a part, or all with another voltage."""

@@ -133,20 +133,23 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
 
 
 def whitened(samples: Samples, terms: Sequence[Term], more: Sequence[Term],
-             events: Events | None = None, offset: FloatArray | None = None) -> FloatArray:
+             events: Events | None = None, offset: FloatArray | None = None, *,
+             own: bool = False) -> FloatArray:
     """
-    Return voltage, level and columns of more terms as the noise of a model leaves them white.
+    Return voltage, level and columns of the mean as the noise of a model leaves them white.
 
-    offset in V; the columns of the model's own mean are left out.
+    Columns are those of more terms, and with `own` those of the model itself; else its measured
+    ones are left out, and what the others add is taken off the voltage.  offset in V.
     """
     run = _filter(samples, terms, events)
-    kept = [term for term in terms if term.ROLE is not Role.MEAN]
+    kept = terms if own else [term for term in terms if term.ROLE is not Role.MEAN]
     columns = _columns(samples, (*kept, *more), run.segment)
-    own = _columns(samples, terms, run.segment)
-    fixed = [k for k, term in enumerate(_owners(terms)) if term is not None and not term.MEASURED]
-    beta = np.array([value for term in terms for value in coefficients(term)])
-    voltage = samples.voltage - own[:, fixed] @ beta[fixed]
-    voltage = voltage if offset is None else voltage - offset
+    voltage = samples.voltage if offset is None else samples.voltage - offset
+    fixed = [] if own else [k for k, term in enumerate(_owners(terms))
+                            if term is not None and not term.MEASURED]
+    if fixed:
+        beta = np.array([value for term in terms for value in coefficients(term)])
+        voltage = voltage - _columns(samples, terms, run.segment)[:, fixed] @ beta[fixed]
     through = run.kalman.innovations(np.column_stack((voltage, columns)))
     return np.asarray(through / np.sqrt(run.full)[:, None], dtype=np.float64)
 
@@ -403,6 +406,14 @@ def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None)
     weight = 1.0 / np.sqrt(variance)
     through = run.kalman.innovations(np.column_stack((samples.voltage, columns))) * weight[:, None]
     beta = _solved(through[:, 1:], through[:, 0])
+    e = (through[:, 0] - through[:, 1:] @ beta) / weight
+    return GaussianFit(with_mean(terms, beta), (), columns @ beta, e, variance,
+                       _log_density(e, variance), run.phi,
+                       run.cost + 1e-8 * samples.n * beta.size)
+
+
+def with_mean(terms: tuple[Term, ...], beta: FloatArray) -> tuple[Term, ...]:
+    """Return terms with the coefficients of all columns of the mean."""
     ou = terms[0]
     assert isinstance(ou, OU)
     result: list[Term] = [replace(ou, u0=float(beta[0]))]
@@ -413,7 +424,4 @@ def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None)
         size = len(term.LINEAR) if term.ROLE is Role.MEAN else 0
         result.append(term.with_linear(beta[at:at + size].tolist()) if size else term)
         at += size
-    e = (through[:, 0] - through[:, 1:] @ beta) / weight
-    return GaussianFit(tuple(result), (), columns @ beta, e, variance,
-                       _log_density(e, variance), run.phi,
-                       run.cost + 1e-8 * samples.n * beta.size)
+    return tuple(result)

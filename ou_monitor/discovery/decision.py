@@ -71,6 +71,11 @@ STEADY = 4.0
 MOSTLY = 0.75
 # Standard errors by which the sum of the gains of all parts must exceed zero: see `is_shared`.
 SHARED = 1.0
+# Relaxation times in a recording from which the rate is one, and no trend: it is then known to
+# sqrt(2/20) = 30 %.
+RELAXES = 20.0
+# Chance from which a cause is not named: it does not show beside the others.
+CHANCE = 0.05
 # Statistics of outliers and clusters, as scores, above which single samples dominate the
 # likelihood, so that the evidence must hold in most segments.
 RAGGED = 8.0
@@ -256,6 +261,15 @@ def helped(before: Statistics, after: Statistics, kind: Kind | None = None) -> b
 
     left = misfit(after)
     return left < LITTLE or left < (1.0 - HELPS) * misfit(before)
+
+
+def earns(gain: float, error: float, chance: float) -> bool:
+    """
+    Return whether a cause earns its place on blocks that were kept back (gain, error in nats).
+
+    A gain that is not known is none to judge by; its chance is that of the fit alone.
+    """
+    return chance <= CHANCE and not gain < -error
 
 
 # Which of those accepted stay.

@@ -152,9 +152,9 @@ class Finding:
     sentence : str
         The same in a sentence.
     baseline : OU or None
-        The plain model, fitted on the first part.
+        The plain model, fitted on everything.
     baseline_score : float
-        Mean log predictive density on the rest, nats per sample.
+        Mean log predictive density of blocks kept back in turn, nats per sample.
     criticism : tuple of Criticism
         All statistics.
     causes : tuple of Cause
@@ -164,7 +164,7 @@ class Finding:
     se : tuple of dict
         Its standard errors, a dict a term.
     score, gain, gain_se : float
-        Of the extended model on the part kept, nats per sample.
+        Of the extended model on blocks kept back in turn, nats per sample.
     crossing : CrossingRate
         What a pilot feels.
     notes : tuple of str
@@ -174,6 +174,8 @@ class Finding:
     simulated : SupplyModel or None
         The extended model as it makes `samples`: without what was undone in
         them, such as repeats.
+    refused : str
+        Why the extended model has not earned its place, in words; empty where it has.
     seed : int
         Of all randomness.
 
@@ -197,6 +199,7 @@ class Finding:
     notes: tuple[str, ...] = ()
     samples: Samples | None = None
     simulated: SupplyModel | None = None
+    refused: str = ''
     seed: int = 0
 
     @property
@@ -246,7 +249,7 @@ class Finding:
                     'baseline_se': self.crossing.baseline_se,
                     'extended_se': self.crossing.extended_se, 'unit': '1/min'}},
             'remaining': [_discrepancy(c, c.after, c.p_after) for c in self.remaining],
-            'notes': list(self.notes)})
+            'refused': self.refused or None, 'notes': list(self.notes)})
         return found
 
     def _extended(self) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import decision
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.laws import View
+from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray
 
@@ -202,6 +203,13 @@ class Fitter:
             return float(fit.density.sum())
 
         return sorted(starts, key=lambda start: -likelihood(start))
+
+
+def is_trend(samples: Samples, model: Composite) -> bool:
+    """Return whether the `ou` of a model is too slow for a recording to be a relaxation."""
+    ou = model.terms[0]
+    assert isinstance(ou, OU)
+    return ou.alpha * float(samples.t[-1] - samples.t[0]) < decision.RELAXES
 
 
 def _joined(composite: Composite) -> Term:

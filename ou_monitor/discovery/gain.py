@@ -1,40 +1,33 @@
 """
 What a model gains on samples that it was not fitted on.
 
-Scores are log densities of one-step predictions.  Neighbours share a part of
-theirs, so errors come from means of blocks.  Only samples at throttle that the
-part fitted covers are scored: elsewhere a model extrapolates, and its score says
-nothing of it.
-
-The gain stated is that of the true model, of which the fitted one loses what
-its parameters are off.  Its error covers both: which samples happen to be
-scored, and that loss.
+Scores are log densities of one-step predictions, each block of the recording kept back in turn
+(`validation`).  Neighbours share a part of theirs, so errors come from means of blocks.  Only
+samples at throttle that the other blocks cover are scored: elsewhere a model extrapolates, and
+its score says nothing of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from functools import cached_property
+from collections.abc import Sequence
 import math
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discovery.errors import Estimation, estimations
 from ou_monitor.discovery.finding import CrossingRate
+from ou_monitor.discovery.validation import HeldOut
 from ou_monitor.discovery.words import unmeasured_words
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.term import Term
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray, NAN
 from scipy.special import ndtr
 from scipy.stats import chi2
 
 # Blocks of the samples kept; the fewest with which a spread is estimated well.
 BLOCKS = 24
-# Mean loss by errors of parameters, nats per sample, from which the part fitted does not
-# determine them: predictions are then as far off by them as by the noise.
-_UNKNOWN = 0.5
 # A gain whose error is so many times as large, and so many nats per sample, is not measured.
 _VAGUE, _WIDE = 10.0, 0.1
 # Level of the crossings: standard deviations below the mean, lowered in steps
@@ -70,83 +63,68 @@ def if_known(gain: float, error: float) -> tuple[float, float]:
 
 
 def without(samples: Samples, model: Composite, *indices: int) -> Composite | None:
-    """Return the model fitted again without some of its terms; None where it cannot be."""
+    """Return the model fitted again to everything without some of its terms; None for none."""
     kept = [term for k, term in enumerate(model.terms) if k not in indices]
+    # What changes a term that is gone has gone with it.
+    names = {term.NAME for term in kept}
+    kept = [term for term in kept if term.CHANGES is None or term.CHANGES.NAME in names]
+    laws = any(model.terms[k].ROLE is Role.LAW for k in indices)
+    known = None if laws else model
+    # Near its old parameters, or far from them: without white noise or an answer to throttle the
+    # rail itself has to be what they were.
+    found = [_fitted(samples, (ou, *kept[1:]), known) for ou in (kept[0], guess(samples))]
+    return max((fit for fit in found if fit is not None), default=None,
+               key=lambda fit: float(fit.density.sum()))
+
+
+def _fitted(samples: Samples, terms: Sequence[Term], known: Composite | None
+            ) -> Composite | None:
+    """Return a fit to everything; None where there is none."""
     try:
-        return fit_composite(samples, kept, samples.train)
+        found = fit_composite(samples, terms, slice(0, samples.n), known, rough=True)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         # Parameters have left what a term allows, or numbers can hold.
         return None
+    return found if found is not None and math.isfinite(float(found.density.sum())) else None
 
 
-class Scale:
+def guess(samples: Samples) -> OU:
+    """Return a start for the fit of an OU: from the correlation of neighbours."""
+    v = samples.voltage
+    c = v - v.mean()
+    power = float(c @ c)
+    keep = min(max(float(c[1:] @ c[:-1]) / power, 0.05), 0.9999)
+    alpha = -math.log(keep) / float(np.median(samples.step[1:]))
+    return OU(alpha, math.sqrt(power / c.size * 2.0 * alpha), float(v.mean()))
+
+
+def gain_of(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_]) -> tuple[float, float]:
+    """Return the gain of one model over another and its error, nats; NaN where it is not known."""
+    both = scored & new.known & old.known
+    if int(both.sum()) < BLOCKS:
+        return NAN, NAN
+    return if_known(*mean_difference(new.density[both], old.density[both]))
+
+
+def why_unknown(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_],
+                throttle: bool) -> str:
+    """Return why a gain cannot be measured, for people; empty where it can."""
+    count = int((scored & new.known & old.known).sum())
+    return unmeasured_words(BLOCKS, count, throttle) if count < BLOCKS else ''
+
+
+def cause_gain(full: HeldOut, less: HeldOut, scored: npt.NDArray[np.bool_]
+               ) -> tuple[float, float, float]:
     """
-    What the gain of a model and of its terms is measured on.
+    Return the gain of the larger of two models, its error, nats per sample, and its chance.
 
-    Parameters
-    ----------
-    samples : Samples
-        The recording.
-    model : Composite
-        Fitted on its first part.
-    scored : ndarray of bool, shape (n,), optional
-        Samples that count; those of `covered` where not given.
-
+    The chance is twice the smaller of two: that of the likelihood ratio on everything, with the
+    price of what was searched, and that of the gain on what was kept back.
     """
-
-    def __init__(self, samples: Samples, model: Composite,
-                 scored: npt.NDArray[np.bool_] | None = None) -> None:
-        self._samples, self._model = samples, model
-        self.scored = samples.covered if scored is None else scored
-
-    @property
-    def estimation(self) -> Estimation:
-        """Return what the samples scored ask of the parameters."""
-        return self._estimations[0]
-
-    @cached_property
-    def _estimations(self) -> list[Estimation]:
-        """Return what errors of parameters cost on the samples scored, and on all kept."""
-        kept = np.zeros(self._samples.n, dtype=np.bool_)
-        kept[self._samples.test] = True
-        return estimations(self._samples, self._model, self.scored, kept)
-
-    def why_unknown(self, terms: Collection[int] | None = None) -> str:
-        """Return why a gain cannot be measured, for people; empty where it can."""
-        model, count = self._model, int(self.scored.sum())
-        if count < BLOCKS:
-            kept = self._samples.n - self._samples.test.start
-            uncovered = int(self._samples.covered.sum()) < BLOCKS <= kept
-            return unmeasured_words(BLOCKS, count, uncovered)
-        if self._estimations[1].loss(terms)[0] <= _UNKNOWN:
-            return ''
-        owners = range(len(model.terms)) if terms is None else terms
-        return unmeasured_words(BLOCKS, count, any(
-            model.terms[k].NEEDS_THROTTLE for k in owners))
-
-    def gain(self, new: FloatArray, old: FloatArray, terms: Collection[int] | None = None
-             ) -> tuple[float, float]:
-        """
-        Return a gain and its standard error, nats per sample; NaN where it cannot be measured.
-
-        That is where `why_unknown` says why, and where the error is both ten
-        times as large as the gain and large beside any gain there is.
-        """
-        if self.why_unknown(terms):
-            return NAN, NAN
-        gain, error = mean_difference(new[self.scored], old[self.scored])
-        return if_known(gain, math.hypot(error, self.estimation.loss(terms)[1]))
-
-
-def cause_gain(samples: Samples, full: Composite, less: Composite, scale: Scale | None = None,
-               terms: Collection[int] | None = None) -> tuple[float, float, float]:
-    """Return the gain of the larger of two models, its error, nats per sample, and its chance."""
-    scale = Scale(samples, full) if scale is None else scale
-    gain, error = scale.gain(full.density, less.density, terms)
-    train = samples.train
-    ratio = 2.0 * float((full.density[train] - less.density[train]).sum())
-    tail = float(chi2.logsf(max(ratio, 0.0), max(full.free - less.free, 1)))
-    fitted = math.exp(min(tail + full.search - less.search, 0.0))
+    gain, error = gain_of(full, less, scored)
+    ratio = 2.0 * float((full.model.density - less.model.density).sum())
+    tail = float(chi2.logsf(max(ratio, 0.0), max(full.model.free - less.model.free, 1)))
+    fitted = math.exp(min(tail + full.model.search - less.model.search, 0.0))
     kept = float(ndtr(-gain / error)) if error > 0.0 else 1.0
     return gain, error, min(1.0, 2.0 * min(fitted, kept))
 
@@ -185,7 +163,7 @@ def crossing_rates(samples: Samples, baseline: Sequence[Term], extended: Sequenc
                    rng: np.random.Generator, scored: npt.NDArray[np.bool_] | None = None
                    ) -> CrossingRate:
     """Compare how often a level is crossed, in the data and in simulations."""
-    scored = samples.covered if scored is None else scored
+    scored = np.ones(samples.n, dtype=np.bool_) if scored is None else scored
     if int(scored.sum()) < BLOCKS:
         return CrossingRate()
     level, t = crossing_level(samples, scored), samples.t

@@ -14,11 +14,11 @@ from dataclasses import dataclass, field, replace
 import math
 
 import numpy as np
-from ou_monitor.criticism.composite import Composite, covariates_of, fit_composite, view_of
+from ou_monitor.criticism.composite import Composite, covariates_of, view_of
 from ou_monitor.criticism.null_bank import criticise, NullBank, simulate_bank, simulate_bank_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision
-from ou_monitor.discovery.fitting import Fitter, Trial
+from ou_monitor.discovery.fitting import Fitter, is_trend, Trial
 from ou_monitor.discovery.gain import BLOCKS, mean_difference
 from ou_monitor.discovery.regression import load_terms, mean_answer
 from ou_monitor.model.terms.catalogue import catalogue
@@ -35,6 +35,10 @@ Progress = Callable[[float], None]
 # Rate, 1/s, from which a fit finds what the load leaves: minutes and tenths of a second are both
 # within reach of it.
 _SLOW = 1.0
+# Intensities that follow throttle: each may only mend the form of the other.
+_CURVES = (LoadDependentSigma, LoadDependentNoise)
+_OTHER_CURVE = {LoadDependentSigma.NAME: LoadDependentNoise.NAME,
+                LoadDependentNoise.NAME: LoadDependentSigma.NAME}
 # Time of one fit, s, up to which the mean is chosen anew after each cause.
 _SOON = 1.0
 
@@ -79,15 +83,14 @@ class Search:
 @dataclass(frozen=True, eq=False)
 class Named:
     """
-    What the search left: a model, its causes, and statistics before and after.
+    What the search left: a model fitted on everything, its causes, statistics before and after.
 
-    `model` was fitted on the first part, `whole` on `part`: everything where that could be done.
+    `bank` is what the statistics are measured by.
 
     """
 
-    model: Composite
     whole: Composite
-    part: slice
+    bank: NullBank
     names: tuple[str, ...]
     rivals: Mapping[str, list[str]]
     dropped: tuple[str, ...]
@@ -133,12 +136,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         search = name_causes(fitter, begun, bank, latent=False, given=[*given, *slow])
         dropped = tuple(name for name in dropped if name not in search.accepted)
         whole, after = _kept_beside(fitter, search, stays, before, bank)
-    part = samples.train if whole is search.composite else slice(0, samples.n)
-    model = search.composite
-    if search.accepted:
-        # The search fits the mean to everything; the gain needs one fitted to the first part.
-        model = fit_composite(samples, model.terms, samples.train, model) or model
-    return Named(model, whole, part, tuple(search.accepted), search.rivals, dropped, before, after,
+    return Named(whole, bank, tuple(search.accepted), search.rivals, dropped, before, after,
                  failure)
 
 
@@ -208,10 +206,14 @@ def _kinds(names: Sequence[str]) -> list[type[Term]]:
 
 def _acceptable(trial: Trial, search: Search, values: Mapping[str, float]) -> bool:
     """Return whether a trial may be accepted."""
+    kind = catalogue()[trial.name]
+    if kind in _CURVES and search.composite.has(_OTHER_CURVE[trial.name]) and (
+            trial.evidence < decision.FORM * search.largest):
+        return False
     new, old = trial.composite.density, search.composite.density
     gains = [float(part.sum()) for part in np.array_split(new - old, BLOCKS)]
     return decision.acceptable(
-        catalogue()[trial.name], trial.evidence, search.largest, decision.is_ragged(values),
+        kind, trial.evidence, search.largest, decision.is_ragged(values),
         decision.is_throughout(*mean_difference(new, old), gains))
 
 
@@ -282,8 +284,7 @@ def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:
                 continue
             found = fitter.best_start(best, kind, view)
             # Two intensities that follow throttle: one may only mend the form of the other.
-            again = kind.FAMILY == LoadDependentSigma.FAMILY and largest > 0.0 and any(
-                best.has(other.NAME) for other in (LoadDependentSigma, LoadDependentNoise))
+            again = kind in _CURVES and best.has(_OTHER_CURVE[kind.NAME])
             if found is not None and not (
                     again and fitter.evidence(found) - fitter.evidence(best)
                     < decision.FORM * largest):
@@ -315,6 +316,9 @@ def _answer(fitter: Fitter, search: Search, start: Sequence[Term]) -> None:
     structural = [term for term in composite.terms
                   if term.ROLE is not Role.LAW and not decision.is_answer(type(term))]
     laws = [term for term in composite.terms if term.ROLE is Role.LAW]
+    gone = {term.NAME for term in own} - {term.NAME for term in answer.terms}
+    if gone and is_trend(fitter.samples, composite):
+        return
     fit = fitter.fit([*structural, *answer.terms, *laws], composite)
     if fit is None or (not start and fitter.evidence(fit) < fitter.evidence(composite)):
         return
@@ -385,6 +389,9 @@ def _prune(fitter: Fitter, search: Search) -> None:
             less = fitter.fit(kept, less)
         if less is None or not full - fitter.evidence(less) < needed:
             continue
+        if decision.is_answer(kind) and is_trend(fitter.samples, less):
+            # The `ou` has taken its place: a trend, and no relaxation any more.
+            continue
         plain = fitter.simplest(search.composite, index)
         if plain is not None and fitter.evidence(plain) - fitter.evidence(less) > needed:
             search.log.append(f'{name} in a simpler form')
@@ -405,6 +412,8 @@ def _kept_beside(fitter: Fitter, search: Search, stays: Sequence[Term],
     whole = fitter.whole(search.composite)
     after = criticise(samples, whole, bank)
     for term in stays:
+        if not term.SEVERAL and search.composite.has(term.NAME):
+            continue
         fit = fitter.join(search.composite, [term], rough=False)
         if fit is None or (fitter.evidence(fit) - fitter.evidence(search.composite)
                            < decision.ACCEPT):

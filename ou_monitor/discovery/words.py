@@ -21,13 +21,11 @@ from ou_monitor.text import listed, number, Z95
 MNAT = ('mnat: a thousandth of a nat of log predictive density. A gain of 1 mnat per sample makes '
         '1000 samples e = 2.7 times as likely as before.')
 # What to say where the error of a gain leaves nothing known of it.
-VAGUE = ('its error is more than ten times the gain, because the first 60 % hardly determine its '
-         'parameters.')
+VAGUE = ('its error is more than ten times the gain, because the rest of the recording hardly '
+         'determines its parameters.')
 # What to say where there is no model to compare with.
 NO_OTHER = 'the model cannot be fitted without it.'
 NOT_KNOWN = 'not known'
-# Chance from which the part fitted does not show a cause.
-_CHANCE = 0.05
 # An estimate whose error is so many times as large is none.
 _UNDETERMINED = 1e4
 
@@ -115,9 +113,9 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
 
 
 def left_out_note(count: int, scored: int) -> str:
-    """Return that samples at throttle which the part fitted does not cover are not scored."""
-    return (f'{count} samples of the last 40 % are at throttle that the first 60 % do not cover: '
-            f'a model fitted there does not apply to them. Only the other {scored} are scored.')
+    """Return that samples at throttle which other blocks do not cover are not scored."""
+    return (f'{count} samples are at throttle that the rest of the recording does not cover: a '
+            f'model fitted there does not apply to them. Only the other {scored} are scored.')
 
 
 def coupling_note(alpha: float, duration: float) -> str:
@@ -141,7 +139,7 @@ def no_relaxation_note(alpha: float, step: float) -> str:
     """Return the note for samples that are farther apart than the rail remembers."""
     return (f'Samples {number(1e3 * step)} ms apart are nearly uncorrelated: the rail is faster '
             f'than the sampling, or the noise is that of the sensor, and alpha = {number(alpha)} '
-            '1/s, fitted on the first 60 %, is only a lower bound.')
+            '1/s is only a lower bound.')
 
 
 def coupling_found(duration: float) -> str:
@@ -158,16 +156,23 @@ def remaining_words(left: Sequence[Criticism]) -> str:
 
 def verdict_sentence(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism],
                      gain: float, gain_se: float, dropped: Sequence[str] = (),
-                     why: str = '', uncovered: int = 0) -> str:
+                     why: str = '', uncovered: int = 0, refused: str = '') -> str:
     """Return the verdict in a sentence or two (gain, gain_se in nats)."""
+    text = _verdict(verdict, causes, left, gain, gain_se, dropped, why, uncovered)
+    return f'{text} {refused}: believe its names, not its numbers.' if refused else text
+
+
+def _verdict(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism], gain: float,
+             gain_se: float, dropped: Sequence[str], why: str, uncovered: int) -> str:
+    """Return the verdict without what speaks against the model."""
     names = _counted([cause.name for cause in causes])
     tried = (f' The nearest entries of the catalogue ({listed(list(dropped))}) fit in part only.'
              if dropped else '')
     if left and uncovered:
-        tried += (f' {uncovered} samples of the last 40 % are at throttle that the first 60 %, on '
-                  'which models are fitted, do not cover: that alone may be what is left'
-                  + ('.' if why else '; a recording that covers its whole range of throttle in '
-                     'both parts would decide.'))
+        tried += (f' {uncovered} samples are at throttle that the rest of the recording does not '
+                  'cover: that alone may be what is left'
+                  + ('.' if why else '; a recording that covers its whole range of throttle more '
+                     'than once would decide.'))
     if verdict is Verdict.NO_EFFECT:
         return ('The plain OU simulates this recording: no statistic that a recording of this '
                 'length supports deviates.')
@@ -217,7 +222,7 @@ def gain_words(gain: float, gain_se: float, why: str = '') -> str:
     if gain > Z95 * gain_se:
         return f'Gain on samples not used for the fit: {size}.'
     if gain < -Z95 * gain_se:
-        return f'Worse on the part kept, which was not used for the fit: {size}.'
+        return f'Worse on samples not used for the fit: {size}.'
     return f'No measurable gain on samples not used for the fit ({size}).'
 
 
@@ -225,11 +230,7 @@ def why_named(gain: float, gain_se: float, chance: float) -> str:
     """Return why a cause is named whose gain does not say so; empty where it does."""
     if gain > Z95 * gain_se or not math.isfinite(chance):
         return ''
-    if chance > _CHANCE:
-        return ('Named by the search, whose evidence is that of the whole recording; models '
-                f'fitted on the first 60 %, with and without it, do not show it '
-                f'(p = {chance:.2g}).')
-    return f'Named for what it explains in the first 60 % (p = {chance:.2g}).'
+    return f'Named for what it explains in the recording as a whole (p = {chance:.2g}).'
 
 
 def overlap_words(causes: Sequence[Cause], gain: float) -> str:
@@ -249,15 +250,12 @@ def overlap_words(causes: Sequence[Cause], gain: float) -> str:
 
 def unmeasured_words(fewest: int, scored: int, throttle: bool) -> str:
     """Return why a gain cannot be measured, and what recording would measure it."""
-    few = f'{scored} samples are left to score it on, fewer than {fewest}'
+    few = (f'{scored} samples are left to score it on, fewer than {fewest}' if scored
+           else 'no part of the recording determines it for the others')
     if throttle:
-        return (f'{few if scored < fewest else "models are fitted on the first 60 % for this"}, '
-                'and throttle there does not cover that of the rest. A recording that covers its '
-                'whole range of throttle in both parts would measure it.')
-    if scored < fewest:
-        return f'{few}. A longer recording would measure it.'
-    return ('the first 60 %, on which models are fitted for this, do not determine it. A longer '
-            'recording would measure it.')
+        return (f'{few}: throttle of one part does not cover that of the others. A recording that '
+                'covers its whole range of throttle more than once would measure it.')
+    return f'{few}. A longer recording would measure it.'
 
 
 @dataclass(frozen=True)
@@ -329,7 +327,7 @@ def gain_remark(gain: float, gain_se: float) -> str:
     if not (math.isfinite(gain) and math.isfinite(gain_se)) or gain > Z95 * gain_se:
         return ''
     if gain < -Z95 * gain_se:
-        return 'worse on the part kept'
+        return 'worse on what was kept back'
     return 'not distinguishable from none'
 
 
@@ -339,9 +337,7 @@ def _remark(cause: Cause) -> str:
         'not measurable here')
     if cause.exact or not remark:
         return remark
-    first = math.isfinite(cause.p_value) and cause.p_value <= _CHANCE
-    return remark + ('; named for what it explains in the first 60 %' if first
-                     else '; named by the search on the whole recording')
+    return remark + '; named for what it explains in the recording as a whole'
 
 
 def _chance(cause: Cause) -> str:

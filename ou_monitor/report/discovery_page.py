@@ -104,7 +104,7 @@ def _causes(finding: Finding) -> list[str]:
 
 def _gain(finding: Finding) -> list[str]:
     c = finding.crossing
-    rows = [['Score on the last 40 %, nats per sample', _value(finding.baseline_score, 4),
+    rows = [['Score on blocks kept back, nats per sample', _value(finding.baseline_score, 4),
              _value(finding.score, 4), _total_gain(finding)]]
     if math.isfinite(c.level):
         rows.append([
@@ -119,7 +119,7 @@ def _gain(finding: Finding) -> list[str]:
     assert finding.baseline is not None
     return [page.table(head, rows, left=[0]),
             page.paragraph(_typeset(crossing_words(finding))),
-            page.paragraph(f'Plain OU, fitted on the first 60 % with nothing else in the model: '
+            page.paragraph(f'Plain OU, with nothing else in the model: '
                            f'{plain_model_words(finding.baseline)}.', soft=True)]
 
 
@@ -204,10 +204,9 @@ def _parameters(finding: Finding) -> list[str]:
                          spec.metadata['unit'] or UNKNOWN, spec.metadata['text']])
     about = ('Extended model: all terms fitted together on the whole recording. Its alpha and '
              'sigma describe what remains of relaxation and noise beside all causes; those of the '
-             'plain OU above, fitted on the first 60 %, include the causes.'
+             'plain OU above include the causes.'
              if finding.causes else
-             'The plain OU is kept, as no cause was named: the same model as above, fitted on the '
-             'whole recording instead of its first 60 %, so that its numbers differ a little.')
+             'The plain OU is kept, as no cause was named: the model above.')
     return [page.paragraph(about),
             page.table(['Term', 'Parameter', 'Estimate \u00b1 standard error', 'Unit',
                         'What it is'], rows, left=[0, 1, 4])]

@@ -163,8 +163,8 @@ def test_what_is_not_known_is_said_and_what_is_worse_too():
     text, html = render(finding), discovery_page(finding)
     for shown in (text, html):
         assert not re.search(r'\bnan\b|- \+- -|\u2013 \u00b1 \u2013', shown)
-        assert shown.count('worse on the part kept') == 1
-        assert 'Worse on the part kept' in html
+        assert shown.count('worse on what was kept back') == 1
+        assert 'Worse on samples not used' in html
     rows = {row[0]: row for row in tables(html)}
     assert rows['load_sag'][2].startswith('not known not measurable here; named by the search')
     assert rows['load_sag'][3] == 'not known'

@@ -80,7 +80,7 @@ def test_a_gain_is_measurable_from_two_errors_on():
     assert 'No measurable gain' in explain(cause.term, {}, 0.003, 0.002, (), False)
     assert 'Gain on samples' in explain(cause.term, {}, 0.015, 0.002, (), False)
     worse = explain(cause.term, {}, -0.015, 0.002, (), False)
-    assert 'Worse on the part kept' in worse and 'No measurable gain' not in worse
+    assert 'Worse on samples not used' in worse and 'No measurable gain' not in worse
 
 
 @pytest.mark.parametrize('after, causes, dropped, verdict', [
@@ -159,14 +159,22 @@ def test_sentences():
 
 
 def test_why_a_cause_without_a_gain_is_named():
-    """By its p: the first part, or the search on everything; nothing where the gain says it."""
+    """By its p on the whole recording; nothing where the gain says it."""
     assert why_named(0.02, 0.005, 1e-9) == '' and why_named(math.nan, math.nan, math.nan) == ''
-    assert 'first 60 % (p = 1e-09)' in why_named(0.001, 0.005, 1e-9)
     for gain, error in ((0.001, 0.005), (math.nan, math.nan)):
-        assert 'whole recording' in why_named(gain, error, 1.0)
+        assert 'as a whole (p = 1e-09)' in why_named(gain, error, 1e-9)
     term = finding().causes[0].term
-    assert 'p = 1)' in explain(term, {}, 0.001, 0.005, [], False, chance=1.0)
+    assert 'p = 0.01)' in explain(term, {}, 0.001, 0.005, [], False, chance=0.01)
     assert 'p = ' not in explain(term, {}, 0.001, 0.005, [], True, chance=0.0)
+
+
+def test_a_model_that_has_not_earned_its_place_is_said_so():
+    """After the verdict, whatever it is."""
+    cause = finding().causes[0]
+    text = verdict_sentence(Verdict.EXPLAINED, [cause], [], -0.015, 0.002,
+                            refused='The extended model predicts worse than the plain OU')
+    assert text.endswith('predicts worse than the plain OU: believe its names, not its numbers.')
+    assert 'believe' not in verdict_sentence(Verdict.EXPLAINED, [cause], [], 0.015, 0.002)
 
 
 def test_gains_that_overlap_are_noted():
@@ -183,6 +191,6 @@ def test_what_is_left_may_be_throttle_never_flown():
     cause = finding().causes[0]
     text = verdict_sentence(
         Verdict.PARTLY_EXPLAINED, [cause], [WORSE], 0.015, 0.002, uncovered=900)
-    assert '900 samples of the last 40 %' in text
-    assert 'last 40 %' not in verdict_sentence(
+    assert '900 samples are at throttle that the rest' in text
+    assert '900 samples' not in verdict_sentence(
         Verdict.EXPLAINED, [cause], [], 0.015, 0.002, uncovered=900)

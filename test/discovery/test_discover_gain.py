@@ -9,6 +9,7 @@ from ou_monitor.discovery.errors import standard_errors
 from ou_monitor.discovery.gain import (
     BLOCKS, cause_gain, crossing_level, crossing_rates, crossings, if_known, mean_difference,
     mean_score, without)
+from ou_monitor.discovery.validation import covered, held_out
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_sag import LoadSag
@@ -67,19 +68,19 @@ def test_a_true_cause_gains_what_theory_says():
     fitted one may lose k / (2 n) nats for each of its five parameters.
     """
     samples = simulated(1, 20_000, 0.5)
+    everything = slice(0, samples.n)
     start = OU(50.0, 0.3, 4.8)
-    plain = fit_composite(samples, [start], samples.train)
-    full = fit_composite(samples, [start, LoadSag(0.1, 0.0)], samples.train)
-    gain, error, chance = cause_gain(samples, full, plain)
+    plain = held_out(samples, fit_composite(samples, [start], everything))
+    full = held_out(samples, fit_composite(samples, [start, LoadSag(0.1, 0.0)], everything))
+    gain, error, chance = cause_gain(full, plain, covered(samples))
     phi = math.exp(-ALPHA / 1000.0)
     var = SIGMA**2 * (1.0 - phi**2) / (2.0 * ALPHA)
     x = samples.voltage - (5.0 - 0.5 * samples.throttle)
     e = x[1:] - phi * x[:-1]
     true = -0.5 * (math.log(2.0 * math.pi * var) + e**2 / var)
-    test = samples.test
-    wanted = float((true[test.start - 1:] - plain.density[test]).mean())
+    wanted = float((true - plain.density[1:]).mean())
     assert gain > 5.0 * error and chance < 1e-20
-    assert abs(gain - wanted) < 3.0 * 5 / (2 * samples.train.stop) + 0.2 * error
+    assert abs(gain - wanted) < 3.0 * 5 / (2 * samples.n) + 0.2 * error
 
 
 def test_a_cause_that_is_not_there_gains_nothing():
@@ -87,9 +88,12 @@ def test_a_cause_that_is_not_there_gains_nothing():
     chances = []
     for seed in range(20):
         samples = simulated(seed)
-        full = fit_composite(samples, [OU(50.0, 0.3, 5.0), LoadSag(0.0, 0.0)], samples.train)
-        gain, error, chance = cause_gain(samples, full, without(samples, full, 1))
-        assert abs(gain) < 3.5 * error + 2.0 / samples.train.stop
+        full = fit_composite(samples, [OU(50.0, 0.3, 5.0), LoadSag(0.0, 0.0)],
+                             slice(0, samples.n))
+        gain, error, chance = cause_gain(
+            held_out(samples, full), held_out(samples, without(samples, full, 1)),
+            covered(samples))
+        assert abs(gain) < 3.5 * error + 2.0 / samples.n
         chances.append(chance)
     # The smallest of 20 is below 1e-3 with chance 2 %; doubling makes it rarer.
     assert min(chances) > 1e-4 and np.median(chances) > 0.1

@@ -218,18 +218,11 @@ def test_the_line_of_a_motor_is_named():
 @pytest.mark.skipif('OU_MONITOR_REALDATA' not in os.environ, reason='no real recordings')
 @pytest.mark.parametrize('name', ['mm_bench_1', 'mm_bench_3'])
 def test_a_motor_that_starts_late_gains_nothing_absurd(name):
-    """What the first part did not see is left out: gains are known within errors, or unknown."""
+    """What the other blocks did not see is left out: gains are known within errors, or unknown."""
     found = discover(Path(os.environ['OU_MONITOR_REALDATA']) / f'{name}.csv')
     for one in (found, *found.causes):
         assert math.isnan(one.gain) == math.isnan(one.gain_se)
         assert math.isnan(one.gain) or one.gain > -3.0 * one.gain_se - 0.05
-    known = found.samples.throttle[found.samples.train]
-    still = float(known.max() - known.min()) < 0.01
-    assert still == (name == 'mm_bench_3')
-    if still:
-        # A motor that stops in the last part only.
-        assert any('the first 60 % do not cover' in note for note in found.notes)
-        assert all(math.isnan(cause.gain) for cause in found.causes if cause.term.NEEDS_THROTTLE)
 
 
 def test_the_page_of_a_plain_rail_keeps_the_plain_model():

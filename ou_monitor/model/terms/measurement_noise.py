@@ -46,6 +46,10 @@ class MeasurementNoise(Term):
         error = math.sqrt(float(np.median(view.variance)))
         return [cls(0.1 * error), cls(0.4 * error)]
 
+    def holds(self, view: View) -> bool:
+        """Return whether it is there at all beside the one-step error."""
+        return self.variance() > _LEAST * float(np.median(view.variance))
+
     def variance(self) -> float:
         """Return the variance that this term adds to each measurement, V^2."""
         return self.std * self.std
@@ -53,3 +57,8 @@ class MeasurementNoise(Term):
     def variances(self, s: Segment) -> FloatArray | float:
         """Return the same at each sample."""
         return self.variance() * np.square(s.noise)
+
+
+# Share of the one-step variance below which white noise is none: it moves the likelihood of n
+# samples by n/4 of its square, so that 10^7 samples would not show it.
+_LEAST = 1e-3

@@ -1,0 +1,164 @@
+"""
+Which of the causes named earn their place, and whether the model does.
+
+A cause is left out again where the rest, fitted again, predicts blocks that were kept back as
+well without it; then the others are asked again, for what one explains another may take over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+import math
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.criticism.composite import Composite
+from ou_monitor.criticism.level_range import stray
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.discovery import decision
+from ou_monitor.discovery.fitting import is_trend
+from ou_monitor.discovery.gain import cause_gain, without
+from ou_monitor.discovery.search import position
+from ou_monitor.discovery.validation import held_out, HeldOut
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.term import Term
+from ou_monitor.records import NAN
+
+# Causes of one kind from which their gain is measured together.
+MANY = 4
+# Rounds of leaving out.
+_ROUNDS = 4
+# Simulations whose range is looked at.
+_DRAWS = 8
+
+
+@dataclass(frozen=True)
+class Worth:
+    """
+    What the model loses without a group of terms.
+
+    Attributes
+    ----------
+    gain, error : float
+        nats per sample.
+    chance : float
+        As `gain.cause_gain` has it.
+    size : int
+        Terms of the group.
+    less : HeldOut, or None
+        The model without it.
+
+    """
+
+    gain: float = NAN
+    error: float = NAN
+    chance: float = NAN
+    size: int = 1
+    less: HeldOut | None = None
+
+
+@dataclass(eq=False)
+class Earned:
+    """
+    The model that is left, and what each of its causes is worth.
+
+    Attributes
+    ----------
+    full : HeldOut
+        The model.
+    names : list of str
+        Its causes, in the order of acceptance.
+    worth : list of Worth
+        One for each.
+    out : list of str
+        Causes that were left out.
+
+    """
+
+    full: HeldOut
+    names: list[str]
+    worth: list[Worth] = field(default_factory=list)
+    out: list[str] = field(default_factory=list)
+
+
+def earned(samples: Samples, model: Composite, names: Sequence[str],
+           scored: npt.NDArray[np.bool_], progress: Callable[[float], None]) -> Earned:
+    """Leave out the causes that do not earn their place, the worst first."""
+    state = Earned(held_out(samples, model), list(names))
+    for turn in range(_ROUNDS):
+        state.worth = _worths(samples, state, scored, lambda share: progress(
+            1.0 - 0.5 ** turn * (1.0 - 0.5 * share)))
+        failing = [k for k, worth in enumerate(state.worth) if worth.less is not None
+                   and not decision.earns(worth.gain, worth.error, worth.chance)
+                   and not _as_trend(samples, state.names[k], worth.less.model)]
+        if not failing or turn == _ROUNDS - 1:
+            return state
+        worst = min(failing, key=lambda k: (-state.worth[k].chance, state.worth[k].gain))
+        less = state.worth[worst].less
+        assert less is not None
+        kept = {term.NAME for term in less.model.terms}
+        gone = state.names[worst]
+        many = state.worth[worst].size > 1
+        left = [name for k, name in enumerate(state.names)
+                if k != worst and not (many and name == gone)
+                and (name in kept or name == gone)]
+        state.out += [name for name in set(state.names) if state.names.count(name)
+                      > left.count(name)]
+        state.names, state.full = left, less
+    return state
+
+
+def _as_trend(samples: Samples, name: str, less: Composite) -> bool:
+    """Return whether the `ou` only takes the place of an answer of the mean, as a trend."""
+    return decision.is_answer(catalogue()[name]) and is_trend(samples, less)
+
+
+def _worths(samples: Samples, state: Earned, scored: npt.NDArray[np.bool_],
+            progress: Callable[[float], None]) -> list[Worth]:
+    """Return what each cause of a model is worth; of many of a kind, all together."""
+    found: dict[tuple[int, ...], Worth] = {}
+    worths = []
+    for k, name in enumerate(state.names):
+        group = group_of(state.full.model, state.names, k)
+        if group not in found:
+            less = without(samples, state.full.model, *group)
+            if less is None:
+                found[group] = Worth(size=len(group))
+            else:
+                other = held_out(samples, less)
+                found[group] = Worth(*cause_gain(state.full, other, scored), len(group), other)
+        worths.append(found[group])
+        progress((k + 1) / len(state.names))
+    return worths
+
+
+def group_of(model: Composite, names: Sequence[str], k: int) -> tuple[int, ...]:
+    """Return where in a model the k-th cause is, with the others of its kind if there are many."""
+    if list(names).count(names[k]) < MANY:
+        return (position(model, names, k),)
+    return tuple(position(model, names, j) for j, name in enumerate(names) if name == names[k])
+
+
+def refusal(samples: Samples, terms: Sequence[Term], gain: float, gain_se: float,
+            rng: np.random.Generator) -> str:
+    """
+    Return why a model has not earned its place, for people; empty where it has.
+
+    gain, gain_se in nats per sample.
+    """
+    if math.isfinite(gain) and not decision.earns(gain, gain_se, 0.0):
+        return 'The extended model predicts worse than the plain OU'
+    try:
+        model = SupplyModel(tuple(terms))
+        drawn = np.array([model.simulate(samples.t, rng, samples.throttle)
+                          for _ in range(_DRAWS)])
+    except ValueError as error:
+        return f'The extended model cannot be simulated ({error})'
+    far = stray(drawn, samples.voltage)
+    if far > 0.0:
+        by = 'without bound' if math.isinf(far) else f'by {far:.2g} V'
+        return ('Simulations of the extended model leave the range that was seen, and a margin of '
+                f'half of it, {by}')
+    return ''
