@@ -47,6 +47,8 @@ class Grid:
         after the one before.
     gaps : int
         Gaps between the stretches.
+    shared : float
+        From the first to the last moment that all series have, s.
 
     """
 
@@ -56,6 +58,7 @@ class Grid:
     rates: tuple[float, ...]
     lost: tuple[int, ...]
     gaps: int
+    shared: float
 
     @property
     def duration(self) -> float:
@@ -99,7 +102,8 @@ def on_grid(series: dict[str, tuple[FloatArray, FloatArray]]) -> Grid:
         ranges = ', '.join(f'{name} {t[0]:.6g}..{t[-1]:.6g} s'
                            for name, (t, _) in zip(series, clean))
         raise InputError(f'the series have no stretch of time in common: {ranges}')
-    return Grid(rate, 0.25 * slowest, runs, tuple(rates), tuple(lost), len(runs) - 1)
+    span = min(float(t[-1]) for t, _ in clean) - max(float(t[0]) for t, _ in clean)
+    return Grid(rate, 0.25 * slowest, runs, tuple(rates), tuple(lost), len(runs) - 1, span)
 
 
 def _spans(t: FloatArray, step: float) -> list[tuple[float, float]]:

@@ -40,6 +40,8 @@ LOWEST = 5.0
 _LONGEST, _SHORTEST, _PIECES = 1.0, 0.1, 40
 FEWEST = 16
 LONGEST_LAG = 0.05
+# Share of the common time that may be lost in gaps without a word.
+_MOST = 0.9
 _BLOCKS = 12
 # With which probability a coupling of the limiting gain would have been seen.
 POWER = 0.9
@@ -123,6 +125,10 @@ def estimate_coupling(
     elif not known:
         notes.append('Throttle is not known: what it does to both would be taken for coupling.')
     grid = on_grid(series)
+    if grid.duration < _MOST * grid.shared:
+        notes.append(f'Only {grid.duration:.3g} s of the {grid.shared:.3g} s in common were used: '
+                     'the rest lies between gaps, or a series has another rate there; --from and '
+                     '--to choose a part.')
     low, high = _band(band, grid)
     length = _segment_length(grid, low)
     frequency, pieces = _segments(grid, length, low, high)

@@ -118,6 +118,19 @@ def test_rates_gaps_nan_and_order():
     assert found.grid.lost[1] >= 3 and found.grid.lost[0] == 0
 
 
+def test_a_jump_of_the_rate_is_told():
+    """From 500 Hz to 50 Hz: what is used is said, with the remedy; the gain holds."""
+    rng = np.random.default_rng(15)
+    t, voltage, signal, throttle = flight(rng, 60.0, seconds=40.0)
+    keep = (t < 24.0) | (np.arange(t.size) % 10 == 0)
+    found = estimate_coupling(t, voltage, t[keep], signal[keep], throttle=throttle)
+    assert found.seen and found.gain_ci95[0] <= 60.0 <= found.gain_ci95[1]
+    assert found.grid.duration == pytest.approx(24.0, abs=0.1)
+    assert any(note.startswith('Only 24 s of the 40 s') for note in found.notes)
+    whole = estimate_coupling(t, voltage, t, signal, throttle=throttle)
+    assert not any(note.startswith('Only') for note in whole.notes)
+
+
 def test_a_much_faster_voltage_is_averaged_not_thinned():
     """What the rail does above the signal's rate does not fold into the band."""
     t = np.arange(400_000) / 20_000.0
