@@ -42,9 +42,10 @@ OVERLAP = 1.0 / 36.0
 # Draws of signs, and how many of them must reach a statistic to be counted
 # rather than extrapolated.
 _DRAWS, _COUNTED = 499, 10
-# Segments that share a sign: the overlap correlates neighbours.  Few segments
-# make shorter blocks, so that there are some 2^24 draws.
-_BLOCK, _BLOCKS = 4, 24
+# Segments that share a sign: the overlap correlates neighbours, and a line or what leaks from
+# slow manoeuvres does so further.  Few segments make shorter blocks, so that there are
+# 2^16 draws.
+_BLOCK, _BLOCKS = 16, 16
 # Family-wise level of the bins that may be a line: surely not chance.
 _LINE = 1e-4
 
@@ -191,6 +192,8 @@ def _drawn(v: ComplexArray, x: ComplexArray, basis: list[ComplexArray],
     shared = _power(signs, np.add.reduceat(np.conj(v) * x, starts))
     squared = shared / np.where(size > 0.0, size, 1.0) / np.maximum(power - taken, 1e-12 * power)
     information = -np.log1p(-np.clip(squared, 0.0, 1.0 - 1e-12))
+    # Drawn signs lose the correlation of neighbours across the ends of blocks.
+    information[0] /= 1.0 + 2.0 * OVERLAP * (starts.size - 1) / count
     return _tail(information.sum(1), 'gamma'), _tail(information.max(1), 'gumbel')
 
 
