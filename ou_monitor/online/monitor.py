@@ -153,7 +153,8 @@ class SupplyMonitor:
         drawn = None if current is None else np.broadcast_to(
             np.asarray(current, dtype=np.float64), stamps.shape)[part]
         try:
-            self._forecast.push(stamps[part], volts[part], load, drawn)
+            self._forecast.push(stamps[part], volts[part], load, drawn,
+                                None if times is None else times[part])
             self._estimator.push(stamps[part], volts[part], load)
             self._outlook.push(stamps[part], volts[part], load, self._newest)
         except Exception as error:

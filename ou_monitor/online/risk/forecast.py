@@ -38,6 +38,9 @@ RUNGS = (0.5, 1.0, 2.0, 5.0, 15.0)
 _LN_RUNGS = np.log(RUNGS)
 # Time from one look to the next, s, and as a share of the horizon.
 LOOK, _LOOK_SHARE = 0.2, 0.2
+# By arrival, s, no sooner: stamps may run, or jump, a thousand times too fast, and a look takes
+# 1 ms.  A replay at four times its speed is looked at as ever.
+_REST = 0.05
 # The window's own tests have found the OU: odds, and horizons that it counts as right.
 _ODDS = 20.0
 # A voltage so late, s, begins a new time line.
@@ -143,6 +146,8 @@ class Forecast:
         self._rungs = tuple(_Rung(horizon) for horizon in RUNGS)
         self.new_time_line()
         self._known = False
+        # Arrival from which on the next look may be, s.
+        self._rested = -math.inf
         self._sampling = Sampling(0.02, 0.1)
 
     def new_time_line(self) -> None:
@@ -159,25 +164,32 @@ class Forecast:
             rung.next = rung.learned = -math.inf
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike, throttle: npt.ArrayLike | None,
-             current: npt.ArrayLike | None = None) -> None:
-        """Add samples, s, V, 0..1, A; NaN is unknown."""
+             current: npt.ArrayLike | None = None, arrival: npt.ArrayLike | None = None
+             ) -> None:
+        """
+        Add samples, s, V, 0..1, A; NaN is unknown.
+
+        arrival: when each came, s, on a monotonic clock, where they come one after another.
+        """
         stamps, volts = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in (t, voltage))
         u, drawn = (np.broadcast_to(np.asarray(NAN if x is None else x, dtype=np.float64),
                                     stamps.shape) for x in (throttle, current))
+        came = np.full(stamps.shape, math.inf) if arrival is None else np.asarray(
+            arrival, dtype=np.float64)
         begin, n = 0, stamps.size
         while begin < n:
             # As far as the next look; stamps that go back are looked at one by one.
-            ahead = np.flatnonzero(stamps[begin:] >= self._next)
+            ahead = np.flatnonzero((stamps[begin:] >= self._next) & (came[begin:] >= self._rested))
             back = np.flatnonzero(np.diff(stamps[begin:]) < -_BACKWARDS)
             end = min([begin + int(ahead[0]) + 1] if ahead.size else [n],
                       [begin + int(back[0]) + 1] if back.size else [n])[0]
             part = slice(begin, end)
             self._loads.push(stamps[part], volts[part], u[part], drawn[part])
-            self._take(stamps[part], volts[part], u[part])
+            self._take(stamps[part], volts[part], u[part], came.item(end - 1))
             begin = end
 
-    def _take(self, t: FloatArray, v: FloatArray, u: FloatArray) -> None:
-        """Take samples up to a look."""
+    def _take(self, t: FloatArray, v: FloatArray, u: FloatArray, came: float) -> None:
+        """Take samples up to a look; the last came at a time, s, inf where that is not known."""
         good = np.isfinite(t) & np.isfinite(v)
         t, v, u = t[good], v[good], np.clip(u[good], 0.0, 1.0)
         if t.size and t[0] < self._newest - _BACKWARDS:
@@ -191,8 +203,9 @@ class Forecast:
         self._newest = t.item(-1)
         self._last = np.concatenate((self._last, v))[-3:]
         self._past.push(t, v, u)
-        if self._newest >= self._next:
+        if self._newest >= self._next and came >= self._rested:
             self._next = self._newest + LOOK
+            self._rested = came + _REST if math.isfinite(came) else -math.inf
             self._look()
 
     @property
