@@ -10,6 +10,7 @@ from ou_monitor.online.input_health import Stamps, StampWatch
 from ou_monitor.online.level import Level
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.risk.flag import FlagLevel
+from ou_monitor.online.risk.forecast import Forecast
 from ou_monitor.online.settings import monitor_settings, MonitorSettings
 from ou_monitor.records import Flag
 import pytest
@@ -226,3 +227,21 @@ def test_memory_is_flat_whatever_arrives():
     after = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
     assert after - before < 500_000
+
+
+@pytest.mark.parametrize('stamps, least', [
+    (1000.0 + DT * np.arange(2000), 8), (1000.0 + np.arange(2000), 30),
+    (1000.0 + DT * np.arange(2000) + np.random.default_rng(9).uniform(-9.0, 9.0, 2000), 8)])
+def test_stamps_that_run_cost_no_more_looks(monkeypatch, stamps, least):
+    """By arrival 20 a second at most; a recording, without arrivals, has them as its stamps say."""
+    looks = []
+    monkeypatch.setattr(Forecast, '_look', lambda self: looks.append(1))
+    volts, came = ou(2000), DT * np.arange(2000)
+    monitor = SupplyMonitor(MonitorSettings())
+    for begin in range(0, 2000, 20):
+        part = slice(begin, begin + 20)
+        monitor.push(stamps[part], volts[part], None, came[part])
+    assert least <= len(looks) <= 2.0 / 0.05 + 1
+    del looks[:]
+    SupplyMonitor(MonitorSettings()).push(1000.0 + np.arange(2000), volts)
+    assert len(looks) == 2000
