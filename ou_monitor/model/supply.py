@@ -13,6 +13,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.model.load_start import LoadStart
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import Term
@@ -40,6 +41,8 @@ class SupplyModel:
     ----------
     terms : tuple of Term
         The first is the `ou`, the only one of its kind.
+    load : LoadStart or None
+        What the load filter knows of this craft at take-off; None: nothing.
 
     Raises
     ------
@@ -50,6 +53,7 @@ class SupplyModel:
     """
 
     terms: tuple[Term, ...]
+    load: LoadStart | None = None
 
     def __post_init__(self) -> None:
         """Check the composition."""

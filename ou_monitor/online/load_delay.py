@@ -39,8 +39,8 @@ _LONGEST = 0.15
 class LoadDelay:
     """Running correlations of voltage and load at several delays."""
 
-    def __init__(self) -> None:
-        self.delay = 0.0
+    def __init__(self, delay: float = 0.0) -> None:
+        self.delay = float(DELAYS[np.argmin(np.abs(DELAYS - delay))])
         self.forget()
 
     def forget(self) -> None:

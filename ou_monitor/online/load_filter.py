@@ -15,6 +15,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import CELL, cells_in_series, INRUSH_TIME, LEVELS, SLOPES
+from ou_monitor.model.load_start import LoadStart
 from ou_monitor.online.load_blocks import Block, LoadBlocks
 from ou_monitor.online.load_current import CurrentFilter, scored
 from ou_monitor.online.load_delay import LoadDelay
@@ -47,6 +48,8 @@ _LEAST_ERROR = 0.1
 _BACKWARDS, _PAUSE = 1.0, 60.0
 # A level that is so many times the last one, or less by that, is no battery of this craft.
 _OTHER_CRAFT = 1.6
+# So much a charged pack may differ from an empty one; the size of its sag on another day, squared.
+_OTHER_PACK, _OTHER_DAY = 1.3, 0.2 ** 2
 # Throttle that was unknown for so long, s, holds no more; beyond the second it is none.
 _HOLD, _MOST_THROTTLE = 1.0, 2.0
 # Bins of the throttle flown.
@@ -92,6 +95,7 @@ class LoadFilter:
     """
 
     def __init__(self) -> None:
+        self._start: LoadStart | None = None
         self._t = self._last = self._throttle = NAN
         self._blocks = LoadBlocks()
         self._newest = -math.inf
@@ -132,6 +136,12 @@ class LoadFilter:
             if back.size:
                 self.new_time_line()
             columns = columns[:, end:]
+
+    def begin_with(self, start: LoadStart | None) -> None:
+        """Begin with what another flight has learned; once a voltage has come it is too late."""
+        if not math.isfinite(self._t):
+            self._start = start
+            self._delay = LoadDelay(0.0 if start is None else start.delay)
 
     def new_time_line(self) -> None:
         """Let the next stamp be anything: coefficients and noise are kept, the level is open."""
@@ -192,6 +202,11 @@ class LoadFilter:
         # Below 2.5 V no lithium cell: the curve is scaled.
         self._cells = float(cells_in_series(self._volts)) if self._volts > 2.5 else \
             self._volts / CELL
+        start = self._start
+        if start is not None and 1.0 / _OTHER_PACK < self._volts / start.volts < _OTHER_PACK:
+            self._cells = start.cells
+        else:
+            self._start = None
         # Whether the coefficients have met a throttle.
         self._loaded = math.isfinite(u)
         self._heard = -math.inf
@@ -213,6 +228,11 @@ class LoadFilter:
         P[1, 1] = m[1] ** 2
         m[0] = self._m[0]
         self._m, self._P = m, P
+        start = self._start
+        if start is not None:
+            self._noise = LoadNoise(self._volts, start.log_variance)
+            m[1:] = start.discharge, *start.coefficients
+            P[2:, 2:] = start.covariance + _OTHER_DAY * np.outer(m[2:], m[2:])
 
     def _open(self, v: float, u: float) -> None:
         """Open the level: a pause, a new time line, or throttle that came or went."""
@@ -321,8 +341,10 @@ class LoadFilter:
     def _between(self, share: float) -> tuple[float, float]:
         """Return the throttles flown, but for that share at each end."""
         total = np.cumsum(self._flown)
+        if not total[-1] > 0.0:
+            return self._throttle, self._throttle
         low, high = np.searchsorted(total, (share * total[-1], (1.0 - share) * total[-1]))
-        return (low / _BINS, high / _BINS) if total[-1] > 0.0 else (self._throttle,) * 2
+        return float(low) / _BINS, float(high) / _BINS
 
     def load(self) -> SupplyLoad:
         """Return what is known now."""
@@ -334,6 +356,8 @@ class LoadFilter:
         sag = np.maximum.accumulate(np.maximum(H @ a, 0.0))
         error = np.sqrt(np.maximum(np.einsum('ij,jk,ik->i', H, C, H), 0.0))
         low, high = self._between(0.1)
+        if high - low < _MOVED and self._start is not None:
+            low, high = self._start.flown
         resistance, resistance_se = self._current.resistance
         basis, level = Basis.THROTTLE, float(self._m[0])
         if math.isfinite(resistance) and self._current.score > self._score:
@@ -368,6 +392,18 @@ class LoadFilter:
             self._t, self._throttle, self._m.copy(), self._P * max(1.0, self._noise.scale),
             tuple(self._lags), self._factor, self._fall(float(self._m[0])),
             self._noise.log_variance, self._between(0.02))
+
+    def learned(self) -> LoadStart | None:
+        """Return what the next flight of this craft may begin with; None: the sag is unknown."""
+        load = self.load()
+        if not load.known:
+            return None
+        scale = max(1.0, self._noise.scale)
+        P = 0.5 * (self._P[2:, 2:] + self._P[2:, 2:].T) * scale
+        return LoadStart(
+            self._cells, float(self._m[0]), tuple(self._m[2:].tolist()),
+            tuple(tuple(row) for row in P.tolist()), max(0.0, float(self._m[1])),
+            self._noise.of_blocks, load.flown, self._delay.delay)
 
     def path(self, t: FloatArray, throttle: FloatArray) -> FloatArray:
         """

@@ -27,10 +27,11 @@ _MEMORY, _FIRST, _SHARE = 2000.0, 50.0, 1.0 / 3.0
 class LoadNoise:
     """Noise of blocks of samples of a pack of `volts`, V."""
 
-    def __init__(self, volts: float) -> None:
-        # 0.4 % of the voltage, and what ripple and changes of throttle usually add.
-        self.b = np.array([math.log((0.004 * volts) ** 2), 2.0, 4.0])
-        self._covariance = np.diag([4.0, 4.0, 9.0])
+    def __init__(self, volts: float, b: tuple[float, float, float] | None = None) -> None:
+        # 0.4 % of the voltage, and what ripple and changes of throttle usually add; or as it
+        # was in another flight, to a factor of 1.4 in the deviation.
+        self.b = np.array([math.log((0.004 * volts) ** 2), 2.0, 4.0] if b is None else b)
+        self._covariance = np.diag([4.0, 4.0, 9.0] if b is None else [0.5, 0.5, 1.0])
         # Of the standard scores: mean square, and correlation from one to the next.
         self.scale, self.correlation = 1.0, 0.0
         self._last, self._n = 0.0, 0
@@ -54,6 +55,11 @@ class LoadNoise:
         least = 0.0 if math.isinf(self._step) else self._step ** 2 / 12.0
         whole = math.exp(float(self.b[0])) * own + least
         return math.log(whole), float(self.b[1]), float(self.b[2])
+
+    @property
+    def of_blocks(self) -> tuple[float, float, float]:
+        """Return b of the mean of a block."""
+        return float(self.b[0]), float(self.b[1]), float(self.b[2])
 
     def see(self, voltage: float) -> None:
         """Look at the steps of the ADC in the means of blocks, V."""

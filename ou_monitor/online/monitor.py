@@ -72,6 +72,7 @@ class SupplyMonitor:
         """Begin with nothing known of the supply."""
         self._estimator = SlidingEstimator(self._settings.window)
         self._load_filter, self._load = LoadFilter(), SupplyLoad()
+        self._load_filter.begin_with(None if self._model is None else self._model.load)
         self._outlook = Outlook(background=self._background)
         self._outlook.set_model(self._model)
         self._newest = Estimate()
@@ -111,6 +112,7 @@ class SupplyMonitor:
         """Change the terms of the supply; window and flag stay."""
         self._model = model
         self._outlook.set_model(model)
+        self._load_filter.begin_with(None if model is None else model.load)
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
              throttle: npt.ArrayLike | None = None, arrival: npt.ArrayLike | None = None,

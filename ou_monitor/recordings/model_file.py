@@ -2,7 +2,8 @@
 Model files: the terms of a supply as YAML.
 
 `model:` is a list of terms, each `{term: NAME, params: {...}, se: {...}}`, the
-first being `ou`; `provenance:` tells where it comes from.  Written by
+first being `ou`; `load:`, where it is, is what the load filter knows at take-off;
+`provenance:` tells where it comes from.  Written by
 `discover`, read by `simulate` and by the estimator node.
 """
 
@@ -16,13 +17,14 @@ import re
 from typing import Any
 
 from ou_monitor.errors import InputError, nearest
+from ou_monitor.model.load_start import LoadStart
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Term
 from ou_monitor.stream.files import one_line, path_words, read_yaml
 import yaml
 
-_KEYS = ('model', 'provenance')
+_KEYS = ('model', 'load', 'provenance')
 _TERM_KEYS = ('term', 'params', 'se')
 _EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d{1,3}')
 
@@ -73,13 +75,22 @@ def parse_model(data: Any, where: str) -> ModelFile:
                          f'{type(entries).__name__}')
     terms = [_term(entry, f'{where}, term {k}') for k, entry in enumerate(entries, start=1)]
     try:
-        model = SupplyModel(tuple(term for term, _ in terms))
+        model = SupplyModel(tuple(term for term, _ in terms), _load(data.get('load')))
     except ValueError as error:
         raise InputError(f'{where}: {error}') from error
     provenance = data.get('provenance') or {}
     if not isinstance(provenance, dict):
         raise InputError(f"{where}: 'provenance' must be a mapping")
     return ModelFile(model, tuple(se for _, se in terms), provenance)
+
+
+def _load(entry: Any) -> LoadStart | None:
+    """Return the entry `load`; null as none at all."""
+    if entry is None:
+        return None
+    if not isinstance(entry, dict):
+        raise ValueError("'load' must be a mapping")
+    return LoadStart.read({str(k): _numbers(v) for k, v in entry.items()})
 
 
 def _term(entry: Any, where: str) -> tuple[Term, dict[str, Any]]:
@@ -138,6 +149,8 @@ def as_yaml(file: ModelFile) -> str:
             entry['se'] = _plain(se)
         entries.append(entry)
     data: dict[str, Any] = {'model': entries}
+    if file.model.load is not None:
+        data['load'] = file.model.load.values()
     if file.provenance:
         data['provenance'] = dict(file.provenance)
     text: str = yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
