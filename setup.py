@@ -24,6 +24,7 @@ setup(
         (SHARE + '/config', glob('config/*.yaml')),
         (SHARE + '/msg_config', glob('msg_config/*.yaml')),
         (SHARE + '/layouts', glob('layouts/*')),
+        (SHARE + '/deploy', glob('deploy/*')),
         (SHARE + '/security', glob('security/*.xml')),
     ],
     # The bounds are those of scripts/requirements-*.txt; test_package.py compares them.
@@ -51,6 +52,7 @@ setup(
             'ou-monitor = ou_monitor.cli.main:main',
             'estimator = ou_monitor.nodes.estimator:main',
             'adaptive_filter = ou_monitor.nodes.adaptive_filter:main',
+            'adc = ou_monitor.nodes.adc:main',
             'replay = ou_monitor.nodes.replay:main',
         ],
     },

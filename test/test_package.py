@@ -21,7 +21,7 @@ from project import project_files, ROOT
 import pytest
 import yaml
 
-EXECUTABLES = ['adaptive_filter', 'estimator', 'ou-monitor', 'replay']
+EXECUTABLES = ['adaptive_filter', 'adc', 'estimator', 'ou-monitor', 'replay']
 # Starting Python, ROS and DDS on a busy machine.
 START_TIMEOUT = 60.0
 DOMAIN = '60'
@@ -91,7 +91,7 @@ def test_colcon_installs_what_ros2_looks_for(installed):
     assert sorted(os.listdir(installed / 'lib' / 'ou_monitor')) == EXECUTABLES
     share = installed / 'share'
     assert (share / 'ament_index/resource_index/packages/ou_monitor').exists()
-    for folder in ('msg_config', 'launch', 'config', 'layouts', 'security'):
+    for folder in ('msg_config', 'launch', 'config', 'layouts', 'security', 'deploy'):
         expected = {path.name for path in (ROOT / folder).iterdir() if path.is_file()}
         assert expected and set(os.listdir(share / 'ou_monitor' / folder)) == expected
 

@@ -17,6 +17,7 @@ import threading
 from typing import Any
 
 from ou_monitor.errors import InputError, refusal
+from ou_monitor.nodes.service_manager import ServiceManager
 
 BAD_INPUT = 2
 # Longest wait inside the executor, s; a signal wakes it anyway.
@@ -130,6 +131,11 @@ def spin(make: Callable[[], Any]) -> int:
     loaded()
     node = make()
     executor.add_node(node)
+    manager = ServiceManager()
+    if manager.interval:
+        # By a timer of the node: an executor that serves no timers is one that hangs.
+        node.every(manager.interval, lambda: manager.tell('WATCHDOG=1'))
+    manager.tell('READY=1')
     try:
         # Not spin(): in rclpy 7.1.6 the EventsExecutor's goes on for ever after a signal.
         while node.context.ok():
@@ -137,6 +143,7 @@ def spin(make: Callable[[], Any]) -> int:
     except ExternalShutdownException:
         node.context.try_shutdown()
     finally:
+        manager.tell('STOPPING=1')
         executor.remove_node(node)
         node.destroy_node()
     return 0

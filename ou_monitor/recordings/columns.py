@@ -11,17 +11,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.layout import Layout, layout_of, parse_definition, Rows, short_name
 from ou_monitor.recordings.mcap_records import IntArray, moment, Table, TimeArray
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.config import FieldPath, FieldSpec, parse_field_path
 from ou_monitor.stream.extract import Extracted, Extractor, ZeroRule
+
+if TYPE_CHECKING:
+    from ou_monitor.recordings.bag import BagReader
 
 # Layouts that are tried for messages of one length; a topic with more of them
 # is not one whose messages are alike.

@@ -7,6 +7,7 @@ from types import ModuleType
 
 from live import ROOT
 from ou_monitor.nodes.adaptive_filter_node import FIXED, RUN_TIME
+from ou_monitor.nodes.adc_node import ADC_PARAMETERS
 from ou_monitor.nodes.base import LOCK, PUBLISH_RATE
 from ou_monitor.nodes.estimator_node import STATE_FILE
 from ou_monitor.nodes.sources import SOURCE_PARAMETERS
@@ -20,6 +21,7 @@ DECLARED = {
     'ou_adaptive_filter': (*RUN_TIME, PUBLISH_RATE, *FIXED, LOCK),
 }
 FILE = ROOT / 'config' / 'ou_monitor.yaml'
+ADC_FILE = ROOT / 'config' / 'adc.yaml'
 LAUNCH = ROOT / 'launch' / 'ou_monitor_launch.py'
 TWO = ROOT / 'launch' / 'ou_monitor_two_batteries_launch.py'
 
@@ -46,9 +48,17 @@ def test_every_parameter_at_its_default(node):
     assert {k: type(v) for k, v in listed.items()} == {k: type(v) for k, v in defaults.items()}
 
 
-def test_every_key_has_a_comment():
+def test_every_parameter_of_the_adc_at_its_default():
+    """As above."""
+    (listed,) = yaml.safe_load(ADC_FILE.read_text()).values()
+    assert listed['ros__parameters'] == {
+        p.name: p.default for p in (*ADC_PARAMETERS, LOCK)}
+
+
+@pytest.mark.parametrize('file', [FILE, ADC_FILE])
+def test_every_key_has_a_comment(file):
     """The line above it."""
-    lines = FILE.read_text().splitlines()
+    lines = file.read_text().splitlines()
     for above, line in zip(lines, lines[1:]):
         if re.match(r' {4,}\w+: \S', line):
             assert above.strip().startswith('#'), line

@@ -4,6 +4,7 @@ import time
 import xml.etree.ElementTree as ElementTree
 
 from live import wait_until
+from made_devices import attributes
 from project import ROOT
 import pytest
 
@@ -66,7 +67,7 @@ def test_the_form_is_that_of_sros2():
     assert root.tag == 'policy' and root.get('version') == '0.2.0' and complaints(root) == []
     paths = [enclave.get('path') for enclave in root.iter('enclave')]
     assert paths == [f'/ou_monitor/{name}' for name in (
-        'estimator', 'adaptive_filter', 'replay', 'live', 'operator')]
+        'estimator', 'adaptive_filter', 'adc', 'replay', 'live', 'operator')]
 
 
 @pytest.mark.parametrize('change', [
@@ -130,6 +131,13 @@ def test_replay_opens_what_the_policy_allows(world):
     """A bag with voltage and throttle, and the clock."""
     world.start('replay', str(ROOT / 'bags' / 'flight'), '--loop', '--rate', '0.5')
     compare(world.probe(), 'replay', 'ou_replay')
+
+
+def test_the_adc_opens_what_the_policy_allows(world, tmp_path):
+    """Its parameters are read once, so nobody need set them."""
+    attributes(tmp_path / 'sys/class/hwmon/hwmon0', name='ina226', in1_input=5000)
+    world.start('adc', '--ros-args', '-p', 'device:=ina226', '-p', f'sysfs:={tmp_path}/sys')
+    compare(world.probe(), 'adc', 'ou_adc')
 
 
 def test_only_the_operator_may_call():

@@ -1,0 +1,1 @@
+"""A voltage from the kernel: Linux IIO and hwmon."""

@@ -1,0 +1,232 @@
+"""
+An IIO device with a buffer: set up, read in blocks, stamped by the kernel.
+
+Limits: one channel; no more than one program can use a buffer.  Without a timestamp channel a
+block has the time at which it was read, which is late by what the scheduler took.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import os
+from pathlib import Path
+import select
+import time
+
+import numpy as np
+from ou_monitor.adc import sysfs
+from ou_monitor.adc.scan import Element, parse_element, Scan
+from ou_monitor.errors import InputError
+from ou_monitor.records import FloatArray
+
+STAMP = 'in_timestamp'
+# An interval of more than so many is a hole: samples that the buffer had no room for.
+HOLE = 1.5
+# Blocks that the kernel's buffer holds: what may pass before samples are lost.
+BLOCKS = 64
+# Longest wait for samples, s: bounds how late an end is noticed.
+NAP = 0.1
+_CLOCKS: dict[str, int] = {
+    'realtime': time.CLOCK_REALTIME, 'realtime_coarse': time.CLOCK_REALTIME,
+    'monotonic': time.CLOCK_MONOTONIC, 'monotonic_raw': time.CLOCK_MONOTONIC_RAW,
+    'monotonic_coarse': time.CLOCK_MONOTONIC, 'boottime': time.CLOCK_BOOTTIME,
+    'tai': time.CLOCK_TAI}
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """
+    Samples at an even spacing.
+
+    Attributes
+    ----------
+    stamp : float
+        Time of the last sample, s since 1970.
+    volts : ndarray, shape (n,)
+        Voltages, V.
+    interval : float
+        Spacing by the kernel's stamps, s; NaN where there are none.
+
+    """
+
+    stamp: float
+    volts: FloatArray
+    interval: float
+
+
+class IioBuffer:
+    """
+    The buffer of one IIO device.
+
+    Parameters
+    ----------
+    folder : Path
+        Its folder in sysfs.
+    character : Path
+        Its character device.
+    channel : str
+        'in_voltage0'; empty: the only voltage channel.
+    block : int
+        Samples that are read at a time; 0: those of 10 ms.
+    rate : float
+        Sampling frequency to set, Hz; 0: as it is.
+    trigger : str
+        Name of the trigger to set; empty: as it is.
+
+    Attributes
+    ----------
+    rate : float
+        Sampling frequency by the device, Hz; NaN when it does not say.
+    block : int
+        Samples that are read at a time.
+    holes : int
+        Times at which samples were missing, by the kernel's stamps.
+
+    """
+
+    def __init__(self, folder: Path, character: Path, channel: str = '', block: int = 0,
+                 rate: float = 0.0, trigger: str = '') -> None:
+        self._folder, self._character = folder, character
+        if not (folder / 'scan_elements').is_dir() or not (folder / 'buffer').is_dir():
+            raise InputError(f'{folder.name} has no buffer (no scan_elements): it can only be '
+                             'polled, give polled:=true')
+        self.channel = _choose(folder, channel)
+        self.holes = 0
+        sysfs.write(folder / 'buffer/enable', 0)
+        if trigger:
+            sysfs.write(folder / 'trigger/current_trigger', trigger)
+        if rate > 0.0:
+            sysfs.write(self._attribute('sampling_frequency'), f'{rate:g}')
+        own = self._attribute('sampling_frequency')
+        self.rate = sysfs.number(own) if own.exists() else float('nan')
+        self.block = block or (max(round(0.01 * self.rate), 1) if self.rate > 0.0 else 1)
+        self._scale = sysfs.number(self._needed('scale'))
+        shift = self._attribute('offset')
+        self._offset = sysfs.number(shift) if shift.exists() else 0.0
+        self._elements = self._enable()
+        self._scan = Scan(self._elements)
+        self._clock = self._stamp_clock()
+        sysfs.write(folder / 'buffer/length', self.block * BLOCKS)
+        if (folder / 'buffer/watermark').exists():
+            sysfs.write(folder / 'buffer/watermark', self.block)
+        self._handle = self._open()
+
+    def _attribute(self, what: str) -> Path:
+        """Return the attribute of the channel, else the one shared by its kind, or by all."""
+        for name in (f'{self.channel}_{what}', f'in_voltage_{what}', what):
+            if (self._folder / name).exists():
+                return self._folder / name
+        return self._folder / f'in_voltage_{what}'
+
+    def _needed(self, what: str) -> Path:
+        path = self._attribute(what)
+        if not path.exists():
+            raise InputError(f'{self._folder.name} does not say what a count of {self.channel} is '
+                             f'(no {self.channel}_{what})')
+        return path
+
+    def _enable(self) -> list[Element]:
+        """Enable the channel and the timestamp alone; return the elements."""
+        scan = self._folder / 'scan_elements'
+        wanted = []
+        for path in sorted(scan.glob('*_en')):
+            name = path.name.removesuffix('_en')
+            chosen = name in (self.channel, STAMP)
+            sysfs.write(path, int(chosen))
+            if chosen:
+                wanted.append(parse_element(name, int(sysfs.number(scan / f'{name}_index')),
+                                            sysfs.read(scan / f'{name}_type')))
+        return wanted
+
+    def _stamp_clock(self) -> int | None:
+        """Return the clock of the timestamps; None where there are none."""
+        if all(element.name != STAMP for element in self._elements):
+            return None
+        path = self._folder / 'current_timestamp_clock'
+        name = sysfs.read(path) if path.exists() else 'realtime'
+        if name not in _CLOCKS:
+            raise InputError(f"{path} is '{name}': one of {', '.join(_CLOCKS)} can be used")
+        return _CLOCKS[name]
+
+    def _open(self) -> int:
+        try:
+            handle = os.open(self._character, os.O_RDONLY | os.O_NONBLOCK)
+        except OSError as error:
+            raise InputError(f'cannot open {self._character}: {sysfs.why(error)}') from error
+        try:
+            sysfs.write(self._folder / 'buffer/enable', 1)
+        except InputError:
+            os.close(handle)
+            raise
+        return handle
+
+    def blocks(self) -> Iterator[Block | None]:
+        """Yield blocks as they come; None when none came for a tenth of a second."""
+        kept = b''
+        whole = self.block * self._scan.size
+        poll = select.poll()
+        poll.register(self._handle, select.POLLIN)
+        while True:
+            if not poll.poll(1e3 * NAP):
+                # Less than a block only where the device is slower than it says.
+                ready = len(kept) // self._scan.size * self._scan.size
+                if ready:
+                    yield from self._decode(kept[:ready], time.time())
+                    kept = kept[ready:]
+                yield None
+                continue
+            try:
+                data = os.read(self._handle, whole - len(kept))
+            except BlockingIOError:
+                continue
+            except OSError as error:
+                raise InputError(f'cannot read {self._character}: {sysfs.why(error)}') from error
+            if not data:
+                # A device that is gone, or a writer that has closed its end.
+                time.sleep(NAP)
+                yield None
+                continue
+            kept += data
+            if len(kept) >= whole:
+                yield from self._decode(kept, time.time())
+                kept = b''
+
+    def _decode(self, data: bytes, now: float) -> Iterator[Block]:
+        volts = self._scan.volts(data, self.channel, self._scale, self._offset)
+        if self._clock is None:
+            yield Block(now, volts, float('nan'))
+            return
+        # Nanoseconds since 1970 need all 64 bits: the difference of the clocks is added to them.
+        apart = 0 if self._clock == time.CLOCK_REALTIME else (
+            time.time_ns() - time.clock_gettime_ns(self._clock))
+        stamps = self._scan.integers(data, STAMP) + apart
+        steps = np.diff(stamps)
+        typical = float(np.median(steps)) if steps.size else float('nan')
+        cuts = np.flatnonzero(steps > HOLE * typical) + 1 if steps.size else np.empty(0, np.int64)
+        self.holes += cuts.size
+        for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), volts.size], strict=True):
+            yield Block(float(stamps[last - 1]) * 1e-9, volts[first:last], 1e-9 * typical)
+
+    def close(self) -> None:
+        """Stop the buffer."""
+        os.close(self._handle)
+        sysfs.write(self._folder / 'buffer/enable', 0)
+
+
+def _names(known: list[str]) -> str:
+    return ', '.join(known) or 'none'
+
+
+def _choose(folder: Path, channel: str) -> str:
+    """Return the channel that is meant."""
+    known = sorted(path.name.removesuffix('_en') for path in (folder / 'scan_elements').glob(
+        'in_voltage*_en'))
+    if channel in known:
+        return channel
+    if channel:
+        raise InputError(f"{folder.name} has no channel '{channel}'; there are: {_names(known)}")
+    if len(known) != 1:
+        raise InputError(f'{folder.name} has {len(known)} voltage channels: give channel:= one of '
+                         f'{_names(known)}')
+    return known[0]

@@ -1,0 +1,161 @@
+"""IIO buffers and polled channels, on devices made of files."""
+
+import os
+import threading
+import time
+
+from made_devices import attributes, iio_device, scans, volts
+import numpy as np
+from ou_monitor.adc.iio import BLOCKS, IioBuffer
+from ou_monitor.adc.polled import PolledChannel, USUAL_RATE
+from ou_monitor.adc.sysfs import find_device
+from ou_monitor.errors import InputError
+import pytest
+
+T0 = 1_700_000_000_000_000_000
+
+
+def take(buffer, n):
+    """Return the first n blocks."""
+    found = []
+    for block in buffer.blocks():
+        if block is not None:
+            found.append(block)
+        if len(found) == n:
+            return found
+
+
+def feed(character, data, pieces=7):
+    """Write to the FIFO from a thread, in pieces that end anywhere."""
+    def write():
+        with character.open('wb', buffering=0) as file:
+            for part in np.array_split(np.frombuffer(data, np.uint8), pieces):
+                file.write(part.tobytes())
+            done.wait(60.0)
+    done = threading.Event()
+    threading.Thread(target=write, daemon=True).start()
+    return done
+
+
+def test_set_up_and_blocks(tmp_path):
+    """Only the channel and the timestamp are enabled; blocks have the stamp of the last one."""
+    folder, character = iio_device(tmp_path)
+    counts = np.arange(-300, 300)
+    done = feed(character, scans(counts, T0 + 100_000 * np.arange(600)))
+    buffer = IioBuffer(folder, character, 'in_voltage1', rate=5000.0, trigger='hr', block=200)
+    first = {name: (folder / name).read_text().strip() for name in (
+        'scan_elements/in_voltage0_en', 'scan_elements/in_voltage1_en',
+        'scan_elements/in_timestamp_en', 'buffer/enable', 'trigger/current_trigger',
+        'buffer/length', 'buffer/watermark')}
+    assert list(first.values()) == ['0', '1', '1', '1', 'hr', str(200 * BLOCKS), '200']
+    found = take(buffer, 3)
+    done.set()
+    np.testing.assert_allclose(np.concatenate([b.volts for b in found]), volts(counts))
+    assert [b.stamp for b in found] == pytest.approx(
+        [T0 * 1e-9 + 1e-4 * k for k in (199, 399, 599)], abs=1e-6)
+    assert found[0].interval == pytest.approx(1e-4) and buffer.holes == 0
+    buffer.close()
+    assert (folder / 'buffer/enable').read_text().startswith('0')
+
+
+def test_a_hole_splits_a_block(tmp_path):
+    """Samples that the buffer lost: two blocks, each with its own stamp."""
+    folder, character = iio_device(tmp_path)
+    stamps = T0 + 100_000 * np.concatenate([np.arange(50), np.arange(80, 130)])
+    done = feed(character, scans(np.arange(100), stamps))
+    buffer = IioBuffer(folder, character, 'in_voltage1')
+    assert buffer.rate == 10_000.0 and buffer.block == 100
+    first, second = take(buffer, 2)
+    done.set()
+    assert (first.volts.size, second.volts.size, buffer.holes) == (50, 50, 1)
+    assert second.stamp - first.stamp == pytest.approx(80e-4, abs=1e-6)
+    buffer.close()
+
+
+def test_a_monotonic_clock_is_brought_to_1970(tmp_path):
+    """By the difference of the clocks when the block is read."""
+    folder, character = iio_device(tmp_path, clock='monotonic')
+    buffer = IioBuffer(folder, character, 'in_voltage1', block=10)
+    now = time.time()
+    done = feed(character, scans(np.arange(10), time.monotonic_ns() + 100_000 * np.arange(10)))
+    (block,) = take(buffer, 1)
+    done.set()
+    assert block.stamp == pytest.approx(now, abs=5.0)
+    buffer.close()
+
+
+def test_without_a_timestamp_blocks_have_the_time_of_reading(tmp_path):
+    folder, character = iio_device(tmp_path)
+    for name in ('en', 'index', 'type'):
+        (folder / f'scan_elements/in_timestamp_{name}').unlink()
+    done = feed(character, (np.arange(100) << 4).astype('>i2').tobytes())
+    buffer = IioBuffer(folder, character, 'in_voltage1')
+    before = time.time()
+    (block,) = take(buffer, 1)
+    done.set()
+    assert before - 60.0 < block.stamp <= time.time() and np.isnan(block.interval)
+    np.testing.assert_allclose(block.volts, volts(np.arange(100)))
+    buffer.close()
+
+
+def test_a_device_is_found_by_each_of_its_names(tmp_path):
+    folder, _ = iio_device(tmp_path)
+    sysfs = tmp_path / 'sys'
+    attributes(sysfs / 'class/hwmon/hwmon2', name='ina226', in1_input=5012)
+    for name in ('iio:device0', 'ads1015', str(folder)):
+        assert find_device(name, sysfs) == folder
+    for name in ('', 'ads1115', str(tmp_path / 'none')):
+        with pytest.raises(InputError, match=r'iio:device0 \(ads1015\), hwmon2 \(ina226\)'):
+            find_device(name, sysfs)
+    attributes(sysfs / 'class/hwmon/hwmon3', name='ina226')
+    with pytest.raises(InputError, match='hwmon2, hwmon3'):
+        find_device('ina226', sysfs)
+
+
+@pytest.mark.parametrize('spoil, words', [
+    (lambda f, c: (f / 'buffer/enable').unlink(), 'cannot set .*buffer/enable'),
+    (lambda f, c: (f / 'in_voltage_scale').unlink(), 'what a count of in_voltage1 is'),
+    (lambda f, c: (f / 'in_voltage_scale').write_text('much\n'), "holds 'much', not a number"),
+    (lambda f, c: (f / 'current_timestamp_clock').write_text('sundial\n'), 'sundial'),
+    (lambda f, c: c.unlink(), 'cannot open .*No such file'),
+    (lambda f, c: os.rename(f / 'scan_elements', f / 'x'), 'has no buffer')])
+def test_what_is_wrong_with_a_device_is_said(tmp_path, spoil, words):
+    folder, character = iio_device(tmp_path)
+    spoil(folder, character)
+    with pytest.raises(InputError, match=words):
+        IioBuffer(folder, character, 'in_voltage1')
+
+
+@pytest.mark.parametrize('channel, words', [
+    ('', 'has 2 voltage channels'), ('in_voltage7', "no channel 'in_voltage7'")])
+def test_the_channel_must_be_known(tmp_path, channel, words):
+    folder, character = iio_device(tmp_path)
+    with pytest.raises(InputError, match=words):
+        IioBuffer(folder, character, channel)
+    with pytest.raises(InputError, match=words):
+        PolledChannel(folder, channel)
+
+
+def test_rights_that_are_missing_are_said(tmp_path, monkeypatch):
+    """In the place of a file that root could write all the same."""
+    folder, character = iio_device(tmp_path)
+
+    def refuse(*args, **kwargs):
+        raise PermissionError(13, 'Permission denied')
+    with monkeypatch.context() as patch, pytest.raises(
+            InputError, match='not permitted; give the user of this node the right'):
+        patch.setattr(os, 'open', refuse)
+        IioBuffer(folder, character, 'in_voltage1')
+
+
+def test_polled_channels(tmp_path):
+    """Hwmon counts in mV; a raw IIO channel in counts of a scale."""
+    folder, _ = iio_device(tmp_path)
+    assert PolledChannel(folder, 'in_voltage1').read() == pytest.approx((2 + 0.0) * 2.5e-3 + 0.025)
+    attributes(tmp_path / 'hwmon2', name='ina226', in1_input=5012, update_interval=20)
+    channel = PolledChannel(tmp_path / 'hwmon2')
+    assert channel.read() == pytest.approx(5.012) and channel.rate == 50.0
+    attributes(tmp_path / 'hwmon2', in1_input=4988)
+    assert channel.read() == pytest.approx(4.988)
+    (tmp_path / 'hwmon2/update_interval').unlink()
+    assert PolledChannel(tmp_path / 'hwmon2').rate == USUAL_RATE

@@ -1,0 +1,86 @@
+"""What systemd is told, on a socket of its kind."""
+
+import os
+import socket
+import subprocess
+import sys
+
+from live import ROOT, wait_until
+from ou_monitor.nodes.service_manager import ServiceManager
+import pytest
+
+
+@pytest.fixture
+def manager(tmp_path, monkeypatch):
+    """Give a socket as systemd's, which the environment names."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as found:
+        found.bind(str(tmp_path / 'notify'))
+        found.settimeout(120.0)
+        monkeypatch.setenv('NOTIFY_SOCKET', str(tmp_path / 'notify'))
+        yield found
+
+
+def test_half_of_the_watchdogs_time(manager, monkeypatch):
+    """In s; not that of another process, nor without a watchdog."""
+    assert ServiceManager().interval == 0.0
+    monkeypatch.setenv('WATCHDOG_USEC', '3000000')
+    assert ServiceManager().interval == 1.5
+    monkeypatch.setenv('WATCHDOG_PID', str(os.getpid() + 1))
+    assert ServiceManager().interval == 0.0
+    ServiceManager().tell('READY=1')
+    assert manager.recv(100) == b'READY=1'
+
+
+def test_an_abstract_socket(monkeypatch):
+    """Its name begins with @ in the variable, and with a zero byte in the kernel."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as found:
+        found.bind(f'\0ou_monitor_{os.getpid()}')
+        found.settimeout(10.0)
+        monkeypatch.setenv('NOTIFY_SOCKET', f'@ou_monitor_{os.getpid()}')
+        ServiceManager().tell('STOPPING=1')
+        assert found.recv(100) == b'STOPPING=1'
+
+
+def test_nobody_listens(monkeypatch, tmp_path):
+    """Neither without a socket, nor with one that is gone, is there an error."""
+    monkeypatch.delenv('NOTIFY_SOCKET', raising=False)
+    ServiceManager().tell('READY=1')
+    monkeypatch.setenv('NOTIFY_SOCKET', str(tmp_path / 'gone'))
+    ServiceManager().tell('READY=1')
+
+
+def test_a_node_is_ready_feeds_the_watchdog_and_stops(world, manager, monkeypatch):
+    """READY once, WATCHDOG while its executor works, STOPPING at the end."""
+    monkeypatch.setenv('WATCHDOG_USEC', '400000')
+    process = world.start('adaptive_filter')
+    got = [manager.recv(100) for _ in range(4)]
+    assert got == [b'READY=1', *3 * [b'WATCHDOG=1']]
+    assert process.stop() == 0
+    wait_until(lambda: manager.recv(100) == b'STOPPING=1')
+
+
+def test_the_unit_is_accepted(tmp_path):
+    """By systemd itself, where it is installed; and every file that it needs is named once."""
+    unit = tmp_path / 'ou_monitor@estimator.service'
+    unit.write_text((ROOT / 'deploy/ou_monitor@.service').read_text())
+    try:
+        done = subprocess.run(['systemd-analyze', 'verify', unit], capture_output=True, text=True,
+                              timeout=120)
+    except FileNotFoundError:
+        pytest.skip('systemd-analyze is not installed')
+    assert (done.returncode, done.stderr) == (0, ''), done.stderr
+    done = subprocess.run(['systemd-analyze', 'security', '--offline=true', '--threshold=25',
+                           unit], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout[-200:]
+
+
+def test_the_nodes_need_no_reader_of_bags():
+    """An apt-only Jazzy has no mcap."""
+    code = ("import sys; sys.modules['mcap'] = sys.modules['mcap_ros2'] = None; "
+            'import ou_monitor.nodes.estimator_node, ou_monitor.nodes.adaptive_filter_node, '
+            'ou_monitor.nodes.adc_node; '
+            "sys.exit(sum(name in sys.modules for name in ('scipy.signal', 'scipy.stats', "
+            "'scipy.optimize', 'scipy.integrate')))")
+    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True,
+                          timeout=120)
+    assert done.returncode == 0, done.stderr
