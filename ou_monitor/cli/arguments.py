@@ -41,10 +41,10 @@ def read_given(args: argparse.Namespace, start: float | None, end: float | None)
         return read_recording(
             args.recording, msg_config=args.msg_config, voltage_topic=args.voltage_topic,
             throttle_topic=args.throttle_topic, partial=args.partial, start=start, end=end,
-            flight=args.flight, columns=_columns(args), progress=progress)
+            flight=args.flight, columns=columns_given(args), progress=progress)
 
 
-def _columns(args: argparse.Namespace) -> CsvColumns | None:
+def columns_given(args: argparse.Namespace) -> CsvColumns | None:
     """Return the columns of a CSV that were named; None when nothing was."""
     from ou_monitor.recordings.csv_table import CsvColumns
 

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import check_outputs, part_of_recording, read_given
+from ou_monitor.cli.arguments import (
+    check_outputs, columns_given, part_of_recording, read_given)
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
@@ -72,7 +73,8 @@ def _of_bag(args: argparse.Namespace, start: float | None, end: float | None,
     from ou_monitor.recordings.read import read_signal, signal_unit
 
     recording = read_given(args, start, end)
-    t, values = read_signal(args.recording, args.signal, partial=args.partial)
+    t, values = read_signal(args.recording, args.signal, partial=args.partial,
+                            columns=columns_given(args))
     return recording, t, values, signal_unit(args.recording, args.signal, partial=args.partial)
 
 

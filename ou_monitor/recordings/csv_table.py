@@ -81,12 +81,15 @@ def read_csv(path: Path, columns: CsvColumns | None = None,
             current[0] if current else np.full(t.shape, np.nan))
 
 
-def read_column(path: Path, name: str) -> tuple[FloatArray, FloatArray]:
-    """Return the stamps and one column of a CSV as they stand, NaN kept."""
-    if name == TIME:
-        raise InputError(f"{path}: '{TIME}' is the time, not a signal")
-    columns = _columns(path, (TIME, name), ())
-    return columns[0], columns[1]
+def read_column(path: Path, name: str, columns: CsvColumns | None = None,
+                ) -> tuple[FloatArray, FloatArray]:
+    """Return the stamps, s, and one column of a CSV as it stands, NaN kept."""
+    wanted = columns or CsvColumns()
+    time = wanted.time or TIME
+    if name == time:
+        raise InputError(f"{path}: '{time}' is the time, not a signal")
+    t, values = _columns(path, (time, name), ())
+    return t * TIME_UNITS[wanted.time_unit], values
 
 
 def column_names(path: Path, needed: str) -> list[str]:

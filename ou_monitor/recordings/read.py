@@ -277,13 +277,13 @@ def _outside(name: str, start: float | None, end: float | None, length: float) -
 
 
 def read_signal(path: str | Path, signal: str, *, partial: bool = False,
-                ) -> tuple[FloatArray, FloatArray]:
-    """Read one scalar over time."""
+                columns: CsvColumns | None = None) -> tuple[FloatArray, FloatArray]:
+    """Read one scalar over time; of a CSV `columns` says which is the time."""
     path = Path(path)
     if not signal:
         raise InputError('the name of the signal is empty: TOPIC/FIELD or a column')
     if path.suffix.lower() == '.csv' and not path.is_dir():
-        return read_column(path, signal)
+        return read_column(path, signal, columns)
     bag = BagReader(path, partial=partial)
     topic, field = _split(path, signal, bag.topics)
     kind = bag.topics[topic]

@@ -100,6 +100,19 @@ def test_column_and_field_path_say_the_same(table, bag, capsys):
     assert other['gain_per_v'] == pytest.approx(one['gain_per_v'], rel=1e-3)
 
 
+def test_a_csv_with_other_names_and_units(series, tmp_path, capsys):
+    """The time of the signal is that of the voltage: its column, in ms."""
+    path = tmp_path / 'other.csv'
+    t, voltage, throttle, x, _ = series
+    np.savetxt(path, np.column_stack([1e3 * t, 1e3 * voltage, throttle, x]), '%.9g', ',',
+               comments='', header='ms,mv,duty,gyro')
+    data = found(capsys, path, '--signal', 'gyro', '--time-column', 'ms', '--time-unit', 'ms',
+                 '--voltage-column', 'mv', '--unit', 'mV', '--throttle-column', 'duty')
+    assert data['seen'] and data['gain_ci95'][0] <= GAIN <= data['gain_ci95'][1]
+    assert 'not a signal' in failure(capsys, path, '--signal', 'ms', '--time-column', 'ms',
+                                     '--voltage-column', 'mv')
+
+
 def test_a_part(table, bag, capsys):
     """--from and --to: only that part of both series counts, whatever the file."""
     for path, signal in ((table, 'gyro_x'), (bag, '/imu/angular_velocity.x')):
