@@ -21,6 +21,10 @@ AHEAD, BEHIND = 0.25, 5.0
 MOST_DELAY = 600.0
 # A publisher that sends nothing for so long, s, while another does is followed no more.
 GIVE_UP = 1.0
+# Intervals from which on a silence may be a pause of the publisher.
+PAUSE = 10.0
+# Tracks kept beyond the publishers that there are, until a batch is over.
+_MORE = 4
 # Share of a new interval in the interval of a publisher.
 _LEARN = 0.05
 
@@ -84,7 +88,10 @@ class _Track:
         step = number - self.number
         if math.isnan(self.interval) or self.interval <= 0.0:
             return float(step - 1)
-        return abs(step - (time - self.time) / self.interval)
+        expected = (time - self.time) / self.interval
+        # Behind a silence either messages were lost, or (less likely by half a message) none was
+        # sent.
+        return min(abs(step - expected), step - 0.5 if expected > PAUSE else math.inf)
 
     def take(self, number: int, time: float, arrived: float) -> None:
         """Take a message."""
@@ -136,16 +143,22 @@ class Publishers:
         for k, (number, time, at) in enumerate(
                 zip(whole.tolist(), times.tolist(), arrived.tolist())):
             kept[k] = self._one(number, time, at, publishers)
-        self._give_up()
+        self._give_up(publishers)
         return kept
 
-    def _give_up(self) -> None:
+    def _give_up(self, publishers: int) -> None:
         """
-        Follow the publisher heard last where the one followed sends nothing.
+        Forget who is gone, and follow another where the one followed sends nothing.
 
         Only after all that came: behind a stall, when nobody was heard, the first message may be
         anybody's.
         """
+        while len(self._tracks) > max(publishers, 2):
+            # Somebody began anew: who has been silent for longest is gone.
+            gone = min(range(len(self._tracks)), key=lambda k: self._tracks[k].arrived)
+            del self._tracks[gone]
+            if gone == 0:
+                self._tracks.insert(0, self._tracks.pop())
         last = max(range(len(self._tracks)), key=lambda k: self._tracks[k].arrived)
         if self._tracks[last].arrived - self._tracks[0].arrived > GIVE_UP:
             self._tracks[0] = self._tracks.pop(last)
@@ -179,13 +192,8 @@ class Publishers:
         if new:
             self._tracks.append(_Track(number, time, arrived))
             best = len(self._tracks) - 1
-            if len(self._tracks) > max(publishers, 2):
-                # Somebody began anew: who has been silent for longest is gone.
-                gone = min(range(best), key=lambda k: self._tracks[k].arrived)
-                if gone == 0:
-                    self._tracks[0] = self._tracks.pop()
-                    return True
-                del self._tracks[gone]
+            if len(self._tracks) > max(publishers, 2) + _MORE:
+                del self._tracks[min(range(1, best), key=lambda k: self._tracks[k].arrived)]
                 best -= 1
         elif best == 0:
             self.lost += number - self._tracks[0].number - 1

@@ -101,3 +101,30 @@ def test_after_a_stall_the_first_is_followed_still(first):
     kept = follow(publishers, sent(2500 + first, 1000, 1e3, 2.5 + 1e-3 * first),
                   sent(500, 200, 200.0, 2.4994 + 1e-3), count=2, batch=50)
     assert kept[0] >= 990 and kept[1] <= 10
+
+
+@pytest.mark.parametrize('pause', [0.2, 0.6, 3.0])
+def test_a_pause_of_the_first_does_not_lose_it_its_place(pause):
+    """Its numbers go on where they were; the other begins meanwhile, or after."""
+    publishers = Publishers()
+    follow(publishers, sent(1, 400, 500.0, 0.0), count=2)
+    start = 0.8 + pause
+    kept = follow(publishers, sent(401, 500, 500.0, start), sent(1, 100, 100.0, start + 0.0005),
+                  count=2, batch=6)
+    assert kept == {0: 500, 1: 0} and publishers.foreign == 100
+
+
+def test_two_that_begin_anew_are_two():
+    """The first ends and begins anew beside another: it is followed within a batch."""
+    publishers = Publishers()
+    follow(publishers, sent(1, 1000, 1e3, 0.0), sent(1, 100, 100.0, 0.0004), count=2)
+    kept = follow(publishers, sent(1, 1000, 1e3, 1.5), sent(101, 150, 100.0, 1.0004), count=2)
+    assert kept[0] + kept[1] >= 900
+
+
+def test_numbers_of_any_order_cost_little():
+    """Each smaller than the one before, as of publishers without end: no more tracks than that."""
+    publishers = Publishers()
+    times = np.arange(2000) * 1e-3
+    publishers.follow(list(range(4000, 2000, -1)), times, times, 2)
+    assert publishers.foreign >= 1990
