@@ -292,7 +292,7 @@ def fly(loop: Loop, seconds: float, seed: int) -> Flight:
             estimator.push(dt * np.arange(k + 1 - block, k + 1), voltage, throttle)
             e = estimator.estimate()
             seen = e.sigma if e.usable else NAN
-            error, alpha = e.sigma_se * e.sigma, e.alpha
+            error, alpha = e.sigma_se, e.alpha
             rows.append((t, low_pass.cutoff, sigma, seen, math.sqrt(commands / block),
                          math.sqrt(turns / block)))
             commands = turns = 0.0

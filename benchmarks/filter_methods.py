@@ -35,7 +35,7 @@ def estimates(flights: Flights, window: float) -> np.ndarray:
             if e.usable:
                 # Known from the next sample on.
                 out[:, f, at + block:at + 2 * block] = np.array(
-                    [e.sigma, e.sigma * e.sigma_se, e.alpha, e.u0, e.u0_se])[:, None]
+                    [e.sigma, e.sigma_se, e.alpha, e.u0, e.u0_se])[:, None]
     return out
 
 

@@ -22,7 +22,7 @@ class Supply(NamedTuple):
     Attributes
     ----------
     sigma, sigma_se : float
-        Noise intensity and its standard error, V/sqrt(s); NaN: not known.
+        Noise intensity, V/sqrt(s), and the standard error of its logarithm; NaN: not known.
     alpha : float
         Relaxation rate, 1/s; NaN: not known.
     throttle : float
@@ -86,7 +86,7 @@ class SupplyInput:
             if 'sigma_se' in values:
                 self._state_heard.heard()
                 self._state = values
-                # Of ln sigma, so relative already: what `AdaptiveLowPass` takes is in V/sqrt(s).
+                # Of ln sigma, as `AdaptiveLowPass` takes it.
                 error = _number(values, 'sigma_se')
                 self._error = error if error >= 0.0 else NAN
                 self._known = [_number(values, key) for key in _FIELDS]
@@ -100,7 +100,7 @@ class SupplyInput:
         why = self._why(fresh, stale_after)
         if why:
             return Supply(throttle=throttle, why=why)
-        return Supply(self._sigma, error * self._sigma, alpha, throttle, level, level_se)
+        return Supply(self._sigma, error, alpha, throttle, level, level_se)
 
     def why_no_throttle(self, stale_after: float) -> str:
         """Say why the throttle is not known."""

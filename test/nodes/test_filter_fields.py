@@ -73,10 +73,10 @@ def test_time_line_of_the_supply():
     assert supply.now(1.0).why == 'no message on /sigma' and math.isnan(supply.now(1.0).sigma)
     supply.take_sigma(0.5)
     assert supply.now(1.0).sigma == 0.5 and math.isnan(supply.now(1.0).alpha)
-    # The estimator's error is that of ln sigma; the filter's is in V/sqrt(s), of the newest sigma.
+    # The error is that of ln sigma, in the estimator and in the filter.
     supply.take_state(state_of(sigma=0.4, sigma_se=0.04, alpha=63.0, throttle=0.3, status='OK'))
     known = supply.now(1.0)
-    assert known.sigma_se == pytest.approx(0.04 * 0.5)
+    assert known.sigma_se == 0.04
     assert (known.alpha, known.throttle, known.why) == (63.0, 0.3, '')
     supply.take_state(state_of(other=1.0))
     assert supply.now(1.0) == known

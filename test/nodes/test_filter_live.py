@@ -190,8 +190,7 @@ def test_the_state_of_the_estimator_is_used_while_it_is_published(rig):
             return value in (values_of(rig.status)[key] if key else rig.status.message)
         wait_until(there, what=value)
     with_state(HELD)
-    # Of ln sigma in the state, in V/sqrt(s) in the filter.
-    told('sigma_se', '0.018')
+    told('sigma_se', '0.03')
     with_state(75.0, status='QUANTIZED_HEAVILY')
     told('', 'because the estimator says QUANTIZED_HEAVILY', status='QUANTIZED_HEAVILY')
     assert rig.probe.set_parameter(NODE, 'law', 'throttle').successful

@@ -10,16 +10,20 @@ from __future__ import annotations
 import enum
 import math
 
+import numpy as np
 from ou_monitor.online.settings import FilterSettings
+from ou_monitor.records import FloatArray
 
 LN2 = math.log(2.0)
 # Highest cutoff as a share of the sample rate (Betaflight allows 0.475).
 OF_RATE = 0.45
 # Samples over which the sample rate is averaged; how far an interval may be from the mean before
 # it is odd; and how many odd ones in a row are a new rate.
-_MEMORY = 100
-_ODD = 5.0
+INTERVALS = 100
+ODD = 5.0
 _NEW = 5
+# A rest of the way, in ln(cutoff), that is not worth a step.
+_ARRIVED = 1e-6
 
 
 class Bound(enum.Enum):
@@ -59,22 +63,32 @@ class SampleInterval:
 
     def add(self, dt: float) -> float:
         """Take an interval above 0, s; return the mean."""
-        if dt > _ODD * self.mean:
+        if dt > ODD * self.mean:
             self._short, self._long = 0, self._long + 2
             if self._n and self._long < 2 * _NEW:
                 return self.mean
             return self._restart(dt)
-        if self.mean > _ODD * dt:
+        if self.mean > ODD * dt:
             self._short += 1
             if self._short >= _NEW:
                 return self._restart(dt)
         else:
             # Two normal intervals make up for a gap.
             self._short, self._long = 0, max(self._long - 1, 0)
-        if self._n < _MEMORY:
+        if self._n < INTERVALS:
             self._n += 1
         self.mean += (dt - self.mean) / self._n
         return self.mean
+
+    @property
+    def settled(self) -> bool:
+        """Whether the mean is over all the samples that it ever will be."""
+        return self._n == INTERVALS
+
+    def went_on(self, mean: float, samples: int) -> None:
+        """Take so many normal intervals, of which the mean is known, s (mean in s)."""
+        self.mean = mean
+        self._short, self._long = 0, max(self._long - samples, 0)
 
     def _restart(self, dt: float) -> float:
         self.mean, self._n = dt, 1
@@ -171,6 +185,45 @@ class CutoffControl:
             self._cutoff = min(self._cutoff, OF_RATE / interval)
         return self._cutoff
 
+    def run(self, wanted: float, error: float, dt: FloatArray) -> FloatArray:
+        """
+        Take one wanted cutoff for many samples; return what `update` would have moved to at each.
+
+        wanted in Hz, dt in s, shape (n,); result in Hz, the share of the sample rate left out.
+        """
+        self._choose(wanted)
+        out: FloatArray = np.full(dt.size, self._aim)
+        k = 0
+        while k < dt.size and self._moving != self._aim:
+            k += self._move_on(error, dt[k:], out[k:])
+        return out
+
+    def _move_on(self, error: float, dt: FloatArray, out: FloatArray) -> int:
+        """Move by the slew limit, or by the smoothing, as long as it is the same of the two."""
+        s = self._settings
+        gap = math.log(self._aim / self._moving)
+        constant = time_constant(s, error)
+        elapsed = np.cumsum(dt)
+        before = elapsed - dt
+        share = -np.expm1(-dt / constant) if constant > 0.0 else np.ones_like(dt)
+        most = s.slew * LN2 if s.slew else math.inf
+        self._slewing = bool(abs(gap) * share[0] > most * dt[0])
+        if self._slewing:
+            ends = ~((abs(gap) - most * before) * share > most * dt)
+            gaps = math.copysign(1.0, gap) * (abs(gap) - most * elapsed)
+        else:
+            decay = np.exp(-before / constant) if constant > 0.0 else (before == 0.0) * 1.0
+            ends = abs(gap) * decay * share > most * dt
+            gaps = gap * decay * (1.0 - share)
+            # Arrived: the one after is at the aim.
+            ends[1:] |= np.abs(gaps[:-1]) < _ARRIVED
+        n = int(np.argmax(ends)) if ends.any() else dt.size
+        out[:n] = self._aim * np.exp(-gaps[:n])
+        if abs(gaps[n - 1]) < _ARRIVED:
+            out[n - 1] = self._aim
+        self._moving = float(out[n - 1])
+        return n
+
     def _choose(self, wanted: float) -> None:
         """Set the aim: the wanted cutoff once it is outside the dead band around the old aim."""
         if wanted != wanted:
@@ -196,8 +249,12 @@ class CutoffControl:
         if self._slewing:
             step = math.copysign(most, step)
         # What is left below any meaning is not crept after for ever.
-        arrived = abs(gap - step) < 1e-6
+        arrived = abs(gap - step) < _ARRIVED
         self._moving = self._aim if arrived else self._moving * math.exp(step)
+
+    def limit(self, cutoff: float) -> None:
+        """Take the cutoff that is in force at the last sample of a run, Hz (cutoff in Hz)."""
+        self._cutoff = cutoff
 
     def _clip(self, cutoff: float) -> float:
         return min(max(cutoff, self._lowest), self._settings.fmax)

@@ -23,10 +23,12 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.online.filter.array_filter import changes, sound_piece, within_rate, WORTH
 from ou_monitor.online.filter.cutoff_control import Bound, CutoffControl, OF_RATE, SampleInterval
 from ou_monitor.online.filter.cutoff_laws import wanted_cutoff
 from ou_monitor.online.filter.filter_state import LowPassState
 from ou_monitor.online.filter.lag import cutoff_for_lag, delay, most_lag, phase_lag
+from ou_monitor.online.filter.sequence import filter_sequence
 from ou_monitor.online.filter.signal_kalman import SignalKalman
 from ou_monitor.online.filter.white_noise import noise_left
 from ou_monitor.online.settings import FilterSettings
@@ -38,6 +40,8 @@ _TWO_PI = 2.0 * math.pi
 _LARGEST, _LATEST, _SHORTEST = 1e150, 1e18, 1e-12
 # A step of so many mean intervals is counted as a gap, once the mean stands on so many samples.
 _GAP, _KNOWN = 5.0, 10
+# Samples of an array that are worked on together.
+_PIECE = 65536
 
 _Maybe = npt.ArrayLike | None
 
@@ -206,8 +210,8 @@ class AdaptiveLowPass:
         sigma : float or array_like, shape (n,)
             Noise intensity, V/sqrt(s); NaN means unknown (fallback cutoff).
         sigma_se : float or array_like, shape (n,), optional
-            Standard error of sigma, V/sqrt(s): a certain sigma moves the
-            cutoff faster.
+            Standard error of ln sigma, as in `Estimate` (0.1: 10 %): a certain
+            sigma moves the cutoff faster.
         alpha : float or array_like, shape (n,), optional
             Relaxation rate of the supply, 1/s; NaN or left out: the parameter.
         throttle : float or array_like, shape (n,), optional
@@ -244,9 +248,60 @@ class AdaptiveLowPass:
                     f'{one.shape}')
         if stamps.ndim == 0:
             return self._step(float(stamps), float(signal), *map(float, others))
-        wide = [np.broadcast_to(one, stamps.shape).tolist() for one in others]
-        return np.array([self._step(*one) for one in
-                         zip(stamps.tolist(), signal.tolist(), *wide, strict=True)])
+        out: FloatArray = np.empty(stamps.size)
+        k = 0
+        while k < stamps.size:
+            many = self._many(stamps, signal, others, k, out)
+            if not many:
+                many = min(WORTH, stamps.size - k)
+                at = slice(k, k + many)
+                wide = [np.broadcast_to(one, stamps.shape)[at].tolist() for one in others]
+                out[at] = [self._step(*one) for one in zip(
+                    stamps[at].tolist(), signal[at].tolist(), *wide, strict=True)]
+            k += many
+        return out
+
+    def _many(self, t: FloatArray, x: FloatArray, others: list[FloatArray], k: int,
+              out: FloatArray) -> int:
+        """Filter samples from the k-th on together where that can be; return how many."""
+        s = self._settings
+        if (s.law == 'kalman' or self._t is None or not self._interval.settled
+                or t.size - k < WORTH):
+            return 0
+        at = slice(k, k + _PIECE)
+        size, dt, mean = sound_piece(t[at], x[at], self._t, self._interval.mean,
+                                     (_LARGEST, _LATEST, _SHORTEST))
+        if size < WORTH:
+            return 0
+        at = slice(k, k + size)
+        heard = [one[at] for one in others[:4] if one.ndim]
+        edges = changes(heard, np.round(20.0 * np.log(mean)))
+        if edges.size > 2 + size // WORTH:
+            return 0
+        cutoff = np.empty(size)
+        for a, b in zip(edges[:-1].tolist(), edges[1:].tolist()):
+            sigma, sigma_se, alpha, throttle = (
+                float(one[k + a]) if one.ndim else float(one) for one in others[:4])
+            error = sigma_se if sigma_se >= 0.0 else NAN
+            cutoff[a:b] = self._control.run(
+                self._ask(sigma, alpha, throttle, float(mean[a])), error, dt[a:b])
+        cutoff = within_rate(cutoff, mean)
+        self._control.limit(float(cutoff[-1]))
+        angle = _TWO_PI * cutoff * dt
+        start, end = np.concatenate(([self._x], x[at][:-1])), x[at]
+        if s.mode == 'derivative':
+            start = end = (end - start) / dt
+        found = filter_sequence(self._state, s.order, angle, start, end)
+        out[at] = end if s.shadow else found
+        if self._offset:
+            fades = self._offset * np.exp(-np.cumsum(angle))
+            out[at] += fades
+            self._offset = float(fades[-1])
+        self._interval.went_on(float(mean[-1]), size)
+        self.counters.samples += size
+        self._t, self._x = float(t[k + size - 1]), float(x[k + size - 1])
+        self._raw, self._out = float(end[-1]), float(out[k + size - 1])
+        return size
 
     def step(self, t: float, x: float, sigma: float, sigma_se: float = NAN,
              alpha: float = NAN, throttle: float = NAN, level: float = NAN,
@@ -259,7 +314,7 @@ class AdaptiveLowPass:
         if not (abs(x) < _LARGEST and abs(t) < _LATEST):
             self.counters.non_finite += 1
             return self._out
-        error = sigma_se / sigma if sigma > 0.0 and sigma_se >= 0.0 else NAN
+        error = sigma_se if sigma_se >= 0.0 else NAN
         derivative = self._settings.mode == 'derivative'
         if self._t is None:
             self.counters.samples += 1

@@ -15,15 +15,18 @@ with g = a + b
 
 from __future__ import annotations
 
-from functools import lru_cache
+from bisect import bisect_right
+from functools import cache, lru_cache
 import math
 
 import numpy as np
 from ou_monitor.online.filter.filter_state import LowPassState
 
 TWO_PI = 2.0 * math.pi
-# Error of the logarithms of noise and cutoff.
-_CLOSE = 1e-7
+# Angles (2 pi cutoff interval) of the table, and the step of their logarithms.
+_LEAST_ANGLE, _MOST_ANGLE, _STEP = 1e-4, 300.0, 0.04
+_STILL = 1e-6
+_LOG_LEAST = math.log(_LEAST_ANGLE)
 
 
 def white_noise(mode: str, order: int, angle: float) -> float:
@@ -61,34 +64,80 @@ def _step(order: int, angle: float, y: float, slope: float, start: float, end: f
     return state.y, state.slope
 
 
-# The signals of one message have the same noise and stamps.
-@lru_cache(maxsize=64)
+class _Table:
+    """
+    Logarithm of the noise over that of the angle, and back: cubics between points of `_STEP`.
+
+    Below its first angle the noise is that power of the angle which it has far below the
+    sample rate, times 1 + c angle; with the step of 0.04 the cubics are off by 3e-7.
+    """
+
+    def __init__(self, mode: str, order: int) -> None:
+        self._of = mode, order
+        count = math.ceil(math.log(_MOST_ANGLE / _LEAST_ANGLE) / _STEP) + 1
+        self._noise: list[float] = []
+        for k in range(count):
+            now = math.log(white_noise(mode, order, _LEAST_ANGLE * math.exp(_STEP * k)))
+            if self._noise and now - self._noise[-1] < _STILL:
+                # Above the sample rate all of it passes, or less than before.
+                break
+            self._noise.append(now)
+        count = len(self._noise)
+        n = self._noise
+        inner = [(8.0 * (n[k + 1] - n[k - 1]) - n[k + 2] + n[k - 2]) / 12.0
+                 for k in range(2, count - 2)]
+        self._power = 1.0 if mode == 'lowpass' else 1.0 + order
+        # Relative change of noise over angle^power with the angle.
+        self._bend = (n[1] - n[0] - self._power * _STEP) / (
+            _LEAST_ANGLE * math.expm1(_STEP))
+        self._slopes = [n[1] - n[0], n[2] - n[1], *inner, n[-2] - n[-3], n[-1] - n[-2]]
+
+    def noise(self, log: float) -> float:
+        """Return the logarithm of the noise at that of an angle."""
+        place = (log - _LOG_LEAST) / _STEP
+        if place < 0.0:
+            return self._noise[0] + self._power * (log - _LOG_LEAST) + self._bend * (
+                math.exp(log) - _LEAST_ANGLE)
+        if place >= len(self._noise) - 1:
+            return math.log(white_noise(*self._of, math.exp(log)))
+        k = int(place)
+        return self._cubic(k, place - k)[0]
+
+    def angle(self, noise: float) -> float:
+        """Return the logarithm of the angle at that of the noise."""
+        k = bisect_right(self._noise, noise) - 1
+        if k < 0:
+            log = _LOG_LEAST
+            for _ in range(3):
+                bent = self._bend * (math.exp(log) - _LEAST_ANGLE)
+                log = _LOG_LEAST + (noise - self._noise[0] - bent) / self._power
+            return log
+        if k >= len(self._noise) - 1:
+            return _LOG_LEAST + _STEP * (len(self._noise) - 1)
+        part = (noise - self._noise[k]) / (self._noise[k + 1] - self._noise[k])
+        for _ in range(3):
+            value, slope = self._cubic(k, part)
+            part -= (value - noise) / slope
+        return _LOG_LEAST + _STEP * (k + part)
+
+    def _cubic(self, k: int, u: float) -> tuple[float, float]:
+        """Return value and slope within the k-th interval, u in 0..1."""
+        rise = self._noise[k + 1] - self._noise[k]
+        m, n = self._slopes[k], self._slopes[k + 1]
+        b, c = 3.0 * rise - 2.0 * m - n, m + n - 2.0 * rise
+        return (self._noise[k] + u * (m + u * (b + u * c)), m + u * (2.0 * b + 3.0 * u * c))
+
+
+_table = cache(_Table)
+
+
 def held_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
     """
     Return the cutoff at which `times` as much white noise comes out as it did at fmax.
 
     fmax in Hz, interval in s.
     """
-    def level(log: float) -> float:
-        return math.log(white_noise(mode, order, TWO_PI * interval * math.exp(log)))
-
-    high = math.log(fmax)
-    top = level(high)
-    wanted = top - 2.0 * math.log(times)
-    # Variance goes with the first power of a cutoff far below the sample rate (a derivative's
-    # with the second or third), with less near it: the root lies above this.
-    low = high - 2.0 * math.log(times) - 1e-9
-    while (bottom := level(low)) > wanted:
-        low -= 1.0
-    # False position with the end that stays halved (Illinois; Dowell & Jarratt 1971).
-    above, below = top - wanted, bottom - wanted
-    while high - low > _CLOSE:
-        at = (low * above - high * below) / (above - below)
-        now = level(at) - wanted
-        if abs(now) < _CLOSE:
-            return math.exp(at)
-        if now > 0.0:
-            high, above, below = at, now, 0.5 * below
-        else:
-            low, below, above = at, now, 0.5 * above
-    return math.exp(low)
+    table = _table(mode, order)
+    scale = math.log(TWO_PI * interval)
+    return math.exp(
+        table.angle(table.noise(math.log(fmax) + scale) - 2.0 * math.log(times)) - scale)

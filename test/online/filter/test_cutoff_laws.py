@@ -8,6 +8,7 @@ from ou_monitor.online.filter.cutoff_laws import (
     cutoff_for_noise, LAWS, relative_cutoff, supply_noise, wanted_cutoff)
 from ou_monitor.online.filter.filter_state import LowPassState
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass
+from ou_monitor.online.filter.white_noise import held_cutoff, white_noise
 from ou_monitor.online.filter.wiener import least_error, sampled_error, squared_error
 from ou_monitor.online.settings import FilterSettings, LAWS as NAMES
 import pytest
@@ -85,6 +86,18 @@ def test_white_samples_come_out_alike(mode, order, fc, times):
     wanted = relative_cutoff(mode, order, fc, times, dt)
     assert wanted < fc
     assert times * rms(wanted) == pytest.approx(rms(fc), rel=1e-5)
+
+
+@pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
+@pytest.mark.parametrize('order', [1, 2])
+def test_the_table_is_the_noise(mode, order):
+    """The cutoff that is found has the wanted noise by the equations that the table stands for."""
+    rng = np.random.default_rng(5)
+    for _ in range(40):
+        angle, times = math.exp(rng.uniform(-11.0, 0.9)), math.exp(rng.uniform(0.0, 4.0))
+        found = held_cutoff(mode, order, angle / TWO_PI, times, 1.0)
+        before, after = (white_noise(mode, order, one) for one in (angle, TWO_PI * found))
+        assert times * times * after == pytest.approx(before, rel=2e-6)
 
 
 @pytest.mark.parametrize('mode, order', [

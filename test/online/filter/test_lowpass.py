@@ -254,7 +254,7 @@ def test_confidence_and_alpha_and_throttle_are_used():
     t, x = np.arange(50) * 1e-3, np.zeros(50)
     sigma = np.where(t < 0.01, 0.3, 0.6)
     got = []
-    for error in (0.006, 0.06, 0.6):
+    for error in (0.01, 0.1, 1.0):
         f = AdaptiveLowPass(slew=0.0)
         f.filter(t, x, sigma, sigma_se=error)
         got.append(f.cutoff)
