@@ -199,7 +199,8 @@ class AdaptiveFilterNode(MonitorNode):
         return self.low_pass.delay + notched
 
     def _known(self) -> Supply:
-        return self._supply.now(self.low_pass.settings.stale_after)
+        return self._supply.now(self.low_pass.settings.stale_after,
+                                self.low_pass.settings.alpha)
 
     def _jumped(self, reason: str) -> None:
         """Do nothing: to the filter a step back is a step of no length, its output stays."""
@@ -225,7 +226,8 @@ class AdaptiveFilterNode(MonitorNode):
             'cutoff': low_pass.cutoff, 'cutoff_wanted': low_pass.wanted,
             'decided_by': self._decided_by(supply), 'lag': low_pass.phase_lag,
             'delay': self._delay, 'lag_frequency': settings.lag_frequency,
-            'sigma': supply.sigma, 'sigma_se': supply.sigma_se, 'alpha': supply.alpha,
+            'sigma': supply.sigma, 'sigma_source': supply.source,
+            'sigma_se': supply.sigma_se, 'alpha': supply.alpha,
             'throttle': supply.throttle, 'level': supply.level,
             'notch_active': self._notch.active, 'notch_source': self._notch.source,
             'notch_frequencies': ', '.join(f'{f:.4g}' for f in self._notch.frequencies),

@@ -11,7 +11,7 @@ from ou_monitor.records import Status
 
 NAN = math.nan
 # Fields of the state that the filter uses as they are.
-_FIELDS = ('alpha', 'throttle', 'u0', 'u0_se')
+_FIELDS = ('alpha', 'throttle', 'u0', 'u0_se', 'load_noise')
 _USABLE = (Status.OK.name, Status.SHORT_WINDOW.name)
 
 
@@ -31,6 +31,8 @@ class Supply(NamedTuple):
         Level at the present throttle and its standard error, V; NaN: not known.
     why : str
         Why sigma is not known; empty when it is.
+    source : str
+        'relaxation': the estimator's sigma; 'load': the noise beside the load; 'none'.
 
     """
 
@@ -41,6 +43,7 @@ class Supply(NamedTuple):
     level: float = NAN
     level_se: float = NAN
     why: str = ''
+    source: str = 'none'
 
 
 class SupplyInput:
@@ -92,15 +95,23 @@ class SupplyInput:
                 self._known = [_number(values, key) for key in _FIELDS]
                 return
 
-    def now(self, stale_after: float) -> Supply:
-        """Return what is known, nothing of it older than `stale_after`, s."""
+    def now(self, stale_after: float, rate: float = NAN) -> Supply:
+        """
+        Return what is known, nothing of it older than `stale_after`, s.
+
+        Without a sigma it is that of an OU of the deviation which the load leaves
+        at the present throttle, and of the `rate`, 1/s: white noise of the ADC is
+        in it, so that it is no less than the supply's own.
+        """
         fresh = _fresh(self._state_heard.age, stale_after)
-        error, (alpha, throttle, level, level_se) = (
+        error, (alpha, throttle, level, level_se, noise) = (
             (self._error, self._known) if fresh else (NAN, [NAN] * len(_FIELDS)))
         why = self._why(fresh, stale_after)
+        if why and noise > 0.0 and rate > 0.0:
+            return Supply(noise * math.sqrt(2.0 * rate), throttle=throttle, source='load')
         if why:
             return Supply(throttle=throttle, why=why)
-        return Supply(self._sigma, error, alpha, throttle, level, level_se)
+        return Supply(self._sigma, error, alpha, throttle, level, level_se, source='relaxation')
 
     def why_no_throttle(self, stale_after: float) -> str:
         """Say why the throttle is not known."""

@@ -87,7 +87,14 @@ def test_time_line_of_the_supply():
     supply.take_state(state_of(sigma='nan', sigma_se='x', status='NO_DATA', throttle=0.2))
     known = supply.now(1.0)
     assert math.isnan(known.sigma) and known.why == 'the estimator says NO_DATA'
-    assert known.throttle == 0.2
+    assert known.throttle == 0.2 and known.source == 'none'
+    # The noise beside the load, 20 mV, is that of an OU of 63 1/s and 0.2245 V/sqrt(s).
+    supply.take_state(state_of(sigma='nan', sigma_se='x', status='NO_RELAXATION', throttle=0.2,
+                               load_noise=0.02))
+    known = supply.now(1.0, 63.0)
+    assert (known.sigma, known.source, known.why) == (
+        pytest.approx(0.02 * math.sqrt(126.0)), 'load', '')
+    assert supply.now(1.0).source == 'none'
     supply.take_state(state_of(sigma=0.5, sigma_se=0.01, status='SHORT_WINDOW'))
     assert supply.now(1.0).sigma == 0.5
     clock.now = 2.0
