@@ -75,6 +75,8 @@ def measure(name: str, recording: Recording) -> list[str]:
     good = np.isfinite(recording.throttle)
     t, v = recording.t[good] - recording.t[good][0], recording.voltage[good]
     u = np.clip(recording.throttle[good], 0.0, 1.0)
+    current = (np.full(t.size, np.nan) if recording.current is None
+               else recording.current[good])
     second = t > 0.5 * t[-1]
     started = time.process_time()
     fit = fit_load(t[~second], v[~second], u[~second])
@@ -85,7 +87,7 @@ def measure(name: str, recording: Recording) -> list[str]:
     spacing = float(np.median(np.diff(t)))
     for k in range(t.size):
         started = time.process_time()
-        loads.push(t[k], v[k], u[k])
+        loads.push(t[k], v[k], u[k], current[k])
         spent += time.process_time() - started
         if t[k] < look:
             continue
@@ -99,11 +101,15 @@ def measure(name: str, recording: Recording) -> list[str]:
         if second[k] and j < t.size and t[j] - t[k] < 1.01 + 2.0 * spacing:
             errors.append(v[j] - loads.path(t[k + 1:j + 1], u[k + 1:j + 1])[-1])
             truths.append(v[j])
+    load = loads.load()
+    ohm = (f'{1e3 * load.resistance:.0f} \u00b1 {1e3 * load.resistance_se:.0f}'
+           if np.isfinite(load.resistance) else '-')
     truth, error = np.array(truths), np.array(errors)
     return [name, f'{t[-1]:.0f}', f'{1.0 / spacing:.0f}', f'{ahead:.2f}',
             f'{explained(truth, truth - error):.2f}', f'{1e3 * np.sqrt(np.mean(error**2)):.0f}',
-            f'{100.0 * np.mean(known):.0f}', f'{fit.condition:.0f}',
-            ', '.join(fit.at_bounds) or '-', f'{fit_time:.1f}', f'{1e6 * spent / t.size:.0f}']
+            f'{100.0 * np.mean(known):.0f}', f'{1e3 * load.delay:.0f}', ohm,
+            f'{fit.condition:.0f}', ', '.join(fit.at_bounds) or '-', f'{fit_time:.1f}',
+            f'{1e6 * spent / t.size:.0f}']
 
 
 def main() -> int:
@@ -123,7 +129,8 @@ def main() -> int:
         rows.append(measure(name, recording))
         print(rows[-1], file=sys.stderr)
     text = table(['flight', 's', 'Hz', 'simulated ahead', '1 s ahead', '1 s ahead, RMSE mV',
-                  'known %', 'condition', 'at bounds', 'fit, CPU s', 'sample, CPU us'], rows)
+                  'known %', 'delay, ms', 'mOhm', 'condition', 'at bounds', 'fit, CPU s',
+                  'sample, CPU us'], rows)
     if options.page:
         put(options.page, text, 'flights')
     else:

@@ -29,9 +29,12 @@ ROOT = Path(__file__).resolve().parent.parent
 START_TIMEOUT = 30.0
 # A node that has not ended so long after SIGINT is killed.
 STOP_TIMEOUT = 5.0
-HEADER = (f'{"t":>6} {"throttle":>8} {"level":>7} {"alpha":>7} {"sigma":>9} {"noise":>7} '
-          f'{"risk":>7} {"cutoff":>7}  status\n'
-          f'{"s":>6} {"0..1":>8} {"V":>7} {"1/s":>7} {"V/sqrt(s)":>9} {"mV rms":>7} '
+# A recorded flight of a 4S quad, 3.3 V a cell as its limit; a simulated 5 V rail with the nodes'
+# own limit.
+RECORDED, LIMIT, SIMULATED = 'bags/recorded/gecko', 13.2, 'bags/flight'
+HEADER = (f'{"t":>6} {"throttle":>8} {"level":>7} {"noise":>6} {"sag":>6} {"error":>6} '
+          f'{"alpha":>7} {"risk":>7} {"cutoff":>7}  load, relaxation\n'
+          f'{"s":>6} {"0..1":>8} {"V":>7} {"mV":>6} {"V":>6} {"V":>6} {"1/s":>7} '
           f'{"0..1":>7} {"Hz":>7}')
 
 
@@ -143,7 +146,7 @@ class Listener:
 
     def _on_state(self, message: Any) -> None:
         self.fields = {item.key: item.value for item in message.status[0].values}
-        self.estimates += math.isfinite(self.number('alpha'))
+        self.estimates += math.isfinite(self.number('load_level'))
 
     def _on_cutoff(self, message: Any) -> None:
         self.cutoff = message.data
@@ -161,14 +164,14 @@ class Listener:
             self._first = self.number('t')
         cells = [
             (self.number('t') - self._first, 6, '.1f'), (self.number('throttle'), 8, '.2f'),
-            (self.number('u0'), 7, '.3f'), (self.number('alpha'), 7, '.1f'),
-            (self.number('sigma'), 9, '.4f'),
-            (1e3 * math.sqrt(max(self.number('var_inf'), 0.0))
-             if math.isfinite(self.number('var_inf')) else math.nan, 7, '.1f'),
+            (self.number('load_level'), 7, '.3f'), (1e3 * self.number('load_noise'), 6, '.1f'),
+            (self.number('load_sag'), 6, '.2f'), (self.number('load_sag_se'), 6, '.2f'),
+            (self.number('alpha'), 7, '.1f'),
             (self.number('brownout_risk'), 7, '.2g'), (self.cutoff, 7, '.1f')]
         text = ' '.join(f'{value:{width}{form}}' if math.isfinite(value) else f'{"-":>{width}}'
                         for value, width, form in cells)
-        return f'{text}  {self.fields.get("status", "waiting")}'
+        return (f'{text}  {self.fields.get("load_status", "waiting")}, '
+                f'{self.fields.get("status", "waiting")}')
 
 
 class Table:
@@ -196,14 +199,15 @@ class Table:
 
 
 def signal_of(bag: str) -> tuple[str, str]:
-    """Return topic and type of what the filter shall filter: an IMU, else the busiest scalar."""
+    """Return what the filter shall filter: an IMU, else the busiest scalar but the throttle."""
     from ou_monitor.nodes.filter_channels import CHANNELS
     from ou_monitor.recordings.bag import BagReader
     with BagReader(bag) as reader:
         known = [topic for topic in reader.info.values() if topic.type in CHANNELS]
     if not known:
         raise DemoError(f'{bag} has no topic that the filter takes ({", ".join(CHANNELS)})')
-    best = max(known, key=lambda topic: (topic.type.endswith('/Imu'), topic.count))
+    best = max(known, key=lambda topic: (
+        topic.type.endswith('/Imu'), not topic.name.endswith('throttle'), topic.count))
     return best.name, best.type
 
 
@@ -219,7 +223,7 @@ def live_page(children: Children) -> str:
     return ''
 
 
-def watch(bag: str, seconds: float, logs: Path) -> Listener:
+def watch(bag: str, seconds: float, logs: Path, limit: float | None) -> Listener:
     """Run the nodes, replay the bag into them and show what they publish."""
     from ou_monitor.nodes.run import make_executor
     import rclpy
@@ -231,7 +235,8 @@ def watch(bag: str, seconds: float, logs: Path) -> Listener:
     executor.add_node(node)
     try:
         with Children(logs) as children:
-            children.start('estimator')
+            children.start('estimator', *(() if limit is None else (
+                '--ros-args', '-p', f'brownout.voltage:={float(limit)}')))
             children.start('adaptive_filter', '--ros-args', '-r', f'input:={topic}',
                            '-r', 'sigma:=/ou_estimator/sigma',
                            '-r', 'state:=/ou_estimator/state')
@@ -279,9 +284,15 @@ def options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog='scripts/demo', description='Estimator and adaptive filter as real ROS 2 '
         'processes, a bag replayed into them, a live table, and an HTML report.')
-    parser.add_argument('--bag', default='bags/flight', help='bag to replay (bags/flight)')
-    parser.add_argument('--seconds', type=float, default=30.0,
-                        help='replay no more than that many seconds (30)')
+    parser.add_argument('--bag', default=RECORDED,
+                        help=f'bag to replay ({RECORDED}, a recorded flight)')
+    parser.add_argument('--simulated', action='store_const', dest='bag', const=SIMULATED,
+                        help=f'replay {SIMULATED}, a simulated 5 V rail at 1 kHz')
+    parser.add_argument('--limit', type=float, metavar='V',
+                        help=f"voltage of a brown-out ({LIMIT} for {RECORDED}, else the nodes' "
+                             'own)')
+    parser.add_argument('--seconds', type=float, default=60.0,
+                        help='replay no more than that many seconds (60)')
     parser.add_argument('--report', type=Path, default=Path('out/demo_report.html'),
                         help='where the report goes (out/demo_report.html)')
     return parser.parse_args()
@@ -326,7 +337,8 @@ def main() -> int:
         topic, _ = signal_of(chosen.bag)
         print(f'Replaying {chosen.bag} over DDS (domain {os.environ["ROS_DOMAIN_ID"]}) into '
               f'estimator and adaptive_filter (which filters {topic})', flush=True)
-        heard = watch(chosen.bag, chosen.seconds, chosen.report.parent)
+        limit = LIMIT if chosen.limit is None and chosen.bag == RECORDED else chosen.limit
+        heard = watch(chosen.bag, chosen.seconds, chosen.report.parent, limit)
         print(f'{heard.estimates} estimates and {heard.outputs} filtered samples arrived')
         if not (heard.estimates and heard.outputs):
             print(f'scripts/demo: nothing usable arrived; last status: {heard.line()}',

@@ -235,6 +235,8 @@ def test_demo_shows_estimates_and_leaves_a_report(tmp_path):
     rows = [line.split() for line in done.stdout.splitlines() if line[:6].strip()
             .replace('.', '').isdigit()]
     # One a second, less what a busy machine takes to start; the last ones have numbers in every
-    # column but, at most, the risk.
+    # column but, at most, sag, alpha and risk.
     assert 3 <= len(rows) <= 10
-    assert all(float(cell) > 0.0 for cell in (*rows[-1][2:6], rows[-1][7]))
+    assert all(float(cell) > 0.0 for cell in (*rows[-1][2:4], rows[-1][8]))
+    # Open-circuit voltage of the 4S pack of the recorded flight.
+    assert 15.0 < float(rows[-1][2]) < 17.5
