@@ -335,15 +335,18 @@ _SIMULATE = Command(
      Option('--rate', metavar='HZ', type=float, help='samples per second'),
      _seed(1, 'same seed, same recording'),
      Option('--throttle', metavar='PROFILE',
-            help='name of a profile, a number 0..1, points T:U,T:U,..., or a CSV file with time_s '
-            'and throttle'),
+            help='name of a profile, a number 0..1, points T:U,T:U,..., a CSV file with time_s '
+            'and throttle, or a recording, whose length is then the default'),
+     *_PART,
      Option('--output', metavar='PATH', type=path_argument,
             help='NAME.mcap for one file, NAME for a rosbag2 folder'),
      Option('--type', choices=_TYPES,
             help='message of the voltage (default battery_state, adc_block from 5 kHz on)'),
      Option('--save-model', metavar='FILE.yaml', type=path_argument,
             help='write the model that was simulated'),
-     Option('--list', action='store_true', help='list presets and profiles'), _JSON))
+     Option('--list', action='store_true', help='list presets and profiles'), _JSON),
+    'Examples: ou-monitor simulate --preset load_40 --output load_40.mcap; ou-monitor simulate '
+    '--model flight.yaml --throttle flight.mcap --from 10 --to 70 --output again.mcap')
 
 COMMANDS = {command.name: command for command in (
     _ANALYZE, _COMPARE, _CONVERT, _COUPLING, _DESIGN, _DISCOVER, _FLEET, _LIVE, _REPRODUCE,

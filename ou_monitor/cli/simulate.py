@@ -7,6 +7,7 @@ import math
 from typing import Any
 
 from ou_monitor.cli import output
+from ou_monitor.cli.arguments import part_of_recording
 from ou_monitor.errors import InputError, nearest
 
 # From this rate on samples travel in blocks by default, Hz.
@@ -24,6 +25,7 @@ def run(args: argparse.Namespace) -> int:
     from ou_monitor.recordings.model_file import as_yaml, ModelFile, read_model
     from ou_monitor.simulation.presets import PRESETS
     from ou_monitor.simulation.profiles import PROFILES, read_profile
+    from ou_monitor.simulation.recorded_throttle import is_recording, read_throttle
 
     if args.list:
         if args.json is not None:
@@ -42,7 +44,12 @@ def run(args: argparse.Namespace) -> int:
             [[name, text] for name, (_, text) in PROFILES.items()], left=[0, 1]))
         return 0
     # A profile by name or number is no file, and no output is taken for one.
-    table = args.throttle if str(args.throttle).lower().endswith('.csv') else None
+    start, end = part_of_recording(args.start, args.end)
+    recorded = args.throttle is not None and is_recording(args.throttle)
+    if not recorded and (start is not None or end is not None):
+        raise InputError('--from and --to take a part of a recorded throttle: give --throttle '
+                         'RECORDING')
+    table = args.throttle if recorded or str(args.throttle).lower().endswith('.csv') else None
     output.check_paths(
         {'--model': args.model, '--throttle': table},
         {'--output': args.output, '--save-model': args.save_model, '--json': args.json})
@@ -59,9 +66,16 @@ def run(args: argparse.Namespace) -> int:
         file, name = read_model(args.model), args.model.stem
     else:
         file = ModelFile(preset.model, provenance={'preset': name})
+    throttle = preset.throttle if args.throttle is None else args.throttle
+    length = preset.duration
+    if recorded:
+        found = read_throttle(throttle, start, end)
+        profile, length = found.profile, found.duration
+    else:
+        profile = read_profile(throttle)
     rate = _positive('--rate', preset.rate if args.rate is None else args.rate, 'Hz')
-    duration = _positive('--duration', preset.duration if args.duration is None
-                         else args.duration, 's')
+    duration = _positive('--duration', length if args.duration is None else args.duration,
+                         's')
     if not 1.0 <= duration * rate <= 1e12:
         raise InputError(f'{duration:g} s at {rate:g} Hz are {duration * rate:.3g} samples, '
                          'outside 1 to 1e12')
@@ -71,8 +85,6 @@ def run(args: argparse.Namespace) -> int:
     if rate > _RATE_MOST:
         raise InputError(f'--rate must be at most {_RATE_MOST:g} Hz, as bags count in ns; got '
                          f'{rate:g}')
-    throttle = preset.throttle if args.throttle is None else args.throttle
-    profile = read_profile(throttle)
     kind = args.type or ('adc_block' if rate >= _BLOCKS_FROM else 'battery_state')
     if args.output is None:
         if args.save_model is None:

@@ -94,7 +94,7 @@ def read_profile(text: str) -> Profile:
         if ':' not in text:
             raise InputError(
                 f"no throttle profile '{text}': {nearest(text, PROFILES)} (or give a number 0..1, "
-                'points T:U,T:U,... or a CSV file)') from None
+                'points T:U,T:U,..., a CSV file or a recording)') from None
         return through(_checked(_points(text), f"throttle '{text}'"))
     _check_throttle(number, f"throttle '{text}'")
     return constant(number)
