@@ -1,0 +1,90 @@
+"""
+Recorded flights beside their simulations: fitted on the first half, the second simulated.
+
+Nothing is set for any one flight.  Flights that are not there are left out, with a word on stderr.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+import sys
+import time
+
+from ou_monitor.comparison.agreement import Agreement, Band
+from ou_monitor.comparison.compare import compare
+from ou_monitor.recordings.read import read_recording
+from real_flights import FLIGHTS
+from tables import put, table
+
+HEAD = ['flight', 's', 'explained', 'bias mV', 'lowest V', 'simulated', 'falls 1 %', 'simulated',
+        'falls 5 %', 'simulated', 'KS', 'verdict', 'CPU s']
+
+
+def flight_number(options: tuple[str, ...]) -> int | None:
+    """Return the number that `convert` is given."""
+    return int(options[options.index('--flight') + 1]) if '--flight' in options else None
+
+
+def beside(of: Band, digits: int) -> str:
+    """Return the median of the simulations and their 95 % band."""
+    return f'{of.median:.{digits}f} [{of.low:.{digits}f}, {of.high:.{digits}f}]'
+
+
+def within(of: Band, factor: float = 2.0) -> bool:
+    """Return whether the median is within a factor of the measured number."""
+    return of.measured / factor <= of.median <= of.measured * factor
+
+
+def row(name: str, found: Agreement, spent: float) -> list[str]:
+    """Return the row of a flight."""
+    first, second = found.falls
+    return [name, f'{found.simulated[1] - found.simulated[0]:.0f}', f'{found.explained:.2f}',
+            f'{1e3 * found.bias:.0f}', f'{found.lowest.measured:.2f}', beside(found.lowest, 2),
+            f'{first.measured:.1f}', beside(first, 1), f'{second.measured:.1f}',
+            beside(second, 1), f'{found.ks_distance:.2f}',
+            'looks like it' if found.verdict.name == 'LOOKS_LIKE_IT' else 'differs',
+            f'{spent:.1f}']
+
+
+def main() -> int:
+    """Compare the flights and print the table, or put it into the page."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument('flight', nargs='*', help='names (default all)')
+    parser.add_argument('--seeds', type=int, default=200, help='simulations of each')
+    parser.add_argument('--page', type=Path, help='page whose table is replaced')
+    options = parser.parse_args()
+    folder = os.environ.get('OU_MONITOR_REALDATA')
+    if folder is None:
+        parser.error('OU_MONITOR_REALDATA is not set: it names the folder of the flights')
+    rows: list[list[str]] = []
+    lowest = rates = one = 0
+    for name, file, given in FLIGHTS:
+        path = Path(folder) / file
+        if options.flight and name not in options.flight:
+            continue
+        if not path.exists():
+            print(f'{name}: {path} is not there, left out', file=sys.stderr)
+            continue
+        recording = read_recording(path, flight=flight_number(given))
+        started = time.process_time()
+        found = compare(recording, seeds=options.seeds)
+        rows.append(row(name, found, time.process_time() - started))
+        print(rows[-1], found.worst, file=sys.stderr)
+        lowest += found.lowest.inside
+        rates += all(within(falls) for falls in found.falls)
+        one += any(within(falls) for falls in found.falls)
+    text = table(HEAD, rows) + (
+        f'\nLowest voltage within its band: {lowest} of {len(rows)}. Falls within a factor of 2 of '
+        f'the measured: through both levels {rates} of {len(rows)}, through one at least {one} of '
+        f'{len(rows)}.\n')
+    if options.page:
+        put(options.page, text, 'beside')
+    else:
+        print(text)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
