@@ -26,7 +26,7 @@ MOVES = 0.01
 # Readings that a fit of the load looks at: means of neighbours beyond it.
 _MOST = 40_000
 # Time constants below which changes of the path may be damped, s.
-_FAST = (0.01, 0.02, 0.04, 0.08, 0.16)
+_FAST = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)
 # Models drawn for the error of a mean.
 _DRAWN = 16
 
@@ -52,9 +52,9 @@ def fit_flight(samples: Readings, progress: Callable[[float], None] | None = Non
     load = None if best is None else best.fit
     path = np.full(samples.t.size, mean) if best is None else _path(
         samples, best.fit, best.current)
-    damping = Damping() if load is None else _damping(samples, path)
+    damped = Damping() if load is None else damping(samples, path)
     slow = 0.0 if load is None else load.slow_std ** 2
-    left = samples.voltage - damping.of(path, samples.t)
+    left = samples.voltage - damped.of(path, samples.t)
     dt = samples.spacing
     ou = fit_residual_ou(left, dt, slow)
     errors, state = innovations(left, dt, ou, slow)
@@ -64,7 +64,7 @@ def fit_flight(samples: Readings, progress: Callable[[float], None] | None = Non
     level_var = (ou.white * dt + 2.0 * ou.variance * ou.tau) / duration
     report(1.0)
     return FlightModel(
-        load, mean, math.sqrt(level_var), damping, 1.0 if best is None else _spread(samples, best),
+        load, mean, math.sqrt(level_var), damped, 1.0 if best is None else _spread(samples, best),
         noise, ou, dt, 1.0 - (level if best is None else best.left) / max(total, 1e-300))
 
 
@@ -146,7 +146,7 @@ def _path(samples: Readings, fit: LoadFit, current: FloatArray | None) -> FloatA
     return fit.model.path(samples.t, samples.throttle, current)
 
 
-def _damping(samples: Readings, path: FloatArray) -> Damping:
+def damping(samples: Readings, path: FloatArray) -> Damping:
     """Return what is missing of the fast changes of the path, V, by least squares."""
     left = samples.voltage - path
     best, most = Damping(), 0.0

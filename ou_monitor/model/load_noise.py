@@ -15,6 +15,7 @@ import numpy as np
 from ou_monitor.model.load import ripple
 from ou_monitor.records import FloatArray
 from scipy.optimize import minimize
+from scipy.signal import lfilter
 
 # Centre and deviation of b1 and b2 before any data: what recordings usually show.
 USUAL = ((2.0, 2.0), (4.0, 3.0))
@@ -24,6 +25,8 @@ _EDGE, _TOP = 0.01, 0.001
 # Errors are drawn from those whose intensity is alike: this share of all to either side, and at
 # least so many.  And how far ln variance is drawn from its estimate.
 _ALIKE, _FEWEST, _FARTHEST = 0.02, 50, 1.0
+# Scores count up to this in the correlation of neighbours; it counts from so many standard errors.
+_CLIP, _CLEAR = 3.0, 3.0
 # Time within which a change of throttle counts, s: what the filter onboard takes as one step; and
 # a hair, for the rounding of stamps.
 _SPAN, _HAIR = 0.02, 1e-6
@@ -53,6 +56,8 @@ class NoiseLaw:
         ln variance at the samples of the fit, rising.
     errors : ndarray, shape (n,)
         Errors there, V, less what is not the noise's: the shape of the law, tails included.
+    memory : float
+        Correlation of neighbouring samples, as of a filter before the ADC.
 
     """
 
@@ -61,6 +66,7 @@ class NoiseLaw:
     limits: tuple[float, float, float]
     intensities: FloatArray
     errors: FloatArray
+    memory: float = 0.0
 
     def features(self, t: FloatArray, throttle: FloatArray) -> FloatArray:
         """Return what the coefficients multiply, shape (n, 3)."""
@@ -79,7 +85,11 @@ class NoiseLaw:
         near = np.clip(at, reach, most - reach) + rng.integers(-reach, reach + 1, at.size)
         off = features @ rng.multivariate_normal(np.zeros(3), self.covariance)
         # As they were, not scaled: an outlier in a calm does not become a larger one in a storm.
-        return np.asarray(self.errors[near] * np.exp(0.5 * np.clip(off, -_FARTHEST, _FARTHEST)))
+        fresh = self.errors[near] * np.exp(0.5 * np.clip(off, -_FARTHEST, _FARTHEST))
+        if self.memory == 0.0:
+            return np.asarray(fresh)
+        fresh[1:] *= math.sqrt(1.0 - self.memory ** 2)
+        return np.asarray(lfilter([1.0], [1.0, -self.memory], fresh), dtype=np.float64)
 
 
 def _features(u: FloatArray, du: FloatArray, limits: tuple[float, float, float]) -> FloatArray:
@@ -125,5 +135,9 @@ def fit_noise_law(t: FloatArray, errors: FloatArray, throttle: FloatArray,
     # A factor of e where there is none, as of noise far below the rounding.
     information += np.diag([1.0, *(deviation ** -2)])
     order = np.argsort(own, kind='stable')
+    scores = np.clip(errors / np.sqrt(own + other), -_CLIP, _CLIP)
+    memory = float(scores[1:] @ scores[:-1]) / float(scores @ scores)
+    if abs(memory) < _CLEAR / math.sqrt(scores.size):
+        memory = 0.0
     return NoiseLaw(np.asarray(found.x), np.linalg.inv(information), limits,
-                    np.log(own[order]), (errors * np.sqrt(share))[order])
+                    np.log(own[order]), (errors * np.sqrt(share))[order], memory)

@@ -3,8 +3,10 @@
 import numpy as np
 from ou_monitor.comparison.agreement import Verdict
 from ou_monitor.comparison.compare import compare
+from ou_monitor.comparison.flight_fit import damping
+from ou_monitor.comparison.flight_model import Readings
 from ou_monitor.errors import InputError
-from ou_monitor.model.load import LoadModel
+from ou_monitor.model.load import LoadModel, lowpass
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.measurement_noise import MeasurementNoise
@@ -99,6 +101,22 @@ def test_the_second_half_follows_from_the_first():
     assert 'load_sag' in found.model and 'load_dependent_noise' in found.model
     assert found.explained > 0.9
     assert found.lowest.inside and all(falls.inside for falls in found.falls)
+
+
+def test_jitter_of_throttle_is_no_noise_and_no_path():
+    """What of the path's fast changes is not in the voltage is damped, by least squares."""
+    rng = np.random.default_rng(8)
+    t = np.arange(4000) / 50.0
+    slow = np.cumsum(rng.standard_normal(t.size)) * 0.05
+    jitter = 0.3 * rng.standard_normal(t.size)
+    path = 15.0 + slow + jitter
+    for share in (0.0, 0.7, 1.0):
+        v = path - share * (path - lowpass(path, t, 0.04)) + 0.1 * rng.standard_normal(t.size)
+        found = damping(Readings(t, v, None), path)
+        # The fast part has a deviation of some 0.2 V: 0.1/(0.2 sqrt(4000)) = 0.008 of the share.
+        assert found.share == pytest.approx(share, abs=0.04)
+        assert share == 0.0 or found.time == 0.04
+        assert np.std(v - found.of(path, t)) == pytest.approx(0.1, rel=0.05)
 
 
 def test_without_throttle_there_is_level_and_noise():

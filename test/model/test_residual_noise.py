@@ -70,6 +70,23 @@ def test_what_is_beside_the_noise_is_not_drawn():
     assert law.draw(t, np.zeros(N), rng).var() == pytest.approx(0.01, rel=0.15)
 
 
+def test_the_memory_of_neighbours():
+    """Noise behind a filter is drawn with the correlation of neighbours and the same variance."""
+    rng = np.random.default_rng(6)
+    t = DT * np.arange(N)
+    e = np.empty(N)
+    e[0] = 0.0
+    for k in range(1, N):
+        e[k] = 0.5 * e[k - 1] + rng.standard_normal()
+    law = fit_noise_law(t, e, np.zeros(N), 0.0)
+    # One standard error is sqrt(1 - 0.25)/sqrt(N) = 0.008.
+    assert law.memory == pytest.approx(0.5, abs=0.032)
+    drawn = law.draw(t, np.zeros(N), rng)
+    assert drawn.var() == pytest.approx(e.var(), rel=0.15)
+    assert drawn[1:] @ drawn[:-1] / (drawn @ drawn) == pytest.approx(0.5, abs=0.04)
+    assert fit_noise_law(t, rng.standard_normal(N), np.zeros(N), 0.0).memory == 0.0
+
+
 def test_changes_count_over_20_ms():
     """A rise in two steps of 10 ms counts in full, at 100 Hz and at 1 kHz."""
     for dt in (0.01, 0.001):
