@@ -76,9 +76,9 @@ def main() -> int:
         rates += all(within(falls) for falls in found.falls)
         one += any(within(falls) for falls in found.falls)
     text = table(HEAD, rows) + (
-        f'\nLowest voltage within its band: {lowest} of {len(rows)}. Falls within a factor of 2 of '
-        f'the measured: through both levels {rates} of {len(rows)}, through one at least {one} of '
-        f'{len(rows)}.\n')
+        f'\nLowest voltage within its band: {lowest} of {len(rows)}. Falls within a factor of 2 '
+        f'of the measured: through both levels {rates} of {len(rows)}, through one at least '
+        f'{one} of {len(rows)}.\n')
     if options.page:
         put(options.page, text, 'beside')
     else:

@@ -93,15 +93,17 @@ def _fit(f: FloatArray, power: FloatArray, count: FloatArray, dt: float, slow: f
     total = max(float(np.sum(count * power) / np.sum(count)) / (2.0 * dt), 1e-300)
 
     def least(shape: FloatArray | None) -> tuple[float, FloatArray]:
-        def cost(q: FloatArray) -> float:
-            density = 2.0 * dt * math.exp(q[0]) + base
+        def cost(q: FloatArray) -> tuple[float, FloatArray]:
+            parts = [np.full(f.size, 2.0 * dt * math.exp(q[0]))]
             if shape is not None:
-                density = density + math.exp(q[1]) * shape
-            return _cost(density, power, count)
+                parts.append(math.exp(q[1]) * shape)
+            density = np.sum(parts, axis=0) + base
+            slope = count * (1.0 / density - power / density ** 2)
+            return _cost(density, power, count), np.array([part @ slope for part in parts])
 
         start = [math.log(0.7 * total)] + ([] if shape is None else [math.log(0.5 * total)])
         low = math.log(1e-9 * total)
-        found = minimize(cost, start, method='L-BFGS-B',
+        found = minimize(cost, start, jac=True, method='L-BFGS-B',
                          bounds=[(low, low + 30.0)] * len(start))
         return float(found.fun), np.exp(found.x)
 
