@@ -36,8 +36,8 @@ def model(sigma: float = SIGMA, sag: float = SAG) -> SupplyModel:
 
 
 def test_a_recording_of_the_model_looks_like_it():
-    """One in twenty may differ by chance: of twelve at most two, but for 2 % of such tests."""
-    found = [compare(drawn(seed), model(), seeds=20, seed=seed) for seed in range(12)]
+    """One in twenty may differ by chance: of ten at most two, but for 1 % of such tests."""
+    found = [compare(drawn(seed), model(), seeds=20, seed=seed) for seed in range(10)]
     assert sum(one.verdict is Verdict.DIFFERS for one in found) <= 2
     assert np.mean([one.p_value for one in found]) > 0.2
 
@@ -83,7 +83,7 @@ def test_only_what_follows_s_is_simulated():
     assert found.traces.t[0] == 30.0
 
 
-def flight(seed: int, n: int = 2000, rate: float = 50.0) -> Recording:
+def flight(seed: int, n: int = 1500, rate: float = 50.0) -> Recording:
     """Return a flight of a pack whose noise follows throttle, in steps of 10 mV."""
     rng = np.random.default_rng(seed)
     t = np.arange(n) / rate
@@ -96,7 +96,7 @@ def flight(seed: int, n: int = 2000, rate: float = 50.0) -> Recording:
 def test_the_second_half_follows_from_the_first():
     """The model that is fitted explains what is not noise, and its bands hold the recording."""
     found = compare(flight(1), seeds=40)
-    assert found.fitted == (0.0, pytest.approx(19.99, abs=0.03))
+    assert found.fitted == (0.0, pytest.approx(14.99, abs=0.03))
     assert found.verdict is Verdict.LOOKS_LIKE_IT
     assert 'load_sag' in found.model and 'load_dependent_noise' in found.model
     assert found.explained > 0.9
@@ -120,11 +120,11 @@ def test_jitter_of_throttle_is_no_noise_and_no_path():
 
 
 def test_without_throttle_there_is_level_and_noise():
-    """An OU and white noise, and the note says so; of four at most one differs by chance."""
+    """An OU and white noise, and the note says so; at most one of two differs by chance."""
     t = np.arange(6000) / 200.0
     supply = SupplyModel((OU(ALPHA, SIGMA, 5.0), MeasurementNoise(0.02)))
     differ = 0
-    for seed, held in enumerate((np.nan, 0.4, np.nan, 0.4)):
+    for seed, held in enumerate((np.nan, 0.4)):
         v = supply.simulate(t, np.random.default_rng(seed), np.full(t.size, 0.4))
         found = compare(Recording(t, v, np.full(t.size, held), 'bench'), seeds=40)
         assert found.model == ('ou', 'measurement_noise')
@@ -138,7 +138,7 @@ def test_held_samples_count_once():
     slow = flight(2, 800)
     fast = Recording(np.arange(4000) / 250.0, np.repeat(slow.voltage, 5),
                      np.repeat(slow.throttle, 5), 'held')
-    one, other = compare(slow, seeds=20), compare(fast, seeds=20)
+    one, other = (compare(each, model(), seeds=20) for each in (slow, fast))
     assert any('repeats its last value' in note for note in other.notes)
     # But for the first reading, whose begin is not in the recording.
     assert other.falls[1].measured == pytest.approx(one.falls[1].measured, rel=0.1)
