@@ -88,7 +88,7 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
     uncovered = samples.n - int(scored.sum())
     if state.drawn is not None:
         scored &= ~state.drawn
-    left = earned(samples, named.whole, named.names, scored,
+    left = earned(samples, named.whole, named.names, plain, scored,
                   lambda share: done(0.6 + 0.3 * share))
     whole = left.full.model
     after = named.after if not left.out else criticise(samples, whole, named.bank)

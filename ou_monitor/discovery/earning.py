@@ -83,13 +83,23 @@ class Earned:
     out: list[str] = field(default_factory=list)
 
 
-def earned(samples: Samples, model: Composite, names: Sequence[str],
+def earned(samples: Samples, model: Composite, names: Sequence[str], plain: HeldOut,
            scored: npt.NDArray[np.bool_], progress: Callable[[float], None]) -> Earned:
-    """Leave out the causes that do not earn their place, the worst first."""
+    """
+    Leave out the causes that do not earn their place, the worst first.
+
+    Interrupted (Ctrl-C), it returns what there is, gains that were not measured yet as unknown.
+    """
     state = Earned(held_out(samples, model), list(names))
     for turn in range(_ROUNDS):
-        state.worth = _worths(samples, state, scored, lambda share: progress(
-            1.0 - 0.5 ** turn * (1.0 - 0.5 * share)))
+        state.worth = []
+        try:
+            _measure(samples, state, plain, scored, lambda share: progress(
+                1.0 - 0.5 ** turn * (1.0 - 0.5 * share)))
+        except KeyboardInterrupt:
+            missing = len(state.names) - len(state.worth)
+            state.worth += [Worth(chance=0.0)] * missing
+            return state
         failing = [k for k, worth in enumerate(state.worth) if worth.less is not None
                    and not decision.earns(worth.gain, worth.error, worth.chance)
                    and not _as_trend(samples, state.names[k], worth.less.model)]
@@ -115,23 +125,28 @@ def _as_trend(samples: Samples, name: str, less: Composite) -> bool:
     return decision.is_answer(catalogue()[name]) and is_trend(samples, less)
 
 
-def _worths(samples: Samples, state: Earned, scored: npt.NDArray[np.bool_],
-            progress: Callable[[float], None]) -> list[Worth]:
-    """Return what each cause of a model is worth; of many of a kind, all together."""
+def _measure(samples: Samples, state: Earned, plain: HeldOut, scored: npt.NDArray[np.bool_],
+             progress: Callable[[float], None]) -> None:
+    """
+    Measure what each cause of a model is worth; of many of a kind, all together.
+
+    The plain OU is always left: a rest that predicts worse than that is none.
+    """
     found: dict[tuple[int, ...], Worth] = {}
-    worths = []
-    for k, name in enumerate(state.names):
+    for k in range(len(state.names)):
         group = group_of(state.full.model, state.names, k)
         if group not in found:
-            less = without(samples, state.full.model, *group)
+            less = without(samples, state.full.model, *group, plain=plain.model)
             if less is None:
                 found[group] = Worth(size=len(group))
             else:
                 other = held_out(samples, less)
+                both = scored & other.known & plain.known
+                if both.any() and other.density[both].mean() < plain.density[both].mean():
+                    other = plain
                 found[group] = Worth(*cause_gain(state.full, other, scored), len(group), other)
-        worths.append(found[group])
+        state.worth.append(found[group])
         progress((k + 1) / len(state.names))
-    return worths
 
 
 def group_of(model: Composite, names: Sequence[str], k: int) -> tuple[int, ...]:

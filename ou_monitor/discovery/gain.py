@@ -62,18 +62,26 @@ def if_known(gain: float, error: float) -> tuple[float, float]:
     return (NAN, NAN) if error > max(_VAGUE * abs(gain), _WIDE) else (gain, error)
 
 
-def without(samples: Samples, model: Composite, *indices: int) -> Composite | None:
-    """Return the model fitted again to everything without some of its terms; None for none."""
+def without(samples: Samples, model: Composite, *indices: int, plain: Composite | None = None
+            ) -> Composite | None:
+    """
+    Return the model fitted again to everything without some of its terms; None for none.
+
+    A fit that is worse than the plain one has gone astray, and is tried from elsewhere.
+    """
     kept = [term for k, term in enumerate(model.terms) if k not in indices]
     # What changes a term that is gone has gone with it.
     names = {term.NAME for term in kept}
     kept = [term for term in kept if term.CHANGES is None or term.CHANGES.NAME in names]
     laws = any(model.terms[k].ROLE is Role.LAW for k in indices)
     known = None if laws else model
-    # Near its old parameters, or far from them: without white noise or an answer to throttle the
-    # rail itself has to be what they were.
-    found = [_fitted(samples, (ou, *kept[1:]), known) for ou in (kept[0], guess(samples))]
-    return max((fit for fit in found if fit is not None), default=None,
+    first = _fitted(samples, kept, known)
+    if first is not None and plain is not None and (
+            float(first.density.sum()) >= float(plain.density.sum())):
+        return first
+    # Without white noise or an answer to throttle the rail itself has to be what they were.
+    second = _fitted(samples, (guess(samples), *kept[1:]), known)
+    return max((fit for fit in (first, second) if fit is not None), default=None,
                key=lambda fit: float(fit.density.sum()))
 
 

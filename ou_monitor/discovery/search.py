@@ -10,7 +10,7 @@ and withdrawn is decided in `decision`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -20,25 +20,16 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import Fitter, is_trend, Trial
 from ou_monitor.discovery.gain import BLOCKS, mean_difference
-from ou_monitor.discovery.regression import load_terms, mean_answer
+from ou_monitor.discovery.load_start import choose_answer, CURVES, OTHER_CURVE, under_load
+from ou_monitor.discovery.search_state import Search
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.load_dependent_noise import LoadDependentNoise
 from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
 from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.measurement_noise import MeasurementNoise
-from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.model.terms.tone import lines_of, Tone
 
 Progress = Callable[[float], None]
 
-# Rate, 1/s, from which a fit finds what the load leaves: minutes and tenths of a second are both
-# within reach of it.
-_SLOW = 1.0
-# Intensities that follow throttle: each may only mend the form of the other.
-_CURVES = (LoadDependentSigma, LoadDependentNoise)
-_OTHER_CURVE = {LoadDependentSigma.NAME: LoadDependentNoise.NAME,
-                LoadDependentNoise.NAME: LoadDependentSigma.NAME}
 # Time of one fit, s, up to which the mean is chosen anew after each cause.
 _SOON = 1.0
 
@@ -46,38 +37,9 @@ _SOON = 1.0
 STOPPED = ('The search for causes was cut short where the next ones would have taken long; there '
            'may be more than are named.')
 
-
-@dataclass(eq=False)
-class Search:
-    """
-    State of the search.
-
-    Attributes
-    ----------
-    composite : Composite
-        The model so far.
-    accepted : list of str
-        Causes in the order of their acceptance.
-    rivals : dict of str to list of str
-        For each cause, those that did as well in its round.
-    log : list of str
-        Trials and their results, one line each.
-    removed : list of str
-        Causes taken out again, because later ones made them needless.
-    largest : float
-        Largest evidence of an accepted cause, nats.
-    stopped : bool
-        Whether the search ended because it took too long.
-
-    """
-
-    composite: Composite
-    accepted: list[str] = field(default_factory=list)
-    rivals: dict[str, list[str]] = field(default_factory=dict)
-    log: list[str] = field(default_factory=list)
-    removed: list[str] = field(default_factory=list)
-    largest: float = 0.0
-    stopped: bool = False
+# Note where it was stopped by hand.
+INTERRUPTED = ('The search for causes was stopped by hand: these are the causes found until then, '
+               'and there may be more.')
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,40 +75,55 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     # Beside lines that were taken out there may be slower ones.
     given = [term.NAME for term in exact if term.FAMILY != 'line']
     begun = Search(fitter.fit(start.terms, start) or start)
+    bare, search, failure, loaded = begun.composite, begun, '', False
     try:
-        _under_load(fitter, begun)
-        search = name_causes(fitter, begun, bank, given=given,
-                             progress=lambda share: progress(0.1 + 0.9 * share))
+        under_load(fitter, begun)
+        loaded = any(kind.FAMILY == LoadSag.FAMILY for kind in _kinds(begun.accepted))
+        search = begun.copy()
+        name_causes(fitter, search, bank, given=given,
+                    progress=lambda share: progress(0.1 + 0.9 * share))
         failure = STOPPED if search.stopped else ''
+    except KeyboardInterrupt:
+        failure = INTERRUPTED
+        # In the middle of the load there is no model that belongs to the names.
+        search = search if search is not begun else Search(bare)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         # A fit outside of what numbers can hold; the criticism still stands.
-        search, failure = begun, f'The search for causes broke off: {error}.'
+        failure = f'The search for causes broke off: {error}.'
+        search = search if search is not begun else Search(bare)
     # Fitted to everything, so that an event in the part kept does not count against a cause.
     whole = fitter.whole(search.composite)
     after = criticise(samples, whole, bank) if search.accepted else before
     kinds = _kinds(search.accepted)
-    out = decision.withdrawn(before, after, kinds)
+    latent = any(decision.is_latent(kind) for kind in kinds)
+    if loaded and latent:
+        measured = criticise(samples, begun.composite, bank)
+        out = decision.withdrawn_under_load(measured, after, kinds)
+    else:
+        out = decision.withdrawn(before, after, kinds)
+    # Noise that the load needs is part of it.
+    out = [k for k in out if not (loaded and search.accepted[k] in begun.accepted)]
     dropped = tuple(search.accepted[k] for k in out)
-    if dropped:
+    if dropped and failure != INTERRUPTED:
         stays = [search.composite.terms[position(search.composite, search.accepted, k)]
                  for k, kind in enumerate(kinds) if k not in out and decision.is_latent(kind)]
         # The causes withdrawn may have hidden measured ones.  A trend that another slow cause
         # replaced is not tried again.
         slow = [kind.NAME for kind in _kinds(search.removed) if kind.FAMILY == 'slow']
-        search = name_causes(fitter, begun, bank, latent=False, given=[*given, *slow])
+        search = begun.copy()
+        name_causes(fitter, search, bank, latent=False, given=[*given, *slow])
         dropped = tuple(name for name in dropped if name not in search.accepted)
-        whole, after = _kept_beside(fitter, search, stays, before, bank)
+        whole, after = _kept_beside(fitter, search, stays, measured if loaded else before, bank,
+                                    loaded)
     return Named(whole, bank, tuple(search.accepted), search.rivals, dropped, before, after,
                  failure)
 
 
-def name_causes(fitter: Fitter, begun: Search, bank: NullBank, *,
+def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
                 given: Sequence[str] = (), latent: bool = True,
-                progress: Progress | None = None) -> Search:
-    """Accept causes one after the other, the best first, beside those of a search begun."""
+                progress: Progress | None = None) -> None:
+    """Accept causes one after the other, the best first, beside those found so far."""
     samples = fitter.samples
-    search = replace(begun, accepted=list(begun.accepted), rivals=dict(begun.rivals),
-                     log=list(begun.log), removed=list(begun.removed))
     values = criticise(samples, search.composite, bank)
     only, reformed = '', False
     for turn in range(decision.MOST):
@@ -173,7 +150,7 @@ def name_causes(fitter: Fitter, begun: Search, bank: NullBank, *,
         best = next(trial for trial in trials if trial.name in named)
         _accept(search, best, trials)
         if best.composite.gaussian.cost < _SOON:
-            _answer(fitter, search, ())
+            choose_answer(fitter, search, ())
         after = criticise(samples, search.composite, bank)
         if best.name == Tone.NAME and _more_lines(fitter, search):
             after = criticise(samples, search.composite, bank)
@@ -191,7 +168,6 @@ def name_causes(fitter: Fitter, begun: Search, bank: NullBank, *,
         if fitter.cost > decision.MOST_COST:
             break
     search.stopped = fitter.cost > decision.MOST_COST
-    return search
 
 
 def position(model: Composite, names: Sequence[str], k: int) -> int:
@@ -207,7 +183,7 @@ def _kinds(names: Sequence[str]) -> list[type[Term]]:
 def _acceptable(trial: Trial, search: Search, values: Mapping[str, float]) -> bool:
     """Return whether a trial may be accepted."""
     kind = catalogue()[trial.name]
-    if kind in _CURVES and search.composite.has(_OTHER_CURVE[trial.name]) and (
+    if kind in CURVES and search.composite.has(OTHER_CURVE[trial.name]) and (
             trial.evidence < decision.FORM * search.largest):
         return False
     new, old = trial.composite.density, search.composite.density
@@ -227,109 +203,6 @@ def _accept(search: Search, best: Trial, trials: Sequence[Trial]) -> None:
     search.composite = best.composite
     search.accepted += [name for name in (best.beside, best.name) if name]
     search.largest = max(search.largest, best.evidence)
-
-
-def _under_load(fitter: Fitter, search: Search) -> None:
-    """
-    Start from the load model: the answer to throttle, and noise that follows it, at once.
-
-    In a flight they are nearly all of the variance: one by one, each would be fitted to what the
-    others leave.  Nothing is accepted that the mean without them does not need.
-    """
-    load, plain = load_terms(fitter.samples), search.composite
-    full = fitter.fit([*plain.terms, *load], plain, rough=True) if load else None
-    if full is None:
-        _answer(fitter, search, ())
-        return
-    noisy = _noise_beside(fitter, full)
-    search.composite = noisy
-    _answer(fitter, search, load)
-    if not any(catalogue()[name].FAMILY == LoadSag.FAMILY for name in search.accepted):
-        # Throttle does not move the mean: what the noise is, the search asks one by one.
-        search.composite, search.accepted = plain, []
-        _answer(fitter, search, ())
-        return
-    means = [term for term in search.composite.terms if decision.is_answer(type(term))]
-    bare = fitter.fit([*plain.terms, *means], plain)
-    if bare is None:
-        return
-    # Again beside the mean as it is now, each for its own evidence.
-    known = [term.NAME for term in plain.terms]
-    best = _noise_beside(fitter, bare)
-    if fitter.evidence(search.composite) > fitter.evidence(best):
-        best = fitter.fit(search.composite.terms, search.composite) or search.composite
-    search.composite = best
-    for term in best.terms:
-        if term.NAME not in known and not decision.is_answer(type(term)):
-            search.accepted.append(term.NAME)
-            search.rivals.setdefault(term.NAME, [])
-            search.log.append(f'{term.NAME}: with the load')
-    _answer(fitter, search, ())
-
-
-def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:
-    """Return a model with the noise that a recording under load shows beside its mean."""
-    best = composite
-    ou = composite.terms[0]
-    assert isinstance(ou, OU)
-    error = math.sqrt(float(np.median(composite.gaussian.variance)))
-    # What the load leaves is slow, and small beside the white noise; or it is the noise itself.
-    slow = replace(ou, alpha=_SLOW, sigma=0.3 * error * math.sqrt(2.0 * _SLOW))
-    largest = 0.0
-    while True:
-        view = fitter.view(best)
-        tried: list[Composite] = []
-        for kind in (LoadDependentSigma, LoadDependentNoise, MeasurementNoise):
-            if best.has(kind.NAME):
-                continue
-            found = fitter.best_start(best, kind, view)
-            # Two intensities that follow throttle: one may only mend the form of the other.
-            again = kind in _CURVES and best.has(_OTHER_CURVE[kind.NAME])
-            if found is not None and not (
-                    again and fitter.evidence(found) - fitter.evidence(best)
-                    < decision.FORM * largest):
-                tried.append(found)
-            if not best.has(MeasurementNoise.NAME) and kind is not LoadDependentSigma:
-                more: list[Term] = [MeasurementNoise(0.8 * error)]
-                if kind is LoadDependentNoise:
-                    more = [*more, *LoadDependentNoise.candidates(view)]
-                found = fitter.fit([slow, *best.terms[1:], *more], best, rough=True)
-                if found is not None:
-                    tried.append(found)
-        top = max(tried, default=None, key=fitter.evidence)
-        gain = -math.inf if top is None else fitter.evidence(top) - fitter.evidence(best)
-        if top is None or gain < decision.ACCEPT:
-            return best
-        largest = max(largest, gain)
-        best = top
-
-
-def _answer(fitter: Fitter, search: Search, start: Sequence[Term]) -> None:
-    """Choose the answers of the mean to what is measured anew, beside the noise found so far."""
-    composite = search.composite
-    answer = mean_answer(fitter.samples, composite, fitter.view(composite), start)
-    own = [term for term in composite.terms if decision.is_answer(type(term))]
-    shape = [replace(term, **dict.fromkeys(term.LINEAR, 0.0)) for term in own]
-    if not start and len(own) == len(answer.terms) and all(
-            replace(term, **dict.fromkeys(term.LINEAR, 0.0)) in shape for term in answer.terms):
-        return
-    structural = [term for term in composite.terms
-                  if term.ROLE is not Role.LAW and not decision.is_answer(type(term))]
-    laws = [term for term in composite.terms if term.ROLE is Role.LAW]
-    gone = {term.NAME for term in own} - {term.NAME for term in answer.terms}
-    if gone and is_trend(fitter.samples, composite):
-        return
-    fit = fitter.fit([*structural, *answer.terms, *laws], composite)
-    if fit is None or (not start and fitter.evidence(fit) < fitter.evidence(composite)):
-        return
-    search.composite = fit
-    before = [name for name in search.accepted if decision.is_answer(catalogue()[name])]
-    names = [term.NAME for term in answer.terms]
-    search.accepted = [*names, *(name for name in search.accepted if name not in before)]
-    for term, worth, rivals in zip(answer.terms, answer.worth, answer.rivals, strict=True):
-        search.rivals[term.NAME] = list(rivals)
-        search.largest = max(search.largest, worth)
-        search.log.append(f'{term.NAME}: {worth:.1f} nats')
 
 
 def _more_lines(fitter: Fitter, search: Search) -> bool:
@@ -405,7 +278,7 @@ def _prune(fitter: Fitter, search: Search) -> None:
 
 
 def _kept_beside(fitter: Fitter, search: Search, stays: Sequence[Term],
-                 before: Mapping[str, float], bank: NullBank
+                 before: Mapping[str, float], bank: NullBank, loaded: bool
                  ) -> tuple[Composite, dict[str, float]]:
     """Put latent causes that were not withdrawn beside the measured ones; return what is left."""
     samples = fitter.samples
@@ -420,7 +293,9 @@ def _kept_beside(fitter: Fitter, search: Search, stays: Sequence[Term],
             continue
         again = fitter.whole(fit)
         left = criticise(samples, again, bank)
-        if decision.withdrawn(before, left, _kinds([*search.accepted, term.NAME])):
+        kinds = _kinds([*search.accepted, term.NAME])
+        if (len(kinds) - 1 in decision.withdrawn_under_load(before, left, kinds) if loaded
+                else decision.withdrawn(before, left, kinds)):
             continue
         search.composite, whole, after = fit, again, left
         search.accepted.append(term.NAME)

@@ -1,0 +1,136 @@
+"""
+Where a search begins: the answer of the mean to throttle and time, and the noise of a load.
+
+On real flights that is nearly all of the variance, so that nothing else can be seen before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+import math
+
+import numpy as np
+from ou_monitor.criticism.composite import Composite
+from ou_monitor.discovery import decision
+from ou_monitor.discovery.fitting import Fitter, is_trend
+from ou_monitor.discovery.regression import load_terms, mean_answer
+from ou_monitor.discovery.search_state import Search
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.load_dependent_noise import LoadDependentNoise
+from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
+from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.term import Role, Term
+
+# Rate, 1/s, from which a fit finds what the load leaves: minutes and tenths of a second are both
+# within reach of it.
+_SLOW = 1.0
+# Intensities that follow throttle: each may only mend the form of the other.
+CURVES = (LoadDependentSigma, LoadDependentNoise)
+OTHER_CURVE = {LoadDependentSigma.NAME: LoadDependentNoise.NAME,
+                LoadDependentNoise.NAME: LoadDependentSigma.NAME}
+
+
+def under_load(fitter: Fitter, search: Search) -> None:
+    """
+    Start from the load model: the answer to throttle, and noise that follows it, at once.
+
+    In a flight they are nearly all of the variance: one by one, each would be fitted to what the
+    others leave.  Nothing is accepted that the mean without them does not need.
+    """
+    load, plain = load_terms(fitter.samples), search.composite
+    full = fitter.fit([*plain.terms, *load], plain, rough=True) if load else None
+    if full is None:
+        choose_answer(fitter, search, ())
+        return
+    noisy = _noise_beside(fitter, full)
+    search.composite = noisy
+    choose_answer(fitter, search, load)
+    if not any(catalogue()[name].FAMILY == LoadSag.FAMILY for name in search.accepted):
+        # Throttle does not move the mean: what the noise is, the search asks one by one.
+        search.composite, search.accepted = plain, []
+        choose_answer(fitter, search, ())
+        return
+    means = [term for term in search.composite.terms if decision.is_answer(type(term))]
+    bare = fitter.fit([*plain.terms, *means], plain)
+    if bare is None:
+        return
+    # Again beside the mean as it is now, each for its own evidence.
+    known = [term.NAME for term in plain.terms]
+    best = _noise_beside(fitter, bare)
+    if fitter.evidence(search.composite) > fitter.evidence(best):
+        best = fitter.fit(search.composite.terms, search.composite) or search.composite
+    search.composite = best
+    for term in best.terms:
+        if term.NAME not in known and not decision.is_answer(type(term)):
+            search.accepted.append(term.NAME)
+            search.rivals.setdefault(term.NAME, [])
+            search.log.append(f'{term.NAME}: with the load')
+    choose_answer(fitter, search, ())
+
+
+def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:
+    """Return a model with the noise that a recording under load shows beside its mean."""
+    best = composite
+    ou = composite.terms[0]
+    assert isinstance(ou, OU)
+    error = math.sqrt(float(np.median(composite.gaussian.variance)))
+    # What the load leaves is slow, and small beside the white noise; or it is the noise itself.
+    slow = replace(ou, alpha=_SLOW, sigma=0.3 * error * math.sqrt(2.0 * _SLOW))
+    largest = 0.0
+    while True:
+        view = fitter.view(best)
+        tried: list[Composite] = []
+        for kind in (LoadDependentSigma, LoadDependentNoise, MeasurementNoise):
+            if best.has(kind.NAME):
+                continue
+            found = fitter.best_start(best, kind, view)
+            # Two intensities that follow throttle: one may only mend the form of the other.
+            again = kind in CURVES and best.has(OTHER_CURVE[kind.NAME])
+            if found is not None and not (
+                    again and fitter.evidence(found) - fitter.evidence(best)
+                    < decision.FORM * largest):
+                tried.append(found)
+            if not best.has(MeasurementNoise.NAME) and kind is not LoadDependentSigma:
+                more: list[Term] = [MeasurementNoise(0.8 * error)]
+                if kind is LoadDependentNoise:
+                    more = [*more, *LoadDependentNoise.candidates(view)]
+                found = fitter.fit([slow, *best.terms[1:], *more], best, rough=True)
+                if found is not None:
+                    tried.append(found)
+        top = max(tried, default=None, key=fitter.evidence)
+        gain = -math.inf if top is None else fitter.evidence(top) - fitter.evidence(best)
+        if top is None or gain < decision.ACCEPT:
+            return best
+        largest = max(largest, gain)
+        best = top
+
+
+def choose_answer(fitter: Fitter, search: Search, start: Sequence[Term]) -> None:
+    """Choose the answers of the mean to what is measured anew, beside the noise found so far."""
+    composite = search.composite
+    answer = mean_answer(fitter.samples, composite, fitter.view(composite), start)
+    own = [term for term in composite.terms if decision.is_answer(type(term))]
+    shape = [replace(term, **dict.fromkeys(term.LINEAR, 0.0)) for term in own]
+    if not start and len(own) == len(answer.terms) and all(
+            replace(term, **dict.fromkeys(term.LINEAR, 0.0)) in shape for term in answer.terms):
+        return
+    structural = [term for term in composite.terms
+                  if term.ROLE is not Role.LAW and not decision.is_answer(type(term))]
+    laws = [term for term in composite.terms if term.ROLE is Role.LAW]
+    gone = {term.NAME for term in own} - {term.NAME for term in answer.terms}
+    if gone and is_trend(fitter.samples, composite):
+        return
+    fit = fitter.fit([*structural, *answer.terms, *laws], composite)
+    if fit is None or (not start and fitter.evidence(fit) < fitter.evidence(composite)):
+        return
+    search.composite = fit
+    before = [name for name in search.accepted if decision.is_answer(catalogue()[name])]
+    names = [term.NAME for term in answer.terms]
+    search.accepted = [*names, *(name for name in search.accepted if name not in before)]
+    for term, worth, rivals in zip(answer.terms, answer.worth, answer.rivals, strict=True):
+        search.rivals[term.NAME] = list(rivals)
+        search.largest = max(search.largest, worth)
+        search.log.append(f'{term.NAME}: {worth:.1f} nats')

@@ -1,0 +1,45 @@
+"""What a search for causes has found so far."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from ou_monitor.criticism.composite import Composite
+
+
+@dataclass(eq=False)
+class Search:
+    """
+    State of the search.
+
+    Attributes
+    ----------
+    composite : Composite
+        The model so far.
+    accepted : list of str
+        Causes in the order of their acceptance.
+    rivals : dict of str to list of str
+        For each cause, those that did as well in its round.
+    log : list of str
+        Trials and their results, one line each.
+    removed : list of str
+        Causes taken out again, because later ones made them needless.
+    largest : float
+        Largest evidence of an accepted cause, nats.
+    stopped : bool
+        Whether the search ended because it took too long.
+
+    """
+
+    composite: Composite
+    accepted: list[str] = field(default_factory=list)
+    rivals: dict[str, list[str]] = field(default_factory=dict)
+    log: list[str] = field(default_factory=list)
+    removed: list[str] = field(default_factory=list)
+    largest: float = 0.0
+    stopped: bool = False
+
+    def copy(self) -> Search:
+        """Return a search that goes on from here and leaves this one as it is."""
+        return replace(self, accepted=list(self.accepted), rivals=dict(self.rivals),
+                       log=list(self.log), removed=list(self.removed))
