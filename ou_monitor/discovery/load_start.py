@@ -29,8 +29,9 @@ from ou_monitor.model.terms.term import Role, Term
 _SLOW = 1.0
 # Intensities that follow throttle: each may only mend the form of the other.
 CURVES = (LoadDependentSigma, LoadDependentNoise)
-OTHER_CURVE = {LoadDependentSigma.NAME: LoadDependentNoise.NAME,
-                LoadDependentNoise.NAME: LoadDependentSigma.NAME}
+OTHER_CURVE = {
+    LoadDependentSigma.NAME: LoadDependentNoise.NAME,
+    LoadDependentNoise.NAME: LoadDependentSigma.NAME}
 
 
 def under_load(fitter: Fitter, search: Search) -> None:

@@ -219,7 +219,7 @@ def test_a_clear_trial_spares_dear_ones(one, left, kind, spared):
 
 
 @pytest.mark.parametrize('kind, cost, may', [
-    (Cheap, 1e9, True), (Dear, 9.9, True), (Dear, 10.1, False)])
+    (Cheap, 1e9, True), (Dear, 5.9, True), (Dear, 6.1, False)])
 def test_dear_kinds_are_tried_while_time_is_left(kind, cost, may):
     assert decision.affordable(kind, cost) is may
 
@@ -357,3 +357,23 @@ def test_the_origins_of_the_constants():
 def test_what_only_the_search_reads(name, value):
     """Limits of rounds and of fits: by value, as no table can reach them."""
     assert getattr(decision, name) == value
+
+
+@pytest.mark.parametrize('gain, error, chance, earns', [
+    (0.01, 0.02, 0.01, True), (-0.01, 0.02, 0.01, True), (-0.03, 0.02, 0.01, False),
+    (0.05, 0.02, 0.06, False), (0.05, 0.02, 0.04, True), (float('nan'), float('nan'), 0.01, True),
+    (float('nan'), float('nan'), 0.83, False), (0.0, 0.0, 1.0, False)])
+def test_what_earns_its_place(gain, error, chance, earns):
+    """A gain below zero by more than its error does not, nor what does not show: p above 0.05."""
+    assert decision.earns(gain, error, chance) is earns
+
+
+@pytest.mark.parametrize('before, after, out', [
+    # It answers for its own signs alone, and for three tenths of what they were.
+    ({'band 1': 20.0, 'kurtosis': 300.0}, {'band 1': 5.9, 'kurtosis': 300.0}, []),
+    ({'band 1': 20.0, 'kurtosis': 300.0}, {'band 1': 6.1, 'kurtosis': 0.0}, [1]),
+    # Small ones may stay in their band; what was never off is no reason to be there.
+    ({'band 1': 5.0}, {'band 1': 4.7}, []), ({'band 1': 5.0}, {'band 1': 4.9}, [1]),
+    ({'band 1': 4.4}, {'band 1': 0.0}, [1])])
+def test_what_is_withdrawn_beside_a_load(before, after, out):
+    assert decision.withdrawn_under_load(before, after, [Mean, Cheap, Intensity]) == out

@@ -16,6 +16,7 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, Events
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.measurement_noise import MeasurementNoise
 from ou_monitor.model.terms.term import Role
 import pytest
 from scipy.special import kolmogorov, ndtri
@@ -34,6 +35,8 @@ GAUSSIAN = {
         {'throttle': [0.0, 0.5, 1.0], 'log_factor': [0.0, 0.5, 0.8]},
         {'log_factor': [0.0, 0.3, 0.8]}, {'log_factor': [0.0, 0.5, 0.65]}),
     'load_dependent_alpha': ({'slope': 1.0}, {'slope': -0.6}),
+    'load_dependent_noise': (
+        {'ripple': 2.0, 'change': 1.5}, {'ripple': 1.0}, {'change': 0.0}),
     'drift': ({'rate': -0.01, 'curvature': 2e-4}, {'rate': 0.0}, {'curvature': 0.0}),
     'measurement_noise': ({'std': 0.5 * STEP}, {'std': 0.4 * STEP}, {'std': 0.6 * STEP}),
     'quantization': ({'step': 0.5 * STEP}, {'step': STEP}),
@@ -115,8 +118,10 @@ def throttle():
 
 
 def simulated(name, params, seed, **ou):
-    """Return samples of the OU with one term, and both."""
-    terms = (catalogue()['ou'](**{**OU, **ou}), catalogue()[name](**params))
+    """Return samples of the OU with one term, and what it changes, and all of them."""
+    kind = catalogue()[name]
+    changed = () if kind.CHANGES is None else (MeasurementNoise(STEP),)
+    terms = (catalogue()['ou'](**{**OU, **ou}), *changed, kind(**params))
     t = np.arange(LENGTH) / RATE
     voltage = SupplyModel(terms).simulate(t, np.random.default_rng(seed), throttle())
     return Samples(t, voltage, throttle()), terms
@@ -176,8 +181,8 @@ def test_scores_of_the_right_model_are_white(name):
     (name, wrong) for name, (_, *changes) in GAUSSIAN.items() for wrong in changes])
 def test_a_wrong_parameter_shows(name, wrong):
     """With one parameter wrong, so far from that that nearly every recording shows it."""
-    samples, (ou, term) = simulated(name, GAUSSIAN[name][0], 11)
-    assert abs(filtered(samples, (ou, replace(term, **wrong)))[1]) > LIMIT + 3.0
+    samples, (*others, term) = simulated(name, GAUSSIAN[name][0], 11)
+    assert abs(filtered(samples, (*others, replace(term, **wrong)))[1]) > LIMIT + 3.0
 
 
 @pytest.mark.parametrize('name', LAWS)

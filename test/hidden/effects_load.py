@@ -210,6 +210,19 @@ def sigma_peak(bench: Bench, gain: float) -> dict[str, object]:
     return {**_intensity(bench, 1 + (ratio - 1) * bump), 'peak_at': at}
 
 
+@effect('load_dependent_noise', also=(('load_dependent_noise', 'measurement_noise'),))
+def noise_of_load(bench: Bench, gain: float) -> dict[str, object]:
+    """Let the ADC sample the ripple of the ESCs: an error of its own at each sample."""
+    low = bench.draw.uniform(0.15, 0.3) * gain * bench.innovation
+    ratio = bench.draw.uniform(3.0, 6.0)
+    u = bench.throttle[bench.lead::bench.substeps][:bench.n]
+    curve = u * (1.4 - u)
+    curve = (curve - curve.min()) / np.ptp(curve)
+    std = low * (1.0 + (ratio - 1.0) * curve)
+    bench.stage('noise', lambda v: v + std * bench.path.normal(size=v.size))
+    return {'std_low_v': low, 'ratio': ratio}
+
+
 def _rate(bench: Bench, curve: np.ndarray) -> dict[str, object]:
     """Scale the conductance that discharges the rail by a curve around 1."""
     curve = curve / np.mean(curve)

@@ -7,6 +7,7 @@ from hidden_circuit import Bench
 
 # Families as in section 6 of the contract.
 LABELS = {
+    'load_dependent_noise': 'intensity',
     'load_sag': 'load', 'load_transient': 'load', 'load_dependent_sigma': 'intensity',
     'load_dependent_alpha': 'restoring', 'drift': 'slow', 'measurement_noise': 'sensor',
     'quantization': 'sensor', 'held_samples': 'sensor', 'saturation': 'sensor',

@@ -20,7 +20,7 @@ def simulated(kind, cause=None, seed=0, **options):
 
 def test_what_exists():
     """All causes, many other shapes and unknowns, all compatible pairs."""
-    assert len(causes()) == 22 and set(causes()) == set(labels)
+    assert len(causes()) == 23 and set(causes()) == set(labels)
     assert {name.partition('/')[0] for name in variants()} <= set(causes())
     assert len(variants()) >= 30 and len(unknowns()) >= 8
     assert {c for pair in pairs() for c in pair} == set(causes())

@@ -84,6 +84,23 @@ def test_sigma_of_throttle(cause):
         assert correlation(np.minimum(whitened(h)**2, 16), load[:-1]) > 8
 
 
+def test_white_noise_of_throttle():
+    """Errors that only one sample has: their share of the changes of it follows the curve."""
+    for h, claimed, rail in each('load_dependent_noise', 4):
+        curve = h.throttle * (1.4 - h.throttle)
+        curve = (curve - curve.min()) / np.ptp(curve)
+        # Neighbouring changes share one error, with opposite signs.
+        d = np.diff(h.voltage)
+        shared = -d[1:] * d[:-1]
+        high, low = (curve[1:-1] > 0.7), (curve[1:-1] < 0.2)
+        std = claimed['std_low_v'] * (1.0 + (claimed['ratio'] - 1.0) * curve[1:-1])
+        for part in (high, low):
+            error = 3.0 * float(shared[part].std()) / np.sqrt(part.sum())
+            rest = rail['innovation_v'] ** 2
+            assert abs(float(np.mean(shared[part] - std[part] ** 2))) < 4.0 * error + 0.05 * rest
+        assert correlation(shared, curve[1:-1]) > 8
+
+
 @pytest.mark.parametrize('cause, shape', [
     ('load_dependent_alpha', lambda load, c: 1 + (c['ratio'] - 1) * load),
     ('load_dependent_alpha/resistance', lambda load, c: 1 / (1 + (1 / c['ratio'] - 1) * load)),
