@@ -68,8 +68,14 @@ class AdaptiveFilterNode(MonitorNode):
     _type = AUTO
     _topic = ''
 
-    def __init__(self, name: str) -> None:
-        super().__init__(name, (*RUN_TIME, PUBLISH_RATE), FIXED)
+    def __init__(self, name: str, *, managed: bool = False) -> None:
+        super().__init__(name, (*RUN_TIME, PUBLISH_RATE), FIXED, managed=managed)
+        if not managed:
+            self.begin()
+
+    def start(self) -> None:
+        """Begin with no message filtered."""
+        self._channels = None
         self._filters: list[AdaptiveLowPass] = []
         # Stands for them until there are any, and for what they would say.
         self._idle = AdaptiveLowPass(**self._of_filter(self.values()))

@@ -8,7 +8,7 @@ What both nodes share: parameters from a table, and callbacks that no error ends
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 import functools
 import inspect
 import math
@@ -61,12 +61,21 @@ class MonitorNode(Node):
         Parameters that may change at run time.
     fixed : sequence of Parameter
         Parameters that are read once, at the start.
+    managed : bool
+        Whether the node begins when it is activated (lifecycle), and then
+        reads `fixed` anew; else `begin` is called at the end of its making.
 
     """
 
+    # Whether it works: between begin and stop.
+    running = False
+
     def __init__(self, name: str, table: Sequence[Parameter],
-                 fixed: Sequence[Parameter] = ()) -> None:
-        super().__init__(name)
+                 fixed: Sequence[Parameter] = (), *, managed: bool = False) -> None:
+        Node.__init__(self, name)
+        self.managed = managed
+        self._made: list[Any] = []
+        self._at_stop: list[Callable[[], object]] = []
         self.faults, self.fault = 0, ''
         self._faulted = -math.inf
         self._publishing: Timer | None = None
@@ -74,11 +83,13 @@ class MonitorNode(Node):
         self._polled: list[Subscription] = []
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._table = {parameter.name: parameter for parameter in table}
+        self._fixed = {parameter.name for parameter in fixed}
         declared = [*table, *fixed, LOCK]
         self._widen_overrides(declared)
+        self._floats = {p.name for p in declared if isinstance(p.default, float)}
         for parameter in declared:
             self.declare_parameter(parameter.name, parameter.default, _descriptor(
-                parameter, read_only=parameter.name not in self._table))
+                parameter, read_only=not managed and parameter.name not in self._table))
         self._warn_misspelt()
         try:
             self.check(self.values())
@@ -88,6 +99,40 @@ class MonitorNode(Node):
         self.add_pre_set_parameters_callback(self._widen)
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self.guarded(self._after_set))
+
+    def start(self) -> None:
+        """Open all that the node works with."""
+
+    def begin(self) -> None:
+        """Start; what has been opened by a start that fails is closed again."""
+        try:
+            self.start()
+        except Exception:
+            self.stop()
+            raise
+        self.running = True
+
+    def stop(self) -> None:
+        """Close all that was opened since `begin`; parameters stay."""
+        self.running = False
+        for made in reversed(self._made):
+            for destroy in (self.destroy_timer, self.destroy_subscription, self.destroy_service,
+                            self.destroy_publisher):
+                if destroy(made):
+                    break
+        for close in self._at_stop:
+            close()
+        del self._made[:], self._polled[:], self._at_stop[:]
+        self._publishing = None
+
+    def at_stop(self, close: Callable[[], object]) -> None:
+        """Have something called when the node stops."""
+        self._at_stop.append(close)
+
+    def destroy_node(self) -> None:
+        """Stop, and end the node."""
+        self.stop()
+        super().destroy_node()
 
     def values(self) -> dict[str, Any]:
         """Return the run-time parameters in force."""
@@ -106,7 +151,9 @@ class MonitorNode(Node):
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
         """Call back every `period` s of real time: silence is told on simulated time too."""
-        return self.create_timer(period, self.guarded(callback), clock=self.steady)
+        timer = self.create_timer(period, self.guarded(callback), clock=self.steady)
+        self._made.append(timer)
+        return timer
 
     def publish_every(self, callback: Callable[[], None]) -> None:
         """Call back at `publish_rate`, which may change."""
@@ -153,16 +200,32 @@ class MonitorNode(Node):
 
     def create_publisher(self, kind: Any, topic: str, qos: Any, **options: Any) -> Publisher:
         """Return a publisher; `qos_overrides` are honoured."""
-        with _readable_overrides(topic):
-            return super().create_publisher(
-                kind, topic, qos, **self._overriding(topic), **options)
+        overriding = self._overriding(topic)
+        with _readable_overrides(topic) if overriding else nullcontext():
+            made = super().create_publisher(kind, topic, qos, **overriding, **options)
+        self._keep(made)
+        return made
 
     def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any,
                             **options: Any) -> Subscription:
         """Return a subscription; `qos_overrides` are honoured."""
-        with _readable_overrides(topic):
-            return super().create_subscription(
-                kind, topic, callback, qos, **self._overriding(topic), **options)
+        overriding = self._overriding(topic)
+        with _readable_overrides(topic) if overriding else nullcontext():
+            made = super().create_subscription(
+                kind, topic, callback, qos, **overriding, **options)
+        self._keep(made)
+        return made
+
+    def create_service(self, kind: Any, name: str, callback: Any, **options: Any) -> Any:
+        """Return a service."""
+        made = super().create_service(kind, name, callback, **options)
+        self._keep(made)
+        return made
+
+    def _keep(self, made: Any) -> None:
+        """Note what is to be closed at the end; rclpy opens its own before there is a list."""
+        if hasattr(self, '_made'):
+            self._made.append(made)
 
     def _overriding(self, topic: str) -> dict[str, Any]:
         """Return the option by which a topic takes `qos_overrides`, where there are any for it."""
@@ -220,8 +283,7 @@ class MonitorNode(Node):
             overrides[name] = _as_double(overrides[name])
 
     def _widen(self, parameters: list[RosParameter]) -> list[RosParameter]:
-        return [_as_double(p) if p.name in self._table
-                and isinstance(self._table[p.name].default, float) else p for p in parameters]
+        return [_as_double(p) if p.name in self._floats else p for p in parameters]
 
     def _warn_misspelt(self) -> None:
         """Name overrides that rclpy would ignore without a word."""
@@ -238,6 +300,10 @@ class MonitorNode(Node):
             return SetParametersResult(
                 successful=False, reason='lock_parameters is set: of the parameters only '
                 'publish_rate can be changed until the node is started anew without it')
+        if self.running and any(p.name in self._fixed for p in parameters):
+            return SetParametersResult(
+                successful=False, reason='it is read when the node is activated: deactivate it '
+                'first')
         try:
             if changed:
                 self.check({**self.values(), **changed})
@@ -246,7 +312,7 @@ class MonitorNode(Node):
         return SetParametersResult(successful=True)
 
     def _after_set(self, parameters: list[RosParameter]) -> None:
-        if any(p.name in self._table for p in parameters):
+        if self.running and any(p.name in self._table for p in parameters):
             self.apply(self.values())
 
 

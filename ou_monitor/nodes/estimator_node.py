@@ -70,13 +70,15 @@ OWN_TOPICS = (*('~/' + key for key in OUTPUTS), '~/brownout', '~/state', '/diagn
 class EstimatorNode(MonitorNode):
     """Sliding OU estimate of one supply, as a node."""
 
-    # Asked by `check` from the beginning on.
-    _started = False
-
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, *, managed: bool = False) -> None:
         self._models = ModelChoice()
         super().__init__(name, (*ESTIMATOR_PARAMETERS, PUBLISH_RATE),
-                         (*SOURCE_PARAMETERS, STATE_FILE))
+                         (*SOURCE_PARAMETERS, STATE_FILE), managed=managed)
+        if not managed:
+            self.begin()
+
+    def start(self) -> None:
+        """Begin with nothing known but a flag that was latched."""
         settings = monitor_settings(_of_monitor(self.values()))
         self._monitor = SupplyMonitor(settings, self._models.use(settings.model_file))
         self._stream = SampleStream(self._monitor)
@@ -107,7 +109,6 @@ class EstimatorNode(MonitorNode):
         self.every(1.0, self._diagnose)
         self.publish_every(lambda: self._publish(*self._report()))
         self.refuse_other_overrides([*OWN_TOPICS, *(s.topic for s in self._sources.values())])
-        self._started = True
 
     def _open_latch(self) -> LatchFile | None:
         """Open the file of the latch; what was latched is latched again."""
@@ -116,6 +117,8 @@ class EstimatorNode(MonitorNode):
             return None
         latch = LatchFile(Path(get_logging_directory()) / Path(name).expanduser(),
                           self.get_fully_qualified_name())
+        # What is being written then is written.
+        self.at_stop(latch.close)
         reason = latch.read()
         if latch.problem:
             self.get_logger().warning(latch.problem)
@@ -124,21 +127,16 @@ class EstimatorNode(MonitorNode):
             self.get_logger().warning(f'The brown-out flag is CRITICAL: {reason}')
         return latch
 
-    def destroy_node(self) -> None:
-        """End the node; what is being written is written."""
-        if self._latch is not None:
-            self._latch.close()
-        super().destroy_node()
-
     def recover(self, error: Exception) -> None:
         """Begin anew after a callback has raised: nothing is known of the supply."""
-        self._monitor.restart(error)
+        if self.running:
+            self._monitor.restart(error)
 
     def check(self, values: Mapping[str, Any]) -> None:
         """Raise `ValueError` when the parameters contradict each other."""
         path = monitor_settings(_of_monitor(values)).model_file
         # At the start there is nothing to be kept waiting.
-        self._models.check(path, PATIENCE if self._started else None)
+        self._models.check(path, PATIENCE if self.running else None)
 
     def apply(self, values: Mapping[str, Any]) -> None:
         """Bring checked parameters into force; no sample in the window is lost."""

@@ -70,6 +70,7 @@ class Stamper:
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
                           on_clock_change=True),
             post_callback=node.guarded(self._jumped))
+        node.at_stop(self._jumps.unregister)
         self.follow()
 
     @property

@@ -20,6 +20,7 @@ from ou_monitor.errors import InputError, refusal
 from ou_monitor.nodes.service_manager import ServiceManager
 
 BAD_INPUT = 2
+LIFECYCLE = '--lifecycle'
 # Longest wait inside the executor, s; a signal wakes it anyway.
 NAP = 1.0
 # Set while a signal may end the process at once.
@@ -76,6 +77,14 @@ def run_node(name: str, about: str, work: Callable[[], int]) -> int:
         return work()
 
     return run(name, checked)
+
+
+def run_managed(name: str, about: str, work: Callable[[bool], int]) -> int:
+    """Run an executable that takes --lifecycle, and ROS arguments."""
+    lifecycle = LIFECYCLE in sys.argv[1:]
+    if lifecycle:
+        sys.argv.remove(LIFECYCLE)
+    return run_node(name, about, lambda: work(lifecycle))
 
 
 def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: list[int]) -> int:

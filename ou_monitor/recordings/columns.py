@@ -164,7 +164,9 @@ class FieldReader:
 
     def read(self, table: Table) -> Column:
         """Return the field of the messages of a table, in its order."""
-        column = self._read(table)
+        # A damaged message may hold a signalling NaN, of which NumPy would warn.
+        with np.errstate(invalid='ignore'):
+            column = self._read(table)
         return replace(column, values=self._zero.apply(column.values))
 
     def _read(self, table: Table) -> Column:

@@ -91,7 +91,9 @@ class Extractor:
         raw = self._value(msg)
         if raw is None:
             return Extracted(stamp, np.empty(0), 1)
-        values = self._zero.apply(self._numbers(raw) * self._scale + self.spec.offset)
+        # A damaged message may hold a signalling NaN, of which NumPy would warn.
+        with np.errstate(invalid='ignore'):
+            values = self._zero.apply(self._numbers(raw) * self._scale + self.spec.offset)
         finite = np.isfinite(values)
         missing = values.size - int(np.count_nonzero(finite))
         if missing:

@@ -334,3 +334,13 @@ def test_a_wrong_path_is_told_by_the_general_way():
     reader = FieldReader(spec, text, partial(general_decoder, spec.type, text))
     with pytest.raises(InputError, match="did you mean 'voltage'"):
         reader.read(table_of([battery('', 5.0)]))
+
+
+def test_a_signalling_nan_is_a_nan():
+    """Of which NumPy warns where it is scaled or widened, and a warning is an error here."""
+    text = 'float32 x\n'
+    signalling = bytes.fromhex('000100000100807f')
+    spec = FieldSpec('x', KIND, 'x', unit_factor=0.1)
+    found, _ = in_bulk(spec, text, table_of([signalling]))
+    assert np.isnan(found[2]).all()
+    assert_both_ways(spec, text, [signalling])

@@ -1,0 +1,88 @@
+"""
+Nodes that a manager configures, activates and deactivates (managed nodes, design.ros2.org).
+
+| state | what is there |
+|---|---|
+| unconfigured, inactive | parameters and the services of the life cycle; nothing else is open |
+| active | all that the plain node has |
+
+Configuring checks what the parameters name (message types, model file), so that activating, which
+begins with nothing known, does not fail for them.  What fails says so on the console, and the
+node stays in the state before.  A latched flag outlasts all of it in its file, `state_file`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from ou_monitor.errors import InputError
+from ou_monitor.nodes.base import MonitorNode
+from ou_monitor.nodes.run import one_line
+from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
+
+SUCCESS, FAILURE, ERROR = (TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE,
+                           TransitionCallbackReturn.ERROR)
+
+
+def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
+    """Return what makes a managed node of a kind, unconfigured."""
+    class Managed(LifecycleNodeMixin, kind):  # type: ignore[misc, valid-type]
+        """A node whose work is begun and ended by transitions."""
+
+        def __init__(self, name: str) -> None:
+            kind.__init__(self, name, managed=True)  # type: ignore[call-arg]
+            LifecycleNodeMixin.__init__(self)
+            change = self._service_change_state
+            asked = change.callback
+
+            def answer(request: Any, response: Any) -> Any:
+                # rclpy 7.1 raises where a state has no such transition, and the node would end.
+                try:
+                    return asked(request, response)
+                except Exception as error:
+                    self.get_logger().error(f'no such transition now: {one_line(error)}')
+                    response.success = False
+                    return response
+            change.callback = answer
+
+        def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+            """Check that it could begin, and end again."""
+            def tried() -> None:
+                self.begin()
+                self.stop()
+            return self._done('configured', tried)
+
+        def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+            """Begin."""
+            return self._done('activated', self.begin)
+
+        def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+            """End; the window is gone."""
+            return self._done('deactivated', self.stop)
+
+        def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+            """Do nothing: an inactive node holds nothing."""
+            return SUCCESS
+
+        def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+            """End, from any state."""
+            return self._done('shut down', self.stop)
+
+        def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+            """Be unconfigured again."""
+            return self._done('reset', self.stop)
+
+        def _done(self, what: str, work: Callable[[], Any]) -> TransitionCallbackReturn:
+            # Left to rclpy an exception would be an error without a word.
+            try:
+                work()
+            except InputError as error:
+                self.get_logger().error(f'cannot be {what}: {error}')
+                return FAILURE
+            except Exception as error:
+                self.get_logger().error(f'cannot be {what}: {type(error).__name__}: {error}')
+                return ERROR
+            return SUCCESS
+
+    return Managed
