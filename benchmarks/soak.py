@@ -357,6 +357,8 @@ def main() -> None:
                         help='of Fast DDS; DEFAULT: shared memory, and UDP beside it')
     parser.add_argument('--json', type=Path, help='file for all figures')
     parser.add_argument('--markdown', type=Path, help='page for the table')
+    parser.add_argument('--beside', type=Path, nargs='*', default=[],
+                        help='figures (--json) of other runs, as further columns')
     options = parser.parse_args()
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     os.environ['FASTDDS_BUILTIN_TRANSPORTS'] = options.transport
@@ -376,7 +378,7 @@ def main() -> None:
             print('ended by a signal: the figures so far', file=sys.stderr)
         finally:
             found = soak.close()
-    text = as_table(found)
+    text = as_table(found, *(json.loads(path.read_text()) for path in options.beside))
     print(text)
     for line in soak.wrong:
         print(f'answered wrongly: {line}')

@@ -21,8 +21,9 @@ IN_TIME = 1.0
 SAMPLES = 40
 # Memory is looked at after the warm-up, s at most, or a fifth of the time; in so many blocks.
 WARM_UP, BLOCKS = 600.0, 20
-# What the node may still say of what came before a phase, s.
-LINGER = 1.5
+# How long the node may speak of what came before a phase, s: the longest `stale_after` that is
+# set, and a report.
+LINGER = 2.3
 
 
 @dataclass
@@ -201,10 +202,17 @@ def figures(heard: Heard, counters: Mapping[str, int], end: Mapping[str, Any]) -
            for what, function in (('', sum), ('_most', max))}, 'counters': dict(counters)}
 
 
-def as_table(found: Mapping[str, Any]) -> str:
-    """Return the figures as a Markdown table."""
+def as_table(*runs: Mapping[str, Any]) -> str:
+    """Return the figures as a Markdown table, a column for each run."""
+    columns = [_column(found) for found in runs]
+    return table(['what', *('found' for _ in runs)], [
+        [row[0], *(column[k][1] for column in columns)] for k, row in enumerate(columns[0])])
+
+
+def _column(found: Mapping[str, Any]) -> list[list[str]]:
+    """Return words and figures of one run."""
     dips = found['dips']
-    rows = [
+    return [
         ['seed, transport, length', f"{found['run']}, {found['minutes']:.1f} min"],
         ['deaths of the node', str(found['deaths'])],
         *([f'longest silence of `{name}` (without the pauses below)',
@@ -218,8 +226,8 @@ def as_table(found: Mapping[str, Any]) -> str:
         ['**delivered, and missed**', str(len(dips['missed']))],
         ['from the begin of a dip to both, median, longest',
          f"{dips['median']:.2f} s, {dips['longest']:.2f} s"],
-        [f"`~/brownout` false in {found['unknowable']} s when nothing could be known",
-         str(found['false'])],
+        ['`~/brownout` false while nothing could be known',
+         f"{found['false']} times in {found['unknowable']} s"],
         ['resident memory at the end, at most',
          f"{found['memory'] / 1e6:.1f} MB, {found['most_memory'] / 1e6:.1f} MB"],
         ['its slope after the warm-up',
@@ -233,4 +241,3 @@ def as_table(found: Mapping[str, Any]) -> str:
             ('deaf', 'the listener without CPU (above 0.1 s)'))),
         *([f'`{name}`', str(value)] for name, value in found['counters'].items()),
         ['exit status after SIGINT, time', f"{found['status']}, {found['took']:.2f} s"]]
-    return table(['what', 'found'], rows)
