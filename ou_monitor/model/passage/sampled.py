@@ -32,6 +32,9 @@ _MOST = 112
 _SLIGHT = 0.35
 # Noise of less than this part of what a step adds is none.
 _NO_NOISE = 1e-4
+# Of fine steps this part: it moves the barrier by 4e-4 of a step, and less noise would take
+# thousands of nodes.
+_NO_FINE_NOISE = 0.02
 # Time, in relaxation times, after which where it began is forgotten.
 _FORGOTTEN = 25.0
 
@@ -98,7 +101,8 @@ def _straight(noise: float) -> tuple[float, FloatArray, FloatArray]:
 def _fine(start: float, barrier: float, step: float, count: float, noise: float) -> float:
     """Return the chance by that of the continuous path to a barrier that is moved."""
     unit = math.sqrt(2.0 * step)
-    overstep, x, u = _straight(float(f'{noise / unit:.3g}'))
+    part = noise / unit
+    overstep, x, u = _straight(float(f'{part:.3g}') if part >= _NO_FINE_NOISE else 0.0)
     at = (start - barrier) / unit
     gap = overstep - at if at <= x[0] else float(np.interp(at, x, u))
     moved = barrier + unit * overstep
