@@ -290,6 +290,11 @@ class SupplyMonitor:
             Probability, the pilot's throttle to come included; NaN without voltage and in the
             first second.
 
+        Raises
+        ------
+        ValueError
+            When the voltage is not finite, or the horizon not positive.
+
         """
         return risk_of_all(self._outlook, self._forecast, self._newest, self._settings,
                            *self._asked(voltage, horizon)).risk
@@ -297,9 +302,27 @@ class SupplyMonitor:
     def risk_if(self, throttle: float, dwell: float, voltage: float | None = None,
                 horizon: float | None = None) -> float:
         """
-        Return the same risk, if throttle goes to `throttle`, stays `dwell` s, and comes back.
+        Return the same risk, if throttle goes to `throttle`, stays, and comes back.
 
-        NaN where the load is not known.
+        Parameters
+        ----------
+        throttle : float
+            Throttle to go to, 0..1.
+        dwell : float
+            Time there, s.
+        voltage, horizon : float, optional
+            As of `risk`.
+
+        Returns
+        -------
+        float
+            Probability; NaN where the load is not known.
+
+        Raises
+        ------
+        ValueError
+            When the throttle lies outside 0..1, the dwell is negative, or as `risk`.
+
         """
         level, ahead = self._asked(voltage, horizon)
         if not (math.isfinite(throttle) and 0.0 <= throttle <= 1.0):
@@ -387,6 +410,11 @@ class SupplyMonitor:
         s = self._settings
         load = f' at throttle {e.throttle:.2f}' if math.isfinite(e.throttle) else ''
         known = 'unknown' if math.isnan(risk) else f'{risk:.2g}'
+        outcome = self._ahead.outcome
+        if outcome.basis != 'none':
+            words = outcome.basis.replace('_', ' ')
+            known += f' (from {words}; most of it: {outcome.cause})' if outcome.cause else \
+                f' (from {words})'
         supply = f'; supply now {e.voltage:.3f} V' if math.isfinite(e.voltage) else ''
         return (f'Brown-out risk {known} within {s.brownout_horizon:g} s of '
                 f'{s.brownout_voltage:g} V (critical from {s.brownout_critical:g}){load}{supply}; '

@@ -113,14 +113,15 @@ class _Rung:
         other = far
         if look.state is not None and look.futures is not None and math.isfinite(peak):
             start, law = mean_now(look.state), self.calibrator.law
-            once = held(peak, dwell, look.state.throttle)
-            mean, deviation = lowest(look.state, once, self.horizon, sampling)
-            middle, spread = law.moments(mean, deviation, start)
-            self.held.add(float(density(y, middle, spread)[0]), float(density(
-                y, middle, np.hypot(spread, look.deviation))[0]), weight, elapsed)
             futures, shares = look.futures
-            several = law.moments(*lowest(look.state, futures, self.horizon, sampling), start)
-            other = self.pilot.add(float(shares @ density(y, *several)), far, weight, elapsed)
+            mean, deviation = lowest(
+                look.state, futures.after(held(peak, dwell, look.state.throttle)), self.horizon,
+                sampling)
+            middle, spread = law.moments(mean, deviation, start)
+            found = density(y, middle, spread)
+            wide = density(y, middle[:1], np.hypot(spread[:1], look.deviation))
+            self.held.add(float(found[0]), float(wide[0]), weight, elapsed)
+            other = self.pilot.add(float(shares @ found[1:]), far, weight, elapsed)
             self.calibrator.add(low, float(mean[0]), float(deviation[0]), start, weight, elapsed)
         self.evidence *= math.exp(-elapsed / MEMORY)
         if look.passage is not None:

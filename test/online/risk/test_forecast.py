@@ -1,0 +1,288 @@
+"""Risk with throttle to come: simulated pilots and packs that use nothing of the package."""
+
+from copy import copy, deepcopy
+from functools import cache
+import math
+from pathlib import Path
+
+import numpy as np
+from ou_monitor.online.monitor import SupplyMonitor
+from ou_monitor.online.risk.flag import FlagLevel
+from ou_monitor.online.settings import MonitorSettings
+from project import ROOT
+import pytest
+from scipy.signal import lfilter
+
+RATE, SECONDS, FLOWN = 50.0, 80.0, 3000
+DT = 1.0 / RATE
+LOOK = round(0.4 * RATE)
+
+
+def telegraph(rng, n):
+    """Return throttle that ramps, in 0.2 s, to a new place about once a second."""
+    wanted = np.empty(n)
+    k = 0
+    while k < n:
+        end = k + 1 + int(rng.exponential(RATE))
+        wanted[k:end] = rng.uniform(0.1, 0.9)
+        k = end
+    return lfilter(np.full(10, 0.1), 1.0, wanted - wanted[0]) + wanted[0]
+
+
+def steps(rng, n):
+    """Return throttle that is set every two to nine seconds, at once."""
+    out = np.empty(n)
+    k = 0
+    while k < n:
+        end = k + int(rng.uniform(2.0, 9.0) * RATE)
+        out[k:end] = rng.uniform(0.15, 0.9)
+        k = end
+    return out
+
+
+def recorded(_, n):
+    """Return the throttle of a recorded flight."""
+    t, u = np.loadtxt(Path(ROOT) / 'bags/recorded/gecko.csv', delimiter=',', skiprows=1,
+                      usecols=(0, 2)).T
+    return np.interp(5.0 + np.arange(n) * DT, t - t[0], u)
+
+
+PILOTS = {'telegraph': telegraph, 'steps': steps, 'recorded': recorded}
+
+
+class Pack:
+    """Sag of x = u^1.8 at once, after 60 ms and after 2 s; discharge; white noise."""
+
+    def __init__(self, u):
+        x = u[0] ** 1.8
+        self.fast, self.slow, self.level = x, x, 16.2
+
+    def volts(self, u, noise):
+        """Return the voltage under a throttle, sample by sample."""
+        out = np.empty(u.size)
+        for k, x in enumerate(u ** 1.8):
+            self.fast += (x - self.fast) * -math.expm1(-DT / 0.06)
+            self.slow += (x - self.slow) * -math.expm1(-DT / 2.0)
+            self.level -= 0.004 * x * DT
+            out[k] = self.level - 0.6 * x - 0.9 * self.fast - 0.5 * self.slow
+        return out + 0.04 * noise
+
+
+@cache
+def flight(pilot, seed=1):
+    """Return throttle, voltage, and the pack after `FLOWN` samples."""
+    rng = np.random.default_rng(seed)
+    u = PILOTS[pilot](rng, round(SECONDS * RATE))
+    noise = rng.standard_normal(u.size)
+    pack = Pack(u)
+    first = pack.volts(u[:FLOWN], noise[:FLOWN])
+    then = copy(pack)
+    return u, np.concatenate((first, pack.volts(u[FLOWN:], noise[FLOWN:]))), then
+
+
+def middle_of(v):
+    return np.median(np.stack((v[:-2], v[1:-1], v[2:])), axis=0)
+
+
+@cache
+def asked(pilot, horizon=1.0):
+    """Return published and conditional risks at three levels, and what happened; (n, 3) each."""
+    u, v, _ = flight(pilot)
+    ahead = round(horizon * RATE)
+    middle = np.concatenate((v[:2], middle_of(v)))
+    looks = np.arange(LOOK - 1, u.size - ahead, LOOK)
+    lows = np.array([middle[k + 1:k + 1 + ahead].min() for k in looks])
+    late = looks > 20.0 * RATE
+    levels = np.quantile(lows[late], (0.02, 0.1, 0.3)).tolist()
+    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=levels[1], brownout_horizon=horizon,
+                                            brownout_floor=0.0))
+    risks, conditional, bases = [], [], []
+    for k in looks:
+        part = slice(k + 1 - LOOK, k + 1)
+        monitor.push((k + 1 - LOOK + np.arange(LOOK)) * DT, v[part], u[part])
+        bases.append(monitor.report(0.0).risk_basis)
+        peak = u[k + 1:k + 1 + ahead].max()
+        dwell = (u[k + 1:k + 1 + ahead] >= peak - 0.05).sum() * DT
+        risks.append([monitor.risk(level, horizon) for level in levels])
+        conditional.append([monitor.risk_if(peak, dwell, level, horizon) for level in levels])
+    happened = lows[:, None] < np.array(levels)
+    return (np.array(risks)[late], np.array(conditional)[late], happened[late].astype(float),
+            [basis for basis, counts in zip(bases, late) if counts])
+
+
+@pytest.mark.parametrize('pilot', list(PILOTS))
+def test_calibrated(pilot):
+    """
+    As many dips as told, within 2.6 deviations and a factor of 1.5, in each third of the risk.
+
+    Horizons of 1 s that begin each 0.4 s: the variance is 2.5 times the binomial one.
+    """
+    risks, conditional, happened, bases = asked(pilot)
+    assert bases.count('load') > 0.9 * len(bases)
+    for said in (risks, conditional):
+        assert np.isfinite(said).all()
+        for low, high in ((0.0, 0.05), (0.05, 0.3), (0.3, 1.01)):
+            inside = (said >= low) & (said < high)
+            told = said[inside].sum()
+            spread = 2.6 * math.sqrt(2.5 * float((said[inside] * (1.0 - said[inside])).sum()))
+            assert told / 1.5 - spread - 5.0 < happened[inside].sum() < 1.5 * told + spread + 5.0
+
+
+@pytest.mark.parametrize('pilot, least', [('telegraph', 0.6), ('recorded', 0.5)])
+def test_the_condition_tells_more_than_the_flight(pilot, least):
+    """Brier skill against the mean frequency, and far above that of the risk with the pilot."""
+    risks, conditional, happened, _ = asked(pilot)
+    base = np.mean((happened.mean(axis=0) - happened) ** 2)
+    skill, without = (1.0 - np.mean((said - happened) ** 2) / base
+                      for said in (conditional, risks))
+    assert skill > least and skill > without + 0.2
+
+
+def monitor_of(**changes):
+    """Return a monitor that has flown, and the time, s."""
+    monitor = deepcopy(_flown())
+    monitor.configure(MonitorSettings(**{
+        'brownout_voltage': 14.6, 'brownout_horizon': 2.0, 'brownout_floor': 0.0, **changes}))
+    return monitor, FLOWN * DT
+
+
+@cache
+def _flown():
+    u, v, _ = flight('telegraph')
+    monitor = SupplyMonitor(MonitorSettings())
+    for part in np.array_split(np.arange(FLOWN), FLOWN // 100):
+        monitor.push(part * DT, v[part], u[part])
+    return monitor
+
+
+def test_flying_at_the_budget_dips_as_often_as_told():
+    """
+    400 flights from the same pack at a budget of 10 %, held for the horizon.
+
+    0.05 of throttle is 0.1 V, more than two deviations of the noise: less than 10 % dip below the
+    budget, more above it.
+    """
+    u, v, pack = flight('telegraph')
+    rng = np.random.default_rng(3)
+    monitor, _ = monitor_of(brownout_voltage=14.75, brownout_budget_limit=0.1,
+                            brownout_critical=0.2)
+    report = monitor.report(0.0)
+    assert report.risk_basis == 'load' and 0.3 < report.budget < 0.85
+    assert 'The risk passes the limit of 0.1' in report.budget_reason
+    assert monitor.risk_if(report.budget, 2.0) == pytest.approx(0.1, abs=0.01)
+
+    def dips(throttle):
+        ahead = np.full(100, throttle)
+        ahead[:10] = np.linspace(u[FLOWN - 1], throttle, 11)[1:]
+        again = copy(pack)
+        noisy = again.volts(ahead, 0.0) + 0.04 * rng.standard_normal((400, 100))
+        low = np.median(np.stack((noisy[:, :-2], noisy[:, 1:-1], noisy[:, 2:])), axis=0)
+        return float((low.min(axis=1) < 14.75).mean())
+    assert dips(report.budget - 0.05) < 0.1 < dips(report.budget + 0.05)
+
+
+def test_asking_changes_nothing_and_is_quick():
+    monitor, _ = monitor_of()
+    first = monitor.risk(14.8, 1.0), monitor.risk_if(0.8, 0.5, 14.8, 1.0)
+    report = monitor.report(0.0)
+    for voltage, horizon in ((12.0, 0.1), (15.0, 60.0), (14.0, 5.0)):
+        monitor.risk(voltage, horizon)
+        monitor.risk_if(0.3, 1.0, voltage, horizon)
+    assert (monitor.risk(14.8, 1.0), monitor.risk_if(0.8, 0.5, 14.8, 1.0)) == first
+    assert monitor.report(0.0).risk == report.risk == monitor.risk()
+    assert report.risk_curve[0] < report.risk_curve[-1]
+    assert report.fields['risk_basis'] == 'load' and '1.0:' in report.fields['risk_curve']
+
+
+@pytest.mark.parametrize('horizon', [0.1, 0.3, 1.0, 3.0, 10.0, 60.0])
+def test_horizons(horizon):
+    """Known from 0.1 to 60 s, within 0..1, falling with the margin."""
+    monitor, _ = monitor_of()
+    risks = [monitor.risk(voltage, horizon) for voltage in (15.0, 14.0, 13.0, 10.0)]
+    held = [monitor.risk_if(0.7, 0.5, voltage, horizon) for voltage in (15.0, 14.0, 13.0, 10.0)]
+    for found in (risks, held):
+        assert all(0.0 <= risk <= 1.0 for risk in found)
+        assert all(np.diff(found) <= 0.0)
+
+
+def test_a_longer_horizon_is_no_safer():
+    """Within the errors of two laws: a tenth of the risk."""
+    monitor, _ = monitor_of()
+    risks = [monitor.risk(14.6, horizon) for horizon in (0.1, 0.5, 2.0, 10.0)]
+    assert all(b > 0.9 * a for a, b in zip(risks, risks[1:]))
+
+
+def test_a_limit_above_the_present_voltage():
+    monitor, _ = monitor_of()
+    assert monitor.risk(17.0, 1.0) == 1.0 and monitor.risk_if(0.2, 1.0, 17.0, 1.0) == 1.0
+
+
+@pytest.mark.parametrize('arguments, words', [
+    ((math.nan, 1.0), 'voltage must be finite'), ((14.0, 0.0), 'horizon must be a positive'),
+    ((14.0, -1.0), 'horizon must be a positive'), ((14.0, math.inf), 'horizon must be')])
+def test_what_cannot_be_asked(arguments, words):
+    monitor, _ = monitor_of()
+    with pytest.raises(ValueError, match=words):
+        monitor.risk(*arguments)
+    with pytest.raises(ValueError, match='throttle must lie within 0..1'):
+        monitor.risk_if(1.2, 1.0, 14.0, 1.0)
+    with pytest.raises(ValueError, match='dwell'):
+        monitor.risk_if(0.5, -1.0, 14.0, 1.0)
+
+
+def test_throttle_is_lost_and_found():
+    """Without throttle the excursions stand; the risk is never NaN."""
+    monitor, t = monitor_of()
+    _, v, _ = flight('telegraph')
+    bases = []
+    for k in range(60):
+        at = t + np.arange(10) * DT
+        t = at[-1] + DT
+        known = k < 5 or k >= 35
+        monitor.push(at, v[3000 + 10 * k:3010 + 10 * k], flight('telegraph')[0][
+            3000 + 10 * k:3010 + 10 * k] if known else math.nan)
+        report = monitor.report(0.0)
+        assert math.isfinite(report.risk)
+        bases.append(report.risk_basis)
+    assert bases[4] == 'load' and bases[20] == 'excursions'
+    assert math.isnan(monitor.risk_if(0.5, 1.0)) == (bases[-1] == 'excursions')
+
+
+def test_voltage_is_lost_in_a_dip():
+    """The risk of the last voltage stays until it is stale; then nothing is known."""
+    monitor, t = monitor_of(brownout_voltage=15.4)
+    at = t + np.arange(10) * DT
+    monitor.push(at, np.full(10, 15.0), 0.9)
+    assert monitor.report(0.0).risk == 1.0
+    monitor.push(at + 0.2, np.full(10, math.nan), 0.9)
+    assert monitor.report(0.2).risk == 1.0
+    late = monitor.report(5.0)
+    assert math.isnan(late.risk) and late.brownout is not False
+
+
+def test_another_battery():
+    """A pack 1 V higher: the risk is known at once, and small again within seconds."""
+    monitor, t = monitor_of(brownout_voltage=14.6)
+    u, v, _ = flight('telegraph')
+    for k in range(100):
+        at = t + np.arange(10) * DT
+        t = at[-1] + DT
+        monitor.push(at, v[3000 + 10 * k:3010 + 10 * k] + 1.0, u[3000 + 10 * k:3010 + 10 * k])
+        assert math.isfinite(monitor.report(0.0).risk)
+    assert monitor.report(0.0).load.level == pytest.approx(
+        17.2 - 0.004 * 0.35 * 80.0, abs=0.4)
+    assert monitor.risk_if(0.3, 1.0, 14.0, 1.0) < 0.01
+
+
+def test_known_from_the_first_second_and_flag_hardly_unknown():
+    """Even before any throttle has moved: on the excursions."""
+    _, v, _ = flight('telegraph')
+    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=13.0, brownout_floor=0.0))
+    for k in range(200):
+        part = slice(10 * k, 10 * k + 10)
+        monitor.push((10 * k + np.arange(10)) * DT, v[part], 0.5)
+        report = monitor.report(0.0)
+        if k > 6:
+            assert math.isfinite(report.risk) and report.flag.level is not FlagLevel.UNKNOWN
+    assert report.risk_basis == 'excursions'
+    assert math.isnan(report.budget) and 'Throttle has not moved' in report.budget_reason

@@ -1,0 +1,159 @@
+"""The lowest voltage of a future: Monte Carlo, closed forms, and what a flight makes of it."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+from ou_monitor.online.risk import load_law
+from ou_monitor.online.risk.calibration import below, Calibrator, density, FarShare
+from ou_monitor.online.risk.load_law import held, lowest, mean_now, Sampling
+from ou_monitor.online.supply_load import LoadState
+import pytest
+from scipy.stats import t as student
+
+# A pack that sags by 1.5 V of 16 V, without errors: x, u, u^3, three lags, inrush.
+COEFFICIENTS = np.array([16.0, 0.0, 1.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+NOISE = 0.05
+SAMPLING = Sampling(0.02, 0.0)
+
+
+def state(throttle=0.4, **changes):
+    """Return what a filter would know that knows all."""
+    x = throttle ** 1.8
+    return replace(LoadState(
+        0.0, throttle, COEFFICIENTS, np.zeros((9, 9)), (x, x, x), 1.0, 0.0,
+        (2.0 * math.log(NOISE), 0.0, 0.0), (0.0, 1.0)), **changes)
+
+
+@pytest.mark.parametrize('n', [1, 2, 8, 64, 512])
+def test_the_largest_of_running_medians(n):
+    """Mean and deviation within four standard errors of 20 000 draws."""
+    rng = np.random.default_rng(n)
+    count = 20000 if n < 100 else 4000
+    x = rng.standard_normal((count, n + 2))
+    middle = np.median(np.stack((x[:, :-2], x[:, 1:-1], x[:, 2:])), axis=0).max(axis=1)
+    mean = np.interp(math.log(n), load_law._LN_N, load_law._MEAN)
+    deviation = np.interp(math.log(n), load_law._LN_N, load_law._DEVIATION)
+    assert mean == pytest.approx(middle.mean(), abs=4.0 * middle.std() / math.sqrt(count))
+    # The kurtosis is below 4.5, so the error of a deviation below 0.94 / sqrt(n).
+    assert deviation == pytest.approx(middle.std(), rel=4.0 * 0.94 / math.sqrt(count))
+
+
+def test_throttle_that_stays():
+    """16 V less 1.5 x, less what the largest of 48 medians is; the first two are a group."""
+    mean, deviation = lowest(state(), held(0.4, 1.0, 0.4), 1.0, SAMPLING)
+    rng = np.random.default_rng(1)
+    v = 16.0 - 1.5 * 0.4 ** 1.8 + NOISE * rng.standard_normal((20000, 52))
+    low = np.median(np.stack((v[:, :-2], v[:, 1:-1], v[:, 2:])), axis=0).min(axis=1)
+    assert mean[0] == pytest.approx(low.mean(), abs=0.05 * NOISE)
+    assert deviation[0] == pytest.approx(low.std(), rel=0.05)
+    assert mean_now(state()) == pytest.approx(16.0 - 1.5 * 0.4 ** 1.8)
+
+
+def test_a_peak_and_its_lag():
+    """x after a lag of 2 s, the mean of its way to the peak; the noise is far smaller."""
+    coefficients = COEFFICIENTS.copy()
+    coefficients[2], coefficients[6] = 0.0, 1.5
+    quiet = (2.0 * math.log(1e-6), 0.0, 0.0)
+    known = state(mean=coefficients, log_variance=quiet)
+    for dwell in (0.5, 2.0):
+        mean, _ = lowest(known, held(0.9, dwell, 0.4), 4.0, SAMPLING)
+        a, b = 0.4 ** 1.8, 0.9 ** 1.8
+        stay = dwell - 0.04
+        start = b + (a - b) * math.exp(-0.04 / 2.0)
+        way = b + (start - b) * (1.0 - math.exp(-stay / 2.0)) * 2.0 / stay
+        back = start + (b - start) * (1.0 - math.exp(-stay / 2.0))
+        rest = 4.0 - dwell
+        after = a + (back - a) * (1.0 - math.exp(-rest / 2.0)) * 2.0 / rest
+        assert mean[0] == pytest.approx(16.0 - 1.5 * max(way, after), abs=1e-4)
+
+
+def test_inrush_is_that_of_a_ramp():
+    """A tenth of the step, 20 ms of 0.2 s, and only in the first group."""
+    coefficients = COEFFICIENTS.copy()
+    coefficients[2], coefficients[8] = 0.0, 2.0
+    known = state(mean=coefficients, log_variance=(2.0 * math.log(1e-6), 0.0, 0.0))
+    mean, _ = lowest(known, held(0.9, 1.0, 0.4), 2.0, SAMPLING)
+    assert mean[0] == pytest.approx(16.0 - 2.0 * 0.5 * 0.1, abs=1e-4)
+
+
+def test_what_is_not_known_of_the_level_is_in_the_deviation():
+    error = np.zeros((9, 9))
+    error[0, 0] = 0.3 ** 2
+    _, exact = lowest(state(), held(0.4, 1.0, 0.4), 1.0, SAMPLING)
+    _, wide = lowest(state(covariance=error), held(0.4, 1.0, 0.4), 1.0, SAMPLING)
+    assert wide[0] == pytest.approx(math.hypot(0.3, exact[0]))
+
+
+def test_the_level_falls_as_charge_is_drawn():
+    """With the discharge per load and the fall of the level per charge."""
+    coefficients = COEFFICIENTS.copy()
+    coefficients[1], coefficients[2] = 1.0 / 80.0, 0.0
+    known = state(mean=coefficients, fall=8.0, log_variance=(2.0 * math.log(1e-6), 0.0, 0.0))
+    mean, _ = lowest(known, held(0.8, 10.0, 0.4), 10.0, SAMPLING)
+    assert mean[0] == pytest.approx(16.0 - 8.0 / 80.0 * 0.8 ** 1.8 * 10.0, abs=1e-4)
+
+
+def test_student():
+    """Density and distribution of that mean and deviation."""
+    scale = 0.2 * math.sqrt(3.0 / 5.0)
+    law = student(5.0, 15.0, scale)
+    x = np.linspace(13.0, 16.0, 7)
+    wide = np.full(7, 0.2)
+    np.testing.assert_allclose(density(x, np.full(7, 15.0), wide), law.pdf(x), rtol=1e-9)
+    for level in x.tolist():
+        np.testing.assert_allclose(below(level, np.array([15.0]), np.array([0.2])),
+                                   law.cdf(level), rtol=1e-6)
+
+
+def test_least_squares_that_forget():
+    """Bias, gain, spread and errors after 40 horizons are those of the normal equations."""
+    rng = np.random.default_rng(2)
+    calibrator = Calibrator()
+    rows, misses = [], []
+    for k in range(40):
+        start, mean = 15.0, 15.0 - rng.uniform(0.2, 1.0)
+        s = math.hypot(0.1, 0.1 * (start - mean))
+        low = start - 0.3 * s + 0.9 * (mean - start) + s * rng.uniform(-1.0, 1.0)
+        x, y = (mean - start) / s, (low - start) / s
+        bias, gain, variance = calibrator.law.values[:3]
+        misses.append(y - bias - gain * x)
+        assert abs(misses[-1]) < 3.0 * math.sqrt(variance)
+        calibrator.add(low, mean, 0.1, start, 0.5, 2.0)
+        rows.append((x, y))
+    keep = 0.5 * np.exp(-2.0 * np.arange(39, -1, -1) / 120.0)
+    design = np.array([(1.0, x) for x, _ in rows])
+    information = np.diag([4.0, 6.25]) + (design * keep[:, None]).T @ design
+    target = np.array([0.0, 6.25]) + (design * keep[:, None]).T @ np.array([y for _, y in rows])
+    b = np.linalg.solve(information, target)
+    variance = (15.0 + float(keep @ np.square(misses))) / (5.0 + keep.sum())
+    errors = np.linalg.inv(information) * variance
+    np.testing.assert_allclose(
+        calibrator.law.values, [*b, variance, errors[0, 0], errors[0, 1], errors[1, 1]],
+        rtol=1e-9)
+
+
+def test_far_out_counts_no_more_than_six_deviations():
+    calibrator = Calibrator()
+    calibrator.add(5.0, 15.0, 0.1, 15.0, 1.0, 0.0)
+    assert calibrator.law.values[2] == pytest.approx((15.0 + 36.0) / 6.0)
+
+
+def test_rule_of_succession():
+    """Half at first; after n horizons that the law has right 1 / (n + 2), by memory."""
+    share = FarShare()
+    assert share.value == 0.5
+    for _ in range(20):
+        share.add(1.0, 0.0, 1.0, 0.0)
+    assert share.value == pytest.approx(1.0 / 22.0)
+    share.add(0.0, 1.0, 1.0, 120.0 * math.log(2.0))
+    # Half of the twenty is forgotten, and one was wrong.
+    assert share.value == pytest.approx(2.0 / 13.0)
+    assert FarShare(19.0).value == pytest.approx(1.0 / 20.0)
+
+
+def test_densities_decide_which_was_right():
+    """Both together, and the posterior share of the far one."""
+    share = FarShare()
+    assert share.add(3.0, 1.0, 1.0, 0.0) == pytest.approx(2.0)
+    assert share.value == pytest.approx(1.25 / 3.0)
