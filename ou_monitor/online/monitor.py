@@ -28,6 +28,7 @@ from ou_monitor.records import Counters, Estimate, Flag, NAN, Status
 
 if TYPE_CHECKING:
     from ou_monitor.model.supply import SupplyModel
+    from ou_monitor.online.risk.first_passage import Passage
 
 # Cautions that make the numbers doubtful; the others only inform.
 _DOUBTFUL = frozenset({Flag.SLOW_RATE, Flag.QUANTIZED, Flag.LOWPASS_UPSTREAM, Flag.SATURATED,
@@ -76,10 +77,12 @@ class SupplyMonitor:
         self._outlook = Outlook(background=self._background)
         self._outlook.set_model(self._model)
         self._newest = Estimate()
-        self._forecast = Forecast(
-            self._load_filter, lambda horizon: self._outlook.passage(self._newest, horizon))
+        self._forecast = Forecast(self._load_filter, self._passage)
         # Risk and budget of the last report.
         self._ahead = Ahead()
+
+    def _passage(self, horizon: float) -> Passage | None:
+        return self._outlook.passage(self._newest, horizon)
 
     @property
     def settings(self) -> MonitorSettings:
