@@ -51,7 +51,7 @@ def test_throttle_that_stays():
 
 
 def test_a_peak_and_its_lag():
-    """x after a lag of 2 s, the mean of its way to the peak; the noise is far smaller."""
+    """Throttle after a lag of 2 s, the mean of its way to the peak; the noise is far smaller."""
     coefficients = COEFFICIENTS.copy()
     coefficients[2], coefficients[6] = 0.0, 1.5
     quiet = (2.0 * math.log(1e-6), 0.0, 0.0)
