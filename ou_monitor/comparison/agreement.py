@@ -124,8 +124,8 @@ class Agreement:
         Share of the simulations that are as odd among the others.
     verdict : Verdict
         The verdict.
-    worst : str
-        One sentence: what the simulation gets wrong most.
+    words : str
+        What the simulation gets wrong most, as a part of a sentence.
     notes : tuple of str
         What was left out or assumed.
     traces : Traces
@@ -152,9 +152,15 @@ class Agreement:
     seeds: int
     p_value: float
     verdict: Verdict
-    worst: str
+    words: str
     notes: tuple[str, ...]
     traces: Traces
+
+    @property
+    def worst(self) -> str:
+        """Return the sentence that says what the simulation gets wrong most."""
+        begin = 'Most wrong' if self.verdict is Verdict.DIFFERS else 'Farthest, but within chance'
+        return f'{begin}: in the simulation, {self.words}.'
 
     def as_data(self) -> dict[str, Any]:
         """Return what `--json` writes."""

@@ -238,15 +238,10 @@ def _agreement(recording: Recording, samples: Readings, own: Readings, yardstick
             float(real.power[k]), np.array([m.power[k] for m in measured])))
             for k, (a, b) in enumerate(zip(yardstick.bands, yardstick.bands[1:]))),
         dips[0] if dips else None, dips[1] if dips else None, int(yardstick.rises.size),
-        distance(real, pooled), seeds, p, verdict, _sentence(worst.words(worst.band), verdict),
+        distance(real, pooled), seeds, p, verdict, worst.words(worst.band),
         tuple(notes),
         Traces(own.t + offset, own.voltage,
                np.full(own.t.size, np.nan) if own.throttle is None else own.throttle, first,
                own.t[::stride] + offset, low, high, yardstick.after if answers.size else empty,
                real.answer, answer_low, answer_high, yardstick.edges,
                real.distribution, pooled))
-
-
-def _sentence(words: str, verdict: Verdict) -> str:
-    begin = 'Most wrong' if verdict is Verdict.DIFFERS else 'Farthest, though within chance'
-    return f'{begin}: in the simulation, {words}.'

@@ -11,11 +11,15 @@ _NOTHING_FITTED = (0.0, 0.0)
 
 def headline(found: Agreement) -> str:
     """Return the sentence that a pilot reads first."""
-    what = (f'{found.verdict.value}: lowest {number(found.lowest.median, 4)} V simulated '
-            f'({number(found.lowest.low, 4)} to {number(found.lowest.high, 4)} in '
-            f'{found.seeds} simulations), {number(found.lowest.measured, 4)} V measured; its mean '
-            f'path explains {share(found.explained)} of the variance.')
-    return what if found.verdict is Verdict.LOOKS_LIKE_IT else f'{what} {found.worst}'
+    low = found.lowest
+    lowest = (f'lowest voltage is {number(low.median, 4)} V ({number(low.low, 4)} to '
+              f'{number(low.high, 4)}), measured {number(low.measured, 4)} V')
+    if found.verdict is Verdict.LOOKS_LIKE_IT:
+        return (f'{found.verdict.value}: its {lowest}, and its mean path explains '
+                f'{share(found.explained)} of the variance.')
+    if 'lowest' in found.words:
+        return f'{found.verdict.value}: {found.words}.'
+    return f'{found.verdict.value}: {found.words}; the {lowest}.'
 
 
 def share(value: float) -> str:
@@ -44,8 +48,8 @@ def rows(found: Agreement) -> list[tuple[str, str, str, str]]:
     out += [row(f'falls through {number(level, 4)} V, 1/min', falls, 3)
             for level, falls in zip(found.levels, found.falls)]
     if found.dip is not None and found.recovery is not None:
-        out += [row(f'dip after {found.rises} rises of throttle, mV', found.dip, 3, -1e3),
-                row('the same 1 s after the rise, mV', found.recovery, 3, -1e3)]
+        out += [row(f'dip after {found.rises} rises, mV', found.dip, 3, -1e3),
+                row('1 s after a rise, mV', found.recovery, 3, -1e3)]
     out += [row(f'rms {number(one.low_hz, 2)} to {number(one.high_hz, 2)} Hz, mV',
                 Band(*(max(x, 0.0) ** 0.5 for x in (
                     one.power.measured, one.power.low, one.power.median, one.power.high))), 3,

@@ -18,15 +18,22 @@ def comparison_page(found: Agreement, command: str = '') -> str:
     sections = [
         page.headline(headline(found)), page.figure(_voltage(found), _VOLTAGE),
         page.section('Side by side', page.table(
-            ['', 'Measured', 'Simulated [95 %]', ''],
-            [[name, typeset(measured), typeset(simulated), remark]
-             for name, measured, simulated, remark in rows(found)], left=[0, 3])),
+            ['', 'Measured', 'Simulated\n[95 %]'], [_row(*row) for row in rows(found)], left=[0])),
         page.section('Mean path and distribution', page.facts(
             [(name, typeset(value)) for name, value in path_rows(found)])),
-        page.section('Throttle, answer to its rises, distribution', *_others(found), folded=True),
+        page.section('Throttle, answer to its rises, distribution, spectrum', *_others(found),
+                     folded=True),
         page.section('Where it comes from', *_origin(found, command), folded=True)]
     return page.page(f'Beside its simulation: {found.recording or "recording"}', parts(found),
                      sections)
+
+
+def _row(name: str, measured: str, simulated: str, remark: str) -> list[str]:
+    """Return cells that are narrow enough for a phone: units and bands below."""
+    what, _, unit = name.rpartition(', ')
+    value, _, band = simulated.partition(' ')
+    return [f'{what}\n{unit}', typeset(measured),
+            f'{typeset(value)}\n{typeset(band)}' + (f', {remark}' if remark else '')]
 
 
 _VOLTAGE = ('Line: measured. Band: 95 % of the simulations at each moment. Pale line: one of '
@@ -61,7 +68,18 @@ def _others(found: Agreement) -> list[str]:
                 legend_row=True)
     plot.line(at.edges, at.simulated_distribution, 'simulated', _SIMULATED, 'thick')
     beside.append(page.figure(plot.line(at.edges, at.distribution, 'measured', 0, 'thick')))
-    return [*drawn, page.pair(*beside)]
+    return [*drawn, page.pair(*beside), page.figure(_spectrum(found))]
+
+
+def _spectrum(found: Agreement) -> Plot:
+    middle = np.array([np.sqrt(one.low_hz * one.high_hz) for one in found.spectrum])
+    power = [one.power for one in found.spectrum]
+    plot = Plot('Power by band of frequency', 'frequency, Hz', 'power, V\u00b2', height=220,
+                log_x=True, log_y=True, legend_row=True)
+    plot.bars(middle, np.array([one.low for one in power]), np.array([one.high for one in power]),
+              'simulated, 95 %', _SIMULATED)
+    plot.markers(middle, np.array([one.measured for one in power]), 'measured', 0)
+    return plot.limits((found.spectrum[0].low_hz, found.spectrum[-1].high_hz))
 
 
 def _origin(found: Agreement, command: str) -> list[str]:
