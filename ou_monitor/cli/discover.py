@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from datetime import datetime, timezone
 import math
 import shlex
@@ -15,6 +16,7 @@ from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
     from ou_monitor.discovery.finding import Finding
+    from ou_monitor.records import Recording
 
 # Statistics and notes shown at most; all of them are in the report.
 _SHOWN = 8
@@ -50,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         if finding.refused and not args.force:
             raise InputError(f'no model saved: {finding.refused[0].lower()}{finding.refused[1:]}; '
                              '--force saves it all the same')
-        output.write_text(model_text(finding), args.save_model)
+        output.write_text(model_text(finding, recording), args.save_model)
         if args.json != output.STDOUT:
             output.say(f'\nModel: {args.save_model}')
     return 0
@@ -61,8 +63,9 @@ def command_line(args: argparse.Namespace) -> str:
     return shlex.join(['ou-monitor', 'discover', args.recording, *repeated(args, 'seed')])
 
 
-def model_text(finding: Finding) -> str:
-    """Return the extended model as the text of a model file."""
+def model_text(finding: Finding, recording: Recording | None = None) -> str:
+    """Return the extended model, and what is known at take-off, as the text of a model file."""
+    from ou_monitor.online.load_filter import LoadFilter
     from ou_monitor.recordings.model_file import as_yaml, ModelFile
 
     if finding.model is None:
@@ -77,7 +80,11 @@ def model_text(finding: Finding) -> str:
         'ou_monitor': __version__, 'verdict': finding.verdict.value,
         'heldout_score': known(finding.score), 'gain': known(finding.gain),
         'gain_se': known(finding.gain_se), 'seed': finding.seed}
-    return as_yaml(ModelFile(finding.model, tuple(dict(se) for se in finding.se), provenance))
+    loads = LoadFilter()
+    if recording is not None:
+        loads.push(recording.t, recording.voltage, recording.throttle, recording.current)
+    model = replace(finding.model, load=loads.learned())
+    return as_yaml(ModelFile(model, tuple(dict(se) for se in finding.se), provenance))
 
 
 def render(finding: Finding) -> str:

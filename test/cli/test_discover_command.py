@@ -15,7 +15,9 @@ from ou_monitor.model.terms.drift import Drift
 from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.tone import Tone
+from ou_monitor.online.load_filter import LoadFilter
 from ou_monitor.recordings.model_file import read_model
+from ou_monitor.recordings.read import read_recording
 from ou_monitor.report.discovery_page import discovery_page
 from project import ROOT
 import pytest
@@ -99,6 +101,10 @@ def test_summary_model_and_page(flight, tmp_path, capsys):
     found = strict(data.read_text())
     assert [term.NAME for term in file.model.terms] == list(found['extended']['params'])
     assert file.se[0]['alpha'] == pytest.approx(found['extended']['se']['ou']['alpha'])
+    # What the load filter learned from the same recording goes with it.
+    recording, loads = read_recording(flight), LoadFilter()
+    loads.push(recording.t, recording.voltage, recording.throttle)
+    assert file.model.load is not None and file.model.load == loads.learned()
     assert file.provenance['recording'] == 'my flight.csv' and file.provenance['seed'] == 5
     assert file.provenance['heldout_score'] == found['extended']['heldout_score']
     text = page.read_text()
