@@ -187,13 +187,15 @@ def skill(cases: list[Case], method: str) -> float:
 
 
 def small(cases: list[Case], method: str) -> str:
-    """Return what was observed and predicted below 0.01."""
+    """Return what was observed and predicted below 0.01, their ratio, and events in all."""
     p, _, y = pooled(cases, method)
     below = p < 0.01
     if not below.any():
         return '-'
     observed, predicted = y[below].mean(), p[below].mean()
-    return f'{observed:.4f} / {predicted:.4f} ({observed / predicted:.1f})'
+    events = y[below].sum() * LOOK / cases[0].horizon
+    return (f'{observed:.4f} / {predicted:.4f} ({observed / predicted:.1f}; {events:.1f} of '
+            f'{below.sum() * LOOK / cases[0].horizon:.0f})')
 
 
 def reliability(cases: list[Case], method: str) -> str:
