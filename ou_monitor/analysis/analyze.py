@@ -111,7 +111,8 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
                          [level.throttle for level in judged if level.wanders])
                      + coupling_items([level.throttle for level in judged if level.coupled])),
         brownout_voltage is None, recording.notes + _left_out(recording, found),
-        overview(recording, voltage, judged))
+        overview(recording, voltage, judged,
+                 None if sliding.last is None else sliding.last.load))
 
 
 def _default_voltage(recording: Recording) -> float:

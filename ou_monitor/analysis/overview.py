@@ -100,9 +100,13 @@ class Overview:
         return float(self.load.noise(low)), float(self.load.noise(high))
 
 
-def overview(recording: Recording, limit: float = NAN,
-             levels: Sequence[LevelResult] = ()) -> Overview:
-    """Return what is always known of a recording (limit in V; levels: where lines were found)."""
+def overview(recording: Recording, limit: float = NAN, levels: Sequence[LevelResult] = (),
+             load: SupplyLoad | None = None) -> Overview:
+    """
+    Return what is always known of a recording.
+
+    limit in V; levels: where lines were found; load: that of the end, found when left out.
+    """
     t, v, u = recording.t, recording.voltage, recording.throttle
     if not recording.n:
         return Overview(NAN, NAN, NAN, limit, 0, 0.0, 0.0, SupplyLoad(), (NAN, NAN), NAN)
@@ -114,7 +118,7 @@ def overview(recording: Recording, limit: float = NAN,
         flown = float(np.quantile(known, 0.01)), float(np.quantile(known, 0.99))
     return Overview(
         float(v[k]), float(t[k] - t[0]), float(u[k]), limit, dips, below, recording.duration,
-        _load(recording), flown, float(known.max()) if known.size else NAN, _strongest(levels))
+        load or _load(recording), flown, float(known.max()) if known.size else NAN, _strongest(levels))
 
 
 def count_dips(t: FloatArray, voltage: FloatArray, limit: float) -> tuple[int, float]:

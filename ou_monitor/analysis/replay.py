@@ -1,11 +1,9 @@
 """
 What the node would have published during a recording, and what it had learned by its end.
 
-The curves over throttle (level, sag, noise intensity, brown-out risk) are those of the node
-(`ou_monitor.online.risk.outlook`), learned from the recording as in flight, so that both say the
-same of the same data, also where throttle never stands still.  Limits: those of the node's
-curves; the risk is that of the supply as it was at the end of the recording, settled at each
-throttle.  What has not been flown is NaN.
+The recording goes through `SupplyMonitor`, as in flight, so that both say the same of the same
+data, also where throttle never stands still.  Limits: those of the monitor; the risk is that of
+the supply as it was at the end of the recording.  What has not been flown is NaN.
 """
 
 from __future__ import annotations
@@ -16,7 +14,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.online.estimator.estimator import SlidingEstimator
+from ou_monitor.online.monitor import SupplyMonitor
+from ou_monitor.online.monitor_report import MonitorReport, RISK_CURVE
 from ou_monitor.online.risk.outlook import Outlook
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
@@ -49,6 +48,10 @@ class Sliding:
         What the node has learned by the end: curves over throttle, risk and budget.
     settings : MonitorSettings
         Of the node; its voltage is the default where none was asked for.
+    last : MonitorReport or None
+        What the node knows at the end; None of a recording too short for a window.
+    highest : float
+        Highest throttle of the recording, 0..1; NaN without throttle.
 
     """
 
@@ -60,6 +63,8 @@ class Sliding:
     brownout_horizon: float
     outlook: Outlook
     settings: MonitorSettings
+    last: MonitorReport | None
+    highest: float
 
     def series(self, name: str) -> FloatArray:
         """Return one field of the estimates as an array."""
@@ -70,11 +75,6 @@ class Sliding:
         value = self.series(name)
         factor = np.exp(Z95 * np.minimum(self.series(name + '_se'), 5.0))
         return value / factor, value * factor
-
-    @property
-    def last_usable(self) -> Estimate | None:
-        """Return the newest estimate that may be acted on; None when there is none."""
-        return next((e for e in reversed(self.estimates) if e.usable), None)
 
 
 def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
@@ -89,45 +89,42 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
         raise ValueError(f'the horizon must be a positive number of seconds, got '
                          f'{brownout_horizon}')
     asked = math.isfinite(brownout_voltage)
-    settings = MonitorSettings(brownout_horizon=brownout_horizon)
+    settings = MonitorSettings(window=window, brownout_horizon=brownout_horizon)
     if asked:
         settings = replace(settings, brownout_voltage=brownout_voltage)
-    estimator, outlook = SlidingEstimator(window=window), Outlook(background=False)
+    monitor = SupplyMonitor(settings, background=False)
     t, voltage, throttle = recording.t, recording.voltage, recording.throttle
     known = recording.has_throttle
-    stamps, estimates, risk = [], [], []
+    reports: list[MonitorReport] = []
+    last = None
     step = max(0.25 * window, recording.duration / MAX_POINTS)
-    # In between, estimates are for the curves alone, which follow the newest.
+    # In between, reports are for what the monitor learns from its own estimates.
     parts = max(1, min(math.ceil(step / _STEP), _MOST // MAX_POINTS))
     first = float(t[0]) if t.size else 0.0
     count = int(recording.duration / step) * parts
     done = 0
-    newest = Estimate()
     for k in range(1, count + 1):
         stop = int(np.searchsorted(t, first + k * step / parts, side='right'))
         if stop == done:
             continue
-        stick = throttle[done:stop] if known else None
-        estimator.push(t[done:stop], voltage[done:stop], stick)
-        # As in `SupplyMonitor`: samples are learned from with the estimate before them.
-        outlook.push(t[done:stop], voltage[done:stop], stick, newest)
+        monitor.push(t[done:stop], voltage[done:stop], throttle[done:stop] if known else None)
         done = stop
+        last = monitor.report(0.0)
         # Until the first window is full its estimates would only look poor.
         filling = t[stop - 1] - first < min(window, 0.5 * recording.duration)
-        newest = estimator.estimate()
         if filling or k % parts:
             continue
-        stamps.append(float(t[stop - 1]))
-        estimates.append(newest)
-        risk.append(outlook.risk(
-            newest, settings.brownout_voltage, settings.brownout_horizon,
-            settings.brownout_watch) if asked else NAN)
+        reports.append(last)
         if progress is not None:
             progress(k / count)
-    if done < t.size and estimates:
-        outlook.push(t[done:], voltage[done:], throttle[done:] if known else None, newest)
-    return Sliding(window, np.array(stamps), tuple(estimates), np.array(risk),
-                   brownout_voltage, brownout_horizon, outlook, settings)
+    if done < t.size and reports:
+        monitor.push(t[done:], voltage[done:], throttle[done:] if known else None)
+        last = monitor.report(0.0)
+    return Sliding(window, np.array([report.estimate.t for report in reports]),
+                   tuple(report.estimate for report in reports),
+                   np.array([report.risk if asked else NAN for report in reports]),
+                   brownout_voltage, brownout_horizon, monitor.outlook, settings, last,
+                   float(np.nanmax(throttle)) if known else NAN)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +156,7 @@ class ByThrottle:
     voltage, horizon : float
         What the risk is of, V and s.
     time : float
-        Stamp of the estimate that the risk rests on, s; NaN when none could be used.
+        Stamp at which the risk is told, s; NaN of a recording too short for a window.
 
     """
 
@@ -193,27 +190,31 @@ def by_throttle(sliding: Sliding, has_throttle: bool) -> ByThrottle:
     outlook = sliding.outlook
     grid = np.linspace(0.0, 1.0, _POINTS)
     asked = math.isfinite(sliding.brownout_voltage)
-    estimate = sliding.last_usable
     curves = outlook.curves
     unknown = np.full(_POINTS, NAN)
     # Without throttle all samples count as of throttle 0: that is no curve.
     known = curves.seen_curve(grid) & has_throttle
     level, level_se = (np.where(known, c, NAN) for c in curves.level_curve(grid))
     ln_sigma, ln_sigma_se = (np.where(known, c, NAN) for c in curves.sigma_curve(grid))
-    # Without a usable one, the last says why there is no budget.
-    given = estimate or (sliding.estimates[-1] if sliding.estimates else Estimate())
-    budget = outlook.budget(given, sliding.settings)
+    last = sliding.last
     risk = unknown
-    if asked and budget.throttles.size:
-        risk = np.where(known, np.interp(grid, budget.throttles, budget.risks), NAN)
+    if asked and last is not None and last.risk_curve:
+        risk = np.interp(grid, RISK_CURVE, last.risk_curve)
+        risk = np.where(grid <= sliding.highest, risk, NAN)
     first = int(known.argmax())
     sag = level[first] - level
     reach = np.where(np.arange(_POINTS) == first, 0.0, Z95 * np.hypot(level_se, level_se[first]))
     return ByThrottle(
         grid, known, level, level_se, sag, sag - reach, sag + reach, np.exp(ln_sigma),
         np.exp(ln_sigma - Z95 * ln_sigma_se), np.exp(ln_sigma + Z95 * ln_sigma_se), risk,
-        budget.throttle if asked else NAN,
-        # What the risk is of stands beside it.
-        budget.reason.split(' Brown-out:')[0] if asked else 'No voltage was asked for.',
-        budget.limit, sliding.brownout_voltage, sliding.brownout_horizon,
-        estimate.t if estimate is not None else NAN)
+        last.budget if asked and last is not None else NAN,
+        _reason(last) if asked else 'No voltage was asked for.',
+        sliding.settings.budget_limit, sliding.brownout_voltage, sliding.brownout_horizon,
+        last.estimate.t if last is not None else NAN)
+
+
+def _reason(last: MonitorReport | None) -> str:
+    """Return what ends the budget; what the risk is of stands beside it."""
+    if last is None:
+        return 'The recording is shorter than half a window.'
+    return last.budget_reason.split(' Brown-out:')[0]

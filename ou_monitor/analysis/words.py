@@ -11,6 +11,7 @@ from ou_monitor.analysis.level_comparison import sigma_change
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.overview import headline as answer, known_lines
 from ou_monitor.analysis.quality import QualityItem, Severity
+from ou_monitor.analysis.replay import ByThrottle
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, NAN, Status
 from ou_monitor.text import number
@@ -30,7 +31,21 @@ def headline(analysis: Analysis) -> str:
     beware = ''.join(f' {words}' for name, words in _BEWARE.items()
                      if any(item.name == name for item in analysis.quality))
     numbers = f' {_numbers(good)}' if good else ''
-    return answer(analysis.overview) + numbers + beware
+    budget = analysis.by_throttle.budget
+    safe = f' Safe up to {100.0 * budget:.0f} % throttle.' if math.isfinite(budget) else ''
+    return answer(analysis.overview) + safe + numbers + beware
+
+
+def _budget_words(curves: ByThrottle) -> str:
+    """Return the budget, and what a throttle beyond it would risk."""
+    words = (f'{100.0 * curves.budget:.0f} % throttle, held for {curves.horizon:g} s: the risk of '
+             f'falling below {curves.voltage:g} V stays under {100.0 * curves.limit:g} %')
+    beyond = [(u, p) for u, p in zip(curves.throttle, curves.risk)
+              if u > curves.budget and p >= max(0.05, 2.0 * curves.limit)]
+    if beyond:
+        u, p = beyond[0]
+        words += f'; at {100.0 * u:.0f} % it is {100.0 * p:.2g} %'
+    return words
 
 
 def _fitted(analysis: Analysis) -> list[LevelResult]:
@@ -42,6 +57,9 @@ def _fitted(analysis: Analysis) -> list[LevelResult]:
 def facts(analysis: Analysis) -> list[tuple[str, str]]:
     """Return what is always known, and why sigma and tau are not, as names and words."""
     found = known_lines(analysis.overview)
+    curves = analysis.by_throttle
+    if math.isfinite(curves.budget):
+        found.insert(-1, ('Safe up to', _budget_words(curves)))
     time: dict[Status, float] = {}
     for level in analysis.levels:
         time[level.estimate.status] = time.get(level.estimate.status, 0.0) + level.time
