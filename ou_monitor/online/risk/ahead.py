@@ -62,7 +62,8 @@ def look_ahead(outlook: Outlook, forecast: Forecast, e: Estimate, load: SupplyLo
             elif not e.usable and load.status is not LoadStatus.NO_DATA:
                 return Ahead(outcome, NAN, load.status.value)
         elif budget.risks.size:
-            risks = budget.risks
+            # Elsewhere it is the prior's.
+            risks = np.where(budget.known, budget.risks, NAN)
     return Ahead(outcome, budget.throttle, budget.reason, _tenths(risks))
 
 
