@@ -164,7 +164,7 @@ def main() -> int:
     text = table(['recording', 'axes', *(f'{kind}: seen' for kind in KINDS),
                   'gain 5 deg/s per V: seen'], rows)
     if options.page:
-        put(options.page, text, 'alarms')
+        put(options.page, text, 'coupling')
     else:
         print(text)
     return 0

@@ -3,7 +3,7 @@
 Write the example and the picture of README.md: `scripts/make_readme.py`.
 
 The example is what the command of README.md really prints about a recorded flight, shortened to
-the paragraphs in `_CHOSEN`; the picture is its report in a headless Chromium or Chrome, reduced to
+its first paragraphs; the picture is its report in a headless Chromium or Chrome, reduced to
 `_SHOWN`.  test/test_readme.py runs the same command and compares.  Without a browser the picture
 stays as it is.
 """
@@ -24,8 +24,8 @@ from browser import Browser, find_browser  # noqa: E402
 README = ROOT / 'README.md'
 PICTURE = ROOT / 'doc' / 'report.png'
 _MARKS = ('<!-- example begins -->\n', '<!-- example ends -->')
-# The first paragraphs, and the tables with these columns.
-_FIRST, _CHOSEN = 3, ('noise mV',)
+# Paragraphs of the output that are shown.
+_FIRST = 3
 # Of the report: voltage and throttle with its load levels, and what lies over throttle.
 _SHOWN = """
     const figures = [...document.querySelectorAll('figure')];
@@ -58,15 +58,8 @@ def run(words: list[str], report: Path) -> str:
 
 
 def shortened(printed: str) -> str:
-    """Return the chosen paragraphs, with an ellipsis where others were."""
-    paragraphs = printed.strip().split('\n\n')
-    kept = [text if k < _FIRST or any(column in text.split('\n')[0] for column in _CHOSEN)
-            else None for k, text in enumerate(paragraphs)]
-    out: list[str] = []
-    for text in kept:
-        if text is not None or not out or out[-1] != '[...]':
-            out.append('[...]' if text is None else text)
-    return '\n\n'.join(out)
+    """Return the first paragraphs, and an ellipsis for the others."""
+    return '\n\n'.join([*printed.strip().split('\n\n')[:_FIRST], '[...]'])
 
 
 def photograph(page: Path) -> bool:

@@ -32,12 +32,16 @@ def headline(analysis: Analysis) -> str:
                      if any(item.name == name for item in analysis.quality))
     numbers = f' {_numbers(good)}' if good else ''
     budget = analysis.by_throttle.budget
-    safe = f' Safe up to {100.0 * budget:.0f} % throttle.' if math.isfinite(budget) else ''
+    safe = '' if math.isnan(budget) else (
+        f' Safe up to {100.0 * budget:.0f} % throttle.' if budget > 0.0 else
+        ' No throttle is safe.')
     return answer(analysis.overview) + safe + numbers + beware
 
 
 def _budget_words(curves: ByThrottle) -> str:
     """Return the budget, and what a throttle beyond it would risk."""
+    if not curves.budget:
+        return f'no throttle, held for {curves.horizon:g} s. {curves.budget_reason}'
     words = (f'{100.0 * curves.budget:.0f} % throttle, held for {curves.horizon:g} s: the risk of '
              f'falling below {curves.voltage:g} V stays under {100.0 * curves.limit:g} %')
     beyond = [(u, p) for u, p in zip(curves.throttle, curves.risk)
