@@ -118,7 +118,8 @@ def overview(recording: Recording, limit: float = NAN, levels: Sequence[LevelRes
         flown = float(np.quantile(known, 0.01)), float(np.quantile(known, 0.99))
     return Overview(
         float(v[k]), float(t[k] - t[0]), float(u[k]), limit, dips, below, recording.duration,
-        load or _load(recording), flown, float(known.max()) if known.size else NAN, _strongest(levels))
+        load or _load(recording), flown, float(known.max()) if known.size else NAN,
+        _strongest(levels))
 
 
 def count_dips(t: FloatArray, voltage: FloatArray, limit: float) -> tuple[int, float]:
