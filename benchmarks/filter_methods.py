@@ -166,7 +166,8 @@ def laws(case: Case) -> dict[str, list[dict[str, Any]]]:
                'signal_poles': 2 if case.kind == 'smooth' else 1}
     constant |= {'coupling': case.coupling}
     return {
-        'kalman': [{**wiener, 'law': 'kalman', 'signal_bandwidth': case.bandwidth}],
+        'kalman': [{**wiener, 'law': 'kalman', 'signal_check': False,
+                    'signal_bandwidth': case.bandwidth}],
         'wiener': [{**wiener, 'signal_bandwidth': share * case.bandwidth}
                    for share in (1.0, 0.5, 0.25, 0.1, 0.03)],
         'constant_noise': [{**constant, 'noise_wanted': share * BODY}

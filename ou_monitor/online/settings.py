@@ -131,6 +131,9 @@ FILTER_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('signal_poles', 1,
               'Poles of the true signal for wiener and kalman: 1 (its spectrum falls with f^2 '
               'above its bandwidth), or 2 (Butterworth, f^4).', 1, 2),
+    Parameter('signal_check', True,
+              'Whether kalman of a signal gives way to the fixed cutoff of least error by the '
+              'signal itself, where that is clearly better.'),
     Parameter('expo', 5.0, 'Curvature of the throttle law, 0..10.', 0.0, 10.0),
     Parameter('smoothing', 0.2,
               'Time constant of the cutoff (in its logarithm), s, at a relative error of sigma '
@@ -264,6 +267,7 @@ class FilterSettings:
     signal_bandwidth: float = 0.0
     signal_rms: float = 0.0
     signal_poles: int = 1
+    signal_check: bool = True
     expo: float = 5.0
     smoothing: float = 0.2
     smoothing_error: float = 0.1

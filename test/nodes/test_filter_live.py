@@ -325,7 +325,7 @@ def test_parameter_change_does_not_move_the_output(rig):
 def test_the_law_kalman_goes_where_the_offline_filter_goes(rig):
     """Switched on in flight: the output goes on, then takes the gain of the model at rest."""
     model = {'n0': 1e-6, 'signal_bandwidth': 5.0, 'signal_rms': 1.0, 'signal_poles': 2,
-             'coupling': 20.0}
+             'coupling': 20.0, 'signal_check': False}
     for name, value in {**model, 'law': 'kalman'}.items():
         result = rig.probe.set_parameter(NODE, name, value)
         assert result.successful, result.reason

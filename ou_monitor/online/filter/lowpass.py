@@ -24,12 +24,12 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.filter.array_filter import changes, sound_piece, within_rate, WORTH
+from ou_monitor.online.filter.checked_kalman import CheckedKalman
 from ou_monitor.online.filter.cutoff_control import Bound, CutoffControl, OF_RATE, SampleInterval
 from ou_monitor.online.filter.cutoff_laws import wanted_cutoff
 from ou_monitor.online.filter.filter_state import LowPassState
 from ou_monitor.online.filter.lag import cutoff_for_lag, delay, most_lag, phase_lag
 from ou_monitor.online.filter.sequence import filter_sequence
-from ou_monitor.online.filter.signal_kalman import SignalKalman
 from ou_monitor.online.filter.white_noise import noise_left
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray
@@ -95,11 +95,11 @@ class AdaptiveLowPass:
         self._control = CutoffControl(self._settings)
         self._state = LowPassState()
         # Of the law kalman; None until its first known sigma.
-        self._kalman: SignalKalman | None = None
+        self._kalman: CheckedKalman | None = None
         self._known = False
         self._sigma = NAN
         # As it was before a parameter changed, until the next sample.
-        self._before: SignalKalman | None = None
+        self._before: CheckedKalman | None = None
         self._interval = SampleInterval()
         self.counters = FilterCounters()
         self._t: float | None = None
@@ -370,7 +370,7 @@ class AdaptiveLowPass:
         self._known = math.isfinite(sigma) and sigma >= 0.0
         if self._known:
             self._sigma = sigma
-            self._kalman = SignalKalman(
+            self._kalman = CheckedKalman(
                 self._settings, x, level if abs(level) < _LARGEST else NAN)
 
     def _run_kalman(self, dt: float, interval: float, x: float, sigma: float, error: float,

@@ -203,6 +203,28 @@ class SignalKalman:
         gain = seen / total if total > 0.0 else np.zeros_like(seen)
         return gain, p - np.outer(gain, seen)
 
+    @property
+    def sigma(self) -> float:
+        """Return the sigma that it goes by, V/sqrt(s)."""
+        return math.exp(self._log_sigma)
+
+    def transfer(self, interval: float, ratio: float) -> tuple[float, float]:
+        """
+        Return sum_k h_k ratio^k and h_1 of the weights h of past samples, and h_0 at ratio 0.
+
+        interval in s.
+        """
+        phi = self._model(round(math.log(interval) / _SAME), interval).phi
+        gain = np.array(self._gain)
+        one = np.eye(gain.size)
+        loop = (one - np.outer(gain, self._look)) @ phi
+        try:
+            state = np.linalg.solve(one - loop * ratio, gain)
+        except np.linalg.LinAlgError:
+            return math.nan, math.nan
+        share = 1.0 - self.mixed
+        return share * float(state[self._slot]), share * float((loop @ gain)[self._slot])
+
     def _tell(self, phi: FloatArray, gain: FloatArray, interval: float) -> None:
         """Tell the lag of the filter as it stands, and what share of the input bounds it."""
         s = self._settings

@@ -80,7 +80,8 @@ CHANGES = [
     {'law': 'kalman', 'n0': 1e-6, 'signal_bandwidth': 3.0, 'signal_rms': 1.0, 'signal_poles': 2},
     {'fmin': 3.0}, {'fmax': 400.0}, {'max_lag': 30.0}, {'lag_frequency': 3.0},
     {'sigma_ref': 0.01}, {'coupling': 0.4}, {'coupling': 0.4, 'noise_wanted': 0.1},
-    {'n0': 1e-3}, {'alpha': 5.0}, {'signal_bandwidth': 5.0}, {'signal_rms': 2.0}, {'expo': 1.0},
+    {'n0': 1e-3}, {'alpha': 5.0}, {'signal_bandwidth': 5.0}, {'signal_rms': 2.0},
+    {'signal_check': False}, {'expo': 1.0},
     {'smoothing': 0.0}, {'smoothing_error': 1.0}, {'smoothing_range': 2.0}, {'slew': 0.0},
     {'dead_band': 0.0}, {'fallback': 30.0}, {'shadow': True}, {'stale_after': 5.0}]
 
