@@ -28,8 +28,8 @@ _ROUNDS = 3
 # as found again: the mean of their logarithms.
 _POWERS = 1e-3, 1e3
 _ALIKE = 0.03
-# Processor time of the fit of a dear law, s a sample: measured.
-_LAW_COST = 5e-5
+# Processor time of the fit of a dear law, s a sample: of the fastest of them.
+_LAW_COST = 1e-5
 
 
 @dataclass(frozen=True, eq=False)

@@ -110,11 +110,21 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         # The causes withdrawn may have hidden measured ones.  A trend that another slow cause
         # replaced is not tried again.
         slow = [kind.NAME for kind in _kinds(search.removed) if kind.FAMILY == 'slow']
-        search = begun.copy()
-        name_causes(fitter, search, bank, latent=False, given=[*given, *slow])
+        # Nor are they the last that could explain it: what did less well may be right.
+        again = begun.copy()
+        if not loaded and fitter.cost <= decision.MOST_COST:
+            name_causes(fitter, again, bank, given=[*given, *slow, *dropped])
+        kinds = _kinds(again.accepted)
+        other = fitter.whole(again.composite)
+        left = criticise(samples, other, bank)
+        if any(map(decision.is_latent, kinds)) and not decision.withdrawn(before, left, kinds):
+            search, whole, after = again, other, left
+        else:
+            search = begun.copy()
+            name_causes(fitter, search, bank, latent=False, given=[*given, *slow])
+            whole, after = _kept_beside(fitter, search, stays, measured if loaded else before,
+                                        bank, loaded)
         dropped = tuple(name for name in dropped if name not in search.accepted)
-        whole, after = _kept_beside(fitter, search, stays, measured if loaded else before, bank,
-                                    loaded)
     return Named(whole, bank, tuple(search.accepted), search.rivals, dropped, before, after,
                  failure)
 
