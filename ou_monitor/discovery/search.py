@@ -69,7 +69,6 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         bank = simulate_bank_of(samples, start, rng)
     else:
         bank = simulate_bank(covariates_of(samples, start), phi, rng)
-    progress(0.1)
     before = criticise(samples, start, bank)
     fitter = Fitter(samples, start.cost)
     # Beside lines that were taken out there may be slower ones.

@@ -248,3 +248,21 @@ def test_bins_hold_as_many_codes_each(code, count):
     # Without the step they do not.
     comb = np.histogram(codes, _bins(codes))[0]
     assert np.ptp(comb[np.flatnonzero(comb)[0]:np.flatnonzero(comb)[-1]]) > 0
+
+
+@pytest.mark.parametrize('limit', [0.149, 0.61])
+def test_stopped_by_hand_it_says_what_it_found(limit):
+    """Ctrl-C in the search, and while gains are measured: the sag is there all the same."""
+    shares = []
+
+    def progress(share):
+        stop = share > limit and not any(before > limit for before in shares)
+        shares.append(share)
+        if stop:
+            raise KeyboardInterrupt
+
+    found = discover(drawn_from(LoadSag(0.5, 0.0), n=6000), progress=progress)
+    assert names(found) == ['load_sag'] and max(shares) == 1.0
+    stopped = any('stopped by hand' in note for note in found.notes)
+    assert stopped == (limit < 0.6)
+    assert math.isnan(found.causes[0].gain) == (limit > 0.6)
