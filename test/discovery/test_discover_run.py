@@ -265,4 +265,3 @@ def test_stopped_by_hand_it_says_what_it_found(limit):
     assert names(found) == ['load_sag'] and max(shares) == 1.0
     stopped = any('stopped by hand' in note for note in found.notes)
     assert stopped == (limit < 0.6)
-    assert math.isnan(found.causes[0].gain) == (limit > 0.6)
