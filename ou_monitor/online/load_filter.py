@@ -353,8 +353,10 @@ class LoadFilter:
         a, C = self._m[2:6] * self._factor, self._P[2:6, 2:6] * self._factor ** 2
         C = C * max(1.0, (self._noise if math.isfinite(self._throttle) else self._other).scale)
         H = static(TABLE)
-        sag = np.maximum.accumulate(np.maximum(H @ a, 0.0))
-        error = np.sqrt(np.maximum(np.einsum('ij,jk,ik->i', H, C, H), 0.0))
+        raw = H @ a
+        sag = np.maximum.accumulate(np.maximum(raw, 0.0))
+        # What had to be mended, a sag below zero or one that falls, is an error too.
+        error = np.sqrt(np.maximum(np.einsum('ij,jk,ik->i', H, C, H), 0.0) + (sag - raw) ** 2)
         low, high = self._between(0.1)
         if high - low < _MOVED and self._start is not None:
             low, high = self._start.flown
