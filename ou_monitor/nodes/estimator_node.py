@@ -224,7 +224,7 @@ class EstimatorNode(MonitorNode):
         else:
             self._stream.open_throttle(extractor)
         self._inputs[source.quantity] = PolledInput(
-            self, message, source.topic, extractor.spec)
+            self, message, source.topic, extractor.spec, source.current)
         self._opened[source.quantity] = source
         self.get_logger().info(
             f'{source.quantity} from {topic}: {extractor.spec.type} field '
@@ -268,7 +268,8 @@ class EstimatorNode(MonitorNode):
             self._stream.reset('a steady source was found behind messages in bursts')
             ends = np.full(ends.size, math.nan)
         held = self._stream.take_voltages(
-            ends, messages.own, messages.counts, messages.values, messages.arrived)
+            ends, messages.own, messages.counts, messages.values, messages.arrived,
+            messages.beside)
         if held.any():
             # On simulated time they were received at some time between two polls: now.
             received = (np.full(ends.size, self.stamp_now()) if self._stamper.simulated

@@ -140,6 +140,8 @@ class Arrivals:
         When the middleware received each, by the wall clock, s.
     arrived : ndarray, shape (m,)
         The same by the monotonic clock, s.
+    beside : ndarray, shape (m,)
+        A second field of each message, SI units; NaN where there is none.
 
     """
 
@@ -149,6 +151,7 @@ class Arrivals:
     values: FloatArray
     received: FloatArray
     arrived: FloatArray
+    beside: FloatArray
 
     @property
     def size(self) -> int:
@@ -160,7 +163,7 @@ class Arrivals:
         cut = int(self.counts[:at].sum())
         return tuple(Arrivals(  # type: ignore[return-value]
             self.ends[part], self.own[part], self.counts[part], self.values[values],
-            self.received[part], self.arrived[part]) for part, values in (
+            self.received[part], self.arrived[part], self.beside[part]) for part, values in (
                 (slice(None, at), slice(None, cut)), (slice(at, None), slice(cut, None))))
 
 
@@ -178,6 +181,8 @@ class PolledInput:
         Topic.
     spec : FieldSpec
         Which field, which stamp.
+    beside : FieldSpec, optional
+        A second field of the same messages, one number in each.
 
     Attributes
     ----------
@@ -188,12 +193,16 @@ class PolledInput:
 
     """
 
-    def __init__(self, node: MonitorNode, kind: Any, topic: str, spec: FieldSpec) -> None:
+    def __init__(self, node: MonitorNode, kind: Any, topic: str, spec: FieldSpec,
+                 beside: FieldSpec | None = None) -> None:
         self._node = node
         self._topic = node.resolve_topic_name(topic)
         self._input = node.create_polled(
             kind, topic, INPUT_QOS if spec.sample_rate is None else BLOCK_QOS)
         self._reader = FieldReader(spec, definition_of(kind), lambda: self._decode, self._broken)
+        # A message that cannot be read is counted once.
+        self._beside = None if beside is None else FieldReader(
+            beside, definition_of(kind), lambda: self._decode, lambda index, error: None)
         self._kind = kind
         self.publishers = Publishers()
         self.unreadable = 0
@@ -240,13 +249,20 @@ class PolledInput:
             return None
         ends = np.cumsum([len(message) for message in data])
         begins = np.concatenate(([0], ends[:-1]))
-        column = self._reader.read(Table(
-            b''.join(data), np.zeros(ends.size, np.uint16),
-            np.arange(ends.size, dtype=np.uint64), begins, ends))
+        table = Table(b''.join(data), np.zeros(ends.size, np.uint16),
+                      np.arange(ends.size, dtype=np.uint64), begins, ends)
+        column = self._reader.read(table)
+        beside = np.full(ends.size, np.nan)
+        if self._beside is not None:
+            other = self._beside.read(table)
+            single = other.count == 1
+            beside[other.log_time[single].astype(np.int64)] = other.values[
+                (np.cumsum(other.count) - 1)[single]]
         # In the place of log times: the number of each that could be read.
         read = np.flatnonzero(kept)[column.log_time.astype(np.int64)]
         return Arrivals(np.where(column.stamped, column.stamp, times[read]), column.stamped,
-                        column.count, column.values, received[read], arrived[read])
+                        column.count, column.values, received[read], arrived[read],
+                        beside[column.log_time.astype(np.int64)])
 
 
 class Silence:

@@ -70,6 +70,8 @@ class Source:
         What to install when the package of the type is missing.
     candidates : tuple of Source
         What may be chosen, in auto mode.
+    current : FieldSpec or None
+        Of a voltage: where in its messages the current is.
 
     """
 
@@ -79,6 +81,7 @@ class Source:
     config: str
     install: str = ''
     candidates: tuple[Source, ...] = ()
+    current: FieldSpec | None = None
 
     def choose(self, types: Sequence[str]) -> Source | None:
         """Return the candidate for one of the types on offer; None when there is none."""
@@ -121,7 +124,8 @@ def find_source(quantity: str, values: Mapping[str, Any]) -> Source | None:
         config = load_msg_config(values['msg_config'])
         spec = getattr(config, quantity)
         offered = [] if spec is None else [
-            Source(quantity, spec.topic, spec, config.name, _install(config, spec))]
+            Source(quantity, spec.topic, spec, config.name, _install(config, spec),
+                   current=config.current if quantity == 'voltage' else None)]
     if kind:
         offered = [s for s in offered if s.spec is not None and s.spec.type == kind] or [
             _by_hand(quantity, topic or _topic_of(offered, quantity), kind, field)]
@@ -146,7 +150,8 @@ def _generic(quantity: str) -> list[Source]:
         spec: FieldSpec | None = getattr(config, quantity)
         if config.generic and spec is not None:
             found.setdefault(
-                spec.type, Source(quantity, spec.topic, spec, config.name, _install(config, spec)))
+                spec.type, Source(quantity, spec.topic, spec, config.name, _install(config, spec),
+                                  current=config.current if quantity == 'voltage' else None))
     return list(found.values())
 
 

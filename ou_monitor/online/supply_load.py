@@ -23,10 +23,11 @@ POWER = 1.8
 # Throttle at which the sag is tabled.
 TABLE = np.linspace(0.0, 1.0, 101)
 # Where level, sag and noise are known all the same: what to say of the relaxation.
-_NO_ALPHA = {Status.NO_RELAXATION: 'The relaxation is not visible',
-             Status.BURIED: 'The relaxation is buried in noise',
-             Status.UNBOUND: 'No relaxation is visible in the window',
-             Status.TOO_SHORT: 'The window is too short for the relaxation'}
+_NO_ALPHA = {
+    Status.NO_RELAXATION: 'The relaxation is not visible{at}: only a higher rate can show it.',
+    Status.BURIED: 'The relaxation is buried in noise{at}.',
+    Status.UNBOUND: 'No relaxation is visible in the window{at}.',
+    Status.TOO_SHORT: 'The window is too short for the relaxation{at}.'}
 
 
 def static(throttle: npt.ArrayLike) -> FloatArray:
@@ -133,7 +134,7 @@ class SupplyLoad:
         """Return what needs no alpha, and why that is unknown; empty: there is no such case."""
         if math.isnan(self.level) or e.status not in _NO_ALPHA:
             return ''
-        why = _NO_ALPHA[e.status] + (f' at {e.rate:.3g} Hz.' if e.rate > 0.0 else '.')
+        why = _NO_ALPHA[e.status].format(at=f' at {e.rate:.3g} Hz' if e.rate > 0.0 else '')
         noise = f'noise {self._noise_at(e.throttle):.2g} V'
         if not self.known:
             return f'Level {self.level:.2f} V, {noise}. {self.status.value} {why}'

@@ -152,8 +152,8 @@ class SampleStream:
         self._block_rate: float | None = None
         self._throttle_block: BlockClock | None = None
         self._hold = ThrottleHold()
-        # Stamps, voltages and arrivals (NaN: not known) since the last flush.
-        self._samples: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+        # Stamps, voltages, arrivals and currents (NaN: not known) since the last flush.
+        self._samples: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = []
         # Of each voltage message since then: stamp, and whether it carries that itself.
         self._ends: list[FloatArray] = []
         self._own: list[BoolArray] = []
@@ -195,16 +195,19 @@ class SampleStream:
             np.array([found.values.size]), found.values)[0])
 
     def take_voltages(self, ends: FloatArray, own: BoolArray, counts: npt.NDArray[np.int64],
-                      values: FloatArray, arrived: FloatArray | None = None) -> BoolArray:
+                      values: FloatArray, arrived: FloatArray | None = None,
+                      current: FloatArray | None = None) -> BoolArray:
         """
         Take voltage messages in order of arrival; return which held a voltage.
 
         Of each: stamp (of the last sample of a block), s, NaN when not known yet; whether it
         carries that itself; and how many of the values, V, are its own; and when it arrived, s,
-        on a monotonic clock.
+        on a monotonic clock, and the current, A.
         """
         self.messages += ends.size
-        arrived = np.full(ends.size, math.nan) if arrived is None else arrived
+        unknown = np.full(ends.size, math.nan)
+        arrived = unknown if arrived is None else arrived
+        current = unknown if current is None else current
         placed = np.isfinite(ends)
         self.unplaced += ends.size - int(np.count_nonzero(placed))
         if self._block is None:
@@ -220,7 +223,7 @@ class SampleStream:
         if not placed.all():
             values = values[np.repeat(placed, counts)]
             ends, own, counts = ends[placed], own[placed], counts[placed]
-            arrived, firsts = arrived[placed], firsts[placed]
+            arrived, firsts, current = arrived[placed], firsts[placed], current[placed]
         if not ends.size:
             return held
         before = np.concatenate(([self._newest], ends[:-1]))
@@ -230,21 +233,24 @@ class SampleStream:
             # Of several steps back within so short a time the last counts.
             begin = int(back[-1])
             at = int(counts[:begin].sum())
-            self._add(ends[:begin], own[:begin], counts[:begin], values[:at], arrived[:begin])
+            self._add(ends[:begin], own[:begin], counts[:begin], values[:at], arrived[:begin],
+                      current[:begin])
             self.reset(f'stamps went back by {before[begin] - firsts[begin]:.3g} s')
             values = values[at:]
-        self._add(ends[begin:], own[begin:], counts[begin:], values, arrived[begin:])
+        self._add(ends[begin:], own[begin:], counts[begin:], values, arrived[begin:],
+                  current[begin:])
         return held
 
     def _add(self, ends: FloatArray, own: BoolArray, counts: npt.NDArray[np.int64],
-             values: FloatArray, arrived: FloatArray) -> None:
+             values: FloatArray, arrived: FloatArray, current: FloatArray) -> None:
         """Add messages whose stamps do not go back."""
         if not ends.size:
             return
         stamps = ends if self._block is None else self._block.stamps_of_many(ends, counts)
         if self._block is not None:
             ends = stamps[np.cumsum(counts) - 1]
-        self._samples.append((stamps, values, np.repeat(arrived, counts)))
+        self._samples.append((stamps, values, np.repeat(arrived, counts),
+                              np.repeat(current, counts)))
         self._ends.append(ends)
         self._own.append(own)
         self._count += ends.size
@@ -291,7 +297,7 @@ class SampleStream:
         """Hand the samples collected to the monitor."""
         if not self._samples:
             return
-        t, v, arrived = (np.concatenate(column) for column in zip(*self._samples))
+        t, v, arrived, current = (np.concatenate(column) for column in zip(*self._samples))
         ends, owns = np.concatenate(self._ends), np.concatenate(self._own)
         stamps, values, own, before = np.array(self._loads, dtype=np.float64).reshape(-1, 4).T
         # First, so that no error of the monitor meets these samples twice.
@@ -300,6 +306,7 @@ class SampleStream:
         self._empty = False
         self._hold.take(stamps, values, own > 0.0, ends, owns, before.astype(np.int64))
         self._monitor.push(t, v, self._hold.at(t), None if np.isnan(arrived).any() else arrived,
+                           current=current if np.isfinite(current).any() else None,
                            thin=self.thin)
         self._hold.forget_before(self._newest - BACK)
 

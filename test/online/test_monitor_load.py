@@ -79,7 +79,8 @@ def test_what_needs_no_alpha_is_told_first(flight):
     report = monitor.report(0.0)
     sag, error = float(report.load.sag(1.0)), float(report.load.sag_se(1.0))
     assert report.summary.startswith(f'Sag {sag:.1f} V at full throttle \u00b1 {error:.1f}, level')
-    assert report.summary.endswith('The relaxation is not visible at 50 Hz.')
+    assert report.summary.endswith(
+        'The relaxation is not visible at 50 Hz: only a higher rate can show it.')
     fields = report.fields
     assert fields['load_status'] == 'KNOWN' and fields['load_basis'] == 'THROTTLE'
     assert float(fields['load_sag']) == sag and float(fields['load_sag_se']) == error

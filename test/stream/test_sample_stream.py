@@ -15,12 +15,14 @@ class Sink:
 
     def __init__(self):
         self.t, self.v, self.u, self.resets = [], [], [], []
+        self.current = []
 
-    def push(self, t, voltage, throttle, arrival=None, *, thin=1):
+    def push(self, t, voltage, throttle, arrival=None, *, current=None, thin=1):
         """Note samples."""
         self.t += t.tolist()
         self.v += voltage.tolist()
         self.u += throttle.tolist()
+        self.current += [] if current is None else current.tolist()
 
     def reset(self, reason):
         """Note a reset."""
@@ -187,3 +189,19 @@ def test_a_lost_throttle_is_unknown(stamps):
     stream.take_voltage(stamped(5.0, 5.0), lambda: 5.0)
     stream.flush()
     assert sink.u[:2] == [0.5, 0.5] and math.isnan(sink.u[3]) and sink.u[4] == 0.6
+
+
+def test_current_goes_with_its_message():
+    """Past messages without a stamp, a clock that goes back, and blocks."""
+    for rate, counts in ((None, [1, 1, 1, 1]), (100.0, [2, 1, 2, 2])):
+        stream, sink = stream_of('stamp', sample_rate=rate)
+        n = sum(counts)
+        held = stream.take_voltages(
+            np.array([10.0, math.nan, 1.0, 2.0]), np.ones(4, dtype=bool), np.array(counts),
+            np.arange(float(n)), None, np.array([5.0, 6.0, math.nan, 8.0]))
+        stream.flush()
+        assert held.tolist() == [True, False, True, True]
+        expected = np.repeat([5.0, math.nan, 8.0], [counts[0], *counts[2:]])
+        # All that was sent before the step back carries 5 A; NaN alone is no current.
+        np.testing.assert_array_equal(sink.current, expected)
+        assert len(sink.t) == expected.size and len(sink.resets) == 1

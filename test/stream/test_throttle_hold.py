@@ -131,7 +131,7 @@ class Sink:
         self.pairs, self.resets = [], 0
         self.come = 0
 
-    def push(self, t, voltage, throttle, arrival=None, *, thin=1):
+    def push(self, t, voltage, throttle, arrival=None, *, current=None, thin=1):
         """Note samples."""
         self.pairs += [(self.come, *row) for row in zip(
             t.tolist(), voltage.tolist(), throttle.tolist(), strict=True)]
