@@ -63,9 +63,11 @@ def fit_flight(samples: Readings, progress: Callable[[float], None] | None = Non
     duration = float(samples.t[-1] - samples.t[0])
     level_var = (ou.white * dt + 2.0 * ou.variance * ou.tau) / duration
     report(1.0)
+    spread, sag_error = (1.0, 0.0) if best is None else (
+        _spread(samples, best), _sag_error(samples, best))
     return FlightModel(
-        load, mean, math.sqrt(level_var), damped, 1.0 if best is None else _spread(samples, best),
-        noise, ou, dt, 1.0 - (level if best is None else best.left) / max(total, 1e-300))
+        load, mean, math.sqrt(level_var), damped, spread, sag_error, noise, ou,
+        float(samples.t[-1]), 1.0 - (level if best is None else best.left) / max(total, 1e-300))
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +160,22 @@ def damping(samples: Readings, path: FloatArray) -> Damping:
         if saved > most:
             best, most = Damping(share, time), saved
     return best
+
+
+def _sag_error(samples: Readings, load: _Load) -> float:
+    """
+    Return the relative error of the sag over a stretch as long as two of the parts.
+
+    In each part left out, the voltage is so many times the predicted path; parts that move more
+    count more.  Warmth, wind and what a motor law leaves out change it from part to part.
+    """
+    squares, weights = [], []
+    for (fit, errors), part in zip(load.parts, _parts(samples)):
+        path = _path(samples, fit, load.current)[part]
+        moved = path - path.mean()
+        weights.append(float(moved @ moved))
+        squares.append((float(moved @ errors) / max(weights[-1], 1e-300)) ** 2)
+    return math.sqrt(float(np.dot(squares, weights)) / max(sum(weights), 1e-300) / 2.0)
 
 
 def _spread(samples: Readings, load: _Load) -> float:

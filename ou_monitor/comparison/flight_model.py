@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import Protocol
 
@@ -113,12 +113,14 @@ class FlightModel:
     spread : float
         Factor on the variance of the slow process: how much farther parts that were left out lay
         from their prediction than the fit says.
+    sag_error : float
+        Relative error of the sag, as parts that were left out show it.
     noise : NoiseLaw
         White noise.
     ou : ResidualOU
         What has memory in the residuals.
-    spacing : float
-        Time from sample to sample in the fit, s.
+    until : float
+        End of the part fitted, s.
     explained : float
         Share of variance explained of parts that were left out of the fit.
 
@@ -129,9 +131,10 @@ class FlightModel:
     level_se: float
     damping: Damping
     spread: float
+    sag_error: float
     noise: NoiseLaw
     ou: ResidualOU
-    spacing: float
+    until: float
     explained: float
 
     @property
@@ -163,7 +166,12 @@ class FlightModel:
         if self.load is None or samples.throttle is None:
             voltage = np.full(n, self.level + self.level_se * rng.standard_normal())
         else:
-            path = self.load.draw(rng).path(samples.t, throttle, samples.current)
+            load = self.load.draw(rng)
+            path = load.path(samples.t, throttle, samples.current)
+            size = load.size * math.exp(self.sag_error * float(rng.standard_normal()))
+            other = replace(load, size=size).path(samples.t, throttle, samples.current)
+            # Over the part fitted the mean is known: a larger sag goes with a higher level.
+            path = other - float((other - path)[samples.t <= self.until].mean())
             voltage = self.damping.of(path, samples.t)
             slow = self.spread * self.load.slow_std ** 2
         dt = np.diff(samples.t, prepend=samples.t[0])
