@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 import math
@@ -29,6 +30,7 @@ def run(args: argparse.Namespace) -> int:
                   **{'--msg-config': args.msg_config})
 
     import numpy as np
+    from ou_monitor.analysis.overview import known_lines, overview
     from ou_monitor.discovery.discover import discover
 
     recording = read_given(args, start, end)
@@ -36,15 +38,16 @@ def run(args: argparse.Namespace) -> int:
     # use for the source line of it.
     with output.Progress('discovering') as progress, np.errstate(all='ignore'):
         finding = discover(recording, seed=args.seed, progress=progress)
+    known = known_lines(overview(recording))
     if args.report is not None:
         from ou_monitor.report.discovery_page import discovery_page
         with output.Progress('drawing') as progress:
-            text = discovery_page(finding, command_line(args), progress)
+            text = discovery_page(finding, command_line(args), progress, known)
         output.write_text(text, args.report)
     if args.json is not None:
         output.write_json(finding.as_data(), args.json)
     if args.json != output.STDOUT:
-        output.say(render(finding))
+        output.say(render(finding, known))
         if args.report is not None:
             output.say(f'\nReport: {args.report}')
     if args.save_model is not None:
@@ -87,8 +90,8 @@ def model_text(finding: Finding, recording: Recording | None = None) -> str:
     return as_yaml(ModelFile(model, tuple(dict(se) for se in finding.se), provenance))
 
 
-def render(finding: Finding) -> str:
-    """Return the finding for a terminal 100 columns wide."""
+def render(finding: Finding, known: Sequence[tuple[str, str]] = ()) -> str:
+    """Return the finding for a terminal; known: what is known of the recording anyway."""
     from ou_monitor.discovery.words import (
         cause_rows, crossing_words, MNAT, overlap_words, plain_model_words, plain_words)
     from ou_monitor.text import number
@@ -97,6 +100,7 @@ def render(finding: Finding) -> str:
         f', {finding.samples.n} used')
     lines = [f'{finding.recording}: {finding.n} samples in {number(finding.duration, 4)} s{used}',
              '', output.paragraph(finding.sentence)]
+    lines += ['', output.facts_table(known)] if known else []
     if finding.causes:
         found = cause_rows(finding.causes)
         rows = [[row.label, row.family, row.gain, row.chance, ', '.join(row.alternatives) or '-']

@@ -343,6 +343,8 @@ def _remark(cause: Cause) -> str:
 def _chance(cause: Cause) -> str:
     if cause.exact:
         return 'exact'
+    if cause.p_value < 1e-6:
+        return '< 1e-6'
     return f'{cause.p_value:.2g}' if math.isfinite(cause.p_value) else NOT_KNOWN
 
 

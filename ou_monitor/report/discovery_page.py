@@ -24,18 +24,25 @@ from ou_monitor.text import number
 _ROWS = 18
 # Rows of dots: sizes, in pixels.
 _WIDTH, _LEFT, _RIGHT, _ROW, _TOP, _BOTTOM = 860, 250, 20, 22, 34, 40
+# Simulations behind the voltage.
+_DRAWS = 20
 # Scores up to about this are drawn on a straight scale, larger ones on a logarithmic.
 _STRAIGHT = 4.0
 _TICKS = (0.0, 4.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 10000.0)
 
 
 def discovery_page(finding: Finding, command: str = '',
-                   progress: Callable[[float], None] | None = None) -> str:
-    """Return the report of a discovery."""
+                   progress: Callable[[float], None] | None = None,
+                   facts: Sequence[tuple[str, str]] = ()) -> str:
+    """Return the report of a discovery; facts: what is known of the recording anyway."""
     subtitle = f'{finding.n} samples in {number(finding.duration, 4)} s'
     if finding.samples is not None and finding.samples.n != finding.n:
         subtitle += f', of which {finding.samples.n} were used'
     sections = [page.headline(_typeset(finding.sentence))]
+    if finding.samples is not None:
+        sections.append(page.figure(_voltage(finding), _VOLTAGE if finding.simulated else ''))
+    if facts:
+        sections.append(page.facts([(name, _typeset(words)) for name, words in facts]))
     if finding.baseline is not None:
         sections += [page.section('Causes', *_causes(finding)),
                      page.section('Gain' if finding.causes else 'What it predicts',
@@ -44,13 +51,38 @@ def discovery_page(finding: Finding, command: str = '',
                          'Statistics before and after' if finding.causes else 'Statistics',
                          *_statistics(finding)),
                      page.section('Data beside simulations', *_comparisons(finding)),
-                     page.section('What is left', *_left(finding)),
-                     page.section('Parameters', *_parameters(finding))]
+                     page.section('What is left', *_left(finding), folded=True),
+                     page.section('Parameters', *_parameters(finding), folded=True)]
     if progress is not None:
         progress(1.0)
-    sections.append(page.section('Where it comes from', *_origin(finding, command)))
+    sections.append(page.section('Where it comes from', *_origin(finding, command), folded=True))
     return page.page(f'What the simulation gets wrong: {finding.recording or "recording"}',
                      subtitle, sections)
+
+
+_VOLTAGE = ('Band: range of 20 simulations of the extended model at each moment, with the throttle '
+            'of the recording.')
+
+
+def _voltage(finding: Finding) -> Plot:
+    """Return the voltage over the band of simulations of the extended model."""
+    samples = finding.samples
+    assert samples is not None
+    t = samples.t - samples.t[0]
+    plot = Plot('Voltage', 'time, s', 'V', height=230, legend_row=True)
+    if finding.simulated is not None:
+        rng = np.random.default_rng(finding.seed)
+        low, high = np.full(samples.n, np.inf), np.full(samples.n, -np.inf)
+        for _ in range(_DRAWS):
+            try:
+                drawn = finding.simulated.simulate(samples.t, rng, samples.throttle)
+            except ValueError:
+                # A force that runs away has no simulation.
+                break
+            low, high = np.fmin(low, drawn), np.fmax(high, drawn)
+        if np.isfinite(low).all():
+            plot.band(t, low, high, 'simulated', 1)
+    return plot.line(t, samples.voltage, 'measured', 0)
 
 
 def _typeset(text: str) -> str:
