@@ -60,8 +60,8 @@ def discovery_page(finding: Finding, command: str = '',
                      subtitle, sections)
 
 
-_VOLTAGE = ('Band: range of 20 simulations of the extended model at each moment, with the throttle '
-            'of the recording.')
+_VOLTAGE = ('Band: range of 20 simulations of the extended model at each moment, with the '
+            'throttle of the recording.')
 
 
 def _voltage(finding: Finding) -> Plot:
