@@ -159,6 +159,7 @@ class Forecast:
         self._samples = 0
         self._begun = NAN
         self._next = -math.inf
+        self._laws: dict[float, tuple[LowestLaw, float, float, float, float]] = {}
         self._kept: dict[float, tuple[float, float, Flown]] = {}
         for rung in self._rungs:
             rung.looks.clear()
@@ -222,6 +223,7 @@ class Forecast:
     def _look(self) -> None:
         """Complete horizons, and begin new ones."""
         self._kept.clear()
+        self._laws.clear()
         self._known = self._loads.load().known
         if self._samples > 1:
             interval = (self._newest - self._begun) / (self._samples - 1)
@@ -252,10 +254,13 @@ class Forecast:
 
     def _learned(self, horizon: float) -> tuple[LowestLaw, float, float, float, float]:
         """Return law, shares of held, pilot and first passage, and evidence, for a horizon."""
-        values = np.array([rung.values for rung in self._rungs])
-        at = math.log(horizon)
-        between = np.array([np.interp(at, _LN_RUNGS, column) for column in values.T])
-        return LowestLaw(between[:6]), *between[6:].tolist()
+        if horizon not in self._laws:
+            place = float(np.interp(math.log(horizon), _LN_RUNGS, np.arange(_LN_RUNGS.size)))
+            low = min(int(place), _LN_RUNGS.size - 2)
+            share = place - low
+            values = (1.0 - share) * self._rungs[low].values + share * self._rungs[low + 1].values
+            self._laws[horizon] = (LowestLaw(values[:6]), *values[6:].tolist())
+        return self._laws[horizon]
 
     def risk(self, voltage: float, horizon: float, passage: float = NAN, *,
              alone: bool = False) -> Outcome:
