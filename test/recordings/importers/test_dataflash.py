@@ -190,3 +190,23 @@ def test_sizes_of_the_writer():
     number, layout, _ = made.known['BAT']
     piece = next(p for p in made.pieces if p[2] == number and p[:2] == b'\xa3\x95')
     assert len(piece) == 3 + struct.calcsize(layout)
+
+
+@pytest.mark.parametrize('kind, columns, name', [
+    ('CURR', 'TimeMS,ThrOut,ThrInt,Volt,Curr,Vcc,CurrTot', 'CURR.ThrOut'),
+    ('CURR', 'TimeMS,Throttle,ThrInt,Volt,Curr,Vcc,CurrTot', 'CURR.Throttle'),
+    ('CTUN', 'TimeMS,ThrOut,ThrInt,Volt,Curr,Vcc,CurrTot', 'CTUN.ThrOut')])
+def test_throttle_of_copters_until_2015(tmp_path, kind, columns, name):
+    """Thousandths, under the names that it had; CTUN goes first, as it is logged more often."""
+    log = Dataflash()
+    log.form(9, 'CURR', 'IhIhhhf', columns if kind == 'CURR' else columns.replace('ThrOut', 'X'))
+    if kind == 'CTUN':
+        log.form(10, 'CTUN', 'IhhhI', 'TimeMS,ThrIn,AngBst,ThrOut,X')
+    for k in range(50):
+        log.put('CURR', 1000 + 100 * k, 350 + k, 0, 1100 + k, 250, 4900, 1.0)
+        if kind == 'CTUN':
+            log.put('CTUN', 1000 + 100 * k, 900, 0, 350 + k, 0)
+    path, found = load(tmp_path, log.binary)
+    throttle = choose(path, found).throttle
+    assert throttle.name == name
+    np.testing.assert_allclose(throttle.values, (350 + np.arange(50)) / 1000.0)
