@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from ou_monitor.comparison.compare import compare
     from ou_monitor.discovery.discover import discover
     from ou_monitor.errors import InputError
     from ou_monitor.online.estimator.estimator import SlidingEstimator
@@ -37,6 +38,7 @@ _HOMES = {
     'Status': 'ou_monitor.records',
     'SupplyMonitor': 'ou_monitor.online.monitor',
     'brownout_probability': 'ou_monitor.online.risk.first_passage',
+    'compare': 'ou_monitor.comparison.compare',
     'discover': 'ou_monitor.discovery.discover',
     'read_pieces': 'ou_monitor.recordings.read',
     'read_recording': 'ou_monitor.recordings.read',
@@ -45,7 +47,7 @@ _HOMES = {
 __all__ = [
     'AdaptiveLowPass', 'AdaptiveNotch', 'Estimate', 'Flag', 'InputError', 'MonitorSettings',
     'Recording', 'SlidingEstimator', 'Status', 'SupplyMonitor', '__version__',
-    'brownout_probability', 'discover', 'read_pieces', 'read_recording',
+    'brownout_probability', 'compare', 'discover', 'read_pieces', 'read_recording',
 ]
 
 

@@ -15,16 +15,13 @@ def headline(found: Agreement) -> str:
     lowest = (f'lowest voltage is {number(low.median, 4)} V ({number(low.low, 4)} to '
               f'{number(low.high, 4)}), measured {number(low.measured, 4)} V')
     if found.verdict is Verdict.LOOKS_LIKE_IT:
-        return (f'{found.verdict.value}: its {lowest}, and its mean path explains '
-                f'{share(found.explained)} of the variance.')
+        # Without throttle the path is a level, which explains nothing.
+        path = '' if not found.explained > 0.0 else (
+            f', and its mean path explains {100.0 * found.explained:.0f} % of the variance')
+        return f'{found.verdict.value}: its {lowest}{path}.'
     if 'lowest' in found.words:
         return f'{found.verdict.value}: {found.words}.'
     return f'{found.verdict.value}: {found.words}; the {lowest}.'
-
-
-def share(value: float) -> str:
-    """Return a share of variance in percent."""
-    return 'nothing' if value <= 0.0 else f'{100.0 * value:.0f} %'
 
 
 def parts(found: Agreement) -> str:
