@@ -8,6 +8,7 @@ from ou_monitor.paper.reproduce import (
     network, probability, published, switching, table1, table2, transient)
 from ou_monitor.paper.reproduce.row import Printed, Verdict
 import pytest
+from scipy.integrate import trapezoid
 from scipy.signal import lsim
 from scipy.stats import norm
 
@@ -275,7 +276,7 @@ def test_share_of_the_variance_at_the_esc_lines():
     """The Lorentzian integrated from 24 kHz up, over its whole."""
     f = np.geomspace(24e3, 1e12, 20001)
     density = 4.0 * 63.0 / (63.0 ** 2 + (2.0 * math.pi * f) ** 2)
-    above = float(np.trapezoid(density * f, np.log(f)))
+    above = float(trapezoid(density * f, np.log(f)))
     assert network.share_above(24e3) == pytest.approx(above, rel=1e-4)
 
 

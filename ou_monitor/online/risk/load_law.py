@@ -28,6 +28,11 @@ _RISE = 2.0
 _SHARE_OF_RISE = INRUSH_TIME / 0.2
 
 
+def _integral(y: FloatArray, x: FloatArray) -> float:
+    """Return the integral by trapezoids (NumPy's is called otherwise in 1.26 and in 2)."""
+    return float(0.5 * np.sum(np.diff(x) * (y[1:] + y[:-1])))
+
+
 def _largest_medians() -> tuple[FloatArray, FloatArray, FloatArray]:
     """
     Return ln n, and mean and deviation of the largest of n running medians of three normals.
@@ -46,8 +51,8 @@ def _largest_medians() -> tuple[FloatArray, FloatArray, FloatArray]:
     for k in range(17):
         below = (first @ power)[:, 0].sum(axis=1)
         # Integrals of 1 - F from the lowest x on.
-        mean = x[0] + np.trapezoid(1.0 - below, x)
-        square = x[0] ** 2 + np.trapezoid(2.0 * x * (1.0 - below), x)
+        mean = x[0] + _integral(1.0 - below, x)
+        square = x[0] ** 2 + _integral(2.0 * x * (1.0 - below), x)
         counts.append(k * np.log(2.0))
         means.append(mean)
         deviations.append(np.sqrt(square - mean ** 2))
