@@ -157,3 +157,14 @@ def test_densities_decide_which_was_right():
     share = FarShare()
     assert share.add(3.0, 1.0, 1.0, 0.0) == pytest.approx(2.0)
     assert share.value == pytest.approx(1.25 / 3.0)
+
+
+def test_a_rise_is_noisier():
+    """Its noise is that of the change that a ramp of 0.2 s makes: a tenth of the step."""
+    noisy = state(log_variance=(2.0 * math.log(NOISE), 0.0, 4.0), mean=COEFFICIENTS * (
+        np.arange(9) == 0))
+    mean, deviation = lowest(noisy, held(0.9, 0.04, 0.9), 0.04, SAMPLING)
+    factor = math.exp(0.5 * 4.0 * math.sqrt(0.05))
+    plain, narrow = lowest(noisy, held(0.4, 0.04, 0.4), 0.04, SAMPLING)
+    assert 16.0 - mean[0] == pytest.approx(factor * (16.0 - plain[0]))
+    assert deviation[0] == pytest.approx(factor * narrow[0])
