@@ -12,7 +12,7 @@ import math
 import numpy as np
 from ou_monitor.model.load import LEVELS, SLOPES
 from ou_monitor.online.load_blocks import Block
-from ou_monitor.online.load_noise import CLIP, LoadNoise
+from ou_monitor.online.load_noise import CLIP, DIVERGED, LoadNoise
 from ou_monitor.records import FloatArray, NAN
 
 # Time constants, s, of polarisation: those of the throttle's filter.
@@ -105,6 +105,9 @@ class CurrentFilter:
         e = block.voltage - float(h @ m)
         g = P @ h
         s = float(h @ g)
+        if not 0.0 <= s < DIVERGED:
+            self._begin(block, x * self._unit)
+            return
         scale = max(1.0, noise.scale)
         z = max(-CLIP, min(CLIP, e / math.sqrt(s + R * scale)))
         self.score = scored(self.score, z, s + R * scale, dt)

@@ -19,7 +19,7 @@ from ou_monitor.model.load_start import LoadStart
 from ou_monitor.online.load_blocks import Block, LoadBlocks
 from ou_monitor.online.load_current import CurrentFilter, scored
 from ou_monitor.online.load_delay import LoadDelay
-from ou_monitor.online.load_noise import CLIP, LoadNoise
+from ou_monitor.online.load_noise import CLIP, DIVERGED, LoadNoise
 from ou_monitor.online.supply_load import (
     Basis, LAGS, LoadState, LoadStatus, POWER, static, SupplyLoad, TABLE)
 from ou_monitor.records import FloatArray, NAN
@@ -237,7 +237,7 @@ class LoadFilter:
     def _open(self, v: float, u: float) -> None:
         """Open the level: a pause, a new time line, or throttle that came or went."""
         here = float(self._m[0])
-        other = self._opening and not 1.0 / _OTHER_CRAFT < v / here < _OTHER_CRAFT
+        other = self._opening and not here / _OTHER_CRAFT < v < here * _OTHER_CRAFT
         if other or (math.isfinite(u) and not self._loaded):
             self._begin(v, u)
             return
@@ -319,6 +319,9 @@ class LoadFilter:
         e = block.voltage - float(h @ m)
         g = P @ h
         s = float(h @ g)
+        if not 0.0 <= s < DIVERGED:
+            self._begin(block.voltage, self._throttle)
+            return
         scale = max(1.0, noise.scale)
         score = e / math.sqrt(s + R * scale)
         # Innovations that follow one another (ADC steps, errors of the form) tell less.
@@ -398,7 +401,7 @@ class LoadFilter:
     def learned(self) -> LoadStart | None:
         """Return what the next flight of this craft may begin with; None: the sag is unknown."""
         load = self.load()
-        if not load.known:
+        if not (load.known and self._m[0] > 0.0):
             return None
         scale = max(1.0, self._noise.scale)
         P = 0.5 * (self._P[2:, 2:] + self._P[2:, 2:].T) * scale
@@ -424,9 +427,10 @@ class LoadFilter:
         now, level = self._t, float(self._m[0])
         out = np.empty(t.size)
         for k in range(t.size):
-            dt = float(t[k]) - now
+            # What lies before the last sample is now.
+            dt = max(0.0, float(t[k]) - now)
             level -= self._m[1] * self._advance(dt, float(throttle[k])) * dt * self._fall(level)
             out[k] = level + self._regressors()[2:] @ self._m[2:]
-            now = float(t[k])
+            now = max(now, float(t[k]))
         self._lagged, self._settled, self._lags = kept
         return out

@@ -15,6 +15,9 @@ from ou_monitor.records import FloatArray
 
 # Standard scores beyond this are weighed down; they score this much, squared, in the noise.
 CLIP, _OUTLIER = 4.0, 16.0
+# Variance of a prediction, V^2, beyond which a filter has left the ground, as after a sensor that
+# said megavolts: it begins anew.
+DIVERGED = 1e12
 # Voltages that differ by less, V, are one reading of an ADC.
 _SAME = 1e-6
 # A change of throttle below that is none.

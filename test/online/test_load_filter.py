@@ -248,3 +248,22 @@ def test_the_recorded_flight():
     ahead = (t >= 100.0) & (t < 110.0)
     path = loads.path(t[ahead], np.clip(u[ahead], 0.0, 1.0))
     assert np.sum((v[ahead] - path) ** 2) < 0.25 * np.sum((v[ahead] - v[ahead].mean()) ** 2)
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_garbage_raises_nothing(seed):
+    """Zero, negative and mad voltages, throttles and currents, holes, and clocks that jump."""
+    rng = np.random.default_rng(seed)
+    loads = LoadFilter()
+    t = 0.0
+    for _ in range(20):
+        n = int(rng.integers(1, 60))
+        stamps = t + np.cumsum(rng.choice([1e-4, 1e-3, 0.02, 0.3, 1.0, 70.0]) * rng.random(n))
+        t = stamps[-1] - rng.choice([0.0, 0.5, 5.0, -1e9], p=[0.8, 0.1, 0.05, 0.05])
+        v = rng.choice([0.0, -5.0, 3.7, 16.0, 1e5, -1e6]) + 0.05 * rng.standard_normal(n)
+        v[rng.random(n) < 0.05] = np.nan
+        loads.push(stamps, v, rng.choice([np.nan, 0.0, 0.5, -1.0]) + rng.random(n),
+                   rng.choice([np.nan, 0.0, 10.0, -1e9, np.inf]) * rng.random(n))
+        load = loads.load()
+        assert load.status in LoadStatus and loads.path(t + np.arange(3.0), np.ones(3)).size == 3
+        loads.learned()
