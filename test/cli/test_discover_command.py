@@ -175,7 +175,7 @@ def test_what_is_not_known_is_said_and_what_is_worse_too():
     rows = {row[0]: row for row in tables(html)}
     assert rows['load_sag'][2].startswith('not known not measurable here; named for')
     assert rows['load_sag'][3] == 'not known'
-    assert 'Gain not measurable here; named by the search' in ' '.join(text.split())
+    assert 'Gain not measurable here; named for what it explains' in ' '.join(text.split())
     assert 'worse' in rows['tone'][2] and 'not distinguishable from none' in rows['drift'][2]
     assert re.search(r'load_sag +load +not known +not known', text)
     assert 'from means of blocks and from the errors of the parameters' in html
