@@ -126,4 +126,6 @@ class MonitorReport:
         values['flags'] = ','.join(flag.name for flag in e.flags)
         for name in ('pushed', 'used', 'non_finite', 'late', 'held', 'resets'):
             values[name] = getattr(e.counters, name)
-        return {name: repr(v) if isinstance(v, float) else str(v) for name, v in values.items()}
+        # NumPy's floats write their type's name beside the number.
+        return {name: repr(float(v)) if isinstance(v, float) else str(v)
+                for name, v in values.items()}

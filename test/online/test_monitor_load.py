@@ -97,3 +97,13 @@ def test_what_is_known_without_throttle_is_told():
     summary = monitor.report(0.0).summary
     assert summary.startswith('Level 16.0') and 'Throttle is not known' in summary
     assert float(monitor.report(0.0).fields['load_noise']) == pytest.approx(0.05, rel=0.15)
+
+
+def test_fields_are_numbers_whatever_leg_they_stand_on(flight):
+    """As text that any language reads: no 'np.float64(0.3)'; numbers round-trip."""
+    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=13.5, brownout_horizon=1.0))
+    monitor.push(*flight)
+    report = monitor.report(0.0)
+    assert report.risk_basis == 'load' and 0.0 < report.budget <= 1.0
+    assert float(report.fields['throttle_budget']) == report.budget
+    assert not [name for name, text in report.fields.items() if 'np.' in text]

@@ -109,4 +109,5 @@ def load_budget(risks: FloatArray, flown: tuple[float, float], limit: float, vol
             reason = 'Within the limit up to full throttle.'
     else:
         throttle, reason = end, f'The risk passes the limit of {limit:.2g} at throttle {end:.2f}.'
-    return ThrottleBudget(throttle, lowest, highest, limit, reason + what, CURVE, risks, known)
+    return ThrottleBudget(float(throttle), lowest, highest, limit, reason + what, CURVE, risks,
+                          known)
