@@ -105,7 +105,7 @@ class AdaptiveNotch:
 
     @property
     def source(self) -> str:
-        """What the notches follow: 'rpm', 'throttle' or 'none'."""
+        """Return what the notches follow: 'rpm', 'throttle' or 'none'."""
         chosen = [] if self._choice is None else self._choice.chosen
         found = {one.family.source for one in chosen if one is not None}
         return 'rpm' if 'rpm' in found else 'throttle' if found else 'none'
