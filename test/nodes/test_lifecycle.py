@@ -32,9 +32,20 @@ class Manager:
 
 
 def topics_of(probe, node):
-    """Return what a node publishes under its own name."""
-    return {name for name, _ in probe.node.get_publisher_names_and_types_by_node(node, '/')
-            if name.startswith(f'/{node}/') and 'transition' not in name}
+    """Return what a node publishes under its own name, once that has been discovered."""
+    # The services of a node may answer before its name is in the graph, and that may be there
+    # before its publishers; this one it has in every state.
+    always = f'/{node}/transition_event'
+    wait_until(lambda: (node, '/') in probe.node.get_node_names_and_namespaces(), what=node)
+    found = set()
+
+    def look():
+        found.clear()
+        found.update(name for name, _ in probe.node.get_publisher_names_and_types_by_node(
+            node, '/'))
+        return always in found
+    wait_until(look, what=always)
+    return {name for name in found if name.startswith(f'/{node}/')} - {always}
 
 
 @pytest.mark.parametrize('name', NODES)

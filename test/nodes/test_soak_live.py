@@ -11,7 +11,7 @@ from live import DEADLINE, new_domain, ROOT
 def test_six_seconds(tmp_path):
     """All processes come and go; the figures are written, and the table between its marks."""
     page = tmp_path / 'page.md'
-    page.write_text('before\n<!-- soak begins -->\nold\n<!-- soak ends -->\nafter\n')
+    page.write_text('before\n<!-- soak begins -->\noutdated\n<!-- soak ends -->\nafter\n')
     env = {key: value for key, value in os.environ.items()
            if key != '_ROS_WHEELS_BOOTSTRAP_COMPLETE'}
     done = subprocess.run(
@@ -24,5 +24,5 @@ def test_six_seconds(tmp_path):
     dips = found['dips']
     assert dips['asked'] == dips['in_time'] + len(dips['lost']) >= 1
     text = page.read_text()
-    assert text.startswith('before\n') and text.endswith('after\n') and 'old' not in text
+    assert text.startswith('before\n') and text.endswith('after\n') and 'outdated' not in text
     assert '| exit status after SIGINT, time | 0' in text
