@@ -170,7 +170,8 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
         lines.append((f'Below {found.limit:g} V', _dips(found) if found.dips else 'never'))
     lines += [('Sag', _sag_words(found)), ('Noise', _noise_words(found))]
     if math.isfinite(found.load.resistance):
-        lines.append(('Resistance', f'{number(1e3 * found.load.resistance)} mOhm'))
+        lines.append(('Resistance', f'{number(1e3 * found.load.resistance)} mOhm (+- '
+                      f'{number(2e3 * found.load.resistance_se, 2)})'))
     if found.line is not None:
         line = found.line
         where = '' if line.level == 'all' else f' at {line.level} throttle'
@@ -224,5 +225,5 @@ def _noise_words(found: Overview) -> str:
 
 def _load(recording: Recording) -> SupplyLoad:
     load = LoadFilter()
-    load.push(recording.t, recording.voltage, recording.throttle)
+    load.push(recording.t, recording.voltage, recording.throttle, recording.current)
     return load.load()

@@ -94,7 +94,12 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
         settings = replace(settings, brownout_voltage=brownout_voltage)
     monitor = SupplyMonitor(settings, background=False)
     t, voltage, throttle = recording.t, recording.voltage, recording.throttle
-    known = recording.has_throttle
+    known, drawn = recording.has_throttle, recording.current
+
+    def push(part: slice) -> None:
+        monitor.push(t[part], voltage[part], throttle[part] if known else None,
+                     current=None if drawn is None else drawn[part])
+
     reports: list[MonitorReport] = []
     last = None
     step = max(0.25 * window, recording.duration / MAX_POINTS)
@@ -107,7 +112,7 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
         stop = int(np.searchsorted(t, first + k * step / parts, side='right'))
         if stop == done:
             continue
-        monitor.push(t[done:stop], voltage[done:stop], throttle[done:stop] if known else None)
+        push(slice(done, stop))
         done = stop
         last = monitor.report(0.0)
         # Until the first window is full its estimates would only look poor.
@@ -118,7 +123,7 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
         if progress is not None:
             progress(k / count)
     if done < t.size and reports:
-        monitor.push(t[done:], voltage[done:], throttle[done:] if known else None)
+        push(slice(done, t.size))
         last = monitor.report(0.0)
     return Sliding(window, np.array([report.estimate.t for report in reports]),
                    tuple(report.estimate for report in reports),
