@@ -37,6 +37,8 @@ MOVES = 0.01
 # Repeats that are called so, at least; and the share of ties by chance up to which
 # an ADC is fine enough to detect them.
 _FEWEST_TIES, _FINE = 20, 0.15
+# The noise of a rail falls to one part in so many at rest: ties are so much likelier there.
+_CALMEST = 100.0
 _FLOAT32 = 1.2e-7
 # Samples looked at for repeats, and passed at once.
 _LOOK, _CHUNK = 200_000, 500_000
@@ -198,7 +200,8 @@ def _ties(v: FloatArray) -> bool:
     chance = min(1.0, code / (math.sqrt(2.0 * math.pi) * float(np.sqrt(np.mean(moved**2)))))
     if chance >= _FINE:
         return False
-    expected = count * max(chance, _ties_without_holds(v, inner))
+    # Where a rail is calm, ties are likelier; but that calm none is, and a sensor was stuck.
+    expected = count * max(chance, min(_ties_without_holds(v, inner), _CALMEST * chance))
     return equal - 1.5 * expected > 6.0 * math.sqrt(max(expected, 1.0))
 
 

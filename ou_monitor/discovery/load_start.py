@@ -85,7 +85,7 @@ def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:
         view = fitter.view(best)
         tried: list[Composite] = []
         for kind in (LoadDependentSigma, LoadDependentNoise, MeasurementNoise):
-            if best.has(kind.NAME):
+            if best.has(kind.NAME) or kind.NAME not in catalogue():
                 continue
             found = fitter.best_start(best, kind, view)
             # Two intensities that follow throttle: one may only mend the form of the other.

@@ -43,7 +43,7 @@ _ROUNDS = 40
 
 
 def load_terms(samples: Samples) -> tuple[Term, ...]:
-    """Return the terms of the load model of a recording; none without throttle."""
+    """Return the terms of the load model that the catalogue has; none without throttle."""
     if samples.throttle is None:
         return ()
     size = math.ceil(samples.n / _MOST)
@@ -61,8 +61,9 @@ def load_terms(samples: Samples) -> tuple[Term, ...]:
     shortest = float(np.median(samples.step[1:]))
     times = [tau for tau in (INRUSH_TIME, model.fast_time, model.slow_time)
              if 0.5 * shortest <= tau <= longest]
-    return (LoadSag(0.0, NEXT_TO_ZERO), *(LoadTransient(0.0, tau, 0.0) for tau in times),
-            Drift(0.0, NEXT_TO_ZERO))
+    terms = (LoadSag(0.0, NEXT_TO_ZERO), *(LoadTransient(0.0, tau, 0.0) for tau in times),
+             Drift(0.0, NEXT_TO_ZERO))
+    return tuple(term for term in terms if term.NAME in catalogue())
 
 
 @dataclass(frozen=True)

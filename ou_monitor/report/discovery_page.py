@@ -40,7 +40,8 @@ def discovery_page(finding: Finding, command: str = '',
         subtitle += f', of which {finding.samples.n} were used'
     sections = [page.headline(_typeset(finding.sentence))]
     if finding.samples is not None:
-        sections.append(page.figure(_voltage(finding), _VOLTAGE if finding.simulated else ''))
+        sections.append(page.figure(_voltage(finding), _VOLTAGE.format(_model_name(finding))
+                                    if finding.simulated else ''))
     if facts:
         sections.append(page.facts([(name, _typeset(words)) for name, words in facts]))
     if finding.baseline is not None:
@@ -60,12 +61,17 @@ def discovery_page(finding: Finding, command: str = '',
                      subtitle, sections)
 
 
-_VOLTAGE = ('Band: range of 20 simulations of the extended model at each moment, with the '
-            'throttle of the recording.')
+_VOLTAGE = ('Band: range of 20 simulations of the {} at each moment, with the throttle of the '
+            'recording.')
+
+
+def _model_name(finding: Finding) -> str:
+    """Return what the model that is simulated is called."""
+    return 'extended model' if finding.causes else 'plain OU'
 
 
 def _voltage(finding: Finding) -> Plot:
-    """Return the voltage over the band of simulations of the extended model."""
+    """Return the voltage over the band of simulations of the model."""
     samples = finding.samples
     assert samples is not None
     t = samples.t - samples.t[0]
@@ -215,8 +221,8 @@ def _plot(curve: Comparison, k: int, name: str) -> Plot:
 
 def _left(finding: Finding) -> list[str]:
     if not finding.remaining:
-        which = 'extended model' if finding.causes else 'plain OU'
-        return [page.paragraph(f'Nothing: no statistic of the {which} lies outside the band.')]
+        return [page.paragraph(f'Nothing: no statistic of the {_model_name(finding)} lies outside '
+                               'the band.')]
     rows = [[c.statistic, _value(c.before), *([_value(c.after)] if finding.causes else []),
              f'{c.p_after:.2g}' if math.isfinite(c.p_after) else NOT_KNOWN,
              plain_words(c.statistic)] for c in finding.remaining]

@@ -181,8 +181,8 @@ def test_the_page_shows_it_all(sag):
         assert part in text
     assert ' '.join(sag.sentence.replace('+-', '\u00b1').split()) in text
     drawings = root.findall('.//figure/svg')
-    # Rows of statistics, and six pictures twice.
-    assert len(drawings) == 1 + 2 * 6
+    # The voltage over its simulations, rows of statistics, and six pictures twice.
+    assert len(drawings) == 2 + 2 * 6
     coordinates = re.findall(r'="([^"]*)"', ''.join(
         re.findall(r'<(?:path|line|circle|rect)[^>]*>', html)))
     assert not any(re.search(r'nan|inf', c) for c in coordinates)
@@ -232,7 +232,8 @@ def test_the_page_of_a_plain_rail_keeps_the_plain_model():
     root = parsed(discovery_page(found))
     text = ' '.join(''.join(root.itertext()).split())
     assert 'The plain OU is kept' in text and 'xtended' not in text
-    assert len(root.findall('.//figure/svg')) == 1 + 6
+    assert 'simulations of the plain OU at each moment' in text
+    assert len(root.findall('.//figure/svg')) == 2 + 6
     assert 'xtended' not in render(found)
 
 

@@ -40,9 +40,10 @@ _APART = [
     {'load_dependent_sigma', 'volatility'}, {'load_dependent_sigma', 'load_dependent_alpha'},
     {'load_dependent_sigma', 'nonlinear_restoring'}, {'volatility', 'nonlinear_restoring'},
     {'load_dependent_alpha', 'load_transient'},
-    {'load_dependent_noise', 'load_dependent_sigma', 'load_dependent_alpha', 'volatility',
-     'regime_switching', 'measurement_noise', 'clock_jitter', 'quantization', 'held_samples'},
-    {'load_dependent_noise', 'saturation', 'jumps', 'glitches', 'heavy_tails'},
+    *({'load_dependent_noise', other} for other in (
+        'load_dependent_sigma', 'load_dependent_alpha', 'volatility', 'regime_switching',
+        'measurement_noise', 'clock_jitter', 'quantization', 'held_samples', 'saturation',
+        'jumps', 'glitches', 'heavy_tails')),
 ]
 
 

@@ -95,11 +95,16 @@ class NonlinearRestoring(Term):
 
         level = [0.0, 1.0]
         # The regression takes the force at the begin of a step for that throughout.
-        b = _climbed(lambda b: scored(b, train)[1], inverse @ (inside.T @ view.z[train]), error)
-        if not alpha > b[0]:
+        # Far from what the data are, or as they are in a sensor that was stuck, a force runs away.
+        with np.errstate(over='ignore', invalid='ignore'):
+            b = _climbed(lambda b: scored(b, train)[1], inverse @ (inside.T @ view.z[train]),
+                         error)
+            if not alpha > b[0]:
+                return None
+            scored(b, train)
+            scores, density = scored(b, slice(None))
+        if not np.isfinite(density).all():
             return None
-        scored(b, train)
-        scores, density = scored(b, slice(None))
         by = dict(zip(powers, b[1:].tolist(), strict=True))
         errors = dict(zip(powers, error[1:].tolist(), strict=True))
         square, cube = by.get(2, 0.0), by.get(3, 0.0)
@@ -152,6 +157,8 @@ def _climbed(density: Callable[[FloatArray], FloatArray], b: FloatArray, error: 
     for _ in range(_ROUNDS):
         scores = np.stack([density(b + _NEAR * step) - now for step in np.diag(error)],
                           axis=1) / _NEAR
+        if not np.isfinite(scores).all():
+            break
         move = error * (np.linalg.pinv(scores.T @ scores) @ scores.sum(axis=0))
         for share in (1.0, 0.3, 0.1):
             new = density(b + share * move)
