@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import inspect
 import itertools
 import math
 import os
@@ -10,6 +11,7 @@ from pathlib import Path
 import random
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -27,9 +29,18 @@ _counter = itertools.count()
 
 
 def new_domain() -> int:
-    """Return a ROS domain nobody else of this test run uses just now: 10..59."""
-    worker = int(re.sub(r'\D', '', os.environ.get('PYTEST_XDIST_WORKER', '')) or 0)
-    return 10 + (worker * 13 + next(_counter)) % 50
+    """Return a ROS domain nobody on this machine uses just now, be it another run of tests."""
+    # Runs at the same time begin at different places, and one passes by what another has taken:
+    # the first participant of a domain has this port (DDSI-RTPS 9.6.1).
+    for _ in range(200):
+        domain = 10 + (37 * os.getpid() + next(_counter)) % 90
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first:
+            try:
+                first.bind(('', 7410 + 250 * domain))
+            except OSError:
+                continue
+            return domain
+    pytest.fail('every ROS domain from 10 to 99 is in use')
 
 
 def wait_until(predicate: Callable[[], Any], timeout: float = DEADLINE, what: str = '') -> Any:
@@ -168,10 +179,23 @@ class Probe:
         except ExternalShutdownException:
             return
 
-    def listen(self, topic: str, kind: Any, qos: Any = 100) -> list[Any]:
-        """Return the list to which messages of a topic will be added."""
+    def listen(self, topic: str, kind: Any, qos: Any = 100,
+               sent: list[float] | None = None) -> list[Any]:
+        """Return the list to which messages of a topic will be added; to `sent` when, s."""
         got: list[Any] = []
-        self.node.create_subscription(kind, topic, got.append, qos)
+        if sent is None:
+            self.node.create_subscription(kind, topic, got.append, qos)
+            return got
+
+        def take(message: Any, info: Any) -> None:
+            sent.append(info['source_timestamp'] * 1e-9)
+            got.append(message)
+
+        # The EventsExecutor of rclpy 7.1 hands over one tuple instead of two arguments.
+        def call(*args: Any) -> None:
+            take(*(args if len(args) == 2 else args[0]))
+        call.__signature__ = inspect.signature(take)  # type: ignore[attr-defined]
+        self.node.create_subscription(kind, topic, call, qos)
         return got
 
     def publisher(self, topic: str, kind: Any, qos: Any = 10) -> Any:
