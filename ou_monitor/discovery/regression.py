@@ -116,6 +116,12 @@ def _there(term: Term, others: Sequence[Term]) -> bool:
     return False
 
 
+def _nearby(one: Term, other: Term) -> bool:
+    """Return whether two terms differ by a time constant of the list, or the next but one."""
+    return (isinstance(one, LoadTransient) and isinstance(other, LoadTransient)
+            and one.delay == other.delay and 0.5 < one.tau / other.tau < 2.0)
+
+
 def _candidates(view: View) -> Iterator[Term]:
     """Yield the candidates of all measured causes of the mean."""
     for kind in catalogue().values():
@@ -179,7 +185,15 @@ class _Regression:
                 0.0 if swapped else self._least(chosen, k, largest))
             if gain > max(most, 0.1) and (swapped or self._steady(chosen, more)):
                 best, most = more, gain
-        return best
+        return best or self._best_exchange(chosen, value)
+
+    def _best_exchange(self, chosen: tuple[int, ...], value: float) -> tuple[int, ...] | None:
+        """Return the set with a time constant nearby in the place of a worse one."""
+        others = [tuple(sorted((*self._less(chosen, j), k))) for j in chosen
+                  for k in range(len(self._pool))
+                  if k not in chosen and _nearby(self._pool[j], self._pool[k])]
+        best = max(others, key=self._value, default=None)
+        return best if best is not None and self._value(best) > value + 0.1 else None
 
     def _least(self, beside: tuple[int, ...], k: int, largest: float) -> float:
         """Return the evidence that a term must bring beside others, nats."""

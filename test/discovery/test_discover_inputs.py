@@ -145,10 +145,17 @@ def test_one_sample_that_differs_is_no_rail(n):
 
 @pytest.mark.parametrize('n', [100, 101])
 def test_a_hundred_samples_are_enough_to_try(n):
-    """A fit, and a gain whose error says how little it is."""
+    """
+    A fit whose errors say how little it is, and no gain, for nothing was added.
+
+    alpha is known to sqrt(2 alpha / T) at best, less where it lies low by chance.  Two fits of
+    one model differ by less than the errors of its three parameters cost, 3 / (2 n) nats.
+    """
     found = discover(Recording(*simulated(n), 'few'))
     assert found.verdict is Verdict.NO_EFFECT and found.baseline is not None
-    assert found.gain_se > 0.01
+    best = math.sqrt(2.0 * RAIL.alpha / (n / 1000.0))
+    assert 0.7 * best < found.se[0]['alpha'] < 2.0 * best
+    assert abs(found.gain) < 1.5 / n and found.gain_se < 1.5 / n
 
 
 @pytest.mark.parametrize('what', ['two', '99', 'constant', 'gaps', 'no throttle', 'nothing'])

@@ -208,11 +208,16 @@ def test_a_clean_bench_stays_quiet():
 
 @pytest.mark.skipif('OU_MONITOR_REALDATA' not in os.environ, reason='no real recordings')
 def test_the_line_of_a_motor_is_named():
-    """mm_bench_3: a line that wanders from 236 to 246 Hz in 0.7 s, most of the variance."""
+    """
+    mm_bench_3: a line that wanders from 236 to 246 Hz in 0.7 s, most of the variance.
+
+    The motor starts late: over all blocks its gain is known to half of itself only, and what
+    names it is the likelihood of the whole.
+    """
     found = discover(Path(os.environ['OU_MONITOR_REALDATA']) / 'mm_bench_3.csv')
     (line,) = [cause for cause in found.causes if cause.term.FAMILY == 'line']
     assert 232.0 < line.term.frequency < 250.0
-    assert line.gain > 5.0 * line.gain_se
+    assert line.gain > line.gain_se and line.p_value < 1e-50
 
 
 @pytest.mark.skipif('OU_MONITOR_REALDATA' not in os.environ, reason='no real recordings')
