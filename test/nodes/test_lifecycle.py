@@ -1,5 +1,6 @@
 """Managed nodes over DDS: transitions, those that fail, and a restart in the middle of a dip."""
 
+import contextlib
 import threading
 import time
 
@@ -8,6 +9,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from live import wait_until
 import pytest
 from rcl_interfaces.srv import GetParameters
+from rclpy._rclpy_pybind11 import RCLError
 from std_msgs.msg import Bool, Float64
 
 NODES = {'estimator': 'ou_estimator', 'adaptive_filter': 'ou_adaptive_filter'}
@@ -113,7 +115,9 @@ def test_a_restart_in_the_middle_of_a_dip(world):
 
     def send():
         while not end.wait(0.002):
-            output.publish(Float64(data=4.0))
+            # One sample of many: where the middleware of a busy machine refuses it, the next.
+            with contextlib.suppress(RCLError):
+                output.publish(Float64(data=4.0))
     thread = threading.Thread(target=send)
     thread.start()
     try:
