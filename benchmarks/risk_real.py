@@ -75,6 +75,8 @@ def fly(name: str, recording: Recording) -> tuple[list[Case], list[Case], dict[s
     u = np.clip(recording.throttle[good], 0.0, 1.0)
     middle = median3(v)
     looks = np.unique(np.searchsorted(t, np.arange(LOOK, t[-1] - max(HORIZONS), LOOK)))
+    # Where samples are rarer than the horizon, or in a gap, there is no lowest one ahead.
+    looks = looks[np.searchsorted(t, t[looks] + min(HORIZONS), 'right') > looks + 1]
     begin = SETTLED if t[-1] >= 30.0 else SHORT_SETTLED
     late = t[looks] >= begin
     lows, levels = {}, {}
