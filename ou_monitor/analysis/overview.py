@@ -23,6 +23,8 @@ from ou_monitor.text import number
 _APART = 0.2
 # The noise follows throttle when it differs by more than that factor between its ends.
 _GROWS = 1.25
+# Lines are part of the answer when they make more than that share of the noise at their level.
+_LOUD = 0.25
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,8 @@ class Line:
         Of the variance of its level, 0..1.
     level : str
         Throttle of that level, in words.
+    lines, all_share : int, float
+        How many lines that level has, and their share together.
 
     """
 
@@ -45,6 +49,8 @@ class Line:
     rms: float
     share: float
     level: str
+    lines: int
+    all_share: float
 
 
 @dataclass(frozen=True)
@@ -139,7 +145,9 @@ def _strongest(levels: Sequence[LevelResult]) -> Line | None:
     if not found:
         return None
     line, level = max(found, key=lambda pair: pair[0].rms)
-    return Line(line.frequency, line.rms, line.share, level.label)
+    lines = level.lines.lines
+    return Line(line.frequency, line.rms, line.share, level.label, len(lines),
+                sum(each.share for each in lines))
 
 
 def headline(found: Overview) -> str:
@@ -155,6 +163,12 @@ def headline(found: Overview) -> str:
     if found.load.known:
         at, sag, _ = found.sag
         parts.append(f'the rail sags by {_volts(sag)} at {100.0 * at:.0f} % throttle')
+    if found.line is not None and found.line.all_share > _LOUD:
+        line = found.line
+        what = (f'a line at {number(line.frequency, 4)} Hz makes' if line.lines == 1 else
+                f'{line.lines} lines, the strongest at {number(line.frequency, 4)} Hz, make')
+        where = '' if line.level == 'all' else f' at {line.level} throttle'
+        parts.append(f'{what} {100.0 * line.all_share:.0f} % of the noise{where}')
     return '; '.join(parts) + '.' if parts else 'The recording holds no samples.'
 
 

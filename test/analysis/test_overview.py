@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 import math
+from types import SimpleNamespace
 
 import numpy as np
 from ou_monitor.analysis.overview import count_dips, headline, known_lines, overview
@@ -80,3 +81,15 @@ def test_what_is_not_known_is_said_and_the_rest_stands():
     assert headline(overview(replace(one, t=one.t[:0], voltage=one.voltage[:0],
                                      throttle=one.throttle[:0]))) \
         == 'The recording holds no samples.'
+
+
+@pytest.mark.parametrize('shares,words', [
+    ((), ''), ((0.2,), ''), ((0.3,), 'a line at 40.00 Hz makes 30 % of the noise'),
+    ((0.2, 0.1), '2 lines, the strongest at 40.00 Hz, make 30 % of the noise')])
+def test_lines_are_part_of_the_answer_when_they_make_a_quarter_of_the_noise(shares, words):
+    """Alone or together; weaker ones are in the list only."""
+    lines = [SimpleNamespace(frequency=40.0 * k, rms=0.01 / k, share=share)
+             for k, share in enumerate(shares, 1)]
+    level = SimpleNamespace(label='all', lines=SimpleNamespace(lines=lines))
+    answer = headline(overview(flight(), 15.2, [level]))
+    assert answer.endswith(f'{words}.') if words else 'line' not in answer

@@ -144,6 +144,21 @@ def test_budget_is_unknown_without_data():
     assert math.isnan(report.budget) and report.fields['throttle_budget'] == 'nan'
 
 
+def test_a_budget_needs_a_second_of_flight():
+    """The sag of a square wave of throttle is known sooner; the pilot and the noise are not."""
+    rng = np.random.default_rng(1)
+    t = np.arange(1200) / 1000.0
+    throttle = 0.2 + 0.6 * (t % 0.4 > 0.2)
+    voltage = 16.0 - 1.2 * throttle ** 1.8 + 0.005 * rng.standard_normal(t.size)
+    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=14.0, brownout_horizon=1.0))
+    monitor.push(t[:900], voltage[:900], throttle[:900])
+    report = monitor.report(0.0)
+    assert report.load.known and math.isnan(report.budget)
+    assert report.budget_reason == 'Less than a second has been flown.'
+    monitor.push(t[900:], voltage[900:], throttle[900:])
+    assert monitor.report(0.0).budget == 0.8
+
+
 def test_model_is_kept_and_changed():
     model = SupplyModel((OU(alpha=63.0, sigma=0.3, u0=5.0),))
     monitor = SupplyMonitor(None, model)

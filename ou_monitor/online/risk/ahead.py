@@ -60,7 +60,8 @@ def look_ahead(outlook: Outlook, forecast: Forecast, e: Estimate, load: SupplyLo
             if known:
                 budget = load_budget(risks, forecast.flown, s.budget_limit, voltage, horizon)
             elif not e.usable and load.status is not LoadStatus.NO_DATA:
-                return Ahead(outcome, NAN, load.status.value)
+                return Ahead(outcome, NAN, load.status.value if not load.known else
+                             'Less than a second has been flown.')
         elif budget.risks.size:
             # Elsewhere it is the prior's.
             risks = np.where(budget.known, budget.risks, NAN)
