@@ -166,6 +166,16 @@ class SupplyMonitor:
             # Whatever it is: a monitor that ends with it says nothing any more.
             self.restart(error)
 
+    def watch(self, voltage: npt.ArrayLike, arrival: npt.ArrayLike) -> None:
+        """
+        Hold samples whose time nobody knows against the floor alone.
+
+        Voltage in V and arrival in s, shape (n,), as of `push`.
+        """
+        volts = np.atleast_1d(np.asarray(voltage, dtype=np.float64))
+        unknown, volts, _ = readings(np.full_like(volts, NAN), volts, None)
+        self._flag.push(unknown, volts, arrival)
+
     def restart(self, error: BaseException) -> None:
         """Begin with nothing known because of an error; the flag stays held, and it is told."""
         words = ' '.join(str(error).split())[:200]
@@ -270,7 +280,7 @@ class SupplyMonitor:
                                  arriving=arriving)
         silence = '' if fresh else self._silence(
             age, e, limit, stamps, arriving, late=silent - here > limit)
-        level, summary = self._judge(e, risk, flag, silence, arriving)
+        level, summary = self._judge(e, risk, flag, silence)
         return MonitorReport(
             e, risk, ahead.budget, ahead.budget_reason, left_out, flag, level, summary, silent,
             limit, stamps, fresh, self._thinned, self._restarts, self._fault, self._load,
@@ -378,7 +388,7 @@ class SupplyMonitor:
             return f'The window was cleared ({self._reset_reason}) and is filling again.'
         return Status.NO_DATA.value
 
-    def _judge(self, e: Estimate, risk: float, flag: FlagState, silence: str, arriving: bool
+    def _judge(self, e: Estimate, risk: float, flag: FlagState, silence: str
                ) -> tuple[Level, str]:
         """Return the level of the diagnostics and the line for the pilot."""
         critical = flag.level is FlagLevel.CRITICAL
@@ -387,7 +397,7 @@ class SupplyMonitor:
             return Level.ERROR, (
                 f'The estimator failed and was started anew ({self._restarts} times so far), and '
                 f'knows nothing yet: {self._fault}.{still}')
-        if silence and critical and arriving and flag.low:
+        if silence and critical and flag.low:
             return Level.ERROR, f'{self._of_risk(e, risk, flag)} {silence}'
         if silence:
             still = f' The brown-out flag is still set: {flag.reason}.' if critical else ''

@@ -112,6 +112,7 @@ class MonitorReport:
         values['brownout_level'] = self.flag.level.name
         values['brownout_level_age'] = self.flag.age
         values['brownout_reason'] = self.flag.reason
+        values['floor_dips'] = self.flag.dips
         values['throttle_budget'] = self.budget
         values['model_left_out'] = ','.join(self.left_out)
         values['throttle_budget_reason'] = self.budget_reason

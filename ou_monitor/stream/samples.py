@@ -138,7 +138,8 @@ class SampleStream:
     messages : int
         Voltage messages taken.
     unplaced : int
-        Messages that could not be placed in time (`/clock` not there yet).
+        Messages that could not be placed in time (`/clock` not there yet); only the floor judges
+        them.
     thin : int
         Of so many samples one is estimated from; see `SupplyMonitor.push`.
 
@@ -221,6 +222,11 @@ class SampleStream:
         held = placed & (np.add.reduceat(np.append(np.isfinite(values), False).astype(np.int64),
                                          np.cumsum(counts) - counts) * (counts > 0) > 0)
         if not placed.all():
+            lost = np.repeat(~placed, counts)
+            if lost.any():
+                # The floor judges them all the same, behind what came before.
+                self.flush()
+                self._monitor.watch(values[lost], np.repeat(arrived, counts)[lost])
             values = values[np.repeat(placed, counts)]
             ends, own, counts = ends[placed], own[placed], counts[placed]
             arrived, firsts, current = arrived[placed], firsts[placed], current[placed]

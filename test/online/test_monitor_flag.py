@@ -104,6 +104,27 @@ def test_floor_of_a_silent_source_does_not_decide():
     assert monitor.report(1.1).brownout is None
 
 
+def test_a_dip_is_told_though_the_source_is_silent_since():
+    """A rail that dies takes its sensor with it, perhaps between two reports: told once."""
+    monitor = SupplyMonitor(MonitorSettings(brownout_hold=0.0))
+    monitor.push([0.0, 0.001, 0.002], [4.2] * 3)
+    report = monitor.report(1.1)
+    assert report.brownout is True and report.level is Level.ERROR
+    assert 'brownout.floor (4.3 V)' in report.summary and 'No voltage for 1.1 s' in report.summary
+    assert report.fields['floor_dips'] == '1'
+    silent = monitor.report(1.2)
+    assert silent.brownout is None and silent.level is Level.STALE
+
+
+def test_samples_that_nobody_can_place_reach_the_floor():
+    """They are no samples of an estimate."""
+    monitor = SupplyMonitor(MonitorSettings(brownout_hold=0.0))
+    monitor.watch([5.0, math.nan, 4.2, 4.2, 1e30, 4.2], 0.01 * np.arange(6))
+    report = monitor.report(None, 1.0)
+    assert report.brownout is True and report.estimate.counters.pushed == 0
+    assert monitor.report(None, 1.1).brownout is None
+
+
 def test_floor_without_an_estimate():
     """Five samples: no fit yet, and the risk knows only the newest ones."""
     monitor = SupplyMonitor()

@@ -16,6 +16,7 @@ class Sink:
     def __init__(self):
         self.t, self.v, self.u, self.resets = [], [], [], []
         self.current = []
+        self.watched = []
 
     def push(self, t, voltage, throttle, arrival=None, *, current=None, thin=1):
         """Note samples."""
@@ -23,6 +24,10 @@ class Sink:
         self.v += voltage.tolist()
         self.u += throttle.tolist()
         self.current += [] if current is None else current.tolist()
+
+    def watch(self, voltage, arrival):
+        """Note samples without a time."""
+        self.watched += list(zip(voltage.tolist(), arrival.tolist()))
 
     def reset(self, reason):
         """Note a reset."""
@@ -134,6 +139,20 @@ def test_without_a_time_nothing_is_placed():
     assert not stream.take_voltage(plain(5.0), lambda: math.nan)
     stream.flush()
     assert sink.v == [] and stream.unplaced == 1
+
+
+def test_without_a_time_the_floor_gets_them():
+    """Behind what came before, each with its arrival; blocks value by value."""
+    for rate, counts in ((None, [1, 1, 1]), (1000.0, [2, 0, 3])):
+        stream, sink = stream_of(sample_rate=rate)
+        stream.take_voltage(plain(5.0), lambda: 1.0)
+        n = sum(counts)
+        held = stream.take_voltages(
+            np.full(3, math.nan), np.zeros(3, bool), np.array(counts), 4.0 + np.arange(n),
+            np.array([7.0, 8.0, 9.0]))
+        assert not held.any() and sink.v == [5.0] and stream.unplaced == 3
+        assert sink.watched == list(zip(
+            (4.0 + np.arange(n)).tolist(), np.repeat([7.0, 8.0, 9.0], counts).tolist()))
 
 
 def test_stamps_that_go_back_clear_the_window_once():

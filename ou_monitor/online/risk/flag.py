@@ -10,8 +10,9 @@ never OK, and never a flag that says false.
 The voltage floor is a threshold on the samples that needs no model: the median of
 the last `brownout.floor_time` seconds decides, so that a lone bad sample does not;
 every sample is judged, also those between two reports, and also those whose stamps are
-late, frozen or irregular: these count in order of arrival.  A bad value that a
-logger repeats for more than half of that time counts.
+late, frozen, irregular or missing: these count in order of arrival.  A dip is told by the next
+update, though nothing may have arrived since.  A bad value that a logger repeats for more than
+half of that time counts.
 """
 
 from __future__ import annotations
@@ -33,6 +34,9 @@ _BACK = 1.0
 _USUAL = 200
 # Samples kept at most: the longest floor_time, 10 s, at 20 kHz.
 _MOST = 200_000
+# A step forward counts as so many `stale_after` at most: twice what is judged together.  Or stamps
+# at random would move the time line on until a float no longer tells its milliseconds.
+_FAR = 4.0
 
 
 class FloorWatch:
@@ -46,10 +50,16 @@ class FloorWatch:
         `stale_after`, s: three samples further apart than twice this are not
         judged together.
 
+    Attributes
+    ----------
+    dips : int
+        How often the voltage has gone down to the floor.
+
     """
 
     def __init__(self, settings: MonitorSettings) -> None:
         self.settings = settings
+        self.dips = 0
         self._usual = math.nan
         self.reset()
 
@@ -72,8 +82,8 @@ class FloorWatch:
         """
         Judge samples (t in s, voltage in V, arrival in s on a monotonic clock).
 
-        With `arrival` they are judged in the order given; without, samples of one batch that are
-        newer than all before are put in order of their stamps.
+        With `arrival` they are judged in the order given, and a stamp may be NaN; without, samples
+        of one batch that are newer than all before are put in order of their stamps.
         """
         if self.settings.floor <= 0.0:
             if self._t.size:
@@ -83,9 +93,7 @@ class FloorWatch:
         times = None if arrival is None else _column(arrival)
         if stamps.shape != volts.shape or (times is not None and times.shape != volts.shape):
             raise ValueError(f't {stamps.shape} and voltage {volts.shape} differ in shape')
-        good = np.isfinite(stamps) & np.isfinite(volts)
-        if times is not None:
-            good &= np.isfinite(times)
+        good = np.isfinite(volts) & np.isfinite(stamps if times is None else times)
         if not good.all():
             stamps, volts = stamps[good], volts[good]
             times = None if times is None else times[good]
@@ -102,16 +110,18 @@ class FloorWatch:
                 order = np.argsort(t, kind='stable')
                 t, v = t[order], v[order]
         steps = np.diff(t, prepend=self._newest)
+        # The comparison is false for NaN too: no stamp is as good as a late one.
         late = ~(steps > 0.0)
+        far = _FAR * self.settings.stale_after
         at = t + self._shift
-        if late.any():
-            last = float(self._t[-1]) if self._t.size else float(t[0])
-            steps = np.where(late, self._step(arrival), steps)
+        if late.any() or (steps[np.isfinite(steps)] > far).any():
+            last = float(self._t[-1]) if self._t.size else 0.0
+            steps = np.where(late, self._step(arrival), np.minimum(steps, far))
             if not self._t.size:
                 steps[0] = 0.0
             at = last + np.cumsum(steps)
             self._shift = float(at[-1] - t[-1])
-        elif arrival is None:
+        if arrival is None and not late.any():
             self._learn(t, self._newest)
         if arrival is not None:
             self._learn(arrival, self._arrived)
@@ -154,6 +164,7 @@ class FloorWatch:
         count = below[ends + 1] - below[begin]
         # The median is at or below the floor where more than half of the samples are.
         low = (count > 1) & (2 * count > ends + 1 - begin)
+        self.dips += int(np.count_nonzero(low & ~np.append(self._low, low[:-1])))
         self._low = bool(low[-1])
         self._was_low = self._was_low or bool(low.any())
         first = max(int(begin[-1]), t.size - _MOST)
@@ -163,9 +174,9 @@ class FloorWatch:
         """Return the number of samples kept."""
         return int(self._t.size)
 
-    def take(self) -> bool:
-        """Return whether the voltage is at or below the floor, or was since the last call."""
-        low, self._was_low = self._low or self._was_low, False
+    def take(self, arriving: bool = True) -> bool:
+        """Return whether a sample since the last call was low, or the last is and more arrive."""
+        low, self._was_low = self._was_low or (self._low and arriving), False
         return low and self.settings.floor > 0.0
 
 
@@ -203,6 +214,8 @@ class FlagState:
         Time spent in the level, s; NaN when the time is not known.
     low : bool
         Whether the voltage is at or below the floor, or was since the last update.
+    dips : int
+        How often it has gone down to the floor so far.
 
     """
 
@@ -212,6 +225,7 @@ class FlagState:
     reason: str = 'nothing is known yet'
     age: float = NAN
     low: bool = False
+    dips: int = 0
 
 
 class BrownoutFlag:
@@ -266,7 +280,8 @@ class BrownoutFlag:
             return False
         self._enter(FlagLevel.UNKNOWN)
         self._above.clear()
-        self._state = FlagState(since=self._since, reason='cleared, not judged since')
+        self._state = FlagState(since=self._since, reason='cleared, not judged since',
+                                dips=self._floor.dips)
         return True
 
     def set_critical(self, reason: str) -> None:
@@ -280,12 +295,12 @@ class BrownoutFlag:
         Judge (t in s, risk 0..1).
 
         `fresh`: the risk rests on samples that are not too old; `arriving`: samples still come,
-        whatever their stamps say, and the floor holds for them (as `fresh` when left out).
+        whatever their stamps say, and a last one at the floor holds (as `fresh` when left out).
         """
         if risk < 0.0 or risk > 1.0:
             raise ValueError(f'a risk must lie within 0..1 or be NaN, got {risk}')
         self._go_to(t)
-        low = self._floor.take() and (fresh if arriving is None else arriving)
+        low = self._floor.take(fresh if arriving is None else arriving)
         known = fresh and not math.isnan(risk)
         wanted, reason = self._wanted(risk, known, low)
         level, reason = self._held(wanted, reason, known or low)
@@ -294,7 +309,7 @@ class BrownoutFlag:
         if known or low:
             self._known = self._now
         self._state = FlagState(level, self._flag(known), self._since, reason,
-                                self._now - self._since, low)
+                                self._now - self._since, low, self._floor.dips)
         return self._state
 
     def _go_to(self, t: float) -> None:

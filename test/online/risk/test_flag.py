@@ -229,10 +229,12 @@ def test_floor_can_be_changed():
     check([flag.update(1.0, NAN)], 'c')
 
 
-def test_floor_of_stale_data_does_not_decide():
-    flag = made()
+def test_floor_of_stale_data_decides_once():
+    """What came since the last update is told; that nothing has come since is not."""
+    flag = made(brownout_hold=0.0)
     flag.push([0.0, 0.01, 0.02], [4.2] * 3)
-    check([flag.update(0.0, NAN, fresh=False)], 'u')
+    check([flag.update(0.1 * k, NAN, fresh=False) for k in range(3)], 'cuu')
+    check([flag.update(0.3, NAN, fresh=False, arriving=True)], 'c')
 
 
 def test_reason_names_the_parameter():

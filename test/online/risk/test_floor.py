@@ -154,6 +154,47 @@ def test_stamps_that_start_anew_keep_what_is_known_by_its_arrival():
     assert floor.take()
 
 
+@pytest.mark.parametrize('part', [slice(0, 3000), slice(1500, 2500), slice(2005, 2011)])
+def test_samples_without_a_stamp_count_by_their_arrival(part):
+    """Of all, of many around a dip, of some of its samples: a dip trips it, a glitch does not."""
+    arrived = 50.0 + 0.001 * np.arange(3000)
+    stamps = 1000.0 + arrived
+    stamps[part] = math.nan
+    volts = np.full(3000, 5.0)
+    volts[[100, 1700]] = 0.0
+    volts[2000:2020] = 4.0
+    floor = watch()
+    tripped = []
+    for k in range(0, 3000, 50):
+        floor.push(stamps[k:k + 50], volts[k:k + 50], arrived[k:k + 50])
+        tripped += [k] if floor.take() else []
+    assert tripped == [2000] and floor.dips == 1
+
+
+def test_stamps_at_random_do_not_wear_it_out():
+    """A million steps of up to 68 years, as of memory that nobody has set; then a dip of 20 ms."""
+    rng = np.random.default_rng(9)
+    n = 2_000_000
+    floor = watch()
+    for k in range(0, n, 10_000):
+        floor.push(rng.uniform(0.0, 2.0 ** 31, 10_000), np.full(10_000, 5.0),
+                   0.001 * (k + np.arange(10_000)))
+    volts = np.full(1000, 5.0)
+    volts[500:520] = 4.0
+    arrived = 0.001 * (n + np.arange(1000))
+    floor.push(1.7e9 + arrived, volts, arrived)
+    assert floor.take() and floor.dips == 1
+
+
+def test_dips_are_counted():
+    """Each way down to the floor, over batches and reads; staying there is none."""
+    floor = watch()
+    for k in range(6):
+        push(floor, [4.0] * 30 if k in (1, 2, 4) else [5.0] * 30, start=0.03 * k)
+        assert floor.take() is (k in (1, 2, 3, 4, 5))
+        assert floor.dips == (0, 1, 1, 1, 2, 2)[k]
+
+
 def test_old_samples_do_not_outvote_a_new_one():
     """Two low ones, an hour, a good one: good."""
     floor = watch()
