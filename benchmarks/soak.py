@@ -7,14 +7,15 @@ CPU that is taken away.
     .venv/bin/python benchmarks/soak.py [--minutes 60] [--seed 1] [--markdown doc/reliability.md]
 
 The node, the source and a busy loop are processes of their own; this one listens over DDS, sets
-parameters and stops the node in slices.  Ctrl-C ends it with the figures so far.
+parameters and stops the node in slices.  With a real-time priority (`chrt -r 1`) the node and the
+busy loop keep it, and source and listener get the next higher one.  Ctrl-C ends it with the
+figures so far.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Callable
 from contextlib import suppress
 import json
 import multiprocessing
@@ -24,7 +25,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from typing import Any
 
@@ -32,7 +32,9 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test/support')]
 
 from live import memory_of, Probe, Process, Starved, values_of  # noqa: E402
-from soak_figures import as_table, figures, Heard, IN_TIME, Span  # noqa: E402
+from soak_dips import Heard, IN_TIME, Said, State  # noqa: E402
+from soak_figures import as_table, figures  # noqa: E402
+from soak_machine import busy, deafen, Machine, set_priority  # noqa: E402
 from soak_schedule import Event, events  # noqa: E402
 from tables import put  # noqa: E402
 
@@ -47,7 +49,7 @@ model:
 # A node that says nothing is asked where it is.
 ASKED = 'import faulthandler, signal; faulthandler.register(signal.SIGUSR1)'
 COUNTERS = ('messages', 'messages_lost', 'foreign_messages', 'pushed', 'used', 'non_finite',
-            'late', 'resets', 'samples_thinned', 'restarts', 'callback_errors')
+            'late', 'resets', 'floor_dips', 'samples_thinned', 'restarts', 'callback_errors')
 # s: between looks at the memory, and at what is reported of the progress; patience with a
 # service, with the start of a node, and with its end.
 LOOK, PROGRESS, ANSWER, START, END = 2.0, 60.0, 20.0, 60.0, 20.0
@@ -55,55 +57,10 @@ LOOK, PROGRESS, ANSWER, START, END = 2.0, 60.0, 20.0, 60.0, 20.0
 SILENT = 1.2
 
 
-class Machine(threading.Thread):
-    """
-    What the machine itself withholds, looked at 50 times a second.
-
-    Attributes
-    ----------
-    node, here : list of tuple of float
-        When the node's main thread was ready and had no CPU for more than WAIT s, by the
-        kernel's account, and when this process had none for PAUSE s; by the monotonic clock, s.
-
-    """
-
-    WAIT, PAUSE = 0.05, 0.1
-
-    def __init__(self, pid: Callable[[], int]) -> None:
-        super().__init__(daemon=True)
-        self._pid = pid
-        self.node: list[Span] = []
-        self.here: list[Span] = []
-
-    def run(self) -> None:
-        """Look until the process ends."""
-        before, last, waited = time.monotonic(), 0, 0.0
-        while True:
-            time.sleep(0.02)
-            now, pid = time.monotonic(), self._pid()
-            if now - before > self.PAUSE:
-                self.here.append((before, now))
-            before = now
-            with suppress(OSError):
-                # ns on the CPU, ns ready without it, since the thread began.
-                account = Path(f'/proc/{pid}/task/{pid}/schedstat').read_text()
-                total = 1e-9 * int(account.split()[1])
-                if pid == last and total - waited > self.WAIT:
-                    self.node.append((now - (total - waited), now))
-                last, waited = pid, total
-
-
-def busy(core: int) -> None:
-    """Keep one core busy."""
-    os.sched_setaffinity(0, {core})
-    while True:
-        pass
-
-
 class Soak:
     """One run: processes, what is heard of them, and what is done to them."""
 
-    def __init__(self, seed: int, seconds: float, folder: Path, domain: int) -> None:
+    def __init__(self, seed: int, seconds: float, folder: Path, domain: int, dense: bool) -> None:
         self.heard = Heard(outputs={
             name: [] for name in ('~/state', '/diagnostics', '~/brownout_risk')})
         self.counters: Counter[str] = Counter()
@@ -117,6 +74,9 @@ class Soak:
         os.mkfifo(fifo)
         model.write_text(MODEL)
         self._events = events(seed, seconds, str(fifo), str(model))
+        # Of the node; what hears it and what feeds it goes before it.
+        self._priority = os.sched_getparam(0).sched_priority
+        set_priority(self._priority + 1)
         self._node = self._start_node()
         self._machine = Machine(lambda: self._node.popen.pid)
         self._machine.start()
@@ -126,17 +86,20 @@ class Soak:
                'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
         self._source = subprocess.Popen(
             [sys.executable, ROOT / 'benchmarks/soak_source.py', str(seed), str(seconds),
-             self._log], env=env)
+             self._log, *(['dense'] if dense else [])], env=env)
         self._starved: tuple[float, Starved] | None = None
         self._busy: tuple[float, multiprocessing.Process] | None = None
         self._begin = self._start = time.monotonic()
-        self._told: set[float] = set()
+        self._told: set[tuple[str, float]] = set()
         self._asked = 0.0
 
     def _start_node(self) -> Process:
-        return Process('estimator', [
+        node = Process('estimator', [
             '--ros-args', '-r', '__ns:=/soak', '-p', 'brownout.hold:=0.0', '-p',
             f"state_file:={self._folder / 'latch'}"], self._domain, self._folder)
+        # Before it has threads.
+        set_priority(self._priority, node.popen.pid)
+        return node
 
     def _listen(self) -> None:
         from diagnostic_msgs.msg import DiagnosticArray
@@ -146,18 +109,20 @@ class Soak:
         node = self._probe.node
         times = self.heard.outputs
 
-        def state(message: Any) -> None:
+        def state(message: Any, number: int) -> None:
             now = time.monotonic()
             times['~/state'].append(now)
             values = self._newest = values_of(message.status[0])
-            self.heard.states.append((
+            counts = [self.counters[name] + int(values[name]) for name in (
+                'messages', 'messages_lost', 'foreign_messages', 'floor_dips')]
+            self.heard.states.append(State(
                 now, values['brownout_level'], values['brownout_reason'], values['brownout'],
-                self.counters['messages'] + int(values['messages'])))
+                *counts, number, float(values['arrival_age'])))
 
-        node.create_subscription(DiagnosticArray, f'{NODE}/state', state, 100)
-        node.create_subscription(
-            Bool, f'{NODE}/brownout',
-            lambda message: self.heard.flags.append((time.monotonic(), message.data)), 100)
+        self._probe.numbered(f'{NODE}/state', DiagnosticArray, state)
+        self._probe.numbered(
+            f'{NODE}/brownout', Bool, lambda message, number: self.heard.flags.append(
+                Said(time.monotonic(), message.data, number)))
         node.create_subscription(
             DiagnosticArray, '/diagnostics',
             lambda message: times['/diagnostics'].append(time.monotonic()), 100)
@@ -256,6 +221,8 @@ class Soak:
                 os.sched_setaffinity(int(task.name), cores)
 
     def _do(self, event: Event) -> None:
+        if event.kind != 'set':
+            self._note(event.kind)
         if event.kind in ('set', 'refused'):
             self._set(event)
         elif event.kind == 'clear':
@@ -268,9 +235,13 @@ class Soak:
         else:
             core = min(os.sched_getaffinity(0))
             self._pin({core})
-            process = multiprocessing.Process(target=busy, args=(core,), daemon=True)
+            process = multiprocessing.Process(
+                target=busy, args=(core, self._priority), daemon=True)
             process.start()
             self._busy = event.begin + event.about[0], process
+
+    def _note(self, name: str, value: str = '') -> None:
+        self.heard.done.append((time.monotonic(), name, value))
 
     def _call(self, client: Any, request: Any) -> Any:
         """Return the answer of a service; None when there is none."""
@@ -293,6 +264,8 @@ class Soak:
         if answer is None:
             return
         for (name, value), result in zip(event.about, answer.results):
+            if result.successful:
+                self._note(name, repr(value))
             if result.successful is (event.kind == 'set'):
                 self.found[event.kind] += 1
             else:
@@ -306,13 +279,17 @@ class Soak:
         print(f"{now / 60.0:5.1f} min: {dips['in_time']} of {dips['asked']} dips, longest "
               f"silence, s: {silent}, {found['memory'] / 1e6:.1f} MB, false {found['false']}",
               flush=True)
-        for what in ('lost', 'missed'):
+        self._explain(dips)
+
+    def _explain(self, dips: dict[str, Any]) -> None:
+        """Say of each dip that was not told what is known of it, once."""
+        for what in ('lost', 'unheard', 'missed'):
             for dip in dips[what]:
-                if dip['begin'] not in self._told:
-                    self._told.add(dip['begin'])
-                    print(f"{what} at {dip['begin'] - self._start:.2f} s: {dip}", *(
-                        state for state in self.heard.states
-                        if dip['begin'] - 0.3 < state[0] < dip['end'] + IN_TIME),
+                if (what, dip['begin']) not in self._told:
+                    self._told.add((what, dip['begin']))
+                    print(f"{what} at {dip['begin'] - self._start:.2f} s: {dip['why']}", *(
+                        state for state in self.heard.states if what == 'missed'
+                        and dip['begin'] - 0.3 < state.at < dip['end'] + IN_TIME),
                         sep='\n  ', flush=True)
 
     def figures(self, seconds: float, end: dict[str, Any]) -> dict[str, Any]:
@@ -342,6 +319,7 @@ class Soak:
         self._source.wait()
         self._probe.close()
         found = self.figures(length, end)
+        self._explain(found['dips'])
         if 'Traceback' in self._node.err or 'Current thread' in self._node.err:
             print(self._node.err[-20000:], file=sys.stderr)
         return found
@@ -355,6 +333,8 @@ def main() -> None:
     parser.add_argument('--domain', type=int, default=91, help='ROS_DOMAIN_ID')
     parser.add_argument('--transport', default='DEFAULT', choices=('DEFAULT', 'UDPv4'),
                         help='of Fast DDS; DEFAULT: shared memory, and UDP beside it')
+    parser.add_argument('--dense', action='store_true', help='dips as close as can be told apart')
+    parser.add_argument('--deafen', action='store_true', help='stop the listener now and then')
     parser.add_argument('--json', type=Path, help='file for all figures')
     parser.add_argument('--markdown', type=Path, help='page for the table')
     parser.add_argument('--beside', type=Path, nargs='*', default=[],
@@ -370,8 +350,11 @@ def main() -> None:
         (Path(folder) / 'sitecustomize.py').write_text(ASKED)
         os.environ['PYTHONPATH'] = os.pathsep.join(
             [folder, *filter(None, [os.environ.get('PYTHONPATH')])])
-        soak = Soak(options.seed, 60.0 * options.minutes, Path(folder), options.domain)
+        soak = Soak(options.seed, 60.0 * options.minutes, Path(folder), options.domain,
+                    options.dense)
         soak.run_by = f'seed {options.seed}, {options.transport}'
+        if options.deafen:
+            multiprocessing.Process(target=deafen, args=(os.getpid(),), daemon=True).start()
         try:
             soak.run()
         except KeyboardInterrupt:

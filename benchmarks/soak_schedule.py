@@ -18,19 +18,23 @@ RATE = 1000.0
 # that of the phase's begin, `backwards`, `jumps` (steps of 10 ms to 12 days, either way),
 # `future` (nine years ahead), `wild` (each within 100 s of the truth), `fast` (milliseconds taken
 # for seconds).  Values: `nan`, `huge` (a fifth of the samples).  Also: `burst` (sent 100 at once),
-# `second` (another publisher of the topic comes, and ends or is killed).
+# `lumps` (no stamps, and three of six seconds sent 100 at once), `second` (another publisher of
+# the topic comes, and ends or is killed).
 SEEN = {'good': 6.0, 'none': 2.0, 'frozen': 1.0, 'backwards': 1.0, 'jumps': 1.0, 'future': 1.0,
-        'wild': 1.0, 'fast': 1.0, 'nan': 1.0, 'huge': 1.0, 'burst': 1.0, 'second': 1.0}
+        'wild': 1.0, 'fast': 1.0, 'nan': 1.0, 'huge': 1.0, 'burst': 1.0, 'lumps': 1.0,
+        'second': 1.0}
 # What holds no voltage that the node can take for one: all samples NaN, millivolts, another
 # message type, a publisher that pauses, or that ends and begins anew.
 UNSEEN = {'only_nan': 0.7, 'millivolts': 0.7, 'type': 0.7, 'silent': 0.7, 'restart': 1.0}
 # During these no estimate can be made, so the flag must never be false.
 NEVER_FALSE = ('frozen', 'backwards', 'wild', 'only_nan', 'type', 'silent')
 LONG, SHORT = (4.0, 12.0), (2.0, 4.0)
-# Nothing is asked of a dip so shortly after the start, or after a new publisher, s: discovery.
-SETTLE, FIRST = 1.0, 3.0
-# Of dips: s between them, s, and V; all at or below the lowest floor that is ever set.
-BETWEEN, DIP, DEPTH = (1.5, 5.0), (0.04, 0.08), (3.0, 4.1)
+# Nothing is asked of a dip so shortly after the start, or after a new publisher, s: discovery;
+# nor so shortly before a publisher ends: what has been sent may go with it.
+SETTLE, FIRST, LEAVE = 1.0, 3.0, 0.3
+# Of dips: s between them (dense ones: never less than two can be told apart), s, and V; all at or
+# below the lowest floor that is ever set.
+BETWEEN, DENSE, DIP, DEPTH = (1.5, 5.0), (1.3, 2.0), (0.04, 0.08), (3.0, 4.1)
 # Events at the node: s between them.
 PAUSE = (1.0, 5.0)
 SLICES = ((0.02, 0.01), (0.05, 0.05), (0.2, 0.1), (0.4, 0.2))
@@ -92,13 +96,13 @@ def phases(seed: int, seconds: float) -> list[Phase]:
     return made
 
 
-def dips(seed: int, sent: list[Phase]) -> list[Dip]:
+def dips(seed: int, sent: list[Phase], dense: bool = False) -> list[Dip]:
     """Return the dips, whole milliseconds each."""
     rng = random.Random(f'dips {seed}')
     made: list[Dip] = []
     now = 0.0
     while True:
-        now = round(now + rng.uniform(*BETWEEN), 3)
+        now = round(now + rng.uniform(*(DENSE if dense else BETWEEN)), 3)
         length = round(rng.uniform(*DIP), 3)
         if now + length >= sent[-1].end:
             return made
@@ -110,9 +114,8 @@ def _unseen(begin: float, end: float, sent: list[Phase]) -> str:
         return 'start'
     for phase in sent:
         if phase.kind in UNSEEN:
-            # What is delivered is counted until a second after a dip.
-            before = 0.1 if phase.kind in ('only_nan', 'millivolts') else 1.1
-            after = SETTLE if phase.kind in ('type', 'restart') else 0.1
+            ends = phase.kind in ('type', 'restart')
+            before, after = (LEAVE, SETTLE) if ends else (0.1, 0.1)
             if end > phase.begin - before and begin < phase.end + after:
                 return phase.kind
     return ''

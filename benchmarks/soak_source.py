@@ -1,11 +1,12 @@
 """
 The source of a soak, in a process of its own: voltages at 1 kHz, with dips, as scheduled.
 
-    python soak_source.py SEED SECONDS LOG
+    python soak_source.py SEED SECONDS LOG [dense]
 
 Each phase and each dip is one line of JSON in the log: when its first and last sample were sent
-(monotonic clock, s), and how many.  Samples that are due while the process has no CPU are sent
-as soon as it has, with the stamps of when they were due.
+(monotonic clock, s), and how many; ten times a second the messages sent so far are one.  Samples
+that are due while the process has no CPU are sent as soon as it has, with the stamps of when they
+were due.
 """
 
 from __future__ import annotations
@@ -41,17 +42,18 @@ BURST, MOST = 100, 1000
 class Source:
     """Sends what is due."""
 
-    def __init__(self, seed: int, seconds: float, log: TextIO) -> None:
+    def __init__(self, seed: int, seconds: float, log: TextIO, dense: bool) -> None:
         self._rng = random.Random(f'source {seed}')
         self._log = log
         self._phases = phases(seed, seconds)
-        self._dips = dips(seed, self._phases)
+        self._dips = dips(seed, self._phases, dense)
         self._node = rclpy.create_node('soak_source')
         self._output: Any = self._node.create_publisher(BatteryState, TOPIC, QOS)
         self._second: subprocess.Popen[bytes] | None = None
         self._phase = self._phases[0]
         self._away, self._offset, self._jump_at = 0.0, 0.0, 0.0
         self._low: list[float] = []
+        self._count, self._counted = 0, -math.inf
         self._start = self._wall = 0.0
 
     def run(self) -> None:
@@ -64,7 +66,9 @@ class Source:
         sent, at, dip_at = 0, 0, 0
         while at < len(self._phases):
             due = int((time.monotonic() - self._start) * RATE)
-            burst = BURST if self._phase.kind == 'burst' else 1
+            lump = self._phase.kind == 'lumps' and sent / RATE % 6.0 < 3.0
+            burst = BURST if lump or self._phase.kind == 'burst' else 1
+            self._tell_count()
             sent = max(sent, due - MOST)
             while due - sent >= burst or sent / RATE >= self._phase.end:
                 now = sent / RATE
@@ -88,6 +92,12 @@ class Source:
     def _note(self, **about: Any) -> None:
         self._log.write(json.dumps(about) + '\n')
         self._log.flush()
+
+    def _tell_count(self) -> None:
+        now = time.monotonic()
+        if now - self._counted >= 0.1:
+            self._counted = now
+            self._note(kind='sent', at=now, count=self._count)
 
     def _tell(self, number: int) -> None:
         dip = self._dips[number]
@@ -145,6 +155,7 @@ class Source:
         if kind == 'type':
             self._output.publish(Float64(data=value))
             return
+        self._count += 1
         if kind == 'only_nan':
             value = math.nan
         elif kind in ('nan', 'huge') and self._rng.random() < BAD:
@@ -163,7 +174,7 @@ class Source:
         """Return the stamp of the sample of a time, s."""
         begin = self._wall + self._phase.begin
         t = self._wall + now
-        if kind == 'none':
+        if kind in ('none', 'lumps'):
             return 0.0
         if kind == 'frozen':
             return begin
@@ -196,7 +207,7 @@ def main() -> None:
     """Run."""
     rclpy.init()
     with Path(sys.argv[3]).open('w', encoding='utf-8') as log:
-        source = Source(int(sys.argv[1]), float(sys.argv[2]), log)
+        source = Source(int(sys.argv[1]), float(sys.argv[2]), log, 'dense' in sys.argv[4:])
         try:
             source.run()
         except KeyboardInterrupt:

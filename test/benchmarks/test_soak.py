@@ -4,52 +4,85 @@ import math
 
 import numpy as np
 import pytest
-from soak_figures import dips_of, false_of, growth, Heard, overlap, silence, unmatched
+from soak_dips import dips_of, Heard, overlap, Said, State, unheard
+from soak_figures import false_of, growth, silence, unmatched
 from soak_schedule import (
-    bad_parameters, DEPTH, Dip, dips, events, Phase, phases, SEEN, SETTLE, UNSEEN)
+    bad_parameters, DEPTH, Dip, dips, events, LEAVE, Phase, phases, SEEN, SETTLE, UNSEEN)
 
 FLOOR = 'the voltage is at or below brownout.floor (4.3 V)'
 
 
-def heard(critical=(), lost=0, flags=None, stops=(), reason=FLOOR):
-    """Return 20 s of states at 10 Hz; CRITICAL at some of them; one dip from 10 to 10.05 s."""
+def heard(critical=(), lost=0, flags=None, stops=(), reason=FLOOR, counted=0, dropped=(),
+          unsaid=()):
+    """
+    Return 20 s of states at 10 Hz; CRITICAL at some of them; one dip from 10 to 10.05 s.
+
+    `lost`: messages that did not reach the node; `counted`: dips by its count; `dropped`,
+    `unsaid`: times of states and flags that did not reach the listener.
+    """
     times = np.arange(0.0, 20.0, 0.1).round(3).tolist()
-    states = [(t, 'CRITICAL' if t in critical else 'OK', reason if t in critical else '',
-               'true' if t in critical else 'false', round(1000.0 * t) - lost * (t > 10.0))
-              for t in times]
-    said = [(t, t in (critical if flags is None else flags)) for t in times]
+    states = [State(t, 'CRITICAL' if t in critical else 'OK', reason if t in critical else '',
+                    'true' if t in critical else 'false', round(1000.0 * t) - lost * (t > 10.0),
+                    lost * (t > 10.0), 0, counted * (t > 10.0), k)
+              for k, t in enumerate(times) if t not in dropped]
+    said = [Said(t, t in (critical if flags is None else flags), k)
+            for k, t in enumerate(times) if t not in unsaid]
     return Heard(states=states, flags=said, stops=list(stops), source=[
+        *({'kind': 'sent', 'at': t, 'count': round(1000.0 * t)} for t in (0.0, 20.0)),
         {'kind': 'dip', 'begin': 10.0, 'end': 10.05, 'samples': 50, 'phase': 'good',
          'unseen': '', 'voltage': 3.0}])
 
 
-@pytest.mark.parametrize('made, in_time, missed, lost', [
-    (heard([10.1]), 1, 0, 0),
-    (heard(), 0, 1, 0),
+@pytest.mark.parametrize('made, fate', [
+    (heard([10.1]), 'in_time'),
+    (heard(), 'missed'),
     # For another reason; said before the dip; not said on the other topic; too late.
-    (heard([10.1], reason='risk 0.5'), 0, 1, 0),
-    (heard([9.9]), 0, 1, 0),
-    (heard([10.1], flags=[]), 0, 1, 0),
-    (heard([11.2]), 0, 1, 0),
+    (heard([10.1], reason='risk 0.5'), 'missed'),
+    (heard([9.9]), 'missed'),
+    (heard([10.1], flags=[]), 'missed'),
+    (heard([11.2], counted=1), 'missed'),
     # Stopped by us meanwhile.
-    (heard([11.2], stops=[(10.1, 10.6)]), 1, 0, 0),
+    (heard([11.2], stops=[(10.1, 10.6)]), 'in_time'),
     # Gone: more than half of its samples, or fewer.
     # (20 ms are left to the poll.)
-    (heard(lost=46), 0, 0, 1),
-    (heard(lost=44), 0, 1, 0),
+    (heard(lost=46), 'lost'),
+    (heard(lost=44), 'missed'),
+    # Counted by the node: the message was lost, of the state or of the flag; or nothing was.
+    (heard([10.1], counted=1, dropped=[10.1]), 'unheard'),
+    (heard([10.1], counted=1, unsaid=[10.1]), 'unheard'),
+    (heard([10.1], counted=1, flags=[], dropped=[10.2]), 'missed'),
+    (heard(counted=1), 'missed'),
+    # A message was lost, but the node counted nothing.
+    (heard(dropped=[10.1]), 'missed'),
 ])
-def test_dips(made, in_time, missed, lost):
-    """Told by the floor on both topics within a second of the node's own time, or not."""
+def test_dips(made, fate):
+    """Told by the floor on both topics within a second of the node's own time, or why not."""
     found = dips_of(made)
-    assert (found['asked'], found['in_time']) == (1, in_time)
-    assert (len(found['missed']), len(found['lost'])) == (missed, lost)
+    kinds = ('lost', 'unheard', 'missed')
+    counts = {'in_time': found['in_time'], **{kind: len(found[kind]) for kind in kinds}}
+    assert found['asked'] == 1 and counts == {kind: kind == fate for kind in counts}
+
+
+def test_a_dip_that_was_not_told_explains_itself():
+    """The node's counts, what the listener lost, what was in force and what was done."""
+    made = heard(lost=3, counted=1, dropped=[10.1, 10.2], unsaid=[10.3], stops=[(10.2, 10.25)])
+    made.done = [(2.0, 'brownout.floor', '4.3'), (9.5, 'clear', ''), (10.5, 'window', '1.0'),
+                 (15.0, 'busy', '')]
+    why, = (dip['why'] for dip in dips_of(made)['unheard'])
+    for words in ('50 samples at 3.00 V within 50.0 ms, stamps and values: good',
+                  'the node counted 1 dips, 1197 messages of 1180, 3 lost', 'and not 2',
+                  'flags and not 1', '0.30 s apart', 'stopped 0.05 s',
+                  'in force: brownout.floor 4.3;',
+                  'done: clear at -0.50 s, window 1.0 at +0.50 s'):
+        assert words in why, why
+    assert unheard(made.states) == 2
 
 
 @pytest.mark.parametrize('change', [{'unseen': 'silent'}, {'samples': 39}])
 def test_dips_that_nobody_could_see_do_not_count(change):
     """Nor those of which too few samples were sent."""
     made = heard()
-    made.source[0].update(change)
+    made.source[-1].update(change)
     assert dips_of(made)['asked'] == 0
 
 
@@ -80,7 +113,7 @@ def test_false_flags_and_flags_that_are_not_sent():
                    {'kind': 'phase', 'name': 'good', 'at': 8.05}]
     spent, found = false_of(made)
     assert spent == 1 and len(found) == 7 and found[0] == (pytest.approx(7.4), 'silent')
-    made.flags = [flag for flag in made.flags if not 5.05 < flag[0] < 7.05]
+    made.flags = [flag for flag in made.flags if not 5.05 < flag.at < 7.05]
     assert unmatched(made) == pytest.approx(1.0)
     assert len(false_of(made)[1]) == 7
 
@@ -118,9 +151,11 @@ def test_the_schedule_is_drawn_from_its_seed():
 
 
 def test_a_dip_is_unseen_where_nothing_is_sent():
-    """And until a new publisher is found."""
-    sent = [Phase('good', 0.0, 100.0), Phase('restart', 100.0, 102.0), Phase('good', 102.0, 200.0)]
-    for dip in dips(1, sent):
-        near = dip.begin + dip.length > 98.9 and dip.begin < 102.0 + SETTLE
-        assert dip.unseen == ('restart' if near else 'start' if dip.begin < 3.0 else '')
+    """And until a new publisher is found; what came before a silence counts."""
+    for kind, before, after in (('restart', LEAVE, SETTLE), ('silent', 0.1, 0.1)):
+        sent = [Phase('good', 0.0, 100.0), Phase(kind, 100.0, 102.0), Phase('good', 102.0, 200.0)]
+        for dip in dips(1, sent, dense=True):
+            near = dip.begin + dip.length > 100.0 - before and dip.begin < 102.0 + after
+            assert dip.unseen == (kind if near else 'start' if dip.begin < 3.0 else '')
     assert isinstance(dips(1, sent)[0], Dip)
+    assert len(dips(1, sent, dense=True)) > 1.7 * len(dips(1, sent))

@@ -22,7 +22,9 @@ def test_six_seconds(tmp_path):
     found = json.loads((tmp_path / 'all.json').read_text())
     assert found['deaths'] == 0 and found['status'] == 0 and found['counters']['messages'] > 1000
     dips = found['dips']
-    assert dips['asked'] == dips['in_time'] + len(dips['lost']) >= 1
+    untold = dips['lost'] + dips['unheard']
+    assert dips['asked'] == dips['in_time'] + len(untold) >= 1, dips['missed']
+    assert found['counters']['floor_dips'] >= dips['in_time']
     text = page.read_text()
     assert text.startswith('before\n') and text.endswith('after\n') and 'outdated' not in text
     assert '| exit status after SIGINT, time | 0' in text

@@ -191,12 +191,22 @@ class Probe:
             sent.append(info['source_timestamp'] * 1e-9)
             got.append(message)
 
+        self._subscribe(topic, kind, take, qos)
+        return got
+
+    def numbered(self, topic: str, kind: Any, take: Callable[[Any, int], None],
+                 qos: Any = 100) -> None:
+        """Have each message of a topic handed over with its publisher's number of it."""
+        self._subscribe(topic, kind, lambda message, info: take(
+            message, info['publication_sequence_number']), qos)
+
+    def _subscribe(self, topic: str, kind: Any, take: Callable[[Any, Any], None], qos: Any
+                   ) -> None:
         # The EventsExecutor of rclpy 7.1 hands over one tuple instead of two arguments.
         def call(*args: Any) -> None:
             take(*(args if len(args) == 2 else args[0]))
         call.__signature__ = inspect.signature(take)  # type: ignore[attr-defined]
         self.node.create_subscription(kind, topic, call, qos)
-        return got
 
     def publisher(self, topic: str, kind: Any, qos: Any = 10) -> Any:
         """Return a publisher."""

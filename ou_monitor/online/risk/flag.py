@@ -70,7 +70,7 @@ class FloorWatch:
         self._shift = 0.0
         self._t = np.empty(0)
         self._v = np.empty(0)
-        self._low = self._was_low = False
+        self._low = self._was_low = self._in_dip = False
 
     def new_time_line(self) -> None:
         """Take stamps that start anew; what is known by its arrival goes on."""
@@ -164,7 +164,10 @@ class FloorWatch:
         count = below[ends + 1] - below[begin]
         # The median is at or below the floor where more than half of the samples are.
         low = (count > 1) & (2 * count > ends + 1 - begin)
-        self.dips += int(np.count_nonzero(low & ~np.append(self._low, low[:-1])))
+        # A sample alone in its time ends no dip, and begins none.
+        sure = low[ends > begin]
+        self.dips += int(np.count_nonzero(sure & ~np.append(self._in_dip, sure)[:-1]))
+        self._in_dip = bool(sure[-1]) if sure.size else self._in_dip
         self._low = bool(low[-1])
         self._was_low = self._was_low or bool(low.any())
         first = max(int(begin[-1]), t.size - _MOST)

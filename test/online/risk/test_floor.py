@@ -195,6 +195,18 @@ def test_dips_are_counted():
         assert floor.dips == (0, 1, 1, 1, 2, 2)[k]
 
 
+def test_a_dip_is_one_whatever_its_stamps_are():
+    """50 samples of 1 kHz whose stamps lie within 100 s of the truth."""
+    arrived = 0.001 * np.arange(3000)
+    stamps = 1000.0 + arrived + np.random.default_rng(6).uniform(-100.0, 100.0, 3000)
+    volts = np.full(3000, 5.0)
+    volts[1000:1050] = volts[2000:2050] = 4.0
+    floor = watch()
+    for k in range(0, 3000, 20):
+        floor.push(stamps[k:k + 20], volts[k:k + 20], arrived[k:k + 20])
+    assert floor.dips == 2
+
+
 def test_old_samples_do_not_outvote_a_new_one():
     """Two low ones, an hour, a good one: good."""
     floor = watch()
