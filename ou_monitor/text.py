@@ -52,3 +52,20 @@ def number(value: float, digits: int = 3) -> str:
 def listed(names: Sequence[str]) -> str:
     """Return names as a list in a sentence."""
     return names[0] if len(names) == 1 else ', '.join(names[:-1]) + ' and ' + names[-1]
+
+
+def chance(p: float) -> str:
+    """Return a probability to two digits, as far as one may be believed: down to 0.001."""
+    if not math.isfinite(p):
+        return '-'
+    return '< 0.001' if p < 0.001 else f'{p:.2g}'
+
+
+def p_words(p: float) -> str:
+    """Return a p-value in a sentence."""
+    return f'p {chance(p)}' if p < 0.001 else f'p = {chance(p)}'
+
+
+def volts(value: float) -> str:
+    """Return a difference of voltage in V, or in mV where that reads better."""
+    return f'{number(value)} V' if abs(value) >= 1.0 else f'{number(1e3 * value)} mV'

@@ -17,7 +17,7 @@ from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.online.load_filter import LoadFilter
 from ou_monitor.online.supply_load import LoadStatus, SupplyLoad
 from ou_monitor.records import FloatArray, NAN, Recording
-from ou_monitor.text import number
+from ou_monitor.text import number, volts
 
 # Undershoots that are closer than that, s, are one dip: an ESC answers within some 100 ms.
 _APART = 0.2
@@ -162,7 +162,7 @@ def headline(found: Overview) -> str:
                      f'{number(found.lowest_at)} s')
     if found.load.known:
         at, sag, _ = found.sag
-        parts.append(f'the rail sags by {_volts(sag)} at {100.0 * at:.0f} % throttle')
+        parts.append(f'the rail sags by {volts(sag)} at {100.0 * at:.0f} % throttle')
     if found.line is not None and found.line.all_share > _LOUD:
         line = found.line
         what = (f'a line at {number(line.frequency, 4)} Hz makes' if line.lines == 1 else
@@ -201,10 +201,6 @@ def _dips(found: Overview) -> str:
             f'{number(found.below, 2)} s in all ({share:.2g} % of the time)')
 
 
-def _volts(value: float) -> str:
-    return f'{number(value)} V' if abs(value) >= 1.0 else f'{number(1e3 * value)} mV'
-
-
 def _sag_words(found: Overview) -> str:
     load = found.load
     if math.isnan(found.flown[0]):
@@ -212,11 +208,11 @@ def _sag_words(found: Overview) -> str:
     if not load.known:
         return f'unknown. {load.status.value}'
     at, sag, se = found.sag
-    words = f'{_volts(sag)} (+- {_volts(2.0 * se)}) at {100.0 * at:.0f} % throttle'
+    words = f'{volts(sag)} (+- {volts(2.0 * se)}) at {100.0 * at:.0f} % throttle'
     if at < 0.95:
         full = float(load.sag(1.0))
-        words += (f', the highest flown; some {_volts(full)} (+- '
-                  f'{_volts(2.0 * float(load.sag_se(1.0)))}) at full throttle, if its form holds')
+        words += (f', the highest flown; some {volts(full)} (+- '
+                  f'{volts(2.0 * float(load.sag_se(1.0)))}) at full throttle, if its form holds')
     return words
 
 

@@ -109,10 +109,17 @@ def command_line(args: argparse.Namespace) -> str:
 
 def render(fleet: Fleet) -> str:
     """Return the fleet for a terminal 100 columns wide."""
+    from ou_monitor.fleet import lowest
     from ou_monitor.fleet.summary import (
         comparison_words, failure_words, finding_words, headline, VEHICLE_HEADS, vehicle_rows)
 
     lines = [output.paragraph(headline(fleet))]
+    known = lowest.facts(fleet)
+    if known:
+        lines += ['', output.facts_table(known), '', output.table(
+            lowest.HEADS, [lowest.cells(row) for row in lowest.worst(fleet)[:_SHOWN]], left=[0])]
+        if fleet.analysed > _SHOWN:
+            lines.append(f'and {fleet.analysed - _SHOWN} more: see the report')
     rows = vehicle_rows(fleet)
     if rows:
         lines += ['', output.table([head for head, _ in VEHICLE_HEADS], rows[:2 * _SHOWN],

@@ -8,8 +8,9 @@ import math
 from typing import Any
 
 import numpy as np
-from ou_monitor.analysis.analyze import Analysis, analyze
+from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.level_result import LevelResult
+from ou_monitor.analysis.overview import Overview
 from ou_monitor.errors import InputError
 from ou_monitor.online.estimator.compiled import kernels
 from ou_monitor.online.risk.first_passage import brownout_probability
@@ -20,8 +21,6 @@ from ou_monitor.text import printable
 # A clock that says less than the year 2000 counts from a start-up, not from 1970; one that says
 # more than 2100 does not count seconds.
 _EPOCH, _LATEST = 946684800.0, 4102444800.0
-# Levels nearer than this tell no slope over throttle.
-_SAG_SPAN = 0.1
 
 
 @dataclass(frozen=True)
@@ -65,8 +64,8 @@ class Options:
 
 
 _NUMBERS = frozenset((
-    'start', 'duration_s', 'samples', 'rate_hz', 'sag', 'sag_se', 'risk_max', 'alpha_p', 'gain',
-    'gain_se'))
+    'start', 'duration_s', 'samples', 'rate_hz', 'lowest', 'dips', 'sag', 'sag_se', 'sag_full',
+    'sag_full_se', 'risk_max', 'alpha_p', 'gain', 'gain_se'))
 
 
 def is_result(found: Mapping[str, Any]) -> bool:
@@ -109,7 +108,6 @@ def _analysed(path: str, options: Options) -> dict[str, Any]:
             recording, levels=options.levels if recording.has_throttle else None,
             window=options.window, brownout_voltage=options.brownout_voltage,
             brownout_horizon=options.brownout_horizon)
-        sag, sag_se = _sag(analysis)
         start = float(recording.t[0])
         known = analysis.sliding.risk[np.isfinite(analysis.sliding.risk)]
         return {
@@ -117,7 +115,7 @@ def _analysed(path: str, options: Options) -> dict[str, Any]:
             'vehicle': recording.source.get('vehicle', ''),
             'start': start if _EPOCH <= start < _LATEST else NAN, 'duration_s': recording.duration,
             'samples': recording.n, 'rate_hz': (recording.n - 1) / recording.duration,
-            'sag': sag, 'sag_se': sag_se, 'risk_max': float(known.max()) if known.size else NAN,
+            **_seen(analysis.overview), 'risk_max': float(known.max()) if known.size else NAN,
             'alpha_p': analysis.alpha_test.p_value,
             'quality': [f'{item.severity.value}: {item.text}' for item in analysis.quality],
             'levels': [_level(level, options) for level in analysis.levels],
@@ -141,27 +139,19 @@ def _level(level: LevelResult, options: Options) -> dict[str, Any]:
         'flags': [flag.name for flag in e.flags], 'level_notes': list(level.notes)}
 
 
-def _sag(analysis: Analysis) -> tuple[float, float]:
-    """
-    Return the slope of the mean over throttle (V per unit) and its standard error.
-
-    Weighted least squares over the levels; where three or more of them scatter
-    by more than their errors, the error is widened by that.
-    """
-    rows = [(level.throttle, level.estimate.u0, level.estimate.u0_se)
-            for level in analysis.levels if level.estimate.usable]
-    u, v, se = (np.array(column) for column in zip(*rows)) if rows else (np.zeros(0),) * 3
-    good = np.isfinite(u) & np.isfinite(v) & (se > 0.0)
-    u, v, se = u[good], v[good], se[good]
-    if u.size < 2 or float(np.ptp(u)) < _SAG_SPAN:
-        return NAN, NAN
-    weight = 1.0 / se ** 2
-    x = u - float(weight @ u / weight.sum())
-    spread = float(weight @ x ** 2)
-    slope = float((weight * x) @ v) / spread
-    rest = v - float(weight @ v / weight.sum()) - slope * x
-    widen = math.sqrt(max(1.0, float(weight @ rest ** 2) / (u.size - 2))) if u.size > 2 else 1.0
-    return slope, widen / math.sqrt(spread)
+def _seen(found: Overview) -> dict[str, float]:
+    """Return the lowest voltage, the dips and the sag of a recording."""
+    limited, sag = math.isfinite(found.limit), (NAN, NAN, NAN)
+    full = full_se = NAN
+    if found.load.known:
+        sag = found.sag
+        full, full_se = float(found.load.sag(1.0)), float(found.load.sag_se(1.0))
+    return {
+        'lowest': found.lowest, 'lowest_at': found.lowest_at,
+        'lowest_throttle': found.lowest_throttle,
+        'dips': found.dips if limited else NAN, 'below_s': found.below if limited else NAN,
+        'sag_throttle': sag[0], 'sag': sag[1], 'sag_se': sag[2],
+        'sag_full': full, 'sag_full_se': full_se}
 
 
 def _discovered(recording: Recording, options: Options) -> dict[str, Any]:

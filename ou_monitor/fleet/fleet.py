@@ -38,6 +38,8 @@ class Fleet:
         Recordings found.
     kept : int
         Of these, done by an earlier run.
+    limit : float
+        Voltage that dips are counted below, V; NaN when none was given.
 
     """
 
@@ -46,6 +48,7 @@ class Fleet:
     notes: tuple[str, ...]
     recordings: int
     kept: int
+    limit: float = NAN
 
     @property
     def vehicles(self) -> list[str]:
@@ -94,7 +97,8 @@ def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[]
             _work(missing, results, parts, options, pool, progress)
     rows, notes = _table(found.sources, results, twice, pattern)
     notes = list(map(printable, (*found.notes, *notes)))
-    return Fleet(rows, judge(rows), tuple(notes), len(found.sources), kept)
+    return Fleet(rows, judge(rows), tuple(notes), len(found.sources), kept,
+                 options.brownout_voltage)
 
 
 def _workers(count: int, scheduler: str | None, version: Callable[[], str], insecure: bool

@@ -9,26 +9,32 @@ import re
 from typing import Any
 
 import numpy as np
+from ou_monitor.fleet import lowest
 from ou_monitor.fleet.comparison import LOGARITHMIC, QUANTITIES, USABLE, Values
 from ou_monitor.fleet.drift import fewest, Trend
 from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import DRIFT_RATE, Judgement, LEAST_VEHICLES, OUTLIER_RATE
-from ou_monitor.fleet.outliers import LEAST, SIMULATIONS
+from ou_monitor.fleet.outliers import LEAST
 from ou_monitor.recordings.samples import counted
 from ou_monitor.records import FloatArray, NAN
-from ou_monitor.text import number
+from ou_monitor.text import chance, number, p_words
 
 # Characters of the name of a vehicle in a table.
 _NAME = 30
 # Heads of the table of vehicles for a terminal and for a page.
 VEHICLE_HEADS = (
-    ('vehicle', 'Vehicle'), ('flights', 'Flights'), ('sigma', '\u03c3, V/\u221as'),
-    ('sigma/flight', '\u03c3 a flight'), ('alpha', '\u03b1, 1/s'),
-    ('alpha/flight', '\u03b1 a flight'), ('sag', 'Sag, V'), ('sag/flight', 'Sag a flight'))
+    ('vehicle', 'Vehicle'), ('flights', 'Flights'), ('lowest V', 'Lowest, V'), ('dips', 'Dips'),
+    ('sag V', 'Sag, V'), ('/flight', 'a flight'), ('sigma', '\u03c3, V/\u221as'),
+    ('/flight', 'a flight'), ('alpha', '\u03b1, 1/s'), ('/flight', 'a flight'))
 
 
 def headline(fleet: Fleet) -> str:
-    """Return what the fleet says, a few sentences."""
+    """Return what the fleet says: the lowest voltage, what stands out, what was analysed."""
+    return ' '.join(part for part in (
+        lowest.sentence(fleet), _standing_out(fleet), _analysed(fleet)) if part)
+
+
+def _analysed(fleet: Fleet) -> str:
     parts = [f'{fleet.analysed} of {counted(fleet.recordings, "recording")} of '
              f'{counted(len(fleet.vehicles), "vehicle")} analysed']
     if fleet.failed:
@@ -39,9 +45,12 @@ def headline(fleet: Fleet) -> str:
     without = {row['path'] for row in fleet.rows if row['status'] is not None} - {
         row['path'] for row in fleet.rows if row['status'] in USABLE}
     if without:
-        parts.append(f'{len(without)} with no estimate at any level')
-    text = ', '.join(parts) + '.'
-    judged = fleet.judgement
+        parts.append(f'{len(without)} with no estimate of sigma at any level')
+    return ', '.join(parts) + '.'
+
+
+def _standing_out(fleet: Fleet) -> str:
+    judged, text = fleet.judgement, ''
     drifting = sorted({t.vehicle for t in judged.drifting})
     odd = {judged.values[name].paths[k] for name, k in judged.odd_recordings()}
     vehicles = sorted({judged.vehicles[name].names[k] for name, k in judged.odd_vehicles()})
@@ -56,7 +65,7 @@ def headline(fleet: Fleet) -> str:
             *judged.recordings.values(), *[v.outliers for v in judged.vehicles.values()]))
         text += (' Nothing stands out.' if tested else
                  ' There are too few recordings a vehicle to tell what stands out.')
-    return text
+    return text.strip()
 
 
 def _listed(names: list[str], most: int = 5) -> str:
@@ -69,7 +78,7 @@ def change(name: str, value: float) -> str:
     if not math.isfinite(value):
         return '-'
     if name not in LOGARITHMIC:
-        return f'{1e3 * value:+.3g} mV'
+        return f'{1e3 * value:+.3g} mV' if abs(value) < 1.0 else f'{value:+.3g} V'
     percent = 100.0 * math.expm1(value)
     if percent >= 100.0:
         return f'x {number(math.exp(value))}'
@@ -83,7 +92,7 @@ def trend_words(trend: Trend) -> str:
             f'{change(trend.quantity, trend.slope)} a flight (95 % '
             f'{change(trend.quantity, trend.low)} to {change(trend.quantity, trend.high)}), '
             f'{change(trend.quantity, flights * trend.slope)} over {trend.flights} flights; '
-            f'p = {trend.p_value:.2g}, over the fleet {trend.p_family:.2g}.')
+            f'{p_words(trend.p_value)}, over the fleet {chance(trend.p_family)}.')
 
 
 def finding_words(fleet: Fleet) -> list[str]:
@@ -93,15 +102,17 @@ def finding_words(fleet: Fleet) -> list[str]:
     for name, k in judged.odd_vehicles():
         one = judged.vehicles[name]
         centre = float(one.outliers.centre[k])
-        found.append(f'{one.names[k]}: {name} is {shown(judged.values[name], one.value[k])}, '
+        values = judged.values[name]
+        found.append(f'{one.names[k]}: {name} is {shown(values, one.value[k])}{_at(values)}, '
                      f'{change(name, float(one.value[k]) - centre)} beside the median of the '
-                     f'vehicles; p over the fleet {_chance(float(one.outliers.chance[k]))}.')
+                     f'vehicles; p over the fleet {chance(float(one.outliers.chance[k]))}.')
     for name, k in judged.odd_recordings():
         values, out = judged.values[name], judged.recordings[name]
         off = change(name, float(values.value[k] - out.centre[k]))
         found.append(f'{values.vehicles[k]}, {values.paths[k]}: {name} is '
-                     f'{shown(values, values.value[k])}, {off} beside the other flights; p over '
-                     f'the fleet {_chance(float(out.chance[k]))}.')
+                     f'{shown(values, values.value[k])}{_at(values)} ({_measured(values, k)}), '
+                     f'{off} beside the other flights; p over the fleet '
+                     f'{chance(float(out.chance[k]))}.')
     return found
 
 
@@ -121,8 +132,18 @@ def shown(values: Values, value: float | FloatArray) -> str:
     return f'{number(float(values.shown(value)))} {QUANTITIES[values.name]}'
 
 
-def _chance(p: float) -> str:
-    return f'below {1.0 / (1 + SIMULATIONS):.1g}' if p < 1.5 / (1 + SIMULATIONS) else f'{p:.2g}'
+def _at(values: Values) -> str:
+    """Return the throttle that recordings are compared at."""
+    if values.name == 'sag':
+        return ' at full throttle'
+    at = values.curve.reference
+    return f' at {100.0 * at:.0f} % throttle' if math.isfinite(at) else ''
+
+
+def _measured(values: Values, k: int) -> str:
+    at = values.throttle[k]
+    return (f'{number(float(values.measured[k]))} as measured'
+            + (f' at {100.0 * at:.0f} %' if math.isfinite(at) else ''))
 
 
 def comparison_words(fleet: Fleet) -> list[str]:
@@ -131,9 +152,10 @@ def comparison_words(fleet: Fleet) -> list[str]:
     notes = []
     references = [judged.values[name].curve.reference for name in LOGARITHMIC]
     if all(map(math.isfinite, references)):
-        notes.append('sigma and alpha are compared at throttle '
-                     + ' and '.join(dict.fromkeys(f'{u:.2f}' for u in references))
-                     + ': their common curves over throttle were taken out.')
+        notes.append('sigma and alpha are shown as measured. To be compared they are brought to '
+                     + ' and '.join(dict.fromkeys(f'{100.0 * u:.0f} %' for u in references))
+                     + ' throttle along a curve common to all, and the error of that curve is '
+                     'counted; sag is compared at full throttle.')
     tests = len(judged.trends)
     if tests:
         need = fewest(tests, DRIFT_RATE)
@@ -167,13 +189,17 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
 def vehicle_rows(fleet: Fleet) -> list[list[str]]:
     """Return a row of cells for each vehicle, under `VEHICLE_HEADS`."""
     judged = fleet.judgement
-    found = []
+    found, seen = [], lowest.once(fleet)
     shown_as = short_names(fleet.vehicles)
     for vehicle in fleet.vehicles:
         flights = {row['path'] for row in fleet.rows if row['vehicle'] == vehicle
                    and row['flight'] is not None}
-        cells = [shown_as[vehicle], str(len(flights))]
-        for name in QUANTITIES:
+        mine = [row for row in seen if row['vehicle'] == vehicle]
+        dips = lowest.dips_of(mine)
+        cells = [shown_as[vehicle], str(len(flights)),
+                 number(min((row['lowest'] for row in mine), default=NAN), 4),
+                 '-' if dips is None else str(dips.count)]
+        for name in ('sag', 'sigma', 'alpha'):
             cells += [_median(judged, name, vehicle), _slope(judged, name, vehicle)]
         found.append(cells)
     return found
@@ -185,7 +211,9 @@ def _median(judged: Judgement, name: str, vehicle: str) -> str:
         return '-'
     k = one.names.index(vehicle)
     star = '*' if one.outliers.found[k] else ''
-    return number(float(judged.values[name].shown(one.value[k]))) + star
+    values = judged.values[name]
+    mine = [k for k, of in enumerate(values.vehicles) if of == vehicle]
+    return number(float(np.median(values.measured[mine]))) + star
 
 
 def _slope(judged: Judgement, name: str, vehicle: str) -> str:
@@ -226,6 +254,7 @@ def as_data(fleet: Fleet) -> dict[str, Any]:
     return {
         'headline': headline(fleet), 'recordings': fleet.recordings, 'analysed': fleet.analysed,
         'failed': len(fleet.failed), 'duplicates': len(fleet.duplicates),
+        'brownout_voltage': fleet.limit,
         'vehicles': [{
             'vehicle': vehicle,
             **{name: _vehicle_value(judged, name, vehicle) for name in QUANTITIES}}

@@ -83,9 +83,19 @@ COLUMNS = (
     Column('duration_s', 'number', 's', 'length of the recording'),
     Column('samples', 'count', '', 'samples of the recording'),
     Column('rate_hz', 'number', 'Hz', 'mean rate of the recording'),
-    Column('sag', 'number', 'V', 'slope of the mean over throttle between the levels of the '
-           'recording (V per unit throttle; negative when the supply sags)'),
+    Column('lowest', 'number', 'V', 'lowest voltage of the recording'),
+    Column('lowest_at', 'number', 's', 'when, from the first sample'),
+    Column('lowest_throttle', 'number', '1', 'throttle then, 0..1'),
+    Column('dips', 'count', '', 'dips below the limit, those less than 0.2 s apart as one; needs '
+           '--brownout-voltage or --cells'),
+    Column('below_s', 'number', 's', 'time below the limit; needs the same'),
+    Column('sag_throttle', 'number', '1', 'highest throttle flown, 0..1; null where the sag is '
+           'unknown'),
+    Column('sag', 'number', 'V', 'sag there, positive, as analyze tells it'),
     Column('sag_se', 'number', 'V', 'standard error of sag'),
+    Column('sag_full', 'number', 'V', 'sag at full throttle, if its form holds up to there; '
+           'recordings are compared by it'),
+    Column('sag_full_se', 'number', 'V', 'standard error of sag_full'),
     Column('alpha_p', 'number', '1', 'p-value of alpha being the same at all levels'),
     Column('quality', 'texts', '', 'what to know about the recording, worst first'),
     Column('risk_max', 'number', '1', 'highest risk that the node would have published on the '
@@ -106,8 +116,10 @@ OF_LEVEL = ('level', 'throttle', 'time_s', 'n', 'mean', 'vpp', 'vrms', 'alpha', 
             'sigma', 'sigma_se', 'var_inf', 'var_inf_se', 'u0', 'u0_se', 'noise_std',
             'excess_kurtosis', 'impulses', 'line_hz', 'line_rms', 'process', 'risk', 'status',
             'flags', 'level_notes')
-_OF_RECORDING = ('recording', 'duration_s', 'samples', 'rate_hz', 'sag', 'sag_se', 'risk_max',
-                 'verdict', 'causes', 'gain', 'gain_se', 'notes')
+_OF_RECORDING = ('recording', 'duration_s', 'samples', 'rate_hz', 'lowest', 'lowest_at',
+                 'lowest_throttle', 'dips', 'below_s', 'sag_throttle', 'sag', 'sag_se', 'sag_full',
+                 'sag_full_se', 'alpha_p', 'quality', 'risk_max', 'verdict', 'causes', 'gain',
+                 'gain_se', 'notes')
 
 
 def rows_of(source: Source, result: Mapping[str, Any], vehicle: Vehicle, flight: int | None,

@@ -60,7 +60,7 @@ def embed(plot: Plot, most: int = MOST) -> str:
         'width': plot.width, 'height': plot.height, 'curves': curves,
         'shades': [[_known(a), _known(b), int(style[1:]), label]
                    for a, b, style, label in plot.shades],
-        'marks': [[_known(x), label] for x, label in plot.marks],
+        'marks': [[_known(x), label] for x, label in plot.marks], 'names': plot.names,
         'block': base64.b64encode(zlib.compress(bytes(block), 6)).decode('ascii')}
     text = json.dumps(found, allow_nan=False, separators=(',', ':'))
     # Neither a tag nor an entity: the same text to a parser of HTML and to one of XML.

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.criticism.curves import outline
+from ou_monitor.fleet import lowest
 from ou_monitor.fleet.comparison import LOGARITHMIC, QUANTITIES, USABLE, Values
 from ou_monitor.fleet.drift import Trend
 from ou_monitor.fleet.fleet import Fleet
@@ -15,43 +16,93 @@ from ou_monitor.fleet.judgement import DRIFT_RATE
 from ou_monitor.fleet.summary import (
     change, comparison_words, failure_words, finding_words, headline, quality_counts, short_names,
     VEHICLE_HEADS, vehicle_rows)
+from ou_monitor.fleet.table import Row
 from ou_monitor.records import FloatArray
 from ou_monitor.report import page
 from ou_monitor.report.page import typeset, UNKNOWN
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import number
+from ou_monitor.text import chance, number
 
 _TITLES = {'sigma': 'Noise intensity \u03c3', 'alpha': 'Relaxation rate \u03b1',
-           'sag': 'Sag over throttle'}
+           'sag': 'Sag at full throttle'}
 _UNITS = {'sigma': 'V/\u221as', 'alpha': '1/s', 'sag': 'V'}
 # Drifts drawn at most; without any, the most likely ones are drawn, so many.
 _DRAWN, _LIKELY = 8, 2
 # Trends in the table: at least, with those of p below 5 %, and at most.
 _LEAST, _MOST = 6, 30
+# Recordings in the table of the lowest voltages.
+_WORST = 12
 # Sentences and recordings listed at most; the table has all of them.
 _SENTENCES, _RECORDINGS = 40, 500
 
 
 def fleet_page(fleet: Fleet, command: str = '') -> str:
     """Return the report of a fleet."""
-    sections = [page.headline(headline(fleet)), page.section('What stands out', *_odd(fleet))]
+    rows = lowest.worst(fleet)
+    sections = [page.headline(_sentence(headline(fleet)))]
+    if rows:
+        sections += [page.figure(_lowest(fleet, rows), 'Each dot is a recording.'),
+                     page.facts([(name, _sentence(words)) for name, words in lowest.facts(fleet)])]
+    sections.append(page.section('What stands out', *_odd(fleet)))
+    if rows:
+        sections.append(page.section('Lowest voltages', *_worst(rows)))
     if fleet.failed or fleet.duplicates:
         sections.append(page.section('Not in the comparison', *_left_out(fleet)))
     sections += [
         page.section('Vehicles', *_vehicles(fleet)),
         page.section('Drift over the flights', *_drift(fleet)),
-        page.section('Distributions', *_distributions(fleet)),
-        page.section('Quality', *_quality(fleet)),
+        page.section('Distributions', *_distributions(fleet), folded=True),
+        page.section('Quality', *_quality(fleet), folded=True),
         page.section('What to know before using these numbers', page.bullets(
             [_sentence(note) for note in (*fleet.notes, *comparison_words(fleet))])),
-        page.section('Recordings', *_recordings(fleet)),
+        page.section('Recordings', *_recordings(fleet), folded=True),
     ]
     if command:
         sections.append(page.section('Where it comes from', page.paragraph(
-            'To repeat this, or to go on with recordings that came later:'), page.code(command)))
+            'To repeat this, or to go on with recordings that came later:'), page.code(command),
+            folded=True))
     subtitle = (f'{fleet.recordings} recordings, {len(fleet.vehicles)} vehicles, '
                 f'{len(fleet.rows)} rows in the table')
     return page.page('Supply noise of a fleet', subtitle, sections)
+
+
+def _lowest(fleet: Fleet, rows: list[Row]) -> Plot:
+    """Return the lowest voltage of each recording over the vehicles, and the limit."""
+    names = [*fleet.vehicles, *(['unknown'] if any(row['vehicle'] is None for row in rows)
+                                else [])]
+    at = np.array([names.index(row['vehicle'] or 'unknown') + 1.0 for row in rows])
+    low = np.array([row['lowest'] for row in rows])
+    under = np.array([bool(row['dips']) for row in rows])
+    x = at + _side_by_side(at, np.array([float(row['flight'] or 0) for row in rows]))
+    plot = Plot('Lowest voltage of every recording', 'vehicle', 'V', height=240).places(
+        list(short_names(names).values()))
+    plot.markers(x[~under], low[~under], 'recordings' if under.any() else '', 0)
+    if under.any():
+        plot.markers(x[under], low[under], 'with dips', 1)
+    if math.isfinite(fleet.limit):
+        plot.line(np.array([0.4, len(names) + 0.6]), np.full(2, fleet.limit),
+                  f'limit {fleet.limit:g} V', 1, 'dash')
+    return plot
+
+
+def _side_by_side(at: FloatArray, flights: FloatArray) -> FloatArray:
+    """Return how far dots of one place are moved, in the order of their flights."""
+    moved = np.zeros(at.size)
+    for place in np.unique(at[np.isfinite(at)]):
+        mine = np.flatnonzero(at == place)
+        if mine.size > 1:
+            moved[mine[np.argsort(flights[mine], kind='stable')]] = np.linspace(
+                -0.32, 0.32, mine.size)
+    return moved
+
+
+def _worst(rows: list[Row]) -> list[str]:
+    listed = [[typeset(cell) if k else cell for k, cell in enumerate(lowest.cells(row))]
+              for row in rows[:_WORST]]
+    more = len(rows) - len(listed)
+    return [page.table(['Recording', 'Lowest, V', 'at, s', 'Dips', 'Below, s', 'Sag, V',
+                        'at throttle'], listed, left=[0])] + (
+        [page.paragraph(f'{more} more are below, under Recordings.', soft=True)] if more else [])
 
 
 def _sentence(text: str) -> str:
@@ -85,16 +136,16 @@ def _vehicles(fleet: Fleet) -> list[str]:
     rows = vehicle_rows(fleet)
     if not rows:
         return [page.paragraph('No vehicle was identified.', soft=True)]
-    numbered = [[str(k + 1), row[0], *[typeset(cell) for cell in row[1:]]]
-                for k, row in enumerate(rows)]
-    parts = [page.table(['#', *[head for _, head in VEHICLE_HEADS]], numbered, left=[1]),
-             page.paragraph('Medians over the flights, and their change a flight. A star marks '
-                            'what stands out.', soft=True)]
+    parts = [page.table([head for _, head in VEHICLE_HEADS],
+                        [[row[0], *map(typeset, row[1:])] for row in rows], left=[0]),
+             page.paragraph('The lowest of all flights, their dips together; the rest are medians '
+                            'of what was measured, and the change a flight of what is compared. '
+                            'A star marks what stands out.', soft=True)]
     for name in LOGARITHMIC:
         values = fleet.judgement.values[name]
         if values.value.size:
             parts.append(page.figure(_by_vehicle(fleet, values), (
-                'Each dot is a recording, under the number of its vehicle in the table.'
+                'As measured: the mean over the levels of each recording.'
                 if name == 'sigma' else '')))
     return parts
 
@@ -104,18 +155,12 @@ def _by_vehicle(fleet: Fleet, values: Values) -> Plot:
     names = fleet.vehicles
     out = fleet.judgement.recordings[values.name]
     x = np.array([names.index(v) + 1.0 if v else np.nan for v in values.vehicles])
-    spread = np.zeros(x.size)
     # Flights lie side by side in their order, so that a drift shows as a slope.
-    for k in range(len(names)):
-        mine = np.flatnonzero(x == k + 1.0)
-        if mine.size > 1:
-            spread[mine[np.argsort(values.flights[mine], kind='stable')]] = np.linspace(
-                -0.32, 0.32, mine.size)
-    y = values.shown(values.value)
-    odd = out.found
+    spread = _side_by_side(x, values.flights.astype(np.float64))
+    y, odd = values.measured, out.found
     plot = Plot(f'{_TITLES[values.name]} of every recording', 'vehicle', _UNITS[values.name],
                 height=260, log_y=values.name in LOGARITHMIC)
-    plot.limits(x=(0.4, max(len(names), 1) + 0.6))
+    plot.places(list(short_names(names).values()))
     for k in range(0, len(names), 2):
         plot.shade(k + 0.5, k + 1.5, 7)
     plot.markers((x + spread)[~odd], y[~odd], 'recordings', 0)
@@ -133,12 +178,12 @@ def _drift(fleet: Fleet) -> list[str]:
     if not judged.drifting:
         parts.append(page.paragraph('No drift stands at the rate of the fleet; the most likely '
                                     'ones are drawn.'))
-    parts += _pairs([page.figure(_trend_plot(judged.values[t.quantity], t), _caption(t))
+    parts += _pairs([page.figure(_trend_plot(judged.values[t.quantity], t), _caption(t, fleet))
                      for t in drawn])
     listed = [t for k, t in enumerate(judged.trends) if k < _LEAST or t.p_value < DRIFT_RATE]
     rows = [[t.vehicle, t.quantity, str(t.flights), typeset(change(t.quantity, t.slope)) + '\n'
              + f'{typeset(change(t.quantity, t.low))} to {typeset(change(t.quantity, t.high))}',
-             f'{t.p_value:.2g}', f'{t.p_family:.2g}',
+             chance(t.p_value), chance(t.p_family),
              'yes' if t.p_family <= DRIFT_RATE else 'no'] for t in listed[:_MOST]]
     parts.append(page.table(['Vehicle', 'Quantity', 'Flights', 'Change a flight', 'p',
                              'p over the fleet', 'Stands'], rows, left=[0, 1]))
@@ -155,9 +200,16 @@ def _pairs(figures: list[str]) -> list[str]:
             for k in range(0, len(figures), 2)]
 
 
-def _caption(trend: Trend) -> str:
+def _compared(name: str, fleet: Fleet) -> str:
+    """Return at which throttle a quantity is compared."""
+    at = fleet.judgement.values[name].curve.reference
+    return 'full throttle' if name == 'sag' else (
+        f'{100.0 * at:.0f} % throttle' if math.isfinite(at) else 'the throttle of each')
+
+
+def _caption(trend: Trend, fleet: Fleet) -> str:
     return (f'{typeset(change(trend.quantity, trend.slope))} a flight; p over the fleet '
-            f'{trend.p_family:.2g}.')
+            f'{chance(trend.p_family)}. At {_compared(trend.quantity, fleet)}, with its error.')
 
 
 def _trend_plot(values: Values, trend: Trend) -> Plot:
@@ -241,15 +293,18 @@ def _recordings(fleet: Fleet) -> list[str]:
                  typeset(number(first['duration_s'] or math.nan))]
         for name, values in judged.values.items():
             cells.append(_cell(values, judged.recordings[name].score, places[name].get(path)))
+        cells[4:4] = [UNKNOWN if first['lowest'] is None else number(first['lowest'], 4),
+                      UNKNOWN if first['dips'] is None else f"{first['dips']:g}"]
         rows.append([*cells, ', '.join(sorted(flags[path])) or UNKNOWN])
-    heads = ['Vehicle', 'Flight', 'Recording', 's', *[
+    heads = ['Vehicle', 'Flight', 'Recording', 's', 'Lowest, V', 'Dips', *[
         f'{symbol}, {_UNITS[name]}' for name, symbol in zip(
             QUANTITIES, ('\u03c3', '\u03b1', 'Sag'))], 'Flags']
     more = len(once) - _RECORDINGS
-    return [page.table(heads, rows, left=[0, 2, 7]), page.paragraph(
-        'At the reference throttle. Small: distance from the flights of the same vehicle in '
-        'standard deviations.' + (f' {more} more recordings are in the Parquet table.'
-                                  if more > 0 else ''), soft=True)]
+    return [page.table(heads, rows, left=[0, 2, 9]), page.paragraph(
+        'As measured. Small: at which throttle, and, where the vehicle has enough flights, how '
+        'far from the others of it, in standard deviations.' + (
+            f' {more} more recordings are in the Parquet table.' if more > 0 else ''),
+        soft=True)]
 
 
 def _date(row: Mapping[str, Any]) -> str:
@@ -259,5 +314,7 @@ def _date(row: Mapping[str, Any]) -> str:
 def _cell(values: Values, score: FloatArray, k: int | None) -> str:
     if k is None:
         return UNKNOWN
-    text = typeset(number(float(values.shown(values.value[k]))))
-    return text + (f'\n{typeset(f"{score[k]:+.1f}")}' if math.isfinite(score[k]) else '')
+    at = values.throttle[k]
+    small = [f'at {100.0 * at:.0f} %'] if math.isfinite(at) else []
+    small += [typeset(f'{score[k]:+.1f} sd')] if math.isfinite(score[k]) else []
+    return typeset(number(float(values.measured[k]))) + '\n' + ', '.join(small)

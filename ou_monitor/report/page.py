@@ -52,7 +52,7 @@ details.section { border-top: 1px solid var(--rule); margin: 10px 0; }
 details.section > summary { cursor: pointer; padding: 8px 0 4px; }
 details.section > summary h2 { display: inline; }
 dl.facts { display: grid; grid-template-columns: max-content 1fr; gap: 3px 16px; margin: 10px 0; }
-dl.facts dt { color: var(--soft); } dl.facts dd { margin: 0; }
+dl.facts dt { color: var(--soft); } dl.facts dd { margin: 0; overflow-wrap: anywhere; }
 @media (max-width: 560px) { dl.facts { grid-template-columns: 1fr; gap: 0; }
   dl.facts dd { margin: 0 0 6px; } }
 li { margin: 3px 0; } li.warn::marker { color: var(--warn); }

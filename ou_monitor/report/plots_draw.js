@@ -236,18 +236,28 @@ function drawCurve(pen, curve, x, y, colour) {
   pen.restore();
 }
 
+// Names cut to the pixels that each has; none where that is too little, as in svg.py.
+function placeNames(names, room) {
+  const most = Math.floor(room / 7) - 1, longest = Math.max(0, ...names.map((n) => n.length));
+  if (most < Math.min(6, longest)) return [];
+  return names.map((n) => (n.length <= most ? n : `${n.slice(0, most - 1)}\u2026`));
+}
+
 // Grid, ticks and labels around the axes.
 function drawAxes(pen, figure, x, y, box, ink) {
   pen.font = FONT;
   pen.lineWidth = 1;
   for (const [scale, count, across] of [[x, box.width > 500 ? 7 : 5, true], [y, 5, false]]) {
-    const ticks = scale.ticks(count);
+    const named = across ? placeNames(figure.names, (box.right - LEFT) / figure.names.length) : [];
+    const ticks = named.length ? named.map((_, k) => k + 1) : scale.ticks(count);
     const uneven = ticks.length < 2 || Math.abs(ticks[1] - ticks[0]) === 0;
     let end = -Infinity;
     for (const value of ticks) {
       const even = !uneven && !(scale.log && scale.high / scale.low >= 10 ** 0.7);
-      const text = numberText(value, even ? ticks[1] - ticks[0] : Math.abs(value) || 1);
+      const text = named.length ? named[value - 1]
+        : numberText(value, even ? ticks[1] - ticks[0] : Math.abs(value) || 1);
       const p = scale.at(value);
+      if (across && !(p >= LEFT - 0.5 && p <= box.right + 0.5)) continue;
       pen.strokeStyle = ink.rule;
       pen.beginPath();
       pen.moveTo(across ? p : LEFT, across ? box.top : p);

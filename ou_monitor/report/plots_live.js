@@ -155,8 +155,9 @@ class LivePlot {
     this.tip.setAttribute('aria-live', spoken ? 'polite' : 'off');
     this.tip.replaceChildren();
     const where = rows.length ? rows[0].found.x : this.cursor;
+    const named = this.figure.names[Math.round(where) - 1];
     element('div', 'live-where', this.tip,
-      `${x.name || 'x'} ${reading(where, this.x)} ${x.unit}`.trim());
+      named || `${x.name || 'x'} ${reading(where, this.x)} ${x.unit}`.trim());
     for (const { curve, found } of rows.slice(0, 10)) {
       const row = element('div', '', this.tip);
       this.swatch(row, curve);

@@ -8,6 +8,7 @@ interactive; paper and browsers without scripts show what is drawn here.  Colour
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
@@ -22,6 +23,8 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 30, 42
 _LETTER = 7.0
 # Half the width of the cap of a bar, pixels.
 _CAP = 7.0
+# Letters that a cut name keeps at least.
+_SHORTEST = 6
 # Height of a legend in a row of its own, pixels.
 _LEGEND = 18
 
@@ -88,6 +91,7 @@ class Plot:
         self.curves: list[Curve] = []
         self.shades: list[tuple[float, float, str, str]] = []
         self.marks: list[tuple[float, str]] = []
+        self.names: tuple[str, ...] = ()
         self._x_range: tuple[float, float] | None = None
         self._y_range: tuple[float, float] | None = None
 
@@ -135,6 +139,11 @@ class Plot:
         """Add a labelled vertical line."""
         self.marks.append((x, label))
         return self
+
+    def places(self, names: Sequence[str]) -> Plot:
+        """Write names below the x axis, at 1, 2 and so on, in place of numbers."""
+        self.names = tuple(names)
+        return self.limits(x=(0.4, max(len(names), 1) + 0.6))
 
     def limits(self, x: tuple[float, float] | None = None,
                y: tuple[float, float] | None = None) -> Plot:
@@ -211,11 +220,16 @@ class Plot:
 
     def _axes(self, x: Scale, y: Scale, right: int, bottom: int) -> list[str]:
         parts = []
-        for ticks, scale, across in ((x.ticks(7), x, True), (y.ticks(5), y, False)):
+        places = [float(k + 1) for k in range(len(self.names))]
+        named = short(self.names, (right - _LEFT) / max(len(self.names), 1))
+        for ticks, scale, across in ((places if named else x.ticks(7), x, True),
+                                     (y.ticks(5), y, False)):
             uneven = scale.log or len(ticks) < 2
             for value in ticks:
                 step = abs(value) if uneven else ticks[1] - ticks[0]
-                text, pixel = escape(tick_text(value, step or 1.0)), float(scale(value))
+                text = named[round(value) - 1] if across and named else tick_text(
+                    value, step or 1.0)
+                text, pixel = escape(text), float(scale(value))
                 if across:
                     parts.append(f'<line class="grid" x1="{pixel:.1f}" y1="{self._top}" '
                                  f'x2="{pixel:.1f}" y2="{bottom}"/><text class="tick" '
@@ -287,6 +301,14 @@ def _legend_entry(curve: Curve, x: float, y: int) -> str:
               f'<path class="line thick {curve.style}" '
               f'd="M{x:.0f},{y - 4}L{x + 18:.0f},{y - 4}"/>')
     return f'{swatch}<text class="legend" x="{x + 22:.0f}" y="{y}">{escape(curve.label)}</text>'
+
+
+def short(names: Sequence[str], room: float) -> list[str]:
+    """Return names cut to the pixels that each has; none where that is too little."""
+    most = int(room / _LETTER) - 1
+    if most < min(_SHORTEST, max(map(len, names), default=0)):
+        return []
+    return [name if len(name) <= most else f'{name[:most - 1]}\u2026' for name in names]
 
 
 def _pixels(*columns: FloatArray) -> list[list[float]]:

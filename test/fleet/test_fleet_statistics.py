@@ -28,11 +28,32 @@ def test_the_curve_over_throttle_is_taken_out():
     assert len(values.paths) == 72
 
 
+def test_the_curve_knows_its_error():
+    """The error of the curve is its scatter over fleets; levels of one flight are not two."""
+    rng = np.random.default_rng(11)
+    slopes, errors, runs = [], [], 300
+    for _ in range(runs):
+        rows = []
+        for k, u in enumerate(rng.uniform(0.1, 0.6, 10)):
+            flight = 0.3 * rng.standard_normal()
+            rows += [{'path': f'f{k}', 'vehicle': 'v', 'flight': k + 1, 'status': 'OK',
+                      'throttle': u + du, 'time_s': 10.0, 'alpha': None, 'sigma_se': 0.02,
+                      'sigma': math.exp(2.0 * u + flight + 0.02 * rng.standard_normal())}
+                     for du in (0.0, 0.02)]
+        curve = values_of(rows, 'sigma').curve
+        slopes.append((curve.heights[1] - curve.heights[0]) / (curve.knots[1] - curve.knots[0]))
+        errors.append(math.sqrt(curve.covariance[0, 0]))
+    # The median of an error with 8 degrees of freedom is 0.96 of it, the scatter of 300 is known
+    # to 4 %; levels taken for independent would make it too small by the root of two.
+    assert 0.96 - 0.16 < np.median(errors) / np.std(slopes) < 0.96 + 0.16
+    assert np.mean(slopes) == pytest.approx(2.0, abs=4.0 * np.std(slopes) / math.sqrt(runs) + 0.05)
+
+
 def test_recordings_without_throttle_or_estimate():
     """The one is compared as it is, the other not at all; an empty table is no error."""
     rng = np.random.default_rng(2)
     rows = table(rng, 1, 6, levels=((None, 20.0),))
-    rows[0] |= {'status': 'TOO_SHORT', 'sigma': None, 'alpha': None, 'sag': None}
+    rows[0] |= {'status': 'TOO_SHORT', 'sigma': None, 'alpha': None, 'sag_full': None}
     values = values_of(rows, 'sigma')
     assert len(values.paths) == 5 and values.curve(np.array([0.7])) == 0.0
     np.testing.assert_allclose(np.exp(values.value), [row['sigma'] for row in rows[1:]])

@@ -108,8 +108,8 @@ def test_results_that_are_none(odd, tmp_path, content):
 def test_a_result_is_checked():
     """As `work` returns it, or not at all."""
     whole = {'vehicle': '', 'levels': [{}], **dict.fromkeys((
-        'start', 'duration_s', 'samples', 'rate_hz', 'sag', 'sag_se', 'risk_max', 'alpha_p',
-        'gain', 'gain_se'), 0.0)}
+        'start', 'duration_s', 'samples', 'rate_hz', 'lowest', 'dips', 'sag', 'sag_se',
+        'sag_full', 'sag_full_se', 'risk_max', 'alpha_p', 'gain', 'gain_se'), 0.0)}
     assert is_result(whole)
     for change in ({'levels': 5}, {'levels': [1]}, {'vehicle': None}, {'start': 'x'}):
         assert not is_result({**whole, **change})

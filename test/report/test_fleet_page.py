@@ -1,14 +1,17 @@
 """The report and the words of a fleet: complete, escaped, and there also when little is known."""
 
+from dataclasses import replace
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
+from ou_monitor.fleet import lowest
 from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import judge
 from ou_monitor.fleet.summary import (
     as_data, change, finding_words, headline, short_names, vehicle_rows)
 from ou_monitor.fleet.table import NAMES
 from ou_monitor.report.fleet_page import fleet_page
+from ou_monitor.text import number
 import pytest
 from simulated_fleets import table
 
@@ -54,7 +57,7 @@ def test_the_page_tells_what_stands_out(odd):
 def test_stars_mark_what_stands(odd):
     """The drifting vehicle at its slope, the odd one at its median; no star elsewhere."""
     cells = {row[0]: row for row in vehicle_rows(odd)}
-    assert cells['<b>uav2</b> & co'][3].endswith('*') and cells['uav4'][2].endswith('*')
+    assert cells['<b>uav2</b> & co'][7].endswith('*') and cells['uav4'][6].endswith('*')
     assert sum('*' in cell for row in cells.values() for cell in row) == 2
 
 
@@ -71,7 +74,7 @@ def test_plain_data_agrees(odd):
     ([{'path': '/f/bad', 'error': 'no bag'}], 'could not be'),
     (table(np.random.default_rng(2), 1, 1), 'too few recordings a vehicle'),
     ([{'path': '/f/a', 'vehicle': 'v', 'flight': 1, 'status': 'TOO_SHORT', 'flags': ['TREND']}],
-     'no estimate at any level'),
+     'no estimate of sigma at any level'),
     ([{**row, 'vehicle': None, 'flight': None} for row in table(
         np.random.default_rng(3), 1, 8)], 'too few recordings a vehicle'),
 ])
@@ -85,7 +88,62 @@ def test_changes_have_their_unit():
     """Percent of what has a logarithm, a factor where it is large, mV of sag."""
     assert [change('sigma', value) for value in (0.0296, -0.4, 1.2, float('nan'))] == [
         '+3 %', '-33 %', 'x 3.32', '-']
-    assert change('sag', -0.0123) == '-12.3 mV'
+    assert change('sag', -0.0123) == '-12.3 mV' and change('sag', 1.98) == '+1.98 V'
+
+
+def seen(path: str, vehicle: str, lowest: float, dips: int | None, **more) -> dict:
+    """Return the row of a recording of which the lowest voltage is known."""
+    return {'path': path, 'recording': path, 'vehicle': vehicle, 'lowest': lowest,
+            'lowest_at': 12.0, 'dips': dips, 'below_s': None if dips is None else 0.1 * dips,
+            **more}
+
+
+def test_the_lowest_voltage_comes_first():
+    """What a pilot asks: dips, the lowest voltage and where, the sag; in words, page and JSON."""
+    rows = [seen('a', 'quad', 14.2, 0, sag=1.2, sag_se=0.1, sag_throttle=0.9),
+            seen('b', 'quad', 13.1, 3, lowest_throttle=0.8, sag=1.9, sag_se=0.2,
+                 sag_throttle=0.95), seen('c', 'hexa', 13.4, 1)]
+    known = replace(fleet(rows), limit=13.5)
+    assert headline(known).startswith(
+        '4 dips below 13.5 V in 2 of 3 recordings, most in b (3): the lowest was 13.10 V at 12.0 '
+        's of b; the rail sags by up to 1.90 V, at 95 % throttle.')
+    assert lowest.facts(known) == [
+        ('Lowest voltage', '13.10 V at 12.0 s of b (quad), at 80 % throttle'),
+        ('Below 13.5 V', '4 dips, 0.40 s in all, in 2 of 3 recordings'),
+        ('Sag', '1.20 V to 1.90 V (+- 400 mV) at the highest throttle flown; known in 2 of 3 '
+         'recordings')]
+    assert [row['path'] for row in lowest.worst(known)] == ['b', 'c', 'a']
+    text = page_text(known)
+    assert text.index('4 dips below') < text.index('Lowest voltages') < text.index('Vehicles')
+    assert vehicle_rows(known)[0][:4] == ['hexa', '0', '13.40', '1']
+    assert as_data(known)['brownout_voltage'] == 13.5
+
+
+def test_without_a_limit_no_dip_is_counted():
+    """Not known is a dash, not 0; and where a limit was kept, that is said."""
+    assert headline(fleet([seen('a', 'quad', 14.2, None)])).startswith(
+        'The lowest voltage was 14.20 V at 12.0 s of a.')
+    assert vehicle_rows(fleet([seen('a', 'quad', 14.2, None)]))[0][3] == '-'
+    kept = replace(fleet([seen('a', 'quad', 14.2, 0)]), limit=14.0)
+    assert headline(kept).startswith('No recording fell below 14 V: the lowest was 14.20 V')
+
+
+def test_what_was_measured_is_shown():
+    """Recordings of one load each keep their order, as in `analyze`, however they are compared."""
+    truth = {0.0: 0.05, 0.05: 0.10, 0.1: 0.32, 0.4: 0.63}
+    known = fleet([seen(f'load {u}', 'rail', 4.8, None, flight=k + 1, level='x', throttle=u,
+                        time_s=20.0, status='OK', sigma=sigma, sigma_se=0.01, alpha=63.0,
+                        alpha_se=0.02)
+                   for k, (u, sigma) in enumerate(truth.items())])
+    values = known.judgement.values['sigma']
+    assert values.measured == pytest.approx(list(truth.values()), rel=1e-12)
+    assert values.throttle == pytest.approx(list(truth), rel=1e-12)
+    # The line through four points does not fit; the moves carry its error, the typical one none.
+    assert not np.array_equal(np.argsort(values.value), np.argsort(values.measured))
+    assert values.error[-1] > 10.0 * 0.01
+    text = page_text(known)
+    for u, sigma in truth.items():
+        assert f'{number(sigma)} at {100 * u:.0f} %' in text
 
 
 def test_long_names_are_cut_where_they_stay_apart():

@@ -20,12 +20,13 @@ def table(rng: np.random.Generator, vehicles: int, flights: int, *, scatter: flo
             sigma = math.log(0.4) + vehicle + scatter * rng.standard_normal()
             sigma += (drift or {}).get(v, 0.0) * f + (odd_flights or {}).get((v, f), 0.0)
             alpha = math.log(63.0) + scatter * rng.standard_normal()
-            sag = -0.5 + 0.05 * rng.standard_normal()
+            sag = 0.5 + 0.05 * rng.standard_normal()
             for u, time in levels:
                 se = 0.2 / math.sqrt(time)
                 rows.append({
                     'path': f'/f/uav{v}/{f}', 'vehicle': f'uav{v}', 'flight': f, 'throttle': u,
-                    'time_s': time, 'status': 'OK', 'sag': sag, 'sag_se': 0.02,
+                    'time_s': time, 'status': 'OK', 'sag': 0.7 * sag, 'sag_se': 0.02,
+                    'sag_throttle': 0.8, 'sag_full': sag, 'sag_full_se': 0.02,
                     'sigma': math.exp(sigma + (0.0 if u is None else SLOPE * u + BEND * u * u)
                                       + se * rng.standard_normal()), 'sigma_se': se,
                     'alpha': math.exp(alpha + 2 * se * rng.standard_normal()),
