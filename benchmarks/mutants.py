@@ -256,6 +256,23 @@ def function_lines(source: bytes) -> list[tuple[int, int, int]]:
             if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))]
 
 
+def function_at(source: bytes, mutant: Mutant) -> tuple[str, int]:
+    """Return qualified name and first line of the outermost function with a mutant in its body."""
+    def within(node: ast.AST, prefix: str) -> tuple[str, int]:
+        for part in ast.iter_child_nodes(node):
+            if not getattr(part, 'lineno', mutant.line) <= mutant.line <= getattr(
+                    part, 'end_lineno', mutant.line):
+                continue
+            if isinstance(part, ast.ClassDef):
+                return within(part, f'{prefix}{part.name}.')
+            if isinstance(part, (ast.FunctionDef, ast.AsyncFunctionDef)) and (
+                    part.body[0].lineno <= mutant.line):
+                return prefix + part.name, min(
+                    [part.lineno, *(one.lineno for one in part.decorator_list)])
+        return '', 0
+    return within(ast.parse(source), '')
+
+
 def lines_that_use(source: bytes, names: set[str]) -> set[int]:
     """Return the lines on which names are read."""
     return {node.lineno for node in ast.walk(ast.parse(source))

@@ -26,7 +26,8 @@ import time
 from typing import Any
 
 from mutants import draw, Mutant
-from mutation_runs import Reach, reach, read_lines, stop, Tree
+from mutation_map import carry, file_of, Reach, reach
+from mutation_runs import prepare, read_lines, stop, Tree
 
 ROOT = Path(__file__).resolve().parent.parent
 SEED = 20261122
@@ -35,7 +36,8 @@ FOLDERS = ('ou_monitor/online', 'ou_monitor/model/terms', 'ou_monitor/criticism'
 # Not by default: real-time runs of ROS, whose timing two runs at once spoil; what builds the
 # package or looks at the sources rather than at what they calculate.
 TESTS = ('test/online', 'test/model', 'test/criticism', 'test/discovery', 'test/analysis',
-         'test/coupling', 'test/simulation', 'test/stream', 'test/fleet', 'test/cli')
+         'test/coupling', 'test/simulation', 'test/stream', 'test/fleet', 'test/cli',
+         'test/test_golden_runs.py')
 STATUSES = ('killed', 'timeout', 'survived', 'not covered')
 
 
@@ -64,13 +66,20 @@ def snapshot(work: Path) -> None:
     part.rename(origin)
 
 
-def collect(work: Path, tests: Sequence[str], trees: queue.Queue[Tree], jobs: int) -> Reach:
+def files_of(origin: Path, tests: Sequence[str]) -> list[str]:
+    """Return the files of tests in files and folders."""
+    return sorted({path.relative_to(origin).as_posix() for name in tests for path in (
+        (origin / name).rglob('test_*.py') if (origin / name).is_dir() else [origin / name])})
+
+
+def collect(work: Path, files: Sequence[str], trees: queue.Queue[Tree], jobs: int,
+            earlier: Path | None) -> Reach:
     """Return the map of the files of tests, running those that are not in it yet."""
     origin, folder = work / 'origin', work / 'reach'
     folder.mkdir(exist_ok=True)
-    files = sorted({path.relative_to(origin).as_posix() for name in tests for path in (
-        (origin / name).rglob('test_*.py') if (origin / name).is_dir() else [origin / name])})
-    out = {name: folder / (name.replace('/', '.') + '.json') for name in files}
+    if earlier:
+        say(f'map: {len(carry(earlier, work, files))} of {len(files)} files carried over')
+    out = {name: folder / file_of(name) for name in files}
     left = [name for name in files if not out[name].exists()]
 
     def one(name: str) -> str:
@@ -108,9 +117,9 @@ def _parallel(function: Any, arguments: Iterable[Any], jobs: int) -> Iterator[An
 
 def choose(mutant: Mutant, reached: Reach, budget: float) -> tuple[list[str], int]:
     """Return the tests to run within a budget, s, nearest and shortest first, and how many."""
-    near = str(Path('test', *Path(mutant.path).parts[1:-1]))
+    near, module = str(Path('test', *Path(mutant.path).parts[1:-1])), Path(mutant.path).stem
     order = sorted(reached.tests(mutant), key=lambda name: (
-        not name.startswith(near), reached.seconds[name], name))
+        f'/test_{module}.py' not in name, not name.startswith(near), reached.seconds[name], name))
     chosen, spent = [], 0.0
     for name in order:
         if chosen and spent + reached.seconds[name] > budget:
@@ -165,9 +174,11 @@ def mutate(given: argparse.Namespace) -> str:
     work.mkdir(parents=True, exist_ok=True)
     snapshot(work)
     origin, trees = work / 'origin', queue.Queue[Tree]()
+    files = files_of(origin, given.tests)
+    prepare(origin, files)
     for k in range(given.jobs):
-        trees.put(Tree(work, f'tree{k}'))
-    reached = collect(work, given.tests, trees, given.jobs)
+        trees.put(Tree(work, f'tree{k}', files))
+    reached = collect(work, files, trees, given.jobs, given.map)
     if reached.failed:
         say(f'{len(reached.failed)} tests fail without a mutant and are left out: '
             + ', '.join(reached.failed))
@@ -194,6 +205,8 @@ def mutate(given: argparse.Namespace) -> str:
         rest = (time.monotonic() - begin) / k * (len(left) - k) / 60.0
         say(f'{k}/{len(left)} {result["status"]} in {result["seconds"]:.0f} s: {result["key"]} '
             f'{result["by"]}; about {rest:.0f} min left')
+    while not trees.empty():
+        trees.get().close()
     return report([(one, results[one.key]) for one in drawn], origin, given.seed)
 
 
@@ -203,7 +216,7 @@ def main() -> int:
     parser.add_argument('--number', type=int, default=150, help='of mutants')
     parser.add_argument('--seed', type=int, default=SEED)
     parser.add_argument('--jobs', type=int, default=2, help='mutants at once')
-    parser.add_argument('--budget', type=float, default=240.0,
+    parser.add_argument('--budget', type=float, default=60.0,
                         help='s of normal time for the tests of one mutant, nearest and '
                         'shortest first')
     parser.add_argument('--folders', nargs='+', default=list(FOLDERS), help='to be mutated')
@@ -211,6 +224,8 @@ def main() -> int:
     parser.add_argument('--work', type=Path,
                         default=Path(tempfile.gettempdir()) / 'ou_monitor_mutation',
                         help='folder of copies, map and results; remove it to begin anew')
+    parser.add_argument('--map', type=Path, metavar='WORK', help='folder of an earlier run, '
+                        'whose map is carried over to files of tests that are the same')
     parser.add_argument('--table', type=Path, help='write table and survivors here')
     given = parser.parse_args()
     if given.number < 1 or given.jobs < 1:

@@ -6,11 +6,11 @@ pytest loads this module as a plugin (`-p mutation_runs`) in the processes start
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 import json
 import os
 from pathlib import Path
+import resource
 import shutil
 import signal
 import subprocess
@@ -18,16 +18,21 @@ import sys
 import time
 from typing import Any
 
-from mutants import function_lines, lines_that_use, Mutant, names_set
+from mutants import function_at, Mutant
 
-# Times the normal time; and the start of the interpreter, which does not shrink with the tests.
-_PATIENCE, _START = 5.0, 30.0
+# Times the normal time of a test, in time of the processor, of which a busy machine takes no more;
+# and what the first use of a module takes, s.
+_PATIENCE, _START = 5.0, 15.0
+# For what waits and does not calculate: times the normal time, and s.
+_WAITING, _WAITED = 10.0, 120.0
 # The context of what a fixture of a whole file, or a process started by a test, reached.
 _FILE = '<file>'
 
 # --- The plugin of pytest in the processes that are started below.
 
 _current = ''
+# Normal time of each test and the longest of its file, s.
+_normal: dict[str, float] = {}
 
 
 def _switch(context: str) -> None:
@@ -37,13 +42,25 @@ def _switch(context: str) -> None:
             coverage.switch_context(context)
 
 
+def set_normal() -> dict[str, float]:
+    """Read which tests were asked for, in order, and their normal time, s."""
+    _normal.update(json.loads(Path(os.environ['MUTATION_TESTS']).read_text()))
+    return _normal
+
+
 def pytest_collection_modifyitems(config: Any, items: list[Any]) -> None:
     """Leave the tests asked for, in the order asked for."""
     if 'MUTATION_TESTS' in os.environ:
-        order = {name: k for k, name in enumerate(
-            json.loads(Path(os.environ['MUTATION_TESTS']).read_text()))}
+        order = {name: k for k, name in enumerate(set_normal())}
         items[:] = sorted((one for one in items if one.nodeid in order),
                           key=lambda one: order[one.nodeid])
+
+
+def _limit(normal: float) -> None:
+    """Let this process calculate for a multiple of a normal time, s, from now on."""
+    _, hard = resource.getrlimit(resource.RLIMIT_CPU)
+    end = time.process_time() + _START + _PATIENCE * normal
+    resource.setrlimit(resource.RLIMIT_CPU, (int(end) + 1, hard))
 
 
 def pytest_runtest_logstart(nodeid: str, location: object) -> None:
@@ -51,6 +68,8 @@ def pytest_runtest_logstart(nodeid: str, location: object) -> None:
     global _current
     _current = nodeid
     _switch(nodeid)
+    if nodeid in _normal:
+        _limit(_normal[nodeid])
 
 
 def pytest_fixture_setup(fixturedef: Any, request: Any) -> None:
@@ -58,6 +77,10 @@ def pytest_fixture_setup(fixturedef: Any, request: Any) -> None:
     # The switch back comes with pytest_runtest_call: before it there is nothing but set-up.
     if fixturedef.scope != 'function':
         _switch(_FILE)
+        if _normal:
+            # It may count to another test where the order is another.
+            file = _current.partition('::')[0]
+            _limit(max(some for name, some in _normal.items() if name.startswith(file)))
 
 
 def pytest_runtest_call(item: Any) -> None:
@@ -86,7 +109,7 @@ def _environment(tree: Path, **more: str) -> dict[str, str]:
             **more}
 
 
-def _run(command: Sequence[str], tree: Path, limit: float, **more: str) -> int | None:
+def run(command: Sequence[str], tree: Path, limit: float, **more: str) -> int | None:
     """Run a command in a tree; return its status, or None after the limit, s."""
     with open(tree.with_suffix('.output'), 'w') as output, subprocess.Popen(
             command, cwd=tree, env=_environment(tree, **more), stdout=output,
@@ -115,7 +138,23 @@ def stop() -> None:
         _end(group)
 
 
-_PYTEST = ('-m', 'pytest', '-q', '-p', 'no:cacheprovider', '-p', 'no:xdist', '-p', 'mutation_runs')
+PYTEST = ('-m', 'pytest', '-q', '-p', 'no:cacheprovider', '-p', 'no:xdist', '-p', 'mutation_runs')
+
+
+def prepare(origin: Path, files: Sequence[str]) -> None:
+    """
+    Compile a copy of the project.
+
+    The byte code of the package is compared with the source by content: that of a mutant may have
+    the size and the second of the source before it.
+    """
+    run([sys.executable, '-m', 'compileall', '-q', '--invalidation-mode', 'checked-hash',
+         'ou_monitor'], origin, 600.0)
+    code = run([sys.executable, *PYTEST, '--collect-only', *files], origin, 1200.0,
+               PYTHONDONTWRITEBYTECODE='')
+    if code:
+        raise RuntimeError(f'tests cannot be collected: '
+                           f'{origin.with_suffix(".output").read_text()[-2000:]}')
 
 
 class Tree:
@@ -128,37 +167,79 @@ class Tree:
         The folder of all copies; 'origin' in it is the one without mutants.
     name : str
         Of this copy.
+    files : sequence of str
+        Files of tests.
 
     """
 
-    def __init__(self, work: Path, name: str) -> None:
-        self.path, self.origin = work / name, work / 'origin'
+    def __init__(self, work: Path, name: str, files: Sequence[str]) -> None:
+        self.path, self.origin, self._files = work / name, work / 'origin', files
         if self.path.exists():
             shutil.rmtree(self.path)
         shutil.copytree(self.origin, self.path, symlinks=True)
+        self._server: subprocess.Popen[str] | None = None
 
-    def tests(self, names: Sequence[str], limit: float) -> tuple[int | None, list[str]]:
-        """Run tests until one fails; return the status and which failed."""
+    def tests(self, names: Sequence[str], seconds: dict[str, float],
+              place: dict[str, Any]) -> tuple[int | None, list[str]]:
+        """Run tests until one fails; return the status, None past the limit, and which failed."""
         chosen, times = self.path.with_suffix('.tests'), self.path.with_suffix('.times')
-        chosen.write_text(json.dumps(list(names)))
+        chosen.write_text(json.dumps({name: seconds[name] for name in names}))
         times.write_text('')
         files = dict.fromkeys(name.partition('::')[0] for name in names)
-        status = _run([sys.executable, *_PYTEST, '-x', *files], self.path, limit,
-                      MUTATION_TESTS=str(chosen), MUTATION_TIMES=str(times))
+        status = self._ask([*PYTEST[2:], '-x', *files],
+                           _WAITED + _WAITING * sum(seconds[name] for name in names),
+                           {'MUTATION_TESTS': str(chosen), 'MUTATION_TIMES': str(times)}, place)
         return status, [name for name, _, failed in read_lines(times) if failed]
+
+    def _ask(self, arguments: Sequence[str], limit: float, more: dict[str, str],
+             place: dict[str, Any]) -> int | None:
+        """Have pytest run in a fork of a process that has collected the tests."""
+        if self._server is None:
+            there, back = os.pipe(), os.pipe()
+            with open(self.path.with_suffix('.server'), 'w') as output:
+                self._server = subprocess.Popen(
+                    [sys.executable, *PYTEST, '-p', 'mutation_server', *self._files],
+                    cwd=self.path, env=_environment(
+                        self.path, MUTATION_READ=str(there[0]), MUTATION_WRITE=str(back[1])),
+                    stdout=output, stderr=subprocess.STDOUT, pass_fds=(there[0], back[1]),
+                    start_new_session=True)
+            os.close(there[0])
+            os.close(back[1])
+            self._requests, self._answers = os.fdopen(there[1], 'w'), os.fdopen(back[0])
+            _running.add(self._server.pid)
+        print(json.dumps({'arguments': list(arguments), 'limit': limit, 'environment': more,
+                          'place': place, 'output': str(self.path.with_suffix('.output'))}),
+              file=self._requests, flush=True)
+        answer = self._answers.readline()
+        if not answer:
+            raise RuntimeError(f'the server ended: '
+                               f'{self.path.with_suffix(".server").read_text()[-2000:]}')
+        status = json.loads(answer)
+        return None if status in (None, -signal.SIGXCPU, -signal.SIGKILL) else int(status)
+
+    def close(self) -> None:
+        """End the process that runs the tests."""
+        if self._server is not None:
+            _running.discard(self._server.pid)
+            _end(self._server.pid)
+            self._server.wait()
+            self._requests.close()
+            self._answers.close()
+            self._server = None
 
     def try_mutant(self, mutant: Mutant, names: Sequence[str],
                    seconds: dict[str, float]) -> dict[str, Any]:
         """Return what the tests say of a mutant."""
         file, left = self.path / mutant.path, list(names)
         source = file.read_bytes()
+        function, line = function_at(source, mutant)
+        place = {'path': mutant.path, 'function': function, 'line': line}
         begin = time.monotonic()
         file.write_bytes(mutant.apply(source))
         try:
             status, by = '', ''
             while not status:
-                limit = _START + _PATIENCE * sum(seconds[name] for name in left)
-                code, failed = self.tests(left, limit)
+                code, failed = self.tests(left, seconds, place)
                 if code is None:
                     status = 'timeout'
                 elif code == 0:
@@ -166,7 +247,7 @@ class Tree:
                 elif code in (3, 4, 5):
                     raise RuntimeError(f'pytest could not run the tests of {mutant.key}: '
                                        f'{self.path.with_suffix(".output").read_text()[-2000:]}')
-                elif failed and self.tests(failed[:1], limit)[0] == 0:
+                elif failed and self.tests(failed[:1], seconds, place)[0] == 0:
                     # It failed once, for want of time perhaps: the rest shall say.
                     left = left[left.index(failed[0]) + 1:]
                     status = '' if left else 'survived'
@@ -180,106 +261,3 @@ class Tree:
 def read_lines(path: Path) -> list[Any]:
     """Return the values of a file of JSON lines; none where there is no file."""
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-
-
-# --- Which tests reach which lines.
-
-def reach(tree: Tree, test: str, out: Path) -> None:
-    """Run one file of tests under coverage; write what each of its tests reached."""
-    data, settings = out.with_suffix('.coverage'), out.with_suffix('.rc')
-    settings.write_text(f'[run]\nsource = ou_monitor\nrelative_files = True\nparallel = True\n'
-                        f'patch = subprocess\ndata_file = {data}\n')
-    times = out.with_suffix('.times')
-    for old in (times, *out.parent.glob(data.name + '*')):
-        old.unlink(missing_ok=True)
-    code = _run([sys.executable, '-m', 'coverage', 'run', f'--rcfile={settings}', *_PYTEST, test],
-                tree.path, 3600.0, MUTATION_TIMES=str(times), COVERAGE_CORE='ctrace')
-    if code not in (0, 1):
-        raise RuntimeError(f'{test} could not be run: pytest ended with {code}, '
-                           f'{tree.path.with_suffix(".output").read_text()[-2000:]}')
-    seconds: Counter[str] = Counter()
-    failed = set()
-    for name, took, wrong in read_lines(times):
-        seconds[name] += took
-        failed |= {name} if wrong else set()
-    good = [name for name in seconds if name not in failed]
-    where = {name: k for k, name in enumerate(good)}
-    found: dict[str, dict[str, set[int]]] = {}
-    from coverage import CoverageData
-    for piece in out.parent.glob(data.name + '.*'):
-        held = CoverageData(str(piece))
-        held.read()
-        own = any('::' in context for context in held.measured_contexts())
-        for path in held.measured_files():
-            for line, contexts in held.contexts_by_lineno(path).items():
-                at = found.setdefault(path, {}).setdefault(str(line), set())
-                for context in contexts:
-                    if context == _FILE or not own:
-                        at |= set(where.values())
-                    elif context in where:
-                        at.add(where[context])
-        piece.unlink()
-    _write(out, {'tests': good, 'seconds': [round(seconds[name], 4) for name in good],
-                 'failed': sorted(failed), 'lines': {
-                     path: {line: sorted(at) for line, at in lines.items() if at}
-                     for path, lines in found.items()}})
-
-
-def _write(path: Path, value: object) -> None:
-    part = path.with_suffix('.part')
-    part.write_text(json.dumps(value))
-    part.rename(path)
-
-
-class Reach:
-    """
-    The map from lines to tests.
-
-    Parameters
-    ----------
-    files : iterable of pathlib.Path
-        What `reach` has written.
-    root : pathlib.Path
-        Of the sources that were run.
-
-    """
-
-    def __init__(self, files: Iterable[Path], root: Path) -> None:
-        self.root = root
-        self.seconds: dict[str, float] = {}
-        self.failed: list[str] = []
-        self._at: dict[str, dict[int, set[str]]] = {}
-        for file in files:
-            read = json.loads(file.read_text())
-            names = read['tests']
-            self.seconds.update(zip(names, read['seconds']))
-            self.failed += read['failed']
-            for path, lines in read['lines'].items():
-                at = self._at.setdefault(path, {})
-                for line, tests in lines.items():
-                    at.setdefault(int(line), set()).update(names[k] for k in tests)
-
-    def _of(self, path: str, lines: Iterable[int]) -> set[str]:
-        at = self._at.get(path, {})
-        return {name for line in lines for name in at.get(line, ())}
-
-    def tests(self, mutant: Mutant) -> set[str]:
-        """Return the tests that reach the statement of a mutant."""
-        source = (self.root / mutant.path).read_bytes()
-        functions = function_lines(source)
-        if any(first <= mutant.line <= last for _, first, last in functions):
-            return self._of(mutant.path, range(mutant.first, mutant.last + 1))
-        # What runs when the module is loaded is reached where it is used: a default by the body
-        # of its function, a name where it is read, all else wherever the module does anything.
-        for head, first, last in functions:
-            if head <= mutant.line < first:
-                return self._of(mutant.path, range(first, last + 1))
-        names = names_set(source, mutant)
-        module = mutant.path.removesuffix('.py').replace('/', '.')
-        within = {line for _, first, last in functions for line in range(first, last + 1)}
-        used = self._of(mutant.path, within & lines_that_use(source, names))
-        for path in self._at:
-            other = (self.root / path).read_bytes()
-            if names and path != mutant.path and module.rpartition('.')[2].encode() in other:
-                used |= self._of(path, lines_that_use(other, names))
-        return used or self._of(mutant.path, within)

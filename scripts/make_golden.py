@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
 """
-Write the golden tables: `scripts/make_golden.py [NAME ...]` (default: those with a truth).
+Write the golden tables: `scripts/make_golden.py [NAME or RUN ...]` (default: all).
 
 test/analysis/golden/NAME.json is what `ou-monitor analyze bags/NAME --json -` finds, without the
-long series (of those every sixteenth value).  Run it after a change that is meant to move the
-numbers, and look at the difference before it is committed.
+long series (of those every sixteenth value); test/golden/RUN.json is what a run of
+test/support/golden_runs.py finds.  Run it after a change that is meant to move the numbers, and
+look at the difference before it is committed.
 """
 
 from __future__ import annotations
@@ -63,10 +64,17 @@ def thinned(value: Any) -> Any:
 
 def main(argv: list[str]) -> int:
     """Write the tables of the bags named."""
-    for name in argv or sorted(path.parent.name for path in BAGS.glob('*/truth.yaml')):
-        text = json.dumps(golden(name), indent=1, allow_nan=False, ensure_ascii=False)
-        (GOLDEN / f'{name}.json').write_text(text + '\n', encoding='utf-8')
-        print(GOLDEN / f'{name}.json')
+    sys.path.insert(1, str(ROOT / 'test' / 'support'))
+    from golden_runs import RUNS
+    bags = sorted(path.parent.name for path in BAGS.glob('*/truth.yaml'))
+    for name in argv or [*bags, *RUNS]:
+        found = RUNS[name]() if name in RUNS else golden(name)
+        path = (ROOT / 'test' / 'golden' if name in RUNS else GOLDEN) / f'{name}.json'
+        # A table of a run is read by a program: one line for each part of it.
+        text = json.dumps(found, indent=None if name in RUNS else 1, allow_nan=False,
+                          ensure_ascii=False)
+        path.write_text(text.replace('}, {', '},\n{') + '\n', encoding='utf-8')
+        print(path)
     return 0
 
 
