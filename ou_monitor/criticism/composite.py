@@ -86,7 +86,7 @@ class Composite:
 
 def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: slice,
                   known: Composite | None = None, *, whole_mean: bool = False,
-                  rough: bool = False) -> Composite | None:
+                  rough: bool = False, begun: bool = False) -> Composite | None:
     """
     Fit a model on a part; None where a law cannot be fitted.
 
@@ -102,7 +102,8 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
     cost = 0.0
     last = 0 if known is not None and _kinds(known.terms) == _kinds(terms) else _ROUNDS
     for turn in range(1 + last):
-        gaussian = fit_gaussian(samples, structural, part, events, offset, whole_mean, rough)
+        gaussian = fit_gaussian(samples, structural, part, events, offset, whole_mean, rough,
+                                begun)
         z, density, cost = gaussian.z, gaussian.density, cost + gaussian.cost
         fits = []
         push, error, moved = np.zeros(samples.n), np.zeros(samples.n), np.zeros(samples.n)

@@ -104,12 +104,17 @@ class GaussianFit:
 
 def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
                  events: Events | None = None, offset: FloatArray | None = None,
-                 whole_mean: bool = False, rough: bool = False) -> GaussianFit:
-    """Fit the Gaussian part by maximum likelihood on a part of the recording (offset in V)."""
+                 whole_mean: bool = False, rough: bool = False, begun: bool = False
+                 ) -> GaussianFit:
+    """
+    Fit the Gaussian part by maximum likelihood on a part of the recording (offset in V).
+
+    begun: whether the parameters were fitted to all of the part already, in some way.
+    """
     voltage = samples.voltage if offset is None else samples.voltage - offset
     chosen = samples.part(part, voltage)
     inside = None if events is None else events.part(part)
-    fit = _maximise(chosen, tuple(terms), inside, rough)
+    fit = _maximise(chosen, tuple(terms), inside, rough, begun=begun)
     cost = fit.cost
     if whole_mean and chosen.n < samples.n:
         mean = _with_mean(samples.part(slice(None), voltage), fit.terms, events)
@@ -212,12 +217,12 @@ def _filter(samples: Samples, terms: Sequence[Term], events: Events | None) -> _
     if events is not None and _states(terms) >= _MANY and not events.error.any():
         # Where noise or pushes enter the state and nothing hides them, the gains of
         # several states hardly change: a filter that is settled saves most of the time.
-        s, space, _ = _space(samples, terms, None)
+        s, space, _ = state_space(samples, terms, None)
         run = Filter(space, samples.n)
         q = s.sigma * s.sigma * -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
         return _Run(s, run, run.variance, run.variance + (events.power - 1.0) * q + events.push,
                     _cost(space, samples.n))
-    s, space, own = _space(samples, terms, events)
+    s, space, own = state_space(samples, terms, events)
     run = Filter(space, samples.n)
     return _Run(s, run, run.variance - own, run.variance, _cost(space, samples.n))
 
@@ -233,8 +238,8 @@ def _states(terms: Sequence[Term]) -> int:
     return 1 + sum(term.STATES for term in terms if term.ROLE is Role.BLOCK)
 
 
-def _space(samples: Samples, terms: Sequence[Term], events: Events | None
-           ) -> tuple[Segment, StateSpace, FloatArray | float]:
+def state_space(samples: Samples, terms: Sequence[Term], events: Events | None
+                ) -> tuple[Segment, StateSpace, FloatArray | float]:
     """Return the segment, the state space, and what events add to each variance predicted."""
     ou = terms[0]
     assert isinstance(ou, OU)
@@ -305,13 +310,17 @@ def _coupled(term: ACCoupling, s: Segment, phi: FloatArray, q: FloatArray
 
 
 def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
-              rough: bool = False, only: Sequence[int] | None = None) -> GaussianFit:
+              rough: bool = False, only: Sequence[int] | None = None, begun: bool = False
+              ) -> GaussianFit:
     """Fit by scoring: the outer product of numerical scores stands for the information."""
     rounds = _FEW_ROUNDS if rough else _ROUNDS
     run = _filter(samples, terms, events)
     states, cost = run.kalman.shape, run.cost
     few = max(_DEAR // (2 * states[1]), 2000)
-    if states[0] * (states[1] - 1) > _DEAR and few < samples.n:
+    if begun and rough:
+        if states[1] > _MANY:
+            return _with_mean(samples, terms, events)
+    elif states[0] * (states[1] - 1) > _DEAR and few < samples.n:
         # Far from the top a part of the samples shows the way.
         part = _liveliest(samples, few)
         # A part determines parameters that were fitted to all samples less well than those did.

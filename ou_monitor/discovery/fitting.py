@@ -15,6 +15,7 @@ import numpy as np
 from ou_monitor.criticism.composite import Composite, fit_composite, pole_beside, view_of
 from ou_monitor.criticism.null_bank import criticise, NullBank
 from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.spectral_start import from_spectrum
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import decision
 from ou_monitor.model.terms.catalogue import catalogue
@@ -25,6 +26,8 @@ from ou_monitor.records import FloatArray
 
 # Starting points that are fitted in full, and samples that decide which.
 _FULL, _GLANCE = 2, 8000
+# Nats by which two fits to one spectrum differ at least.
+_ALIKE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +86,11 @@ class Fitter:
         return view_of(self.samples, composite.gaussian, composite.z, self.samples.train)
 
     def fit(self, terms: Sequence[Term | type[Term]], known: Composite | None,
-            rough: bool = False) -> Composite | None:
+            rough: bool = False, begun: bool = False) -> Composite | None:
         """Return a fit to the first part, its mean to everything; None where there is none."""
         try:
             found = fit_composite(self.samples, terms, self.samples.train, known,
-                                  whole_mean=True, rough=rough)
+                                  whole_mean=True, rough=rough, begun=begun)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             # Parameters have left what a term allows, or numbers can hold.
             return None
@@ -164,6 +167,9 @@ class Fitter:
             found = self.fit([*composite.terms, kind], composite)
             return found if found is not None and found.terms[-1].holds(view) else None
         starts = list(kind.candidates(view))
+        if kind.BROAD and not any(term.ROLE is Role.BLOCK and term.NEEDS_THROTTLE
+                                  for term in composite.terms):
+            return self._by_spectrum(composite, starts, view)
         known = [term for term in starts if term.ROLE is Role.MEAN]
         hidden = [term for term in starts if term.ROLE is not Role.MEAN]
         if len(known) > _FULL:
@@ -179,6 +185,22 @@ class Fitter:
                     best is None or self.evidence(found) > self.evidence(best)):
                 best = found
         return best
+
+    def _by_spectrum(self, composite: Composite, starts: Sequence[Term], view: View
+                     ) -> Composite | None:
+        """Return the best fit from starts that the spectrum of the scores has moved."""
+        ou, *others = composite.gaussian.terms
+        laws = [term for term in composite.terms if term.ROLE is Role.LAW]
+        moved = [from_spectrum(self.samples, composite, [start.beside(ou), *others, start])
+                 for start in starts]
+        moved = sorted((way for way in moved if way[0][-1].holds(view)), key=lambda way: -way[1])
+        # Those that went the same way are one.
+        ways = [way for k, way in enumerate(moved)
+                if not any(way[1] > other[1] - _ALIKE for other in moved[:k])]
+        fits = [self.fit([*terms, *laws], composite, rough=True, begun=True)
+                for terms, _ in ways[:_FULL]]
+        return max((fit for fit in fits if fit is not None and _joined(fit).holds(view)),
+                   default=None, key=self.evidence)
 
     def simplest(self, composite: Composite, index: int) -> Composite | None:
         """Return the fit with one term in its simplest form; None where it is that already."""

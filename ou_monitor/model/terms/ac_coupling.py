@@ -34,6 +34,7 @@ class ACCoupling(Term):
     ROLE: ClassVar[Role] = Role.BLOCK
     FREE: ClassVar[tuple[str, ...]] = ('corner',)
     DEAR: ClassVar[bool] = True
+    BROAD: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('-band',)
     STATES: ClassVar[int] = 1
     SEVERAL: ClassVar[bool] = True

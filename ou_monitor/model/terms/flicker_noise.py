@@ -40,6 +40,7 @@ class FlickerNoise(Term):
     ROLE: ClassVar[Role] = Role.BLOCK
     FREE: ClassVar[tuple[str, ...]] = ('amplitude', 'high')
     DEAR: ClassVar[bool] = True
+    BROAD: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('band', 'autocorrelation')
     # At least: one to every three octaves.
     STATES: ClassVar[int] = 4

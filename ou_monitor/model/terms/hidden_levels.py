@@ -13,10 +13,11 @@ from ou_monitor.records import FloatArray
 _MEDIAN = 0.6745
 
 
-def moving(residual: FloatArray, size: int) -> slice:
-    """Return the segment of a size in which the voltage moves most: there levels change."""
-    starts = range(0, residual.size - size + 1, max(size // 2, 1))
-    begin = max(starts, key=lambda k: float(residual[k:k + size].var()))
+def moving(view: View, size: int) -> slice:
+    """Return the segment of a size in which the voltage moves most beside its noise."""
+    moves = (view.residual / np.sqrt(view.variance))[view.train]
+    starts = range(0, moves.size - size + 1, max(size // 2, 1))
+    begin = max(starts, key=lambda k: float(moves[k:k + size].var()))
     return slice(begin, begin + size)
 
 

@@ -85,7 +85,8 @@ class LoadDependentSigma(Term):
         price = 0.5 * math.log(u.size)
         forms = []
         inner = np.unique(np.quantile(u, np.linspace(0.05, 0.95, 91)))
-        for knots in (np.array([low, high]), _greedy(bins, low, high, price + _KNOT_PRICE),
+        ends = _ends(view.throttle)
+        for knots in (ends, _greedy(bins, ends, price + _KNOT_PRICE),
                       *(np.array([at - _EDGE, at + _EDGE]) for at in inner)):
             factors, misfit = _to_bins(bins, knots)
             found = _STEP_PRICE if knots[-1] - knots[0] < 3.0 * _EDGE else (
@@ -106,7 +107,7 @@ class LoadDependentSigma(Term):
         """Return a straight line."""
         if view.throttle is None:
             return ()
-        low, high = np.quantile(view.throttle[view.train], [0.01, 0.99]).tolist()
+        low, high = _ends(view.throttle).tolist()
         return (cls((low, high), (0.0, 0.5)),) if high - low > _APART else ()
 
 
@@ -120,6 +121,15 @@ _BINS, _IN_BIN, _MOST_KNOTS = 40, 20, 9
 _MOST = 4.0
 # Knots nearer than this are one, and half the width of a step, in throttle.
 _APART, _EDGE = 0.02, 0.002
+
+
+def _ends(throttle: FloatArray) -> FloatArray:
+    """
+    Return the knots of a straight line: where it ends, so that it is level nowhere.
+
+    Of throttle throughout, which is known, also of the part kept.
+    """
+    return np.array([throttle.min(), throttle.max()])
 
 
 Bins = tuple[FloatArray, FloatArray, FloatArray]
@@ -148,9 +158,8 @@ def _to_bins(bins: Bins, knots: FloatArray) -> tuple[FloatArray, float]:
     return factors, 0.5 * float(left @ left)
 
 
-def _greedy(bins: Bins, low: float, high: float, price: float) -> FloatArray:
+def _greedy(bins: Bins, knots: FloatArray, price: float) -> FloatArray:
     """Return knots: the ends, and one after the other where it helps most, while it pays."""
-    knots = np.array([low, high])
     misfit = _to_bins(bins, knots)[1]
     while knots.size < _MOST_KNOTS:
         tried = [np.sort(np.append(knots, at)) for at in bins[0].tolist()

@@ -122,7 +122,7 @@ class RegimeSwitching(Term):
         spread = math.sqrt(float(np.mean(view.residual[view.train] ** 2)))
         step = 1.0 / view.rate
         first = slice(0, min(_SHORT, view.train.stop))
-        busy = moving(view.residual[view.train], first.stop)
+        busy = moving(view, first.stop)
         # Coordinates: ln rates, level in innovations, ln sigma ratio, ln scale.
         shortest = math.exp(-_fastest(view))
         for faster in _FASTER:
@@ -276,6 +276,9 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
         return None, 0.0, 2
     mean = (mean - mean.mean()) / spread
     step = size / view.rate
+    # What throttle does to the noise is none of the levels'.
+    noisy = view.variance[view.train][:count * size].reshape(count, size).mean(axis=1)[1:]
+    noisy /= math.exp(float(np.mean(np.log(noisy))))
 
     def value(x: FloatArray, states: int) -> float:
         if max(x[0], x[1]) > _fastest(view) or min(x[0], x[1]) < -6.0 or abs(x[4]) > 4.0:
@@ -286,12 +289,13 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
         log = np.empty((states, states, count - 1))
         for i, j in np.ndindex(states, states):
             e = mean[1:] - level[j] - keep * (mean[:-1] - level[i])
-            log[i, j] = log_normal(e, 0.0, math.exp(2.0 * x[4]))
+            log[i, j] = log_normal(e, 0.0, math.exp(2.0 * x[4]) * noisy)
         return log_likelihood(log.transpose(2, 0, 1), _transition(x, step, states), law)
 
     # Without a level the rates say nothing: correlation and scale alone.
-    rest = mean[1:] - (keep := float(mean[1:] @ mean[:-1]) / count) * mean[:-1]
-    least = float(log_normal(rest, 0.0, float(rest.var())).sum())
+    keep = float(mean[1:] @ (mean[:-1] / noisy)) / float(mean[:-1] @ (mean[:-1] / noisy))
+    rest = mean[1:] - keep * mean[:-1]
+    least = float(log_normal(rest, 0.0, float(np.mean(rest**2 / noisy)) * noisy).sum())
     best: tuple[float, FloatArray, int] | None = None
     for states, level in ((2, 1.7), (3, 1.2)):
         for dwell in (0.5, 2.0):

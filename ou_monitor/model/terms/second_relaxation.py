@@ -24,6 +24,7 @@ class SecondRelaxation(Term):
     ROLE: ClassVar[Role] = Role.BLOCK
     FREE: ClassVar[tuple[str, ...]] = ('alpha', 'sigma')
     DEAR: ClassVar[bool] = True
+    BROAD: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('band', 'autocorrelation')
     STATES: ClassVar[int] = 1
     IMITATES: ClassVar[tuple[str, ...]] = ('flicker_noise', 'regime_switching')

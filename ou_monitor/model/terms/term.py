@@ -116,6 +116,9 @@ class Term:
         Penalty for what is searched beside the free parameters, nats.
     DEAR : bool
         Whether a fit takes seconds, so that cheaper terms are tried first.
+    BROAD : bool
+        Whether its spectrum is broad and the same throughout, so that a fit starts from that of
+        the scores (`Role.BLOCK`).
     STATES : int
         States that it adds to the linear system (`Role.BLOCK`).
     CHANGES : type of Term, or None
@@ -148,6 +151,7 @@ class Term:
     REFUTED_BY: ClassVar[tuple[str, ...]] = ()
     SEARCH: ClassVar[float] = 0.0
     DEAR: ClassVar[bool] = False
+    BROAD: ClassVar[bool] = False
     STATES: ClassVar[int] = 0
     CHANGES: ClassVar[type[Term] | None] = None
     LIVE: ClassVar[Live] = Live.NOT
