@@ -20,7 +20,7 @@ import time
 import numpy as np
 from ou_monitor.cli.main import main as command
 from ou_monitor.model.load_fit import fit_load
-from ou_monitor.online.load_filter import LoadFilter
+from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Recording
 from tables import put, table

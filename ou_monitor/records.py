@@ -55,6 +55,15 @@ class Status(enum.Enum):
         'the sampling rate.')
 
 
+class Level(enum.IntEnum):
+    """Levels of diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
 class Flag(enum.Enum):
     """A caution about the input; the value is the sentence for the pilot."""
 

@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 from ou_monitor.analysis.level_result import LevelResult
-from ou_monitor.online.load_filter import LoadFilter
-from ou_monitor.online.supply_load import LoadStatus, SupplyLoad
+from ou_monitor.online.load.load_filter import LoadFilter
+from ou_monitor.online.load.supply_load import LoadStatus, SupplyLoad
 from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import number, volts
 

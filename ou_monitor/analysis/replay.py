@@ -15,7 +15,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.monitor import SupplyMonitor
-from ou_monitor.online.monitor_report import MonitorReport, RISK_CURVE
+from ou_monitor.online.report import MonitorReport, RISK_CURVE
 from ou_monitor.online.risk.outlook import Outlook
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording

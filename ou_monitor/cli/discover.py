@@ -68,7 +68,7 @@ def command_line(args: argparse.Namespace) -> str:
 
 def model_text(finding: Finding, recording: Recording | None = None) -> str:
     """Return the extended model, and what is known at take-off, as the text of a model file."""
-    from ou_monitor.online.load_filter import LoadFilter
+    from ou_monitor.online.load.load_filter import LoadFilter
     from ou_monitor.recordings.model_file import as_yaml, ModelFile
 
     if finding.model is None:

@@ -12,8 +12,9 @@ import math
 from typing import Any
 
 import numpy as np
+from ou_monitor.records import FloatArray
 
-# Coefficients of x, u, u^3, x after three lags, and inrush, with x = u^1.8 (load_filter.py).
+# Coefficients of x, u, u^3, x after three lags, and inrush, with x = u^1.8 (load/load_filter.py).
 SIZE = 7
 _COLUMNS = ('coefficients', 'covariance', 'log_variance', 'flown')
 
@@ -108,3 +109,26 @@ def _numbers(value: Any) -> Any:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError(f'{value!r} is no number')
     return float(value)
+
+
+def usual_coefficients() -> tuple[FloatArray, FloatArray, float]:
+    """
+    Return mean and covariance of the coefficients, and mean sag, per volt of pack: the prior.
+
+    a = S b: S is log-normal about 0.12; of b, beta(0.5, 1) lags by 60 ms, two shapes are
+    normal(0, 0.2) and take 0.7 of themselves from the first, and the rest is log-normal.
+    """
+    def lognormal(median: float, deviation: float) -> tuple[float, float]:
+        mean = median * math.exp(0.5 * deviation ** 2)
+        return mean, mean ** 2 * math.expm1(deviation ** 2)
+
+    size, size_var = lognormal(0.12, 0.6)
+    parts = [(0.0, 0.2 ** 2), (0.0, 0.2 ** 2), (1.0 / 3.0, 4.0 / 45.0),
+             lognormal(0.2, 0.5), lognormal(0.3, 0.5), lognormal(1.5, 1.0)]
+    means, variances = np.array(parts).T
+    mix = np.vstack([(-0.7, -0.7, -1.0, 0.0, 0.0, 0.0), np.eye(6)])
+    mean = mix @ means
+    mean[0] += 1.0
+    square = np.outer(mean, mean)
+    cov = (size ** 2 + size_var) * (mix @ np.diag(variances) @ mix.T + square) - size**2 * square
+    return size * mean, cov, size

@@ -37,11 +37,11 @@ from ou_monitor.nodes.sources import MOTOR_PARAMETERS
 from ou_monitor.nodes.supply_input import Supply, SupplyInput
 from ou_monitor.online.filter.cutoff_control import Bound
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass, FilterCounters
-from ou_monitor.online.level import Level
 from ou_monitor.online.notch.notch import AdaptiveNotch
 from ou_monitor.online.notch.settings import notch_options, NOTCH_PARAMETERS, NotchSettings
 from ou_monitor.online.settings import (
     FILTER_PARAMETERS, filter_settings, FilterSettings, Parameter)
+from ou_monitor.records import Level
 from std_msgs.msg import Float64
 
 AUTO = 'auto'

@@ -29,8 +29,8 @@ from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import diagnostic, MonitorNode, to_time
 from ou_monitor.nodes.inputs import Silence
 from ou_monitor.nodes.pacing import wait_until
-from ou_monitor.online.level import Level
 from ou_monitor.online.settings import Parameter
+from ou_monitor.records import Level
 from sensor_msgs.msg import BatteryState, JointState
 
 ADC_PARAMETERS: tuple[Parameter, ...] = (

@@ -36,12 +36,11 @@ from ou_monitor.nodes.latch_file import LatchFile
 from ou_monitor.nodes.model_choice import ModelChoice, PATIENCE
 from ou_monitor.nodes.publisher_watch import PublisherWatch
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
-from ou_monitor.online.level import Level
 from ou_monitor.online.monitor import SupplyMonitor
-from ou_monitor.online.monitor_report import MonitorReport
+from ou_monitor.online.report import MonitorReport
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.settings import ESTIMATOR_PARAMETERS, monitor_settings, Parameter
-from ou_monitor.records import FloatArray
+from ou_monitor.records import FloatArray, Level
 from ou_monitor.stream.arrival import SourceClock
 from ou_monitor.stream.samples import SampleStream
 from rclpy.logging import get_logging_directory

@@ -15,16 +15,14 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.input_health import patience, readings, Stamps, StampWatch
-from ou_monitor.online.level import Level
-from ou_monitor.online.load_filter import LoadFilter
-from ou_monitor.online.monitor_report import MonitorReport
-from ou_monitor.online.risk.ahead import Ahead, look_ahead, risk_of_all
+from ou_monitor.online.load.load_filter import LoadFilter
+from ou_monitor.online.load.supply_load import SupplyLoad
+from ou_monitor.online.report import MonitorReport
 from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
 from ou_monitor.online.risk.forecast import Forecast
-from ou_monitor.online.risk.outlook import Outlook
+from ou_monitor.online.risk.outlook import Ahead, look_ahead, Outlook, risk_of_all
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.online.supply_load import SupplyLoad
-from ou_monitor.records import Counters, Estimate, Flag, NAN, Status
+from ou_monitor.records import Counters, Estimate, Flag, Level, NAN, Status
 
 if TYPE_CHECKING:
     from ou_monitor.model.supply import SupplyModel

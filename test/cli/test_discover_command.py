@@ -15,7 +15,7 @@ from ou_monitor.model.terms.drift import Drift
 from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.tone import Tone
-from ou_monitor.online.load_filter import LoadFilter
+from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.report.discovery_page import discovery_page

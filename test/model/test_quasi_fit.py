@@ -5,8 +5,8 @@ import math
 from dense import block_autocovariances, fisher, restricted
 import numpy as np
 from ou_monitor.model import arma
-from ou_monitor.model.exact_fit import fit_exact
 from ou_monitor.model.ou import simulate
+from ou_monitor.online.estimator.irregular import fit_exact
 import pytest
 from scipy.linalg import toeplitz
 from scipy.optimize import minimize

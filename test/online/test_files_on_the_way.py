@@ -17,7 +17,7 @@ import pytest
 
 ROOT = str(Path(ou_monitor.__file__).parent)
 # With the module of the node whose callback it is, and what judges the stamps.
-MOST = 33
+MOST = 26
 
 
 def files_of(calls):

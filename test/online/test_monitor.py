@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 from ou_monitor.model.ou import simulate
-from ou_monitor.online.level import Level
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import (
     ESTIMATOR_PARAMETERS, FILTER_PARAMETERS, filter_settings, FilterSettings, monitor_settings,
     MonitorSettings)
+from ou_monitor.records import Level
 import pytest
 
 

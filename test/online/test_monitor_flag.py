@@ -7,10 +7,10 @@ import numpy as np
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.online.level import Level
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.settings import ESTIMATOR_PARAMETERS, monitor_settings, MonitorSettings
+from ou_monitor.records import Level
 import pytest
 
 RATE = 1000.0

@@ -21,15 +21,14 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.online.load_filter import LoadFilter
-from ou_monitor.online.risk.calibration import (
-    below, Calibrator, density, FarShare, LowestLaw, MEMORY)
-from ou_monitor.online.risk.excursions import excursion_risk, excursions
+from ou_monitor.online.load.load_filter import LoadFilter
+from ou_monitor.online.load.supply_load import LoadState
 from ou_monitor.online.risk.first_passage import Passage
-from ou_monitor.online.risk.load_law import Futures, held, lowest, mean_now, Sampling
-from ou_monitor.online.risk.past import BLOCK, Past
-from ou_monitor.online.risk.pilot import Flown, flown, pilot
-from ou_monitor.online.supply_load import LoadState
+from ou_monitor.online.risk.lowest import (
+    below, Calibrator, density, FarShare, Futures, held, lowest, LowestLaw, mean_now, MEMORY,
+    Sampling)
+from ou_monitor.online.risk.past import (
+    BLOCK, excursion_risk, excursions, Flown, flown, Past, pilot)
 from ou_monitor.records import FloatArray, NAN
 from scipy.special import expit
 

@@ -1,16 +1,16 @@
 """
-What lies ahead of the supply: the risk at the present throttle, and the throttle that is left.
+What lies ahead of the supply: risk, what it stands on, the curve over throttle, and the budget.
 
-The window knows the supply of the last seconds; the curves learned in flight know
-the intensity of the present throttle, which after a step is not that of the
-window; and how fast the intensity has been seen to wander tells what may become of
-it within the horizon.
+The window knows the supply of the last seconds; the curves learned in flight know the intensity
+of the present throttle, which after a step is not that of the window; and how fast the intensity
+has been seen to wander tells what may become of it within the horizon.  `Forecast` knows the
+other legs.
 
-Limits: throttle stays as it is; a throttle not flown before has the error of the
-curves' prior, and is never called safe beyond the range flown; alpha is that of the
-present estimate at every throttle, as the paper assumes; the supply is taken to have
-settled, so the dip that follows a step of throttle (inrush, overshoot) is not in the
-risk, nor is further discharge; the terms of a model file count as `EventRisk` says.
+Limits: no throttle above the highest flown in the last minutes is called safe.  Of first passage:
+throttle stays as it is; a throttle not flown before has the error of the curves' prior; alpha is
+that of the present estimate at every throttle, as the paper assumes; the supply is taken to have
+settled, so the dip that follows a step of throttle (inrush, overshoot) is not in the risk, nor is
+further discharge; the terms of a model file count as `EventRisk` says.
 """
 
 from __future__ import annotations
@@ -23,8 +23,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.passage.law import prepare
+from ou_monitor.online.load.supply_load import LoadStatus, SupplyLoad
 from ou_monitor.online.risk.curves import LearnedCurves
 from ou_monitor.online.risk.first_passage import as_sampled, Passage, risk_of, Supply
+from ou_monitor.online.risk.forecast import Forecast, Outcome
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN
 
@@ -327,3 +329,97 @@ def _with_events(risk: FloatArray, added: FloatArray) -> FloatArray:
     inside = np.minimum(risk, 1.0 - 1e-16)
     total: FloatArray = np.where(risk >= 1.0, 1.0, -np.expm1(np.log1p(-inside) + added))
     return total
+
+
+@dataclass(frozen=True)
+class Ahead:
+    """
+    Risk and budget of one instant.
+
+    Attributes
+    ----------
+    outcome : Outcome
+        Risk, its leg, and what makes most of it.
+    budget : float
+        Throttle budget, 0..1; NaN when not known.
+    budget_reason : str
+        What ends it, or why it is not known.
+    curve : tuple of float
+        Risk if throttle goes to each tenth and stays for the horizon; empty when not known.
+
+    """
+
+    outcome: Outcome = Outcome()
+    budget: float = NAN
+    budget_reason: str = ''
+    curve: tuple[float, ...] = ()
+
+
+def look_ahead(outlook: Outlook, forecast: Forecast, e: Estimate, load: SupplyLoad,
+               settings: MonitorSettings) -> Ahead:
+    """Return what lies ahead by the settings."""
+    s = settings
+    voltage, horizon = s.brownout_voltage, s.brownout_horizon
+    outcome = risk_of_all(outlook, forecast, e, s, voltage, horizon)
+    risks = forecast.risk_if(_GRID, horizon, voltage, horizon)
+    known = not np.isnan(risks).any()
+    if known and outcome.basis != 'first_passage':
+        budget = load_budget(risks, forecast.flown, s.budget_limit, voltage, horizon)
+    else:
+        budget = outlook.budget(e, s)
+        if math.isnan(budget.throttle):
+            if known:
+                budget = load_budget(risks, forecast.flown, s.budget_limit, voltage, horizon)
+            elif not e.usable and load.status is not LoadStatus.NO_DATA:
+                return Ahead(outcome, NAN, load.status.value if not load.known else
+                             'Less than a second has been flown.')
+        elif budget.risks.size:
+            # Elsewhere it is the prior's.
+            risks = np.where(budget.known, budget.risks, NAN)
+    return Ahead(outcome, budget.throttle, budget.reason, _tenths(risks))
+
+
+def _tenths(risks: FloatArray) -> tuple[float, ...]:
+    return () if np.isnan(risks).all() else tuple(risks[::5].tolist())
+
+
+def risk_of_all(outlook: Outlook, forecast: Forecast, e: Estimate, settings: MonitorSettings,
+                voltage: float, horizon: float) -> Outcome:
+    """Return the risk of all legs together; voltage in V, horizon in s."""
+    passage = outlook.risk(e, voltage, horizon, settings.brownout_watch) if e.usable else NAN
+    if e.usable and math.isnan(passage):
+        # The tables of events that a model file names are not there yet.
+        return Outcome()
+    return forecast.risk(voltage, horizon, passage, alone=outlook.events is not None)
+
+
+def load_budget(risks: FloatArray, flown: tuple[float, float], limit: float, voltage: float,
+                dwell: float) -> ThrottleBudget:
+    """Return the budget from the risks at `_GRID`, held for `dwell`, s; voltage in V."""
+    lowest, highest = flown
+    known = (_GRID >= lowest) & (_GRID <= highest)
+    what = f' Brown-out: below {voltage:g} V while it is held for {dwell:g} s.'
+    if np.isnan(risks).any():
+        return ThrottleBudget(NAN, lowest, highest, limit, 'The load is not known.')
+    # A risk that falls again beyond a peak is no way through.
+    risks = np.maximum.accumulate(risks)
+    within = int(np.searchsorted(risks, limit, 'right'))
+    if within == 0:
+        return ThrottleBudget(0.0, lowest, highest, limit,
+                              f'Even idle is above the limit: risk {risks[0]:.2g}.' + what,
+                              _GRID, risks, known)
+    end = 1.0
+    if within < _GRID.size:
+        low, high = risks[within - 1], risks[within]
+        # The logarithm of the risk is nearly straight over so short a way.
+        end = _GRID[within - 1] + (_GRID[within] - _GRID[within - 1]) * (
+            math.log(limit / low) / math.log(high / low) if low > 0.0 else 0.0)
+    if end > highest:
+        throttle, reason = highest, (f'No data above {highest:.2f}; within the limit up to '
+                                     'there.')
+        if highest == 1.0:
+            reason = 'Within the limit up to full throttle.'
+    else:
+        throttle, reason = end, f'The risk passes the limit of {limit:.2g} at throttle {end:.2f}.'
+    return ThrottleBudget(float(throttle), lowest, highest, limit, reason + what, _GRID, risks,
+                          known)

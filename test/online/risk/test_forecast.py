@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 import numpy as np
-from ou_monitor.online.load_filter import LoadFilter
+from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.risk.first_passage import Passage, Supply
 from ou_monitor.online.risk.flag import FlagLevel

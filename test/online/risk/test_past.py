@@ -3,9 +3,8 @@
 import math
 
 import numpy as np
-from ou_monitor.online.risk.excursions import excursion_risk, excursions
-from ou_monitor.online.risk.past import BLOCK, Past, sliding
-from ou_monitor.online.risk.pilot import flown, pilot
+from ou_monitor.online.risk.past import (
+    BLOCK, excursion_risk, excursions, flown, Past, pilot, sliding)
 import pytest
 from scipy.special import expit
 

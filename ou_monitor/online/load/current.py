@@ -11,8 +11,7 @@ import math
 
 import numpy as np
 from ou_monitor.model.load import LEVELS, SLOPES
-from ou_monitor.online.load_blocks import Block
-from ou_monitor.online.load_noise import CLIP, DIVERGED, LoadNoise
+from ou_monitor.online.load.blocks import Block, CLIP, DIVERGED, LoadNoise, scored
 from ou_monitor.records import FloatArray, NAN
 
 # Time constants, s, of polarisation: those of the throttle's filter.
@@ -133,13 +132,3 @@ class CurrentFilter:
     def level(self) -> float:
         """Return the open-circuit voltage, V."""
         return float(self._m[0])
-
-
-# Time, s, over which predictors are compared.
-_COMPARED = 30.0
-
-
-def scored(before: float, z: float, variance: float, dt: float) -> float:
-    """Return the running mean of the log density of one block, nat; a clipped z counts less."""
-    now = -0.5 * (z * z + math.log(variance))
-    return now if math.isnan(before) else before - math.expm1(-dt / _COMPARED) * (now - before)

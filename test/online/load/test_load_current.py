@@ -2,8 +2,8 @@
 
 import numpy as np
 from ou_monitor.model.load import LoadModel
-from ou_monitor.online.load_filter import LoadFilter
-from ou_monitor.online.supply_load import Basis, LoadStatus
+from ou_monitor.online.load.load_filter import LoadFilter
+from ou_monitor.online.load.supply_load import Basis, LoadStatus
 import pytest
 
 FULL = 60.0

@@ -15,12 +15,11 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import CELL, cells_in_series, INRUSH_TIME, LEVELS, SLOPES
-from ou_monitor.model.load_start import LoadStart
-from ou_monitor.online.load_blocks import Block, LoadBlocks
-from ou_monitor.online.load_current import CurrentFilter, scored
-from ou_monitor.online.load_delay import LoadDelay
-from ou_monitor.online.load_noise import CLIP, DIVERGED, LoadNoise
-from ou_monitor.online.supply_load import (
+from ou_monitor.model.load_start import LoadStart, usual_coefficients
+from ou_monitor.online.load.blocks import (
+    Block, CLIP, DIVERGED, LoadBlocks, LoadDelay, LoadNoise, scored)
+from ou_monitor.online.load.current import CurrentFilter
+from ou_monitor.online.load.supply_load import (
     Basis, LAGS, LoadState, LoadStatus, POWER, static, SupplyLoad, TABLE)
 from ou_monitor.records import FloatArray, NAN
 
@@ -57,32 +56,7 @@ _BINS = 50
 # dE/ds, V, of a cell at each 10 mV of open-circuit voltage from 3.4 V.
 _LOWEST, _PER_VOLT = 3.4, 100.0
 _SLOPE_AT = np.interp(_LOWEST + np.arange(91) / _PER_VOLT, LEVELS, SLOPES).tolist()
-
-
-def _prior() -> tuple[FloatArray, FloatArray, float]:
-    """
-    Return mean and covariance of the coefficients, and mean sag, per volt of pack.
-
-    a = S b: S is log-normal about 0.12; of b, beta(0.5, 1) lags by 60 ms, two shapes are
-    normal(0, 0.2) and take 0.7 of themselves from the first, and the rest is log-normal.
-    """
-    def lognormal(median: float, deviation: float) -> tuple[float, float]:
-        mean = median * math.exp(0.5 * deviation ** 2)
-        return mean, mean ** 2 * math.expm1(deviation ** 2)
-
-    size, size_var = lognormal(0.12, 0.6)
-    parts = [(0.0, 0.2 ** 2), (0.0, 0.2 ** 2), (1.0 / 3.0, 4.0 / 45.0),
-             lognormal(0.2, 0.5), lognormal(0.3, 0.5), lognormal(1.5, 1.0)]
-    means, variances = np.array(parts).T
-    mix = np.vstack([(-0.7, -0.7, -1.0, 0.0, 0.0, 0.0), np.eye(6)])
-    mean = mix @ means
-    mean[0] += 1.0
-    square = np.outer(mean, mean)
-    cov = (size ** 2 + size_var) * (mix @ np.diag(variances) @ mix.T + square) - size**2 * square
-    return size * mean, cov, size
-
-
-_MEAN, _COV, _SIZE = _prior()
+_MEAN, _COV, _SIZE = usual_coefficients()
 _STATES = 2 + _MEAN.size
 
 
@@ -100,7 +74,8 @@ class LoadFilter:
         self._blocks = LoadBlocks()
         self._newest = -math.inf
         self._opening = False
-        self._current = CurrentFilter()
+        # None until a current has been measured.
+        self._current: CurrentFilter | None = None
         self._delay = LoadDelay()
         # Blocks that wait for their throttle, and throttle as it was heard: stamp and value.
         self._waiting: deque[Block] = deque()
@@ -192,7 +167,10 @@ class LoadFilter:
                 self._throttle = u
                 self._predict(block.t)
                 self._correct(block, du, since)
-        self._current.take(block, self._cells, fresh=fresh)
+        if self._current is None and math.isfinite(block.current):
+            self._current = CurrentFilter()
+        if self._current is not None:
+            self._current.take(block, self._cells, fresh=fresh)
         self._t, self._last, self._throttle = block.t, block.last, u
         self._heard = block.last if math.isfinite(block.throttle) else self._heard
 
@@ -363,10 +341,12 @@ class LoadFilter:
         low, high = self._between(0.1)
         if high - low < _MOVED and self._start is not None:
             low, high = self._start.flown
-        resistance, resistance_se = self._current.resistance
         basis, level = Basis.THROTTLE, float(self._m[0])
-        if math.isfinite(resistance) and self._current.score > self._score:
-            basis, level = Basis.CURRENT, self._current.level
+        resistance = resistance_se = NAN
+        if self._current is not None:
+            resistance, resistance_se = self._current.resistance
+            if math.isfinite(resistance) and self._current.score > self._score:
+                basis, level = Basis.CURRENT, self._current.level
         load = SupplyLoad(
             LoadStatus.STILL, level, resistance, resistance_se, basis=basis, flown=(low, high),
             _sag=tuple(sag.tolist()),

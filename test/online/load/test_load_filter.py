@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 from ou_monitor.model.load import LoadModel
-from ou_monitor.online.load_filter import LoadFilter
-from ou_monitor.online.supply_load import LAGS, LoadStatus, SupplyLoad
+from ou_monitor.online.load.load_filter import LoadFilter
+from ou_monitor.online.load.supply_load import LAGS, LoadStatus, SupplyLoad
 from ou_monitor.recordings.read import read_recording
 from project import ROOT
 import pytest

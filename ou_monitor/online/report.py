@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ou_monitor.online.input_health import Stamps
-from ou_monitor.online.level import Level
+from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.risk.flag import FlagState
-from ou_monitor.online.supply_load import SupplyLoad
-from ou_monitor.records import Estimate
+from ou_monitor.records import Estimate, Level
 
 # Throttles of `risk_curve`.
 RISK_CURVE = tuple(k / 10.0 for k in range(11))

@@ -2,9 +2,9 @@
 
 import numpy as np
 from ou_monitor.model.load import LoadModel
-from ou_monitor.online.load_delay import DELAYS, LoadDelay
-from ou_monitor.online.load_filter import LoadFilter
-from ou_monitor.online.supply_load import LoadStatus
+from ou_monitor.online.load.blocks import DELAYS, LoadDelay
+from ou_monitor.online.load.load_filter import LoadFilter
+from ou_monitor.online.load.supply_load import LoadStatus
 import pytest
 
 TRUE = LoadModel(4, 0.25, charge=0.85, size=0.15, power=1.8)

@@ -5,8 +5,8 @@ import math
 from dense import kalman_log_likelihood, ou_covariance, restricted
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.model.exact_fit import _Likelihood, fit_exact
 from ou_monitor.model.ou import simulate
+from ou_monitor.online.estimator.irregular import _Likelihood, fit_exact
 import pytest
 
 

@@ -8,9 +8,9 @@ from ou_monitor.model.load import LoadModel
 from ou_monitor.model.load_start import LoadStart
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.online.load_filter import LoadFilter
+from ou_monitor.online.load.load_filter import LoadFilter
+from ou_monitor.online.load.supply_load import LoadStatus
 from ou_monitor.online.monitor import SupplyMonitor
-from ou_monitor.online.supply_load import LoadStatus
 from ou_monitor.recordings.model_file import as_yaml, ModelFile, parse_model, read_model
 import pytest
 import yaml

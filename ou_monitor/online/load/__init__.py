@@ -1,0 +1,1 @@
+"""Throttle or current -> voltage under load: level, sag, noise."""

@@ -1,0 +1,354 @@
+"""
+What one block of samples tells: its voltage, how late its throttle is, and its noise.
+
+Blocks have equal throttle and come at most some 50 times a second.  Limits first: a block that
+still fills is not given out, so a fast source is followed 20 ms late; of several changes of
+throttle within 20 ms the first three are told apart.
+
+Delay: the answer, over what is faster than a second, is compared with throttles that are 0 to
+200 ms late; the largest correlation wins.  A source slower than 7 Hz cannot tell, and a delay is
+taken only where it leaves a quarter less of the variance than the present one.
+
+Noise: ln variance = b . (1, ripple(u), sqrt|du|), learned by Fisher scoring; of a mean of n
+samples the part that scatters within a block counts 1/n.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from ou_monitor.model.load import ripple
+from ou_monitor.online.load.supply_load import POWER
+from ou_monitor.records import FloatArray, NAN
+
+# Width, s, of the bins: the motors and the pack answer more slowly than that.
+WIDTH = 0.02
+# Samples further apart than this, s, stand alone.
+_APART = 0.75 * WIDTH
+# Throttles that differ by less are equal: the sag's difference is below the ADC's step.
+_EQUAL = 0.01
+# So many changes of throttle within a bin end a block.
+_CHANGES = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """
+    Samples in a row with one throttle.
+
+    Attributes
+    ----------
+    t, last : float
+        Mean and last stamp, s.
+    voltage : float
+        Mean voltage, V.
+    throttle : float
+        Mean throttle, 0..1; NaN where unknown.
+    current : float
+        Mean of the currents that are known, A; NaN without one.
+    n : int
+        Samples.
+    within : float
+        Variance of one sample about the mean, V^2; NaN of a single one.
+
+    """
+
+    t: float
+    last: float
+    voltage: float
+    throttle: float
+    current: float
+    n: int
+    within: float
+
+
+class LoadBlocks:
+    """
+    Collects samples into blocks.
+
+    A sample that follows 15 ms or more after the last is a block at once: a slow source waits
+    for nothing.
+    """
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Take the next sample as the first one; the block that fills is left out."""
+        self._sums: FloatArray | None = None
+        # Of the last sample: stamp, throttle, step to it, changes in its bin so far.
+        self._last = (-math.inf, NAN, math.inf, 0)
+        self._zero = NAN
+
+    def push(self, columns: FloatArray) -> list[Block]:
+        """
+        Return the blocks that samples complete.
+
+        Columns of shape (4, n): t, s, and voltage, V, finite, t rising; throttle, 0..1; A.
+        """
+        t, voltage, throttle, current = columns
+        if not t.size:
+            return []
+        if math.isnan(self._zero):
+            # Squares are taken from here, so that they lose no digits.
+            self._zero = float(voltage[0])
+        before, held, step, changes = self._last
+        dt = np.diff(t, prepend=before)
+        bins = np.floor(np.concatenate(([t[0] if before == -math.inf else before], t)) / WIDTH)
+        alone = dt >= _APART
+        fresh = alone | (np.concatenate(([step], dt[:-1])) >= _APART) | (np.diff(bins) != 0.0)
+        u = np.concatenate(([held], throttle))
+        differs = ~((np.abs(np.diff(u)) <= _EQUAL) | (np.isnan(u[1:]) & np.isnan(u[:-1])))
+        # Changes since the bin began.
+        total = np.cumsum(differs & ~fresh) + changes
+        base = np.maximum.accumulate(np.where(fresh, total, 0))
+        count = total - base
+        starts = np.flatnonzero(fresh | differs & (count <= _CHANGES))
+        self._last = float(t[-1]), float(throttle[-1]), float(dt[-1]), int(count[-1])
+        known = np.isfinite(current)
+        off = voltage - self._zero
+        rows = np.stack((np.ones(t.size), t, off, off * off, throttle,
+                         np.where(known, current, 0.0), known, t))
+        cuts = starts if starts.size and starts[0] == 0 else np.concatenate(([0], starts))
+        sums = np.add.reduceat(rows, cuts, axis=1)
+        sums[-1] = t[np.append(cuts[1:], t.size) - 1]
+        done = []
+        if self._sums is not None:
+            if starts.size and starts[0] == 0:
+                done.append(self._block(self._sums))
+            else:
+                sums[:-1, 0] += self._sums[:-1]
+        done += [self._block(column) for column in sums.T[:-1]]
+        self._sums = sums[:, -1]
+        if alone[-1]:
+            done.append(self._block(self._sums))
+            self._sums = None
+        return done
+
+    def _block(self, sums: FloatArray) -> Block:
+        n, t, off, square, throttle, current, known, last = sums.tolist()
+        within = max(0.0, square - off * off / n) / (n - 1.0) if n > 1.0 else NAN
+        return Block(t / n, last, self._zero + off / n, throttle / n,
+                     current / known if known else NAN, int(n), within)
+
+
+DELAYS: FloatArray = np.array([0.0, 0.05, 0.1, 0.15, 0.2])  # s
+# What is slower than this, s, is no answer to a stick but discharge and recovery.
+_SLOW = 1.0
+# A third of the answer lags by 60 ms: the prior of the filter.
+_SHARE, _LAG = 1.0 / 3.0, 0.06
+# Time compared, s, before a first answer, and memory, s.
+_FIRST, _MEMORY = 10.0, 60.0
+# Residual variance of another delay over that of the present one at which it is taken.
+_BETTER = 0.75
+# Time, s, for which it must be so.
+_LASTING = 3.0
+# Pieces of a test of relation, s: answers in them are as good as independent; memory, s; fewest.
+_PIECE, _PIECES_MEMORY, _FEWEST = 2.0, 120.0, 5.0
+# A load that moves less than this, rms, tells of no relation.
+_MOVED = 0.01
+# Standard errors of a relation: one false alarm in 700 looks.
+_SIGNIFICANT = 3.0
+# Longest step between blocks, s, that tells these delays apart.
+_LONGEST = 0.15
+
+
+class LoadDelay:
+    """Running correlations of voltage and load at several delays."""
+
+    def __init__(self, delay: float = 0.0) -> None:
+        self.delay = float(DELAYS[np.argmin(np.abs(DELAYS - delay))])
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew after a break in time; the delay stays."""
+        self._t = math.nan
+        self._past: deque[tuple[float, float]] = deque()
+        self._seen = self._better = 0.0
+        self._xx = 0.0
+        self._xv, self._vv = np.zeros(DELAYS.size), np.zeros(DELAYS.size)
+        # Of the piece that fills: time, load squared, products, voltage squared; of the
+        # correlations of whole pieces: weight, sums and sums of squares.
+        self._filled, self._own = 0.0, np.zeros((3, DELAYS.size))
+        self._pieces, self._sum, self._squares = 0.0, self._xv * 0.0, self._xv * 0.0
+
+    def take(self, t: float, v: float, u: float) -> bool:
+        """Take a block, s, V, 0..1 as it was heard; return whether the delay is another one."""
+        dt = t - self._t
+        if not 0.0 < dt <= _LONGEST:
+            self.forget()
+        if math.isnan(self._t):
+            self._t, self._load, self._slow_load, self._slow_volts = t, u ** POWER, u ** POWER, v
+            return False
+        self._t = t
+        x = u ** POWER
+        self._load = x + (self._load - x) * math.exp(-dt / _LAG)
+        x += _SHARE * (self._load - x)
+        keep = math.exp(-dt / _SLOW)
+        self._slow_load = x + (self._slow_load - x) * keep
+        self._slow_volts = v + (self._slow_volts - v) * keep
+        x -= self._slow_load
+        past = self._past
+        past.append((t, v - self._slow_volts))
+        while len(past) > 1 and past[1][0] <= t - DELAYS[-1]:
+            past.popleft()
+        times, volts = zip(*past)
+        then = np.array(volts)[np.maximum(np.searchsorted(times, t + 1e-6 - DELAYS, 'right') - 1,
+                                          0)]
+        forgotten = 1.0 - dt / _MEMORY
+        self._xx = self._xx * forgotten + x * x * dt
+        self._xv = self._xv * forgotten + then * (x * dt)
+        self._vv = self._vv * forgotten + then * then * dt
+        self._filled += dt
+        self._own += np.stack((np.full(DELAYS.size, x * x), x * then, then * then)) * dt
+        if self._filled >= _PIECE:
+            xx, xv, vv = self._own
+            if xx[0] > _MOVED ** 2 * self._filled:
+                r = xv / np.sqrt(np.maximum(xx * vv, 1e-300))
+                keep = 1.0 - _PIECE / _PIECES_MEMORY
+                self._pieces = self._pieces * keep + 1.0
+                self._sum = self._sum * keep + r
+                self._squares = self._squares * keep + r * r
+            self._filled, self._own = 0.0, np.zeros((3, DELAYS.size))
+        # The load must have changed, by a stick and not by rounding.
+        self._seen += dt * (x * x > 1e-6)
+        return self._seen >= _FIRST and self._choose(dt)
+
+    @property
+    def unrelated(self) -> bool:
+        """Whether the correlations in pieces of 2 s are not below zero, by a t-test."""
+        if self._pieces < _FEWEST:
+            return False
+        now = int(np.searchsorted(DELAYS, self.delay - 1e-9))
+        mean = self._sum[now] / self._pieces
+        variance = self._squares[now] / self._pieces - mean * mean
+        return bool(mean > -_SIGNIFICANT * math.sqrt(max(0.0, variance) / (self._pieces - 1.0)))
+
+    def _choose(self, dt: float) -> bool:
+        left = 1.0 - np.minimum(self._xv, 0.0) ** 2 / np.maximum(self._xx * self._vv, 1e-300)
+        best = int(np.argmin(left))
+        now = int(np.searchsorted(DELAYS, self.delay - 1e-9))
+        self._better = self._better + dt if left[best] < _BETTER * left[now] else 0.0
+        if self._better < _LASTING:
+            return False
+        self._better = 0.0
+        self.delay = float(DELAYS[best])
+        return True
+
+
+# Standard scores beyond this are weighed down; they score this much, squared, in the noise.
+CLIP, _OUTLIER = 4.0, 16.0
+# Variance of a prediction, V^2, beyond which a filter has left the ground, as after a sensor that
+# said megavolts: it begins anew.
+DIVERGED = 1e12
+# Voltages that differ by less, V, are one reading of an ADC.
+_SAME = 1e-6
+# A change of throttle below that is none.
+_HELD = 1e-3
+# Corrections after which the noise is forgotten; at first sooner, by a third of all so far, as the
+# coefficients are wrong then.
+_NOISE_MEMORY, _NOISE_FIRST, _NOISE_SHARE = 2000.0, 50.0, 1.0 / 3.0
+
+
+class LoadNoise:
+    """Noise of blocks of samples of a pack of `volts`, V."""
+
+    def __init__(self, volts: float, b: tuple[float, float, float] | None = None) -> None:
+        # 0.4 % of the voltage, and what ripple and changes of throttle usually add; or as it
+        # was in another flight, to a factor of 1.4 in the deviation.
+        self.b = np.array([math.log((0.004 * volts) ** 2), 2.0, 4.0] if b is None else b)
+        self._covariance = np.diag([4.0, 4.0, 9.0] if b is None else [0.5, 0.5, 1.0])
+        # Of the standard scores: mean square, and correlation from one to the next.
+        self.scale, self.correlation = 1.0, 0.0
+        self._last, self._n = 0.0, 0
+        # Step of the ADC, V, and share of the blocks that are another value than the one before.
+        self._step, self._changing, self._held = math.inf, 1.0, math.nan
+        self._unseen = (0.05 * volts) ** 2
+        # Samples in a block, the variance within one, and that of its mean, V^2.
+        self._size, self._within, self._between = 1.0, 0.0, 0.0
+
+    def variance(self, u: float, du: float, n: int) -> float:
+        """Return the variance of a mean of n samples, V^2."""
+        whole = math.exp(float(self.b[0] + self.b[1] * ripple(u) + self.b[2] * math.sqrt(du)))
+        return whole + self._within * max(0.0, 1.0 / n - 1.0 / self._size)
+
+    @property
+    def log_variance(self) -> tuple[float, float, float]:
+        """Return b of a single sample."""
+        own = 1.0
+        if self._between > 0.0:
+            own += self._within * (1.0 - 1.0 / self._size) / self._between
+        least = 0.0 if math.isinf(self._step) else self._step ** 2 / 12.0
+        whole = math.exp(float(self.b[0])) * own + least
+        return math.log(whole), float(self.b[1]), float(self.b[2])
+
+    @property
+    def of_blocks(self) -> tuple[float, float, float]:
+        """Return b of the mean of a block."""
+        return float(self.b[0]), float(self.b[1]), float(self.b[2])
+
+    def see(self, voltage: float) -> None:
+        """Look at the steps of the ADC in the means of blocks, V."""
+        step = abs(voltage - self._held)
+        self._held = voltage
+        changed = step > _SAME
+        if changed:
+            self._step = min(self._step, step)
+        self._changing += max(0.002, 1.0 / (self._n + 20.0)) * (changed - self._changing)
+
+    @property
+    def rounding(self) -> float:
+        """Return the variance of rounding, V^2; of a value that is held all is one rounding."""
+        if math.isinf(self._step):
+            # It has never changed: the step may be anything.
+            return self._unseen
+        return self._step ** 2 / 12.0 / max(self._changing, 0.002)
+
+    def follow(self, score: float) -> None:
+        """Take a clipped standard score: innovations in a row on one side are no news."""
+        self.correlation += max(0.002, 1.0 / (self._n + 50.0)) * (
+            score * self._last - self.correlation)
+        self.correlation = max(0.0, min(0.9, self.correlation))
+        self._last = score
+        self._n += 1
+
+    def learn(self, e: float, s: float, u: float, du: float, n: int, within: float) -> None:
+        """
+        Score ln variance (Fisher) by one innovation.
+
+        e in V; s, the variance of what is predicted, and `within`, that of one of the n samples
+        about their mean (NaN: unknown), in V^2.
+        """
+        f: FloatArray = np.array([1.0, ripple(u), math.sqrt(du)])
+        R = self.variance(u, du, n)
+        square = min(e * e / (s + R), _OUTLIER)
+        # What the state does not know is not noise.
+        share = max(R / (s + R), 0.05)
+        C = self._covariance
+        C *= 1.0 + 1.0 / min(_NOISE_MEMORY, _NOISE_FIRST + _NOISE_SHARE * self._n)
+        g = C @ f
+        own = float(f @ g)
+        # The square of a standard normal has the variance 2.
+        total = own + 2.0 / share ** 2
+        self.b += g * min((square - 1.0) / share / total, 0.7 / own)
+        C -= np.outer(g, g) / total
+        C *= min(1.0, 9.0 / float(C.diagonal().max()))
+        weight = max(0.002, 1.0 / (self._n + 20.0))
+        self.scale += weight * (square - self.scale)
+        self._size += weight * (n - self._size)
+        if n > 1 and du < _HELD:
+            self._within += weight * (within - self._within)
+            self._between += weight * (math.exp(float(f @ self.b)) - self._between)
+
+
+# Time, s, over which predictors are compared.
+_COMPARED = 30.0
+
+
+def scored(before: float, z: float, variance: float, dt: float) -> float:
+    """Return the running mean of the log density of one block, nat; a clipped z counts less."""
+    now = -0.5 * (z * z + math.log(variance))
+    return now if math.isnan(before) else before - math.expm1(-dt / _COMPARED) * (now - before)
