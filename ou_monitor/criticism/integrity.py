@@ -34,9 +34,11 @@ LEAST = 100
 NAMED_STEP = 0.3
 # Throttle that moves less than this says nothing.
 MOVES = 0.01
-# Repeats that are called so, at least; and the share of ties by chance up to which
-# an ADC is fine enough to detect them.
+# Repeats that are called so, at least; and the share of ties by chance up to which the size of
+# the changes says how many there are.
 _FEWEST_TIES, _FINE = 20, 0.15
+# Samples apart at which values alike are counted: with 8 of them seven values held of ten show.
+_APART = 2, 4, 8
 # The noise of a rail falls to one part in so many at rest: ties are so much likelier there.
 _CALMEST = 100.0
 _FLOAT32 = 1.2e-7
@@ -194,31 +196,35 @@ def _ties(v: FloatArray) -> bool:
         return False
     code = max(find_step(v), _FLOAT32 * float(np.abs(v).max()))
     moved = step[(step != 0.0) & inner]
-    if not moved.size:
+    if moved.size < 2:
         return False
     # Chance of two normal values one code apart or less, on average over their codes.
     chance = min(1.0, code / (math.sqrt(2.0 * math.pi) * float(np.sqrt(np.mean(moved**2)))))
-    if chance >= _FINE:
+    if chance >= _FINE and float(np.mean(moved[1:] * moved[:-1] > 0.0)) > 0.5:
+        # A voltage that goes on where it goes stays in each code for a while.
         return False
     # Where a rail is calm, ties are likelier; but that calm none is, and a sensor was stuck.
-    expected = count * max(chance, min(_ties_without_holds(v, inner), _CALMEST * chance))
-    return equal - 1.5 * expected > 6.0 * math.sqrt(max(expected, 1.0))
+    expected = count * max(chance if chance < _FINE else 0.0,
+                           min(_ties_without_holds(v, inner), _CALMEST * chance))
+    return equal - expected > 6.0 * math.sqrt(max(expected, 1.0))
 
 
 def _ties_without_holds(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
     """
     Return the share of ties to neighbours that values alike without any hold explain.
 
-    Values two apart are alike by chance of their codes, whatever the intensity does over the
-    recording; neighbours are the more so as they lie nearer to each other: sqrt(2) for a
-    diffusion, 1 for white noise.  Of a share h held, h^2 are alike two apart, too: ten per cent
-    held count as one.
+    Values some samples apart are alike by chance of their codes, whatever the intensity does over
+    the recording; neighbours are the more so as they lie nearer to each other, by sqrt(k) over k
+    samples in a diffusion and less in white noise, or as the recording itself says.  Of a share h
+    held, h^k are alike k apart, too.
     """
-    apart = v[2:] - v[:-2]
-    usual = float(np.median(np.abs(apart)))
-    near = float(np.median(np.abs(v[1:] - v[:-1])))
-    nearer = min(max(usual / near, 1.0), math.sqrt(2.0)) if near > 0.0 else math.sqrt(2.0)
-    return nearer * float(np.mean(apart[inner[1:]] == 0.0)) if inner[1:].any() else 0.0
+    near = float(np.mean((v[1:] - v[:-1]) ** 2))
+    shares = []
+    for k in _APART:
+        apart = v[k:] - v[:-k]
+        nearer = math.sqrt(max(k, float(np.mean(apart**2)) / near)) if near > 0.0 else math.sqrt(k)
+        shares.append(nearer * float(np.mean(apart[inner[k - 1:]] == 0.0)))
+    return min(shares)
 
 
 def _refreshed(t: FloatArray, period: float) -> FloatArray:

@@ -28,16 +28,15 @@ def test_ties_by_chance_of_the_codes_are_no_holds():
     assert 'held_samples' not in [term.NAME for term in exact]
 
 
-@pytest.mark.parametrize('share, found', [(0.0, False), (0.02, True)])
-def test_values_that_were_held(share, found):
-    """
-    Of an ADC without steps: 80 of 4000 values that are held are no chance.
-
-    In its own codes of 10 mV no share of holds is told from chance (doc/discovery.md).
-    """
+@pytest.mark.parametrize('dither, share, found', [
+    (1.0, 0.0, False), (1.0, 0.02, True),
+    # In its own codes of 10 mV.
+    (0.0, 0.0, False), (0.0, 0.3, True), (0.0, 0.5, True), (0.0, 0.7, True)])
+def test_values_that_were_held(dither, share, found):
+    """Of an ADC without steps 80 of 4000 values that are held are no chance."""
     t, voltage, throttle = flown()
     rng = np.random.default_rng(4)
-    held = voltage + 0.01 * (rng.random(t.size) - 0.5)
+    held = voltage + 0.01 * dither * (rng.random(t.size) - 0.5)
     for k in np.flatnonzero(rng.random(t.size) < share)[1:]:
         held[k] = held[k - 1]
     exact = examine(Recording(t, held, throttle)).exact
