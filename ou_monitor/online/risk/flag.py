@@ -10,7 +10,8 @@ never OK, and never a flag that says false.
 The voltage floor is a threshold on the samples that needs no model: the median of
 the last `brownout.floor_time` seconds decides, so that a lone bad sample does not;
 every sample is judged, also those between two reports, and also those whose stamps are
-late, frozen, irregular or missing: these count in order of arrival.  A dip is told by the next
+late, frozen, irregular or missing: these count in order of arrival.  Samples that come at once,
+stamped as they were sent, lie as far apart as they usually arrive.  A dip is told by the next
 update, though nothing may have arrived since.  A bad value that a logger repeats for more than
 half of that time counts.
 """
@@ -114,39 +115,49 @@ class FloorWatch:
         late = ~(steps > 0.0)
         far = _FAR * self.settings.stale_after
         at = t + self._shift
-        if late.any() or (steps[np.isfinite(steps)] > far).any():
-            last = float(self._t[-1]) if self._t.size else 0.0
-            steps = np.where(late, self._step(arrival), np.minimum(steps, far))
-            if not self._t.size:
-                steps[0] = 0.0
-            at = last + np.cumsum(steps)
+        if arrival is not None or late.any() or (steps[np.isfinite(steps)] > far).any():
+            elapsed = np.cumsum(np.where(late, self._waits(arrival), np.minimum(steps, far)))
+            if self._t.size:
+                at = float(self._t[-1]) + self._paced(elapsed, arrival)
+            else:
+                at = self._paced(elapsed - elapsed[0], arrival)
             self._shift = float(at[-1] - t[-1])
-        if arrival is None and not late.any():
-            self._learn(t, self._newest)
         if arrival is not None:
             self._learn(arrival, self._arrived)
             self._arrived = float(arrival[-1])
+        elif not late.any():
+            self._learn(t, self._newest)
         self._newest = float(t[-1])
         return at, v
 
-    def _step(self, arrival: FloatArray | None) -> FloatArray | float:
+    def _waits(self, arrival: FloatArray | None) -> FloatArray | float:
         """Return how far late samples move the time line on, s."""
-        usual = self._usual
         if arrival is None or self._arrived == -math.inf:
             # Not known: two samples fill the time, and two of three decide.
-            return 0.5 * self.settings.brownout_floor_time if math.isnan(usual) else usual
-        # A link that was held up sends at once what took its time.
-        return np.maximum(np.diff(arrival, prepend=self._arrived),
-                          0.0 if math.isnan(usual) else usual)
+            return (0.5 * self.settings.brownout_floor_time if math.isnan(self._usual)
+                    else self._usual)
+        return np.maximum(np.diff(arrival, prepend=self._arrived), 0.0)
+
+    def _paced(self, elapsed: FloatArray, arrival: FloatArray | None) -> FloatArray:
+        """
+        Return the time since the newest sample, s, of none less than its number demands.
+
+        A link or a driver that was held up sends at once what took its time.
+        """
+        if arrival is None or math.isnan(self._usual):
+            return elapsed
+        least = self._usual * np.arange(1.0, elapsed.size + 1.0)
+        return least + np.maximum.accumulate(np.maximum(elapsed - least, 0.0))
 
     def _learn(self, times: FloatArray, before: float) -> None:
-        """Learn the usual interval (times in s); of a pause no more than `stale_after` counts."""
+        """Learn the usual interval (times in s); a pause counts as two of them for each sample."""
         known = before > -math.inf
         n = times.size - 1 + known
         if not n:
             return
         span = float(times[-1]) - (before if known else float(times[0]))
-        interval = min(max(span / n, 0.0), self.settings.stale_after)
+        most = 2.0 * self._usual if self._usual > 0.0 else self.settings.stale_after
+        interval = min(max(span / n, 0.0), most)
         share = 1.0 if math.isnan(self._usual) else min(1.0, n / _USUAL)
         usual = 0.0 if math.isnan(self._usual) else self._usual
         self._usual = usual + share * (interval - usual)

@@ -195,6 +195,32 @@ def test_dips_are_counted():
         assert floor.dips == (0, 1, 1, 1, 2, 2)[k]
 
 
+@pytest.mark.parametrize('kind', ['lumps', 'catching up', 'jitter'])
+@pytest.mark.parametrize('low, trips', [(42, True), (15, True), (7, False)])
+def test_samples_sent_at_once_lie_as_far_apart_as_usual(kind, low, trips):
+    """
+    Of 1 kHz: 100 at once, 600 at once behind a pause, or two at once, stamped as they are sent.
+
+    A dip of 42 samples among 600 in 6 ms is no median of 20 ms of their stamps.
+    """
+    sent = 0.001 * np.arange(1.0, 6001.0)
+    if kind == 'lumps':
+        sent = 0.1 * np.ceil(sent / 0.1 - 1e-6) + 1e-5 * (np.arange(6000) % 100)
+    elif kind == 'jitter':
+        sent[1::2] -= 0.00098
+    else:
+        sent[3000:3600] = 3.6 + 1e-5 * np.arange(600)
+    volts = np.full(6000, 5.0)
+    volts[3333:3333 + low] = 4.0
+    floor = watch()
+    tripped = []
+    # Fetched 50 times a second.
+    for part in np.split(np.arange(6000), np.searchsorted(sent, 0.02 * np.arange(1, 310))):
+        floor.push(1000.0 + sent[part], volts[part], sent[part])
+        tripped += [part[0]] if part.size and floor.take() else []
+    assert floor.dips == trips and bool(tripped) is trips
+
+
 def test_a_dip_is_one_whatever_its_stamps_are():
     """50 samples of 1 kHz whose stamps lie within 100 s of the truth."""
     arrived = 0.001 * np.arange(3000)
