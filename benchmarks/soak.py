@@ -57,12 +57,16 @@ LOOK, PROGRESS, ANSWER, START, END = 2.0, 60.0, 20.0, 60.0, 20.0
 SILENT = 1.2
 
 
+def steady(wall: float) -> float:
+    """Return a time of the wall clock by the monotonic clock, s."""
+    return wall + time.monotonic() - time.time()
+
+
 class Soak:
     """One run: processes, what is heard of them, and what is done to them."""
 
     def __init__(self, seed: int, seconds: float, folder: Path, domain: int, dense: bool) -> None:
-        self.heard = Heard(outputs={
-            name: [] for name in ('~/state', '/diagnostics', '~/brownout_risk')})
+        self.heard = Heard(outputs={name: [] for name in ('/diagnostics', '~/brownout_risk')})
         self.counters: Counter[str] = Counter()
         self.found: Counter[str] = Counter(set=0, refused=0, wrong=0, unanswered=0)
         self.wrong: list[str] = []
@@ -107,28 +111,22 @@ class Soak:
         from std_msgs.msg import Bool, Float64
         from std_srvs.srv import Trigger
         node = self._probe.node
-        times = self.heard.outputs
 
-        def state(message: Any, number: int) -> None:
-            now = time.monotonic()
-            times['~/state'].append(now)
+        def state(message: Any, number: int, sent: float) -> None:
             values = self._newest = values_of(message.status[0])
             counts = [self.counters[name] + int(values[name]) for name in (
                 'messages', 'messages_lost', 'foreign_messages', 'floor_dips')]
             self.heard.states.append(State(
-                now, values['brownout_level'], values['brownout_reason'], values['brownout'],
-                *counts, number, float(values['arrival_age'])))
+                steady(sent), values['brownout_level'], values['brownout_reason'],
+                values['brownout'], *counts, number, float(values['arrival_age'])))
 
         self._probe.numbered(f'{NODE}/state', DiagnosticArray, state)
-        self._probe.numbered(
-            f'{NODE}/brownout', Bool, lambda message, number: self.heard.flags.append(
-                Said(time.monotonic(), message.data, number)))
-        node.create_subscription(
-            DiagnosticArray, '/diagnostics',
-            lambda message: times['/diagnostics'].append(time.monotonic()), 100)
-        node.create_subscription(
-            Float64, f'{NODE}/brownout_risk',
-            lambda message: times['~/brownout_risk'].append(time.monotonic()), 100)
+        for topic, kind, said in (
+                (f'{NODE}/brownout', Bool, self.heard.flags),
+                (f'{NODE}/brownout_risk', Float64, self.heard.outputs['~/brownout_risk']),
+                ('/diagnostics', DiagnosticArray, self.heard.outputs['/diagnostics'])):
+            self._probe.numbered(topic, kind, lambda message, number, sent, said=said: said.append(
+                Said(steady(sent), getattr(message, 'data', None), number)))
         self._setter = node.create_client(SetParameters, f'{NODE}/set_parameters')
         self._clearer = node.create_client(Trigger, f'{NODE}/clear_brownout')
 
@@ -172,7 +170,7 @@ class Soak:
 
     def _ask(self, now: float) -> None:
         """Have a node that is silent write where its threads are, once a second."""
-        silent = now - max(self.heard.outputs['~/state'][-1], self._asked)
+        silent = now - max(self.heard.states[-1].at, self._asked)
         if self._starved is not None or silent < SILENT or self._node.popen.poll() is not None:
             return
         self._asked = now

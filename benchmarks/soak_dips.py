@@ -3,7 +3,8 @@ What became of each dip of a soak, and what was known of it where it was not tol
 
 A dip that was not told in time is one of three: its messages did not reach the node (not
 delivered); the node counted it (`floor_dips`) and the message that said so did not reach the
-listener, by the numbers of the messages (not heard); or it was missed.
+listener, by the numbers of the messages (not heard); or it was missed.  Messages count from when
+the node sent them: a listener without CPU hears them late.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 
 Span = tuple[float, float]
 # A dip is told in time within so long, s, of its begin.  Not counted, there and in silences: time
-# that the node was stopped by us or had no CPU though it was ready, or that the listener had none.
+# that the node was stopped by us or had no CPU though it was ready.
 IN_TIME = 1.0
 # A dip of fewer low samples that reached the wire is no dip of 40 ms.
 SAMPLES = 40
@@ -33,7 +34,7 @@ class State(NamedTuple):
     Attributes
     ----------
     at : float
-        When it was heard, by the monotonic clock, s.
+        When it was sent, by the monotonic clock, s.
     level, reason, brownout : str
         The flag.
     messages, lost, foreign, dips : int
@@ -59,10 +60,10 @@ class State(NamedTuple):
 
 
 class Said(NamedTuple):
-    """One message of `~/brownout`: when it was heard, s, what it says, and its number."""
+    """One message of another output: when it was sent, s, what it says, and its number."""
 
     at: float
-    value: bool
+    value: Any = None
     number: int = 0
 
 
@@ -75,8 +76,8 @@ class Heard:
     ----------
     states : list of State
     flags : list of Said
-    outputs : dict of str to list of float
-        Times of the messages of each output.
+    outputs : dict of str to list of Said
+        The messages of the other outputs.
     memory : list of (time, bytes)
     stops, withheld, deaf : list of (begin, end)
         When the node was stopped, when it was ready and had no CPU, and when the listener had
@@ -91,7 +92,7 @@ class Heard:
 
     states: list[State] = field(default_factory=list)
     flags: list[Said] = field(default_factory=list)
-    outputs: dict[str, list[float]] = field(default_factory=dict)
+    outputs: dict[str, list[Said]] = field(default_factory=dict)
     memory: list[tuple[float, float]] = field(default_factory=list)
     stops: list[Span] = field(default_factory=list)
     withheld: list[Span] = field(default_factory=list)
@@ -103,7 +104,7 @@ class Heard:
     def pauses(self) -> list[Span]:
         """Return the time that is not the node's: the union of all of it, in order."""
         made: list[Span] = []
-        for begin, end in sorted([*self.stops, *self.withheld, *self.deaf]):
+        for begin, end in sorted([*self.stops, *self.withheld]):
             if made and begin <= made[-1][1]:
                 made[-1] = made[-1][0], max(end, made[-1][1])
             else:
@@ -168,7 +169,7 @@ def fate(dip: Mapping[str, Any], heard: Heard, sent: tuple[Sequence[float], Sequ
     states = heard.states[first:last + 1]
     before, after = states[0], states[-1]
     said = heard.flags[max(bisect_left(heard.flags, (before.at,)) - 1, 0):
-                       bisect_right(heard.flags, (after.at, True, math.inf)) + 1]
+                       bisect_left(heard.flags, (after.at,)) + 2]
     mute, silent = unheard(states), unheard(said)
     seen = any(s.level == 'CRITICAL' and 'brownout.floor (' in s.reason for s in states[1:])
     # What is sent during the last fiftieth of a second may wait for the next poll.

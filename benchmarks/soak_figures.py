@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from scipy import stats
-from soak_dips import dips_of, Heard, overlap, Span, unheard
+from soak_dips import dips_of, Heard, overlap, Said, Span, State, unheard
 from soak_schedule import NEVER_FALSE
 from tables import table
 
@@ -20,9 +20,14 @@ WARM_UP, BLOCKS = 600.0, 20
 LINGER = 2.3
 
 
-def silence(times: Sequence[float], stops: Sequence[Span]) -> tuple[float, float]:
-    """Return the longest gap, s: as it was, and without the time that the node was stopped."""
-    gaps = list(zip(times, times[1:]))
+def silence(said: Sequence[Said] | Sequence[State], stops: Sequence[Span]
+            ) -> tuple[float, float]:
+    """
+    Return the longest gap, s: as it was, and without the time that the node was stopped.
+
+    Of messages that follow one another by their numbers: between others, some were not heard.
+    """
+    gaps = [(a.at, b.at) for a, b in zip(said, said[1:]) if b.number == a.number + 1]
     if not gaps:
         return math.nan, math.nan
     return (max(b - a for a, b in gaps),
@@ -80,7 +85,8 @@ def figures(heard: Heard, counters: Mapping[str, int], end: Mapping[str, Any]) -
     sizes = [size for _, size in heard.memory]
     return {
         **end, 'deaths': len(heard.deaths),
-        'silence': {name: silence(times, pauses) for name, times in heard.outputs.items()},
+        'silence': {name: silence(said, pauses) for name, said in (
+            ('~/state', heard.states), *heard.outputs.items())},
         'unmatched': unmatched(heard), 'dips': dips_of(heard),
         'unheard': unheard(heard.states),
         'false': len(false), 'false_in': sorted({name for _, name in false}),

@@ -91,14 +91,17 @@ def test_silence_without_the_time_of_stops():
     stops = [(1.0, 1.9), (1.95, 2.0)]
     assert overlap(0.5, 1.97, stops) == pytest.approx(0.92)
     assert overlap(2.0, 3.0, stops) == 0.0
-    gap, net = silence([0.0, 0.5, 2.0, 3.2], stops)
+    said = [Said(at, None, k) for k, at in enumerate([0.0, 0.5, 2.0, 3.2])]
+    gap, net = silence(said, stops)
     assert (gap, net) == (pytest.approx(1.5), pytest.approx(1.2))
+    # One that was not heard is no silence.
+    assert silence([*said, Said(9.0, None, 5)], stops) == (gap, net)
 
 
 def test_pauses_are_one_account():
-    """Stopped, without CPU, not heard: their union, so that no time counts twice."""
+    """Stopped or without CPU: their union, so that no time counts twice."""
     made = heard([11.4], stops=[(10.1, 10.3)])
-    made.withheld, made.deaf = [(10.2, 10.6)], [(5.0, 6.0), (10.55, 10.6)]
+    made.withheld = [(5.0, 6.0), (10.2, 10.6)]
     assert made.pauses() == [(5.0, 6.0), (10.1, 10.6)]
     assert dips_of(made)['in_time'] == 1
     made.withheld = []

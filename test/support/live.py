@@ -194,11 +194,11 @@ class Probe:
         self._subscribe(topic, kind, take, qos)
         return got
 
-    def numbered(self, topic: str, kind: Any, take: Callable[[Any, int], None],
+    def numbered(self, topic: str, kind: Any, take: Callable[[Any, int, float], None],
                  qos: Any = 100) -> None:
-        """Have each message of a topic handed over with its publisher's number of it."""
+        """Hand over each message of a topic, its publisher's number of it, and when sent, s."""
         self._subscribe(topic, kind, lambda message, info: take(
-            message, info['publication_sequence_number']), qos)
+            message, info['publication_sequence_number'], info['source_timestamp'] * 1e-9), qos)
 
     def _subscribe(self, topic: str, kind: Any, take: Callable[[Any, Any], None], qos: Any
                    ) -> None:
