@@ -10,8 +10,8 @@ from dataclasses import fields, is_dataclass
 
 import numpy as np
 from ou_monitor import AdaptiveLowPass, AdaptiveNotch, SlidingEstimator, SupplyMonitor
-from ou_monitor.online.load_delay import LoadDelay
-from ou_monitor.online.load_filter import LoadFilter
+from ou_monitor.online.load.blocks import LoadDelay
+from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.settings import MonitorSettings
 from scipy.signal import lfilter
 
@@ -116,7 +116,7 @@ def delays():
     return found
 
 
-def _flight(rng, n, dt=1e-3):
+def flight(rng, n, dt=1e-3):
     """Return an OU of 63 / s about a level that sags with throttle, which steps; stamps."""
     t = np.arange(n) * dt
     u = _sticks(t, rng, 2.0)
@@ -135,14 +135,14 @@ def risk():
     """Return reports, risks, budget and curves of monitors through flights."""
     throttles, found = np.linspace(0.0, 1.0, 9), []
     for made, n, level, more in (
-            (_flight, 9000, 4.55, {}), (_flight, 3000, 4.6, {'brownout_watch': 'sampled'}),
+            (flight, 9000, 4.55, {}), (flight, 3000, 4.6, {'brownout_watch': 'sampled'}),
             (_slow_flight, 1200, 14.6, {'window': 10.0}),
             (_slow_flight, 600, 14.6, {'brownout_watch': 'sampled', 'window': 10.0})):
         t, v, u = made(np.random.default_rng(41), n)
         u[5000:5600] = np.nan
         monitor = SupplyMonitor(MonitorSettings(
             brownout_voltage=level, brownout_horizon=1.0, brownout_budget_limit=0.05, **more))
-        every = 1500 if made is _flight else 300
+        every = 1500 if made is flight else 300
         for k in range(0, n, every):
             for begin in range(k, k + every, 50 if every == 300 else 250):
                 part = slice(begin, begin + (50 if every == 300 else 250))
@@ -176,7 +176,7 @@ def number(text):
 def estimates():
     """Return estimates of windows of all kinds."""
     rng = np.random.default_rng(51)
-    t, v, u = _flight(rng, 2400)
+    t, v, u = flight(rng, 2400)
     noise = rng.standard_normal(t.size)
     some = np.sort(rng.permutation(t.size)[:1700])
     jittered = t + 2e-4 * rng.standard_normal(t.size)

@@ -5,9 +5,7 @@ import math
 import numpy as np
 from numpy.testing import assert_allclose
 from ou_monitor.model.load import ripple
-from ou_monitor.online.load_blocks import LoadBlocks
-from ou_monitor.online.load_current import scored
-from ou_monitor.online.load_noise import LoadNoise
+from ou_monitor.online.load.blocks import LoadBlocks, LoadNoise, scored
 import pytest
 
 NAN = math.nan
