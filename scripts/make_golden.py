@@ -4,8 +4,8 @@ Write the golden tables: `scripts/make_golden.py [NAME or RUN ...]` (default: al
 
 test/analysis/golden/NAME.json is what `ou-monitor analyze bags/NAME --json -` finds, without the
 long series (of those every sixteenth value); test/golden/RUN.json is what a run of
-test/support/golden_runs.py finds.  Run it after a change that is meant to move the numbers, and
-look at the difference before it is committed.
+test/support/golden_runs.py or golden_models.py finds.  Run it after a change that is meant to move
+the numbers, and look at the difference before it is committed.
 """
 
 from __future__ import annotations
@@ -65,13 +65,15 @@ def thinned(value: Any) -> Any:
 def main(argv: list[str]) -> int:
     """Write the tables of the bags named."""
     sys.path.insert(1, str(ROOT / 'test' / 'support'))
-    from golden_runs import RUNS
+    import golden_models
+    import golden_runs
+    runs = {**golden_runs.RUNS, **golden_models.RUNS}
     bags = sorted(path.parent.name for path in BAGS.glob('*/truth.yaml'))
-    for name in argv or [*bags, *RUNS]:
-        found = RUNS[name]() if name in RUNS else golden(name)
-        path = (ROOT / 'test' / 'golden' if name in RUNS else GOLDEN) / f'{name}.json'
+    for name in argv or [*bags, *runs]:
+        found = runs[name]() if name in runs else golden(name)
+        path = (ROOT / 'test' / 'golden' if name in runs else GOLDEN) / f'{name}.json'
         # A table of a run is read by a program: one line for each part of it.
-        text = json.dumps(found, indent=None if name in RUNS else 1, allow_nan=False,
+        text = json.dumps(found, indent=None if name in runs else 1, allow_nan=False,
                           ensure_ascii=False)
         path.write_text(text.replace('}, {', '},\n{') + '\n', encoding='utf-8')
         print(path)
