@@ -273,7 +273,7 @@ class Soak:
     def _report(self, now: float) -> None:
         found = self.figures(now, {'status': '-', 'took': 0.0})
         dips = found['dips']
-        silent = ', '.join(f'{name} {net:.2f}' for name, (_, net) in found['silence'].items())
+        silent = ', '.join(f'{name} {net:.2f}' for name, (_, net, _) in found['silence'].items())
         print(f"{now / 60.0:5.1f} min: {dips['in_time']} of {dips['asked']} dips, longest "
               f"silence, s: {silent}, {found['memory'] / 1e6:.1f} MB, false {found['false']}",
               flush=True)
@@ -318,6 +318,9 @@ class Soak:
         self._probe.close()
         found = self.figures(length, end)
         self._explain(found['dips'])
+        for name, (_, net, at) in found['silence'].items():
+            print(f'{name} was silent for {net:.2f} s at {at - self._start:.2f} s; done: '
+                  f'{self.heard.lately(at, at + net)}')
         if 'Traceback' in self._node.err or 'Current thread' in self._node.err:
             print(self._node.err[-20000:], file=sys.stderr)
         return found
@@ -350,7 +353,8 @@ def main() -> None:
             [folder, *filter(None, [os.environ.get('PYTHONPATH')])])
         soak = Soak(options.seed, 60.0 * options.minutes, Path(folder), options.domain,
                     options.dense)
-        soak.run_by = f'seed {options.seed}, {options.transport}'
+        soak.run_by = f'seed {options.seed}, {options.transport}' + (
+            ', dense' if options.dense else '')
         if options.deafen:
             multiprocessing.Process(target=deafen, args=(os.getpid(),), daemon=True).start()
         try:

@@ -111,6 +111,12 @@ class Heard:
                 made.append((begin, end))
         return made
 
+    def lately(self, begin: float, end: float) -> str:
+        """Return what was done to the node shortly before a time, and until another."""
+        return ', '.join(f'{name} {value}'.strip() + f' at {t - begin:+.2f} s'
+                         for t, name, value in self.done
+                         if begin - BEFORE < t < end) or 'nothing'
+
     def sent(self) -> tuple[list[float], list[float]]:
         """Return how many messages the source had sent, and when, s."""
         lines = [line for line in self.source if line['kind'] == 'sent']
@@ -180,9 +186,6 @@ def fate(dip: Mapping[str, Any], heard: Heard, sent: tuple[Sequence[float], Sequ
     else:
         kind = 'lost' if due - came > 0.5 * dip['samples'] else 'missed'
     now = {name: value for t, name, value in heard.done if t < dip['begin'] and value}
-    lately = [f'{name} {value}'.strip() + f' at {t - dip["begin"]:+.2f} s'
-              for t, name, value in heard.done
-              if -BEFORE < t - dip['begin'] < dip['end'] - dip['begin'] + IN_TIME]
     near = (before.at, after.at)
     gaps = np.diff([s.at for s in states])
     return kind, '; '.join([
@@ -197,7 +200,7 @@ def fate(dip: Mapping[str, Any], heard: Heard, sent: tuple[Sequence[float], Sequ
             ('stopped', heard.stops), ('node without CPU', heard.withheld),
             ('listener without CPU', heard.deaf))),
         'in force: ' + (', '.join(f'{k} {v}' for k, v in now.items()) or 'defaults'),
-        'done: ' + (', '.join(lately) or 'nothing')])
+        'done: ' + heard.lately(dip['begin'], dip['end'] + IN_TIME)])
 
 
 def dips_of(heard: Heard) -> dict[str, Any]:

@@ -21,17 +21,17 @@ LINGER = 2.3
 
 
 def silence(said: Sequence[Said] | Sequence[State], stops: Sequence[Span]
-            ) -> tuple[float, float]:
+            ) -> tuple[float, float, float]:
     """
-    Return the longest gap, s: as it was, and without the time that the node was stopped.
+    Return the longest gap, s: as it was, without time that the node was stopped; when the latter.
 
     Of messages that follow one another by their numbers: between others, some were not heard.
     """
     gaps = [(a.at, b.at) for a, b in zip(said, said[1:]) if b.number == a.number + 1]
     if not gaps:
-        return math.nan, math.nan
+        return math.nan, math.nan, math.nan
     return (max(b - a for a, b in gaps),
-            max(b - a - overlap(a, b, stops) for a, b in gaps))
+            *max((b - a - overlap(a, b, stops), a) for a, b in gaps))
 
 
 def false_of(heard: Heard) -> tuple[int, list[tuple[float, str]]]:
@@ -112,7 +112,7 @@ def _column(found: Mapping[str, Any]) -> list[list[str]]:
         ['seed, transport, length', f"{found['run']}, {found['minutes']:.1f} min"],
         ['deaths of the node', str(found['deaths'])],
         *([f'longest silence of `{name}` (without the pauses below)',
-           f'{gap:.2f} s ({net:.2f} s)'] for name, (gap, net) in found['silence'].items()),
+           f'{gap:.2f} s ({net:.2f} s)'] for name, (gap, net, _) in found['silence'].items()),
         ['longest time from a state that knows the flag to the next `~/brownout`',
          f"{found['unmatched']:.2f} s"],
         ['dips of 40 to 80 ms that the node must see', str(dips['asked'])],

@@ -92,10 +92,10 @@ def test_silence_without_the_time_of_stops():
     assert overlap(0.5, 1.97, stops) == pytest.approx(0.92)
     assert overlap(2.0, 3.0, stops) == 0.0
     said = [Said(at, None, k) for k, at in enumerate([0.0, 0.5, 2.0, 3.2])]
-    gap, net = silence(said, stops)
-    assert (gap, net) == (pytest.approx(1.5), pytest.approx(1.2))
+    gap, net, at = silence(said, stops)
+    assert (gap, net, at) == (pytest.approx(1.5), pytest.approx(1.2), 2.0)
     # One that was not heard is no silence.
-    assert silence([*said, Said(9.0, None, 5)], stops) == (gap, net)
+    assert silence([*said, Said(9.0, None, 5)], stops) == (gap, net, at)
 
 
 def test_pauses_are_one_account():
