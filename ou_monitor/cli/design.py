@@ -13,8 +13,8 @@ from ou_monitor.cli import output
 from ou_monitor.cli.output import paragraph, table
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.paper.network.components import PowerNetwork, UNITS
-from ou_monitor.paper.network.design import default_voltage, Design, design
-from ou_monitor.paper.network.design_words import answer, as_data, effect, probability, remarks
+from ou_monitor.paper.network.design import (
+    answer, as_data, default_voltage, Design, design, effect, probability, remarks)
 from ou_monitor.stream.files import read_yaml
 from ou_monitor.text import number
 

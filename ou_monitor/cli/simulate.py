@@ -23,9 +23,8 @@ _DURATION_MOST = 9e9
 def run(args: argparse.Namespace) -> int:
     """Simulate."""
     from ou_monitor.recordings.model_file import as_yaml, ModelFile, read_model
-    from ou_monitor.simulation.presets import PRESETS
-    from ou_monitor.simulation.profiles import PROFILES, read_profile
-    from ou_monitor.simulation.recorded_throttle import is_recording, read_throttle
+    from ou_monitor.simulation.profiles import is_recording, PROFILES, read_profile, read_throttle
+    from ou_monitor.simulation.simulation import PRESETS
 
     if args.list:
         if args.json is not None:

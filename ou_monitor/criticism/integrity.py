@@ -24,8 +24,8 @@ from ou_monitor.model.terms.held_samples import HeldSamples
 from ou_monitor.model.terms.quantization import Quantization
 from ou_monitor.model.terms.saturation import Saturation
 from ou_monitor.model.terms.term import Term
-from ou_monitor.online.estimator.intake import Batch
 from ou_monitor.online.estimator.quality import refresh_period, Repeats
+from ou_monitor.online.estimator.series import Batch
 from ou_monitor.records import FloatArray, Recording
 
 # Fewer samples than this are not fitted.

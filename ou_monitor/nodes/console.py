@@ -1,11 +1,13 @@
-"""What a node says on the console: once, and then rarely."""
+"""What a node says: of what changes, on the console, and who publishes its voltage."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from ou_monitor.nodes.base import MonitorNode
 from ou_monitor.online.risk.flag import FlagLevel, FlagState
+from ou_monitor.stream.arrival import Publishers
 
 # How often it is said that a topic has no publisher, s.
 AGAIN = 60.0
@@ -49,3 +51,44 @@ class Console:
         else:
             self._node.get_logger().info(
                 f'The brown-out flag is no longer CRITICAL, but {state.level.name}.')
+
+
+class PublisherWatch:
+    """Names of the publishers of one topic, and counts of their messages, in words."""
+
+    def __init__(self) -> None:
+        self._names: tuple[str, ...] = ()
+        self._publishers = Publishers()
+        self._lost = self._lost_of_late = 0
+        self._looked = -math.inf
+
+    def look(self, ends: list[Any], publishers: Publishers, now: float) -> None:
+        """Take who publishes (endpoints), and what was counted of them (now in s)."""
+        self._names = tuple(
+            f'{end.node_namespace.rstrip("/")}/{end.node_name} '
+            f'[{bytes(end.endpoint_gid).hex()[-8:]}]' for end in ends)
+        self._publishers = publishers
+        if now - self._looked >= 1.0:
+            self._lost_of_late, self._lost = publishers.lost - self._lost, publishers.lost
+            self._looked = now
+
+    def notes(self, topic: str) -> list[str]:
+        """Return what is to be said of the publishers of a topic."""
+        notes = []
+        if self._lost_of_late:
+            notes.append(f'{self._lost_of_late} messages were lost within the last second.')
+        if len(self._names) > 1:
+            followed = ('the first is followed, the others are left out'
+                        if self._publishers.numbered else
+                        'the middleware does not number messages, so they are mixed')
+            notes.append(f"{len(self._names)} publishers on {topic} ({', '.join(self._names)}): "
+                         f'{followed}.')
+        return notes
+
+    def fields(self) -> dict[str, str]:
+        """Return the same as fields of a status."""
+        counted = self._publishers
+        return {'messages_lost': str(counted.lost),
+                'messages_lost_by': 'sequence numbers' if counted.numbered else 'not known',
+                'foreign_messages': str(counted.foreign),
+                'publishers': ', '.join(self._names)}

@@ -21,7 +21,6 @@ from ou_monitor.recordings.columns import batches, join
 from ou_monitor.recordings.csv_table import CsvColumns, read_column, read_csv
 from ou_monitor.recordings.importers.formats import is_log
 from ou_monitor.recordings.importers.log import UNKNOWN
-from ou_monitor.recordings.log_bag import log_as_bag
 from ou_monitor.recordings.samples import (
     check_throttle, dropped_words, known_current, late_words, overlap, part_words,
     repeated_words, SampleReader, span_words, usable_voltage)
@@ -108,6 +107,8 @@ def read_recording(
                 raise InputError(f'{path} is a log: {option} is for bags; convert chooses among '
                                  'the series of a log')
         named_series = columns or CsvColumns()
+        # Here, for bags and CSV need nothing of it.
+        from ou_monitor.recordings.write_log import log_as_bag
         with log_as_bag(path, flight=flight, voltage=named_series.voltage,
                         throttle=named_series.throttle, progress=progress) as (bag, named):
             return named(read_recording(bag, start=start, end=end))

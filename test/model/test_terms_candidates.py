@@ -5,9 +5,9 @@ import math
 
 import numpy as np
 from ou_monitor.model.terms.flicker_noise import FlickerNoise
-from ou_monitor.model.terms.hidden_levels import relaxing
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import order_power
+from ou_monitor.model.terms.regime_switching import relaxing
 from ou_monitor.model.terms.second_relaxation import SecondRelaxation
 import pytest
 from scipy.linalg import dft

@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 from live import ROOT, wait_until
-from ou_monitor.nodes.service_manager import ServiceManager
+from ou_monitor.nodes.run import ServiceManager
 import pytest
 
 

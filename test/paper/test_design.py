@@ -8,8 +8,7 @@ import numpy as np
 from ou_monitor.model.passage.law import mean_first_passage
 from ou_monitor.paper.network.components import PowerNetwork
 from ou_monitor.paper.network.design import (
-    default_voltage, design, row_of, Verdict, with_capacitance)
-from ou_monitor.paper.network.design_words import answer, effect, remarks
+    answer, default_voltage, design, effect, remarks, row_of, Verdict, with_capacitance)
 from ou_monitor.paper.network.rail import rail_at
 import pytest
 

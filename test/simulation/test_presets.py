@@ -3,9 +3,8 @@
 import math
 
 import numpy as np
-from ou_monitor.simulation.presets import PRESETS
 from ou_monitor.simulation.profiles import read_profile
-from ou_monitor.simulation.simulation import simulated
+from ou_monitor.simulation.simulation import PRESETS, simulated
 import pytest
 
 # Typed from the paper's Tables 1 and 2: throttle, Vrms in mV.

@@ -20,11 +20,11 @@ from ou_monitor.model import arma
 from ou_monitor.online.estimator import judgement
 from ou_monitor.online.estimator.compiled import COMPILED
 from ou_monitor.online.estimator.fit import fit_window, Fitted, from_window, TREND_SCORE
-from ou_monitor.online.estimator.intake import as_column, BATCH, Batch, Intake, Thinner
+from ou_monitor.online.estimator.intake import as_column, BATCH, Intake, Thinner
 from ou_monitor.online.estimator.irregular import fit_irregular, MOST
 from ou_monitor.online.estimator.quality import (
     examine, Quality, refresh_period, Repeats, TAIL, whole)
-from ou_monitor.online.estimator.series import T, U, Y
+from ou_monitor.online.estimator.series import Batch, T, U, Y
 from ou_monitor.online.estimator.window import FACTOR, FEWEST, LAGS, Resolution, Sums
 from ou_monitor.records import Counters, Estimate, FloatArray, NAN, Status
 

@@ -8,14 +8,13 @@ memory copy.  Sorting, dropping and counting happen here and nowhere else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import math
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.estimator.compiled import COMPILED
-from ou_monitor.online.estimator.series import IntArray
+from ou_monitor.online.estimator.series import Batch, IntArray
 from ou_monitor.records import Counters, FloatArray, NAN
 
 # Samples collected before a batch is worked off: large enough that NumPy's
@@ -32,32 +31,6 @@ MEMORY = 32
 # Samples averaged to one at most: 10 MHz; stamps that lie closer are no time.
 MOST_BLOCK = 1000.0
 _NONE = np.empty(0, dtype=np.int64)
-
-
-@dataclass(slots=True)
-class Batch:
-    """
-    Clean samples in order; views that hold until the next push.
-
-    Attributes
-    ----------
-    t, y : ndarray, shape (n,)
-        Stamps (s, strictly increasing) and voltage (V).
-    u : ndarray, shape (n,), or None
-        Throttle, NaN where unknown; None: unknown throughout.
-    shortest, longest : float
-        Least and largest step, from the sample before on, s.
-    restart : bool
-        Whether everything before this batch is to be forgotten.
-
-    """
-
-    t: FloatArray
-    y: FloatArray
-    u: FloatArray | None
-    shortest: float
-    longest: float
-    restart: bool
 
 
 class Intake:

@@ -24,7 +24,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.online.estimator.intake import Batch
+from ou_monitor.online.estimator.series import Batch
 from ou_monitor.records import FloatArray, NAN
 
 # Gaps that may differ from the pattern: lost samples, a logger that was late.

@@ -110,17 +110,6 @@ class HatFilter:
         """Mean square of the last fifty or so misses, in standard deviations; about 1 is right."""
         return self._scatter if self.started else math.nan
 
-    @property
-    def forgetting(self) -> float:
-        """Time in which the shape changes by `CurvePrior.change`, s."""
-        return self._forgetting
-
-    @forgetting.setter
-    def forgetting(self, value: float) -> None:
-        """Change how fast the curve is forgotten; what is known stays."""
-        self._forgetting = value
-        self._set_rate()
-
     def start(self, value: float, prior: CurvePrior) -> None:
         """Begin from a flat curve at `value`, as uncertain as the prior says."""
         n = self.nodes

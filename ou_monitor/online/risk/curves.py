@@ -20,6 +20,10 @@ from ou_monitor.online.risk.curve_filters import (
     BINS, CurvePrior, HatFilter, noise_variance, Pool, Squares, STEADY, Wander)
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN
 
+# Nodes of the curves over throttle 0..1, and the times, s, in which the intensity at a throttle
+# not flown is forgotten to 20 % and the sag there to 1 % of the voltage; the level common to all
+# throttles is followed within seconds.
+_NODES, FORGETTING, SHAPE_FORGETTING = 9, 300.0, 1800.0
 # Samples are looked at in blocks of this length, s, and of this many samples or more.
 _BLOCK, _FEWEST = 0.05, 32
 # A slow source is not waited for longer than this, s.
@@ -75,39 +79,11 @@ class CurvePoint(NamedTuple):
 
 
 class LearnedCurves:
-    """
-    Level and noise intensity against throttle, learned in flight.
+    """Level and noise intensity against throttle, learned in flight."""
 
-    Parameters
-    ----------
-    nodes : int
-        Nodes of the piecewise-linear curves over throttle 0..1; 3..26.
-    forgetting : float
-        Time in which the intensity at a throttle not flown is forgotten to 20 %, s.
-    shape_forgetting : float
-        Time in which the sag at a throttle not flown is forgotten to 1 % of the voltage, s; the
-        level common to all throttles is followed within seconds.
-
-    Raises
-    ------
-    ValueError
-        For a number of nodes or a time that cannot be.
-
-    """
-
-    def __init__(self, nodes: int = 9, *, forgetting: float = 300.0,
-                 shape_forgetting: float = 1800.0) -> None:
-        if not 3 <= nodes <= (BINS + 1) // 2:
-            raise ValueError(f'nodes must lie within 3..{(BINS + 1) // 2}, got {nodes}')
-        self._level = HatFilter(nodes, _seconds('shape_forgetting', shape_forgetting))
-        self._intensity = HatFilter(nodes, _seconds('forgetting', forgetting))
-        self._nodes = nodes
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything learned, as for another supply."""
-        self._level = HatFilter(self._nodes, self._level.forgetting)
-        self._intensity = HatFilter(self._nodes, self._intensity.forgetting)
+    def __init__(self) -> None:
+        self._level = HatFilter(_NODES, SHAPE_FORGETTING)
+        self._intensity = HatFilter(_NODES, FORGETTING)
         self._pending: list[tuple[FloatArray, ...]] = []
         self._waiting, self._begin = 0, NAN
         self._newest = -math.inf
@@ -119,26 +95,6 @@ class LearnedCurves:
         self._pool = Pool()
         self._squares = Squares()
         self._wander = Wander()
-
-    @property
-    def forgetting(self) -> float:
-        """Time in which the intensity is forgotten to 20 %, s."""
-        return self._intensity.forgetting
-
-    @forgetting.setter
-    def forgetting(self, value: float) -> None:
-        """Change it; nothing learned is lost."""
-        self._intensity.forgetting = _seconds('forgetting', value)
-
-    @property
-    def shape_forgetting(self) -> float:
-        """Time in which the sag is forgotten to 1 % of the voltage, s."""
-        return self._level.forgetting
-
-    @shape_forgetting.setter
-    def shape_forgetting(self, value: float) -> None:
-        """Change it; nothing learned is lost."""
-        self._level.forgetting = _seconds('shape_forgetting', value)
 
     @property
     def throttle_known(self) -> bool:
@@ -201,10 +157,6 @@ class LearnedCurves:
         """Return how ln(sigma) goes beside the curve: where it is now, and how fast it walks."""
         return self._wander
 
-    def seen(self, throttle: float) -> bool:
-        """Whether data within half the distance of two nodes weigh more than the prior."""
-        return bool(self.seen_curve(np.array([throttle])).item())
-
     def level_curve(self, throttles: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return levels and their standard errors, V, at throttles of shape (k,)."""
         return self._level.curve(throttles, self._ahead())
@@ -218,7 +170,7 @@ class LearnedCurves:
         return min(self._newest - self._clock, _AHEAD) if self._level.started else 0.0
 
     def seen_curve(self, throttles: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return `seen` at throttles of shape (k,); False where throttle is NaN."""
+        """Return where (k,) data within half a distance of nodes weigh more than the prior."""
         ratio = np.minimum(self._level.seen(), self._intensity.seen())
         known = np.isfinite(throttles)
         place = np.clip(np.where(known, throttles, 0.0), 0.0, 1.0) * (BINS - 1)
@@ -388,10 +340,3 @@ def _column(values: Any) -> FloatArray:
     """Return values as a float array of shape (n,)."""
     array = np.asarray(values, dtype=np.float64)
     return array.reshape(1) if array.ndim == 0 else array
-
-
-def _seconds(name: str, value: float) -> float:
-    number = float(value)
-    if not (math.isfinite(number) and number > 0.0):
-        raise ValueError(f'{name} must be a positive number of seconds, got {value}')
-    return number

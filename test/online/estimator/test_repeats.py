@@ -5,8 +5,8 @@ import math
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor import SlidingEstimator
-from ou_monitor.online.estimator.intake import Batch
 from ou_monitor.online.estimator.quality import refresh_period, Repeats, whole
+from ou_monitor.online.estimator.series import Batch
 from ou_monitor.records import Counters, Flag, Status
 import pytest
 from scipy.signal import lfilter

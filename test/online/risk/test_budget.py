@@ -100,7 +100,7 @@ def test_learned_curves_bracket_the_exact_risk():
     off, known = [], []
     for seed in range(40):
         curves = learned(seed)
-        known.append(curves.seen(0.5))
+        known.append(curves.seen_curve(np.array([0.5])).item())
         off.append(budget(curves).throttle - exact_budget(1e-3))
     assert np.mean(known) > 0.8
     # d ln(risk) / du is about 20 here: 0.05 of throttle is a factor of e.
