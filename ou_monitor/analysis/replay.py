@@ -92,7 +92,7 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
     settings = MonitorSettings(window=window, brownout_horizon=brownout_horizon)
     if asked:
         settings = replace(settings, brownout_voltage=brownout_voltage)
-    monitor = SupplyMonitor(settings, background=False)
+    monitor = SupplyMonitor(settings)
     t, voltage, throttle = recording.t, recording.voltage, recording.throttle
     known, drawn = recording.has_throttle, recording.current
 

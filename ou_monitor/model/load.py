@@ -17,7 +17,6 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
-from scipy.linalg import solve_banded
 
 Number = TypeVar('Number', float, FloatArray)
 
@@ -71,6 +70,8 @@ def ripple(throttle: Number) -> Number:
 
 def lowpass(x: FloatArray, t: FloatArray, tau: float, start: float | None = None) -> FloatArray:
     """Return x after a first-order low-pass of tau, s; exact for x held over each step."""
+    # Here, for the nodes need none of it: SciPy costs them 35 MB.
+    from scipy.linalg import solve_banded
     keep = np.exp(-np.diff(t) / tau)
     bands = np.ones((2, x.size))
     bands[1, :-1] = -keep

@@ -78,7 +78,8 @@ class EstimatorNode(MonitorNode):
     def start(self) -> None:
         """Begin with nothing known but a flag that was latched."""
         settings = monitor_settings(_of_monitor(self.values()))
-        self._monitor = SupplyMonitor(settings, self._models.use(settings.model_file))
+        self._monitor = SupplyMonitor(settings, self._models.use(settings.model_file),
+                                      background=True)
         self._stream = SampleStream(self._monitor)
         self._inputs: dict[str, PolledInput] = {}
         self._arrived = Silence(self.steady_now)

@@ -54,7 +54,7 @@ def test_the_node_says_the_same():
     """
     simulated = swept(2)
     found = by_throttle(slide(simulated, 2.0, 4.5), True)
-    monitor = SupplyMonitor(MonitorSettings(), background=False)
+    monitor = SupplyMonitor(MonitorSettings())
     for part in np.array_split(np.arange(simulated.n), int(10 * simulated.duration)):
         monitor.push(simulated.t[part], simulated.voltage[part], simulated.throttle[part])
         report = monitor.report(age=0.0)

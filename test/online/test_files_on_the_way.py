@@ -42,8 +42,7 @@ def test_one_voltage_message_to_one_report(moving, monkeypatch):
     """Throttle still or moving; the quality of the input is looked at four times a window."""
     monkeypatch.setenv('OU_MONITOR_COMPILED', '0')
     rng = np.random.default_rng(1)
-    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=4.5, brownout_horizon=1.0),
-                            background=False)
+    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=4.5, brownout_horizon=1.0))
     stream = SampleStream(monitor)
     stream.open_voltage(Extractor(FieldSpec('voltage', 'x/msg/X', 'data')))
     stream.open_throttle(Extractor(FieldSpec('throttle', 'x/msg/X', 'data')))

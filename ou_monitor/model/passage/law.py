@@ -35,9 +35,6 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
-from scipy.linalg import solve_banded
-from scipy.ndimage import map_coordinates, spline_filter
-from scipy.special import erfcx, gammaln, log_ndtr, logsumexp, pbdv
 
 # The table: barrier, w and lambda; each axis is even in a coordinate of its own,
 # b = 4 sinh(u), w = 2 sinh(v).
@@ -58,6 +55,34 @@ _LOG_TWO_PI = math.log(2.0 * math.pi)
 _NEVER = 26.0
 
 
+# Below this ln Phi comes from the asymptotic series, 1e-12 off at most (Abramowitz & Stegun
+# 26.2.12, last term first); erfc loses digits from -37 on.
+_FAR = -20.0
+_SERIES = (10395.0, -945.0, 105.0, -15.0, 3.0, -1.0, 1.0)
+
+
+def normal_below(x: npt.ArrayLike) -> FloatArray:
+    """Return Phi(x), elementwise; SciPy's would cost the nodes 35 MB."""
+    z = np.asarray(x, dtype=np.float64) * -math.sqrt(0.5)
+    values = np.array([math.erfc(each) for each in z.ravel().tolist()])
+    return np.asarray(0.5 * values.reshape(z.shape))
+
+
+def log_normal_below(x: npt.ArrayLike) -> FloatArray:
+    """Return ln Phi(x), elementwise."""
+    z = np.asarray(x, dtype=np.float64)
+    least = normal_below(np.maximum(-np.abs(z), _FAR))
+    near = np.where(z > 0.0, np.log1p(-least), np.log(least))
+    if not (z < _FAR).any():
+        return near
+    with np.errstate(over='ignore'):
+        far = np.minimum(z, _FAR)
+        square = far * far
+    series = np.polyval(_SERIES, 1.0 / square)
+    return np.where(z < _FAR, np.log(series) - np.log(-far) - 0.5 * square - 0.5 * _LOG_TWO_PI,
+                    near)
+
+
 def mean_first_passage(start: float, barrier: float) -> float:
     """
     Return the mean time of a unit OU from `start` up to `barrier`.
@@ -69,8 +94,9 @@ def mean_first_passage(start: float, barrier: float) -> float:
         return 0.0
     if barrier > _NEVER:
         return math.inf
-    # Here, for the nodes need none of it: it costs them 25 MB.
+    # Here, for the nodes need none of it: SciPy costs them 60 MB.
     from scipy.integrate import quad
+    from scipy.special import erfcx
     total, _ = quad(lambda z: float(erfcx(-z / math.sqrt(2.0))), start, barrier,
                     epsabs=0.0, epsrel=1e-10, limit=200)
     return math.sqrt(math.pi / 2.0) * float(total)
@@ -131,13 +157,12 @@ class PassageTable:
             at[1] = np.minimum(v / _DV, _W_NODES - 1.0)
             at[2] = (0.5 * np.log(grown) - _LAMBDA[0]) / _DL
             at += _PAD
-            r = map_coordinates(self.coefficients, at, order=3, mode='mirror', prefilter=False)
-            chance: FloatArray = np.minimum(2.0 * np.exp(log_ndtr(-y) + r), 1.0)
+            r = spline_at(self.coefficients, at)
+            chance: FloatArray = np.minimum(2.0 * np.exp(log_normal_below(-y) + r), 1.0)
             long = s > _S_HIGH
             if not long.any():
                 return chance
-            rate = np.exp(map_coordinates(self.log_rate, at[:1, long], order=3, mode='mirror',
-                                          prefilter=False))
+            rate = np.exp(spline_at(self.log_rate, at[:1, long]))
             with np.errstate(divide='ignore'):
                 chance[long] = -np.expm1(np.log1p(-chance[long]) - rate * (s[long] - _S_HIGH))
             return chance
@@ -184,8 +209,31 @@ def spline(table: FloatArray) -> FloatArray:
             first = 4.0 * a - 6.0 * b + 4.0 * c - d
             a, b, c, d = (np.take(table, [-k], axis) for k in range(1, 5))
             table = np.concatenate((first, table, 4.0 * a - 6.0 * b + 4.0 * c - d), axis)
-    coefficients: FloatArray = spline_filter(table, order=3, mode='mirror')
-    return coefficients
+        # The basis has 1/6, 2/3, 1/6 at the nodes; beyond the ends the table is mirrored.
+        nodes = table.shape[axis]
+        basis = 2.0 / 3.0 * np.eye(nodes) + (np.eye(nodes, k=1) + np.eye(nodes, k=-1)) / 6.0
+        basis[0, 1] = basis[-1, -2] = 1.0 / 3.0
+        table = np.moveaxis(np.tensordot(np.linalg.inv(basis), table, (1, axis)), 0, axis)
+    return np.ascontiguousarray(table)
+
+
+def spline_at(coefficients: FloatArray, at: FloatArray) -> FloatArray:
+    """Return the spline at places, shape (axes, n), at least one node from the ends."""
+    first = np.floor(at).astype(np.intp)
+    x = at - first
+    left = 1.0 - x
+    weights = np.stack((left**3, 4.0 - 3.0 * x * x * (2.0 - x),
+                        4.0 - 3.0 * left * left * (2.0 - left), x**3), axis=-1) / 6.0
+    # Rows of four neighbours along the last axis, and which of them are near a place.
+    rows = np.lib.stride_tricks.sliding_window_view(coefficients.ravel(), 4)
+    near = np.zeros((x.shape[1], 1), np.intp)
+    for axis, size in enumerate(coefficients.shape[:-1]):
+        near = (size * near + first[axis][:, None] - 1)[..., None] + np.arange(4)
+        near = near.reshape(x.shape[1], 4 ** (axis + 1))
+    value = rows[coefficients.shape[-1] * near + first[-1][:, None] - 1]
+    for axis in reversed(range(len(weights))):
+        value = value.reshape(x.shape[1], 4**axis, 4) @ weights[axis][..., None]
+    return np.asarray(value.ravel())
 
 
 def _solve(b: FloatArray, fine_w: int, fine_s: int) -> FloatArray:
@@ -197,47 +245,61 @@ def _solve(b: FloatArray, fine_w: int, fine_s: int) -> FloatArray:
     nodes is taken.
     """
     w = _W_SCALE * np.sinh(_DV / fine_w * np.arange((_W_NODES - 1) * fine_w + 1))
-    first, second = _differences(w)
+    first, second = (weights[..., None] for weights in _differences(w))
     step = _DL / fine_s
     lead = math.ceil(_LEAD / step)
-    inner, n = w[1:-1], w.size - 2
+    inner = w[1:-1, None]
     # Extrapolation to the last node by the parabola through the three before it.
     far = _parabola(w[-4:-1], w[-1])
     # It begins with the limit of short spans, R = -b sqrt(T) w / 2.
-    r = -0.5 * b[:, None] * math.exp(_LAMBDA[0] - lead * step) * w
+    r = -0.5 * b * math.exp(_LAMBDA[0] - lead * step) * w[:, None]
     before = math.exp(-step) * r
-    table = np.empty((b.size, _W_NODES, _S_NODES))
-    bands = np.zeros((5, b.size, n))
+    table = np.empty((_S_NODES, _W_NODES, b.size))
     for k in range(1, lead + (_S_NODES - 1) * fine_s + 1):
         at = _LAMBDA[0] + (k - lead) * step
         c = 1.0 / math.sqrt(1.0 + math.exp(2.0 * at))
         t = 1.0 - c * c
-        beta = b[:, None] * math.sqrt(t)
+        beta = b * math.sqrt(t)
         y = c * inner
-        g = c * np.exp(-0.5 * y * y - 0.5 * _LOG_TWO_PI - log_ndtr(-y))
+        g = c * np.exp(-0.5 * y * y - 0.5 * _LOG_TWO_PI - log_normal_below(-y))
         guess = 2.0 * r - before
-        slope = first[0] * guess[:, :-2] + first[1] * guess[:, 1:-1] + first[2] * guess[:, 2:]
+        slope = first[0] * guess[:-2] + first[1] * guess[1:-1] + first[2] * guess[2:]
         drift = beta + (inner * (1.0 - 2.0 * t) - 2.0 * g) + 2.0 * slope
-        right = (2.0 * r - 0.5 * before)[:, 1:-1] / step - slope * slope - beta * g
-        low, main, high = (-(second[j] + drift * first[j]) for j in range(3))
-        main += 1.5 / step
-        # The last row holds r[-1] = far . r[-4:-1].
-        bands[1, :, 1:] = high[:, :-1]
-        bands[2] = main
-        bands[3, :, :-1] = low[:, 1:]
-        bands[4, :, -3] = high[:, -1] * far[0]
-        bands[3, :, -2] += high[:, -1] * far[1]
-        bands[2, :, -1] += high[:, -1] * far[2]
-        solved = solve_banded((2, 1), bands[1:].reshape(4, -1), right.ravel(),
-                              check_finite=False).reshape(b.size, n)
-        bands[4, :, -3] = 0.0
-        after = np.zeros_like(r)
-        after[:, 1:-1] = solved
-        after[:, -1] = solved[:, -3:] @ far
-        r, before = after, r
+        right = (2.0 * r - 0.5 * before)[1:-1] / step - slope * slope - beta * g
+        bands = -(second + drift * first)
+        bands[1] += 1.5 / step
+        r, before = tridiagonal(bands, right, far), r
         if k >= lead and (k - lead) % fine_s == 0:
-            table[:, :, (k - lead) // fine_s] = r[:, ::fine_w]
-    return table
+            table[(k - lead) // fine_s] = r[::fine_w]
+    return np.ascontiguousarray(table.T)
+
+
+def tridiagonal(bands: FloatArray, right: FloatArray, far: FloatArray) -> FloatArray:
+    """
+    Return x of the inner nodes, 0 before them and x[-1] = far . x[-4:-1] after them.
+
+    bands: below, on and above the diagonal, shape (3, n, systems); right: (n, systems).
+    """
+    low, main, high = bands
+    p, q = np.empty_like(right), np.empty_like(right)
+    # The last row holds x[-1]: three of its neighbours, of which the farthest goes first.
+    last = high[-1] * far[:, None]
+    main[-1] += last[2]
+    low[-1] += last[1]
+    p[0], q[0] = high[0] / main[0], right[0] / main[0]
+    for j in range(1, len(right)):
+        if j == len(right) - 1:
+            low[j] -= last[0] * p[j - 2]
+            right[j] -= last[0] * q[j - 2]
+        pivot = main[j] - low[j] * p[j - 1]
+        p[j] = high[j] / pivot
+        q[j] = (right[j] - low[j] * q[j - 1]) / pivot
+    x = np.zeros((len(right) + 2, right.shape[1]))
+    x[-2] = q[-1]
+    for j in range(len(right) - 2, -1, -1):
+        x[j + 1] = q[j] - p[j] * x[j + 2]
+    x[-1] = far @ x[-4:-1]
+    return x
 
 
 def _differences(w: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -261,35 +323,49 @@ def _log_rate(b: FloatArray) -> FloatArray:
     For 0 < b <= 8 from the power series of the Hermite function, in which all terms
     but the first are positive: nu = 2 Gamma(1 - nu/2) / sum over n >= 1 of
     Gamma((n - nu)/2) (sqrt(2) b)^n / n!.  Beyond, nu is the inverse of the mean
-    time, an asymptotic series.  Below 0 the function itself is looked at.
+    time, an asymptotic series.  Below 0 it is the lowest energy above a wall.
 
     """
     result = np.empty(b.size)
-    # The first zero is above 1, and below 17 for the barriers of the table.
-    trial = np.linspace(0.99, 17.0, 200)
-    n = np.arange(1.0, 260.0)
-    log_factorial = gammaln(n + 1.0)
+    n = range(1, 260)
 
-    def excess(log_nu: float, log_terms: FloatArray) -> float:
+    def excess(log_nu: float, log_terms: list[float]) -> float:
         nu = math.exp(log_nu)
-        total = logsumexp(log_terms + gammaln(0.5 * (n - nu)))
-        return float(math.log(2.0) + gammaln(1.0 - 0.5 * nu) - total) - log_nu
+        logs = [term + math.lgamma(0.5 * (k - nu)) for k, term in zip(n, log_terms, strict=True)]
+        top = max(logs)
+        total = top + math.log(math.fsum(math.exp(each - top) for each in logs))
+        return math.log(2.0) + math.lgamma(1.0 - 0.5 * nu) - total - log_nu
 
     for k, barrier in enumerate(b.tolist()):
         if barrier <= 0.0:
-            # One barrier at a time: arrays of more than 500 elements crash pbdv in
-            # SciPy 1.11.4 to 1.12 (segmentation fault).
-            first = int((pbdv(trial, -barrier)[0] < 0.0).argmax())
-            result[k] = math.log(_root(lambda nu, z: float(pbdv(nu, z)[0]), -barrier,
-                                       float(trial[first - 1]), float(trial[first])))
+            result[k] = math.log(_lowest_energy(barrier))
         elif barrier <= 8.0:
-            result[k] = _root(excess, n * math.log(math.sqrt(2.0) * barrier) - log_factorial,
-                              -40.0, -1e-12)
+            result[k] = _root(excess, [j * math.log(math.sqrt(2.0) * barrier)
+                                       - math.lgamma(j + 1.0) for j in n], -40.0, -1e-12)
         else:
             z = 1.0 / (barrier * barrier)
             result[k] = (math.log(barrier) - 0.5 * barrier * barrier - 0.5 * _LOG_TWO_PI
                          - math.log1p(z * (1.0 + z * (3.0 + z * (15.0 + z * 105.0)))))
     return result
+
+
+def _lowest_energy(barrier: float) -> float:
+    """
+    Return the least nu of -f'' + (x^2/4 - 1/2) f = nu f, f zero at the barrier and far below.
+
+    f = exp(-x^2/4) times the backward equation's; by collocation at Chebyshev points
+    (Trefethen, Spectral Methods in MATLAB, 2000, program 6).
+    """
+    order, length = 64, 14.0
+    x = np.cos(math.pi * np.arange(order + 1) / order)
+    c = np.ones(order + 1)
+    c[[0, -1]] = 2.0
+    c[1::2] *= -1.0
+    slopes = np.outer(c, 1.0 / c) / (x[:, None] - x + np.eye(order + 1))
+    slopes -= np.diag(slopes.sum(axis=1))
+    place = barrier + 0.5 * length * (x - 1.0)
+    energy = np.diag(0.25 * place**2 - 0.5) - (2.0 / length) ** 2 * slopes @ slopes
+    return float(np.linalg.eigvals(energy[1:-1, 1:-1]).real.min())
 
 
 def _root(f: Callable[[float, T], float], argument: T, low: float, high: float) -> float:

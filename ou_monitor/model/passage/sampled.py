@@ -19,9 +19,9 @@ from functools import lru_cache
 import math
 
 import numpy as np
-from ou_monitor.model.passage.law import passage_probability
+from ou_monitor.model.passage.law import (
+    log_normal_below, normal_below, passage_probability)
 from ou_monitor.records import FloatArray
-from scipy.special import log_ndtr, ndtr
 
 # The state is taken as within this many standard deviations.
 _REACH = 4.7
@@ -88,10 +88,10 @@ def _straight(noise: float) -> tuple[float, FloatArray, FloatArray]:
     else:
         middle, fine = min(-5.0 * noise, -1.0), 0.5 * min(noise, 1.0)
         x, weight = _gauss((low, middle, 0.0, 5.0 * noise + 1.0), (1.0, fine, fine))
-        weight = weight * np.exp(block * log_ndtr(-x / noise))
+        weight = weight * np.exp(block * log_normal_below(-x / noise))
     kernel = _normal(x - x[:, None]) * weight
     # Below the grid the function is the line through its first value.
-    below = ndtr(low - x)
+    below = normal_below(low - x)
     right = x - kernel @ x - x * below + _normal(low - x)
     kernel[:, 0] += below
     found = np.linalg.solve(np.eye(x.size) - kernel, right)
@@ -179,14 +179,14 @@ def _doubled(start: float, barrier: float, step: float, count: int, noise: float
     gap = (barrier - phi * begin) / math.hypot(spread, noise)
     kernel = _normal((x - phi * begin[:, None]) / spread) * weight
     if samples == 1.0:
-        seen, unseen = ndtr(-gap), ndtr(gap)
+        seen, unseen = normal_below(-gap), normal_below(gap)
         if noise > 0.0:
-            kernel *= ndtr((barrier - x) / noise)
+            kernel *= normal_below((barrier - x) / noise)
         # What the nodes miss of the chance not to be seen, the cut far below included.
         kernel *= (unseen / np.maximum(kernel.sum(axis=1), 1e-300))[:, None]
     else:
         kernel /= np.maximum(kernel.sum(axis=1), 1e-300)[:, None]
-        each = log_ndtr((barrier - begin) / noise)
+        each = log_normal_below((barrier - begin) / noise)
         hidden, later = 0.5 * (samples - 1.0) * each, 0.5 * (samples + 1.0) * each[1:]
         seen = -(kernel @ np.expm1(later)) * np.exp(hidden) - np.expm1(hidden)
         kernel *= np.exp(hidden[:, None] + later)
@@ -205,12 +205,12 @@ def _doubled(start: float, barrier: float, step: float, count: int, noise: float
     total = float(seen[0] + first @ result)
     if not left:
         return min(total, 1.0)
-    # Now each block begins from the same law, and is seen at the same rate.
+    # Now share block begins from the same law, and is seen at the same rate.
     law = first @ power
     size = float(law.sum())
     if size < 1e-290 or total >= 1.0:
         return 1.0
-    each = min(float(law @ chance) / size, 1.0)
-    if each >= 1.0:
+    share = min(float(law @ chance) / size, 1.0)
+    if share >= 1.0:
         return 1.0
-    return -math.expm1(math.log1p(-total) + left * math.log1p(-each))
+    return -math.expm1(math.log1p(-total) + left * math.log1p(-share))

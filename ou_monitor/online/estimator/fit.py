@@ -21,7 +21,6 @@ from ou_monitor.model import arma
 from ou_monitor.online.estimator.compiled import COMPILED
 from ou_monitor.online.estimator.window import Sums
 from ou_monitor.records import FloatArray
-from scipy.linalg.lapack import dposv, dsyev
 
 # Directions of the load that vary less than this share of the largest are
 # left out: the window does not show them.
@@ -31,7 +30,6 @@ _STILL = 1e-12
 # Exponents of theta, as many as lags could be; parts of vectors.
 _COUNT = np.arange(256.0)
 _ONE, _NO_TIME = np.ones(1), np.zeros(1)
-_IDENTITIES = [np.eye(size) for size in range(8)]
 
 
 @dataclass(slots=True)
@@ -127,7 +125,7 @@ class Moments:
             3, *self._raw.shape[1:])
         basis = self.basis
         inner = gram[1:, 1:]
-        cov = basis @ _inverse(basis.T @ inner @ basis) @ basis.T
+        cov = basis @ np.linalg.inv(basis.T @ inner @ basis) @ basis.T
         # The gradient of half a log-determinant is half the trace of inverse times change.
         return Regression(cov @ gram[1:, 0], cov,
                           (0.5 * float(np.vdot(cov, by_log_a[1:, 1:])),
@@ -139,7 +137,7 @@ class Moments:
         cov = mean.cov
         if self.basis is not self._load:
             load = self._load
-            cov = load @ _inverse(load.T @ gram[1:, 1:] @ load) @ load.T
+            cov = load @ np.linalg.inv(load.T @ gram[1:, 1:] @ load) @ load.T
         # What the load does not explain of the trend and of the voltage.
         x, y = gram[1:, -1], gram[1:, 0]
         explained = cov @ x
@@ -171,15 +169,6 @@ class Moments:
         return weights
 
 
-def _inverse(inner: FloatArray) -> FloatArray:
-    """Return the inverse of a symmetric matrix; LAPACK's own call, as these are small."""
-    if not inner.size:
-        return inner
-    _, inverse, bad = dposv(inner, _IDENTITIES[len(inner)])
-    # Sums over few pairs need not be positive.
-    return np.asarray(np.linalg.inv(inner) if bad else inverse, dtype=np.float64)
-
-
 def independent(cov: FloatArray) -> FloatArray:
     """Return the independent, unit-variance combinations (columns) of variables that vary."""
     variances = cov.diagonal()
@@ -195,7 +184,7 @@ def independent(cov: FloatArray) -> FloatArray:
     if not variances.size:
         return np.empty((0, 0))
     scale = np.sqrt(variances)
-    values, vectors, _ = dsyev(cov / (scale[:, None] * scale))
+    values, vectors = np.linalg.eigh(cov / (scale[:, None] * scale))
     found: FloatArray = vectors[:, values > _UNSEEN * values[-1]] / scale[:, None]
     return found
 

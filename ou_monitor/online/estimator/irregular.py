@@ -5,7 +5,8 @@ Dearer than the sums over lags, so only for windows that need it: irregular sour
 with many holes.  The inverse covariance of a sampled OU is tridiagonal, so the likelihood costs
 O(n) in LAPACK (`pttrf`): K = K_ou + nu I with A = I + nu K_ou^-1 tridiagonal, K^-1 = K_ou^-1 A^-1
 and log|K| = log|K_ou| + log|A|.  It is the likelihood of the Kalman filter, restricted to the
-contrasts of the regressors (REML: Harville, J. Am. Stat. Assoc. 72 (1977) 320).
+contrasts of the regressors (REML: Harville, J. Am. Stat. Assoc. 72 (1977) 320).  It needs SciPy,
+0.3 s and 45 MB that other sources spare the nodes: `SlidingEstimator` loads it in a thread.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from ou_monitor.online.estimator.fit import Fitted, independent, Outcome, TREND_
 from ou_monitor.online.estimator.series import FAST, SLOW, T, U, Y
 from ou_monitor.records import FloatArray
 from scipy.linalg.lapack import dpttrf, dpttrs
+from scipy.optimize import minimize
 
 # Search range of the noise share nu / mean step: ten thousand times the
 # diffusion of one step hides any OU.
@@ -113,8 +115,6 @@ def fit_exact(t: FloatArray, y: FloatArray, regressors: FloatArray) -> ExactFit:
     # lam = x^2 keeps the noise share positive and smooth at zero.
     starts = [(a, x) for a in np.linspace(low, high, 7)[1:-1] for x in (0.1, 1.0)]
     values = [likelihood.solve(a, x * x)[0] for a, x in starts]
-    # Here, for most sources are even: it costs the nodes 25 MB.
-    from scipy.optimize import minimize
     found = minimize(lambda z: likelihood.solve(z[0], z[1] * z[1])[0],
                      starts[int(np.argmin(values))], method='L-BFGS-B',
                      bounds=[(low, high), (0.0, math.sqrt(_MOST_NOISE))],
@@ -130,10 +130,6 @@ def fit_exact(t: FloatArray, y: FloatArray, regressors: FloatArray) -> ExactFit:
     edge = -1 if log_alpha < low + 0.05 else 1 if log_alpha > high - 0.05 else 0
     return ExactFit(math.exp(log_alpha), math.sqrt(scale), share * scale * likelihood.step,
                     beta, cov, -value, edge)
-
-
-# Samples up to which the exact likelihood is used (some 50 ms).
-MOST = 4096
 
 
 def fit_irregular(columns: FloatArray, moves: bool) -> Fitted:

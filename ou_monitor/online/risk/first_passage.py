@@ -18,7 +18,6 @@ import numpy.typing as npt
 from ou_monitor.model.passage.law import passage_probability
 from ou_monitor.model.passage.sampled import sampled_passage_probability
 from ou_monitor.records import Estimate, FloatArray, NAN
-from scipy.special import expit, logit
 
 # Nodes over where the supply is now; those of the other averages are below.
 _START_NODES = 3
@@ -180,9 +179,11 @@ def as_sampled(e: Estimate, supply: Supply, voltage: float, horizon: float,
     seen = sampled_passage_probability(
         start, barrier, alpha / e.rate, max(int(horizon * e.rate), 1), noise)
     certain = float(passage_probability(start, barrier, alpha * horizon))
-    odds = logit(np.clip([seen, risk, certain], _TINY, 1.0 - _TINY))
+    chances = np.clip([seen, risk, certain], _TINY, 1.0 - _TINY)
+    odds = (chances / (1.0 - chances)).tolist()
     # What errors do to the odds they do to both.
-    return float(expit(odds[0] + odds[1] - odds[2])) if 0.0 < seen < 1.0 else float(seen)
+    both = odds[0] * odds[1] / odds[2]
+    return both / (1.0 + both) if 0.0 < seen < 1.0 else float(seen)
 
 
 def _averaged(start: FloatArray, barrier: FloatArray, span: FloatArray, weight: FloatArray,

@@ -30,7 +30,6 @@ from ou_monitor.online.risk.lowest import (
 from ou_monitor.online.risk.past import (
     BLOCK, excursion_risk, excursions, Flown, flown, Past, pilot)
 from ou_monitor.records import FloatArray, NAN
-from scipy.special import expit
 
 # Horizons, s, from which the flight learns; those between are interpolated in ln h.
 RUNGS = (0.5, 1.0, 2.0, 5.0, 15.0)
@@ -292,7 +291,7 @@ class Forecast:
         if not math.isnan(passage):
             if alone or math.isnan(far):
                 return Outcome(passage, 'first_passage', DOMINANT[0])
-            share = float(expit(math.log(_ODDS - 1.0) + evidence))
+            share = 0.5 + 0.5 * math.tanh(0.5 * (math.log(_ODDS - 1.0) + evidence))
             first = missed * far + (1.0 - missed) * passage
             risk = share * first + (1.0 - share) * risk
             if share > 0.5:

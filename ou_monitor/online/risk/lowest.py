@@ -24,9 +24,9 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import INRUSH_TIME, ripple
+from ou_monitor.model.passage.law import normal_below
 from ou_monitor.online.load.supply_load import LAGS, LoadState, POWER
 from ou_monitor.records import FloatArray
-from scipy.special import ndtr, stdtr
 
 # The first group after a rise, in time constants of the inrush.
 _RISE = 2.0
@@ -48,7 +48,7 @@ def _largest_medians() -> tuple[FloatArray, FloatArray, FloatArray]:
     since the last that passed), whose steps are doubled.
     """
     x = np.linspace(-6.0, 8.0, 561)
-    over = ndtr(-x)
+    over = normal_below(-x)
     step = np.zeros((x.size, 3, 3))
     step[:, 0, 0], step[:, 0, 1] = 1.0 - over, over
     step[:, 1, 2] = step[:, 2, 0] = 1.0 - over
@@ -167,6 +167,9 @@ def lowest(state: LoadState, futures: Futures, horizon: float, sampling: Samplin
 FREEDOM = 5.0
 _NORM = math.exp(math.lgamma(0.5 * FREEDOM + 0.5) - math.lgamma(0.5 * FREEDOM)) / math.sqrt(
     math.pi * (FREEDOM - 2.0))
+# Coefficients of its tail in the squares of sqrt(FREEDOM / (FREEDOM + t^2)), last first.
+_TAIL = [8.0 / (3.0 * math.pi) * math.comb(2 * k, k) / 4.0**k / (2 * k + 5)
+         for k in range(9, -1, -1)]
 # Horizons' worth of the prior, its variance, and the prior of bias and gain.
 _PRIOR, _PRIOR_VARIANCE = 5.0, 3.0
 _BIAS, _GAIN = 0.5, 0.4
@@ -185,8 +188,13 @@ def density(x: FloatArray, mean: FloatArray, deviation: FloatArray) -> FloatArra
 
 def below(level: float, mean: FloatArray, deviation: FloatArray) -> FloatArray:
     """Return P(x < level) of that Student's t, elementwise."""
-    return np.asarray(stdtr(FREEDOM, (level - mean) / deviation
-                            * math.sqrt(FREEDOM / (FREEDOM - 2.0))))
+    t = (level - mean) / deviation * math.sqrt(FREEDOM / (FREEDOM - 2.0))
+    # Abramowitz & Stegun 26.7.4; far out its terms cancel, and the tail is summed.
+    angle = np.arctan2(math.sqrt(FREEDOM), np.abs(t))
+    c = np.sin(angle)
+    tail = (angle - np.cos(angle) * c * (1.0 + 2.0 / 3.0 * c * c)) / math.pi
+    tail = np.where(c < 0.2, c**5 * np.polyval(_TAIL, c * c), tail)
+    return np.asarray(np.where(t < 0.0, tail, 1.0 - tail))
 
 
 class LowestLaw:

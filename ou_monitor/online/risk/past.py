@@ -29,7 +29,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from ou_monitor.online.risk.lowest import Futures
 from ou_monitor.records import FloatArray, NAN
-from scipy.special import expit
 
 # Length of a block, s, how much is kept, s, and the silence that is not bridged, s.
 BLOCK, KEPT, SILENCE = 0.05, 300.0, 2.5
@@ -188,8 +187,8 @@ def excursion_risk(now: float, levels: FloatArray, horizon: float, mean: float, 
     margin = np.maximum(now - levels, 0.0) / deviation
     far = np.minimum(margin, _FARTHEST)
     score = b[0] + b[1] * np.clip(far - mean / deviation, -4.0, _FARTHEST) + b[2] * far
-    return np.asarray(expit(score) * np.minimum(1.0, _FARTHEST / np.maximum(
-        margin, _FARTHEST)) ** _POWER)
+    return np.asarray(np.minimum(1.0, _FARTHEST / np.maximum(margin, _FARTHEST)) ** _POWER / (
+        1.0 + np.exp(-score)))
 
 
 # Throttle that makes a past instant like the present, and s in which it is forgotten.

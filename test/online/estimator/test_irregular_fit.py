@@ -6,7 +6,10 @@ from dense import kalman_log_likelihood, ou_covariance, restricted
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.model.ou import simulate
+from ou_monitor.online.estimator import estimator as module
+from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.estimator.irregular import _Likelihood, fit_exact
+from ou_monitor.records import Status
 import pytest
 
 
@@ -123,3 +126,19 @@ def test_edges_are_told():
     swing = rng.standard_normal(400) * 0.1 + (-1.0) ** np.arange(400)
     assert fit_exact(t, swing, x).edge == 1
     assert fit_exact(t, simulate(t, 30.0, 0.5, rng), x).edge == 0
+
+
+def test_a_node_waits_for_no_module(monkeypatch):
+    """Until the exact fit is loaded its windows are as of too few samples; then all is told."""
+    there = []
+    monkeypatch.setattr(module, 'loaded', lambda name: bool(there))
+    t, y, _ = made(3, n=1500)
+    for background in (True, False):
+        one = SlidingEstimator(60.0, background=background)
+        one.push(t, y)
+        assert (one.estimate().status is Status.TOO_FEW_SAMPLES) == background
+        there.append(True)
+        again = SlidingEstimator(60.0, background=background)
+        again.push(t, y)
+        assert again.estimate().status is Status.OK
+        there.clear()

@@ -95,7 +95,7 @@ def model(*terms):
 def test_jumps_change_the_odds_by_orders_of_magnitude():
     """Drops of 0.5 V, ten a minute: within 1 s one comes with a chance of 15 %."""
     plain, jumpy = SupplyMonitor(SETTINGS), SupplyMonitor(
-        SETTINGS, model(Jumps(10.0 / 60.0, -0.5, 0.02)), background=False)
+        SETTINGS, model(Jumps(10.0 / 60.0, -0.5, 0.02)))
     before, after = (flown(m, [(0.2, 3.0)]).risk for m in (plain, jumpy))
     # The excursions have their say.
     assert before < 1e-5
@@ -103,7 +103,7 @@ def test_jumps_change_the_odds_by_orders_of_magnitude():
 
 
 def test_a_model_is_taken_and_dropped_without_a_loss():
-    monitor = SupplyMonitor(SETTINGS, background=False)
+    monitor = SupplyMonitor(SETTINGS)
     first = flown(monitor, [(0.2, 3.0)])
     monitor.set_model(model(Jumps(1.0, -0.5, 0.0), Tone(0.01, 100.0, 0.0, 0.0),
                             LoadSag(0.3, 0.0), MeasurementNoise(0.01)))
@@ -117,7 +117,7 @@ def test_a_model_is_taken_and_dropped_without_a_loss():
 
 
 def test_until_the_tables_are_there_the_risk_is_unknown_not_small():
-    monitor = SupplyMonitor(SETTINGS)
+    monitor = SupplyMonitor(SETTINGS, background=True)
     flown(monitor, [(0.2, 3.0)])
     monitor.set_model(model(Jumps(10.0 / 60.0, -0.5, 0.02)))
     assert math.isnan(monitor.report(0.0).risk)
