@@ -85,20 +85,7 @@ def parse_element(name: str, index: int, kind: str) -> Element:
 
 
 class Scan:
-    """
-    Layout of the scans of a buffer.
-
-    Parameters
-    ----------
-    elements : sequence of Element
-        Those that are enabled.
-
-    Attributes
-    ----------
-    size : int
-        Bytes in one scan.
-
-    """
+    """Layout of the scans of a buffer with the elements that are enabled; `size` in bytes."""
 
     def __init__(self, elements: Sequence[Element]) -> None:
         self._elements = {element.name: element for element in elements}
@@ -162,32 +149,11 @@ class Block:
 
 class IioBuffer:
     """
-    The buffer of one IIO device.
+    The buffer of one IIO device: its folder in sysfs and its character device.
 
-    Parameters
-    ----------
-    folder : Path
-        Its folder in sysfs.
-    character : Path
-        Its character device.
-    channel : str
-        'in_voltage0'; empty: the only voltage channel.
-    block : int
-        Samples that are read at a time; 0: those of 10 ms.
-    rate : float
-        Sampling frequency to set, Hz; 0: as it is.
-    trigger : str
-        Name of the trigger to set; empty: as it is.
-
-    Attributes
-    ----------
-    rate : float
-        Sampling frequency by the device, Hz; NaN when it does not say.
-    block : int
-        Samples that are read at a time.
-    holes : int
-        Times at which samples were missing, by the kernel's stamps.
-
+    `channel` is 'in_voltage0' or empty (the only one), `block` samples are read at a time (0: as
+    many as in 10 ms), `rate`, Hz, and `trigger` are set unless 0 and empty.  Then `rate` is that
+    of the device, NaN when it does not say; `holes`: when samples were missing, by its stamps.
     """
 
     def __init__(self, folder: Path, character: Path, channel: str = '', block: int = 0,

@@ -103,22 +103,9 @@ USUAL_RATE = 10.0
 
 class PolledChannel:
     """
-    One channel of a hwmon or IIO device.
+    One channel ('in1', 'in_voltage0'; empty: the only one) of a hwmon or IIO device.
 
-    Parameters
-    ----------
-    folder : Path
-        Its folder in sysfs.
-    channel : str
-        'in1' of a hwmon, 'in_voltage0' of an IIO device; empty: the only one.
-
-    Attributes
-    ----------
-    channel : str
-        The channel.
-    rate : float
-        How often the driver converts, Hz, or 10 where it does not say.
-
+    `rate` is how often the driver converts, Hz, or 10 where it does not say.
     """
 
     def __init__(self, folder: Path, channel: str = '') -> None:

@@ -23,22 +23,7 @@ def seen_range(voltage: FloatArray) -> tuple[float, float]:
 
 
 def stray(simulated: FloatArray, voltage: FloatArray) -> float:
-    """
-    Return how far simulations lie outside what was seen, V; 0 where each lies within.
-
-    Parameters
-    ----------
-    simulated : ndarray, shape (..., n)
-        One simulation or many, V; one that is not finite is infinitely far.
-    voltage : ndarray, shape (m,)
-        The recording, V.
-
-    Returns
-    -------
-    float
-        Distance of the farthest sample from the range of `seen_range`, V.
-
-    """
+    """Return how far simulations, V, shape (..., n), leave `seen_range`, V; inf: not finite."""
     low, high = seen_range(voltage)
     if not np.isfinite(simulated).all():
         return float('inf')

@@ -52,28 +52,11 @@ class StateSpace:
 
 class Filter:
     """
-    Gains and predictive variances of a model; filters any number of series.
+    Gains and predictive variances of a model; filters any number of series of n samples.
 
-    Parameters
-    ----------
-    model : StateSpace
-        The model, of all samples or of the first ones.
-    n : int, optional
-        Samples; beyond those of `model` it is taken as constant and settled.
-
-    Attributes
-    ----------
-    variance : ndarray, shape (n,)
-        Variance of the one-step innovations, V^2.
-    shape : (int, int)
-        Samples whose gains were found one by one, and states.
-
-    Raises
-    ------
-    ValueError
-        When the precision is not positive definite: a covariance is singular
-        or not finite.
-
+    Beyond the samples of the model it is taken as constant and settled.  `variance`, V^2, shape
+    (n,), is that of the innovations; `shape`: samples with gains of their own, and states.
+    ValueError when the precision is not positive definite.
     """
 
     def __init__(self, model: StateSpace, n: int | None = None) -> None:

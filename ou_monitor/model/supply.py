@@ -118,17 +118,9 @@ class SupplyModel:
 
 class Simulation:
     """
-    A simulation that goes on from segment to segment.
+    A simulation that goes on from segment to segment; each term gets a child of `rng`.
 
     The same seed gives the same samples, to rounding, whatever the segments.
-
-    Parameters
-    ----------
-    model : SupplyModel
-        What is simulated.
-    rng : numpy.random.Generator
-        Source of randomness; each term gets a child of it.
-
     """
 
     def __init__(self, model: SupplyModel, rng: np.random.Generator) -> None:

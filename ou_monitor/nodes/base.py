@@ -49,22 +49,10 @@ class MonitorNode(Node):
     """
     Node whose parameters come from a table.
 
-    A parameter change is checked as a whole (`check` raises `ValueError` with
-    the reason and the old values stay) and then handed to `apply`, which must
-    not lose state.
-
-    Parameters
-    ----------
-    name : str
-        Node name.
-    table : sequence of Parameter
-        Parameters that may change at run time.
-    fixed : sequence of Parameter
-        Parameters that are read once, at the start.
-    managed : bool
-        Whether the node begins when it is activated (lifecycle), and then
-        reads `fixed` anew; else `begin` is called at the end of its making.
-
+    A change of those in `table` is checked as a whole (`check` raises `ValueError` with the reason
+    and the old values stay) and then handed to `apply`, which must not lose state.  Those in
+    `fixed` are read once, at the start; a managed node begins when it is activated (lifecycle),
+    and then reads them anew, else `begin` is called at the end of its making.
     """
 
     # Whether it works: between begin and stop.

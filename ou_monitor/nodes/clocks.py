@@ -151,13 +151,8 @@ class SendClock:
     """
     Turn source timestamps of single samples into stamps.
 
-    Attributes
-    ----------
-    in_bursts : bool
-        The messages come in bursts that show no steady source: their times are worth nothing.
-    settled : int
-        How often a line was found after times that were worth nothing had been given.
-
+    `in_bursts`: the messages show no steady source, and their times are worth nothing; `settled`:
+    how often a line was found after such times had been given.
     """
 
     def __init__(self) -> None:

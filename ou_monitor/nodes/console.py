@@ -14,15 +14,7 @@ AGAIN = 60.0
 
 
 class Console:
-    """
-    Says what changes.
-
-    Parameters
-    ----------
-    node : MonitorNode
-        Whose logger is used.
-
-    """
+    """Says what changes, with the node's logger."""
 
     def __init__(self, node: MonitorNode) -> None:
         self._node = node

@@ -47,18 +47,7 @@ CLOCK_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class Stamper:
-    """
-    Time of messages, and notice when that time steps back.
-
-    Parameters
-    ----------
-    node : MonitorNode
-        Whose clock and subscriptions are used.
-    on_jump : callable
-        Called with the reason when the clock stepped: what came before is
-        void.
-
-    """
+    """Time of messages; `on_jump` is called with the reason when that clock stepped."""
 
     def __init__(self, node: MonitorNode, on_jump: Callable[[str], None]) -> None:
         self._node = node
@@ -171,26 +160,8 @@ class PolledInput:
     """
     One field of the messages of a topic, fetched when it is asked for, many at a time.
 
-    Parameters
-    ----------
-    node : MonitorNode
-        Who subscribes.
-    kind : type
-        Message class.
-    topic : str
-        Topic.
-    spec : FieldSpec
-        Which field, which stamp.
-    beside : FieldSpec, optional
-        A second field of the same messages, one number in each.
-
-    Attributes
-    ----------
-    publishers : Publishers
-        Who sends, and what was lost.
-    unreadable : int
-        Messages that could not be decoded.
-
+    `spec` says which field and stamp, `beside` a second field, of one number in each.
+    `publishers` are who sends, `unreadable` counts messages that could not be decoded.
     """
 
     def __init__(self, node: MonitorNode, kind: Any, topic: str, spec: FieldSpec,

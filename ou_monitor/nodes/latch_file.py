@@ -21,20 +21,9 @@ _KEYS = {'node', 'level', 'reason', 'time'}
 
 class LatchFile:
     """
-    Remembers that the flag of one node is latched.
+    Remembers that the flag of one node is latched: in a file, or in one of a folder.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file; of a folder a file in it, named after the node.
-    node : str
-        Full name of the node.
-
-    Attributes
-    ----------
-    problem : str
-        Why the file could not be read or written, in one line; empty when it could.
-
+    `problem` says why the file could not be read or written, in one line.
     """
 
     def __init__(self, path: str | Path, node: str) -> None:

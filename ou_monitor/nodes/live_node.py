@@ -39,15 +39,7 @@ _BESIDE = ('sigma', 'state', 'rpm', 'throttle', 'clock')
 
 
 class LiveNode(Node):
-    """
-    Listens, and makes rows for the page.
-
-    Parameters
-    ----------
-    estimator, low_pass : str
-        Names of the nodes that are listened to.
-
-    """
+    """Listens to the nodes `estimator` and `low_pass`, and makes rows for the page."""
 
     def __init__(self, estimator: str, low_pass: str) -> None:
         super().__init__('ou_live')

@@ -23,15 +23,9 @@ class ModelChoice:
     """
     Model of the parameter `model_file`.
 
-    A file is read when the path changes, not again when another parameter
-    does: give an empty path and then the old one to have it read anew.  It is read in a thread.
-    What is not read within `PATIENCE` comes into force later, or becomes the `problem`.
-
-    Attributes
-    ----------
-    problem : str
-        What is wrong with the file given last, in one line; empty when nothing is.
-
+    A file is read when the path changes, not again when another parameter does: give an empty path
+    and then the old one to have it read anew.  It is read in a thread.  What is not read within
+    `PATIENCE` comes into force later, or becomes the `problem`, one line.
     """
 
     def __init__(self) -> None:

@@ -19,20 +19,8 @@ class MotorInputs:
     """
     Newest throttle, and motor speeds that have not been asked for yet.
 
-    Parameters
-    ----------
-    node : MonitorNode
-        Whose subscriptions these are.
-    values : mapping
-        Parameters of `sources.MOTOR_PARAMETERS`.
-    now : callable
-        Monotonic clock, s.
-
-    Attributes
-    ----------
-    problems : dict of str to str
-        Why a quantity is not used.
-
+    By the values of `sources.MOTOR_PARAMETERS` and a monotonic clock, s; `problems` says of a
+    quantity why it is not used.
     """
 
     def __init__(self, node: MonitorNode, values: Mapping[str, Any],

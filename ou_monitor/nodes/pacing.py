@@ -91,18 +91,7 @@ SWITCH = 0.0002
 
 
 class Prefetch(Generic[Item]):
-    """
-    Iterate over a source that a thread reads ahead.
-
-    Parameters
-    ----------
-    source : iterable
-        Read in the thread; what it raises is raised where the iteration
-        reaches that point.
-    ahead : int
-        Items held at most.
-
-    """
+    """Iterate over a source that a thread reads ahead, by so many items; it raises in turn."""
 
     def __init__(self, source: Iterable[Item], ahead: int = AHEAD) -> None:
         self._source = source

@@ -35,24 +35,7 @@ Message = tuple[str, str, int, bytes]
 
 
 class Player(Node):
-    """
-    Publishes one bag.
-
-    Parameters
-    ----------
-    name : str
-        Node name.
-    bag : BagReader
-        What to play.
-    options : argparse.Namespace
-        Options of `replay`, checked.
-
-    Raises
-    ------
-    InputError
-        When a topic is not in the bag, or nothing is left to play.
-
-    """
+    """Publishes one bag, by the checked options of `replay`."""
 
     def __init__(self, name: str, bag: BagReader, options: argparse.Namespace) -> None:
         super().__init__(name, start_parameter_services=False)

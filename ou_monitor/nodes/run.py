@@ -176,12 +176,8 @@ class ServiceManager:
     """
     The service manager that has started this process, if one has.
 
-    Attributes
-    ----------
-    interval : float
-        How often it is to be told that the process works, s: half of the time after which it
-        would end the process; 0: not at all.
-
+    `interval`, s, is how often it is told that the process works: half of the time after which it
+    would end the process; 0: not at all.
     """
 
     def __init__(self) -> None:

@@ -47,17 +47,7 @@ class Supply(NamedTuple):
 
 
 class SupplyInput:
-    """
-    Newest of `sigma` and `state`, each forgotten when it is stale.
-
-    Parameters
-    ----------
-    now : callable
-        Monotonic clock, s.
-    topics : tuple of str
-        Resolved names of `sigma` and `state`, for what is told.
-
-    """
+    """Newest of `sigma` and `state`, each forgotten when it is stale (`now`: monotonic, s)."""
 
     def __init__(self, now: Callable[[], float], topics: tuple[str, str]) -> None:
         self._topic, self._state_topic = topics

@@ -33,23 +33,9 @@ CHUNK_SIZE = 128 * 1024  # bytes
 
 class BagTarget:
     """
-    A new .mcap file, or a new rosbag2 directory with one in it.
+    A new .mcap file, or a new rosbag2 directory with one in it: `file`, open for writing.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        Ends in .mcap for a file; else a directory is made.
-
-    Attributes
-    ----------
-    file : binary file
-        The MCAP file, open for writing.
-
-    Raises
-    ------
-    InputError
-        When the target exists, its folder does not, or it cannot be written.
-
+    InputError when the target exists, its folder does not, or it cannot be written.
     """
 
     def __init__(self, path: Path) -> None:

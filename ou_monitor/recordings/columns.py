@@ -116,27 +116,11 @@ def _spread(begin: IntArray, count: IntArray) -> IntArray:
 
 class FieldReader:
     """
-    Reads one field, and its stamp, of messages of one type.
+    Reads one field, and its stamp, of messages of one type (ros2msg text `definition`).
 
-    Parameters
-    ----------
-    spec : FieldSpec
-        Which field, which stamp, which unit.  Its `nan` rule is not applied:
-        what is not finite is NaN.
-    definition : str
-        The ros2msg text of the type.
-    decoder : callable
-        Returns the general decoder of the type, bytes -> message; asked for
-        once, and only when it is needed.
-    broken : callable, optional
-        Called with the log time (ns) of a message that cannot be decoded and
-        with the error; when it returns, the message is left out.
-
-    Attributes
-    ----------
-    general : int
-        Messages that went the general way.
-
+    The `nan` rule of `spec` is not applied: what is not finite is NaN.  `decoder` returns the
+    general decoder, and is asked only when needed; `broken` is called with the log time, ns, of a
+    message that cannot be decoded and the error.  `general` counts messages that went that way.
     """
 
     def __init__(

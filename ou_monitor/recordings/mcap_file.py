@@ -51,28 +51,9 @@ class McapFile(McapIndex):
     """
     One .mcap file: its channels, and where its messages are (see `McapIndex`).
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        The file.
-    partial : bool
-        Whether the whole file is walked for damage, whatever its summary says.
-    codec : Codec
-        Reader of the contents of records.
-    max_chunk : int, optional
-        Bytes that a chunk may unpack to; else as of `chunk_limit`.
-
-    Attributes
-    ----------
-    origin_ns : int
-        Where the time of the recording counts from, ns: the first message of
-        the bag that the file belongs to.
-
-    Raises
-    ------
-    InputError
-        When it is missing, empty or foreign.
-
+    `partial`: the whole file is walked for damage, whatever its summary says; `max_chunk`: bytes
+    that a chunk may unpack to, else as of `chunk_limit`; `origin_ns`: first message of the bag.
+    InputError when it is missing, empty or foreign.
     """
 
     def __init__(self, path: Path, partial: bool, codec: Codec,

@@ -98,36 +98,10 @@ class McapIndex:
     """
     What is known of one .mcap file.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        The file.
-    codec : Codec
-        Reader of the contents of records.
-
-    Attributes
-    ----------
-    topics : dict of int to TopicRecord
-        Channels of ROS 2 messages.
-    skipped : set of int
-        Other channels.
-    schemas : dict of int to schema
-        Definitions by their numbers.
-    counts : dict of int to int
-        Messages of each channel in `topics`.
-    spans : list of Span
-        Where they are.
-    breaks : list of Break
-        Damage, in the order of the file; what is outside of it is in `spans`.
-    about : dict of str to str
-        What its metadata records say of the recording.
-    notes : list of str
-        Topics left out, and the like.
-    start_ns, end_ns : int
-        Log times of the first and last message, ns.
-    chunk_limit, file_limit : int
-        Bytes that one chunk, and all of them, may unpack to.
-
+    `topics`: channels of ROS 2 messages, `skipped` the others, `schemas` definitions by number,
+    `counts` messages of each channel, `spans` where they are, `breaks` damage in the order of the
+    file, `about` its metadata, `notes` topics left out; `start_ns`, `end_ns` log times of first
+    and last message; `chunk_limit`, `file_limit` bytes that one chunk, or all, may unpack to.
     """
 
     def __init__(self, path: Path, codec: Codec) -> None:

@@ -137,32 +137,9 @@ class SampleReader:
     """
     Reads voltage and throttle of a bag, keeping only what has not been taken.
 
-    Parameters
-    ----------
-    bag : BagReader
-        The bag.
-    msg_config, voltage_topic, throttle_topic :
-        As in `read_recording`.
-    start, end : float or None
-        Part to read, s after the first message.
-
-    Attributes
-    ----------
-    name : str
-        Of the bag, for people.
-    duration : float
-        From the first to the last message of the whole bag, s.
-    source : dict of str to str
-        Topics, types and files; what the bag says of itself; `vehicle`, where
-        that or the log it was converted from names one.
-    held : int
-        Samples read and not taken.
-
-    Raises
-    ------
-    InputError
-        When the topics cannot be told, or the part holds no voltage.
-
+    Topics as in `read_recording`, `start` and `end` in s after the first message.  `duration`, s,
+    is that of the whole bag, `source` topics, types, files and what the bag says of itself, `held`
+    samples read and not taken.  InputError: the topics cannot be told, or there is no voltage.
     """
 
     def __init__(

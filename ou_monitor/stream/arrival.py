@@ -33,12 +33,8 @@ class SourceClock:
     """
     Age of the newest sample, counted from its stamp where that is of our clock.
 
-    Attributes
-    ----------
-    name : str
-        'ros': stamps are of the node's clock; 'foreign': they are not, and only the arrival
-        counts; 'unknown': nothing has arrived.
-
+    `name` is 'ros' for stamps of the node's clock, 'foreign' where only the arrival counts, and
+    'unknown' before anything has arrived.
     """
 
     def __init__(self) -> None:

@@ -32,24 +32,10 @@ GAP_LEAST = 0.25  # s
 
 class BlockClock:
     """
-    Turns the stamps of blocks into stamps of samples.
+    Turns the stamps of blocks into stamps of samples of a rate, Hz.
 
-    Parameters
-    ----------
-    sample_rate : float
-        Rate of the samples within a block, Hz.
-
-    Attributes
-    ----------
-    gaps : int
-        Times the time line was started anew because a stamp was further than
-        max(2 blocks, 0.25 s) from where it was expected.
-
-    Raises
-    ------
-    ValueError
-        When the rate is not positive and finite.
-
+    `gaps` counts when the time line was started anew, because a stamp was further than
+    max(2 blocks, 0.25 s) from where it was expected.
     """
 
     def __init__(self, sample_rate: float) -> None:

@@ -62,20 +62,7 @@ class Extracted:
 
 
 class Extractor:
-    """
-    Takes one field and its stamp out of messages of one type.
-
-    Parameters
-    ----------
-    spec : FieldSpec
-        Which field, which stamp, which unit.
-
-    Raises
-    ------
-    InputError
-        When a path in `spec` is malformed.
-
-    """
+    """Takes one field and its stamp out of messages of one type; InputError: malformed path."""
 
     def __init__(self, spec: FieldSpec) -> None:
         """Prepare the paths once; messages arrive at kHz."""
@@ -177,16 +164,7 @@ class ManyExtractor:
     """
     Takes several numbers out of messages of one type: a number, an array, or a field of each.
 
-    Parameters
-    ----------
-    spec : FieldSpec
-        Which; 'esc[].esc_rpm' is that field of each element of `esc`.
-
-    Raises
-    ------
-    InputError
-        When the path is malformed.
-
+    'esc[].esc_rpm' is that field of each element of `esc`.  InputError when a path is malformed.
     """
 
     def __init__(self, spec: FieldSpec) -> None:

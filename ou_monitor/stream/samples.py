@@ -43,15 +43,7 @@ SLACK = 0.1
 
 
 class ThrottleHold:
-    """
-    Places throttle values on the time line of the voltage, and looks them up.
-
-    Parameters
-    ----------
-    sample_rate : float, optional
-        Rate of the samples within a block of voltage, Hz; None: no blocks.
-
-    """
+    """Places throttle on the time line of the voltage (blocks: rate, Hz), and looks it up."""
 
     def __init__(self, sample_rate: float | None = None) -> None:
         self._slack = 0.0 if sample_rate is None else SLACK / sample_rate
@@ -124,25 +116,10 @@ KEEP = 1024
 
 class SampleStream:
     """
-    Collects samples between two reports.
+    Collects samples between two reports, for the monitor; throttle is paired at each `flush`.
 
-    Throttle is paired by the rule of `ThrottleHold`, at each `flush`.
-
-    Parameters
-    ----------
-    monitor : SupplyMonitor
-        Gets the samples at `flush`.
-
-    Attributes
-    ----------
-    messages : int
-        Voltage messages taken.
-    unplaced : int
-        Messages that could not be placed in time (`/clock` not there yet); only the floor judges
-        them.
-    thin : int
-        Of so many samples one is estimated from; see `SupplyMonitor.push`.
-
+    `messages` of voltage were taken, `unplaced` could not be placed in time (`/clock` not there
+    yet) and only the floor judges them; of `thin` samples one is estimated from.
     """
 
     def __init__(self, monitor: SupplyMonitor) -> None:

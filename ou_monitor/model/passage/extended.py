@@ -55,23 +55,11 @@ class _Cell:
 
 class ExtendedPassage:
     """
-    Probability of going below a level, with other terms of a model.
+    Probability of going below a level, with other terms of a model; its `ou` is given live.
 
-    `prepare` makes tables for a small range of alpha and sigma, in a thread of its
-    own if wished; `probability` only looks them up.
-
-    Parameters
-    ----------
-    model : SupplyModel
-        Its `ou` is not used: that is given live.
-
-    Attributes
-    ----------
-    used : tuple of str
-        Names of the terms that change the risk.
-    left_out : tuple of str
-        Names of the terms that move the supply and that the risk does not know of.
-
+    `prepare` makes tables for a small range of alpha and sigma, in a thread of its own if wished;
+    `probability` only looks them up.  `used` and `left_out` name the terms that change the risk,
+    and those that move the supply and that the risk does not know of.
     """
 
     def __init__(self, model: SupplyModel) -> None:

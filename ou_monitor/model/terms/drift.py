@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
-from ou_monitor.model.terms.term import NEXT_TO_ZERO, parameter, Role, Term
+from ou_monitor.model.terms.term import by_parameters, NEXT_TO_ZERO, parameter, Role, Term
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,10 @@ class Drift(Term):
     FAMILY: ClassVar[str] = 'slow'
     STAGE: ClassVar[Stage] = Stage.LEVEL
     ROLE: ClassVar[Role] = Role.MEAN
-    LINEAR: ClassVar[tuple[str, ...]] = ('rate', 'curvature')
+    # The curvature is left out of a fit where it is 0.
+    LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
+        ('rate', 'curvature'),
+        lambda term: ('rate', 'curvature') if term.curvature else ('rate',))
     SIGNS: ClassVar[tuple[str, ...]] = ('time', 'band 0')
     MEASURED: ClassVar[bool] = True
     # Time mends a little of whatever the form of a larger effect leaves.
@@ -35,11 +38,6 @@ class Drift(Term):
 
     rate: float = parameter('V/s', 'slope at the first sample')
     curvature: float = parameter('V/s^2', 'coefficient of t^2')
-
-    def check(self) -> None:
-        """Leave the curvature out of a fit where it is 0."""
-        if self.curvature == 0.0:
-            object.__setattr__(self, 'LINEAR', ('rate',))
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""

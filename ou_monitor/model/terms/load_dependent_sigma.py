@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
-from ou_monitor.model.terms.term import Live, parameters, Role, Term
+from ou_monitor.model.terms.term import by_parameters, Live, parameters, Role, Term
 from ou_monitor.records import FloatArray
 
 
@@ -29,6 +29,9 @@ class LoadDependentSigma(Term):
     ROLE: ClassVar[Role] = Role.DRIVE
     SIGNS: ClassVar[tuple[str, ...]] = ('variance throttle',)
     MEASURED: ClassVar[bool] = True
+    # Where it steps was searched for.
+    SEARCH: ClassVar[float] = by_parameters(
+        0.0, lambda term: _STEP_PRICE if term.steps() else 0.0)
     LIVE: ClassVar[Live] = Live.BY_THROTTLE
     MEANING: ClassVar[str] = 'The noise grows or shrinks with throttle.'
     REMEDY: ClassVar[str] = (
@@ -44,11 +47,12 @@ class LoadDependentSigma(Term):
             raise ValueError(
                 f'{self.NAME}: throttle and log_factor need the same number of values, got '
                 f'{len(self.throttle)} and {len(self.log_factor)}')
-        if len(self.throttle) == 2 and self.throttle[1] - self.throttle[0] < 3.0 * _EDGE:
-            # Where it steps was searched for.
-            object.__setattr__(self, 'SEARCH', _STEP_PRICE)
         if any(b <= a for a, b in zip(self.throttle, self.throttle[1:])):
             raise ValueError(f'{self.NAME}.throttle must rise, got {list(self.throttle)}')
+
+    def steps(self) -> bool:
+        """Return whether it is one step."""
+        return len(self.throttle) == 2 and self.throttle[1] - self.throttle[0] < 3.0 * _EDGE
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
-from ou_monitor.model.terms.term import Live, NEXT_TO_ZERO, parameter, Role, Term
+from ou_monitor.model.terms.term import by_parameters, Live, NEXT_TO_ZERO, parameter, Role, Term
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,9 @@ class LoadSag(Term):
     STAGE: ClassVar[Stage] = Stage.LEVEL
     NEEDS_THROTTLE: ClassVar[bool] = True
     ROLE: ClassVar[Role] = Role.MEAN
-    LINEAR: ClassVar[tuple[str, ...]] = ('linear', 'square')
+    # The square is left out of a fit where it is 0.
+    LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
+        ('linear', 'square'), lambda term: ('linear', 'square') if term.square else ('linear',))
     SIGNS: ClassVar[tuple[str, ...]] = ('throttle',)
     MEASURED: ClassVar[bool] = True
     LIVE: ClassVar[Live] = Live.BY_THROTTLE
@@ -38,11 +40,6 @@ class LoadSag(Term):
 
     linear: float = parameter('V', 'fall at full throttle, linear part')
     square: float = parameter('V', 'fall at full throttle, square part')
-
-    def check(self) -> None:
-        """Leave the square out of a fit where it is 0."""
-        if self.square == 0.0:
-            object.__setattr__(self, 'LINEAR', ('linear',))
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""

@@ -11,7 +11,7 @@ import numpy as np
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import broad_peaks, keeps_its_height, rotation
 from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
-from ou_monitor.model.terms.term import parameter, Role, Term
+from ou_monitor.model.terms.term import by_parameters, parameter, Role, Term
 from ou_monitor.model.terms.tone import SHARP, WIDEST
 from ou_monitor.records import FloatArray
 
@@ -31,7 +31,10 @@ class Resonance(Term):
     FAMILY: ClassVar[str] = 'line'
     STAGE: ClassVar[Stage] = Stage.LEVEL
     ROLE: ClassVar[Role] = Role.BLOCK
-    FREE: ClassVar[tuple[str, ...]] = ('frequency', 'damping', 'std')
+    # The tilt is fitted where it is not 0.
+    FREE: ClassVar[tuple[str, ...]] = by_parameters(
+        ('frequency', 'damping', 'std'),
+        lambda term: ('frequency', 'damping', 'std', *(('tilt',) if term.tilt else ())))
     DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('line', '+band', 'autocorrelation')
     SEARCH: ClassVar[float] = 5.0
@@ -51,11 +54,6 @@ class Resonance(Term):
     damping: float = parameter('1/s', 'rate at which ringing dies out', 0.0, above=True)
     std: float = parameter('V', 'standard deviation', 0.0)
     tilt: float = parameter('', 'slope of the spectrum: 1 low-pass, -1 band-pass', -1.0, 1.0)
-
-    def check(self) -> None:
-        """Fit the tilt where it is not 0."""
-        if self.tilt != 0.0:
-            object.__setattr__(self, 'FREE', ('frequency', 'damping', 'std', 'tilt'))
 
     def moved(self, name: str, by: float) -> Resonance:
         """Return the term with one coordinate moved: the tilt itself, logarithms else."""

@@ -12,16 +12,18 @@ know of it from the class.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 import enum
 import math
-from typing import Any, ClassVar, Self
+from typing import Any, cast, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 from ou_monitor.model.terms.laws import LawFit, View
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.records import FloatArray
+
+Value = TypeVar('Value')
 
 # A coefficient to start from that is not left out as 0 is.
 NEXT_TO_ZERO = 1e-12
@@ -65,6 +67,21 @@ def parameters(unit: str, text: str) -> Any:
     """Declare a parameter that is a list of numbers; as `parameter`, any finite value."""
     return field(metadata={'unit': unit, 'text': text, 'low': -math.inf, 'high': math.inf,
                            'above': False, 'several': True})
+
+
+class _ByParameters(Generic[Value]):
+    """What a class says of its terms, and each term from its own parameters."""
+
+    def __init__(self, usual: Value, own: Callable[[Any], Value]) -> None:
+        self._usual, self._own = usual, own
+
+    def __get__(self, term: Any, kind: type) -> Value:
+        return self._usual if term is None else self._own(term)
+
+
+def by_parameters(usual: Value, own: Callable[[Any], Value]) -> Value:
+    """Declare an attribute of a class that a term works out from its parameters."""
+    return cast('Value', _ByParameters(usual, own))
 
 
 @dataclass(frozen=True)

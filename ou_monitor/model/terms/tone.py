@@ -12,7 +12,7 @@ from ou_monitor.model.spectral_lines import find_lines, fit_sinusoid, Line, on_g
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import keeps_its_height, rotation
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
-from ou_monitor.model.terms.term import parameter, Role, Term
+from ou_monitor.model.terms.term import by_parameters, parameter, Role, Term
 from ou_monitor.records import FloatArray
 
 
@@ -28,8 +28,13 @@ class Tone(Term):
     NAME: ClassVar[str] = 'tone'
     FAMILY: ClassVar[str] = 'line'
     STAGE: ClassVar[Stage] = Stage.LEVEL
-    ROLE: ClassVar[Role] = Role.MEAN
-    LINEAR: ClassVar[tuple[str, ...]] = ('amplitude', 'phase')
+    # A line that wanders is two states, not known columns.
+    ROLE: ClassVar[Role] = by_parameters(
+        Role.MEAN, lambda term: Role.BLOCK if term.linewidth else Role.MEAN)
+    LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
+        ('amplitude', 'phase'), lambda term: () if term.linewidth else ('amplitude', 'phase'))
+    FREE: ClassVar[tuple[str, ...]] = by_parameters(
+        (), lambda term: ('amplitude', 'frequency', 'linewidth') if term.linewidth else ())
     SIGNS: ClassVar[tuple[str, ...]] = ('line',)
     SEARCH: ClassVar[float] = 10.0
     STATES: ClassVar[int] = 2
@@ -47,13 +52,6 @@ class Tone(Term):
     frequency: float = parameter('Hz', 'frequency', 0.0, above=True)
     phase: float = parameter('rad', 'phase at the first sample')
     linewidth: float = parameter('Hz', 'width of the line; 0: a pure tone', 0.0)
-
-    def check(self) -> None:
-        """Take a line that wanders as two states, not as known columns."""
-        if self.linewidth > 0.0:
-            object.__setattr__(self, 'ROLE', Role.BLOCK)
-            object.__setattr__(self, 'LINEAR', ())
-            object.__setattr__(self, 'FREE', ('amplitude', 'frequency', 'linewidth'))
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""

@@ -240,15 +240,7 @@ def build() -> Kernels:
 
 
 class Compilation:
-    """
-    Compiles once, in a thread.
-
-    Attributes
-    ----------
-    ready : Kernels or None
-        The compiled functions, as soon as they are there.
-
-    """
+    """Compiles once, in a thread; `ready` are the functions, None until they are there."""
 
     def __init__(self) -> None:
         self.ready: Kernels | None = None

@@ -61,23 +61,9 @@ class Moments:
     """
     Sample autocovariances of the voltage and of what may explain its mean.
 
-    Parameters
-    ----------
-    sums : Sums
-        Of the window; lags without pairs count as uncorrelated.
-    trend : bool
-        Whether time is a regressor.
-
-    Attributes
-    ----------
-    n : int
-        Samples.
-    mean : ndarray, shape (c,)
-        Means of voltage (less its reference), load, and time (0).
-    basis : ndarray, shape (c, r)
-        Load and time coefficients of each of the r regressors, which are
-        independent combinations of them; the last row is time.
-
+    Lags without pairs count as uncorrelated.  `mean`, shape (c,): of voltage (less its reference),
+    load, and time (0); `basis`, shape (c, r): coefficients of load and, last, time in each of r
+    independent regressors.
     """
 
     def __init__(self, sums: Sums, trend: bool) -> None:

@@ -210,15 +210,7 @@ class Intake:
 
 
 class Thinner:
-    """
-    Learns the rate of the source, and averages blocks of m samples where it is too fast.
-
-    Parameters
-    ----------
-    fastest : float
-        Highest rate at which samples are kept, Hz.
-
-    """
+    """Learns the rate of the source, and averages blocks of m samples beyond `fastest`, Hz."""
 
     def __init__(self, fastest: float) -> None:
         self._fastest = fastest

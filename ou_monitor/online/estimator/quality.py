@@ -111,18 +111,11 @@ def _several_sizes(sizes: FloatArray) -> bool:
 
 class Repeats:
     """
-    Drops repeats from a stream, in batches of any size.
+    Drops repeats from a stream, in batches of any size; `period`: samples per refresh.
 
-    A refresh may happen to give the value of the one before: in a run that is
-    longer than a period it is put where it belongs, so that dropping repeats
-    does not select changes.  It is passed on when half a period after it has
-    been seen.
-
-    Attributes
-    ----------
-    period : float
-        Samples per refresh; 1: nothing is dropped.
-
+    A refresh may happen to give the value of the one before: in a run that is longer than a period
+    it is put where it belongs, so that dropping repeats does not select changes.  It is passed on
+    when half a period after it has been seen.
     """
 
     def __init__(self) -> None:

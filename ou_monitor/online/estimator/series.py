@@ -101,12 +101,7 @@ class Series:
     """
     Columns over a sliding window, addressed by a sample number that only grows.
 
-    Parameters
-    ----------
-    reach : int
-        This many samples stay readable behind the window, for pairs that
-        reach back; `runs` counts up to it.
-
+    `reach` samples stay readable behind the window, for pairs that reach back.
     """
 
     def __init__(self, reach: int) -> None:

@@ -67,19 +67,7 @@ class Sums:
 
 
 class LagSums:
-    """
-    Slots over one `Series`.
-
-    Parameters
-    ----------
-    series : Series
-        The samples.
-    lags : int
-        Number of lags K.
-    slot : float
-        Length of a slot, s; slots are counted from `origin`, s.
-
-    """
+    """Slots of a length, s, counted from `origin`, s, over one `Series`, for so many lags."""
 
     def __init__(self, series: Series, lags: int, slot: float) -> None:
         self._series = series
@@ -306,17 +294,7 @@ FEWEST = 100
 
 
 class Resolution:
-    """
-    Samples and sums at one resolution.
-
-    Parameters
-    ----------
-    window : float
-        Length of the window, s.
-    parent : Resolution, optional
-        The next finer one, from which this one takes its samples.
-
-    """
+    """Samples and sums at one resolution of a window, s, taken from the next finer one."""
 
     def __init__(self, window: float, parent: Resolution | None = None) -> None:
         self.series = Series(LAGS)

@@ -72,17 +72,10 @@ class CurvePrior:
 
 class HatFilter:
     """
-    A piecewise-linear curve over throttle 0..1 and how well it is known.
+    A piecewise-linear curve over throttle 0..1, at even nodes, and how well it is known.
 
-    The state is the value at each node, and the drift of all of them together.
-
-    Parameters
-    ----------
-    nodes : int
-        Number of nodes, >= 2, evenly spaced from 0 to 1.
-    forgetting : float
-        Time in which the shape changes by `CurvePrior.change`, s.
-
+    The state is the value at each node, and the drift of all of them together; in `forgetting`, s,
+    the shape changes by `CurvePrior.change`.
     """
 
     def __init__(self, nodes: int, forgetting: float) -> None:

@@ -27,17 +27,7 @@ _NEARLY_ONE = 1.0 - 1e-12
 
 
 class EventRisk:
-    """
-    Risk that events add.
-
-    Parameters
-    ----------
-    model : SupplyModel
-        As `discover` saved it.
-    background : bool
-        Whether tables are made in a thread; else the caller waits for them.
-
-    """
+    """Risk that events of a model add; its tables are made in a thread, or waited for."""
 
     def __init__(self, model: SupplyModel, *, background: bool = True) -> None:
         kept = SupplyModel(tuple(term for term in model.terms if term.LIVE is not Live.BY_TIME))

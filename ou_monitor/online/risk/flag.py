@@ -243,16 +243,7 @@ class FlagState:
 
 
 class BrownoutFlag:
-    """
-    State machine of the flag.
-
-    Parameters
-    ----------
-    settings : MonitorSettings, optional
-        The `brownout_*` settings and `stale_after`; the defaults when left
-        out.
-
-    """
+    """State machine of the flag, by the `brownout_*` settings and `stale_after`."""
 
     def __init__(self, settings: MonitorSettings | None = None) -> None:
         self._settings = settings or MonitorSettings()

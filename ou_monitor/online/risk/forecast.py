@@ -129,15 +129,9 @@ class _Rung:
 
 class Forecast:
     """
-    Risk with throttle to come, and what a throttle would do.
+    Risk with throttle to come, and what a throttle would do; `push` feeds the load filter.
 
-    Parameters
-    ----------
-    loads : LoadFilter
-        The voltage under load; fed by `push`.
-    passage : callable
-        Gives the first-passage leg as it is now for a horizon, s; None when not known.
-
+    `passage` gives the first-passage leg as it is now for a horizon, s; None when not known.
     """
 
     def __init__(self, loads: LoadFilter, passage: Callable[[float], Passage | None]) -> None:

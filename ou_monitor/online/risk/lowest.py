@@ -248,15 +248,7 @@ class Calibrator:
 
 
 class FarShare:
-    """
-    Share of horizons that are not as a law says.
-
-    Parameters
-    ----------
-    right : float
-        Horizons that a law counts as right before any; one counts as wrong.
-
-    """
+    """Share of horizons that are not as a law says; `right` count as right before any."""
 
     def __init__(self, right: float = 1.0) -> None:
         self._right, self._wrong = right, 1.0

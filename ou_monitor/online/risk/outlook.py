@@ -182,15 +182,7 @@ _NEWEST = 3
 
 
 class Outlook:
-    """
-    Risk and throttle budget of one supply.
-
-    Parameters
-    ----------
-    background : bool
-        Whether tables for the terms of a model are made in a thread.
-
-    """
+    """Risk and throttle budget of one supply; tables for a model are made in a thread, or not."""
 
     def __init__(self, *, background: bool = True) -> None:
         # A third of a second, once: not while samples are coming.

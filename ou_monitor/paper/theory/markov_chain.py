@@ -181,15 +181,8 @@ class AliasTable:
     """
     Draws from the rows of a stochastic matrix in constant time.
 
-    Walker, ACM Trans. Math. Software 3 (1977) 253.
-
-    Attributes
-    ----------
-    keep : ndarray, shape (n, n)
-        Probability of keeping the column first chosen.
-    other : ndarray, shape (n, n)
-        Column taken otherwise.
-
+    Walker, ACM Trans. Math. Software 3 (1977) 253: `keep`, shape (n, n), the chance to keep the
+    column first chosen, `other` the column taken otherwise.
     """
 
     def __init__(self, probabilities: FloatArray) -> None:
