@@ -22,6 +22,13 @@ FORM = {
 ASK = {'publish': 'get_publisher_names_and_types_by_node',
        'subscribe': 'get_subscriber_names_and_types_by_node',
        'reply': 'get_service_names_and_types_by_node'}
+# What only managed nodes open.
+LIFECYCLE = ('change_state', 'get_state', 'get_available_states', 'get_available_transitions',
+             'get_transition_graph', 'transition_event')
+INPUTS = {'estimator': (('/voltage', '/throttle'), []),
+          'adaptive_filter': (('/input', '/throttle', '/rpm'), [
+              '-p', 'notch.count:=4', '-r', 'sigma:=ou_estimator/sigma',
+              '-r', 'state:=ou_estimator/state'])}
 
 
 def complaints(element: ElementTree.Element) -> list[str]:
@@ -94,10 +101,13 @@ def opened(probe, node: str) -> dict[str, set[str]]:
         return dict.fromkeys(ASK, set())
 
 
-def compare(probe, executable: str, node: str) -> None:
+def compare(probe, executable: str, node: str, managed: bool = False) -> None:
     """Wait until a node has opened what the policy allows, and nothing else."""
     wanted = allowed(executable)
     wanted.setdefault('subscribe', set())
+    if not managed:
+        wanted = {verb: names - {f'/{node}/{own}' for own in LIFECYCLE}
+                  for verb, names in wanted.items()}
     wait_until(lambda: all(wanted[verb] <= names for verb, names in opened(probe, node).items()),
                what=f'{node} to open {wanted}; it has {opened(probe, node)}')
     # What would come later is no part of the policy either.
@@ -105,26 +115,23 @@ def compare(probe, executable: str, node: str) -> None:
     assert opened(probe, node) == wanted, 'change security/ou_monitor_policy.xml with the node'
 
 
-def test_the_estimator_opens_what_the_policy_allows(world):
-    """With both inputs found and time from /clock, which is all that it can open."""
+@pytest.mark.parametrize('managed', [False, True])
+@pytest.mark.parametrize('name', INPUTS)
+def test_a_node_opens_what_the_policy_allows(world, name, managed):
+    """With all inputs found, wired as the launch file does, and time from /clock; when active."""
+    from lifecycle_msgs.msg import Transition
+    from lifecycle_msgs.srv import ChangeState
     from std_msgs.msg import Float32
-    world.start('estimator', '--ros-args', '-p', 'use_sim_time:=true')
+    topics, options = INPUTS[name]
+    world.start(name, *['--lifecycle'] * managed, '--ros-args', '-p', 'use_sim_time:=true',
+                *options)
     probe = world.probe()
-    outputs = [probe.publisher(topic, Float32) for topic in ('/voltage', '/throttle')]
-    compare(probe, 'estimator', 'ou_estimator')
-    assert len(outputs) == 2
-
-
-def test_the_filter_opens_what_the_policy_allows(world):
-    """With all inputs found, and wired as the launch file does."""
-    from std_msgs.msg import Float32
-    world.start('adaptive_filter', '--ros-args', '-p', 'use_sim_time:=true', '-p',
-                'notch.count:=4', '-r', 'sigma:=ou_estimator/sigma', '-r',
-                'state:=ou_estimator/state')
-    probe = world.probe()
-    outputs = [probe.publisher(topic, Float32) for topic in ('/input', '/throttle', '/rpm')]
-    compare(probe, 'adaptive_filter', 'ou_adaptive_filter')
-    assert len(outputs) == 3
+    outputs = [probe.publisher(topic, Float32) for topic in topics]
+    for step in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE) * managed:
+        assert probe.call(ChangeState, f'/ou_{name}/change_state', ChangeState.Request(
+            transition=Transition(id=step))).success
+    compare(probe, name, f'ou_{name}', managed)
+    assert len(outputs) == len(topics)
 
 
 def test_replay_opens_what_the_policy_allows(world):
