@@ -272,7 +272,8 @@ def write_report(bag: str, report: Path) -> None:
     """Have the command line analyze the same bag."""
     report.parent.mkdir(parents=True, exist_ok=True)
     done = subprocess.run(
-        [sys.executable, '-m', 'ou_monitor.cli.main', 'analyze', bag, '--report', str(report)],
+        [sys.executable, '-m', 'ou_monitor.cli.main', 'analyze', bag, '--report', str(report),
+         '--force'],
         cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
     if done.returncode or not report.is_file():
         last = done.stderr.strip().splitlines()[-1:] or ['no report was written']

@@ -73,11 +73,13 @@ class Analysis:
 
 def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
             window: float = 2.0, brownout_voltage: float | None = None,
-            brownout_horizon: float = 5.0, progress: Progress | None = None) -> Analysis:
+            brownout_horizon: float = 5.0, cells: int = 0,
+            progress: Progress | None = None) -> Analysis:
     """
     Analyse a recording load level by load level.
 
-    window in s, brownout_voltage in V, brownout_horizon in s, progress 0..1.
+    window in s, brownout_voltage in V (of so many cells, to tell it by the cell),
+    brownout_horizon in s, progress 0..1.
     """
     if not (np.diff(recording.t) > 0.0).all():
         raise ValueError('stamps must be finite and increase, as read_recording leaves them')
@@ -112,7 +114,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
                      + coupling_items([level.throttle for level in judged if level.coupled])),
         brownout_voltage is None, recording.notes + _left_out(recording, found),
         overview(recording, voltage, judged,
-                 None if sliding.last is None else sliding.last.load))
+                 None if sliding.last is None else sliding.last.load, cells))
 
 
 def _default_voltage(recording: Recording) -> float:

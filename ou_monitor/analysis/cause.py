@@ -19,7 +19,7 @@ import numpy as np
 from ou_monitor.analysis.level_comparison import AlphaTest, LEVEL
 from ou_monitor.analysis.relaxation import Relaxation, Release
 from ou_monitor.records import NAN
-from ou_monitor.text import Z95
+from ou_monitor.text import Z95, p_words
 from scipy import stats
 
 # A level that is off by more than this share of the transient has settled elsewhere; by less
@@ -79,7 +79,7 @@ def judge_cause(relaxation: Relaxation, alpha: AlphaTest) -> Cause:
     corner = 1.0 / (2.0 * math.pi * relaxation.tau)
     of_noise = {
         'agrees': 'tau agrees with 1/alpha of the noise',
-        'differs': f'tau is not 1/alpha of the noise (p {_small(p)})',
+        'differs': f'tau is not 1/alpha of the noise ({p_words(p)})',
         'undetermined': 'the data neither separate tau from 1/alpha of the noise nor show '
                         'them equal'}[noise]
     if math.isfinite(low):
@@ -95,10 +95,6 @@ def judge_cause(relaxation: Relaxation, alpha: AlphaTest) -> Cause:
                         f'of the instrument ({corner:.2g} Hz) explains it'}[instrument]
     return Cause(noise, ratio, low, high, p, instrument, corner, step, step_se,
                  f'{of_noise[0].upper()}{of_noise[1:]}; {of_instrument}.')
-
-
-def _small(p: float) -> str:
-    return '< 1e-6' if p < 1e-6 else f'= {p:.1g}'
 
 
 def _nothing(relaxation: Relaxation) -> str:

@@ -35,7 +35,7 @@ import math
 import numpy as np
 from ou_monitor.analysis.levels import Segment
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
-from ou_monitor.text import Z95
+from ou_monitor.text import p_words, Z95
 from scipy import stats
 from scipy.special import chndtrinc
 
@@ -189,15 +189,15 @@ class AlphaTest:
                     f'a usable fit{" that one OU describes" if self.withheld else ""}.')
         least, ends = _factor(self.detectable_ratio), 'from the lowest to the highest throttle'
         if self.verdict == 'differs':
-            return (f'Alpha depends on load (p = {self.p_value:.2g}): it changes by a factor of '
+            return (f'Alpha depends on load ({p_words(self.p_value)}): it changes by a factor of '
                     f'{_factor(self.ratio)} (95 % {_factor(self.ratio_low)} to '
                     f'{_factor(self.ratio_high)}) {ends}; the paper assumes a constant alpha.')
         if self.verdict == 'constant':
-            return (f'Alpha shows no dependence on load (p = {self.p_value:.2g}); the test would '
+            return (f'Alpha shows no dependence on load ({p_words(self.p_value)}); the test would '
                     f'have detected a change by a factor of {least} {ends} (90 %).')
-        return (f'This recording cannot decide whether alpha depends on load (p = '
-                f'{self.p_value:.2g}): the test would have detected only a change by a factor of '
-                f'{least} {ends} (90 %).')
+        return ('This recording cannot decide whether alpha depends on load '
+                f'({p_words(self.p_value)}): the test would have detected only a change by a '
+                f'factor of {least} {ends} (90 %).')
 
 
 def _factor(ratio: float) -> str:

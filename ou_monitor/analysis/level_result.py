@@ -23,6 +23,7 @@ from ou_monitor.criticism.level_tests import adjusted, examine_level, holm, Shap
 from ou_monitor.model.spectral_lines import find_lines, Grid, LineSearch, on_grid, without_lines
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Recording, Status
+from ou_monitor.text import p_words
 from scipy import stats
 
 # Standard error of ln(alpha) beyond which a segment does not count.
@@ -351,8 +352,8 @@ def judge_levels(recording: Recording, results: Sequence[LevelResult]
 def _scatter_notes(scatter: float, p: float) -> tuple[str, ...]:
     """Say that the segments differ: that they are not one process, or only what was widened."""
     if p < FAMILY_WISE:
-        return (f'Its segments differ {scatter:.1f} times more than sampling allows (p = '
-                f'{p:.1g}): the level is not one process; the intervals were widened by that '
+        return (f'Its segments differ {scatter:.1f} times more than sampling allows ('
+                f'{p_words(p)}): the level is not one process; the intervals were widened by that '
                 'factor.',)
     if scatter > _WIDENED:
         return (f'The intervals are wider by a factor of {scatter:.1f}, by which its segments '

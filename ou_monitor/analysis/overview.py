@@ -78,6 +78,8 @@ class Overview:
         Highest throttle; NaN without throttle.
     line : Line or None
         Strongest spectral line; None when there is none.
+    cells : int
+        Cells in series that the limit is of; 0 when it is of the whole.
 
     """
 
@@ -92,6 +94,7 @@ class Overview:
     flown: tuple[float, float]
     highest: float
     line: Line | None = None
+    cells: int = 0
 
     @property
     def sag(self) -> tuple[float, float, float]:
@@ -107,11 +110,12 @@ class Overview:
 
 
 def overview(recording: Recording, limit: float = NAN, levels: Sequence[LevelResult] = (),
-             load: SupplyLoad | None = None) -> Overview:
+             load: SupplyLoad | None = None, cells: int = 0) -> Overview:
     """
     Return what is always known of a recording.
 
-    limit in V; levels: where lines were found; load: that of the end, found when left out.
+    limit in V, of so many cells; levels: where lines were found; load: that of the end, found
+    when left out.
     """
     t, v, u = recording.t, recording.voltage, recording.throttle
     if not recording.n:
@@ -125,7 +129,7 @@ def overview(recording: Recording, limit: float = NAN, levels: Sequence[LevelRes
     return Overview(
         float(v[k]), float(t[k] - t[0]), float(u[k]), limit, dips, below, recording.duration,
         load or _load(recording), flown, float(known.max()) if known.size else NAN,
-        _strongest(levels))
+        _strongest(levels), cells)
 
 
 def count_dips(t: FloatArray, voltage: FloatArray, limit: float) -> tuple[int, float]:
@@ -152,6 +156,12 @@ def _strongest(levels: Sequence[LevelResult]) -> Line | None:
 
 def headline(found: Overview) -> str:
     """Return the answer in one sentence."""
+    parts = answers(found)
+    return '; '.join(parts) + '.' if parts else 'The recording holds no samples.'
+
+
+def answers(found: Overview) -> list[str]:
+    """Return the parts of the answer: the lowest voltage, then sag and lines."""
     parts = []
     if math.isfinite(found.limit):
         lowest = f'the lowest was {number(found.lowest, 4)} V at {number(found.lowest_at)} s'
@@ -169,7 +179,7 @@ def headline(found: Overview) -> str:
                 f'{line.lines} lines, the strongest at {number(line.frequency, 4)} Hz, make')
         where = '' if line.level == 'all' else f' at {line.level} throttle'
         parts.append(f'{what} {100.0 * line.all_share:.0f} % of the noise{where}')
-    return '; '.join(parts) + '.' if parts else 'The recording holds no samples.'
+    return parts
 
 
 def known_lines(found: Overview) -> list[tuple[str, str]]:
@@ -181,7 +191,9 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
     lines = [('Lowest voltage',
               f'{number(found.lowest, 4)} V at {number(found.lowest_at)} s{where}')]
     if math.isfinite(found.limit):
-        lines.append((f'Below {found.limit:g} V', _dips(found) if found.dips else 'never'))
+        cells = f' ({found.limit / found.cells:.3g} V a cell)' if found.cells else ''
+        lines.append((f'Below {found.limit:g} V',
+                      (_dips(found) if found.dips else 'never') + cells))
     lines += [('Sag', _sag_words(found)), ('Noise', _noise_words(found))]
     if math.isfinite(found.load.resistance):
         lines.append(('Resistance', f'{number(1e3 * found.load.resistance)} mOhm (+- '

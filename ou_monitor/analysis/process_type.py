@@ -32,6 +32,7 @@ import math
 from ou_monitor.criticism.innovations import FAMILY_WISE
 from ou_monitor.criticism.level_tests import Shape, TestResult
 from ou_monitor.records import Estimate, Status
+from ou_monitor.text import p_words
 from scipy import stats
 
 # A level is called Gaussian only when the tests would have detected this excess kurtosis.
@@ -183,4 +184,4 @@ def _plain(kind: ProcessType, why: str, figures: str = '') -> Verdict:
 
 
 def _p(test: TestResult) -> str:
-    return 'p < 1e-6' if test.p_adjusted < 1e-6 else f'p = {test.p_adjusted:.1g}'
+    return p_words(test.p_adjusted)

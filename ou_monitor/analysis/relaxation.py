@@ -28,7 +28,7 @@ import numpy as np
 from ou_monitor.analysis.level_comparison import mean_variance
 from ou_monitor.analysis.steps import Step, Window
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
-from ou_monitor.text import Z95
+from ou_monitor.text import p_words, Z95
 from scipy import stats
 
 _FEWEST = 12
@@ -141,10 +141,9 @@ class Relaxation:
             return (f'The fit leaves out the first {1e3 * self.left_out:.2g} ms after the change '
                     'of throttle, which one exponential does not describe; a second exponential '
                     'nearly as slow would still bias tau.' if self.left_out > 0.0 else '')
-        p = '< 1e-6' if self.misfit_p < 1e-6 else f'= {self.misfit_p:.1g}'
-        return (f'One exponential does not describe it (p {p}; mean square of the residuals '
-                f'{self.misfit:.2f} of what the noise has): do not rely on tau, on its interval, '
-                'or on what follows from them.')
+        return (f'One exponential does not describe it ({p_words(self.misfit_p)}; mean square of '
+                f'the residuals {self.misfit:.2f} of what the noise has): do not rely on tau, on '
+                'its interval, or on what follows from them.')
 
     @property
     def log_se(self) -> float:

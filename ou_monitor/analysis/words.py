@@ -9,7 +9,7 @@ import numpy as np
 from ou_monitor.analysis.analyze import Analysis
 from ou_monitor.analysis.level_comparison import sigma_change
 from ou_monitor.analysis.level_result import LevelResult
-from ou_monitor.analysis.overview import headline as answer, known_lines
+from ou_monitor.analysis.overview import answers, headline as answer, known_lines
 from ou_monitor.analysis.quality import QualityItem, Severity
 from ou_monitor.analysis.replay import ByThrottle
 from ou_monitor.online.settings import MonitorSettings
@@ -36,6 +36,18 @@ def headline(analysis: Analysis) -> str:
         f' Safe up to {100.0 * budget:.0f} % throttle.' if budget > 0.0 else
         ' No throttle is safe.')
     return answer(analysis.overview) + safe + numbers + beware
+
+
+def in_short(analysis: Analysis) -> tuple[str, str]:
+    """Return the answer and what stands behind it, a line each."""
+    first, *others = answers(analysis.overview) or ['The recording holds no samples']
+    budget = analysis.by_throttle.budget
+    if budget > 0.0:
+        others.insert(1, f'safe up to {100.0 * budget:.0f} % throttle')
+    if not others:
+        others = ['the sag is unknown']
+    text = '; '.join(others[:2])
+    return f'{first}.', f'{text[0].upper()}{text[1:]}.'
 
 
 def _budget_words(curves: ByThrottle) -> str:

@@ -11,14 +11,16 @@ from ou_monitor.analysis.data import as_data
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.relaxation import Relaxation
 from ou_monitor.analysis.words import (
-    brownout_sentence, caution, facts, headline, relaxation_sentence)
+    brownout_sentence, caution, facts, headline, in_short, relaxation_sentence)
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    check_outputs, part_of_recording, positive_number, read_given, repeated, throttle_levels)
+    brownout_limit, check_outputs, part_of_recording, positive_number, read_given, repeated,
+    throttle_levels)
 from ou_monitor.cli.output import facts_table, item, paragraph, table
+from ou_monitor.cli.progress import Progress
 from ou_monitor.errors import InputError
 from ou_monitor.records import Recording
-from ou_monitor.text import number
+from ou_monitor.text import chance, number
 
 _UNKNOWN = '-'
 # Rows of a table for people; the JSON has them all.
@@ -31,8 +33,7 @@ def run(args: argparse.Namespace) -> int:
     levels = throttle_levels(args.levels)
     window = positive_number('--window', args.window)
     horizon = positive_number('--brownout-horizon', args.brownout_horizon)
-    voltage = None if args.brownout_voltage is None else positive_number(
-        '--brownout-voltage', args.brownout_voltage)
+    voltage = brownout_limit(args)
     _in_range(voltage, horizon)
     start, end = part_of_recording(args.start, args.end)
     recording = read_given(args, start, end)
@@ -42,9 +43,9 @@ def run(args: argparse.Namespace) -> int:
     if levels is not None and not recording.has_throttle:
         raise InputError(f"--levels: '{args.recording}' has no throttle; leave --levels out, or "
                          'name the topic with --throttle-topic')
-    with output.Progress('analyzing') as progress:
+    with Progress('analyzing') as progress:
         analysis = analyze(recording, levels=levels, window=window, brownout_voltage=voltage,
-                           brownout_horizon=horizon, progress=progress)
+                           brownout_horizon=horizon, cells=args.cells or 0, progress=progress)
     if args.report is not None:
         from ou_monitor.report.analysis_page import analysis_page
         output.write_text(analysis_page(analysis, command_line(args)), args.report)
@@ -52,15 +53,14 @@ def run(args: argparse.Namespace) -> int:
         output.write_json(as_data(analysis), args.json)
     if args.json != output.STDOUT:
         output.say(render(analysis))
-        if args.report is not None:
-            output.say(f'\nReport: {args.report}')
+        output.summary(*in_short(analysis), report=args.report, json=args.json)
     return 0
 
 
 def command_line(args: argparse.Namespace) -> str:
     """Return the command that repeats this analysis."""
     return shlex.join(['ou-monitor', 'analyze', args.recording, *repeated(
-        args, 'levels', 'window', 'brownout_voltage', 'brownout_horizon')])
+        args, 'levels', 'window', 'brownout_voltage', 'cells', 'brownout_horizon')])
 
 
 def _in_range(voltage: float | None, horizon: float) -> None:
@@ -151,7 +151,7 @@ def _lines(analysis: Analysis) -> str:
         return ''
     rows = [[level.label, number(line.frequency, 4), number(1e3 * line.rms),
              f'{number(1e3 * line.rms_low)} to {number(1e3 * line.rms_high)}',
-             f'{100.0 * line.share:.2g} %', _p(line.p_value)]
+             f'{100.0 * line.share:.2g} %', chance(line.p_value)]
             for level in searched for line in level.lines.lines]
     if not rows:
         least = max(level.lines.detectable for level in searched)
@@ -185,7 +185,7 @@ def _changes(fit: Relaxation, start: float) -> str:
              _with_se(change.level_before, change.level_before_se),
              _with_se(change.level, change.level_se),
              _millivolts(change.amplitude, change.amplitude_se),
-             number(1e3 * change.beyond), _p(change.beyond_p)]
+             number(1e3 * change.beyond), chance(change.beyond_p)]
             for change in fit.releases[:_MOST_CHANGES]]
     more = len(fit.releases) - _MOST_CHANGES
     return table(['at s', 'throttle', 'level before V', 'level after V', 'A mV', side,
@@ -200,7 +200,7 @@ def _by_throttle(analysis: Analysis) -> str:
     levels = [level for level in analysis.levels if math.isfinite(level.throttle) and level.n]
     if levels:
         rows = [[level.label, _mv_interval(level.sag.sag, *level.sag.interval),
-                 _interval(level, 'sigma'), _p(curves.at(level.throttle, 'risk'))]
+                 _interval(level, 'sigma'), chance(curves.at(level.throttle, 'risk'))]
                 for level in levels]
     else:
         rows = [[f'{10 * k} %',
@@ -208,7 +208,7 @@ def _by_throttle(analysis: Analysis) -> str:
                                                                       'sag_high'))),
                  '{} [{}, {}]'.format(*(number(curves.at(0.1 * k, name)) for name in (
                      'sigma', 'sigma_low', 'sigma_high'))),
-                 _p(curves.at(0.1 * k, 'risk'))]
+                 chance(curves.at(0.1 * k, 'risk'))]
                 for k in range(11) if math.isfinite(curves.at(0.1 * k, 'sigma'))]
     if not rows or not analysis.recording.has_throttle:
         return sentence
@@ -228,12 +228,6 @@ def _remarks(analysis: Analysis) -> str:
     said = {one.text for one in analysis.quality}
     items += [item(note) for note in analysis.notes if note not in said]
     return '\n'.join(items)
-
-
-def _p(p: float) -> str:
-    if not math.isfinite(p):
-        return _UNKNOWN
-    return '< 1e-6' if p < 1e-6 else f'{p:.2g}'
 
 
 def _mv(value: float) -> str:

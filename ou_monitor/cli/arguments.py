@@ -7,6 +7,7 @@ import math
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor.cli import output
+from ou_monitor.cli.progress import Progress
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
     from ou_monitor.records import Recording
 
 _NAN = float('nan')
+# A lithium cell under load is empty at that, V (Betaflight's vbat_min_cell_voltage, and design's
+# default); none is ever charged to the other.
+CELL_LIMIT, _CELL_MOST = 3.3, 5.0
 # Options of the topics, by the names that the parser gives them.
 _TOPICS = ('msg_config', 'voltage_topic', 'throttle_topic', 'flight', 'time_column',
            'voltage_column', 'throttle_column', 'unit', 'time_unit')
@@ -28,7 +32,7 @@ def check_outputs(args: argparse.Namespace, *names: str, **inputs: Any) -> None:
     for option, target in targets.items():
         if target == output.STDOUT:
             raise InputError(f"{option} needs a file: '-' is not supported")
-    output.check_paths(inputs, {'--json': args.json, **targets})
+    output.check_paths(inputs, {'--json': args.json, **targets}, args.force)
     for target in (args.json, *targets.values()):
         output.check_writable(target)
 
@@ -37,7 +41,7 @@ def read_given(args: argparse.Namespace, start: float | None, end: float | None)
     """Read RECORDING as the arguments say, with a progress bar (start, end in s)."""
     from ou_monitor.recordings.read import read_recording
 
-    with output.Progress('reading') as progress:
+    with Progress('reading') as progress:
         return read_recording(
             args.recording, msg_config=args.msg_config, voltage_topic=args.voltage_topic,
             throttle_topic=args.throttle_topic, partial=args.partial, start=start, end=end,
@@ -75,6 +79,20 @@ def positive_number(option: str, text: str) -> float:
     if not (math.isfinite(value) and value > 0.0):
         raise InputError(f"{option}: '{text}' is not a positive number")
     return value
+
+
+def brownout_limit(args: argparse.Namespace) -> float | None:
+    """Return the limit of ``--brownout-voltage`` and ``--cells``, V; None when there is none."""
+    if args.brownout_voltage is None:
+        return None if args.cells is None else args.cells * CELL_LIMIT
+    voltage = positive_number('--brownout-voltage', args.brownout_voltage)
+    if args.cells is None:
+        return voltage
+    if voltage > _CELL_MOST:
+        raise InputError(
+            f'--brownout-voltage: with --cells {args.cells} it is volts a cell, and no cell has '
+            f'{voltage:g} V: write {voltage / args.cells:.3g}, or leave --cells out')
+    return float(args.cells * voltage)
 
 
 def throttle_levels(text: str | None) -> tuple[float, ...] | None:

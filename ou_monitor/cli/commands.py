@@ -8,15 +8,19 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
+from ou_monitor.cli.options import (
+    estimate, FILES, flight_number, FORCE, JSON, levels, limit, Option, PART, pole_count,
+    RECORDING, REPORT, seed, TOPICS, TYPES, WithoutOut)
 from ou_monitor.cli.output import path_argument
 
 
-class Option:
-    """Names of an option or of an argument, and what argparse knows of it."""
+class _Help(argparse.HelpFormatter):
+    """Help whose lines that begin with blanks, such as examples, stay as they are."""
 
-    def __init__(self, *names: str, **keywords: Any) -> None:
-        self.names = names
-        self.keywords = keywords
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        fill = super()._fill_text
+        return '\n'.join(line if line.startswith('  ') or not line else fill(line, width, indent)
+                         for line in text.split('\n'))
 
 
 @dataclass(frozen=True)
@@ -36,8 +40,10 @@ class Command:
         Begin of its help.
     options : tuple
         Options; a tuple of two or more is a choice of at most one of them.
+    examples : tuple of str
+        Command lines, without ``ou-monitor`` and its name.
     epilog : str
-        End of its help.
+        What stands before the examples at the end of its help.
 
     """
 
@@ -46,13 +52,17 @@ class Command:
     module: str
     description: str
     options: tuple[Option | tuple[Option, ...], ...]
+    examples: tuple[str, ...]
     epilog: str = ''
 
     def add_to(self, subparsers: Any) -> None:
         """Add the parser of this command."""
         parser: argparse.ArgumentParser = subparsers.add_parser(
             self.name, allow_abbrev=False, help=self.job.replace('%', '%%'),
-            description=self.description, epilog=self.epilog)
+            description=self.description, epilog='\n'.join([
+                *([self.epilog, ''] if self.epilog else []), 'Examples:',
+                *[f'  ou-monitor {self.name} {example}'.rstrip() for example in self.examples]]),
+            formatter_class=_Help)
         for option in self.options:
             choice = option if isinstance(option, tuple) else (option,)
             group = parser.add_mutually_exclusive_group() if len(choice) > 1 else parser
@@ -66,99 +76,17 @@ class Command:
         return function(args)
 
 
-class _WithoutOut(argparse.Action):
-    """A flag that needs no OUT; an optional positional could not follow an option."""
-
-    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
-                 values: Any, option_string: str | None = None) -> None:
-        """Set the flag."""
-        setattr(namespace, self.dest, True)
-        for action in parser._actions:
-            if action.dest == 'out':
-                action.required = False
-
-
-def _flight_number(text: str) -> int:
-    if not text.isascii() or not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 1 on")
-    return int(text)
-
-
-def _pole_count(text: str) -> int:
-    if not text.isascii() or not text.isdigit() or int(text) < 2 or int(text) % 2:
-        raise argparse.ArgumentTypeError(f"'{text}' is not an even number from 2 on")
-    return int(text)
-
-
-_RECORDING = Option(
-    'recording', metavar='RECORDING',
-    help='.mcap file, rosbag2 folder, CSV with columns time_s, voltage_v[, throttle], or a log '
-    'that convert reads (.bbl, .bin, .ulg)')
-# Which part of a recording is read.
-_PART = (
-    Option('--from', metavar='S', dest='start',
-           help='leave out what comes before, s after the first message'),
-    Option('--to', metavar='S', dest='end',
-           help='leave out what comes from here on, s after the first message'))
-# How a bag is read.
-_TOPICS = (
-    Option('--msg-config', metavar='NAME',
-           help='msg_config that says which topic and field is the voltage'),
-    Option('--voltage-topic', metavar='TOPIC', help='topic of the voltage'),
-    Option('--throttle-topic', metavar='TOPIC', help='topic of the throttle'),
-    Option('--partial', action='store_true', help='use what a truncated file still holds'))
-# How a log or a CSV is read.
-_FILES = (
-    Option('--flight', metavar='N', type=_flight_number,
-           help='which flight of a log with several, from 1 (default: the largest)'),
-    Option('--time-column', metavar='NAME', help='column of a CSV (default: time_s)'),
-    Option('--voltage-column', metavar='NAME',
-           help='column of a CSV (default: voltage_v), or series of a log (default: the battery)'),
-    Option('--throttle-column', metavar='NAME',
-           help='column of a CSV, 0..1 (default: throttle, if it is there), or series of a '
-           'log'),
-    Option('--unit', choices=('V', 'mV'), help='of the voltage in a CSV (default: V)'),
-    Option('--time-unit', choices=('s', 'ms', 'us', 'ns'),
-           help='of the time in a CSV (default: s)'))
-_JSON = Option('--json', metavar='FILE',
-               help="write the result as JSON ('-': to standard output, alone)")
-_REPORT = Option('--report', metavar='FILE.html', help='write a self-contained HTML page')
-_TYPES = ('battery_state', 'float32', 'float64', 'adc_block')
-
-
-def _seed_number(text: str) -> int:
-    if not text.isascii() or not text.isdigit():
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number, 0 or more")
-    return int(text)
-
-
-def _seed(default: int, text: str = 'same seed, same result') -> Option:
-    return Option('--seed', metavar='N', type=_seed_number, default=default,
-                  help=f'{text} (default: %(default)s)')
-
-
-def _levels(found: str) -> Option:
-    return Option('--levels', metavar='0,0.05,...',
-                  help=f'throttles 0..1 of the load levels (default: {found})')
-
-
-def _estimate(voltage: str) -> tuple[Option, ...]:
-    return (
-        Option('--window', metavar='S', default='2.0',
-               help='window of the sliding estimate, s (default: %(default)s)'),
-        Option('--brownout-voltage', metavar='V', help=voltage),
-        Option('--brownout-horizon', metavar='S', default='5.0',
-               help='horizon of that risk, s (default: %(default)s)'))
-
-
 _ANALYZE = Command(
     'analyze', 'Vpp, Vrms, alpha, tau, sigma, Var_inf with 95 % intervals per load level',
     'ou_monitor.cli.analyze',
     'Analyze the noise of a supply: per load level Vpp, Vrms, alpha, tau, sigma and Var_inf with '
     '95 % intervals, and the type of process.',
-    (_RECORDING, _levels('found'), *_PART,
-     *_estimate('voltage that must not be undershot, V (default: as the node, 4.5)'),
-     *_TOPICS, *_FILES, _JSON, _REPORT))
+    (RECORDING, levels('found'), *PART,
+     *estimate('voltage that must not be undershot, V (default: as the node, 4.5)'),
+     *TOPICS, *FILES, JSON, REPORT, FORCE),
+    ('flight.bbl --cells 4 --report flight.html',
+     'flight.mcap --brownout-voltage 14 --from 10 --to 70',
+     'log.csv --time-column t --voltage-column vbat --unit mV'))
 
 _COMPARE = Command(
     'compare', 'a recording beside simulations of it: what the simulation gets wrong most',
@@ -166,7 +94,7 @@ _COMPARE = Command(
     'Simulate a recording over its own throttle many times, and show both side by side: mean '
     'path, lowest voltage, falls through low levels, spectrum, answer to throttle, distribution. '
     'Without --model, a model is fitted to the part before S, and the rest is simulated.',
-    (_RECORDING, *_PART,
+    (RECORDING, *PART,
      Option('--model', metavar='FILE.yaml', type=path_argument,
             help='simulate this model, as discover --save-model writes it; its level is moved to '
             'that of the first seconds'),
@@ -174,14 +102,12 @@ _COMPARE = Command(
             help='begin of what is simulated, s after the first sample (default: half of the '
             'recording; with --model its begin)'),
      Option('--seeds', metavar='N', default='50', help='simulations (default: %(default)s)'),
-     _seed(0, 'same seed, same simulations'),
-     Option('--brownout-voltage', metavar='V',
-            help='also count falls through this voltage, V (default: two low levels that the '
+     seed(0, 'same seed, same simulations'),
+     *limit('also count falls through this voltage, V (default: two low levels that the '
             'recording shows)'),
-     *_TOPICS, *_FILES, _JSON, _REPORT),
-    'Examples: ou-monitor compare flight.mcap --report flight.html; ou-monitor compare '
-    'flight.mcap --fit-until 60 --brownout-voltage 14; ou-monitor compare flight.mcap --model '
-    'other_day.yaml')
+     *TOPICS, *FILES, JSON, REPORT, FORCE),
+    ('flight.mcap --report flight.html', 'flight.bbl --fit-until 60 --cells 4',
+     'flight.mcap --model other_day.yaml'))
 
 _CONVERT = Command(
     'convert', 'a log becomes an MCAP bag', 'ou_monitor.cli.convert',
@@ -192,7 +118,7 @@ _CONVERT = Command(
     (Option('log', metavar='LOG', type=path_argument, help='what to read'),
      Option('out', metavar='OUT', type=path_argument,
             help='what to write: NAME.mcap for one file, NAME for a rosbag2 folder'),
-     Option('--list', action=_WithoutOut, nargs=0, default=False,
+     Option('--list', action=WithoutOut, nargs=0, default=False,
             help='show what could be taken, * what would be, and write nothing (without OUT)'),
      Option('--voltage', metavar='NAME',
             help='which voltage (default: the battery, if there is one)'),
@@ -206,17 +132,19 @@ _CONVERT = Command(
      Option('--imu', metavar='NAME', action='append', default=[],
             help="which gyro becomes /imu, or 'none'; may be given several times (default: the "
             'first of the list)'),
-     Option('--poles', metavar='N', type=_pole_count,
+     Option('--poles', metavar='N', type=pole_count,
             help='magnets of a rotor, for eRPM (default: as the log says)'),
-     Option('--flight', metavar='N', type=_flight_number,
+     Option('--flight', metavar='N', type=flight_number,
             help='which flight of a file with several, from 1 (default: the largest)'),
      (Option('--drop-held', action='store_true',
              help='drop voltages that a logger repeats until the ADC is read again'),
       Option('--drop-repeats', action='store_true',
              help='as --drop-held; where no steady refresh is found, drop every repeat')),
-     Option('--type', choices=_TYPES, default='battery_state',
+     Option('--type', choices=TYPES, default='battery_state',
             help='message of the voltage (default %(default)s; adc_block needs a steady 10 kHz)'),
-     _JSON),
+     JSON, FORCE),
+    ('flight.ulg --list', 'flight.bbl flight.mcap --drop-held',
+     'flight.bin flight.mcap --signal RCOU.C3'),
     'Read: PX4 ULog (.ulg), ArduPilot dataflash (.bin, .log), Betaflight and INAV blackbox '
     '(.bbl, .bfl), CSV with the column time_s; the first bytes decide, not the ending.')
 
@@ -225,7 +153,7 @@ _COUPLING = Command(
     'ou_monitor.cli.coupling',
     'Estimate how much noise of the supply is in a signal: gain with 95 % interval and lag, or '
     'the gain that would have been detected.',
-    (_RECORDING, *_PART,
+    (RECORDING, *PART,
      Option('--signal', metavar='NAME', required=True,
             help='TOPIC/FIELD.PATH (/imu/angular_velocity.x), a column, or a series of a log '
             '(gyroUnfilt[0], IMU.GyrX)'),
@@ -233,7 +161,9 @@ _COUPLING = Command(
             help='frequencies looked at, Hz (default: 5 to a quarter of the slower rate)'),
      Option('--level', metavar='P', default='0.05',
             help='probability of a false alarm (default: %(default)s)'),
-     *_TOPICS, *_FILES, _JSON))
+     *limit('also count dips below this voltage, V'), *TOPICS, *FILES, JSON, REPORT, FORCE),
+    ('flight.bbl --signal gyroUnfilt[0] --report gyro.html',
+     'flight.mcap --signal /imu/angular_velocity.x --band 10,100'))
 
 _DESIGN = Command(
     'design', 'which capacitance brings the brown-out risk under X at throttle Y',
@@ -261,7 +191,9 @@ _DESIGN = Command(
      Option('--network', metavar='FILE.yaml',
             help='components as a YAML mapping of name to value; --set goes first'),
      Option('--list', action='store_true', help='list the components and their defaults'),
-     _JSON),
+     JSON, FORCE),
+    ('--risk 1e-3 --throttle 0.6', '--risk 1e-3 --throttle 0.6 --set battery_resistance=30mOhm',
+     '--list'),
     'Values are in SI units, or with prefix and unit: 470uF, 40mOhm, 24kHz.')
 
 _DISCOVER = Command(
@@ -269,13 +201,15 @@ _DISCOVER = Command(
     'ou_monitor.cli.discover',
     'Fit and simulate the plain OU, find what it gets wrong, name the cause, extend the model, '
     'and measure the gain on samples not used for the fit.',
-    (_RECORDING, *_PART, _seed(0), *_TOPICS, *_FILES, _JSON,
+    (RECORDING, *PART, seed(0), *limit('also count dips below this voltage, V'), *TOPICS, *FILES,
+     JSON,
      Option('--save-model', metavar='FILE.yaml',
             help='write the extended model, for simulate --model and the estimator'),
      Option('--force', action='store_true',
-            help='write it even where it predicts worse than the plain OU or its simulations '
-                 'leave the range that was seen'),
-     _REPORT))
+            help='overwrite files that exist already, and save the model even where it predicts '
+                 'worse than the plain OU or its simulations leave the range that was seen'),
+     REPORT),
+    ('flight.mcap --report causes.html', 'flight.bbl --save-model flight.yaml --force'))
 
 _FLEET = Command(
     'fleet', 'many recordings -> a table (Parquet) and a report: outliers, drift of a vehicle',
@@ -298,8 +232,10 @@ _FLEET = Command(
             'name none (default: the folder it lies in)'),
      Option('--discover', action='store_true',
             help='also look for causes; some seconds a recording (default: off)'),
-     _seed(0, 'of discover'), _levels('found in each recording'),
-     *_estimate('also give the risk of going below this voltage, V'), *_TOPICS, _JSON))
+     seed(0, 'of discover'), levels('found in each recording'),
+     *estimate('count dips below this voltage, V, and give the risk of them'), *TOPICS, JSON,
+     FORCE),
+    ('logs/ --output fleet --cells 4', 'logs/ --output fleet --vehicle-from "(uav[0-9]+)"'))
 
 _LIVE = Command(
     'live', 'a page to watch while flying, from the topics of the nodes',
@@ -314,14 +250,16 @@ _LIVE = Command(
      Option('--estimator', metavar='NODE', default='/ou_estimator',
             help='name of the estimator (default: %(default)s)'),
      Option('--filter', metavar='NODE', default='/ou_adaptive_filter',
-            help='name of the adaptive filter (default: %(default)s)')))
+            help='name of the adaptive filter (default: %(default)s)')),
+    ('', '--port 9000', '--host 0.0.0.0'))
 
 _REPRODUCE = Command(
     'reproduce', 'recompute every number of the paper, verdict per row',
     'ou_monitor.cli.reproduce',
     'Recompute every number of the paper: printed value, recomputed value, and whether it agrees, '
     'differs by rounding, or does not hold.',
-    (_seed(1, 'same seed, same simulations'), _JSON, _REPORT))
+    (seed(1, 'same seed, same simulations'), JSON, REPORT, FORCE),
+    ('--report paper.html', '--json -'))
 
 _SIMULATE = Command(
     'simulate', 'a recording from a model', 'ou_monitor.cli.simulate',
@@ -333,20 +271,20 @@ _SIMULATE = Command(
              help='model file, as discover writes it')),
      Option('--duration', metavar='S', type=float, help='length, s'),
      Option('--rate', metavar='HZ', type=float, help='samples per second'),
-     _seed(1, 'same seed, same recording'),
+     seed(1, 'same seed, same recording'),
      Option('--throttle', metavar='PROFILE',
             help='name of a profile, a number 0..1, points T:U,T:U,..., a CSV file with time_s '
             'and throttle, or a recording, whose length is then the default'),
-     *_PART,
+     *PART,
      Option('--output', metavar='PATH', type=path_argument,
             help='NAME.mcap for one file, NAME for a rosbag2 folder'),
-     Option('--type', choices=_TYPES,
+     Option('--type', choices=TYPES,
             help='message of the voltage (default battery_state, adc_block from 5 kHz on)'),
      Option('--save-model', metavar='FILE.yaml', type=path_argument,
             help='write the model that was simulated'),
-     Option('--list', action='store_true', help='list presets and profiles'), _JSON),
-    'Examples: ou-monitor simulate --preset load_40 --output load_40.mcap; ou-monitor simulate '
-    '--model flight.yaml --throttle flight.mcap --from 10 --to 70 --output again.mcap')
+     Option('--list', action='store_true', help='list presets and profiles'), JSON, FORCE),
+    ('--preset load_40 --output load_40.mcap',
+     '--model flight.yaml --throttle flight.mcap --from 10 --to 70 --output again.mcap'))
 
 COMMANDS = {command.name: command for command in (
     _ANALYZE, _COMPARE, _CONVERT, _COUPLING, _DESIGN, _DISCOVER, _FLEET, _LIVE, _REPRODUCE,

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    check_outputs, part_of_recording, positive_number, read_given, repeated)
+    brownout_limit, check_outputs, part_of_recording, read_given, repeated)
+from ou_monitor.cli.progress import Progress
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,21 +23,20 @@ _FEWEST, _MOST = 20, 10_000
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     start, end = part_of_recording(args.start, args.end)
-    seeds, until, levels = _seeds(args.seeds), _until(args.fit_until), ()
-    if args.brownout_voltage is not None:
-        levels = (positive_number('--brownout-voltage', args.brownout_voltage),)  # type: ignore
+    seeds, until, limit = _seeds(args.seeds), _until(args.fit_until), brownout_limit(args)
     check_outputs(args, 'report', RECORDING=args.recording,
                   **{'--msg-config': args.msg_config, '--model': args.model})
 
     import numpy as np
     from ou_monitor.comparison.compare import compare
+    from ou_monitor.comparison.words import in_short
     from ou_monitor.recordings.model_file import read_model
 
     model = None if args.model is None else read_model(args.model).model
     recording = read_given(args, start, end)
-    with output.Progress('comparing') as progress, np.errstate(over='ignore', under='ignore'):
+    with Progress('comparing') as progress, np.errstate(over='ignore', under='ignore'):
         found = compare(recording, model, fit_until=until, seeds=seeds, seed=args.seed,
-                        levels=levels, progress=progress)
+                        levels=() if limit is None else (limit,), progress=progress)
     if args.report is not None:
         from ou_monitor.report.comparison_page import comparison_page
         output.write_text(comparison_page(found, command_line(args)), args.report)
@@ -44,14 +44,13 @@ def run(args: argparse.Namespace) -> int:
         output.write_json(found.as_data(), args.json)
     if args.json != output.STDOUT:
         output.say(render(found))
-        if args.report is not None:
-            output.say(f'\nReport: {args.report}')
+        output.summary(*in_short(found), report=args.report, json=args.json)
     return 0
 
 
 def command_line(args: argparse.Namespace) -> str:
     """Return the command that repeats this comparison."""
-    more = repeated(args, 'fit_until', 'seeds', 'seed', 'brownout_voltage')
+    more = repeated(args, 'fit_until', 'seeds', 'seed', 'brownout_voltage', 'cells')
     if args.model is not None:
         more += ['--model', str(args.model)]
     return shlex.join(['ou-monitor', 'compare', args.recording, *more])

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ou_monitor.cli import output
+from ou_monitor.cli.progress import Progress
 from ou_monitor.errors import InputError
 
 # Endings that OUT cannot have: a folder of that name would mislead.
@@ -20,25 +21,26 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"--list writes no bag: leave '{args.out}' out")
     elif args.out.suffix.lower() in LOG_ENDINGS:
         raise InputError(f"OUT '{args.out}' must end in .mcap, or be the name of a folder")
-    output.check_paths({'LOG': args.log}, {'OUT': args.out, '--json': args.json})
+    output.check_paths({'LOG': args.log}, {'OUT': args.out, '--json': args.json}, args.force)
     output.check_writable(args.json)
     if args.out is not None:
-        _check_new(args.out)
+        _check_place(args.out, args.force)
 
     from ou_monitor.recordings.importers.formats import import_log
     from ou_monitor.recordings.importers.log import Request
 
     names = frozenset(name for name in (args.voltage, args.throttle, args.current, *args.signal)
                       if name is not None)
-    with output.Progress('reading') as progress:
+    with Progress('reading') as progress:
         log = import_log(args.log, Request(args.flight, names, args.poles, args.list, progress))
     return _list(args, log) if args.list else _convert(args, log)
 
 
-def _check_new(out: Path) -> None:
-    """Refuse an OUT that is there, before a long log is read; writing checks again."""
-    if out.exists() or out.is_symlink():
-        raise InputError(f'{out} exists already: remove it or choose another name')
+def _check_place(out: Path, force: bool) -> None:
+    """Refuse an OUT that cannot be written, before a long log is read; writing checks again."""
+    if not force and (out.exists() or out.is_symlink()):
+        raise InputError(f"OUT '{out}' exists already: --force overwrites it, or give another "
+                         'name')
     if not out.parent.is_dir():
         raise InputError(f'cannot write {out}: there is no folder {out.parent}')
 
@@ -63,7 +65,7 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
              **{f'log_{key}': value for key, value in log.facts.items()}}
     if held:
         about['held_samples'] = held[0]
-    with output.Progress('writing') as progress:
+    with Progress('writing') as progress, output.replacing(args.out, args.force):
         topics, moved = write_log(chosen, args.out, about, kind=args.type, extras=extras,
                                   progress=progress)
     notes = (*log.notes, *chosen.notes, *extras.notes, *held, *moved)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 import math
 from pathlib import Path
+import shlex
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    check_outputs, columns_given, part_of_recording, read_given)
+    brownout_limit, check_outputs, columns_given, part_of_recording, read_given, repeated)
+from ou_monitor.cli.progress import Progress
+from ou_monitor.coupling import words
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,10 +23,11 @@ if TYPE_CHECKING:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    check_outputs(args, RECORDING=args.recording, **{'--msg-config': args.msg_config})
-    band, level = _band(args.band), _level(args.level)
+    check_outputs(args, 'report', RECORDING=args.recording, **{'--msg-config': args.msg_config})
+    band, level, limit = _band(args.band), _level(args.level), brownout_limit(args)
     start, end = part_of_recording(args.start, args.end)
 
+    from ou_monitor.analysis.overview import answers, known_lines, overview
     from ou_monitor.coupling.coupling import estimate_coupling
     from ou_monitor.recordings.importers.formats import is_log
 
@@ -39,11 +44,19 @@ def run(args: argparse.Namespace) -> int:
                                   throttle=recording.throttle, band=band, level=level)
     except InputError as error:
         raise InputError(f"'{args.recording}', signal '{args.signal}': {error}") from error
+    seen = overview(recording, math.nan if limit is None else limit, cells=args.cells or 0)
+    known = known_lines(seen)
+    if args.report is not None:
+        from ou_monitor.report.coupling_page import coupling_page
+        output.write_text(coupling_page(found, recording, (t, values), args.signal, unit, known,
+                                        seen, command_line(args)), args.report)
     if args.json is not None:
         output.write_json(as_data(found, recording.name, args.signal, unit, recording.notes),
                           args.json)
     if args.json != output.STDOUT:
-        output.say(render(found, recording.name, args.signal, unit, recording.notes))
+        output.say(render(found, recording.name, args.signal, unit, recording.notes, known))
+        output.summary(words.headline(found, args.signal, unit),
+                       f'{answers(seen)[0]}.', report=args.report, json=args.json)
     return 0
 
 
@@ -59,7 +72,7 @@ def _of_log(args: argparse.Namespace, start: float | None, end: float | None,
             raise InputError(f'{args.recording} is a log: {option} is for bags')
     if any(value is not None for value in (args.time_column, args.unit, args.time_unit)):
         raise InputError(f'{args.recording} is a log: its time and units are known')
-    with output.Progress('reading') as progress:
+    with Progress('reading') as progress:
         recording, series = read_log_signal(
             Path(args.recording), args.signal, voltage=args.voltage_column,
             throttle=args.throttle_column, flight=args.flight, start=start, end=end,
@@ -97,38 +110,22 @@ def as_data(found: Coupling, name: str, signal: str, unit: str, notes: tuple[str
         'notes': [*notes, *found.notes]}
 
 
-def render(found: Coupling, name: str, signal: str, unit: str, notes: tuple[str, ...]) -> str:
-    """Return the finding for a terminal 100 columns wide."""
-    per = f'{unit} per V'.lstrip()
-    grid = found.grid
-    low, high = found.frequency[0], found.frequency[-1]
-    peak = int(found.coherence.argmax())
-    lines = [f'{name}, {signal}: {grid.duration:.4g} s in common, {low:.3g}..{high:.3g} Hz, '
-             f'{found.segments:.0f} segments' + (', throttle taken out' if found.partial else ''),
-             '']
-    if found.seen:
-        a, b = found.gain_ci95
-        lines += [
-            f'Coupling detected (p = {found.p_value:.2g}, level {found.level:g}).',
-            f'  gain    {found.gain:.4g} {per}  [{a:.4g}, {b:.4g}] 95 %',
-            f'  lag     {1e3 * found.lag:.3g} ms of the signal behind the voltage '
-            f'(standard error {1e3 * found.lag_se:.2g} ms)',
-            f'  share   {100.0 * found.noise_share:.3g} % of the signal in this band']
-    else:
-        lines += [
-            f'No coupling detected (p = {found.p_value:.2g}, level {found.level:g}).',
-            f'  limit   a gain of {found.limit:.4g} {per} would have been detected with '
-            '90 % probability']
-    lines.append(f'  largest squared coherence {found.coherence[peak]:.3g} at '
-                 f'{found.frequency[peak]:.3g} Hz, threshold {found.threshold:.3g}')
-    extra = [f'{lost} samples of the {what} dropped.' for lost, what in
-             zip(grid.lost, ('voltage', 'signal')) if lost]
-    if grid.gaps:
-        extra.append(f'{grid.gaps} gap{"s" * (grid.gaps != 1)} left out.')
-    remarks = [*notes, *extra, *found.notes]
-    if remarks:
-        lines += ['', *[output.item(text) for text in remarks]]
+def render(found: Coupling, name: str, signal: str, unit: str, notes: tuple[str, ...],
+           known: Sequence[tuple[str, str]] = ()) -> str:
+    """Return the finding for a terminal; known: what is known of the voltage anyway."""
+    lines = [f'{name}, {signal}: {words.parts(found)}', '',
+             output.paragraph(words.headline(found, signal, unit)), '',
+             output.facts_table([*known, *words.facts(found, unit)])]
+    said = words.remarks(found, notes)
+    if said:
+        lines += ['', *[output.item(text) for text in said]]
     return '\n'.join(lines)
+
+
+def command_line(args: argparse.Namespace) -> str:
+    """Return the command that repeats this."""
+    return shlex.join(['ou-monitor', 'coupling', args.recording, *repeated(
+        args, 'signal', 'band', 'level', 'brownout_voltage', 'cells')])
 
 
 def _band(text: str | None) -> tuple[float, float] | None:

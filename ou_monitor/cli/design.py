@@ -51,7 +51,7 @@ def _shown(value: object, network: PowerNetwork) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    output.check_paths({'--network': args.network}, {'--json': args.json})
+    output.check_paths({'--network': args.network}, {'--json': args.json}, args.force)
     if args.list:
         _list(args.json)
         return 0

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING
 
 from ou_monitor import __version__
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import check_outputs, part_of_recording, read_given, repeated
+from ou_monitor.cli.arguments import (
+    brownout_limit, check_outputs, part_of_recording, read_given, repeated)
+from ou_monitor.cli.progress import Progress
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,6 +28,7 @@ _SHOWN = 8
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     start, end = part_of_recording(args.start, args.end)
+    limit = brownout_limit(args)
     check_outputs(args, 'save_model', 'report', RECORDING=args.recording,
                   **{'--msg-config': args.msg_config})
 
@@ -36,34 +39,34 @@ def run(args: argparse.Namespace) -> int:
     recording = read_given(args, start, end)
     # What overflows on the way ends as not finite, which the search refuses: a user has no
     # use for the source line of it.
-    with output.Progress('discovering') as progress, np.errstate(all='ignore'):
+    with Progress('discovering') as progress, np.errstate(all='ignore'):
         finding = discover(recording, seed=args.seed, progress=progress)
-    known = known_lines(overview(recording))
+    known = known_lines(overview(recording, math.nan if limit is None else limit,
+                                 cells=args.cells or 0))
     if args.report is not None:
         from ou_monitor.report.discovery_page import discovery_page
-        with output.Progress('drawing') as progress:
+        with Progress('drawing') as progress:
             text = discovery_page(finding, command_line(args), progress, known)
         output.write_text(text, args.report)
     if args.json is not None:
         output.write_json(finding.as_data(), args.json)
     if args.json != output.STDOUT:
         output.say(render(finding, known))
-        if args.report is not None:
-            output.say(f'\nReport: {args.report}')
+        saved = args.save_model if args.force or not finding.refused else None
+        output.summary(*in_short(finding), report=args.report, json=args.json, model=saved)
     if args.save_model is not None:
         # Last: that there is none must not keep the others from being written.
         if finding.refused and not args.force:
             raise InputError(f'no model saved: {finding.refused[0].lower()}{finding.refused[1:]}; '
                              '--force saves it all the same')
         output.write_text(model_text(finding, recording), args.save_model)
-        if args.json != output.STDOUT:
-            output.say(f'\nModel: {args.save_model}')
     return 0
 
 
 def command_line(args: argparse.Namespace) -> str:
     """Return the command that repeats this discovery."""
-    return shlex.join(['ou-monitor', 'discover', args.recording, *repeated(args, 'seed')])
+    return shlex.join(['ou-monitor', 'discover', args.recording, *repeated(
+        args, 'seed', 'brownout_voltage', 'cells')])
 
 
 def model_text(finding: Finding, recording: Recording | None = None) -> str:
@@ -90,23 +93,48 @@ def model_text(finding: Finding, recording: Recording | None = None) -> str:
     return as_yaml(ModelFile(model, tuple(dict(se) for se in finding.se), provenance))
 
 
+def in_short(finding: Finding) -> tuple[str, str]:
+    """Return the causes and the gain, a line each."""
+    from ou_monitor.discovery.finding import Verdict
+    from ou_monitor.discovery.plain_names import both_names
+    from ou_monitor.discovery.words import gain_words
+
+    names = ', '.join(dict.fromkeys(both_names(cause.name) for cause in finding.causes))
+    first = {Verdict.NO_EFFECT: 'The plain OU simulates this recording',
+             Verdict.UNEXPLAINED: 'No known cause explains what the plain OU gets wrong',
+             Verdict.EXPLAINED: f'Explained by {names}',
+             Verdict.PARTLY_EXPLAINED: f'Explained in part by {names}'}.get(
+                 finding.verdict, finding.sentence.rstrip('.'))
+    return f'{first}.', (gain_words(finding.gain, finding.gain_se) if finding.causes else
+                         f'{finding.n} samples in {finding.duration:.4g} s.')
+
+
+def told(finding: Finding) -> str:
+    """Return the verdict with what a pilot calls each cause."""
+    from ou_monitor.discovery.plain_names import plain
+
+    return plain(finding.sentence, [cause.name for cause in finding.causes])
+
+
 def render(finding: Finding, known: Sequence[tuple[str, str]] = ()) -> str:
     """Return the finding for a terminal; known: what is known of the recording anyway."""
     from ou_monitor.discovery.words import (
         cause_rows, crossing_words, MNAT, overlap_words, plain_model_words, plain_words)
+    from ou_monitor.discovery.plain_names import PLAIN_NAMES
     from ou_monitor.text import number
 
     used = '' if finding.samples is None or finding.samples.n == finding.n else (
         f', {finding.samples.n} used')
     lines = [f'{finding.recording}: {finding.n} samples in {number(finding.duration, 4)} s{used}',
-             '', output.paragraph(finding.sentence)]
+             '', output.paragraph(told(finding))]
     lines += ['', output.facts_table(known)] if known else []
     if finding.causes:
         found = cause_rows(finding.causes)
-        rows = [[row.label, row.family, row.gain, row.chance, ', '.join(row.alternatives) or '-']
+        rows = [[PLAIN_NAMES.get(row.name, row.name), row.label, row.family, row.gain,
+                 row.chance, ', '.join(row.alternatives) or '-']
                 for row in found]
-        lines += ['', output.table(['cause', 'family', 'gain mnat/sample', 'p', 'alternatives'],
-                                   rows, left=[0, 1, 4]), '']
+        lines += ['', output.table(['what it is', 'cause', 'family', 'gain mnat/sample', 'p',
+                                    'alternatives'], rows, left=[0, 1, 2, 5]), '']
         for row in found:
             lines += [output.item(f'{row.name}: {estimate}') for estimate in row.estimates]
         overlap = overlap_words(finding.causes, finding.gain)

@@ -12,7 +12,9 @@ from typing import Any, TYPE_CHECKING
 
 from ou_monitor import __version__
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import positive_number, repeated, throttle_levels
+from ou_monitor.cli.arguments import (
+    brownout_limit, positive_number, repeated, throttle_levels)
+from ou_monitor.cli.progress import Progress
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,6 +38,11 @@ def run(args: argparse.Namespace) -> int:
     folder = Path(args.output)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--output '{folder}' is a file: name a folder")
+    output.check_paths({}, {'--json': args.json}, args.force)
+    if not (folder / 'parts').is_dir():
+        # Of an earlier run both are made again; any others are not ours.
+        output.check_paths({}, {f'--output ({name})': folder / name for name in (REPORT, TABLE)},
+                           args.force)
     output.check_writable(args.json)
 
     from ou_monitor.fleet.find import find_recordings
@@ -46,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     pattern = None if args.vehicle_from is None else read_pattern(args.vehicle_from)
     found = find_recordings(args.recordings, leave_out=folder)
     try:
-        with output.Progress('comparing') as comparing, output.Progress('analyzing') as progress:
+        with Progress('comparing') as comparing, Progress('analyzing') as progress:
             fleet = run_fleet(
                 found, folder, options, version, workers=workers, scheduler=args.scheduler,
                 insecure=args.insecure, pattern=pattern, stated_options=more,
@@ -96,14 +103,17 @@ def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
         from ou_monitor.fleet.summary import as_data
         output.write_json(as_data(fleet), args.json)
     if args.json != output.STDOUT:
+        from ou_monitor.fleet.summary import in_short
         output.say(render(fleet))
-        output.say(f'\nTable: {folder / TABLE}\nReport: {folder / REPORT}')
+        output.summary(*in_short(fleet), table=folder / TABLE, report=folder / REPORT,
+                       json=args.json)
 
 
 def command_line(args: argparse.Namespace) -> str:
     """Return the command that repeats this fleet."""
     words = ['ou-monitor', 'fleet', *args.recordings, '--output', args.output, *repeated(
-        args, 'vehicle_from', 'levels', 'window', 'brownout_voltage', 'brownout_horizon')]
+        args, 'vehicle_from', 'levels', 'window', 'brownout_voltage', 'cells',
+        'brownout_horizon')]
     return shlex.join(words + (['--discover', '--seed', str(args.seed)] if args.discover else []))
 
 
@@ -158,8 +168,7 @@ def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
         load_msg_config(config)
     return Options(
         levels=throttle_levels(args.levels), window=positive_number('--window', args.window),
-        brownout_voltage=math.nan if args.brownout_voltage is None else positive_number(
-            '--brownout-voltage', args.brownout_voltage),
+        brownout_voltage=math.nan if (limit := brownout_limit(args)) is None else limit,
         brownout_horizon=positive_number('--brownout-horizon', args.brownout_horizon),
         msg_config=config, voltage_topic=args.voltage_topic, throttle_topic=args.throttle_topic,
         partial=args.partial, discover=args.discover, seed=args.seed), more

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 import enum
 import json
 import math
@@ -13,15 +13,15 @@ from pathlib import Path
 import shutil
 import sys
 from textwrap import fill
-import time
 from typing import Any
 
 import numpy as np
 from ou_monitor.errors import InputError
 
 STDOUT = '-'
-# Lines are broken to be read at this width.
-COLUMNS = 100
+# Lines are broken to be read at this width, or at that of a narrower terminal, but for these.
+COLUMNS, _NARROWEST = 100, 40
+_NO_FILE = 'Nothing was written: --report FILE.html draws it, --json FILE keeps the numbers.'
 # Files of a rosbag2 folder, beside its metadata.yaml: storage files, compressed or not.
 _STORAGE = ('.mcap', '.db3', '.zst', '.zstd', '.lz4')
 
@@ -98,8 +98,12 @@ def path_argument(text: str) -> Path:
 
 
 def check_paths(inputs: Mapping[str, str | Path | None],
-                outputs: Mapping[str, str | Path | None]) -> None:
-    """Refuse paths that are empty, and outputs that would overwrite an input or each other."""
+                outputs: Mapping[str, str | Path | None], force: bool = False) -> None:
+    """
+    Refuse paths that are empty, and outputs that would overwrite an input or each other.
+
+    Nor is anything else overwritten that is there already, but by `force`.
+    """
     for name, given in (*inputs.items(), *outputs.items()):
         if given is not None and not str(given):
             raise InputError(f'{name}: the path is empty')
@@ -114,6 +118,35 @@ def check_paths(inputs: Mapping[str, str | Path | None],
             if _same(target, earlier):
                 raise InputError(f"{other} and {name} are both '{target}': give each its own "
                                  'name')
+    for name, target in written:
+        # A folder where a file belongs is told by `check_writable`.
+        if target.is_file() and not force:
+            raise InputError(f"{name} '{target}' exists already: --force overwrites it, or give "
+                             'another name')
+
+
+@contextmanager
+def replacing(bag: Path, force: bool) -> Iterator[None]:
+    """Make room for a bag; what was there comes back when writing fails."""
+    if not (bag.exists() or bag.is_symlink()):
+        yield
+        return
+    if not force:
+        raise InputError(f"'{bag}' exists already: --force overwrites it, or give another name")
+    if bag.is_dir() and not all(
+            one.name == 'metadata.yaml' or one.name.endswith(_STORAGE) for one in bag.iterdir()):
+        raise InputError(f"'{bag}' is a folder that holds more than a bag: it is not overwritten")
+    aside = bag.with_name(f'.{bag.name}.{os.getpid()}.old')
+    os.rename(bag, aside)
+    try:
+        yield
+    except BaseException:
+        os.rename(aside, bag)
+        raise
+    if aside.is_dir() and not aside.is_symlink():
+        shutil.rmtree(aside)
+    else:
+        aside.unlink()
 
 
 def _is_device(path: Path) -> bool:
@@ -149,9 +182,16 @@ def check_writable(target: str | None) -> None:
         raise InputError(f"cannot write '{target}': the folder '{path.parent}' does not exist")
 
 
+def columns() -> int:
+    """Return the width to write for: of the terminal where there is one, at most `COLUMNS`."""
+    if not sys.stdout.isatty():
+        return COLUMNS
+    return max(_NARROWEST, min(COLUMNS, shutil.get_terminal_size().columns))
+
+
 def paragraph(text: str, begin: str = '') -> str:
     """Break a paragraph into lines; words and paths stay whole."""
-    return fill(text, COLUMNS, initial_indent=begin, subsequent_indent=' ' * len(begin),
+    return fill(text, columns(), initial_indent=begin, subsequent_indent=' ' * len(begin),
                 break_long_words=False, break_on_hyphens=False)
 
 
@@ -160,18 +200,44 @@ def item(text: str) -> str:
     return paragraph(text, '- ')
 
 
+def summary(answer: str, detail: str, **files: object) -> None:
+    """Write the last three lines, which a terminal still shows: answer, detail, files."""
+    last = '; '.join(f'{name.capitalize()}: {path}' for name, path in files.items()
+                     if path is not None and str(path) != STDOUT)
+    say('\n' + '\n'.join([paragraph(answer), paragraph(detail), last or _NO_FILE]))
+
+
 def facts_table(facts: Sequence[tuple[str, str]]) -> str:
     """Lay out names and what is known of each, the words broken beside the names."""
     width = max((len(name) for name, _ in facts), default=0) + 2
-    return '\n'.join(fill(words, COLUMNS, initial_indent=name.ljust(width),
+    return '\n'.join(fill(words, columns(), initial_indent=name.ljust(width),
                           subsequent_indent=' ' * width, break_long_words=False,
                           break_on_hyphens=False) for name, words in facts)
 
 
 def table(headers: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:
-    """Lay out an aligned table in plain text."""
+    """Lay out an aligned table in plain text; one too wide for a terminal in parts."""
     grid = [list(headers), *[list(row) for row in rows]]
-    widths = [max(len(line[k]) for line in grid) for k in range(len(headers))]
+    if sys.stdout.isatty():
+        return '\n\n'.join(_aligned([[line[k] for k in part] for line in grid],
+                                    [n for n, k in enumerate(part) if k in left])
+                           for part in _parts(grid, shutil.get_terminal_size().columns))
+    return _aligned(grid, left)
+
+
+def _parts(grid: Sequence[Sequence[str]], most: int) -> list[list[int]]:
+    """Return which columns stand together in `most` letters; the first leads each part."""
+    widths = [max(len(line[k]) for line in grid) for k in range(len(grid[0]))]
+    parts = [[0]]
+    for k in range(1, len(widths)):
+        if len(parts[-1]) > 1 and sum(widths[c] + 2 for c in (*parts[-1], k)) - 2 > most:
+            parts.append([0])
+        parts[-1].append(k)
+    return parts
+
+
+def _aligned(grid: Sequence[Sequence[str]], left: Sequence[int]) -> str:
+    widths = [max(len(line[k]) for line in grid) for k in range(len(grid[0]))]
 
     def lay(line: Sequence[str]) -> str:
         cells = [cell.ljust(width) if k in left else cell.rjust(width)
@@ -180,46 +246,3 @@ def table(headers: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[
 
     rule = '  '.join('-' * width for width in widths)
     return '\n'.join([lay(grid[0]), rule, *[lay(line) for line in grid[1:]]])
-
-
-class Progress:
-    """
-    A progress bar on standard error; silent unless that is a terminal.
-
-    Parameters
-    ----------
-    label : str
-        What is being done.
-
-    """
-
-    def __init__(self, label: str) -> None:
-        self._label = label
-        self._live = sys.stderr.isatty()
-        self._drawn = 0.0
-
-    def __call__(self, share: float) -> None:
-        """Show that `share`, 0..1, is done."""
-        now = time.monotonic()
-        if not self._live or (now - self._drawn < 0.1 and share < 1.0):
-            return
-        self._drawn = now
-        width = max(10, min(40, shutil.get_terminal_size().columns - len(self._label) - 12))
-        full = int(width * min(max(share, 0.0), 1.0))
-        sys.stderr.write(f"\r{self._label} [{'#' * full}{'.' * (width - full)}] {share:4.0%}")
-        sys.stderr.flush()
-
-    def close(self) -> None:
-        """Wipe the bar."""
-        if self._live and self._drawn:
-            sys.stderr.write('\r\x1b[K')
-            sys.stderr.flush()
-        self._live = False
-
-    def __enter__(self) -> Progress:
-        """Return the bar."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Wipe the bar, whatever happened."""
-        self.close()

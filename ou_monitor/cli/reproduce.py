@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import check_outputs
+from ou_monitor.cli.progress import Progress
 
 if TYPE_CHECKING:
     from ou_monitor.paper.reproduce.reproduce import Reproduction
@@ -16,9 +17,9 @@ def run(args: argparse.Namespace) -> int:
     """Reproduce."""
     check_outputs(args, 'report')
 
-    from ou_monitor.paper.reproduce.reproduce import as_data, reproduce
+    from ou_monitor.paper.reproduce.reproduce import as_data, headline, reproduce
 
-    with output.Progress('recomputing') as progress:
+    with Progress('recomputing') as progress:
         result = reproduce(args.seed, progress)
     if args.report is not None:
         from ou_monitor.report.reproduction_page import reproduction_page
@@ -28,8 +29,9 @@ def run(args: argparse.Namespace) -> int:
         output.write_json(as_data(result), args.json)
     if args.json != output.STDOUT:
         output.say(render(result))
-        if args.report is not None:
-            output.say(f'\nReport: {args.report}')
+        points = ', '.join(point.title for point in result.points[:2])
+        output.summary(headline(result), f'{len(result.points)} points, the first: {points}.',
+                       report=args.report, json=args.json)
     return 0
 
 

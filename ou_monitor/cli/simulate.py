@@ -8,6 +8,7 @@ from typing import Any
 
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import part_of_recording
+from ou_monitor.cli.progress import Progress
 from ou_monitor.errors import InputError, nearest
 
 # From this rate on samples travel in blocks by default, Hz.
@@ -27,6 +28,7 @@ def run(args: argparse.Namespace) -> int:
     from ou_monitor.simulation.simulation import PRESETS
 
     if args.list:
+        output.check_paths({}, {'--json': args.json}, args.force)
         if args.json is not None:
             output.write_json({
                 'presets': {name: {'throttle': p.throttle, 'rate_hz': p.rate,
@@ -51,7 +53,8 @@ def run(args: argparse.Namespace) -> int:
     table = args.throttle if recorded or str(args.throttle).lower().endswith('.csv') else None
     output.check_paths(
         {'--model': args.model, '--throttle': table},
-        {'--output': args.output, '--save-model': args.save_model, '--json': args.json})
+        {'--output': args.output, '--save-model': args.save_model, '--json': args.json},
+        args.force)
     if args.output is not None and args.output.suffix.lower() in _NO_BAG:
         raise InputError(f"--output '{args.output}': {args.output.suffix} is not written; give "
                          'NAME.mcap for one file, or NAME for a rosbag2 folder')
@@ -114,8 +117,9 @@ def _write(args: argparse.Namespace, model: Any, profile: Any, duration: float, 
     from ou_monitor.simulation.simulation import simulated
 
     total, done = round(duration * rate), 0
-    with RecordingWriter(args.output, type=kind, sample_rate=rate) as writer, \
-            output.Progress('simulating') as progress:
+    with output.replacing(args.output, args.force), \
+            RecordingWriter(args.output, type=kind, sample_rate=rate) as writer, \
+            Progress('simulating') as progress:
         for piece in simulated(model, profile, duration=duration, rate=rate, seed=args.seed,
                                name=name):
             writer.write(piece)

@@ -24,6 +24,15 @@ def headline(found: Agreement) -> str:
     return f'{found.verdict.value}: {found.words}; the {lowest}.'
 
 
+def in_short(found: Agreement) -> tuple[str, str]:
+    """Return the verdict and the lowest voltages, a line each."""
+    low = found.lowest
+    said = f': {found.words}' if found.verdict is Verdict.DIFFERS else ''
+    return (f'{found.verdict.value}{said}.',
+            f'Lowest voltage measured {number(low.measured, 4)} V, simulated '
+            f'{number(low.median, 4)} V ({number(low.low, 4)} to {number(low.high, 4)}).')
+
+
 def parts(found: Agreement) -> str:
     """Return which parts were fitted and simulated."""
     first, last = found.simulated

@@ -15,7 +15,7 @@ from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Term
-from ou_monitor.text import listed, number, Z95
+from ou_monitor.text import chance as shown_chance, listed, number, p_words, Z95
 
 # What a gain is counted in.
 MNAT = ('mnat: a thousandth of a nat of log predictive density. A gain of 1 mnat per sample makes '
@@ -230,7 +230,7 @@ def why_named(gain: float, gain_se: float, chance: float) -> str:
     """Return why a cause is named whose gain does not say so; empty where it does."""
     if gain > Z95 * gain_se or not math.isfinite(chance):
         return ''
-    return f'Named for what it explains in the recording as a whole (p = {chance:.2g}).'
+    return f'Named for what it explains in the recording as a whole ({p_words(chance)}).'
 
 
 def overlap_words(causes: Sequence[Cause], gain: float) -> str:
@@ -343,9 +343,7 @@ def _remark(cause: Cause) -> str:
 def _chance(cause: Cause) -> str:
     if cause.exact:
         return 'exact'
-    if cause.p_value < 1e-6:
-        return '< 1e-6'
-    return f'{cause.p_value:.2g}' if math.isfinite(cause.p_value) else NOT_KNOWN
+    return shown_chance(cause.p_value) if math.isfinite(cause.p_value) else NOT_KNOWN
 
 
 def _explanation(group: Sequence[Cause]) -> str:

@@ -117,7 +117,7 @@ def _work(missing: Sequence[Source], results: dict[Path, dict[str, Any]], parts:
     # The largest first: the last one to end is then a short one.
     order = sorted(missing, key=lambda source: (-source.size, source.path))
     tell = progress or (lambda share: None)
-    tell(0.0)
+    tell(kept / (kept + len(order)))
     tasks = [(str(source.path), options.as_data()) for source in order]
     for done, (k, result, why) in enumerate(pool.each(work, tasks)):
         if result is None:

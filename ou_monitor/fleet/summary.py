@@ -34,6 +34,13 @@ def headline(fleet: Fleet) -> str:
         lowest.sentence(fleet), _standing_out(fleet), _analysed(fleet)) if part)
 
 
+def in_short(fleet: Fleet) -> tuple[str, str]:
+    """Return the answer, and what stands out and was analysed, a line each."""
+    first = lowest.sentence(fleet).split('; ')[0].rstrip('.')
+    return (f'{first}.' if first else _analysed(fleet),
+            f'{_standing_out(fleet)} {_analysed(fleet) if first else ""}'.strip())
+
+
 def _analysed(fleet: Fleet) -> str:
     parts = [f'{fleet.analysed} of {counted(fleet.recordings, "recording")} of '
              f'{counted(len(fleet.vehicles), "vehicle")} analysed']

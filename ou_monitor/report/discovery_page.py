@@ -10,6 +10,7 @@ import math
 import numpy as np
 from ou_monitor.criticism.curves import compare_curves, Comparison
 from ou_monitor.discovery.finding import Criticism, Finding
+from ou_monitor.discovery.plain_names import plain, PLAIN_NAMES
 from ou_monitor.discovery.words import (
     cause_rows, crossing_words, gain_remark, MNAT, NOT_KNOWN, overlap_words, plain_model_words,
     plain_words, with_error)
@@ -18,7 +19,7 @@ from ou_monitor.report import page
 from ou_monitor.report.page import rounded, UNKNOWN
 from ou_monitor.report.scale import span
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import number
+from ou_monitor.text import chance, number
 
 # Rows of statistics drawn at most.
 _ROWS = 18
@@ -38,7 +39,8 @@ def discovery_page(finding: Finding, command: str = '',
     subtitle = f'{finding.n} samples in {number(finding.duration, 4)} s'
     if finding.samples is not None and finding.samples.n != finding.n:
         subtitle += f', of which {finding.samples.n} were used'
-    sections = [page.headline(_typeset(finding.sentence))]
+    sections = [page.headline(_typeset(plain(
+        finding.sentence, [cause.name for cause in finding.causes])))]
     if finding.samples is not None:
         sections.append(page.figure(_voltage(finding), _VOLTAGE.format(_model_name(finding))
                                     if finding.simulated else ''))
@@ -121,14 +123,14 @@ def _causes(finding: Finding) -> list[str]:
         return [page.paragraph('No cause was named.')]
     found = cause_rows(finding.causes)
     overlap = overlap_words(finding.causes, finding.gain)
-    rows = [[row.label, row.family,
+    rows = [[f'{PLAIN_NAMES.get(row.name, row.name)}\n{row.label}', row.family,
              _minus(_typeset(row.gain)) + (f'\n{row.remark}' if row.remark else ''),
              row.chance, ', '.join(row.alternatives) or UNKNOWN] for row in found]
     return [
         page.table(['Cause', 'Family', 'Gain, mnat per sample', 'p', 'Alternatives'], rows,
                    left=[0, 1, 4]),
         *([page.paragraph(overlap)] if overlap else []),
-        page.bullets([_typeset(f'{row.label}: {row.explanation}') for row in found]),
+        page.bullets([_typeset(f'{PLAIN_NAMES.get(row.name, row.name)} ({row.label}): {row.explanation}') for row in found]),
         page.paragraph(
             'Gain: the loss of held-out score when the cause is left out and the rest is fitted '
             'again; its standard error comes from means of blocks and from the errors of the '
@@ -224,7 +226,7 @@ def _left(finding: Finding) -> list[str]:
         return [page.paragraph(f'Nothing: no statistic of the {_model_name(finding)} lies outside '
                                'the band.')]
     rows = [[c.statistic, _value(c.before), *([_value(c.after)] if finding.causes else []),
-             f'{c.p_after:.2g}' if math.isfinite(c.p_after) else NOT_KNOWN,
+             chance(c.p_after) if math.isfinite(c.p_after) else NOT_KNOWN,
              plain_words(c.statistic)] for c in finding.remaining]
     head = ['Statistic', 'Plain OU', *(['Extended'] if finding.causes else []), 'p', 'In words']
     return [page.table(head, rows, left=[0, len(head) - 1])]

@@ -14,11 +14,10 @@ from functools import cache
 import hashlib
 from html import escape
 from importlib import resources
-import math
 
 from ou_monitor.report.embedding import embed
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import number
+from ou_monitor.text import chance, number
 
 # What is not known, as a page sets it.
 UNKNOWN = '\u2013'
@@ -195,7 +194,5 @@ def rounded(value: float, digits: int = 3) -> str:
 
 
 def probability(p: float) -> str:
-    """Return a probability to two digits; below 1e-6 only that."""
-    if not math.isfinite(p):
-        return UNKNOWN
-    return '< 1e\u22126' if p < 1e-6 else typeset(f'{p:.2g}')
+    """Return a probability to two digits; below 0.001 only that."""
+    return typeset(chance(p))

@@ -8,6 +8,7 @@ import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.model.ou import simulate
 from ou_monitor.recordings.bag import BagWriter
+from pages import self_contained
 import pytest
 
 RATE, GAIN = 250.0, 25.0
@@ -131,7 +132,8 @@ def test_none_is_said_with_the_limit(table, capsys):
     assert 0.0 < data['gain_limit_per_v'] < GAIN
     assert main(['coupling', str(table), '--signal', 'gyro_y']) == 0
     text = capsys.readouterr().out
-    assert 'No coupling detected' in text and 'would have been detected' in text
+    assert 'No noise of the supply is seen in gyro_y' in text and 'would have been' in text
+    assert text.index('No noise') < text.index('Lowest voltage') < text.index('Chance')
     assert max(map(len, text.splitlines())) <= 100
 
 
@@ -139,7 +141,27 @@ def test_seen_is_said_in_words(table, capsys):
     """Gain, interval, lag."""
     assert main(['coupling', str(table), '--signal', 'gyro_x', '--band', '10,60']) == 0
     text = capsys.readouterr().out
-    assert 'Coupling detected' in text and 'per V' in text and '10..60 Hz' in text
+    assert re.search(r'gyro_x from 10 to 60 Hz is noise of the supply: 2\d\.\d per V\.', text)
+    assert 'p < 0.001' in text and not re.search(r'\de-\d', text)
+    assert text.splitlines()[-1].startswith('Nothing was written')
+
+
+def test_the_page(table, tmp_path, capsys):
+    """Voltage with its limit first, then the coherence; well formed; the same words as in text."""
+    target = tmp_path / 'coupling.html'
+    assert main(['coupling', str(table), '--signal', 'gyro_x', '--brownout-voltage', '4.9',
+                 '--report', str(target)]) == 0
+    said = capsys.readouterr().out
+    assert said.splitlines()[-1] == f'Report: {target}'
+    html = target.read_text(encoding='utf-8')
+    text = ' '.join(' '.join(self_contained(html).itertext()).split())
+    answer = said.split('\n\n')[1].replace('\n', ' ')
+    assert answer in text and 'limit 4.9 V' in text
+    assert html.index(answer) < html.index('>Voltage<') < html.index('dips below 4.9 V') < (
+        html.index('What the voltage and the signal share'))
+    # Not again without being asked to.
+    assert 'exists already: --force' in failure(
+        capsys, table, '--signal', 'gyro_x', '--report', target)
 
 
 @pytest.mark.parametrize('options, words', [

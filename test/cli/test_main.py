@@ -3,6 +3,7 @@
 from dataclasses import replace
 import os
 import re
+import shlex
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -39,7 +40,20 @@ def test_version_and_help(capsys):
 def test_every_command_has_help_and_json(command, capsys):
     """As the contract asks; a page to look at has no result to write."""
     assert cli.main([command, '--help']) == 0
-    assert ('--json FILE' in capsys.readouterr().out) == (command != 'live')
+    told = capsys.readouterr().out
+    assert ('--json FILE' in told) == ('--force' in told) == (command != 'live')
+
+
+@pytest.mark.parametrize('command', sorted(cli.COMMANDS))
+def test_every_help_ends_with_examples(command, capsys):
+    """Each on a line of its own, to be copied; and each is a command line that is understood."""
+    assert cli.main([command, '--help']) == 0
+    told = capsys.readouterr().out.partition('Examples:\n')[2].splitlines()
+    assert len(told) >= 2
+    for line in told:
+        program, *words = shlex.split(line)
+        assert (program, words[0]) == ('ou-monitor', command)
+        assert cli.build_parser([command]).parse_args(words).command == command
 
 
 @pytest.mark.parametrize('argv, words', [

@@ -6,6 +6,7 @@ import errno
 import io
 import json
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -58,34 +59,6 @@ def test_table_is_aligned():
     assert text.splitlines() == ['   n  word', '----  --------', '   1  a', '1000  long one']
 
 
-def test_progress_is_silent_without_a_terminal(capsys):
-    """Nothing reaches a log file."""
-    with output.Progress('work') as progress:
-        progress(0.5)
-        progress(1.0)
-    assert capsys.readouterr() == ('', '')
-
-
-class Terminal(io.StringIO):
-    """A standard error that is a terminal."""
-
-    def isatty(self):
-        """Say so."""
-        return True
-
-
-def test_progress_draws_and_wipes_on_a_terminal(monkeypatch):
-    """The bar fills to 100 % and is gone at the end, also after an exception."""
-    terminal = Terminal()
-    monkeypatch.setattr('sys.stderr', terminal)
-    with pytest.raises(KeyboardInterrupt):
-        with output.Progress('work') as progress:
-            progress(1.0)
-            assert 'work [####' in terminal.getvalue() and '100%' in terminal.getvalue()
-            raise KeyboardInterrupt
-    assert terminal.getvalue().endswith('\r\x1b[K')
-
-
 def test_paths_that_collide_or_are_empty_are_named(tmp_path):
     """By name, by another spelling, by a link; two outputs; but not two devices."""
     source = tmp_path / 'in.csv'
@@ -121,7 +94,7 @@ def test_what_a_bag_is_made_of_is_not_overwritten(tmp_path, name, part):
         with pytest.raises(InputError, match='would overwrite RECORDING'):
             output.check_paths({'RECORDING': str(bag)}, {'--report': str(bag / name)})
     else:
-        output.check_paths({'RECORDING': str(bag)}, {'--report': str(bag / name)})
+        output.check_paths({'RECORDING': str(bag)}, {'--report': str(bag / name)}, force=True)
 
 
 def test_what_was_there_stays_when_the_disk_is_full(tmp_path, monkeypatch):
@@ -137,3 +110,86 @@ def test_what_was_there_stays_when_the_disk_is_full(tmp_path, monkeypatch):
     with pytest.raises(InputError, match='No space left'):
         output.write_text('new page', target)
     assert target.read_text() == 'old' and list(tmp_path.iterdir()) == [target]
+
+
+def test_what_is_there_is_overwritten_when_forced_only(tmp_path):
+    """A file of any output; what is no file, such as a device, is no loss."""
+    there = tmp_path / 'report.html'
+    there.write_text('old')
+    with pytest.raises(InputError, match="--report .*report.html' exists already: --force"):
+        output.check_paths({}, {'--report': there})
+    output.check_paths({}, {'--report': there}, force=True)
+    output.check_paths({}, {'--json': '-', '--report': '/dev/null', '--save-model': None})
+
+
+def bag_folder(path: Path, content: str) -> Path:
+    """Make a rosbag2 folder of sorts."""
+    path.mkdir()
+    (path / 'metadata.yaml').write_text(content)
+    (path / f'{path.name}_0.mcap').write_text(content)
+    return path
+
+
+def test_a_bag_makes_room_for_the_next(tmp_path):
+    """The old one goes when the new one is whole, and comes back when it is not."""
+    bag = bag_folder(tmp_path / 'bag', 'old')
+    with pytest.raises(InputError, match='exists already: --force'):
+        with output.replacing(bag, force=False):
+            pytest.fail('there is no room')
+    with pytest.raises(KeyboardInterrupt):
+        with output.replacing(bag, force=True):
+            assert not bag.exists()
+            raise KeyboardInterrupt
+    assert (bag / 'metadata.yaml').read_text() == 'old'
+    with output.replacing(bag, force=True):
+        bag_folder(bag, 'new')
+    assert (bag / 'metadata.yaml').read_text() == 'new' and list(tmp_path.iterdir()) == [bag]
+    (bag / 'notes.txt').write_text('mine')
+    with pytest.raises(InputError, match='holds more than a bag'):
+        with output.replacing(bag, force=True):
+            pytest.fail('nothing of a user is taken away')
+    assert (bag / 'notes.txt').read_text() == 'mine'
+    with output.replacing(tmp_path / 'other.mcap', force=False):
+        pass
+
+
+class Screen(io.StringIO):
+    """A standard output that is a terminal."""
+
+    def isatty(self):
+        """Say so."""
+        return True
+
+
+@pytest.mark.parametrize('width', [40, 60, 80, 200])
+def test_the_width_of_the_terminal_is_kept(monkeypatch, width):
+    """Paragraphs end there, or at 100; tables come in parts, the first column in each."""
+    monkeypatch.setattr('sys.stdout', Screen())
+    monkeypatch.setattr('shutil.get_terminal_size', lambda *_: os.terminal_size((width, 24)))
+    words = ' '.join(['word'] * 60)
+    for text in (output.paragraph(words), output.item(words),
+                 output.facts_table([('Sag', words), ('Noise', words)])):
+        assert max(map(len, text.splitlines())) <= min(width, 100)
+    heads = ['vehicle', *[f'column {k}' for k in range(8)]]
+    text = output.table(heads, [[f'uav{k}', *['12.34'] * 8] for k in range(3)], left=[0])
+    assert max(map(len, text.splitlines())) <= width
+    assert text.count('uav1') == text.count('vehicle') >= (2 if width < 92 else 1)
+    for head in heads:
+        assert head in text
+
+
+def test_a_file_is_as_wide_as_ever(monkeypatch):
+    """What no terminal shows is not broken by the width of one."""
+    monkeypatch.setenv('COLUMNS', '40')
+    assert output.columns() == 100
+    heads = [f'column {k}' for k in range(20)]
+    assert len(output.table(heads, [['1'] * 20]).splitlines()) == 3
+
+
+def test_the_last_lines(capsys):
+    """Three: the answer, what stands behind it, and what was written where."""
+    output.summary('It fell to 13 V.', 'It sags by 2 V.', report='a.html', json='-', model=None)
+    output.summary('It fell to 13 V.', 'It sags by 2 V.', report=None)
+    first, second = capsys.readouterr().out.strip('\n').split('\n\n')
+    assert first.splitlines() == ['It fell to 13 V.', 'It sags by 2 V.', 'Report: a.html']
+    assert second.splitlines()[-1].startswith('Nothing was written: --report')

@@ -1,0 +1,121 @@
+"""Options that several commands share; imports none of them."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+
+class Option:
+    """Names of an option or of an argument, and what argparse knows of it."""
+
+    def __init__(self, *names: str, **keywords: Any) -> None:
+        self.names = names
+        self.keywords = keywords
+
+
+class WithoutOut(argparse.Action):
+    """A flag that needs no OUT; an optional positional could not follow an option."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
+                 values: Any, option_string: str | None = None) -> None:
+        """Set the flag."""
+        setattr(namespace, self.dest, True)
+        for action in parser._actions:
+            if action.dest == 'out':
+                action.required = False
+
+
+def flight_number(text: str) -> int:
+    """Return the number of a flight, from 1."""
+    if not text.isascii() or not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 1 on")
+    return int(text)
+
+
+def pole_count(text: str) -> int:
+    """Return the magnets of a rotor."""
+    if not text.isascii() or not text.isdigit() or int(text) < 2 or int(text) % 2:
+        raise argparse.ArgumentTypeError(f"'{text}' is not an even number from 2 on")
+    return int(text)
+
+
+RECORDING = Option(
+    'recording', metavar='RECORDING',
+    help='.mcap file, rosbag2 folder, CSV with columns time_s, voltage_v[, throttle], or a log '
+    'that convert reads (.bbl, .bin, .ulg)')
+# Which part of a recording is read.
+PART = (
+    Option('--from', metavar='S', dest='start',
+           help='leave out what comes before, s after the first message'),
+    Option('--to', metavar='S', dest='end',
+           help='leave out what comes from here on, s after the first message'))
+# How a bag is read.
+TOPICS = (
+    Option('--msg-config', metavar='NAME',
+           help='msg_config that says which topic and field is the voltage'),
+    Option('--voltage-topic', metavar='TOPIC', help='topic of the voltage'),
+    Option('--throttle-topic', metavar='TOPIC', help='topic of the throttle'),
+    Option('--partial', action='store_true', help='use what a truncated file still holds'))
+# How a log or a CSV is read.
+FILES = (
+    Option('--flight', metavar='N', type=flight_number,
+           help='which flight of a log with several, from 1 (default: the largest)'),
+    Option('--time-column', metavar='NAME', help='column of a CSV (default: time_s)'),
+    Option('--voltage-column', metavar='NAME',
+           help='column of a CSV (default: voltage_v), or series of a log (default: the battery)'),
+    Option('--throttle-column', metavar='NAME',
+           help='column of a CSV, 0..1 (default: throttle, if it is there), or series of a '
+           'log'),
+    Option('--unit', choices=('V', 'mV'), help='of the voltage in a CSV (default: V)'),
+    Option('--time-unit', choices=('s', 'ms', 'us', 'ns'),
+           help='of the time in a CSV (default: s)'))
+JSON = Option('--json', metavar='FILE',
+               help="write the result as JSON ('-': to standard output, alone)")
+FORCE = Option('--force', action='store_true', help='overwrite files that exist already')
+REPORT = Option('--report', metavar='FILE.html', help='write a self-contained HTML page')
+# Cells of the largest packs that fly, with room.
+_MOST_CELLS = 28
+TYPES = ('battery_state', 'float32', 'float64', 'adc_block')
+
+
+def _cell_count(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= _MOST_CELLS:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of cells, 1 to {_MOST_CELLS}")
+    return int(text)
+
+
+def _seed_number(text: str) -> int:
+    if not text.isascii() or not text.isdigit():
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number, 0 or more")
+    return int(text)
+
+
+def seed(default: int, text: str = 'same seed, same result') -> Option:
+    """Return the option of a seed."""
+    return Option('--seed', metavar='N', type=_seed_number, default=default,
+                  help=f'{text} (default: %(default)s)')
+
+
+def levels(found: str) -> Option:
+    """Return the option of the load levels; found: what they are without it."""
+    return Option('--levels', metavar='0,0.05,...',
+                  help=f'throttles 0..1 of the load levels (default: {found})')
+
+
+def limit(meaning: str) -> tuple[Option, ...]:
+    """Return the options of the limit; meaning: what --brownout-voltage does, and its default."""
+    return (Option('--brownout-voltage', metavar='V', help=meaning),
+            Option('--cells', metavar='N', type=_cell_count,
+                   help='cells in series: --brownout-voltage is then volts a cell (default with '
+                   '--cells: 3.3)'))
+
+
+def estimate(voltage: str) -> tuple[Option, ...]:
+    """Return the options of the sliding estimate and of the risk."""
+    return (
+        Option('--window', metavar='S', default='2.0',
+               help='window of the sliding estimate, s (default: %(default)s)'),
+        *limit(voltage),
+        Option('--brownout-horizon', metavar='S', default='5.0',
+               help='horizon of that risk, s (default: %(default)s)'))
