@@ -51,15 +51,17 @@ def command(text: str) -> list[str]:
 
 def run(words: list[str], report: Path) -> str:
     """Return what the command prints, its report written to `report`."""
-    words = [str(report) if word.endswith('.html') else word for word in words[1:]]
+    named = words[1:]
+    words = [str(report) if word.endswith('.html') else word for word in named]
     done = subprocess.run([sys.executable, '-m', 'ou_monitor.cli.main', *words], cwd=ROOT,
                           capture_output=True, text=True, check=True)
-    return done.stdout
+    return done.stdout.replace(str(report), next(w for w in named if w.endswith('.html')))
 
 
 def shortened(printed: str) -> str:
-    """Return the first paragraphs, and an ellipsis for the others."""
-    return '\n\n'.join([*printed.strip().split('\n\n')[:_FIRST], '[...]'])
+    """Return the first paragraphs, an ellipsis for the others, and the last."""
+    parts = printed.strip().split('\n\n')
+    return '\n\n'.join([*parts[:_FIRST], '[...]', parts[-1]])
 
 
 def photograph(page: Path) -> bool:

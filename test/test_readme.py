@@ -1,11 +1,14 @@
 """The documents name only what exists: files, links, options, keys, and examples that run."""
 
+import argparse
 import importlib.util
 from pathlib import Path
 import re
 import subprocess
 import sys
 
+from ou_monitor.cli.arguments import brownout_limit, CELL_LIMIT
+from ou_monitor.cli.commands import COMMANDS
 from project import ROOT
 import pytest
 
@@ -261,3 +264,29 @@ def test_options_are_seen():
     """The pattern above sees an option that is named."""
     line = next(line for line in README.splitlines() if 'ou-monitor analyze R' in line)
     assert re.findall(r'(?<![\w-])--[a-z][\w-]*', line) == ['--report']
+
+
+def test_the_glossary_has_the_words_of_the_screens():
+    """Every name of a fact and of a quantity is explained; the words are in order."""
+    rows = re.findall(r'^\| ([^|]+) \| [^|]+ \|$', (ROOT / 'doc/glossary.md').read_text(), re.M)
+    words = rows[2:] if rows[1].startswith('-') else rows[1:]
+    assert words == sorted(words, key=str.lower) and len(set(words)) == len(words)
+    known = ' '.join(words).lower()
+    for word in ('sag', 'rail', 'alpha', 'sigma', 'tau', 'Var_inf', 'brown-out', 'first passage',
+                 'nat', 'innovation', 'load level', 'noise', 'line', 'budget', 'dip', 'limit',
+                 'risk', 'resistance', 'cell', 'coupling', 'horizon', 'window', 'throttle'):
+        assert re.search(rf'\b{word.lower()}\b', known), word
+    for page in ('README.md', 'doc/commands.md', 'doc/analysis.md', 'doc/index.rst'):
+        assert 'glossary' in (ROOT / page).read_text(), page
+
+
+def test_the_limit_is_documented_as_it_is():
+    """The volts a cell of --cells alone, and what no cell has."""
+    text = ' '.join((ROOT / 'doc/commands.md').read_text().split())
+    assert f'`--cells N` alone takes {CELL_LIMIT:g} V a cell' in text
+    args = argparse.Namespace(brownout_voltage='3.5', cells=4)
+    assert brownout_limit(args) == 14.0 and '`--cells 4 --brownout-voltage 3.5` is 14 V' in text
+    for name in ('analyze', 'compare', 'coupling', 'discover', 'fleet'):
+        options = [n for one in COMMANDS[name].options if not isinstance(one, tuple)
+                   for n in one.names]
+        assert {'--cells', '--brownout-voltage'} <= set(options), name

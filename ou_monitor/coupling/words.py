@@ -33,7 +33,8 @@ def facts(found: Coupling, unit: str) -> list[tuple[str, str]]:
         lines += [('Would be seen', f'a gain of {number(found.limit, 4)} {_per(unit)}, in '
                    f'{100.0 * POWER:.0f} % of such recordings'),
                   ('For the filter', 'no law that follows sigma helps this signal')]
-    return [*lines, ('Chance', f'{p_words(found.p_value)}; seen is what is below {chance(found.level)}'),
+    return [*lines, ('Chance', f'{p_words(found.p_value)}; seen is what is below '
+                     f'{chance(found.level)}'),
             ('Largest coherence', f'{number(found.coherence[peak])} (squared) at '
              f'{number(found.frequency[peak])} Hz; by chance up to {number(found.threshold)}')]
 

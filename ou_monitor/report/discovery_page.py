@@ -130,7 +130,9 @@ def _causes(finding: Finding) -> list[str]:
         page.table(['Cause', 'Family', 'Gain, mnat per sample', 'p', 'Alternatives'], rows,
                    left=[0, 1, 4]),
         *([page.paragraph(overlap)] if overlap else []),
-        page.bullets([_typeset(f'{PLAIN_NAMES.get(row.name, row.name)} ({row.label}): {row.explanation}') for row in found]),
+        page.bullets([_typeset(
+            f'{PLAIN_NAMES.get(row.name, row.name)} ({row.label}): {row.explanation}')
+            for row in found]),
         page.paragraph(
             'Gain: the loss of held-out score when the cause is left out and the rest is fitted '
             'again; its standard error comes from means of blocks and from the errors of the '

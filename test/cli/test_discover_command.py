@@ -95,7 +95,7 @@ def test_summary_model_and_page(flight, tmp_path, capsys):
                  str(model), '--report', str(page)]) == 0
     out = capsys.readouterr().out
     assert all(len(line) <= 100 for line in out.replace(str(tmp_path), '').splitlines())
-    for part in ('explained by load_sag', 'gain mnat/sample', 'times a minute',
+    for part in ('explained by sag (load_sag)', 'gain mnat/sample', 'times a minute',
                  'Plain OU: alpha', str(model), str(page)):
         assert part in out
     file = read_model(model)
