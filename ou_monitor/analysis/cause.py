@@ -19,7 +19,7 @@ import numpy as np
 from ou_monitor.analysis.level_comparison import AlphaTest, LEVEL
 from ou_monitor.analysis.relaxation import Relaxation, Release
 from ou_monitor.records import NAN
-from ou_monitor.text import Z95, p_words
+from ou_monitor.text import p_words, Z95
 from scipy import stats
 
 # A level that is off by more than this share of the transient has settled elsewhere; by less

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     if levels is not None and not recording.has_throttle:
         raise InputError(f"--levels: '{args.recording}' has no throttle; leave --levels out, or "
                          'name the topic with --throttle-topic')
-    with Progress('analyzing') as progress:
+    with Progress('analyzing', args.json == output.STDOUT) as progress:
         analysis = analyze(recording, levels=levels, window=window, brownout_voltage=voltage,
                            brownout_horizon=horizon, cells=args.cells or 0, progress=progress)
     if args.report is not None:

@@ -41,7 +41,7 @@ def read_given(args: argparse.Namespace, start: float | None, end: float | None)
     """Read RECORDING as the arguments say, with a progress bar (start, end in s)."""
     from ou_monitor.recordings.read import read_recording
 
-    with Progress('reading') as progress:
+    with Progress('reading', args.json == output.STDOUT) as progress:
         return read_recording(
             args.recording, msg_config=args.msg_config, voltage_topic=args.voltage_topic,
             throttle_topic=args.throttle_topic, partial=args.partial, start=start, end=end,

@@ -34,7 +34,8 @@ def run(args: argparse.Namespace) -> int:
 
     model = None if args.model is None else read_model(args.model).model
     recording = read_given(args, start, end)
-    with Progress('comparing') as progress, np.errstate(over='ignore', under='ignore'):
+    with Progress('comparing', args.json == output.STDOUT) as progress, \
+            np.errstate(over='ignore', under='ignore'):
         found = compare(recording, model, fit_until=until, seeds=seeds, seed=args.seed,
                         levels=() if limit is None else (limit,), progress=progress)
     if args.report is not None:

@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
 
     names = frozenset(name for name in (args.voltage, args.throttle, args.current, *args.signal)
                       if name is not None)
-    with Progress('reading') as progress:
+    with Progress('reading', args.json == output.STDOUT) as progress:
         log = import_log(args.log, Request(args.flight, names, args.poles, args.list, progress))
     return _list(args, log) if args.list else _convert(args, log)
 
@@ -65,7 +65,8 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
              **{f'log_{key}': value for key, value in log.facts.items()}}
     if held:
         about['held_samples'] = held[0]
-    with Progress('writing') as progress, output.replacing(args.out, args.force):
+    with Progress('writing', args.json == output.STDOUT) as progress, \
+            output.replacing(args.out, args.force):
         topics, moved = write_log(chosen, args.out, about, kind=args.type, extras=extras,
                                   progress=progress)
     notes = (*log.notes, *chosen.notes, *extras.notes, *held, *moved)

@@ -72,7 +72,7 @@ def _of_log(args: argparse.Namespace, start: float | None, end: float | None,
             raise InputError(f'{args.recording} is a log: {option} is for bags')
     if any(value is not None for value in (args.time_column, args.unit, args.time_unit)):
         raise InputError(f'{args.recording} is a log: its time and units are known')
-    with Progress('reading') as progress:
+    with Progress('reading', args.json == output.STDOUT) as progress:
         recording, series = read_log_signal(
             Path(args.recording), args.signal, voltage=args.voltage_column,
             throttle=args.throttle_column, flight=args.flight, start=start, end=end,

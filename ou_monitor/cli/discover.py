@@ -39,13 +39,14 @@ def run(args: argparse.Namespace) -> int:
     recording = read_given(args, start, end)
     # What overflows on the way ends as not finite, which the search refuses: a user has no
     # use for the source line of it.
-    with Progress('discovering') as progress, np.errstate(all='ignore'):
+    with Progress('discovering', args.json == output.STDOUT) as progress, \
+            np.errstate(all='ignore'):
         finding = discover(recording, seed=args.seed, progress=progress)
     known = known_lines(overview(recording, math.nan if limit is None else limit,
                                  cells=args.cells or 0))
     if args.report is not None:
         from ou_monitor.report.discovery_page import discovery_page
-        with Progress('drawing') as progress:
+        with Progress('drawing', args.json == output.STDOUT) as progress:
             text = discovery_page(finding, command_line(args), progress, known)
         output.write_text(text, args.report)
     if args.json is not None:
@@ -130,10 +131,10 @@ def render(finding: Finding, known: Sequence[tuple[str, str]] = ()) -> str:
     lines += ['', output.facts_table(known)] if known else []
     if finding.causes:
         found = cause_rows(finding.causes)
-        rows = [[PLAIN_NAMES.get(row.name, row.name), row.label, row.family, row.gain,
+        rows = [[row.label, PLAIN_NAMES.get(row.name, row.name), row.family, row.gain,
                  row.chance, ', '.join(row.alternatives) or '-']
                 for row in found]
-        lines += ['', output.table(['what it is', 'cause', 'family', 'gain mnat/sample', 'p',
+        lines += ['', output.table(['cause', 'what it is', 'family', 'gain mnat/sample', 'p',
                                     'alternatives'], rows, left=[0, 1, 2, 5]), '']
         for row in found:
             lines += [output.item(f'{row.name}: {estimate}') for estimate in row.estimates]

@@ -53,7 +53,9 @@ def run(args: argparse.Namespace) -> int:
     pattern = None if args.vehicle_from is None else read_pattern(args.vehicle_from)
     found = find_recordings(args.recordings, leave_out=folder)
     try:
-        with Progress('comparing') as comparing, Progress('analyzing') as progress:
+        quiet = args.json == output.STDOUT
+        with Progress('comparing', quiet) as comparing, \
+                Progress('analyzing', quiet) as progress:
             fleet = run_fleet(
                 found, folder, options, version, workers=workers, scheduler=args.scheduler,
                 insecure=args.insecure, pattern=pattern, stated_options=more,

@@ -70,8 +70,9 @@ FILES = (
     Option('--unit', choices=('V', 'mV'), help='of the voltage in a CSV (default: V)'),
     Option('--time-unit', choices=('s', 'ms', 'us', 'ns'),
            help='of the time in a CSV (default: s)'))
-JSON = Option('--json', metavar='FILE',
-               help="write the result as JSON ('-': to standard output, alone)")
+JSON = Option(
+    '--json', metavar='FILE',
+    help="write the result as JSON ('-': to standard output, alone)")
 FORCE = Option('--force', action='store_true', help='overwrite files that exist already')
 REPORT = Option('--report', metavar='FILE.html', help='write a self-contained HTML page')
 # Cells of the largest packs that fly, with room.

@@ -202,8 +202,12 @@ def item(text: str) -> str:
 
 def summary(answer: str, detail: str, **files: object) -> None:
     """Write the last three lines, which a terminal still shows: answer, detail, files."""
-    last = '; '.join(f'{name.capitalize()}: {path}' for name, path in files.items()
-                     if path is not None and str(path) != STDOUT)
+    made = {name: path for name, path in files.items()
+            if path is not None and str(path) != STDOUT}
+    if len(made) > 1:
+        # Who asked for JSON will find it; people look for the page.
+        made.pop('json', None)
+    last = '; '.join(f'{name.capitalize()}: {path}' for name, path in made.items())
     say('\n' + '\n'.join([paragraph(answer), paragraph(detail), last or _NO_FILE]))
 
 

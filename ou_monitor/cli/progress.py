@@ -25,11 +25,13 @@ class Progress:
     ----------
     label : str
         What is being done.
+    quiet : bool
+        Write no lines where there is no terminal: a program reads what the command says.
 
     """
 
-    def __init__(self, label: str) -> None:
-        self._label = label
+    def __init__(self, label: str, quiet: bool = False) -> None:
+        self._label, self._quiet = label, quiet
         self._live = sys.stderr.isatty()
         self._drawn = 0.0
         self._told = time.monotonic()
@@ -41,7 +43,7 @@ class Progress:
         now = time.monotonic()
         self._first = self._first or (now, share)
         if not self._live:
-            if now - self._told >= _EVERY and share < 1.0:
+            if now - self._told >= _EVERY and share < 1.0 and not self._quiet:
                 self._told = now
                 self._write(f'{self._label}: {share:.0%} done{self._left(share, now)}\n')
             return

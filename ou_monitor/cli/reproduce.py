@@ -19,7 +19,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ou_monitor.paper.reproduce.reproduce import as_data, headline, reproduce
 
-    with Progress('recomputing') as progress:
+    with Progress('recomputing', args.json == output.STDOUT) as progress:
         result = reproduce(args.seed, progress)
     if args.report is not None:
         from ou_monitor.report.reproduction_page import reproduction_page

@@ -119,7 +119,7 @@ def _write(args: argparse.Namespace, model: Any, profile: Any, duration: float, 
     total, done = round(duration * rate), 0
     with output.replacing(args.output, args.force), \
             RecordingWriter(args.output, type=kind, sample_rate=rate) as writer, \
-            Progress('simulating') as progress:
+            Progress('simulating', args.json == output.STDOUT) as progress:
         for piece in simulated(model, profile, duration=duration, rate=rate, seed=args.seed,
                                name=name):
             writer.write(piece)

@@ -29,11 +29,13 @@ def analysis_page(analysis: Analysis, command: str = '') -> str:
                 f'{rounded(rate)} Hz on average')
     after = parts.transients(analysis)
     first, *others = _over_time(analysis)
+    sliding = _sliding(analysis)
     sections = [
         page.headline(headline(analysis)), first, page.facts(typeset_facts(analysis)), *others,
         page.section('Load levels', _levels_table(analysis.levels), _ou_table(analysis.levels)),
         page.section('What to know before using these numbers', parts.quality(analysis)),
         page.section('Over throttle', *parts.curves(analysis)),
+        page.section('Sigma and alpha over time', *sliding, folded=True),
         *([page.section('After changes of throttle', *after, folded=True)] if after else []),
         page.section('Shape', *_shape(analysis), *parts.lines(analysis), folded=True),
         page.section('Type of process', *parts.process(analysis), folded=True),
@@ -102,10 +104,25 @@ def _over_time(analysis: Analysis) -> list[str]:
                 voltage.shade(float(t[s.start]), float(t[s.stop - 1]), k, level.label)
         drawn = [page.figure(voltage),
                  page.figure(throttle, _levels_caption(analysis))]
+    if np.isfinite(sliding.risk).any():
+        plot = Plot(f'Risk of going below {sliding.brownout_voltage:g} V within '
+                    f'{sliding.brownout_horizon:g} s', 'time, s', 'probability', height=170)
+        plot.limits(x=limits, y=(-0.02, 1.02))
+        plot.line(sliding.t - start, sliding.risk, colour=1, style='thick')
+        drawn.append(page.figure(plot))
+    return drawn
+
+
+def _sliding(analysis: Analysis) -> list[str]:
+    """Return the plots of the sliding estimate, and why some windows have none."""
+    recording, sliding = analysis.recording, analysis.sliding
     if not sliding.t.size:
-        return [*drawn, page.paragraph(
+        return [page.paragraph(
             f'No sliding estimate: the recording is shorter than half a window of '
             f'{sliding.window:g} s.', soft=True)]
+    start = float(recording.t[0])
+    limits = (0.0, max(recording.duration, 1e-9))
+    drawn = []
     known = np.array([e.usable for e in sliding.estimates])
     for name, title, unit in (('sigma', 'Noise intensity \u03c3', 'V/\u221as'),
                               ('alpha', 'Relaxation rate \u03b1', '1/s')):
@@ -119,12 +136,6 @@ def _over_time(analysis: Analysis) -> list[str]:
         plot.limits(y=span([value, low, high], log=True, trim=0.01))
         plot.band(sliding.t - start, low, high, '95 % interval')
         plot.line(sliding.t - start, value, 'estimate', style='thick')
-        drawn.append(page.figure(plot))
-    if np.isfinite(sliding.risk).any():
-        plot = Plot(f'Risk of going below {sliding.brownout_voltage:g} V within '
-                    f'{sliding.brownout_horizon:g} s', 'time, s', 'probability', height=170)
-        plot.limits(x=limits, y=(-0.02, 1.02))
-        plot.line(sliding.t - start, sliding.risk, colour=1, style='thick')
         drawn.append(page.figure(plot))
     lost = int((~known).sum())
     if lost:

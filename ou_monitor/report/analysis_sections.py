@@ -19,7 +19,7 @@ from ou_monitor.text import Z95
 # Changes drawn in one plot, and relaxation times of them.
 _MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
 # Smaller risks are drawn as this.
-_LEAST_RISK = 1e-9
+_LEAST_RISK = 1e-4
 _TESTS = {'mean_drift': 'Mean moves', 'variance_drift': 'Intensity moves',
           'gaussian': 'Not Gaussian', 'impulses': 'Impulses', 'correlated': 'Correlated',
           'one_relaxation': 'Not one relaxation', 'second_relaxation': 'Second relaxation'}

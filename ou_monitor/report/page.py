@@ -28,9 +28,10 @@ _DARK = ('#5cb3f0', '#ff8a45', '#35cfa0', '#ea9cc9', '#e6b84a', '#9bd2f7', '#b59
 
 _STYLE = """
 :root { color-scheme: light dark; --paper: #ffffff; --ink: #1c2326; --soft: #5d686c;
-  --rule: #dde3e5; --panel: #f5f7f8; --warn: #9a4a00; LIGHT }
+  --rule: #dde3e5; --panel: #f5f7f8; --edge: #9aa6aa88; --warn: #9a4a00; LIGHT }
 @media (prefers-color-scheme: dark) { :root { --paper: #14191b; --ink: #e6eaeb;
-  --soft: #9aa6aa; --rule: #2e373a; --panel: #1c2326; --warn: #ffb070; DARK } }
+  --soft: #9aa6aa; --rule: #2e373a; --panel: #1c2326;
+  --edge: #00000099; --warn: #ffb070; DARK } }
 * { box-sizing: border-box; }
 body { margin: 0 auto; padding: 24px 20px 48px; max-width: 940px; background: var(--paper);
   color: var(--ink); font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
@@ -39,7 +40,14 @@ h2 { font-size: 17px; margin: 30px 0 8px; }
 p { margin: 6px 0; } .soft { color: var(--soft); }
 .headline { font-size: 17px; padding: 12px 16px; margin: 14px 0; background: var(--panel);
   border-left: 4px solid var(--c0); border-radius: 3px; }
-.scroll { overflow-x: auto; margin: 0 0 14px; }
+.scroll { overflow-x: auto; margin: 0 0 14px; background-color: var(--paper);
+  background-image: linear-gradient(to right, var(--paper), var(--paper)),
+    linear-gradient(to right, var(--paper), var(--paper)),
+    linear-gradient(to right, var(--edge), transparent),
+    linear-gradient(to left, var(--edge), transparent);
+  background-position: left, right, left, right; background-repeat: no-repeat;
+  background-size: 24px 100%, 24px 100%, 12px 100%, 12px 100%;
+  background-attachment: local, local, scroll, scroll; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums;
   font-size: 14px; }
 th { text-align: right; font-weight: 600; color: var(--soft); vertical-align: bottom;
@@ -53,7 +61,10 @@ details.section > summary h2 { display: inline; }
 dl.facts { display: grid; grid-template-columns: max-content 1fr; gap: 3px 16px; margin: 10px 0; }
 dl.facts dt { color: var(--soft); } dl.facts dd { margin: 0; overflow-wrap: anywhere; }
 @media (max-width: 560px) { dl.facts { grid-template-columns: 1fr; gap: 0; }
-  dl.facts dd { margin: 0 0 6px; } }
+  dl.facts dd { margin: 0 0 6px; }
+  body { padding: 16px 14px 32px; } .headline { font-size: 16px; padding: 10px 12px; }
+  table { font-size: 13px; } th, td { padding: 4px 7px 4px 0; }
+  td.left { white-space: normal; overflow-wrap: anywhere; min-width: 84px; } }
 li { margin: 3px 0; } li.warn::marker { color: var(--warn); }
 code { font: 13px/1.5 ui-monospace, Menlo, Consolas, monospace; background: var(--panel);
   padding: 2px 5px; border-radius: 3px; overflow-wrap: anywhere; }

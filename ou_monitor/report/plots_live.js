@@ -339,7 +339,7 @@ async function start() {
     + 'Ctrl the wheel zooms, with Shift it moves; two fingers do both. Click a name to hide it. '
     + 'Plots with the same x axis move together.';
   const first = plots[0].root.closest('figure');
-  (first.closest('.pair') || first).before(hint);
+  (first.closest('.pair') || first).after(hint);
   for (const pair of document.querySelectorAll('.pair')) {
     new ResizeObserver(() => level(pair)).observe(pair);
   }

@@ -9,8 +9,10 @@ from ou_monitor.cli.discover import render
 from ou_monitor.cli.main import main
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.finding import Cause, Finding, Verdict
+from ou_monitor.discovery.plain_names import both_names, plain, PLAIN_NAMES
 from ou_monitor.discovery.words import explain, parameters
 from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.drift import Drift
 from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.ou import OU
@@ -135,6 +137,7 @@ def test_too_short_still_writes_all_but_the_model(tmp_path, capsys):
     assert 'no model' in failure(capsys, *words, data)
     assert strict(data.read_text())['verdict'] == 'insufficient_data'
     assert 'at least' in page.read_text() and not (tmp_path / 'm.yaml').exists()
+    page.unlink()
     assert main([str(word) for word in words] + ['-']) == 2
     out, err = capsys.readouterr()
     assert strict(out)['verdict'] == 'insufficient_data' and err.count('\n') == 1
@@ -172,12 +175,14 @@ def test_what_is_not_known_is_said_and_what_is_worse_too():
         assert not re.search(r'\bnan\b|- \+- -|\u2013 \u00b1 \u2013', shown)
         assert shown.count('worse on what was kept back') == 1
         assert 'Worse on samples not used' in html
-    rows = {row[0]: row for row in tables(html)}
+    # What a pilot calls it, and below that its name.
+    rows = {row[0].split()[-1]: row for row in tables(html)}
+    assert rows['load_sag'][0] == 'sag load_sag'
     assert rows['load_sag'][2].startswith('not known not measurable here; named for')
     assert rows['load_sag'][3] == 'not known'
     assert 'Gain not measurable here; named for what it explains' in ' '.join(text.split())
     assert 'worse' in rows['tone'][2] and 'not distinguishable from none' in rows['drift'][2]
-    assert re.search(r'load_sag +load +not known +not known', text)
+    assert re.search(r'load_sag +sag +load +not known +not known', text)
     assert 'from means of blocks and from the errors of the parameters' in html
 
 
@@ -187,7 +192,8 @@ def test_terms_that_share_a_gain_are_one_row():
     finding = made(*[(tone, 0.02, 0.002, 1e-9) for tone in tones],
                    (Tone(0.01, 41.0, 0.0, 0.0), 0.03, 0.002, 1e-9))
     text, html = render(finding), discovery_page(finding)
-    assert [row[0] for row in tables(html)[1:]] == ['tone x3', 'tone']
+    named = PLAIN_NAMES['tone']
+    assert [row[0] for row in tables(html)[1:]] == [f'{named} tone x3', f'{named} tone']
     assert text.count('20.0 +- 2.0') == 1 and text.count('tone x3') == 1
     for tone in tones:
         assert parameters(tone, {}) in ' '.join(text.split())
@@ -212,3 +218,19 @@ def test_bad_recordings_are_one_line(tmp_path, capsys):
     path = tmp_path / 'odd.csv'
     path.write_text('a,b\n1,2\n')
     failure(capsys, 'discover', path)
+
+
+def test_every_cause_has_a_plain_name():
+    """Of the catalogue, none more; each stands for one cause."""
+    assert set(PLAIN_NAMES) == set(catalogue()) - {'ou'}
+    assert len(set(PLAIN_NAMES.values())) == len(PLAIN_NAMES)
+
+
+def test_plain_names_stand_before_the_names_in_code():
+    """Once each; an English word stands for a cause only where it is one."""
+    assert plain('load_sag, drift and tone explain it. Worse without load_sag; a drift is left.',
+                 ['load_sag', 'drift']) == (
+        'Sag (load_sag), discharge or warming (drift) and tone explain it. Worse without sag; a '
+        'drift is left.')
+    assert plain('The plain OU simulates it.') == 'The plain OU simulates it.'
+    assert both_names('load_sag') == 'sag (load_sag)' and both_names('new') == 'new'

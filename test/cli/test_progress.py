@@ -36,6 +36,15 @@ def test_what_is_short_says_nothing_off_a_terminal(capsys, clock):
     assert lines[-1] == 'work: 83% done, 10 s left'
 
 
+def test_a_program_that_reads_the_output_is_not_told(capsys, clock):
+    """Beside JSON on standard output nothing is written, however long it takes."""
+    with Progress('work', quiet=True) as progress:
+        for second in range(40):
+            clock[0] = 100.0 + second
+            progress(second / 60.0)
+    assert capsys.readouterr() == ('', '')
+
+
 def test_progress_draws_and_wipes_on_a_terminal(monkeypatch):
     """The bar fills to 100 % and is gone at the end, also after an exception."""
     terminal = Terminal()
