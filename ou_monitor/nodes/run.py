@@ -20,6 +20,10 @@ from typing import Any
 
 from ou_monitor.errors import InputError, refusal
 
+# Before NumPy is loaded.  Matrices here are small, and threads of BLAS that share a core wait for
+# one another: of a node with a real-time priority beside another task, each for 0.1 s.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
 BAD_INPUT = 2
 LIFECYCLE = '--lifecycle'
 # Longest wait inside the executor, s; a signal wakes it anyway.

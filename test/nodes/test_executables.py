@@ -142,3 +142,16 @@ def test_qos_overrides_are_taken_or_refused(world):
         assert refused.wait() == 2
         (line,) = [line for line in refused.err.splitlines() if 'FATAL' in line]
         assert words in line
+
+
+def test_the_nodes_have_one_thread_of_blas():
+    """More of them on one core wait for one another; what the user says stands."""
+    code = ('import ou_monitor.nodes.run, os, sys; assert "numpy" not in sys.modules; '
+            'print(os.environ["OPENBLAS_NUM_THREADS"])')
+    for given, threads in ((None, '1'), ('2', '2')):
+        env = {**os.environ, 'PYTHONPATH': str(ROOT), 'OPENBLAS_NUM_THREADS': given or ''}
+        if given is None:
+            del env['OPENBLAS_NUM_THREADS']
+        done = subprocess.run([sys.executable, '-c', code], env=env, capture_output=True,
+                              text=True, check=True)
+        assert done.stdout == f'{threads}\n'
