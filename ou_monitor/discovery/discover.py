@@ -30,7 +30,6 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role
-from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Recording
 from scipy.special import ndtri
 
@@ -66,6 +65,8 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
 
     """
     if not isinstance(recording, Recording):
+        # Here, for a recording that is given needs no reader: it is a third of all modules.
+        from ou_monitor.recordings.read import read_recording
         recording = read_recording(recording)
     done: Progress = progress or (lambda share: None)
     state = examine(recording, lambda share: done(0.05 * share))

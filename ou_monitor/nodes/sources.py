@@ -97,19 +97,17 @@ class Source:
 
     def open_many(self) -> tuple[Any, ManyExtractor]:
         """Return the message class and what takes several numbers out of it."""
-        if self.spec is None:
-            raise InputError(f'the type of the {self.quantity} is not known yet')
-        message = message_class(self.spec.type, self.install)
-        extractor = ManyExtractor(self.spec)
-        extractor.extract(message())
-        return message, extractor
+        return self._open(ManyExtractor)
 
     def open(self) -> tuple[Any, Extractor]:  # noqa: A003
         """Return the message class and the extractor, tried on an empty message."""
+        return self._open(Extractor)
+
+    def _open(self, kind: Any) -> tuple[Any, Any]:
         if self.spec is None:
             raise InputError(f'the type of the {self.quantity} is not known yet')
         message = message_class(self.spec.type, self.install)
-        extractor = Extractor(self.spec)
+        extractor = kind(self.spec)
         extractor.extract(message())
         return message, extractor
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 import math
 
@@ -12,6 +13,22 @@ from scipy.signal import welch
 
 # Lines that follow throttle looked into.
 _MOST = 3
+
+
+def wandering(linewidth: float, rng: np.random.Generator) -> Callable[[FloatArray], FloatArray]:
+    """Return what draws, for steps in s, the phase that widens a line to `linewidth`, Hz."""
+    last = 0.0
+
+    def walk(step: FloatArray) -> FloatArray:
+        nonlocal last
+        if not linewidth > 0.0:
+            return np.zeros(step.size)
+        spread = np.sqrt(2.0 * math.pi * linewidth * np.where(np.isfinite(step), step, 0.0))
+        path = last + np.cumsum(spread * rng.standard_normal(step.size))
+        last = float(path[-1])
+        return np.asarray(path)
+
+    return walk
 
 
 def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,

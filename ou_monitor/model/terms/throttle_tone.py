@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.lines import order_lines, rotation
+from ou_monitor.model.terms.lines import order_lines, rotation, wandering
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
@@ -52,20 +52,16 @@ class ThrottleTone(Term):
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        turns = wander = 0.0
+        turns = 0.0
+        wander = wandering(self.linewidth, rng)
 
         def effect(s: Segment) -> None:
-            nonlocal turns, wander
+            nonlocal turns
             step = np.where(np.isfinite(s.step), s.step, 0.0)
             run = turns + np.cumsum((self.idle + self.slope * s.throttle) * step)
             turns = float(run[-1]) % 1.0
             phase = 2.0 * math.pi * run + self.phase
-            if self.linewidth > 0.0:
-                walk = wander + np.cumsum(np.sqrt(2.0 * math.pi * self.linewidth * step)
-                                          * rng.standard_normal(s.t.size))
-                wander = float(walk[-1])
-                phase += walk
-            s.level += self.amplitude * np.sin(phase)
+            s.level += self.amplitude * np.sin(phase + wander(s.step))
 
         return effect
 

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from ou_monitor.model.spectral_lines import find_lines, fit_sinusoid, Line, on_grid
 from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.lines import keeps_its_height, rotation
+from ou_monitor.model.terms.lines import keeps_its_height, rotation, wandering
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import by_parameters, parameter, Role, Term
 from ou_monitor.records import FloatArray
@@ -55,18 +55,11 @@ class Tone(Term):
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        wander = 0.0
+        wander = wandering(self.linewidth, rng)
 
         def effect(s: Segment) -> None:
-            nonlocal wander
             phase = 2.0 * math.pi * ((s.at - s.origin) * self.frequency % 1.0) + self.phase
-            if self.linewidth > 0.0:
-                step = np.where(np.isfinite(s.step), s.step, 0.0)
-                walk = wander + np.cumsum(np.sqrt(2.0 * math.pi * self.linewidth * step)
-                                          * rng.standard_normal(s.t.size))
-                wander = float(walk[-1])
-                phase += walk
-            s.level += self.amplitude * np.sin(phase)
+            s.level += self.amplitude * np.sin(phase + wander(s.step))
 
         return effect
 

@@ -143,6 +143,21 @@ def check_state(u0: npt.ArrayLike, d: int) -> FloatArray:
     return state
 
 
+def check_starts(u0: npt.ArrayLike, paths: int, d: int) -> FloatArray:
+    """Return the first states of paths, shape (paths, d), of one for all or one for each."""
+    first = np.atleast_1d(np.asarray(u0, dtype=np.float64))
+    if first.shape not in ((d,), (paths, d)):
+        raise ValueError(f'u0 must have shape ({d},) or ({paths}, {d}), got {first.shape}')
+    return np.array(np.broadcast_to(first, (paths, d)))
+
+
+def mean_and_covariance(found: FloatArray, d: int) -> tuple[FloatArray, FloatArray]:
+    """Return mean and covariance from rows of 1, E u and E u u'."""
+    mean = found[:, 1:1 + d]
+    second = found[:, 1 + d:].reshape(-1, d, d)
+    return mean, second - mean[:, :, None] * mean[:, None, :]
+
+
 def moment_matrix(matrix: FloatArray, offset: FloatArray) -> FloatArray:
     """Return the linear equation of (1, u, u u') under du/dt = A u + a (matrix in 1/s)."""
     d = offset.size

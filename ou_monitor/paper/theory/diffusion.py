@@ -24,7 +24,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.paper.theory.affine import (
-    AffineSystem, check_state, check_times, flow, moment_matrix, propagate)
+    AffineSystem, check_starts, check_state, check_times, flow, mean_and_covariance,
+    moment_matrix, propagate)
 from ou_monitor.paper.theory.switched_system import SwitchedSystem
 from ou_monitor.records import FloatArray
 from scipy.linalg import expm
@@ -90,9 +91,7 @@ class LinearDiffusion:
         found = propagate(
             self._moment_matrix(), check_times(t),
             np.concatenate([[1.0], first, np.outer(first, first).ravel()]))
-        mean = found[:, 1:1 + d]
-        second = found[:, 1 + d:].reshape(-1, d, d)
-        return mean, second - mean[:, :, None] * mean[:, None, :]
+        return mean_and_covariance(found, d)
 
     def simulate(
         self, t: npt.ArrayLike, u0: npt.ArrayLike, rng: np.random.Generator, *,
@@ -108,14 +107,11 @@ class LinearDiffusion:
         t in s, max_step in s.
         """
         times, d = check_times(t), self.offset.size
-        first = np.atleast_1d(np.asarray(u0, dtype=np.float64))
         if paths < 1:
             raise ValueError(f'paths must be 1 or more, got {paths}')
-        if first.shape not in ((d,), (paths, d)):
-            raise ValueError(f'u0 must have shape ({d},) or ({paths}, {d}), got {first.shape}')
+        u = check_starts(u0, paths, d)
         if max_step is not None and not max_step > 0.0:
             raise ValueError(f'max_step must be positive, got {max_step} s')
-        u = np.array(np.broadcast_to(first, (paths, d)))
         found = np.empty((paths, times.size, d))
         found[:, 0] = u
         with np.errstate(over='ignore', invalid='ignore'):

@@ -20,7 +20,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.paper.theory.affine import (
-    AffineSystem, check_state, check_times, flow, moment_matrix, propagate)
+    AffineSystem, check_starts, check_state, check_times, flow, mean_and_covariance,
+    moment_matrix, propagate)
 from ou_monitor.paper.theory.markov_chain import Generator
 from ou_monitor.paper.theory.matrix_model import MatrixModel
 from ou_monitor.records import FloatArray
@@ -162,10 +163,7 @@ class SwitchedSystem:
         """Draw paths, exact between the jumps and exact in the jumps (t in s)."""
         at_eps, times, d = self.scaled(eps, scaling), check_times(t), self.dimension
         state = at_eps.generator.starts(paths, rng, start)
-        first = np.atleast_1d(np.asarray(u0, dtype=np.float64))
-        if first.shape not in ((d,), (paths, d)):
-            raise ValueError(f'u0 must have shape ({d},) or ({paths}, {d}), got {first.shape}')
-        u = np.array(np.broadcast_to(first, (paths, d)))
+        u = check_starts(u0, paths, d)
         found = np.empty((paths, times.size, d))
         found[:, 0] = u
         with np.errstate(over='ignore', invalid='ignore'):
@@ -203,6 +201,4 @@ class SwitchedSystem:
             change[block, block] += moment_matrix(at_eps.matrices[x], at_eps.offsets[x])
         state = np.outer(at_eps.generator.stationary, joint).ravel()
         found = propagate(change, times, state).reshape(times.size, n, size).sum(axis=1)
-        mean = found[:, 1:1 + d]
-        second = found[:, 1 + d:].reshape(-1, d, d)
-        return mean, second - mean[:, :, None] * mean[:, None, :]
+        return mean_and_covariance(found, d)
