@@ -15,8 +15,7 @@ import numpy as np
 from ou_monitor.comparison.flight_model import Damping, FlightModel, Readings
 from ou_monitor.model.load import lowpass
 from ou_monitor.model.load_fit import fit_load, LoadFit
-from ou_monitor.model.load_noise import fit_noise_law
-from ou_monitor.model.residual_ou import fit_residual_ou, innovations, SLOW_TIME
+from ou_monitor.model.residual import fit_noise_law, fit_residual_ou, innovations, SLOW_TIME
 from ou_monitor.records import FloatArray
 
 # Parts of what is fitted that are left out in turn.

@@ -10,8 +10,7 @@ import numpy as np
 from ou_monitor.criticism.adc import find_step
 from ou_monitor.model.load import lowpass
 from ou_monitor.model.load_fit import LoadFit
-from ou_monitor.model.load_noise import NoiseLaw
-from ou_monitor.model.residual_ou import ResidualOU, SLOW_TIME
+from ou_monitor.model.residual import NoiseLaw, ResidualOU, SLOW_TIME
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.quantization import Quantization
 from ou_monitor.records import FloatArray

@@ -14,7 +14,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite
-from ou_monitor.criticism.level_range import stray
+from ou_monitor.criticism.curves import stray
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import is_trend

@@ -30,11 +30,9 @@ from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import diagnostic, MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.console import Console
 from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of, IMU
+from ou_monitor.nodes.filter_inputs import MotorInputs, Supply, SupplyInput
 from ou_monitor.nodes.inputs import INPUT_QOS, Silence, Stamper, types_on
-from ou_monitor.nodes.message_types import message_class
-from ou_monitor.nodes.motor_inputs import MotorInputs
-from ou_monitor.nodes.sources import MOTOR_PARAMETERS
-from ou_monitor.nodes.supply_input import Supply, SupplyInput
+from ou_monitor.nodes.sources import message_class, MOTOR_PARAMETERS
 from ou_monitor.online.filter.cutoff_control import Bound
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass, FilterCounters
 from ou_monitor.online.notch.notch import AdaptiveNotch

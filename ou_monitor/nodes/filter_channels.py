@@ -13,7 +13,7 @@ import math
 from typing import Any
 
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.nodes.message_types import message_class
+from ou_monitor.nodes.sources import message_class
 from ou_monitor.stream.config import FieldPath, FieldSpec, parse_field_path
 from ou_monitor.stream.extract import Extractor
 

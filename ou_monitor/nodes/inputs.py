@@ -18,7 +18,7 @@ import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode
 from ou_monitor.nodes.clocks import SendClock, SimClockMap
-from ou_monitor.nodes.message_types import definition_of
+from ou_monitor.nodes.sources import definition_of
 from ou_monitor.recordings.columns import FieldReader
 from ou_monitor.recordings.mcap_records import Table
 from ou_monitor.records import FloatArray

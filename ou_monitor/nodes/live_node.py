@@ -18,7 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.filter_channels import channels_of
 from ou_monitor.nodes.inputs import INPUT_QOS
-from ou_monitor.nodes.message_types import message_class
+from ou_monitor.nodes.sources import message_class
 from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
 from std_msgs.msg import Float64

@@ -12,8 +12,8 @@ import time
 from typing import Any
 
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.nodes.message_types import message_class
 from ou_monitor.nodes.pacing import Prefetch, SpacingError, wait_until
+from ou_monitor.nodes.sources import message_class
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.write import LAST_HEADER_NS
 from rclpy.duration import Duration

@@ -1,7 +1,7 @@
 """Whether simulations can be mistaken for a recording in level."""
 
 import numpy as np
-from ou_monitor.criticism.level_range import seen_range, stray
+from ou_monitor.criticism.curves import seen_range, stray
 import pytest
 
 

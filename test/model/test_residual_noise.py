@@ -2,9 +2,8 @@
 
 import numpy as np
 from ou_monitor.model.load import ripple
-from ou_monitor.model.load_noise import changes, fit_noise_law
 from ou_monitor.model.ou import simulate
-from ou_monitor.model.residual_ou import fit_residual_ou, innovations
+from ou_monitor.model.residual import changes, fit_noise_law, fit_residual_ou, innovations
 import pytest
 
 DT, N = 0.01, 12_000

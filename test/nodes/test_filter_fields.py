@@ -8,7 +8,7 @@ from live import wait_until
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.filter_channels import CHANNELS, channels_of
-from ou_monitor.nodes.supply_input import SupplyInput
+from ou_monitor.nodes.filter_inputs import SupplyInput
 import pytest
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 

@@ -1,8 +1,7 @@
 """Where voltage and throttle come from: msg_config, overrides, what is not installed."""
 
 from ou_monitor.errors import InputError
-from ou_monitor.nodes.message_types import message_class
-from ou_monitor.nodes.sources import find_source, SOURCE_PARAMETERS
+from ou_monitor.nodes.sources import find_source, message_class, SOURCE_PARAMETERS
 import pytest
 
 

@@ -25,14 +25,13 @@ import numpy.typing as npt
 from ou_monitor.model.passage.law import prepare
 from ou_monitor.online.load.supply_load import LoadStatus, SupplyLoad
 from ou_monitor.online.risk.curves import LearnedCurves
-from ou_monitor.online.risk.first_passage import as_sampled, Passage, risk_of, Supply
+from ou_monitor.online.risk.first_passage import as_sampled, EventRisk, Passage, risk_of, Supply
 from ou_monitor.online.risk.forecast import Forecast, Outcome
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN
 
 if TYPE_CHECKING:
     from ou_monitor.model.supply import SupplyModel
-    from ou_monitor.online.risk.events import EventRisk
 
 # probability(u0, u0_se, ln_sigma, ln_sigma_se, ln_alpha, ln_alpha_se) -> risk, elementwise.
 Probability = Callable[
@@ -202,7 +201,6 @@ class Outlook:
             return
         # Here, for without a model the nodes need none of it: it costs them 60 MB.
         from ou_monitor.model.terms.measurement_noise import MeasurementNoise
-        from ou_monitor.online.risk.events import EventRisk
         self._events = EventRisk(model, background=self._background)
         self._noise = math.sqrt(sum(
             term.std**2 for term in model.terms if isinstance(term, MeasurementNoise)))
