@@ -9,6 +9,7 @@ imported where ROS 2 is not installed, so that the executables can say so.
 
 from __future__ import annotations
 
+import atexit
 from collections.abc import Callable
 import gc
 import os
@@ -16,7 +17,7 @@ import signal
 import socket
 import sys
 import threading
-from typing import Any
+from typing import Any, NoReturn
 
 from ou_monitor.errors import InputError, refusal
 
@@ -81,7 +82,21 @@ def run_node(name: str, about: str, work: Callable[[], int]) -> int:
                              '--ros-args, as in --ros-args -p NAME:=VALUE -r FROM:=TO')
         return work()
 
-    return run(name, checked)
+    end(run(name, checked))
+
+
+def end(status: int) -> NoReturn:
+    """
+    End the process; all that wants order, the participant of DDS too, is closed before.
+
+    Left to itself the interpreter takes its modules down for 0.1 to 0.3 s, and waits for threads
+    that make tables of the risk.
+    """
+    gc.collect()
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
 
 
 def run_managed(name: str, about: str, work: Callable[[bool], int]) -> int:

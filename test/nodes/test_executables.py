@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 
-from live import ROOT, wait_until
+from live import DEADLINE, ROOT, wait_until
 import pytest
 
 NODES = {'estimator': 'ou_estimator', 'adaptive_filter': 'ou_adaptive_filter'}
@@ -155,3 +155,20 @@ def test_the_nodes_have_one_thread_of_blas():
         done = subprocess.run([sys.executable, '-c', code], env=env, capture_output=True,
                               text=True, check=True)
         assert done.stdout == f'{threads}\n'
+
+
+def test_no_thread_holds_up_the_end(tmp_path):
+    """One that never ends, as one that makes a table may for a while; what was said is told."""
+    code = ('import atexit, threading, time\n'
+            'from ou_monitor.nodes.run import run_node\n'
+            'def work():\n'
+            '    threading.Thread(target=time.sleep, args=(1e6,)).start()\n'
+            '    atexit.register(print, "at exit")\n'
+            '    print("done", end=" ")\n'
+            '    return 3\n'
+            'run_node("one", "about", work)\n')
+    env = {**os.environ, 'PYTHONPATH': str(ROOT), 'ROS_LOG_DIR': str(tmp_path),
+           'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
+    done = subprocess.run([sys.executable, '-c', code], env=env, capture_output=True, text=True,
+                          timeout=DEADLINE)
+    assert (done.returncode, done.stdout, done.stderr) == (3, 'done at exit\n', '')
