@@ -237,28 +237,6 @@ def noise_variance(e: Estimate) -> float:
     return e.noise_std ** 2 if e.noise_std > 0.0 else 0.0
 
 
-class Pool:
-    """Means of blocks at one throttle."""
-
-    def __init__(self) -> None:
-        self.n = 0
-        self.begin = self.end = self.time = 0.0
-        self.voltage = self.throttle = self.apart = 0.0
-
-    def add(self, n: int, begin: float, end: float, dt: float, voltage: float, throttle: float,
-            apart: float) -> None:
-        """Add a block of n samples."""
-        if not self.n:
-            self.begin = begin
-        self.n += n
-        self.end = end
-        self.time += n * dt
-        share = n / self.n
-        self.voltage += share * (voltage - self.voltage)
-        self.throttle += share * (throttle - self.throttle)
-        self.apart += share * (apart - self.apart)
-
-
 class Squares:
     """Squares of innovations, until there are enough for a logarithm."""
 

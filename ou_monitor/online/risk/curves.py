@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.risk.curve_filters import (
-    BINS, CurvePrior, HatFilter, noise_variance, Pool, Squares, STEADY, Wander)
+    BINS, CurvePrior, HatFilter, noise_variance, Squares, STEADY, Wander)
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN
 
 # Nodes of the curves over throttle 0..1, and the times, s, in which the intensity at a throttle
@@ -76,6 +76,28 @@ class CurvePoint(NamedTuple):
 
     value: float
     se: float
+
+
+class Pool:
+    """Means of blocks at one throttle."""
+
+    def __init__(self) -> None:
+        self.n = 0
+        self.begin = self.end = self.time = 0.0
+        self.voltage = self.throttle = self.apart = 0.0
+
+    def add(self, n: int, begin: float, end: float, dt: float, voltage: float, throttle: float,
+            apart: float) -> None:
+        """Add a block of n samples."""
+        if not self.n:
+            self.begin = begin
+        self.n += n
+        self.end = end
+        self.time += n * dt
+        share = n / self.n
+        self.voltage += share * (voltage - self.voltage)
+        self.throttle += share * (throttle - self.throttle)
+        self.apart += share * (apart - self.apart)
 
 
 class LearnedCurves:

