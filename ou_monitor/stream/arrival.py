@@ -133,6 +133,10 @@ class Publishers:
             self.numbered = False
             return kept
         whole = np.array(numbers, dtype=np.int64)
+        if publishers <= 1 and self._tracks and (
+                arrived[0] - max(track.arrived for track in self._tracks) > GIVE_UP):
+            # The only one begins anew behind a silence: whoever else was here is gone.
+            del self._tracks[1:]
         if publishers <= 1 and len(self._tracks) <= 1:
             self._alone(whole, times, arrived)
             return kept

@@ -122,6 +122,16 @@ def test_two_that_begin_anew_are_two():
     assert kept[0] + kept[1] >= 900
 
 
+def test_the_only_one_begins_anew_without_loss():
+    """Another was there before; behind a silence its first messages, many at once, are kept."""
+    publishers = Publishers()
+    follow(publishers, sent(1, 1000, 1e3, 0.0), sent(1, 200, 200.0, 0.0004), count=2)
+    follow(publishers, sent(1001, 1000, 1e3, 1.0), count=1)
+    foreign = publishers.foreign
+    kept = follow(publishers, sent(1, 2000, 1e3, 4.0), count=1, batch=2000)
+    assert kept[0] == 2000 and publishers.foreign == foreign
+
+
 def test_numbers_of_any_order_cost_little():
     """Each smaller than the one before, as of publishers without end: no more tracks than that."""
     publishers = Publishers()
