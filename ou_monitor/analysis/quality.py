@@ -30,6 +30,8 @@ _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
 _UNEVEN = 0.05
 # No supply of a UAV has more, V; the millivolts of any do.
 _MOST_VOLTS = 1000.0
+# No autopilot tells its battery less often, s; nor, once a second, for as long in one flight, s.
+_LONG_STEP, _SLOW, _LONG_FLIGHT = 5.0, 0.9, 10_800.0
 # Throttle may go beyond 0..1 by so much, as sticks out of trim do, and by more for so small a
 # share of the samples.
 _TRIM, _RARE = 0.05, 0.01
@@ -122,10 +124,16 @@ def _of_units(recording: Recording) -> list[QualityItem]:
     middle = float(np.median(np.abs(recording.voltage))) if recording.n else 0.0
     if middle > _MOST_VOLTS:
         items.append(QualityItem('VOLTAGE_UNIT', Severity.WARNING, (
-            f'Half of the voltages exceed {middle:.4g}, more than any supply of a UAV in volts: '
-            'are they millivolts, or counts of an ADC? Alpha and tau hold; figures in V are in '
-            'that unit instead, and no risk is computed. Divide millivolts by 1000 (for a bag: '
-            'unit_factor in a msg config).')))
+            f'The median of the voltages is {middle:.4g}, more than any supply of a UAV has in '
+            'volts: is this mV, or counts of an ADC? Alpha and tau hold; figures in V are in '
+            'that unit instead, and no risk is computed. --unit mV reads a CSV in mV; for a bag '
+            'there is unit_factor in a msg config.')))
+    step = float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0
+    if step > _LONG_STEP or (step > _SLOW and recording.duration > _LONG_FLIGHT):
+        items.append(QualityItem('TIME_UNIT', Severity.WARNING, (
+            f'The samples are {step:.3g} s apart, over {recording.duration / 3600.0:.3g} hours: '
+            'is the time in ms or us? --time-unit ms reads a CSV in ms. All rates and times are '
+            'wrong by that factor otherwise.')))
     known = recording.throttle[np.isfinite(recording.throttle)]
     low, high = np.quantile(known, (_RARE, 1.0 - _RARE)) if known.size else (0.0, 1.0)
     if low < -_TRIM or high > 1.0 + _TRIM:

@@ -19,6 +19,7 @@ from ou_monitor.text import number
 # What changes the meaning of the numbers in the headline itself.
 _BEWARE = {
     'VOLTAGE_UNIT': 'Beware: the voltages seem to be millivolts or counts, not volts.',
+    'TIME_UNIT': 'Beware: the time seems to be in ms or us, not in s.',
     'SECOND_RELAXATION': ('Beware: the noise shows a second relaxation, so tau is that of a '
                           'mixture.'),
     'NOT_SETTLED': ('Beware: the levels, and so tau, include the settling after changes of '

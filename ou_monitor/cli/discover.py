@@ -112,9 +112,9 @@ def in_short(finding: Finding) -> tuple[str, str]:
 
 def told(finding: Finding) -> str:
     """Return the verdict with what a pilot calls each cause."""
-    from ou_monitor.discovery.plain_names import plain
+    from ou_monitor.discovery.plain_names import answer
 
-    return plain(finding.sentence, [cause.name for cause in finding.causes])
+    return answer(finding.sentence, [cause.name for cause in finding.causes])
 
 
 def render(finding: Finding, known: Sequence[tuple[str, str]] = ()) -> str:

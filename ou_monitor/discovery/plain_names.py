@@ -30,6 +30,8 @@ PLAIN_NAMES = {
     'tone': 'a line at a fixed frequency',
     'volatility': 'noise that comes and goes',
 }
+# What is left is listed by its own heading.
+_LEFT = re.compile(r'(another part remains|no known cause explains it): [^.]*\.')
 # Names that are no words of English; the others stand for themselves where they are no cause.
 _CODE = re.compile(r'(?<![\w(])(' + '|'.join(
     name for name in sorted(PLAIN_NAMES, key=len, reverse=True) if '_' in name) + r')(?![\w)])')
@@ -51,6 +53,11 @@ def plain(text: str, causes: Sequence[str] = ()) -> str:
         if '_' not in name and name in PLAIN_NAMES:
             text = re.sub(rf'(?<![\w(]){name}(?![\w)])', both_names(name), text, count=1)
     return text[:1].upper() + text[1:]
+
+
+def answer(text: str, causes: Sequence[str] = ()) -> str:
+    """Return a verdict as a pilot reads it: plain names, without the statistics that are left."""
+    return plain(_LEFT.sub(r'\1.', text), causes)
 
 
 def both_names(name: str) -> str:

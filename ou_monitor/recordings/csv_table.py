@@ -33,6 +33,8 @@ _MARK = ': the decimal mark is a point'
 _LONGEST = 40
 # A log of 1000 columns has lines of some 10 000 characters.
 MOST_OF_LINE = 65536
+# Share of steps back in what is no time; a supply is not read less often, s.
+_BACK, _LONGEST_STEP = 0.25, 100.0
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,24 @@ def read_csv(path: Path, columns: CsvColumns | None = None,
                          f"{', '.join(named)}")
     optional = throttle[1] if CURRENT in named else (*throttle[1], CURRENT)
     t, v, u, *current = _columns(path, (time, voltage, *throttle[0]), optional)
+    _check_time(path, t * TIME_UNITS[wanted.time_unit], v, (time, voltage))
     return (t * TIME_UNITS[wanted.time_unit], v * VOLTAGE_UNITS[wanted.unit], u,
             current[0] if current else np.full(t.shape, np.nan))
+
+
+def _check_time(path: Path, t: FloatArray, voltage: FloatArray, names: tuple[str, str]) -> None:
+    """Refuse a time that cannot be one in seconds, or that is the voltage (t in s)."""
+    step = np.diff(t)
+    step = step[np.isfinite(step)]
+    if not step.size:
+        return
+    if float(np.mean(step < 0.0)) > _BACK and (np.diff(voltage) > 0.0).all():
+        raise InputError(f"{path}: '{names[0]}' runs backwards, and '{names[1]}' only ever rises: "
+                         'are the two columns swapped?')
+    usual = float(np.median(step))
+    if usual > _LONGEST_STEP:
+        raise InputError(f"{path}: the samples are {usual:g} s apart by '{names[0]}': is it in "
+                         'ms, us or ns? --time-unit says so')
 
 
 def read_column(path: Path, name: str, columns: CsvColumns | None = None,

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from ou_monitor.criticism.curves import compare_curves, Comparison
 from ou_monitor.discovery.finding import Criticism, Finding
-from ou_monitor.discovery.plain_names import plain, PLAIN_NAMES
+from ou_monitor.discovery.plain_names import answer, PLAIN_NAMES
 from ou_monitor.discovery.words import (
     cause_rows, crossing_words, gain_remark, MNAT, NOT_KNOWN, overlap_words, plain_model_words,
     plain_words, with_error)
@@ -39,7 +39,7 @@ def discovery_page(finding: Finding, command: str = '',
     subtitle = f'{finding.n} samples in {number(finding.duration, 4)} s'
     if finding.samples is not None and finding.samples.n != finding.n:
         subtitle += f', of which {finding.samples.n} were used'
-    sections = [page.headline(_typeset(plain(
+    sections = [page.headline(_typeset(answer(
         finding.sentence, [cause.name for cause in finding.causes])))]
     if finding.samples is not None:
         sections.append(page.figure(_voltage(finding), _VOLTAGE.format(_model_name(finding))
@@ -52,8 +52,8 @@ def discovery_page(finding: Finding, command: str = '',
                                   *_gain(finding)),
                      page.section(
                          'Statistics before and after' if finding.causes else 'Statistics',
-                         *_statistics(finding)),
-                     page.section('Data beside simulations', *_comparisons(finding)),
+                         *_statistics(finding), folded=True),
+                     page.section('Data beside simulations', *_comparisons(finding), folded=True),
                      page.section('What is left', *_left(finding), folded=True),
                      page.section('Parameters', *_parameters(finding), folded=True)]
     if progress is not None:

@@ -54,7 +54,8 @@ th { text-align: right; font-weight: 600; color: var(--soft); vertical-align: bo
   border-bottom: 1px solid var(--soft); padding: 4px 10px 4px 0; }
 td { text-align: right; padding: 4px 10px 4px 0; border-bottom: 1px solid var(--rule);
   white-space: nowrap; } td.left, th.left { text-align: left; }
-td small { color: var(--soft); }
+td small { color: var(--soft); display: inline-block; max-width: 250px; white-space: normal;
+  line-height: 1.3; }
 details.section { border-top: 1px solid var(--rule); margin: 10px 0; }
 details.section > summary { cursor: pointer; padding: 8px 0 4px; }
 details.section > summary h2 { display: inline; }

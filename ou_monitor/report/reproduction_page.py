@@ -28,15 +28,16 @@ def reproduction_page(result: Reproduction, command: str = '') -> str:
     """Return the report of a reproduction."""
     sections = [
         page.headline(headline(result)),
-        page.section('Eight points to read the paper with', *_points(result)),
         page.section('Figures, simulated from the numbers printed', *_figures(result)),
+        page.section('Eight points to read the paper with', *_points(result)),
         page.section('Every number', page.paragraph(
             'Agrees: the recomputed number rounds to the printed one, or its interval (3 standard '
             'errors, or the range given) reaches it. Rounding: it agrees once the underlying '
             'readings move within their own rounding. Claims are written as bounds: "> 0" claims '
             'that something rises.', soft=True)),
         *[page.section(f'{where}: {tally(rows)}', _table(rows), page.bullets(
-            [_typeset(f'{row.quantity}: {row.sentence} How: {row.how}.') for row in rows]))
+            [_typeset(f'{row.quantity}: {row.sentence} How: {row.how}.') for row in rows]),
+            folded=True)
           for where, rows in result.parts()],
         page.section('Where it comes from', page.paragraph(
             f'Random numbers from seed {result.seed}; another seed moves the simulated numbers '

@@ -50,6 +50,10 @@ def test_headline_warns_of_what_changes_its_own_numbers():
     assert 'Beware' not in headline(analyze(simulated))
     sentence = headline(analyze(replace(simulated, voltage=1e3 * simulated.voltage)))
     assert sentence.endswith('Beware: the voltages seem to be millivolts or counts, not volts.')
+    found = analyze(replace(simulated, t=1e3 * simulated.t[::20], voltage=simulated.voltage[::20],
+                            throttle=simulated.throttle[::20], current=None))
+    assert headline(found).endswith('Beware: the time seems to be in ms or us, not in s.')
+    assert any('is the time in ms or us? --time-unit ms' in text for text in cautions(found))
 
 
 def test_the_same_caution_of_two_levels_is_said_once():

@@ -9,7 +9,7 @@ from ou_monitor.cli.discover import render
 from ou_monitor.cli.main import main
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.finding import Cause, Finding, Verdict
-from ou_monitor.discovery.plain_names import both_names, plain, PLAIN_NAMES
+from ou_monitor.discovery.plain_names import answer, both_names, plain, PLAIN_NAMES
 from ou_monitor.discovery.words import explain, parameters
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
@@ -234,3 +234,6 @@ def test_plain_names_stand_before_the_names_in_code():
         'drift is left.')
     assert plain('The plain OU simulates it.') == 'The plain OU simulates it.'
     assert both_names('load_sag') == 'sag (load_sag)' and both_names('new') == 'new'
+    assert answer('load_sag explains a part of it; another part remains: errors depend, and noise '
+                  'rises (3 more). Gain: none.') == (
+        'Sag (load_sag) explains a part of it; another part remains. Gain: none.')

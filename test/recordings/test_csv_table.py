@@ -2,7 +2,7 @@
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.csv_table import read_csv
+from ou_monitor.recordings.csv_table import CsvColumns, read_csv
 from ou_monitor.recordings.read import read_recording
 import pytest
 
@@ -102,3 +102,22 @@ def test_options_of_bags(tmp_path):
     path = written(tmp_path, 'time_s,voltage_v\n3,5\n')
     with pytest.raises(InputError, match='--msg-config is for bags'):
         read_recording(path, msg_config='px4')
+
+
+def test_swapped_columns_and_odd_times_are_told(tmp_path):
+    """A time that jumps about beside a voltage that only rises; samples minutes apart."""
+    rng = np.random.default_rng(1)
+    volts, times = 16.0 + 0.1 * rng.standard_normal(200), 0.01 * np.arange(200)
+
+    def csv(time, voltage):
+        return written(tmp_path, 'time_s,voltage_v\n' + ''.join(
+            f'{a:.6f},{b:.6f}\n' for a, b in zip(time, voltage)))
+
+    with pytest.raises(InputError, match="'voltage_v' only ever rises: are the two columns swap"):
+        read_csv(csv(volts, times))
+    with pytest.raises(InputError, match='10000 s apart by .time_s.: is it in ms, us or ns'):
+        read_csv(csv(1e6 * times, volts))
+    # Sorted by another column, or told in its unit, it is a recording.
+    read_csv(csv(times[::-1], volts))
+    t, *_ = read_csv(csv(1e6 * times, volts), CsvColumns(time_unit='us'))
+    np.testing.assert_allclose(t, times, rtol=0.0, atol=1e-9)

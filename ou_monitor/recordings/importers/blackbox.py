@@ -249,7 +249,7 @@ def _throttles(t: FloatArray, columns: dict[str, FloatArray],
     if 'rcCommand[3]' in columns:
         finer = blackbox_motion.high_resolution(headers)
         yield Series('rcCommand[3]', THROTTLE, t,
-                     (columns['rcCommand[3]'] / finer - 1000.0) / 1000.0,
+                     (_signed(columns['rcCommand[3]']) / finer - 1000.0) / 1000.0,
                      f'(x / {finer:g} - 1000) / 1000' if finer > 1.0 else '(x - 1000) / 1000',
                      'stick', 1)
     if 'setpoint[3]' in columns:
@@ -258,6 +258,12 @@ def _throttles(t: FloatArray, columns: dict[str, FloatArray],
     for name in motors:
         yield Series(name, THROTTLE, t, (columns[name] - low) / (high - low),
                      f'(x - {low:g}) / {high - low:g}', 'one motor')
+
+
+def _signed(value: FloatArray) -> FloatArray:
+    """Return counts that a logger wrote without their sign: a stick below its lowest pulse."""
+    value = np.where(value >= 2.0 ** 31, value - 2.0 ** 32, value)
+    return np.where((value >= 2.0 ** 15) & (value < 2.0 ** 16), value - 2.0 ** 16, value)
 
 
 def _pair(value: Any) -> tuple[float, float] | None:

@@ -35,6 +35,15 @@ def test_a_flight(tmp_path):
     np.testing.assert_allclose(stick.values, (rows[:, STICK] - 1000) / 1000, rtol=1e-12)
 
 
+def test_a_stick_below_its_lowest_pulse(tmp_path):
+    """Written without its sign it is 4 thousand million; it is no throttle, not full throttle."""
+    rows = quad()
+    rows[:8, STICK] = (988, 2 ** 32 - 12, 2 ** 16 - 12, 1000, 2000, 2012, 1500, 1250)
+    path, log = load(tmp_path, blackbox(rows))
+    stick = choose(path, log, throttle='rcCommand[3]').throttle
+    assert stick.values[:8].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.5, 0.25]
+
+
 @pytest.mark.parametrize('firmware, headers, volts, amperes', [
     ('Betaflight 4.0.0', {}, 0.01, 0.01),
     ('Betaflight 3.5.7 (x)', {}, 0.1, 0.01),
