@@ -29,6 +29,8 @@ _SHARE, _NEAR = 0.99, 0.1
 # a printed step of one code or the next.  Gaps between codes that show it, at least; decimals.
 _SPARSE, _FEWEST_CODES = 2.0, 4
 _DECIMALS = range(7)
+# Equal changes from which they come again and again: of a voltage without codes no two are equal.
+_AGAIN = 20
 # Samples at a rail, visits to it, and standard errors above its neighbours, at least.
 _LEAST, _VISITS, _CLEAR = 8, 3, 5.0
 # With steps above this many standard deviations of the noise the codes next to
@@ -71,6 +73,17 @@ def find_step(voltage: FloatArray) -> float:
         if step > 8.0 * rounding:
             return step
     return _unprinted(codes, gaps, weight)
+
+
+def usual_change(voltage: FloatArray) -> float:
+    """Return the change that comes most often, V; 0 where none comes again and again."""
+    # Codes to which something was added now and then lie on no lattice, but most changes do.
+    rounding = 2.0 * _FLOAT32 * float(np.abs(voltage).max())
+    size = np.sort(np.abs(np.diff(voltage[:_MOST])))
+    size = size[size > rounding]
+    first = np.flatnonzero(np.diff(size, prepend=-np.inf) > rounding)
+    count = np.diff(first, append=size.size)
+    return float(size[first[count.argmax()]]) if count.max(initial=0) >= _AGAIN else 0.0
 
 
 def _unprinted(codes: FloatArray, gaps: FloatArray, weight: FloatArray) -> float:

@@ -1,9 +1,9 @@
 """
 What a recording shows without any model, and the samples left for one.
 
-Not-a-number, stamps, repeated values, codes and rails: exact findings, for in a
-diffusion ties have probability zero.  Stamps that scatter about an even grid are either true,
-and then the increments follow the steps, or wrong, and then they do not.
+Not-a-number, stamps, repeated values, codes and rails: exact findings, for in a diffusion ties
+have probability zero.  Stamps that scatter about an even grid are either true, and then the
+increments follow the steps, or wrong, and then they do not.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.criticism.adc import find_knee, find_rails, find_step, redraw
+from ou_monitor.criticism.adc import find_knee, find_rails, find_step, redraw, usual_change
 from ou_monitor.criticism.readings import counted, usable, why_nothing
 from ou_monitor.criticism.samples import (
     choose_samples, events_between, lines_between, Samples, without_tones)
@@ -37,7 +37,7 @@ MOVES = 0.01
 # Repeats that are called so, at least; and the share of ties by chance up to which the size of
 # the changes says how many there are.
 _FEWEST_TIES, _FINE = 20, 0.15
-# Samples apart at which values alike are counted: with 8 of them seven values held of ten show.
+# Samples apart at which values alike are counted: at 8 seven held of ten show.
 _APART = 2, 4, 8
 # The noise of a rail falls to one part in so many at rest: ties are so much likelier there.
 _CALMEST = 100.0
@@ -127,7 +127,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     drawn = None
     noise = _innovation_std(v)
     step = find_step(v)
-    low, high = find_rails(v, step, noise)
+    low, high = find_rails(v, step or usual_change(v), noise)
     soft = 'readings squeezed near the end of the range'
     if not math.isfinite(low) and not math.isfinite(high):
         low, high = _knees(v, noise)
@@ -190,22 +190,23 @@ def _ties(v: FloatArray) -> bool:
     step = np.diff(v)
     # At the ends of the range there are other reasons to repeat.
     inner = (v[1:] > v.min()) & (v[1:] < v.max())
-    equal = int(((step == 0.0) & inner).sum())
-    count = int(inner.sum())
+    equal, count = int(((step == 0.0) & inner).sum()), int(inner.sum())
     if equal < _FEWEST_TIES:
         return False
-    code = max(find_step(v), _FLOAT32 * float(np.abs(v).max()))
     moved = step[(step != 0.0) & inner]
     if moved.size < 2:
         return False
+    code = max(find_step(v), usual_change(v), _FLOAT32 * float(np.abs(v).max()))
     # Chance of two normal values one code apart or less, on average over their codes.
     chance = min(1.0, code / (math.sqrt(2.0 * math.pi) * float(np.sqrt(np.mean(moved**2)))))
     if chance >= _FINE and float(np.mean(moved[1:] * moved[:-1] > 0.0)) > 0.5:
         # A voltage that goes on where it goes stays in each code for a while.
         return False
-    # Where a rail is calm, ties are likelier; but that calm none is, and a sensor was stuck.
-    expected = count * max(chance if chance < _FINE else 0.0,
-                           min(_ties_without_holds(v, inner), _CALMEST * chance))
+    share = _ties_without_holds(v, inner)
+    if int(((step[1:] == 0.0) & (step[:-1] != 0.0)).sum()) < _FEWEST_TIES:
+        # Where a rail is calm, ties are likelier; but that calm none is, and a sensor was stuck.
+        share = min(share, _CALMEST * chance)
+    expected = count * max(chance if chance < _FINE else 0.0, share)
     return equal - expected > 6.0 * math.sqrt(max(expected, 1.0))
 
 
@@ -280,9 +281,8 @@ def _knees(v: FloatArray, noise: float) -> tuple[float, float]:
 def _saturation(v: FloatArray, low: float, high: float) -> Term:
     """Return the term; a rail that was not met is put where no reading comes."""
     far = 1e3 * (float(v.max()) - float(v.min()))
-    return Saturation(
-        low=low if math.isfinite(low) else float(v.min()) - far,
-        high=high if math.isfinite(high) else float(v.max()) + far)
+    return Saturation(low if math.isfinite(low) else float(v.min()) - far,
+                      high if math.isfinite(high) else float(v.max()) + far)
 
 
 def _useful(u: FloatArray | None, recorded: bool, notes: list[str]) -> FloatArray | None:

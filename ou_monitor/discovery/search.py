@@ -110,14 +110,18 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         # replaced is not tried again.
         slow = [kind.NAME for kind in _kinds(search.removed) if kind.FAMILY == 'slow']
         # Nor are they the last that could explain it: what did less well may be right.
-        again = begun.copy()
+        found = None
         if not loaded and fitter.cost <= decision.MOST_COST:
+            again = begun.copy()
             name_causes(fitter, again, bank, given=[*given, *slow, *dropped])
-        kinds = _kinds(again.accepted)
-        other = fitter.whole(again.composite)
-        left = criticise(samples, other, bank)
-        if any(map(decision.is_latent, kinds)) and not decision.withdrawn(before, left, kinds):
-            search, whole, after = again, other, left
+            kinds = _kinds(again.accepted)
+            other = fitter.whole(again.composite)
+            left = criticise(samples, other, bank)
+            if any(map(decision.is_latent, kinds)) and not decision.withdrawn(
+                    before, left, kinds):
+                found = again, other, left
+        if found is not None:
+            search, whole, after = found
         else:
             search = begun.copy()
             name_causes(fitter, search, bank, latent=False, given=[*given, *slow])

@@ -1,0 +1,133 @@
+"""
+Effects hidden in recorded flights, in units of what the recording itself shows.
+
+Sizes are in standard deviations of white noise with the second differences of the recording, in
+which no slow motion shows; a twentieth of them, the largest, are the load's.  An ADC is coarse
+beside less than half of its step.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from ou_monitor import Recording
+from ou_monitor.criticism.adc import find_step
+from ou_monitor.records import FloatArray
+from scipy.signal import lfilter
+
+# Effect of a recording and its noise: what to add, or what to do.
+Inject = Callable[[Recording, float, np.random.Generator], Recording]
+
+
+def noise_of(voltage: FloatArray) -> float:
+    """Return the standard deviation of white noise with these second differences, V."""
+    bent = np.abs(np.diff(voltage, 2))
+    usual = bent[bent <= np.quantile(bent, 0.95)]
+    return max(float(np.sqrt(np.mean(usual**2) / 6.0)), 0.5 * find_step(voltage))
+
+
+def _added(recording: Recording, more: FloatArray) -> Recording:
+    """Return a recording with something on the supply, read by its own ADC."""
+    voltage = recording.voltage + more
+    step = find_step(recording.voltage)
+    if step > 0.0:
+        # As printed: a code of 5.28 mV may be there as 5 or as 6.
+        decimals = next((k for k in range(7) if np.allclose(
+            recording.voltage, recording.voltage.round(k), 0.0, 1e-8)), 9)
+        low = float(recording.voltage.min())
+        voltage = (low + step * np.rint((voltage - low) / step)).round(decimals)
+    return replace(recording, voltage=voltage)
+
+
+def _relaxing(drive: FloatArray, rate: float, step: float) -> FloatArray:
+    """Return what pushes leave behind that relax at a rate (1/s; step in s)."""
+    return np.asarray(lfilter([1.0], [1.0, -np.exp(-rate * step)], drive))
+
+
+def _step(recording: Recording) -> float:
+    return float(np.median(np.diff(recording.t)))
+
+
+def tone(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
+    """A steady line at a third of the band."""
+    rate = 1.0 / _step(recording)
+    at = rng.uniform(0.1, 0.4) * rate
+    return _added(recording, 0.8 * noise * np.sin(2.0 * np.pi * at * recording.t))
+
+
+def jumps(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
+    """Falls of ten deviations, one a second, that recover within ten samples."""
+    step = _step(recording)
+    hit = rng.random(recording.t.size) < step * max(1.0, 40.0 / (recording.t.size * step))
+    drive = hit * noise * rng.uniform(-14.0, -8.0, recording.t.size)
+    return _added(recording, _relaxing(drive, 0.1 / step, step))
+
+
+def glitches(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
+    """Single wrong values, one of two hundred, of ten deviations either way."""
+    hit = rng.random(recording.t.size) < 0.005
+    return _added(recording, hit * noise * 10.0 * rng.standard_normal(recording.t.size))
+
+
+def held(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
+    """Three values of ten repeat the one before."""
+    voltage = recording.voltage.copy()
+    for k in np.flatnonzero(rng.random(voltage.size) < 0.3)[1:]:
+        voltage[k] = voltage[k - 1]
+    return replace(recording, voltage=voltage)
+
+
+def steps(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
+    """Codes two deviations apart."""
+    return replace(recording, voltage=2.0 * noise * np.rint(recording.voltage / (2.0 * noise)))
+
+
+def white(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
+    """White noise as large again as what is there."""
+    return _added(recording, noise * rng.standard_normal(recording.t.size))
+
+
+def drift(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
+    """A fall by four deviations from begin to end."""
+    return _added(recording, -4.0 * noise * np.linspace(0.0, 1.0, recording.t.size))
+
+
+def slow(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
+    """An OU of two deviations that forgets within a second or two."""
+    step, rate = _step(recording), rng.uniform(0.5, 1.5)
+    push = rng.standard_normal(recording.t.size) * np.sqrt(-np.expm1(-2.0 * rate * step))
+    return _added(recording, 2.0 * noise * _relaxing(push, rate, step))
+
+
+def levels(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
+    """Two levels five deviations apart, for a second or so each."""
+    flips = rng.random(recording.t.size) < _step(recording) / rng.uniform(0.8, 1.6)
+    return _added(recording, -5.0 * noise * (np.cumsum(flips) % 2))
+
+
+def jitter(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
+    """Stamps wrong by a tenth of a step."""
+    off = 0.1 * _step(recording) * rng.standard_normal(recording.t.size)
+    return replace(recording, t=recording.t + off)
+
+
+def rail(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
+    """An ADC that ends where one reading of fifty would be below."""
+    return replace(recording, voltage=np.maximum(
+        recording.voltage, np.quantile(recording.voltage, 0.02)))
+
+
+# Each with the names that are right for it.
+EFFECTS: dict[str, tuple[Inject, frozenset[str]]] = {
+    'tone': (tone, frozenset({'tone'})),
+    'jumps': (jumps, frozenset({'jumps'})),
+    'glitches': (glitches, frozenset({'glitches'})),
+    'held': (held, frozenset({'held_samples'})),
+    'steps': (steps, frozenset({'quantization'})),
+    'white': (white, frozenset({'measurement_noise'})),
+    'drift': (drift, frozenset({'drift'})),
+    'slow': (slow, frozenset({'second_relaxation', 'flicker_noise'})),
+    'levels': (levels, frozenset({'regime_switching'})),
+    'jitter': (jitter, frozenset({'clock_jitter'})),
+    'rail': (rail, frozenset({'saturation'})),
+}
