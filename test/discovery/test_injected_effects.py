@@ -2,6 +2,7 @@
 
 from functools import cache
 
+from injected import EFFECTS, noise_of
 import numpy as np
 from ou_monitor import read_recording, Recording
 from ou_monitor.criticism.integrity import examine
@@ -41,3 +42,23 @@ def test_values_that_were_held(dither, share, found):
         held[k] = held[k - 1]
     exact = examine(Recording(t, held, throttle)).exact
     assert ('held_samples' in [term.NAME for term in exact]) is found
+
+
+@pytest.mark.parametrize('effect', sorted(EFFECTS))
+def test_what_shows_without_a_model(effect):
+    """Holds, steps and a rail are named; what is added to the supply is none of them."""
+    t, voltage, throttle = flown()
+    flight = Recording(t, voltage, throttle)
+    inject, names = EFFECTS[effect]
+    hidden = inject(flight, noise_of(voltage), np.random.default_rng(7))
+    exact = {term.NAME for term in examine(hidden).exact}
+    assert exact == (names if effect in ('held', 'steps', 'rail') else set())
+
+
+@pytest.mark.parametrize('height', [0.0151, 0.3333])
+def test_codes_moved_by_what_is_no_code_are_no_holds(height):
+    """Ties stay those of the ADC where something else than codes was added now and then."""
+    t, voltage, throttle = flown()
+    rng = np.random.default_rng(8)
+    moved = voltage + height * (np.cumsum(rng.random(t.size) < 0.005) % 2)
+    assert examine(Recording(t, moved, throttle)).exact == ()

@@ -49,14 +49,14 @@ def _step(recording: Recording) -> float:
 
 
 def tone(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """A steady line at a third of the band."""
+    """Add a steady line."""
     rate = 1.0 / _step(recording)
     at = rng.uniform(0.1, 0.4) * rate
     return _added(recording, 0.8 * noise * np.sin(2.0 * np.pi * at * recording.t))
 
 
 def jumps(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Falls of ten deviations, one a second, that recover within ten samples."""
+    """Add falls of ten deviations, one a second, that recover within ten samples."""
     step = _step(recording)
     hit = rng.random(recording.t.size) < step * max(1.0, 40.0 / (recording.t.size * step))
     drive = hit * noise * rng.uniform(-14.0, -8.0, recording.t.size)
@@ -64,13 +64,13 @@ def jumps(recording: Recording, noise: float, rng: np.random.Generator) -> Recor
 
 
 def glitches(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Single wrong values, one of two hundred, of ten deviations either way."""
+    """Add single wrong values, one of two hundred, of ten deviations either way."""
     hit = rng.random(recording.t.size) < 0.005
     return _added(recording, hit * noise * 10.0 * rng.standard_normal(recording.t.size))
 
 
 def held(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Three values of ten repeat the one before."""
+    """Let three values of ten repeat the one before."""
     voltage = recording.voltage.copy()
     for k in np.flatnonzero(rng.random(voltage.size) < 0.3)[1:]:
         voltage[k] = voltage[k - 1]
@@ -78,41 +78,41 @@ def held(recording: Recording, noise: float, rng: np.random.Generator) -> Record
 
 
 def steps(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Codes two deviations apart."""
+    """Read in codes two deviations apart."""
     return replace(recording, voltage=2.0 * noise * np.rint(recording.voltage / (2.0 * noise)))
 
 
 def white(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """White noise as large again as what is there."""
+    """Add white noise as large again as what is there."""
     return _added(recording, noise * rng.standard_normal(recording.t.size))
 
 
 def drift(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """A fall by four deviations from begin to end."""
+    """Add a fall by four deviations from begin to end."""
     return _added(recording, -4.0 * noise * np.linspace(0.0, 1.0, recording.t.size))
 
 
 def slow(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """An OU of two deviations that forgets within a second or two."""
+    """Add an OU of two deviations that forgets within a second or two."""
     step, rate = _step(recording), rng.uniform(0.5, 1.5)
     push = rng.standard_normal(recording.t.size) * np.sqrt(-np.expm1(-2.0 * rate * step))
     return _added(recording, 2.0 * noise * _relaxing(push, rate, step))
 
 
 def levels(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Two levels five deviations apart, for a second or so each."""
+    """Add two levels five deviations apart, for a second or so each."""
     flips = rng.random(recording.t.size) < _step(recording) / rng.uniform(0.8, 1.6)
     return _added(recording, -5.0 * noise * (np.cumsum(flips) % 2))
 
 
 def jitter(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Stamps wrong by a tenth of a step."""
+    """Make stamps wrong by a tenth of a step."""
     off = 0.1 * _step(recording) * rng.standard_normal(recording.t.size)
     return replace(recording, t=recording.t + off)
 
 
 def rail(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """An ADC that ends where one reading of fifty would be below."""
+    """Read by an ADC that ends where one reading of fifty would be below."""
     return replace(recording, voltage=np.maximum(
         recording.voltage, np.quantile(recording.voltage, 0.02)))
 
