@@ -4,8 +4,8 @@ Write the golden tables: `scripts/make_golden.py [NAME or RUN ...]` (default: al
 
 test/analysis/golden/NAME.json is what `ou-monitor analyze bags/NAME --json -` finds, without the
 long series (of those every sixteenth value); test/golden/RUN.json is what a run of
-test/support/golden_runs.py or golden_models.py finds.  Run it after a change that is meant to move
-the numbers, and look at the difference before it is committed.
+test/support/golden_*.py finds.  Run it after a change that is meant to move the numbers, and look
+at the difference before it is committed.
 """
 
 from __future__ import annotations
@@ -66,8 +66,9 @@ def main(argv: list[str]) -> int:
     """Write the tables of the bags named."""
     sys.path.insert(1, str(ROOT / 'test' / 'support'))
     import golden_models
+    import golden_parts
     import golden_runs
-    runs = {**golden_runs.RUNS, **golden_models.RUNS}
+    runs = {**golden_runs.RUNS, **golden_models.RUNS, **golden_parts.RUNS}
     bags = sorted(path.parent.name for path in BAGS.glob('*/truth.yaml'))
     for name in argv or [*bags, *runs]:
         found = runs[name]() if name in runs else golden(name)

@@ -9,11 +9,12 @@ import json
 import math
 
 import golden_models
+import golden_parts
 import golden_runs
 from project import ROOT
 import pytest
 
-RUNS = {**golden_runs.RUNS, **golden_models.RUNS}
+RUNS = {**golden_runs.RUNS, **golden_models.RUNS, **golden_parts.RUNS}
 # Another BLAS or version of NumPy moves numbers by less; what is below the second is nothing.
 RELATIVE, ABSOLUTE = 1e-5, 1e-9
 

@@ -5,6 +5,7 @@ import math
 
 from golden_runs import flight, table
 import numpy as np
+from ou_monitor import discover
 from ou_monitor.criticism.battery import statistics
 from ou_monitor.criticism.composite import (
     covariates_of, fit_composite, pole_beside, view_of)
@@ -31,7 +32,7 @@ def _throttle(n, seed=4):
     return np.repeat(np.random.default_rng(seed).uniform(0.2, 0.9, n // 50 + 1), 50)[:n]
 
 
-def _samples(n, *others, seed=11, uneven=False):
+def samples_of(n, *others, seed=11, uneven=False):
     """Return samples of the OU with other terms, 1 kHz or with steps of 1 and 2 ms."""
     rng = np.random.default_rng(seed)
     t = 1e-3 * (np.cumsum(rng.choice([1, 1, 2], n)) if uneven else np.arange(n))
@@ -40,7 +41,7 @@ def _samples(n, *others, seed=11, uneven=False):
     return Samples(t, model.simulate(t, rng, u), u)
 
 
-def _view(samples, *terms, share=1.0):
+def view_at(samples, *terms, share=1.0):
     gaussian = evaluate(samples, (term('ou', **OU), *terms))
     return view_of(samples, gaussian, gaussian.z, slice(0, round(share * samples.n)))
 
@@ -58,7 +59,7 @@ def terms():
         more = [] if name == 'ou' else [*beside, one]
         part = {}
         for uneven in (False, True):
-            samples = _samples(1200, *more, uneven=uneven)
+            samples = samples_of(1200, *more, uneven=uneven)
             part[f'volts {uneven}'] = table(samples.voltage[::150])
             if one.ROLE in (Role.LAW, Role.EXACT):
                 continue
@@ -68,7 +69,7 @@ def terms():
         part['free'] = {name: [table(one.moved(name, 0.1).values()), one.per_coordinate(name)]
                         for name in one.free()}
         if one.ROLE is not Role.EXACT and name != 'ou':
-            view = _view(_samples(4000, *more), *beside, share=0.8)
+            view = view_at(samples_of(4000, *more), *beside, share=0.8)
             part['candidates'] = [table(other.values()) for other in type(one).candidates(view)]
             part['simplest'] = [table(other.values()) for other in type(one).simplest(view)]
             part['holds'] = one.holds(view)
@@ -91,8 +92,8 @@ def laws():
     """Return laws as they are fitted at the true OU."""
     found = {}
     for name, params in _LAWS.items():
-        samples = _samples(2000 if name == 'regime_switching' else 6000, term(name, **params))
-        fit = catalogue()[name].fit_law(_view(samples, share=0.8))
+        samples = samples_of(2000 if name == 'regime_switching' else 6000, term(name, **params))
+        fit = catalogue()[name].fit_law(view_at(samples, share=0.8))
         found[name] = 'none' if fit is None else table({
             'term': fit.term.values(), 'se': fit.se, 'z': fit.z[::400], 'free': fit.free,
             'gain': float(fit.gain.sum()),
@@ -148,9 +149,10 @@ def criticism():
                'noise': (term('measurement_noise', std=0.02),),
                'sigma': (term('load_dependent_sigma', throttle=[0.0, 0.5, 1.0],
                               log_factor=[0.0, 0.5, 0.8]),),
-               'jumps': (term('jumps', rate=5.0, mean=-0.1, std=0.05),)}
+               'jumps': (term('jumps', rate=5.0, mean=-0.1, std=0.05),),
+               'glitches': (term('glitches', probability=0.01, std=0.5),)}
     for name, others in effects.items():
-        samples = _samples(3000, *others, seed=91, uneven=name == 'slow')
+        samples = samples_of(3000, *others, seed=91, uneven=name == 'slow')
         ou = term('ou', **OU)
         plain = fit_composite(samples, [ou], samples.train)
         given = covariates_of(samples, plain)
@@ -177,7 +179,7 @@ def criticism():
         part['levels'] = holm([examine_level(halves, e), examine_level(
             halves[:1], replace(e, status=Status.NO_RELAXATION, alpha=math.nan))])
         found[name] = table(part)
-    samples = _samples(1500, seed=92)
+    samples = samples_of(1500, seed=92)
     push, error, power = np.zeros(1500), np.zeros(1500), np.ones(1500)
     push[300], error[700], power[900:950] = 0.02, 0.01, 3.0
     fit = fit_gaussian(samples, [term('ou', **OU), term('measurement_noise', std=0.01)],
@@ -198,7 +200,7 @@ def discovery():
              False),
             ('sigma', [term('load_dependent_sigma', throttle=[0.0, 0.5, 1.0],
                             log_factor=[0.0, 0.5, 0.8])], False)):
-        samples = _samples(3000, *others, seed=95, uneven=uneven)
+        samples = samples_of(3000, *others, seed=95, uneven=uneven)
         ou = term('ou', **OU)
         every = slice(0, samples.n)
         plain = fit_composite(samples, [ou], every)
@@ -226,4 +228,24 @@ def discovery():
     return found
 
 
-RUNS = {run.__name__: run for run in (terms, laws, integrity, criticism, discovery)}
+def findings():
+    """Return what `discover` says of short recordings with one or two effects."""
+    found = {}
+    for name, others in (
+            ('sag', [term('load_sag', linear=0.3, square=0.1)]),
+            ('tone, jumps', [term('tone', amplitude=0.05, frequency=50.0, phase=0.4,
+                                  linewidth=0.0), term('jumps', rate=5.0, mean=-0.2, std=0.05)]),
+            ('glitches', [term('glitches', probability=0.01, std=0.5)])):
+        s = samples_of(2500, *others, seed=97)
+        made = discover(Recording(s.t, s.voltage, s.throttle, name))
+        found[name] = table({
+            'verdict': made.verdict.name, 'gain': [made.gain, made.gain_se, made.score],
+            'causes': [[one.name, one.gain, one.gain_se, one.alternatives, one.exact]
+                       for one in made.causes],
+            'criticism': [[one.statistic.replace(' ', '_'), one.before, one.after]
+                          for one in made.criticism][:12]})
+    return found
+
+
+RUNS = {run.__name__: run for run in (
+    terms, laws, integrity, criticism, discovery, findings)}

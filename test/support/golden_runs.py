@@ -60,7 +60,16 @@ def load():
     def part(t, u, offset=0.0, step=0.0, current=None):
         v = _pack(t, np.where(np.isfinite(u), u, 0.4), rng) + offset
         v = step * np.round(v / step) if step else v
-        loads.push(t, v, u, current)
+        drawn = np.full(t.size, np.nan) if current is None else current
+        # What the first samples say, before they have taught it the rest.
+        for n in (0, 1, 2, 4, 9):
+            some = slice(n, max(2 * n, 1))
+            loads.push(t[some], v[some], u[some], drawn[some])
+            early = loads.state()
+            found.append([] if early is None else table([
+                early.mean[:2], np.sqrt(np.diag(early.covariance))[:4], early.log_variance[0],
+                loads.load().resistance, loads.load().status.name]))
+        loads.push(t[18:], v[18:], u[18:], drawn[18:])
         ahead = t[-1] + np.array([0.01, 0.1, 1.0, 5.0, 30.0])
         state = loads.state()
         one = loads.load()

@@ -192,3 +192,60 @@ def test_the_first_calls_have_rows_of_the_width_that_is_used(monkeypatch, size):
     assert width in {given[0].shape[1] for name, given in calls if name == 'add_slots'}
     (slid,) = [given for name, given in calls if name == 'slide']
     assert slid[10] == 2 and slid[11].shape[1] == 10
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_the_text_of_the_kernels_is_that_of_their_twins(monkeypatch, seed):
+    """
+    The loops as Python runs them, where NumPy sums: estimates on the way, to 1e-5.
+
+    Gaps, throttle that moves, slots that are open, windows that slide and bad samples.
+    """
+    from ou_monitor import SlidingEstimator
+    rng = np.random.default_rng(seed)
+    t = np.arange(900) * 2e-3
+    u = 0.2 + 0.5 * (np.floor(t / 0.3) % 2)
+    y = 5.0 + 0.05 * np.sin(9.0 * t) + 0.02 * np.cumsum(rng.standard_normal(900)) / 5.0
+    if seed == 1:
+        t[400:] += 0.15
+        y[700] = math.nan
+    y -= 0.3 * u * (seed == 2)
+    plain = SlidingEstimator(0.8 if seed < 3 else 5.0)
+    looped = SlidingEstimator(0.8 if seed < 3 else 5.0)
+    kernels = compiled.Kernels(arma.fit_sums, arma.search, arma.finish, compiled.take_slots,
+                               compiled.add_slots, compiled.slide, compiled.check)
+    start = 0
+    while start < t.size:
+        stop = start + int(rng.integers(1, 90))
+        part = slice(start, stop)
+        found = []
+        for one, ready in ((plain, None), (looped, kernels)):
+            monkeypatch.setattr(compiled.COMPILED, 'ready', ready)
+            one.push(t[part], y[part], u[part] if seed == 2 else None)
+            e = one.estimate()
+            found.append([e.alpha, e.sigma, e.var_inf, e.u0, e.noise_std, e.alpha_se, e.sigma_se,
+                          e.u0_se, e.n, e.counters.used, e.t])
+            assert one.counters == plain.counters
+        assert found[1] == pytest.approx(found[0], rel=1e-5, abs=1e-9, nan_ok=True)
+        start = stop
+
+
+@pytest.mark.parametrize('change, good', [
+    (None, True), (('t', 3, 1e-4), False), (('t', 0, -1e-2), False), (('t', 5, -1e-4), False),
+    (('y', 2, math.nan), False), (('y', 0, math.inf), False), (('y', 9, -math.inf), False),
+    (('y', 4, compiled.LARGEST), True)])
+def test_even_and_finite_samples(change, good):
+    """Each step within its bounds, the first to the sample before; infinity is not finite."""
+    t, y = 1.0 + np.arange(10) * 1e-3, np.zeros(10)
+    if change is not None:
+        name, k, by = change
+        if name == 't':
+            t[k] += by
+        else:
+            y[k] = by
+    assert compiled.check(t, y, 1.0 - 1e-3, 0.95e-3, 1.05e-3) == good
+    # The bounds belong to what is even.
+    whole = np.array([1.0, 2.0, 3.0])
+    assert compiled.check(whole, np.zeros(3), 0.0, 1.0, 2.0)
+    assert compiled.check(whole, np.zeros(3), 0.0, 0.5, 1.0)
+    assert not compiled.check(whole, np.zeros(3), 0.0, 1.5, 2.0)

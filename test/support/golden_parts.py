@@ -1,0 +1,227 @@
+"""What parts of the online side and of the criticism find at their edges, for golden tables."""
+
+from dataclasses import replace
+
+from golden_models import samples_of, view_at
+from golden_runs import table
+import numpy as np
+from ou_monitor import AdaptiveLowPass
+from ou_monitor.criticism.composite import Composite
+from ou_monitor.criticism.samples import choose_samples, events_between, lines_between
+from ou_monitor.criticism.spectral_start import from_spectrum
+from ou_monitor.criticism.structure import evaluate
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.online.input_health import patience, readings, StampWatch
+from ou_monitor.online.risk.curve_filters import Wander
+from ou_monitor.online.risk.curves import LearnedCurves
+from ou_monitor.online.risk.flag import BrownoutFlag
+from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.records import Estimate, Flag, Status
+from scipy.signal import lfilter
+from term_examples import OU, term
+
+
+def curves():
+    """Return curves learned from throttle that steps, ramps, pauses, goes back and stays away."""
+    rng = np.random.default_rng(101)
+    n = 6000
+    t = np.arange(n) * 1e-3
+    u = np.clip(np.concatenate((np.repeat(rng.random(6), 500), np.linspace(0.1, 0.9, 1500),
+                                np.repeat([0.3, 1.4, -0.3], 500))), -0.5, 1.5)
+    noise = lfilter([1.0], [1.0, -np.exp(-0.063)], 0.02 * (1.0 + u) * rng.standard_normal(n))
+    v = 5.0 - 0.3 * u + noise
+    t[4000:] += 7.0
+    t[4200:4300] -= 0.05
+    v[100:110] = np.nan
+    u[2500:2600] = np.nan
+    plain = Estimate(alpha=63.0, sigma=0.632, var_inf=3.2e-3, u0=5.0, noise_std=0.004,
+                     alpha_se=0.1, sigma_se=0.02, var_inf_se=0.1, status=Status.OK, rate=1000.0)
+    found = []
+    for kind, e in (('plain', plain), ('held', replace(plain, flags=(Flag.HELD_SAMPLES,))),
+                    ('unknown', replace(plain, status=Status.NO_RELAXATION)),
+                    ('fast', replace(plain, alpha=900.0))):
+        one = LearnedCurves()
+        one.forgetting, one.shape_forgetting = 20.0, 200.0
+        for begin in range(0, n, 60):
+            part = slice(begin, begin + 60)
+            one.update(t[part], np.repeat(v[part][::3], 3) if kind == 'held' else v[part],
+                       u[part], e)
+            if begin % 1500 == 1440:
+                at = np.array([-0.2, 0.0, 0.15, 0.5, 0.82, 1.0])
+                found.append(table([kind, one.level_curve(at), one.sigma_curve(at),
+                                    one.seen_curve(at), one.scatter, one.extent,
+                                    [one.level_at(x) for x in (0.0, 0.33, 1.0)],
+                                    [one.wander.value, one.wander.variance, one.wander.speed]]))
+        # Set back by an hour: what was learned is older.
+        one.update(t[:300] - 3600.0, v[:300], u[:300], e)
+        found.append(table([one.level_at(0.5), one.sigma_at(0.5), one.throttle_known]))
+    wander = Wander()
+    for k in range(60):
+        wander.elapse(0.25 * (1 + k % 3))
+        wander.correct(0.3 * np.sin(0.2 * k), 0.01 + 0.02 * (k % 4))
+        if k % 9 == 0:
+            found.append(table([wander.value, wander.variance, wander.speed, wander.fast_speed]))
+    return found
+
+
+def flags():
+    """Return levels, reasons and dips of the flag through dips, late and odd samples, clocks."""
+    found = []
+    for more in ({}, {'brownout_latch': True, 'brownout_hold': 0.3}, {'brownout_delay': 0.5},
+                 {'brownout_floor_time': 0.2, 'stale_after': 0.4}, {'brownout_floor': 0.0}):
+        rng = np.random.default_rng(111)
+        flag = BrownoutFlag(MonitorSettings(brownout_voltage=4.5, **more))
+        rows = []
+        t, arrival = 0.0, 0.0
+        for k in range(90):
+            n = int(rng.integers(1, 12))
+            dt = (0.005, 0.02, 0.1)[k // 30]
+            stamps = t + dt * np.arange(1, n + 1)
+            v = 4.9 + 0.02 * rng.standard_normal(n)
+            if k % 13 in (5, 6):
+                v -= 0.7
+            if k % 7 == 3:
+                v[n // 2] = (0.0, np.nan, 4.29)[k % 3]
+            if k % 17 == 9:
+                stamps -= 0.3
+            if k == 50:
+                flag.new_time_line()
+                stamps -= 100.0
+            t, arrival = float(stamps[-1]), arrival + n * dt
+            if k % 19 == 11:
+                arrival += 1.5
+                t += 1.5
+            flag.push(stamps, v, None if k % 5 else arrival - dt * np.arange(n)[::-1] * (k % 2))
+            risk = (0.001, 0.02, 0.2, np.nan)[(k // 4) % 4]
+            state = flag.update(arrival, risk, fresh=k % 11 != 4, arriving=k % 23 != 20)
+            rows.append([state.level.name, state.brownout, state.since, state.age, state.low,
+                         state.dips])
+            if k in (40, 70):
+                rows.append([flag.clear()])
+            if k == 60:
+                flag.set_critical('told')
+        found.append(table(rows))
+    return found
+
+
+def stamps():
+    """Return what stamps and readings are good for, batch by batch."""
+    rng = np.random.default_rng(121)
+    found = []
+    for late in (0.0, 0.08, 0.15, 0.6):
+        watch, t, rows = StampWatch(), 0.0, ''
+        for k in range(60):
+            n = int(rng.integers(1, 15))
+            batch = t + 0.01 * np.arange(1, n + 1)
+            batch[rng.random(n) < late] -= 0.2
+            batch[rng.random(n) < 0.02] = np.nan
+            if 20 <= k < 26:
+                batch[:] = t
+            if k == 40:
+                watch.start_anew()
+            t = max(t, float(np.nanmax(np.append(batch, t))))
+            watch.push(batch, None if k % 2 else 5.0 + 0.05 * k + 0.001 * np.arange(n))
+            rows += watch.judge(0.3, 0.01).name[0]
+        found.append(rows)
+    settings = MonitorSettings(stale_after=0.8)
+    found.append(table([patience(settings, rate, n) for rate in (0.0, 10.0, 500.0, 1500.0)
+                        for n in (19, 20, 5000)]))
+    found.append(table(readings(np.array([1.0, 1e9, 1e19, np.nan]), np.array(
+        [5.0, 1e6, 1.0001e6, -1e7]), np.array([2.0, 2.01, -2.0, np.nan]))))
+    return found
+
+
+def chains():
+    """Return filters that run for long: what is checked against the low-passes, and arrays."""
+    rng = np.random.default_rng(131)
+    n = 7000
+    t = np.cumsum(rng.choice([1.95e-3, 2e-3, 2.05e-3], n))
+    x = 0.5 * np.sin(9.0 * t) + 0.4 * rng.standard_normal(n) * (1.0 + (t > 8.0))
+    found = []
+    for options in ({'law': 'kalman', 'coupling': 1.0, 'signal_bandwidth': 2.0, 'signal_rms': 0.4},
+                    {'law': 'kalman', 'coupling': 1.0, 'signal_bandwidth': 0.2, 'signal_rms': 0.05,
+                     'n0': 1e-4, 'order': 1},
+                    {'law': 'kalman', 'coupling': 1.0, 'signal_bandwidth': 2.0, 'signal_rms': 0.4,
+                     'signal_poles': 2, 'mode': 'derivative', 'n0': 1e-4},
+                    {'law': 'kalman', 'coupling': 1.0, 'signal_bandwidth': 2.0, 'signal_rms': 0.4,
+                     'signal_poles': 2, 'max_lag': 8.0}):
+        one = AdaptiveLowPass(**options)
+        for begin in range(0, n, 1400):
+            part = slice(begin, begin + 1400)
+            y = one.filter(t[part], x[part], 0.6, sigma_se=0.1)
+            found.append(table([y[::350], one.cutoff, one.phase_lag, one.bound.name,
+                                one.noise_left]))
+    even = 2e-3 * np.arange(n)
+    for options in ({}, {'order': 1}, {'mode': 'derivative'}, {'smoothing': 0.0, 'slew': 0.0},
+                    {'smoothing': 0.0}, {'slew': 0.0}, {'dead_band': 0.0}, {'shadow': True},
+                    {'law': 'threshold', 'signal_bandwidth': 0.0}):
+        for stamps_ in (even, t):
+            for sigma in (np.repeat(rng.uniform(0.1, 1.5, 7), 1000), np.full(n, 0.3)):
+                one, other = AdaptiveLowPass(**options), AdaptiveLowPass(**options)
+                y = one.filter(stamps_, x, sigma, sigma_se=0.05)
+                single = [other.step(*row) for row in zip(
+                    stamps_[:1500].tolist(), x[:1500].tolist(), sigma[:1500].tolist(),
+                    np.full(1500, 0.05).tolist())]
+                found.append(table([y[::900], single[::300], one.cutoff, other.cutoff, one.wanted,
+                                    one.bound.name]))
+    return found
+
+
+def long():
+    """Return which samples of long recordings are used, events beside them, lines above them."""
+    rng = np.random.default_rng(141)
+    n = 260_000
+    t = np.arange(n) * 1e-3
+    found = {}
+    for name, alpha in (('slow', 2.0), ('usual', 63.0), ('fast', 900.0), ('white', 1e9)):
+        keep = np.exp(-alpha * 1e-3)
+        v = 5.0 + lfilter([0.05 * np.sqrt(1.0 - keep * keep)], [1.0, -keep],
+                          rng.standard_normal(n))
+        v += 0.01 * np.sin(2.0 * np.pi * 411.0 * t)
+        for at in (5_001, 77_778, 130_003, 200_001):
+            v[at:] += 0.4 * (1.0 if at % 2 else -1.0)
+        which, _ = choose_samples(v, 1000.0)
+        u = np.zeros(n)
+        u[77_000:] = 0.5
+        thin = slice(0, n, 5)
+        found[name] = table([
+            [which.start, which.stop, which.step], events_between(v, None, 1000.0, thin),
+            events_between(v, u, 1000.0, thin),
+            [tone.values() for tone in lines_between(t, v, thin)],
+            [tone.values() for tone in lines_between(t + 1e-4 * (t > 99.0), v, thin)]])
+    return found
+
+
+def latent():
+    """Return where fits with one more state begin, and laws with levels or three states."""
+    found = {}
+    for name, others, more in (
+            ('second', [], [term('second_relaxation', alpha=4.0, sigma=0.1)]),
+            ('driven', [term('load_dependent_sigma', throttle=[0.0, 1.0], log_factor=[0.0, 0.6]),
+                        term('load_dependent_alpha', slope=0.5),
+                        term('measurement_noise', std=0.01),
+                        term('load_dependent_noise', ripple=1.0, change=0.0)],
+             [term('resonance', frequency=120.0, damping=40.0, std=0.03, tilt=-0.5)])):
+        samples = samples_of(4000, *others, *more, seed=151)
+        ou = term('ou', **OU)
+        # At the truth: where a likelihood is flat, versions of SciPy end elsewhere.
+        gaussian = evaluate(samples, [ou, *others])
+        composite = Composite((ou, *others), (), gaussian, gaussian.z, gaussian.density, 3, 0.0)
+        terms, gain = from_spectrum(samples, composite, [*composite.terms, *more])
+        found[name] = table([[one.values() for one in terms[1:]], gain])
+    for name, params in (
+            ('levels', {'rate_up': 4.0, 'rate_down': 5.0, 'level': -0.3, 'sigma_ratio': 1.0,
+                        'at_once': 1.0, 'states': 2.0}),
+            ('three', {'rate_up': 4.0, 'rate_down': 5.0, 'level': 0.0, 'sigma_ratio': 2.5,
+                       'at_once': 1.0, 'states': 3.0})):
+        samples = samples_of(2500, term('regime_switching', **params), seed=152)
+        view = view_at(samples, share=0.8)
+        fit = catalogue()['regime_switching'].fit_law(view)
+        again = fit.term.refit_law(view)
+        found[name] = table([fit.term.values(), fit.se, float(fit.gain.sum()), fit.z[::300],
+                             again.term.values(), float(again.gain.sum()),
+                             fit.term.holds(view)])
+    return found
+
+
+RUNS = {run.__name__: run for run in (curves, flags, stamps, chains, long, latent)}
