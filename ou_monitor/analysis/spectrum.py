@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 from ou_monitor.analysis.levels import Segment
+from ou_monitor.criticism.curves import even_on_log
 from ou_monitor.records import Estimate, FloatArray, Recording
 from scipy.signal import welch
 
@@ -68,7 +69,7 @@ def level_spectrum(recording: Recording, segments: Sequence[Segment],
             summed, weight = summed + n * density, weight + n
     # The first bin above zero is what removing the mean has left; the last,
     # at the Nyquist frequency, is not doubled as the others are.
-    frequency, density = _even_on_log(frequency[2:-1], summed[2:-1] / weight)
+    frequency, density = even_on_log(frequency[2:-1], summed[2:-1] / weight, _PER_DECADE)
     fitted = np.full(frequency.size, math.nan)
     if estimate.usable:
         fitted = ou_spectrum(frequency, estimate.alpha, estimate.sigma, rate, estimate.noise_std)
@@ -85,17 +86,6 @@ def segment_rate(recording: Recording, segments: Sequence[Segment]) -> float:
 def _pieces(segments: Sequence[Segment], length: int) -> int:
     """Return how many half-overlapping pieces of that length the segments hold."""
     return sum(max(0, 2 * (s.stop - s.start) // length - 1) for s in segments)
-
-
-def _even_on_log(frequency: FloatArray, density: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Average neighbours, so that the points lie evenly on a log axis."""
-    if frequency.size < 3:
-        return frequency, density
-    bins = np.floor(_PER_DECADE * np.log10(frequency / frequency[0])).astype(np.intp)
-    count = np.bincount(bins)
-    some = count > 0
-    return (np.bincount(bins, frequency)[some] / count[some],
-            np.bincount(bins, density)[some] / count[some])
 
 
 def ou_spectrum(frequency: FloatArray, alpha: float, sigma: float, rate: float,

@@ -219,3 +219,13 @@ def stray(simulated: FloatArray, voltage: FloatArray) -> float:
     if not np.isfinite(simulated).all():
         return float('inf')
     return max(0.0, low - float(np.min(simulated)), float(np.max(simulated)) - high)
+
+
+def even_on_log(x: FloatArray, y: FloatArray, per_decade: int) -> tuple[FloatArray, FloatArray]:
+    """Average neighbours of a curve over rising x > 0, so that its points lie evenly on a log."""
+    if x.size < 3:
+        return x, y
+    bins = np.floor(per_decade * np.log10(x / x[0])).astype(np.intp)
+    count = np.bincount(bins)
+    some = count > 0
+    return np.bincount(bins, x)[some] / count[some], np.bincount(bins, y)[some] / count[some]

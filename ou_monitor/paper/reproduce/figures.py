@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from ou_monitor.criticism.curves import even_on_log
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ac_coupling import ACCoupling
@@ -117,9 +118,4 @@ def _spectrum(state: published.LoadState, rng: np.random.Generator) -> Spectrum:
 
 def _density(u: FloatArray) -> tuple[FloatArray, FloatArray]:
     frequency, density = welch(u, published.SAMPLING_HZ, nperseg=u.size // 4)
-    frequency, density = frequency[2:-1], density[2:-1]
-    bins = np.floor(_PER_DECADE * np.log10(frequency / frequency[0])).astype(np.intp)
-    count = np.bincount(bins)
-    some = count > 0
-    return (np.bincount(bins, frequency)[some] / count[some],
-            np.bincount(bins, density)[some] / count[some])
+    return even_on_log(frequency[2:-1], density[2:-1], _PER_DECADE)
