@@ -46,9 +46,8 @@ COUPLINGS = (0.1, 0.3, 1.0, 1.5, 2.0, 3.0, 4.0)
 # The threshold just above what a quiet hover has: where a law is most tempted.
 _ABOVE = 0.72
 _BARE = {'smoothing': 0.0, 'slew': 0.0, 'dead_band': 0.0}
-# A body rate as quick as the loop makes it; its coupling is that of the loop.
-_KALMAN = {'law': 'kalman', 'signal_check': False, 'signal_bandwidth': 5.0,
-           'signal_rms': 0.3, 'signal_poles': 2, 'n0': 1e-7}
+# Its coupling is that of the loop.
+_KALMAN = {'law': 'kalman', 'n0': 1e-7}
 CASES: dict[str, dict[str, object]] = {
     'constant_noise, defaults': {},
     'constant_noise, defaults, sigma ~ load^3': {'steepness': 3.0},

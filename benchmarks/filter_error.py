@@ -12,7 +12,7 @@ import math
 from pathlib import Path
 
 import filter_methods as methods
-from filter_signals import ADC, BODY, Case, CASES, Flights, fly, kalman, RATE, SPREAD
+from filter_signals import ADC, Case, CASES, Flights, fly, kalman, RATE, SPREAD
 import numpy as np
 from ou_monitor.online.filter.cutoff_laws import wanted_cutoff
 from ou_monitor.online.settings import FilterSettings
@@ -106,15 +106,15 @@ def run_dterm(flights: int, seconds: float, seed: int, window: float,
         keep(name, setting, noise,
              methods.sweep(flown.truth, cutoff[None], 2, True)[0], cutoff)
     for limit in _LAGS:
-        options = {**base, 'law': 'kalman', 'signal_check': False, 'coupling': CASE.coupling,
-                   'signal_poles': 2, 'signal_bandwidth': CASE.bandwidth, 'signal_rms': BODY,
-                   'fmin': 5.0, 'fmax': 300.0, 'max_lag': limit, 'n0': CASE.white**2 / RATE}
+        options = {**base, 'law': 'kalman', 'coupling': CASE.coupling, 'fmin': 5.0,
+                   'fmax': 300.0, 'max_lag': limit, 'n0': CASE.white**2 / RATE}
         setting = f'lag <= {limit:g} degrees' if limit else 'free'
         tell(f'{KALMAN}, {setting}')
-        # Its gains do not look at the signal, so that noise and signal may be run apart.
-        noise, cutoff = methods.adaptive(options, flown, seen, flown.noise)
-        keep(KALMAN, setting, noise, methods.adaptive(options, flown, seen, flown.truth)[0],
-             cutoff)
+        # It learns from powers, which are the same to sampling error with the noise turned over:
+        # half the difference of both is the noise, half the sum the signal.
+        both, cutoff = methods.adaptive(options, flown, seen, flown.truth + flown.noise)
+        other, _ = methods.adaptive(options, flown, seen, flown.truth - flown.noise)
+        keep(KALMAN, setting, 0.5 * (both - other), 0.5 * (both + other), cutoff)
     slope = kalman(CASE, flown)[1]
     points.append(Point('Kalman filter that knows sigma', '-', math.nan, math.nan,
                         methods.lag_ms(slope, flown.slope),

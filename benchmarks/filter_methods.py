@@ -166,8 +166,7 @@ def laws(case: Case) -> dict[str, list[dict[str, Any]]]:
                'signal_poles': 2 if case.kind == 'smooth' else 1}
     constant |= {'coupling': case.coupling}
     return {
-        'kalman': [{**wiener, 'law': 'kalman', 'signal_check': False,
-                    'signal_bandwidth': case.bandwidth}],
+        'kalman': [{**base, 'law': 'kalman', 'coupling': case.coupling}],
         'wiener': [{**wiener, 'signal_bandwidth': share * case.bandwidth}
                    for share in (1.0, 0.5, 0.25, 0.1, 0.03)],
         'constant_noise': [{**constant, 'noise_wanted': share * BODY}
@@ -178,7 +177,7 @@ def mistaken(case: Case) -> dict[str, dict[str, Any]]:
     """Return the options of `kalman` with each of what it is told wrong by a factor of 2."""
     right = laws(case)['kalman'][0]
     found = {}
-    for name in ('n0', 'signal_bandwidth', 'signal_rms', 'coupling'):
+    for name in ('n0', 'coupling'):
         for factor, word in ((0.5, 'half'), (2.0, 'twice')):
             # The gyro's own noise is next to nothing beside the supply's.
             if right.get(name) and not (name == 'n0' and case.kind != 'voltage'):

@@ -2,7 +2,7 @@
 Gyros of recorded flights, unfiltered where the log has them so, with throttle and motor speeds.
 
 Betaflight logs the gyro before its filters as `gyroUnfilt` (from 4.5), or in `debug` when
-debug_mode is GYRO_SCALED (6); else `gyroADC`, behind them.  eRPM is logged in hundreds.
+debug_mode is GYRO_SCALED (6); else `gyroADC`, behind them.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ from pathlib import Path
 import sys
 
 import numpy as np
-from orangebox import Parser
-from orangebox.types import FrameType
-from ou_monitor.recordings.importers import blackbox
+from ou_monitor.recordings.importers.choose import choose
+from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import Request
 
 # Name, file below OU_MONITOR_REALDATA, number of the flight, which gyro.
@@ -27,7 +26,8 @@ FLIGHTS = (
     ('roma 3', 'raw/bf_roma_6s.bbl', 3, 'debug'),
     ('gecko', 'raw/ie_btfl_002.bbl', 1, 'gyroADC'),
 )
-POLES = 14
+# Gyros logged at 50 Hz, below what a notch follows.
+SLOW = (('erle', 'raw/ac_erle_althold2.BIN', 1, 'IMU'), ('jd', 'raw/ac_jd_2004.bin', 1, 'IMU'))
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Gyro:
     Attributes
     ----------
     name, kind : str
-        Name; the field of the log.
+        Name; the gyro of the log.
     t : ndarray, shape (n,)
         s.
     rate : float
@@ -46,7 +46,7 @@ class Gyro:
     signal : ndarray, shape (n, 3)
         Angular velocity, degree/s.
     throttle : ndarray, shape (n,)
-        Mean of the motors' commands, 0..1.
+        As `convert` chooses it: where the log has them the mean of the motors' commands, 0..1.
     rpm : ndarray, shape (n, 4), or None
         Of the shafts.
 
@@ -69,20 +69,21 @@ def folder() -> Path | None:
 
 def read(name: str, seconds: float = np.inf) -> Gyro | None:
     """Read a flight up to so many s; None where it is not there, with a word on stderr."""
-    file, number, kind = next(one[1:] for one in FLIGHTS if one[0] == name)
+    file, number, kind = next(one[1:] for one in (*FLIGHTS, *SLOW) if one[0] == name)
     where = folder()
     if where is None or not (where / file).exists():
         print(f'{name}: {file} is not there, left out', file=sys.stderr)
         return None
-    parser = Parser.load(str(where / file), number, True)
-    names = [one.name for one in parser.reader.field_defs[FrameType.INTRA]]
-    wanted = ['time', *(f'{kind}[{k}]' for k in range(3)), *(f'motor[{k}]' for k in range(4)),
-              *(one for one in (f'eRPM[{k}]' for k in range(4)) if one in names)]
-    table, _ = blackbox._frames(parser, [names.index(one) for one in wanted], Request())
-    table, _ = blackbox._in_time(table)
-    t = 1e-6 * (table[:, 0] - table[0, 0])
-    table, t = table[t <= seconds], t[t <= seconds]
-    low, high = parser.headers['motorOutput']
-    throttle = np.clip((table[:, 4:8].mean(axis=1) - low) / (high - low), 0.0, 1.0)
-    rpm = 100.0 * table[:, 8:] / (0.5 * POLES) if table.shape[1] > 8 else None
-    return Gyro(name, kind, t, (t.size - 1) / float(t[-1] - t[0]), table[:, 1:4], throttle, rpm)
+    log = import_log(where / file, Request(number, poles=14 if name == 'bf3s' else None))
+    (gyro,) = (one for one in log.inertial if one.name == kind)
+    part = gyro.t - gyro.t[0] <= seconds
+    t = gyro.t[part]
+    throttle = choose(where / file, log).throttle
+    assert throttle is not None
+    held = throttle.values[np.clip(np.searchsorted(throttle.t, t, 'right') - 1, 0, None)]
+    rpm = None
+    if log.speeds is not None:
+        place = np.clip(np.searchsorted(log.speeds.t, t, 'right') - 1, 0, None)
+        rpm = 60.0 / (2.0 * np.pi) * log.speeds.values[place]
+    return Gyro(name, kind, t - t[0], (t.size - 1) / float(t[-1] - t[0]),
+                np.degrees(gyro.angular_velocity[part]), held, rpm)

@@ -115,8 +115,8 @@ class AdaptiveFilterNode(MonitorNode):
         NotchSettings.from_options(notch_options(values))
         if self._channels is not None and _not_a_voltage(self._type, settings):
             raise ValueError(
-                f'law {settings.law} without signal_bandwidth is for a voltage, and {self._topic} '
-                f'is {self._type}: set signal_bandwidth, signal_rms and coupling first')
+                f'law {settings.law} without {_of_signal(settings)} is for a voltage, and '
+                f'{self._topic} is {self._type}: set it first')
 
     def apply(self, values: Mapping[str, Any]) -> None:
         """Bring checked parameters into force; the output does not move."""
@@ -288,8 +288,8 @@ class AdaptiveFilterNode(MonitorNode):
             return Level.WARN, 'use_sim_time is set, but nothing comes on /clock (any more).'
         if _not_a_voltage(self._type, s):
             return Level.WARN, (
-                f'Law {s.law} without signal_bandwidth takes {self._topic} of type {self._type} '
-                'for the voltage: set signal_bandwidth, signal_rms and coupling.')
+                f'Law {s.law} without {_of_signal(s)} takes {self._topic} of type {self._type} '
+                'for the voltage: set it.')
         missing = math.isnan(supply.throttle if s.law == 'throttle' else supply.sigma)
         if missing:
             return Level.WARN, (
@@ -320,5 +320,10 @@ class AdaptiveFilterNode(MonitorNode):
 
 def _not_a_voltage(kind: str, settings: FilterSettings) -> bool:
     """Tell whether a law that would filter the voltage itself meets a signal that is none."""
-    return (kind == 'sensor_msgs/msg/Imu' and settings.law in ('kalman', 'wiener')
-            and not settings.signal_bandwidth)
+    own = {'kalman': settings.of_voltage, 'wiener': not settings.signal_bandwidth}
+    return kind == 'sensor_msgs/msg/Imu' and own.get(settings.law, False)
+
+
+def _of_signal(settings: FilterSettings) -> str:
+    """Return the parameter by which a law knows that its signal is not the voltage."""
+    return 'coupling' if settings.law == 'kalman' else 'signal_bandwidth'

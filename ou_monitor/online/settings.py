@@ -124,16 +124,13 @@ FILTER_PARAMETERS: tuple[Parameter, ...] = (
               "Relaxation rate of the supply while the estimator's is not known, 1/s.",
               1.0e-6, 1.0e9),
     Parameter('signal_bandwidth', 0.0,
-              'Bandwidth of the true signal for wiener and kalman, Hz; 0: the signal is the '
-              'voltage itself.', 0.0, 1.0e6),
+              'Bandwidth of the true signal for wiener, Hz; 0: the signal is the voltage itself '
+              '(for kalman: unless coupling is above 0).', 0.0, 1.0e6),
     Parameter('signal_rms', 0.0,
-              'Rms of the true signal for wiener and kalman, unit of the signal.', 0.0, 1.0e12),
+              'Rms of the true signal for wiener, unit of the signal.', 0.0, 1.0e12),
     Parameter('signal_poles', 1,
-              'Poles of the true signal for wiener and kalman: 1 (its spectrum falls with f^2 '
+              'Poles of the true signal for wiener: 1 (its spectrum falls with f^2 '
               'above its bandwidth), or 2 (Butterworth, f^4).', 1, 2),
-    Parameter('signal_check', True,
-              'Whether kalman of a signal gives way to the fixed cutoff of least error by the '
-              'signal itself, where that is clearly better.'),
     Parameter('expo', 5.0, 'Curvature of the throttle law, 0..10.', 0.0, 10.0),
     Parameter('smoothing', 0.2,
               'Time constant of the cutoff (in its logarithm), s, at a relative error of sigma '
@@ -267,7 +264,6 @@ class FilterSettings:
     signal_bandwidth: float = 0.0
     signal_rms: float = 0.0
     signal_poles: int = 1
-    signal_check: bool = True
     expo: float = 5.0
     smoothing: float = 0.2
     smoothing_error: float = 0.1
@@ -314,19 +310,29 @@ class FilterSettings:
             raise ValueError(
                 'law wiener cannot be used in mode derivative: it is the cutoff for the signal '
                 'itself; use constant_noise, or kalman with signal_poles 2')
-        if self.mode == 'derivative' and not (self.signal_bandwidth and self.signal_poles == 2):
-            raise ValueError(
-                'law kalman in mode derivative needs signal_bandwidth and signal_poles 2: the '
-                'derivative of a signal of one pole has no finite variance')
-        if self.signal_bandwidth:
+        if self.law == 'kalman':
+            if self.mode == 'derivative' and self.of_voltage:
+                raise ValueError(
+                    'law kalman in mode derivative is for a signal that is not the voltage: it '
+                    'needs coupling (above 0)')
+            if not (self.coupling > 0.0 or self.n0 > 0.0):
+                raise ValueError(
+                    'law kalman needs the noise: n0 (white noise of the measurement), and '
+                    'coupling where the signal is not the voltage')
+        elif self.signal_bandwidth:
             if not (self.signal_rms > 0.0 and (self.coupling > 0.0 or self.n0 > 0.0)):
                 raise ValueError(
-                    f'law {self.law} with signal_bandwidth needs signal_rms and the noise: '
-                    'coupling, n0 or both (above 0)')
+                    'law wiener with signal_bandwidth needs signal_rms and the noise: coupling, '
+                    'n0 or both (above 0)')
         elif not self.n0 > 0.0:
             raise ValueError(
-                f'law {self.law} needs n0 (the white noise of the measurement, above 0), or '
+                'law wiener needs n0 (the white noise of the measurement, above 0), or '
                 'signal_bandwidth, signal_rms and coupling')
+
+    @property
+    def of_voltage(self) -> bool:
+        """Tell whether law kalman takes the signal for the voltage itself."""
+        return not (self.coupling or self.signal_bandwidth)
 
     @property
     def lowest(self) -> float:

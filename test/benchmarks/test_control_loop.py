@@ -29,11 +29,10 @@ def test_a_steep_load_hunts_even_at_the_defaults():
 
 
 def test_a_kalman_filter_of_limited_lag_does_not_hunt():
-    """With the same steep load and coupling, and its limit of the lag in force."""
+    """What it learns moves the cutoff of its lag, no more than with the loop cut."""
     verdict = judge(Loop(coupling=1.5, steepness=3.0, filter={
-        'law': 'kalman', 'signal_bandwidth': 5.0, 'signal_rms': 0.3, 'signal_poles': 2,
-        'coupling': 1.5, 'n0': 1e-7, 'max_lag': 20.0}), SECONDS)
-    assert not verdict.cycle and verdict.swing < 0.3
+        'law': 'kalman', 'coupling': 1.5, 'n0': 1e-7, 'max_lag': 20.0}), SECONDS)
+    assert not verdict.cycle and verdict.swing < 1.2 * verdict.quiet
 
 
 def test_a_threshold_hunts_from_a_coupling_on():

@@ -8,7 +8,7 @@ The derivative is the same low-pass with the slope of the input for its input:
 no term of it jumps when the cutoff moves, and it is the exact response to an
 input that is linear between samples.
 
-With the law `kalman` the output is that of `signal_kalman`; the low-pass runs
+With the law `kalman` the output is that of `voltage_kalman` or `learned_wiener`; the low-pass runs
 beside it at the cutoff of the same lag, and takes over where sigma is not known.
 
 Limits: the cutoff is constant within a step; sampling folds what lies above
@@ -24,12 +24,13 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.filter.array_filter import changes, sound_piece, within_rate, WORTH
-from ou_monitor.online.filter.checked_kalman import CheckedKalman
 from ou_monitor.online.filter.cutoff_control import Bound, CutoffControl, OF_RATE, SampleInterval
 from ou_monitor.online.filter.cutoff_laws import wanted_cutoff
 from ou_monitor.online.filter.filter_state import LowPassState
 from ou_monitor.online.filter.lag import cutoff_for_lag, delay, most_lag, phase_lag
+from ou_monitor.online.filter.learned_wiener import LearnedWiener
 from ou_monitor.online.filter.sequence import filter_sequence
+from ou_monitor.online.filter.voltage_kalman import VoltageKalman
 from ou_monitor.online.filter.white_noise import noise_left
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray
@@ -95,11 +96,11 @@ class AdaptiveLowPass:
         self._control = CutoffControl(self._settings)
         self._state = LowPassState()
         # Of the law kalman; None until its first known sigma.
-        self._kalman: CheckedKalman | None = None
+        self._kalman: VoltageKalman | LearnedWiener | None = None
         self._known = False
         self._sigma = NAN
         # As it was before a parameter changed, until the next sample.
-        self._before: CheckedKalman | None = None
+        self._before: VoltageKalman | LearnedWiener | None = None
         self._interval = SampleInterval()
         self.counters = FilterCounters()
         self._t: float | None = None
@@ -181,10 +182,11 @@ class AdaptiveLowPass:
             raise ValueError(
                 f"mode cannot change from '{self._settings.mode}' to '{settings.mode}' while "
                 'filtering: the output would change its unit; make a new filter')
+        other = settings.of_voltage != self._settings.of_voltage
         self._settings = settings
         self._control.configure(settings)
         self._asked = None
-        if settings.law != 'kalman':
+        if settings.law != 'kalman' or other:
             self._kalman, self._before, self._known = None, None, False
         elif self._kalman is not None:
             self._before = copy(self._kalman)
@@ -370,8 +372,9 @@ class AdaptiveLowPass:
         self._known = math.isfinite(sigma) and sigma >= 0.0
         if self._known:
             self._sigma = sigma
-            self._kalman = CheckedKalman(
-                self._settings, x, level if abs(level) < _LARGEST else NAN)
+            self._kalman = (
+                VoltageKalman(self._settings, x, level if abs(level) < _LARGEST else NAN)
+                if self._settings.of_voltage else LearnedWiener(self._settings, x))
 
     def _run_kalman(self, dt: float, interval: float, x: float, sigma: float, error: float,
                     alpha: float, level: tuple[float, float]) -> None:

@@ -77,11 +77,11 @@ def test_the_cutoff_may_jump_at_every_sample(order, mode):
 CHANGES = [
     {'order': 1}, {'law': 'threshold'}, {'law': 'throttle'}, {'law': 'wiener', 'n0': 1e-6},
     {'law': 'kalman', 'n0': 1e-6}, {'signal_poles': 2},
-    {'law': 'kalman', 'n0': 1e-6, 'signal_bandwidth': 3.0, 'signal_rms': 1.0, 'signal_poles': 2},
+    {'law': 'kalman', 'n0': 1e-6, 'coupling': 1.0},
     {'fmin': 3.0}, {'fmax': 400.0}, {'max_lag': 30.0}, {'lag_frequency': 3.0},
     {'sigma_ref': 0.01}, {'coupling': 0.4}, {'coupling': 0.4, 'noise_wanted': 0.1},
     {'n0': 1e-3}, {'alpha': 5.0}, {'signal_bandwidth': 5.0}, {'signal_rms': 2.0},
-    {'signal_check': False}, {'expo': 1.0},
+    {'expo': 1.0},
     {'smoothing': 0.0}, {'smoothing_error': 1.0}, {'smoothing_range': 2.0}, {'slew': 0.0},
     {'dead_band': 0.0}, {'fallback': 30.0}, {'shadow': True}, {'stale_after': 5.0}]
 
@@ -97,7 +97,7 @@ def test_no_parameter_change_moves_the_output(change, mode):
     """At the same stamp not at all, 1 ns later by no more than the filter moves in 1 ns."""
     if mode == 'derivative' and (
             change.get('law') == 'wiener' or change == {'law': 'kalman', 'n0': 1e-6}):
-        # Refused, which test_cutoff_laws and test_signal_kalman see to.
+        # Refused, which test_cutoff_laws and test_learned_wiener see to.
         return
     f, y = warm(mode=mode)
     f.configure(**change)
@@ -335,7 +335,7 @@ def test_a_relaxation_rate_is_used_within_the_range_of_the_parameter(alpha, used
     """Within 1e-6..1e9 1/s the filter is that of the parameter alpha; else alpha is not known."""
     x = np.random.default_rng(2).standard_normal(50)
     t = np.arange(50) * 1e-3
-    options = {'law': 'kalman', 'coupling': 1.0, 'signal_bandwidth': 30.0, 'signal_rms': 1.0}
+    options = {'law': 'kalman', 'coupling': 1.0, 'n0': 1e-4}
     got = AdaptiveLowPass(**options).filter(t, x, 0.3, alpha=alpha)
     at_default = AdaptiveLowPass(**options).filter(t, x, 0.3)
     assert (got.tolist() == at_default.tolist()) is not used

@@ -1,39 +1,33 @@
 r"""
-Kalman filter of a signal in the noise of the supply: the law `kalman`.
+The law `kalman` of the voltage itself: an OU around its level, seen in white noise.
 
-The signal is one of
+The level is the estimator's and has an error, which is an OU of `LEVEL_TIME` beside the voltage's
+own; without a level the voltage counts as a random walk.  The state is the deviation from the
+level and the error of the level, both exact over a step of any length.  The estimate is the one of
+least mean square error (Kalman 1960; Anderson & Moore, Optimal Filtering, 1979, ch. 3), with sigma
+where the truth would have to stand.
 
-    the voltage itself, an Ornstein-Uhlenbeck process (OU) around its level, where
-    the level is the estimator's and has an error that is estimated beside it;
-    an OU of `signal_rms` and rate 2 pi signal_bandwidth (one pole);
-    a Butterworth process of two poles, s'' + sqrt2 w s' + w^2 s = white,
+Its lag is that of the steady filter with the gain of the moment, over the mean step.  Where it
+exceeds the limit the output is mixed with what is unfiltered, just so far that the limit is kept
+(`lag.share_for_lag`).
 
-seen with `coupling` times the deviation of the supply (an OU) and white noise
-of density n0; see `signal_model`.  The estimate is the one of least mean square
-error (Kalman 1960; Anderson & Moore, Optimal Filtering, 1979, ch. 3), with
-sigma where the truth would have to stand.
-
-Its lag is that of the steady filter with the gain of the moment, over the mean
-step.  Where it exceeds the limit the output is mixed with what is unfiltered,
-just so far that the limit is kept (`lag.share_for_lag`).
-
-Limits: what is assumed of the signal decides; its gain at frequency 0 is below
-1, and the slope of what is steady is not 0.  Steps within 1 % of each other
-count as equal.
+Limits: its gain at frequency 0 is below 1.  Steps within 1 % of each other count as equal.
 """
 
 from __future__ import annotations
 
 import cmath
 import math
+from typing import NamedTuple
 
 import numpy as np
 from ou_monitor.online.filter.cutoff_control import time_constant
 from ou_monitor.online.filter.lag import phase_lag, share_for_lag
-from ou_monitor.online.filter.signal_model import has_beside, Known, size_of, Step, step_model
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
 
+# Time over which what is not told of the level moves, s: ten of the default windows.
+LEVEL_TIME = 20.0
 # Relative change of sigma, alpha or the step that is worth another model; of the error of the
 # level, as a factor.
 _SAME = 0.01
@@ -46,23 +40,59 @@ _MODELS = 64
 _LARGEST = 1e60
 
 
-class SignalKalman:
+class Known(NamedTuple):
     """
-    Kalman filter of the signal that the settings describe.
+    What is known of the supply.
+
+    Attributes
+    ----------
+    sigma : float
+        Noise intensity, V/sqrt(s).
+    alpha : float
+        Relaxation rate, 1/s.
+    level_se : float
+        Standard error of the level, V; NaN: there is no level.
+
+    """
+
+    sigma: float
+    alpha: float
+    level_se: float
+
+
+class Step(NamedTuple):
+    """
+    The model over one step: transition, driving and stationary variance of each state.
+
+    Attributes
+    ----------
+    phi, drive, still : ndarray, shape (2,)
+        All covariances are diagonal.
+
+    """
+
+    phi: FloatArray
+    drive: FloatArray
+    still: FloatArray
+
+
+class VoltageKalman:
+    """
+    Kalman filter of the voltage.
 
     Parameters
     ----------
     settings : FilterSettings
-        Signal, noise, mode and limits of the lag.
+        White noise and limits of the lag.
     x : float
-        Signal as measured, where it begins.
+        Voltage as measured, where it begins, V.
     level : float
-        Level of the supply, V, where it is the signal; NaN: not known.
+        Level of the supply, V; NaN: not known.
 
     Attributes
     ----------
     y : float
-        Output: the signal, or its slope in mode derivative (unit/s).
+        Output, V.
     lag : float
         Lag of the output at `lag_frequency`, degrees; NaN while not known.
     mixed : float
@@ -72,28 +102,12 @@ class SignalKalman:
 
     def __init__(self, settings: FilterSettings, x: float, level: float) -> None:
         self._settings = settings
-        # Whether the slope is wanted: the second of the state.
-        self._slot = 1 if settings.mode == 'derivative' else 0
-        self.y = 0.0 if self._slot else x
+        self.y = x
         self.lag, self.mixed = NAN, 0.0
         self._log_sigma, self._known = NAN, Known(NAN, NAN, NAN)
         self._level = level if level == level else x
-        self._lay_out(x, 0.0)
-
-    def _lay_out(self, signal: float, slope: float) -> None:
-        """Begin from an estimate, of which nothing is known but itself."""
-        s = self._settings
-        size = size_of(s)
-        # Whether the signal is the voltage itself, and what is seen beside it.
-        self._own, self._beside = not s.signal_bandwidth, has_beside(s)
-        self._x = [0.0] * size
-        self._x[0] = signal - (self._level if self._own else 0.0)
-        if not self._own and s.signal_poles == 2:
-            self._x[1] = slope
-        self._look = np.zeros(size)
-        self._look[0] = 1.0
-        if self._beside:
-            self._look[-1] = 1.0
+        # Deviation from the level, error of the level.
+        self._x = [x - self._level, 0.0]
         self._cov: FloatArray | None = None
         self._forget()
 
@@ -102,26 +116,17 @@ class SignalKalman:
         self._models: dict[int, Step] = {}
         self._key: int | None = None
         self._moving = True
-        self._gain, self._told = [0.0] * len(self._x), [NAN] * len(self._x)
+        self._gain, self._told = [0.0, 0.0], [NAN, NAN]
 
     def configure(self, settings: FilterSettings) -> None:
         """Change settings; the estimate goes on."""
-        old, self._settings = self._settings, settings
-        signal = self._x[0] + (self._level + self._x[1] if self._own else 0.0)
-        slope = 0.0 if self._own or old.signal_poles == 1 else self._x[1]
-        if size_of(old) != size_of(settings) or any(
-                bool(getattr(old, name)) != bool(getattr(settings, name))
-                for name in ('signal_bandwidth', 'coupling')) or (
-                old.signal_poles != settings.signal_poles):
-            if not settings.signal_bandwidth:
-                self._level = signal
-            self._lay_out(signal, slope)
+        self._settings = settings
         self._forget()
 
     def advance(self, dt: float, interval: float, x: float, slope: float, sigma: float,
                 error: float, alpha: float, level: float, level_se: float) -> float:
         """Take a sample (dt in s, interval in s, alpha in 1/s, level in V, level_se in V)."""
-        if self._own and level == level and level != self._level:
+        if level == level and level != self._level:
             # The error of the level takes it up, so that what comes out stays.
             self._x[1] -= level - self._level
             self._level = level
@@ -132,18 +137,11 @@ class SignalKalman:
         step = self._model(key, dt)
         if self._moving:
             self._correct(step, interval)
-        old = self._x
-        new = [sum(a * b for a, b in zip(row, old, strict=True)) for row in step.rows]
-        off = x - new[0]
-        if self._own:
-            off -= self._level
-        if self._beside:
-            off -= new[-1]
-        self._x = [a + k * off for a, k in zip(new, self._gain, strict=True)]
-        found = self._x[self._slot]
-        if self._own:
-            found += self._level + self._x[1]
-        self.y = found + self.mixed * ((slope if self._slot else x) - found)
+        deviation, wrong = self._x[0] * float(step.phi[0]), self._x[1] * float(step.phi[1])
+        off = x - self._level - deviation - wrong
+        self._x = [deviation + self._gain[0] * off, wrong + self._gain[1] * off]
+        found = self._level + self._x[0] + self._x[1]
+        self.y = found + self.mixed * (x - found)
         return self.y
 
     def _learn(self, sigma: float, error: float, alpha: float, level: float, level_se: float,
@@ -156,7 +154,7 @@ class SignalKalman:
         self._log_sigma += (wanted - self._log_sigma) * (
             -math.expm1(-dt / constant) if constant > 0.0 else 1.0)
         unsure = NAN
-        if self._own and level == level:
+        if level == level:
             unsure = min(level_se, _LARGEST) if level_se > 0.0 else 0.0
         old, now = self._known, Known(math.exp(self._log_sigma), alpha, unsure)
         if (abs(now.sigma - old.sigma) <= _SAME * old.sigma
@@ -165,7 +163,7 @@ class SignalKalman:
             return
         if self._cov is not None and unsure > old.level_se:
             more = self._cov.copy()
-            more[-1, -1] += unsure * unsure - old.level_se * old.level_se
+            more[1, 1] += unsure * unsure - old.level_se * old.level_se
             self._cov = more
         self._known = now
         self._models.clear()
@@ -176,7 +174,7 @@ class SignalKalman:
         if step is None:
             if len(self._models) >= _MODELS:
                 self._models.clear()
-            step = self._models[key] = step_model(self._settings, self._known, dt)
+            step = self._models[key] = step_model(self._known, dt)
         return step
 
     def _correct(self, step: Step, interval: float) -> None:
@@ -197,55 +195,46 @@ class SignalKalman:
 
     def _gain_over(self, step: Step, white: float) -> tuple[FloatArray, FloatArray]:
         """Return the gain after a step and the covariance with it."""
-        p = step.still if self._cov is None else step.phi @ self._cov @ step.phi.T + step.drive
-        seen = p @ self._look
-        total = float(self._look @ seen) + white
+        p = np.diag(step.still) if self._cov is None else (
+            step.phi[:, None] * self._cov * step.phi + np.diag(step.drive))
+        seen = p.sum(axis=1)
+        total = float(seen.sum()) + white
         gain = seen / total if total > 0.0 else np.zeros_like(seen)
         return gain, p - np.outer(gain, seen)
-
-    @property
-    def sigma(self) -> float:
-        """Return the sigma that it goes by, V/sqrt(s)."""
-        return math.exp(self._log_sigma)
-
-    def transfer(self, interval: float, ratio: float) -> tuple[float, float]:
-        """
-        Return sum_k h_k ratio^k and h_1 of the weights h of past samples, and h_0 at ratio 0.
-
-        interval in s.
-        """
-        phi = self._model(round(math.log(interval) / _SAME), interval).phi
-        gain = np.array(self._gain)
-        one = np.eye(gain.size)
-        loop = (one - np.outer(gain, self._look)) @ phi
-        try:
-            state = np.linalg.solve(one - loop * ratio, gain)
-        except np.linalg.LinAlgError:
-            return math.nan, math.nan
-        share = 1.0 - self.mixed
-        return share * float(state[self._slot]), share * float((loop @ gain)[self._slot])
 
     def _tell(self, phi: FloatArray, gain: FloatArray, interval: float) -> None:
         """Tell the lag of the filter as it stands, and what share of the input bounds it."""
         s = self._settings
-        w = 2.0 * math.pi * s.lag_frequency
-        back = cmath.exp(-1j * w * interval)
-        one = np.eye(gain.size)
-        loop = (one - np.outer(gain, self._look)) @ phi
+        back = cmath.exp(-2j * math.pi * s.lag_frequency * interval)
+        loop = (np.eye(2) - gain[:, None]) * phi
         try:
-            state = np.linalg.solve(one - loop * back, gain)
+            h = complex(np.linalg.solve(np.eye(2) - loop * back, gain).sum())
         except np.linalg.LinAlgError:
             # Nothing is corrected, nothing decays: it has no response.
             return
-        h = complex(self._look @ state if self._own else state[self._slot])
-        raw = 1.0 + 0.0j
-        if self._slot:
-            # Both behind the true derivative.
-            h /= 1j * w
-            raw = (1.0 - back) / (1j * w * interval)
         most = math.radians(phase_lag(s.order, s.lowest, s.lag_frequency))
-        self.mixed = share_for_lag(h, raw, most)
-        self.lag = math.degrees(-cmath.phase(h + self.mixed * (raw - h)))
+        self.mixed = share_for_lag(h, 1.0 + 0.0j, most)
+        self.lag = math.degrees(-cmath.phase(h + self.mixed * (1.0 - h)))
+
+
+def step_model(known: Known, dt: float) -> Step:
+    """Return the model for a step of `dt`, s (dt in s)."""
+    levelled = known.level_se == known.level_se
+    slow = 1.0 / LEVEL_TIME
+    error = known.level_se if levelled else 0.0
+    both = (_ou(known.alpha if levelled else 0.0, known.sigma, dt),
+            _ou(slow, error * math.sqrt(2.0 * slow), dt))
+    return Step(*(np.array(one) for one in zip(*both, strict=True)))
+
+
+def _ou(rate: float, intensity: float, dt: float) -> tuple[float, float, float]:
+    """Return transition, driving and stationary variance of an OU; of a random walk at rate 0."""
+    if rate == 0.0:
+        # Nothing is known of where it starts: the first sample decides.
+        drive = intensity * intensity * dt
+        return 1.0, drive, 1e6 * drive
+    still = intensity * intensity / (2.0 * rate)
+    return math.exp(-rate * dt), -still * math.expm1(-2.0 * rate * dt), still
 
 
 def _alike(one: float, other: float) -> bool:

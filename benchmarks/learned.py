@@ -1,0 +1,116 @@
+"""
+Law `kalman` on recorded gyros: told the noise, and nothing of the signal.
+
+    OU_MONITOR_REALDATA=FOLDER python benchmarks/learned.py --page doc/filter.md
+
+The truth is a gyro axis below 30 Hz (an eighth of the rate, if that is less) without phase, in
+stretches of 20 s from 8 s on; to it come supply noise (an OU of 63 1/s, 0.09 of the truth's
+deviation) and white noise of 0.01 rad/s, or a tenth of the truth's deviation if that is less.  The
+mean square error, from the 200th sample on, is over that of the best of 15 fixed cutoffs of 2 to
+110 Hz (0.44 of the rate) in hindsight, stretch by stretch.
+
+The constants of `learned_wiener` and `low_pass_span` were chosen on bf3s, roma and jd, then, for
+what happens in the first second, on gecko.  nazgul and erle chose nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+import math
+from pathlib import Path
+import sys
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+import gyros  # noqa: E402
+import numpy as np  # noqa: E402
+from ou_monitor import AdaptiveLowPass  # noqa: E402
+from scipy import signal  # noqa: E402
+from tables import put, table  # noqa: E402
+
+SEED, ALPHA, SPREAD, WHITE = 20261122, 63.0, 0.05, 0.01
+SIGMA = SPREAD * math.sqrt(2.0 * ALPHA)
+SECONDS, FIRST = 20.0, 8.0
+MODES = {'lowpass': 'signal', 'derivative': 'D term'}
+# By how much the deviation of the noise is told wrong.
+TOLD = (1.0, 2.0, 0.7)
+
+
+def stretches(gyro: gyros.Gyro, most: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield stamps and truth (rad/s) of some stretches of each axis."""
+    rate = 1.0 / float(np.median(np.diff(gyro.t)))
+    t = np.arange(gyro.t[0], gyro.t[-1], 1.0 / rate)
+    sos = signal.butter(4, min(30.0, rate / 8.0), fs=rate, output='sos')
+    begins = np.arange(FIRST, gyro.t[-1] - 0.6 * SECONDS, SECONDS)
+    if begins.size > most:
+        begins = begins[np.linspace(0, begins.size - 1, most).round().astype(int)]
+    for axis in gyro.signal.T:
+        truth = signal.sosfiltfilt(sos, np.radians(np.interp(t, gyro.t, axis)))
+        for begin in begins:
+            part = (t >= begin) & (t < begin + SECONDS)
+            yield t[part], truth[part]
+
+
+def ratios(t: np.ndarray, truth: np.ndarray, mode: str, rng: np.random.Generator,
+           factors: list[float]) -> list[float]:
+    """Return the errors over that of the best fixed cutoff, noise told right and wrong."""
+    rate = (t.size - 1) / float(t[-1] - t[0])
+    white = min(WHITE, 0.1 * float(truth.std()))
+    coupling = 0.09 * float(truth.std()) / SPREAD
+    keep = math.exp(-ALPHA / rate)
+    x = (truth + white * rng.standard_normal(t.size) + coupling * signal.lfilter(
+        [SPREAD * math.sqrt(1.0 - keep * keep)], [1.0, -keep], rng.standard_normal(t.size)))
+    target = truth if mode == 'lowpass' else np.gradient(truth, 1.0 / rate)
+    top = min(110.0, 0.44 * rate)
+
+    def error(sigma: float, **options: object) -> float:
+        out = AdaptiveLowPass(mode=mode, **options).filter(t, x, sigma)
+        return float(np.mean((out - target)[200:]**2))
+    best = min(error(math.nan, law='threshold', fmin=0.5 * f, fmax=f + 1e-3, fallback=f)
+               for f in np.geomspace(2.0, top, 15))
+    return [error(SIGMA, law='kalman', fmin=1.0, fmax=top, alpha=ALPHA, coupling=told * coupling,
+                  n0=(told * white)**2 / rate) / best for told in factors]
+
+
+def measure(gyro: gyros.Gyro, most: int, told: list[float]) -> list[list[str]]:
+    """Return a row a mode: geometric mean and worst of all stretches."""
+    rows = []
+    for mode, name in MODES.items():
+        rng = np.random.default_rng(SEED)
+        found = np.array([ratios(t, truth, mode, rng, told)
+                          for t, truth in stretches(gyro, most)])
+        means, worst = np.exp(np.mean(np.log(found), axis=0)), np.max(found, axis=0)
+        rows.append([gyro.name, name, str(len(found)), *(
+            cell for pair in zip(means, worst) for cell in (f'{pair[0]:.2f}', f'{pair[1]:.2f}'))])
+    return rows
+
+
+def main() -> int:
+    """Measure and print the table, or put it into the page."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument('flight', nargs='*', help='names (default all)')
+    parser.add_argument('--stretches', type=int, default=4, help='most of an axis')
+    parser.add_argument('--told', type=float, nargs='+', default=list(TOLD),
+                        help='by how much the deviation of the noise is told wrong')
+    parser.add_argument('--page', type=Path, help='page whose table is replaced')
+    options = parser.parse_args()
+    if gyros.folder() is None:
+        parser.error('OU_MONITOR_REALDATA is not set: it names the folder of the flights')
+    rows = []
+    for name, *_ in (*gyros.FLIGHTS, *gyros.SLOW):
+        gyro = gyros.read(name) if name in (options.flight or [name]) else None
+        if gyro is not None:
+            rows += measure(gyro, options.stretches, options.told)
+            print(*rows[-2:], sep='\n', file=sys.stderr)
+    text = table(['gyro', '', 'stretches', *(word for told in options.told for word in (
+        'mean' if told == 1.0 else f'noise told {told:g} times: mean', 'worst'))], rows)
+    if options.page:
+        put(options.page, text, 'learned')
+    else:
+        print(text)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,227 @@
+r"""
+The law `kalman` of a signal in the noise of the supply: the best filter, learned in flight.
+
+Nothing is told of the signal.  The outputs z of four low-passes and the input (`low_pass_span`)
+are signal and noise, z = z_s + z_n, and the noise is known: `coupling` times the supply's, an OU
+of sigma and alpha, and white noise n0.  Of all linear combinations of z
+
+    w = (C_s + C_n)^-1 c_s,    C_s = C_z - C_n,
+
+has the least mean square error to the last of z_s, the signal or its slope: the multichannel
+Wiener filter (Doclo & Moonen 2002, IEEE Trans. Signal Process. 50, 2230).  C_z is a running mean
+of z z^T over `_MEMORY`; a hop counts by the inverse of its noise squared, as the variance of z z^T
+goes.  C_s is what of C_z - C_n is larger than its sampling error, direction by direction.
+
+- Noise that is told too large, so that the signal would be negative, is made as small as it must
+  be.  For a slope, whose power is finite, some direction holds next to no signal, and noise that
+  is told too small is made as large as what is there.
+- A hop that does not fit C_s + C_n (its largest normalised square lies above the 99.9 % quantile
+  of chi squared) opens the filter at once: C_s grows in proportion, as in a manoeuvre after calm.
+
+Its lag is that of the combination; where it exceeds the limit, the input is mixed in, just so far
+that the limit is kept (`lag.share_for_lag`).
+
+Limits: for a signal, noise that is told too small passes as signal.  The gain at frequency 0 is
+below 1.  What moves slower than 2 Hz, or faster than 128 Hz, is filtered no better than by those.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+
+import numpy as np
+from ou_monitor.online.filter.cutoff_control import time_constant
+from ou_monitor.online.filter.lag import phase_lag, share_for_lag
+from ou_monitor.online.filter.low_pass_span import COUNT, LowPassSpan
+from ou_monitor.online.settings import FilterSettings
+from ou_monitor.records import FloatArray, NAN
+
+_TWO_PI = 2.0 * math.pi
+# s between new weights, over which the output moves to them, and of what is remembered; chosen
+# on bf3s, roma, jd and gecko (benchmarks/learned.py).
+_HOP, _MEMORY = 0.01, 5.0
+# s of no signal that are counted before the first sample.
+_BEFORE = 1.0
+# 99.9 % quantile of chi squared with 5 degrees of freedom.
+_MISFIT = 20.515
+# Samples of a hop at most, for fast inputs.
+_ROWS = 256
+# Noise of each output that is added for the arithmetic: as a share of its noise and of its power.
+_FLOOR, _FLOOR_OF_ALL, _TINY = 1e-9, 1e-12, 1e-200
+# Least share of the noise that is believed; nothing beyond the largest is learned from.
+_LEAST, _LARGEST = 1e-3, 1e60
+# Samples further apart than so many intervals count as if they were not.
+_GAP = 5.0
+_RAW = np.eye(COUNT)[-1]
+
+
+class LearnedWiener:
+    """
+    The filter of least error in the span of a few low-passes.
+
+    Parameters
+    ----------
+    settings : FilterSettings
+        Noise, mode and limits of the lag.
+    x : float
+        Signal as measured, where it begins.
+
+    Attributes
+    ----------
+    y : float
+        Output: the signal, or its slope in mode derivative (unit/s).
+    lag : float
+        Lag of the output at `lag_frequency`, degrees; NaN while not known.
+    mixed : float
+        Share of what is unfiltered in it, 0..1, for the limit of the lag.
+
+    """
+
+    def __init__(self, settings: FilterSettings, x: float) -> None:
+        self._settings = settings
+        self._slope = settings.mode == 'derivative'
+        self.y = 0.0 if self._slope else x
+        self.lag, self.mixed = NAN, 0.0
+        self._x = x
+        self._span = LowPassSpan(self._slope)
+        # States of the low-passes, start and end of the step.
+        self._state = np.zeros(2 * COUNT)
+        self._state[:-2:2] = self.y
+        self._rows = np.empty((_ROWS, COUNT))
+        self._n, self._for = 0, 0.0
+        self._weights = np.zeros(COUNT) if self._slope else _RAW.copy()
+        self._offset = 0.0
+        self._log_sigma = NAN
+        # Means of z z^T and of the noise in it, sum of the weights and of their squares.
+        self._power = self._noise = np.zeros((COUNT, COUNT))
+        self._sum = self._squares = self._level = 0.0
+        self._whiten: FloatArray | None = None
+        # Share of the noise that is believed at most.
+        self._most = _LARGEST if self._slope else 1.0
+
+    def __copy__(self) -> LearnedWiener:
+        """Return one that goes its own way; what is kept of steps and noise is shared."""
+        other = object.__new__(LearnedWiener)
+        other.__dict__.update(self.__dict__)
+        other._state, other._rows = self._state.copy(), self._rows.copy()
+        return other
+
+    def configure(self, settings: FilterSettings) -> None:
+        """Change settings; the estimate goes on."""
+        self._settings = settings
+
+    def advance(self, dt: float, interval: float, x: float, slope: float, sigma: float,
+                error: float, alpha: float, level: float, level_se: float) -> float:
+        """Take a sample (dt in s, alpha in 1/s); the level of a voltage plays no part."""
+        state, raw = self._state, slope if self._slope else x
+        state[-2], state[-1] = slope if self._slope else self._x, raw
+        self._x = x
+        state[:-2] = self._span.step(dt) @ state
+        row = self._rows[self._n]
+        row[:-1], row[-1] = state[:-2:2], raw
+        self._n += 1
+        self._for += dt
+        self._offset *= math.exp(-dt / _HOP)
+        found = float(row @ self._weights)
+        self.y = found + self._offset
+        if self._n == _ROWS or self._for > _HOP - 0.5 * interval:
+            self._learn(interval, sigma, error, alpha)
+            self._offset += found - float(row @ self._weights)
+            self._n, self._for = 0, 0.0
+        return self.y
+
+    def _learn(self, interval: float, sigma: float, error: float, alpha: float) -> None:
+        """Take a hop into what is known, and make new weights of it."""
+        rows = self._rows[:self._n]
+        if not np.max(np.abs(rows)) < _LARGEST:
+            return
+        noise = self._noise_now(interval, sigma, error, alpha)
+        misfit = self._misfit(rows)
+        self._remember(rows, noise, interval)
+        try:
+            found = self._best(noise, misfit)
+        except np.linalg.LinAlgError:
+            # Rounding after noise that was larger by many powers of ten: what is remembered goes.
+            self._sum, self._whiten = 0.0, None
+            return
+        if np.all(np.isfinite(found)):
+            self._limit(found, interval)
+
+    def _best(self, noise: FloatArray, misfit: float) -> FloatArray:
+        """Return the weights of least error beside the noise of now."""
+        # A floor, in the signal as measured and in the noise.
+        floor = np.diag(_FLOOR * np.diag(self._noise + noise)
+                        + _FLOOR_OF_ALL * np.diag(self._power) + _TINY)
+        root = np.linalg.cholesky(self._noise + floor)
+        inverse = np.linalg.inv(root)
+        shares, turn = np.linalg.eigh(inverse @ (self._power + floor) @ inverse.T)
+        # The sampling error of a share is about this times itself.
+        unsure = 1.0 + math.sqrt(2.0 * self._squares) / self._sum
+        believed = min(max(float(shares[0]) * unsure, _LEAST), self._most)
+        grown = (root @ turn) * np.sqrt(np.maximum(shares - believed * unsure, 0.0))
+        root = np.linalg.cholesky(believed * (noise + floor))
+        inverse = np.linalg.inv(root)
+        part = inverse @ grown
+        shares, turn = np.linalg.eigh(part @ part.T)
+        shares = np.maximum(shares, 0.0)
+        self._whiten = (inverse.T @ turn) / np.sqrt(1.0 + shares)
+        kept = misfit * shares / (1.0 + misfit * shares)
+        return np.asarray((inverse.T @ turn) @ (kept * (turn.T @ root[-1])))
+
+    def _noise_now(self, interval: float, sigma: float, error: float,
+                   alpha: float) -> FloatArray:
+        """Return the covariance of the noise; sigma is followed in its logarithm."""
+        s = self._settings
+        wanted = math.log(min(max(sigma, 1.0 / _LARGEST), _LARGEST))
+        constant = time_constant(s, error)
+        if self._log_sigma != self._log_sigma or not constant > 0.0:
+            self._log_sigma = wanted
+        self._log_sigma += (wanted - self._log_sigma) * (
+            -math.expm1(-self._for / constant) if constant > 0.0 else 0.0)
+        found = s.n0 / interval * self._span.noise(interval, math.inf)
+        if s.coupling:
+            supply = (s.coupling * math.exp(self._log_sigma))**2 / (2.0 * alpha)
+            found = found + min(supply, _LARGEST) * self._span.noise(interval, alpha)
+        return found
+
+    def _misfit(self, rows: FloatArray) -> float:
+        """Return by how much the signal exceeds what is known of it; 1: it fits."""
+        if self._whiten is None:
+            return 1.0
+        squares = np.sum((rows @ self._whiten)**2, axis=1)
+        if not np.max(squares) > _MISFIT:
+            return 1.0
+        return min(max(float(np.mean(squares)) / COUNT, 1.0), _LARGEST)
+
+    def _remember(self, rows: FloatArray, noise: FloatArray, interval: float) -> None:
+        """Take a hop and its noise into the means."""
+        level = max(float(noise[-1, -1]), _TINY)
+        span = min(self._for, _GAP * interval * self._n)
+        if not self._sum:
+            self._level, self._power, self._noise = level, noise, noise
+            self._sum, self._squares = _BEFORE, _BEFORE * max(_HOP, interval)
+        weight = span * min(max(self._level / level, 1e-6), 1e6)**2
+        keep = math.exp(-self._for / _MEMORY)
+        self._sum = keep * self._sum + weight
+        self._squares = keep * keep * self._squares + weight * weight
+        share = weight / self._sum
+        self._power = self._power + share * (rows.T @ rows / self._n - self._power)
+        self._noise = self._noise + share * (noise - self._noise)
+
+    def _limit(self, weights: FloatArray, interval: float) -> None:
+        """Take weights, with so much of the input as the limit of the lag needs."""
+        s = self._settings
+        response = self._span.response(interval, s.lag_frequency)
+        if self._slope:
+            # Both behind the true derivative.
+            response = response / (1j * _TWO_PI * s.lag_frequency)
+        h, raw = complex(weights @ response), complex(response[-1])
+        if not abs(h) > 1e-9 * abs(raw):
+            # Nothing comes through: there is no lag to tell.
+            self._weights, self.lag, self.mixed = weights, NAN, 0.0
+            return
+        most = math.radians(phase_lag(s.order, s.lowest, s.lag_frequency))
+        self.mixed = share_for_lag(h, raw, most)
+        self._weights = weights + self.mixed * (_RAW - weights)
+        self.lag = math.degrees(-cmath.phase(h + self.mixed * (raw - h)))
