@@ -137,6 +137,9 @@ def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: li
         raise
     finally:
         rclpy.try_shutdown()
+        if stopped:
+            # The signal has ended the context, but not the log file: its last lines wait.
+            binding.rclpy_logging_fini()
 
 
 def _init(rclpy: Any, binding: Any, args: list[str] | None) -> None:

@@ -172,3 +172,16 @@ def test_no_thread_holds_up_the_end(tmp_path):
     done = subprocess.run([sys.executable, '-c', code], env=env, capture_output=True, text=True,
                           timeout=DEADLINE)
     assert (done.returncode, done.stdout, done.stderr) == (3, 'done at exit\n', '')
+
+
+def test_the_log_file_has_the_last_lines(world, tmp_path):
+    """What was said just before a signal is in the file too."""
+    process = world.start('estimator', '--ros-args', '-p', 'no_such.parameter:=3')
+    wait_until(lambda: 'no_such.parameter' in process.err, what='the warning')
+    wait_until(lambda: 'Waiting for a publisher' in process.err, what='the node at work')
+    assert process.stop() == 0
+    logged = ''.join(path.read_text() for path in world.folder.rglob(
+        f'*_{process.popen.pid}_*.log'))
+    for line in process.err.splitlines():
+        assert line.partition(']: ')[2] in logged
+    assert 'Waiting for a publisher' in logged
