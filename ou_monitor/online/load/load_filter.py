@@ -280,8 +280,8 @@ class LoadFilter:
         P[:, 0] -= P[:, 1] * used
         # A pack recovers in a gap by more than it walks: up to 2 % in a minute.
         self._resize(dt)
-        P[0, 0] += (_WALK * self._cells) ** 2 * dt + (0.02 * self._volts) ** 2 * min(
-            max(0.0, dt - 2.0), 60.0) / 60.0
+        P[0, 0] += (_WALK * self._cells) ** 2 * dt + (
+            0.02 * self._volts) ** 2 * max(0.0, dt - 2.0) / 60.0
         P[2:, 2:] += (_WARMING * dt) * np.outer(m[2:], m[2:])
         P[range(2, _STATES), range(2, _STATES)] += _CHANGE * dt * (_SIZE * self._volts) ** 2
         self._flown *= 1.0 - min(dt / _FLOWN_MEMORY, 1.0)
