@@ -35,7 +35,7 @@ def test_rc_in_white_noise_is_the_ou_of_the_theory():
     The noise is white up to a/lambda, here 2e-5; alpha is 62.5 1/s at 0.4 F.
     """
     rail = rail_at(replace(RC, bulk_capacitance=0.4, esc_frequency=1e6), 0.4)
-    density = rail.load.switching_density
+    density = 2.0 * rail.load.switching_rms**2 / rail.load.switching_rate
     assert rail.alpha == pytest.approx(62.5, rel=1e-9)
     assert rail.var_inf == pytest.approx(density * 0.04 / (2.0 * 0.4), rel=1e-4)
     assert rail.sigma == pytest.approx(math.sqrt(density) / 0.4, rel=1e-4)

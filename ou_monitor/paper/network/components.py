@@ -227,16 +227,6 @@ class Load:
     sag: float
     input_conductance: float
 
-    @property
-    def switching_density(self) -> float:
-        """
-        Return the two-sided density of the ESC current at low frequency, A^2/Hz.
-
-        2 rms^2 / rate: the S of Var_inf = S R / (2 C).
-
-        """
-        return 2.0 * self.switching_rms**2 / self.switching_rate
-
     def mean(self, rail: str) -> float:
         """Return the mean of a rail, V."""
         return {'bus': self.bus, 'regulated': self.regulated}[rail]
