@@ -33,6 +33,8 @@ PAGES = (
      390, 'dark'),
     ('compare', ('compare', GECKO), 1000, 'light'),
     ('discover', ('discover', GECKO), 1000, 'light'),
+    ('coupling', ('coupling', 'bags/recorded/gecko_gyro.csv', '--signal', 'gyro_x_deg_s',
+                  '--cells', '4'), 1000, 'light'),
     ('fleet', ('fleet', 'bags', '--brownout-voltage', '4.5'), 1000, 'light'),
     ('reproduce', ('reproduce',), 1000, 'light'),
 )

@@ -376,7 +376,7 @@ class SupplyMonitor:
         if age is not None and age > limit:
             why = f'stale_after = {self._settings.stale_after:g} s'
             if limit < self._settings.stale_after:
-                why = f'a source of {e.rate:.3g} Hz is stale after {limit:.2g} s'
+                why = f'a source of {float(f"{e.rate:.3g}"):g} Hz is stale after {limit:.2g} s'
             if late:
                 return (f'Voltages arrive late: the newest is {age:.1f} s old by its stamp '
                         f'({why}); the publisher, the link or this machine cannot keep up.')
