@@ -44,9 +44,8 @@ class SupplyMonitor:
     model : SupplyModel, optional
         Terms of the supply, as `discover` found them; none when left out.
     background : bool
-        Whether tables for these terms are made, and what irregular stamps need is loaded,
-        in a thread, so that reports never wait; until then the risk or the estimate is
-        unknown.
+        Whether tables for these terms are made in a thread, so that reports never wait;
+        until they are there the risk is unknown.
 
     """
 
@@ -70,8 +69,7 @@ class SupplyMonitor:
 
     def _begin(self) -> None:
         """Begin with nothing known of the supply."""
-        self._estimator = SlidingEstimator(self._settings.window,
-                                           background=self._background)
+        self._estimator = SlidingEstimator(self._settings.window)
         self._load_filter, self._load = LoadFilter(), SupplyLoad()
         self._load_filter.begin_with(None if self._model is None else self._model.load)
         self._outlook = Outlook(background=self._background)

@@ -74,14 +74,15 @@ def test_the_unit_is_accepted(tmp_path):
     assert done.returncode == 0, done.stdout[-200:]
 
 
-def test_the_nodes_need_no_reader_of_bags_and_begin_without_scipy():
-    """An apt-only Jazzy has no mcap; SciPy would cost the estimator 35 MB."""
+def test_the_nodes_need_no_reader_of_bags_and_no_scipy():
+    """An apt-only Jazzy has no mcap; SciPy would cost the estimator 50 MB."""
     code = ("import sys; sys.modules['mcap'] = sys.modules['mcap_ros2'] = None; "
             'import ou_monitor.nodes.estimator_node, ou_monitor.nodes.adaptive_filter_node, '
             'ou_monitor.nodes.adc_node; '
             'from ou_monitor import MonitorSettings, SupplyMonitor; '
             'm = SupplyMonitor(MonitorSettings(brownout_voltage=4.5)); '
-            'm.push([0.001 * k for k in range(500)], [5.0 + 0.01 * (k % 7) for k in range(500)], '
+            'm.push([0.001 * k + 4e-7 * (k * k % 997) for k in range(500)], '
+            '[5.0 + 0.01 * (k % 7) for k in range(500)], '
             '[0.3 + 0.001 * (k % 100) for k in range(500)]); m.report(0.0); '
             "sys.exit('scipy' in sys.modules)")
     done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True,

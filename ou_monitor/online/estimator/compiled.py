@@ -7,15 +7,12 @@ loops over samples are written out here and tested against their NumPy twins to
 1e-9.  Compiling takes seconds (half a second from Numba's cache), so it runs
 in a thread; until it is done, and if it fails, NumPy does the work.
 Set OU_MONITOR_COMPILED=0 to keep to NumPy.
-
-What irregular stamps need is loaded likewise (`loaded`), where no caller may wait.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-import functools
 import importlib.util
 import logging
 import math
@@ -279,17 +276,3 @@ def kernels(wait: bool = False) -> Kernels | None:
         if wait and thread is not None:
             thread.join()
     return COMPILED.ready
-
-
-@functools.cache
-def _loader(module: str) -> threading.Thread:
-    """Return the thread that loads a module."""
-    thread = threading.Thread(target=importlib.import_module, args=(module,), daemon=True,
-                              name='ou_monitor-load')
-    thread.start()
-    return thread
-
-
-def loaded(module: str) -> bool:
-    """Whether a module has been loaded; begin it in a thread if not."""
-    return not _loader(module).is_alive()

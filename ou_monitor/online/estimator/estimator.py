@@ -18,9 +18,10 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.model import arma
 from ou_monitor.online.estimator import judgement
-from ou_monitor.online.estimator.compiled import COMPILED, loaded
+from ou_monitor.online.estimator.compiled import COMPILED
 from ou_monitor.online.estimator.fit import fit_window, Fitted, from_window, TREND_SCORE
 from ou_monitor.online.estimator.intake import as_column, BATCH, Intake, Thinner
+from ou_monitor.online.estimator.irregular import fit_irregular, MOST
 from ou_monitor.online.estimator.quality import (
     examine, Quality, refresh_period, Repeats, TAIL, whole)
 from ou_monitor.online.estimator.series import Batch, T, U, Y
@@ -37,7 +38,8 @@ _EVEN = 0.5
 # Jitter of the stamps, in relaxation times, from which they are taken as they
 # are: an even grid is then wrong by its square.
 _JITTER = 0.1
-# An ADC step is white noise only where the OU crosses several codes: D >= (0.7 step / sigma)^2.
+# An ADC step is white noise only where the OU crosses several codes within a
+# step: D >= (0.7 step / sigma)^2 (doc/estimation.md).
 _DITHER = 0.7
 # A diffusion of one step below this share of the variance is rounding of the sums.
 _EXACT = 1e-14
@@ -45,8 +47,6 @@ _EXACT = 1e-14
 _RAMP = 1e-9
 # The quality of the input is looked at this many times per window.
 _LOOKS = 4
-# Samples up to which the exact likelihood is used (some 50 ms).
-_MOST = 4096
 # Where repeats are looked for: a third of the samples repeat at two a refresh, or more.
 _TIED = 0.25
 _DOUBLE = np.dtype(np.float64)
@@ -64,9 +64,6 @@ class SlidingEstimator:
     fastest : float
         Highest rate kept, Hz; sources faster than this are averaged in blocks,
         and the fit knows it.
-    background : bool
-        Whether what irregular stamps need is loaded in a thread; until then it is as if they
-        were too few.
 
     Raises
     ------
@@ -75,9 +72,7 @@ class SlidingEstimator:
 
     """
 
-    def __init__(self, window: float = 2.0, *, fastest: float = 1.0e4,
-                 background: bool = False) -> None:
-        self._background = background
+    def __init__(self, window: float = 2.0, *, fastest: float = 1.0e4) -> None:
         self._window = _positive('window', window, 's')
         self._intake = Intake()
         self._fastest = _positive('fastest', fastest, 'Hz')
@@ -279,17 +274,16 @@ class SlidingEstimator:
             't': intake.newest, 'voltage': self._tail.item(-1), 'throttle': series.last(U),
             'n': n * m, 'duration': duration, 'counters': counters,
             'rate': (n - 1) * m / duration if duration > 0.0 else NAN}
-        status, found = Status.TOO_FEW_SAMPLES, None
-        if main.item(Y, at) == main.item(Y, end - 1) and n >= MIN_SAMPLES and not (
-                np.ptp(main[Y, at:end]) > 0.0):
+        status = None
+        if n < MIN_SAMPLES:
+            status = Status.TOO_FEW_SAMPLES
+        elif main.item(Y, at) == main.item(Y, end - 1) and not np.ptp(main[Y, at:end]) > 0.0:
             status = Status.CONSTANT
-        elif n >= MIN_SAMPLES:
-            found = self._fit(quality, duration)
-        if found is None:
+        if status is not None:
             return Estimate(status=status, u0=float(main[Y, at:end].mean()),
                             flags=tuple(judgement.input_flags(counters, quality, NAN)),
                             **measured)
-        fit, smoothness = found
+        fit, smoothness = self._fit(quality, duration)
         return judgement.judge(fit, measured, quality, self._throttle_std(), smoothness)
 
     def _throttle_std(self) -> float:
@@ -299,21 +293,14 @@ class SlidingEstimator:
             return NAN
         return self._finest.sums.throttle_std if series.moves else 0.0
 
-    def _fit_exactly(self, moves: bool) -> tuple[Fitted, float] | None:
-        """Return the fit at the stamps as they are, or None while it is being loaded."""
-        if self._background and not loaded('ou_monitor.online.estimator.irregular'):
-            return None
-        from ou_monitor.online.estimator.irregular import fit_irregular
-        return fit_irregular(self._finest.series.all_columns(), moves), NAN
-
-    def _fit(self, quality: Quality, duration: float) -> tuple[Fitted, float] | None:
+    def _fit(self, quality: Quality, duration: float) -> tuple[Fitted, float]:
         """Return the fit, and how much smoother than it neighbouring increments are."""
         series = self._finest.series
         moves = series.moves and series.known
         sums = self._finest.sums.total()
-        if self._thinner.m == 1 and series.size <= _MOST and (
+        if self._thinner.m == 1 and series.size <= MOST and (
                 sums.pairs[-1] < _EVEN * (sums.n - LAGS)):
-            return self._fit_exactly(moves)
+            return fit_irregular(series.all_columns(), moves), NAN
         resolution, m = self._finest, self._thinner.m
         step = duration / (series.size - 1) if series.even else self._step(series.column(T))
         fit = fit_window(sums, m, self._start)
@@ -327,8 +314,8 @@ class SlidingEstimator:
             if fit.scale < _EXACT * float(sums.second[0, 0]) / sums.n:
                 # Load and trend leave nothing but rounding.
                 fit = replace(fit, correlated=False)
-            if m == 1 and series.size <= _MOST and self._jitter * fit.a / step > _JITTER:
-                return self._fit_exactly(moves)
+            if m == 1 and series.size <= MOST and self._jitter * fit.a / step > _JITTER:
+                return fit_irregular(series.all_columns(), moves), NAN
         # Coarser where noise, or an ADC step, hides what the lags can hold.
         while fit.correlated and resolution.series.size >= FACTOR * FEWEST and (
                 fit.theta ** LAGS > _LOST

@@ -3,14 +3,15 @@ The fit for windows whose stamps are not evenly spaced: the exact Gaussian likel
 
 Dearer than the sums over lags, so only for windows that need it: irregular sources, and windows
 with many holes.  The inverse covariance of a sampled OU is tridiagonal, so the likelihood costs
-O(n) in LAPACK (`pttrf`): K = K_ou + nu I with A = I + nu K_ou^-1 tridiagonal, K^-1 = K_ou^-1 A^-1
-and log|K| = log|K_ou| + log|A|.  It is the likelihood of the Kalman filter, restricted to the
-contrasts of the regressors (REML: Harville, J. Am. Stat. Assoc. 72 (1977) 320).  It needs SciPy,
-0.3 s and 45 MB that other sources spare the nodes: `SlidingEstimator` loads it in a thread.
+O(n): K = K_ou + nu I with A = I + nu K_ou^-1 tridiagonal, K^-1 = K_ou^-1 A^-1 and log|K| =
+log|K_ou| + log|A|.  It is the likelihood of the Kalman filter, restricted to the contrasts of the
+regressors (REML: Harville, J. Am. Stat. Assoc. 72 (1977) 320).  Without SciPy, which would cost
+the nodes 45 MB.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 import math
 
@@ -19,8 +20,6 @@ from ou_monitor.model import arma
 from ou_monitor.online.estimator.fit import Fitted, independent, Outcome, TREND_SCORE
 from ou_monitor.online.estimator.series import FAST, SLOW, T, U, Y
 from ou_monitor.records import FloatArray
-from scipy.linalg.lapack import dpttrf, dpttrs
-from scipy.optimize import minimize
 
 # Search range of the noise share nu / mean step: ten thousand times the
 # diffusion of one step hides any OU.
@@ -88,9 +87,8 @@ class _Likelihood:
         log_det = float(np.log(rest).sum()) - self.n * math.log(2.0 * alpha)
         w = self.table
         if nu > 0.0:
-            d, e, _ = dpttrf(1.0 + nu * diag, nu * off)
-            log_det += float(np.log(d).sum())
-            w = dpttrs(d, e, self.table)[0]
+            more, w = solve_tridiagonal(1.0 + nu * diag, nu * off, self.table)
+            log_det += more
         kw = diag[:, None] * w
         kw[1:] += off[:, None] * w[:-1]
         kw[:-1] += off[:, None] * w[1:]
@@ -105,6 +103,83 @@ class _Likelihood:
         return value, scale, beta, inverse * scale
 
 
+def solve_tridiagonal(diag: FloatArray, off: FloatArray, right: FloatArray
+                      ) -> tuple[float, FloatArray]:
+    """
+    Return the log-determinant and the solutions (n, k) of a symmetric positive system.
+
+    Cyclic reduction: every second unknown is eliminated, again and again.
+    """
+    log_det, halves = 0.0, []
+    while diag.size > 1:
+        # Each odd one has a neighbour before it and, but for the last of an even number, after it.
+        pivots, before, after, w = diag[1::2], off[0::2], off[1::2], right[1::2]
+        m, k = pivots.size, after.size
+        halves.append((pivots, before, after, w))
+        log_det += float(np.log(pivots).sum())
+        back, ahead = before / pivots, after / pivots[:k]
+        diag, right = diag[0::2].copy(), right[0::2].copy()
+        diag[:m] -= back * before
+        diag[1:k + 1] -= ahead * after
+        right[:m] -= back[:, None] * w
+        right[1:k + 1] -= ahead[:, None] * w[:k]
+        off = -back[:k] * after
+    log_det += math.log(diag.item(0))
+    x = right / diag[:, None]
+    for pivots, before, after, w in reversed(halves):
+        odd = w - before[:, None] * x[:pivots.size]
+        odd[:after.size] -= after[:, None] * x[1:after.size + 1]
+        both = np.empty((pivots.size + len(x), x.shape[1]))
+        both[0::2], both[1::2] = x, odd / pivots[:, None]
+        x = both
+    return log_det, x
+
+
+# Step of the differences, in ln alpha and in the root of the noise share: truncation and rounding
+# are then alike, 1e-7 of a curvature of one.
+_STEP = 1e-3
+# A step that gains less than this, nats, is the last: it ends a thousandth of a standard error
+# from the optimum at most, and a logarithm of 4096 densities is rounded to 1e-9.
+_SETTLED = 1e-6
+
+
+def _least(f: Callable[[float, float], float], start: tuple[float, float],
+           low: tuple[float, float], high: tuple[float, float]) -> tuple[float, float]:
+    """
+    Return where f is least within a box.
+
+    Newton's method with derivatives by differences, damped (Levenberg) where f is not convex
+    or a step leads up.
+    """
+    here, value, damping, h = np.array(start), f(*start), 0.0, _STEP
+    for _ in range(60):
+        a, x = here.tolist()
+        up, down, right, left = f(a + h, x), f(a - h, x), f(a, x + h), f(a, x - h)
+        gradient = np.array([up - down, right - left]) / (2.0 * h)
+        mixed = f(a + h, x + h) + f(a - h, x - h) + 2.0 * value - up - down - right - left
+        curved = np.array([[up + down - 2.0 * value, 0.5 * mixed],
+                           [0.5 * mixed, right + left - 2.0 * value]]) / (h * h)
+        # On an end beyond which f falls, only the other is left.
+        stays = ((here <= low) & (gradient > 0.0)) | ((here >= high) & (gradient < 0.0))
+        gradient[stays] = 0.0
+        curved[stays] = curved[:, stays] = 0.0
+        least = float(np.linalg.eigvalsh(curved)[0])
+        while True:
+            lift = max(damping, 1e-3 - 1.1 * least if least < 1e-3 else 0.0)
+            step = np.linalg.solve(curved + lift * np.eye(2), -gradient)
+            there = np.clip(here + step, low, high)
+            new = f(*there.tolist())
+            if new <= value or not -float(gradient @ step) >= _SETTLED:
+                break
+            damping = max(10.0 * damping, 1.0)
+        gain = value - new
+        if gain > 0.0:
+            here, value, damping = there, new, 0.1 * damping if damping > 1e-2 else 0.0
+        if gain < _SETTLED:
+            break
+    return float(here[0]), float(here[1])
+
+
 def fit_exact(t: FloatArray, y: FloatArray, regressors: FloatArray) -> ExactFit:
     """Fit alpha, sigma, the white noise and the mean by restricted likelihood (t in s, y in V)."""
     likelihood = _Likelihood(t, y, regressors)
@@ -115,11 +190,11 @@ def fit_exact(t: FloatArray, y: FloatArray, regressors: FloatArray) -> ExactFit:
     # lam = x^2 keeps the noise share positive and smooth at zero.
     starts = [(a, x) for a in np.linspace(low, high, 7)[1:-1] for x in (0.1, 1.0)]
     values = [likelihood.solve(a, x * x)[0] for a, x in starts]
-    found = minimize(lambda z: likelihood.solve(z[0], z[1] * z[1])[0],
-                     starts[int(np.argmin(values))], method='L-BFGS-B',
-                     bounds=[(low, high), (0.0, math.sqrt(_MOST_NOISE))],
-                     options={'ftol': 1e-13, 'gtol': 1e-7})
-    log_alpha, share = float(found.x[0]), float(found.x[1]) ** 2
+    # Less noise than by the step of the differences is none, see below.
+    log_alpha, root = _least(lambda a, x: likelihood.solve(a, x * x)[0],
+                             starts[int(np.argmin(values))], (low, _STEP),
+                             (high, math.sqrt(_MOST_NOISE)))
+    share = root * root
     value, scale, beta, cov = likelihood.solve(log_alpha, share)
     clean = likelihood.solve(log_alpha, 0.0)
     if clean[0] <= value:
@@ -130,6 +205,10 @@ def fit_exact(t: FloatArray, y: FloatArray, regressors: FloatArray) -> ExactFit:
     edge = -1 if log_alpha < low + 0.05 else 1 if log_alpha > high - 0.05 else 0
     return ExactFit(math.exp(log_alpha), math.sqrt(scale), share * scale * likelihood.step,
                     beta, cov, -value, edge)
+
+
+# Samples up to which the exact likelihood is used (some 50 ms).
+MOST = 4096
 
 
 def fit_irregular(columns: FloatArray, moves: bool) -> Fitted:
