@@ -346,6 +346,15 @@ def withdrawn_under_load(before: Statistics, after: Statistics, accepted: Sequen
     return [k for k, kind in enumerate(accepted) if is_latent(kind) and fails(kind)]
 
 
+def searched_again(loaded: bool, cost: float) -> bool:
+    """
+    Return whether the search goes on once without what was withdrawn (cost of fits so far, s).
+
+    Beside a load what stays is put back alone: there something fails whatever is named.
+    """
+    return not loaded and cost <= MOST_COST
+
+
 # The verdict on the recording.
 
 def largest_chance(values: Statistics) -> float:

@@ -111,7 +111,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         slow = [kind.NAME for kind in _kinds(search.removed) if kind.FAMILY == 'slow']
         # Nor are they the last that could explain it: what did less well may be right.
         found = None
-        if not loaded and fitter.cost <= decision.MOST_COST:
+        if decision.searched_again(loaded, fitter.cost):
             again = begun.copy()
             name_causes(fitter, again, bank, given=[*given, *slow, *dropped])
             kinds = _kinds(again.accepted)

@@ -377,3 +377,11 @@ def test_what_earns_its_place(gain, error, chance, earns):
     ({'band 1': 4.4}, {'band 1': 0.0}, [1])])
 def test_what_is_withdrawn_beside_a_load(before, after, out):
     assert decision.withdrawn_under_load(before, after, [Mean, Cheap, Intensity]) == out
+
+
+@pytest.mark.parametrize('loaded, cost, again', [
+    (False, 0.0, True), (False, decision.MOST_COST, True),
+    (False, decision.MOST_COST + 0.1, False), (True, 0.0, False)])
+def test_the_search_goes_on_without_what_was_withdrawn(loaded, cost, again):
+    """Once, where it costs little; under load the other latent causes are kept instead."""
+    assert decision.searched_again(loaded, cost) is again
