@@ -1,0 +1,76 @@
+"""What begins a series: the law of the first sample, and models that cannot be simulated."""
+
+import math
+
+import numpy as np
+from numpy.testing import assert_allclose
+from ou_monitor.criticism.curves import compare_curves
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.structure import evaluate, state_space
+from ou_monitor.discovery.decision import rivals_of, TIE
+from ou_monitor.model.terms.ac_coupling import ACCoupling
+from ou_monitor.model.terms.load_dependent_alpha import LoadDependentAlpha
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.online.risk.flag import FloorWatch
+from ou_monitor.online.settings import MonitorSettings
+
+
+def test_the_first_sample_behind_a_high_pass_has_the_law_of_its_throttle():
+    """OU and its low-pass: variances in the ratio rate / (rate + alpha), alpha as at first."""
+    n = 50
+    throttle = np.linspace(0.1, 0.9, n)
+    samples = Samples(1e-3 * np.arange(n), np.random.default_rng(1).standard_normal(n), throttle)
+    ou, alpha = OU(60.0, 0.5, 5.0), LoadDependentAlpha(0.8)
+    plain = evaluate(samples, (ou, alpha))
+    space = state_space(samples, (ou, alpha, ACCoupling(3.0, 0.0)), None)[1]
+    rate = 2.0 * math.pi * 3.0
+    first = float(plain.variance[0])
+    # The same step from the first sample to the second says what alpha is at the first.
+    at_first = -1e3 * math.log(state_space(samples, (ou, alpha), None)[1].f[1, 0, 0])
+    share = rate / (rate + at_first)
+    assert_allclose(space.q[0] / first, [[1.0, share], [share, share]], rtol=0.02)
+    late = -1e3 * math.log(state_space(samples, (ou, alpha), None)[1].f[-1, 0, 0])
+    assert abs(rate / (rate + late) / share - 1.0) > 0.1
+
+
+def test_a_model_that_runs_away_has_no_band():
+    """Whether at the first simulation or at a later one; the others keep theirs."""
+    class Away:
+        """Fails from a given simulation on."""
+
+        def __init__(self, good):
+            self.left = good
+
+        def simulate(self, t, rng, throttle):
+            """Return noise, or fail."""
+            self.left -= 1
+            if self.left < 0:
+                raise ValueError('runs away')
+            return 5.0 + rng.standard_normal(t.size)
+
+    rng = np.random.default_rng(2)
+    samples = Samples(1e-3 * np.arange(500), 5.0 + rng.standard_normal(500), None)
+    for found in compare_curves(samples, [Away(0), Away(1), Away(9)], rng, 3):
+        (none, _), one, three = found.bands
+        assert np.isnan(none).all()
+        assert_allclose(one[0], one[1])
+        known = np.isfinite(three[0])
+        assert known.any() and (three[0][known] <= three[1][known]).all()
+        assert (three[0][known] < three[1][known]).any()
+
+
+def test_rivals_are_within_a_tie():
+    """Not at its edge; the best one is none."""
+    evidence = [('a', 5.0 + TIE), ('b', 5.0), ('c', 5.0 + 0.01), ('d', 9.0 + TIE)]
+    assert rivals_of('a', evidence) == ['c', 'd'] and rivals_of('d', evidence) == []
+
+
+def test_the_usual_interval_is_learned_over_many_samples():
+    """One sample that is late by nine intervals counts as two, and moves it little."""
+    watch = FloorWatch(MonitorSettings())
+    for k in range(50):
+        watch.push(0.01 * (10 * k + np.arange(10)), np.full(10, 4.9))
+    before = watch._usual
+    assert abs(before - 0.01) < 1e-9
+    watch.push(np.array([4.99 + 0.1]), np.array([4.9]))
+    assert 0.0 < watch._usual - before < 0.2 * before
