@@ -1,0 +1,43 @@
+"""The limit: of the pack, or by the cell."""
+
+from argparse import Namespace
+
+import numpy as np
+from ou_monitor.analysis.overview import known_lines, overview
+from ou_monitor.cli.arguments import brownout_limit
+from ou_monitor.cli.main import main
+from ou_monitor.errors import InputError
+from ou_monitor.records import Recording
+import pytest
+
+
+@pytest.mark.parametrize('voltage, cells, limit', [
+    (None, None, None), ('14', None, 14.0), (None, 4, 13.2), ('3.5', 4, 14.0), ('3.5', 1, 3.5),
+    ('4.5', None, 4.5)])
+def test_with_cells_it_is_volts_a_cell(voltage, cells, limit):
+    """Without, of the whole; cells alone have a limit of their own."""
+    found = brownout_limit(Namespace(brownout_voltage=voltage, cells=cells))
+    assert found == (None if limit is None else pytest.approx(limit, rel=1e-12))
+
+
+def test_volts_of_the_pack_beside_cells_are_refused():
+    """With the number that is meant."""
+    with pytest.raises(InputError, match='no cell has 14 V: write 3.5, or leave --cells out'):
+        brownout_limit(Namespace(brownout_voltage='14', cells=4))
+
+
+@pytest.mark.parametrize('cells', ['0', '-1', '2.5', 'four', '99'])
+def test_a_number_of_cells(cells, capsys):
+    """One line."""
+    assert main(['analyze', 'x.csv', '--cells', cells]) == 2
+    assert f"'{cells}' is not a number of cells, 1 to 28" in capsys.readouterr().err
+
+
+def test_the_limit_is_told_by_the_cell():
+    """Beside its dips."""
+    t = np.arange(200) * 0.01
+    voltage = np.where(t == t[50], 13.0, 15.0)
+    made = Recording(t, voltage, np.full(t.size, np.nan), 'made')
+    assert dict(known_lines(overview(made, 13.2, cells=4)))['Below 13.2 V'].endswith(
+        '; 3.3 V a cell')
+    assert 'a cell' not in dict(known_lines(overview(made, 13.2)))['Below 13.2 V']
