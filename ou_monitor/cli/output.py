@@ -208,7 +208,7 @@ def summary(answer: str, detail: str, **files: object) -> None:
         # Who asked for JSON will find it; people look for the page.
         made.pop('json', None)
     last = '; '.join(f'{name.capitalize()}: {path}' for name, path in made.items())
-    say('\n' + '\n'.join([paragraph(answer), paragraph(detail), last or _NO_FILE]))
+    say('\n' + '\n'.join([paragraph(answer), paragraph(detail), last or paragraph(_NO_FILE)]))
 
 
 def facts_table(facts: Sequence[tuple[str, str]]) -> str:
