@@ -223,7 +223,7 @@ _LAWS = ({'law': 'constant_noise'}, {'law': 'constant_noise', 'coupling': 2.0, '
          {'law': 'wiener', 'coupling': 2.0, 'signal_bandwidth': 4.0, 'signal_rms': 1.0},
          {'law': 'kalman', 'coupling': 2.0, 'signal_bandwidth': 4.0, 'signal_rms': 1.0},
          {'law': 'kalman', 'coupling': 1.0, 'signal_bandwidth': 9.0, 'signal_rms': 0.5,
-          'signal_poles': 2, 'signal_check': False, 'max_lag': 25.0, 'n0': 1e-3},
+          'signal_poles': 2, 'max_lag': 25.0, 'n0': 1e-3},
          {'law': 'kalman', 'signal_bandwidth': 3.0, 'signal_rms': 0.02, 'coupling': 1.0,
           'max_lag': 10.0})
 
