@@ -338,17 +338,16 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
             if only is None or k in only]
     base = _with_mean(samples, terms, events)
     terms, cost = base.terms, cost + base.cost
-    value, damping, inverse = float(base.density.sum()), 0.0, np.zeros((0, 0))
+    value, damping = float(base.density.sum()), 0.0
+    inverse = outer = np.zeros((0, 0))
     for _ in range(rounds):
-        scores = np.empty((samples.n, len(free)))
-        for j, (k, name) in enumerate(free):
-            moved = _moved(terms, k, name, _STEP)
-            there = evaluate(samples, moved, events, inside=True)
-            cost += there.cost
-            scores[:, j] = (there.density - base.density) / _STEP
-        information = scores.T @ scores
-        gradient = scores.sum(axis=0)
+        scores, information, spent = _scored(samples, terms, events, base, free)
+        cost += spent
+        gradient, outer = scores.sum(axis=0), scores.T @ scores
         scale = np.sqrt(information.diagonal()) + 1e-12
+        inverse = np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+        if 0.5 * float(gradient @ inverse @ gradient) < (_NEARLY if rough else _SETTLED):
+            break
         better = None
         for _ in range(6):
             ridge = (damping + 1e-9) * np.eye(len(free))
@@ -371,11 +370,32 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
         damping *= 0.3
         if gain < (_NEARLY if rough else _SETTLED):
             break
-    inverse = np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+    # Errors hold whatever the tails (sandwich of White 1982).
+    covariance = inverse @ outer @ inverse
     se: list[dict[str, float]] = [{} for _ in terms]
     for j, (k, name) in enumerate(free):
-        se[k][name] = math.sqrt(max(inverse[j, j], 0.0)) * abs(terms[k].per_coordinate(name))
+        se[k][name] = math.sqrt(max(covariance[j, j], 0.0)) * abs(terms[k].per_coordinate(name))
     return replace(base, se=tuple(se), cost=cost)
+
+
+def _scored(samples: Samples, terms: tuple[Term, ...], events: Events | None, base: GaussianFit,
+            free: Sequence[tuple[int, str]]) -> tuple[FloatArray, FloatArray, float]:
+    """
+    Return scores, shape (n, free), expected information, and what they cost, s.
+
+    The information is that of a normal law with the predicted variances: unlike the outer product
+    of the scores it holds for heavy tails too, which would shorten each step by their kurtosis.
+    """
+    v, cost = base.variance, 0.0
+    z = base.innovation / np.sqrt(v)
+    means, spreads = np.empty((2, samples.n, len(free)))
+    for j, (k, name) in enumerate(free):
+        there = evaluate(samples, _moved(terms, k, name, _STEP), events, inside=True)
+        cost += there.cost
+        means[:, j] = (there.innovation - base.innovation) / (_STEP * np.sqrt(v))
+        spreads[:, j] = (there.variance - v) / (_STEP * v)
+    scores = -means * z[:, None] + 0.5 * spreads * (z * z - 1.0)[:, None]
+    return scores, means.T @ means + 0.5 * spreads.T @ spreads, cost
 
 
 def _solved(columns: FloatArray, y: FloatArray) -> FloatArray:

@@ -1,9 +1,10 @@
 """
 What a load model leaves over: white noise that follows throttle, and an OU.
 
-The intensity of the noise follows throttle and its changes: ln variance = b0 + b1 ripple(u)
-+ b2 sqrt(|du|), with du the change of throttle in 20 ms, or from the sample before where that is
-older.  Beyond the throttles and changes of the fit it stays at their edge.
+The intensity of the noise follows throttle and its changes: variance = exp(b0 + b1 ripple(u))
++ exp(b2) du^2, with du the change of throttle in 20 ms, or from the sample before where that is
+older: the two are not read at one moment, so that a change leaves an error as large as itself.
+Beyond the throttles and changes of the fit it stays at their edge.
 
 The Ornstein-Uhlenbeck process, beside white noise, is found by Whittle's likelihood of the
 periodogram, in bins of frequency; what has another law than the normal, or an intensity that
@@ -21,8 +22,9 @@ from ou_monitor.records import FloatArray
 from scipy.optimize import minimize
 from scipy.signal import lfilter, periodogram, ss2tf
 
-# Centre and deviation of b1 and b2 before any data: what recordings usually show.
-USUAL = ((2.0, 2.0), (4.0, 3.0))
+# Centre and deviation of b1 before any data, what recordings usually show; and of b2, about ln of
+# the mean square of the errors: a wide choice.
+USUAL = ((2.0, 2.0), (0.0, 4.0))
 # Shares of the samples at each end of throttle, and at the top of its changes, that the law does
 # not go beyond.
 _EDGE, _TOP = 0.01, 0.001
@@ -51,7 +53,7 @@ class NoiseLaw:
     Attributes
     ----------
     b : ndarray, shape (3,)
-        Coefficients of ln variance, V^2.
+        Coefficients of the variance, V^2.
     covariance : ndarray, shape (3, 3)
         Their covariance.
     limits : tuple of float
@@ -72,14 +74,14 @@ class NoiseLaw:
     errors: FloatArray
     memory: float = 0.0
 
-    def features(self, t: FloatArray, throttle: FloatArray) -> FloatArray:
-        """Return what the coefficients multiply, shape (n, 3)."""
-        return _features(throttle, changes(t, throttle), self.limits)
+    def variance(self, t: FloatArray, throttle: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the variance, V^2, and how ln of it changes with the coefficients, (n, 3)."""
+        return _variance(self.b, *_features(throttle, changes(t, throttle), self.limits))
 
     def draw(self, t: FloatArray, throttle: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Return noise, V, of samples with that throttle; the coefficients' errors are drawn."""
-        features = self.features(t, throttle)
-        wanted = features @ self.b
+        variance, slopes = self.variance(t, throttle)
+        wanted = np.log(variance)
         # Any of those that are as intense, and its neighbours: as many at the ends as between.
         first = np.searchsorted(self.intensities, wanted, side='left')
         last = np.searchsorted(self.intensities, wanted, side='right')
@@ -87,7 +89,7 @@ class NoiseLaw:
         most = self.errors.size - 1
         reach = min(max(_FEWEST, int(_ALIKE * self.errors.size)), most // 2)
         near = np.clip(at, reach, most - reach) + rng.integers(-reach, reach + 1, at.size)
-        off = features @ rng.multivariate_normal(np.zeros(3), self.covariance)
+        off = slopes @ rng.multivariate_normal(np.zeros(3), self.covariance)
         # As they were, not scaled: an outlier in a calm does not become a larger one in a storm.
         fresh = self.errors[near] * np.exp(0.5 * np.clip(off, -_FARTHEST, _FARTHEST))
         if self.memory == 0.0:
@@ -96,10 +98,22 @@ class NoiseLaw:
         return np.asarray(lfilter([1.0], [1.0, -self.memory], fresh), dtype=np.float64)
 
 
-def _features(u: FloatArray, du: FloatArray, limits: tuple[float, float, float]) -> FloatArray:
+def _features(u: FloatArray, du: FloatArray, limits: tuple[float, float, float]
+              ) -> tuple[FloatArray, FloatArray]:
+    """Return ripple and squared change, within the limits."""
     low, high, most = limits
-    inside = np.clip(u, low, high)
-    return np.stack([np.ones(u.size), ripple(inside), np.sqrt(np.minimum(du, most))], axis=1)
+    return ripple(np.clip(u, low, high)), np.square(np.minimum(du, most))
+
+
+def _variance(b: FloatArray, rippled: FloatArray, square: FloatArray
+              ) -> tuple[FloatArray, FloatArray]:
+    """Return the variance, V^2, and the slopes of its logarithm over the coefficients."""
+    still, moved = np.exp(np.clip([b[0] + b[1] * rippled, np.full(rippled.size, b[2])],
+                                  -200.0, 200.0))
+    moved = moved * square
+    whole = still + moved
+    slopes = np.stack([still, still * rippled, moved], axis=1) / whole[:, None]
+    return np.asarray(whole, dtype=np.float64), np.asarray(slopes, dtype=np.float64)
 
 
 def fit_noise_law(t: FloatArray, errors: FloatArray, throttle: FloatArray,
@@ -117,25 +131,26 @@ def fit_noise_law(t: FloatArray, errors: FloatArray, throttle: FloatArray,
     square = errors * errors
     total = float(square.mean())
     centre, deviation = np.array(USUAL).T
+    centre = centre + [0.0, math.log(max(total, 1e-300))]
 
     def cost(b: FloatArray) -> tuple[float, FloatArray]:
-        own = np.exp(np.clip(features @ b, -200.0, 200.0))
+        own, slopes = _variance(b, *features)
         whole = own + other
         away = (b[1:] - centre) / deviation
-        slope = 0.5 * features.T @ (own * (1.0 / whole - square / whole ** 2))
+        slope = 0.5 * slopes.T @ (own * (1.0 / whole - square / whole ** 2))
         slope[1:] += away / deviation
         return (0.5 * float(np.sum(np.log(whole) + square / whole)) + 0.5 * float(away @ away),
                 slope)
 
     # A floor, so that noise below the rounding does not run away to nothing.
     least = math.log(1e-6 * total)
-    start = np.array([max(math.log(max(total - other, 0.1 * total)), least + 1.0), 0.0, 0.0])
+    start = np.array([max(math.log(max(total - other, 0.1 * total)), least + 1.0), 0.0, centre[1]])
     found = minimize(cost, start, jac=True, method='L-BFGS-B',
                      bounds=[(least, None), (None, None), (None, None)])
-    own = np.exp(features @ found.x)
+    own, slopes = _variance(found.x, *features)
     share = own / (own + other)
     # Fisher information of ln variance: half a square of the share that is the noise's own.
-    information = 0.5 * (features * (share ** 2)[:, None]).T @ features
+    information = 0.5 * (slopes * (share ** 2)[:, None]).T @ slopes
     # A factor of e where there is none, as of noise far below the rounding.
     information += np.diag([1.0, *(deviation ** -2)])
     order = np.argsort(own, kind='stable')
@@ -143,7 +158,7 @@ def fit_noise_law(t: FloatArray, errors: FloatArray, throttle: FloatArray,
     memory = float(scores[1:] @ scores[:-1]) / float(scores @ scores)
     if abs(memory) < _CLEAR / math.sqrt(scores.size):
         memory = 0.0
-    return NoiseLaw(np.asarray(found.x), np.linalg.inv(information), limits,
+    return NoiseLaw(np.asarray(found.x), np.asarray(np.linalg.inv(information)), limits,
                     np.log(own[order]), (errors * np.sqrt(share))[order], memory)
 
 

@@ -36,7 +36,7 @@ GAUSSIAN = {
         {'log_factor': [0.0, 0.3, 0.8]}, {'log_factor': [0.0, 0.5, 0.65]}),
     'load_dependent_alpha': ({'slope': 1.0}, {'slope': -0.6}),
     'load_dependent_noise': (
-        {'ripple': 2.0, 'change': 1.5}, {'ripple': 1.0}, {'change': 0.0}),
+        {'ripple': 2.0, 'step': 30.0}, {'ripple': 1.0}, {'step': 0.0}),
     'drift': ({'rate': -0.01, 'curvature': 2e-4}, {'rate': 0.0}, {'curvature': 0.0}),
     'measurement_noise': ({'std': 0.5 * STEP}, {'std': 0.4 * STEP}, {'std': 0.6 * STEP}),
     'quantization': ({'step': 0.5 * STEP}, {'step': STEP}),

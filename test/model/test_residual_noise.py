@@ -48,9 +48,9 @@ def test_the_law_is_found_and_drawn():
     rng = np.random.default_rng(4)
     t = DT * np.arange(N)
     u = rng.random(N // 50)[np.arange(N) // 50]
-    b = np.array([-6.0, 2.5, 3.0])
-    log = b[0] + b[1] * ripple(u) + b[2] * np.sqrt(changes(t, u))
-    e = np.exp(0.5 * log) * rng.standard_normal(N)
+    b = np.array([-6.0, 2.5, -1.0])
+    variance = np.exp(b[0] + b[1] * ripple(u)) + np.exp(b[2]) * changes(t, u) ** 2
+    e = np.sqrt(variance) * rng.standard_normal(N)
     law = fit_noise_law(t, e, u, 0.0)
     assert np.all(np.abs(law.b - b) < 4.0 * np.sqrt(np.diag(law.covariance)))
     assert np.all(np.sqrt(np.diag(law.covariance))[:2] < 0.06)

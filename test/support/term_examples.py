@@ -16,7 +16,7 @@ EXAMPLES = {
     'load_transient': {'gain': -0.2, 'tau': 0.03, 'delay': 0.0125},
     'load_dependent_sigma': {'throttle': [0.0, 0.4, 1.0], 'log_factor': [0.0, 0.7, 0.4]},
     'load_dependent_alpha': {'slope': 0.8},
-    'load_dependent_noise': {'ripple': 2.0, 'change': 3.0},
+    'load_dependent_noise': {'ripple': 2.0, 'step': 3.0},
     'drift': {'rate': -0.01, 'curvature': 0.002},
     'measurement_noise': {'std': 0.02},
     'quantization': {'step': 0.01},

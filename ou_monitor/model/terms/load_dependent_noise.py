@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+import math
 from typing import ClassVar
 
 import numpy as np
@@ -19,19 +20,23 @@ from ou_monitor.records import FloatArray
 _SPAN = 0.02
 # Stamps nearer than this are one, s.
 _HAIR = 1e-9
-# A fit stays within: a factor of e^4 on the variance, at the ripple's peak and for a step of
-# full throttle.
+# A fit stays within a factor of e^4 on the deviation at the ripple's peak; and within these ratios
+# for a step of throttle, of which the least is none.
 _MOST = 8.0
+_LEAST_STEP, _MOST_STEP = 1e-3, 1e5
+# Ratios that a start is chosen from.
+_STEPS = np.geomspace(0.1, 1e4, 26)
 
 
 @dataclass(frozen=True)
 class LoadDependentNoise(Term):
     """
-    Multiply the variance of the white noise by exp(ripple r(u) + change sqrt|du|).
+    Multiply the variance of the white noise by exp(ripple r(u)) + (step du)^2.
 
     r(u) = u (1.4 - u)/0.49 is the ripple current of an ESC over throttle, 1 at u = 0.7; du is the
-    change of throttle in the last 20 ms.  It changes what `measurement_noise` adds, and nothing
-    without one.
+    change of throttle in the last 20 ms: throttle and voltage are not read at one moment, so that
+    an error as large as the change is added.  It changes what `measurement_noise` adds, and
+    nothing without one.
     """
 
     NAME: ClassVar[str] = 'load_dependent_noise'
@@ -54,47 +59,60 @@ class LoadDependentNoise(Term):
         'either')
 
     ripple: float = parameter('', 'ln of the factor on the variance at throttle 0.7')
-    change: float = parameter('', 'the same for a change of throttle from 0 to 1 within 20 ms')
+    step: float = parameter(
+        '', 'what a change of throttle from 0 to 1 within 20 ms adds, over that deviation', 0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
         recent = _Recent()
 
         def effect(s: Segment) -> None:
-            power = self.ripple * ripple(s.throttle)
-            if self.change:
-                power += self.change * np.sqrt(np.abs(s.throttle - recent(s.at, s.throttle)))
-            s.noise = s.noise * np.exp(0.5 * np.clip(power, -_MOST, _MOST))
+            factor = np.exp(np.clip(self.ripple * ripple(s.throttle), -_MOST, _MOST))
+            if self.step:
+                factor += np.square(self.step * (s.throttle - recent(s.at, s.throttle)))
+            s.noise = s.noise * np.sqrt(factor)
 
         return effect
 
     def free(self) -> tuple[str, ...]:
-        """Return both: logarithms, of either sign."""
-        return 'ripple', 'change'
+        """Return both: logarithms, the first of either sign."""
+        return 'ripple', 'step'
 
     def moved(self, name: str, by: float) -> LoadDependentNoise:
         """Return the term with one logarithm moved."""
-        value = min(max(getattr(self, name) + by, -_MOST), _MOST)
-        return replace(self, **{name: value})
+        if name == 'step':
+            return replace(self, step=min(max(
+                self.step * math.exp(by), _LEAST_STEP), _MOST_STEP))
+        return replace(self, ripple=min(max(self.ripple + by, -_MOST), _MOST))
 
     def per_coordinate(self, name: str) -> float:
-        """Return 1: both are logarithms already."""
-        return 1.0
+        """Return the derivative of a parameter with respect to its logarithm."""
+        return self.step if name == 'step' else 1.0
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return what the logarithms of the squared scores say."""
+        """Return the slope that the logarithms of the squared scores have, and the best step."""
         if view.throttle is None:
             return ()
         u = view.throttle[view.train]
-        columns = np.column_stack((
-            np.ones(u.size), ripple(u),
-            np.sqrt(np.abs(u - _Recent()(view.at[view.train], u)))))
-        # The logarithm of a squared normal score, cut from below: those next to zero say nothing.
-        log = np.log(np.maximum(view.z[view.train] ** 2, 1e-3))
-        beta = np.linalg.lstsq(columns, log, rcond=1e-8)[0]
-        bound = np.clip(beta, -0.5 * _MOST, 0.5 * _MOST).tolist()
-        return (cls(bound[1], bound[2]),)
+        square = view.z[view.train] ** 2
+        moved = np.square(u - _Recent()(view.at[view.train], u))
+        # Where throttle rests, ripple alone is seen.  The logarithm of a squared normal score, cut
+        # from below: those next to zero say nothing.
+        still = moved <= float(np.median(moved))
+        columns = np.column_stack((np.ones(u.size), ripple(u)))
+        log = np.log(np.maximum(square[still], 1e-3))
+        beta = np.linalg.lstsq(columns[still], log, rcond=1e-8)[0]
+        slope = float(np.clip(beta[1], -0.5 * _MOST, 0.5 * _MOST))
+        base = np.exp(slope * ripple(u))
+
+        def cost(step: float) -> float:
+            factor = base + step * step * moved
+            # Of any scale: the measurement noise beside it is fitted.
+            return 0.5 * float(np.log(factor).mean()) + 0.5 * math.log(
+                max(float((square / factor).mean()), 1e-300))
+
+        return (cls(slope, min(_STEPS.tolist(), key=cost)),)
 
 
 class _Recent:
