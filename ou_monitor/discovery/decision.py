@@ -187,6 +187,17 @@ def settled(tried: Kind, left: Statistics | None, kind: Kind,
             and tried.FAMILY != kind.FAMILY and not imitate(kind, tried))
 
 
+def comes_first(tried: Kind, evidence: float, kind: Kind, values: Statistics) -> bool:
+    """
+    Return whether a clear line is accepted before a dear kind of another family is tried.
+
+    Where nothing is as far off as the line; the other kind has its turn beside it.
+    """
+    largest = max(map(abs, values.values()), default=0.0)
+    return (kind.DEAR and tried.FAMILY == 'line' != kind.FAMILY and evidence > CLEAR
+            and asks(tried, values) >= largest and not imitate(kind, tried))
+
+
 def affordable(kind: Kind, cost: float) -> bool:
     """Return whether the search may still try a kind after fits of this cost (s)."""
     return not kind.DEAR or cost <= MOST_COST
@@ -211,11 +222,16 @@ def is_answer(kind: Kind) -> bool:
     return kind.MEASURED and kind.ROLE is Role.MEAN
 
 
+def could_be(kind: Kind, evidence: float, largest: float) -> bool:
+    """Return whether a trial has the evidence that its kind needs (evidence, largest in nats)."""
+    return evidence > least_evidence(kind, largest)
+
+
 def acceptable(kind: Kind, evidence: float, largest: float, ragged: bool, throughout: bool
                ) -> bool:
     """Return whether a trial may be accepted (evidence, largest in nats)."""
     # A few outliers that coincide with one throttle by chance imitate an answer to throttle.
-    return evidence > least_evidence(kind, largest) and (
+    return could_be(kind, evidence, largest) and (
         throughout or not (kind.MEASURED and ragged))
 
 

@@ -99,10 +99,9 @@ class Fitter:
 
     def whole(self, model: Composite) -> Composite:
         """Return a model fitted to everything; as it is where that cannot be done."""
-        # Without the levels that switching adds, the rail would seem to relax slower.
-        known = model if model.offset is not None else None
         try:
-            again = fit_composite(self.samples, model.terms, slice(0, self.samples.n), known)
+            # What its laws have found is that of all samples already.
+            again = fit_composite(self.samples, model.terms, slice(0, self.samples.n), model)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             return model
         self.cost += 0.0 if again is None else again.cost
@@ -128,6 +127,7 @@ class Fitter:
             if only and kind.NAME != only or not decision.affordable(kind, self.cost):
                 continue
             if any(decision.settled(catalogue()[trial.name], trial.left, kind, trial.shown)
+                   or decision.comes_first(catalogue()[trial.name], trial.evidence, kind, values)
                    for trial in found):
                 continue
             best = self.best_start(composite, kind, view)

@@ -20,7 +20,7 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import Fitter, is_trend, Trial
 from ou_monitor.discovery.gain import BLOCKS, mean_difference
-from ou_monitor.discovery.load_start import choose_answer, CURVES, OTHER_CURVE, under_load
+from ou_monitor.discovery.load_start import choose_answer, OTHER_CURVE, under_load
 from ou_monitor.discovery.search_state import Search
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
@@ -147,8 +147,14 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
         deep = latent and len(hidden) < decision.MOST_LATENT
         for tier in range(decision.TIERS if deep else 1):
             # Measured inputs first: latent causes can imitate them, and cost more.
-            trials += fitter.trials(search.composite, values, given, tier, bank, only)
+            trials += fitter.trials(
+                search.composite, values, [*given, *search.hopeless, *_in_vain(search, values)],
+                tier, bank, only)
             good = [trial for trial in trials if _acceptable(trial, search, values)]
+            search.hopeless |= {trial.name for trial in trials if _only_form(trial, search)}
+            search.failed |= {
+                trial.name: decision.asks(catalogue()[trial.name], values) for trial in trials
+                if not decision.could_be(catalogue()[trial.name], trial.evidence, search.largest)}
             if good:
                 break
             if tier == 0 and not reformed and decision.any_off(values):
@@ -162,12 +168,13 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
         named = {trial.name for trial in good}
         best = next(trial for trial in trials if trial.name in named)
         _accept(search, best, trials)
-        if best.composite.gaussian.cost < _SOON:
+        chosen = best.composite.gaussian.cost < _SOON
+        if chosen:
             choose_answer(fitter, search, ())
         after = criticise(samples, search.composite, bank)
         if best.name == Tone.NAME and _more_lines(fitter, search):
             after = criticise(samples, search.composite, bank)
-        _prune(fitter, search)
+        _prune(fitter, search, chosen)
         kind = catalogue()[best.name]
         if decision.tier_of(kind, values) > 0 and not (
                 decision.helped(values, after) or decision.helped(values, after, kind)):
@@ -196,14 +203,25 @@ def _kinds(names: Sequence[str]) -> list[type[Term]]:
 def _acceptable(trial: Trial, search: Search, values: Mapping[str, float]) -> bool:
     """Return whether a trial may be accepted."""
     kind = catalogue()[trial.name]
-    if kind in CURVES and search.composite.has(OTHER_CURVE[trial.name]) and (
-            trial.evidence < decision.FORM * search.largest):
+    if _only_form(trial, search):
         return False
     new, old = trial.composite.density, search.composite.density
     gains = [float(part.sum()) for part in np.array_split(new - old, BLOCKS)]
     return decision.acceptable(
         kind, trial.evidence, search.largest, decision.is_ragged(values),
         decision.is_throughout(*mean_difference(new, old), gains))
+
+
+def _in_vain(search: Search, values: Mapping[str, float]) -> list[str]:
+    """Return the dear kinds that have failed, and that nothing asks for more than it did then."""
+    return [name for name, asked in search.failed.items() if catalogue()[name].DEAR
+            and decision.asks(catalogue()[name], values) <= asked]
+
+
+def _only_form(trial: Trial, search: Search) -> bool:
+    """Return whether a curve over throttle may only mend the form of another one."""
+    return trial.name in OTHER_CURVE and search.composite.has(OTHER_CURVE[trial.name]) and (
+        trial.evidence < decision.FORM * search.largest)
 
 
 def _accept(search: Search, best: Trial, trials: Sequence[Trial]) -> None:
@@ -258,13 +276,17 @@ def _reform(fitter: Fitter, search: Search) -> bool:
     return search.composite is not composite
 
 
-def _prune(fitter: Fitter, search: Search) -> None:
-    """Take out causes that are not needed beside those accepted since."""
+def _prune(fitter: Fitter, search: Search, chosen: bool) -> None:
+    """
+    Take out causes that are not needed beside those accepted since.
+
+    chosen: whether the regression has just decided on the answers to what is measured.
+    """
     full = fitter.evidence(search.composite)
     last = catalogue()[search.accepted[-1]]
-    for name in search.accepted[:-1]:
+    for name in dict.fromkeys(search.accepted[:-1]):
         kind = catalogue()[name]
-        if not decision.in_doubt(kind, last):
+        if not decision.in_doubt(kind, last) or (chosen and decision.is_answer(kind)):
             continue
         index = next(k for k, term in enumerate(search.composite.terms) if term.NAME == name)
         kept = [term for k, term in enumerate(search.composite.terms) if k != index]

@@ -26,6 +26,10 @@ class Search:
         Causes taken out again, because later ones made them needless.
     largest : float
         Largest evidence of an accepted cause, nats.
+    hopeless : set of str
+        Causes that may only mend the form of another one, and are not tried again.
+    failed : dict of str to float
+        Causes without evidence, and the statistic that asked for each.
     stopped : bool
         Whether the search ended because it took too long.
 
@@ -37,9 +41,12 @@ class Search:
     log: list[str] = field(default_factory=list)
     removed: list[str] = field(default_factory=list)
     largest: float = 0.0
+    hopeless: set[str] = field(default_factory=set)
+    failed: dict[str, float] = field(default_factory=dict)
     stopped: bool = False
 
     def copy(self) -> Search:
         """Return a search that goes on from here and leaves this one as it is."""
         return replace(self, accepted=list(self.accepted), rivals=dict(self.rivals),
-                       log=list(self.log), removed=list(self.removed))
+                       log=list(self.log), removed=list(self.removed),
+                       hopeless=set(self.hopeless), failed=dict(self.failed))

@@ -144,6 +144,39 @@ def curvature_se(value: Callable[[FloatArray], float], at: FloatArray, step: flo
     return errors
 
 
+def refine(value: Callable[[FloatArray], float], start: Sequence[float] | FloatArray,
+           step: float = 0.1) -> tuple[FloatArray, float, FloatArray] | None:
+    """
+    Maximise a function from near its top (Newton's steps); None where it is not near.
+
+    Returns where, how much, and standard errors as `curvature_se`.
+    """
+    x = np.asarray(start, dtype=np.float64)
+    moves = step * np.eye(x.size)
+    for _ in range(_NEWTON):
+        top = value(x)
+        up = np.array([value(x + move) for move in moves])
+        down = np.array([value(x - move) for move in moves])
+        gradient, bend = (up - down) / (2.0 * step), np.diag((up - 2.0 * top + down) / step**2)
+        for i, j in zip(*np.triu_indices(x.size, 1)):
+            both = value(x + moves[i] + moves[j])
+            bend[i, j] = bend[j, i] = (both - up[i] - up[j] + top) / step**2
+        if not np.isfinite(bend).all() or np.linalg.eigvalsh(bend)[-1] >= 0.0:
+            return None
+        by = np.linalg.solve(-bend, gradient)
+        if 0.5 * float(by @ gradient) < _FLAT:
+            return x, top, np.sqrt(1.0 / -np.diag(bend))
+        further = x + np.clip(by, -0.5, 0.5)
+        if value(further) <= top:
+            return None
+        x = further
+    return None
+
+
+# Newton's steps at most, and nats below which one is none.
+_NEWTON, _FLAT = 4, 0.05
+
+
 def mixture_cdf(z: FloatArray, weight: FloatArray, mean: FloatArray, std: FloatArray
                 ) -> FloatArray:
     """Return the cdf of normal mixtures."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 import math
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.laws import climb, curvature_se, LawFit, normal_scores, View
+from ou_monitor.model.terms.laws import (
+    climb, curvature_se, LawFit, normal_scores, refine, View)
 from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
 from ou_monitor.model.terms.term import Live, parameter, Role, Term
 from ou_monitor.records import FloatArray
@@ -52,15 +54,19 @@ class Volatility(Term):
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Fit a log-variance that wanders, taken as constant over short segments."""
-        return cls._climbed(view, _start(view), 60)
+        return cls._climbed(view, _start(view), known=False)
 
     def refit_law(self, view: View) -> LawFit | None:
         """Fit again, from where it was."""
         return self._climbed(view, np.array([
-            math.log(max(self.std, 1e-3)), math.log(self.rate), _start(view)[2]]), 30)
+            math.log(max(self.std, 1e-3)), math.log(self.rate), _start(view)[2]]), known=True)
+
+    def holds(self, view: View) -> bool:
+        """Return whether it wanders: a recording of fewer relaxations shows a trend of sigma."""
+        return self.rate * float(view.at[-1]) > _WANDERS
 
     @classmethod
-    def _climbed(cls, view: View, start: FloatArray, most: int) -> LawFit | None:
+    def _climbed(cls, view: View, start: FloatArray, known: bool) -> LawFit | None:
         """Return the fit near a start."""
         size, squares, sizes = _segments(view)
         span = size / view.rate
@@ -71,13 +77,17 @@ class Volatility(Term):
                 return -math.inf
             return float(_grid(squares[:trained], sizes[:trained], span, x)[1].sum())
 
-        x, top = climb(value, start, size=0.25, most=most)
-        if top == -math.inf:
-            return None
+        near = refine(value, start) if known else None
+        if near is not None:
+            x, _, e = near
+        else:
+            x, top = climb(value, start, size=0.25, most=_EVALUATIONS[known])
+            if top == -math.inf:
+                return None
+            e = curvature_se(value, x)
         before, density, levels = _grid(squares, sizes, span, x)
         scores = _scores(view.z, before, levels, size)[:view.z.size]
         gain = np.repeat((density + 0.5 * squares) / sizes, size)[:view.z.size]
-        e = curvature_se(value, x)
         term = cls(math.exp(x[0]), math.exp(x[1]))
         # As known at the end of each segment.
         log = np.log(np.maximum(before, 1e-300)) - sizes[:, None] * levels - 0.5 * squares[
@@ -127,6 +137,9 @@ def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) ->
     padded = np.zeros(count * size)
     padded[:z.size] = z
     z = padded.reshape(count, size, 1)
+    # Levels that no segment believes in.
+    some = before.max(axis=0) > _BELIEVED
+    before, levels = before[:, some], levels[some]
     std = np.exp(levels)
     log_density = -levels - 0.5 * (z / std) ** 2
     known = np.cumsum(log_density, axis=1) - log_density
@@ -141,8 +154,15 @@ def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) ->
 _SEGMENTS = 1500
 _LEVELS = 65
 _EVERY = 4
+# Relaxations of ln sigma in a recording, from which its variance is known to a factor of e:
+# sqrt(2/2) = 1.
+_WANDERS = 2.0
+# Evaluations of a fit from afar and from nearby; chance below which a level counts as none.
+_EVALUATIONS = 60, 30
+_BELIEVED = 1e-9
 
 
+@lru_cache(maxsize=8)
 def _rouwenhorst(keep: float) -> FloatArray:
     """
     Return the chances to go from level to level, shape (levels, levels).
