@@ -292,6 +292,10 @@ def earns(gain: float, error: float, chance: float) -> bool:
     return chance <= CHANCE and not gain < -error
 
 
+# Standard errors from which a line is there, whatever else is left.
+SURE = 25.0
+
+
 # Which of those accepted stay.
 
 def in_doubt(kind: Kind, last: Kind) -> bool:

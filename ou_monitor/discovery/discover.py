@@ -103,7 +103,7 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
     verdict = judge(after, len(causes), len(named.dropped))
     criticism = _criticism(named.before, after)
     remaining = sorted((c for c in criticism if c.is_off), key=lambda c: -abs(c.after))
-    refused = refusal(samples, whole.terms, gain, gain_se, rng) if causes else ''
+    refused = refusal(samples, whole.terms, gain, gain_se) if causes else ''
     # The other exact terms were undone in the samples; the model needs them again.
     undone = tuple(t for t in state.exact if t.NAME != 'quantization')
     baseline = plain.model.terms[0]

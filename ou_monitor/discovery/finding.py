@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 import enum
+from functools import cached_property
 import math
 from typing import Any
 
 from ou_monitor.criticism.samples import Samples
+from ou_monitor.discovery.felt import Felt, felt
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Term
@@ -213,6 +215,13 @@ class Finding:
         """Return what the extended model gets wrong, worst first."""
         return tuple(sorted((c for c in self.criticism if c.is_off), key=lambda c: -abs(c.after)))
 
+    @cached_property
+    def felt(self) -> Felt:
+        """Return what the extended model says in units that a pilot feels."""
+        if self.samples is None or self.simulated is None:
+            return Felt()
+        return felt(self.samples, self.simulated.terms, self.crossing.level)
+
     def as_data(self) -> dict[str, Any]:
         """
         Return the finding as JSON holds it.
@@ -221,7 +230,7 @@ class Finding:
         -------
         dict
             As CONTRACT section 5, and beside it `sentence`, `remaining`,
-            `notes`, and `se` and `units` beside all `params`.
+            `felt`, `notes`, and `se` and `units` beside all `params`.
 
         """
         baseline = self.baseline
@@ -249,7 +258,8 @@ class Finding:
                     'baseline_se': self.crossing.baseline_se,
                     'extended_se': self.crossing.extended_se, 'unit': '1/min'}},
             'remaining': [_discrepancy(c, c.after, c.p_after) for c in self.remaining],
-            'refused': self.refused or None, 'notes': list(self.notes)})
+            'felt': self.felt.as_data(), 'refused': self.refused or None,
+            'notes': list(self.notes)})
         return found
 
     def _extended(self) -> dict[str, Any]:

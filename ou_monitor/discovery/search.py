@@ -18,6 +18,7 @@ from ou_monitor.criticism.composite import Composite, covariates_of, view_of
 from ou_monitor.criticism.null_bank import criticise, NullBank, simulate_bank, simulate_bank_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision
+from ou_monitor.discovery.errors import standard_errors
 from ou_monitor.discovery.fitting import Fitter, is_trend, Trial
 from ou_monitor.discovery.gain import BLOCKS, mean_difference
 from ou_monitor.discovery.load_start import choose_answer, OTHER_CURVE, under_load
@@ -102,34 +103,69 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         out = decision.withdrawn(before, after, kinds)
     # Noise that the load needs is part of it.
     out = [k for k in out if not (loaded and search.accepted[k] in begun.accepted)]
+    out = _in_doubt(samples, whole, search.accepted, out)
     dropped = tuple(search.accepted[k] for k in out)
+    found = _Result(search, whole, after)
     if dropped and failure != INTERRUPTED:
         stays = [search.composite.terms[position(search.composite, search.accepted, k)]
                  for k, kind in enumerate(kinds) if k not in out and decision.is_latent(kind)]
-        # The causes withdrawn may have hidden measured ones.  A trend that another slow cause
-        # replaced is not tried again.
-        slow = [kind.NAME for kind in _kinds(search.removed) if kind.FAMILY == 'slow']
-        # Nor are they the last that could explain it: what did less well may be right.
-        found = None
-        if decision.searched_again(loaded, fitter.cost):
-            again = begun.copy()
-            name_causes(fitter, again, bank, given=[*given, *slow, *dropped])
-            kinds = _kinds(again.accepted)
-            other = fitter.whole(again.composite)
-            left = criticise(samples, other, bank)
-            if any(map(decision.is_latent, kinds)) and not decision.withdrawn(
-                    before, left, kinds):
-                found = again, other, left
-        if found is not None:
-            search, whole, after = found
-        else:
-            search = begun.copy()
-            name_causes(fitter, search, bank, latent=False, given=[*given, *slow])
-            whole, after = _kept_beside(fitter, search, stays, measured if loaded else before,
-                                        bank, loaded)
-        dropped = tuple(name for name in dropped if name not in search.accepted)
-    return Named(whole, bank, tuple(search.accepted), search.rivals, dropped, before, after,
-                 failure)
+        # What is sure whatever comes now.
+        sure = begun if loaded else Search(bare)
+        found = _Result(sure, sure.composite, criticise(samples, sure.composite, bank))
+        try:
+            found = _without(fitter, search, begun, dropped, stays, before,
+                             measured if loaded else before, bank, given, loaded)
+        except KeyboardInterrupt:
+            failure = INTERRUPTED
+        dropped = tuple(name for name in dropped if name not in found.search.accepted)
+    return Named(found.whole, bank, tuple(found.search.accepted), found.search.rivals, dropped,
+                 before, found.after, failure)
+
+
+@dataclass(frozen=True)
+class _Result:
+    """A search, its model fitted to everything, and what that leaves."""
+
+    search: Search
+    whole: Composite
+    after: Mapping[str, float]
+
+
+def _in_doubt(samples: Samples, whole: Composite, names: Sequence[str], out: Sequence[int]
+              ) -> list[int]:
+    """Return those to withdraw, less the lines that are there whatever else is left."""
+    if not any(names[k] == Tone.NAME for k in out):
+        return list(out)
+    errors = standard_errors(samples, whole, slice(0, samples.n))
+
+    def is_sure(k: int) -> bool:
+        at = position(whole, names, k)
+        term = whole.terms[at]
+        return isinstance(term, Tone) and (
+            term.amplitude > decision.SURE * errors[at].get('amplitude', math.inf))
+
+    return [k for k in out if not is_sure(k)]
+
+
+def _without(fitter: Fitter, search: Search, begun: Search, dropped: Sequence[str],
+             stays: Sequence[Term], before: Mapping[str, float], measured: Mapping[str, float],
+             bank: NullBank, given: Sequence[str], loaded: bool) -> _Result:
+    """Search again without what was withdrawn; `measured` is what the measured causes left."""
+    # The causes withdrawn may have hidden measured ones.  A trend that another slow cause
+    # replaced is not tried again.
+    slow = [kind.NAME for kind in _kinds(search.removed) if kind.FAMILY == 'slow']
+    # Nor are they the last that could explain it: what did less well may be right.
+    if decision.searched_again(loaded, fitter.cost):
+        again = begun.copy()
+        name_causes(fitter, again, bank, given=[*given, *slow, *dropped])
+        kinds = _kinds(again.accepted)
+        other = fitter.whole(again.composite)
+        left = criticise(fitter.samples, other, bank)
+        if any(map(decision.is_latent, kinds)) and not decision.withdrawn(before, left, kinds):
+            return _Result(again, other, left)
+    search = begun.copy()
+    name_causes(fitter, search, bank, latent=False, given=[*given, *slow])
+    return _Result(search, *_kept_beside(fitter, search, stays, measured, bank, loaded))
 
 
 def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,

@@ -197,15 +197,16 @@ def _counted(names: Sequence[str]) -> list[str]:
 
 
 def crossing_words(finding: Finding) -> str:
-    """Return what a pilot feels, in a sentence."""
+    """Return what a pilot feels, in some sentences."""
     c = finding.crossing
     if not math.isfinite(c.observed):
-        return ''
+        return finding.felt.words
     extended = (f', the extended model {number(c.extended)} +- {number(c.extended_se, 2)}'
                 if finding.causes and math.isfinite(c.extended) else '')
     return (f'The voltage fell through {number(c.level, 4)} V '
             f'{number(c.observed)} +- {number(c.observed_se, 2)} times a minute; the plain OU '
-            f'predicts {number(c.baseline)} +- {number(c.baseline_se, 2)}{extended}.')
+            f'predicts {number(c.baseline)} +- {number(c.baseline_se, 2)}{extended}. '
+            + finding.felt.words).rstrip()
 
 
 def plain_model_words(baseline: OU) -> str:

@@ -59,8 +59,10 @@ def both(request):
             terms.append(MeasurementNoise(fit.noise_std))
         gaussian = evaluate(samples, terms)
     else:
-        start = OU(1.0 / float(np.median(samples.step[1:])), 1.0, float(samples.voltage.mean()))
-        gaussian = fit_composite(samples, [start], slice(0, samples.n)).gaussian
+        # No relaxation: both whiten by nothing but the mean.
+        rate = 1.0 / float(np.median(samples.step[1:]))
+        gaussian = evaluate(samples, [OU(rate, math.sqrt(2.0 * rate) * float(
+            samples.voltage.std()), float(samples.voltage.mean()))])
     return samples, level, fit, view_of(samples, gaussian, gaussian.z, slice(0, samples.n))
 
 

@@ -385,3 +385,23 @@ def test_what_is_withdrawn_beside_a_load(before, after, out):
 def test_the_search_goes_on_without_what_was_withdrawn(loaded, cost, again):
     """Once, where it costs little; under load the other latent causes are kept instead."""
     assert decision.searched_again(loaded, cost) is again
+
+
+@pytest.mark.parametrize('evidence, largest, first', [
+    (31.0, 20.0, True), (29.0, 20.0, False), (31.0, 80.0, False)])
+def test_a_clear_line_comes_first(evidence, largest, first):
+    """Where nothing is as far off; kinds of its own family are tried beside it all the same."""
+    kinds, values = catalogue(), {'line': 30.0, 'band 1': largest}
+    tone = kinds['tone']
+    assert decision.comes_first(tone, evidence, kinds['flicker_noise'], values) is first
+    assert not decision.comes_first(tone, evidence, kinds['resonance'], values)
+    assert not decision.comes_first(tone, evidence, kinds['jumps'], values)
+    assert not decision.comes_first(kinds['measurement_noise'], 1e3, kinds['flicker_noise'],
+                                    {'autocorrelation lag 1': -30.0})
+
+
+def test_evidence_that_a_kind_needs():
+    """`could_be` is the price of a kind, whatever the segments say."""
+    jumps = catalogue()['jumps']
+    assert decision.could_be(jumps, decision.ACCEPT + 1.0, 0.0)
+    assert not decision.could_be(jumps, decision.ACCEPT - 1.0, 0.0)

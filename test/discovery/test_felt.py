@@ -1,0 +1,64 @@
+"""What a model says in a pilot's units."""
+
+import math
+
+import numpy as np
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.discovery.earning import refusal
+from ou_monitor.discovery.felt import felt
+from ou_monitor.model.terms.glitches import Glitches
+from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.load_transient import LoadTransient
+from ou_monitor.model.terms.ou import OU
+import pytest
+
+N, RATE = 6000, 100.0
+T = np.arange(N) / RATE
+# 0.5 s of full throttle each 5 s.
+U = np.where(T % 5.0 < 0.5, 1.0, 0.0)
+INRUSH = (LoadSag(1.0, 0.0), LoadTransient(-0.5, 0.1, 0.0))
+
+
+def flown(*terms):
+    """Return samples of the mean of some terms, 15 V at rest, with one dip of another making."""
+    samples = Samples(T, np.zeros(N), U)
+    path = np.full(N, 15.0)
+    for term in terms:
+        path += term.columns(samples.segment(1.0, 0.0)) @ np.array(term.linear_values())
+    path[(T > 22.0) & (T < 22.1)] -= 1.0
+    return Samples(T, path, U)
+
+
+def test_a_punch_out_dips_and_comes_back():
+    """1 V of sag and 0.5 V of inrush, of which 90 % are gone after 0.1 s ln 10."""
+    found = felt(flown(*INRUSH), (OU(1.0, 0.01, 15.0), *INRUSH), 14.5)
+
+    assert found.dip == pytest.approx(1.0 + 0.5 * math.exp(-0.1), rel=1e-6)
+    assert found.after == pytest.approx(0.01)
+    assert found.recovered == pytest.approx(0.5 * math.exp(-0.1), rel=1e-6)
+    assert found.within == pytest.approx(0.1 * math.log(10.0), abs=0.011)
+    assert (found.dips, found.made) == (13, 12)
+    assert 'costs 1.5 V after 10 ms, of which 0.45 V come back within 0.24 s' in found.words
+    assert 'Throttle made 12 of the 13 dips below 14.50 V.' in found.words
+    assert found.as_data()['dips'] == {'level_v': 14.5, 'count': 13, 'made_by_throttle': 12}
+
+
+def test_a_sag_stays():
+    """Nothing comes back, and nothing is said of it."""
+    found = felt(flown(INRUSH[0]), (OU(1.0, 0.01, 15.0), INRUSH[0]), 14.5)
+    assert found.recovered == 0.0 and math.isnan(found.within)
+    assert 'come back' not in found.words and 'costs 1.0 V' in found.words
+
+
+def test_without_an_answer_to_throttle_nothing_is_said():
+    """Neither of a model without one, nor of a recording without throttle."""
+    assert felt(flown(), (OU(1.0, 0.01, 15.0),), 14.5).words == ''
+    assert felt(Samples(T, T, None), INRUSH, 14.5).words == ''
+
+
+def test_what_leaves_the_range_is_refused():
+    """Bad samples of 100 V were never seen; the same model without them passes."""
+    samples, ou = flown(*INRUSH), OU(1.0, 0.01, 15.0)
+    assert refusal(samples, (ou, *INRUSH), 0.1, 0.01) == ''
+    assert 'leave the range' in refusal(samples, (ou, *INRUSH, Glitches(0.1, 100.0)), 0.1, 0.01)
+    assert 'predicts worse' in refusal(samples, (ou, *INRUSH), -0.1, 0.01)
