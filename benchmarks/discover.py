@@ -1,8 +1,9 @@
 """
-What `discover` makes of hidden effects: one command, two parts.
+What `discover` makes of hidden effects and of real recordings: one command, three parts.
 
     python benchmarks/discover.py blind [--each 10] [--lines FILE] [--table FILE]
     python benchmarks/discover.py limits [--runs 40] [--lines FILE] [--figure FILE]
+    python benchmarks/discover.py flights [--table FILE] [NAME...]
 
 See README.md beside this file.
 """
@@ -10,10 +11,13 @@ See README.md beside this file.
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Sequence
 import datetime
+import math
 import os
 from pathlib import Path
+from statistics import mean, median
 import sys
 import time
 from typing import Any
@@ -30,7 +34,7 @@ import discover_runs as runs  # noqa: E402
 from discover_tables import heat_map, report  # noqa: E402
 from hidden_effects import causes, KINDS, pairs, unknowns, variants  # noqa: E402
 import numpy as np  # noqa: E402
-from tables import put  # noqa: E402
+from tables import put, table  # noqa: E402
 
 SEED = 20260131
 
@@ -129,6 +133,43 @@ def limits(given: argparse.Namespace) -> int:
     return 0
 
 
+def flights(given: argparse.Namespace) -> int:
+    """Run the recordings of real runs; write their table."""
+    folder = os.environ.get('OU_MONITOR_REALDATA')
+    if folder is None:
+        raise ValueError('OU_MONITOR_REALDATA is not set: it names the folder of the recordings')
+    rows, agreed, spent = [], [], []
+    for name, found in runs.examine_recorded(Path(folder), given.names, not given.whole):
+        whole = found[0]
+        extended, count = whole['extended'], Counter(one['name'] for one in whole['causes'])
+        names = ', '.join(one if many == 1 else f'{one} x{many}' for one, many in count.items())
+        alike = runs.agreement(*found[1:]) if len(found) == 3 else float('nan')
+        gain = '-' if extended['gain'] is None else (
+            f'{extended["gain"]:.2f} \u00b1 {extended["gain_se"]:.2f}')
+        falls = ', '.join('-' if extended['crossing_rate'][key] is None else (
+            f'{extended["crossing_rate"][key]:.3g}') for key in (
+                'observed', 'baseline', 'extended'))
+        rows.append([name, whole['verdict'].replace('_', ' '), names or '-', gain, falls,
+                     'yes' if whole['refused'] else 'no',
+                     '-' if math.isnan(alike) else f'{alike:.2f}', f'{whole["cpu_s"]:.1f}'])
+        say(' | '.join(rows[-1]))
+        spent.append(whole['cpu_s'])
+        agreed += [] if math.isnan(alike) else [alike]
+    if not rows:
+        say('no recording was run')
+        return 1
+    head = ['recording', 'verdict', 'causes', 'gain, nats',
+            'falls a minute: seen, plain OU, extended', 'refused', 'halves agree', 'CPU s']
+    text = table(head, rows) + (
+        f'\nCPU time: {median(spent):.1f} s at the median, {max(spent):.1f} s at most.'
+        + (f' Halves name the same causes (Jaccard): {mean(agreed):.2f} in the mean of '
+           f'{len(agreed)} recordings.\n' if agreed else '\n'))
+    print(text)
+    if given.table:
+        put(given.table, text, 'runs')
+    return 0
+
+
 def _write(given: argparse.Namespace, text: str, svg: str) -> None:
     """Write table and drawing where they are asked for; the table shows the drawing."""
     if given.figure:
@@ -203,6 +244,12 @@ def _parser() -> argparse.ArgumentParser:
                       help='only these effects, causes or parts of a pair; none is left out')
     part.add_argument('--strength', type=_positive, default=1.0, help='1: moderate')
     part.add_argument('--duration', type=_positive, default=60.0, help='s')
+    part = parts.add_parser('flights', help='recordings of real runs',
+                            description='recordings of real runs, whole and in halves')
+    part.set_defaults(action=flights)
+    part.add_argument('names', nargs='*', help='recordings (default all)')
+    part.add_argument('--whole', action='store_true', help='no halves')
+    part.add_argument('--table', type=Path, help='write the table here, between its marks')
     part = parts.choices['limits']
     part.add_argument('--causes', nargs='+', choices=causes(), default=list(CAUSES))
     part.add_argument('--durations', nargs='+', type=_positive, default=list(DURATIONS))
@@ -215,7 +262,7 @@ def main() -> int:
     """Parse arguments, measure, write."""
     parser = _parser()
     given = parser.parse_args()
-    if given.jobs < 1:
+    if given.part != 'flights' and given.jobs < 1:
         parser.error('--jobs needs 1 or more')
     if given.part == 'blind':
         given.pairs = 10 * given.each if given.pairs is None else given.pairs

@@ -1,9 +1,13 @@
-"""One hidden effect after the other, each in a process of its own with a time limit."""
+"""
+One hidden effect after the other, each in a process of its own with a time limit.
+
+And recordings of real runs, whole and in halves, where `OU_MONITOR_REALDATA` names their folder.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 import json
 import multiprocessing
@@ -18,7 +22,9 @@ from typing import Any
 from blind_scores import hide, outcome
 from hidden_effects import Hidden
 from ou_monitor import discover
+from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Recording
+from real_flights import BENCHES, FLIGHTS
 
 _ROOT = Path(__file__).resolve().parent.parent
 TIME_LIMIT = 'time limit'
@@ -193,6 +199,49 @@ def _collect(pipe: Connection, task: Task, process: Any) -> dict[str, Any]:
     code = process.exitcode
     timed = stuck or code == -signal.SIGALRM
     return {**_nothing(task), 'failure': TIME_LIMIT if timed else f'ended with status {code}'}
+
+
+def examine_recorded(folder: Path, names: Iterable[str], halves: bool
+                     ) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """
+    Discover recordings of real runs.
+
+    Yields
+    ------
+    tuple of str and list of dict
+        Name, and for the whole, and for its halves if they are asked for: JSON of the finding,
+        and `cpu_s` beside it.
+
+    """
+    for name, file, options in (*FLIGHTS, *BENCHES):
+        if (names and name not in names) or not (folder / file).exists():
+            continue
+        flight = int(options[options.index('--flight') + 1]) if '--flight' in options else None
+        whole = read_recording(folder / file, flight=flight)
+        middle = whole.t.size // 2
+        found = []
+        for part in (slice(None), slice(0, middle), slice(middle, None))[:3 if halves else 1]:
+            began = time.process_time()
+            data = discover(_part(whole, part)).as_data()
+            found.append({**data, 'cpu_s': time.process_time() - began})
+        yield name, found
+
+
+def _part(recording: Recording, part: slice) -> Recording:
+    """Return a part of a recording."""
+    def of(x: Any) -> Any:
+        return None if x is None else x[part]
+
+    return replace(recording, t=recording.t[part], voltage=recording.voltage[part],
+                   throttle=of(recording.throttle), current=of(recording.current))
+
+
+def agreement(one: dict[str, Any], other: dict[str, Any]) -> float:
+    """Return the share of the causes of either finding that both name (Jaccard); NaN for none."""
+    if 'insufficient_data' in (one['verdict'], other['verdict']):
+        return float('nan')
+    first, second = ({cause['name'] for cause in found['causes']} for found in (one, other))
+    return len(first & second) / len(first | second) if first | second else 1.0
 
 
 def warm_up() -> None:

@@ -38,6 +38,9 @@ FLIGHTS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ('cf_pair', 'cf_pair_large.csv', ()),
     ('cf_takeoff', 'cf_takeoff.csv', ()),
 )
+# Recordings on the bench, which only discover looks at.
+BENCHES = tuple((name, f'{name}.csv', ()) for name in (
+    'mm_bench_1', 'mm_bench_3', 'mm_bench_5', 'xt_pico_a'))
 # Seconds until a load should be known; of a flight shorter than 30 s.
 SETTLED, SHORT_SETTLED = 20.0, 8.0
 # Seconds from one look at the filter to the next: it is read as a node would.
