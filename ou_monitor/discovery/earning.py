@@ -130,7 +130,7 @@ def _leave_out(state: Earned, worst: int) -> None:
 
 def _straying(samples: Samples, state: Earned) -> int | None:
     """
-    Return the cause without which simulations stay nearest to what was seen; None for none.
+    Return the cause without which simulations stay within what was seen; None for none.
 
     One-step predictions say little of how far a process goes: an intensity or an event that fits
     them may still be none that the recording shows.  Answers of the mean are not asked.
@@ -146,8 +146,9 @@ def _straying(samples: Samples, state: Earned) -> int | None:
         return None
     other = {k: far_of(worth.less.model) for k, worth in enumerate(state.worth)
              if worth.less is not None and not decision.is_answer(catalogue()[state.names[k]])}
-    best = min(other, key=lambda k: (other[k], state.worth[k].gain), default=None)
-    return best if best is not None and other[best] < far else None
+    # One that costs least: several that would have to go together are no such cause.
+    return min((k for k, stays in other.items() if not stays > 0.0), default=None,
+               key=lambda k: state.worth[k].gain)
 
 
 def _far(samples: Samples, terms: Sequence[Term]) -> float:
