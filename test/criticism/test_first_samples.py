@@ -11,8 +11,6 @@ from ou_monitor.discovery.decision import rivals_of, TIE
 from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.load_dependent_alpha import LoadDependentAlpha
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.online.risk.flag import FloorWatch
-from ou_monitor.online.settings import MonitorSettings
 
 
 def test_the_first_sample_behind_a_high_pass_has_the_law_of_its_throttle():
@@ -63,14 +61,3 @@ def test_rivals_are_within_a_tie():
     """Not at its edge; the best one is none."""
     evidence = [('a', 5.0 + TIE), ('b', 5.0), ('c', 5.0 + 0.01), ('d', 9.0 + TIE)]
     assert rivals_of('a', evidence) == ['c', 'd'] and rivals_of('d', evidence) == []
-
-
-def test_the_usual_interval_is_learned_over_many_samples():
-    """One sample that is late by nine intervals counts as two, and moves it little."""
-    watch = FloorWatch(MonitorSettings())
-    for k in range(50):
-        watch.push(0.01 * (10 * k + np.arange(10)), np.full(10, 4.9))
-    before = watch._usual
-    assert abs(before - 0.01) < 1e-9
-    watch.push(np.array([4.99 + 0.1]), np.array([4.9]))
-    assert 0.0 < watch._usual - before < 0.2 * before
