@@ -63,7 +63,8 @@ def test_digits_follow_the_error(value, error, text):
     assert with_error(value, error) == text
 
 
-@pytest.mark.parametrize('chance, text', [(0.9e-6, '< 1e-6'), (1.1e-6, '1.1e-06'), (0.25, '0.25')])
+@pytest.mark.parametrize('chance, text', [
+    (0.9e-3, '< 0.001'), (1.1e-3, '0.0011'), (0.25, '0.25')])
 def test_chances_as_text(chance, text):
     assert cause_rows([replace(SAG, p_value=chance)])[0].chance == text
 

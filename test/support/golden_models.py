@@ -229,12 +229,10 @@ def discovery():
 
 
 def findings():
-    """Return what `discover` says of short recordings with one or two effects."""
+    """Return what `discover` says of short recordings with one effect each."""
     found = {}
     for name, others in (
             ('sag', [term('load_sag', linear=0.3, square=0.1)]),
-            ('tone, jumps', [term('tone', amplitude=0.05, frequency=50.0, phase=0.4,
-                                  linewidth=0.0), term('jumps', rate=5.0, mean=-0.2, std=0.05)]),
             ('glitches', [term('glitches', probability=0.01, std=0.5)])):
         s = samples_of(2500, *others, seed=97)
         made = discover(Recording(s.t, s.voltage, s.throttle, name))
