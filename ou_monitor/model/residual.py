@@ -29,8 +29,8 @@ USUAL = ((2.0, 2.0), (0.0, 4.0))
 # not go beyond.
 _EDGE, _TOP = 0.01, 0.001
 # Errors are drawn from those whose intensity is alike: this share of all to either side, and at
-# least so many.  And how far ln variance is drawn from its estimate.
-_ALIKE, _FEWEST, _FARTHEST = 0.02, 50, 1.0
+# least so many.  How far ln variance is drawn from its estimate, and what of it is rounding.
+_ALIKE, _FEWEST, _FARTHEST, _ROUNDING = 0.02, 50, 1.0, 1e-9
 # Scores count up to this in the correlation of neighbours; it counts from so many standard errors.
 _CLIP, _CLEAR = 3.0, 3.0
 # Time within which a change of throttle counts, s: what the filter onboard takes as one step; and
@@ -83,8 +83,9 @@ class NoiseLaw:
         variance, slopes = self.variance(t, throttle)
         wanted = np.log(variance)
         # Any of those that are as intense, and its neighbours: as many at the ends as between.
-        first = np.searchsorted(self.intensities, wanted, side='left')
-        last = np.searchsorted(self.intensities, wanted, side='right')
+        # By rounding the same intensity comes out in two ways.
+        first = np.searchsorted(self.intensities, wanted - _ROUNDING, side='left')
+        last = np.searchsorted(self.intensities, wanted + _ROUNDING, side='right')
         at = first + (rng.random(wanted.size) * (last - first)).astype(np.int64)
         most = self.errors.size - 1
         reach = min(max(_FEWEST, int(_ALIKE * self.errors.size)), most // 2)
