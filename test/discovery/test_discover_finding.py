@@ -162,7 +162,7 @@ def test_why_a_cause_without_a_gain_is_named():
     """By its p on the whole recording; nothing where the gain says it."""
     assert why_named(0.02, 0.005, 1e-9) == '' and why_named(math.nan, math.nan, math.nan) == ''
     for gain, error in ((0.001, 0.005), (math.nan, math.nan)):
-        assert 'as a whole (p = 1e-09)' in why_named(gain, error, 1e-9)
+        assert 'as a whole (p < 0.001)' in why_named(gain, error, 1e-9)
     term = finding().causes[0].term
     assert 'p = 0.01)' in explain(term, {}, 0.001, 0.005, [], False, chance=0.01)
     assert 'p = ' not in explain(term, {}, 0.001, 0.005, [], True, chance=0.0)
