@@ -34,7 +34,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'test/support')]
 from live import memory_of, Probe, Process, Starved, values_of  # noqa: E402
 from soak_dips import Heard, IN_TIME, Said, State  # noqa: E402
 from soak_figures import as_table, figures  # noqa: E402
-from soak_machine import busy, deafen, Machine, set_priority  # noqa: E402
+from soak_machine import at_leisure, busy, deafen, Machine, set_priority  # noqa: E402
 from soak_schedule import Event, events  # noqa: E402
 from tables import put  # noqa: E402
 
@@ -271,7 +271,9 @@ class Soak:
                 self.wrong.append(f'{name} = {value!r}: {result.successful} {result.reason}')
 
     def _report(self, now: float) -> None:
-        found = self.figures(now, {'status': '-', 'took': 0.0})
+        # Sums take seconds at the end of an hour: not before the node.
+        with at_leisure():
+            found = self.figures(now, {'status': '-', 'took': 0.0})
         dips = found['dips']
         silent = ', '.join(f'{name} {net:.2f}' for name, (_, net, _) in found['silence'].items())
         print(f"{now / 60.0:5.1f} min: {dips['in_time']} of {dips['asked']} dips, longest "

@@ -184,7 +184,9 @@ def fate(dip: Mapping[str, Any], heard: Heard, sent: tuple[Sequence[float], Sequ
     if counted > 0:
         kind = 'unheard' if (silent if seen else mute) else 'missed'
     else:
-        kind = 'lost' if due - came > 0.5 * dip['samples'] else 'missed'
+        # By what was sent, or by the node's numbers: what came may be of before.
+        gone = max(due - came, after.lost - before.lost)
+        kind = 'lost' if gone > 0.5 * dip['samples'] else 'missed'
     now = {name: value for t, name, value in heard.done if t < dip['begin'] and value}
     near = (before.at, after.at)
     gaps = np.diff([s.at for s in states])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 import math
 from typing import Any
@@ -44,8 +44,10 @@ def false_of(heard: Heard) -> tuple[int, list[tuple[float, str]]]:
             continue
         begin, end = now['at'] + LINGER, then['at']
         spent += max(end - begin, 0.0)
-        found += [(said.at, now['name']) for said in heard.flags if not said.value
-                  and begin + overlap(now['at'], begin, pauses) < said.at < end]
+        begin += overlap(now['at'], begin, pauses)
+        part = slice(bisect_right(heard.flags, (begin, True, math.inf)),
+                     bisect_left(heard.flags, (end,)))
+        found += [(said.at, now['name']) for said in heard.flags[part] if not said.value]
     return round(spent), found
 
 

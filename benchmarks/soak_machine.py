@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import random
@@ -60,6 +60,18 @@ def set_priority(priority: int, pid: int = 0) -> None:
     """Set the priority of a process that is in a real-time class."""
     if os.sched_getscheduler(pid) in REAL_TIME:
         os.sched_setparam(pid, os.sched_param(priority))
+
+
+@contextmanager
+def at_leisure() -> Iterator[None]:
+    """Do without a real-time priority in this thread."""
+    policy, priority = os.sched_getscheduler(0), os.sched_getparam(0)
+    if policy in REAL_TIME:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, priority)
 
 
 def busy(core: int, priority: int) -> None:

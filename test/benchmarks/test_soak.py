@@ -13,17 +13,19 @@ FLOOR = 'the voltage is at or below brownout.floor (4.3 V)'
 
 
 def heard(critical=(), lost=0, flags=None, stops=(), reason=FLOOR, counted=0, dropped=(),
-          unsaid=()):
+          unsaid=(), backlog=0):
     """
     Return 20 s of states at 10 Hz; CRITICAL at some of them; one dip from 10 to 10.05 s.
 
-    `lost`: messages that did not reach the node; `counted`: dips by its count; `dropped`,
-    `unsaid`: times of states and flags that did not reach the listener.
+    `lost`: messages that did not reach the node; `backlog`: of those before, which came now;
+    `counted`: dips by its count; `dropped`, `unsaid`: times of states and flags that did not reach
+    the listener.
     """
     times = np.arange(0.0, 20.0, 0.1).round(3).tolist()
     states = [State(t, 'CRITICAL' if t in critical else 'OK', reason if t in critical else '',
-                    'true' if t in critical else 'false', round(1000.0 * t) - lost * (t > 10.0),
-                    lost * (t > 10.0), 0, counted * (t > 10.0), k)
+                    'true' if t in critical else 'false',
+                    round(1000.0 * t) + (backlog - lost) * (t > 10.0), lost * (t > 10.0), 0,
+                    counted * (t > 10.0), k)
               for k, t in enumerate(times) if t not in dropped]
     said = [Said(t, t in (critical if flags is None else flags), k)
             for k, t in enumerate(times) if t not in unsaid]
@@ -44,9 +46,11 @@ def heard(critical=(), lost=0, flags=None, stops=(), reason=FLOOR, counted=0, dr
     # Stopped by us meanwhile.
     (heard([11.2], stops=[(10.1, 10.6)]), 'in_time'),
     # Gone: more than half of its samples, or fewer.
-    # (20 ms are left to the poll.)
     (heard(lost=46), 'lost'),
-    (heard(lost=44), 'missed'),
+    (heard(lost=24), 'missed'),
+    # By the node's numbers, though as many came from before.
+    (heard(backlog=100, lost=46), 'lost'),
+    (heard(backlog=100), 'missed'),
     # Counted by the node: the message was lost, of the state or of the flag; or nothing was.
     (heard([10.1], counted=1, dropped=[10.1]), 'unheard'),
     (heard([10.1], counted=1, unsaid=[10.1]), 'unheard'),
