@@ -18,7 +18,7 @@ from ou_monitor.online.risk.flag import BrownoutFlag
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, Flag, Status
 from scipy.signal import lfilter
-from term_examples import OU, term
+from term_examples import EXAMPLES, OU, term
 
 
 def curves():
@@ -217,7 +217,7 @@ def latent():
             ('driven', [term('load_dependent_sigma', throttle=[0.0, 1.0], log_factor=[0.0, 0.6]),
                         term('load_dependent_alpha', slope=0.5),
                         term('measurement_noise', std=0.01),
-                        term('load_dependent_noise', ripple=1.0, change=0.0)],
+                        term('load_dependent_noise', **EXAMPLES['load_dependent_noise'])],
              [term('resonance', frequency=120.0, damping=40.0, std=0.03, tilt=-0.5)])):
         samples = samples_of(4000, *others, *more, seed=151)
         ou = term('ou', **OU)
