@@ -71,7 +71,7 @@ class LoadStart:
                    self.cells, self.volts, self.discharge, self.delay)
         if not all(map(math.isfinite, numbers)):
             raise ValueError('the numbers of the load must be finite')
-        if not np.allclose(P, P.T, rtol=1e-6, atol=1e-9 * float(P.diagonal().max())):
+        if not np.allclose(P, P.T, rtol=1e-6, atol=1e-9 * float(np.abs(P.diagonal()).max())):
             raise ValueError('the covariance of the load must be symmetric')
         if np.linalg.eigvalsh(P)[0] < -1e-9 * float(P.diagonal().max()):
             raise ValueError('the covariance of the load must not be negative')
