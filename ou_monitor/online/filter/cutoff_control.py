@@ -11,6 +11,7 @@ import enum
 import math
 
 import numpy as np
+from ou_monitor.online.filter.cutoff_way import ARRIVED, CutoffWay
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray
 
@@ -22,8 +23,6 @@ OF_RATE = 0.45
 INTERVALS = 100
 ODD = 5.0
 _NEW = 5
-# A rest of the way, in ln(cutoff), that is not worth a step.
-_ARRIVED = 1e-6
 
 
 class Bound(enum.Enum):
@@ -185,44 +184,31 @@ class CutoffControl:
             self._cutoff = min(self._cutoff, OF_RATE / interval)
         return self._cutoff
 
-    def run(self, wanted: float, error: float, dt: FloatArray) -> FloatArray:
+    def run(self, begin: list[int], wanted: list[float], error: list[float],
+            dt: FloatArray) -> FloatArray:
         """
-        Take one wanted cutoff for many samples; return what `update` would have moved to at each.
+        Take what the law wants from some samples on; return what `update` would have moved to.
+
+        begin: where each wanted cutoff begins, the first 0.
 
         wanted in Hz, dt in s, shape (n,); result in Hz, the share of the sample rate left out.
         """
-        self._choose(wanted)
-        out: FloatArray = np.full(dt.size, self._aim)
-        k = 0
-        while k < dt.size and self._moving != self._aim:
-            k += self._move_on(error, dt[k:], out[k:])
-        return out
-
-    def _move_on(self, error: float, dt: FloatArray, out: FloatArray) -> int:
-        """Move by the slew limit, or by the smoothing, as long as it is the same of the two."""
         s = self._settings
-        gap = math.log(self._aim / self._moving)
-        constant = time_constant(s, error)
-        elapsed = np.cumsum(dt)
-        before = elapsed - dt
-        share = -np.expm1(-dt / constant) if constant > 0.0 else np.ones_like(dt)
-        most = s.slew * LN2 if s.slew else math.inf
-        self._slewing = bool(abs(gap) * share[0] > most * dt[0])
-        if self._slewing:
-            ends = ~((abs(gap) - most * before) * share > most * dt)
-            gaps = math.copysign(1.0, gap) * (abs(gap) - most * elapsed)
-        else:
-            decay = np.exp(-before / constant) if constant > 0.0 else (before == 0.0) * 1.0
-            ends = abs(gap) * decay * share > most * dt
-            gaps = gap * decay * (1.0 - share)
-            # Arrived: the one after is at the aim.
-            ends[1:] |= np.abs(gaps[:-1]) < _ARRIVED
-        n = int(np.argmax(ends)) if ends.any() else dt.size
-        out[:n] = self._aim * np.exp(-gaps[:n])
-        if abs(gaps[n - 1]) < _ARRIVED:
-            out[n - 1] = self._aim
-        self._moving = float(out[n - 1])
-        return n
+        elapsed = np.concatenate(([0.0], np.cumsum(dt)))
+        way = CutoffWay(elapsed, dt, s.slew * LN2 if s.slew else math.inf)
+        aim, gap = math.nan, 0.0
+        for first, last, one, of in zip(begin, [*begin[1:], dt.size], wanted, error):
+            old = self._aim
+            self._choose(one)
+            if first == 0 or old != self._aim:
+                gap += math.log(self._aim / (self._moving if first == 0 else old))
+            if gap or self._aim != aim:
+                aim = self._aim
+                gap = way.go(first, last, aim, gap, time_constant(s, of))
+        if way.slewing is not None:
+            self._slewing = way.slewing
+        self._moving = self._aim * math.exp(-gap) if gap else self._aim
+        return way.cutoff()
 
     def _choose(self, wanted: float) -> None:
         """Set the aim: the wanted cutoff once it is outside the dead band around the old aim."""
@@ -249,12 +235,12 @@ class CutoffControl:
         if self._slewing:
             step = math.copysign(most, step)
         # What is left below any meaning is not crept after for ever.
-        arrived = abs(gap - step) < _ARRIVED
+        arrived = abs(gap - step) < ARRIVED
         self._moving = self._aim if arrived else self._moving * math.exp(step)
 
-    def limit(self, cutoff: float) -> None:
-        """Take the cutoff that is in force at the last sample of a run, Hz (cutoff in Hz)."""
-        self._cutoff = cutoff
+    def limit(self, interval: float) -> None:
+        """Keep what a run ended with below its share of the sample rate (interval in s)."""
+        self._cutoff = min(self._moving, OF_RATE / interval)
 
     def _clip(self, cutoff: float) -> float:
         return min(max(cutoff, self._lowest), self._settings.fmax)

@@ -22,9 +22,11 @@ from __future__ import annotations
 from collections.abc import Callable
 import math
 
-from ou_monitor.online.filter.white_noise import held_cutoff
+import numpy as np
+from ou_monitor.online.filter.white_noise import held_cutoff, held_cutoffs
 from ou_monitor.online.filter.wiener import least_error, least_sampled_error
 from ou_monitor.online.settings import FilterSettings
+from ou_monitor.records import FloatArray
 
 TWO_PI = 2.0 * math.pi
 _ROOT2 = math.sqrt(2.0)
@@ -46,6 +48,27 @@ def wanted_cutoff(settings: FilterSettings, sigma: float, alpha: float, throttle
     rate = alpha if 1e-6 <= alpha <= 1e9 else settings.alpha
     wanted = LAWS[settings.law](settings, sigma, rate, interval)
     return min(max(wanted, settings.lowest), settings.fmax)
+
+
+def wanted_cutoffs(settings: FilterSettings, heard: FloatArray, interval: float) -> FloatArray:
+    """
+    Return `wanted_cutoff` of each row of heard (sigma, alpha, throttle), shape (n,).
+
+    heard in V/sqrt(s), 1/s and 0..1; interval in s; result in Hz.
+    """
+    s = settings
+    sigma = heard[:, 0]
+    known = (sigma >= 0.0) & (sigma < math.inf)
+    times = np.where(known, sigma, s.sigma_ref) / s.sigma_ref
+    if (s.law != 'constant_noise' or s.coupling
+            or not _held(s.fmax, float(times.max()), interval)):
+        # NaN never equals itself.
+        rows = list(map(tuple, np.where(np.isnan(heard), math.inf, heard).tolist()))
+        found = {(a, b, c): wanted_cutoff(s, a, b, c, interval) for a, b, c in set(rows)}
+        return np.array([found[row] for row in rows])
+    wanted = held_cutoffs(s.mode, s.order, s.fmax, np.maximum(times, 1.0), interval)
+    wanted = np.clip(np.where(times > 1.0, wanted, s.fmax), s.lowest, s.fmax)
+    return np.where(known, wanted, NAN)
 
 
 def threshold_law(settings: FilterSettings, sigma: float, alpha: float,
@@ -108,11 +131,16 @@ def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: 
         Cutoff, Hz.
 
     """
-    if interval > 0.0 and 1e-6 < TWO_PI * fmax * interval < 1e2 and times < 1e3:
+    if _held(fmax, times, interval):
         return held_cutoff(mode, order, fmax, times, interval)
     if mode == 'lowpass':
         return fmax / (times * times)
     return float(fmax * times ** (-2.0 / 3.0)) if order == 2 else fmax / times
+
+
+def _held(fmax: float, times: float, interval: float) -> bool:
+    """Tell whether the table of white noise has the cutoff."""
+    return interval > 0.0 and 1e-6 < TWO_PI * fmax * interval < 1e2 and times < 1e3
 
 
 def supply_noise(mode: str, order: int, cutoff: float, alpha: float) -> float:

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.filter.array_filter import changes, sound_piece, within_rate, WORTH
 from ou_monitor.online.filter.cutoff_control import Bound, CutoffControl, OF_RATE, SampleInterval
-from ou_monitor.online.filter.cutoff_laws import wanted_cutoff
+from ou_monitor.online.filter.cutoff_laws import wanted_cutoff, wanted_cutoffs
 from ou_monitor.online.filter.filter_state import LowPassState
 from ou_monitor.online.filter.lag import cutoff_for_lag, delay, most_lag, phase_lag
 from ou_monitor.online.filter.learned_wiener import LearnedWiener
@@ -41,8 +41,11 @@ _TWO_PI = 2.0 * math.pi
 _LARGEST, _LATEST, _SHORTEST = 1e150, 1e18, 1e-12
 # A step of so many mean intervals is counted as a gap, once the mean stands on so many samples.
 _GAP, _KNOWN = 5.0, 10
-# Samples of an array that are worked on together.
-_PIECE = 65536
+# Samples of an array that are worked on together: what they need stays in the cache.
+_PIECE = 16384
+# Change of the mean interval, as a share, at which the law is asked anew: five standard
+# deviations of the mean over 100 intervals that are uniform within half of themselves.
+_MOVED = 0.1
 
 _Maybe = npt.ArrayLike | None
 
@@ -109,6 +112,8 @@ class AdaptiveLowPass:
         self._out = NAN
         self._asked: tuple[float, ...] | None = None
         self._wanted = NAN
+        # Mean interval with which the law was asked, s.
+        self._interval_asked = 0.0
 
     @property
     def settings(self) -> FilterSettings:
@@ -275,20 +280,27 @@ class AdaptiveLowPass:
                                      (_LARGEST, _LATEST, _SHORTEST))
         if size < WORTH:
             return 0
+        if abs(mean[0] - self._interval_asked) > _MOVED * self._interval_asked:
+            self._interval_asked = float(mean[0])
+        asked = self._interval_asked
+        if not asked * (1.0 - _MOVED) <= mean.min() <= mean.max() <= asked * (1.0 + _MOVED):
+            moved = np.abs(mean - asked) > _MOVED * asked
+            size = int(np.argmax(moved)) if moved.any() else size
+            if size < WORTH:
+                return 0
+            dt, mean = dt[:size], mean[:size]
         at = slice(k, k + size)
-        heard = [one[at] for one in others[:4] if one.ndim]
-        edges = changes(heard, np.round(20.0 * np.log(mean)))
-        if edges.size > 2 + size // WORTH:
-            return 0
-        cutoff = np.empty(size)
-        for a, b in zip(edges[:-1].tolist(), edges[1:].tolist()):
-            sigma, sigma_se, alpha, throttle = (
-                float(one[k + a]) if one.ndim else float(one) for one in others[:4])
-            error = sigma_se if sigma_se >= 0.0 else NAN
-            cutoff[a:b] = self._control.run(
-                self._ask(sigma, alpha, throttle, float(mean[a])), error, dt[a:b])
-        cutoff = within_rate(cutoff, mean)
-        self._control.limit(float(cutoff[-1]))
+        begin = changes([one[at] for one in others[:4] if one.ndim], size)
+        # sigma, its error, alpha, throttle.
+        heard = np.empty((len(begin), 4))
+        for column, one in enumerate(others[:4]):
+            heard[:, column] = one[at][begin] if one.ndim else one
+        wanted = wanted_cutoffs(s, heard[:, [0, 2, 3]], asked)
+        error = np.where(heard[:, 1] >= 0.0, heard[:, 1], NAN)
+        cutoff = within_rate(
+            self._control.run(begin, wanted.tolist(), error.tolist(), dt), mean)
+        self._control.limit(float(mean[-1]))
+        self._asked = None
         angle = _TWO_PI * cutoff * dt
         start, end = np.concatenate(([self._x], x[at][:-1])), x[at]
         if s.mode == 'derivative':
@@ -406,12 +418,14 @@ class AdaptiveLowPass:
         s = self._settings
         if s.law == 'kalman':
             return self._of_its_lag()
-        # NaN never equals itself; the jitter of the stamps is not worth a new search, and the
-        # interval is not known at the first sample.
-        rate = round(20.0 * math.log(interval)) if interval > 0.0 else math.inf
-        asked = (*(one if one == one else math.inf for one in (sigma, alpha, throttle)), rate)
+        # The jitter of the stamps is not worth a new search.
+        if abs(interval - self._interval_asked) > _MOVED * self._interval_asked:
+            self._interval_asked = interval
+        # NaN never equals itself.
+        asked = (*(one if one == one else math.inf for one in (sigma, alpha, throttle)),
+                 self._interval_asked)
         if asked != self._asked:
-            self._wanted = wanted_cutoff(s, sigma, alpha, throttle, interval)
+            self._wanted = wanted_cutoff(s, sigma, alpha, throttle, self._interval_asked)
             self._asked = asked
         return self._wanted
 

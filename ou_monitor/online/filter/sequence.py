@@ -1,14 +1,21 @@
 r"""
-The low-pass over many samples at once: the arithmetic of `filter_state`, in blocks.
+The low-pass over many samples at once: the arithmetic of `filter_state`, as sums.
 
-A cutoff that moves only stretches time, so that what a state at the beginning of a block makes of
-the rest of it depends on nothing but the sum of the angles since: exp(A theta), closed.  So
-every block is run from rest at its first sample, all blocks side by side, and what the block
-before leaves over is added.  The result is that of the samples one by one, to rounding.
+A cutoff that moves only stretches time, and an input that is linear in a step has the steady
+response x - sqrt(2) r (order 1: x - r) with r its rise over the angle of the step.  What is
+left of a state beside that turns and decays by exp(lambda theta), whatever the cutoff, and jumps
+only where r or x does.  With Theta the sum of the angles so far
+
+    z_k = exp(lambda Theta_k) (z_0 + sum_j exp(-lambda Theta_(j-1)) jump_j),
+
+lambda = (-1 + i) / sqrt(2), or -1: a sum over a block, in which the exponential stays finite, and
+one step from block to block.  Coefficients that change with every sample cost no more than fixed
+ones.  Rounding: r is large where the angle is small, so that below `_LEAST` samples go one by one.
 """
 
 from __future__ import annotations
 
+import cmath
 import math
 
 import numpy as np
@@ -16,32 +23,40 @@ from ou_monitor.online.filter.filter_state import LowPassState
 from ou_monitor.records import FloatArray
 
 _ROOT2 = math.sqrt(2.0)
-# Samples that are worked on together, and those of one block: the arrays stay in the cache.
-_CHUNK, _BLOCK = 65536, 256
-# After so much angle nothing of a state is left: exp(-53) < 1e-23.
-_FORGOTTEN = {1: 53.0, 2: 75.0}
+# Samples that are worked on together: the arrays stay in the cache.
+_CHUNK = 16384
+# Angle of a block: exp(100) is far from the largest number, and 100 rounds by 1e-14.
+_SPAN = 100.0
+_LEAST = 1e-4
+# After so much angle nothing of a state is left: exp(-75 / sqrt(2)) < 1e-23.
+_FORGOTTEN = 75.0
 # Angles that differ by less, as a share, count as one; a biquad of less angle would round more.
 _SAME, _SMALL = 1e-9, 0.02
 
 
 def filter_sequence(state: LowPassState, order: int, angle: FloatArray, start: FloatArray,
                     end: FloatArray) -> FloatArray:
-    """Return the output at each sample (all of shape (n,)); the state goes on from the last."""
+    """
+    Return the output at each sample (all of shape (n,)); the state goes on from the last.
+
+    `start` is `end` of the sample before, or each its own `end` (the slopes of a derivative).
+    """
     out: FloatArray = np.empty_like(angle)
     for k in range(0, angle.size, _CHUNK):
         at = slice(k, k + _CHUNK)
         lowest, highest = float(angle[at].min()), float(angle[at].max())
         if order == 2 and lowest > _SMALL and highest - lowest < _SAME * lowest:
             out[at] = _even(state, 0.5 * (lowest + highest), start[at], end[at])
+        elif lowest < _LEAST:
+            out[at] = [state.advance(order, *one) for one in zip(
+                angle[at].tolist(), start[at].tolist(), end[at].tolist(), strict=True)]
         else:
             out[at] = _uneven(state, order, angle[at], start[at], end[at])
     return out
 
 
-def _left_over(order: int, a: FloatArray, y: float, slope: float) -> FloatArray:
-    """Return what a state makes of the output after angles, without input."""
-    if order == 1:
-        return np.asarray(np.exp(-a) * y)
+def _left_over(a: FloatArray, y: float, slope: float) -> FloatArray:
+    """Return what a state of order 2 makes of the output after angles, without input."""
     p = a / _ROOT2
     return np.asarray(np.exp(-p) * ((y * np.cos(p)) + (y + _ROOT2 * slope) * np.sin(p)))
 
@@ -66,9 +81,9 @@ def _even(state: LowPassState, angle: float, start: FloatArray, end: FloatArray)
     else:
         out = np.asarray(lfilter([a1, f12 * a2 - f22 * a1], poles, start - x0)
                          + lfilter([b1, f12 * b2 - f22 * b1], poles, end - x0)) + x0
-    steps = np.arange(1, min(int(_FORGOTTEN[2] / angle), end.size) + 1)
+    steps = np.arange(1, min(int(_FORGOTTEN / angle), end.size) + 1)
     left = np.asarray(angle * steps, dtype=np.float64)
-    out[:left.size] += _left_over(2, left, state.y - x0, state.slope)
+    out[:left.size] += _left_over(left, state.y - x0, state.slope)
     if end.size > 1:
         # The slope before the last step is what the last step made of it.
         before = LowPassState(float(out[-2]))
@@ -81,87 +96,66 @@ def _even(state: LowPassState, angle: float, start: FloatArray, end: FloatArray)
 
 def _uneven(state: LowPassState, order: int, angle: FloatArray, start: FloatArray,
             end: FloatArray) -> FloatArray:
-    """Filter in blocks of `_BLOCK`, side by side."""
+    """Filter by sums, in blocks of an angle of `_SPAN` at most, one block a row."""
     n = angle.size
-    length = min(_BLOCK, n)
+    length = min(max(int(_SPAN / float(angle.max())), 1), n)
     count = -(-n // length)
-
-    def blocks(values: FloatArray, fill: float) -> FloatArray:
-        """Return samples in columns of `length`, one block a column."""
-        whole: FloatArray = np.full(count * length, fill)
-        whole[:n] = values
-        return np.ascontiguousarray(whole.reshape(count, length).T)
+    late = _ROOT2 if order == 2 else 1.0
+    held = np.array_equal(start, end)
+    slope = None if held else (end - start) / angle
+    steady = end if slope is None else end - late * slope
+    source = -end if slope is None else slope
+    last = 0.0 if slope is None else float(slope[-1])
     # What is beyond the end does not move.
-    theta = blocks(angle, 1.0)
-    x0, x1 = blocks(start, float(end[-1])), blocks(end, float(end[-1]))
-    out, slopes = (_first if order == 1 else _second)(theta, x0, x1)
-    total = np.cumsum(theta, axis=0)
-    last = np.full(count, length - 1)
-    last[-1] = n - 1 - (count - 1) * length
-    y, s = state.y, state.slope if order == 2 else 0.0
-    dys, dss = np.empty(count), np.empty(count)
-    for b, (first, y1, s1, a) in enumerate(zip(
-            x0[0].tolist(), out[last, np.arange(count)].tolist(),
-            slopes[last, np.arange(count)].tolist(), total[last, np.arange(count)].tolist())):
-        dy, ds = y - first, s
-        dys[b], dss[b] = dy, ds
-        if order == 1:
-            y = y1 + math.exp(-a) * dy
-            continue
-        p = a / _ROOT2
-        decay = math.exp(-p)
-        cos, sin = decay * math.cos(p), decay * math.sin(p)
-        y = y1 + (cos + sin) * dy + _ROOT2 * sin * ds
-        s = s1 + (cos - sin) * ds - _ROOT2 * sin * dy
-    rows = int(np.max(np.sum(total <= _FORGOTTEN[order], axis=0)))
-    a = np.asarray(total[:rows], dtype=np.float64)
+    p, jump = np.zeros((2, count, length))
+    np.divide(angle, late, out=p.reshape(-1)[:n])
+    np.subtract(source[1:], source[:-1], out=jump.reshape(-1)[1:n])
+    np.cumsum(p, axis=1, out=p)
+    grow = np.exp(p)
+    off = state.y - (float(end[0]) if slope is None else
+                     float(start[0]) - late * float(slope[0]))
     if order == 1:
-        out[:rows] += np.exp(-a) * dys
+        a = _sums(jump, grow)
+        left = off
+        for row, (total, angle_) in enumerate(zip(
+                a[:, -1].tolist(), p[:, -1].tolist(), strict=True)):
+            a[row] += left
+            left = math.exp(-angle_) * (left + total)
+        a /= grow
+        out = a.reshape(-1)[:n] + steady
+        state.y, state.slope = float(out[-1]), 0.0
+        return np.asarray(out)
+    cos, sin = np.cos(p), np.sin(p)
+    a, b = _sums(jump, grow * cos), _sums(jump, grow * sin, 0.0)
+    turn = state.slope - (0.0 if slope is None else float(slope[0]))
+    # The frame in which the jumps are real: d = u + v, s = -sqrt2 v; turned by pi / 4 for slopes.
+    z = complex(off + turn / _ROOT2, -turn / _ROOT2) if slope is None else complex(
+        off / _ROOT2, -turn - off / _ROOT2)
+    for row, (total, other, angle_) in enumerate(zip(
+            a[:, -1].tolist(), b[:, -1].tolist(), p[:, -1].tolist(), strict=True)):
+        a[row] += z.real
+        b[row] -= z.imag
+        z = cmath.exp(complex(-angle_, angle_)) * (z + complex(total, -other))
+    if slope is None:
+        along, across = cos + sin, sin - cos
+        size, state.slope = 1.0, -_ROOT2 * z.imag
     else:
-        p = a / _ROOT2
-        out[:rows] += np.exp(-p) * (np.cos(p) * dys + np.sin(p) * (dys + _ROOT2 * dss))
-    state.y, state.slope = y, s
-    return np.ascontiguousarray(out.T).reshape(-1)[:n]
+        along, across = cos, sin
+        size, state.slope = _ROOT2, last - z.real - z.imag
+    a *= along
+    b *= across
+    a += b
+    a /= grow
+    a *= size
+    out = a.reshape(-1)[:n] + steady
+    state.y = float(out[-1])
+    return np.asarray(out)
 
 
-def _first(angle: FloatArray, start: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Run order 1 down the columns, each from rest at its first sample."""
-    lost = np.expm1(-angle)
-    push = (end - start) * (1.0 + lost / angle)
-    out = np.empty_like(angle)
-    y = start[0].copy()
-    for k in range(angle.shape[0]):
-        y += lost[k] * (y - start[k]) + push[k]
-        out[k] = y
-    return out, np.zeros_like(angle)
-
-
-def _second(angle: FloatArray, start: FloatArray, end: FloatArray,
-            ) -> tuple[FloatArray, FloatArray]:
-    """Run order 2 down the columns, each from rest at its first sample."""
-    p = angle / _ROOT2
-    lost, h, q = np.expm1(-p), np.sin(0.5 * p), np.cos(0.5 * p)
-    decay = 1.0 + lost
-    # exp(-p) cos p - 1 and exp(-p) sin p, written in what is small for a short step.
-    h2 = 2.0 * h * h
-    c, s = lost - decay * h2, 2.0 * decay * h * q
-    rise = end - start
-    push = rise * (1.0 + c / p)
-    add, cross, keep = c + s, _ROOT2 * s, 1.0 + (c - s)
-    push_slope = rise * add / angle
-    out, slopes = np.empty_like(angle), np.empty_like(angle)
-    y, slope = start[0].copy(), np.zeros(angle.shape[1])
-    off, part = np.empty_like(y), np.empty_like(y)
-    for k in range(angle.shape[0]):
-        np.subtract(y, start[k], out=off)
-        np.multiply(add[k], off, out=part)
-        y += part
-        np.multiply(cross[k], slope, out=part)
-        y += part
-        y += push[k]
-        slope *= keep[k]
-        off *= cross[k]
-        slope -= off
-        slope -= push_slope[k]
-        out[k], slopes[k] = y, slope
-    return out, slopes
+def _sums(jump: FloatArray, weight: FloatArray, first: float = 1.0) -> FloatArray:
+    """Return the sums along the rows of jumps, each by the weight before it."""
+    found = np.empty_like(jump)
+    found[:, 0] = first * jump[:, 0]
+    np.multiply(jump[:, 1:], weight[:, :-1], out=found[:, 1:])
+    np.cumsum(found, axis=1, out=found)
+    return found

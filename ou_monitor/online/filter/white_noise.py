@@ -21,6 +21,7 @@ import math
 
 import numpy as np
 from ou_monitor.online.filter.filter_state import LowPassState
+from ou_monitor.records import FloatArray
 
 TWO_PI = 2.0 * math.pi
 # Angles (2 pi cutoff interval) of the table, and the step of their logarithms.
@@ -120,6 +121,22 @@ class _Table:
             part -= (value - noise) / slope
         return _LOG_LEAST + _STEP * (k + part)
 
+    def angles(self, noise: FloatArray) -> FloatArray:
+        """Return `angle` of many."""
+        points, slopes = np.array(self._noise), np.array(self._slopes)
+        k = np.clip(np.searchsorted(points, noise, side='right') - 1, 0, points.size - 2)
+        rise = points[k + 1] - points[k]
+        m, n = slopes[k], slopes[k + 1]
+        b, c = 3.0 * rise - 2.0 * m - n, m + n - 2.0 * rise
+        part = (noise - points[k]) / rise
+        for _ in range(3):
+            value = points[k] + part * (m + part * (b + part * c))
+            part -= (value - noise) / (m + part * (2.0 * b + 3.0 * part * c))
+        found: FloatArray = _LOG_LEAST + _STEP * (k + part)
+        for at in np.flatnonzero((noise < points[0]) | (noise >= points[-1])).tolist():
+            found[at] = self.angle(float(noise[at]))
+        return found
+
     def _cubic(self, k: int, u: float) -> tuple[float, float]:
         """Return value and slope within the k-th interval, u in 0..1."""
         rise = self._noise[k + 1] - self._noise[k]
@@ -129,6 +146,15 @@ class _Table:
 
 
 _table = cache(_Table)
+
+
+def held_cutoffs(mode: str, order: int, fmax: float, times: FloatArray, interval: float,
+                 ) -> FloatArray:
+    """Return `held_cutoff` of many, Hz, shape (n,)."""
+    table = _table(mode, order)
+    scale = math.log(TWO_PI * interval)
+    return np.asarray(np.exp(table.angles(
+        table.noise(math.log(fmax) + scale) - 2.0 * np.log(times)) - scale))
 
 
 def held_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
