@@ -8,6 +8,7 @@ The adaptive low-pass against hindsight, against the truth, in a loop, as a node
     python benchmarks/filter.py loop --table doc/filter_dterm.md --figure doc/filter_loop.svg
     python benchmarks/filter.py flight --figure doc/filter_flight.svg
     python benchmarks/filter.py node --table doc/filter_dterm.md
+    python benchmarks/filter.py arrays --table doc/filter.md
 """
 
 from __future__ import annotations
@@ -28,8 +29,11 @@ import filter_error  # noqa: E402
 import filter_methods as methods  # noqa: E402
 from filter_signals import CASES, fly, RATE  # noqa: E402
 import numpy as np  # noqa: E402
+from ou_monitor import AdaptiveLowPass  # noqa: E402
 from ou_monitor.report.svg import Plot  # noqa: E402
 import ros_throughput  # noqa: E402
+from scipy.signal import butter, sosfilt  # noqa: E402
+from tables import table  # noqa: E402
 
 SEED = 20261121
 BAGS = Path(__file__).resolve().parent.parent / 'bags'
@@ -146,6 +150,35 @@ def node(given: argparse.Namespace) -> tuple[str, str]:
     return ros_throughput.filter_node(given.seconds), ''
 
 
+def arrays(given: argparse.Namespace) -> tuple[str, str]:
+    """CPU time of arrays over that of scipy's sosfilt, in one run."""
+    n, rng = round(given.seconds * RATE), np.random.default_rng(given.seed)
+    x = rng.standard_normal(n)
+    stamps = (np.arange(n) / RATE, np.cumsum(rng.uniform(0.5, 1.5, n)) / RATE)
+    sigmas = (0.6, np.repeat(rng.uniform(0.1, 2.0, n // 100 + 1), 100)[:n],
+              rng.uniform(0.1, 2.0, n))
+
+    def cost(work: Callable[[], object]) -> float:
+        spent = []
+        for _ in range(5):
+            begin = time.process_time()
+            work()
+            spent.append(time.process_time() - begin)
+        return min(spent)
+    sections = butter(2, 0.1, output='sos')
+    unit = cost(lambda: sosfilt(sections, x))
+    rows = []
+    for name, options in (
+            ('constant_noise', {}), ('its derivative', {'mode': 'derivative'}),
+            ('wiener', {'law': 'wiener', 'n0': 1e-5})):
+        ratios = [cost(lambda t=t, sigma=sigma, options=options: AdaptiveLowPass(
+            **options).filter(t, x, sigma)) / unit for sigma in sigmas for t in stamps]
+        rows.append([name, *(f'{ratio:.0f}' for ratio in ratios)])
+    head = [f'{sigma}, {t}' for sigma in ('one sigma', '10 a second', 'each its own')
+            for t in ('even', 'jitter')]
+    return table(['law', *head], rows), ''
+
+
 def _write(given: argparse.Namespace, text: str, drawing: str) -> None:
     if given.table and text:
         begin, end = f'<!-- {given.part} begins -->', f'<!-- {given.part} ends -->'
@@ -168,7 +201,7 @@ def main() -> int:
     parts = parser.add_subparsers(dest='part', required=True)
     for action, flights, seconds in ((error, 10, 40.0), (bags, 1, 40.0), (windows, 6, 40.0),
                                      (dterm, 10, 40.0), (loop, 1, 30.0), (flight, 1, 30.0),
-                                     (node, 1, 20.0)):
+                                     (node, 1, 20.0), (arrays, 1, 300.0)):
         part = parts.add_parser(action.__name__, help=action.__doc__)
         part.set_defaults(action=action)
         part.add_argument('--flights', type=int, default=flights)

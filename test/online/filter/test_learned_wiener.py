@@ -124,8 +124,8 @@ def test_a_manoeuvre_after_calm_opens_it(flown, monkeypatch):
     x = calm + WHITE * rng.standard_normal(t.size) + COUPLING * ou(rng, t.size, ALPHA, SPREAD)
 
     def onset():
-        y = made().filter(t, x, SIGMA)
-        return float(np.mean((y - calm)[5000:5500]**2))
+        y = made().filter(t[:5500], x[:5500], SIGMA)
+        return float(np.mean((y - calm[:5500])[5000:]**2))
     open_ = onset()
     monkeypatch.setattr(learned_wiener, '_MISFIT', math.inf)
     assert open_ < 0.7 * onset()
@@ -175,7 +175,7 @@ def test_a_change_does_not_move_the_output(flown, change, mode):
     going_on = x[999] + (x[999] - x[998]) * 1e-3
     soon = [one.step(t[999] + 1e-6, going_on, SIGMA) for one in (f, twin)]
     assert soon[0] == pytest.approx(soon[1], abs=2e-3 * (100.0 if mode == 'derivative' else 1.0))
-    assert np.all(np.isfinite(f.filter(t[1000:], x[1000:], SIGMA)))
+    assert np.all(np.isfinite(f.filter(t[1000:2000], x[1000:2000], SIGMA)))
 
 
 def test_without_sigma_the_fallback_takes_over_without_a_jump(flown):
