@@ -24,7 +24,7 @@ from ou_monitor.discovery.validation import held_out, HeldOut
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Term
-from ou_monitor.records import NAN
+from ou_monitor.records import FloatArray, NAN
 
 # Causes of one kind from which their gain is measured together.
 MANY = 4
@@ -133,11 +133,12 @@ def _straying(samples: Samples, state: Earned) -> int | None:
     Return the cause without which simulations stay within what was seen; None for none.
 
     One-step predictions say little of how far a process goes: an intensity or an event that fits
-    them may still be none that the recording shows.  Answers of the mean are not asked.
+    them may still be none that the recording shows.  Answers of the mean are not asked.  Half of
+    the simulations have to leave it: heavy tails may do so once.
     """
     def far_of(model: Composite) -> float:
         try:
-            return _far(samples, model.terms)
+            return float(np.median(_far(samples, model.terms)))
         except ValueError:
             return math.inf
 
@@ -151,11 +152,20 @@ def _straying(samples: Samples, state: Earned) -> int | None:
                key=lambda k: state.worth[k].gain)
 
 
-def _far(samples: Samples, terms: Sequence[Term]) -> float:
-    """Return how far simulations leave what was seen, V; always the same ones."""
+def _far(samples: Samples, terms: Sequence[Term]) -> FloatArray:
+    """
+    Return how far the level of each simulation leaves what was seen, V; always the same ones.
+
+    The level is a median of five: single wrong or wild samples do not move it.
+    """
     rng, model = np.random.default_rng(0), SupplyModel(tuple(terms))
-    return max(stray(model.simulate(samples.t, rng, samples.throttle), samples.voltage)
-               for _ in range(_DRAWS))
+
+    def level(voltage: FloatArray) -> FloatArray:
+        near = np.lib.stride_tricks.sliding_window_view(voltage, 5)
+        return np.asarray(np.median(near, axis=1))
+
+    return np.array([stray(level(model.simulate(samples.t, rng, samples.throttle)),
+                           samples.voltage) for _ in range(_DRAWS)])
 
 
 def _as_trend(samples: Samples, name: str, less: Composite) -> bool:
@@ -203,7 +213,7 @@ def refusal(samples: Samples, terms: Sequence[Term], gain: float, gain_se: float
     if math.isfinite(gain) and not decision.earns(gain, gain_se, 0.0):
         return 'The extended model predicts worse than the plain OU'
     try:
-        far = _far(samples, terms)
+        far = float(_far(samples, terms).max())
     except ValueError as error:
         return f'The extended model cannot be simulated ({error})'
     if far > 0.0:

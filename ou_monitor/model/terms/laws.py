@@ -157,6 +157,8 @@ def refine(value: Callable[[FloatArray], float], start: Sequence[float] | FloatA
         top = value(x)
         up = np.array([value(x + move) for move in moves])
         down = np.array([value(x - move) for move in moves])
+        if not np.isfinite([top, *up, *down]).all():
+            return None
         gradient, bend = (up - down) / (2.0 * step), np.diag((up - 2.0 * top + down) / step**2)
         for i, j in zip(*np.triu_indices(x.size, 1)):
             both = value(x + moves[i] + moves[j])
