@@ -192,7 +192,7 @@ def recordings(draw):
 ONE = [('voltage', EPOCH * 10**9, EPOCH + 0.1, 1.0)]
 
 
-@settings(max_examples=60, deadline=None,
+@settings(max_examples=60, deadline=None, derandomize=True,
           suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(recordings())
 @example((ONE + [('throttle', EPOCH * 10**9 + 1, EPOCH + 0.05, 0.5)], (False, False), 'drop',
