@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.estimator.estimator import SlidingEstimator
-from ou_monitor.online.input_health import patience, readings, Stamps, StampWatch
+from ou_monitor.online.estimator.intake import patience, readings, Stamps, StampWatch
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.report import MonitorReport

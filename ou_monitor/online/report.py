@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ou_monitor.online.input_health import Stamps
+from ou_monitor.online.estimator.intake import Stamps
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.risk.flag import FlagState
 from ou_monitor.records import Estimate, Level

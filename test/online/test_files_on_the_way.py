@@ -16,8 +16,7 @@ from ou_monitor.stream.samples import SampleStream
 import pytest
 
 ROOT = str(Path(ou_monitor.__file__).parent)
-# With the module of the node whose callback it is, and what judges the stamps.
-MOST = 26
+MOST = 24
 
 
 def files_of(calls):
@@ -39,7 +38,7 @@ def files_of(calls):
 
 @pytest.mark.parametrize('moving', [False, True])
 def test_one_voltage_message_to_one_report(moving, monkeypatch):
-    """Throttle still or moving; the quality of the input is looked at four times a window."""
+    """Throttle still or moving."""
     monkeypatch.setenv('OU_MONITOR_COMPILED', '0')
     rng = np.random.default_rng(1)
     monitor = SupplyMonitor(MonitorSettings(brownout_voltage=4.5, brownout_horizon=1.0))
@@ -71,7 +70,5 @@ def test_one_voltage_message_to_one_report(moving, monkeypatch):
         # All of it is known, so that nothing was left out on the way.
         assert reports[0].estimate.status is Status.OK
         assert math.isfinite(reports[0].risk) and math.isfinite(reports[0].budget)
-    looked = [files for files in passed if 'online/estimator/quality.py' in files]
-    assert 0 < len(looked) < len(passed)
-    assert all(len(files) + 1 <= MOST for files in passed if files not in looked), passed
-    assert all(len(files) <= MOST for files in looked), looked
+    # One more is the module of the node whose callback it is.
+    assert all(len(files) + 1 <= MOST for files in passed), passed

@@ -11,7 +11,7 @@ from ou_monitor.criticism.samples import choose_samples, events_between, lines_b
 from ou_monitor.criticism.spectral_start import from_spectrum
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.online.input_health import patience, readings, StampWatch
+from ou_monitor.online.estimator.intake import patience, readings, StampWatch
 from ou_monitor.online.risk.curve_filters import Wander
 from ou_monitor.online.risk.curves import LearnedCurves
 from ou_monitor.online.risk.flag import BrownoutFlag

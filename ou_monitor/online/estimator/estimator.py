@@ -17,13 +17,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model import arma
-from ou_monitor.online.estimator import judgement
 from ou_monitor.online.estimator.compiled import COMPILED
 from ou_monitor.online.estimator.fit import fit_window, Fitted, from_window, TREND_SCORE
 from ou_monitor.online.estimator.intake import as_column, BATCH, Intake, Thinner
 from ou_monitor.online.estimator.irregular import fit_irregular, MOST
 from ou_monitor.online.estimator.quality import (
-    examine, Quality, refresh_period, Repeats, TAIL, whole)
+    examine, input_flags, judge, Quality, recount, refresh_period, Repeats, TAIL, whole)
 from ou_monitor.online.estimator.series import Batch, T, U, Y
 from ou_monitor.online.estimator.window import FACTOR, FEWEST, LAGS, Resolution, Sums
 from ou_monitor.records import Counters, Estimate, FloatArray, NAN, Status
@@ -174,7 +173,7 @@ class SlidingEstimator:
             self._work_off()
             if self._last is not None and self._intake.used == used == self._last.counters.used:
                 # Nothing new in the window: the same numbers, not merely close ones.
-                self._last = judgement.recount(self._last, self._intake.counters)
+                self._last = recount(self._last, self._intake.counters)
             else:
                 self._last = self._estimate()
             self._cached = self._last
@@ -266,7 +265,7 @@ class SlidingEstimator:
             return Estimate(t=intake.newest, voltage=float(self._tail[-1]), n=n,
                             duration=duration, rate=(n - 1) / duration if duration else NAN,
                             counters=counters, status=Status.TOO_FEW_SAMPLES,
-                            flags=tuple(judgement.input_flags(counters, quality, NAN)))
+                            flags=tuple(input_flags(counters, quality, NAN)))
         main, _, at, end = series.store(series.first)
         duration = main.item(T, end - 1) - main.item(T, at)
         m, n = self._thinner.m, end - at
@@ -281,10 +280,10 @@ class SlidingEstimator:
             status = Status.CONSTANT
         if status is not None:
             return Estimate(status=status, u0=float(main[Y, at:end].mean()),
-                            flags=tuple(judgement.input_flags(counters, quality, NAN)),
+                            flags=tuple(input_flags(counters, quality, NAN)),
                             **measured)
         fit, smoothness = self._fit(quality, duration)
-        return judgement.judge(fit, measured, quality, self._throttle_std(), smoothness)
+        return judge(fit, measured, quality, self._throttle_std(), smoothness)
 
     def _throttle_std(self) -> float:
         """Return the standard deviation of throttle in the window; NaN when unknown."""

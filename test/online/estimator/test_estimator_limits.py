@@ -5,7 +5,7 @@ import math
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.model import arma
-from ou_monitor.online.estimator import estimator as module, judgement
+from ou_monitor.online.estimator import estimator as module
 from ou_monitor.online.estimator.fit import fit_window
 from ou_monitor.online.estimator.window import Resolution, Sums
 from ou_monitor.records import Flag, Status
@@ -19,8 +19,8 @@ LAGS = 24
 def fitted(monkeypatch):
     """Return a function that fits one window and returns what was fitted, and how."""
     seen = []
-    judge, irregular = judgement.judge, module.fit_irregular
-    monkeypatch.setattr(judgement, 'judge', lambda fit, *rest: (
+    judge, irregular = module.judge, module.fit_irregular
+    monkeypatch.setattr(module, 'judge', lambda fit, *rest: (
         seen.append(fit), judge(fit, *rest))[1])
     monkeypatch.setattr(module, 'fit_irregular', lambda *args: (
         seen.append('as they are'), irregular(*args))[1])

@@ -5,8 +5,7 @@ import math
 
 import numpy as np
 from ou_monitor.online.estimator.fit import Fitted, Outcome
-from ou_monitor.online.estimator.judgement import input_flags, judge, log_errors
-from ou_monitor.online.estimator.quality import Quality
+from ou_monitor.online.estimator.quality import input_flags, judge, log_errors, Quality
 from ou_monitor.records import Counters, Flag, Status
 import pytest
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from ou_monitor.model import arma
 from ou_monitor.online.estimator.fit import independent, Moments
-from ou_monitor.online.estimator.judgement import load_at, slope_at
+from ou_monitor.online.estimator.quality import load_at, slope_at
 from ou_monitor.online.estimator.window import Resolution
 import pytest
 from scipy.linalg import toeplitz

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from ou_monitor.online.risk.past import (
+from ou_monitor.online.risk.futures import (
     BLOCK, excursion_risk, excursions, flown, Past, pilot, sliding)
 import pytest
 from scipy.special import expit
