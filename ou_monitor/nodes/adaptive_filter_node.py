@@ -30,6 +30,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import diagnostic, MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.console import Console
 from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of, IMU
+from ou_monitor.nodes.filter_frames import Frames
 from ou_monitor.nodes.filter_inputs import MotorInputs, Supply, SupplyInput
 from ou_monitor.nodes.inputs import INPUT_QOS, Silence, Stamper, types_on
 from ou_monitor.nodes.sources import message_class, MOTOR_PARAMETERS
@@ -162,23 +163,28 @@ class AdaptiveFilterNode(MonitorNode):
                          for _ in channels.names]
         self._output = self.create_publisher(
             message_class(channels.output or kind), '~/output', 10)
-        self.create_subscription(message, 'input', self.with_info(self._take_input), INPUT_QOS)
+        self._frames = Frames(kind, channels, self._topic)
+        self.create_subscription(
+            message, 'input', self.with_info(self._take_input), INPUT_QOS, raw=True)
         self.get_logger().info(
             f"filtering {self._topic} ({kind}, {', '.join(channels.names)})")
 
-    def _take_input(self, message: Any, info: Any) -> None:
+    def _take_input(self, data: bytes, info: Any) -> None:
         self._input_silence.heard()
-        if self._channels is None:
-            raise InputError('a message came before its type was known')
-        values = self._channels.take(message)
-        stamp = self._stamper.time_of(message, info)
+        try:
+            frame = self._frames.open(data)
+        except InputError:
+            self._dropped += 1
+            return
+        values = frame.values
+        stamp = self._stamper.time_of(frame.stamp, info)
         self._unplaced = math.isnan(stamp)
         if not values or not all(map(math.isfinite, (stamp, *values))):
             self._dropped += 1
             return
         supply = self._known()
         values = self._notched(stamp, values, supply)
-        self._output.publish(self._channels.put(message, [
+        self._output.publish(frame.put([
             channel.step(stamp, value, supply.sigma, supply.sigma_se, supply.alpha,
                          supply.throttle, supply.level, supply.level_se)
             for channel, value in zip(self._filters, values, strict=True)],

@@ -26,6 +26,29 @@ _NONE = (math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True)
+class Group:
+    """
+    Numbers of a message that it holds together or not at all.
+
+    Attributes
+    ----------
+    fields : tuple of FieldPath
+        One for each signal.
+    covariance : FieldPath or None
+        A matrix that shrinks with their noise; -1 as its first element says that the message does
+        not hold them, all 0 that it is not known.
+    needed : bool
+        Whether a message that does not hold them is left out; else they are 0 to the filter, and
+        stay in the message as they are.
+
+    """
+
+    fields: tuple[FieldPath, ...]
+    covariance: FieldPath | None = None
+    needed: bool = True
+
+
+@dataclass(frozen=True)
 class Channels:
     """
     The signals of one message type.
@@ -34,89 +57,84 @@ class Channels:
     ----------
     names : tuple of str
         Signals, one low-pass each.
-    take : callable
-        Message to its values; empty where the message does not hold them.
-    put : callable
-        Message, filtered values, and the share that is left of the variance of white
-        noise, to the message that goes out.
+    groups : tuple of Group
+        Where they are.
     output : str
-        Its type; empty: that of the input.
+        Type of what goes out; empty: that of the input.
+    make : callable or None
+        Message and filtered values to a message of that type; None: they take the signals' places.
 
     """
 
     names: tuple[str, ...]
-    take: Callable[[Any], Sequence[float]]
-    put: Callable[[Any, Sequence[float], float], Any]
+    groups: tuple[Group, ...]
     output: str = ''
+    make: Callable[[Any, Sequence[float]], Any] | None = None
+
+    def take(self, message: Any) -> Sequence[float]:
+        """Return the values in a message; empty where it does not hold them."""
+        values: list[float] = []
+        for group in self.groups:
+            found = None if _is_absent(message, group) else [
+                _walk(message, path) for path in group.fields]
+            if found is None or None in found:
+                if group.needed:
+                    return ()
+                found = [0.0] * len(group.fields)
+            values += map(float, found)
+        return tuple(values)
+
+    def put(self, message: Any, values: Sequence[float], left: float) -> Any:
+        """Return the message that goes out; `left` of the variance of white noise is left."""
+        if self.make is not None:
+            return self.make(message, values)
+        at = 0
+        for group in self.groups:
+            mine, at = values[at:at + len(group.fields)], at + len(group.fields)
+            if _is_absent(message, group):
+                continue
+            for path, value in zip(group.fields, mine, strict=True):
+                _set(message, path, value)
+            if group.covariance is not None:
+                matrix = _walk(message, group.covariance)
+                for place, value in enumerate(matrix):
+                    matrix[place] = value * left
+        return message
 
 
-def _put_data(message: Any, values: Sequence[float], _: float) -> Any:
-    message.data = values[0]
-    return message
+def _is_absent(message: Any, group: Group) -> bool:
+    return group.covariance is not None and _walk(message, group.covariance)[0] == -1.0
 
 
-def _put_voltage(message: Any, values: Sequence[float], _: float) -> Any:
-    message.voltage = values[0]
-    return message
+def _set(message: Any, path: FieldPath, value: float) -> None:
+    holder, last = _walk(message, path[:-1]), path[-1]
+    if isinstance(last, str):
+        setattr(holder, last, value)
+    else:
+        holder[last] = value
 
 
-def _take_gyro(message: Any) -> Sequence[float]:
-    if message.angular_velocity_covariance[0] == -1.0:
-        # The message says that it holds none.
-        return ()
-    return _vector(message.angular_velocity)
-
-
-def _put_gyro(message: Any, values: Sequence[float], left: float) -> Any:
-    _set(message.angular_velocity, values)
-    _scale(message.angular_velocity_covariance, left)
-    return message
-
-
-def _take_both(message: Any) -> Sequence[float]:
-    rates = _take_gyro(message)
-    if not rates:
-        return ()
-    absent = message.linear_acceleration_covariance[0] == -1.0
-    return (*rates, *((0.0, 0.0, 0.0) if absent else _vector(message.linear_acceleration)))
-
-
-def _put_both(message: Any, values: Sequence[float], left: float) -> Any:
-    _put_gyro(message, values[:3], left)
-    # Where the message says that it holds none, it goes on saying so.
-    if message.linear_acceleration_covariance[0] != -1.0:
-        _set(message.linear_acceleration, values[3:])
-        _scale(message.linear_acceleration_covariance, left)
-    return message
-
-
-def _vector(vector: Any) -> Sequence[float]:
-    return vector.x, vector.y, vector.z
-
-
-def _set(vector: Any, values: Sequence[float]) -> None:
+def _fill(vector: Any, values: Sequence[float]) -> None:
     vector.x, vector.y, vector.z = values
 
 
-def _scale(covariance: Any, left: float) -> None:
-    """Scale a matrix in place; all 0 says that it is not known, and stays."""
-    for place, value in enumerate(covariance):
-        covariance[place] = value * left
+def _vector(name: str, *, needed: bool = True) -> Group:
+    return Group(tuple((name, axis) for axis in 'xyz'), (f'{name}_covariance',), needed)
 
 
-_DATA = Channels(('data',), lambda message: (message.data,), _put_data)
-_GYRO = Channels(('x', 'y', 'z'), _take_gyro, _put_gyro)
+_RATES = _vector('angular_velocity')
+_DATA = Channels(('data',), (Group((('data',),)),))
+_GYRO = Channels(('x', 'y', 'z'), (_RATES,))
 
 # The types that are filtered without a field being named.
 CHANNELS: dict[str, Channels] = {
     'std_msgs/msg/Float32': _DATA,
     'std_msgs/msg/Float64': _DATA,
-    'sensor_msgs/msg/BatteryState': Channels(
-        ('voltage',), lambda message: (message.voltage,), _put_voltage),
+    'sensor_msgs/msg/BatteryState': Channels(('voltage',), (Group((('voltage',),)),)),
     IMU: _GYRO,
 }
 _BOTH = Channels(('x', 'y', 'z', 'acceleration x', 'acceleration y', 'acceleration z'),
-                 _take_both, _put_both)
+                 (_RATES, _vector('linear_acceleration', needed=False)))
 
 
 def channels_of(kind: str, field: str, *, mode: str = 'lowpass',
@@ -142,22 +160,22 @@ def _derivative(kind: str, channels: Channels) -> Channels:
     """Return channels whose output is a derivative, with the header of the input."""
     stamped = hasattr(message_class(kind)(), 'header')
     output = ACCEL if channels is _GYRO else VECTOR if stamped else PLAIN
-    make = message_class(output)
+    made_of = message_class(output)
 
-    def put(message: Any, values: Sequence[float], _: float) -> Any:
-        out = make()
+    def derive(message: Any, values: Sequence[float]) -> Any:
+        out = made_of()
         if output == PLAIN:
             out.data = values[0]
             return out
         out.header = message.header
         if output == ACCEL:
-            _set(out.accel.angular, values)
-            _set(out.accel.linear, _NONE)
+            _fill(out.accel.angular, values)
+            _fill(out.accel.linear, _NONE)
         else:
-            _set(out.vector, (values[0], math.nan, math.nan))
+            _fill(out.vector, (values[0], math.nan, math.nan))
         return out
 
-    return replace(channels, put=put, output=output)
+    return replace(channels, output=output, make=derive)
 
 
 def _field_channel(kind: str, field: str) -> Channels:
@@ -171,21 +189,7 @@ def _field_channel(kind: str, field: str) -> Channels:
         raise InputError(
             f"input.field: '{field}' of {kind} holds a {type(value).__name__}, which cannot take "
             'a filtered value: name a float field')
-    holder, last = steps[:-1], steps[-1]
-
-    def take(message: Any) -> Sequence[float]:
-        value = _walk(message, steps)
-        return () if value is None else (float(value),)
-
-    def put(message: Any, values: Sequence[float], _: float) -> Any:
-        at = _walk(message, holder)
-        if isinstance(last, str):
-            setattr(at, last, values[0])
-        else:
-            at[last] = values[0]
-        return message
-
-    return Channels((field,), take, put)
+    return Channels((field,), (Group((steps,)),))
 
 
 def _walk(message: Any, steps: FieldPath) -> Any:

@@ -90,12 +90,9 @@ class Stamper:
             source = smooth(source)
         return self._map(source) if self.simulated else source
 
-    def time_of(self, message: Any, info: Any) -> float:
-        """Return the header's stamp, s; without one (or when it is 0) the source time."""
-        header = getattr(message, 'header', None)
-        if header is not None and (header.stamp.sec or header.stamp.nanosec):
-            return float(header.stamp.sec + header.stamp.nanosec * 1e-9)
-        return self.source_time(float(info['source_timestamp']) * 1e-9)
+    def time_of(self, stamp: float, info: Any) -> float:
+        """Return a header's stamp, s; where it is 0, as without one, the source time."""
+        return stamp or self.source_time(float(info['source_timestamp']) * 1e-9)
 
     def _clock(self, message: Any, info: Any) -> None:
         self._clock_heard.heard()
@@ -179,11 +176,7 @@ class PolledInput:
         self.unreadable = 0
 
     def _decode(self, data: bytes) -> Any:
-        try:
-            return deserialize_message(data, self._kind)
-        except Exception as error:
-            # Of the middleware: it has no type of its own.
-            raise InputError(f'a message on {self._topic} cannot be read: {error}') from error
+        return decode(data, self._kind, self._topic)
 
     def _broken(self, index: int, error: InputError) -> None:
         """Leave out a message that cannot be read."""
@@ -234,6 +227,15 @@ class PolledInput:
         return Arrivals(np.where(column.stamped, column.stamp, times[read]), column.stamped,
                         column.count, column.values, received[read], arrived[read],
                         beside[column.log_time.astype(np.int64)])
+
+
+def decode(data: bytes, kind: Any, topic: str) -> Any:
+    """Return a message of a class of messages."""
+    try:
+        return deserialize_message(data, kind)
+    except Exception as error:
+        # Of the middleware: it has no type of its own.
+        raise InputError(f'a message on {topic} cannot be read: {error}') from error
 
 
 class Silence:
