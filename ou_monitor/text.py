@@ -54,6 +54,11 @@ def listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else ', '.join(names[:-1]) + ' and ' + names[-1]
 
 
+def counted(count: int, word: str = 'sample') -> str:
+    """Return '1 sample', '2 samples'."""
+    return f'{count} {word}' if count == 1 else f'{count} {word}s'
+
+
 def chance(p: float) -> str:
     """Return a probability to two digits, as far as one may be believed: down to 0.001."""
     if not math.isfinite(p):

@@ -19,7 +19,7 @@ import numpy as np
 from ou_monitor.analysis.level_comparison import AlphaTest, LEVEL
 from ou_monitor.analysis.relaxation import Relaxation, Release
 from ou_monitor.records import NAN
-from ou_monitor.text import p_words, Z95
+from ou_monitor.text import p_words, volts, Z95
 from scipy import stats
 
 # A level that is off by more than this share of the transient has settled elsewhere; by less
@@ -85,7 +85,7 @@ def judge_cause(relaxation: Relaxation, alpha: AlphaTest) -> Cause:
     if math.isfinite(low):
         of_noise += f' (tau alpha = {ratio:.2f}, 95 % {low:.2f} to {high:.2f})'
     of_instrument = {
-        'excluded': f'the level changes with the load by {1e3 * step:.3g} mV and stays, so '
+        'excluded': f'the level changes with the load by {volts(step)} and stays, so '
                     'this is not the high-pass of an AC-coupled instrument',
         'possible': 'the voltage returns to the level before although the load has changed: a '
                     f'high-pass of {corner:.2g} Hz (AC coupling) would do the same to the '

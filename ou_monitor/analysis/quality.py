@@ -22,7 +22,7 @@ from ou_monitor.analysis.levels import GAP_STEPS, SETTLE
 from ou_monitor.analysis.relaxation import Relaxation
 from ou_monitor.online.estimator.quality import examine, TAIL
 from ou_monitor.records import Estimate, Flag, Recording, Status
-from ou_monitor.text import Z95
+from ou_monitor.text import counted, Z95
 
 # Flags that inform; the others make numbers doubtful.
 _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
@@ -154,7 +154,7 @@ def _of_stamps(recording: Recording) -> list[QualityItem]:
     pauses = steps > GAP_STEPS * median
     if pauses.any():
         items.append(QualityItem('PAUSES', Severity.WARNING, (
-            f'{int(pauses.sum())} pause{"s" if pauses.sum() > 1 else ""} without samples, '
+            f'{counted(int(pauses.sum()), "pause")} without samples, '
             f'{float(steps[pauses].sum()):.3g} s in all, the longest '
             f'{float(steps.max()):.3g} s; no level spans a pause.')))
     jitter = float(np.sqrt(np.mean((steps[~pauses] / median - 1.0) ** 2)))

@@ -40,6 +40,8 @@ _HALF_95 = 1.920729410347062
 _CHANCE = 1e-4
 # Probability that one exponential is said not to be enough where it is.
 BADLY_FITTED = 1e-3
+# Probability that noise alone goes as far as one change of load.
+_ALONE = 0.05
 # Where it is not, so much of tau is left out at first, and what is left has to fit this well: of
 # a rail 16 times faster than the instrument, or motors that follow late, nothing is left by then.
 _LATER, _WELL = 1.0 / 3.0, 0.05
@@ -128,6 +130,12 @@ class Relaxation:
     likelihood_gain: float = NAN
     misfit_p: float = NAN
     left_out: float = 0.0
+
+    @property
+    def clear(self) -> tuple[Release, ...]:
+        """Return the changes that stand out of the noise one by one, at 5 %."""
+        return tuple(change for change in self.releases if change.beyond_p < _ALONE
+                     or abs(change.amplitude) > Z95 * change.amplitude_se)
 
     @property
     def badly_fitted(self) -> bool:

@@ -14,7 +14,7 @@ from ou_monitor.analysis.quality import QualityItem, Severity
 from ou_monitor.analysis.replay import ByThrottle
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, NAN, Status
-from ou_monitor.text import number
+from ou_monitor.text import counted, number
 
 # What changes the meaning of the numbers in the headline itself.
 _BEWARE = {
@@ -32,10 +32,11 @@ def headline(analysis: Analysis) -> str:
     beware = ''.join(f' {words}' for name, words in _BEWARE.items()
                      if any(item.name == name for item in analysis.quality))
     numbers = f' {_numbers(good)}' if good else ''
-    budget = analysis.by_throttle.budget
-    safe = '' if math.isnan(budget) else (
-        f' Safe up to {100.0 * budget:.0f} % throttle.' if budget > 0.0 else
-        ' No throttle is safe.')
+    curves = analysis.by_throttle
+    safe = '' if math.isnan(curves.budget) else (
+        f' Safe up to {100.0 * curves.budget:.0f} % throttle.' if curves.budget > 0.0 else
+        f' No throttle keeps the risk within {curves.horizon:g} s below '
+        f'{100.0 * curves.limit:g} %.')
     return answer(analysis.overview) + safe + numbers + beware
 
 
@@ -159,7 +160,7 @@ def relaxation_sentence(analysis: Analysis, k: int) -> str:
         return cause.sentence
     count = len(fit.releases)
     what = {'release': 'fall', 'load': 'rise'}[fit.kind]
-    return (f'After {count} {what}{"s" if count > 1 else ""} of throttle the voltage relaxes in '
+    return (f'After {counted(count, what)} of throttle the voltage relaxes in '
             f'tau = {number(1e3 * fit.tau)} (95 % {open_end(1e3 * fit.tau_low)} to '
             f'{open_end(1e3 * fit.tau_high)}) ms. {_led(fit.caveat)}{cause.sentence}')
 

@@ -117,9 +117,11 @@ def _levels(analysis: Analysis) -> str:
 
 def _parameters(analysis: Analysis) -> str:
     rows = [[level.label, *[_interval(level, name) for name in ('alpha', 'sigma', 'var_inf')],
-             number(1e3 * level.estimate.tau)] for level in analysis.levels]
-    return table(['throttle', 'alpha 1/s [95 %]', 'sigma V/sqrt(s) [95 %]', 'Var_inf V^2 [95 %]',
-                  'tau ms'], rows)
+             number(1e3 * level.estimate.tau)] for level in analysis.levels
+            if level.estimate.usable]
+    return '' if not rows else table(
+        ['throttle', 'alpha 1/s [95 %]', 'sigma V/sqrt(s) [95 %]', 'Var_inf V^2 [95 %]', 'tau ms'],
+        rows)
 
 
 def _interval(level: LevelResult, name: str) -> str:
@@ -186,11 +188,12 @@ def _changes(fit: Relaxation, start: float) -> str:
              _with_se(change.level, change.level_se),
              _millivolts(change.amplitude, change.amplitude_se),
              number(1e3 * change.beyond), chance(change.beyond_p)]
-            for change in fit.releases[:_MOST_CHANGES]]
-    more = len(fit.releases) - _MOST_CHANGES
-    return table(['at s', 'throttle', 'level before V', 'level after V', 'A mV', side,
-                  'p of noise'], rows) + (
-        f'\n{more} more changes are in the JSON.' if more > 0 else '')
+            for change in fit.clear[:_MOST_CHANGES]]
+    more = len(fit.releases) - len(rows)
+    rest = f'{more} more changes are in the JSON.' if more else ''
+    return '\n'.join(part for part in (table(
+        ['at s', 'throttle', 'level before V', 'level after V', 'A mV', side, 'p of noise'],
+        rows) if rows else '', rest) if part)
 
 
 def _by_throttle(analysis: Analysis) -> str:

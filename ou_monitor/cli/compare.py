@@ -82,7 +82,7 @@ def render(found: Agreement) -> str:
     lines = [output.paragraph(headline(found)), '',
              output.paragraph(f'{found.recording}: {parts(found)}; {", ".join(found.model)}'), '',
              output.table(['', 'measured', 'simulated [95 %]', ''], rows(found), left=[0, 3]), '',
-             output.table(['', ''], path_rows(found), left=[0])]
+             output.facts_table(path_rows(found))]
     if found.notes:
         lines += ['', *[output.item(note) for note in found.notes]]
     return '\n'.join(lines)

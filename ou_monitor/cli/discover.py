@@ -35,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
     from ou_monitor.analysis.overview import known_lines, overview
     from ou_monitor.discovery.discover import discover
+    from ou_monitor.discovery.plain_names import in_short
 
     recording = read_given(args, start, end)
     # What overflows on the way ends as not finite, which the search refuses: a user has no
@@ -94,40 +95,17 @@ def model_text(finding: Finding, recording: Recording | None = None) -> str:
     return as_yaml(ModelFile(model, tuple(dict(se) for se in finding.se), provenance))
 
 
-def in_short(finding: Finding) -> tuple[str, str]:
-    """Return the causes and the gain, a line each."""
-    from ou_monitor.discovery.finding import Verdict
-    from ou_monitor.discovery.plain_names import both_names
-    from ou_monitor.discovery.words import gain_words
-
-    names = ', '.join(dict.fromkeys(both_names(cause.name) for cause in finding.causes))
-    first = {Verdict.NO_EFFECT: 'The plain OU simulates this recording',
-             Verdict.UNEXPLAINED: 'No known cause explains what the plain OU gets wrong',
-             Verdict.EXPLAINED: f'Explained by {names}',
-             Verdict.PARTLY_EXPLAINED: f'Explained in part by {names}'}.get(
-                 finding.verdict, finding.sentence.rstrip('.'))
-    return f'{first}.', (gain_words(finding.gain, finding.gain_se) if finding.causes else
-                         f'{finding.n} samples in {finding.duration:.4g} s.')
-
-
-def told(finding: Finding) -> str:
-    """Return the verdict with what a pilot calls each cause."""
-    from ou_monitor.discovery.plain_names import answer
-
-    return answer(finding.sentence, [cause.name for cause in finding.causes])
-
-
 def render(finding: Finding, known: Sequence[tuple[str, str]] = ()) -> str:
     """Return the finding for a terminal; known: what is known of the recording anyway."""
     from ou_monitor.discovery.words import (
         cause_rows, crossing_words, MNAT, overlap_words, plain_model_words, plain_words)
-    from ou_monitor.discovery.plain_names import PLAIN_NAMES
+    from ou_monitor.discovery.plain_names import headline, PLAIN_NAMES
     from ou_monitor.text import number
 
     used = '' if finding.samples is None or finding.samples.n == finding.n else (
         f', {finding.samples.n} used')
     lines = [f'{finding.recording}: {finding.n} samples in {number(finding.duration, 4)} s{used}',
-             '', output.paragraph(told(finding))]
+             '', output.paragraph(headline(finding))]
     lines += ['', output.facts_table(known)] if known else []
     if finding.causes:
         found = cause_rows(finding.causes)

@@ -19,11 +19,11 @@ from ou_monitor.comparison.judgement import (
 from ou_monitor.comparison.yardstick import Measures, Yardstick
 from ou_monitor.criticism.curves import stray
 from ou_monitor.criticism.integrity import without_repeats
-from ou_monitor.criticism.readings import counted, usable, why_nothing
+from ou_monitor.criticism.readings import usable, why_nothing
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray, Recording
-from ou_monitor.text import number
+from ou_monitor.text import counted, number
 
 # Readings that a part needs, and seconds; simulations for a verdict at 5 %.
 _LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 1.0, 20, 10_000

@@ -66,7 +66,7 @@ def rows(found: Agreement) -> list[tuple[str, str, str, str]]:
 def path_rows(found: Agreement) -> list[tuple[str, str]]:
     """Return what is said of the mean path and of the distribution."""
     thirds = ', '.join(number(1e3 * b, 2) for b in found.bias_by_third)
-    return [('variance explained by the mean path', number(found.explained, 3)),
-            ('its rms error, mV', number(1e3 * found.rmse, 3)),
-            ('its bias, mV (by thirds)', f'{number(1e3 * found.bias, 2)} ({thirds})'),
-            ('KS distance of the distributions', number(found.ks_distance, 2))]
+    return [('Mean path', f'explains {number(100.0 * found.explained, 3)} % of the variance'),
+            ('Its rms error', f'{number(1e3 * found.rmse, 3)} mV'),
+            ('Its bias', f'{number(1e3 * found.bias, 2)} mV (by thirds {thirds})'),
+            ('Distributions', f'{number(found.ks_distance, 2)} apart (KS distance)')]

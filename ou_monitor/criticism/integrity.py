@@ -15,7 +15,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import find_knee, find_rails, find_step, redraw, usual_change
-from ou_monitor.criticism.readings import counted, usable, why_nothing
+from ou_monitor.criticism.readings import usable, why_nothing
 from ou_monitor.criticism.samples import (
     choose_samples, events_between, lines_between, Samples, without_tones)
 from ou_monitor.model.terms.catalogue import catalogue
@@ -27,6 +27,7 @@ from ou_monitor.model.terms.term import Term
 from ou_monitor.online.estimator.quality import refresh_period, Repeats
 from ou_monitor.online.estimator.series import Batch
 from ou_monitor.records import FloatArray, Recording
+from ou_monitor.text import counted
 
 # Fewer samples than this are not fitted.
 LEAST = 100
@@ -342,7 +343,7 @@ def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
     gaps = int((number > 1.0).sum())
     notes = []
     if gaps:
-        notes.append(f'{gaps} gap{"s" if gaps > 1 else ""} in the stamps, the longest '
+        notes.append(f'{counted(gaps, "gap")} in the stamps, the longest '
                      f'{float(step.max()):.3g} s: kept as they are.')
     off = t - grid
     scatter = float(off.std()) / usual

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray, Recording
-from ou_monitor.text import number
+from ou_monitor.text import counted, number
 
 # Far from the others: so many times their spread, and so many times as far as they go.
 _FAR, _GAP = 50.0, 5.0
@@ -32,11 +32,6 @@ _UNIT, _PERCENT, _PULSE = (-1.5, 1.5), (-1.0, 150.0), (700.0, 2400.0)
 _EDGE = 0.05
 # Second differences up to so many roundings are none.
 _ROUNDINGS = 16.0
-
-
-def counted(count: int, what: str) -> str:
-    """Return a number of things, with its plural."""
-    return f'{count} {what}' + ('' if count == 1 else 's')
 
 
 def usable(recording: Recording, notes: list[str]

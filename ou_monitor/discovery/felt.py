@@ -79,8 +79,9 @@ class Felt:
                       f'{number(self.recovered, 2)} V come back within {number(self.within, 2)} s')
         found += '.'
         if self.dips:
-            found += (f' Throttle made {self.made} of the {self.dips} dips below '
-                      f'{number(self.level, 4)} V.')
+            made = (f'made {self.made} of the {self.dips} dips' if self.dips > 1 else
+                    f'{"made" if self.made else "did not make"} the one dip')
+            found += f' Throttle {made} below {number(self.level, 4)} V.'
         return found
 
 

@@ -1,9 +1,14 @@
-"""What a pilot calls a cause, beside its name in code, YAML and JSON."""
+"""What a pilot calls a cause, beside its name in code, YAML and JSON; the finding in short."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+import math
 import re
+
+from ou_monitor.discovery.finding import Finding, Verdict
+from ou_monitor.discovery.words import gain_words
+from ou_monitor.text import listed, number, Z95
 
 PLAIN_NAMES = {
     'ac_coupling': 'an AC-coupled instrument',
@@ -30,8 +35,8 @@ PLAIN_NAMES = {
     'tone': 'a line at a fixed frequency',
     'volatility': 'noise that comes and goes',
 }
-# What is left is listed by its own heading.
-_LEFT = re.compile(r'(another part remains|no known cause explains it): [^.]*\.')
+# As many causes stand in the first sentence; a table has the others.
+_FIRST = 3
 # Names that are no words of English; the others stand for themselves where they are no cause.
 _CODE = re.compile(r'(?<![\w(])(' + '|'.join(
     name for name in sorted(PLAIN_NAMES, key=len, reverse=True) if '_' in name) + r')(?![\w)])')
@@ -55,9 +60,43 @@ def plain(text: str, causes: Sequence[str] = ()) -> str:
     return text[:1].upper() + text[1:]
 
 
-def answer(text: str, causes: Sequence[str] = ()) -> str:
-    """Return a verdict as a pilot reads it: plain names, without the statistics that are left."""
-    return plain(_LEFT.sub(r'\1.', text), causes)
+def headline(finding: Finding) -> str:
+    """Return what to read first: the strongest causes, and what they are worth."""
+    strongest, worth = in_short(finding)
+    if not finding.causes:
+        return strongest
+    closer = ('With them it passes every test.' if finding.verdict is Verdict.EXPLAINED else
+              'With them it comes closer, but is not yet right.')
+    refused = f' {finding.refused}: believe its names, not its numbers.' if finding.refused else ''
+    return f'{strongest} {closer} {worth}{refused}'
+
+
+def in_short(finding: Finding) -> tuple[str, str]:
+    """Return the strongest causes, and what all are worth in errors of prediction."""
+    if not finding.causes:
+        return plain(finding.sentence), f'{finding.n} samples in {finding.duration:.4g} s.'
+    order = sorted(finding.causes, key=lambda c: -c.gain if math.isfinite(c.gain) else math.inf)
+    names = [both_names(name) for name in dict.fromkeys(cause.name for cause in order)]
+    more = len(names) - _FIRST
+    others = [f'{more} more'] if more > 0 else []
+    return (f'A plain simulation lacks {listed([*names[:_FIRST], *others])}.',
+            worth_words(finding.gain, finding.gain_se))
+
+
+def worth_words(gain: float, gain_se: float) -> str:
+    """
+    Return a gain as that of smaller errors of prediction.
+
+    Errors smaller by 1 - exp(-gain) and else alike would gain as much.
+
+    gain, gain_se in nats.
+    """
+    if not (gain > Z95 * gain_se):
+        return gain_words(gain, gain_se)
+    best, low, high = (100.0 * -math.expm1(-max(g, 0.0)) for g in (
+        gain, gain - Z95 * gain_se, gain + Z95 * gain_se))
+    return ('Prediction errors on samples not used for the fit shrink by '
+            f'{number(best, 2)} % ({number(low, 2)} to {number(high, 2)} %).')
 
 
 def both_names(name: str) -> str:

@@ -8,8 +8,7 @@ import math
 
 from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.table import Row
-from ou_monitor.recordings.samples import counted
-from ou_monitor.text import number, volts
+from ou_monitor.text import counted, number, volts
 
 # Heads of the table of recordings; what stands in a bracket is small on a page.
 HEADS = ('recording', 'lowest V', 'at s', 'dips', 'below s', 'sag V', 'at throttle')

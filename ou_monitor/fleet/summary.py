@@ -15,9 +15,8 @@ from ou_monitor.fleet.drift import fewest, Trend
 from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import DRIFT_RATE, Judgement, LEAST_VEHICLES, OUTLIER_RATE
 from ou_monitor.fleet.outliers import LEAST
-from ou_monitor.recordings.samples import counted
 from ou_monitor.records import FloatArray, NAN
-from ou_monitor.text import chance, number, p_words
+from ou_monitor.text import chance, counted, number, p_words
 
 # Characters of the name of a vehicle in a table.
 _NAME = 30

@@ -19,8 +19,7 @@ import subprocess
 import sys
 
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.samples import counted
-from ou_monitor.text import printable
+from ou_monitor.text import counted, printable
 
 METADATA, PATTERN, FOLDER = 'metadata', 'pattern', 'folder'
 _SHOWN = 3

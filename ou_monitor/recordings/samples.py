@@ -24,7 +24,7 @@ from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.blocks import BlockClock
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.stream.samples import BoolArray, ThrottleHold
-from ou_monitor.text import printable
+from ou_monitor.text import counted, printable
 
 VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
 # Squares and cubes of what is beyond this overflow; no supply comes near it.
@@ -33,11 +33,6 @@ LARGEST = 1e9  # V
 _STRETCH = 20
 # A throttle beyond this is none in 0..1, however generous its ends.
 MOST_THROTTLE = 2.0
-
-
-def counted(count: int, word: str = 'sample') -> str:
-    """Return '1 sample', '2 samples'."""
-    return f'{count} {word}' if count == 1 else f'{count} {word}s'
 
 
 def usable_voltage(t: FloatArray, voltage: FloatArray) -> npt.NDArray[np.bool_]:

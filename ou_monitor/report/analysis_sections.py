@@ -120,9 +120,10 @@ def _changes(analysis: Analysis, fit: Relaxation) -> str:
              _with_error(change.level, change.level_se, 4, 1.0),
              _with_error(change.amplitude, change.amplitude_se, 3, 1e3),
              rounded(1e3 * change.beyond), probability(change.beyond_p)]
-            for change in fit.releases]
-    return page.table(['At, s', 'Throttle', 'Level before, V', 'Level after, V', 'A, mV', side,
-                       'p of noise'], rows, left=[1])
+            for change in fit.clear]
+    return '' if not rows else page.table(
+        ['At, s', 'Throttle', 'Level before, V', 'Level after, V', 'A, mV', side, 'p of noise'],
+        rows, left=[1])
 
 
 def _with_error(value: float, se: float, digits: int, scale: float) -> str:

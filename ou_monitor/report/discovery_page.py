@@ -10,7 +10,7 @@ import math
 import numpy as np
 from ou_monitor.criticism.curves import compare_curves, Comparison
 from ou_monitor.discovery.finding import Criticism, Finding
-from ou_monitor.discovery.plain_names import answer, PLAIN_NAMES
+from ou_monitor.discovery.plain_names import headline, PLAIN_NAMES
 from ou_monitor.discovery.words import (
     cause_rows, crossing_words, gain_remark, MNAT, NOT_KNOWN, overlap_words, plain_model_words,
     plain_words, with_error)
@@ -39,8 +39,7 @@ def discovery_page(finding: Finding, command: str = '',
     subtitle = f'{finding.n} samples in {number(finding.duration, 4)} s'
     if finding.samples is not None and finding.samples.n != finding.n:
         subtitle += f', of which {finding.samples.n} were used'
-    sections = [page.headline(_typeset(answer(
-        finding.sentence, [cause.name for cause in finding.causes])))]
+    sections = [page.headline(_typeset(headline(finding)))]
     if finding.samples is not None:
         sections.append(page.figure(_voltage(finding), _VOLTAGE.format(_model_name(finding))
                                     if finding.simulated else ''))

@@ -21,7 +21,7 @@ from ou_monitor.records import FloatArray
 from ou_monitor.report import page
 from ou_monitor.report.page import typeset, UNKNOWN
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import chance, number
+from ou_monitor.text import chance, counted, number
 
 _TITLES = {'sigma': 'Noise intensity \u03c3', 'alpha': 'Relaxation rate \u03b1',
            'sag': 'Sag at full throttle'}
@@ -61,8 +61,9 @@ def fleet_page(fleet: Fleet, command: str = '') -> str:
         sections.append(page.section('Where it comes from', page.paragraph(
             'To repeat this, or to go on with recordings that came later:'), page.code(command),
             folded=True))
-    subtitle = (f'{fleet.recordings} recordings, {len(fleet.vehicles)} vehicles, '
-                f'{len(fleet.rows)} rows in the table')
+    subtitle = (f'{counted(fleet.recordings, "recording")}, '
+                f'{counted(len(fleet.vehicles), "vehicle")}, '
+                f'{counted(len(fleet.rows), "row")} in the table')
     return page.page('Supply noise of a fleet', subtitle, sections)
 
 

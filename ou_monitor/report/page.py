@@ -34,8 +34,9 @@ _STYLE = """
   --edge: #00000099; --warn: #ffb070; DARK } }
 * { box-sizing: border-box; }
 body { margin: 0 auto; padding: 24px 20px 48px; max-width: 940px; background: var(--paper);
-  color: var(--ink); font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
-h1 { font-size: 22px; margin: 0 0 2px; overflow-wrap: anywhere; }
+  color: var(--ink); font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif;
+  overflow-wrap: break-word; }
+h1 { font-size: 22px; margin: 0 0 2px; }
 h2 { font-size: 17px; margin: 30px 0 8px; }
 p { margin: 6px 0; } .soft { color: var(--soft); }
 .headline { font-size: 17px; padding: 12px 16px; margin: 14px 0; background: var(--panel);
@@ -66,7 +67,7 @@ dl.facts dt { color: var(--soft); } dl.facts dd { margin: 0; overflow-wrap: anyw
   body { padding: 16px 14px 32px; } .headline { font-size: 16px; padding: 10px 12px; }
   table { font-size: 13px; } th, td { padding: 4px 7px 4px 0; }
   td.left { white-space: normal; overflow-wrap: anywhere; min-width: 92px; } }
-li { margin: 3px 0; } li.warn::marker { color: var(--warn); }
+li { margin: 3px 0; overflow-wrap: anywhere; } li.warn::marker { color: var(--warn); }
 code { font: 13px/1.5 ui-monospace, Menlo, Consolas, monospace; background: var(--panel);
   padding: 2px 5px; border-radius: 3px; overflow-wrap: anywhere; }
 figure { margin: 10px 0; } figcaption { font-size: 13px; color: var(--soft); }

@@ -1,6 +1,8 @@
 """`ou-monitor discover`: CSV in; summary, JSON, model and page out; bad input one line."""
 
+from dataclasses import replace
 import json
+import math
 import re
 from xml.etree import ElementTree
 
@@ -9,12 +11,14 @@ from ou_monitor.cli.discover import render
 from ou_monitor.cli.main import main
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.finding import Cause, Finding, Verdict
-from ou_monitor.discovery.plain_names import answer, both_names, plain, PLAIN_NAMES
+from ou_monitor.discovery.plain_names import (
+    both_names, headline, in_short, plain, PLAIN_NAMES)
 from ou_monitor.discovery.words import explain, parameters
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.drift import Drift
 from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.measurement_noise import MeasurementNoise
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.tone import Tone
 from ou_monitor.online.load.load_filter import LoadFilter
@@ -97,7 +101,7 @@ def test_summary_model_and_page(flight, tmp_path, capsys):
                  str(model), '--report', str(page)]) == 0
     out = capsys.readouterr().out
     assert all(len(line) <= 100 for line in out.replace(str(tmp_path), '').splitlines())
-    for part in ('explained by sag (load_sag)', 'gain mnat/sample', 'times a minute',
+    for part in ('A plain simulation lacks sag (load_sag)', 'gain mnat/sample', 'times a minute',
                  'Plain OU: alpha', str(model), str(page)):
         assert part in out
     file = read_model(model)
@@ -234,6 +238,26 @@ def test_plain_names_stand_before_the_names_in_code():
         'drift is left.')
     assert plain('The plain OU simulates it.') == 'The plain OU simulates it.'
     assert both_names('load_sag') == 'sag (load_sag)' and both_names('new') == 'new'
-    assert answer('load_sag explains a part of it; another part remains: errors depend, and noise '
-                  'rises (3 more). Gain: none.') == (
-        'Sag (load_sag) explains a part of it; another part remains. Gain: none.')
+
+
+def test_the_headline_names_the_strongest_and_what_all_are_worth():
+    """Three by their gain, the rest counted; errors are smaller by 1 - exp(-gain)."""
+    nan = float('nan')
+    finding = replace(made(
+        (LoadSag(0.6, 0.0), 0.2, 0.01, 0.0), (Drift(0.1, 0.0), nan, nan, nan),
+        *[(Tone(0.01, f, 0.0, 0.0), 0.3, 0.01, 0.0) for f in (11.0, 23.0)]),
+        gain=math.log(2.0), gain_se=0.1)
+    first = ('A plain simulation lacks a line at a fixed frequency (tone), sag (load_sag) and '
+             'discharge or warming (drift)')
+    assert headline(finding) == (
+        f'{first}. With them it passes every test. Prediction errors on samples not used for the '
+        'fit shrink by 50 % (39 to 59 %).')
+    more = replace(finding, verdict=Verdict.PARTLY_EXPLAINED, refused='It strays', causes=(
+        *finding.causes, *made((MeasurementNoise(0.01), 0.1, 0.01, 0.0)).causes))
+    assert ('sag (load_sag), noise of the sensor (measurement_noise) and 1 more. With them it '
+            'comes closer, but is not yet right.') in headline(more)
+    assert headline(more).endswith('It strays: believe its names, not its numbers.')
+    assert in_short(replace(finding, gain=0.19))[1].startswith('No measurable gain')
+    nothing = replace(finding, causes=(), sentence='load_sag was tried.')
+    assert headline(nothing) == 'Sag (load_sag) was tried.'
+    assert in_short(nothing)[1] == '400 samples in 4 s.'

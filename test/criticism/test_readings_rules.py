@@ -3,8 +3,9 @@
 import math
 
 import numpy as np
-from ou_monitor.criticism.readings import counted, find_bad, usable, why_nothing
+from ou_monitor.criticism.readings import find_bad, usable, why_nothing
 from ou_monitor.records import Recording
+from ou_monitor.text import counted
 import pytest
 
 N = 1001

@@ -118,7 +118,7 @@ def _end(risks: FloatArray, known: npt.NDArray[np.bool_], lowest: float, highest
         if math.isnan(risks.item(first)):
             return NAN, f'The risk could not be computed at throttle {lowest:.2f}.'
         if first == 0:
-            return 0.0, f'Even idle is above the limit: risk {risks.item(0):.2g}.'
+            return 0.0, f'Even at idle the risk is {risks.item(0):.2g}, more than allowed.'
         if not within[0]:
             return NAN, (f'Above the limit at {lowest:.2f}, the lowest throttle flown '
                          f'(risk {risks.item(first):.2g}); no data below.')
@@ -370,7 +370,8 @@ def load_budget(risks: FloatArray, flown: tuple[float, float], limit: float, vol
     within = int(np.searchsorted(risks, limit, 'right'))
     if within == 0:
         return ThrottleBudget(
-            0.0, f'Even idle is above the limit: risk {risks[0]:.2g}.' + what, risks, known)
+            0.0, f'Even at idle the risk is {risks[0]:.2g}, more than allowed.{what}', risks,
+            known)
     end = 1.0
     if within < _GRID.size:
         low, high = risks[within - 1], risks[within]

@@ -8,6 +8,7 @@ import math
 
 from ou_monitor.paper.reproduce import published
 from ou_monitor.paper.reproduce.row import Printed, Range, Row
+from ou_monitor.text import counted
 
 WHERE = 'Table 1'
 # A step finer than the smallest reading over this says nothing.
@@ -108,7 +109,7 @@ def _vrms() -> list[Row]:
     return [Row(
         WHERE, f'Vrms, {state.label}', 'mV', state.vrms, k * step.size,
         f'multiple of a common step of {step.low:.4g} to {step.high:.4g} mV',
-        f'{k} step{"s" if k > 1 else ""}, so Vrms and sigma are known to half a step, '
+        f'{counted(k, "step")}, so Vrms and sigma are known to half a step, '
         f'{50.0 * step.size / state.vrms.value:.2g} %.',
         point=4) for state, k in zip(published.LOADED, step.multiples)]
 
