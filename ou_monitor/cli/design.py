@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def render(result: Design, source: str) -> str:
-    """Return the table and the answer for a terminal 100 columns wide."""
+    """Return the answer and its table for a terminal 100 columns wide."""
     present = result.present
     chosen = [(present, 'present')]
     if result.least is not None:
@@ -105,16 +105,14 @@ def render(result: Design, source: str) -> str:
               probability(r.risk_ou), probability(r.risk_crossing), mark]
              for r, mark in sorted(chosen, key=lambda item: item[0].capacitance)]
     name = 'battery bus' if result.rail == 'bus' else 'regulated rail'
-    head = (f'{name} at throttle {result.throttle:g}: mean {present.mean:.4g} V (sag of the bus '
-            f'{present.sag:.3g} V), brown-out at {result.voltage:g} V ({source}), risk allowed '
-            f'{result.target:g} within {result.horizon:g} s')
+    given = (f'{name} at throttle {result.throttle:g}: mean {present.mean:.4g} V (sag of the bus '
+             f'{present.sag:.3g} V), brown-out at {result.voltage:g} V ({source}), risk allowed '
+             f'{result.target:g} within {result.horizon:g} s')
     lines = [
-        paragraph(head), '',
+        paragraph(answer(result)), '', paragraph(given), '',
         table(['C uF', 'ESR mOhm', 'alpha 1/s', 'tau us', 'sigma V/sqrt(s)', 'Var_inf V^2',
                'mean time', 'risk OU', 'crossing', ''], cells, left=[9]), '']
-    for text in (answer(result), effect(result), *remarks(result)):
-        if text:
-            lines.append(paragraph(text))
+    lines += [paragraph(text) for text in (effect(result), *remarks(result)) if text]
     return '\n'.join(lines)
 
 
