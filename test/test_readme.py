@@ -194,9 +194,8 @@ def test_filter_numbers_are_those_of_the_laws():
     """Noise taken off between 150 and 20 Hz, lags, and what the pole of Kalman loses."""
     import math
 
-    from ou_monitor.online.filter.cutoff_laws import supply_noise
+    from ou_monitor.online.filter.cutoff_laws import squared_error, supply_noise
     from ou_monitor.online.filter.lag import cutoff_for_lag
-    from ou_monitor.online.filter.wiener import squared_error
     off = {mode: 1.0 - math.sqrt(supply_noise(mode, 2, 20.0, 63.0)
                                  / supply_noise(mode, 2, 150.0, 63.0))
            for mode in ('lowpass', 'derivative')}

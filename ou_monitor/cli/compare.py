@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
 
     import numpy as np
     from ou_monitor.comparison.compare import compare
-    from ou_monitor.comparison.words import in_short
+    from ou_monitor.comparison.judgement import in_short
     from ou_monitor.recordings.model_file import read_model
 
     model = None if args.model is None else read_model(args.model).model
@@ -77,7 +77,7 @@ def _until(text: str | None) -> float | None:
 
 def render(found: Agreement) -> str:
     """Return the comparison for a terminal 100 columns wide."""
-    from ou_monitor.comparison.words import headline, parts, path_rows, rows
+    from ou_monitor.comparison.judgement import headline, parts, path_rows, rows
 
     lines = [output.paragraph(headline(found)), '',
              output.paragraph(f'{found.recording}: {parts(found)}; {", ".join(found.model)}'), '',

@@ -13,11 +13,11 @@ from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
     brownout_limit, check_outputs, columns_given, part_of_recording, read_given, repeated)
 from ou_monitor.cli.progress import Progress
-from ou_monitor.coupling import words
+from ou_monitor.coupling.coupling import (
+    Coupling, estimate_coupling, facts, headline, parts, remarks)
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
-    from ou_monitor.coupling.coupling import Coupling
     from ou_monitor.records import FloatArray, Recording
 
 
@@ -28,7 +28,6 @@ def run(args: argparse.Namespace) -> int:
     start, end = part_of_recording(args.start, args.end)
 
     from ou_monitor.analysis.overview import answers, known_lines, overview
-    from ou_monitor.coupling.coupling import estimate_coupling
     from ou_monitor.recordings.importers.formats import is_log
 
     if is_log(Path(args.recording)):
@@ -55,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
                           args.json)
     if args.json != output.STDOUT:
         output.say(render(found, recording.name, args.signal, unit, recording.notes, known))
-        output.summary(words.headline(found, args.signal, unit),
+        output.summary(headline(found, args.signal, unit),
                        f'{answers(seen)[0]}.', report=args.report, json=args.json)
     return 0
 
@@ -113,10 +112,10 @@ def as_data(found: Coupling, name: str, signal: str, unit: str, notes: tuple[str
 def render(found: Coupling, name: str, signal: str, unit: str, notes: tuple[str, ...],
            known: Sequence[tuple[str, str]] = ()) -> str:
     """Return the finding for a terminal; known: what is known of the voltage anyway."""
-    lines = [f'{name}, {signal}: {words.parts(found)}', '',
-             output.paragraph(words.headline(found, signal, unit)), '',
-             output.facts_table([*known, *words.facts(found, unit)])]
-    said = words.remarks(found, notes)
+    lines = [f'{name}, {signal}: {parts(found)}', '',
+             output.paragraph(headline(found, signal, unit)), '',
+             output.facts_table([*known, *facts(found, unit)])]
+    said = remarks(found, notes)
     if said:
         lines += ['', *[output.item(text) for text in said]]
     return '\n'.join(lines)

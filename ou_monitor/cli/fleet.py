@@ -93,7 +93,7 @@ def version() -> str:
 
 
 def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
-    from ou_monitor.fleet.results import write_whole
+    from ou_monitor.fleet.table import write_whole
     from ou_monitor.fleet.table import write_table
     from ou_monitor.report.fleet_page import fleet_page
 

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from ou_monitor.fleet import lowest
 from ou_monitor.fleet.comparison import LOGARITHMIC, QUANTITIES, USABLE, Values
-from ou_monitor.fleet.drift import fewest, Trend
 from ou_monitor.fleet.fleet import Fleet
-from ou_monitor.fleet.judgement import DRIFT_RATE, Judgement, LEAST_VEHICLES, OUTLIER_RATE
-from ou_monitor.fleet.outliers import LEAST
+from ou_monitor.fleet.judgement import (
+    DRIFT_RATE, fewest, Judgement, LEAST, LEAST_VEHICLES, OUTLIER_RATE, Trend)
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.text import chance, counted, number, p_words
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from ou_monitor.comparison.agreement import Agreement
-from ou_monitor.comparison.words import headline, parts, path_rows, rows
+from ou_monitor.comparison.judgement import headline, parts, path_rows, rows
 from ou_monitor.report import page
 from ou_monitor.report.page import typeset
 from ou_monitor.report.svg import Plot

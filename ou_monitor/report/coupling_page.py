@@ -7,8 +7,7 @@ import math
 
 import numpy as np
 from ou_monitor.analysis.overview import Overview
-from ou_monitor.coupling.coupling import Coupling
-from ou_monitor.coupling.words import facts, headline, parts, remarks
+from ou_monitor.coupling.coupling import Coupling, facts, headline, parts, remarks
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.report import page
 from ou_monitor.report.svg import Plot

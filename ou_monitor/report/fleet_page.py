@@ -10,9 +10,8 @@ import numpy as np
 from ou_monitor.criticism.curves import outline
 from ou_monitor.fleet import lowest
 from ou_monitor.fleet.comparison import LOGARITHMIC, QUANTITIES, USABLE, Values
-from ou_monitor.fleet.drift import Trend
 from ou_monitor.fleet.fleet import Fleet
-from ou_monitor.fleet.judgement import DRIFT_RATE
+from ou_monitor.fleet.judgement import DRIFT_RATE, Trend
 from ou_monitor.fleet.summary import (
     change, comparison_words, failure_words, finding_words, headline, quality_counts, short_names,
     VEHICLE_HEADS, vehicle_rows)

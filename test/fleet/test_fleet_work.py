@@ -13,8 +13,9 @@ from ou_monitor.errors import InputError
 from ou_monitor.fleet.analysis import Options, work
 from ou_monitor.fleet.cluster import check_address
 from ou_monitor.fleet.find import duplicates, find_recordings
-from ou_monitor.fleet.results import Parts, write_whole
+from ou_monitor.fleet.fleet import Parts
 from ou_monitor.fleet.summary import failure_words
+from ou_monitor.fleet.table import write_whole
 from ou_monitor.fleet.vehicles import assign, natural, number_flights, read_pattern
 from ou_monitor.fleet.workers import LocalWorkers, LOST, usable_memory
 import pytest

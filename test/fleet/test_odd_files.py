@@ -9,8 +9,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.fleet import vehicles
 from ou_monitor.fleet.analysis import is_result, Options
 from ou_monitor.fleet.find import duplicates, find_recordings
-from ou_monitor.fleet.fleet import run_fleet
-from ou_monitor.fleet.results import Parts
+from ou_monitor.fleet.fleet import Parts, run_fleet
 from ou_monitor.fleet.vehicles import match_paths, read_pattern
 from ou_monitor.model.ou import simulate
 import pytest

@@ -1,5 +1,5 @@
-r"""
-The low-pass itself: two numbers of state, solved exactly over a step of any length.
+"""
+The low-pass itself: two numbers of state, over a step of any length, and over many samples.
 
 With w = 2 pi fc, input x, output y:
 
@@ -14,11 +14,32 @@ the absolute impulse response: 1 for order 1, coth(pi / 2) = 1.0903 for order 2.
 Between samples the input is linear.  Held at the newest value instead, it
 would lead by half a sample (18 degrees at a tenth of the sample rate); linear
 it has no phase error and an amplitude that falls short by (pi f dt)^2 / 3.
+
+Many samples at once: a cutoff that moves only stretches time, and an input that is linear in a
+step has the steady response x - sqrt(2) r (order 1: x - r) with r its rise over the angle of the
+step.  What is left of a state beside that turns and decays by exp(lambda theta), whatever the
+cutoff, and jumps only where r or x does.  With Theta the sum of the angles so far
+
+    z_k = exp(lambda Theta_k) (z_0 + sum_j exp(-lambda Theta_(j-1)) jump_j),
+
+lambda = (-1 + i) / sqrt(2), or -1: a sum over a block, in which the exponential stays finite, and
+one step from block to block.  Coefficients that change with every sample cost no more than fixed
+ones.  Rounding: r is large where the angle is small, so that below `_LEAST` samples go one by one.
+
+Samples are worked on together while they are finite and their intervals even to a factor of
+five; the others go one by one.  The output is that of the samples one by one, to rounding
+(angles within 1e-9 of each other count as one).
 """
 
 from __future__ import annotations
 
+import cmath
 import math
+from typing import NamedTuple
+
+import numpy as np
+from ou_monitor.online.filter.cutoff_control import INTERVALS, ODD, OF_RATE
+from ou_monitor.records import FloatArray
 
 _ROOT2 = math.sqrt(2.0)
 
@@ -61,3 +82,201 @@ class LowPassState:
         self.y += (c + s) * off + _ROOT2 * s * slope + rise * (1.0 + c / p)
         self.slope += (c - s) * slope - _ROOT2 * s * off - rise * (c + s) / angle
         return self.y
+
+
+# Samples that are worked on together: the arrays stay in the cache.
+_CHUNK = 16384
+# Angle of a block: exp(100) is far from the largest number, and 100 rounds by 1e-14.
+_SPAN = 100.0
+_LEAST = 1e-4
+# After so much angle nothing of a state is left: exp(-75 / sqrt(2)) < 1e-23.
+_FORGOTTEN = 75.0
+# Angles that differ by less, as a share, count as one; a biquad of less angle would round more.
+_SAME, _SMALL = 1e-9, 0.02
+
+
+def filter_sequence(state: LowPassState, order: int, angle: FloatArray, start: FloatArray,
+                    end: FloatArray) -> FloatArray:
+    """
+    Return the output at each sample (all of shape (n,)); the state goes on from the last.
+
+    `start` is `end` of the sample before, or each its own `end` (the slopes of a derivative).
+    """
+    out: FloatArray = np.empty_like(angle)
+    for k in range(0, angle.size, _CHUNK):
+        at = slice(k, k + _CHUNK)
+        lowest, highest = float(angle[at].min()), float(angle[at].max())
+        if order == 2 and lowest > _SMALL and highest - lowest < _SAME * lowest:
+            out[at] = _even(state, 0.5 * (lowest + highest), start[at], end[at])
+        elif lowest < _LEAST:
+            out[at] = [state.advance(order, *one) for one in zip(
+                angle[at].tolist(), start[at].tolist(), end[at].tolist(), strict=True)]
+        else:
+            out[at] = _uneven(state, order, angle[at], start[at], end[at])
+    return out
+
+
+def _left_over(a: FloatArray, y: float, slope: float) -> FloatArray:
+    """Return what a state of order 2 makes of the output after angles, without input."""
+    p = a / _ROOT2
+    return np.asarray(np.exp(-p) * ((y * np.cos(p)) + (y + _ROOT2 * slope) * np.sin(p)))
+
+
+def _even(state: LowPassState, angle: float, start: FloatArray, end: FloatArray) -> FloatArray:
+    """Filter with one angle: a biquad from rest, and what the state leaves over."""
+    from scipy.signal import lfilter
+
+    def step(y: float, slope: float, *ends: float) -> tuple[float, float]:
+        one = LowPassState(y)
+        one.slope = slope
+        one.advance(2, angle, *ends)
+        return one.y, one.slope
+    (f11, f21), (f12, f22) = step(1.0, 0.0, 0.0, 0.0), step(0.0, 1.0, 0.0, 0.0)
+    (a1, a2), (b1, b2) = step(0.0, 0.0, 1.0, 0.0), step(0.0, 0.0, 0.0, 1.0)
+    poles = [1.0, -(f11 + f22), f11 * f22 - f12 * f21]
+    zeros = [b1, a1 - f22 * b1 + f12 * b2, f12 * a2 - f22 * a1]
+    x0 = float(start[0])
+    # From rest at x0; `start` of one sample is `end` of the one before but for a derivative.
+    if np.array_equal(start[1:], end[:-1]):
+        out = np.asarray(lfilter(zeros, poles, end - x0)) + x0
+    else:
+        out = np.asarray(lfilter([a1, f12 * a2 - f22 * a1], poles, start - x0)
+                         + lfilter([b1, f12 * b2 - f22 * b1], poles, end - x0)) + x0
+    steps = np.arange(1, min(int(_FORGOTTEN / angle), end.size) + 1)
+    left = np.asarray(angle * steps, dtype=np.float64)
+    out[:left.size] += _left_over(left, state.y - x0, state.slope)
+    if end.size > 1:
+        # The slope before the last step is what the last step made of it.
+        before = LowPassState(float(out[-2]))
+        before.advance(2, angle, float(start[-1]), float(end[-1]))
+        state.slope = (float(out[-1]) - before.y) / f12
+        state.y = float(out[-2])
+    state.advance(2, angle, float(start[-1]), float(end[-1]))
+    return out
+
+
+def _uneven(state: LowPassState, order: int, angle: FloatArray, start: FloatArray,
+            end: FloatArray) -> FloatArray:
+    """Filter by sums, in blocks of an angle of `_SPAN` at most, one block a row."""
+    n = angle.size
+    length = min(max(int(_SPAN / float(angle.max())), 1), n)
+    count = -(-n // length)
+    late = _ROOT2 if order == 2 else 1.0
+    held = np.array_equal(start, end)
+    slope = None if held else (end - start) / angle
+    steady = end if slope is None else end - late * slope
+    source = -end if slope is None else slope
+    last = 0.0 if slope is None else float(slope[-1])
+    # What is beyond the end does not move.
+    p, jump = np.zeros((2, count, length))
+    np.divide(angle, late, out=p.reshape(-1)[:n])
+    np.subtract(source[1:], source[:-1], out=jump.reshape(-1)[1:n])
+    np.cumsum(p, axis=1, out=p)
+    grow = np.exp(p)
+    off = state.y - (float(end[0]) if slope is None else
+                     float(start[0]) - late * float(slope[0]))
+    if order == 1:
+        a = _sums(jump, grow)
+        left = off
+        for row, (total, angle_) in enumerate(zip(
+                a[:, -1].tolist(), p[:, -1].tolist(), strict=True)):
+            a[row] += left
+            left = math.exp(-angle_) * (left + total)
+        a /= grow
+        out = a.reshape(-1)[:n] + steady
+        state.y, state.slope = float(out[-1]), 0.0
+        return np.asarray(out)
+    cos, sin = np.cos(p), np.sin(p)
+    a, b = _sums(jump, grow * cos), _sums(jump, grow * sin, 0.0)
+    turn = state.slope - (0.0 if slope is None else float(slope[0]))
+    # The frame in which the jumps are real: d = u + v, s = -sqrt2 v; turned by pi / 4 for slopes.
+    z = complex(off + turn / _ROOT2, -turn / _ROOT2) if slope is None else complex(
+        off / _ROOT2, -turn - off / _ROOT2)
+    for row, (total, other, angle_) in enumerate(zip(
+            a[:, -1].tolist(), b[:, -1].tolist(), p[:, -1].tolist(), strict=True)):
+        a[row] += z.real
+        b[row] -= z.imag
+        z = cmath.exp(complex(-angle_, angle_)) * (z + complex(total, -other))
+    if slope is None:
+        along, across = cos + sin, sin - cos
+        size, state.slope = 1.0, -_ROOT2 * z.imag
+    else:
+        along, across = cos, sin
+        size, state.slope = _ROOT2, last - z.real - z.imag
+    a *= along
+    b *= across
+    a += b
+    a /= grow
+    a *= size
+    out = a.reshape(-1)[:n] + steady
+    state.y = float(out[-1])
+    return np.asarray(out)
+
+
+def _sums(jump: FloatArray, weight: FloatArray, first: float = 1.0) -> FloatArray:
+    """Return the sums along the rows of jumps, each by the weight before it."""
+    found = np.empty_like(jump)
+    found[:, 0] = first * jump[:, 0]
+    np.multiply(jump[:, 1:], weight[:, :-1], out=found[:, 1:])
+    np.cumsum(found, axis=1, out=found)
+    return found
+
+
+# Samples of a piece from which it is worth it.
+WORTH = 48
+
+
+class Piece(NamedTuple):
+    """
+    Samples that can be worked on together.
+
+    Attributes
+    ----------
+    size : int
+        Number.
+    dt, mean : ndarray, shape (size,)
+        Interval before each, and mean interval at each, s.
+
+    """
+
+    size: int
+    dt: FloatArray
+    mean: FloatArray
+
+
+def sound_piece(t: FloatArray, x: FloatArray, before: float, mean: float,
+                limits: tuple[float, float, float]) -> Piece:
+    """Return the samples from the first on of which none is odd (before in s, mean in s)."""
+    from scipy.signal import lfilter
+    largest, latest, shortest = limits
+    # NaN is neither.
+    if not (-latest < t.min() and t.max() < latest and -largest < x.min() and x.max() < largest):
+        good = (np.abs(x) < largest) & (np.abs(t) < latest)
+        n = int(np.argmin(good)) if not good.all() else t.size
+        t, x = t[:n], x[:n]
+    dt = np.diff(t, prepend=before)
+    keep = 1.0 - 1.0 / INTERVALS
+    means = np.asarray(lfilter([1.0 - keep], [1.0, -keep], dt, zi=[keep * mean])[0])
+    n = dt.size
+    if n and not (dt.min() >= shortest and dt.max() <= ODD * min(mean, means.min())
+                  and max(mean, means.max()) <= ODD * dt.min()):
+        past = np.concatenate(([mean], means[:-1]))
+        odd = (dt < shortest) | (dt > ODD * past) | (past > ODD * dt)
+        if odd.any():
+            n = int(np.argmax(odd))
+    return Piece(n, dt[:n], means[:n])
+
+
+def changes(heard: list[FloatArray], size: int) -> list[int]:
+    """Return where a run of one value of all that is heard begins, the first at 0."""
+    moved = np.zeros(size - 1, dtype=np.bool_)
+    for one in heard:
+        moved |= (one[1:] != one[:-1]) & ~(np.isnan(one[1:]) & np.isnan(one[:-1]))
+    return [0, *(np.flatnonzero(moved) + 1).tolist()]
+
+
+def within_rate(cutoff: FloatArray, mean: FloatArray) -> FloatArray:
+    """Return a cutoff, Hz, below its share of the sample rate."""
+    if float(cutoff.max()) * float(mean.max()) < OF_RATE:
+        return cutoff
+    return np.minimum(cutoff, OF_RATE / mean)

@@ -23,13 +23,12 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.online.filter.array_filter import changes, sound_piece, within_rate, WORTH
 from ou_monitor.online.filter.cutoff_control import Bound, CutoffControl, OF_RATE, SampleInterval
 from ou_monitor.online.filter.cutoff_laws import wanted_cutoff, wanted_cutoffs
-from ou_monitor.online.filter.filter_state import LowPassState
+from ou_monitor.online.filter.filter_state import (
+    changes, filter_sequence, LowPassState, sound_piece, within_rate, WORTH)
 from ou_monitor.online.filter.lag import cutoff_for_lag, delay, most_lag, phase_lag
 from ou_monitor.online.filter.learned_wiener import LearnedWiener
-from ou_monitor.online.filter.sequence import filter_sequence
 from ou_monitor.online.filter.voltage_kalman import VoltageKalman
 from ou_monitor.online.filter.white_noise import noise_left
 from ou_monitor.online.settings import FilterSettings

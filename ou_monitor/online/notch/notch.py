@@ -19,11 +19,9 @@ import numpy.typing as npt
 from ou_monitor.online.filter.cutoff_control import SampleInterval
 from ou_monitor.online.filter.lowpass import FilterCounters
 from ou_monitor.online.notch.biquads import HIGHEST, Notch, phase_lag
-from ou_monitor.online.notch.choice import Candidate, Choice
-from ou_monitor.online.notch.law import MotorLaw
+from ou_monitor.online.notch.choice import Candidate, Choice, Frames
+from ou_monitor.online.notch.motors import MotorLaw, MotorSpeeds
 from ou_monitor.online.notch.settings import NotchSettings
-from ou_monitor.online.notch.spectrum import Frames
-from ou_monitor.online.notch.speeds import MotorSpeeds
 from ou_monitor.records import FloatArray
 
 NAN = math.nan

@@ -5,8 +5,7 @@ import time
 
 import numpy as np
 from ou_monitor import AdaptiveLowPass
-from ou_monitor.online.filter.filter_state import LowPassState
-from ou_monitor.online.filter.sequence import filter_sequence
+from ou_monitor.online.filter.filter_state import filter_sequence, LowPassState
 import pytest
 from scipy import signal
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 from ou_monitor.online.filter.filter_state import LowPassState
-from ou_monitor.online.filter.low_pass_span import COUNT, CUTOFFS, LowPassSpan
+from ou_monitor.online.filter.learned_wiener import COUNT, CUTOFFS, LowPassSpan
 import pytest
 
 INTERVAL = 2e-3

@@ -4,10 +4,8 @@ import math
 
 import numpy as np
 from numpy.testing import assert_allclose
-from ou_monitor.online.notch.choice import Candidate, Choice, families, Family
-from ou_monitor.online.notch.law import HIGH, LOW, MotorLaw
-from ou_monitor.online.notch.spectrum import Frames
-from ou_monitor.online.notch.speeds import MotorSpeeds
+from ou_monitor.online.notch.choice import Candidate, Choice, families, Family, Frames
+from ou_monitor.online.notch.motors import HIGH, LOW, MotorLaw, MotorSpeeds
 import pytest
 
 NAN = math.nan
