@@ -7,17 +7,15 @@ import math
 import shlex
 
 from ou_monitor.analysis.analyze import Analysis, analyze
-from ou_monitor.analysis.data import as_data
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.relaxation import Relaxation
 from ou_monitor.analysis.words import (
-    brownout_sentence, caution, facts, headline, in_short, relaxation_sentence)
+    as_data, brownout_sentence, caution, facts, headline, in_short, relaxation_sentence)
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
     brownout_limit, check_outputs, part_of_recording, positive_number, read_given, repeated,
     throttle_levels)
-from ou_monitor.cli.output import facts_table, item, paragraph, table
-from ou_monitor.cli.progress import Progress
+from ou_monitor.cli.output import facts_table, item, paragraph, Progress, table
 from ou_monitor.errors import InputError
 from ou_monitor.records import Recording
 from ou_monitor.text import chance, number

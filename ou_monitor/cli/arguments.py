@@ -7,7 +7,7 @@ import math
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor.cli import output
-from ou_monitor.cli.progress import Progress
+from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
     brownout_limit, check_outputs, part_of_recording, read_given, repeated)
-from ou_monitor.cli.progress import Progress
+from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ou_monitor.cli import output
-from ou_monitor.cli.progress import Progress
+from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
 # Endings that OUT cannot have: a folder of that name would mislead.
@@ -48,9 +48,8 @@ def _check_place(out: Path, force: bool) -> None:
 def _convert(args: argparse.Namespace, log: Any) -> int:
     from dataclasses import replace
 
-    from ou_monitor.recordings.importers.choose import choose, drop_held
-    from ou_monitor.recordings.importers.extras import choose_extras
-    from ou_monitor.recordings.write_log import write_log
+    from ou_monitor.recordings.importers.choose import choose, choose_extras, drop_held
+    from ou_monitor.recordings.write import write_log
 
     chosen = choose(args.log, log, voltage=args.voltage, throttle=args.throttle,
                     current=args.current)
@@ -108,8 +107,7 @@ def _taken(chosen: Any, extras: Any) -> dict[str, dict[str, Any]]:
 
 def _list(args: argparse.Namespace, log: Any) -> int:
     import numpy as np
-    from ou_monitor.recordings.importers.choose import default
-    from ou_monitor.recordings.importers.extras import default_inertial
+    from ou_monitor.recordings.importers.choose import default, default_inertial
     from ou_monitor.recordings.importers.log import CURRENT, SIGNAL, THROTTLE, VOLTAGE
 
     taken = {quantity: [one.name for one in default(log, quantity)]

@@ -12,7 +12,7 @@ from typing import Any, TYPE_CHECKING
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
     brownout_limit, check_outputs, columns_given, part_of_recording, read_given, repeated)
-from ou_monitor.cli.progress import Progress
+from ou_monitor.cli.output import Progress
 from ou_monitor.coupling.coupling import (
     Coupling, estimate_coupling, facts, headline, parts, remarks)
 from ou_monitor.errors import InputError

@@ -14,7 +14,7 @@ from ou_monitor import __version__
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
     brownout_limit, check_outputs, part_of_recording, read_given, repeated)
-from ou_monitor.cli.progress import Progress
+from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
@@ -97,9 +97,9 @@ def model_text(finding: Finding, recording: Recording | None = None) -> str:
 
 def render(finding: Finding, known: Sequence[tuple[str, str]] = ()) -> str:
     """Return the finding for a terminal; known: what is known of the recording anyway."""
+    from ou_monitor.discovery.plain_names import headline, PLAIN_NAMES
     from ou_monitor.discovery.words import (
         cause_rows, crossing_words, MNAT, overlap_words, plain_model_words, plain_words)
-    from ou_monitor.discovery.plain_names import headline, PLAIN_NAMES
     from ou_monitor.text import number
 
     used = '' if finding.samples is None or finding.samples.n == finding.n else (

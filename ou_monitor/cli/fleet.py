@@ -14,7 +14,7 @@ from ou_monitor import __version__
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
     brownout_limit, positive_number, repeated, throttle_levels)
-from ou_monitor.cli.progress import Progress
+from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import check_outputs
-from ou_monitor.cli.progress import Progress
+from ou_monitor.cli.output import Progress
 
 if TYPE_CHECKING:
     from ou_monitor.paper.reproduce.reproduce import Reproduction

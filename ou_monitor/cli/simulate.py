@@ -8,7 +8,7 @@ from typing import Any
 
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import part_of_recording
-from ou_monitor.cli.progress import Progress
+from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError, nearest
 
 # From this rate on samples travel in blocks by default, Hz.

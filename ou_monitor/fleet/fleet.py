@@ -20,7 +20,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.fleet.analysis import is_result, Options, work
 from ou_monitor.fleet.find import duplicates, Found, Source
 from ou_monitor.fleet.judgement import judge, Judgement
-from ou_monitor.fleet.table import Row, rows_of, reason, write_whole
+from ou_monitor.fleet.table import reason, Row, rows_of, write_whole
 from ou_monitor.fleet.vehicles import assign, match_paths, number_flights
 from ou_monitor.fleet.workers import LocalWorkers, Workers
 from ou_monitor.records import NAN

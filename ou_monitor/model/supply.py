@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.load_start import LoadStart
+from ou_monitor.model.load import LoadStart
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import Term

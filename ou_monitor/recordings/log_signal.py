@@ -13,9 +13,8 @@ import re
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.importers.choose import choose
-from ou_monitor.recordings.importers.extras import (
-    clean_inertial, clean_speeds, default_inertial, IMU, named_series, pace_notes, SPEEDS)
+from ou_monitor.recordings.importers.choose import (
+    choose, clean_inertial, clean_speeds, default_inertial, IMU, named_series, pace_notes, SPEEDS)
 from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import clean, Log, Progress, Request, Series, SIGNAL
 from ou_monitor.records import FloatArray, Recording

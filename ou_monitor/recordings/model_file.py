@@ -17,7 +17,7 @@ import re
 from typing import Any
 
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.model.load_start import LoadStart
+from ou_monitor.model.load import LoadStart
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Term

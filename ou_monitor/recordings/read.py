@@ -108,7 +108,7 @@ def read_recording(
                                  'the series of a log')
         named_series = columns or CsvColumns()
         # Here, for bags and CSV need nothing of it.
-        from ou_monitor.recordings.write_log import log_as_bag
+        from ou_monitor.recordings.write import log_as_bag
         with log_as_bag(path, flight=flight, voltage=named_series.voltage,
                         throttle=named_series.throttle, progress=progress) as (bag, named):
             return named(read_recording(bag, start=start, end=end))

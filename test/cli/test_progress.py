@@ -2,7 +2,7 @@
 
 import io
 
-from ou_monitor.cli.progress import duration, Progress
+from ou_monitor.cli.output import duration, Progress
 import pytest
 
 

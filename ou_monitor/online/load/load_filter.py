@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.load import CELL, cells_in_series, INRUSH_TIME, LEVELS, SLOPES
-from ou_monitor.model.load_start import LoadStart, usual_coefficients
+from ou_monitor.model.load import (
+    CELL, cells_in_series, INRUSH_TIME, LEVELS, LoadStart, SLOPES, usual_coefficients)
 from ou_monitor.online.load.blocks import (
     Block, CLIP, DIVERGED, LoadBlocks, LoadDelay, LoadNoise, scored)
 from ou_monitor.online.load.current import CurrentFilter

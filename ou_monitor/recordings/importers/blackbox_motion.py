@@ -15,8 +15,8 @@ import struct
 from typing import Any
 
 import numpy as np
-from ou_monitor.recordings.importers.log import Series, SIGNAL, UNKNOWN
-from ou_monitor.recordings.importers.motion import DEGREE, GRAVITY, Inertial, MotorSpeeds, RPM
+from ou_monitor.recordings.importers.log import (
+    DEGREE, GRAVITY, Inertial, MotorSpeeds, RPM, Series, SIGNAL, UNKNOWN)
 from ou_monitor.records import FloatArray
 
 GYRO, UNFILTERED, DEBUG, ACCELEROMETER = 'gyroADC', 'gyroUnfilt', 'debug', 'accSmooth'

@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, from_start, Log, one_flight, quiet, quiet_process, Request, Series, SIGNAL, start_of,
-    THROTTLE, UNKNOWN, VOLTAGE)
-from ou_monitor.recordings.importers.motion import FRD_TO_FLU, Inertial, MotorSpeeds, RPM
+    CURRENT, FRD_TO_FLU, from_start, Inertial, Log, MotorSpeeds, one_flight, quiet, quiet_process,
+    Request, RPM, Series, SIGNAL, start_of, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import FloatArray
 from pymavlink import DFReader
 

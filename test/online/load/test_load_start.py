@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.model.load import LoadModel
-from ou_monitor.model.load_start import LoadStart
+from ou_monitor.model.load import LoadModel, LoadStart
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.online.load.load_filter import LoadFilter

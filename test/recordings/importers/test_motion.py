@@ -6,11 +6,10 @@ from made_logs import blackbox, Dataflash, px4_flight, quad, ulog
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.importers.extras import (
+from ou_monitor.recordings.importers.choose import (
     choose_extras, clean_inertial, pace_notes, topic_of)
 from ou_monitor.recordings.importers.formats import import_log
-from ou_monitor.recordings.importers.log import Log, Request, Series
-from ou_monitor.recordings.importers.motion import Inertial
+from ou_monitor.recordings.importers.log import Inertial, Log, Request, Series
 from ou_monitor.recordings.read import read_signal, signal_unit
 import pytest
 
