@@ -127,7 +127,6 @@ class SampleStream:
         self._voltage: Extractor | None = None
         self._throttle: Extractor | None = None
         self._block: BlockClock | None = None
-        self._block_rate: float | None = None
         self._throttle_block: BlockClock | None = None
         self._hold = ThrottleHold()
         # Stamps, voltages, arrivals and currents (NaN: not known) since the last flush.
@@ -148,7 +147,7 @@ class SampleStream:
         """Set where the voltage is in its messages."""
         self._voltage = extractor
         rate = extractor.spec.sample_rate
-        self._block, self._block_rate = None if rate is None else BlockClock(rate), rate
+        self._block = None if rate is None else BlockClock(rate)
         self._hold = ThrottleHold(rate)
 
     def open_throttle(self, extractor: Extractor) -> None:
@@ -192,10 +191,8 @@ class SampleStream:
             # What the extractor dropped goes on as NaN: the monitor counts it.
             values = _one_each(counts, values)
             counts = np.ones(ends.size, dtype=np.int64)
-            firsts = ends
         else:
             placed &= counts > 0
-            firsts = ends - (counts - 1) / (self._block_rate or 1.0)
         held = placed & (np.add.reduceat(np.append(np.isfinite(values), False).astype(np.int64),
                                          np.cumsum(counts) - counts) * (counts > 0) > 0)
         if not placed.all():
@@ -206,34 +203,34 @@ class SampleStream:
                 self._monitor.watch(values[lost], np.repeat(arrived, counts)[lost])
             values = values[np.repeat(placed, counts)]
             ends, own, counts = ends[placed], own[placed], counts[placed]
-            arrived, firsts, current = arrived[placed], firsts[placed], current[placed]
+            arrived, current = arrived[placed], current[placed]
         if not ends.size:
             return held
+        stamps = ends if self._block is None else self._block.stamps_of_many(ends, counts)
+        last = np.cumsum(counts) - 1
+        firsts, ends = stamps[last + 1 - counts], stamps[last]
+        columns = stamps, values, np.repeat(arrived, counts), np.repeat(current, counts)
+        # Blocks that come late are on one time line all the same: it goes back where it begins
+        # anew.
         before = np.concatenate(([self._newest], ends[:-1]))
         back = np.flatnonzero(firsts < before - BACK)
-        begin = 0
         if back.size:
             # Of several steps back within so short a time the last counts.
             begin = int(back[-1])
             at = int(counts[:begin].sum())
-            self._add(ends[:begin], own[:begin], counts[:begin], values[:at], arrived[:begin],
-                      current[:begin])
-            self.reset(f'stamps went back by {before[begin] - firsts[begin]:.3g} s')
-            values = values[at:]
-        self._add(ends[begin:], own[begin:], counts[begin:], values, arrived[begin:],
-                  current[begin:])
+            self._add(ends[:begin], own[:begin], *(column[:at] for column in columns))
+            self._begin_anew(f'stamps went back by {before[begin] - firsts[begin]:.3g} s')
+            self._add(ends[begin:], own[begin:], *(column[at:] for column in columns))
+        else:
+            self._add(ends, own, *columns)
         return held
 
-    def _add(self, ends: FloatArray, own: BoolArray, counts: npt.NDArray[np.int64],
-             values: FloatArray, arrived: FloatArray, current: FloatArray) -> None:
-        """Add messages whose stamps do not go back."""
+    def _add(self, ends: FloatArray, own: BoolArray, stamps: FloatArray, values: FloatArray,
+             arrived: FloatArray, current: FloatArray) -> None:
+        """Add messages whose stamps do not go back: two columns of them, and of their samples."""
         if not ends.size:
             return
-        stamps = ends if self._block is None else self._block.stamps_of_many(ends, counts)
-        if self._block is not None:
-            ends = stamps[np.cumsum(counts) - 1]
-        self._samples.append((stamps, values, np.repeat(arrived, counts),
-                              np.repeat(current, counts)))
+        self._samples.append((stamps, values, arrived, current))
         self._ends.append(ends)
         self._own.append(own)
         self._count += ends.size
@@ -295,14 +292,18 @@ class SampleStream:
 
     def reset(self, reason: str) -> None:
         """Clear the window: what came before belongs to another time line."""
+        self._begin_anew(reason)
+        if self._block is not None:
+            self._block.reset()
+
+    def _begin_anew(self, reason: str) -> None:
+        """Clear the window; blocks are on a new time line already."""
         self.flush()
         if not self._empty:
             self._monitor.reset(reason)
             self._empty = True
         self._newest = -math.inf
         self._hold.restart(self._last_throttle)
-        if self._block is not None:
-            self._block.reset()
 
 
 def _one_each(counts: npt.NDArray[np.int64], values: FloatArray) -> FloatArray:

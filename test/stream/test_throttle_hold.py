@@ -192,13 +192,15 @@ def recordings(draw):
 ONE = [('voltage', EPOCH * 10**9, EPOCH + 0.1, 1.0)]
 
 
-@settings(max_examples=60, deadline=None, derandomize=True,
+@settings(max_examples=60, deadline=None,
           suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(recordings())
 @example((ONE + [('throttle', EPOCH * 10**9 + 1, EPOCH + 0.05, 0.5)], (False, False), 'drop',
           set()))
 @example((ONE + [('throttle', EPOCH * 10**9 + 1, EPOCH + 0.05, 0.5)], (False, False), 'drop',
           {1}))
+@example(([('voltage', EPOCH * 10**9 + k, EPOCH + 0.1 - 0.09 * k, [4.0 * k + j for j in range(4)])
+           for k in range(2)], (True, False), 'drop', set()))
 def test_node_and_bench_pair_alike(tmp_path, drawn):
     """What the node knew when it handed a sample on is what the bench reads up to there."""
     messages, blocks, nan, flushes = drawn
