@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from ou_monitor.criticism.samples import Samples
 import pytest
 from scipy.linalg import expm, solve_continuous_lyapunov
 from term_examples import agrees, ALPHA, clusters, has_covariance, SIGMA, still, supply, term, U0
@@ -137,3 +138,18 @@ def test_level_is_lost():
     x = supply(term('ac_coupling', corner=10.0, offset=0.0), u0=U0 + 7.0).simulate(
         np.arange(50_000) * 1e-2, np.random.default_rng(7))
     assert abs(x.mean()) < 4.0 * math.sqrt(VAR / 50_000)
+
+
+def test_columns_of_the_mean_pass_as_levels_do():
+    """A constant is gone from the start, a step decays, and sums of columns stay sums."""
+    t = 0.01 * np.arange(200)
+    coupling = term('ac_coupling', corner=2.0, offset=1.7)
+    step = np.where(t >= 0.5, 1.0, 0.0)
+    columns = np.column_stack([np.full(t.size, 3.0), step, 3.0 - 2.0 * step])
+    shown = coupling.pass_through(columns, Samples(t, step, None).segment(ALPHA, SIGMA))
+    assert np.abs(shown[:, 0]).max() < 1e-12
+    rate = 4.0 * math.pi
+    ramp = -math.expm1(-0.01 * rate) / (0.01 * rate)
+    late = t >= 0.5 - 1e-9
+    np.testing.assert_allclose(shown[late, 1], ramp * np.exp(-rate * (t[late] - 0.5)), atol=1e-12)
+    np.testing.assert_allclose(shown[:, 2], -2.0 * shown[:, 1], atol=1e-12)

@@ -259,7 +259,7 @@ class AdaptiveLowPass:
         while k < stamps.size:
             many = self._many(stamps, signal, others, k, out)
             if not many:
-                many = min(WORTH, stamps.size - k)
+                many = WORTH
                 at = slice(k, k + many)
                 wide = [np.broadcast_to(one, stamps.shape)[at].tolist() for one in others]
                 out[at] = [self._step(*one) for one in zip(

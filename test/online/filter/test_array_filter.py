@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 from ou_monitor import AdaptiveLowPass
-from ou_monitor.online.filter.filter_state import filter_sequence, LowPassState
+from ou_monitor.online.filter.filter_state import filter_sequence, LowPassState, sound_piece
 import pytest
 from scipy import signal
 
@@ -160,3 +160,29 @@ def test_a_new_sigma_at_each_sample_costs_little():
     low_pass.filter(10.0 + np.arange(N) * 1e-3, sigma, sigma)
     assert (time.process_time() - begin) / N < 60e-6
     assert math.isfinite(low_pass.cutoff)
+
+
+@pytest.mark.parametrize('place, change, sound', [
+    (30, {}, 60), (30, {'dt': 4.9e-3}, 60), (30, {'dt': 6e-3}, 30), (30, {'dt': 0.21e-3}, 60),
+    (30, {'dt': 0.19e-3}, 30), (0, {'dt': 6e-3}, 0), (30, {'x': math.nan}, 30),
+    (30, {'x': 2e6}, 30), (0, {'x': math.inf}, 0), (30, {'t': math.nan}, 30)])
+def test_samples_that_are_sound_together(place, change, sound):
+    """Up to the first of another interval, by a factor of five of the mean, or of no number."""
+    dt, x = np.full(60, 1e-3), np.ones(60)
+    dt[place] = change.get('dt', 1e-3)
+    t = 7.0 + np.cumsum(dt)
+    x[place], t[place] = change.get('x', 1.0), change.get('t', t[place])
+    piece = sound_piece(t, x, 7.0, 1e-3, (1e6, 1e9, 1e-6))
+    assert piece[0] == sound and piece[1].size == piece[2].size == sound
+    assert np.allclose(piece[1], dt[:sound])
+    # The mean interval forgets over a hundred.
+    mean = 1e-3
+    for step, told in zip(piece[1], piece[2]):
+        mean += (step - mean) / 100.0
+        assert told == pytest.approx(mean, rel=1e-9)
+
+
+def test_no_interval_below_the_shortest():
+    """However even: below it stamps are no time."""
+    t = 7.0 + 1e-7 * np.arange(1, 31)
+    assert sound_piece(t, np.ones(30), 7.0, 1e-7, (1e6, 1e9, 1e-6))[0] == 0

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 from ou_monitor.online.risk.curve_filters import Squares
-from ou_monitor.online.risk.curves import Pool
+from ou_monitor.online.risk.curves import LearnedCurves, Pool
 import pytest
 from simulated_flights import fly, log_sigma, truth
 
@@ -84,3 +84,18 @@ def test_means_are_weighted_by_samples():
     assert (pool.n, pool.begin, pool.end) == (40, 0.0, 0.39)
     assert [pool.time, pool.voltage, pool.throttle, pool.apart] == pytest.approx(
         [0.4, 4.25, 0.35, 0.01])
+
+
+@pytest.mark.parametrize('step, even', [(1.0, True), (1.45, True), (1.6, False), (2.0, False),
+                                        (0.55, True), (0.45, False)])
+def test_a_sample_that_was_lost_is_no_even_step(step, even, monkeypatch):
+    """One step longer, or shorter, than half of the mean one, and squares are taken one by one."""
+    seen = []
+    monkeypatch.setattr(Squares, 'add', lambda self, *given: seen.append(given[5]))
+    curves = LearnedCurves()
+    n = 2000
+    dt = np.full(n, 1e-3)
+    dt[n // 2] *= step
+    t = np.cumsum(dt)
+    curves.update(t, np.full(n, 5.0), np.full(n, THROTTLE), truth(THROTTLE))
+    assert seen and set(seen) == {even}

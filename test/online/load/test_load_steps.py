@@ -1,0 +1,151 @@
+"""One step of the load's filters is one of a textbook Kalman filter; what its numbers say."""
+
+import copy
+import math
+
+import numpy as np
+from ou_monitor.model.load import LEVELS, SLOPES
+from ou_monitor.online.load import current as amps, load_filter as volts
+from ou_monitor.online.load.blocks import Block, CLIP
+from ou_monitor.online.load.current import CurrentFilter
+from ou_monitor.online.load.load_filter import LoadFilter
+from ou_monitor.online.load.supply_load import LAGS, LoadStatus, POWER, static
+import pytest
+
+
+def updated(m, P, h, e, total):
+    """Return mean and covariance after a scalar innovation of a variance."""
+    gain = P @ h / total
+    return m + gain * e, P - np.outer(gain, P @ h)
+
+
+def weighed(noise, e, s, R, rounding=0.0):
+    """Return the variance that an innovation is weighed by: scale, correlation, clipping."""
+    total = s + R * max(1.0, noise.scale) * (1.0 + noise.correlation) / (1.0 - noise.correlation)
+    total += rounding
+    return total * max(1.0, abs(e) / math.sqrt(total) / CLIP)
+
+
+def block(t, v, u=math.nan, x=math.nan):
+    """Return a block of one sample."""
+    return Block(t, t, v, u, x, 1, math.nan)
+
+
+@pytest.mark.parametrize('off', [0.02, -0.05, 3.0])
+def test_a_block_with_current(off):
+    """Charge drawn, polarisation, walks and gain, and a voltage far out weighed down."""
+    one = CurrentFilter()
+    rng = np.random.default_rng(2)
+    for k in range(60):
+        one.take(block(0.05 * k, 15.0 + 0.02 * rng.standard_normal(), x=20.0 + 10.0 * (k % 7 == 0)
+                       ), 4.0, fresh=False)
+    before, noise = copy.deepcopy(one), copy.deepcopy(one.noise)
+    dt, x = 0.1, 25.0 / before._unit
+    m, P = before._m, before._P
+    lags = [x + (low - x) * math.exp(-dt / tau) for low, tau in zip(before._lags, (2.0, 15.0))]
+    F = np.eye(5)
+    F[0, 1] = -x * dt * 4.0 * float(np.interp(m[0] / 4.0, LEVELS, SLOPES))
+    change = amps._CHANGE * before._volts ** 2
+    Q = np.diag([(amps._WALK * 4.0) ** 2, 0.0, change, change, change]) * dt
+    m, P = F @ m, F @ P @ F.T + Q
+    h = np.array([1.0, 0.0, -x, -lags[0], -lags[1]])
+    v = float(h @ m) + off
+    m, P = updated(m, P, h, off, weighed(noise, off, float(h @ P @ h),
+                                         noise.variance(0.0, 0.0, 1)))
+    one.take(block(before._t + dt, v, x=25.0), 4.0, fresh=False)
+    np.testing.assert_allclose(one._m, m, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(one._P, P, rtol=1e-7, atol=1e-12)
+    assert one._lags == pytest.approx(lags, rel=1e-12)
+
+
+def test_a_current_filter_that_diverged_begins_anew():
+    """A variance that is none, as after rounding at megavolts, leaves nothing behind."""
+    one = CurrentFilter()
+    for k in range(20):
+        one.take(block(0.05 * k, 15.0, x=20.0), 4.0, fresh=False)
+    one._P[0, 0] = 1e13
+    one.take(block(1.0, 14.0, x=20.0), 4.0, fresh=False)
+    fresh = CurrentFilter()
+    fresh.take(block(1.0, 14.0, x=20.0), 4.0, fresh=False)
+    np.testing.assert_array_equal(one._P, fresh._P)
+    np.testing.assert_array_equal(one._m, fresh._m)
+    assert one.level == fresh.level and math.isnan(one.score)
+
+
+def flown(throttles=(0.2, 0.6)):
+    """Return a filter that has seen a few seconds of a pack of 15 V."""
+    loads = LoadFilter()
+    rng = np.random.default_rng(4)
+    for k in range(200):
+        u = throttles[k // 20 % len(throttles)]
+        loads._take(block(0.02 * k, 15.0 - u + 0.02 * rng.standard_normal(), u))
+    return loads
+
+
+@pytest.mark.parametrize('off', [0.02, -0.1, 5.0])
+@pytest.mark.parametrize('dt', [0.02, 5.0])
+def test_a_block_with_throttle(off, dt):
+    """Charge drawn, the lags, walks and gain; a gap lets the pack recover."""
+    loads = flown()
+    u = loads._throttle
+    before, noise = copy.deepcopy(loads), copy.deepcopy(loads._noise)
+    m, P, cells = before._m, before._P, before._cells
+    x = u ** POWER
+    lagged = u + (before._lagged - u) * math.exp(-dt / 0.004)
+    x = lagged ** POWER
+    F, Q = np.eye(9), np.zeros((9, 9))
+    F[0, 1] = -x * dt * before._fall(float(m[0]))
+    m, P = F @ m, F @ P @ F.T
+    factor = before._factor + ((min(4.3, max(3.2, m[0] / cells)) / 3.8) ** 0.8
+                               - before._factor) * -math.expm1(-dt / 30.0)
+    Q[0, 0] = (0.0015 * cells) ** 2 * dt + (0.02 * before._volts) ** 2 * max(0.0, dt - 2.0) / 60.0
+    Q[2:, 2:] = dt * (0.25 ** 2 / 100.0 * np.outer(m[2:], m[2:]) + np.eye(7)
+                      * 0.02 ** 2 / 100.0 * (volts._SIZE * before._volts) ** 2)
+    P = P + Q
+    lags = [x + (low - x) * math.exp(-dt / tau) for low, tau in zip(before._lags, LAGS)]
+    settled = lagged + (before._settled - lagged) * math.exp(-dt / 0.02)
+    h = np.array([1.0, 0.0, *(-factor * y for y in (
+        lagged ** POWER, lagged, lagged ** 3, *lags, max(lagged - settled, 0.0)))])
+    v = float(h @ m) + off
+    noise.see(v)
+    m, P = updated(m, P, h, off, weighed(noise, off, float(h @ P @ h),
+                                         noise.variance(u, 0.0, 1), noise.rounding))
+    loads._take(block(before._t + dt, v, u))
+    np.testing.assert_allclose(loads._m, m, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(loads._P, P, rtol=1e-6, atol=1e-12)
+    assert loads._lags == pytest.approx(lags, rel=1e-12)
+
+
+def test_a_load_filter_that_diverged_begins_anew():
+    """As that of the current."""
+    loads = flown()
+    loads._P[0, 0] = 1e13
+    loads._take(block(loads._t + 0.02, 12.0, loads._throttle))
+    fresh = LoadFilter()
+    fresh._take(block(0.0, 12.0, loads._throttle))
+    np.testing.assert_array_equal(loads._P, fresh._P)
+    np.testing.assert_array_equal(loads._m, fresh._m)
+
+
+@pytest.mark.parametrize('sag, error, status', [
+    (1.0, 0.1, LoadStatus.KNOWN), (1.0, 0.30, LoadStatus.KNOWN),
+    (1.0, 0.36, LoadStatus.UNCERTAIN), (1.0, 1.0, LoadStatus.UNCERTAIN),
+    (-1.0, 0.45, LoadStatus.NO_RELATION), (-1.0, 0.55, LoadStatus.UNCERTAIN),
+    (0.0, 0.004, LoadStatus.NO_RELATION), (0.01, 0.004, LoadStatus.KNOWN),
+    (0.0, 0.2, LoadStatus.UNCERTAIN)])
+def test_what_is_said_of_the_sag(sag, error, status):
+    """
+    By the fall over the throttle flown, V, and its error.
+
+    Known to a third of itself or to half the noise (20 mV); below zero by two errors, or less
+    than two errors though these are small, is no relation.
+    """
+    loads = flown()
+    low, high = loads._between(0.1)
+    reach = float(static(high)[0] - static(low)[0]) * loads._factor
+    loads._m[2:], loads._P[:] = 0.0, 0.0
+    loads._m[2], loads._P[2, 2] = sag / reach, (error / reach) ** 2
+    loads._noise.b[:] = math.log(0.02 ** 2), 0.0, 0.0
+    loads._noise.scale, loads._noise._within = 1.0, 0.0
+    loads._noise._step = math.inf
+    assert loads.load().status is status
