@@ -174,6 +174,31 @@ def test_no_thread_holds_up_the_end(tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (3, 'done at exit\n', '')
 
 
+def test_a_middleware_that_does_not_let_go_is_left(tmp_path):
+    """Nothing of Python runs while it waits, as for a lock that a stopped process holds."""
+    code = ('import ctypes\n'
+            'from ou_monitor.nodes import run\n'
+            'from rclpy.node import Node\n'
+            'run.END = 0.2\n'
+            'class Stuck(Node):\n'
+            '    def destroy_node(self):\n'
+            '        print("ending", flush=True)\n'
+            # Unlike CDLL it keeps the interpreter's lock.
+            '        ctypes.PyDLL(None).sleep(1000)\n'
+            'def work():\n'
+            '    def make():\n'
+            '        node = Stuck("stuck")\n'
+            '        node.context.try_shutdown()\n'
+            '        return node\n'
+            '    return run.spin(make)\n'
+            'run.run_node("stuck", "about", work)\n')
+    env = {**os.environ, 'PYTHONPATH': str(ROOT), 'ROS_LOG_DIR': str(tmp_path),
+           'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
+    done = subprocess.run([sys.executable, '-c', code], env=env, capture_output=True, text=True,
+                          timeout=DEADLINE)
+    assert (done.returncode, done.stdout) == (-signal.SIGALRM, 'ending\n')
+
+
 def test_the_log_file_has_the_last_lines(world, tmp_path):
     """What was said just before a signal is in the file too."""
     process = world.start('estimator', '--ros-args', '-p', 'no_such.parameter:=3')
