@@ -48,8 +48,8 @@ def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> in
     # rclpy ends the context on SIGINT and SIGTERM and then calls the handler that was there
     # before.  Python's own would raise KeyboardInterrupt inside whatever callback runs, and the
     # EventsExecutor turns that into SystemError: so ours only notes the signal.  While modules
-    # are still being loaded there is nothing to be ended in order: the process ends at once.  While
-    # a node is being made no callback runs, and what is made of it is left as for any error.
+    # are still being loaded there is nothing to be ended in order: the process ends at once.
+    # While a node is being made no callback runs, and it is left as for any error.
     stopped: list[int] = []
     _loading.set()
 
