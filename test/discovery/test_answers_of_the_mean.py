@@ -1,9 +1,11 @@
 """What the regression of the mean counts as alike, as next to each other, as a candidate."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
-from ou_monitor.discovery.regression import _candidates, _nearby, _there
+from ou_monitor.discovery import decision, regression
+from ou_monitor.discovery.regression import _candidates, _lost, _nearby, _Regression, _there, FOLDS
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.drift import Drift
 from ou_monitor.model.terms.load_sag import LoadSag
@@ -43,3 +45,97 @@ def test_candidates_are_measured_causes_of_the_mean(throttle):
     wanted = {kind for kind in catalogue().values() if kind.ROLE is Role.MEAN and kind.MEASURED
               and (throttle is not None or not kind.NEEDS_THROTTLE)}
     assert kinds == wanted and (LoadSag in kinds) is (throttle is not None)
+
+
+N = 1200
+
+
+def made(pool, columns, voltage, monkeypatch):
+    """Return the regression of a voltage on 1 and on the columns of each term of a pool."""
+    through = np.column_stack([voltage, np.ones(N), *columns])
+    monkeypatch.setattr(regression, 'whitened', lambda *given: through.copy())
+    model = SimpleNamespace(terms=(), events=None, offset=None)
+    return _Regression(SimpleNamespace(n=N), model, pool), through
+
+
+def squares(through, at, fitted, scored):
+    """Return half the squares that least squares on some rows leaves on others."""
+    beta = np.linalg.lstsq(through[np.ix_(fitted, at)], through[fitted, 0], rcond=None)[0]
+    rest = through[scored, 0] - through[np.ix_(scored, at)] @ beta
+    return 0.5 * float(rest @ rest)
+
+
+@pytest.fixture
+def driven():
+    """Return a pool of terms, their columns, and a voltage that two of them make."""
+    rng = np.random.default_rng(5)
+    u = np.repeat(rng.random(N // 20), 20)
+    slow = [np.convolve(u, np.exp(-np.arange(400) / tau) / tau)[:N] for tau in (20.0, 30.0, 300.0)]
+    pool = [LoadSag(0.1, 0.0), answer(0.2), answer(0.3), answer(3.0), Drift(0.1, 0.0)]
+    columns = [np.column_stack([u, u * u][:len(pool[0].LINEAR)]), *slow,
+               np.column_stack([np.linspace(-1.0, 1.0, N), np.linspace(-1.0, 1.0, N) ** 2][
+                   :len(pool[4].LINEAR)])]
+    columns = [column.reshape(N, -1) for column in columns]
+    voltage = 3.0 - 4.0 * u - 6.0 * slow[0] + rng.standard_normal(N)
+    return pool, columns, voltage
+
+
+def test_evidence_is_the_less_of_price_and_blocks_kept_back(driven, monkeypatch):
+    """By least squares on the rows themselves; what was searched for is taken off."""
+    pool, columns, voltage = driven
+    found, through = made(pool, columns, voltage, monkeypatch)
+    ends = np.cumsum([2, *(len(term.LINEAR) for term in pool)])
+    everything = np.arange(N)
+    blocks = np.array_split(everything, FOLDS)
+    for chosen in ((), (0,), (0, 1), (1, 3, 4)):
+        at = np.concatenate([[1], *(np.arange(ends[k], ends[k + 1]) for k in chosen)]).astype(int)
+        whole = squares(through, at, everything, everything) + 0.5 * math.log(N) * at.size
+        kept = sum(squares(through, at, np.setdiff1d(everything, block), block)
+                   for block in blocks)
+        search = sum(pool[k].SEARCH for k in chosen)
+        assert found._value(chosen) == pytest.approx(-max(whole, kept) - search, rel=1e-6)
+    gram = through.T @ through
+    assert _lost(gram, gram, np.array([1, 2])) == pytest.approx(
+        squares(through, np.array([1, 2]), everything, everything), rel=1e-6)
+
+
+@pytest.mark.parametrize('start', [(), (4,), (0, 3), (0, 1, 3, 4)])
+def test_the_search_ends_at_what_made_the_voltage(driven, start, monkeypatch):
+    """From any start: sag and one lag, the one that is worth more first, none of them free."""
+    pool, columns, voltage = driven
+    found, _ = made(pool, columns, voltage, monkeypatch)
+    answered = found.search(start)
+    assert {type(term) for term in answered.terms} == {LoadSag, LoadTransient}
+    (lag,) = (term for term in answered.terms if isinstance(term, LoadTransient))
+    assert lag.tau in (0.2, 0.3) and answered.worth[0] >= answered.worth[1] > 3.0
+    chosen = tuple(sorted(pool.index(term) for term in answered.terms))
+    for k, worth in zip((pool.index(term) for term in answered.terms), answered.worth):
+        assert worth == pytest.approx(found._value(chosen) - found._value(found._less(chosen, k)))
+    # A lag nearby in its place is no better.
+    assert found._best_exchange(chosen, found._value(chosen)) is None
+    (other,) = {1, 2} - set(chosen)
+    worse = tuple(sorted((0, other)))
+    if found._value(chosen) > found._value(worse) + 0.1:
+        assert found._best_exchange(worse, found._value(worse)) == chosen
+
+
+def test_one_of_a_kind_unless_there_may_be_several(driven, monkeypatch):
+    """Lags add up, a second sag takes the place of the first."""
+    pool, columns, voltage = driven
+    found, _ = made([*pool, LoadSag(0.2, 0.0)], [*columns, columns[0]], voltage, monkeypatch)
+    assert LoadTransient.SEVERAL and not LoadSag.SEVERAL
+    assert found._with((0, 1), 3) == (0, 1, 3) and found._with((0, 1), 5) == (1, 5)
+    assert found._one_of_a_kind([0, 1, 5, 4]) == (1, 4, 5)
+    assert found._less((0, 1, 4), 1) == (0, 4)
+    # Two that are the same are rivals only of another kind.
+    assert found._rivals((1, 5), 5) == ()
+
+
+def test_another_cause_that_does_as_well_is_a_rival(driven, monkeypatch):
+    """Within a tie of the evidence, in the place of the one."""
+    pool, columns, voltage = driven
+    found, _ = made([pool[0], pool[4]], [columns[0], columns[0]], voltage, monkeypatch)
+    near = abs(found._value((0,)) - found._value((1,)))
+    assert near < decision.TIE and found._rivals((0,), 0) == ('drift',)
+    found, _ = made([pool[0], pool[4]], [columns[0], columns[4]], voltage, monkeypatch)
+    assert found._rivals((0,), 0) == ()

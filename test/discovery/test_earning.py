@@ -1,0 +1,151 @@
+"""Which causes are left out, one after the other: tables, with fits and scores that are given."""
+
+from types import SimpleNamespace
+
+import numpy as np
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.discovery import earning
+from ou_monitor.discovery.earning import Earned, earned, group_of, MANY, refusal, Worth
+from ou_monitor.model.terms.drift import Drift
+from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.second_relaxation import SecondRelaxation
+from ou_monitor.model.terms.tone import Tone
+import pytest
+
+BASE = OU(50.0, 0.5, 5.0)
+KINDS = {'measurement_noise': MeasurementNoise(0.01),
+         'second_relaxation': SecondRelaxation(3.0, 0.1), 'drift': Drift(0.1, 0.0),
+         'tone': Tone(0.01, 10.0, 0.0, 0.0)}
+
+
+def scored_model(*names):
+    """Return a model with these causes, as it is scored."""
+    return SimpleNamespace(model=SimpleNamespace(terms=(BASE, *(KINDS[n] for n in names))))
+
+
+def state_of(*names, sizes=()):
+    """Return a state in which each cause may be left out alone."""
+    worth = [Worth(0.1, 0.01, 0.0, 1, scored_model(*names[:k], *names[k + 1:]))
+             for k in range(len(names))]
+    return Earned(scored_model(*names), list(names), worth)
+
+
+@pytest.mark.parametrize('names, worst, less, size, left, out', [
+    (['drift', 'tone'], 0, ['tone'], 1, ['tone'], ['drift']),
+    # What the rest does not hold any more goes with it.
+    (['drift', 'tone', 'measurement_noise'], 1, ['drift'], 1, ['drift'],
+     ['measurement_noise', 'tone']),
+    # One of several alone, or all of them together.
+    (['tone', 'drift', 'tone'], 0, ['drift', 'tone'], 1, ['drift', 'tone'], ['tone']),
+    (['tone', 'drift', 'tone', 'tone', 'tone'], 0, ['drift'], 4, ['drift'], ['tone'])])
+def test_what_goes_with_a_cause(names, worst, less, size, left, out):
+    """Names and model go on without it."""
+    state = state_of(*names)
+    rest = scored_model(*less)
+    state.worth[worst] = Worth(0.0, 1.0, 1.0, size, rest)
+    earning._leave_out(state, worst)
+    assert state.names == left and sorted(state.out) == out and state.full is rest
+
+
+def test_many_of_a_kind_are_one_group():
+    """Up to three lines have a gain each, from four on one together."""
+    few, many = ['tone'] * (MANY - 1) + ['drift'], ['tone', 'drift'] + ['tone'] * (MANY - 1)
+    model = scored_model(*few).model
+    assert [group_of(model, few, k) for k in range(MANY)] == [(1,), (2,), (3,), (4,)]
+    model = scored_model(*many).model
+    assert group_of(model, many, 0) == group_of(model, many, 3) == (1, 3, 4, 5)
+    assert group_of(model, many, 1) == (2,)
+
+
+def run(monkeypatch, values, names):
+    """Return what is left, with (gain, chance) of each cause in each round; error 0.01."""
+    rounds = iter(values)
+    monkeypatch.setattr(earning, 'held_out', lambda samples, model: scored_model(*names))
+    monkeypatch.setattr(earning, '_straying', lambda samples, state: None)
+    monkeypatch.setattr(earning, '_as_trend', lambda *given: False)
+
+    def measure(samples, state, plain, scored, progress):
+        table = next(rounds)
+        for k, name in enumerate(state.names):
+            gain, chance = table[name]
+            rest = [one for j, one in enumerate(state.names) if j != k]
+            state.worth.append(Worth(gain, 0.01, chance, 1, scored_model(*rest)))
+
+    monkeypatch.setattr(earning, '_measure', measure)
+    return earned(None, None, names, None, None, lambda share: None)
+
+
+def test_the_worst_goes_first_and_the_others_are_measured_again(monkeypatch):
+    """By chance, then by gain; a cause that failed beside a worse one may stay."""
+    found = run(monkeypatch, [
+        {'drift': (-0.1, 0.9), 'tone': (-0.2, 0.9), 'measurement_noise': (-0.3, 0.5)},
+        {'drift': (0.5, 0.0), 'measurement_noise': (-0.3, 0.5)},
+        {'drift': (0.5, 0.0)}], ['drift', 'tone', 'measurement_noise'])
+    assert found.names == ['drift'] and found.out == ['tone', 'measurement_noise']
+    assert [worth.gain for worth in found.worth] == [0.5]
+
+
+def test_after_four_rounds_what_is_left_stays(monkeypatch):
+    """Even if it fails."""
+    names = ['drift', 'tone', 'measurement_noise', 'second_relaxation']
+    bad = dict.fromkeys(names, (-0.1, 0.9))
+    found = run(monkeypatch, [bad] * 4, names)
+    assert len(found.names) == 1 and len(found.out) == 3
+
+
+@pytest.mark.parametrize('full, less, gains, out', [
+    (0.0, (0.0, 0.0), (0.1, 0.2), None), (1.0, (0.0, 1.0), (0.2, 0.1), 0),
+    (1.0, (1.0, 0.0), (0.1, 0.2), 1), (1.0, (0.0, 0.0), (0.2, 0.1), 1),
+    (1.0, (2.0, 0.5), (0.1, 0.2), None)])
+def test_the_cause_by_which_simulations_stray(full, less, gains, out, monkeypatch):
+    """Of those without which they stay within what was seen, the one that costs least."""
+    state = state_of('tone', 'measurement_noise')
+    state.worth = [Worth(gain, 0.01, 0.0, 1, worth.less)
+                   for gain, worth in zip(gains, state.worth)]
+    far = {state.full.model.terms: full,
+           **{worth.less.model.terms: by for worth, by in zip(state.worth, less)}}
+    monkeypatch.setattr(earning, '_far', lambda samples, terms: np.full(3, far[terms]))
+    assert earning._straying(None, state) == out
+
+
+def test_a_model_that_cannot_be_simulated_strays_without_bound(monkeypatch):
+    """An answer of the mean is never the one that is left out for it."""
+    def far(samples, terms):
+        if any(term.NAME == 'tone' for term in terms):
+            raise ValueError('runs away')
+        return np.zeros(3)
+
+    monkeypatch.setattr(earning, '_far', far)
+    assert earning._straying(None, state_of('drift', 'tone')) == 1
+    assert earning._straying(None, state_of('drift')) is None
+
+
+def test_how_far_simulations_leave_what_was_seen():
+    """Nothing where the model is that of the samples; its level by 2 V, less the margin."""
+    rng = np.random.default_rng(3)
+    t = 1e-3 * np.arange(3000)
+    v = 5.0 + 0.05 * rng.standard_normal(t.size)
+    samples = Samples(t, v, None)
+    still = earning._far(samples, [OU(60.0, 0.5, 5.0)])
+    assert still.shape == (16,) and (still == 0.0).all()
+    away = earning._far(samples, [OU(60.0, 0.5, 7.0)])
+    seen = v.max() - v.min()
+    assert away == pytest.approx(np.full(16, 7.0 - v.max() - 0.5 * seen), abs=0.25)
+    assert (earning._far(samples, [OU(60.0, 0.5, 7.0)]) == away).all()
+
+
+@pytest.mark.parametrize('gain, far, said', [
+    (0.1, 0.0, ''), (-0.1, 0.0, 'worse than the plain OU'), (float('nan'), 0.0, ''),
+    (0.1, 0.25, 'by 0.25 V'), (0.1, float('inf'), 'without bound'),
+    (0.1, None, 'cannot be simulated (runs away)')])
+def test_why_a_model_has_not_earned_its_place(gain, far, said, monkeypatch):
+    """Its gain first, then its simulations."""
+    def given(samples, terms):
+        if far is None:
+            raise ValueError('runs away')
+        return np.array([0.0, far])
+
+    monkeypatch.setattr(earning, '_far', given)
+    text = refusal(None, (BASE,), gain, 0.01)
+    assert said in text and bool(text) is bool(said)
