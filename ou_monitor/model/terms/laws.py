@@ -144,39 +144,49 @@ def curvature_se(value: Callable[[FloatArray], float], at: FloatArray, step: flo
     return errors
 
 
-def refine(value: Callable[[FloatArray], float], start: Sequence[float] | FloatArray,
+def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | FloatArray,
            step: float = 0.1) -> tuple[FloatArray, float, FloatArray] | None:
     """
-    Maximise a function from near its top (Newton's steps); None where it is not near.
+    Maximise a function from near its top (Newton's steps); None where it has no value.
 
-    Returns where, how much, and standard errors as `curvature_se`.
+    `values` takes points, shape (points, parameters), side by side.  Returns where, how much,
+    and standard errors as `curvature_se`.
     """
     x = np.asarray(start, dtype=np.float64)
-    moves = step * np.eye(x.size)
-    for _ in range(_NEWTON):
-        top = value(x)
-        up = np.array([value(x + move) for move in moves])
-        down = np.array([value(x - move) for move in moves])
-        if not np.isfinite([top, *up, *down]).all():
+    size = x.size
+    moves, pairs = step * np.eye(size), np.triu_indices(size, 1)
+    both = moves[pairs[0]] + moves[pairs[1]]
+    around = np.concatenate(([np.zeros(size)], moves, -moves, both, -both))
+    turn = 0
+    while True:
+        found = values(x + around)
+        if not np.isfinite(found).all():
             return None
+        top, up, down = found[0], found[1:size + 1], found[size + 1:2 * size + 1]
         gradient, bend = (up - down) / (2.0 * step), np.diag((up - 2.0 * top + down) / step**2)
-        for i, j in zip(*np.triu_indices(x.size, 1)):
-            both = value(x + moves[i] + moves[j])
-            bend[i, j] = bend[j, i] = (both - up[i] - up[j] + top) / step**2
-        if not np.isfinite(bend).all() or np.linalg.eigvalsh(bend)[-1] >= 0.0:
+        # From both sides: a third derivative would tilt what one side says.
+        sides = found[2 * size + 1:].reshape(2, -1).sum(axis=0)
+        alone = up + down - top
+        bend[pairs] = (sides - alone[pairs[0]] - alone[pairs[1]]) / (2.0 * step**2)
+        bend += np.triu(bend, 1).T
+        curve, axes = np.linalg.eigh(bend)
+        if curve[0] >= 0.0:
             return None
-        by = np.linalg.solve(-bend, gradient)
-        if 0.5 * float(by @ gradient) < _FLAT:
-            return x, top, np.sqrt(1.0 / -np.diag(bend))
-        further = x + np.clip(by, -0.5, 0.5)
-        if value(further) <= top:
-            return None
-        x = further
-    return None
+        # Uphill along each axis, also where it bends the other way.
+        by = axes @ (axes.T @ gradient / np.maximum(np.abs(curve), _STRAIGHT * -curve[0]))
+        gain = 0.5 * float(by @ gradient)
+        ends = x + np.clip(by, -0.5, 0.5) * _SHARES[:, None]
+        further = values(ends) if gain >= _FLAT and turn < _NEWTON else found[:1]
+        if not further.max() > top:
+            return x, float(top), np.sqrt(1.0 / np.maximum(-np.diag(bend), 1e-300))
+        x, turn = ends[int(np.argmax(further))], turn + 1
 
 
-# Newton's steps at most, and nats below which one is none.
-_NEWTON, _FLAT = 4, 0.05
+# Newton's steps at most, nats below which one is none, shares of one that are tried, and the least
+# curvature, as a share of the largest.
+_NEWTON, _FLAT = 5, 0.05
+_SHARES = np.array([1.0, 0.4, 0.1])
+_STRAIGHT = 1e-3
 
 
 def mixture_cdf(z: FloatArray, weight: FloatArray, mean: FloatArray, std: FloatArray

@@ -13,8 +13,7 @@ from ou_monitor.model.terms.laws import (
 from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
 from ou_monitor.model.terms.term import Live, parameter, Role, Term
 from ou_monitor.records import FloatArray
-from scipy.special import ndtr
-from scipy.stats import binom
+from scipy.special import comb, digamma, ndtr
 
 
 @dataclass(frozen=True)
@@ -72,12 +71,21 @@ class Volatility(Term):
         span = size / view.rate
         trained = view.train.stop // size
 
-        def value(x: FloatArray) -> float:
-            if not (-4.0 < x[0] < 1.0 and -7.0 < x[1] < 5.0):
-                return -math.inf
-            return float(_grid(squares[:trained], sizes[:trained], span, x)[1].sum())
+        def values(points: FloatArray) -> FloatArray:
+            found = np.full(points.shape[0], -math.inf)
+            inside = np.flatnonzero((np.abs(points[:, 0] + 1.5) < 2.5)
+                                    & (np.abs(points[:, 1] + 1.0) < 6.0))
+            # Those of one rate share the chances from level to level.
+            for rate in np.unique(points[inside, 1]).tolist():
+                at = inside[points[inside, 1] == rate]
+                found[at] = _grid(squares[:trained], sizes[:trained], span, points[at])[1].sum(
+                    axis=0)
+            return found
 
-        near = refine(value, start) if known else None
+        def value(x: FloatArray) -> float:
+            return float(values(x[None])[0])
+
+        near = refine(values, start) if known else None
         if near is not None:
             x, _, e = near
         else:
@@ -85,7 +93,7 @@ class Volatility(Term):
             if top == -math.inf:
                 return None
             e = curvature_se(value, x)
-        before, density, levels = _grid(squares, sizes, span, x)
+        before, density, levels = (one[..., 0] for one in _grid(squares, sizes, span, x[None]))
         scores = _scores(view.z, before, levels, size)[:view.z.size]
         gain = np.repeat((density + 0.5 * squares) / sizes, size)[:view.z.size]
         term = cls(math.exp(x[0]), math.exp(x[1]))
@@ -128,7 +136,9 @@ def _start(view: View) -> FloatArray:
     far = next((lag for lag in lags if covariance(lag) < 0.6 * near), lags[-1] if lags else 0)
     fall = math.log(near / max(covariance(far), 0.05 * near)) if far else 1.0
     rate = max(fall, 0.02) / (max(far - 1, 1) * size / view.rate)
-    return np.array([0.5 * math.log(near), min(math.log(rate), 4.0), float(log.mean())])
+    # The mean of the logarithm of a chi square is below the logarithm of its mean.
+    below = 0.5 * (float(digamma(0.5 * size)) - math.log(0.5 * size))
+    return np.array([0.5 * math.log(near), min(math.log(rate), 4.0), float(log.mean()) - below])
 
 
 def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) -> FloatArray:
@@ -157,6 +167,8 @@ _EVERY = 4
 # Relaxations of ln sigma in a recording, from which its variance is known to a factor of e:
 # sqrt(2/2) = 1.
 _WANDERS = 2.0
+# Chances of the levels.
+_STATIONARY: FloatArray = comb(_LEVELS - 1, np.arange(_LEVELS)) / 2.0 ** (_LEVELS - 1)
 # Evaluations of a fit from afar and from nearby; chance below which a level counts as none.
 _EVALUATIONS = 60, 30
 _BELIEVED = 1e-9
@@ -185,21 +197,29 @@ def _rouwenhorst(keep: float) -> FloatArray:
     return chances
 
 
-def _grid(squares: FloatArray, sizes: FloatArray, span: float, x: FloatArray
+def _grid(squares: FloatArray, sizes: FloatArray, span: float, points: FloatArray
           ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the law of the level before each segment, its log density, and the levels."""
+    """
+    Return the law of the level before each segment, its log density, and the levels.
+
+    Of all points, shape (points, 3), which have one rate, side by side: they are the last axis.
+    """
     reach = math.sqrt(_LEVELS - 1.0)
-    levels = x[2] + math.exp(x[0]) * np.linspace(-reach, reach, _LEVELS)
-    kernel = _rouwenhorst(math.exp(-math.exp(x[1]) * span))
-    law = binom.pmf(np.arange(_LEVELS), _LEVELS - 1, 0.5)
-    log_density = -sizes[:, None] * levels - 0.5 * squares[:, None] * np.exp(-2.0 * levels)
-    top = log_density.max(axis=1)
-    weight = np.exp(log_density - top[:, None])
-    before = np.empty((squares.size, _LEVELS))
+    std = np.exp(points[:, :1])
+    levels = points[:, 2:] + std * np.linspace(-reach, reach, _LEVELS)
+    kernel = _rouwenhorst(math.exp(-math.exp(float(points[0, 1])) * span))
+    weight = -0.5 * squares[:, None, None] * np.exp(-2.0 * levels)
+    weight -= sizes[:, None, None] * levels
+    top = weight.max(axis=2)
+    weight -= top[:, :, None]
+    np.exp(weight, out=weight)
+    before = np.empty_like(weight)
+    law = np.tile(_STATIONARY, (points.shape[0], 1))
     for k, row in enumerate(weight):
         before[k] = law
         law = (law * row) @ kernel
         if k % _EVERY == 0:
-            law /= law.sum()
-    before /= before.sum(axis=1, keepdims=True)
-    return before, np.log((before * weight).sum(axis=1)) + top, levels
+            law /= law.sum(axis=1, keepdims=True)
+    before /= before.sum(axis=2, keepdims=True)
+    density = np.log(np.einsum('kpl,kpl->kp', before, weight)) + top
+    return before.transpose(0, 2, 1), density, levels.T
