@@ -60,12 +60,15 @@ class Samples:
         Stamps, s, rising, and V.
     throttle : ndarray, shape (n,), or None
         0..1; None when it says nothing (unknown, or constant).
+    longer : Samples, or None
+        Samples that begin with these.
 
     """
 
     t: FloatArray
     voltage: FloatArray
     throttle: FloatArray | None
+    longer: Samples | None = None
 
     @property
     def n(self) -> int:
@@ -86,11 +89,31 @@ class Samples:
         """Return a part, or all with another voltage."""
         v = self.voltage if voltage is None else voltage
         return Samples(self.t[part], v[part],
-                       None if self.throttle is None else self.throttle[part])
+                       None if self.throttle is None else self.throttle[part],
+                       self.longer or self if slice(None, part.stop) == part else None)
+
+    def columns(self, term: Term) -> FloatArray:
+        """Return the columns of a term of the mean, computed once, as none looks ahead."""
+        source = self.longer or self
+        # Its coefficients apart, a term has the same columns again and again.
+        unit = term.with_linear([1.0] * len(term.LINEAR))
+        if unit not in source._known:
+            source._known[unit] = unit.columns(source.segment(1.0, 0.0))
+        return source._known[unit][:self.n]
 
     @cached_property
-    def columns(self) -> dict[Term, FloatArray]:
-        """Return columns of the mean that were computed before, by term with coefficients 1."""
+    def _known(self) -> dict[Term, FloatArray]:
+        """Return columns that were computed before."""
+        return {}
+
+    @cached_property
+    def means(self) -> dict[tuple[Term, ...], FloatArray]:
+        """Return the mean that was computed last, V, by the terms with their coefficients."""
+        return {}
+
+    @cached_property
+    def designs(self) -> dict[tuple[Term, ...], FloatArray]:
+        """Return voltage, level and columns that were put side by side last, by terms."""
         return {}
 
     @cached_property

@@ -20,6 +20,7 @@ from ou_monitor.model.terms.ac_coupling import ACCoupling, bridge
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.segment import Segment
 from ou_monitor.model.terms.term import Role, Term
+from ou_monitor.model.terms.tone import Tone
 from ou_monitor.records import FloatArray
 
 # Measurement noise that stands for none, as a share of what a step adds.
@@ -29,7 +30,7 @@ _STEP = 1e-4
 _ROUNDS, _FEW_ROUNDS, _LAST_ROUNDS = 12, 6, 2
 # Samples times further states that are too dear to begin with.
 _DEAR = 30000
-# With more states than this the part has to do.
+# With more states than this the part has to do; with more lines they are fitted apart.
 _MANY = 4
 # Samples in which the gain of a constant model has settled: the predictive
 # variance is then within some 1e-5 of its limit.
@@ -114,7 +115,7 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
     voltage = samples.voltage if offset is None else samples.voltage - offset
     chosen = samples.part(part, voltage)
     inside = None if events is None else events.part(part)
-    fit = _maximise(chosen, tuple(terms), inside, rough, begun=begun)
+    fit = _beside_lines(chosen, tuple(terms), inside, rough, begun)
     cost = fit.cost
     if whole_mean and chosen.n < samples.n:
         mean = _with_mean(samples.part(slice(None), voltage), fit.terms, events)
@@ -127,9 +128,7 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
              se: Sequence[dict[str, float]] = (), inside: bool = False) -> GaussianFit:
     """Return what a model with given parameters says of a recording."""
     run = _filter(samples, terms, events)
-    columns = _columns(samples, terms, run.segment)
-    beta = np.array([value for term in terms for value in coefficients(term)])
-    mean = columns @ beta
+    mean = _mean(samples, terms, run.segment)
     e = run.kalman.innovations(samples.voltage - mean)
     # An event is the law's to expect, at its own sample: not so while it is fitted around.
     variance = run.full if inside else run.plain
@@ -179,20 +178,41 @@ def coefficients(term: Term) -> list[float]:
 
 def _columns(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
     """Return all columns of the mean, through the instrument."""
-    parts = [np.ones((s.t.size, 1))]
-    for term in terms:
-        if term.ROLE is Role.MEAN and term.NAME != 'ou':
-            # Its coefficients apart, a term has the same columns again and again.
-            unit = term.with_linear([1.0] * len(term.LINEAR))
-            if unit not in samples.columns:
-                samples.columns[unit] = term.columns(s)
-            parts.append(samples.columns[unit])
-    columns = np.concatenate(parts, axis=1)
+    return _design(samples, terms, s)[:, 1:]
+
+
+def _design(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
+    """Return the voltage and all columns of the mean; as they were where they are the same."""
+    means = _means(terms)
+    key = tuple(term.with_linear([1.0] * len(term.LINEAR)) for term in means)
+    if key not in samples.designs:
+        samples.designs.clear()
+        samples.designs[key] = np.concatenate([
+            samples.voltage[:, None], np.ones((samples.n, 1)), *map(samples.columns, means)],
+            axis=1)
+    design = samples.designs[key]
     for term in terms:
         if isinstance(term, ACCoupling):
+            design = design.copy()
             # What the instrument shows has a level of its own.
-            columns[:, 1:] = term.pass_through(columns[:, 1:], s)
-    return columns
+            design[:, 2:] = term.pass_through(design[:, 2:], s)
+    return design
+
+
+def _means(terms: Sequence[Term]) -> tuple[Term, ...]:
+    return tuple(term for term in terms if term.ROLE is Role.MEAN and term.NAME != 'ou')
+
+
+def _mean(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
+    """Return the mean of the voltage, V; as it was where only the noise has changed."""
+    beta = np.array([value for term in terms for value in coefficients(term)])
+    if any(isinstance(term, ACCoupling) for term in terms):
+        return np.asarray(_columns(samples, terms, s) @ beta)
+    key = (*beta.tolist(), *_means(terms))
+    if key not in samples.means:
+        samples.means.clear()
+        samples.means[key] = _columns(samples, terms, s) @ beta
+    return samples.means[key]
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,6 +327,32 @@ def _coupled(term: ACCoupling, s: Segment, phi: FloatArray, q: FloatArray
     cov[0] = q[0] * np.array([[1.0, share], [share, share]])
     cov[:, 1, 0] = cov[:, 0, 1]
     return f, cov, np.array([1.0, -1.0])
+
+
+def _beside_lines(samples: Samples, terms: tuple[Term, ...], events: Events | None, rough: bool,
+                  begun: bool) -> GaussianFit:
+    """
+    Fit by scoring, many lines as they are beside the noise to begin with.
+
+    In what the noise tells of itself, coefficients of the mean do not occur, and a line is found
+    at its frequency whatever the noise is elsewhere: so the other terms are fitted to what lines
+    leave, and then all coefficients again.
+    """
+    lines = [k for k, term in enumerate(terms) if isinstance(term, Tone)
+             and term.ROLE is Role.MEAN]
+    if len(lines) <= _MANY:
+        return _maximise(samples, terms, events, rough, begun=begun)
+    first = _with_mean(samples, terms, events)
+    level = sum(samples.columns(term) @ np.array(term.linear_values()) for term in (
+        first.terms[k] for k in lines))
+    others = tuple(term for k, term in enumerate(first.terms) if k not in lines)
+    rest = _maximise(samples.part(slice(None), samples.voltage - level), others, events, rough,
+                     begun=begun)
+    found, errors = iter(rest.terms), iter(rest.se or [{} for _ in others])
+    last = _with_mean(samples, tuple(
+        term if k in lines else next(found) for k, term in enumerate(first.terms)), events)
+    se = tuple({} if k in lines else next(errors) for k in range(len(terms)))
+    return replace(last, se=se, cost=first.cost + rest.cost + last.cost)
 
 
 def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
@@ -429,14 +475,14 @@ def _moved(terms: tuple[Term, ...], k: int, name: str, by: float) -> tuple[Term,
 def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None) -> GaussianFit:
     """Fit the coefficients of the mean by generalised least squares; events count as known."""
     run = _filter(samples, terms, events)
-    variance, columns = run.full, _columns(samples, terms, run.segment)
+    variance, design = run.full, _design(samples, terms, run.segment)
     if not (variance > 0.0).all():
         raise ArithmeticError('variances that are not above 0')
     weight = 1.0 / np.sqrt(variance)
-    through = run.kalman.innovations(np.column_stack((samples.voltage, columns))) * weight[:, None]
+    through = run.kalman.innovations(design) * weight[:, None]
     beta = _solved(through[:, 1:], through[:, 0])
     e = (through[:, 0] - through[:, 1:] @ beta) / weight
-    return GaussianFit(with_mean(terms, beta), (), columns @ beta, e, variance,
+    return GaussianFit(with_mean(terms, beta), (), design[:, 1:] @ beta, e, variance,
                        _log_density(e, variance), run.phi,
                        run.cost + 1e-8 * samples.n * beta.size)
 

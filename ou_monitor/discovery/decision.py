@@ -82,7 +82,7 @@ RAGGED = 8.0
 # Most causes accepted, and most latent ones among them: each round costs as much as all before;
 # no recording of test/hidden, with two effects at most, needed more.
 MOST, MOST_LATENT = 8, 3
-# Lines that come with a tone at most: harmonics of a motor or PWM up to the 13th.
+# Lines that are joined to a tone at once: harmonics of a motor or PWM up to the 13th.
 MOST_LINES = 12
 # Score from which a statistic counts as misfit (by chance one of 16 000 does), and the sum of
 # their squares below which the search asks no further: four scores of 5.

@@ -34,6 +34,9 @@ Progress = Callable[[float], None]
 # Time of one fit, s, up to which the mean is chosen anew after each cause.
 _SOON = 1.0
 
+# Turns in which lines are joined to a tone: three motors or converters, each with its harmonics.
+_LINE_TURNS = 3
+
 # Note where the search was cut short.
 STOPPED = ('The search for causes was cut short where the next ones would have taken long; there '
            'may be more than are named.')
@@ -209,6 +212,10 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
             choose_answer(fitter, search, ())
         after = criticise(samples, search.composite, bank)
         if best.name == Tone.NAME and _more_lines(fitter, search):
+            # Beside the strongest the next ones show.
+            for _ in range(_LINE_TURNS - 1):
+                if not _more_lines(fitter, search):
+                    break
             after = criticise(samples, search.composite, bank)
         _prune(fitter, search, chosen)
         kind = catalogue()[best.name]
