@@ -30,6 +30,8 @@ from scipy.stats import ks_2samp
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from moments_and_paths import (  # noqa: E402, I100
+    moments_of_diffusion, moments_of_switched, paths_of_diffusion)
 from ou_monitor.paper.theory.affine import check_state, check_times  # noqa: E402, I100
 from ou_monitor.paper.theory.diffusion import (  # noqa: E402
     CORRECT_FACTOR, diffusion_limit, PRINTED_FACTOR)
@@ -170,17 +172,17 @@ def diffusion_convergence(
     ends = np.array([times[0], times[-1]])
     small = np.asarray(eps, dtype=np.float64)
     limit = diffusion_limit(system, factor)
-    mean, covariance = limit.moments(times, u0)
+    mean, covariance = moments_of_diffusion(limit, times, u0)
     scale = float(np.abs(covariance).max())
     errors = np.empty((2, small.size))
     p_values = np.empty((small.size, system.dimension))
     for k, value in enumerate(small.tolist()):
-        there = system.moments(times, u0, eps=value, scaling='diffusion')
+        there = moments_of_switched(system, times, u0, eps=value, scaling='diffusion')
         errors[:, k] = (
             np.abs(there[0] - mean).max(), np.abs(there[1] - covariance).max() / scale)
         switched = system.simulate(
             ends, u0, rng, eps=value, paths=paths, scaling='diffusion')[:, -1]
-        diffused = limit.simulate(ends, u0, rng, paths=paths)[:, -1]
+        diffused = paths_of_diffusion(limit, ends, u0, rng, paths=paths)[:, -1]
         p_values[k] = [ks_2samp(a, b).pvalue
                        for a, b in zip(switched.T, diffused.T, strict=True)]
     exact = errors[0].max() <= 1e-9 * max(float(np.abs(mean).max()), math.sqrt(scale))

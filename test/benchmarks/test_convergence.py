@@ -7,6 +7,7 @@ from chains import PAPER, THREE, vector_system
 from convergence import (
     averaging_convergence, AVERAGING_ORDER, cycle, diffusion_convergence, esc_chain, fit_order,
     fluctuation_covariance, main, ou_of_switching, SwitchedOU)
+from moments_and_paths import moments_of_diffusion, moments_of_switched
 import numpy as np
 from ou_monitor.paper.theory.diffusion import diffusion_limit, PRINTED_FACTOR
 from ou_monitor.paper.theory.markov_chain import Generator
@@ -95,8 +96,8 @@ def test_eps_is_a_clock_and_a_speed():
 def test_variance_of_the_switched_rail_is_where_its_moments_settle(eps):
     """The resolvent against the equation of the moments, run until it rests."""
     rail = SwitchedOU(2.0, THREE, np.array([1.0, -2.0, 0.5]))
-    mean, covariance = rail.system().moments(
-        [0.0, 30.0], [0.0], eps=eps, scaling='diffusion')
+    mean, covariance = moments_of_switched(
+        rail.system(), [0.0, 30.0], [0.0], eps=eps, scaling='diffusion')
     assert mean[1, 0] == pytest.approx(rail.level, rel=1e-9)
     assert covariance[1, 0, 0] == pytest.approx(rail.variance(eps), rel=1e-9)
 
@@ -157,14 +158,14 @@ def test_vector_system_converges_in_law_to_its_limit():
     t = np.linspace(0.0, 1.0, 3)
     eps = np.array([0.01, 0.005, 0.0025])
     limit = diffusion_limit(SYSTEM)
-    mean, covariance = limit.moments(t, [0.5, 1.0])
+    mean, covariance = moments_of_diffusion(limit, t, [0.5, 1.0])
     errors = []
     for value in eps.tolist():
-        there = SYSTEM.moments(t, [0.5, 1.0], eps=value, scaling='diffusion')
+        there = moments_of_switched(SYSTEM, t, [0.5, 1.0], eps=value, scaling='diffusion')
         errors.append([np.abs(there[0] - mean).max(), np.abs(there[1] - covariance).max()])
     assert np.all(np.abs(np.diff(np.log2(errors), axis=0) + 1.0) < 0.2)
     assert np.max(errors[-1]) < 5e-3
-    printed = diffusion_limit(SYSTEM, PRINTED_FACTOR).moments(t, [0.5, 1.0])[1]
+    printed = moments_of_diffusion(diffusion_limit(SYSTEM, PRINTED_FACTOR), t, [0.5, 1.0])[1]
     assert np.abs(printed - covariance).max() > 0.3 * np.abs(covariance).max()
     tested = diffusion_convergence(
         SYSTEM, [0.0, 1.0], [0.5, 1.0], [0.1, 0.05], np.random.default_rng(24), 2000)
@@ -183,7 +184,7 @@ def test_sigma_of_the_rail_follows_from_the_switching():
     rail = SwitchedOU(63.0, chain, 900.0 * on)
     t, n = [0.0, 1e-3], 1000
     u = rail.system().simulate(t, [rail.level], np.random.default_rng(28), paths=n)[:, 1, 0]
-    _, exact = rail.system().moments(t, [rail.level])
+    _, exact = moments_of_switched(rail.system(), t, [rail.level])
     process = rail.sigma() ** 2 * -math.expm1(-0.126) / 126.0
     assert exact[1, 0, 0] == pytest.approx(process, rel=0.02)
     assert np.var(u) == pytest.approx(exact[1, 0, 0], rel=5.0 * math.sqrt(2.0 / n))
@@ -214,7 +215,7 @@ def test_averaging_has_order_one_half():
     limit = PAPER.averaged().solve(t, U0)[-1]
     exact = []
     for value in eps.tolist():
-        mean, covariance = PAPER.moments([0.0, 1.0], U0, eps=value)
+        mean, covariance = moments_of_switched(PAPER, [0.0, 1.0], U0, eps=value)
         exact.append(math.sqrt(np.trace(covariance[1]) + np.sum((mean[1] - limit) ** 2)))
     assert abs(fit_order(eps, exact).order - AVERAGING_ORDER) < 0.02
     # The measured errors are those that the moments say.
@@ -231,7 +232,8 @@ def test_averaging_has_the_constant_of_the_central_limit_theorem():
     t = np.array([0.0, 0.3, 1.0])
     limit = fluctuation_covariance(PAPER, t, U0)
     distance = [
-        np.abs(PAPER.moments(t, U0, eps=eps)[1] / eps - limit)[1:].max() / np.abs(limit).max()
+        np.abs(moments_of_switched(PAPER, t, U0, eps=eps)[1] / eps - limit)[1:].max()
+        / np.abs(limit).max()
         for eps in (1e-2, 1e-3)]
     assert distance[1] < 1e-3
     assert distance[0] / distance[1] == pytest.approx(10.0, rel=0.1)
@@ -241,7 +243,8 @@ def test_the_mean_converges_with_order_one():
     """The bias of the average is eps, smaller than the spread: exact moments."""
     t, eps = np.linspace(0.0, 1.0, 6), [0.01, 0.005, 0.0025]
     limit = PAPER.averaged().solve(t, U0)
-    errors = [np.abs(PAPER.moments(t, U0, eps=value)[0] - limit).max() for value in eps]
+    errors = [np.abs(moments_of_switched(PAPER, t, U0, eps=value)[0] - limit).max()
+              for value in eps]
     assert fit_order(eps, errors).order == pytest.approx(1.0, abs=0.02)
 
 

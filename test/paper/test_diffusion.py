@@ -4,10 +4,11 @@ import math
 
 from chains import THREE, vector_system
 from convergence import cycle
+from moments_and_paths import (
+    _weak_step, moments_of_diffusion, moments_of_switched, paths_of_diffusion, step_covariance)
 import numpy as np
 from ou_monitor.paper.theory.diffusion import (
-    balance_defect, diffusion_limit, LinearDiffusion, PRINTED_FACTOR, step_covariance,
-    switching_drift)
+    balance_defect, diffusion_limit, LinearDiffusion, PRINTED_FACTOR, switching_drift)
 from ou_monitor.paper.theory.markov_chain import Generator
 from ou_monitor.paper.theory.switched_system import SwitchedSystem
 import pytest
@@ -38,7 +39,7 @@ def test_intensity_and_drift_are_integrals_of_correlations():
     b = quad_vec(drift, 0.0, 30.0, epsabs=1e-11)[0]
     correction = switching_drift(SYSTEM)
     assert correction.matrix @ u + correction.offset == pytest.approx(b, rel=1e-8)
-    assert limit.drift(u) == pytest.approx(
+    assert limit.matrix @ u + limit.offset == pytest.approx(
         b + SYSTEM.drift_matrix @ u + SYSTEM.drift_offset, rel=1e-8)
     assert diffusion_limit(SYSTEM, PRINTED_FACTOR).intensity(u) == pytest.approx(
         limit.intensity(u) / 2.0, rel=1e-12)
@@ -67,7 +68,7 @@ def test_the_order_of_the_jumps_matters_to_the_drift():
     b = switching_drift(system).matrix
     weight = chain.stationary[:, None] * chain.potential
     swapped = np.einsum('xy,xij,yjk->ik', weight, turn, turn)
-    mean = system.moments([0.0, 1.0], [1.0, 0.5], eps=0.01, scaling='diffusion')[0][1]
+    mean = moments_of_switched(system, [0.0, 1.0], [1.0, 0.5], eps=0.01, scaling='diffusion')[0][1]
     assert np.abs(mean - expm(b) @ [1.0, 0.5]).max() < 0.02
     assert np.abs(mean - expm(swapped) @ [1.0, 0.5]).max() > 0.2
 
@@ -92,10 +93,10 @@ def test_additive_paths_are_exact_at_any_spacing():
     limit = LinearDiffusion(
         np.array([[-1.0, 0.5], [-0.5, -2.0]]), np.array([1.0, 0.0]), np.zeros((2, 2, 2)),
         np.array([[1.0, 0.3], [0.0, 0.5]]))
-    assert limit.is_additive
     n = 20_000
-    u = limit.simulate([0.0, 2.0], [3.0, -1.0], np.random.default_rng(25), paths=n)[:, 1]
-    mean, covariance = limit.moments([0.0, 2.0], [3.0, -1.0])
+    u = paths_of_diffusion(
+        limit, [0.0, 2.0], [3.0, -1.0], np.random.default_rng(25), paths=n)[:, 1]
+    mean, covariance = moments_of_diffusion(limit, [0.0, 2.0], [3.0, -1.0])
     assert covariance[1] == pytest.approx(
         step_covariance(limit.matrix, limit.noise_offsets.T @ limit.noise_offsets, 2.0))
     spread = np.sqrt(np.diag(covariance[1]))
@@ -124,11 +125,11 @@ def test_the_scheme_has_weak_order_two():
     start = np.tile([1.0, -0.5], (weights.size, 1))
     errors = []
     for h in (0.02, 0.01, 0.005):
-        mean, covariance = limit.moments([0.0, h], start[0])
+        mean, covariance = moments_of_diffusion(limit, [0.0, h], start[0])
         second = covariance[1] + np.outer(mean[1], mean[1])
         found = np.zeros((3, 2))
         for forward in (True, False):
-            u = limit._weak_step(start, h, kicks, np.full(weights.size, forward))
+            u = _weak_step(limit, start, h, kicks, np.full(weights.size, forward))
             found[0] += 0.5 * weights @ u
             found[1:] += 0.5 * np.einsum('p,pi,pj->ij', weights, u, u)
         errors.append(np.abs(found - np.vstack([mean[1], second])).max())
@@ -138,8 +139,8 @@ def test_the_scheme_has_weak_order_two():
 def test_multiplicative_paths_have_the_moments():
     """Paths of many default steps: mean and covariance within five errors of 20 000 paths."""
     limit, n, t = diffusion_limit(SYSTEM), 20_000, [0.0, 0.5, 1.0]
-    u = limit.simulate(t, [0.5, 1.0], np.random.default_rng(26), paths=n)
-    mean, covariance = limit.moments(t, [0.5, 1.0])
+    u = paths_of_diffusion(limit, t, [0.5, 1.0], np.random.default_rng(26), paths=n)
+    mean, covariance = moments_of_diffusion(limit, t, [0.5, 1.0])
     for k in (1, 2):
         rest = u[:, k] - mean[k]
         assert (np.abs(rest.mean(axis=0)) < 5.0 * rest.std(axis=0) / math.sqrt(n)).all()
@@ -151,8 +152,8 @@ def test_multiplicative_paths_have_the_moments():
 def test_geometric_brownian_motion_is_exact():
     """Scalar multiplicative noise: the flows commute, so one step of any length is the law."""
     limit = LinearDiffusion(np.array([[0.3]]), np.zeros(1), np.array([[[0.8]]]), np.zeros((1, 1)))
-    u = limit.simulate(
-        [0.0, 2.0], [1.0], np.random.default_rng(27), paths=5000, max_step=10.0)[:, 1, 0]
+    u = paths_of_diffusion(
+        limit, [0.0, 2.0], [1.0], np.random.default_rng(27), paths=5000, max_step=10.0)[:, 1, 0]
     normal = (np.log(u) - (0.3 - 0.32) * 2.0) / (0.8 * math.sqrt(2.0))
     assert kstest(normal, 'norm').pvalue > 1e-4
 
@@ -163,16 +164,18 @@ def test_paths_that_overflow_are_refused(noise):
     limit = LinearDiffusion(
         np.array([[9.0]]), np.zeros(1), np.array([[[noise]]]), np.ones((1, 1)))
     with pytest.raises(ValueError, match='unstable: a path overflows before t = 100 s'):
-        limit.simulate([0.0, 1.0, 100.0], [1.0], np.random.default_rng(0))
+        paths_of_diffusion(limit, [0.0, 1.0, 100.0], [1.0], np.random.default_rng(0))
 
 
 @pytest.mark.parametrize('call, message', [
     (lambda: diffusion_limit(SYSTEM, 0.0), 'factor must be positive'),
-    (lambda: diffusion_limit(SYSTEM).simulate(
-        [0.0], [0.0, 0.0], np.random.default_rng(0), max_step=0.0), 'max_step must be positive'),
-    (lambda: diffusion_limit(SYSTEM).simulate([0.0], [0.0], np.random.default_rng(0)),
+    (lambda: paths_of_diffusion(
+        diffusion_limit(SYSTEM), [0.0], [0.0, 0.0], np.random.default_rng(0), max_step=0.0),
+     'max_step must be positive'),
+    (lambda: paths_of_diffusion(diffusion_limit(SYSTEM), [0.0], [0.0], np.random.default_rng(0)),
      'u0 must have shape'),
-    (lambda: diffusion_limit(SYSTEM).moments([1.0, 0.0], [0.0, 0.0]), 'must not decrease'),
+    (lambda: moments_of_diffusion(diffusion_limit(SYSTEM), [1.0, 0.0], [0.0, 0.0]),
+     'must not decrease'),
 ])
 def test_wrong_arguments_are_refused(call, message):
     with pytest.raises(ValueError, match=message):

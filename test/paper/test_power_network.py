@@ -4,11 +4,11 @@ from dataclasses import replace
 import math
 
 from hypothesis import given, settings, strategies as st
+from moments_and_paths import step_covariance
 import numpy as np
 from ou_monitor.model.passage.law import mean_first_passage
 from ou_monitor.paper.network.components import load_at, MAY_BE_ZERO, PowerNetwork, UNITS
 from ou_monitor.paper.network.rail import rail_at, UnstableNetworkError
-from ou_monitor.paper.theory.diffusion import step_covariance
 import pytest
 from scipy.integrate import quad
 from scipy.linalg import expm

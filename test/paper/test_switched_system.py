@@ -3,6 +3,7 @@
 import math
 
 from chains import CYCLE, drawn, PAPER
+from moments_and_paths import moments_of_switched
 import numpy as np
 from ou_monitor.paper.theory.affine import flow
 from ou_monitor.paper.theory.markov_chain import Generator
@@ -71,7 +72,7 @@ def test_mean_is_that_of_feynman_and_kac():
     """E exp(integral of r(x)) = pi exp((Q + diag r) t) 1."""
     rates = np.array([-1.0, 0.5, -3.0])
     system = SwitchedSystem(CYCLE, rates[:, None, None])
-    mean, covariance = system.moments([0.0, 0.9], [1.0])
+    mean, covariance = moments_of_switched(system, [0.0, 0.9], [1.0])
     for power, found in ((1, mean[1, 0]), (2, covariance[1, 0, 0] + mean[1, 0] ** 2)):
         expected = CYCLE.stationary @ expm((CYCLE.q + np.diag(power * rates)) * 0.9)
         assert found == pytest.approx(expected.sum(), rel=1e-11)
@@ -86,7 +87,7 @@ def test_simulation_has_the_exact_moments(eps, scaling):
     t, paths = [0.0, 0.4, 1.2], 20_000
     found = system.simulate(
         t, [1.0, -1.0], np.random.default_rng(9), eps=eps, scaling=scaling, paths=paths)
-    mean, covariance = system.moments(t, [1.0, -1.0], eps=eps, scaling=scaling)
+    mean, covariance = moments_of_switched(system, t, [1.0, -1.0], eps=eps, scaling=scaling)
     for k in (1, 2):
         rest = found[:, k] - mean[k]
         assert (np.abs(rest.mean(axis=0)) < 5.0 * rest.std(axis=0) / math.sqrt(paths)).all()
@@ -109,7 +110,8 @@ def test_balanced_changes_nothing_at_eps_one():
     pi = CYCLE.stationary
     assert np.tensordot(pi, balanced.matrices, 1) == pytest.approx(0.0, abs=1e-14)
     for found, expected in zip(
-            balanced.moments([0.0, 0.5], U0), PAPER.moments([0.0, 0.5], U0), strict=True):
+            moments_of_switched(balanced, [0.0, 0.5], U0),
+            moments_of_switched(PAPER, [0.0, 0.5], U0), strict=True):
         assert found == pytest.approx(expected, rel=1e-11, abs=1e-13)
 
 
@@ -127,7 +129,7 @@ def test_paths_that_overflow_are_refused():
     (lambda: PAPER.simulate([0.0], U0, np.random.default_rng(0), eps=0.0), 'eps must be'),
     (lambda: PAPER.simulate([0.0], U0, np.random.default_rng(0), scaling='fast'), 'scaling'),
     (lambda: PAPER.simulate([0.0], [1.0], np.random.default_rng(0)), 'u0 must have shape'),
-    (lambda: PAPER.moments([0.0], [1.0]), r'u0 must have shape \(3,\)'),
+    (lambda: moments_of_switched(PAPER, [0.0], [1.0]), r'u0 must have shape \(3,\)'),
     (lambda: SwitchedSystem.of_matrix_model(
         CYCLE, alpha=[1, 2], omega=0, beta=0, alpha_p=1), r'alpha must be one number or'),
     (lambda: SwitchedSystem.of_models(

@@ -1,5 +1,5 @@
 """
-Affine systems du/dt = A u + a: exact flow, solution, first and second moments.
+Affine systems du/dt = A u + a: exact flow and solution.
 
 Between two jumps a switched system is affine, its average is affine, and so
 are the vector fields of its diffusion limit: all of them move along this flow.
@@ -149,41 +149,3 @@ def check_starts(u0: npt.ArrayLike, paths: int, d: int) -> FloatArray:
     if first.shape not in ((d,), (paths, d)):
         raise ValueError(f'u0 must have shape ({d},) or ({paths}, {d}), got {first.shape}')
     return np.array(np.broadcast_to(first, (paths, d)))
-
-
-def mean_and_covariance(found: FloatArray, d: int) -> tuple[FloatArray, FloatArray]:
-    """Return mean and covariance from rows of 1, E u and E u u'."""
-    mean = found[:, 1:1 + d]
-    second = found[:, 1 + d:].reshape(-1, d, d)
-    return mean, second - mean[:, :, None] * mean[:, None, :]
-
-
-def moment_matrix(matrix: FloatArray, offset: FloatArray) -> FloatArray:
-    """Return the linear equation of (1, u, u u') under du/dt = A u + a (matrix in 1/s)."""
-    d = offset.size
-    one = np.eye(d)
-    column = offset[:, None]
-    full = np.zeros((1 + d + d * d, 1 + d + d * d))
-    full[1:1 + d, 0] = offset
-    full[1:1 + d, 1:1 + d] = matrix
-    full[1 + d:, 1:1 + d] = np.kron(column, one) + np.kron(one, column)
-    full[1 + d:, 1 + d:] = np.kron(matrix, one) + np.kron(one, matrix)
-    return full
-
-
-def propagate(change: FloatArray, times: FloatArray, state: FloatArray) -> FloatArray:
-    """
-    Solve dy/dt = M y from time to time by the matrix exponential.
-
-    change in 1/s, times in s.
-    """
-    found = np.empty((times.size, state.size))
-    found[0] = state
-    steps: dict[float, FloatArray] = {}
-    for k, dt in enumerate(np.diff(times).tolist()):
-        # Equal steps of a grid differ in the last digits; they are one step.
-        key = float(f'{dt:.12e}')
-        if key not in steps:
-            steps[key] = expm(change * dt)
-        found[k + 1] = steps[key] @ found[k]
-    return found

@@ -19,9 +19,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.paper.theory.affine import (
-    AffineSystem, check_starts, check_state, check_times, flow, mean_and_covariance,
-    moment_matrix, propagate)
+from ou_monitor.paper.theory.affine import AffineSystem, check_starts, check_times, flow
 from ou_monitor.paper.theory.markov_chain import Generator
 from ou_monitor.paper.theory.matrix_model import MatrixModel
 from ou_monitor.records import FloatArray
@@ -175,30 +173,3 @@ class SwitchedSystem:
                             f'unstable: a path overflows before t = {times[k + 1]:g} s')
                     found[:, k + 1] = u
         return found
-
-    def moments(
-        self, t: npt.ArrayLike, u0: npt.ArrayLike, *, eps: float = 1.0,
-        scaling: Scaling = 'averaging',
-    ) -> tuple[FloatArray, FloatArray]:
-        """
-        Return exact mean and covariance, without simulation.
-
-        E[1_x], E[u 1_x] and E[u u' 1_x] together obey a linear equation,
-        solved by the matrix exponential. The chain starts in its stationary
-        law.
-
-        t in s.
-        """
-        times = check_times(t)
-        at_eps = self.scaled(eps, scaling)
-        n, d = at_eps.offsets.shape
-        first = check_state(u0, d)
-        joint = np.concatenate([[1.0], first, np.outer(first, first).ravel()])
-        size = joint.size
-        change = np.asarray(np.kron(at_eps.generator.q.T, np.eye(size)), dtype=np.float64)
-        for x in range(n):
-            block = slice(x * size, (x + 1) * size)
-            change[block, block] += moment_matrix(at_eps.matrices[x], at_eps.offsets[x])
-        state = np.outer(at_eps.generator.stationary, joint).ravel()
-        found = propagate(change, times, state).reshape(times.size, n, size).sum(axis=1)
-        return mean_and_covariance(found, d)
