@@ -31,18 +31,10 @@ _LEAST = 0.02
 
 class Progress:
     """
-    How far a command is, on standard error.
+    How far a command is, on standard error; `quiet`: no lines where there is no terminal.
 
     A terminal shows a bar and the time left; elsewhere a line comes every 10 s, so that what ends
     sooner says nothing.
-
-    Parameters
-    ----------
-    label : str
-        What is being done.
-    quiet : bool
-        Write no lines where there is no terminal: a program reads what the command says.
-
     """
 
     def __init__(self, label: str, quiet: bool = False) -> None:

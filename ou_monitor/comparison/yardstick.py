@@ -63,15 +63,7 @@ class Yardstick:
     """
     What to measure, chosen from the recorded part alone.
 
-    Parameters
-    ----------
-    samples : Readings
-        The part.
-    lsb : float
-        Step of the ADC, V; 0 where none is seen.
-    limits : tuple of float
-        Levels, V, that the user asks for beside the two low ones.
-
+    lsb: step of the ADC, V, 0 where none is seen; limits: levels, V, beside the two low ones.
     """
 
     def __init__(self, samples: Readings, lsb: float, limits: tuple[float, ...] = ()) -> None:

@@ -41,22 +41,10 @@ class ClusterWorkers(Workers):
     """
     The workers of a Dask scheduler, which have this package and the recordings at the same paths.
 
-    Parameters
-    ----------
-    address : str
-        Address of the scheduler; the certificates of ``tls://`` are those of
-        Dask's configuration (``distributed.comm.tls``).
-    check : callable
-        Of no arguments; what it returns must be the same here and on every worker.
-    insecure : bool
-        Whether an address of another machine may be without TLS.
-
-    Raises
-    ------
-    InputError
-        When the address is not safe, no scheduler or no worker answers, or the
-        workers have another version.
-
+    Certificates of ``tls://`` are those of Dask's configuration (``distributed.comm.tls``); what
+    `check` returns must be the same here and on every worker; `insecure` lets an address of
+    another machine be without TLS.  InputError: the address is not safe, no scheduler or no
+    worker answers, or the workers have another version.
     """
 
     def __init__(self, address: str, check: Callable[[], str], insecure: bool = False) -> None:

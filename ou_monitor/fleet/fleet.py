@@ -34,21 +34,9 @@ _MOST = 50_000_000
 
 class Parts:
     """
-    The results in a folder.
+    The results in the folder of a fleet, which is created; InputError where that cannot be.
 
-    Parameters
-    ----------
-    folder : pathlib.Path
-        Folder of the fleet; created when it is missing.
-    options : mapping
-        What the results depend on, the version of the package among it, as
-        JSON holds it.
-
-    Raises
-    ------
-    InputError
-        When the folder cannot be created or written.
-
+    options: what the results depend on, the version of the package among it, as JSON holds it.
     """
 
     def __init__(self, folder: Path, options: Mapping[str, Any]) -> None:

@@ -80,22 +80,9 @@ class BagWriter:
     """
     Writes a bag: an .mcap file when the path ends in .mcap, else a rosbag2 directory.
 
-    A context manager; when its block is left by an exception, what was written
-    is removed.
-
-    Parameters
-    ----------
-    path : str or path
-        Target; must not exist, its folder must.
-    about : mapping of str to str, optional
-        Where the data came from; kept in a metadata record of the file, and
-        in the custom data of metadata.yaml.
-
-    Raises
-    ------
-    InputError
-        When the target exists or cannot be written.
-
+    A context manager; when its block is left by an exception, what was written is removed.
+    `about`, where the data came from, is kept in a metadata record of the file, and in the custom
+    data of metadata.yaml.  InputError: the target exists or cannot be written.
     """
 
     def __init__(self, path: Path | str, *, about: Mapping[str, str] | None = None) -> None:

@@ -116,53 +116,15 @@ def _definitions(kind: str, text: str) -> Definitions:
 
 class BagReader:
     """
-    Reads a bag: an .mcap file or a rosbag2 directory.
+    Reads a bag, .mcap file or rosbag2 directory; with `partial` as far as a damaged one holds.
 
-    Parameters
-    ----------
-    path : str or path
-        File or directory.
-    partial : bool
-        Whether a damaged bag is read as far as it holds (`damage` then says
-        what is wrong).
-    max_chunk : int, optional
-        Bytes that a chunk may unpack to.  Else the environment variable
-        OU_MONITOR_MAX_CHUNK_MB, or 256 times the file, at least 64 MiB and at
-        most an eighth of the memory.
-
-    Attributes
-    ----------
-    topics : dict of str to str
-        Topic -> message type.
-    info : dict of str to TopicInfo
-        Topic -> type, number of messages, QoS.
-    sample_rates : dict of str to float
-        Topic -> rate of the samples within its blocks, Hz, where the bag
-        states it (those written here do).
-    about : dict of str to str
-        What the bag says of itself: the custom data of its metadata.yaml or
-        of its files, such as the vehicle.
-    origins : dict of str to dict of str to str
-        Topic -> where its values came from, where the bag states it (those
-        that `ou-monitor convert` writes do).
-    start_ns, end_ns : int
-        Log times of the first and last message, ns.
-    message_count : int
-        Messages of all topics.
-    partial : bool
-        As given.
-    damage : str or None
-        Where and how the bag is damaged: byte, reason, and the time of the
-        newest message before, as s into the recording and as log time.
-    notes : tuple of str
-        Topics left out, and the like.
-
-    Raises
-    ------
-    InputError
-        When the bag is missing, empty, foreign, holds no messages, or is
-        damaged and not `partial`.
-
+    max_chunk: bytes that a chunk may unpack to; else OU_MONITOR_MAX_CHUNK_MB, or 256 times the
+    file, at least 64 MiB and at most an eighth of the memory.  By topic: message types in
+    `topics`, number and QoS in `info`, rate of the samples within blocks, Hz, in `sample_rates`,
+    and where values came from in `origins`, as far as the bag states it.  `about` is the custom
+    data of metadata.yaml or of the files; `start_ns`, `end_ns` the log times of the first and last
+    message; `damage` where and how the bag is damaged, else None; `notes` topics left out, and the
+    like.  InputError: missing, empty, foreign, without messages, or damaged and not `partial`.
     """
 
     def __init__(self, path: Path | str, *, partial: bool = False,

@@ -96,27 +96,10 @@ def as_nanoseconds(t: FloatArray, name: str) -> npt.NDArray[np.int64]:
 
 class RecordingWriter:
     """
-    Writes a recording that comes in pieces; memory does not grow with them.
+    Writes a recording that comes in pieces, as `write_recording`; memory does not grow with them.
 
-    A context manager; what was written is removed when its block fails.
-
-    Parameters
-    ----------
-    path, type, start_ns, sample_rate, block :
-        As in `write_recording`.
-
-    Attributes
-    ----------
-    topics : dict of str to str
-        Topic -> message type, as written so far.
-    notes : tuple of str
-        What was changed on the way, one sentence each.
-
-    Raises
-    ------
-    InputError
-        As `write_recording`.
-
+    A context manager; what was written is removed when its block fails.  `topics`: their message
+    types; `notes`: what was changed on the way, one sentence each.
     """
 
     def __init__(self, path: str | Path, *, type: str = 'battery_state',  # noqa: A002

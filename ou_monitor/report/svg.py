@@ -59,25 +59,11 @@ class Curve:
 
 class Plot:
     """
-    One plot with two axes.
+    One plot with two axes; its title is read by screen readers, its size is in pixels.
 
-    Parameters
-    ----------
-    title : str
-        What is shown; stands above the plot and is read by screen readers.
-    x_label, y_label : str
-        Quantity and unit.
-    width, height : int
-        Size, pixels of the drawing; the page scales it.
-    log_x, log_y : bool
-        Logarithmic axes.
-    legend_low : bool
-        A legend that fits neither beside the title nor below it goes to the
-        lower left of the axes instead of the upper right.
-    legend_row : bool
-        The legend has a row of its own below the title in any case, as of plots
-        side by side that should have axes of one size.
-
+    legend_low: a legend that fits neither beside the title nor below it goes to the lower left of
+    the axes instead of the upper right.  legend_row: it has a row of its own below the title, as
+    of plots side by side that should have axes of one size.
     """
 
     def __init__(self, title: str, x_label: str, y_label: str, *, width: int = 860,

@@ -102,15 +102,8 @@ class Publishers:
     """
     Follows the first of several publishers of one topic, and counts what is lost of it.
 
-    Attributes
-    ----------
-    lost : int
-        Messages of the publisher followed that never came, by its numbers.
-    foreign : int
-        Messages of other publishers.
-    numbered : bool
-        Whether the middleware numbers messages; without, nothing is known of either.
-
+    `lost`: its messages that never came, by their numbers; `foreign`: those of others; `numbered`:
+    whether the middleware numbers messages: without, nothing is known of either.
     """
 
     def __init__(self) -> None:

@@ -25,22 +25,9 @@ ARRIVED = 1e-6
 
 class CutoffWay:
     """
-    Stretches of one way.
+    Stretches of one way; `slewing`: whether the slew limit cut the last move, None: no move.
 
-    Parameters
-    ----------
-    elapsed : ndarray, shape (n + 1,)
-        Time before each sample, and at the end, s.
-    dt : ndarray, shape (n,)
-        Time of each sample, s.
-    most : float
-        Slew limit, 1/s.
-
-    Attributes
-    ----------
-    slewing : bool or None
-        Whether the last move was cut by the slew limit; None: there was no move.
-
+    elapsed, shape (n + 1,): s before each of n samples and at the end; dt: of each, s; most: 1/s.
     """
 
     def __init__(self, elapsed: FloatArray, dt: FloatArray, most: float) -> None:
@@ -154,17 +141,10 @@ class Bound(enum.Enum):
 
 class SampleInterval:
     """
-    Mean time between samples, s, over some 100 of them.
+    Mean time between samples, s, over some 100 of them; 0 before the second sample.
 
-    An interval of more than five means is a gap and left out, unless gaps are
-    a third of all; five in a row that are five times off are a new rate, which
-    starts the mean anew.
-
-    Attributes
-    ----------
-    mean : float
-        Mean interval, s; 0 before the second sample.
-
+    An interval of more than five means is a gap and left out, unless gaps are a third of all;
+    five in a row that are five times off are a new rate, which starts the mean anew.
     """
 
     __slots__ = ('_long', '_n', '_short', 'mean')
@@ -227,15 +207,7 @@ def time_constant(settings: FilterSettings, error: float) -> float:
 
 
 class CutoffControl:
-    """
-    The cutoff in force, and what holds it.
-
-    Parameters
-    ----------
-    settings : FilterSettings
-        Limits, smoothing, slew, dead band, fallback.
-
-    """
+    """The cutoff in force, and what holds it."""
 
     def __init__(self, settings: FilterSettings) -> None:
         self._settings = settings

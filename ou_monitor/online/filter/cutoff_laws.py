@@ -232,35 +232,16 @@ def constant_noise_law(settings: FilterSettings, sigma: float, alpha: float,
 
 
 def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
-    r"""
-    Return the cutoff that makes `times` as much white noise come out as at fmax once did.
+    """
+    Return the cutoff, Hz, that makes `times` as much white noise come out as at fmax once did.
 
-    Of the sampled filter, see `white_noise.held_cutoff`.  Far below the sample
-    rate: white noise of two-sided density N through a low-pass has the variance
-    N w / 2 (order 1) or N w / (2 sqrt 2) (order 2): rms ~ sqrt(fc), so
-    fc = fmax / times^2 for both.  Derivative, order 2: N int w'^2 |H|^2 dw' / 2 pi
-    = N w^3 / (2 sqrt 2), so rms ~ fc^(3/2) and fc = fmax / times^(2/3).
-    Derivative, order 1: the integral is infinite and the sample rate makes it
-    finite; independent samples of variance v give v w^2, so fc = fmax / times.
-
-    Parameters
-    ----------
-    mode : {'lowpass', 'derivative'}
-        What comes out.
-    order : {1, 2}
-        Order.
-    fmax : float
-        Cutoff at `times` = 1, Hz.
-    times : float
-        Sigma over sigma_ref, 1 or more.
-    interval : float
-        Time between samples, s; 0: not known, as if sampled without end.
-
-    Returns
-    -------
-    float
-        Cutoff, Hz.
-
+    Of the sampled filter, see `white_noise.held_cutoff`; interval in s, 0: as if sampled without
+    end.  Far below the sample rate: white noise of two-sided density N through a low-pass has the
+    variance N w / 2 (order 1) or N w / (2 sqrt 2) (order 2): rms ~ sqrt(fc), so fc = fmax /
+    times^2 for both.  Derivative, order 2: N int w'^2 |H|^2 dw' / 2 pi = N w^3 / (2 sqrt 2), so
+    rms ~ fc^(3/2) and fc = fmax / times^(2/3).  Derivative, order 1: the integral is infinite and
+    the sample rate makes it finite; independent samples of variance v give v w^2, so fc = fmax /
+    times.
     """
     if _held(fmax, times, interval):
         return held_cutoff(mode, order, fmax, times, interval)

@@ -45,17 +45,7 @@ _ROOT2 = math.sqrt(2.0)
 
 
 class LowPassState:
-    """
-    State of one low-pass.
-
-    Attributes
-    ----------
-    y : float
-        Output, unit of the input.
-    slope : float
-        y' / w of order 2, unit of the input; 0 for order 1.
-
-    """
+    """A low-pass: output `y` and, of order 2, `slope` = y' / w, in the unit of the input."""
 
     __slots__ = ('slope', 'y')
 

@@ -59,15 +59,7 @@ _GONE = 1e-18
 
 
 class LowPassSpan:
-    """
-    The low-passes, and the input as the last of `COUNT` outputs.
-
-    Parameters
-    ----------
-    slope : bool
-        Whether the derivative comes out: the input is the difference quotient.
-
-    """
+    """The low-passes, the input last of `COUNT` outputs; slope: it is the difference quotient."""
 
     def __init__(self, slope: bool) -> None:
         self.slope = slope
@@ -176,24 +168,10 @@ _RAW = np.eye(COUNT)[-1]
 
 class LearnedWiener:
     """
-    The filter of least error in the span of a few low-passes.
+    The filter of least error in the span of a few low-passes, from a first sample x on.
 
-    Parameters
-    ----------
-    settings : FilterSettings
-        Noise, mode and limits of the lag.
-    x : float
-        Signal as measured, where it begins.
-
-    Attributes
-    ----------
-    y : float
-        Output: the signal, or its slope in mode derivative (unit/s).
-    lag : float
-        Lag of the output at `lag_frequency`, degrees; NaN while not known.
-    mixed : float
-        Share of what is unfiltered in it, 0..1, for the limit of the lag.
-
+    `y` is the signal, or its slope in mode derivative (unit/s); `lag` that of the output at
+    `lag_frequency`, degrees, NaN while not known; `mixed` the share of what is unfiltered in it.
     """
 
     def __init__(self, settings: FilterSettings, x: float) -> None:

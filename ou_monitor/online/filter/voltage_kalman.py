@@ -78,26 +78,9 @@ class Step(NamedTuple):
 
 class VoltageKalman:
     """
-    Kalman filter of the voltage.
+    Kalman filter of the voltage, V, from a first one x on (level of the supply in V, or NaN).
 
-    Parameters
-    ----------
-    settings : FilterSettings
-        White noise and limits of the lag.
-    x : float
-        Voltage as measured, where it begins, V.
-    level : float
-        Level of the supply, V; NaN: not known.
-
-    Attributes
-    ----------
-    y : float
-        Output, V.
-    lag : float
-        Lag of the output at `lag_frequency`, degrees; NaN while not known.
-    mixed : float
-        Share of what is unfiltered in it, 0..1, for the limit of the lag.
-
+    `y` is the output, V; `lag` and `mixed` are those of `LearnedWiener`.
     """
 
     def __init__(self, settings: FilterSettings, x: float, level: float) -> None:

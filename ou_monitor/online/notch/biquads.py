@@ -45,20 +45,9 @@ NARROWEST, WIDEST = 0.08, 2.0
 
 class Notch:
     """
-    One notch of one channel.
+    One notch of one channel; it begins as if its first sample x had always been there.
 
-    Parameters
-    ----------
-    x : float
-        First sample: it begins as if that had always been there.
-
-    Attributes
-    ----------
-    width : float
-        Bandwidth over frequency.
-    share : float
-        Share of it that is in force, 0..1.
-
+    `width`: bandwidth over frequency; `share`: how much of it is in force, 0..1.
     """
 
     __slots__ = ('_g', '_ratio', '_s1', '_s2', 'share', 'width')

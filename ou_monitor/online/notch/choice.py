@@ -35,20 +35,7 @@ _GAP, _UNEVEN = 5.0, 0.3
 
 
 class Frames:
-    """
-    Collects samples and what went with them; makes spectra.
-
-    Parameters
-    ----------
-    interval : float
-        Mean time between samples, s.
-
-    Attributes
-    ----------
-    frequencies : ndarray, shape (K,)
-        Of the bins, Hz.
-
-    """
+    """Spectra of samples of an interval, s, and what went with them; `frequencies` in Hz."""
 
     def __init__(self, interval: float) -> None:
         self.interval = interval
@@ -148,24 +135,9 @@ def families(count: int) -> tuple[Family, ...]:
 
 class Choice:
     """
-    Choice of the candidate of each channel.
+    Choice of the candidate of each channel; `chosen`: one a channel, None: no notch.
 
-    Parameters
-    ----------
-    frequencies : ndarray, shape (K,)
-        Of the bins, Hz.
-    settings : tuple of float
-        `fmin` and `cutoff`, Hz.
-    rate : float
-        Sample rate, Hz.
-    channels, count : int
-        Channels; most notches.
-
-    Attributes
-    ----------
-    chosen : list of (Candidate or None)
-        One a channel; None: no notch.
-
+    frequencies of the bins, Hz; settings: `fmin` and `cutoff`, Hz; rate of the samples, Hz.
     """
 
     def __init__(self, frequencies: FloatArray, settings: tuple[float, float], rate: float,

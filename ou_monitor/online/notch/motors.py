@@ -30,17 +30,7 @@ _CHANGES, _FROZEN, _LEAST = 20, 50.0, 1.0
 
 
 class MotorSpeeds:
-    """
-    Newest speeds of the motors.
-
-    Parameters
-    ----------
-    per_unit : float
-        Hz for one of what comes.
-    stale_after : float
-        s.
-
-    """
+    """Newest speeds of the motors (per_unit: Hz for one of what comes; stale_after in s)."""
 
     def __init__(self, per_unit: float, stale_after: float) -> None:
         self._per_unit, self._stale_after = per_unit, stale_after
@@ -100,24 +90,7 @@ _PRIOR, _FRAMES, _SPREAD = 0.1, 8.0, 0.3
 
 
 class MotorLaw:
-    """
-    The law in force, and all that could be.
-
-    Parameters
-    ----------
-    frequencies : ndarray, shape (K,)
-        Of the bins, Hz.
-    fmin : float
-        Lowest frequency of a notch, Hz.
-    rate : float
-        Sample rate, Hz.
-
-    Attributes
-    ----------
-    a, b : float
-        Hz; NaN while not known.
-
-    """
+    """The law in force, `a` and `b` in Hz, NaN while not known, and all others (all in Hz)."""
 
     def __init__(self, frequencies: FloatArray, fmin: float, rate: float) -> None:
         highest = HIGHEST * rate

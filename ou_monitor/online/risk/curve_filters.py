@@ -334,17 +334,10 @@ _WIDE = 0.5
 
 class Wander:
     """
-    A level that walks at random, seen through noise.
+    A level that walks at random, seen through noise: its value and the variance of that.
 
-    Attributes
-    ----------
-    value, variance : float
-        Where it is by all that has been seen, and how well that is known.
-    speed : float
-        Variance that it gains per second, as far as is known.
-    fast_speed : float
-        The same, the faster of what may be counted more.
-
+    `speed`: variance that it gains per second; `fast_speed`: the faster of what may be counted
+    more.
     """
 
     def __init__(self) -> None:

@@ -42,20 +42,9 @@ _FAR = 4.0
 
 class FloorWatch:
     """
-    Whether the voltage is at or below the floor.
+    Whether the voltage is at or below the floor; `dips`: how often it has gone down to it.
 
-    Parameters
-    ----------
-    settings : MonitorSettings
-        `floor`, V (0: off), `brownout_floor_time`, s, and
-        `stale_after`, s: three samples further apart than twice this are not
-        judged together.
-
-    Attributes
-    ----------
-    dips : int
-        How often the voltage has gone down to the floor.
-
+    Three samples further apart than twice `stale_after` are not judged together.
     """
 
     def __init__(self, settings: MonitorSettings) -> None:
