@@ -29,8 +29,7 @@ from ou_monitor.fleet.analysis import Options, work  # noqa: E402, I202
 from ou_monitor.fleet.workers import LocalWorkers, usable_cores  # noqa: E402
 from ou_monitor.recordings.write import write_recording  # noqa: E402
 from ou_monitor.records import Recording  # noqa: E402
-from ou_monitor.simulation.profiles import read_profile  # noqa: E402
-from ou_monitor.simulation.simulation import PRESETS, simulated  # noqa: E402
+from ou_monitor.simulation import PRESETS, read_profile, simulated  # noqa: E402
 from tables import table  # noqa: E402
 
 BEGIN, END = '<!-- benchmark begins -->', '<!-- benchmark ends -->'

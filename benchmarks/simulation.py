@@ -35,8 +35,7 @@ from ou_monitor.model.terms.jumps import Jumps  # noqa: E402
 from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring  # noqa: E402
 from ou_monitor.model.terms.ou import OU  # noqa: E402
 from ou_monitor.model.terms.term import Term  # noqa: E402
-from ou_monitor.simulation.profiles import PROFILES  # noqa: E402
-from ou_monitor.simulation.simulation import PRESETS  # noqa: E402
+from ou_monitor.simulation import PRESETS, PROFILES  # noqa: E402
 from tables import put, table  # noqa: E402
 
 ALPHA, SIGMA, RATE = 63.0, 0.632, 1000.0

@@ -26,9 +26,8 @@ sys.path.insert(0, str(ROOT))
 from ou_monitor.model.ou import simulate  # noqa: E402, I100, I202
 from ou_monitor.recordings.write import TYPES, write_recording  # noqa: E402
 from ou_monitor.records import FloatArray, Recording  # noqa: E402
-from ou_monitor.simulation.profiles import FLIGHT, PROFILES  # noqa: E402
-from ou_monitor.simulation.simulation import (  # noqa: E402
-    ALPHA, FLIGHT_NOISE, FLIGHT_SAG, SIGMA, TRANSIENT_SAG, U0)
+from ou_monitor.simulation import (  # noqa: E402
+    ALPHA, FLIGHT, FLIGHT_NOISE, FLIGHT_SAG, PROFILES, SIGMA, TRANSIENT_SAG, U0)
 
 # 2024-01-01T00:00:00Z: a fixed start, for a bag must not depend on the day.
 START_NS = 1_704_067_200 * 1_000_000_000

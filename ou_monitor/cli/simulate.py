@@ -24,8 +24,7 @@ _DURATION_MOST = 9e9
 def run(args: argparse.Namespace) -> int:
     """Simulate."""
     from ou_monitor.recordings.model_file import as_yaml, ModelFile, read_model
-    from ou_monitor.simulation.profiles import is_recording, PROFILES, read_profile, read_throttle
-    from ou_monitor.simulation.simulation import PRESETS
+    from ou_monitor.simulation import is_recording, PRESETS, PROFILES, read_profile, read_throttle
 
     if args.list:
         output.check_paths({}, {'--json': args.json}, args.force)
@@ -114,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
 def _write(args: argparse.Namespace, model: Any, profile: Any, duration: float, rate: float,
            kind: str, name: str) -> dict[str, Any]:
     from ou_monitor.recordings.write import RecordingWriter
-    from ou_monitor.simulation.simulation import simulated
+    from ou_monitor.simulation import simulated
 
     total, done = round(duration * rate), 0
     with output.replacing(args.output, args.force), \

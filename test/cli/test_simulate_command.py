@@ -16,7 +16,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.read import read_recording
-from ou_monitor.simulation.simulation import PRESETS
+from ou_monitor.simulation import PRESETS
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]

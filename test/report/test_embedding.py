@@ -3,7 +3,7 @@
 from hypothesis import given, strategies as st
 import numpy as np
 from ou_monitor.report import page
-from ou_monitor.report.embedding import embed, envelope
+from ou_monitor.report.page import embed, envelope
 from ou_monitor.report.svg import Curve, Plot
 from pages import parsed, self_contained, unpacked
 import pytest

@@ -9,7 +9,7 @@ import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.report import page
 from ou_monitor.report.analysis_page import analysis_page
-from ou_monitor.report.embedding import embed
+from ou_monitor.report.page import embed
 from ou_monitor.report.svg import Plot
 import pytest
 from simulated_recordings import recording

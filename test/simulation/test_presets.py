@@ -3,8 +3,7 @@
 import math
 
 import numpy as np
-from ou_monitor.simulation.profiles import read_profile
-from ou_monitor.simulation.simulation import PRESETS, simulated
+from ou_monitor.simulation import PRESETS, read_profile, simulated
 import pytest
 
 # Typed from the paper's Tables 1 and 2: throttle, Vrms in mV.

@@ -2,7 +2,7 @@
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.simulation.profiles import constant, PROFILES, read_profile, through
+from ou_monitor.simulation import constant, PROFILES, read_profile, through
 import pytest
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.read import read_recording
-from ou_monitor.simulation.profiles import is_recording, read_throttle
+from ou_monitor.simulation import is_recording, read_throttle
 import pytest
 
 ROWS = '1000,12.0,0.1\n1001,12.0,0.1\n1002,11.5,0.6\n1003,11.4,0.2\n1004,11.9,0.2\n'

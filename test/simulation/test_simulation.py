@@ -6,8 +6,7 @@ from ou_monitor.model.supply import SEGMENT, SupplyModel
 from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.simulation.profiles import constant, read_profile
-from ou_monitor.simulation.simulation import simulated
+from ou_monitor.simulation import constant, read_profile, simulated
 import pytest
 
 SAGGING = SupplyModel((OU(63.0, 0.3, 5.0), LoadSag(0.5, 0.0)))

@@ -1,1 +1,0 @@
-"""Supplies, throttle profiles and recordings to simulate."""
