@@ -164,7 +164,9 @@ def _without(fitter: Fitter, search: Search, begun: Search, dropped: Sequence[st
         kinds = _kinds(again.accepted)
         other = fitter.whole(again.composite)
         left = criticise(fitter.samples, other, bank)
-        if any(map(decision.is_latent, kinds)) and not decision.withdrawn(before, left, kinds):
+        out = _in_doubt(fitter.samples, other, again.accepted,
+                        decision.withdrawn(before, left, kinds))
+        if any(map(decision.is_latent, kinds)) and not out:
             return _Result(again, other, left)
     search = begun.copy()
     name_causes(fitter, search, bank, latent=False, given=[*given, *slow])
@@ -362,20 +364,28 @@ def _kept_beside(fitter: Fitter, search: Search, stays: Sequence[Term],
     samples = fitter.samples
     whole = fitter.whole(search.composite)
     after = criticise(samples, whole, bank)
-    for term in stays:
-        if not term.SEVERAL and search.composite.has(term.NAME):
-            continue
-        fit = fitter.join(search.composite, [term], rough=False)
-        if fit is None or (fitter.evidence(fit) - fitter.evidence(search.composite)
-                           < decision.ACCEPT):
-            continue
-        again = fitter.whole(fit)
-        left = criticise(samples, again, bank)
-        kinds = _kinds([*search.accepted, term.NAME])
-        if (len(kinds) - 1 in decision.withdrawn_under_load(before, left, kinds) if loaded
-                else decision.withdrawn(before, left, kinds)):
-            continue
-        search.composite, whole, after = fit, again, left
-        search.accepted.append(term.NAME)
-        search.rivals.setdefault(term.NAME, [])
+    # Lines come at once: none explains what the others do.
+    lines = [term for term in stays if isinstance(term, Tone)]
+    groups: list[list[Term]] = [[*lines], *([term] for term in stays if term not in lines)]
+    for terms in groups:
+        more = [term for term in terms if term.SEVERAL or not search.composite.has(term.NAME)]
+        while more:
+            fit = fitter.join(search.composite, more, rough=False)
+            if fit is None or (fitter.evidence(fit) - fitter.evidence(search.composite)
+                               < decision.ACCEPT * len(more)):
+                break
+            again = fitter.whole(fit)
+            left = criticise(samples, again, bank)
+            names = [*search.accepted, *(term.NAME for term in more)]
+            kinds = _kinds(names)
+            out = _in_doubt(samples, again, names, (
+                decision.withdrawn_under_load if loaded else decision.withdrawn)(
+                    before, left, kinds))
+            bad = [k - len(search.accepted) for k in out if k >= len(search.accepted)]
+            if not bad:
+                search.composite, whole, after, search.accepted = fit, again, left, names
+                for term in more:
+                    search.rivals.setdefault(term.NAME, [])
+                break
+            more = [term for k, term in enumerate(more) if k not in bad]
     return whole, after

@@ -1,0 +1,100 @@
+"""Which lines `discover` names: those of the supply, however much else is left, and no others."""
+
+from dataclasses import replace
+import os
+from pathlib import Path
+
+import numpy as np
+from ou_monitor import discover
+from ou_monitor.analysis.level_result import fit_level
+from ou_monitor.analysis.levels import LoadLevel, Segment
+from ou_monitor.criticism.composite import covariates_of, fit_composite
+from ou_monitor.criticism.null_bank import criticise, simulate_bank
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.discovery import decision
+from ou_monitor.discovery.errors import standard_errors
+from ou_monitor.discovery.fitting import Fitter
+from ou_monitor.discovery.search import _in_doubt, _kept_beside
+from ou_monitor.discovery.search_state import Search
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.load_transient import LoadTransient
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.tone import Tone
+from ou_monitor.recordings.read import read_recording
+from ou_monitor.records import NAN, Recording
+import pytest
+
+REAL = Path(os.environ.get('OU_MONITOR_REALDATA', 'nowhere'))
+RATE = 50.0
+T = np.arange(2000) / RATE
+RAIL = OU(20.0, 0.1, 15.0)
+
+
+def voltage(*terms, throttle=None, seed=0):
+    """Return a rail with terms on it, V."""
+    return SupplyModel((RAIL, *terms)).simulate(T, np.random.default_rng(seed), throttle)
+
+
+@pytest.mark.parametrize('amplitude, stays', [(0.006, False), (0.009, True)])
+def test_only_a_sure_line_is_never_withdrawn(amplitude, stays):
+    """Whatever else is left, a line of more than 25 standard errors is there."""
+    samples = Samples(T, voltage(Tone(amplitude, 13.0, 0.5, 0.0)), None)
+    whole = fit_composite(samples, [RAIL, Tone(0.0, 13.0, 0.0, 0.0)], slice(0, samples.n))
+    error = standard_errors(samples, whole, slice(0, samples.n))[1]['amplitude']
+    assert (amplitude > decision.SURE * error) == stays
+    assert _in_doubt(samples, whole, ['tone'], [0]) == ([] if stays else [0])
+
+
+def test_other_causes_have_no_such_right():
+    """Only lines stay for their size: withdrawn is withdrawn."""
+    samples = Samples(T, voltage(Tone(0.2, 13.0, 0.5, 0.0)), None)
+    whole = fit_composite(samples, [RAIL, Tone(0.0, 13.0, 0.0, 0.0)], slice(0, samples.n))
+    assert _in_doubt(samples, replace(whole), ['second_relaxation'], [0]) == [0]
+
+
+def test_lines_are_put_back_together():
+    """One at a time each would leave what the other explains, and go again."""
+    tones = [Tone(0.05, 13.0, 0.5, 0.0), Tone(0.04, 7.0, 0.5, 0.0)]
+    samples = Samples(T, voltage(*tones), None)
+    start = fit_composite(samples, [RAIL], samples.train)
+    bank = simulate_bank(covariates_of(samples, start), float(start.gaussian.phi[1]),
+                         np.random.default_rng(0))
+    search = Search(start)
+    _kept_beside(Fitter(samples), search, tones, criticise(samples, start, bank), bank, False)
+    assert search.accepted == ['tone', 'tone']
+
+
+@pytest.mark.parametrize('frequency, terms', [
+    (0.4, (LoadSag(1.0, 0.0),)),
+    (0.25, (LoadSag(0.8, 0.6), LoadTransient(0.3, 1.0, 0.0))),
+    (1.1, (LoadSag(1.0, 0.0), LoadTransient(0.5, 0.3, 0.0)))])
+@pytest.mark.parametrize('line', [False, True])
+def test_the_flown_path_is_no_line_of_the_supply(frequency, terms, line):
+    """Circles flown at some tenths of a hertz move throttle, and that the rail."""
+    rng = np.random.default_rng(1)
+    hold = np.repeat(rng.standard_normal(T.size // 5), 5)
+    throttle = 0.5 + 0.2 * np.sin(2.0 * np.pi * frequency * T) + 0.02 * hold
+    tones = (Tone(0.05, 13.0, 0.0, 0.0),) if line else ()
+    found = discover(Recording(T, voltage(*terms, *tones, throttle=throttle), throttle, 'path'))
+    assert [cause.term.frequency for cause in found.causes if cause.name == 'tone'] == (
+        [pytest.approx(13.0, abs=0.01)] if line else [])
+    assert {'load_sag', 'load_transient'} & {cause.name for cause in found.causes}
+
+
+@pytest.mark.skipif(not (REAL / 'xt_pico_a.csv').exists(), reason='recorded runs are elsewhere')
+def test_analyze_and_discover_name_the_same_lines_of_a_comb():
+    """A second of xt_pico_a, a comb of 106.5 Hz: each clear line of one is one of the other."""
+    whole = read_recording(REAL / 'xt_pico_a.csv')
+    n = 5_000
+    part = replace(whole, t=whole.t[:n], voltage=whole.voltage[:n], throttle=np.full(n, NAN))
+    level = fit_level(part, part, LoadLevel(NAN, (Segment(0, n),)), 1)
+    tones = [cause for cause in discover(part).causes if cause.name == 'tone']
+    ours = [(line.frequency, line.p_value < 1e-5) for line in level.lines.lines]
+    theirs = [(one.term.frequency, one.term.amplitude > 7.0 * one.se['amplitude'])
+              for one in tones]
+    # Two bins.
+    for some, others in ((ours, theirs), (theirs, ours)):
+        assert sum(clear for _, clear in some) >= 5
+        for frequency, clear in some:
+            assert not clear or any(abs(frequency - other) < 2.0 for other, _ in others), frequency
