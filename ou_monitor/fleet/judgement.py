@@ -82,9 +82,10 @@ class Trend:
 
 def trends(all_values: Sequence[Values]) -> tuple[Trend, ...]:
     """Test every vehicle and quantity with enough flights."""
+    from ou_monitor.criticism.level_tests import adjusted
     found = [trend for values in all_values for trend in _of_values(values)]
-    adjusted = holm(np.array([trend.p_value for trend in found]))
-    done = [replace(trend, p_family=float(p)) for trend, p in zip(found, adjusted)]
+    done = [replace(trend, p_family=p) for trend, p in zip(
+        found, adjusted([trend.p_value for trend in found]))]
     return tuple(sorted(done, key=lambda t: (t.p_family, t.p_value, t.vehicle, t.quantity)))
 
 
@@ -108,16 +109,6 @@ def _of_values(values: Values) -> list[Trend]:
                            # All values equal: no order, no drift.
                            p_value if math.isfinite(p_value) else 1.0))
     return found
-
-
-def holm(p_values: FloatArray) -> FloatArray:
-    """Return p-values adjusted for all tests together (Holm 1979)."""
-    m = p_values.size
-    order = np.argsort(p_values, kind='stable')
-    raised = np.maximum.accumulate((m - np.arange(m)) * p_values[order]) if m else p_values
-    adjusted = np.empty(m)
-    adjusted[order] = np.minimum(raised, 1.0)
-    return adjusted
 
 
 def fewest(tests: int, rate: float) -> int:

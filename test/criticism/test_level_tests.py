@@ -6,7 +6,7 @@ import numpy as np
 from ou_monitor.analysis.level_result import fit_segment
 from ou_monitor.criticism.innovations import fresh, innovations
 from ou_monitor.criticism.level_tests import (
-    EFFECT, examine_level, FAMILY_WISE, holm, Shape, TestResult)
+    adjusted, EFFECT, examine_level, FAMILY_WISE, holm, Shape, TestResult)
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Estimate, Flag, Recording, Status
 import pytest
@@ -188,6 +188,8 @@ def test_holm_is_that_of_the_textbook():
     assert [test.p_adjusted for test in first.tests] == pytest.approx(
         [0.04, math.nan, 0.06], nan_ok=True)
     assert [test.p_adjusted for test in second.tests] == pytest.approx([0.06, 0.5])
+    assert adjusted([0.04, 0.01, 0.03, 0.005]) == pytest.approx((0.06, 0.03, 0.06, 0.02))
+    assert adjusted([]) == () and adjusted([0.9, 0.8]) == (1.0, 1.0)
 
 
 def test_rates_of_impulses_have_their_poisson_interval():

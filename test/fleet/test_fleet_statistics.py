@@ -5,7 +5,7 @@ import math
 import numpy as np
 from ou_monitor.fleet.comparison import values_of
 from ou_monitor.fleet.judgement import (
-    DRIFT_RATE, fewest, holm, judge, LEAST_FLIGHTS, OUTLIER_RATE, outliers, trends)
+    DRIFT_RATE, fewest, judge, LEAST_FLIGHTS, OUTLIER_RATE, outliers, trends)
 import pytest
 from simulated_fleets import BEND, LEVELS, SLOPE, table
 
@@ -101,13 +101,6 @@ def test_small_groups_and_unknown_vehicles_are_not_judged():
     assert np.isnan(found.score).all() and not found.found.any()
     # Values that do not scatter at all are no division by zero.
     assert not outliers(np.ones(8), np.zeros(8), ['a'] * 8, 0.05, simulations=50).found.any()
-
-
-def test_holm_is_holm():
-    """Against the definition, and monotone."""
-    p = np.array([0.04, 0.01, 0.03, 0.005])
-    np.testing.assert_allclose(holm(p), [0.06, 0.03, 0.06, 0.02])
-    assert holm(np.zeros(0)).size == 0 and holm(np.array([0.9, 0.8])).max() == 1.0
 
 
 def test_fewest_flights():

@@ -172,14 +172,11 @@ class LagSums:
         """Move the rows to the front, of a larger store if need be."""
         if self._tail + more <= len(self._begins):
             return
-        kept = slice(self._head, self._tail)
-        rows, begins = self._rows[kept].copy(), self._begins[kept].copy()
-        if len(begins) + more > len(self._begins):
-            size = 2 * (len(begins) + more)
-            self._rows = np.empty((size, self._ends[-1]))
-            self._begins = np.empty(size, dtype=np.int64)
+        rows, begins = self._rows[self._head:self._tail], self._begins[self._head:self._tail]
+        size = max(len(self._begins), 2 * (len(begins) + more))
         self._head, self._tail = 0, len(begins)
-        self._rows[:self._tail], self._begins[:self._tail] = rows, begins
+        self._rows, self._begins = (np.concatenate([kept, np.empty(
+            (size - len(kept), *kept.shape[1:]), kept.dtype)]) for kept in (rows, begins))
 
     def _variables(self, begin: int, end: int) -> FloatArray:
         """Return the variables of samples begin..end-1, shape (c, end - begin)."""
@@ -351,34 +348,26 @@ class Resolution:
         """Return the next coarser resolution, up to date."""
         if self._coarser is None:
             self._coarser = Resolution(self._window, self)
-        self._coarser.catch_up()
+        self._coarser._take(self.series)
         return self._coarser
 
-    def catch_up(self) -> None:
-        """Take what the finer resolution has got since the last time."""
-        if self._parent is None:
-            return
-        fine = self._parent.series
+    def _take(self, fine: Series) -> None:
+        """Take what a finer series has got since the last time."""
         begin = max(self._taken, fine.first)
         skipped = begin != self._taken
         if begin >= fine.end:
             return
-        runs = fine.runs(begin, fine.end)
-        starts = np.flatnonzero(runs == 0)
-        if (skipped or not self.series.size) and (not starts.size or starts[0] != 0):
-            starts = np.concatenate(([0], starts))
-        edges = starts.tolist()
-        if not edges or edges[0] != 0:
-            edges = [0, *edges]
-        edges.append(fine.end - begin)
+        starts = set(np.flatnonzero(fine.runs(begin, fine.end) == 0).tolist())
+        if skipped or not self.series.size:
+            starts.add(0)
+        edges = sorted({0, *starts, fine.end - begin})
         throttle = fine.throttle(begin, fine.end)
         columns = fine.columns(begin, fine.end)
         if throttle is not None:
             columns = np.concatenate([columns, throttle[None, :]])
-        is_start = set(starts.tolist())
         parts, breaks, count = [], [], 0
         for low, high in zip(edges[:-1], edges[1:]):
-            if low in is_start:
+            if low in starts:
                 breaks.append(count)
             whole = (high - low) // FACTOR
             stop = low + whole * FACTOR
