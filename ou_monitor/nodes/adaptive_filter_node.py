@@ -145,11 +145,11 @@ class AdaptiveFilterNode(MonitorNode):
             self._motors.watch()
         if self._channels is None:
             self._found = types_on(self, self._topic)
-            if not self._found:
-                self._console.waiting(self._topic)
             known = [kind for kind in self._found if self._field or kind in CHANNELS]
             if known:
                 self._open(known[0])
+        if self._input_silence.age is None and (self._channels is not None or not self._found):
+            self._console.waiting(self._topic)
 
     def _channels_of(self, kind: str) -> Channels:
         return channels_of(kind, self._field, mode=self.get_parameter(_MODE.name).value,

@@ -9,8 +9,9 @@ from ou_monitor.nodes.base import MonitorNode
 from ou_monitor.online.risk.flag import FlagLevel, FlagState
 from ou_monitor.stream.arrival import Publishers
 
-# How often it is said that a topic has no publisher, s.
+# How often it is said that a topic has no publisher, and how long one may be silent, s.
 AGAIN = 60.0
+MUTE = 10.0
 
 
 class Console:
@@ -18,19 +19,37 @@ class Console:
 
     def __init__(self, node: MonitorNode) -> None:
         self._node = node
-        self._waiting = -math.inf
+        self._waiting = self._muted = -math.inf
         self._critical = False
 
     def waiting(self, topic: str) -> None:
-        """Say that a topic has no publisher, while it has none: at once, then once a minute."""
+        """
+        Say why no message has come yet on a topic.
+
+        It has no publisher: at once, then once a minute; or one that is not heard, after a while.
+        """
         now, topic = self._node.steady_now(), self._node.resolve_topic_name(topic)
-        if now - self._waiting < AGAIN or self._node.count_publishers(topic):
+        if self._node.count_publishers(topic):
+            self._mute(now, topic)
+            return
+        self._muted = -math.inf
+        if now - self._waiting < AGAIN:
             return
         self._waiting = now
         alike = [name for name, _ in self._node.get_topic_names_and_types()
                  if topic in name and name != topic]
         hint = f" (there is {', '.join(alike)})" if alike else ''
         self._node.get_logger().info(f'Waiting for a publisher on {topic}{hint}.')
+
+    def _mute(self, now: float, topic: str) -> None:
+        if self._muted == -math.inf:
+            self._muted = now + MUTE
+        if now < self._muted:
+            return
+        self._muted = now + AGAIN
+        self._node.get_logger().info(
+            f'{topic} has a publisher, but no message has come: it sends none, or runs as another '
+            'user, whose messages Fast DDS does not bring (doc/deploy.md).')
 
     def flag(self, state: FlagState) -> None:
         """Say when the flag becomes CRITICAL, and when it is no longer."""

@@ -171,7 +171,7 @@ class EstimatorNode(MonitorNode):
         """Look at who publishes, 5 times a second."""
         self._stamper.follow()
         self._look_at_publishers()
-        if self._arrived.age is None:
+        if self._arrived.age is None and 'voltage' not in self._problems:
             self._console.waiting(self._sources['voltage'].topic)
         for source in self._sources.values():
             if source.quantity in self._opened:

@@ -23,7 +23,8 @@ def test_nodes_come_up_and_end(world, file):
     """Those that are described are seen, and SIGINT ends all of them with status 0."""
     probe = world.probe()
     launched = subprocess.Popen(
-        ['ros2', 'launch', 'ou_monitor', file], start_new_session=True,
+        # -n: at a terminal `ros2 launch` leaves the signal of its nodes to the terminal.
+        ['ros2', 'launch', '-n', 'ou_monitor', file], start_new_session=True,
         env={**os.environ, 'ROS_DOMAIN_ID': str(world.domain)})
     try:
         wait_until(lambda: set(FILES[file]) <= set(probe.node.get_fully_qualified_node_names()),

@@ -1,6 +1,8 @@
 """What systemd is told, on a socket of its kind."""
 
 import os
+import re
+import shlex
 import socket
 import subprocess
 import sys
@@ -72,6 +74,32 @@ def test_the_unit_is_accepted(tmp_path):
     done = subprocess.run(['systemd-analyze', 'security', '--offline=true', '--threshold=25',
                            unit], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stdout[-200:]
+
+
+@pytest.mark.parametrize('name, names', [
+    ('estimator', []), ('adaptive_filter', ['sigma:=ou_estimator/sigma',
+                                            'state:=ou_estimator/state', 'input:=imu'])])
+def test_the_command_of_the_unit(tmp_path, name, names):
+    """As bash runs it: both set-ups sourced, the file of parameters, names of topics as words."""
+    install = tmp_path / 'opt/ou_monitor/install'
+    ros = tmp_path / 'opt/ros/jazzy'
+    node = install / 'ou_monitor/lib/ou_monitor' / name
+    for folder in (ros, node.parent):
+        folder.mkdir(parents=True)
+    (ros / 'setup.bash').write_text('export FIRST=1\n')
+    (install / 'local_setup.bash').write_text('export SECOND=$FIRST\n')
+    node.write_text('#!/bin/sh\necho "$SECOND" "$@"\nexit 3\n')
+    node.chmod(0o755)
+    unit = (ROOT / 'deploy/ou_monitor@.service').read_text()
+    (line,) = re.findall('^ExecStart=(.*)$', unit, re.M)
+    line = line.replace('/opt/', f'{tmp_path}/opt/').replace('%i', name).replace('$$', '$')
+    given = ROOT / 'deploy' / f'{name}.env'
+    env = dict(re.findall('^(REMAP)=(.*)$', given.read_text(), re.M)) if given.exists() else {}
+    done = subprocess.run(shlex.split(line), env=env, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 3
+    assert done.stdout.split() == [
+        '1', '--ros-args', '--params-file', f'/etc/ou_monitor/{name}.yaml',
+        *(word for one in names for word in ('-r', one))]
 
 
 def test_the_nodes_need_no_reader_of_bags_and_no_scipy():
