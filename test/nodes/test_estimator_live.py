@@ -292,13 +292,18 @@ def test_blocks_of_adc_samples(world):
     assert rig.status.message == 'Waiting for a publisher on /adc/voltage.'
     rig.connect(Float32MultiArray)
     path = ou_path(20000, 1e-4, seed=9, sigma=0.3)
-    start = time.monotonic()
-    for k in range(200):
-        time.sleep(max(start + 0.01 * k - time.monotonic(), 0.0))
-        throttle.publish(Float32(data=0.25))
-        rig.output.publish(Float32MultiArray(data=path[100 * k:100 * (k + 1)]))
-    rig.settle(20000)
-    wait_until(lambda: rig.count('n') >= 16000)
+
+    def full():
+        start = time.monotonic()
+        for k in range(200):
+            time.sleep(max(start + 0.01 * k - time.monotonic(), 0.0))
+            throttle.publish(Float32(data=0.25))
+            rig.output.publish(Float32MultiArray(data=path[100 * k:100 * (k + 1)]))
+        told = len(rig.states)
+        wait_until(lambda: len(rig.states) > told + 3)
+        return rig.count('n') >= 16000
+    # Where a busy machine holds the sender up, the window is not full: then once more.
+    wait_until(full)
     # 0.5 % of standard error; but two pauses of 0.15 s of a busy machine within the window, each
     # taken for a gap by the blocks' time line, cost 15 % of the samples and 11 % of sigma.
     assert float(rig.field('sigma')) == pytest.approx(0.3, rel=0.2)
