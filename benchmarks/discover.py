@@ -1,8 +1,9 @@
 """
-What `discover` makes of hidden effects and of real recordings: one command, three parts.
+What `discover` makes of hidden effects, of none, and of real recordings: one command, four parts.
 
     python benchmarks/discover.py blind [--each 10] [--lines FILE] [--table FILE]
     python benchmarks/discover.py limits [--runs 40] [--lines FILE] [--figure FILE]
+    python benchmarks/discover.py nulls [--each 40] [--elsewhere FILE] [--lines FILE]
     python benchmarks/discover.py flights [--table FILE] [NAME...]
 
 See README.md beside this file.
@@ -30,6 +31,7 @@ _ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(_ROOT), *(str(_ROOT / 'test' / name) for name in ('support', 'hidden'))]
 
 from discover_limits import CAUSES, DURATIONS, figure, limits_table, Point, Search  # noqa: E402
+from discover_nulls import nulls_of, nulls_table  # noqa: E402
 import discover_runs as runs  # noqa: E402
 from discover_tables import heat_map, report  # noqa: E402
 from hidden_effects import causes, KINDS, pairs, unknowns, variants  # noqa: E402
@@ -170,6 +172,25 @@ def flights(given: argparse.Namespace) -> int:
     return 0
 
 
+def nulls(given: argparse.Namespace) -> int:
+    """Run recordings with nothing hidden; write their table."""
+    lines = []
+    for line in nulls_of(given.each, given.seed, given.elsewhere, given.generators, given.lines,
+                         not given.no_run):
+        lines.append(line)
+        said = ', '.join(line['false']) or 'nothing false'
+        say(f'{line["generator"]} {line["number"]}: {line["rate"]:g} Hz, {line["duration"]:g} s, '
+            f'{line["verdict"]}, {said}')
+    if not lines:
+        say('no recording was run')
+        return 1
+    text = f'Seed {given.seed}.\n\n{nulls_table(lines)}'
+    print(text)
+    if given.table:
+        put(given.table, text, 'nulls')
+    return 0
+
+
 def _write(given: argparse.Namespace, text: str, svg: str) -> None:
     """Write table and drawing where they are asked for; the table shows the drawing."""
     if given.figure:
@@ -244,6 +265,19 @@ def _parser() -> argparse.ArgumentParser:
                       help='only these effects, causes or parts of a pair; none is left out')
     part.add_argument('--strength', type=_positive, default=1.0, help='1: moderate')
     part.add_argument('--duration', type=_positive, default=60.0, help='s')
+    part = parts.add_parser('nulls', help='recordings with nothing hidden',
+                            description='recordings with nothing hidden: false alarms')
+    part.set_defaults(action=nulls)
+    part.add_argument('--seed', type=_count, default=SEED, help='of all that is drawn')
+    part.add_argument('--each', type=_count, default=40, help='recordings of each generator')
+    part.add_argument('--elsewhere', type=Path, metavar='FILE',
+                      help="a generator of another hand: make('null', seed, T=duration) returns "
+                      'stamps, throttle and voltage at 1 kHz, its noise following throttle')
+    part.add_argument('--generators', nargs='+', help='only these: plain, flown, elsewhere')
+    part.add_argument('--lines', type=Path, help='JSON lines: results, added one by one; what is '
+                      'in it is not run again')
+    part.add_argument('--no-run', action='store_true', help='only what is in --lines')
+    part.add_argument('--table', type=Path, help='write the table here, between its marks')
     part = parts.add_parser('flights', help='recordings of real runs',
                             description='recordings of real runs, whole and in halves')
     part.set_defaults(action=flights)
@@ -262,7 +296,7 @@ def main() -> int:
     """Parse arguments, measure, write."""
     parser = _parser()
     given = parser.parse_args()
-    if given.part != 'flights' and given.jobs < 1:
+    if given.part in ('blind', 'limits') and given.jobs < 1:
         parser.error('--jobs needs 1 or more')
     if given.part == 'blind':
         given.pairs = 10 * given.each if given.pairs is None else given.pairs

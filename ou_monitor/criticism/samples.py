@@ -107,7 +107,7 @@ class Samples:
         return {}
 
     @cached_property
-    def means(self) -> dict[tuple[Term, ...], FloatArray]:
+    def means(self) -> dict[tuple[object, ...], FloatArray]:
         """Return the mean that was computed last, V, by the terms with their coefficients."""
         return {}
 

@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
+from ou_monitor.criticism.mean_columns import (
+    coefficients, columns_of, design_of, mean_of, owners, solved, with_mean)
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.model.innovations import Filter, StateSpace
 from ou_monitor.model.terms.ac_coupling import ACCoupling, bridge
@@ -128,7 +130,7 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
              se: Sequence[dict[str, float]] = (), inside: bool = False) -> GaussianFit:
     """Return what a model with given parameters says of a recording."""
     run = _filter(samples, terms, events)
-    mean = _mean(samples, terms, run.segment)
+    mean = mean_of(samples, terms, run.segment)
     e = run.kalman.innovations(samples.voltage - mean)
     # An event is the law's to expect, at its own sample: not so while it is fitted around.
     variance = run.full if inside else run.plain
@@ -147,72 +149,20 @@ def whitened(samples: Samples, terms: Sequence[Term], more: Sequence[Term],
     """
     run = _filter(samples, terms, events)
     kept = terms if own else [term for term in terms if term.ROLE is not Role.MEAN]
-    columns = _columns(samples, (*kept, *more), run.segment)
+    columns = columns_of(samples, (*kept, *more), run.segment)
     voltage = samples.voltage if offset is None else samples.voltage - offset
-    fixed = [] if own else [k for k, term in enumerate(_owners(terms))
+    fixed = [] if own else [k for k, term in enumerate(owners(terms))
                             if term is not None and not term.MEASURED]
     if fixed:
         beta = np.array([value for term in terms for value in coefficients(term)])
-        voltage = voltage - _columns(samples, terms, run.segment)[:, fixed] @ beta[fixed]
+        voltage = voltage - columns_of(samples, terms, run.segment)[:, fixed] @ beta[fixed]
     through = run.kalman.innovations(np.column_stack((voltage, columns)))
     return np.asarray(through / np.sqrt(run.full)[:, None], dtype=np.float64)
-
-
-def _owners(terms: Sequence[Term]) -> list[Term | None]:
-    """Return the term of each column of the mean; None for the level."""
-    return [None, *(term for term in terms if term.ROLE is Role.MEAN and term.NAME != 'ou'
-                    for _ in term.LINEAR)]
 
 
 def _log_density(e: FloatArray, variance: FloatArray) -> FloatArray:
     density: FloatArray = -0.5 * (np.log(2.0 * math.pi * variance) + e * e / variance)
     return density
-
-
-def coefficients(term: Term) -> list[float]:
-    """Return the coefficients of a term's columns."""
-    if isinstance(term, OU):
-        return [term.u0]
-    return term.linear_values() if term.ROLE is Role.MEAN else []
-
-
-def _columns(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
-    """Return all columns of the mean, through the instrument."""
-    return _design(samples, terms, s)[:, 1:]
-
-
-def _design(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
-    """Return the voltage and all columns of the mean; as they were where they are the same."""
-    means = _means(terms)
-    key = tuple(term.with_linear([1.0] * len(term.LINEAR)) for term in means)
-    if key not in samples.designs:
-        samples.designs.clear()
-        samples.designs[key] = np.concatenate([
-            samples.voltage[:, None], np.ones((samples.n, 1)), *map(samples.columns, means)],
-            axis=1)
-    design = samples.designs[key]
-    for term in terms:
-        if isinstance(term, ACCoupling):
-            design = design.copy()
-            # What the instrument shows has a level of its own.
-            design[:, 2:] = term.pass_through(design[:, 2:], s)
-    return design
-
-
-def _means(terms: Sequence[Term]) -> tuple[Term, ...]:
-    return tuple(term for term in terms if term.ROLE is Role.MEAN and term.NAME != 'ou')
-
-
-def _mean(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
-    """Return the mean of the voltage, V; as it was where only the noise has changed."""
-    beta = np.array([value for term in terms for value in coefficients(term)])
-    if any(isinstance(term, ACCoupling) for term in terms):
-        return np.asarray(_columns(samples, terms, s) @ beta)
-    key = (*beta.tolist(), *_means(terms))
-    if key not in samples.means:
-        samples.means.clear()
-        samples.means[key] = _columns(samples, terms, s) @ beta
-    return samples.means[key]
 
 
 @dataclass(frozen=True, eq=False)
@@ -444,19 +394,6 @@ def _scored(samples: Samples, terms: tuple[Term, ...], events: Events | None, ba
     return scores, means.T @ means + 0.5 * spreads.T @ spreads, cost
 
 
-def _solved(columns: FloatArray, y: FloatArray) -> FloatArray:
-    """Return least squares; coefficients that nothing determines come out as small as may be."""
-    # By the normal equations: scaled, columns here are never so alike that it matters, and
-    # least squares by orthogonal factors take ten times as long.
-    scale = np.sqrt(np.einsum('ij,ij->j', columns, columns))
-    scale[scale == 0.0] = 1.0
-    gram = columns.T @ columns / np.outer(scale, scale)
-    inverse = np.asarray(np.linalg.pinv(gram, rcond=1e-12, hermitian=True), dtype=np.float64)
-    many: FloatArray = inverse @ (
-        columns.T @ y / scale) / scale
-    return many
-
-
 def _liveliest(samples: Samples, size: int) -> slice:
     """Return the part of a size in which throttle moves most; the first without throttle."""
     if samples.throttle is None:
@@ -475,28 +412,13 @@ def _moved(terms: tuple[Term, ...], k: int, name: str, by: float) -> tuple[Term,
 def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None) -> GaussianFit:
     """Fit the coefficients of the mean by generalised least squares; events count as known."""
     run = _filter(samples, terms, events)
-    variance, design = run.full, _design(samples, terms, run.segment)
+    variance, design = run.full, design_of(samples, terms, run.segment)
     if not (variance > 0.0).all():
         raise ArithmeticError('variances that are not above 0')
     weight = 1.0 / np.sqrt(variance)
     through = run.kalman.innovations(design) * weight[:, None]
-    beta = _solved(through[:, 1:], through[:, 0])
+    beta = solved(through[:, 1:], through[:, 0])
     e = (through[:, 0] - through[:, 1:] @ beta) / weight
     return GaussianFit(with_mean(terms, beta), (), design[:, 1:] @ beta, e, variance,
                        _log_density(e, variance), run.phi,
                        run.cost + 1e-8 * samples.n * beta.size)
-
-
-def with_mean(terms: tuple[Term, ...], beta: FloatArray) -> tuple[Term, ...]:
-    """Return terms with the coefficients of all columns of the mean."""
-    ou = terms[0]
-    assert isinstance(ou, OU)
-    result: list[Term] = [replace(ou, u0=float(beta[0]))]
-    at = 1
-    for term in terms[1:]:
-        if isinstance(term, ACCoupling):
-            term = replace(term, offset=float(beta[0]))
-        size = len(term.LINEAR) if term.ROLE is Role.MEAN else 0
-        result.append(term.with_linear(beta[at:at + size].tolist()) if size else term)
-        at += size
-    return tuple(result)

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.criticism.composite import Composite
+from ou_monitor.criticism.mean_columns import coefficients
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.structure import coefficients, evaluate
+from ou_monitor.criticism.structure import evaluate
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray, NAN

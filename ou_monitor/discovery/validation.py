@@ -18,8 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite
+from ou_monitor.criticism.mean_columns import with_mean
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.structure import evaluate, whitened, with_mean
+from ou_monitor.criticism.structure import evaluate, whitened
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray
 

@@ -9,9 +9,10 @@ from ou_monitor.criticism.adc import find_rails, redraw
 from ou_monitor.criticism.composite import _same
 from ou_monitor.criticism.curves import _bins, compare_curves
 from ou_monitor.criticism.level_tests import _correlated, _mean_drift
+from ou_monitor.criticism.mean_columns import solved
 from ou_monitor.criticism.readings import why_nothing
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.structure import _solved, evaluate, Events
+from ou_monitor.criticism.structure import evaluate, Events
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.records import Estimate, Status
 import pytest
@@ -170,7 +171,7 @@ def test_least_squares_of_few_and_of_many_columns(width):
     columns, y = rng.standard_normal((1000, width)), rng.standard_normal(1000)
     columns[:, 1] = 0.0
     columns *= np.geomspace(1.0, 1e3, width)
-    assert_allclose(_solved(columns, y), np.linalg.pinv(columns) @ y, atol=1e-9)
+    assert_allclose(solved(columns, y), np.linalg.pinv(columns) @ y, atol=1e-9)
 
 
 def test_why_nothing_can_be_fitted():
