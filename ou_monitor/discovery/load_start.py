@@ -104,9 +104,24 @@ def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:
         top = max(tried, default=None, key=fitter.evidence)
         gain = -math.inf if top is None else fitter.evidence(top) - fitter.evidence(best)
         if top is None or gain < decision.ACCEPT:
-            return best
+            return _without_mend(fitter, best)
         largest = max(largest, gain)
         best = top
+
+
+def _without_mend(fitter: Fitter, composite: Composite) -> Composite:
+    """Return a model without the one of two curves over throttle that only mends the other."""
+    if not all(composite.has(kind.NAME) for kind in CURVES):
+        return composite
+    # Whichever came first: the wrong one may have stood for the right one until that came.
+    less = [fitter.fit([term for term in composite.terms if not isinstance(term, kind)], composite,
+                       rough=True) for kind in CURVES]
+    fits = [fit for fit in less if fit is not None]
+    if len(fits) < len(CURVES):
+        return composite
+    lost = [fitter.evidence(composite) - fitter.evidence(fit) for fit in fits]
+    least = int(np.argmin(lost))
+    return fits[least] if lost[least] < decision.FORM * max(lost) else composite
 
 
 def choose_answer(fitter: Fitter, search: Search, start: Sequence[Term]) -> None:

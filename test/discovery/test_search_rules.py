@@ -6,6 +6,7 @@ import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision, fitting, search as rules
 from ou_monitor.discovery.fitting import Fitter, Trial
+from ou_monitor.discovery.load_start import _without_mend
 from ou_monitor.discovery.search_state import Search
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.drift import Drift
@@ -205,6 +206,24 @@ def test_a_curve_that_mends_another_one(evidence, only):
     alone = Search(Model([BASE], 0.0), [], largest=5.0 / decision.FORM)
     assert not rules._only_form(one, alone)
     assert LoadDependentNoise.NAME in rules.OTHER_CURVE
+
+
+@pytest.mark.parametrize('noise, sigma, left', [
+    # Evidence without either: what one brings beside the other, in tenths of what that brings.
+    (91.0, 10.0, {'load_dependent_sigma'}), (89.0, 10.0, {*rules.OTHER_CURVE}),
+    (10.0, 91.0, {'load_dependent_noise'}), (10.0, 89.0, {*rules.OTHER_CURVE}),
+    (91.0, None, {*rules.OTHER_CURVE})])
+def test_the_curve_that_came_first_may_be_the_one_that_mends(noise, sigma, left):
+    """Whichever of two was accepted first: less than a tenth of the other is its form."""
+    curve = LoadDependentNoise(1.0, 2.0)
+    model = Model([BASE, NOISE, curve, SIGMA], 100.0)
+    table = Table({('measurement_noise', 'load_dependent_sigma'): noise,
+                   ('measurement_noise', 'load_dependent_noise'): sigma})
+    # Fits are rough: a nat worse.
+    table.worth = {key: None if worth is None else worth + 1.0
+                   for key, worth in table.worth.items()}
+    found = _without_mend(table, model)
+    assert {term.NAME for term in found.terms} - {'ou', 'measurement_noise'} == left
 
 
 def test_a_trial_that_is_accepted():
