@@ -3,9 +3,14 @@
 from pathlib import Path
 import unittest
 
+from ament_index_python.packages import get_package_prefix, PackageNotFoundError
 import pytest
 
 pytest.importorskip('launch_testing', reason='needs a sourced ROS 2 with launch_testing')
+try:
+    get_package_prefix('ou_monitor')
+except PackageNotFoundError:
+    pytest.skip('needs the workspace of this package', allow_module_level=True)
 
 from launch import LaunchDescription  # noqa: E402, I100
 from launch.actions import IncludeLaunchDescription  # noqa: E402
