@@ -210,9 +210,9 @@ def test_a_curve_that_mends_another_one(evidence, only):
 
 @pytest.mark.parametrize('noise, sigma, left', [
     # Evidence without either: what one brings beside the other, in tenths of what that brings.
-    (91.0, 10.0, {'load_dependent_sigma'}), (89.0, 10.0, {*rules.OTHER_CURVE}),
-    (10.0, 91.0, {'load_dependent_noise'}), (10.0, 89.0, {*rules.OTHER_CURVE}),
-    (91.0, None, {*rules.OTHER_CURVE})])
+    (91.5, 10.0, {'load_dependent_sigma'}), (89.0, 10.0, {*rules.OTHER_CURVE}),
+    (10.0, 91.5, {'load_dependent_noise'}), (10.0, 89.0, {*rules.OTHER_CURVE}),
+    (91.5, None, {*rules.OTHER_CURVE})])
 def test_the_curve_that_came_first_may_be_the_one_that_mends(noise, sigma, left):
     """Whichever of two was accepted first: less than a tenth of the other is its form."""
     curve = LoadDependentNoise(1.0, 2.0)
