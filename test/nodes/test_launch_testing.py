@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip('launch_testing', reason='needs a sourced ROS 2 with launch_testing')
 try:
     get_package_prefix('ou_monitor')
-except PackageNotFoundError:
+except (PackageNotFoundError, OSError):
     pytest.skip('needs the workspace of this package', allow_module_level=True)
 
 from launch import LaunchDescription  # noqa: E402, I100
