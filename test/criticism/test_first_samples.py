@@ -5,11 +5,13 @@ import math
 import numpy as np
 from numpy.testing import assert_allclose
 from ou_monitor.criticism.curves import compare_curves
+from ou_monitor.criticism.mean_columns import columns_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, state_space
 from ou_monitor.discovery.decision import rivals_of, TIE
 from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.load_dependent_alpha import LoadDependentAlpha
+from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.ou import OU
 
 
@@ -61,3 +63,20 @@ def test_rivals_are_within_a_tie():
     """Not at its edge; the best one is none."""
     evidence = [('a', 5.0 + TIE), ('b', 5.0), ('c', 5.0 + 0.01), ('d', 9.0 + TIE)]
     assert rivals_of('a', evidence) == ['c', 'd'] and rivals_of('d', evidence) == []
+
+
+def test_the_mean_is_seen_through_the_instrument():
+    """Columns of the load are high-passed; that of the level is the instrument's own."""
+    t = 0.01 * np.arange(300)
+    u = np.where(t >= 1.0, 0.8, 0.2)
+    samples = Samples(t, 5.0 - u, u)
+    ou, sag, coupling = OU(60.0, 0.5, 5.0), LoadSag(0.3, 0.1), ACCoupling(2.0, 0.0)
+    s = samples.segment(60.0, 0.5)
+    bare = columns_of(samples, (ou, sag), s)
+    shown = columns_of(samples, (ou, sag, coupling), s)
+    assert bare.shape == shown.shape == (300, 3)
+    assert_allclose(shown[:, 0], 1.0)
+    assert_allclose(shown[:, 1:], coupling.pass_through(bare[:, 1:], s), atol=1e-12)
+    assert np.abs(shown[:90, 1:]).max() < 1e-9 < np.abs(bare[:90, 1:]).min()
+    # What is kept from before is not touched.
+    assert_allclose(columns_of(samples, (ou, sag), s), bare)

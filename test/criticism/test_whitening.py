@@ -93,3 +93,15 @@ def test_an_ac_coupled_instrument_is_found_and_said(corner):
             assert 'AC-coupled' in item.text
     assert found >= 8
     assert sum(analyze(recording(seed)).levels[0].coupled for seed in range(10)) <= 1
+
+
+@pytest.mark.parametrize('slow, coupled', [(0.2, True), (5.0, False)])
+def test_power_that_is_missing_is_a_high_pass_where_it_is_slow(slow, coupled):
+    """Innovations without a band below, or above, the rate of the OU."""
+    rng = np.random.default_rng(3)
+    n = 20000
+    spectrum = np.fft.rfft(rng.standard_normal(n))
+    omega = 2.0 * np.pi * np.fft.rfftfreq(n, 1.0 / RATE) / ALPHA
+    spectrum *= np.where(np.abs(np.log(np.maximum(omega, 1e-9) / slow)) < 0.7, 0.3, 1.0)
+    pole = other_pole([np.fft.irfft(spectrum, n)], RATE, ALPHA, 4e-4, 0.0)
+    assert (pole.coupling_p < FAMILY_WISE) is coupled

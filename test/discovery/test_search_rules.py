@@ -247,3 +247,23 @@ def test_dear_kinds_fail_until_something_asks_for_more():
     search = Search(Model([BASE], 0.0), failed={dear.NAME: 6.0, 'measurement_noise': 99.0})
     assert rules._in_vain(search, {sign.lstrip('+-'): 5.9 * by}) == [dear.NAME]
     assert rules._in_vain(search, {sign.lstrip('+-'): 6.1 * by}) == []
+
+
+def test_starts_that_the_spectrum_moved_the_same_way_are_one(monkeypatch):
+    """The best of those that hold are fitted, roughly and from there on."""
+    starts = [SecondRelaxation(float(k), 0.1) for k in range(1, 6)]
+    gains = dict(zip(starts, (5.0, 4.95, 3.0, 9.0, 2.0)))
+    monkeypatch.setattr(fitting, 'from_spectrum', lambda samples, composite, terms: (
+        terms, gains[terms[-1]]))
+    monkeypatch.setattr(SecondRelaxation, 'holds', lambda self, view: self.alpha != 4.0)
+    fitter, asked = Table({}), []
+
+    def fit(terms, known, rough=False, begun=False):
+        asked.append((terms[-1].alpha, rough, begun))
+        return Model(terms, -terms[-1].alpha)
+
+    fitter.fit = fit
+    found = fitter._by_spectrum(Model([BASE], 0.0), starts, None)
+    # 4 does not hold, and 2 went the way of 1.
+    assert asked == [(1.0, True, True), (3.0, True, True)]
+    assert found.terms[-1].alpha == 1.0

@@ -149,3 +149,29 @@ def test_what_is_said_of_the_sag(sag, error, status):
     loads._noise.scale, loads._noise._within = 1.0, 0.0
     loads._noise._step = math.inf
     assert loads.load().status is status
+
+
+@pytest.mark.parametrize('throttles', [(0.3,), (0.2, 0.6)])
+def test_an_open_level_shares_the_errors_of_the_coefficients(throttles):
+    """The voltage at hand is known to 2 % whatever they are; so is the fall to come, to theirs."""
+    for one in (flown(throttles), current_flown()):
+        u = throttles[-1]
+        rest = (15.0, u) if isinstance(one, LoadFilter) else (15.0, 0.8)
+        one._settle(*rest)
+        h = one._regressors() if isinstance(one, LoadFilter) else one._regressors(rest[1])
+        assert float(h @ one._m) == pytest.approx(15.0)
+        assert float(h @ one._P @ h) == pytest.approx((0.02 * one._volts) ** 2, rel=1e-9)
+        np.testing.assert_allclose(one._P, one._P.T, rtol=1e-12, atol=1e-15)
+        own = one._P[1:, 1:]
+        np.testing.assert_allclose(one._P[0, 1:], -own @ h[1:], rtol=1e-12)
+        assert np.linalg.eigvalsh(one._P)[0] > -1e-9 * np.trace(one._P)
+
+
+def current_flown():
+    """Return a filter of the current that has seen a few seconds."""
+    one = CurrentFilter()
+    rng = np.random.default_rng(6)
+    for k in range(60):
+        one.take(block(0.05 * k, 15.0 + 0.02 * rng.standard_normal(), x=20.0 + 10.0 * (k % 7 == 0)
+                       ), 4.0, fresh=False)
+    return one
