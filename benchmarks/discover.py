@@ -1,10 +1,11 @@
 """
-What `discover` makes of hidden effects, of none, and of real recordings: one command, four parts.
+What `discover` makes of hidden effects, of none, and of real recordings: one command, five parts.
 
     python benchmarks/discover.py blind [--each 10] [--lines FILE] [--table FILE]
     python benchmarks/discover.py limits [--runs 40] [--lines FILE] [--figure FILE]
     python benchmarks/discover.py nulls [--each 40] [--elsewhere FILE] [--lines FILE]
     python benchmarks/discover.py flights [--table FILE] [NAME...]
+    python benchmarks/discover.py injected [--table FILE] [--effects NAME...] [NAME...]
 
 See README.md beside this file.
 """
@@ -30,11 +31,13 @@ _ROOT = Path(__file__).resolve().parent.parent
 # What is tested, and what counts as right.
 sys.path[:0] = [str(_ROOT), *(str(_ROOT / 'test' / name) for name in ('support', 'hidden'))]
 
+from discover_injected import examine, HIDDEN, injected_table  # noqa: E402
 from discover_limits import CAUSES, DURATIONS, figure, limits_table, Point, Search  # noqa: E402
 from discover_nulls import nulls_of, nulls_table  # noqa: E402
 import discover_runs as runs  # noqa: E402
 from discover_tables import heat_map, report  # noqa: E402
 from hidden_effects import causes, KINDS, pairs, unknowns, variants  # noqa: E402
+from injected import EFFECTS  # noqa: E402
 import numpy as np  # noqa: E402
 from tables import put, table  # noqa: E402
 
@@ -191,6 +194,22 @@ def nulls(given: argparse.Namespace) -> int:
     return 0
 
 
+def injected(given: argparse.Namespace) -> int:
+    """Hide effects in the recordings of real runs; write their table."""
+    folder = os.environ.get('OU_MONITOR_REALDATA')
+    if folder is None:
+        raise ValueError('OU_MONITOR_REALDATA is not set: it names the folder of the recordings')
+    results = examine(Path(folder), given.names, given.effects, given.seed, say)
+    if not results:
+        say('no recording was run')
+        return 1
+    text = injected_table(results)
+    print(text)
+    if given.table:
+        put(given.table, text, 'injected')
+    return 0
+
+
 def _write(given: argparse.Namespace, text: str, svg: str) -> None:
     """Write table and drawing where they are asked for; the table shows the drawing."""
     if given.figure:
@@ -283,6 +302,13 @@ def _parser() -> argparse.ArgumentParser:
     part.set_defaults(action=flights)
     part.add_argument('names', nargs='*', help='recordings (default all)')
     part.add_argument('--whole', action='store_true', help='no halves')
+    part.add_argument('--table', type=Path, help='write the table here, between its marks')
+    part = parts.add_parser('injected', help='effects hidden in recordings of real runs',
+                            description='effects hidden in recordings of real runs')
+    part.set_defaults(action=injected)
+    part.add_argument('names', nargs='*', help='recordings (default all)')
+    part.add_argument('--effects', nargs='+', choices=EFFECTS, default=list(HIDDEN))
+    part.add_argument('--seed', type=_count, default=1, help='of all that is drawn')
     part.add_argument('--table', type=Path, help='write the table here, between its marks')
     part = parts.choices['limits']
     part.add_argument('--causes', nargs='+', choices=causes(), default=list(CAUSES))

@@ -99,7 +99,7 @@ def test_what_is_named_exists(path):
 @pytest.mark.parametrize('mark', [
     'accuracy', 'speed', 'blind', 'limits', 'error', 'bags', 'windows', 'dterm', 'loop', 'node',
     'calibration', 'alarms', 'coupling', 'cost', 'peers', 'files', 'memory', 'flights', 'beside',
-    'notch', 'learned', 'soak', 'nodes'])
+    'notch', 'learned', 'soak', 'nodes', 'injected'])
 def test_tables_of_benchmarks_have_their_place(mark):
     """The marks of a table are on one page, with numbers between them; the command names it."""
     begin, end = f'<!-- {mark} begins -->', f'<!-- {mark} ends -->'

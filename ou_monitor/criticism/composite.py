@@ -16,7 +16,8 @@ import numpy as np
 from ou_monitor.criticism.battery import Covariates, large_ones, throttle_paths
 from ou_monitor.criticism.innovations import other_pole, OtherPole
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.structure import Events, fit_gaussian, GaussianFit
+from ou_monitor.criticism.structure import (
+    driven, Events, fit_gaussian, GaussianFit, white_noise)
 from ou_monitor.model.terms.laws import LawFit, View
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
@@ -157,10 +158,11 @@ def _same(events: Events | None, offset: FloatArray | None, found: Events, moved
 def view_of(samples: Samples, gaussian: GaussianFit, z: FloatArray, part: slice) -> View:
     """Return what a law or a candidate may look at."""
     residual = samples.voltage - gaussian.mean
+    white = white_noise(samples, gaussian.terms, driven(samples, gaussian.terms))
     return View(z=z, variance=gaussian.variance, phi=gaussian.phi,
                 state=np.concatenate(([0.0], residual[:-1])), residual=residual,
                 at=samples.t - samples.t[0], step=samples.step, throttle=samples.throttle,
-                train=part)
+                train=part, trust=np.clip(1.0 - white / gaussian.variance, 0.0, 1.0))
 
 
 def pole_beside(samples: Samples, composite: Composite) -> OtherPole:
@@ -176,7 +178,7 @@ def pole_beside(samples: Samples, composite: Composite) -> OtherPole:
     assert isinstance(ou, OU)
     rate = 1.0 / float(np.median(samples.step[1:]))
     return other_pole([composite.z], rate, ou.alpha, ou.sigma ** 2 / (2.0 * ou.alpha),
-                      sum(term.variance() for term in others))
+                      samples.blur + sum(term.variance() for term in others))
 
 
 def covariates_of(samples: Samples, composite: Composite) -> Covariates:

@@ -80,13 +80,13 @@ def compare_curves(samples: Samples, models: Sequence[SupplyModel], rng: np.rand
         for k, (a, b) in enumerate(zip(low, high)):
             bands[k].append((np.where(np.isfinite(a), a, np.nan),
                              np.where(np.isfinite(b), b, np.nan)))
-    return [Comparison(title, xl, yl, x, curve(samples.voltage), tuple(bands[k]), *log)
+    return [Comparison(title, xl, yl, x, curve(samples.logged), tuple(bands[k]), *log)
             for k, ((title, xl, yl), x, curve, log) in enumerate(curves)]
 
 
 def _curves(samples: Samples) -> list[_Curve]:
     """Return title and labels, x, the curve as a function of the voltage, and how to draw it."""
-    v, n = samples.voltage, samples.n
+    v, n = samples.logged, samples.n
     step = float(np.median(samples.step[1:]))
     even = samples.even
     grid = np.arange(samples.t[0], samples.t[-1] + 0.5 * step, step)

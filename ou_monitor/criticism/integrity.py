@@ -140,7 +140,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
         notes.append(f'{int(drawn.sum())} {soft} were redrawn from the '
                      'law of an OU beyond it, given their neighbours.')
         v = redraw(v, low, high, step, np.random.default_rng(0))
-    _judge_step(step, _innovation_std(v), exact, notes)
+    cell = _judge_step(step, _innovation_std(v), exact, notes)
     stamps = judge_stamps(t, v)
     notes += stamps.notes
     if stamps.error > 0.0:
@@ -151,6 +151,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
         samples = _joined(samples, *events)
         notes.append(f'{between.size} samples around changes that stand out between neighbours '
                      'were kept as well.')
+    samples = samples.spread(samples.voltage, cell, np.random.default_rng(0))
     report(1.0)
     return Integrity(samples, tuple(exact), tuple(notes), raw=_as_logged(*logged, exact),
                      drawn=drawn)
@@ -256,19 +257,17 @@ def _innovation_std(v: FloatArray) -> float:
         np.sqrt(np.mean(np.square(np.clip(e, -middle, middle)))) / 0.8729)
 
 
-def _judge_step(step: float, noise: float, exact: list[Term], notes: list[str]) -> None:
-    """Name the step of the ADC where it matters."""
+def _judge_step(step: float, noise: float, exact: list[Term], notes: list[str]) -> float:
+    """Name the step of the ADC where it matters, and return it, V; else 0."""
     if step <= 0.0:
-        return
+        return 0.0
     # Rounding adds step^2/12 to each sample, and so up to twice that to an innovation.
     own = math.sqrt(max(noise * noise - step * step / 6.0, 0.01 * noise * noise))
-    if step >= NAMED_STEP * own:
-        exact.append(Quantization(step))
-        notes.append(f'The ADC counts in steps of {1e3 * step:.3g} mV, {step / own:.2g} times the '
-                     'noise between samples.')
-    else:
-        notes.append(f'The ADC counts in steps of {1e3 * step:.3g} mV, small beside the noise '
-                     'between samples.')
+    named = step >= NAMED_STEP * own
+    exact += [Quantization(step)] if named else []
+    size = f'{step / own:.2g} times the' if named else 'small beside the'
+    notes.append(f'The ADC counts in steps of {1e3 * step:.3g} mV, {size} noise between samples.')
+    return step if named else 0.0
 
 
 def _knees(v: FloatArray, noise: float) -> tuple[float, float]:

@@ -77,8 +77,9 @@ def simulate_bank_of(samples: Samples, composite: Composite, rng: np.random.Gene
     model, rows, given = SupplyModel(composite.terms), [], covariates_of(samples, composite)
     for _ in range(size):
         y = model.simulate(samples.t, rng, samples.throttle)
-        fit = evaluate(Samples(samples.t, y, samples.throttle), composite.terms)
-        state = np.concatenate(([0.0], (y - fit.mean)[:-1]))
+        drawn = samples.spread(y, samples.cell, rng)
+        fit = evaluate(drawn, composite.terms)
+        state = np.concatenate(([0.0], (drawn.voltage - fit.mean)[:-1]))
         rows.append(statistics(fit.z, replace(given, state=state, large=None), lines=False))
     return _summary(rows)
 

@@ -9,7 +9,7 @@ would lose the relaxation, a segment from the middle is used instead.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 import math
 
@@ -62,6 +62,10 @@ class Samples:
         0..1; None when it says nothing (unknown, or constant).
     longer : Samples, or None
         Samples that begin with these.
+    codes : ndarray, shape (n,), or None
+        V, as logged, where `voltage` is those codes spread over their cells.
+    cell : float
+        Width of a cell, V; 0 where nothing was spread.
 
     """
 
@@ -69,6 +73,8 @@ class Samples:
     voltage: FloatArray
     throttle: FloatArray | None
     longer: Samples | None = None
+    codes: FloatArray | None = None
+    cell: float = 0.0
 
     @property
     def n(self) -> int:
@@ -90,7 +96,8 @@ class Samples:
         v = self.voltage if voltage is None else voltage
         return Samples(self.t[part], v[part],
                        None if self.throttle is None else self.throttle[part],
-                       self.longer or self if slice(None, part.stop) == part else None)
+                       self.longer or self if slice(None, part.stop) == part else None,
+                       None if self.codes is None else self.codes[part], self.cell)
 
     def columns(self, term: Term) -> FloatArray:
         """Return the columns of a term of the mean, computed once, as none looks ahead."""
@@ -100,6 +107,29 @@ class Samples:
         if unit not in source._known:
             source._known[unit] = unit.columns(source.segment(1.0, 0.0))
         return source._known[unit][:self.n]
+
+    @property
+    def logged(self) -> FloatArray:
+        """Return the voltage as logged, V."""
+        return self.voltage if self.codes is None else self.codes
+
+    @property
+    def blur(self) -> float:
+        """Return the variance that spreading has added to each sample, V^2."""
+        return self.cell * self.cell / 12.0
+
+    def spread(self, codes: FloatArray, cell: float, rng: np.random.Generator) -> Samples:
+        """
+        Return the samples with codes, V, each drawn anew within its cell (width in V; 0: as is).
+
+        The log density of a value drawn evenly within a cell is, in the mean, at most the log
+        probability of the code over the width (Jensen; Theis et al., ICLR 2016): no law gains by
+        being ever narrower where codes repeat, as it does from the density at a code itself.
+        """
+        if not cell > 0.0:
+            return replace(self, voltage=codes)
+        drawn = codes + cell * (rng.random(self.n) - 0.5)
+        return replace(self, voltage=drawn, longer=self.longer or self, codes=codes, cell=cell)
 
     @cached_property
     def _known(self) -> dict[Term, FloatArray]:

@@ -17,7 +17,7 @@ import math
 import numpy as np
 from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.structure import state_space
+from ou_monitor.criticism.structure import driven, state_space, white_noise
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.model.whittle import Ordinates
@@ -62,14 +62,12 @@ class _Spectrum:
         self._few = Samples(step * np.arange(3.0), np.zeros(3), None)
         ou = terms[0]
         assert isinstance(ou, OU)
-        s = samples.segment(ou.alpha, ou.sigma)
-        for term in terms:
-            if term.ROLE is Role.DRIVE:
-                term.start(np.random.default_rng(0))(s)
+        s = driven(samples, terms)
         self._faster = math.exp(float(np.mean(np.log(s.alpha / ou.alpha))))
         self._louder = 1.0 / math.sqrt(float(np.mean((ou.sigma / s.sigma) ** 2)))
-        noise = sum(term.variance() for term in terms)
-        each = np.zeros(samples.n) + sum(term.variances(s) for term in terms)
+        self._blur = samples.blur
+        noise = samples.blur + sum(term.variance() for term in terms)
+        each = white_noise(samples, terms, s)
         self._noisier = 1.0 / float(np.mean(noise / each)) if noise > 0.0 else 1.0
 
     def of(self, terms: Sequence[Term]) -> FloatArray:
@@ -83,6 +81,7 @@ class _Spectrum:
         left = self._turn[:, None, None] * np.eye(h.size) - f
         seen = np.linalg.solve(left.transpose(0, 2, 1), np.broadcast_to(
             h[:, None], (self._turn.size, h.size, 1)))[..., 0]
-        noise = sum(term.variance() for term in terms[1:] if term.ROLE is Role.NOISE)
+        noise = self._blur + sum(
+            term.variance() for term in terms[1:] if term.ROLE is Role.NOISE)
         found: FloatArray = np.einsum('ki,ij,kj->k', seen.conj(), q, seen).real
         return found + noise * self._noisier

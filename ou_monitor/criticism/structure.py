@@ -211,12 +211,7 @@ def _states(terms: Sequence[Term]) -> int:
 def state_space(samples: Samples, terms: Sequence[Term], events: Events | None
                 ) -> tuple[Segment, StateSpace, FloatArray | float]:
     """Return the segment, the state space, and what events add to each variance predicted."""
-    ou = terms[0]
-    assert isinstance(ou, OU)
-    s = samples.segment(ou.alpha, ou.sigma)
-    for term in terms:
-        if term.ROLE is Role.DRIVE:
-            term.start(_RNG)(s)
+    s = driven(samples, terms)
     whole = s
     if events is None and samples.n > _SETTLES and samples.even and not any(
             term.ROLE is Role.DRIVE or (term.ROLE is Role.BLOCK and term.NEEDS_THROTTLE)
@@ -248,10 +243,26 @@ def state_space(samples: Samples, terms: Sequence[Term], events: Events | None
         to = at + h.size
         f_all[:, at:to, at:to], q_all[:, at:to, at:to], h_all[at:to] = f, cov, h
         at = to
-    r = np.full(n, floor) + sum(term.variances(s) for term in terms)
+    r = floor + white_noise(samples, terms, s)
     if events is not None:
         r += events.error
     return whole, StateSpace(f_all, q_all, h_all, r), own
+
+
+def driven(samples: Samples, terms: Sequence[Term]) -> Segment:
+    """Return the samples as a segment, with what throttle does to alpha, sigma and noise."""
+    ou = terms[0]
+    assert isinstance(ou, OU)
+    s = samples.segment(ou.alpha, ou.sigma)
+    for term in terms:
+        if term.ROLE is Role.DRIVE:
+            term.start(_RNG)(s)
+    return s
+
+
+def white_noise(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
+    """Return the variance of white noise in each sample of a segment of them, V^2."""
+    return np.full(s.t.size, samples.blur) + sum(term.variances(s) for term in terms)
 
 
 def _first(s: Segment, n: int) -> Segment:

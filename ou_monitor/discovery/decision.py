@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 import math
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
@@ -352,18 +353,21 @@ def withdrawn(before: Statistics, after: Statistics, accepted: Sequence[Kind]) -
     return [k for k, kind in enumerate(accepted) if is_latent(kind) and fails(kind)]
 
 
-def withdrawn_under_load(before: Statistics, after: Statistics, accepted: Sequence[Kind]
-                         ) -> list[int]:
+def withdrawn_under_load(before: Statistics, after: Statistics, accepted: Sequence[Kind],
+                         asked: Mapping[str, Statistics] = MappingProxyType({})) -> list[int]:
     """
     Return which of the accepted causes claim what they do not explain, beside a load.
 
     No form of the load is complete on a real flight, so that something always fails; a latent
-    cause answers for its own signs, as the load and the noise that follows it left them.
+    cause answers for its own signs, as the load and the noise that follows it left them, or as
+    they were when it was accepted (`asked`, by name): a larger effect may have hidden them.
     """
     def fails(kind: Kind) -> bool:
-        own = {name: value for name, value in before.items()
+        own = {name for name, value in before.items()
                if any(is_sign(sign, name, value) for sign in kind.SIGNS)}
-        largest = max(map(abs, own.values()), default=0.0)
+        largest = max((abs(value) for values in (before, asked.get(kind.NAME, {}))
+                       for name, value in values.items()
+                       if any(is_sign(sign, name, value) for sign in kind.SIGNS)), default=0.0)
         return largest < OFF or any(abs(after.get(name, 0.0)) > max(FAILS, LOAD_SHARE * largest)
                                     for name in own)
 

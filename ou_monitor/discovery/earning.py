@@ -165,7 +165,7 @@ def _far(samples: Samples, terms: Sequence[Term]) -> FloatArray:
         return np.asarray(np.median(near, axis=1))
 
     return np.array([stray(level(model.simulate(samples.t, rng, samples.throttle)),
-                           samples.voltage) for _ in range(_DRAWS)])
+                           samples.logged) for _ in range(_DRAWS)])
 
 
 def _as_trend(samples: Samples, name: str, less: Composite) -> bool:

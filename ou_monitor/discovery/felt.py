@@ -120,7 +120,7 @@ def _path(samples: Samples, answers: Sequence[Term]) -> FloatArray:
 
 def _dips(samples: Samples, path: FloatArray, level: float) -> tuple[int, int]:
     """Return the number of dips below a level, V, and of those that the path makes."""
-    v, t = samples.voltage, samples.t
+    v, t = samples.logged, samples.t
     below = np.flatnonzero(v < level)
     if not below.size:
         return 0, 0

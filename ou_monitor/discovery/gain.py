@@ -147,7 +147,7 @@ def crossings(t: FloatArray, voltage: FloatArray, level: float,
 
 def crossing_level(samples: Samples, scored: npt.NDArray[np.bool_] | None = None) -> float:
     """Return a level that is crossed now and then in both parts, V."""
-    v = samples.voltage
+    v = samples.logged
     fitted, kept = np.zeros((2, samples.n), dtype=np.bool_)
     fitted[samples.train] = True
     kept[samples.test] = True
@@ -185,7 +185,7 @@ def crossing_rates(samples: Samples, baseline: Sequence[Term], extended: Sequenc
         except ValueError:
             found = [NAN, NAN]
         rates.append((float(np.mean(found)), float(np.std(found, ddof=1)) / math.sqrt(len(found))))
-    observed = crossings(t, samples.voltage, level, scored)
+    observed = crossings(t, samples.logged, level, scored)
     # As if crossings came independently of each other; none at all is as uncertain as one.
     minutes = float(np.diff(t)[scored[1:] & scored[:-1]].sum()) / 60.0
     error = math.sqrt(max(observed * minutes, 1.0)) / minutes if minutes > 0.0 else NAN

@@ -54,7 +54,7 @@ def load_terms(samples: Samples) -> tuple[Term, ...]:
 
     u = np.clip(samples.throttle, 0.0, 1.0)
     try:
-        model = fit_load(mean(samples.t - samples.t[0]), mean(samples.voltage), mean(u)).model
+        model = fit_load(mean(samples.t - samples.t[0]), mean(samples.logged), mean(u)).model
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return ()
     longest = 0.25 * float(samples.t[-1] - samples.t[0])

@@ -101,7 +101,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     latent = any(decision.is_latent(kind) for kind in kinds)
     if loaded and latent:
         measured = criticise(samples, begun.composite, bank)
-        out = decision.withdrawn_under_load(measured, after, kinds)
+        out = decision.withdrawn_under_load(measured, after, kinds, search.asked)
     else:
         out = decision.withdrawn(before, after, kinds)
     # Noise that the load needs is part of it.
@@ -168,8 +168,9 @@ def _without(fitter: Fitter, search: Search, begun: Search, dropped: Sequence[st
                         decision.withdrawn(before, left, kinds))
         if any(map(decision.is_latent, kinds)) and not out:
             return _Result(again, other, left)
-    search = begun.copy()
+    asked, search = search.asked, begun.copy()
     name_causes(fitter, search, bank, latent=False, given=[*given, *slow])
+    search.asked = {**search.asked, **asked}
     return _Result(search, *_kept_beside(fitter, search, stays, measured, bank, loaded))
 
 
@@ -209,6 +210,7 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
         named = {trial.name for trial in good}
         best = next(trial for trial in trials if trial.name in named)
         _accept(search, best, trials)
+        search.asked[best.name] = values
         chosen = best.composite.gaussian.cost < _SOON
         if chosen:
             choose_answer(fitter, search, ())
@@ -379,8 +381,8 @@ def _kept_beside(fitter: Fitter, search: Search, stays: Sequence[Term],
             names = [*search.accepted, *(term.NAME for term in more)]
             kinds = _kinds(names)
             out = _in_doubt(samples, again, names, (
-                decision.withdrawn_under_load if loaded else decision.withdrawn)(
-                    before, left, kinds))
+                decision.withdrawn_under_load(before, left, kinds, search.asked) if loaded
+                else decision.withdrawn(before, left, kinds)))
             bad = [k - len(search.accepted) for k in out if k >= len(search.accepted)]
             if not bad:
                 search.composite, whole, after, search.accepted = fit, again, left, names

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from ou_monitor.criticism.composite import Composite
@@ -28,6 +29,8 @@ class Search:
         Largest evidence of an accepted cause, nats.
     hopeless : set of str
         Causes that may only mend the form of another one, and are not tried again.
+    asked : dict of str to dict
+        For each cause accepted in a round, the statistics that it was accepted for.
     failed : dict of str to float
         Causes without evidence, and the statistic that asked for each.
     stopped : bool
@@ -42,6 +45,7 @@ class Search:
     removed: list[str] = field(default_factory=list)
     largest: float = 0.0
     hopeless: set[str] = field(default_factory=set)
+    asked: dict[str, Mapping[str, float]] = field(default_factory=dict)
     failed: dict[str, float] = field(default_factory=dict)
     stopped: bool = False
 
@@ -49,4 +53,5 @@ class Search:
         """Return a search that goes on from here and leaves this one as it is."""
         return replace(self, accepted=list(self.accepted), rivals=dict(self.rivals),
                        log=list(self.log), removed=list(self.removed),
-                       hopeless=set(self.hopeless), failed=dict(self.failed))
+                       hopeless=set(self.hopeless), asked=dict(self.asked),
+                       failed=dict(self.failed))

@@ -42,6 +42,16 @@ def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
             np.log(norm.T.reshape(-1)[:n]) + top)
 
 
+def smoothed(log_density: FloatArray, transition: FloatArray, start: FloatArray) -> FloatArray:
+    """Return the law of the state at each sample given all of them, shape (n, k)."""
+    ahead = forward(log_density, transition, start)[0][1:]
+    behind = forward(log_density[::-1].transpose(0, 2, 1), transition.T,
+                     np.ones(start.size))[0][::-1]
+    both: FloatArray = np.concatenate((ahead, ahead[-1:])) * behind
+    law: FloatArray = both / np.maximum(both.sum(axis=1, keepdims=True), _NONE)
+    return law
+
+
 def log_likelihood(log_density: FloatArray, transition: FloatArray, start: FloatArray) -> float:
     """Return the sum of the evidence of `forward`, at a small part of its cost."""
     k = transition.shape[0]

@@ -89,7 +89,7 @@ def _voltage(finding: Finding) -> Plot:
             low, high = np.fmin(low, drawn), np.fmax(high, drawn)
         if np.isfinite(low).all():
             plot.band(t, low, high, 'simulated', 1)
-    return plot.line(t, samples.voltage, 'measured', 0)
+    return plot.line(t, samples.logged, 'measured', 0)
 
 
 def _typeset(text: str) -> str:

@@ -7,8 +7,8 @@ import numpy as np
 from ou_monitor.model.terms.flicker_noise import FlickerNoise
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import order_power
-from ou_monitor.model.terms.regime_switching import relaxing
 from ou_monitor.model.terms.second_relaxation import SecondRelaxation
+from ou_monitor.model.terms.switching_chain import relaxing
 import pytest
 from scipy.linalg import dft
 from scipy.stats import median_abs_deviation

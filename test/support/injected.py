@@ -3,7 +3,7 @@ Effects hidden in recorded flights, in units of what the recording itself shows.
 
 Sizes are in standard deviations of white noise with the second differences of the recording, in
 which no slow motion shows; a twentieth of them, the largest, are the load's.  An ADC is coarse
-beside less than half of its step.
+beside less than half of its step.  Strengths of 1 to 3 are moderate.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from ou_monitor.criticism.adc import find_step
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
 
-# Effect of a recording and its noise: what to add, or what to do.
+# Effect of a recording and its strength times its noise, V: what to add, or what to do.
 Inject = Callable[[Recording, float, np.random.Generator], Recording]
 
 
@@ -48,6 +48,12 @@ def _step(recording: Recording) -> float:
     return float(np.median(np.diff(recording.t)))
 
 
+def _often(recording: Recording, rate: float) -> float:
+    """Return the chance a sample of events at a rate (1/s), or of 40 in a short recording."""
+    step = _step(recording)
+    return step * max(rate, 40.0 / (recording.t.size * step))
+
+
 def tone(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
     """Add a steady line."""
     rate = 1.0 / _step(recording)
@@ -56,17 +62,25 @@ def tone(recording: Recording, noise: float, rng: np.random.Generator) -> Record
 
 
 def jumps(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Add falls of ten deviations, one a second, that recover within ten samples."""
+    """Add falls of six deviations, one a second, that recover within ten samples."""
     step = _step(recording)
-    hit = rng.random(recording.t.size) < step * max(1.0, 40.0 / (recording.t.size * step))
-    drive = hit * noise * rng.uniform(-14.0, -8.0, recording.t.size)
+    hit = rng.random(recording.t.size) < _often(recording, 1.0)
+    drive = hit * noise * rng.uniform(-8.0, -4.0, recording.t.size)
     return _added(recording, _relaxing(drive, 0.1 / step, step))
 
 
 def glitches(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Add single wrong values, one of two hundred, of ten deviations either way."""
-    hit = rng.random(recording.t.size) < 0.005
-    return _added(recording, hit * noise * 10.0 * rng.standard_normal(recording.t.size))
+    """Add single wrong values, one of a hundred, of six deviations either way."""
+    hit = rng.random(recording.t.size) < 0.01
+    return _added(recording, hit * noise * 6.0 * rng.standard_normal(recording.t.size))
+
+
+def dropouts(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
+    """Add falls by six deviations for two or three samples, one a second."""
+    begins = rng.random(recording.t.size) < _often(recording, 1.0)
+    longer = begins & (rng.random(recording.t.size) < 0.5)
+    down = begins | np.roll(begins, 1) | np.roll(longer, 2)
+    return _added(recording, -6.0 * noise * down)
 
 
 def held(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
@@ -87,22 +101,38 @@ def white(recording: Recording, noise: float, rng: np.random.Generator) -> Recor
     return _added(recording, noise * rng.standard_normal(recording.t.size))
 
 
+def tails(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
+    """Add an OU that forgets within ten samples, driven by Student-t noise of three degrees."""
+    step = _step(recording)
+    push = rng.standard_t(3.0, recording.t.size) / np.sqrt(3.0)
+    return _added(recording, noise * _relaxing(push, 0.1 / step, step))
+
+
+def regimes(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
+    """Add an OU as fast that is three times as intense for a second now and then."""
+    step = _step(recording)
+    flips = rng.random(recording.t.size) < _often(recording, 1.0)
+    push = (1.0 + 2.0 * (np.cumsum(flips) % 2)) * rng.standard_normal(recording.t.size)
+    return _added(recording, noise * _relaxing(push, 0.1 / step, step))
+
+
 def drift(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
     """Add a fall by four deviations from begin to end."""
     return _added(recording, -4.0 * noise * np.linspace(0.0, 1.0, recording.t.size))
 
 
 def slow(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Add an OU of two deviations that forgets within a second or two."""
+    """Add an OU of two deviations that forgets within a second or two, or in a thirtieth."""
     step, rate = _step(recording), rng.uniform(0.5, 1.5)
+    rate = max(rate, 30.0 / (recording.t.size * step))
     push = rng.standard_normal(recording.t.size) * np.sqrt(-np.expm1(-2.0 * rate * step))
     return _added(recording, 2.0 * noise * _relaxing(push, rate, step))
 
 
 def levels(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Add two levels five deviations apart, for a second or so each."""
-    flips = rng.random(recording.t.size) < _step(recording) / rng.uniform(0.8, 1.6)
-    return _added(recording, -5.0 * noise * (np.cumsum(flips) % 2))
+    """Add two levels four deviations apart, for a second or so each."""
+    flips = rng.random(recording.t.size) < _often(recording, 1.0 / rng.uniform(0.8, 1.6))
+    return _added(recording, -4.0 * noise * (np.cumsum(flips) % 2))
 
 
 def jitter(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
@@ -122,9 +152,12 @@ EFFECTS: dict[str, tuple[Inject, frozenset[str]]] = {
     'tone': (tone, frozenset({'tone'})),
     'jumps': (jumps, frozenset({'jumps'})),
     'glitches': (glitches, frozenset({'glitches'})),
+    'dropouts': (dropouts, frozenset({'glitches', 'regime_switching'})),
     'held': (held, frozenset({'held_samples'})),
     'steps': (steps, frozenset({'quantization'})),
     'white': (white, frozenset({'measurement_noise'})),
+    'tails': (tails, frozenset({'heavy_tails'})),
+    'regimes': (regimes, frozenset({'regime_switching', 'volatility'})),
     'drift': (drift, frozenset({'drift'})),
     'slow': (slow, frozenset({'second_relaxation', 'flicker_noise'})),
     'levels': (levels, frozenset({'regime_switching'})),

@@ -45,6 +45,8 @@ class View:
         0..1.
     train : slice
         The part that parameters are fitted on.
+    trust : ndarray, shape (n,), or float
+        Share of each error that the filter takes for the rail's: 1 without white noise.
 
     """
 
@@ -57,6 +59,7 @@ class View:
     step: FloatArray
     throttle: FloatArray | None
     train: slice
+    trust: FloatArray | float = 1.0
 
     @property
     def rate(self) -> float:

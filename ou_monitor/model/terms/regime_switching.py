@@ -7,13 +7,15 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.hidden_chain import forward, log_likelihood
+from ou_monitor.model.hidden_chain import forward, log_likelihood, smoothed
 from ou_monitor.model.terms.laws import (
     climb, curvature_se, LawFit, log_normal, normal_scores, View)
 from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
+from ou_monitor.model.terms.switching_chain import (
+    calm_levels, chain_of, moving, NO_LEVEL, rates_between, relaxing, Scores, stationary_law,
+    step_chances, without_levels)
 from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
-from scipy.linalg import expm
 from scipy.special import ndtr
 
 # Events drawn for one segment at most: bounds time and memory.
@@ -62,7 +64,7 @@ class RegimeSwitching(Term):
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
         count = int(self.states)
-        rates = _rates(self.rate_up, self.rate_down, count)
+        rates = rates_between(self.rate_up, self.rate_down, count)
         leave = rates.sum(axis=1)
         now_in = 0
         next_at = math.nan
@@ -70,9 +72,9 @@ class RegimeSwitching(Term):
         def effect(s: Segment) -> None:
             nonlocal now_in, next_at
             if math.isnan(next_at):
-                now_in = _pick(rng, _stationary(rates))
+                now_in = _pick(rng, stationary_law(rates))
                 next_at = float(s.at[0]) + rng.standard_exponential() / leave[now_in]
-            changes = float(_stationary(rates) @ leave)
+            changes = float(stationary_law(rates) @ leave)
             if changes * (s.at[-1] - next_at) > _MOST:
                 raise ValueError(f'{self.NAME}: {changes:g} changes a second are more than '
                                  f'{_MOST} in one segment of samples; so many are noise')
@@ -109,9 +111,9 @@ class RegimeSwitching(Term):
 
     def holds(self, view: View) -> bool:
         """Return whether so many changes are expected that they are a law, not a few steps."""
-        rates = _rates(self.rate_up, self.rate_down, int(self.states))
+        rates = rates_between(self.rate_up, self.rate_down, int(self.states))
         span = float(view.at[view.train.stop - 1] - view.at[0])
-        return float(_stationary(rates) @ rates.sum(axis=1)) * span >= _CHANGES
+        return float(stationary_law(rates) @ rates.sum(axis=1)) * span >= _CHANGES
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
@@ -119,7 +121,6 @@ class RegimeSwitching(Term):
         # The best with a level of its own, and without.
         best: dict[bool, tuple[float, FloatArray, float, View]] = {}
         spread = math.sqrt(float(np.mean(view.residual[view.train] ** 2)))
-        step = 1.0 / view.rate
         first = slice(0, min(_SHORT, view.train.stop))
         busy = moving(view, first.stop)
         # Coordinates: ln rates, level in innovations, ln sigma ratio, ln scale.
@@ -127,7 +128,7 @@ class RegimeSwitching(Term):
         for faster in _FASTER:
             relaxed = relaxing(view, faster)
             unit = math.sqrt(float(np.median(relaxed.variance)))
-            units = units_of(relaxed)
+            scores = Scores.of(relaxed).at_once
             # Two levels that hide how fast the rail relaxes make most of the spread.
             height = (1.0 if faster == 1.0 else 2.0) * spread / unit
             # Densities of volts, over those without states.
@@ -136,7 +137,7 @@ class RegimeSwitching(Term):
             def value(x: FloatArray) -> float:
                 if not _inside(x, view):
                     return -math.inf
-                chain = _chain(relaxed.z[part], relaxed.phi[part], units[part], step, x, once)[0]
+                chain = chain_of(scores.part(part), x, once)[0]
                 return log_likelihood(*chain) - float(plain[part].sum())
 
             for dwell in (5.0 * shortest, 50.0 * shortest):
@@ -151,14 +152,18 @@ class RegimeSwitching(Term):
                         best[level != 0.0] = top, x, once, relaxed
         two: LawFit | None = None
         trials = list(best.values())
+        hidden = calm_levels(view, busy, spread, -np.log([5.0 * shortest, 50.0 * shortest]))
+        if hidden is not None:
+            trials.append((0.0, *hidden))
+        levels = [trial[1] for trial in trials if trial[1] is not best.get(False, (0.0, None))[1]]
         while trials:
             _, x, once, relaxed = trials.pop()
             fit = cls._finished(relaxed, x, once, 80)
             if fit is None:
                 continue
-            if x is best.get(True, (0.0, None))[1] and fit.offset is not None:
-                # The residual without the levels shows how fast the rail relaxes.
-                again = relaxing(view, faster_by(view, fit.offset))
+            if any(x is start for start in levels) and fit.offset is not None:
+                # The residual without the levels shows how fast the rail relaxes, and its noise.
+                again = without_levels(view, fit.offset)
                 unit = math.sqrt(float(np.median(again.variance)))
                 term = fit.term
                 assert isinstance(term, RegimeSwitching)
@@ -194,10 +199,12 @@ class RegimeSwitching(Term):
         unit = math.sqrt(float(np.median(view.variance)))
         ratio = math.log(max(self.sigma_ratio, 1e-2))
         states = int(self.states)
-        law = _stationary(_rates(self.rate_up, self.rate_down, states))
-        # Such that the mean square is that of the scores.
+        law = stationary_law(rates_between(self.rate_up, self.rate_down, states))
+        # Such that the mean square is that of the scores; beside clear levels it is 1.
         square = float(law @ np.exp(2.0 * ratio * np.arange(states)))
-        scale = 0.5 * math.log(float(np.mean(view.z[view.train] ** 2)) / square)
+        if abs(self.level) < unit:
+            square /= float(np.mean(view.z[view.train] ** 2))
+        scale = -0.5 * math.log(square)
         return self._finished(view, np.array([
             math.log(self.rate_up), math.log(self.rate_down), self.level / unit, ratio,
             scale]), self.at_once, 40, states)
@@ -206,44 +213,43 @@ class RegimeSwitching(Term):
     def _finished(cls, view: View, start: FloatArray, at_once: float, most: int,
                   states: int = 2) -> LawFit | None:
         """Return the fit near a start."""
-        z, phi = view.z[view.train][:_LONG], view.phi[view.train][:_LONG]
-        units = units_of(view)
-        within = units[view.train][:_LONG]
-        step, unit = 1.0 / view.rate, math.sqrt(float(np.median(view.variance)))
+        scores = Scores.of(view)
+        part = slice(view.train.start, min(view.train.stop, view.train.start + _LONG))
+        within = scores.part(part).following(start, at_once, states)
 
         def value(x: FloatArray) -> float:
             if not _inside(x, view):
                 return -math.inf
-            return log_likelihood(*_chain(z, phi, within, step, x, at_once, states)[0])
+            return log_likelihood(*chain_of(within, x, at_once, states)[0])
 
         if states == 2:
             # Few changes in few samples say little of rates; what is counted in all says more.
-            counted = _counted(forward(*_chain(z, phi, within, step, start, at_once)[0])[0], step)
+            counted = _counted(forward(*chain_of(within, start, at_once)[0])[0], scores.step)
             start = max(np.array(start), np.append(counted, start[2:]), key=value)
         x, top = climb(value, start, size=0.2, most=most)
         if top == -math.inf:
             return None
-        chain, mean, std = _chain(view.z, view.phi, units, step, x, at_once, states)
+        unit = math.sqrt(float(np.median(view.variance)))
+        chain, mean, std = chain_of(scores.following(x, at_once, states), x, at_once, states)
         before, density = forward(*chain)
         chance = np.zeros(view.z.size)
         for i, j in np.ndindex(states, states):
             chance += before[:, i] * chain[1][i, j] * ndtr((view.z - mean[i, j]) / std[j])
-        scores = normal_scores(chance)
+        normal = normal_scores(chance)
         term = cls(math.exp(x[0]), math.exp(x[1]), float(x[2]) * unit, math.exp(x[3]),
                    at_once, float(states))
         e = curvature_se(value, x)
         se = {'rate_up': term.rate_up * float(e[0]), 'rate_down': term.rate_down * float(e[1]),
               'level': unit * float(e[2]), 'sigma_ratio': term.sigma_ratio * float(e[3])}
-        number = before @ np.arange(states)
-        after = np.append(number[1:], number[-1])
+        after = smoothed(*chain) @ np.arange(states)
         moved = term.level * (after - after.mean())
         if at_once == 0.0:
             moved = first_order(view.phi, (1.0 - view.phi) * moved, 0.0)
-        offset = None if abs(x[2]) < _NO_LEVEL else moved
+        offset = None if abs(x[2]) < NO_LEVEL else moved
         # As known at each sample.
         known = np.concatenate((before[1:], before[-1:]))
         power = 1.0 / (known @ np.exp(-2.0 * (x[4] + x[3] * np.arange(states))))
-        return LawFit(term, se, scores, density - log_normal(view.z), 5,
+        return LawFit(term, se, normal, density - log_normal(view.z), 5,
                       power=None if abs(x[3]) < _NO_RATIO else power, offset=offset)
 
 
@@ -282,14 +288,14 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
     def value(x: FloatArray, states: int) -> float:
         if max(x[0], x[1]) > _fastest(view) or min(x[0], x[1]) < -6.0 or abs(x[4]) > 4.0:
             return -math.inf
-        law = _stationary(_rates(math.exp(x[0]), math.exp(x[1]), states))
+        law = stationary_law(rates_between(math.exp(x[0]), math.exp(x[1]), states))
         keep, state = math.tanh(x[3]), np.arange(states)
         level = x[2] * (state - law @ state)
         log = np.empty((states, states, count - 1))
         for i, j in np.ndindex(states, states):
             e = mean[1:] - level[j] - keep * (mean[:-1] - level[i])
             log[i, j] = log_normal(e, 0.0, math.exp(2.0 * x[4]) * noisy)
-        return log_likelihood(log.transpose(2, 0, 1), _transition(x, step, states), law)
+        return log_likelihood(log.transpose(2, 0, 1), step_chances(x, step, states), law)
 
     # Without a level the rates say nothing: correlation and scale alone.
     keep = float(mean[1:] @ (mean[:-1] / noisy)) / float(mean[:-1] @ (mean[:-1] / noisy))
@@ -323,8 +329,6 @@ _FASTEST = 30.0
 _CHANGES = 8.0
 # Evidence from which there are three states, nats.
 _THIRD = 10.0
-# A level of fewer innovations than this is none.
-_NO_LEVEL = 0.2
 # A ratio of which the logarithm is less than this is 1.
 _NO_RATIO = 0.05
 
@@ -340,99 +344,8 @@ def _inside(x: FloatArray, view: View) -> bool:
                 and abs(x[3]) <= 3.0 and abs(x[4]) <= 2.0)
 
 
-def _rates(up: float, down: float, states: int) -> FloatArray:
-    """Return the rates from each state to each other, 1/s; 0 on the diagonal."""
-    ones = np.ones((states, states))
-    return up * np.triu(ones, 1) + down * np.tril(ones, -1)
-
-
-def _stationary(rates: FloatArray) -> FloatArray:
-    """Return the stationary law of a chain."""
-    flow = np.vstack(((rates - np.diag(rates.sum(axis=1))).T / rates.max(),
-                      np.ones(rates.shape[0])))
-    law: FloatArray = np.linalg.lstsq(flow, np.eye(rates.shape[0] + 1)[-1], rcond=None)[0]
-    return law
-
-
 def _pick(rng: np.random.Generator, weight: FloatArray) -> int:
     """Draw a number with the given weights."""
     total = np.cumsum(weight)
     return min(int(np.searchsorted(total, rng.random() * total[-1], side='right')),
                weight.size - 1)
-
-
-def _transition(x: FloatArray, step: float, states: int) -> FloatArray:
-    rates = _rates(math.exp(x[0]), math.exp(x[1]), states)
-    moved: FloatArray = expm((rates - np.diag(rates.sum(axis=1))) * step)
-    return moved
-
-
-def _chain(z: FloatArray, phi: FloatArray, unit: FloatArray, step: float, x: FloatArray,
-           at_once: float, states: int = 2
-           ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], FloatArray, FloatArray]:
-    """
-    Return what a filter takes, and what each pair of states expects.
-
-    The mean of each pair, shape (states, states, n), and the deviation of each
-    state.  `unit` is that of the level in each score: steps may be uneven.
-    """
-    state = np.arange(states, dtype=np.float64)
-    transition = _transition(x, step, states)
-    law = _stationary(_rates(math.exp(x[0]), math.exp(x[1]), states))
-    std = np.exp(x[4] + x[3] * state)
-    # The level enters the innovations where it changes, and a little while it is on;
-    # where it comes at the rate alpha, only the latter.
-    height = x[2] * unit
-    pull = height * (1.0 - phi)
-    mean, log = np.empty((states, states, z.size)), np.empty((states, states, z.size))
-    for i, j in np.ndindex(states, states):
-        mean[i, j] = pull * (i - float(law @ state)) + height * at_once * (j - i)
-        log[i, j] = log_normal(z, mean[i, j], float(std[j]) ** 2)
-    return (log.transpose(2, 0, 1), transition, law), mean, std
-
-
-# Median of the size of a normal score.
-_MEDIAN = 0.6745
-
-
-def moving(view: View, size: int) -> slice:
-    """Return the segment of a size in which the voltage moves most beside its noise."""
-    moves = (view.residual / np.sqrt(view.variance))[view.train]
-    starts = range(0, moves.size - size + 1, max(size // 2, 1))
-    begin = max(starts, key=lambda k: float(moves[k:k + size].var()))
-    return slice(begin, begin + size)
-
-
-def relaxing(view: View, faster: float) -> View:
-    """
-    Return what a rail that relaxes faster leaves over.
-
-    The relaxation that was fitted without levels is that of both together.
-    """
-    if faster == 1.0:
-        return view
-    phi = view.phi**faster
-    e = view.z * np.sqrt(view.variance) + (view.phi - phi) * view.state
-    inside = e[view.train]
-    # Most of what it leaves is noise, however large the levels are.
-    middle = float(np.median(inside))
-    std = float(np.median(np.abs(inside - middle))) / _MEDIAN
-    if not std > 0.0:
-        return view
-    spread = 1.0 - phi * phi
-    variance = std * std * spread / float(np.median(spread))
-    return replace(view, z=(e - middle) / np.sqrt(variance), phi=phi, variance=variance)
-
-
-def faster_by(view: View, levels: FloatArray) -> float:
-    """Return how much faster the rail relaxes than it seems to with these levels on it, V."""
-    r = (view.residual - levels)[view.train]
-    r = r - r.mean()
-    keep = min(max(float(r[1:] @ r[:-1]) / float(r @ r), 1e-3), 1.0 - 1e-9)
-    return max(math.log(keep) / math.log(float(np.median(view.phi[view.train]))), 1.0)
-
-
-def units_of(view: View) -> FloatArray:
-    """Return how much of a score the median standard deviation is, sample by sample."""
-    units: FloatArray = np.sqrt(float(np.median(view.variance)) / view.variance)
-    return units

@@ -1,0 +1,68 @@
+"""Codes coarser than the noise count as any value of their cells, so that ties pay for no law."""
+
+import math
+
+import numpy as np
+from ou_monitor import Recording
+from ou_monitor.criticism.composite import fit_composite
+from ou_monitor.criticism.integrity import examine
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.discovery.gain import guess
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.quantization import Quantization
+from ou_monitor.model.terms.volatility import Volatility
+import pytest
+from scipy.signal import lfilter
+from scipy.special import ndtr
+
+STEP, N = 0.005, 1500
+T = np.arange(N) / 100.0
+
+
+def read(noise: float) -> np.ndarray:
+    """Return the codes of a slow rail and of white noise of so many steps."""
+    rng = np.random.default_rng(5)
+    rail = lfilter([1.0], [1.0, -0.99], 0.1 * STEP * rng.standard_normal(N))
+    return STEP * np.rint((rail + noise * STEP * rng.standard_normal(N)) / STEP)
+
+
+@pytest.mark.parametrize('noise, spread', [(0.2, True), (2.0, True), (8.0, False)])
+def test_only_coarse_codes_are_spread(noise, spread):
+    """Each value stays within half a step of its code, and the codes are kept."""
+    codes = 3.8 + read(noise)
+    samples = examine(Recording(T, codes, np.full(N, np.nan))).samples
+    assert (samples.cell > 0.0) is spread and (samples.codes is not None) is spread
+    assert np.abs(samples.voltage - codes).max() <= 0.5 * STEP * (1.0 + 1e-6)
+    assert samples.logged == pytest.approx(codes, abs=1e-12)
+    part = samples.part(slice(10, 20))
+    assert part.logged == pytest.approx(codes[10:20], abs=1e-12) and part.cell == samples.cell
+
+
+def test_the_mean_log_density_within_a_cell_is_at_most_that_of_the_cell():
+    """Of a normal law one step wide, at codes up to two steps away."""
+    rng = np.random.default_rng(6)
+    codes = STEP * rng.integers(-2, 3, 20000)
+    samples = Samples(np.arange(codes.size) / 100.0, codes, None).spread(codes, STEP, rng)
+    z = samples.voltage / STEP
+    for code in range(-2, 3):
+        at = samples.logged == STEP * code
+        mean = float(np.mean(-0.5 * z[at] ** 2)) - math.log(math.sqrt(2.0 * math.pi))
+        cell = math.log(ndtr(code + 0.5) - ndtr(code - 0.5))
+        # Half the variance of the log density, (code^2 + ..)/12; and 5 errors of a mean of 4000.
+        error = (abs(code) + 0.1) / math.sqrt(12.0 * 4000)
+        assert -(code ** 2 + 1.0) / 20.0 < mean - cell < 5.0 * error
+    assert samples.blur == pytest.approx(STEP ** 2 / 12.0)
+
+
+def test_ties_pay_for_no_wandering_intensity():
+    """A rail of constant sigma, 0.2 steps of noise: from codes as they are, hundreds of nats."""
+    codes = 3.8 + read(0.2)
+    spread = examine(Recording(T, codes, np.full(N, np.nan))).samples
+    gains = []
+    for samples in (Samples(T, codes, None), spread):
+        part = slice(0, samples.n)
+        plain = fit_composite(samples, [guess(samples), Quantization(STEP)], part)
+        law = fit_composite(samples, [*plain.terms, Volatility], part, plain)
+        gains.append(float((law.density - plain.density).sum()))
+    assert gains[0] > 300.0 > 30.0 > gains[1]
+    assert isinstance(plain.terms[0], OU)
