@@ -132,6 +132,9 @@ def injected_table(results: Sequence[Hidden]) -> str:
         mine = {one.effect: one for one in results if one.recording == name and one.effect}
         cells = []
         for effect in effects:
+            if effect not in mine:
+                cells.append('-')
+                continue
             outcome = mine[effect].outcome(bare)
             named[effect] += outcome == 'yes'
             counted[effect] += outcome != 'there'
