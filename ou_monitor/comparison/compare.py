@@ -18,8 +18,8 @@ from ou_monitor.comparison.judgement import (
     band, differences, distance, judge, LEVEL)
 from ou_monitor.comparison.yardstick import Measures, Yardstick
 from ou_monitor.criticism.curves import stray
-from ou_monitor.criticism.integrity import without_repeats
 from ou_monitor.criticism.readings import usable, why_nothing
+from ou_monitor.criticism.repeats import without_repeats
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray, Recording

@@ -47,6 +47,8 @@ _FOUND = 50.0
 # Falls from just below the knee, at least, and how noisy beside all; and parts of the
 # recording of which half must have been beyond it.
 _FEWEST, _AS_NOISY, _PARTS = 30, 0.6, 10
+# Samples before from which lines are predicted: two for each, and as many for the noise about it.
+_LINES = 16
 # Beyond so many scales a reading says nothing of what was there.
 _FAR = 8.0
 # Sums of squares that are none; far from it, their inverse is still a number.
@@ -186,7 +188,7 @@ def find_knee(voltage: FloatArray, noise: float, side: float) -> float | None:
     """Return where readings begin to be squeezed (voltage in V, noise in V)."""
     x = side * voltage
     plain = _likelihood(x)
-    best, found = plain + _FOUND, None
+    best, found, undone, squeezed = plain + _FOUND, None, x, 0.0
     for share in _SHARES:
         knee = float(np.quantile(x, 1.0 - share))
         over = np.maximum(x - knee, 0.0)
@@ -197,11 +199,15 @@ def find_knee(voltage: FloatArray, noise: float, side: float) -> float | None:
             part = np.minimum(far, _FAR)
             # Beyond, on along the tangent.
             stretched = np.expm1(part) + (far - part) * math.exp(_FAR)
-            value = float(part.sum()) + _likelihood(
-                np.minimum(x, knee) + scale * noise * stretched)
+            whole = np.minimum(x, knee) + scale * noise * stretched
+            value = float(part.sum()) + _likelihood(whole)
             if value > best:
-                best, found = value, knee
-    return side * found if found is not None and _is_limit(x, found) else None
+                best, found, undone, squeezed = value, knee, whole, float(part.sum())
+    if found is None or not _is_limit(x, found):
+        return None
+    # A line is slow at its turning points: of what is predicted with it they are no likelier.
+    gain = squeezed + _likelihood(undone, _LINES) - _likelihood(x, _LINES)
+    return side * found if gain > _FOUND else None
 
 
 def _is_limit(x: FloatArray, knee: float) -> bool:
@@ -222,9 +228,12 @@ def _is_limit(x: FloatArray, knee: float) -> bool:
     return sum(bool(part.any()) for part in parts) >= _PARTS // 2
 
 
-def _likelihood(x: FloatArray) -> float:
-    """Return the log-likelihood of an AR(1), but for a constant, nats."""
-    a, b = x[:-1] - x[:-1].mean(), x[1:] - x[1:].mean()
-    e = b - float(a @ b) / max(float(a @ a), _TINY) * a
-    count = int(e.size)
+def _likelihood(x: FloatArray, order: int = 1) -> float:
+    """Return the log-likelihood of an AR of some order, but for a constant, nats."""
+    count = int(x.size - order)
+    c = x - x.mean()
+    past = np.lib.stride_tricks.sliding_window_view(c, order + 1)
+    square = past.T @ past
+    weights = np.linalg.lstsq(square[:order, :order], square[:order, order], rcond=None)[0]
+    e = past[:, order] - past[:, :order] @ weights
     return -0.5 * count * math.log(max(float(e @ e), _TINY) / count)

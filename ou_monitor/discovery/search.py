@@ -111,7 +111,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     found = _Result(search, whole, after)
     if dropped and failure != INTERRUPTED:
         stays = [search.composite.terms[position(search.composite, search.accepted, k)]
-                 for k, kind in enumerate(kinds) if k not in out and decision.is_latent(kind)]
+                 for k, kind in enumerate(kinds) if k not in out and not kind.MEASURED]
         # What is sure whatever comes now.
         sure = begun if loaded else Search(bare)
         found = _Result(sure, sure.composite, criticise(samples, sure.composite, bank))
@@ -169,9 +169,15 @@ def _without(fitter: Fitter, search: Search, begun: Search, dropped: Sequence[st
         if any(map(decision.is_latent, kinds)) and not out:
             return _Result(again, other, left)
     asked, search = search.asked, begun.copy()
+    latent = [term for term in stays if decision.is_latent(type(term))]
+    for term in stays:
+        # What follows throttle without being an answer of the mean: it may be too dear by now.
+        fit = None if term in latent else fitter.join(search.composite, [term], rough=False)
+        if fit and fitter.evidence(fit) - fitter.evidence(search.composite) >= decision.ACCEPT:
+            search.take(term.NAME, fit)
     name_causes(fitter, search, bank, latent=False, given=[*given, *slow])
     search.asked = {**search.asked, **asked}
-    return _Result(search, *_kept_beside(fitter, search, stays, measured, bank, loaded))
+    return _Result(search, *_kept_beside(fitter, search, latent, measured, bank, loaded))
 
 
 def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,

@@ -49,6 +49,12 @@ class Search:
     failed: dict[str, float] = field(default_factory=dict)
     stopped: bool = False
 
+    def take(self, name: str, composite: Composite) -> None:
+        """Take a cause back into the model."""
+        self.composite = composite
+        self.accepted.append(name)
+        self.rivals.setdefault(name, [])
+
     def copy(self) -> Search:
         """Return a search that goes on from here and leaves this one as it is."""
         return replace(self, accepted=list(self.accepted), rivals=dict(self.rivals),

@@ -107,9 +107,9 @@ class Resonance(Term):
     def holds(self, view: View) -> bool:
         """Return whether it turns before it dies out, and dies out sooner than a line does."""
         width = self.damping / math.pi
-        return WIDEST < width < 2.0 * self.frequency and not (
-            width < SHARP * self.frequency
-            and keeps_its_height(view, self.frequency, width))
+        # What is too wide for a tone; or would be one but for its height.
+        return width < 2.0 * self.frequency and (width >= SHARP * self.frequency or (
+            width > WIDEST and not keeps_its_height(view, self.frequency, width)))
 
 
 # Tilt to begin with, and at most: at 1 a step would add no noise in one direction.

@@ -1,0 +1,121 @@
+"""
+Stamps: true where the voltage follows them, wrong where it does not.
+
+Stamps that scatter about an even grid are either true, and then the increments follow the steps,
+or wrong, and then they do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from ou_monitor.records import FloatArray
+from ou_monitor.text import counted
+
+# Scatter below this share of a step is put onto the grid: it changes nothing else.
+_SMALL = 0.02
+# Scatter above this share of a step is no scatter about a grid.
+_LARGE = 0.45
+# Correlation of neighbouring errors up to which they count as independent.
+_WHITE = 0.3
+# The increments must be the rail's to at least this share, and follow the steps
+# to less than this, for the stamps to be called wrong.
+_RAIL, _FOLLOW, _SURE = 0.5, 0.25, 0.06
+_TINY = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Stamps:
+    """
+    What became of the stamps.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n,)
+        Stamps to use, s.
+    error : float
+        Standard deviation of stamps that are wrong, s; 0: none are.
+    notes : tuple of str
+        Sentences.
+
+    """
+
+    t: FloatArray
+    error: float
+    notes: tuple[str, ...]
+
+
+def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
+    """
+    Judge stamps, and put them onto the grid where that is where they belong.
+
+    t in s, voltage in V.
+    """
+    step = np.diff(t)
+    usual = float(np.median(step))
+    # Without gaps first: steps that scatter by half of their length look like gaps.
+    number = np.ones(step.size)
+    grid = on_grid(t, number)
+    if float((t - grid).std()) > _LARGE * usual:
+        number = np.maximum(1.0, np.rint(step / usual))
+        grid = on_grid(t, number)
+    gaps = int((number > 1.0).sum())
+    notes = []
+    if gaps:
+        notes.append(f'{counted(gaps, "gap")} in the stamps, the longest '
+                     f'{float(step.max()):.3g} s: kept as they are.')
+    off = t - grid
+    scatter = float(off.std()) / usual
+    if scatter < _TINY:
+        return Stamps(t if gaps else grid, 0.0, tuple(notes))
+    white = abs(_correlation(off[1:], off[:-1])) < _WHITE
+    if scatter < _SMALL:
+        notes.append(f'Stamps scatter by {100.0 * scatter:.2g} % of a step about an even grid: '
+                     'taken as even.')
+        return Stamps(grid, 0.0, tuple(notes))
+    if white and scatter < _LARGE and _wrong(step / usual, number, voltage):
+        error = float(off.std())
+        notes.append(f'Stamps scatter by {1e3 * error:.3g} ms about an even grid while the '
+                     'voltage does not follow: the stamps are wrong, the grid was used.')
+        return Stamps(grid, error, tuple(notes))
+    uneven = float(step[number == 1.0].std()) / usual
+    if uneven > _SMALL:
+        notes.append(f'Steps between stamps scatter by {100.0 * uneven:.2g} %: taken as they '
+                     'are.')
+    return Stamps(t, 0.0, tuple(notes))
+
+
+def on_grid(t: FloatArray, number: FloatArray) -> FloatArray:
+    """Return the even grid nearest to stamps (t in s, result in s)."""
+    k = np.concatenate(([0.0], np.cumsum(number)))
+    k -= k.mean()
+    middle = float(t.mean())
+    grid: FloatArray = middle + float(k @ (t - middle)) / float(k @ k) * k
+    return grid
+
+
+def _wrong(step: FloatArray, number: FloatArray, voltage: FloatArray) -> bool:
+    """Return whether increments do not follow the steps as those of a rail would."""
+    change = np.diff(voltage)
+    change = change - np.median(change)
+    limit = 4.0 * float(np.median(np.abs(change))) / 0.6745
+    use = (number == 1.0) & (np.abs(change) < limit)
+    if use.sum() < 200:
+        return False
+    # White noise of the sensor makes neighbouring increments undo each other; it
+    # follows no step.
+    both = use[1:] & use[:-1]
+    power = float(np.mean(change[use] ** 2))
+    noise = -2.0 * float(np.mean((change[1:] * change[:-1])[both])) / power
+    square = change[use] ** 2 / power - 1.0
+    x = step[use] - step[use].mean()
+    follow = float(x @ square) / float(x @ x)
+    error = float(square.std()) / float(np.sqrt(x @ x))
+    return 1.0 - noise > _RAIL and error < _SURE and follow < _FOLLOW
+
+
+def _correlation(a: FloatArray, b: FloatArray) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    norm = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / norm if norm > 0.0 else 0.0
