@@ -4,7 +4,7 @@ import copy
 import math
 
 import numpy as np
-from ou_monitor.model.load import LEVELS, SLOPES
+from ou_monitor.model.load import LEVELS, SLOPES, usual_coefficients
 from ou_monitor.online.load import current as amps, load_filter as volts
 from ou_monitor.online.load.blocks import Block, CLIP
 from ou_monitor.online.load.current import CurrentFilter
@@ -175,3 +175,23 @@ def current_flown():
         one.take(block(0.05 * k, 15.0 + 0.02 * rng.standard_normal(), x=20.0 + 10.0 * (k % 7 == 0)
                        ), 4.0, fresh=False)
     return one
+
+
+def test_coefficients_begin_with_the_prior_or_with_another_flight():
+    """Discharge to a factor of two; what another flight learned may differ by a fifth."""
+    first = block(0.0, 15.0, 0.3)
+    plain, begun = LoadFilter(), LoadFilter()
+    plain._take(first)
+    mean, covariance, _ = usual_coefficients()
+    np.testing.assert_allclose(plain._m[1:], [1.0 / 80.0, *(15.0 * mean)])
+    np.testing.assert_allclose(plain._P[2:, 2:], 225.0 * covariance)
+    assert plain._P[1, 1] == pytest.approx(1.0 / 80.0 ** 2)
+    assert not plain._P[1, 2:].any()
+    learned = flown().learned()
+    begun.begin_with(learned)
+    begun._take(first)
+    coefficients = np.array(learned.coefficients)
+    np.testing.assert_allclose(begun._m[1:], [learned.discharge, *coefficients])
+    np.testing.assert_allclose(begun._P[2:, 2:], np.array(learned.covariance)
+                               + 0.2 ** 2 * np.outer(coefficients, coefficients))
+    np.testing.assert_allclose(begun._noise.b, learned.log_variance)
