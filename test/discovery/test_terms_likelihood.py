@@ -285,3 +285,12 @@ def test_noise_that_is_heavy_tailed_throughout_has_no_jumps(dof):
     view = view_of(samples, gaussian, gaussian.z, slice(0, samples.n))
     assert catalogue()['jumps'].fit_law(view) is None
     assert catalogue()['heavy_tails'].fit_law(view) is not None
+
+
+def test_a_force_with_a_square_and_a_cube_is_fitted_with_both():
+    """Each within four of its errors, and each more than four from none."""
+    wanted = {'square': 900.0, 'cube': 9000.0}
+    fit, _, _ = law_fitted('nonlinear_restoring', wanted, 3)
+    for name, value in wanted.items():
+        found, error = getattr(fit.term, name), fit.se[name]
+        assert abs(found - value) < 4.0 * error < value
