@@ -147,7 +147,8 @@ def test_any_number_on_the_topics_gives_a_finite_output(samples):
 
 def test_a_change_of_parameters_holds_from_the_next_sample_on():
     """The estimate goes on; gain and steps are those of the new white noise."""
-    t, x, sigma = recording()
+    t, x = 1e-3 * np.arange(600), recording()[1]
+    sigma = np.full(600, 0.6)
     changed, other = made(), made()
     for one in (changed, other):
         one.filter(t[:300], x[:300], sigma[:300], alpha=63.0, level=5.0)
