@@ -13,6 +13,7 @@ import ou_monitor
 from ou_monitor import discover
 from ou_monitor.cli.discover import render
 from ou_monitor.discovery.finding import Verdict
+from ou_monitor.discovery.plain_names import headline
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.drift import Drift
@@ -182,8 +183,8 @@ def test_the_page_shows_it_all(sag):
                  'Mean voltage by throttle', 'Spectrum', 'Autocorrelation', 'V/sqrt(s)'):
         assert part in text
     # Names of causes stand behind plain ones.
-    sentence = sag.sentence.replace('by load_sag', 'by sag (load_sag)')
-    assert ' '.join(sentence.replace('+-', '\u00b1').split()) in text
+    said = headline(sag)
+    assert 'sag (load_sag)' in said and ' '.join(said.replace('+-', '\u00b1').split()) in text
     drawings = root.findall('.//figure/svg')
     # The voltage over its simulations, rows of statistics, and six pictures twice.
     assert len(drawings) == 2 + 2 * 6
