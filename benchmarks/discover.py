@@ -187,7 +187,7 @@ def nulls(given: argparse.Namespace) -> int:
     if not lines:
         say('no recording was run')
         return 1
-    text = f'Seed {given.seed}.\n\n{nulls_table(lines)}'
+    text = nulls_table(lines).strip()
     print(text)
     if given.table:
         put(given.table, text, 'nulls')
