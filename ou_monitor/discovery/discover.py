@@ -174,8 +174,9 @@ def _causes(samples: Samples, state: Integrity, left: Earned, se: tuple[dict[str
     for term in state.exact:
         why = ''
         if term.ROLE is Role.NOISE:
-            index = next(i for i, t in enumerate(model.terms) if t.NAME == term.NAME)
-            less = without(samples, model, index)
+            # The plain OU, to which a model may come down, has none.
+            index = next((i for i, t in enumerate(model.terms) if t.NAME == term.NAME), None)
+            less = None if index is None else without(samples, model, index)
             gain, error = (math.nan, math.nan) if less is None else gain_of(
                 left.full, held_out(samples, less), scored)
             why = '' if math.isfinite(gain) else NO_OTHER if less is None else VAGUE
