@@ -331,6 +331,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
         # Far from the top a part of the samples shows the way.
         part = _liveliest(samples, few)
         # A part determines parameters that were fitted to all samples less well than those did.
+        begin = terms
         first = _maximise(
             samples.part(part), terms, None if events is None else events.part(part),
             only=(0, len(terms) - 1) if rough else None)
@@ -338,6 +339,11 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
         if rough or states[1] > _MANY:
             shrink = math.sqrt((part.stop - part.start) / samples.n)
             fit = _with_mean(samples, terms, events)
+            # Nor may what suits the part be worse for all.
+            before = fit if rough else _with_mean(samples, begin, events)
+            cost += 0.0 if rough else before.cost
+            if float(before.density.sum()) > float(fit.density.sum()):
+                fit = before
             return replace(fit, cost=cost + fit.cost, se=tuple(
                 {name: value * shrink for name, value in errors.items()} for errors in first.se))
         rounds = _LAST_ROUNDS
