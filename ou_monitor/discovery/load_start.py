@@ -16,6 +16,7 @@ from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import Fitter, is_trend
 from ou_monitor.discovery.regression import load_terms, mean_answer
 from ou_monitor.discovery.search_state import Search
+from ou_monitor.discovery.throttle_laws import compare_laws
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_dependent_noise import LoadDependentNoise
 from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
@@ -27,11 +28,6 @@ from ou_monitor.model.terms.term import Role, Term
 # Rate, 1/s, from which a fit finds what the load leaves: minutes and tenths of a second are both
 # within reach of it.
 _SLOW = 1.0
-# Intensities that follow throttle: each may only mend the form of the other.
-CURVES = (LoadDependentSigma, LoadDependentNoise)
-OTHER_CURVE = {
-    LoadDependentSigma.NAME: LoadDependentNoise.NAME,
-    LoadDependentNoise.NAME: LoadDependentSigma.NAME}
 
 
 def under_load(fitter: Fitter, search: Search) -> None:
@@ -69,6 +65,7 @@ def under_load(fitter: Fitter, search: Search) -> None:
             search.accepted.append(term.NAME)
             search.rivals.setdefault(term.NAME, [])
             search.log.append(f'{term.NAME}: with the load')
+    compare_laws(fitter, search)
     choose_answer(fitter, search, ())
 
 
@@ -80,7 +77,6 @@ def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:
     error = math.sqrt(float(np.median(composite.gaussian.variance)))
     # What the load leaves is slow, and small beside the white noise; or it is the noise itself.
     slow = replace(ou, alpha=_SLOW, sigma=0.3 * error * math.sqrt(2.0 * _SLOW))
-    largest = 0.0
     while True:
         view = fitter.view(best)
         tried: list[Composite] = []
@@ -88,11 +84,7 @@ def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:
             if best.has(kind.NAME) or kind.NAME not in catalogue():
                 continue
             found = fitter.best_start(best, kind, view)
-            # Two intensities that follow throttle: one may only mend the form of the other.
-            again = kind in CURVES and best.has(OTHER_CURVE[kind.NAME])
-            if found is not None and not (
-                    again and fitter.evidence(found) - fitter.evidence(best)
-                    < decision.FORM * largest):
+            if found is not None:
                 tried.append(found)
             if not best.has(MeasurementNoise.NAME) and kind is not LoadDependentSigma:
                 more: list[Term] = [MeasurementNoise(0.8 * error)]
@@ -104,24 +96,8 @@ def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:
         top = max(tried, default=None, key=fitter.evidence)
         gain = -math.inf if top is None else fitter.evidence(top) - fitter.evidence(best)
         if top is None or gain < decision.ACCEPT:
-            return _without_mend(fitter, best)
-        largest = max(largest, gain)
+            return best
         best = top
-
-
-def _without_mend(fitter: Fitter, composite: Composite) -> Composite:
-    """Return a model without the one of two curves over throttle that only mends the other."""
-    if not all(composite.has(kind.NAME) for kind in CURVES):
-        return composite
-    # Whichever came first: the wrong one may have stood for the right one until that came.
-    less = [fitter.fit([term for term in composite.terms if not isinstance(term, kind)], composite,
-                       rough=True) for kind in CURVES]
-    fits = [fit for fit in less if fit is not None]
-    if len(fits) < len(CURVES):
-        return composite
-    lost = [fitter.evidence(composite) - fitter.evidence(fit) for fit in fits]
-    least = int(np.argmin(lost))
-    return fits[least] if lost[least] < decision.FORM * max(lost) else composite
 
 
 def choose_answer(fitter: Fitter, search: Search, start: Sequence[Term]) -> None:

@@ -21,8 +21,9 @@ from ou_monitor.discovery import decision
 from ou_monitor.discovery.errors import standard_errors
 from ou_monitor.discovery.fitting import Fitter, is_trend, Trial
 from ou_monitor.discovery.gain import BLOCKS, mean_difference
-from ou_monitor.discovery.load_start import choose_answer, OTHER_CURVE, under_load
+from ou_monitor.discovery.load_start import choose_answer, under_load
 from ou_monitor.discovery.search_state import Search
+from ou_monitor.discovery.throttle_laws import compare_laws, LAWS, OTHER_CURVE, worth
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
 from ou_monitor.model.terms.load_sag import LoadSag
@@ -198,8 +199,10 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
             trials += fitter.trials(
                 search.composite, values, [*given, *search.hopeless, *_in_vain(search, values)],
                 tier, bank, only)
-            good = [trial for trial in trials if _acceptable(trial, search, values)]
-            search.hopeless |= {trial.name for trial in trials if _only_form(trial, search)}
+            search.hopeless |= {trial.name for trial in trials
+                                if _only_form(fitter, trial, search)}
+            good = [trial for trial in trials if trial.name not in search.hopeless
+                    and _acceptable(trial, search, values)]
             search.failed |= {
                 trial.name: decision.asks(catalogue()[trial.name], values) for trial in trials
                 if not decision.could_be(catalogue()[trial.name], trial.evidence, search.largest)}
@@ -229,6 +232,9 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
             after = criticise(samples, search.composite, bank)
         _prune(fitter, search, chosen)
         kind = catalogue()[best.name]
+        if kind in LAWS or kind.ROLE is Role.NOISE:
+            compare_laws(fitter, search)
+            after = criticise(samples, search.composite, bank)
         if decision.tier_of(kind, values) > 0 and not (
                 decision.helped(values, after) or decision.helped(values, after, kind)):
             # The effect may not be in the catalogue; other terms would only imitate it.  One
@@ -240,6 +246,8 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
         values = after
         if fitter.cost > decision.MOST_COST:
             break
+    if fitter.cost <= decision.MOST_COST:
+        compare_laws(fitter, search)
     search.stopped = fitter.cost > decision.MOST_COST
 
 
@@ -256,8 +264,6 @@ def _kinds(names: Sequence[str]) -> list[type[Term]]:
 def _acceptable(trial: Trial, search: Search, values: Mapping[str, float]) -> bool:
     """Return whether a trial may be accepted."""
     kind = catalogue()[trial.name]
-    if _only_form(trial, search):
-        return False
     new, old = trial.composite.density, search.composite.density
     gains = [float(part.sum()) for part in np.array_split(new - old, BLOCKS)]
     return decision.acceptable(
@@ -271,10 +277,11 @@ def _in_vain(search: Search, values: Mapping[str, float]) -> list[str]:
             and decision.asks(catalogue()[name], values) <= asked]
 
 
-def _only_form(trial: Trial, search: Search) -> bool:
+def _only_form(fitter: Fitter, trial: Trial, search: Search) -> bool:
     """Return whether a curve over throttle may only mend the form of another one."""
-    return trial.name in OTHER_CURVE and search.composite.has(OTHER_CURVE[trial.name]) and (
-        trial.evidence < decision.FORM * search.largest)
+    other = OTHER_CURVE.get(trial.name, '')
+    return search.composite.has(other) and trial.evidence > decision.ACCEPT and (
+        trial.evidence < decision.FORM * worth(fitter, search.composite, other))
 
 
 def _accept(search: Search, best: Trial, trials: Sequence[Trial]) -> None:

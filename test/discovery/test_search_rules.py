@@ -6,7 +6,6 @@ import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision, fitting, search as rules
 from ou_monitor.discovery.fitting import Fitter, Trial
-from ou_monitor.discovery.load_start import _without_mend
 from ou_monitor.discovery.search_state import Search
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.drift import Drift
@@ -195,35 +194,18 @@ def test_positions_of_causes_that_recur():
     assert [rules.position(model, names, k) for k in range(3)] == [1, 2, 3]
 
 
-@pytest.mark.parametrize('evidence, only', [(4.9, True), (5.1, False)])
+@pytest.mark.parametrize('evidence, only', [(9.9, True), (10.1, False)])
 def test_a_curve_that_mends_another_one(evidence, only):
-    """Below a share of the largest evidence it may only mend the form of the other."""
-    search = Search(Model([BASE, SIGMA], 0.0), ['load_dependent_sigma'],
-                    largest=5.0 / decision.FORM)
+    """Below a share of what the other one explains it may only mend its form."""
+    search = Search(Model([BASE, NOISE, SIGMA], 500.0), ['load_dependent_sigma'], largest=1e6)
+    # A rough fit of the table is a nat worse.
+    fitter = Table({('measurement_noise',): 501.0 - 10.0 / decision.FORM})
     one = Trial('load_dependent_noise', Model([BASE], 0.0), evidence)
-    assert rules._only_form(one, search) is only
-    assert not rules._only_form(Trial('drift', Model([BASE], 0.0), evidence), search)
-    alone = Search(Model([BASE], 0.0), [], largest=5.0 / decision.FORM)
-    assert not rules._only_form(one, alone)
+    assert rules._only_form(fitter, one, search) is only
+    assert not rules._only_form(fitter, Trial('drift', Model([BASE], 0.0), evidence), search)
+    alone = Search(Model([BASE], 0.0), [])
+    assert not rules._only_form(fitter, one, alone)
     assert LoadDependentNoise.NAME in rules.OTHER_CURVE
-
-
-@pytest.mark.parametrize('noise, sigma, left', [
-    # Evidence without either: what one brings beside the other, in tenths of what that brings.
-    (91.5, 10.0, {'load_dependent_sigma'}), (89.0, 10.0, {*rules.OTHER_CURVE}),
-    (10.0, 91.5, {'load_dependent_noise'}), (10.0, 89.0, {*rules.OTHER_CURVE}),
-    (91.5, None, {*rules.OTHER_CURVE})])
-def test_the_curve_that_came_first_may_be_the_one_that_mends(noise, sigma, left):
-    """Whichever of two was accepted first: less than a tenth of the other is its form."""
-    curve = LoadDependentNoise(1.0, 2.0)
-    model = Model([BASE, NOISE, curve, SIGMA], 100.0)
-    table = Table({('measurement_noise', 'load_dependent_sigma'): noise,
-                   ('measurement_noise', 'load_dependent_noise'): sigma})
-    # Fits are rough: a nat worse.
-    table.worth = {key: None if worth is None else worth + 1.0
-                   for key, worth in table.worth.items()}
-    found = _without_mend(table, model)
-    assert {term.NAME for term in found.terms} - {'ou', 'measurement_noise'} == left
 
 
 def test_a_trial_that_is_accepted():

@@ -1,0 +1,126 @@
+"""The laws of throttle are compared with each other, each fitted beside the same other terms."""
+
+from types import SimpleNamespace
+
+import numpy as np
+from ou_monitor import discover, Recording
+from ou_monitor.discovery import decision
+from ou_monitor.discovery.fitting import Fitter
+from ou_monitor.discovery.search_state import Search
+from ou_monitor.discovery.throttle_laws import compare_laws
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.load_dependent_alpha import LoadDependentAlpha
+from ou_monitor.model.terms.load_dependent_noise import LoadDependentNoise
+from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
+from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.ou import OU
+import pytest
+
+WHITE = MeasurementNoise(0.01)
+LAWS = {'s': LoadDependentSigma((0.0, 1.0), (0.0, 0.5)), 'n': LoadDependentNoise(1.0, 0.0),
+        'a': LoadDependentAlpha(0.5)}
+LETTER = {term.NAME: letter for letter, term in LAWS.items()}
+
+
+class Model:
+    """Terms, and an evidence in nats."""
+
+    def __init__(self, terms, evidence):
+        self.terms, self.worth = tuple(terms), evidence
+
+    def has(self, name):
+        """Return whether there is a term of that name."""
+        return any(term.NAME == name for term in self.terms)
+
+
+class Table(Fitter):
+    """Fits whose evidence is that of a table by the letters of their laws."""
+
+    def __init__(self, worth):
+        super().__init__(SimpleNamespace(n=1000))
+        self.worth = worth
+
+    def evidence(self, composite):
+        """Return that of the model."""
+        return composite.worth
+
+    def view(self, composite):
+        """White noise is there."""
+        return SimpleNamespace(variance=np.array([1e-4]))
+
+    def fit(self, terms, known, rough=False, begun=False):
+        """Return the model of the table."""
+        letters = sorted(LETTER[term.NAME] for term in terms if term.NAME in LETTER)
+        return Model(terms, self.worth[''.join(letters)])
+
+    def best_start(self, composite, kind, view):
+        """Return the model with one law more."""
+        return self.fit([*composite.terms, LAWS[LETTER[kind.NAME]]], composite)
+
+
+def compared(worth, letters, white=True):
+    """Return the search after the comparison, and the letters of its laws."""
+    laws = [LAWS[letter] for letter in letters]
+    terms = [OU(50.0, 0.5, 5.0), *([WHITE] if white else []), *laws]
+    search = Search(Model(terms, worth[''.join(sorted(letters))]), [
+        *([WHITE.NAME] if white else []), *(term.NAME for term in laws)])
+    compare_laws(Table(worth), search)
+    return search, ''.join(sorted(LETTER[name] for name in search.accepted if name in LETTER))
+
+
+ALONE = {'': 0.0, 's': 30.0, 'n': 14.0, 'a': 5.0, 'ns': 31.0, 'as': 31.0, 'an': 16.0, 'ans': 32.0}
+
+
+@pytest.mark.parametrize('letters', ['s', 'n', 'a', 'ns', 'an', 'as', 'ans'])
+def test_the_best_law_is_named_whatever_was_tried_first(letters):
+    """From any set the search ends at the one law that brings more than the others."""
+    search, left = compared(ALONE, letters)
+    assert left == 's' and search.rivals[LAWS['s'].NAME] == []
+    assert search.composite.worth == 30.0
+
+
+@pytest.mark.parametrize('lost, told', [(2.9, ['load_dependent_noise']), (3.1, [])])
+def test_a_law_that_does_nearly_as_well_is_a_rival(lost, told):
+    """Within three nats after a full fit in its place; one that does better takes the place."""
+    assert decision.TIE == 3.0
+    search, left = compared({**ALONE, 'n': 30.0 - lost, 'ns': 30.5}, 's')
+    assert left == 's' and search.rivals[LAWS['s'].NAME] == told
+
+
+@pytest.mark.parametrize('both, left', [(64.0, 's'), (66.0, 'ns')])
+def test_two_curves_stay_where_each_explains_a_tenth_of_the_other(both, left):
+    """Of 600 nats of the one, 60 of the other: less may be a matter of its form."""
+    worth = {**ALONE, 's': 600.0, 'n': 400.0, 'as': 601.0, 'an': 401.0, 'ns': 600.0 + both - 5.0,
+             'ans': 600.0 + both - 4.0}
+    assert decision.FORM == 0.1
+    assert compared(worth, 'ns')[1] == left
+
+
+def test_what_gave_way_to_a_form_does_not_come_back():
+    """A law that stood for what the form of another leaves is not tried again."""
+    worth = {**ALONE, 'n': 5000.0, 's': 2000.0, 'an': 5025.0, 'ns': 5350.0, 'as': 2010.0,
+             'ans': 5360.0}
+    search, left = compared(worth, 'an')
+    assert left == 'n'
+    assert search.hopeless == {LAWS['a'].NAME, LAWS['s'].NAME}
+
+
+def test_ripple_needs_white_noise():
+    """Without it the law of the white noise is no rival of sigma."""
+    worth = {letters: value for letters, value in ALONE.items() if 'n' not in letters}
+    assert compared(worth, 's', white=False)[1] == 's'
+
+
+def test_constant_white_noise_does_not_follow_throttle():
+    """Sigma that follows throttle beside constant white noise is named, its rivals are not."""
+    rng = np.random.default_rng(6)
+    t = np.arange(6000) / 100.0
+    walk = np.repeat(rng.uniform(0.2, 0.7, 120), 50)
+    throttle = np.convolve(np.pad(walk, 10, 'edge'), np.full(21, 1.0 / 21.0), 'valid')
+    truth = SupplyModel((OU(6.0, 0.15, 20.0), LoadSag(1.5, 0.0), MeasurementNoise(0.035),
+                         LoadDependentSigma((0.0, 1.0), (0.0, 1.8))))
+    voltage = truth.simulate(t, rng, throttle)
+    names = [cause.name for cause in discover(Recording(t, voltage, throttle, 'simulated')).causes]
+    assert 'load_dependent_sigma' in names
+    assert 'load_dependent_noise' not in names and 'load_dependent_alpha' not in names
