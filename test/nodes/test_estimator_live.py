@@ -240,7 +240,9 @@ def test_current_of_the_battery_gives_a_resistance(world):
     wait_until(lambda: rig.field('load_basis') == 'CURRENT', what='the current')
     ohm, error = (float(rig.field(f'load_resistance{end}')) for end in ('', '_se'))
     assert abs(ohm - 0.02) < 2.0 * error < 0.01
-    assert float(rig.field('load_level')) == pytest.approx(16.0, abs=0.15)
+    # What relaxes in 15 s is not told from the level in 20 s: 0.12 V below after all samples, 0.17
+    # after 95 %.  The mean under load lies 0.65 V below.
+    assert float(rig.field('load_level')) == pytest.approx(16.0, abs=0.25)
     assert rig.field('load_status') == 'NO_THROTTLE'
 
 
