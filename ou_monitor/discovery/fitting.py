@@ -85,6 +85,11 @@ class Fitter:
         """Return what a model leaves over."""
         return view_of(self.samples, composite.gaussian, composite.z, self.samples.train)
 
+    def holds(self, composite: Composite) -> bool:
+        """Return whether all terms of a model still mean what their names say."""
+        view = self.view(composite)
+        return all(term.holds(view) for term in composite.terms)
+
     def fit(self, terms: Sequence[Term | type[Term]], known: Composite | None,
             rough: bool = False, begun: bool = False) -> Composite | None:
         """Return a fit to the first part, its mean to everything; None where there is none."""

@@ -108,6 +108,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     # Noise that the load needs is part of it.
     out = [k for k in out if not (loaded and search.accepted[k] in begun.accepted)]
     out = _in_doubt(samples, whole, search.accepted, out)
+    out = sorted({*out, *_other(fitter, whole, search.accepted)})
     dropped = tuple(search.accepted[k] for k in out)
     found = _Result(search, whole, after)
     if dropped and failure != INTERRUPTED:
@@ -151,6 +152,13 @@ def _in_doubt(samples: Samples, whole: Composite, names: Sequence[str], out: Seq
     return [k for k in out if not is_sure(k)]
 
 
+def _other(fitter: Fitter, whole: Composite, names: Sequence[str]) -> list[int]:
+    """Return the latent causes that are something else by now than their name says."""
+    view = fitter.view(whole)
+    return [k for k, kind in enumerate(_kinds(names)) if decision.is_latent(kind)
+            and not whole.terms[position(whole, names, k)].holds(view)]
+
+
 def _without(fitter: Fitter, search: Search, begun: Search, dropped: Sequence[str],
              stays: Sequence[Term], before: Mapping[str, float], measured: Mapping[str, float],
              bank: NullBank, given: Sequence[str], loaded: bool) -> _Result:
@@ -165,8 +173,9 @@ def _without(fitter: Fitter, search: Search, begun: Search, dropped: Sequence[st
         kinds = _kinds(again.accepted)
         other = fitter.whole(again.composite)
         left = criticise(fitter.samples, other, bank)
-        out = _in_doubt(fitter.samples, other, again.accepted,
-                        decision.withdrawn(before, left, kinds))
+        out = [*_in_doubt(fitter.samples, other, again.accepted,
+                          decision.withdrawn(before, left, kinds)),
+               *_other(fitter, other, again.accepted)]
         if any(map(decision.is_latent, kinds)) and not out:
             return _Result(again, other, left)
     asked, search = search.asked, begun.copy()
@@ -244,8 +253,6 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
                 break
             only = best.name
         values = after
-        if fitter.cost > decision.MOST_COST:
-            break
     if fitter.cost <= decision.MOST_COST:
         compare_laws(fitter, search)
     search.stopped = fitter.cost > decision.MOST_COST
@@ -355,7 +362,7 @@ def _prune(fitter: Fitter, search: Search, chosen: bool) -> None:
         needed = decision.needed_evidence(kind)
         if less is not None and full - fitter.evidence(less) < needed + decision.ROUGH:
             less = fitter.fit(kept, less)
-        if less is None or not full - fitter.evidence(less) < needed:
+        if less is None or not full - fitter.evidence(less) < needed or not fitter.holds(less):
             continue
         if decision.is_answer(kind) and is_trend(fitter.samples, less):
             # The `ou` has taken its place: a trend, and no relaxation any more.
@@ -396,6 +403,7 @@ def _kept_beside(fitter: Fitter, search: Search, stays: Sequence[Term],
             out = _in_doubt(samples, again, names, (
                 decision.withdrawn_under_load(before, left, kinds, search.asked) if loaded
                 else decision.withdrawn(before, left, kinds)))
+            out += _other(fitter, again, names)
             bad = [k - len(search.accepted) for k in out if k >= len(search.accepted)]
             if not bad:
                 search.composite, whole, after, search.accepted = fit, again, left, names

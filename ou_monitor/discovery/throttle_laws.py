@@ -17,7 +17,7 @@ from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_dependent_alpha import LoadDependentAlpha
 from ou_monitor.model.terms.load_dependent_noise import LoadDependentNoise
 from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
-from ou_monitor.model.terms.term import Role, Term
+from ou_monitor.model.terms.term import Term
 
 LAWS: tuple[type[Term], ...] = (LoadDependentSigma, LoadDependentNoise, LoadDependentAlpha)
 _NAMES = tuple(kind.NAME for kind in LAWS)
@@ -52,7 +52,7 @@ def _moved(fitter: Fitter, search: Search) -> bool:
              if kind.NAME in catalogue() and not composite.has(kind.NAME)
              and (kind.CHANGES is None or composite.has(kind.CHANGES.NAME))
              for found in [fitter.best_start(less, kind, fitter.view(less))]
-             if found is not None and _whole(fitter, found)]
+             if found is not None and fitter.holds(found)]
     value = fitter.evidence(composite)
     if any(fitter.evidence(found) > value - decision.ROUGH for _, _, found in swaps):
         composite = fitter.fit(composite.terms, composite) or composite
@@ -97,12 +97,6 @@ def _without(fitter: Fitter, composite: Composite, name: str) -> Composite | Non
     """Return the fit without the term of a name."""
     kept: Sequence[Term] = [term for term in composite.terms if term.NAME != name]
     return fitter.fit(kept, composite, rough=True)
-
-
-def _whole(fitter: Fitter, found: Composite) -> bool:
-    """Return whether the noises of a model are still there beside a law in another's place."""
-    view = fitter.view(found)
-    return all(term.holds(view) for term in found.terms if term.ROLE is Role.NOISE)
 
 
 def _in_full(fitter: Fitter, found: Composite, value: float) -> Composite:

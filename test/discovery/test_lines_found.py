@@ -8,18 +8,20 @@ import numpy as np
 from ou_monitor import discover
 from ou_monitor.analysis.level_result import fit_level
 from ou_monitor.analysis.levels import LoadLevel, Segment
-from ou_monitor.criticism.composite import covariates_of, fit_composite
+from ou_monitor.criticism.composite import Composite, covariates_of, fit_composite
 from ou_monitor.criticism.null_bank import criticise, simulate_bank
 from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.errors import standard_errors
 from ou_monitor.discovery.fitting import Fitter
-from ou_monitor.discovery.search import _in_doubt, _kept_beside
+from ou_monitor.discovery.search import _in_doubt, _kept_beside, _other
 from ou_monitor.discovery.search_state import Search
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_sag import LoadSag
 from ou_monitor.model.terms.load_transient import LoadTransient
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.resonance import Resonance
 from ou_monitor.model.terms.tone import Tone
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import NAN, Recording
@@ -51,6 +53,16 @@ def test_other_causes_have_no_such_right():
     samples = Samples(T, voltage(Tone(0.2, 13.0, 0.5, 0.0)), None)
     whole = fit_composite(samples, [RAIL, Tone(0.0, 13.0, 0.0, 0.0)], slice(0, samples.n))
     assert _in_doubt(samples, replace(whole), ['second_relaxation'], [0]) == [0]
+
+
+@pytest.mark.parametrize('damping, other', [(2.0, []), (60.0, [0])])
+def test_ringing_that_dies_out_before_it_turns_is_something_else(damping, other):
+    """5 Hz turn in 0.2 s: a damping of 2 /s lets it ring, 60 /s do not."""
+    samples = Samples(T, voltage(), None)
+    terms = (RAIL, Resonance(5.0, damping, 0.02, 0.0))
+    gaussian = evaluate(samples, terms)
+    whole = Composite(terms, ({}, {}), gaussian, gaussian.z, gaussian.density, 6, 0.0)
+    assert _other(Fitter(samples), whole, ['resonance']) == other
 
 
 def test_lines_are_put_back_together():
