@@ -19,6 +19,7 @@ from ou_monitor.criticism.spectral_start import from_spectrum
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import decision
 from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.drift import Drift
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
@@ -144,7 +145,17 @@ class Fitter:
                     trial = replace(trial, left=criticise(self.samples, best, bank),
                                     shown=self.poles_shown(best))
                 found.append(trial)
+        if any(decision.may_be_a_trend(catalogue()[trial.name]) for trial in found):
+            found += self._trend(composite, view, before, given)
         return found
+
+    def _trend(self, composite: Composite, view: View, before: float, given: Collection[str]
+               ) -> list[Trial]:
+        """Return a trial of `drift`, which is measured, beside latent causes that are slow."""
+        if composite.has(Drift.NAME) or Drift.NAME in given or Drift.NAME not in catalogue():
+            return []
+        best = self.best_start(composite, Drift, view)
+        return [] if best is None else [Trial(Drift.NAME, best, self.evidence(best) - before)]
 
     def poles_shown(self, composite: Composite) -> frozenset[str]:
         """Return the causes that the score test of another pole shows beside a model."""

@@ -25,8 +25,10 @@ from ou_monitor.discovery.load_start import choose_answer, under_load
 from ou_monitor.discovery.search_state import Search
 from ou_monitor.discovery.throttle_laws import compare_laws, LAWS, OTHER_CURVE, worth
 from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.drift import Drift
 from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
 from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.second_relaxation import SecondRelaxation
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.model.terms.tone import lines_of, Tone
 
@@ -99,12 +101,11 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     whole = fitter.whole(search.composite)
     after = criticise(samples, whole, bank) if search.accepted else before
     kinds = _kinds(search.accepted)
-    latent = any(decision.is_latent(kind) for kind in kinds)
-    if loaded and latent:
+    # What the measured causes left, which the load begins with.
+    measured = before
+    if loaded and any(map(decision.is_latent, kinds)):
         measured = criticise(samples, begun.composite, bank)
-        out = decision.withdrawn_under_load(measured, after, kinds, search.asked)
-    else:
-        out = decision.withdrawn(before, after, kinds)
+    out = decision.withdrawn(measured, after, kinds, search.asked)
     # Noise that the load needs is part of it.
     out = [k for k in out if not (loaded and search.accepted[k] in begun.accepted)]
     out = _in_doubt(samples, whole, search.accepted, out)
@@ -118,13 +119,24 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         sure = begun if loaded else Search(bare)
         found = _Result(sure, sure.composite, criticise(samples, sure.composite, bank))
         try:
-            found = _without(fitter, search, begun, dropped, stays, before,
-                             measured if loaded else before, bank, given, loaded)
+            found = _without(fitter, search, begun, dropped, stays, measured, bank, given,
+                             loaded)
         except KeyboardInterrupt:
             failure = INTERRUPTED
         dropped = tuple(name for name in dropped if name not in found.search.accepted)
-    return Named(found.whole, bank, tuple(found.search.accepted), found.search.rivals, dropped,
-                 before, found.after, failure)
+    return Named(found.whole, bank, tuple(found.search.accepted),
+                 _with_trends(samples, found.whole, found.search.rivals), dropped, before,
+                 found.after, failure)
+
+
+def _with_trends(samples: Samples, whole: Composite, rivals: Mapping[str, list[str]]
+                 ) -> dict[str, list[str]]:
+    """Return the rivals of each cause; of a pole that is a trend, a drift of any form is one."""
+    duration = float(samples.t[-1] - samples.t[0])
+    slow = any(isinstance(term, SecondRelaxation) and term.alpha * duration < decision.RELAXES
+               for term in whole.terms) and not whole.has(Drift.NAME)
+    return {name: [*others, Drift.NAME] if slow and name == SecondRelaxation.NAME
+            and Drift.NAME not in others else others for name, others in rivals.items()}
 
 
 @dataclass(frozen=True)
@@ -153,14 +165,14 @@ def _in_doubt(samples: Samples, whole: Composite, names: Sequence[str], out: Seq
 
 
 def _other(fitter: Fitter, whole: Composite, names: Sequence[str]) -> list[int]:
-    """Return the latent causes that are something else by now than their name says."""
+    """Return the states that are something else by now than their name says."""
     view = fitter.view(whole)
-    return [k for k, kind in enumerate(_kinds(names)) if decision.is_latent(kind)
+    return [k for k, kind in enumerate(_kinds(names)) if kind.ROLE is Role.BLOCK
             and not whole.terms[position(whole, names, k)].holds(view)]
 
 
 def _without(fitter: Fitter, search: Search, begun: Search, dropped: Sequence[str],
-             stays: Sequence[Term], before: Mapping[str, float], measured: Mapping[str, float],
+             stays: Sequence[Term], measured: Mapping[str, float],
              bank: NullBank, given: Sequence[str], loaded: bool) -> _Result:
     """Search again without what was withdrawn; `measured` is what the measured causes left."""
     # The causes withdrawn may have hidden measured ones.  A trend that another slow cause
@@ -174,7 +186,7 @@ def _without(fitter: Fitter, search: Search, begun: Search, dropped: Sequence[st
         other = fitter.whole(again.composite)
         left = criticise(fitter.samples, other, bank)
         out = [*_in_doubt(fitter.samples, other, again.accepted,
-                          decision.withdrawn(before, left, kinds)),
+                          decision.withdrawn(measured, left, kinds, again.asked)),
                *_other(fitter, other, again.accepted)]
         if any(map(decision.is_latent, kinds)) and not out:
             return _Result(again, other, left)
@@ -187,7 +199,7 @@ def _without(fitter: Fitter, search: Search, begun: Search, dropped: Sequence[st
             search.take(term.NAME, fit)
     name_causes(fitter, search, bank, latent=False, given=[*given, *slow])
     search.asked = {**search.asked, **asked}
-    return _Result(search, *_kept_beside(fitter, search, latent, measured, bank, loaded))
+    return _Result(search, *_kept_beside(fitter, search, latent, measured, bank))
 
 
 def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
@@ -214,7 +226,7 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
                     and _acceptable(trial, search, values)]
             search.failed |= {
                 trial.name: decision.asks(catalogue()[trial.name], values) for trial in trials
-                if not decision.could_be(catalogue()[trial.name], trial.evidence, search.largest)}
+                if trial.evidence <= decision.ACCEPT}
             if good:
                 break
             if tier == 0 and not reformed and decision.any_off(values):
@@ -226,7 +238,9 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
             break
         trials = fitter.refine(search.composite, trials)
         named = {trial.name for trial in good}
-        best = next(trial for trial in trials if trial.name in named)
+        name = decision.best_of([(trial.name, trial.evidence) for trial in trials
+                                 if trial.name in named])
+        best = next(trial for trial in trials if trial.name == name)
         _accept(search, best, trials)
         search.asked[best.name] = values
         chosen = best.composite.gaussian.cost < _SOON
@@ -274,7 +288,7 @@ def _acceptable(trial: Trial, search: Search, values: Mapping[str, float]) -> bo
     new, old = trial.composite.density, search.composite.density
     gains = [float(part.sum()) for part in np.array_split(new - old, BLOCKS)]
     return decision.acceptable(
-        kind, trial.evidence, search.largest, decision.is_ragged(values),
+        kind, trial.evidence, decision.is_ragged(values),
         decision.is_throughout(*mean_difference(new, old), gains))
 
 
@@ -380,7 +394,7 @@ def _prune(fitter: Fitter, search: Search, chosen: bool) -> None:
 
 
 def _kept_beside(fitter: Fitter, search: Search, stays: Sequence[Term],
-                 before: Mapping[str, float], bank: NullBank, loaded: bool
+                 before: Mapping[str, float], bank: NullBank
                  ) -> tuple[Composite, dict[str, float]]:
     """Put latent causes that were not withdrawn beside the measured ones; return what is left."""
     samples = fitter.samples
@@ -400,9 +414,8 @@ def _kept_beside(fitter: Fitter, search: Search, stays: Sequence[Term],
             left = criticise(samples, again, bank)
             names = [*search.accepted, *(term.NAME for term in more)]
             kinds = _kinds(names)
-            out = _in_doubt(samples, again, names, (
-                decision.withdrawn_under_load(before, left, kinds, search.asked) if loaded
-                else decision.withdrawn(before, left, kinds)))
+            out = _in_doubt(samples, again, names,
+                            decision.withdrawn(before, left, kinds, search.asked))
             out += _other(fitter, again, names)
             bad = [k - len(search.accepted) for k in out if k >= len(search.accepted)]
             if not bad:

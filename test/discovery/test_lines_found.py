@@ -73,7 +73,7 @@ def test_lines_are_put_back_together():
     bank = simulate_bank(covariates_of(samples, start), float(start.gaussian.phi[1]),
                          np.random.default_rng(0))
     search = Search(start)
-    _kept_beside(Fitter(samples), search, tones, criticise(samples, start, bank), bank, False)
+    _kept_beside(Fitter(samples), search, tones, criticise(samples, start, bank), bank)
     assert search.accepted == ['tone', 'tone']
 
 
