@@ -30,7 +30,7 @@ _ROUNDS = 3
 _POWERS = 1e-3, 1e3
 _ALIKE = 0.03
 # Processor time of the fit of a dear law, s a sample: of the fastest of them.
-_LAW_COST = 1e-5
+LAW_COST = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
             view = replace(view_of(samples, gaussian, z, part), variance=gaussian.variance * power)
             fit = law.refit_law(view) if isinstance(law, Term) else law.fit_law(view)
             if law.DEAR:
-                cost += _LAW_COST * samples.n
+                cost += LAW_COST * samples.n
             if fit is None:
                 return None
             laws[k] = fit.term

@@ -66,6 +66,9 @@ AGAIN_SHARE = 0.005
 # shapes the other curve brought 0.7 % at most; but the curves of the flights in doc/discovery.md
 # leave a tenth of what the first explains, and this was chosen on them.
 FORM = 0.1
+# Share of its evidence that a latent law must keep beside a free law of throttle: what throttle
+# explains the larger part of, in whatever form, is throttle's.
+OWN = 0.5
 # The recording cannot separate causes within this of the best from it, nats: odds below 20.
 TIE = 3.0
 # Evidence from which a measured cause stays after others were accepted, nats: its price (BIC) is
@@ -252,6 +255,11 @@ def best_of(trials: Sequence[tuple[str, float]]) -> str:
             name == Drift.NAME and value > top - TIE for name, value in trials):
         return Drift.NAME
     return best
+
+
+def is_throttles(alone: float, beside: float) -> bool:
+    """Return whether throttle explains what a latent law does (alone, beside it: in nats)."""
+    return beside < max(ACCEPT, OWN * alone)
 
 
 def is_ragged(values: Statistics) -> bool:

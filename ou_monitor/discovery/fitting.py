@@ -12,12 +12,14 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from ou_monitor.criticism.composite import Composite, fit_composite, pole_beside, view_of
+from ou_monitor.criticism.composite import (
+    Composite, fit_composite, LAW_COST, pole_beside, view_of)
 from ou_monitor.criticism.null_bank import criticise, NullBank
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.spectral_start import from_spectrum
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import decision
+from ou_monitor.discovery.free_law import free_law
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.drift import Drift
 from ou_monitor.model.terms.laws import View
@@ -126,6 +128,8 @@ class Fitter:
         view = self.view(composite)
         before = self.evidence(composite)
         found: list[Trial] = []
+        free: FloatArray | None = None
+        asked = False
         model = [type(term) for term in composite.terms]
         for kind in decision.kinds_to_try(catalogue().values(), model, values, given, tier,
                                           self.samples.throttle is not None,
@@ -136,6 +140,11 @@ class Fitter:
                    or decision.comes_first(catalogue()[trial.name], trial.evidence, kind, values)
                    for trial in found):
                 continue
+            if kind.ROLE is Role.LAW and decision.is_latent(kind):
+                if not asked:
+                    free, asked = free_law(self.samples, view.z), True
+                if free is not None and self._is_throttles(kind, view, free):
+                    continue
             best = self.best_start(composite, kind, view)
             if best is not None:
                 with_it = kind.CHANGES is not None and not composite.has(kind.CHANGES.NAME)
@@ -156,6 +165,24 @@ class Fitter:
             return []
         best = self.best_start(composite, Drift, view)
         return [] if best is None else [Trial(Drift.NAME, best, self.evidence(best) - before)]
+
+    def _is_throttles(self, kind: type[Term], view: View, free: FloatArray) -> bool:
+        """Return whether a free law of throttle, a log-variance, explains what a kind does."""
+        def evidence(view: View) -> float:
+            if kind.DEAR:
+                self.cost += LAW_COST * self.samples.n
+            try:
+                fit = kind.fit_law(view)
+            except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+                return -math.inf
+            return -math.inf if fit is None else (
+                float(fit.gain.sum()) - fit.term.SEARCH
+                - 0.5 * fit.free * math.log(self.samples.train.stop))
+
+        beside = evidence(replace(view, z=view.z * np.exp(-0.5 * free),
+                                  variance=view.variance * np.exp(free)))
+        return decision.is_throttles(
+            evidence(view) if beside > decision.ACCEPT else 0.0, beside)
 
     def poles_shown(self, composite: Composite) -> frozenset[str]:
         """Return the causes that the score test of another pole shows beside a model."""

@@ -243,6 +243,15 @@ def test_a_trend_comes_before_a_slow_cause_that_does_as_well(trials, best):
     assert decision.best_of(trials) == best
 
 
+@pytest.mark.parametrize('alone, beside, throttles', [
+    # The larger part of it is throttle's, or none is.
+    (100.0, 49.0, True), (100.0, 51.0, False), (100.0, 130.0, False), (692.0, 171.0, True),
+    # Beside the free law it needs what any cause needs.
+    (8.0, 5.9, True), (8.0, 6.1, False), (0.0, -20.0, True)])
+def test_what_throttle_explains_in_another_form(alone, beside, throttles):
+    assert decision.is_throttles(alone, beside) is throttles
+
+
 @pytest.mark.parametrize('name, value, ragged', [
     ('kurtosis', 7.9, False), ('kurtosis', 8.1, True), ('tails beyond 4', 8.1, True),
     ('clustering 0.1 s', 8.1, True), ('kurtosis', -20.0, False), ('skewness', 20.0, False)])

@@ -294,3 +294,12 @@ def test_a_force_with_a_square_and_a_cube_is_fitted_with_both():
     for name, value in wanted.items():
         found, error = getattr(fit.term, name), fit.se[name]
         assert abs(found - value) < 4.0 * error < value
+
+
+def test_a_force_that_only_softens_is_no_term():
+    """An intensity that wanders looks like one: larger steps where deviations are large."""
+    samples, terms = simulated('volatility', {'std': 0.6, 'rate': 2.0}, 11)
+    gaussian = evaluate(samples, terms[:1])
+    view = view_of(samples, gaussian, gaussian.z, slice(0, samples.n))
+    fit = catalogue()['nonlinear_restoring'].fit_law(view)
+    assert fit is None or fit.term.cube > 0.0

@@ -110,6 +110,9 @@ class NonlinearRestoring(Term):
         square, cube = by.get(2, 0.0), by.get(3, 0.0)
         # A force that would push away at large deviations is held just short of it.
         cube = max(cube, _HOLDS * square * square / alpha)
+        if not cube > 0.0:
+            # It would only push away: no term does that.
+            return None
         return LawFit(cls(square, cube), {'square': errors.get(2, math.nan),
                                           'cube': errors.get(3, math.nan)}, scores,
                       density - log_normal(view.z), len(powers))
