@@ -158,11 +158,14 @@ def _same(events: Events | None, offset: FloatArray | None, found: Events, moved
 def view_of(samples: Samples, gaussian: GaussianFit, z: FloatArray, part: slice) -> View:
     """Return what a law or a candidate may look at."""
     residual = samples.voltage - gaussian.mean
-    white = white_noise(samples, gaussian.terms, driven(samples, gaussian.terms))
+    s = driven(samples, gaussian.terms)
+    white = white_noise(samples, gaussian.terms, s)
+    added = s.sigma * s.sigma * -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
     return View(z=z, variance=gaussian.variance, phi=gaussian.phi,
                 state=np.concatenate(([0.0], residual[:-1])), residual=residual,
                 at=samples.t - samples.t[0], step=samples.step, throttle=samples.throttle,
-                train=part, trust=np.clip(1.0 - white / gaussian.variance, 0.0, 1.0))
+                train=part, trust=np.clip(1.0 - white / gaussian.variance, 0.0, 1.0),
+                driven=np.clip(added / gaussian.variance, 0.0, 1.0))
 
 
 def pole_beside(samples: Samples, composite: Composite) -> OtherPole:

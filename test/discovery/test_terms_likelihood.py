@@ -20,6 +20,7 @@ from ou_monitor.model.terms.measurement_noise import MeasurementNoise
 from ou_monitor.model.terms.term import Role
 import pytest
 from scipy.special import kolmogorov, ndtri
+from scipy.stats import kstest
 
 RATE, LENGTH = 1000.0, 60000
 OU = {'alpha': 63.0, 'sigma': 0.632, 'u0': 5.0}
@@ -303,3 +304,20 @@ def test_a_force_that_only_softens_is_no_term():
     view = view_of(samples, gaussian, gaussian.z, slice(0, samples.n))
     fit = catalogue()['nonlinear_restoring'].fit_law(view)
     assert fit is None or fit.term.cube > 0.0
+
+
+@pytest.mark.parametrize('share', [0.0, 0.2, 0.5])
+def test_heavy_tails_are_those_of_the_rail_not_of_the_sensor(share):
+    """White noise hides the middle of a Student-t of three degrees, and not its tails."""
+    samples, terms = simulated('heavy_tails', {'dof': 3.0}, 11)
+    rng = np.random.default_rng(5)
+    std = STEP * math.sqrt(share / max(1.0 - share, 1e-9))
+    samples = replace(samples, voltage=samples.voltage + std * rng.standard_normal(LENGTH))
+    known = (terms[0], catalogue()['measurement_noise'](std)) if share else terms[:1]
+    gaussian = evaluate(samples, known)
+    fit = catalogue()['heavy_tails'].fit_law(
+        view_of(samples, gaussian, gaussian.z, slice(0, samples.n)))
+    assert abs(fit.term.dof - 3.0) < 4.0 * fit.se['dof'] < 1.5
+    assert (fit.power is None) is (share > 0.0)
+    # Scores are normal: Kolmogorov's distance has a tail of 1e-4 beyond 2.2/sqrt(n).
+    assert kstest(fit.z, 'norm').statistic < 2.2 / math.sqrt(LENGTH)

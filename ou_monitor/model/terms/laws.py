@@ -47,6 +47,9 @@ class View:
         The part that parameters are fitted on.
     trust : ndarray, shape (n,), or float
         Share of each error that the filter takes for the rail's: 1 without white noise.
+    driven : ndarray, shape (n,), or float
+        Share of each variance that the noise of the `ou` adds in the step before: 1 without white
+        noise and other states.
 
     """
 
@@ -60,6 +63,7 @@ class View:
     throttle: FloatArray | None
     train: slice
     trust: FloatArray | float = 1.0
+    driven: FloatArray | float = 1.0
 
     @property
     def rate(self) -> float:
