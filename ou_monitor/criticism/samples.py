@@ -131,6 +131,15 @@ class Samples:
         drawn = codes + cell * (rng.random(self.n) - 0.5)
         return replace(self, voltage=drawn, longer=self.longer or self, codes=codes, cell=cell)
 
+    def redrawn(self, at: npt.NDArray[np.int64], voltage: FloatArray) -> Samples:
+        """Return the samples with others at some places (voltage in V, one for each place)."""
+        v, codes = self.voltage.copy(), self.codes
+        v[at] = voltage
+        if codes is not None:
+            codes = codes.copy()
+            codes[at] += self.cell * np.rint((voltage - codes[at]) / self.cell)
+        return replace(self, voltage=v, longer=self.longer or self, codes=codes)
+
     @cached_property
     def _known(self) -> dict[Term, FloatArray]:
         """Return columns that were computed before."""

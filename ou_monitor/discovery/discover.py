@@ -15,13 +15,17 @@ from ou_monitor.criticism.integrity import examine, Integrity
 from ou_monitor.criticism.null_bank import criticise, family_chance
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, fit_gaussian
+from ou_monitor.discovery.clipped import redrawn
 from ou_monitor.discovery.decision import judge, NOTHING, RELAXES
 from ou_monitor.discovery.earning import Earned, earned, refusal
 from ou_monitor.discovery.errors import standard_errors
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
+from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.gain import (
     crossing_rates, gain_of, guess, mean_score, why_unknown, without)
+from ou_monitor.discovery.load_start import under_load
 from ou_monitor.discovery.search import Named, named_causes, position, Progress
+from ou_monitor.discovery.search_state import Search
 from ou_monitor.discovery.validation import covered, held_out, HeldOut
 from ou_monitor.discovery.words import (
     coupling_found, coupling_note, explain, left_out_note, NO_OTHER, no_relaxation_note, VAGUE,
@@ -29,12 +33,15 @@ from ou_monitor.discovery.words import (
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.saturation import Saturation
 from ou_monitor.model.terms.term import Role
 from ou_monitor.records import Recording
 from scipy.special import ndtri
 
 # Why the gain of a line is not known that was found in all samples, of which some are used.
 FAST = 'the samples that are used are too few to show a line so fast.'
+# Times that clipped samples are drawn from a load, which is fitted to them in turn.
+_REDRAWN = 2
 # Steps of more relaxation times than this hide the relaxation.
 _BLIND = 1.0
 
@@ -76,6 +83,8 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
     rng = np.random.default_rng(seed)
     try:
         start = _start(samples, state)
+        if state.drawn is not None:
+            samples, start = _unclipped(samples, state, start)
         done(0.1)
         named = named_causes(samples, start, rng, state.exact,
                              lambda share: done(0.1 + 0.5 * share))
@@ -138,6 +147,20 @@ def _start(samples: Samples, state: Integrity) -> Composite:
     start = fit_composite(samples, [clean.terms[0], *steps], samples.train) if steps else clean
     assert start is not None
     return start
+
+
+def _unclipped(samples: Samples, state: Integrity, start: Composite
+               ) -> tuple[Samples, Composite]:
+    """Return the samples with clipped ones as the load and its noise say, and where to start."""
+    assert state.drawn is not None
+    ends = next(term for term in state.exact if isinstance(term, Saturation))
+    rng = np.random.default_rng(0)
+    for _ in range(_REDRAWN):
+        search = Search(start)
+        under_load(Fitter(samples), search)
+        samples = redrawn(samples, search.composite, ends, state.drawn, rng)
+        start = _start(samples, state)
+    return samples, start
 
 
 def _plain(samples: Samples, state: Integrity) -> HeldOut:

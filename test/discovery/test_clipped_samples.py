@@ -1,0 +1,68 @@
+"""Clipped readings are drawn from what was measured: throttle and white noise of the sensor."""
+
+import math
+
+import numpy as np
+from ou_monitor import discover, Recording
+from ou_monitor.criticism.composite import fit_composite
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.discovery.clipped import redrawn
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
+from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.saturation import Saturation
+import pytest
+
+RATE, N = 200.0, 8000
+TERMS = (OU(20.0, 0.25, 16.0), LoadSag(1.0, 0.0), LoadDependentSigma((0.0, 1.0), (0.0, 1.0)),
+         MeasurementNoise(0.02))
+
+
+def flown(seed, share):
+    """Return stamps, voltage, throttle and the reading that a share is below."""
+    t = np.arange(N) / RATE
+    u = 0.5 + 0.3 * np.sin(0.9 * t) + 0.15 * np.sin(5.1 * t)
+    v = SupplyModel(TERMS).simulate(t, np.random.default_rng(seed), u)
+    return t, v, u, float(np.quantile(v, share))
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_what_is_drawn_is_as_what_was_clipped(seed):
+    """In the mean to four errors, given the parameters: neighbours in time share a part of it."""
+    t, v, u, low = flown(seed, 0.08)
+    clipped = v <= low
+    seen = Samples(t, np.maximum(v, low), u)
+    model = fit_composite(Samples(t, v, u), TERMS, slice(0, N))
+    ends = Saturation(low, 100.0)
+    drawn = redrawn(seen, model, ends, clipped, np.random.default_rng(seed))
+    assert (drawn.voltage[~clipped] == v[~clipped]).all()
+    assert (drawn.voltage[clipped] <= low).all()
+    off = drawn.voltage[clipped] - v[clipped]
+    # A run of clipped readings counts once.
+    runs = int((clipped[1:] & ~clipped[:-1]).sum())
+    assert abs(float(off.mean())) < 4.0 * float(off.std()) / math.sqrt(runs)
+
+
+def test_codes_stay_codes():
+    """Each drawn reading has the code of the cell that it lies in."""
+    t, v, u, _ = flown(4, 0.08)
+    cell = 0.05
+    codes = cell * np.rint(np.maximum(v, 15.2) / cell)
+    samples = Samples(t, v, u).spread(codes, cell, np.random.default_rng(0))
+    clipped = codes <= codes.min()
+    model = fit_composite(samples, TERMS, slice(0, N))
+    drawn = redrawn(samples, model, Saturation(float(codes.min()), 100.0), clipped,
+                    np.random.default_rng(0))
+    assert (np.abs(drawn.voltage - drawn.logged) < 0.5001 * cell).all()
+    assert np.abs(drawn.logged / cell - np.rint(drawn.logged / cell)).max() < 1e-6
+    assert (drawn.logged[clipped] < 15.2 + 0.5 * cell).all()
+
+
+def test_a_rail_at_the_bottom_gives_no_cause_that_is_not_there():
+    """What an OU that knows no throttle puts there was alpha(throttle), or wandering noise."""
+    t, v, u, low = flown(5, 0.06)
+    found = discover(Recording(t, np.maximum(v, low), u))
+    assert {cause.name for cause in found.causes} == {
+        'saturation', 'load_sag', 'load_dependent_sigma', 'measurement_noise'}
