@@ -1,4 +1,4 @@
-"""A latent law of the noise must show beside any law of throttle, not only beside its usual form."""
+"""A latent law of the noise must show beside any law of throttle, not only beside the usual."""
 
 import numpy as np
 from ou_monitor import discover, Recording
@@ -62,7 +62,7 @@ def test_throttle_that_rests_says_nothing():
 
 
 def test_another_form_of_the_measured_law_is_no_latent_one():
-    """White noise as long as throttle has moved in the last half second: no wandering, no tails."""
+    """White noise where throttle has moved in the last half second: no wandering, no tails."""
     rng = np.random.default_rng(4)
     t, u = flown(5)
     moved = lfilter([1.0], [1.0, -np.exp(-1.0 / (0.3 * RATE))], np.abs(np.diff(u, prepend=u[0])))
