@@ -31,6 +31,8 @@ _LARGEST = 25.0
 # Precisions of a coefficient, a logarithm of a variance, before the recording: from one that may
 # be anything to one that 1000 squares hardly move.
 _STIFFNESS = tuple(4.0 ** k for k in range(6))
+# Times by which throttle is moved for comparison: by chance the true one does best once in 20.
+_SHIFTS = 19
 # Steps of a fit, and the gain of one that is too little for another, nats.
 _STEPS, _SETTLED = 30, 0.05
 
@@ -49,7 +51,8 @@ def free_law(samples: Samples, z: FloatArray) -> FloatArray | None:
     Returns
     -------
     ndarray, shape (n,), or None
-        None where throttle does not predict that of blocks that were kept back.
+        None where throttle does not predict that of blocks that were kept back, or that of
+        another time says more than half as much.
 
     """
     u = samples.throttle
@@ -72,8 +75,17 @@ def free_law(samples: Samples, z: FloatArray) -> FloatArray | None:
     best = int(np.argmax(worth))
     if not worth[best] > decision.ACCEPT:
         return None
-    beta = _fitted(columns, square, count, known.sum(axis=0), _STIFFNESS[best])
-    return np.asarray(np.repeat(columns @ beta, size)[:samples.n])
+
+    def fitted(columns: FloatArray) -> FloatArray:
+        return columns @ _fitted(columns, square, count, known.sum(axis=0), _STIFFNESS[best])
+
+    log = fitted(columns)
+    # An intensity that wanders goes with any throttle for a while.
+    others = [_gain(fitted(np.roll(columns, k * begin.size // (_SHIFTS + 1), axis=0)), square,
+                    count) for k in range(1, _SHIFTS + 1)]
+    if max(others) > decision.OWN * _gain(log, square, count):
+        return None
+    return np.asarray(np.repeat(log, size)[:samples.n])
 
 
 def _paths(u: FloatArray, rate: float) -> Iterator[FloatArray]:
@@ -125,9 +137,14 @@ def _kept_back(columns: FloatArray, square: FloatArray, count: FloatArray, block
     rest = np.ones(count.size, dtype=np.bool_)
     rest[block] = False
     beta = _fitted(columns[rest], square[rest], count[rest], known, stiff)
-    level = math.log(max(float(square[rest].sum() / count[rest].sum()), 1e-300))
-    return (_density(columns[block] @ beta, square[block], count[block])
-            - _density(np.full(count[block].size, level), square[block], count[block]))
+    return _gain(columns[block] @ beta, square[block], count[block],
+                 float(square[rest].sum() / count[rest].sum()))
+
+
+def _gain(log: FloatArray, square: FloatArray, count: FloatArray, level: float = 0.0) -> float:
+    """Return what a law gains over one variance throughout, their mean where none is given."""
+    level = math.log(max(level or float(square.sum() / count.sum()), 1e-300))
+    return _density(log, square, count) - _density(np.full(log.size, level), square, count)
 
 
 def _density(log: FloatArray, square: FloatArray, count: FloatArray) -> float:
