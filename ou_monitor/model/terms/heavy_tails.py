@@ -64,7 +64,6 @@ class HeavyTails(Term):
                       power=law.power() if float(np.median(share)) > _ALONE else None)
 
 
-
 class _Mixture:
     """
     Scores of which a share of the variance is Student-t and the rest normal.
