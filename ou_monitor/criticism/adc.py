@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.records import FloatArray
 from scipy.special import ndtr, ndtri
 
@@ -36,6 +37,8 @@ _LEAST, _VISITS, _CLEAR = 8, 3, 5.0
 # With steps above this many standard deviations of the noise the codes next to
 # each other say nothing of a density.
 _COARSE = 2.0
+# Parts of equal size by throttle, each with a noise of its own.
+_LOADS = 8
 # Sweeps over all samples drawn: excursions last some relaxation times at most.
 _SWEEPS = 60
 # Shares of the samples beyond the knee, and scales in standard deviations of the
@@ -119,32 +122,52 @@ def _fitted(codes: FloatArray, gaps: FloatArray, weight: FloatArray, first: floa
     return step if weight[off < max(near, _NEAR * step)].sum() >= _SHARE * weight.sum() else 0.0
 
 
-def find_rails(voltage: FloatArray, step: float, noise: float) -> tuple[float, float]:
+def find_rails(voltage: FloatArray, step: float, noise: float,
+               throttle: FloatArray | None = None) -> tuple[float, float]:
     """Return the readings at which the ADC clips (voltage in V, step in V, noise in V)."""
     if step > _COARSE * noise:
         return -math.inf, math.inf
-    high = float(voltage.max()) if _clipped(voltage, step, 1.0) else math.inf
-    low = float(voltage.min()) if _clipped(voltage, step, -1.0) else -math.inf
+    told = _told(voltage, step, throttle)
+    high = float(voltage.max()) if _clipped(voltage, step, 1.0, told) else math.inf
+    low = float(voltage.min()) if _clipped(voltage, step, -1.0, told) else -math.inf
     return low, high
 
 
-def _clipped(voltage: FloatArray, step: float, side: float) -> bool:
+def _told(voltage: FloatArray, step: float, throttle: FloatArray | None) -> npt.NDArray[np.bool_]:
+    """
+    Return the samples at throttles at which the noise fills the codes.
+
+    A rail at idle may be so quiet that it stays within one code, the top one: that is no end.
+    """
+    if throttle is None or not step > 0.0:
+        return np.ones(voltage.size, dtype=bool)
+    edges = np.unique(np.quantile(throttle, np.arange(1, _LOADS) / _LOADS))
+    load = np.searchsorted(edges, throttle)
+    change, same = np.diff(voltage), load[1:] == load[:-1]
+    of = load[1:][same]
+    count = np.maximum(np.bincount(of, minlength=edges.size + 1), 1)
+    power = np.bincount(of, weights=change[same] ** 2, minlength=edges.size + 1) / count
+    return np.asarray(step <= _COARSE * np.sqrt(power))[load]
+
+
+def _clipped(voltage: FloatArray, step: float, side: float, told: npt.NDArray[np.bool_]) -> bool:
     """Return whether the top (or with side -1 the bottom) holds more than its neighbours say."""
     top = float(voltage.max()) if side > 0.0 else -float(voltage.min())
     tie = _FLOAT32 * abs(top)
     width = step if step > 0.0 else tie
     below = top - side * voltage
-    at = below < 0.5 * width + tie
+    at = (below < 0.5 * width + tie) & told
     count = int(at.sum())
     # The extremes of a bell need not be tested where nothing is heaped.
     if count < _LEAST or int((at[1:] & ~at[:-1]).sum()) < _VISITS:
         return False
-    others = below[~at]
+    others = below[below >= 0.5 * width + tie]
     if not others.size or float(others.min()) > max(3.5 * step, 0.2 * float(others.std())):
         # Far from all others: a code of its own, no end of a range.
         return False
     if step > 0.0:
-        expected = max(float((np.abs(below - k * step) < 0.5 * step).sum()) for k in (1, 2, 3))
+        expected = max(float((np.abs(below[told] - k * step) < 0.5 * step).sum())
+                       for k in (1, 2, 3))
     else:
         # As dense as the nearest interval that holds some samples.
         reach = float(np.partition(others, min(_LEAST, others.size - 1))[:_LEAST].max())

@@ -109,7 +109,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     drawn = None
     noise = _innovation_std(v)
     step = find_step(v)
-    low, high = find_rails(v, step or usual_change(v), noise)
+    low, high = find_rails(v, step or usual_change(v), noise, u)
     soft = 'readings squeezed near the end of the range'
     if not math.isfinite(low) and not math.isfinite(high):
         low, high = _knees(v, noise)

@@ -1,5 +1,5 @@
 """
-What the search decides: which causes are tried, accepted, kept, withdrawn; the verdict.
+What the search decides: which causes are tried, accepted, kept, withdrawn.
 
 Pure functions of statistics (normal scores by name), evidence (nats) and the attributes of the
 causes; this module fits nothing.
@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.battery import is_sign
 from ou_monitor.criticism.innovations import OtherPole
-from ou_monitor.criticism.null_bank import family_chance
-from ou_monitor.discovery.finding import Verdict
 from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.drift import Drift
+from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.load_transient import LoadTransient
 from ou_monitor.model.terms.second_relaxation import SecondRelaxation
 from ou_monitor.model.terms.term import Role, Term
 
@@ -101,10 +101,6 @@ MISFIT, LITTLE = 4.0, 100.0
 # Share of the misfit that a latent cause must remove for the search to go on.
 HELPS = 0.5
 
-# Chance of the largest statistic above which a model without causes passes.
-NOTHING = 0.01
-# The same for a model with causes: they were chosen to pass, so that a failure means more.
-PASSES = 0.001
 # A statistic beyond this fails: of 70, one by chance in 10 000 recordings.
 FAILS = 4.8
 # Shares that a statistic may keep of its own value and of the largest value, both before any cause
@@ -297,6 +293,26 @@ def rivals_of(best: str, evidence: Sequence[tuple[str, float]]) -> list[str]:
     return [name for name, value in evidence if name != best and value > top - TIE]
 
 
+def is_plainer(one: Kind, other: Kind) -> bool:
+    """Return whether a cause is named before another that does as well: less was searched."""
+    return one.SEARCH < other.SEARCH and one.FAMILY == other.FAMILY
+
+
+def only_to_changes(answers: Iterable[Kind]) -> bool:
+    """
+    Return whether a mean answers to throttle by transients alone.
+
+    What was behind a coupling does: no steady current is seen there.
+    """
+    names = {kind.NAME for kind in answers}
+    return LoadTransient.NAME in names and LoadSag.NAME not in names
+
+
+def relaxes(rate: float, duration: float) -> bool:
+    """Return whether a recording shows a rate (1/s; duration in s), and no trend."""
+    return rate * duration >= RELAXES
+
+
 def helped(before: Statistics, after: Statistics, kind: Kind | None = None) -> bool:
     """Return whether the misfit has shrunk: of all statistics, or of those that ask for a kind."""
     asking = {name for name, value in before.items()
@@ -394,21 +410,3 @@ def searched_again(loaded: bool, cost: float) -> bool:
     Beside a load what stays is put back alone: there something fails whatever is named.
     """
     return not loaded and cost <= MOST_COST
-
-
-# The verdict on the recording.
-
-def largest_chance(values: Statistics) -> float:
-    """Return the chance that the largest statistic of a right model is as large as this one."""
-    largest = max((abs(value) for value in values.values()), default=0.0)
-    return family_chance(largest, max(len(values), 1))
-
-
-def judge(after: Statistics, causes: int, dropped: int) -> Verdict:
-    """Return the verdict."""
-    chance = largest_chance(after)
-    if causes == 0:
-        return Verdict.NO_EFFECT if chance > NOTHING and not dropped else Verdict.UNEXPLAINED
-    if chance > PASSES and not dropped:
-        return Verdict.EXPLAINED
-    return Verdict.PARTLY_EXPLAINED

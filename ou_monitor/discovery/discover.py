@@ -16,7 +16,7 @@ from ou_monitor.criticism.null_bank import criticise, family_chance
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, fit_gaussian
 from ou_monitor.discovery.clipped import redrawn
-from ou_monitor.discovery.decision import judge, NOTHING, RELAXES
+from ou_monitor.discovery.decision import relaxes
 from ou_monitor.discovery.earning import Earned, earned, refusal
 from ou_monitor.discovery.errors import standard_errors
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
@@ -27,6 +27,7 @@ from ou_monitor.discovery.load_start import under_load
 from ou_monitor.discovery.search import Named, named_causes, position, Progress
 from ou_monitor.discovery.search_state import Search
 from ou_monitor.discovery.validation import covered, held_out, HeldOut
+from ou_monitor.discovery.verdict import judge, NOTHING
 from ou_monitor.discovery.words import (
     coupling_found, coupling_note, explain, left_out_note, NO_OTHER, no_relaxation_note, VAGUE,
     verdict_sentence)
@@ -255,6 +256,6 @@ def _notes(state: Integrity, named: Named, model: Composite, dropped: Sequence[s
         notes.append(coupling_found(duration))
     elif ou.alpha * step > _BLIND:
         notes.append(no_relaxation_note(ou.alpha, step))
-    elif ou.alpha * duration > RELAXES:
+    elif relaxes(ou.alpha, duration):
         notes.append(coupling_note(ou.alpha, duration))
     return tuple(notes)

@@ -102,7 +102,7 @@ def earned(samples: Samples, model: Composite, names: Sequence[str], plain: Held
             return state
         failing = [k for k, worth in enumerate(state.worth) if worth.less is not None
                    and not decision.earns(worth.gain, worth.error, worth.chance)
-                   and not _as_trend(samples, state.names[k], worth.less.model)]
+                   and not _as_trend(samples, state, k)]
         if turn == _ROUNDS - 1:
             return state
         worst = (min(failing, key=lambda k: (-state.worth[k].chance, state.worth[k].gain))
@@ -168,9 +168,11 @@ def _far(samples: Samples, terms: Sequence[Term]) -> FloatArray:
                            samples.logged) for _ in range(_DRAWS)])
 
 
-def _as_trend(samples: Samples, name: str, less: Composite) -> bool:
+def _as_trend(samples: Samples, state: Earned, k: int) -> bool:
     """Return whether the `ou` only takes the place of an answer of the mean, as a trend."""
-    return decision.is_answer(catalogue()[name]) and is_trend(samples, less)
+    less = state.worth[k].less
+    return (decision.is_answer(catalogue()[state.names[k]]) and less is not None
+            and is_trend(samples, less.model) and not is_trend(samples, state.full.model))
 
 
 def _measure(samples: Samples, state: Earned, plain: HeldOut, scored: npt.NDArray[np.bool_],

@@ -274,7 +274,7 @@ def is_trend(samples: Samples, model: Composite) -> bool:
     """Return whether the `ou` of a model is too slow for a recording to be a relaxation."""
     ou = model.terms[0]
     assert isinstance(ou, OU)
-    return ou.alpha * float(samples.t[-1] - samples.t[0]) < decision.RELAXES
+    return not decision.relaxes(ou.alpha, float(samples.t[-1] - samples.t[0]))
 
 
 def _joined(composite: Composite) -> Term:

@@ -17,10 +17,12 @@ from ou_monitor.discovery.fitting import Fitter, is_trend
 from ou_monitor.discovery.regression import load_terms, mean_answer
 from ou_monitor.discovery.search_state import Search
 from ou_monitor.discovery.throttle_laws import compare_laws
+from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_dependent_noise import LoadDependentNoise
 from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
 from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.load_transient import LoadTransient
 from ou_monitor.model.terms.measurement_noise import MeasurementNoise
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
@@ -67,6 +69,43 @@ def under_load(fitter: Fitter, search: Search) -> None:
             search.log.append(f'{term.NAME}: with the load')
     compare_laws(fitter, search)
     choose_answer(fitter, search, ())
+    _coupled(fitter, search)
+
+
+def _coupled(fitter: Fitter, search: Search) -> None:
+    """Let a coupled sag stand for transients alone where it does better; a tie makes rivals."""
+    composite = search.composite
+    means = [term for term in composite.terms if decision.is_answer(type(term))]
+    if ACCoupling.NAME not in catalogue() or not decision.only_to_changes(map(type, means)):
+        return
+    changes = [term for term in means if isinstance(term, LoadTransient)]
+    if any(term.delay > 0.0 for term in changes):
+        return
+    # What a step of throttle leaves dies out with the corner.
+    tau = max(term.tau for term in changes)
+    coupling = ACCoupling(0.5 / (math.pi * tau), 0.0)
+    ou, *others = [term for term in composite.terms if term not in means]
+    structural = [term for term in others if term.ROLE is not Role.LAW]
+    laws = [term for term in others if term.ROLE is Role.LAW]
+    fit = fitter.fit([coupling.beside(ou), *structural, LoadSag(0.0, 0.0), coupling, *laws],
+                     composite)
+    # A rail that does not relax within the recording is, coupled, one that does.
+    if fit is None or is_trend(fitter.samples, fit):
+        return
+    gain = fitter.evidence(fit) - fitter.evidence(composite)
+    names = [term.NAME for term in means]
+    if abs(gain) < decision.TIE:
+        for name in names:
+            search.rivals[name] = [*search.rivals.get(name, []), ACCoupling.NAME]
+    if gain < decision.TIE:
+        return
+    search.log.append(f'{ACCoupling.NAME} and {LoadSag.NAME} in place of {", ".join(names)}: '
+                      f'{gain:.1f} nats')
+    search.composite = fit
+    search.accepted = [LoadSag.NAME, ACCoupling.NAME,
+                       *(name for name in search.accepted if name not in names)]
+    for name in (LoadSag.NAME, ACCoupling.NAME):
+        search.rivals[name] = []
 
 
 def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:

@@ -57,10 +57,10 @@ def load_terms(samples: Samples) -> tuple[Term, ...]:
         model = fit_load(mean(samples.t - samples.t[0]), mean(samples.logged), mean(u)).model
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return ()
-    longest = 0.25 * float(samples.t[-1] - samples.t[0])
+    duration = float(samples.t[-1] - samples.t[0])
     shortest = float(np.median(samples.step[1:]))
     times = [tau for tau in (INRUSH_TIME, model.fast_time, model.slow_time)
-             if 0.5 * shortest <= tau <= longest]
+             if 0.5 * shortest <= tau and decision.relaxes(1.0 / tau, duration)]
     terms = (LoadSag(0.0, NEXT_TO_ZERO), *(LoadTransient(0.0, tau, 0.0) for tau in times),
              Drift(0.0, NEXT_TO_ZERO))
     return tuple(term for term in terms if term.NAME in catalogue())
@@ -124,10 +124,15 @@ def _nearby(one: Term, other: Term) -> bool:
 
 def _candidates(view: View) -> Iterator[Term]:
     """Yield the candidates of all measured causes of the mean."""
+    duration = float(view.at[-1])
     for kind in catalogue().values():
         if kind.ROLE is Role.MEAN and kind.MEASURED and (
                 view.throttle is not None or not kind.NEEDS_THROTTLE):
-            yield from kind.candidates(view)
+            for term in kind.candidates(view):
+                # An answer that is late for good does not die out: it has no rate.
+                if (not isinstance(term, LoadTransient) or term.delay > 0.0
+                        or decision.relaxes(1.0 / term.tau, duration)):
+                    yield term
 
 
 class _Regression:
@@ -154,6 +159,7 @@ class _Regression:
             if better is None:
                 break
             chosen = better
+        chosen = self._plainest(chosen)
         worth = [self._value(chosen) - self._value(self._less(chosen, k)) for k in chosen]
         order = np.argsort(-np.array(worth)) if worth else np.zeros(0, dtype=int)
         found = [chosen[k] for k in order.tolist()]
@@ -236,14 +242,28 @@ class _Regression:
         """Return whether the larger set gains in more than one of the blocks."""
         return decision.is_shared(self._evaluated(less)[1] - self._evaluated(more)[1])
 
+    def _plainest(self, chosen: tuple[int, ...]) -> tuple[int, ...]:
+        """Return a set in which a cause that does as well stands for one that was searched."""
+        for k in chosen:
+            plain = [j for j in self._as_good(chosen, k)
+                     if decision.is_plainer(type(self._pool[j]), type(self._pool[k]))]
+            if plain:
+                less = self._less(chosen, k)
+                return self._with(less, max(
+                    plain, key=lambda j: self._value(self._with(less, j))))
+        return chosen
+
+    def _as_good(self, chosen: tuple[int, ...], k: int) -> list[int]:
+        """Return the terms of other kinds that do as well in the place of one."""
+        value, less = self._value(chosen), self._less(chosen, k)
+        return [j for j, term in enumerate(self._pool)
+                if type(term) is not type(self._pool[k]) and j not in chosen
+                and len(self._with(less, j)) == len(chosen)
+                and self._value(self._with(less, j)) > value - decision.TIE]
+
     def _rivals(self, chosen: tuple[int, ...], k: int) -> tuple[str, ...]:
         """Return the causes that do as well in the place of one."""
-        value, less = self._value(chosen), self._less(chosen, k)
-        names = [term.NAME for j, term in enumerate(self._pool)
-                 if type(term) is not type(self._pool[k]) and j not in chosen
-                 and len(self._with(less, j)) == len(chosen)
-                 and self._value(self._with(less, j)) > value - decision.TIE]
-        return tuple(dict.fromkeys(names))
+        return tuple(dict.fromkeys(self._pool[j].NAME for j in self._as_good(chosen, k)))
 
 
 def _lost(fitted: FloatArray, scored: FloatArray, at: npt.NDArray[np.int64]) -> float:

@@ -133,8 +133,9 @@ def _with_trends(samples: Samples, whole: Composite, rivals: Mapping[str, list[s
                  ) -> dict[str, list[str]]:
     """Return the rivals of each cause; of a pole that is a trend, a drift of any form is one."""
     duration = float(samples.t[-1] - samples.t[0])
-    slow = any(isinstance(term, SecondRelaxation) and term.alpha * duration < decision.RELAXES
-               for term in whole.terms) and not whole.has(Drift.NAME)
+    slow = not whole.has(Drift.NAME) and any(
+        isinstance(term, SecondRelaxation) and not decision.relaxes(term.alpha, duration)
+        for term in whole.terms)
     return {name: [*others, Drift.NAME] if slow and name == SecondRelaxation.NAME
             and Drift.NAME not in others else others for name, others in rivals.items()}
 

@@ -102,6 +102,18 @@ def test_a_rail_is_five_errors_above_its_neighbours():
     assert find_rails(x, 1.0, 2.0)[1] == math.inf
 
 
+def test_a_code_in_which_the_rail_idles_is_no_rail():
+    """A third of the time idle, in the top code; clipped there, other throttles say so."""
+    rng, n = np.random.default_rng(6), 24000
+    throttle = np.repeat(np.where(np.arange(240) % 3 == 0, 0.0, rng.uniform(0.4, 1.0, 240)), 100)
+    noise = np.where(throttle > 0.0, 1.0, 0.05) * rng.standard_normal(n)
+    v = np.rint(2.0 - 8.0 * throttle + noise)
+    v = np.minimum(v, 2.0)
+    assert find_rails(v, 1.0, 1.0) == (-math.inf, 2.0)
+    assert find_rails(v, 1.0, 1.0, throttle) == (-math.inf, math.inf)
+    assert find_rails(np.minimum(v, -2.0), 1.0, 1.0, throttle) == (-math.inf, -2.0)
+
+
 def test_a_value_far_from_all_others_is_no_rail():
     """Beyond 3.5 steps, and a fifth of the deviation of the others."""
     rng = np.random.default_rng(6)

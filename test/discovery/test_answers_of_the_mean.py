@@ -45,6 +45,13 @@ def test_candidates_are_measured_causes_of_the_mean(throttle):
     wanted = {kind for kind in catalogue().values() if kind.ROLE is Role.MEAN and kind.MEASURED
               and (throttle is not None or not kind.NEEDS_THROTTLE)}
     assert kinds == wanted and (LoadSag in kinds) is (throttle is not None)
+    lags = [term for term in found if isinstance(term, LoadTransient)]
+    # In 4 s a rate of 5 1/s is one; what is late for good has none.
+    assert all(term.tau <= 0.2 for term in lags if term.delay == 0.0)
+    assert all(term.tau > 100.0 for term in lags if term.delay > 0.0)
+    if throttle is not None:
+        assert max(term.tau for term in lags if term.delay == 0.0) > 0.13
+        assert any(term.delay > 0.0 for term in lags)
 
 
 N = 1200
@@ -139,3 +146,15 @@ def test_another_cause_that_does_as_well_is_a_rival(driven, monkeypatch):
     assert near < decision.TIE and found._rivals((0,), 0) == ('drift',)
     found, _ = made([pool[0], pool[4]], [columns[0], columns[4]], voltage, monkeypatch)
     assert found._rivals((0,), 0) == ()
+
+
+@pytest.mark.parametrize('size, named', [(8.0, LoadSag), (20.0, LoadTransient)])
+def test_a_sag_stands_for_a_lag_that_does_no_better(driven, size, named, monkeypatch):
+    """What a lag makes is named a sag while noise hides which, and a lag where it shows."""
+    pool, columns, _ = driven
+    columns = [columns[0], columns[0] + 0.1 * columns[1]]
+    voltage = 3.0 - size * columns[1][:, 0] + np.random.default_rng(0).standard_normal(N)
+    found, _ = made(pool[:2], columns, voltage, monkeypatch)
+    answered = found.search((1,))
+    assert [type(term) for term in answered.terms] == [named]
+    assert answered.rivals == ((('load_transient',) if named is LoadSag else ()),)

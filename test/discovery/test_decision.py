@@ -3,7 +3,6 @@
 from typing import ClassVar
 
 from ou_monitor.discovery import decision
-from ou_monitor.discovery.finding import Verdict
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Role, Term
 import pytest
@@ -336,16 +335,6 @@ def test_an_ac_coupling_may_leave_three_quarters_of_the_slow_power_missing(left,
     assert found == ([0] if withdrawn else [])
 
 
-@pytest.mark.parametrize('score, causes, dropped, verdict', [
-    # One statistic: 1 % at 2.576, 0.1 % at 3.291.
-    (2.57, 0, 0, Verdict.NO_EFFECT), (2.58, 0, 0, Verdict.UNEXPLAINED),
-    (0.0, 0, 1, Verdict.UNEXPLAINED),
-    (3.28, 1, 0, Verdict.EXPLAINED), (-3.30, 1, 0, Verdict.PARTLY_EXPLAINED),
-    (0.0, 1, 1, Verdict.PARTLY_EXPLAINED)])
-def test_the_verdict(score, causes, dropped, verdict):
-    assert decision.judge({'a': score}, causes, dropped) is verdict
-
-
 def test_the_origins_of_the_constants():
     """What the comments say of chances is so."""
     assert 2.0 * norm.sf(decision.ASK) == pytest.approx(0.0093, rel=0.01)
@@ -409,3 +398,24 @@ def test_a_clear_line_comes_first(evidence, largest, first):
     assert not decision.comes_first(tone, evidence, kinds['jumps'], values)
     assert not decision.comes_first(kinds['measurement_noise'], 1e3, kinds['flicker_noise'],
                                     {'autocorrelation lag 1': -30.0})
+
+
+@pytest.mark.parametrize('one, other, plainer', [
+    ('load_sag', 'load_transient', True), ('load_transient', 'load_sag', False),
+    ('load_sag', 'load_sag', False), ('drift', 'load_transient', False)])
+def test_what_was_not_searched_is_named_first(one, other, plainer):
+    """Within a family: of a sag and a lag that do as well, the sag."""
+    assert decision.is_plainer(catalogue()[one], catalogue()[other]) is plainer
+
+
+@pytest.mark.parametrize('rate, duration, shown', [
+    (1.0, 19.9, False), (1.0, 20.1, True), (10.0, 2.1, True), (0.1, 100.0, False)])
+def test_twenty_relaxations_make_a_rate(rate, duration, shown):
+    assert decision.relaxes(rate, duration) is shown
+
+
+@pytest.mark.parametrize('names, changes', [
+    (['load_transient'], True), (['load_transient', 'load_transient', 'drift'], True),
+    (['load_transient', 'load_sag'], False), (['drift'], False), ([], False)])
+def test_a_mean_that_answers_to_changes_only(names, changes):
+    assert decision.only_to_changes(catalogue()[name] for name in names) is changes

@@ -4,8 +4,9 @@ from dataclasses import replace
 import json
 import math
 
-from ou_monitor.discovery.decision import failing, judge, largest_chance, withdrawn
+from ou_monitor.discovery.decision import failing, withdrawn
 from ou_monitor.discovery.finding import Cause, Criticism, CrossingRate, Finding, Verdict
+from ou_monitor.discovery.verdict import judge, largest_chance
 from ou_monitor.discovery.words import (
     coupling_note, explain, overlap_words, parameters, plain_words, verdict_sentence, why_named,
     with_error)
@@ -86,7 +87,10 @@ def test_a_gain_is_measurable_from_two_errors_on():
 @pytest.mark.parametrize('after, causes, dropped, verdict', [
     ({'a': 1.0, 'b': -2.0}, 0, 0, 'no_effect'), ({'a': 1.0, 'b': -6.0}, 0, 0, 'unexplained'),
     ({'a': 1.0}, 0, 1, 'unexplained'), ({'a': 3.0}, 2, 0, 'explained'),
-    ({'a': -8.0}, 2, 0, 'partly_explained'), ({'a': 1.0}, 1, 1, 'partly_explained')])
+    ({'a': -8.0}, 2, 0, 'partly_explained'), ({'a': 1.0}, 1, 1, 'partly_explained'),
+    # One statistic: 1 % at 2.576, 0.1 % at 3.291.
+    ({'a': 2.57}, 0, 0, 'no_effect'), ({'a': 2.58}, 0, 0, 'unexplained'),
+    ({'a': 3.28}, 1, 0, 'explained'), ({'a': -3.30}, 1, 0, 'partly_explained')])
 def test_verdicts(after, causes, dropped, verdict):
     """Passing or failing, with and without causes."""
     assert judge(after, causes, dropped).value == verdict

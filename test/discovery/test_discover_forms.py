@@ -8,9 +8,12 @@ from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import fit_gaussian
 from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.clock_jitter import ClockJitter
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import order_lines
+from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.measurement_noise import MeasurementNoise
 from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.regime_switching import RegimeSwitching
@@ -96,3 +99,17 @@ def test_laws_where_a_step_is_long(law, alpha):
     assert abs(score(plain.z[1:]**2, square[1:])) > 1.5 * FAR
     assert abs(score(simulated.z[1:]**2, square[1:])) < FAR
     assert abs(score(simulated.z[1:], state[1:]**3)) < FAR
+
+
+def test_a_sag_behind_a_coupling():
+    """The mean answers to changes only: transients say so too, but not what the noise says."""
+    rng, n, rate = np.random.default_rng(7), 12000, 200.0
+    t = np.arange(n) / rate
+    throttle = 0.4 + rail(rng, n, 2.0, rate, 0.1)
+    made = SupplyModel((OU(6.0, 0.2, 16.0), LoadSag(1.4, 0.0), MeasurementNoise(0.02),
+                        ACCoupling(3.0, 0.0)))
+    finding = discover(Recording(t, made.simulate(t, rng, throttle), throttle))
+    found = {cause.name: cause.term for cause in finding.causes}
+    assert set(found) == {'load_sag', 'ac_coupling', 'measurement_noise'}
+    assert found['ac_coupling'].corner == pytest.approx(3.0, rel=0.15)
+    assert found['load_sag'].linear == pytest.approx(1.4, rel=0.1)

@@ -89,8 +89,10 @@ class LoadTransient(Term):
         # Late by whole steps, and for good: a delay.
         latest = max(_LATEST, 4.0 * step)
         late = np.unique(np.rint(np.geomspace(step, latest, _DELAYS) / step)) * step
-        return [*lags, *(cls(0.0, longest, float(delay)) for delay in late)]
+        return [*lags, *(cls(0.0, _FOR_GOOD * 4.0 * longest, float(delay)) for delay in late)]
 
 
 # Delays tried, and the longest of them, s.
 _DELAYS, _LATEST = 12, 0.1
+# Durations of a recording in which an answer loses a hundredth: it follows no trend.
+_FOR_GOOD = 100.0

@@ -13,6 +13,9 @@ from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
 from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 
+# Relaxation times in a recording, at least.
+_LEAST = 3.0
+
 
 @dataclass(frozen=True)
 class SecondRelaxation(Term):
@@ -57,10 +60,14 @@ class SecondRelaxation(Term):
         """Return poles slower and faster than that of the ou, of less variance."""
         rate = -math.log(max(float(np.median(view.phi[1:])), 1e-300)) * view.rate
         spread = float(np.std(view.residual))
-        slowest = 3.0 / float(view.at[-1])
+        slowest = _LEAST / float(view.at[-1])
         found = [cls(a, 0.5 * spread * math.sqrt(2.0 * a))
                  for a in (rate / 60.0, rate / 15.0, rate / 4.0) if a > slowest]
         return [*found, cls(6.0 * rate, 0.3 * spread * math.sqrt(12.0 * rate))]
+
+    def holds(self, view: View) -> bool:
+        """Return whether it relaxes within the recording: else it is a trend."""
+        return self.alpha * float(view.at[-1]) > _LEAST
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return its one state."""
