@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import ClassVar
@@ -158,7 +159,7 @@ class RegimeSwitching(Term):
         levels = [trial[1] for trial in trials if trial[1] is not best.get(False, (0.0, None))[1]]
         while trials:
             _, x, once, relaxed = trials.pop()
-            fit = cls._finished(relaxed, x, once, 80)
+            fit = cls._finished(relaxed, [x], once, 80)
             if fit is None:
                 continue
             if any(x is start for start in levels) and fit.offset is not None:
@@ -181,14 +182,14 @@ class RegimeSwitching(Term):
             slow, ahead, states = _slow_levels(view)
             if slow is not None and ahead > max(float(two.gain[view.train].sum()), _SLOW_AHEAD):
                 # Fitted is the relaxation of both; that of the noise alone comes with the fit.
-                return cls._finished(view, slow, 0.0, 1, states) or two
+                return cls._finished(view, [slow], 0.0, 1, states) or two
         # Three states: of sigma, or of the level, whichever the two differ in.
         starts = [np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]
         if two.power is None:
             starts = [np.array(begin) * [1.0, 1.0, 0.6, 0.0, 1.0]]
         part, found = slice(0, min(view.train.stop, _LONG)), two
         for start in starts:
-            three = cls._finished(view, start, at_once, 70, 3)
+            three = cls._finished(view, [start], at_once, 70, 3)
             ahead = _THIRD if found is two else 0.0
             if three is not None and float((three.gain - found.gain)[part].sum()) > ahead:
                 found = three
@@ -200,28 +201,29 @@ class RegimeSwitching(Term):
         ratio = math.log(max(self.sigma_ratio, 1e-2))
         states = int(self.states)
         law = stationary_law(rates_between(self.rate_up, self.rate_down, states))
-        # Such that the mean square is that of the scores; beside clear levels it is 1.
         square = float(law @ np.exp(2.0 * ratio * np.arange(states)))
-        if abs(self.level) < unit:
-            square /= float(np.mean(view.z[view.train] ** 2))
-        scale = -0.5 * math.log(square)
-        return self._finished(view, np.array([
-            math.log(self.rate_up), math.log(self.rate_down), self.level / unit, ratio,
-            scale]), self.at_once, 40, states)
+        # Such that the mean square is that of the scores, or 1, as in clear levels; 0 where the
+        # `ou` has the sigma of the lowest state.
+        mean = float(np.mean(view.z[view.train] ** 2)) if abs(self.level) < unit else 1.0
+        starts = [np.array([math.log(self.rate_up), math.log(self.rate_down), self.level / unit,
+                            ratio, scale])
+                  for scale in (0.5 * math.log(mean / square), 0.0)]
+        return self._finished(view, starts, self.at_once, 40, states)
 
     @classmethod
-    def _finished(cls, view: View, start: FloatArray, at_once: float, most: int,
+    def _finished(cls, view: View, starts: Sequence[FloatArray], at_once: float, most: int,
                   states: int = 2) -> LawFit | None:
-        """Return the fit near a start."""
+        """Return the fit near the best of some starts, which differ in scale alone."""
         scores = Scores.of(view)
         part = slice(view.train.start, min(view.train.stop, view.train.start + _LONG))
-        within = scores.part(part).following(start, at_once, states)
+        within = scores.part(part).following(starts[0], at_once, states)
 
         def value(x: FloatArray) -> float:
             if not _inside(x, view):
                 return -math.inf
             return log_likelihood(*chain_of(within, x, at_once, states)[0])
 
+        start = max(starts, key=value)
         if states == 2:
             # Few changes in few samples say little of rates; what is counted in all says more.
             counted = _counted(forward(*chain_of(within, start, at_once)[0])[0], scores.step)
@@ -248,7 +250,8 @@ class RegimeSwitching(Term):
         offset = None if abs(x[2]) < NO_LEVEL else moved
         # As known at each sample.
         known = np.concatenate((before[1:], before[-1:]))
-        power = 1.0 / (known @ np.exp(-2.0 * (x[4] + x[3] * np.arange(states))))
+        # Over the sigma of the lowest state, which so becomes that of the `ou`.
+        power = 1.0 / (known @ np.exp(-2.0 * x[3] * np.arange(states)))
         return LawFit(term, se, normal, density - log_normal(view.z), 5,
                       power=None if abs(x[3]) < _NO_RATIO else power, offset=offset)
 

@@ -101,7 +101,8 @@ class Volatility(Term):
         log = np.log(np.maximum(before, 1e-300)) - sizes[:, None] * levels - 0.5 * squares[
             :, None] * np.exp(-2.0 * levels)
         weight = np.exp(log - log.max(axis=1)[:, None])
-        power = weight.sum(axis=1) / (weight @ np.exp(-2.0 * levels))
+        # Over the median, which so becomes the sigma of the `ou`.
+        power = weight.sum(axis=1) / (weight @ np.exp(2.0 * (x[2] - levels)))
         return LawFit(term, {'std': term.std * float(e[0]), 'rate': term.rate * float(e[1])},
                       scores, gain, 3, power=np.repeat(power, size)[:view.z.size])
 
