@@ -17,6 +17,7 @@ import numpy as np
 from ou_monitor.criticism.composite import Composite, covariates_of, view_of
 from ou_monitor.criticism.null_bank import criticise, NullBank, simulate_bank, simulate_bank_of
 from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.errors import standard_errors
 from ou_monitor.discovery.fitting import Fitter, is_trend, Trial
@@ -26,8 +27,10 @@ from ou_monitor.discovery.search_state import Search
 from ou_monitor.discovery.throttle_laws import compare_laws, LAWS, OTHER_CURVE, worth
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.drift import Drift
+from ou_monitor.model.terms.lines import prominence
 from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
 from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.resonance import Resonance
 from ou_monitor.model.terms.second_relaxation import SecondRelaxation
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.model.terms.tone import lines_of, Tone
@@ -152,15 +155,22 @@ class _Result:
 def _in_doubt(samples: Samples, whole: Composite, names: Sequence[str], out: Sequence[int]
               ) -> list[int]:
     """Return those to withdraw, less the lines that are there whatever else is left."""
-    if not any(names[k] == Tone.NAME for k in out):
-        return list(out)
-    errors = standard_errors(samples, whole, slice(0, samples.n))
+    errors: Sequence[Mapping[str, float]] = ()
+    if any(names[k] == Tone.NAME for k in out):
+        errors = standard_errors(samples, whole, slice(0, samples.n))
 
     def is_sure(k: int) -> bool:
+        if names[k] not in (Tone.NAME, Resonance.NAME):
+            return False
         at = position(whole, names, k)
         term = whole.terms[at]
-        return isinstance(term, Tone) and (
-            term.amplitude > decision.SURE * errors[at].get('amplitude', math.inf))
+        if isinstance(term, Tone):
+            return term.amplitude > decision.SURE * errors[at].get('amplitude', math.inf)
+        assert isinstance(term, Resonance)
+        z = evaluate(samples, [other for other in whole.terms
+                               if other is not term and other.ROLE is not Role.LAW]).z
+        rate = 1.0 / float(np.median(samples.step[1:]))
+        return prominence(z, rate, term.frequency, term.damping / math.pi) > decision.OFF
 
     return [k for k in out if not is_sure(k)]
 

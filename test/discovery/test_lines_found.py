@@ -48,6 +48,21 @@ def test_only_a_sure_line_is_never_withdrawn(amplitude, stays):
     assert _in_doubt(samples, whole, ['tone'], [0]) == ([] if stays else [0])
 
 
+def test_ringing_that_stands_out_on_both_sides_is_never_withdrawn():
+    """A peak is no slope of the spectrum, and none where the spectrum ends."""
+    samples = Samples(T, voltage(Resonance(10.0, 6.0, 0.02, 0.0)), None)
+
+    def left(frequency, damping):
+        terms = (RAIL, Resonance(frequency, damping, 0.02, 0.0))
+        gaussian = evaluate(samples, terms)
+        whole = Composite(terms, ({}, {}), gaussian, gaussian.z, gaussian.density, 6, 0.0)
+        return _in_doubt(samples, whole, ['resonance'], [0])
+
+    assert left(10.0, 6.0) == []
+    # Beside the peak, on its flank, and so broad that there is nothing below it.
+    assert left(18.0, 6.0) == left(12.0, 6.0) == left(2.0, 6.0) == [0]
+
+
 def test_other_causes_have_no_such_right():
     """Only lines stay for their size: withdrawn is withdrawn."""
     samples = Samples(T, voltage(Tone(0.2, 13.0, 0.5, 0.0)), None)

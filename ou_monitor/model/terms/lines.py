@@ -76,6 +76,24 @@ def keeps_its_height(view: View, frequency: float, linewidth: float) -> bool:
     return bool((power * power).mean() < _LEVEL * power.mean() ** 2)
 
 
+def prominence(z: FloatArray, rate: float, frequency: float, width: float) -> float:
+    """
+    Return by how many standard errors the power of a peak exceeds that on both of its sides.
+
+    z: scores; rate, frequency, width (at half its height) in Hz.  The powers are compared by
+    their logarithms, the less of both sides counts; -inf where the spectrum ends on one side.
+    """
+    power = np.abs(np.fft.rfft(z - z.mean()))[1:] ** 2
+    away = (np.fft.rfftfreq(z.size, 1.0 / rate)[1:] - frequency) / width
+    inside = power[np.abs(away) <= 0.5]
+    sides = [power[(sign * away > 1.0) & (sign * away < 2.5)] for sign in (-1.0, 1.0)]
+    if not inside.size or not all(side.size for side in sides):
+        return -math.inf
+    # A mean of n exponential variables is known to one part in sqrt(n).
+    return min(math.log(inside.mean() / side.mean()) / math.sqrt(1 / inside.size + 1 / side.size)
+               for side in sides)
+
+
 def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
     """Return the broad peaks of scores (rate in Hz)."""
     found = []
