@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.integrity import examine, Integrity
-from ou_monitor.criticism.null_bank import criticise, family_chance
+from ou_monitor.criticism.null_bank import criticise, family_chance, family_edge
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, fit_gaussian
 from ou_monitor.discovery.clipped import redrawn
@@ -37,7 +37,6 @@ from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.saturation import Saturation
 from ou_monitor.model.terms.term import Role
 from ou_monitor.records import Recording
-from scipy.special import ndtri
 
 # Why the gain of a line is not known that was found in all samples, of which some are used.
 FAST = 'the samples that are used are too few to show a line so fast.'
@@ -229,8 +228,7 @@ def _causes(samples: Samples, state: Integrity, left: Earned, se: tuple[dict[str
 def _criticism(before: Mapping[str, float], after: Mapping[str, float]) -> tuple[Criticism, ...]:
     """Return all statistics with the band that a right model leaves with chance `NOTHING`."""
     count = len(before)
-    one = -math.expm1(math.log1p(-NOTHING) / count)
-    edge = -float(ndtri(0.5 * one))
+    edge = family_edge(NOTHING, count)
     return tuple(Criticism(
         name, value, after.get(name, math.nan), -edge, edge, family_chance(value, count),
         family_chance(after[name], count) if name in after else math.nan)
