@@ -34,6 +34,8 @@ _DECIMALS = range(7)
 _AGAIN = 20
 # Samples at a rail, visits to it, and standard errors above its neighbours, at least.
 _LEAST, _VISITS, _CLEAR = 8, 3, 5.0
+# Codes that noise lifts clipped readings by, at most.
+_LIFTED = 2
 # With steps above this many standard deviations of the noise the codes next to
 # each other say nothing of a density.
 _COARSE = 2.0
@@ -128,9 +130,7 @@ def find_rails(voltage: FloatArray, step: float, noise: float,
     if step > _COARSE * noise:
         return -math.inf, math.inf
     told = _told(voltage, step, throttle)
-    high = float(voltage.max()) if _clipped(voltage, step, 1.0, told) else math.inf
-    low = float(voltage.min()) if _clipped(voltage, step, -1.0, told) else -math.inf
-    return low, high
+    return -_limit(-voltage, step, told), _limit(voltage, step, told)
 
 
 def _told(voltage: FloatArray, step: float, throttle: FloatArray | None) -> npt.NDArray[np.bool_]:
@@ -150,29 +150,45 @@ def _told(voltage: FloatArray, step: float, throttle: FloatArray | None) -> npt.
     return np.asarray(step <= _COARSE * np.sqrt(power))[load]
 
 
-def _clipped(voltage: FloatArray, step: float, side: float, told: npt.NDArray[np.bool_]) -> bool:
-    """Return whether the top (or with side -1 the bottom) holds more than its neighbours say."""
-    top = float(voltage.max()) if side > 0.0 else -float(voltage.min())
+def _limit(x: FloatArray, step: float, told: npt.NDArray[np.bool_]) -> float:
+    """
+    Return the reading at the top that holds more than its neighbours below say; inf for none.
+
+    A stage before the ADC may clip, and noise after it lift some readings by a code or two.
+    """
+    top = float(x.max())
     tie = _FLOAT32 * abs(top)
     width = step if step > 0.0 else tie
-    below = top - side * voltage
-    at = (below < 0.5 * width + tie) & told
-    count = int(at.sum())
-    # The extremes of a bell need not be tested where nothing is heaped.
-    if count < _LEAST or int((at[1:] & ~at[:-1]).sum()) < _VISITS:
-        return False
-    others = below[below >= 0.5 * width + tie]
-    if not others.size or float(others.min()) > max(3.5 * step, 0.2 * float(others.std())):
-        # Far from all others: a code of its own, no end of a range.
-        return False
-    if step > 0.0:
-        expected = max(float((np.abs(below[told] - k * step) < 0.5 * step).sum())
-                       for k in (1, 2, 3))
-    else:
-        # As dense as the nearest interval that holds some samples.
-        reach = float(np.partition(others, min(_LEAST, others.size - 1))[:_LEAST].max())
-        expected = _LEAST * 2.0 * tie / max(reach, tie)
-    return count - expected > _CLEAR * math.sqrt(count + expected)
+    below = top - x
+    for codes in range(1, (_LIFTED if step > 0.0 else 0) + 2):
+        inside = below < (codes - 0.5) * width + tie
+        at = inside & told
+        count = int(at.sum())
+        # The extremes of a bell need not be tested where nothing is heaped.
+        if count < _LEAST or int((at[1:] & ~at[:-1]).sum()) < _VISITS:
+            continue
+        others = below[~inside]
+        if not others.size or float(others.min()) > (codes - 1) * step + max(
+                3.5 * step, 0.2 * float(others.std())):
+            # Far from all others: a code of its own, no end of a range.
+            continue
+        if step > 0.0:
+            # A tail that falls has no more in any code than in those below.
+            next_ones = [float((np.abs(below[told] - (codes - 1 + k) * step)
+                                < 0.5 * step).sum()) for k in (1, 2, 3)]
+            expected = codes * max(next_ones)
+            if codes > 1 and next_ones[0] > max(next_ones[1:]) + _CLEAR * math.sqrt(next_ones[0]):
+                # The flank of a bell: a rail at rest.
+                continue
+        else:
+            # As dense as the nearest interval that holds some samples.
+            reach = float(np.partition(others, min(_LEAST, others.size - 1))[:_LEAST].max())
+            expected = _LEAST * 2.0 * tie / max(reach, tie)
+        if count - expected > _CLEAR * math.sqrt(count + codes * expected):
+            full = max(range(codes), key=lambda k: int(
+                (np.abs(below[told] - k * width) < 0.5 * width + tie).sum()))
+            return float(x[np.abs(below - full * width) < 0.5 * width + tie].max())
+    return math.inf
 
 
 def redraw(voltage: FloatArray, low: float, high: float, step: float,

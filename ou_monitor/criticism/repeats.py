@@ -29,8 +29,6 @@ _APART, _PERIODS = (2, 4, 8), range(9, 101)
 _CALMEST = 100.0
 # Standard errors by which ties must exceed what is expected, and ends of runs may fall short.
 _CLEAR, _SHORT = 6.0, 3.0
-# Codes that the usual change spans where one by a single code is a small one.
-_SPANS = 2.0
 # Share at either end of the range where readings may be squeezed together.
 _END = 0.1
 _FLOAT32 = 1.2e-7
@@ -128,12 +126,16 @@ def _stuck(v: FloatArray) -> npt.NDArray[np.bool_]:
     equal = (step == 0.0) & (v[1:] > v.min()) & (v[1:] < v.max())
     size = np.sort(np.abs(step[step != 0.0]))
     code = _code(v)
-    if not size.size or float(size[size.size // 2]) < (_SPANS - 0.5) * code:
-        return none
-    chance = min(_ties_of_codes(size, code)[0] / step.size, 0.9)
-    least = max(2, math.ceil(math.log(step.size) / -math.log(chance)))
     edge = np.diff(equal.astype(np.int8), prepend=0, append=0)
     begins, ends = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1)
+    if not size.size or not begins.size:
+        return none
+    chance = _ties_of_codes(size, code)[0] / step.size
+    if float(size[size.size // 2]) < 1.5 * code:
+        # Where most changes are by one code, what is alike stays so more often than codes say.
+        chance = max(chance, float(np.mean(ends - begins > 1)))
+    chance = min(chance, 0.9)
+    least = max(2, math.ceil(math.log(step.size) / -math.log(chance)))
     long = (ends - begins >= least) & (begins > 0) & (ends < step.size)
     begins, ends = begins[long], ends[long]
     if begins.size < _FEWEST_TIES:
@@ -142,6 +144,9 @@ def _stuck(v: FloatArray) -> npt.NDArray[np.bool_]:
     if float(np.mean((v[begins] > low) & (v[begins] < high))) < 0.5:
         return none
     usual = 0.5 - _SHORT / math.sqrt(12.0 * begins.size)
+    if 0.5 * float(np.mean(size < 1.25 * code)) > usual:
+        # Coming to rest by a code is no small change.
+        return none
     for ending in (np.abs(step[begins - 1]), np.abs(step[ends])):
         rank = (np.searchsorted(size, ending - 0.25 * code)
                 + np.searchsorted(size, ending + 0.25 * code)) / (2.0 * size.size)

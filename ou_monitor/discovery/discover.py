@@ -23,9 +23,9 @@ from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.gain import (
     crossing_rates, gain_of, guess, mean_score, why_unknown, without)
-from ou_monitor.discovery.load_start import under_load
+from ou_monitor.discovery.load_start import whole_load
+from ou_monitor.discovery.regression import load_terms
 from ou_monitor.discovery.search import Named, named_causes, position, Progress
-from ou_monitor.discovery.search_state import Search
 from ou_monitor.discovery.validation import covered, held_out, HeldOut
 from ou_monitor.discovery.verdict import judge, NOTHING
 from ou_monitor.discovery.words import (
@@ -156,9 +156,8 @@ def _unclipped(samples: Samples, state: Integrity, start: Composite
     ends = next(term for term in state.exact if isinstance(term, Saturation))
     rng = np.random.default_rng(0)
     for _ in range(_REDRAWN):
-        search = Search(start)
-        under_load(Fitter(samples), search)
-        samples = redrawn(samples, search.composite, ends, state.drawn, rng)
+        model = whole_load(Fitter(samples), start, load_terms(samples)) or start
+        samples = redrawn(samples, model, ends, state.drawn, rng)
         start = _start(samples, state)
     return samples, start
 

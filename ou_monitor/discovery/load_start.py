@@ -40,11 +40,10 @@ def under_load(fitter: Fitter, search: Search) -> None:
     others leave.  Nothing is accepted that the mean without them does not need.
     """
     load, plain = load_terms(fitter.samples), search.composite
-    full = fitter.fit([*plain.terms, *load], plain, rough=True) if load else None
-    if full is None:
+    noisy = whole_load(fitter, plain, load)
+    if noisy is None:
         choose_answer(fitter, search, ())
         return
-    noisy = _noise_beside(fitter, full)
     search.composite = noisy
     choose_answer(fitter, search, load)
     if not any(catalogue()[name].FAMILY == LoadSag.FAMILY for name in search.accepted):
@@ -106,6 +105,12 @@ def _coupled(fitter: Fitter, search: Search) -> None:
                        *(name for name in search.accepted if name not in names)]
     for name in (LoadSag.NAME, ACCoupling.NAME):
         search.rivals[name] = []
+
+
+def whole_load(fitter: Fitter, plain: Composite, load: Sequence[Term]) -> Composite | None:
+    """Return a model with all terms of a load and the noise beside them; None for no load."""
+    full = fitter.fit([*plain.terms, *load], plain, rough=True) if load else None
+    return None if full is None else _noise_beside(fitter, full)
 
 
 def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:
