@@ -102,6 +102,27 @@ def test_a_rail_is_five_errors_above_its_neighbours():
     assert find_rails(x, 1.0, 2.0)[1] == math.inf
 
 
+@pytest.mark.parametrize('side', (1.0, -1.0))
+@pytest.mark.parametrize('later', [0.0, 0.015, 0.03])
+def test_a_stage_that_clips_before_the_noise_of_the_adc(side, later):
+    """Some readings come out a code beyond; the limit is the code in which they pile up."""
+    rng = np.random.default_rng(7)
+    v = np.minimum(noise(), 1.5) + later * rng.standard_normal(noise().size)
+    v = side * 0.1 * np.round(v / 0.1)
+    assert find_rails(v, 0.1, 1.0) == pytest.approx(
+        (-math.inf, 1.5) if side > 0 else (-1.5, math.inf))
+
+
+def test_a_bell_of_few_codes_is_no_rail():
+    """A rail at rest in three codes, above those of a flight."""
+    rng = np.random.default_rng(8)
+    rest = np.rint(0.7 * rng.standard_normal(4000))
+    v = np.concatenate((rest, -3.0 - rng.integers(0, 60, 6000)))
+    v = np.concatenate([part for pair in zip(np.array_split(rest, 9), np.array_split(
+        v[4000:], 9), strict=True) for part in pair])
+    assert find_rails(v, 1.0, 2.0) == (-math.inf, math.inf)
+
+
 def test_a_code_in_which_the_rail_idles_is_no_rail():
     """A third of the time idle, in the top code; clipped there, other throttles say so."""
     rng, n = np.random.default_rng(6), 24000

@@ -60,7 +60,7 @@ def test_values_held_are_found_beside_a_line(line):
     assert left(v) == 1 + np.count_nonzero(np.diff(v))
 
 
-@pytest.mark.parametrize('code', [0.0, 0.1, 0.2])
+@pytest.mark.parametrize('code', [0.0, 0.1, 0.2, 0.3])
 def test_a_link_that_is_lost_for_a_while_is_found(code):
     """0.1 to 0.4 s, 25 times: what it held goes, codes alike by chance stay."""
     x = wander(4)
@@ -71,7 +71,7 @@ def test_a_link_that_is_lost_for_a_while_is_found(code):
         lost[begin:begin + int(RATE * rng.uniform(0.1, 0.4))] = True
     v = v[np.maximum.accumulate(np.where(lost, 0, np.arange(N)))]
     # Where the next code is the same by chance, a run is longer.
-    assert 0 <= N - lost.sum() - left(v) <= 25
+    assert 0 <= N - lost.sum() - left(v) <= 25 * (2 if code > 0.2 else 1)
 
 
 def test_a_rail_at_rest_is_not_held():
