@@ -2,7 +2,8 @@
 `analyze` and `discover` see the same in the same samples: one whitening, one finder, one test.
 
 `analyze` takes a recording as one load level, fitted by the onboard estimator; `discover` scores
-the same model with its own filter of many terms.  The samples are those that `discover` keeps.
+the same model with its own filter of many terms.  The samples are those that `discover` keeps, of
+every bag and of every recorded run there is, tables and raw logs.
 """
 
 import math
@@ -32,6 +33,7 @@ from ou_monitor.model.terms.measurement_noise import MeasurementNoise
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.second_relaxation import SecondRelaxation
 from ou_monitor.model.terms.tone import lines_of
+from ou_monitor.recordings.csv_table import CsvColumns
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import NAN, Recording
 from project import ROOT
@@ -39,18 +41,31 @@ import pytest
 
 REAL = Path(os.environ.get('OU_MONITOR_REALDATA', 'nowhere'))
 PATHS = [*sorted(path.parent for path in (ROOT / 'bags').glob('**/metadata.yaml')),
-         *(sorted(REAL.glob('*.csv')))]
+         *sorted(REAL.glob('*.csv')), *sorted((REAL / 'raw').glob('*.[bBu]*'))]
+BATTERY = 'battery_status[0].voltage_v'
 # A line this unlikely by chance is clear: the two models whiten a little differently.
 CLEAR = 1e-3 * FALSE_ALARM
+
+
+def as_one_level(recording):
+    """Return what `analyze` says of a recording as one load level."""
+    whole = LoadLevel(NAN, (Segment(0, recording.n),))
+    return fit_level(recording, recording, whole, 1)
 
 
 @pytest.fixture(scope='module', params=PATHS, ids=lambda path: path.name)
 def both(request):
     """Return samples, what `analyze` says of them, and what `discover` may look at."""
-    kept = examine(read_recording(request.param)).samples
-    samples = Samples(kept.t, kept.voltage, None)
-    recording = Recording(samples.t, samples.voltage, np.full(samples.n, NAN), 'same')
-    level = fit_level(recording, recording, LoadLevel(NAN, (Segment(0, samples.n),)), 1)
+    # Of the two batteries of a log the first.
+    columns = CsvColumns(voltage=BATTERY) if request.param.suffix == '.ulg' else None
+    whole = read_recording(request.param, columns=columns)
+    kept = examine(whole)
+    if kept.samples is None:
+        # Neither verb says anything.
+        assert not as_one_level(whole).estimate.usable
+        pytest.skip(kept.reason)
+    samples = Samples(kept.samples.t, kept.samples.voltage, None)
+    level = as_one_level(Recording(samples.t, samples.voltage, np.full(samples.n, NAN), 'same'))
     # Lines were found before they were taken out of the fit.
     fit = level.with_lines or level.estimate
     if fit.usable:
@@ -78,7 +93,11 @@ def test_the_scores_are_the_same(both):
 
 
 def test_the_lines_are_the_same(both):
-    """Each clear line of one is a line of the other, to the width of two bins."""
+    """
+    Each clear line of one is a line of the other, to the width of two bins or by its summit.
+
+    The same summit has the same p; of a hump the one that proposes more finds a wider foot.
+    """
     _, level, _, view = both
     ours = level.lines.lines
     theirs = [line for line in lines_of(view) if line.p_value < FALSE_ALARM]
@@ -86,7 +105,9 @@ def test_the_lines_are_the_same(both):
         for line in some:
             assert line.p_value > CLEAR or any(
                 abs(line.frequency - other.frequency)
-                < 2.0 * max(line.resolution, other.resolution) for other in others), line
+                < 2.0 * max(line.resolution, other.resolution)
+                or math.isclose(line.p_value, other.p_value, rel_tol=0.01)
+                for other in others), line
 
 
 def test_another_pole_is_the_same(both):
@@ -125,8 +146,7 @@ def fitted(*terms, throttle=None, seed=0):
 def test_discover_tries_the_pole_that_analyze_reports(terms, shown):
     """The test of a level and that of the search: the same question, the same answer."""
     samples, composite = fitted(*terms)
-    recording = Recording(samples.t, samples.voltage, np.full(N, NAN), 'same')
-    level = fit_level(recording, recording, LoadLevel(NAN, (Segment(0, N),)), 1)
+    level = as_one_level(Recording(samples.t, samples.voltage, np.full(N, NAN), 'same'))
     pole = pole_beside(samples, composite)
     # One level, one family of one: Holm leaves its p-values as they are.
     of_level = level.shape['second_relaxation']

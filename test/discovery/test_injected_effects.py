@@ -1,10 +1,12 @@
 """Effects hidden in a recorded flight are found; what it shows by itself is not taken for them."""
 
 from functools import cache
+import os
+from pathlib import Path
 
 from injected import EFFECTS, noise_of
 import numpy as np
-from ou_monitor import read_recording, Recording
+from ou_monitor import discover, read_recording, Recording
 from ou_monitor.criticism.integrity import examine
 from project import ROOT
 import pytest
@@ -62,3 +64,33 @@ def test_codes_moved_by_what_is_no_code_are_no_holds(height):
     rng = np.random.default_rng(8)
     moved = voltage + height * (np.cumsum(rng.random(t.size) < 0.005) % 2)
     assert examine(Recording(t, moved, throttle)).exact == ()
+
+
+REAL = Path(os.environ.get('OU_MONITOR_REALDATA', 'nowhere'))
+# Recorded runs, and the seconds of each in which effects are hidden: short, so that it is cheap.
+FLIGHTS = {'gecko': (ROOT / 'bags' / 'recorded' / 'gecko.csv', 30.0, 40.0),
+           'cf_solo': (REAL / 'cf_solo_large.csv', 10.0, 30.0)}
+
+
+@cache
+def piece(name):
+    """Return a piece of a recorded run, and the causes that it has by itself."""
+    path, first, last = FLIGHTS[name]
+    whole = read_recording(path)
+    part = (whole.t >= first) & (whole.t < last)
+    found = Recording(whole.t[part], whole.voltage[part], whole.throttle[part])
+    return found, [cause.name for cause in discover(found).causes]
+
+
+@pytest.mark.parametrize('name, effect', [
+    ('gecko', 'jumps'), ('cf_solo', 'tone'), ('cf_solo', 'regimes')])
+def test_what_is_hidden_in_a_flight_is_named_beside_its_sag(name, effect):
+    """At strength 2, the middle of the table in doc/discovery.md; the flight alone has none."""
+    if not FLIGHTS[name][0].exists():
+        pytest.skip('recorded runs are elsewhere')
+    flight, own = piece(name)
+    inject, right = EFFECTS[effect]
+    hidden = inject(flight, 2.0 * noise_of(flight.voltage), np.random.default_rng(7))
+    found = [cause.name for cause in discover(hidden).causes]
+    assert right & set(found) and not right & set(own)
+    assert 'load_sag' in own and ('load_sag' in found or effect == 'regimes')
