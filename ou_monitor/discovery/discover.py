@@ -24,8 +24,9 @@ from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.gain import (
     crossing_rates, gain_of, guess, mean_score, why_unknown, without)
 from ou_monitor.discovery.load_start import whole_load
+from ou_monitor.discovery.named import Named, named_causes
 from ou_monitor.discovery.regression import load_terms
-from ou_monitor.discovery.search import Named, named_causes, position, Progress
+from ou_monitor.discovery.search import position, Progress
 from ou_monitor.discovery.validation import covered, held_out, HeldOut
 from ou_monitor.discovery.verdict import judge, NOTHING
 from ou_monitor.discovery.words import (

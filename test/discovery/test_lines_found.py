@@ -15,7 +15,7 @@ from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.errors import standard_errors
 from ou_monitor.discovery.fitting import Fitter
-from ou_monitor.discovery.search import _in_doubt, _kept_beside, _other
+from ou_monitor.discovery.named import _in_doubt, _kept_beside, _other
 from ou_monitor.discovery.search_state import Search
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_sag import LoadSag
