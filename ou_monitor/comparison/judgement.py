@@ -223,7 +223,8 @@ def rows(found: Agreement) -> list[tuple[str, str, str, str]]:
 def path_rows(found: Agreement) -> list[tuple[str, str]]:
     """Return what is said of the mean path and of the distribution."""
     thirds = ', '.join(number(1e3 * b, 2) for b in found.bias_by_third)
+    worst = [('Farthest off', found.words)] if found.verdict is Verdict.LOOKS_LIKE_IT else []
     return [('Mean path', f'explains {number(100.0 * found.explained, 3)} % of the variance'),
             ('Its rms error', f'{number(1e3 * found.rmse, 3)} mV'),
             ('Its bias', f'{number(1e3 * found.bias, 2)} mV (by thirds {thirds})'),
-            ('Distributions', f'{number(found.ks_distance, 2)} apart (KS distance)')]
+            ('Distributions', f'{number(found.ks_distance, 2)} apart (KS distance)'), *worst]

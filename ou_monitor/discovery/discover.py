@@ -24,7 +24,7 @@ from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.gain import (
     crossing_rates, gain_of, guess, mean_score, why_unknown, without)
 from ou_monitor.discovery.load_start import whole_load
-from ou_monitor.discovery.named import Named, named_causes
+from ou_monitor.discovery.named import INTERRUPTED, Named, named_causes
 from ou_monitor.discovery.regression import load_terms
 from ou_monitor.discovery.search import position, Progress
 from ou_monitor.discovery.validation import covered, held_out, HeldOut
@@ -123,7 +123,7 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
     return Finding(
         recording=recording.name, n=recording.n, duration=recording.duration, verdict=verdict,
         sentence=verdict_sentence(verdict, causes, remaining, gain, gain_se, named.dropped, why,
-                                  uncovered, refused),
+                                  uncovered, refused, named.failure == INTERRUPTED),
         baseline=baseline, baseline_score=mean_score(plain.density, scored & plain.known),
         criticism=criticism, causes=causes, model=SupplyModel((*whole.terms, *undone)),
         se=(*se, *({} for _ in undone)),

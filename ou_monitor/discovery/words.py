@@ -156,8 +156,13 @@ def remaining_words(left: Sequence[Criticism]) -> str:
 
 def verdict_sentence(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism],
                      gain: float, gain_se: float, dropped: Sequence[str] = (),
-                     why: str = '', uncovered: int = 0, refused: str = '') -> str:
+                     why: str = '', uncovered: int = 0, refused: str = '',
+                     stopped: bool = False) -> str:
     """Return the verdict in a sentence or two (gain, gain_se in nats)."""
+    if stopped and verdict is Verdict.UNEXPLAINED:
+        rest = f': {remaining_words(left)}' if left else ''
+        return ('The simulation deviates from the recording; the search was stopped before it '
+                f'found a cause{rest}.')
     text = _verdict(verdict, causes, left, gain, gain_se, dropped, why, uncovered)
     return f'{text} {refused}: believe its names, not its numbers.' if refused else text
 

@@ -102,6 +102,10 @@ def test_sentences_of_the_verdict():
             why=why, uncovered=7)
         assert text.endswith(end)
     assert 'uncovered' not in verdict_sentence(Verdict.NO_EFFECT, [], [], 0.0, 0.1)
+    for verdict, said in ((Verdict.UNEXPLAINED, True), (Verdict.NO_EFFECT, False)):
+        text = verdict_sentence(verdict, [], [], 0.0, 0.1, stopped=True)
+        assert ('stopped before it found a cause.' in text) == said
+        assert 'no known cause' not in text
 
 
 def test_notes_with_numbers():
