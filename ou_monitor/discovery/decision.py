@@ -31,7 +31,8 @@ Kind = type[Term]
 ASK = 2.6
 # The same for terms that take seconds to fit: one of 700.
 ASK_DEAR = 3.2
-# A statistic beyond this shows that the model is wrong: of 70, one by chance in 2000 recordings.
+# A statistic beyond this shows that the model is wrong: of 70, one by chance in 700 recordings
+# (`family_chance`; 15 of 8700 simulated plain ones).
 OFF = 4.5
 # Evidence, nats, from which a cause that leaves no statistic beyond OFF spares the trials of dear
 # kinds of other families: e^30 is more than another kind would gain by chance.
@@ -95,13 +96,13 @@ RAGGED = 8.0
 MOST, MOST_LATENT = 8, 3
 # Lines that are joined to a tone at once: harmonics of a motor or PWM up to the 13th.
 MOST_LINES = 12
-# Score from which a statistic counts as misfit (by chance one of 16 000 does), and the sum of
+# Score from which a statistic counts as misfit (by chance one of 8000 does), and the sum of
 # their squares below which the search asks no further: four scores of 5.
 MISFIT, LITTLE = 4.0, 100.0
 # Share of the misfit that a latent cause must remove for the search to go on.
 HELPS = 0.5
 
-# A statistic beyond this fails: of 70, one by chance in 10 000 recordings.
+# A statistic beyond this fails: of 70, one by chance in 2300 recordings (3 of 8700 simulated).
 FAILS = 4.8
 # Shares that a statistic may keep of its own value and of the largest value, both before any cause
 # was accepted: the form of a cause leaves as much of a large effect.

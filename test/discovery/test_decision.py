@@ -2,6 +2,7 @@
 
 from typing import ClassVar
 
+from ou_monitor.criticism.null_bank import family_chance
 from ou_monitor.discovery import decision
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Role, Term
@@ -339,11 +340,11 @@ def test_the_origins_of_the_constants():
     """What the comments say of chances is so."""
     assert 2.0 * norm.sf(decision.ASK) == pytest.approx(0.0093, rel=0.01)
     assert 2.0 * norm.sf(decision.ASK_DEAR) == pytest.approx(1 / 700, rel=0.05)
-    assert 70 * 2.0 * norm.sf(decision.OFF) == pytest.approx(1 / 2000, rel=0.1)
-    assert 70 * 2.0 * norm.sf(decision.FAILS) == pytest.approx(1 / 10_000, rel=0.15)
+    assert family_chance(decision.OFF, 70) == pytest.approx(1 / 700, rel=0.05)
+    assert family_chance(decision.FAILS, 70) == pytest.approx(1 / 2300, rel=0.05)
     assert binom.sf(decision.MOSTLY * 24 - 1, 24, 0.5) == pytest.approx(0.011, rel=0.05)
     assert norm.sf(decision.STEADY) == pytest.approx(1 / 30_000, rel=0.1)
-    assert 2.0 * norm.sf(decision.MISFIT) == pytest.approx(1 / 16_000, rel=0.05)
+    assert family_chance(decision.MISFIT, 1) == pytest.approx(1 / 8000, rel=0.05)
 
 
 @pytest.mark.parametrize('name, value', [
