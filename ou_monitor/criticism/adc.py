@@ -39,8 +39,9 @@ _LIFTED = 2
 # With steps above this many standard deviations of the noise the codes next to
 # each other say nothing of a density.
 _COARSE = 2.0
-# Parts of equal size by throttle, each with a noise of its own.
-_LOADS = 8
+# Parts of equal size by throttle, each with a noise of its own, and how near to its lowest it is
+# idle.
+_LOADS, _STILL = 8, 0.01
 # Sweeps over all samples drawn: excursions last some relaxation times at most.
 _SWEEPS = 60
 # Shares of the samples beyond the knee, and scales in standard deviations of the
@@ -142,12 +143,17 @@ def _told(voltage: FloatArray, step: float, throttle: FloatArray | None) -> npt.
     if throttle is None or not step > 0.0:
         return np.ones(voltage.size, dtype=bool)
     edges = np.unique(np.quantile(throttle, np.arange(1, _LOADS) / _LOADS))
-    load = np.searchsorted(edges, throttle)
+    load = np.where(_idle(throttle), edges.size + 1, np.searchsorted(edges, throttle))
     change, same = np.diff(voltage), load[1:] == load[:-1]
     of = load[1:][same]
-    count = np.maximum(np.bincount(of, minlength=edges.size + 1), 1)
-    power = np.bincount(of, weights=change[same] ** 2, minlength=edges.size + 1) / count
+    count = np.maximum(np.bincount(of, minlength=edges.size + 2), 1)
+    power = np.bincount(of, weights=change[same] ** 2, minlength=edges.size + 2) / count
     return np.asarray(step <= _COARSE * np.sqrt(power))[load]
+
+
+def _idle(throttle: FloatArray) -> npt.NDArray[np.bool_]:
+    """Return where throttle is at its lowest."""
+    return np.asarray(throttle <= throttle.min() + _STILL)
 
 
 def _limit(x: FloatArray, step: float, told: npt.NDArray[np.bool_]) -> float:
@@ -223,7 +229,8 @@ def redraw(voltage: FloatArray, low: float, high: float, step: float,
     return v
 
 
-def find_knee(voltage: FloatArray, noise: float, side: float) -> float | None:
+def find_knee(voltage: FloatArray, noise: float, side: float,
+              throttle: FloatArray | None = None) -> float | None:
     """Return where readings begin to be squeezed (voltage in V, noise in V)."""
     x = side * voltage
     plain = _likelihood(x)
@@ -243,6 +250,11 @@ def find_knee(voltage: FloatArray, noise: float, side: float) -> float | None:
             if value > best:
                 best, found, undone, squeezed = value, knee, whole, float(part.sum())
     if found is None or not _is_limit(x, found):
+        return None
+    # Where idle is beyond it, and what is beyond it idle, it may be how quiet the rail is then.
+    idle = None if throttle is None else _idle(throttle)
+    if idle is not None and not idle.all() and min(
+            float(idle[x > found].mean()), float((x > found)[idle].mean())) > 0.5:
         return None
     # A line is slow at its turning points: of what is predicted with it they are no likelier.
     gain = squeezed + _likelihood(undone, _LINES) - _likelihood(x, _LINES)

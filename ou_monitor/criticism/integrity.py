@@ -112,7 +112,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     low, high = find_rails(v, step or usual_change(v), noise, u)
     soft = 'readings squeezed near the end of the range'
     if not math.isfinite(low) and not math.isfinite(high):
-        low, high = _knees(v, noise)
+        low, high = _knees(v, noise, u)
     else:
         soft = 'samples at the end of the range'
     if math.isfinite(low) or math.isfinite(high):
@@ -168,11 +168,11 @@ def _judge_step(step: float, noise: float, exact: list[Term], notes: list[str]) 
     return step if named else 0.0
 
 
-def _knees(v: FloatArray, noise: float) -> tuple[float, float]:
+def _knees(v: FloatArray, noise: float, u: FloatArray | None) -> tuple[float, float]:
     """Return the limits beyond which readings are squeezed; infinite where there is none."""
     if not noise > 0.0:
         return -math.inf, math.inf
-    bottom, top = find_knee(v, noise, -1.0), find_knee(v, noise, 1.0)
+    bottom, top = find_knee(v, noise, -1.0, u), find_knee(v, noise, 1.0, u)
     return -math.inf if bottom is None else bottom, math.inf if top is None else top
 
 

@@ -163,6 +163,10 @@ def test_a_knee_is_found_where_it_is(side, share):
     found = find_knee(v, step, side)
     assert found is not None and abs(found - knee) < 0.12
     assert find_knee(v, step, -side) is None
+    # All of it at idle: how quiet the rail is then; at a throttle that never moves, all is.
+    idle = np.where(side * v > side * knee, 0.0, 0.5)
+    assert find_knee(v, step, side, idle) is None
+    assert find_knee(v, step, side, 0.5 - idle) == find_knee(v, step, side, 0.0 * idle) == found
 
 
 @pytest.mark.parametrize('seed', range(3))
