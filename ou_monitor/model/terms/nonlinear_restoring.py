@@ -108,11 +108,11 @@ class NonlinearRestoring(Term):
         by = dict(zip(powers, b[1:].tolist(), strict=True))
         errors = dict(zip(powers, error[1:].tolist(), strict=True))
         square, cube = by.get(2, 0.0), by.get(3, 0.0)
-        # A force that would push away at large deviations is held just short of it.
-        cube = max(cube, _HOLDS * square * square / alpha)
-        if not cube > 0.0:
-            # It would only push away: no term does that.
+        if cube < 0.0:
+            # It would push away: no term does that, and what it scores is not that of one.
             return None
+        # A square that would push away at large deviations is held just short of it.
+        cube = max(cube, _HOLDS * square * square / alpha)
         return LawFit(cls(square, cube), {'square': errors.get(2, math.nan),
                                           'cube': errors.get(3, math.nan)}, scores,
                       density - log_normal(view.z), len(powers))
