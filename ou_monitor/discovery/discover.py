@@ -30,8 +30,8 @@ from ou_monitor.discovery.search import position, Progress
 from ou_monitor.discovery.validation import covered, held_out, HeldOut
 from ou_monitor.discovery.verdict import judge, NOTHING
 from ou_monitor.discovery.words import (
-    coupling_found, coupling_note, explain, left_out_note, NO_OTHER, no_relaxation_note, VAGUE,
-    verdict_sentence)
+    coupling_found, coupling_note, explain, left_out_note, NO_OTHER, no_relaxation_note,
+    throttles_note, VAGUE, verdict_sentence)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.ou import OU
@@ -244,6 +244,8 @@ def _notes(state: Integrity, named: Named, model: Composite, dropped: Sequence[s
                      if name in named.dropped else
                      f"'{name}' fitted, but does not help to predict what was kept back: left "
                      'out.')
+    if named.throttles:
+        notes.append(throttles_note(named.throttles))
     if uncovered:
         notes.append(left_out_note(uncovered, samples.n - uncovered))
     duration = float(samples.t[-1] - samples.t[0])

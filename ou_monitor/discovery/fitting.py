@@ -8,7 +8,7 @@ log-likelihood on the part fitted, less its price, plus that on the part kept.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import math
 
 import numpy as np
@@ -74,11 +74,14 @@ class Fitter:
         The recording.
     cost : float
         Processor time of the fits, s, estimated from their filters.
+    throttles : set of str
+        Latent laws with clear evidence, most of which a free law of throttle explains.
 
     """
 
     samples: Samples
     cost: float = 0.0
+    throttles: set[str] = field(default_factory=set)
 
     def evidence(self, composite: Composite) -> float:
         """Return the evidence for a model, nats."""
@@ -181,8 +184,11 @@ class Fitter:
 
         beside = evidence(replace(view, z=view.z * np.exp(-0.5 * free),
                                   variance=view.variance * np.exp(free)))
-        return decision.is_throttles(
-            evidence(view) if beside > decision.ACCEPT else 0.0, beside)
+        alone = evidence(view) if beside > decision.ACCEPT else 0.0
+        found = decision.is_throttles(alone, beside)
+        if found and alone > decision.CLEAR:
+            self.throttles.add(kind.NAME)
+        return found
 
     def poles_shown(self, composite: Composite) -> frozenset[str]:
         """Return the causes that the score test of another pole shows beside a model."""

@@ -44,7 +44,7 @@ class Named:
     """
     What the search left: a model fitted on everything, its causes, statistics before and after.
 
-    `bank` is what the statistics are measured by.
+    `bank` is what the statistics are measured by; `throttles` are laws that throttle explains.
 
     """
 
@@ -56,6 +56,7 @@ class Named:
     before: Mapping[str, float]
     after: Mapping[str, float]
     failure: str
+    throttles: tuple[str, ...]
 
 
 def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
@@ -116,7 +117,8 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         dropped = tuple(name for name in dropped if name not in found.search.accepted)
     return Named(found.whole, bank, tuple(found.search.accepted),
                  _with_trends(samples, found.whole, found.search.rivals), dropped, before,
-                 found.after, failure)
+                 found.after, failure,
+                 tuple(sorted(fitter.throttles.difference(found.search.accepted))))
 
 
 def _with_trends(samples: Samples, whole: Composite, rivals: Mapping[str, list[str]]

@@ -112,6 +112,14 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
     return ' '.join(part for part in parts if part)
 
 
+def throttles_note(names: Sequence[str]) -> str:
+    """Return the note on latent laws that were not named, as throttle explains most of them."""
+    quoted = listed([f"'{name}'" for name in names])
+    return ('The noise follows throttle and its changes in a form that the catalogue does not '
+            f'have: it explains most of what {quoted} would, so '
+            f'{"none of them is" if names[1:] else "that is not"} named.')
+
+
 def left_out_note(count: int, scored: int) -> str:
     """Return that samples at throttle which other blocks do not cover are not scored."""
     return (f'{count} samples are at throttle that the rest of the recording does not cover: a '
