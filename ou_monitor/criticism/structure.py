@@ -122,7 +122,8 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
     if whole_mean and chosen.n < samples.n:
         mean = _with_mean(samples.part(slice(None), voltage), fit.terms, events)
         fit, cost = replace(fit, terms=mean.terms), cost + mean.cost
-    whole = evaluate(samples, fit.terms, events, fit.se)
+    # A rough fit of many states has found no errors.
+    whole = evaluate(samples, fit.terms, events, fit.se or tuple({} for _ in fit.terms))
     return replace(whole, cost=cost + whole.cost)
 
 

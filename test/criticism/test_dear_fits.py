@@ -4,6 +4,9 @@ import numpy as np
 from ou_monitor.criticism import structure
 from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
+from ou_monitor.discovery.errors import standard_errors
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.flicker_noise import FlickerNoise
 from ou_monitor.model.terms.measurement_noise import MeasurementNoise
 from ou_monitor.model.terms.ou import OU
 
@@ -21,3 +24,14 @@ def test_what_suits_a_part_is_not_taken_where_it_is_worse_for_all(monkeypatch):
     again = fit_composite(samples, best.terms, slice(0, t.size), best)
     assert again.density.sum() >= best.density.sum() - 1e-6
     assert again.gaussian.se[1]['std'] > 0.0
+
+
+def test_a_rough_fit_of_many_states_has_no_errors_and_says_so_of_each_term():
+    """One dict a term, empty or not: those of laws come after them."""
+    t = np.arange(400) / 100.0
+    terms = (OU(5.0, 0.1, 12.0), FlickerNoise(0.01, 0.5, 20.0))
+    samples = Samples(t, SupplyModel(terms).simulate(t, np.random.default_rng(3)), None)
+    fit = fit_composite(samples, terms, slice(0, samples.n), rough=True, begun=True)
+    assert fit.se == ({}, {})
+    found = standard_errors(samples, fit, slice(0, samples.n))
+    assert len(found) == 2 and found[0]['u0'] > 0.0
