@@ -57,18 +57,19 @@ def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> in
         if _loading.is_set():
             os._exit(0)
         stopped.append(number)
-        if _making.is_set():
+        # Only the first: another would break off what it has begun.
+        if _making.is_set() and len(stopped) == 1:
             from rclpy.executors import ExternalShutdownException
             raise ExternalShutdownException
 
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    previous = [signal.signal(n, note) for n in numbers]
+    # They stay until the process ends.  With Ctrl-C both the terminal and ros2 launch send SIGINT,
+    # and Python's handler would raise in a destructor of the middleware, which aborts.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, note)
     try:
         return _run(name, work, args, stopped)
     finally:
         _loading.clear()
-        for number, handler in zip(numbers, previous, strict=True):
-            signal.signal(number, handler)
 
 
 def loaded() -> None:

@@ -59,6 +59,40 @@ def test_a_signal_at_any_moment_of_the_start(world, number):
         assert process.stop(number) == 0, process.err
 
 
+@pytest.mark.parametrize('name', NODES)
+def test_ctrl_c_of_a_launch_is_two_signals(world, name):
+    """The second comes while the first is being answered; benchmarks/soak_exits.py has 200."""
+    for spacing in (0.001, 0.005, 0.02, 0.04):
+        process = world.start(name)
+        wait_until(lambda process=process: 'Waiting for' in process.err, what='the node at work')
+        process.popen.send_signal(signal.SIGINT)
+        # Not a wait for something: this is what is tried.
+        time.sleep(spacing)
+        assert process.stop() == 0, process.err
+
+
+def test_a_signal_while_it_ends_is_only_noted(tmp_path):
+    """In a destructor of the middleware Python's own handler would raise, which aborts."""
+    code = ('import atexit, os, signal\n'
+            'from ou_monitor.nodes.run import run_node\n'
+            'class Loop:\n'
+            '    def __init__(self):\n'
+            '        self.me = self\n'
+            '    def __del__(self):\n'
+            '        os.kill(os.getpid(), signal.SIGINT)\n'
+            '        print("destroyed", end=" ")\n'
+            'def work():\n'
+            '    Loop()\n'
+            '    atexit.register(os.kill, os.getpid(), signal.SIGINT)\n'
+            '    return 3\n'
+            'run_node("one", "about", work)\n')
+    env = {**os.environ, 'PYTHONPATH': str(ROOT), 'ROS_LOG_DIR': str(tmp_path),
+           'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
+    done = subprocess.run([sys.executable, '-c', code], env=env, capture_output=True, text=True,
+                          timeout=DEADLINE)
+    assert (done.returncode, done.stdout, done.stderr) == (3, 'destroyed ', '')
+
+
 @pytest.mark.parametrize('name, arguments, words', [
     ('estimator', ['-p', 'window:=-1.0'], 'window out of range'),
     ('estimator', ['-p', 'window:=long'], "'window' to 'long'"),
