@@ -120,7 +120,9 @@ class EstimatorNode(MonitorNode):
         self.at_stop(latch.close)
         reason = latch.read()
         if latch.problem:
-            self.get_logger().warning(latch.problem)
+            self.get_logger().error(latch.problem)
+        if latch.refused:
+            self._monitor.doubt_brownout(latch.problem)
         if reason and self._monitor.settings.brownout_latch:
             self._monitor.set_brownout(reason)
             self.get_logger().warning(f'The brown-out flag is CRITICAL: {reason}')
@@ -365,12 +367,14 @@ class EstimatorNode(MonitorNode):
         if notes:
             summary = ' '.join((summary, *notes))
             level = max(level, Level.WARN) if level is not Level.STALE else level
+        if self._latch is not None and self._latch.problem:
+            # The owner relies on it, whatever the input does.
+            level, summary = Level.ERROR, f'{summary} {self._latch.problem}.'
         return report, level, summary
 
     def _notes(self) -> list[str]:
         """Return what is to be said of the input whatever else is."""
-        notes = [text for text in (
-            self._models.problem, '' if self._latch is None else self._latch.problem) if text]
+        notes = [self._models.problem] if self._models.problem else []
         if self._stream.thin > 1:
             notes.append(f'Overload: one of {self._stream.thin} samples is estimated from; the '
                          'floor judges all.')

@@ -1,29 +1,37 @@
 """
 The latched flag on disk: a brown-out that resets the companion does not clear its own latch.
 
-One JSON object in one small file, replaced as a whole (rename after fsync).  No ROS here.
+One JSON object in one small file.  The file exists as long as the node runs: it says OK or
+CRITICAL and carries the name of the node, and the lock of its inode says that the node runs.
+No file is written or replaced but a regular file with that name in it.  No ROS here.
 """
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+import fcntl
 import json
 import os
 from pathlib import Path
 import stat
+import tempfile
 import time
 from typing import Any
 
-# More than any of ours; nothing longer is read.
+# Size above which a file is not read, bytes; ours have at most 1000.
 _MOST = 4096
 _KEYS = {'node', 'level', 'reason', 'time'}
+# Time between attempts to write, s.
+RETRY = 1.0
 
 
 class LatchFile:
     """
-    Remembers that the flag of one node is latched: in a file, or in one of a folder.
+    Keeps the flag of one node in a file, or in a file named after the node in a folder.
 
-    `problem` says why the file could not be read or written, in one line.
+    `problem` says in one line why the file cannot be used now; empty: the disk has what was asked
+    for last.  `refused`: the file found at the start may not be touched, and stays as it is; what
+    it said, if anything, is unknown.
     """
 
     def __init__(self, path: str | Path, node: str) -> None:
@@ -31,80 +39,156 @@ class LatchFile:
         if self.path.is_dir():
             self.path /= node.strip('/').replace('/', '_') + '.latch.json'
         self.problem = ''
+        self.refused = False
         self._node = node
-        self._held: bool | None = None
+        # An open handle of the file that holds its lock.
+        self._lock: int | None = None
+        self._wanted: dict[str, Any] = self._record(False, '')
+        self._written: dict[str, Any] | None = None
+        self._tried = 0.0
         # A disk may take a second for an fsync: not in a callback.
         self._writer = ThreadPoolExecutor(1, 'latch_file')
+        self._job: Future[None] | None = None
+
+    def _record(self, latched: bool, reason: str) -> dict[str, Any]:
+        return {'node': self._node, 'level': 'CRITICAL' if latched else 'OK',
+                'reason': reason[:300], 'time': time.time()}
 
     def read(self) -> str:
-        """Return why the flag was latched, and when; empty when it was not, or is not known."""
+        """Claim the file, or make it; return why and when the flag was latched, if it was."""
         try:
-            data = self._load()
-        except FileNotFoundError:
-            return ''
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            found = self._claim()
         except (OSError, ValueError) as error:
-            self.problem = f'state_file {self.path} is not used: {_words(error)}'
+            self.refused = True
+            self.problem = (f'state_file {self.path} is refused and left as it is: '
+                            f'{_words(error)}; no latch is kept over a restart')
             return ''
-        self._held = True
-        when = time.strftime('%Y-%m-%d %H:%M:%S UTC', time.gmtime(data['time']))
-        return f'latched before the node was started anew, at {when}: {data["reason"]}'
+        if found is None:
+            self._write(self._wanted)
+            return ''
+        self._wanted = self._written = found
+        if found['level'] == 'OK':
+            return ''
+        when = time.strftime('%Y-%m-%d %H:%M:%S UTC', time.gmtime(found['time']))
+        reason = ' '.join(c for c in found['reason'].split() if c.isprintable())[:300]
+        return f'latched before the node was started anew, at {when}: {reason}'
 
-    def _load(self) -> dict[str, Any]:
-        # Without O_NONBLOCK a FIFO would wait for its writer.
-        handle = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)
+    def keep(self, latched: bool, reason: str) -> None:
+        """Have the file say whether the flag is latched; called often, it retries a write."""
+        if self.refused:
+            return
+        changed = latched != (self._wanted['level'] == 'CRITICAL')
+        if changed:
+            self._wanted = self._record(latched, reason)
+        if self._written is not self._wanted and (self._job is None or self._job.done()) and (
+                changed or time.monotonic() - self._tried >= RETRY):
+            self._tried = time.monotonic()
+            self._job = self._writer.submit(self._write, self._wanted)
+
+    def close(self) -> None:
+        """Write what is not written yet, and give the file up."""
+        if not self.refused and self._written is not self._wanted:
+            self._writer.submit(self._write, self._wanted)
+        self._writer.shutdown()
+        self._hold(None)
+
+    def _write(self, record: dict[str, Any]) -> None:
+        """Replace the file; what was written by the job before is not written again."""
+        if self._written is record:
+            return
         try:
-            if not stat.S_ISREG(os.fstat(handle).st_mode):
-                raise ValueError('it is not a regular file')
-            text = os.read(handle, _MOST + 1)
+            self._replace(json.dumps(record).encode())
+        except (OSError, ValueError) as error:
+            self.problem = (f'state_file {self.path} cannot be written: {_words(error)}; no latch '
+                            'is kept over a restart until it can')
+            return
+        self._written, self.problem = record, ''
+
+    def _claim(self) -> dict[str, Any] | None:
+        """Return what the file says, locked from here on; None: there is none."""
+        try:
+            # Opening a device may have an effect, and a FIFO has a reader then.
+            kind = os.lstat(self.path).st_mode
+        except FileNotFoundError:
+            return None
+        if not stat.S_ISREG(kind):
+            raise ValueError('it is a symbolic link' if stat.S_ISLNK(kind)
+                             else 'it is not a regular file')
+        # What took its place meanwhile is not followed, waited for or locked.
+        handle = os.open(self.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        try:
+            found = self._parse(handle)
+            mine = os.fstat(handle)
+            if self._lock is None or not os.path.samestat(os.fstat(self._lock), mine):
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    raise ValueError('another node of this name is using it') from None
+                # Its owner replaces the file before it lets go of the lock.
+                if not os.path.samestat(os.lstat(self.path), mine):
+                    raise ValueError('another node of this name is using it')
+                self._hold(handle)
+                handle = -1
         finally:
-            os.close(handle)
+            if handle >= 0:
+                os.close(handle)
+        return found
+
+    def _parse(self, handle: int) -> dict[str, Any]:
+        """Return the record in an open file; `ValueError` where it is not one of this node."""
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            raise ValueError('it is not a regular file')
+        text = os.read(handle, _MOST + 1)
         if len(text) > _MOST:
-            raise ValueError(f'it is larger than {_MOST} bytes')
+            raise ValueError(f'it is larger than {_MOST} bytes, and not of this node')
         try:
             data = json.loads(text)
         except (ValueError, RecursionError):
-            raise ValueError('it is damaged') from None
-        if not isinstance(data, dict) or set(data) != _KEYS or data['level'] != 'CRITICAL' or (
-                not isinstance(data['reason'], str) or not isinstance(data['time'], (int, float))
-                or not 0.0 <= data['time'] < 1e11):
-            raise ValueError('it is damaged')
+            raise ValueError('it is damaged, or not of this node') from None
+        if not isinstance(data, dict) or set(data) != _KEYS or (
+                data['level'] not in ('OK', 'CRITICAL') or not isinstance(data['reason'], str)
+                or not isinstance(data['time'], (int, float)) or not 0.0 <= data['time'] < 1e11):
+            raise ValueError('it is damaged, or not of this node')
         if data['node'] != self._node:
-            raise ValueError('it is that of another node')
-        data['reason'] = ' '.join(c for c in data['reason'].split() if c.isprintable())[:300]
+            raise ValueError('it belongs to another node')
         return data
 
-    def keep(self, latched: bool, reason: str) -> None:
-        """Write the file when the flag has become latched, and remove it when it no longer is."""
-        if latched == self._held:
-            return
-        self._held = latched
-        text = json.dumps({'node': self._node, 'level': 'CRITICAL', 'reason': reason[:300],
-                           'time': time.time()}) if latched else ''
-        self._writer.submit(self._replace, text)
-
-    def _replace(self, text: str) -> None:
+    def _replace(self, text: bytes) -> None:
+        """Write beside, sync, read back, lock and rename."""
+        there = self._claim() is not None
+        # Made by O_CREAT | O_EXCL under a random name: no other file is opened or removed.
+        handle, beside = tempfile.mkstemp(prefix=f'.{self.path.name}.', dir=self.path.parent)
         try:
-            if text:
-                self.path.parent.mkdir(parents=True, exist_ok=True)
-                beside = self.path.with_name(f'.{self.path.name}.{os.getpid()}')
-                with beside.open('w') as file:
-                    file.write(text)
-                    file.flush()
-                    os.fsync(file.fileno())
-                beside.replace(self.path)
-            else:
-                self.path.unlink(missing_ok=True)
-            folder = os.open(self.path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
-        except OSError as error:
-            self.problem = f'state_file {self.path} cannot be written: {_words(error)}'
+            # Readable by all, as an ordinary file is.
+            os.fchmod(handle, 0o644)
+            os.write(handle, text)
+            os.fsync(handle)
+            if os.pread(handle, _MOST, 0) != text:
+                raise ValueError('it does not read as it was written')
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not there:
+                # Fails where a file has come meanwhile.  File systems of SD cards have no links.
+                os.close(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
+            os.rename(beside, self.path)
+        except BaseException:
+            os.close(handle)
+            os.unlink(beside)
+            raise
+        self._hold(handle)
+        folder = os.open(self.path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+        if not os.path.samestat(os.lstat(self.path), os.fstat(handle)):
+            raise ValueError('another file has taken its place')
 
-    def close(self) -> None:
-        """Wait for what is being written."""
-        self._writer.shutdown()
+    def _hold(self, handle: int | None) -> None:
+        """Keep the handle that has the lock, in place of the one before."""
+        old, self._lock = self._lock, handle
+        if old is not None:
+            os.close(old)
 
 
 def _words(error: Exception) -> str:

@@ -215,6 +215,10 @@ class SupplyMonitor:
         """Set the flag CRITICAL, as before a restart; latch, hold and clearing act as ever."""
         self._flag.set_critical(reason)
 
+    def doubt_brownout(self, reason: str) -> None:
+        """Report the flag as UNKNOWN for this reason wherever it is not CRITICAL."""
+        self._flag.doubt(reason)
+
     def reset(self, reason: str) -> None:
         """Clear the window, and remember why for the next reports; the flag stays held."""
         self._estimator.reset()

@@ -1,58 +1,168 @@
-"""The latch on disk: kept, cleared, and never believed when it is damaged."""
+"""The latch on disk: kept, cleared, retried, and no other file is touched."""
 
+import errno
 import json
 import os
+import stat
+import threading
 
+from live import wait_until
+from ou_monitor.nodes import latch_file
 from ou_monitor.nodes.latch_file import LatchFile
 import pytest
 
+GOOD = {'node': '/n', 'level': 'CRITICAL', 'reason': 'low', 'time': 1.7e9}
+
+
+def level_of(path):
+    """Return what the file says."""
+    return json.loads(path.read_text())['level']
+
+
+def use(latch):
+    """Do all that a node does with a latch, a dip included."""
+    latch.read()
+    for latched in (False, True, False, True):
+        latch.keep(latched, 'the voltage is low')
+    latch.close()
+
 
 def test_kept_until_it_is_cleared(tmp_path):
-    """A folder gets a file named after the node; another node's is not believed."""
+    """In a folder, a file named after the node; nothing else is left there."""
     latch = LatchFile(tmp_path, '/a/ou_estimator')
     assert latch.read() == '' and latch.problem == ''
+    path = tmp_path / 'a_ou_estimator.latch.json'
+    assert level_of(path) == 'OK'
     latch.keep(True, 'the voltage is low')
     latch.keep(True, 'and again')
     latch.close()
-    path = tmp_path / 'a_ou_estimator.latch.json'
-    assert list(tmp_path.iterdir()) == [path]
+    assert list(tmp_path.iterdir()) == [path] and level_of(path) == 'CRITICAL'
     again = LatchFile(tmp_path, '/a/ou_estimator')
     assert 'the voltage is low' in again.read() and 'UTC' in again.read()
-    other = LatchFile(path, '/b/ou_estimator')
-    assert other.read() == '' and 'another node' in other.problem
     again.keep(False, '')
     again.close()
-    assert list(tmp_path.iterdir()) == [] and again.problem == ''
-
-
-GOOD = {'node': '/n', 'level': 'CRITICAL', 'reason': 'low', 'time': 1.7e9}
+    assert list(tmp_path.iterdir()) == [path] and level_of(path) == 'OK'
+    assert again.problem == ''
+    assert LatchFile(tmp_path, '/a/ou_estimator').read() == ''
 
 
 @pytest.mark.parametrize('text', [
     '', '{', 'null', '[' * 3000, 'x' * 100_000, '\x00\xff', json.dumps({**GOOD, 'time': 'now'}),
     json.dumps({**GOOD, 'time': 1e300}), json.dumps({**GOOD, 'time': float('nan')}),
-    json.dumps({**GOOD, 'level': 'OK'}), json.dumps({**GOOD, 'more': 1}),
-    json.dumps({**GOOD, 'reason': None}), '1' * 4000], ids=lambda text: text[:12])
-def test_a_damaged_file_is_one_line(tmp_path, text):
+    json.dumps({**GOOD, 'level': 'WARN'}), json.dumps({**GOOD, 'more': 1}),
+    json.dumps({**GOOD, 'reason': None}), '1' * 4000, json.dumps({**GOOD, 'node': '/other'})],
+    ids=lambda text: text[:12])
+def test_a_file_that_is_not_its_own_is_left(tmp_path, text):
+    """Notes, a damaged file, another node's brown-out: refused in one line, byte for byte kept."""
     path = tmp_path / 'state'
     path.write_text(text)
+    before = path.stat()
     latch = LatchFile(path, '/n')
-    assert latch.read() == '' and latch.problem
+    use(latch)
+    assert latch.refused and latch.read() == ''
     assert '\n' not in latch.problem and len(latch.problem) < 300 + len(str(path))
+    assert path.read_text() == text and list(tmp_path.iterdir()) == [path]
+    assert (path.stat().st_ino, path.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+
+
+def test_what_is_no_regular_file_is_left(tmp_path):
+    """A FIFO hangs nothing; of a link neither end is touched, be it to a file of its own."""
+    own, fifo, link, dangling = (tmp_path / name for name in ('own', 'fifo', 'link', 'dangling'))
+    own.write_text(json.dumps(GOOD))
+    os.mkfifo(fifo)
+    link.symlink_to(own)
+    dangling.symlink_to(tmp_path / 'none')
+    (tmp_path / 'n.latch.json').mkdir()
+    for path in (fifo, link, dangling, tmp_path):
+        latch = LatchFile(path, '/n')
+        use(latch)
+        assert latch.refused and latch.problem
+    assert stat.S_ISFIFO(fifo.lstat().st_mode) and link.is_symlink() and dangling.is_symlink()
+    assert json.loads(own.read_text()) == GOOD
+    assert {path.name for path in tmp_path.iterdir()} == {
+        'own', 'fifo', 'link', 'dangling', 'n.latch.json'}
+    latch = LatchFile('/proc/no/such/file', '/n')
+    use(latch)
+    assert latch.refused
+
+
+def test_of_two_nodes_on_one_file_the_second_refuses(tmp_path):
+    """While the first runs, through its writes too; a node of another name always."""
+    path = tmp_path / 'state'
+    first = LatchFile(path, '/n')
+    first.read()
+    use(LatchFile(path, '/other'))
+    second = LatchFile(path, '/n')
+    second.read()
+    assert second.refused
+    first.keep(True, 'low')
+    wait_until(lambda: level_of(path) == 'CRITICAL', what='the latch')
+    third = LatchFile(path, '/n')
+    use(third)
+    assert third.refused and level_of(path) == 'CRITICAL'
+    first.close()
+    after = LatchFile(path, '/n')
+    assert 'low' in after.read() and not after.refused
+    after.close()
+
+
+def test_one_that_is_replaced_meanwhile_is_left(tmp_path):
+    """By notes: not written until they are gone; then the latch comes back by itself."""
+    path = tmp_path / 'state'
+    latch = LatchFile(path, '/n')
+    latch.read()
+    path.unlink()
+    path.write_text('notes')
+    latch.keep(True, 'low')
+    wait_until(lambda: latch.problem, what='the problem')
+    assert path.read_text() == 'notes' and not latch.refused
+    path.unlink()
+    wait_until(lambda: (latch.keep(True, 'low'), path.exists())[1], what='the latch')
     latch.close()
+    assert level_of(path) == 'CRITICAL' and latch.problem == ''
+
+
+@pytest.mark.parametrize('call', ['write', 'fsync', 'rename'])
+def test_a_write_that_fails_is_done_again(tmp_path, monkeypatch, call):
+    """A full disk: said, retried by the same state until it is written, and nothing is left."""
+    path = tmp_path / 'state'
+    latch = LatchFile(path, '/n')
+    latch.read()
+    full, tried = threading.Event(), threading.Event()
+    right = getattr(os, call)
+
+    def fails(*arguments):
+        if full.is_set():
+            tried.set()
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return right(*arguments)
+    monkeypatch.setattr(latch_file.os, call, fails)
+    full.set()
+    latch.keep(True, 'low')
+    wait_until(lambda: latch.problem, what='the problem')
+    assert tried.is_set() and level_of(path) == 'OK' and list(tmp_path.iterdir()) == [path]
+    full.clear()
+    wait_until(lambda: (latch.keep(True, 'low'), latch.problem == '')[1], what='the latch')
+    assert level_of(path) == 'CRITICAL'
+    latch.close()
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_text_that_does_not_read_as_written_replaces_nothing(tmp_path, monkeypatch):
+    """Nor does a part of it, which a full disk takes."""
+    path = tmp_path / 'state'
+    latch = LatchFile(path, '/n')
+    latch.read()
+    right = os.write
+    monkeypatch.setattr(latch_file.os, 'write',
+                        lambda handle, text: right(handle, text[:-1]))
+    latch.keep(True, 'low')
+    wait_until(lambda: latch.problem, what='the problem')
+    latch.close()
+    assert level_of(path) == 'OK' and list(tmp_path.iterdir()) == [path]
 
 
 def test_control_characters_of_a_hostile_file_stay_in_it(tmp_path):
     path = tmp_path / 'state'
     path.write_text(json.dumps({**GOOD, 'reason': 'a \x1b[31m\nlow b'}))
     assert LatchFile(path, '/n').read().endswith('a low b')
-
-
-def test_a_fifo_and_a_folder_without_rights_hang_nothing(tmp_path):
-    os.mkfifo(tmp_path / 'fifo')
-    latch = LatchFile(tmp_path / 'fifo', '/n')
-    assert latch.read() == '' and 'regular file' in latch.problem
-    latch = LatchFile('/proc/no/such/file', '/n')
-    latch.keep(True, 'low')
-    latch.close()
-    assert 'cannot be written' in latch.problem

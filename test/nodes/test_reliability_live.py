@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import resource
 import subprocess
 import sys
 import threading
@@ -196,8 +197,7 @@ def test_the_latch_survives_a_restart(world, tmp_path):
     rig = Rig(world, 'keep', *arguments)
     rig.live([5.0] * 50 + [4.0] * 200)
     wait_until(lambda: rig.field('brownout_level') == 'CRITICAL', what='the flag')
-    wait_until(path.exists, what='the file')
-    assert json.loads(path.read_text())['level'] == 'CRITICAL'
+    wait_until(lambda: json.loads(path.read_text())['level'] == 'CRITICAL', what='the file')
     rig.process.kill()
     again = Rig(world, 'keep', *arguments)
     wait_until(lambda: again.field('brownout_level') == 'CRITICAL', what='the latch')
@@ -206,8 +206,48 @@ def test_the_latch_survives_a_restart(world, tmp_path):
     wait_until(lambda: again.flags and again.flags[-1].data, what='the flag itself')
     answer = again.probe.call(Trigger, f'{again.node}/clear_brownout', Trigger.Request())
     assert answer.success
-    wait_until(lambda: not path.exists(), what='no file')
-    assert again.process.stop() == 0
+    wait_until(lambda: json.loads(path.read_text())['level'] == 'OK', what='the file')
+    # A second node of that name: the file is in use.
+    other = world.start('estimator', '--ros-args', '-r', '__ns:=/keep', *arguments)
+    wait_until(lambda: 'is refused' in other.err, what='the refusal')
+    assert other.stop() == 0 and again.process.stop() == 0
+
+
+def test_a_state_file_of_another_is_refused_and_told(world, tmp_path):
+    """ERROR and UNKNOWN though the input is good; a dip is CRITICAL, and the file stays."""
+    path = tmp_path / 'notes'
+    path.write_text('my notes')
+    rig = Rig(world, 'notes', '-p', f'state_file:={path}', '-p', 'brownout.hold:=0.0')
+
+    def steady():
+        rig.live(ou_path(250, 0.002, seed=6))
+        return rig.field('status') == 'OK' and rig.status.level == ERROR
+    wait_until(steady, what='an estimate')
+    assert rig.field('brownout_level') == 'UNKNOWN' and not rig.flags
+    assert str(path) in rig.field('brownout_reason') and str(path) in rig.status.message
+    rig.live([3.0] * 100)
+    wait_until(lambda: rig.flags and rig.flags[-1].data, what='the flag')
+    assert rig.process.stop() == 0 and path.read_text() == 'my notes'
+
+
+def test_a_latch_that_the_disk_refused_is_written_later(world, tmp_path):
+    """A limit of the size of files stands for a full disk, of the node alone."""
+    path = tmp_path / 'latch'
+    arguments = ('-p', 'brownout.latch:=true', '-p', f'state_file:={path}')
+    rig = Rig(world, 'full', *arguments)
+    pid = rig.process.popen.pid
+    limits = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (10, limits[1]))
+    rig.live([5.0] * 50 + [4.0] * 200)
+    wait_until(lambda: 'cannot be written' in rig.status.message, what='the problem')
+    assert rig.status.level == ERROR and json.loads(path.read_text())['level'] == 'OK'
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, limits)
+    wait_until(lambda: json.loads(path.read_text())['level'] == 'CRITICAL', what='the latch')
+    wait_until(lambda: 'cannot be written' not in rig.status.message, what='no problem')
+    rig.process.kill()
+    again = Rig(world, 'full', *arguments)
+    wait_until(lambda: again.field('brownout_level') == 'CRITICAL', what='the latch')
+    assert again.process.stop() == 0 and list(tmp_path.glob('.latch*')) == []
 
 
 @pytest.mark.parametrize('rate', [5000.0, 20000.0])

@@ -244,6 +244,8 @@ class BrownoutFlag:
         # Since when the risk is without a break at or above what a level is entered at.
         self._above: dict[FlagLevel, float] = {}
         self._state = FlagState()
+        # Why nothing but CRITICAL is reported; empty: no such reason.
+        self._doubt = ''
 
     @property
     def settings(self) -> MonitorSettings:
@@ -283,6 +285,10 @@ class BrownoutFlag:
         self._enter(FlagLevel.CRITICAL)
         self._state = FlagState(FlagLevel.CRITICAL, True, self._since, reason)
 
+    def doubt(self, reason: str) -> None:
+        """Report UNKNOWN for this reason in place of OK and WARN, from now on."""
+        self._doubt = reason
+
     def update(self, t: float, risk: float, *, fresh: bool = True,
                arriving: bool | None = None) -> FlagState:
         """
@@ -302,8 +308,11 @@ class BrownoutFlag:
             self._enter(level)
         if known or low:
             self._known = self._now
-        self._state = FlagState(level, self._flag(known), self._since, reason,
-                                self._now - self._since, low, self._floor.dips)
+        flag = self._flag(known)
+        if self._doubt and level is not FlagLevel.CRITICAL:
+            level, flag, reason = FlagLevel.UNKNOWN, None, self._doubt
+        self._state = FlagState(level, flag, self._since, reason, self._now - self._since, low,
+                                self._floor.dips)
         return self._state
 
     def _go_to(self, t: float) -> None:
