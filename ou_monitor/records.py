@@ -18,6 +18,28 @@ from ou_monitor.text import Z95
 FloatArray = npt.NDArray[np.float64]
 
 NAN = float('nan')
+# Largest factor between a positive parameter and an end of its 95 % interval: beyond it the
+# parameter is unknown.
+LARGEST_FACTOR = 10.0
+# The same as a standard error of the parameter's logarithm.
+LARGEST_LOG_SE = math.log(LARGEST_FACTOR) / Z95
+# Exponent beyond which a factor counts as infinite: exp(709.78) is the largest float.
+_INFINITE = 709.0
+
+
+def exp_or_inf(log: float) -> float:
+    """Return ``exp(log)``, infinite where it is too large for a float."""
+    return math.inf if log > _INFINITE else math.exp(log)
+
+
+def log_interval(value: float, log_se: float, z: float = Z95) -> tuple[float, float]:
+    """Return the ends ``value * exp(-+z log_se)``; NaN when unknown, 0 and inf when open."""
+    return value * exp_or_inf(-z * log_se), value * exp_or_inf(z * log_se)
+
+
+def determined(value: float, low: float, high: float) -> bool:
+    """Whether an interval spans at most `LARGEST_FACTOR` either way."""
+    return low * LARGEST_FACTOR >= value and high <= value * LARGEST_FACTOR
 
 
 class Status(enum.Enum):
@@ -41,8 +63,8 @@ class Status(enum.Enum):
         'The voltage does not change at all in the window: the sensor is stuck, or its '
         'step is larger than the noise.')
     TOO_SHORT = (
-        'The window holds fewer than 5 relaxation times: alpha cannot be told; lengthen '
-        'the window.')
+        'The window holds too few relaxation times: alpha is uncertain by more than a factor '
+        'of 10; lengthen the window.')
     UNBOUND = (
         'No restoring force visible: the voltage wanders through the whole window; lengthen '
         'the window, or look for drift and load changes.')
@@ -123,6 +145,10 @@ class Counters:
     resets: int = 0
 
 
+# Parameters of an estimate whose standard errors are those of the logarithm.
+LOG_NAMES = ('alpha', 'sigma', 'var_inf')
+
+
 @dataclass(frozen=True)
 class Estimate:
     """
@@ -132,7 +158,8 @@ class Estimate:
 
     Standard errors of `alpha`, `sigma`, `var_inf` are those of the *logarithm*
     (dimensionless, relative): the 95 % interval is
-    ``alpha * exp(+-1.96 * alpha_se)``, see `interval`.  `u0_se` is in volts.
+    ``alpha * exp(+-1.96 * alpha_se)``, see `interval`.  Beyond `LARGEST_LOG_SE`
+    the parameter and its error are NaN, and the status says so.  `u0_se` is in volts.
 
     Attributes
     ----------
@@ -199,6 +226,19 @@ class Estimate:
     rate: float = NAN
     counters: Counters = field(default_factory=Counters)
 
+    def __post_init__(self) -> None:
+        """Make every parameter NaN whose error exceeds `LARGEST_LOG_SE`."""
+        wide = [name for name in LOG_NAMES if getattr(self, name + '_se') > LARGEST_LOG_SE]
+        if not wide:
+            return
+        unknown: dict[str, object] = dict.fromkeys(
+            [*wide, *(name + '_se' for name in wide), 'u0_se'], NAN)
+        if self.status in (Status.OK, Status.SHORT_WINDOW):
+            unknown['status'] = (Status.NO_RELAXATION if self.alpha > self.rate
+                                 else Status.TOO_SHORT)
+        for name, value in unknown.items():
+            object.__setattr__(self, name, value)
+
     @property
     def usable(self) -> bool:
         """Whether the numbers may be acted on."""
@@ -232,11 +272,9 @@ class Estimate:
             For a name that has no interval on the log scale.
 
         """
-        if name not in ('alpha', 'sigma', 'var_inf'):
+        if name not in LOG_NAMES:
             raise ValueError(f"no log-scale interval for '{name}': alpha, sigma or var_inf")
-        value: float = getattr(self, name)
-        factor = math.exp(z * getattr(self, name + '_se'))
-        return value / factor, value * factor
+        return log_interval(getattr(self, name), getattr(self, name + '_se'), z)
 
 
 @dataclass(frozen=True, eq=False)

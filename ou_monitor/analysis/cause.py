@@ -18,8 +18,8 @@ import math
 import numpy as np
 from ou_monitor.analysis.level_comparison import AlphaTest, LEVEL
 from ou_monitor.analysis.relaxation import Relaxation, Release
-from ou_monitor.records import NAN
-from ou_monitor.text import p_words, volts, Z95
+from ou_monitor.records import determined, log_interval, NAN
+from ou_monitor.text import number, p_words, volts, Z95
 from scipy import stats
 
 # A level that is off by more than this share of the transient has settled elsewhere; by less
@@ -104,6 +104,9 @@ def _nothing(relaxation: Relaxation) -> str:
     if relaxation.moves_on:
         return (f'After throttle {what}, the voltage keeps moving for the whole time observed '
                 'and settles at no level that could be fitted.')
+    if relaxation.bounded:
+        return (f'After throttle {what}, the voltage settles in tau < '
+                f'{number(1e3 * relaxation.tau_high)} ms (95 %); how much less is not determined.')
     return f'No relaxation is detected after throttle {what}.'
 
 
@@ -119,7 +122,11 @@ def _against_noise(relaxation: Relaxation, alpha: AlphaTest
         # The p-value and the interval rest on an error of tau that does not hold.
         return 'undetermined', math.exp(log), NAN, NAN, NAN
     word = 'differs' if p < LEVEL else 'agrees' if reach < math.log(_CLOSE) else 'undetermined'
-    return word, math.exp(log), math.exp(log - Z95 * se), math.exp(log + Z95 * se), p
+    ratio = math.exp(log)
+    low, high = log_interval(ratio, se)
+    if not determined(ratio, low, high):
+        ratio = low = high = NAN
+    return word, ratio, low, high, p
 
 
 def _against_instrument(relaxation: Relaxation) -> tuple[str, float, float]:

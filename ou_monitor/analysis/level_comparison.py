@@ -34,7 +34,8 @@ import math
 
 import numpy as np
 from ou_monitor.analysis.levels import Segment
-from ou_monitor.records import Estimate, FloatArray, NAN, Recording
+from ou_monitor.records import (
+    determined, Estimate, exp_or_inf, FloatArray, log_interval, NAN, Recording)
 from ou_monitor.text import p_words, Z95
 from scipy import stats
 from scipy.special import chndtrinc
@@ -146,7 +147,8 @@ class AlphaTest:
         Ratio of alpha between the lowest and the highest level that the test detects with 90 %
         probability, where ln(alpha) is a straight line over throttle.
     ratio, ratio_low, ratio_high : float
-        That ratio as fitted, highest over lowest throttle, and its 95 % interval.
+        That ratio as fitted, highest over lowest throttle (NaN where it is not determined), and
+        its 95 % interval.
     withheld : tuple of float
         Throttles of usable levels that one OU in white noise does not describe.
 
@@ -167,8 +169,7 @@ class AlphaTest:
     @property
     def interval(self) -> tuple[float, float]:
         """Return the 95 % interval of the common alpha, 1/s."""
-        reach = math.exp(Z95 * self.alpha_se) if math.isfinite(self.alpha_se) else NAN
-        return self.alpha / reach, self.alpha * reach
+        return log_interval(self.alpha, self.alpha_se)
 
     @property
     def sentence(self) -> str:
@@ -189,9 +190,11 @@ class AlphaTest:
                     f'a usable fit{" that one OU describes" if self.withheld else ""}.')
         least, ends = _factor(self.detectable_ratio), 'from the lowest to the highest throttle'
         if self.verdict == 'differs':
-            return (f'Alpha depends on load ({p_words(self.p_value)}): it changes by a factor of '
-                    f'{_factor(self.ratio)} (95 % {_factor(self.ratio_low)} to '
-                    f'{_factor(self.ratio_high)}) {ends}; the paper assumes a constant alpha.')
+            size = 'by a factor that is not determined' if math.isnan(self.ratio) else (
+                f'by a factor of {_factor(self.ratio)} (95 % {_factor(self.ratio_low)} to '
+                f'{_factor(self.ratio_high)})')
+            return (f'Alpha depends on load ({p_words(self.p_value)}): it changes {size} {ends}; '
+                    'the paper assumes a constant alpha.')
         if self.verdict == 'constant':
             return (f'Alpha shows no dependence on load ({p_words(self.p_value)}); the test would '
                     f'have detected a change by a factor of {least} {ends} (90 %).')
@@ -231,12 +234,12 @@ def alpha_constancy(throttles: Sequence[float], estimates: Sequence[Estimate],
     reach = float(np.ptp(x))
     along = (x - float(weight @ x / weight.sum())) / reach
     size = float(weight @ along ** 2)
-    slope = float(weight @ (along * logs)) / size
-    wide = float(stats.norm.ppf(0.975)) / math.sqrt(size)
-    detectable = math.exp(math.sqrt(_noncentrality(freedom) / size))
+    ratio = exp_or_inf(float(weight @ (along * logs)) / size)
+    low, high = log_interval(ratio, 1.0 / math.sqrt(size))
+    detectable = exp_or_inf(math.sqrt(_noncentrality(freedom) / size))
     verdict = 'differs' if p < LEVEL else 'constant' if detectable <= NARROW else 'undetermined'
-    return AlphaTest(verdict, len(good), *common, statistic, p, detectable, math.exp(slope),
-                     math.exp(slope - wide), math.exp(slope + wide), withheld)
+    return AlphaTest(verdict, len(good), *common, statistic, p, detectable,
+                     ratio if determined(ratio, low, high) else NAN, low, high, withheld)
 
 
 def at_common_alpha(logs: FloatArray, errors: FloatArray) -> FloatArray:
@@ -261,7 +264,7 @@ class SigmaChange:
     Attributes
     ----------
     ratio, ratio_low, ratio_high : float
-        As fitted, and its 95 % interval.
+        As fitted (NaN where it is not determined), and its 95 % interval.
 
     """
 
@@ -278,8 +281,8 @@ class SigmaChange:
 def sigma_change(low: Estimate, high: Estimate) -> SigmaChange:
     """Compare sigma of two levels that are usable."""
     ratio = high.sigma / low.sigma
-    reach = math.exp(Z95 * math.hypot(low.sigma_se, high.sigma_se))
-    return SigmaChange(ratio, ratio / reach, ratio * reach)
+    ends = log_interval(ratio, math.hypot(low.sigma_se, high.sigma_se))
+    return SigmaChange(ratio if determined(ratio, *ends) else NAN, *ends)
 
 
 def _noncentrality(freedom: int) -> float:

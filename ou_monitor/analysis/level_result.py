@@ -22,13 +22,11 @@ from ou_monitor.criticism.innovations import FAMILY_WISE, fresh, innovations
 from ou_monitor.criticism.level_tests import adjusted, examine_level, holm, Shape
 from ou_monitor.model.spectral_lines import find_lines, Grid, LineSearch, on_grid, without_lines
 from ou_monitor.online.estimator.estimator import SlidingEstimator
-from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Recording, Status
+from ou_monitor.records import (
+    Estimate, Flag, FloatArray, LOG_NAMES, NAN, Recording, Status)
 from ou_monitor.text import p_words
 from scipy import stats
 
-# Standard error of ln(alpha) beyond which a segment does not count.
-_MAX_SE = 1.0
-_LOG_NAMES = ('alpha', 'sigma', 'var_inf')
 # Fewer samples than this are not even offered to the estimator.
 _MIN_SEGMENT = 16
 # Intervals widened by more than this factor have a note.
@@ -61,17 +59,16 @@ def pool(estimates: Sequence[Estimate]) -> tuple[Estimate, float]:
         raise ValueError('nothing to pool: no estimates')
     if len(estimates) == 1:
         return estimates[0], 1.0
-    sorted_out = [_doubted(e) for e in estimates]
-    good = [e for e in sorted_out if e.usable]
-    if sum(e.duration for e in good) < 0.5 * sum(e.duration for e in sorted_out) or not good:
-        return _majority(sorted_out), 1.0
+    good = [e for e in estimates if e.usable]
+    if sum(e.duration for e in good) < 0.5 * sum(e.duration for e in estimates) or not good:
+        return _majority(estimates), 1.0
     if len(good) == 1:
         return good[0], 1.0
     weight = np.array([e.duration for e in good])
     weight /= weight.sum()
     values: dict[str, float] = {}
     scatter = 1.0
-    for name in _LOG_NAMES:
+    for name in LOG_NAMES:
         logs = np.log([getattr(e, name) for e in good])
         se = np.array([getattr(e, name + '_se') for e in good])
         mean = float(weight @ logs)
@@ -102,11 +99,11 @@ def disagreement(estimates: Sequence[Estimate]) -> float:
     three against its own standard errors; the error of alpha is carried over to the common alpha,
     for a segment whose alpha came out low shows too small a one.
     """
-    good = [e for e in map(_doubted, estimates) if e.usable]
+    good = [e for e in estimates if e.usable]
     if len(good) < 2:
         return NAN
     least = 1.0
-    for name in _LOG_NAMES:
+    for name in LOG_NAMES:
         logs = np.log([getattr(e, name) for e in good])
         own = np.array([getattr(e, name + '_se') for e in good])
         if name != 'sigma':
@@ -114,16 +111,7 @@ def disagreement(estimates: Sequence[Estimate]) -> float:
         weight = 1.0 / own ** 2
         chi2 = float(weight @ (logs - float(weight @ logs / weight.sum())) ** 2)
         least = min(least, float(stats.chi2.sf(chi2, len(good) - 1)))
-    return min(1.0, len(_LOG_NAMES) * least)
-
-
-def _doubted(e: Estimate) -> Estimate:
-    """Return the estimate without its numbers when they say nothing of alpha."""
-    if not e.usable or e.alpha_se <= _MAX_SE:
-        return e
-    status = Status.NO_RELAXATION if e.alpha > e.rate else Status.TOO_SHORT
-    return Estimate(t=e.t, status=status, u0=e.u0, throttle=e.throttle, flags=e.flags, n=e.n,
-                    duration=e.duration, rate=e.rate, counters=e.counters)
+    return min(1.0, len(LOG_NAMES) * least)
 
 
 def _majority(estimates: Sequence[Estimate]) -> Estimate:

@@ -213,9 +213,10 @@ def unsettled(relaxations: Sequence[Relaxation], throttles: Sequence[float],
         start = f'After throttle {what} the voltage '
         end = (f'the levels leave out only {1e3 * SETTLE:.3g} ms: alpha and sigma here include '
                'the settling')
-        if fit.detected:
+        if not fit.moves_on:
+            tau = f'= {1e3 * fit.tau:.3g}' if fit.detected else f'< {1e3 * fit.tau_high:.3g}'
             most = 100.0 * min(1.0, max(shares[x] for x in where))
-            text = (f'{start}settles in tau = {1e3 * fit.tau:.3g} ms, and {end} (up to '
+            text = (f'{start}settles in tau {tau} ms, and {end} (up to '
                     f'{most:.0f} % of the variance).')
         else:
             text = f'{start}keeps moving for the whole time observed, and {end}.'
@@ -228,13 +229,14 @@ def _share(fit: Relaxation, throttle: float, estimate: Estimate, time: float) ->
     changes = [change for change in fit.releases if change.throttle_after == throttle]
     if not changes:
         return 0.0
-    if not fit.detected:
+    tau = fit.tau if fit.detected else fit.tau_high
+    if not tau < math.inf:
         return math.inf if fit.moves_on else 0.0
     # Of A exp(-t / tau), squared, from the end of what is left out to the end of what is watched.
-    left = sum(change.amplitude ** 2 * max(0.0, math.exp(-2.0 * SETTLE / fit.tau)
-                                           - math.exp(-2.0 * change.duration / fit.tau))
+    left = sum(change.amplitude ** 2 * max(0.0, math.exp(-2.0 * SETTLE / tau)
+                                           - math.exp(-2.0 * change.duration / tau))
                for change in changes if math.isfinite(change.amplitude))
-    return 0.5 * fit.tau * left / (time * estimate.var_inf)
+    return 0.5 * tau * left / (time * estimate.var_inf)
 
 
 def line_item(throttle: float, without: Estimate, with_lines: Estimate | None) -> QualityItem:

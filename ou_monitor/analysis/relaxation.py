@@ -27,7 +27,7 @@ import math
 import numpy as np
 from ou_monitor.analysis.level_comparison import mean_variance
 from ou_monitor.analysis.steps import Step, Window
-from ou_monitor.records import Estimate, FloatArray, NAN, Recording
+from ou_monitor.records import determined, Estimate, FloatArray, NAN, Recording
 from ou_monitor.text import p_words, Z95
 from scipy import stats
 
@@ -104,8 +104,8 @@ class Relaxation:
     releases : tuple of Release
         Those fitted.
     tau, tau_low, tau_high : float
-        s, and 95 % interval; an end that the data leave open is 0 or inf; all NaN when no
-        relaxation is detected.
+        s, and 95 % interval; tau is NaN where the interval spans more than a factor of 10 either
+        way, an open end is 0 or inf; all NaN when no relaxation is detected.
     misfit : float
         Mean square of the standardised innovations: 1 when one exponential in the level's noise
         describes it.
@@ -155,9 +155,7 @@ class Relaxation:
 
     @property
     def log_se(self) -> float:
-        """Return the standard error of ln(tau); NaN when an end of the interval is open."""
-        if not (self.tau_low > 0.0 and math.isfinite(self.tau_high)):
-            return NAN
+        """Return the standard error of ln(tau), where tau is known."""
         return math.log(self.tau_high / self.tau_low) / (2.0 * Z95)
 
     def decay(self, change: Release, since: FloatArray) -> FloatArray:
@@ -166,13 +164,19 @@ class Relaxation:
 
     @property
     def detected(self) -> bool:
-        """Whether a relaxation is detected."""
+        """Whether a relaxation is detected, and its tau known."""
         return math.isfinite(self.tau)
+
+    @property
+    def bounded(self) -> bool:
+        """Whether only an upper bound of tau is known."""
+        return not self.detected and self.tau_high < math.inf
 
     @property
     def moves_on(self) -> bool:
         """Whether the voltage moves, and does not level off while watched."""
-        return not self.detected and self.likelihood_gain > _limit(len(self.releases))
+        return not (self.detected or self.bounded) and (
+            self.likelihood_gain > _limit(len(self.releases)))
 
 
 def fit_relaxation(recording: Recording, kind: str, steps: Sequence[Step],
@@ -205,7 +209,8 @@ def fit_relaxation(recording: Recording, kind: str, steps: Sequence[Step],
             float(recording.t[step.enter]), throttles[step.before], throttles[step.after],
             before, before_se, level, level_se, amplitude, amplitude_se, beyond, bound,
             float(window.since[-1]), window.n))
-    return Relaxation(kind, tuple(releases), tau, low, high, scale, drop, misfit_p, left_out)
+    return Relaxation(kind, tuple(releases), tau if determined(tau, low, high) else NAN, low, high,
+                      scale, drop, misfit_p, left_out)
 
 
 def _watched(recording: Recording, steps: Sequence[Step], estimates: Sequence[Estimate],

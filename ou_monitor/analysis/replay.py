@@ -18,7 +18,7 @@ from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.report import MonitorReport, RISK_CURVE
 from ou_monitor.online.risk.outlook import Outlook
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.records import Estimate, FloatArray, NAN, Recording
+from ou_monitor.records import Estimate, FloatArray, LARGEST_LOG_SE, NAN, Recording
 from ou_monitor.text import Z95
 
 MAX_POINTS = 300
@@ -71,9 +71,9 @@ class Sliding:
         return np.array([getattr(e, name) for e in self.estimates], dtype=np.float64)
 
     def interval(self, name: str) -> tuple[FloatArray, FloatArray]:
-        """Return the ends of the 95 % intervals of a field; an error beyond e^5 counts as that."""
+        """Return the ends of the 95 % intervals of a field."""
         value = self.series(name)
-        factor = np.exp(Z95 * np.minimum(self.series(name + '_se'), 5.0))
+        factor = np.exp(Z95 * self.series(name + '_se'))
         return value / factor, value * factor
 
 
@@ -200,7 +200,8 @@ def by_throttle(sliding: Sliding, has_throttle: bool) -> ByThrottle:
     # Without throttle all samples count as of throttle 0: that is no curve.
     known = curves.seen_curve(grid) & has_throttle
     level, level_se = (np.where(known, c, NAN) for c in curves.level_curve(grid))
-    ln_sigma, ln_sigma_se = (np.where(known, c, NAN) for c in curves.sigma_curve(grid))
+    ln_sigma, ln_sigma_se = curves.sigma_curve(grid)
+    ln_sigma = np.where(known & (ln_sigma_se <= LARGEST_LOG_SE), ln_sigma, NAN)
     last = sliding.last
     risk = unknown
     if asked and last is not None and last.risk_curve:

@@ -104,13 +104,14 @@ def _numbers(good: Sequence[LevelResult]) -> str:
                 f'relaxes in tau = {_tau(e)} ms: a standard deviation of '
                 f'{number(1e3 * math.sqrt(e.var_inf))} mV.')
     found = sigma_change(low.estimate, high.estimate)
-    factor = (f'factor {number(found.ratio)}, 95 % {number(found.ratio_low)} to '
-              f'{number(found.ratio_high)}')
+    factor = 'by a factor that is not determined' if math.isnan(found.ratio) else (
+        f'factor {number(found.ratio)}, 95 % {number(found.ratio_low)} to '
+        f'{number(found.ratio_high)}')
     if not found.differs:
         change = (f'sigma does not change measurably from {low.label} to {high.label} throttle '
                   f'({factor})')
     else:
-        verb = 'grows' if found.ratio > 1.0 else 'falls'
+        verb = 'grows' if found.ratio_low > 1.0 else 'falls'
         change = (f'sigma {verb} from {number(low.estimate.sigma)} to '
                   f'{number(high.estimate.sigma)} V/sqrt(s) from {low.label} to {high.label} '
                   f'throttle ({factor})')
@@ -168,17 +169,12 @@ def relaxation_sentence(analysis: Analysis, k: int) -> str:
     count = len(fit.releases)
     what = {'release': 'fall', 'load': 'rise'}[fit.kind]
     return (f'After {counted(count, what)} of throttle the voltage relaxes in '
-            f'tau = {number(1e3 * fit.tau)} (95 % {open_end(1e3 * fit.tau_low)} to '
-            f'{open_end(1e3 * fit.tau_high)}) ms. {_led(fit.caveat)}{cause.sentence}')
+            f'tau = {number(1e3 * fit.tau)} (95 % {number(1e3 * fit.tau_low)} to '
+            f'{number(1e3 * fit.tau_high)}) ms. {_led(fit.caveat)}{cause.sentence}')
 
 
 def _led(text: str) -> str:
     return f'{text} ' if text else ''
-
-
-def open_end(value: float) -> str:
-    """Return one end of an interval; ``open`` where the data leave it so."""
-    return number(value) if 0.0 < value < math.inf else 'open'
 
 
 def as_data(analysis: Analysis) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Term
+from ou_monitor.records import LARGEST_LOG_SE
 from ou_monitor.text import chance as shown_chance, listed, number, p_words, Z95
 
 # What a gain is counted in.
@@ -26,8 +27,6 @@ VAGUE = ('its error is more than ten times the gain, because the rest of the rec
 # What to say where there is no model to compare with.
 NO_OTHER = 'the model cannot be fitted without it.'
 NOT_KNOWN = 'not known'
-# An estimate whose error is so many times as large is none.
-_UNDETERMINED = 1e4
 
 _PLAIN = ((
     'autocorrelation', 'neighbouring prediction errors are correlated'),
@@ -65,18 +64,23 @@ def plain_words(statistic: str) -> str:
 
 def parameters(term: Term, se: Mapping[str, Any]) -> str:
     """Return the estimates of a term with units and standard errors."""
-    return '; '.join(f'{name} = {with_error(value, se.get(name))}{_unit(term, name)}'
-                     for name, value in term.values().items())
+    return '; '.join(
+        f'{name} = {with_error(value, se.get(name), positive=term.positive(name))}'
+        f'{_unit(term, name)}' for name, value in term.values().items())
 
 
-def with_error(value: Any, error: Any) -> str:
-    """Return a number, or a list of them, with its standard error where known."""
+def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
+    """
+    Return a number, or a list of them, with its standard error where known.
+
+    A positive number is not determined beyond `LARGEST_LOG_SE`, as in an `Estimate`.
+    """
     if isinstance(value, list):
         errors = error if isinstance(error, list) else [None] * len(value)
         return '[' + ', '.join(with_error(v, e) for v, e in zip(value, errors)) + ']'
     if isinstance(error, float) and math.isfinite(error) and error > 0.0:
-        if abs(value) * _UNDETERMINED < error and value != 0.0:
-            return f'{number(value, 2)} (not determined)'
+        if positive and 0.0 < LARGEST_LOG_SE * value < error:
+            return 'not determined'
         digits = min(max(2 + math.floor(math.log10(max(abs(value) / error, 1.0))), 2), 6)
         return f'{number(value, digits)} +- {number(error, 2)}'
     return number(value, 4)

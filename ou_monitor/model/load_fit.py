@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.model.load import CELL, cells_in_series, charge_at, LoadModel
-from ou_monitor.records import FloatArray, NAN
-from ou_monitor.text import Z95
+from ou_monitor.records import determined, FloatArray, log_interval, NAN
 from scipy.linalg import solve_banded
 from scipy.optimize import least_squares
 
@@ -96,8 +95,8 @@ class LoadFit:
         if not self.model.full_current:
             return NAN, NAN, NAN
         value = self.model.size * self.model.cells * CELL / self.model.full_current
-        factor = math.exp(Z95 * math.sqrt(self.covariance[0, 0]))
-        return value, value / factor, value * factor
+        low, high = log_interval(value, math.sqrt(self.covariance[0, 0]))
+        return value if determined(value, low, high) else NAN, low, high
 
 
 def _bounds(charge: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

@@ -241,7 +241,8 @@ def _parameters(finding: Finding) -> list[str]:
             value = getattr(term, spec.name)
             value = list(value) if isinstance(value, tuple) else value
             rows.append([term.NAME, spec.name,
-                         _typeset(with_error(value, se.get(spec.name))),
+                         _typeset(with_error(value, se.get(spec.name),
+                                             positive=term.positive(spec.name))),
                          spec.metadata['unit'] or UNKNOWN, spec.metadata['text']])
     about = ('Extended model: all terms fitted together on the whole recording. Its alpha and '
              'sigma describe what remains of relaxation and noise beside all causes; those of the '

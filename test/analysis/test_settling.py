@@ -34,7 +34,7 @@ def warned(analysis):
 @pytest.mark.parametrize('tau, levels', [(0.2, {0.2, 0.5}), (0.1, {0.2, 0.5}), (0.016, set())])
 def test_a_slow_sag_is_named_where_alpha_holds_it(tau, levels):
     """With 0.2 s alpha comes out less than half; with 16 ms nothing is left and nothing said."""
-    analysis = analyze(stays(tau))
+    analysis = analyze(stays(tau, seconds=4.0))
     assert warned(analysis) == set(analysis.alpha_test.withheld) == levels
     alphas = [level.estimate.alpha for level in analysis.levels]
     if tau == 0.2:

@@ -347,6 +347,11 @@ class Term:
         return next(str(spec.metadata['unit']) for spec in fields(cls) if spec.name == name)
 
     @classmethod
+    def positive(cls, name: str) -> bool:
+        """Return whether a parameter has no negative values."""
+        return next(spec.metadata['low'] >= 0.0 for spec in fields(cls) if spec.name == name)
+
+    @classmethod
     def read(cls, params: Mapping[str, Any]) -> Self:
         """
         Return a term from named values.

