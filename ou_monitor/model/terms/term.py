@@ -349,7 +349,8 @@ class Term:
     @classmethod
     def positive(cls, name: str) -> bool:
         """Return whether a parameter has no negative values."""
-        return next(spec.metadata['low'] >= 0.0 for spec in fields(cls) if spec.name == name)
+        return next(float(spec.metadata['low']) >= 0.0 for spec in fields(cls)
+                    if spec.name == name)
 
     @classmethod
     def read(cls, params: Mapping[str, Any]) -> Self:

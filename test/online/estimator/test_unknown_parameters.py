@@ -12,7 +12,8 @@ from ou_monitor.analysis.words import as_data
 from ou_monitor.cli.analyze import render
 from ou_monitor.online.estimator.fit import Fitted, Outcome
 from ou_monitor.online.estimator.quality import judge, Quality
-from ou_monitor.records import Counters, Estimate, LARGEST_FACTOR, LARGEST_LOG_SE, Recording, Status
+from ou_monitor.records import (
+    Counters, Estimate, LARGEST_FACTOR, LARGEST_LOG_SE, Recording, Status)
 import pytest
 
 NAMES = ('alpha', 'sigma', 'var_inf')
