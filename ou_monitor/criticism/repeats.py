@@ -15,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import find_step, usual_change
 from ou_monitor.criticism.stamps import on_grid
-from ou_monitor.online.estimator.quality import refresh_period, Repeats
-from ou_monitor.online.estimator.series import Batch
 from ou_monitor.records import FloatArray
+from ou_monitor.timeline.refresh import reading_places
 
 # Repeats, or runs of them, that are called so, at least; and the share of ties by chance up to
 # which the size of the changes says how many there are.
@@ -32,39 +31,22 @@ _CLEAR, _SHORT = 6.0, 3.0
 # Share at either end of the range where readings may be squeezed together.
 _END = 0.1
 _FLOAT32 = 1.2e-7
-# Samples looked at for repeats, and passed at once.
-_LOOK, _CHUNK = 200_000, 500_000
+# Samples looked at for repeats.
+_LOOK = 200_000
 
 
 def without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
                     ) -> tuple[FloatArray, FloatArray, FloatArray | None, float]:
     """Return the refreshes, and the samples a refresh: 1 where none repeats."""
-    first = max(0, (v.size - _LOOK) // 2)
-    look = v[first:first + _LOOK]
-    period = refresh_period(look)
+    places, period = reading_places(v)
     if period <= 1.0:
-        held = v[1:] == v[:-1] if _ties(look) else _stuck(v)
+        first = max(0, (v.size - _LOOK) // 2)
+        held = v[1:] == v[:-1] if _ties(v[first:first + _LOOK]) else _stuck(v)
         if not held.any():
             return t, v, u, 1.0
         fresh = np.concatenate(([True], ~held))
         return t[fresh], v[fresh], None if u is None else u[fresh], v.size / fresh.sum()
-    repeats = Repeats()
-    repeats.period = period
-    parts = []
-    for begin in range(0, v.size, _CHUNK):
-        part = slice(begin, begin + _CHUNK)
-        step = np.diff(t[part])
-        kept = repeats.drop(Batch(
-            t[part], v[part], None if u is None else u[part],
-            float(step.min(initial=math.inf)), float(step.max(initial=0.0)), False))
-        if kept is not None:
-            parts.append(kept)
-    t = np.concatenate([part.t for part in parts])
-    v = np.concatenate([part.y for part in parts])
-    known = [part.u for part in parts if part.u is not None]
-    # The first one was there before the recording began: since when is not known.
-    return (_refreshed(t[1:], period), v[1:], np.concatenate(known)[1:] if known else None,
-            period)
+    return (_refreshed(t[places], period), v[places], None if u is None else u[places], period)
 
 
 def _ties(v: FloatArray) -> bool:

@@ -22,10 +22,11 @@ from ou_monitor.online.estimator.fit import fit_window, Fitted, from_window, TRE
 from ou_monitor.online.estimator.intake import as_column, BATCH, Intake, Thinner
 from ou_monitor.online.estimator.irregular import fit_irregular, MOST
 from ou_monitor.online.estimator.quality import (
-    examine, input_flags, judge, Quality, recount, refresh_period, Repeats, TAIL, whole)
-from ou_monitor.online.estimator.series import Batch, T, U, Y
+    examine, input_flags, judge, Quality, recount, TAIL)
+from ou_monitor.online.estimator.series import T, U, Y
 from ou_monitor.online.estimator.window import FACTOR, FEWEST, LAGS, Resolution, Sums
 from ou_monitor.records import Counters, Estimate, FloatArray, NAN, Status
+from ou_monitor.timeline.refresh import Batch, refresh_period, Repeats, whole
 
 # Samples from which a fit is tried.
 MIN_SAMPLES = 20

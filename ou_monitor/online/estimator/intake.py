@@ -20,9 +20,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.estimator.compiled import COMPILED
-from ou_monitor.online.estimator.series import Batch, IntArray
+from ou_monitor.online.estimator.series import IntArray
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Counters, FloatArray, NAN
+from ou_monitor.timeline.refresh import Batch
 
 # No supply that this monitors comes near it, V; squares and cubes of what is beyond overflow.
 MOST_VOLTAGE = 1.0e6

@@ -1,25 +1,14 @@
 """
-What the input and the fit are good for: repeats, ADC steps, bias, honest errors, status, flags.
+What the input and the fit are good for: ADC steps, bias, honest errors, status, flags.
 
 In a diffusion equal neighbours have probability zero, so repeats, lattices and mass at the
 extremes are exact findings, told from the samples before any model.
-
-Repeats: a source of 100 Hz logged at 1 kHz gives each value ten times.  Taken as samples the
-repeats look like increments of zero.  They are told by the distances between changes: all equal,
-or of two neighbouring lengths where the rates have no whole ratio (3, 3, 4).  A coarse ADC makes
-ties as well, but at irregular distances; a ramp, a square wave or a ripple through a coarse ADC
-changes regularly, but by one code each time.
 
 Small-sample correction.  The restricted likelihood leaves 2/T of the bias of alpha (Tang & Chen,
 J. Econometrics 149 (2009) 65: 4/T with unknown mean, half of it from the mean).  Var_inf =
 sigma^2 / (2 alpha) is convex in alpha and unbiased already at alpha - 1/T.  Both are published,
 and users divide one by the other, so one correction serves both: 1.5/T, which leaves each high by
 0.5/(alpha T), a thirtieth of its standard error at alpha T = 126.
-
-Limits: at least two samples a refresh; where the ADC step is larger than 1.3 times the increment
-between refreshes, repeats are not told from the ADC's own ties (the flag QUANTIZED is raised
-there); nor is a source whose refreshes come early or late by more than a tenth of a period
-(standard deviation).
 """
 
 from __future__ import annotations
@@ -30,175 +19,9 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from ou_monitor.online.estimator.fit import Fitted, Outcome
-from ou_monitor.online.estimator.series import Batch
 from ou_monitor.records import Counters, Estimate, Flag, FloatArray, NAN, Status
-
-# Gaps that may differ from the pattern: lost samples, a logger that was late.
-_ODD = 0.05
-# Widest pattern, in periods: gaps of 7..13 where 10 is meant.
-_WIDEST = 0.35
-# Evidence against gaps of independent changes, nats: by chance once in 5e8.
-_EVIDENCE = 20.0
-# Share of changes that must be of another size than the commonest.
-_SIZES = 0.1
-# Least share of regular gaps with which a known period is kept.
-_KEEP = 0.8
-# Fewest gaps from which a known period is given up.
-_FEWEST = 8
-# Sizes of steps that differ by less than this share are one (rounding of float32).
-_SAME = 1e-3
-
-
-def refresh_period(y: FloatArray, known: float = 1.0) -> float:
-    """Return samples per refresh of the source (y in V)."""
-    steps = np.diff(y)
-    changes = np.flatnonzero(steps)
-    gaps = np.diff(changes).astype(np.float64)
-    if known > 1.0:
-        if gaps.size < _FEWEST:
-            return known
-        allowed = max(1.0, _WIDEST * known)
-        if (np.abs(_excess(gaps, known)) <= allowed).mean() >= _KEEP:
-            return _period(gaps, known)
-    if gaps.size < 2:
-        return 1.0
-    usual = float(np.median(gaps))
-    if usual < 2.0:
-        return 1.0
-    # Two neighbouring lengths, but not the double ones of refreshes that gave the same value.
-    period = _period(gaps, float(gaps[gaps <= 1.5 * usual].mean()))
-    distance = np.sort(np.abs(_excess(gaps, period)))
-    width = float(distance[math.ceil((1.0 - _ODD) * gaps.size) - 1])
-    # Whole samples: less than one is one of two neighbouring lengths.
-    if width >= 1.0 and width > _WIDEST * period:
-        return 1.0
-    chance = _chance(period, width, int(gaps.max()))
-    if gaps.size * _divergence(1.0 - _ODD, chance) < _EVIDENCE:
-        return 1.0
-    return period if _several_sizes(np.abs(steps[changes])) else 1.0
-
-
-def _period(gaps: FloatArray, near: float) -> float:
-    """Return the mean period of the gaps, given one close to it; outliers are left out."""
-    number = np.maximum(1.0, np.rint(gaps / near))
-    good = np.abs(gaps - near * number) <= max(1.0, _WIDEST * near)
-    return float(gaps[good].sum() / number[good].sum()) if good.any() else near
-
-
-def _excess(gaps: FloatArray, period: float) -> FloatArray:
-    """Return gaps less the nearest whole number, at least one, of periods."""
-    excess: FloatArray = gaps - period * np.maximum(1.0, np.rint(gaps / period))
-    return excess
-
-
-def _chance(period: float, width: float, longest: int) -> float:
-    """Return how many gaps of independent changes would fit the pattern (geometric law)."""
-    gaps = np.arange(1.0, max(longest, 20.0 * period) + 1.0)
-    law = np.power(1.0 - 1.0 / period, gaps - 1.0) / period
-    return float(law[np.abs(_excess(gaps, period)) <= width + 1e-9].sum())
-
-
-def _divergence(share: float, chance: float) -> float:
-    """Return the Kullback-Leibler divergence of two Bernoulli laws, nats; 0 when not above."""
-    if chance >= share:
-        return 0.0
-    return (share * math.log(share / max(chance, 1e-12))
-            + (1.0 - share) * math.log((1.0 - share) / (1.0 - chance)))
-
-
-def _several_sizes(sizes: FloatArray) -> bool:
-    """Whether a tenth of the steps are of another size than the commonest."""
-    ordered = np.sort(sizes)
-    # A new size begins where the next step is larger by more than rounding.
-    begins = np.flatnonzero(np.diff(ordered) > _SAME * ordered[1:]) + 1
-    counts = np.diff(np.concatenate(([0], begins, [ordered.size])))
-    return bool(counts.max() <= (1.0 - _SIZES) * ordered.size)
-
-
-class Repeats:
-    """
-    Drops repeats from a stream, in batches of any size; `period`: samples per refresh.
-
-    A refresh may happen to give the value of the one before: in a run that is longer than a period
-    it is put where it belongs, so that dropping repeats does not select changes.  It is passed on
-    when half a period after it has been seen.
-    """
-
-    def __init__(self) -> None:
-        self.period = 1.0
-        self.forget()
-
-    def forget(self) -> None:
-        """Take the next sample as the first one; the period stays known."""
-        self._waiting = np.empty((3, 0))
-        self._value = math.nan
-        self._place = 0
-        self._last = -math.inf
-
-    def drop(self, batch: Batch) -> Batch | None:
-        """Return the refreshes among samples; None when there are none."""
-        u = np.full(batch.t.size, NAN) if batch.u is None else batch.u
-        columns = np.concatenate([self._waiting, np.stack([batch.t, batch.y, u])], axis=1)
-        t, y, u = columns[:, self._fresh(columns)]
-        if not t.size:
-            return None
-        steps = np.diff(t, prepend=self._last)
-        self._last = float(t[-1])
-        # The first sample of all follows nothing: no pause lies before it.
-        rest = steps if steps[0] < math.inf or t.size == 1 else steps[1:]
-        return Batch(t, y, None if batch.u is None else u, float(steps.min()),
-                     float(rest.max()), batch.restart)
-
-    def _fresh(self, columns: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return which samples are refreshes; those not known yet are kept waiting."""
-        y = columns[1]
-        n = y.size
-        starts = np.concatenate(([0], np.flatnonzero(y[1:] != y[:-1]) + 1))
-        begins = starts.copy()
-        if y[0] == self._value:
-            # The first run began before these samples.
-            begins[0] = -self._place
-        sizes = np.diff(np.append(starts, n))
-        place = np.arange(n) - np.repeat(begins, sizes)
-        length = np.repeat(np.diff(np.append(begins, n)), sizes)
-        number = np.rint(place / self.period)
-        due = np.rint(number * self.period) == place
-        sure = (number == 0.0) | (length >= (number + 0.5) * self.period)
-        last = int(starts[-1])
-        unsure = np.flatnonzero(due[last:] & ~sure[last:])
-        known = last + int(unsure[0]) if unsure.size else n
-        fresh: npt.NDArray[np.bool_] = due & sure
-        fresh[known:] = False
-        self._value = float(y[-1])
-        self._place = int(place[-1]) + 1 - (n - known)
-        self._waiting = columns[:, known:].copy()
-        return fresh
-
-
-def whole(columns: FloatArray) -> Batch | None:
-    """Return a window as one batch; None when it is empty (columns in s)."""
-    t, y, u = columns[:3]
-    if not t.size:
-        return None
-    steps = np.diff(t) if t.size > 1 else np.array([math.inf])
-    return Batch(t, y, None if np.isnan(u).all() else u, float(steps.min()),
-                 float(steps.max()), restart=False)
-
-
-def refreshes(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return a series where its source was read, and samples per reading (t in s)."""
-    period = refresh_period(y) if y.size > 1 else 1.0
-    batch = whole(np.stack([t, y, np.full(t.size, NAN)]))
-    if period > 1.0 and batch is not None:
-        repeats = Repeats()
-        repeats.period = period
-        batch = repeats.drop(batch)
-    if period > 1.0 and batch is not None:
-        return batch.t, batch.y, period
-    return t, y, 1.0
-
+from ou_monitor.timeline.refresh import refresh_period
 
 # Raw samples looked at.
 TAIL = 1024

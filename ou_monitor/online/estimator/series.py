@@ -9,7 +9,6 @@ when the first throttle arrives.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -69,32 +68,6 @@ def lagged(t: FloatArray, u: FloatArray, tau: float, before: tuple[float, float,
     near = np.abs(out - u) < _SETTLED
     out[near] = u[near]
     return out
-
-
-@dataclass(slots=True)
-class Batch:
-    """
-    Clean samples in order; views that hold until the next push.
-
-    Attributes
-    ----------
-    t, y : ndarray, shape (n,)
-        Stamps (s, strictly increasing) and voltage (V).
-    u : ndarray, shape (n,), or None
-        Throttle, NaN where unknown; None: unknown throughout.
-    shortest, longest : float
-        Least and largest step, from the sample before on, s.
-    restart : bool
-        Whether everything before this batch is to be forgotten.
-
-    """
-
-    t: FloatArray
-    y: FloatArray
-    u: FloatArray | None
-    shortest: float
-    longest: float
-    restart: bool
 
 
 class Series:

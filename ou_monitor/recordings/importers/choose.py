@@ -22,12 +22,12 @@ import re
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.online.estimator.quality import refreshes
 from ou_monitor.recordings.importers.log import (
     ANY, clean, CURRENT, Inertial, LARGEST, Log, MotorSpeeds, near, rising, Series, THROTTLE,
     UNKNOWN, VOLTAGE)
 from ou_monitor.recordings.samples import check_throttle
 from ou_monitor.records import FloatArray
+from ou_monitor.timeline.refresh import refreshes
 
 # What leaves a quantity out.
 NONE = 'none'
