@@ -19,8 +19,8 @@ import sys
 
 import numpy as np
 from ou_monitor.coupling.coupling import estimate_coupling
-from ou_monitor.recordings.csv_table import read_column, read_csv
 from ou_monitor.recordings.importers.choose import choose
+from ou_monitor.recordings.importers.csv_table import read_column, read_csv
 from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import Request
 from scipy import stats
@@ -72,7 +72,8 @@ def flights(folder: Path) -> Iterator[Flight]:
     for name, file in TABLES:
         path = folder / file
         if path.exists():
-            t, voltage, throttle, *_ = read_csv(path)
+            raw = read_csv(path)
+            t, voltage, throttle = raw.t, raw.voltage, raw.throttle
             yield Flight(name, t, voltage, throttle, *_rate(path))
 
 

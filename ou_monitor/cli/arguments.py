@@ -11,7 +11,8 @@ from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
-    from ou_monitor.recordings.csv_table import CsvColumns
+    from ou_monitor.recordings.importers.csv_table import CsvColumns
+    from ou_monitor.recordings.importers.log import Series
     from ou_monitor.records import Recording
 
 _NAN = float('nan')
@@ -42,15 +43,29 @@ def read_given(args: argparse.Namespace, start: float | None, end: float | None)
     from ou_monitor.recordings.read import read_recording
 
     with Progress('reading', args.json == output.STDOUT) as progress:
-        return read_recording(
-            args.recording, msg_config=args.msg_config, voltage_topic=args.voltage_topic,
-            throttle_topic=args.throttle_topic, partial=args.partial, start=start, end=end,
-            flight=args.flight, columns=columns_given(args), progress=progress)
+        return read_recording(args.recording, **_as_given(args, start, end, progress))
+
+
+def read_given_beside(args: argparse.Namespace, start: float | None, end: float | None,
+                      ) -> tuple[Recording, Series]:
+    """Read RECORDING and the signal of the arguments, likewise (start, end in s)."""
+    from ou_monitor.recordings.read import read_beside
+
+    with Progress('reading', args.json == output.STDOUT) as progress:
+        return read_beside(args.recording, args.signal, **_as_given(args, start, end, progress))
+
+
+def _as_given(args: argparse.Namespace, start: float | None, end: float | None,
+              progress: Progress) -> dict[str, Any]:
+    return {'msg_config': args.msg_config, 'voltage_topic': args.voltage_topic,
+            'throttle_topic': args.throttle_topic, 'partial': args.partial, 'start': start,
+            'end': end, 'flight': args.flight, 'columns': columns_given(args),
+            'progress': progress}
 
 
 def columns_given(args: argparse.Namespace) -> CsvColumns | None:
     """Return the columns of a CSV that were named; None when nothing was."""
-    from ou_monitor.recordings.csv_table import CsvColumns
+    from ou_monitor.recordings.importers.csv_table import CsvColumns
 
     given = {name: getattr(args, option) for name, option in _COLUMNS.items()
              if getattr(args, option) is not None}

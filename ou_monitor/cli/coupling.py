@@ -5,20 +5,18 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 import math
-from pathlib import Path
 import shlex
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    brownout_limit, check_outputs, columns_given, part_of_recording, read_given, repeated)
-from ou_monitor.cli.output import Progress
+    brownout_limit, check_outputs, part_of_recording, read_given_beside, repeated)
 from ou_monitor.coupling.coupling import (
     Coupling, estimate_coupling, facts, headline, parts, remarks)
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
-    from ou_monitor.records import FloatArray, Recording
+    pass
 
 
 def run(args: argparse.Namespace) -> int:
@@ -28,12 +26,11 @@ def run(args: argparse.Namespace) -> int:
     start, end = part_of_recording(args.start, args.end)
 
     from ou_monitor.analysis.overview import answers, known_lines, overview
-    from ou_monitor.recordings.importers.formats import is_log
+    from ou_monitor.recordings.importers.log import UNKNOWN
 
-    if is_log(Path(args.recording)):
-        recording, t, values, unit = _of_log(args, start, end)
-    else:
-        recording, t, values, unit = _of_bag(args, start, end)
+    recording, series = read_given_beside(args, start, end)
+    t, values = series.t, series.values
+    unit = '' if series.unit == UNKNOWN else series.unit
     if start is not None or end is not None:
         # What lies outside the part has no voltage beside it, and is not counted as dropped.
         part = (t >= recording.t[0]) & (t <= recording.t[-1])
@@ -57,37 +54,6 @@ def run(args: argparse.Namespace) -> int:
         output.summary(headline(found, args.signal, unit),
                        f'{answers(seen)[0]}.', report=args.report, json=args.json)
     return 0
-
-
-def _of_log(args: argparse.Namespace, start: float | None, end: float | None,
-            ) -> tuple[Recording, FloatArray, FloatArray, str]:
-    """Return supply, stamps and values of the signal, and its unit, of a log."""
-    from ou_monitor.recordings.log_signal import read_log_signal
-
-    for option, value in (('--msg-config', args.msg_config),
-                          ('--voltage-topic', args.voltage_topic),
-                          ('--throttle-topic', args.throttle_topic)):
-        if value is not None:
-            raise InputError(f'{args.recording} is a log: {option} is for bags')
-    if any(value is not None for value in (args.time_column, args.unit, args.time_unit)):
-        raise InputError(f'{args.recording} is a log: its time and units are known')
-    with Progress('reading', args.json == output.STDOUT) as progress:
-        recording, series = read_log_signal(
-            Path(args.recording), args.signal, voltage=args.voltage_column,
-            throttle=args.throttle_column, flight=args.flight, start=start, end=end,
-            progress=progress)
-    return recording, series.t, series.values, '' if series.unit == '?' else series.unit
-
-
-def _of_bag(args: argparse.Namespace, start: float | None, end: float | None,
-            ) -> tuple[Recording, FloatArray, FloatArray, str]:
-    """Return supply, stamps and values of the signal, and its unit, of a bag or a CSV."""
-    from ou_monitor.recordings.read import read_signal, signal_unit
-
-    recording = read_given(args, start, end)
-    t, values = read_signal(args.recording, args.signal, partial=args.partial,
-                            columns=columns_given(args))
-    return recording, t, values, signal_unit(args.recording, args.signal, partial=args.partial)
 
 
 def as_data(found: Coupling, name: str, signal: str, unit: str, notes: tuple[str, ...],

@@ -1,5 +1,5 @@
 """
-Any recording -> `Recording`: .mcap, rosbag2 directory, CSV; and any scalar beside it.
+Any recording -> `Recording`: bag, CSV or log of an autopilot; and any scalar beside it.
 
 Limits: stamps of a bag are seconds of its own clock in float64, which for a clock
 that counts from 1970 resolves 0.24 us; more than that is not kept.  Stamps of a signal
@@ -15,19 +15,22 @@ import math
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.columns import batches, join
-from ou_monitor.recordings.csv_table import CsvColumns, read_column, read_csv
-from ou_monitor.recordings.importers.formats import is_log
-from ou_monitor.recordings.importers.log import UNKNOWN
+from ou_monitor.recordings.importers.choose import (
+    choose as choose_series, columns_of, drop_held, NONE, signal_of)
+from ou_monitor.recordings.importers.csv_table import CsvColumns, read_column, read_csv
+from ou_monitor.recordings.importers.formats import import_log, is_csv, is_log
+from ou_monitor.recordings.importers.log import (
+    Log, RawColumns, Request, Series, SIGNAL, UNKNOWN, VOLTAGE)
 from ou_monitor.recordings.samples import (
     check_throttle, dropped_words, known_current, late_words, overlap, part_words,
     repeated_words, SampleReader, span_words, usable_voltage)
 from ou_monitor.recordings.standard_types import IMU
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.config import FieldSpec
-from ou_monitor.text import printable
 
 # Samples of a piece, where the caller does not say.
 PIECE = 1_000_000
@@ -63,7 +66,7 @@ def read_recording(
         Whether a damaged bag is read as far as it holds; a note says so.
     start, end : float, optional
         Part to read, s after the first message of the bag (by log time) or
-        the first sample of the CSV: start <= t < end.  Of a bag only the
+        the first sample of the CSV or log: start <= t < end.  Of a bag only the
         chunks in it are read, and those before it back to the last throttle,
         which is held.
     flight : int, optional
@@ -88,30 +91,16 @@ def read_recording(
     """
     path = Path(path)
     _check_part(start, end)
-    if path.suffix.lower() == '.csv' and not path.is_dir():
-        for option, value in (('--msg-config', msg_config), ('--voltage-topic', voltage_topic),
-                              ('--throttle-topic', throttle_topic)):
-            if value is not None:
-                raise InputError(f'{path} is a CSV: {option} is for bags')
+    topics = {'--msg-config': msg_config, '--voltage-topic': voltage_topic,
+              '--throttle-topic': throttle_topic}
+    if is_csv(path):
+        _refuse_topics(path, 'a CSV', topics)
         if flight is not None:
             raise InputError(f'{path} is a CSV: --flight is for logs')
-        name = printable(path.name)
-        return _cut(tidy(*read_csv(path, columns), name, {'file': name, 'format': 'csv'}, []),
-                    start, end)
+        return _cut(tidy(read_csv(path, columns)), start, end)
     if is_log(path):
-        if columns is not None and columns != CsvColumns(None, columns.voltage, columns.throttle):
-            raise InputError(f'{path} is a log: its time and units are known')
-        for option, value in (('--msg-config', msg_config), ('--voltage-topic', voltage_topic),
-                              ('--throttle-topic', throttle_topic)):
-            if value is not None:
-                raise InputError(f'{path} is a log: {option} is for bags; convert chooses among '
-                                 'the series of a log')
-        named_series = columns or CsvColumns()
-        # Here, for bags and CSV need nothing of it.
-        from ou_monitor.recordings.write import log_as_bag
-        with log_as_bag(path, flight=flight, voltage=named_series.voltage,
-                        throttle=named_series.throttle, progress=progress) as (bag, named):
-            return named(read_recording(bag, start=start, end=end))
+        _refuse_topics(path, 'a log', topics)
+        return _of_log(path, frozenset(), columns, flight, start, end, progress)[0]
     if flight is not None or columns is not None:
         raise InputError(f'{path} is a bag: --flight is for logs, names and units of columns are '
                          'for logs and CSVs')
@@ -123,7 +112,59 @@ def read_recording(
     whole = reader.take()
     if not whole.n:
         raise InputError(_nothing(reader, start, end))
-    return replace(whole, notes=(*reader.bag_notes(), *reader.sample_notes()))
+    return _refreshed(replace(whole, notes=(*reader.bag_notes(), *reader.sample_notes())))
+
+
+def _refuse_topics(path: Path, kind: str, topics: Mapping[str, object]) -> None:
+    """Refuse options that choose among the topics of a bag."""
+    for option, value in topics.items():
+        if value is not None:
+            raise InputError(f'{path} is {kind}: {option} is for bags')
+
+
+def _of_log(path: Path, names: frozenset[str], columns: CsvColumns | None, flight: int | None,
+            start: float | None, end: float | None,
+            progress: Callable[[float], None] | None) -> tuple[Recording, Log]:
+    """Read the supply of a log, and the log with the series of these names."""
+    named = columns or CsvColumns()
+    if named != CsvColumns(None, named.voltage, named.throttle):
+        raise InputError(f'{path} is a log: its time and units are known')
+    wanted = (name for name in (named.voltage, named.throttle) if name is not None)
+    log = import_log(path, Request(flight, names.union(wanted), progress=progress))
+    chosen = choose_series(path, log, voltage=named.voltage, throttle=named.throttle,
+                           option='--{}-column')
+    whole = tidy(columns_of(path, log, chosen))
+    if chosen.throttle is None and named.throttle != NONE:
+        whole = replace(whole, notes=(*whole.notes, 'The throttle is unknown: the log holds '
+                                                    'none (--throttle-column NAME).'))
+    return _cut(_refreshed(whole), start, end), log
+
+
+def _refreshed(recording: Recording) -> Recording:
+    """Drop what a logger repeats between two readings: of a log, and of a bag made of one."""
+    source = recording.source
+    if not _is_logged(source):
+        # `convert` did it already, and wrote what it did.
+        told = [source['held_samples']] if 'held_samples' in source else []
+        return replace(recording, notes=(*recording.notes, *told))
+    volts = Series(source.get('voltage', source.get('voltage_field', VOLTAGE)), VOLTAGE,
+                   recording.t, recording.voltage, '1')
+    kept, words = drop_held(volts)
+    return _samples(recording, np.isin(recording.t, kept.t), (*recording.notes, words))
+
+
+def _is_logged(source: Mapping[str, str]) -> bool:
+    """Whether a recording is a log, or a bag of all samples of one, by its source."""
+    return ('held_samples' not in source
+            and source.get('log_format', source['format']) not in ('csv', 'mcap'))
+
+
+def _samples(recording: Recording, which: slice | npt.NDArray[np.bool_], notes: tuple[str, ...],
+             ) -> Recording:
+    """Return some samples of a recording."""
+    return replace(recording, t=recording.t[which], voltage=recording.voltage[which],
+                   throttle=recording.throttle[which], notes=notes,
+                   current=None if recording.current is None else recording.current[which])
 
 
 def read_pieces(
@@ -137,7 +178,8 @@ def read_pieces(
 
     One after another the pieces are what `read_recording` returns, as long as
     no sample comes more than `samples` samples late; one that does is dropped,
-    and a note of its piece says so.  A CSV is read whole all the same.
+    and a note of its piece says so.  A CSV, a log and a bag made of one by
+    `convert` are read whole all the same.
 
     Parameters
     ----------
@@ -165,19 +207,25 @@ def read_pieces(
     if samples < 1:
         raise ValueError(f'a piece must hold at least 1 sample, got {samples}')
     path = Path(path)
-    if path.suffix.lower() == '.csv' and not path.is_dir():
+    whole: Recording | None = None
+    if is_csv(path) or is_log(path):
         whole = read_recording(path, msg_config=msg_config, voltage_topic=voltage_topic,
-                               throttle_topic=throttle_topic, start=start, end=end)
+                               throttle_topic=throttle_topic, start=start, end=end,
+                               progress=progress)
+    else:
+        _check_part(start, end)
+        reader = SampleReader(
+            BagReader(path, partial=partial), msg_config=msg_config, voltage_topic=voltage_topic,
+            throttle_topic=throttle_topic, start=start, end=end)
+        if _is_logged(reader.source):
+            whole = read_recording(path, msg_config=msg_config, voltage_topic=voltage_topic,
+                                   throttle_topic=throttle_topic, partial=partial, start=start,
+                                   end=end, progress=progress)
+    if whole is not None:
         for first in range(0, whole.n, samples):
-            part = slice(first, first + samples)
-            yield replace(whole, t=whole.t[part], voltage=whole.voltage[part],
-                          throttle=whole.throttle[part], notes=whole.notes if first == 0 else (),
-                          current=None if whole.current is None else whole.current[part])
+            yield _samples(whole, slice(first, first + samples),
+                           whole.notes if first == 0 else ())
         return
-    _check_part(start, end)
-    reader = SampleReader(
-        BagReader(path, partial=partial), msg_config=msg_config, voltage_topic=voltage_topic,
-        throttle_topic=throttle_topic, start=start, end=end)
     notes = reader.bag_notes()
     # One piece is kept back, so that the last one can carry the notes on all.
     ready: Recording | None = None
@@ -207,11 +255,10 @@ def _taken(
             yield piece
 
 
-def tidy(
-    t: FloatArray, voltage: FloatArray, throttle: FloatArray, current: FloatArray, name: str,
-    source: dict[str, str], notes: list[str],
-) -> Recording:
+def tidy(raw: RawColumns) -> Recording:
     """Return a `Recording`: finite, in order, each stamp once; notes say what that took."""
+    t, voltage, throttle, current = raw.t, raw.voltage, raw.throttle, raw.current
+    name, notes = raw.name, list(raw.notes)
     check_throttle(name, throttle, voltage)
     good = usable_voltage(t, voltage)
     if not good.all():
@@ -233,7 +280,7 @@ def tidy(
     if t.size > 2 and (spacing := float(np.median(np.diff(t)))) >= _SPARSE:
         notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '
                      '--time-unit says so of a CSV.')
-    return Recording(t, voltage, throttle, name, source, tuple(notes), known_current(current))
+    return Recording(t, voltage, throttle, name, raw.source, tuple(notes), known_current(current))
 
 
 def _unusable(name: str, notes: Sequence[str]) -> str:
@@ -267,14 +314,36 @@ def _cut(recording: Recording, start: float | None, end: float | None) -> Record
     part = (t >= (start or 0.0)) & (t < (math.inf if end is None else end))
     if not part.any():
         raise InputError(_outside(recording.name, start, end, float(t[-1])))
-    return replace(recording, t=recording.t[part], voltage=recording.voltage[part],
-                   throttle=recording.throttle[part],
-                   current=None if recording.current is None else recording.current[part],
-                   notes=(*recording.notes, part_words(start, end)))
+    return _samples(recording, part, (*recording.notes, part_words(start, end)))
 
 
 def _outside(name: str, start: float | None, end: float | None, length: float) -> str:
     return f'{name} holds no sample {span_words(start, end)}: it lasts {length:.3f} s'
+
+
+def read_beside(
+    path: str | Path, signal: str, *, msg_config: str | Path | None = None,
+    voltage_topic: str | None = None, throttle_topic: str | None = None, partial: bool = False,
+    start: float | None = None, end: float | None = None, flight: int | None = None,
+    columns: CsvColumns | None = None, progress: Callable[[float], None] | None = None,
+) -> tuple[Recording, Series]:
+    """Read a recording as `read_recording`, and the whole of one scalar; a log is read once."""
+    path = Path(path)
+    if is_log(path):
+        _check_part(start, end)
+        _refuse_topics(path, 'a log', {
+            '--msg-config': msg_config, '--voltage-topic': voltage_topic,
+            '--throttle-topic': throttle_topic})
+        recording, log = _of_log(path, frozenset((signal,)), columns, flight, start, end,
+                                 progress)
+        series, said = signal_of(path, log, signal)
+        return replace(recording, notes=(*recording.notes, *said)), series
+    recording = read_recording(
+        path, msg_config=msg_config, voltage_topic=voltage_topic, throttle_topic=throttle_topic,
+        partial=partial, start=start, end=end, flight=flight, columns=columns, progress=progress)
+    t, values = read_signal(path, signal, partial=partial, columns=columns)
+    unit = signal_unit(path, signal, partial=partial) or UNKNOWN
+    return recording, Series(signal, SIGNAL, t, values, '1', own_unit=unit)
 
 
 def read_signal(path: str | Path, signal: str, *, partial: bool = False,
@@ -283,7 +352,7 @@ def read_signal(path: str | Path, signal: str, *, partial: bool = False,
     path = Path(path)
     if not signal:
         raise InputError('the name of the signal is empty: TOPIC/FIELD or a column')
-    if path.suffix.lower() == '.csv' and not path.is_dir():
+    if is_csv(path):
         return read_column(path, signal, columns)
     bag = BagReader(path, partial=partial)
     topic, field = _split(path, signal, bag.topics)
@@ -302,7 +371,7 @@ def read_signal(path: str | Path, signal: str, *, partial: bool = False,
 def signal_unit(path: str | Path, signal: str, *, partial: bool = False) -> str:
     """Return the unit of a scalar of a bag; empty where nothing states it."""
     path = Path(path)
-    if path.suffix.lower() == '.csv' and not path.is_dir():
+    if is_csv(path):
         return ''
     bag = BagReader(path, partial=partial)
     topic, field = _split(path, signal, bag.topics)

@@ -12,21 +12,18 @@ series std_msgs/Float64; the unit of each is in the metadata of its topic.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import heapq
 import math
 from pathlib import Path
-import tempfile
 from types import TracebackType
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagWriter
-from ou_monitor.recordings.importers.choose import choose, Chosen, drop_held, Extras, SPEEDS
-from ou_monitor.recordings.importers.formats import import_log
-from ou_monitor.recordings.importers.log import Inertial, MotorSpeeds, Request, Series
+from ou_monitor.recordings.importers.choose import Chosen, Extras, SPEEDS
+from ou_monitor.recordings.importers.log import Inertial, MotorSpeeds, Series
 from ou_monitor.recordings.standard_types import (
     BATTERY_STATE, encode_battery, encode_block, encode_imu, encode_joints, encode_scalars,
     FLOAT32, FLOAT32_ARRAY, FLOAT64, IMU, JOINT_STATE)
@@ -324,28 +321,3 @@ def _messages(place: int, stamps: Stamps, stream: _Stream) -> Iterator[Timed]:
         for t, message in zip(stamps[part].tolist(), stream.encode(stamps[part], part),
                               strict=True):
             yield t, place, message
-
-
-@contextmanager
-def log_as_bag(path: Path, *, flight: int | None = None, voltage: str | None = None,
-               throttle: str | None = None,
-               progress: Callable[[float], None] | None = None,
-               ) -> Iterator[tuple[Path, Callable[[Recording], Recording]]]:
-    """Yield the bag of a log, and what gives a recording of it the name and notes of the log."""
-    log = import_log(path, Request(
-        flight, frozenset(one for one in (voltage, throttle) if one), progress=progress))
-    chosen = choose(path, log, voltage=voltage, throttle=throttle, option='--{}-column')
-    volts, held = drop_held(chosen.voltage)
-    chosen = replace(chosen, voltage=volts)
-
-    def named(recording: Recording) -> Recording:
-        source = {'file': path.name, 'format': log.format, 'voltage': volts.name}
-        if chosen.throttle is not None:
-            source['throttle'] = chosen.throttle.name
-        return replace(recording, name=path.name, source={**source, **log.facts},
-                       notes=(*log.notes, *chosen.notes, held, *recording.notes))
-
-    with tempfile.TemporaryDirectory(prefix='ou_monitor_') as folder:
-        bag = Path(folder) / 'log.mcap'
-        write_log(chosen, bag, {})
-        yield bag, named

@@ -227,5 +227,5 @@ def test_a_log_is_taken_as_it_is(logs, tmp_path, capsys):
             (['--signal', 'debug/angular_velocity.x'], "no gyro 'debug'"),
             (['--signal', 'motor[0]', '--msg-config', 'x'], 'is for bags'),
             (['--signal', 'motor[0]', '--flight', '2'], 'no flight 2'),
-            (['--signal', 'motor[0]', '--from', '90'], 'holds no voltage')):
+            (['--signal', 'motor[0]', '--from', '90'], 'holds no sample')):
         assert words in failure(capsys, path, *arguments)

@@ -33,7 +33,7 @@ from ou_monitor.model.terms.measurement_noise import MeasurementNoise
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.second_relaxation import SecondRelaxation
 from ou_monitor.model.terms.tone import lines_of
-from ou_monitor.recordings.csv_table import CsvColumns
+from ou_monitor.recordings.importers.csv_table import CsvColumns
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import NAN, Recording
 from project import ROOT

@@ -2,7 +2,7 @@
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.csv_table import CsvColumns, read_csv
+from ou_monitor.recordings.importers.csv_table import CsvColumns, read_csv
 from ou_monitor.recordings.read import read_recording
 import pytest
 
@@ -25,7 +25,8 @@ def written(tmp_path, text, encoding='utf-8'):
 ])
 def test_good_ones(tmp_path, text):
     """Delimiters, order, extra columns, comments, blank lines and quotes."""
-    t, voltage, throttle, _ = read_csv(written(tmp_path, text))
+    raw = read_csv(written(tmp_path, text))
+    t, voltage, throttle = raw.t, raw.voltage, raw.throttle
     assert t.tolist() == [0.0, 1.0]
     assert voltage.tolist() == [5.0, 5.5]
     assert throttle.tolist() == [0.1, 0.2]
@@ -119,5 +120,5 @@ def test_swapped_columns_and_odd_times_are_told(tmp_path):
         read_csv(csv(1e6 * times, volts))
     # Sorted by another column, or told in its unit, it is a recording.
     read_csv(csv(times[::-1], volts))
-    t, *_ = read_csv(csv(1e6 * times, volts), CsvColumns(time_unit='us'))
+    t = read_csv(csv(1e6 * times, volts), CsvColumns(time_unit='us')).t
     np.testing.assert_allclose(t, times, rtol=0.0, atol=1e-9)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.csv_table import CsvColumns
+from ou_monitor.recordings.importers.csv_table import CsvColumns
 from ou_monitor.recordings.read import read_recording
 import pytest
 
@@ -14,14 +14,15 @@ REAL = os.environ.get('OU_MONITOR_REALDATA')
 
 
 @pytest.mark.skipif(REAL is None, reason='OU_MONITOR_REALDATA names no folder of recordings')
+@pytest.mark.parametrize('options', [(), ('--drop-held',)])
 @pytest.mark.parametrize('file,package,voltage', [
     ('bf_3s_erpm2.bbl', 'orangebox', None), ('ac_erle_althold2.BIN', 'pymavlink', None),
     ('px_sample_log_small.ulg', 'pyulog', 'battery_status[1].voltage_v')])
-def test_a_log_is_what_its_bag_would_be(file, package, voltage, tmp_path):
+def test_a_log_is_what_its_bag_would_be(file, package, voltage, options, tmp_path):
     """Samples, throttle, and the notes of the conversion; the name is that of the log."""
     pytest.importorskip(package)
     log = Path(REAL) / 'raw' / file
-    assert main(['convert', str(log), str(tmp_path / 'bag'), '--drop-held',
+    assert main(['convert', str(log), str(tmp_path / 'bag'), *options,
                  *(() if voltage is None else ('--voltage', voltage))]) == 0
     columns = None if voltage is None else CsvColumns(voltage=voltage)
     wanted = read_recording(tmp_path / 'bag')

@@ -10,7 +10,7 @@ import lz4.frame
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagReader, BagWriter
-from ou_monitor.recordings.importers.csv_log import MOST_COLUMNS
+from ou_monitor.recordings.importers.csv_table import MOST_COLUMNS
 from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import Request
 from ou_monitor.recordings.mcap_records import find_by_index, find_messages, MAGIC, Op

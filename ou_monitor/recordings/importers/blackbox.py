@@ -4,15 +4,21 @@ Betaflight and INAV blackbox, read by orangebox.
 Limits first: the ADC is read more slowly than is logged, so most voltages are
 repeats (``--drop-held``).  Frames that were predicted from damaged ones are
 left out up to the next key frame.  orangebox is under GPL-3; nothing of it is
-loaded for other formats.
+loaded for other formats.  The axes are Betaflight's own (x forwards, y left, z up),
+which are those of `base_link`.
+
+Scales are those of Betaflight's viewer (flightlog_parser, flightlog_fields_presenter) and of
+the header: `gyro_scale`, `acc_1G`, `motor_poles`, `blackbox_high_resolution`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+import math
 from operator import itemgetter
 from pathlib import Path
 import re
+import struct
 from typing import Any
 
 import numpy as np
@@ -20,9 +26,9 @@ from orangebox import Parser
 from orangebox.reader import Reader
 from orangebox.types import FrameType
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.importers import blackbox_motion
 from ou_monitor.recordings.importers.log import (
-    CURRENT, Flight, from_start, Log, quiet, Request, Series, start_of, THROTTLE, VOLTAGE)
+    CURRENT, DEGREE, Flight, from_start, GRAVITY, Inertial, Log, MotorSpeeds, quiet, Request, RPM,
+    Series, SIGNAL, start_of, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import FloatArray
 
 # The clock counts us in 32 bits.
@@ -32,6 +38,16 @@ WRAP = 2**32
 _PAUSE = 10.0
 # Fewest frames after a step in time that are a part of the flight and not broken bytes.
 _PART = 16
+
+GYRO, UNFILTERED, DEBUG, ACCELEROMETER = 'gyroADC', 'gyroUnfilt', 'debug', 'accSmooth'
+ERPM = 'eRPM'
+# debug_mode GYRO_SCALED of Betaflight 4.0 to 4.5: the gyro before its filters, deg/s.
+_GYRO_SCALED, _FIRST, _LAST = 6, (4, 0, 0), (4, 6, 0)
+# A scale below this is in rad/us, as Baseflight had it, not in deg/s.
+_BASEFLIGHT = 1e-3
+
+Fields = dict[str, FloatArray]
+Headers = dict[str, Any]
 
 _FIRMWARE = re.compile(r'(Betaflight|Cleanflight|INAV|EmuFlight)\s+(\d+)\.(\d+)\.?(\d*)', re.I)
 
@@ -96,10 +112,10 @@ def read(path: Path, request: Request) -> Log:
                      f'the largest ({length}): --flight N chooses another.')
     series = [*_battery(t, columns, headers, notes), *_throttles(t, columns, headers)]
     known = {one.name for one in series}
-    shows_gyro = blackbox_motion.shows_gyro(headers, *_version(headers))
-    series += blackbox_motion.signals(t, columns, headers, known, debug_gyro=shows_gyro)
-    inertial, speeds = blackbox_motion.motion(t, columns, headers, notes, debug_gyro=shows_gyro,
-                                              poles=request.poles)
+    shows_gyro = _shows_gyro(headers, *_version(headers))
+    series += _signals(t, columns, headers, known, debug_gyro=shows_gyro)
+    inertial, speeds = _motion(t, columns, headers, notes, debug_gyro=shows_gyro,
+                               poles=request.poles)
     start = start_of(series)
     return Log('blackbox', from_start(series, start), facts, tuple(notes),
                from_start(inertial, start),
@@ -168,7 +184,7 @@ def _in_time(table: FloatArray) -> tuple[FloatArray, int]:
     return kept, len(table) - len(kept)
 
 
-def _facts(headers: dict[str, Any]) -> dict[str, str]:
+def _facts(headers: Headers) -> dict[str, str]:
     facts = {}
     for fact, key in (('firmware', 'Firmware revision'), ('vehicle', 'Craft name'),
                       ('board', 'Board information'), ('started', 'Log start datetime')):
@@ -179,7 +195,7 @@ def _facts(headers: dict[str, Any]) -> dict[str, str]:
     return facts
 
 
-def _version(headers: dict[str, Any]) -> tuple[str, tuple[int, int, int]]:
+def _version(headers: Headers) -> tuple[str, tuple[int, int, int]]:
     """Return the firmware and its version; ('', (0, 0, 0)) when unknown."""
     found = _FIRMWARE.search(str(headers.get('Firmware revision', '')))
     if found is None:
@@ -188,7 +204,7 @@ def _version(headers: dict[str, Any]) -> tuple[str, tuple[int, int, int]]:
     return found[1].lower(), (major, minor, patch)
 
 
-def _battery_scales(headers: dict[str, Any]) -> tuple[float | None, float | None]:
+def _battery_scales(headers: Headers) -> tuple[float | None, float | None]:
     """
     Return V and A per unit; None where it is not known.
 
@@ -214,7 +230,7 @@ def _battery_scales(headers: dict[str, Any]) -> tuple[float | None, float | None
     return None, None
 
 
-def _battery(t: FloatArray, columns: dict[str, FloatArray], headers: dict[str, Any],
+def _battery(t: FloatArray, columns: Fields, headers: Headers,
              notes: list[str]) -> Iterator[Series]:
     volts, amperes = _battery_scales(headers)
     for field, quantity, words, rank in (
@@ -236,8 +252,8 @@ def _battery(t: FloatArray, columns: dict[str, FloatArray], headers: dict[str, A
         yield one
 
 
-def _throttles(t: FloatArray, columns: dict[str, FloatArray],
-               headers: dict[str, Any]) -> Iterator[Series]:
+def _throttles(t: FloatArray, columns: Fields,
+               headers: Headers) -> Iterator[Series]:
     motors = [name for name in columns if name.startswith('motor[')]
     low, high = _pair(headers.get('motorOutput')) or _pair(
         [headers.get('minthrottle'), headers.get('maxthrottle')]) or (1000.0, 2000.0)
@@ -247,7 +263,7 @@ def _throttles(t: FloatArray, columns: dict[str, FloatArray],
                      f'(mean of {len(motors)} motors - {low:g}) / {high - low:g}',
                      f'mean of {len(motors)} motors', 0)
     if 'rcCommand[3]' in columns:
-        finer = blackbox_motion.high_resolution(headers)
+        finer = _high_resolution(headers)
         yield Series('rcCommand[3]', THROTTLE, t,
                      (_signed(columns['rcCommand[3]']) / finer - 1000.0) / 1000.0,
                      f'(x / {finer:g} - 1000) / 1000' if finer > 1.0 else '(x - 1000) / 1000',
@@ -272,3 +288,121 @@ def _pair(value: Any) -> tuple[float, float] | None:
             isinstance(x, (int, float)) for x in value) and value[1] > value[0]:
         return float(value[0]), float(value[1])
     return None
+
+
+def _high_resolution(headers: Headers) -> float:
+    """Return by what gyro, sticks and setpoints are larger than usual: 1 or 10."""
+    return 10.0 if _number(headers, 'blackbox_high_resolution') else 1.0
+
+
+def _motion(t: FloatArray, columns: Fields, headers: Headers, notes: list[str], *,
+            debug_gyro: bool, poles: int | None,
+            ) -> tuple[tuple[Inertial, ...], MotorSpeeds | None]:
+    """Return gyros with the accelerometer, and motor speeds (t in s)."""
+    acc = _three(columns, ACCELEROMETER)
+    one_g = _number(headers, 'acc_1G')
+    if acc is not None and not one_g:
+        notes.append('accSmooth was left out of /imu: the header does not state acc_1G.')
+        acc = None
+    scaled = None if acc is None else acc * (GRAVITY / one_g)
+    words = f'accSmooth {GRAVITY:g} / {one_g:g}' if scaled is not None else 'no accelerometer'
+    inertial = []
+    gyro = _gyro_scale(headers)
+    for name, scale, rank, what in (
+            (GYRO, gyro, 0, "gyro after the autopilot's filters"),
+            (UNFILTERED, gyro, 1, 'gyro before the filters'),
+            (DEBUG, DEGREE if debug_gyro else None, 2,
+             'gyro before the filters (debug_mode GYRO_SCALED)')):
+        values = _three(columns, name)
+        if values is None or (name == DEBUG and not debug_gyro):
+            continue
+        if scale is None:
+            notes.append(f'{name} was left out of /imu: the header does not state gyro_scale.')
+            continue
+        inertial.append(Inertial(name, t, values * scale, scaled, f'{name} {scale:.6g}, {words}',
+                                 what, rank))
+    return tuple(inertial), _speeds(t, columns, headers, notes, poles)
+
+
+def _shows_gyro(headers: Headers, firmware: str, version: tuple[int, int, int]) -> bool:
+    """Whether the debug fields hold the gyro before its filters."""
+    return (firmware == 'betaflight' and _FIRST <= version < _LAST
+            and headers.get('debug_mode') == _GYRO_SCALED)
+
+
+def _gyro_scale(headers: Headers) -> float | None:
+    """Return rad/s per unit of the gyro; None where the header does not state it."""
+    raw: Any = headers.get('gyro_scale', headers.get('gyro.scale'))
+    try:
+        # The bits of a float, written as a whole number.
+        bits = int(raw, 16) if isinstance(raw, str) else int(raw)
+        scale = float(struct.unpack('<f', struct.pack('<I', bits))[0])
+    except (TypeError, ValueError, struct.error, OverflowError):
+        return None
+    if not (math.isfinite(scale) and scale > 0.0):
+        return None
+    if scale < _BASEFLIGHT:
+        return scale * 1e6
+    return scale * DEGREE / _high_resolution(headers)
+
+
+def _signals(t: FloatArray, columns: Fields, headers: Headers, known: set[str], *,
+             debug_gyro: bool) -> Iterator[Series]:
+    """Yield the fields that are nothing else, in SI where their unit is known (t in s)."""
+    gyro, one_g = _gyro_scale(headers), _number(headers, 'acc_1G')
+    rates = DEGREE / _high_resolution(headers)
+    for name, values in columns.items():
+        stem = name.partition('[')[0]
+        if name == 'time' or name in known:
+            continue
+        scale, unit, words = 1.0, UNKNOWN, 'as logged'
+        if stem in (GYRO, UNFILTERED) and gyro is not None:
+            scale, unit, words = gyro, 'rad/s', 'gyro'
+        elif stem == DEBUG and debug_gyro and not name.endswith('[3]'):
+            scale, unit, words = DEGREE, 'rad/s', 'gyro before the filters'
+        elif stem == ACCELEROMETER and one_g:
+            scale, unit, words = GRAVITY / one_g, 'm/s^2', 'accelerometer'
+        elif stem == 'setpoint':
+            scale, unit, words = rates, 'rad/s', 'rate asked for'
+        elif stem == 'BaroAlt':
+            scale, unit, words = 0.01, 'm', 'altitude by the barometer'
+        yield Series(name, SIGNAL, t, values * scale, f'{scale:.6g}', words, own_unit=unit)
+
+
+def _speeds(t: FloatArray, columns: Fields, headers: Headers, notes: list[str],
+            poles: int | None) -> MotorSpeeds | None:
+    fields = sorted((name for name in columns if name.startswith(f'{ERPM}[')), key=_place)
+    if not fields:
+        return None
+    stated = _number(headers, 'motor_poles')
+    count = poles or int(stated)
+    if count < 2:
+        notes.append('eRPM was left out: the header does not state motor_poles; give --poles N, '
+                     'the magnets of a rotor (14 is common).')
+        return None
+    # Logged are hundreds of electrical turns a minute, of which a pair of poles makes one.
+    scale = 100.0 * RPM * 2.0 / count
+    values = np.column_stack([columns[name] for name in fields]) * scale
+    origin = '--poles' if poles else 'the header'
+    return MotorSpeeds(tuple(f'motor_{_place(name)}' for name in fields), t, values,
+                       f'eRPM {scale:.6g}', f'rotor speed, {count} poles by {origin}')
+
+
+def _place(name: str) -> int:
+    digits = name.partition('[')[2].rstrip(']')
+    return int(digits) if digits.isdigit() else 0
+
+
+def _three(columns: Fields, stem: str) -> FloatArray | None:
+    """Return three axes as rows of (n, 3); None when one is missing."""
+    names = [f'{stem}[{axis}]' for axis in range(3)]
+    if not all(name in columns for name in names):
+        return None
+    return np.column_stack([columns[name] for name in names])
+
+
+def _number(headers: Headers, key: str) -> float:
+    """Return a positive number of the header; 0 when it states none."""
+    value = headers.get(key)
+    good = isinstance(value, (int, float)) and math.isfinite(value) and value > 0
+    return float(value) if good and value is not None else 0.0

@@ -1,5 +1,5 @@
 """
-What of a log goes into a bag: voltage, throttle, current, gyros, speeds, named series.
+What is taken from a log: voltage, throttle, current, gyros, speeds, named series.
 
 The battery is meant when nothing is said, never a rail behind a regulator; of
 several batteries the user chooses.  For the throttle the smallest rank is
@@ -23,10 +23,11 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers.log import (
-    ANY, clean, CURRENT, Inertial, LARGEST, Log, MotorSpeeds, near, rising, Series, THROTTLE,
-    UNKNOWN, VOLTAGE)
+    ANY, clean, CURRENT, Inertial, LARGEST, Log, MotorSpeeds, near, RawColumns, rising, Series,
+    SIGNAL, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.recordings.samples import check_throttle
 from ou_monitor.records import FloatArray
+from ou_monitor.text import printable
 from ou_monitor.timeline.refresh import refreshes
 
 # What leaves a quantity out.
@@ -96,6 +97,43 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
                          + ''.join(f' ({note})' for note in notes))
     notes += _also(log, (volts, first), option)
     return Chosen(chosen[0], chosen[1], chosen[2], tuple(notes))
+
+
+def columns_of(path: Path, log: Log, chosen: Chosen) -> RawColumns:
+    """
+    Return the samples of a log as `convert` writes them and a bag returns them.
+
+    Stamps to 1 ns, values as float32: a log and the bag made of it give equal results.
+    """
+    volts = chosen.voltage
+    t = _in_a_bag(volts.t)
+    held = {}
+    for one in (chosen.throttle, chosen.current):
+        if one is not None:
+            # A value holds until the next one.
+            place = np.searchsorted(_in_a_bag(one.t), t, 'right')
+            held[one.quantity] = np.append(np.nan, _single(one.values))[place]
+    taken = {quantity: one for quantity, one in (
+        (VOLTAGE, volts), (THROTTLE, chosen.throttle), (CURRENT, chosen.current))
+        if one is not None}
+    unknown = np.full(volts.n, np.nan)
+    return RawColumns(
+        t, _single(volts.values), held.get(THROTTLE, unknown), held.get(CURRENT, unknown),
+        printable(path.name),
+        {'file': printable(path.name), 'format': log.format,
+         **{quantity: one.name for quantity, one in taken.items() if quantity != CURRENT},
+         **log.facts},
+        (*log.notes, *chosen.notes), {quantity: one.scale for quantity, one in taken.items()})
+
+
+def _in_a_bag(t: FloatArray) -> FloatArray:
+    """Return stamps as a message holds them: whole seconds and ns (t in s)."""
+    whole, rest = np.divmod(np.rint(t * 1e9), 1e9)
+    return whole + rest * 1e-9
+
+
+def _single(values: FloatArray) -> FloatArray:
+    return values.astype(np.float32).astype(np.float64)
 
 
 def default(log: Log, quantity: str) -> list[Series]:
@@ -282,6 +320,52 @@ def named_series(path: Path, log: Log, name: str) -> Series:
     if hint.startswith('valid:'):
         hint = 'see --list of convert'
     raise InputError(f"{path} has no series '{name}': {hint}")
+
+
+def signal_of(path: Path, log: Log, signal: str) -> tuple[Series, tuple[str, ...]]:
+    """Return a series by its name or by the topic that `convert` gives it, and notes on it."""
+    if not signal:
+        raise InputError('the name of the signal is empty: see convert LOG --list')
+    series, said = clean(_of_topic(path, log, signal) or named_series(path, log, signal))
+    if not series.n:
+        raise InputError(f'{path}: {signal} has no usable sample' + ''.join(
+            f' ({sentence})' for sentence in said))
+    return series, tuple(f'{signal}: {sentence}'
+                         for sentence in (*said, *pace_notes(series.t)))
+
+
+_RATE, _FORCE = 'angular_velocity', 'linear_acceleration'
+
+
+def _of_topic(path: Path, log: Log, signal: str) -> Series | None:
+    """Return a series of a topic of `convert`: NAME/angular_velocity.x, motor_speed/..."""
+    found = re.fullmatch(rf'/?(.+)/({_RATE}|{_FORCE})\.([xyz])', signal)
+    if found is not None:
+        name, field, axis = found.groups()
+        held = (default_inertial(log) if name == IMU else
+                [one for one in log.inertial if one.name == name])
+        if not held:
+            known = ', '.join(one.name for one in log.inertial) or 'none'
+            raise InputError(f"{path} has no gyro '{name}': it holds {known}")
+        one, _ = clean_inertial(held[0])
+        values = one.angular_velocity if field == _RATE else one.acceleration
+        if values is None:
+            raise InputError(f"{path}: {held[0].name} has no {field.replace('_', ' ')}")
+        return Series(signal, SIGNAL, one.t, values[:, 'xyz'.index(axis)], one.scale,
+                      own_unit='rad/s' if field == _RATE else 'm/s^2')
+    found = re.fullmatch(rf'/?{SPEEDS}/velocity\[(\d+)\]', signal)
+    if found is None:
+        return None
+    if log.speeds is None:
+        raise InputError(f'{path} holds no motor speeds'
+                         + ''.join(f' ({note})' for note in log.notes if 'eRPM' in note))
+    speeds, _ = clean_speeds(log.speeds)
+    place = int(found[1])
+    if place >= len(speeds.names):
+        raise InputError(f'{path} holds {len(speeds.names)} motor speeds: velocity[{place}] is '
+                         'not there')
+    return Series(signal, SIGNAL, speeds.t, speeds.values[:, place], speeds.scale,
+                  own_unit='rad/s')
 
 
 def topic_of(name: str) -> str:

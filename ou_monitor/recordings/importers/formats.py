@@ -77,7 +77,7 @@ FORMATS = (
            lambda head: head.startswith(BLACKBOX),
            'ou_monitor.recordings.importers.blackbox', 'orangebox', 'blackbox'),
     Format('csv', 'CSV with the column time_s (.csv)', _is_text,
-           'ou_monitor.recordings.importers.csv_log'),
+           'ou_monitor.recordings.importers.csv_table'),
 )
 
 
@@ -101,6 +101,11 @@ def detect(path: Path) -> Format:
             return one
     raise InputError(f"'{path}' cannot be converted: it begins like none of the formats read "
                      'today: ' + '; '.join(one.words for one in FORMATS))
+
+
+def is_csv(path: Path) -> bool:
+    """Return whether a path names a CSV: a recording, whatever its first bytes."""
+    return path.suffix.lower() == '.csv' and not path.is_dir()
 
 
 def is_log(path: Path) -> bool:

@@ -214,6 +214,28 @@ class Log:
     names: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, eq=False)
+class RawColumns:
+    """Samples of a supply as a file holds them: neither in order nor each stamp once."""
+
+    # Stamps, s; NaN where not known.
+    t: FloatArray
+    # V, with every repeat that the logger wrote; NaN where not known.
+    voltage: FloatArray
+    # 0..1, held from its last value on; NaN where not known.
+    throttle: FloatArray
+    # A, positive while the battery is drained; NaN where not known.
+    current: FloatArray
+    # Of the file, printable.
+    name: str
+    # What is known of its origin: file, format, the series taken, firmware.
+    source: dict[str, str]
+    # What was dropped or could not be read, one sentence each.
+    notes: tuple[str, ...] = ()
+    # Quantity -> how its SI values were made from what is logged, where the file says so.
+    scales: dict[str, str] = field(default_factory=dict)
+
+
 @dataclass(frozen=True)
 class Request:
     """

@@ -11,14 +11,14 @@ from made_logs import blackbox, copter, px4_flight, quad, ulog
 from mcap.reader import make_reader
 import numpy as np
 from ou_monitor.cli.main import main
-from ou_monitor.recordings.read import read_recording, read_signal
+from ou_monitor.recordings.read import read_beside, read_pieces, read_recording, read_signal
 from project import ROOT
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_typestore, Stores
 import yaml
 
-ROWS = quad(400)
+ROWS = quad(400, refresh=1)
 
 
 def px4():
@@ -72,6 +72,59 @@ def test_log_to_bag_and_back(tmp_path, log, name, kind):
     assert back.source['log_firmware'] == firmware
     assert back.source['log_file'] == 'a.log'
     assert back.source['log_time'] == 's from the start of the log'
+
+
+def analyzed(path, json_file):
+    """Return the JSON of `analyze`, without what names the file and what else it holds."""
+    assert main(['analyze', str(path), '--json', str(json_file), '--force']) == 0
+    data = json.loads(json_file.read_text())
+    for name in ('recording', 'source'):
+        del data[name]
+    data['notes'] = [note for note in data['notes'] if not note.startswith('Also in the log')]
+    data['quality'] = [one for one in data['quality']
+                       if not one['text'].startswith('Also in the log')]
+    return data
+
+
+@pytest.mark.parametrize('options', [[], ['--drop-held']])
+def test_a_log_and_its_bag_give_one_json(tmp_path, options):
+    """One reading of 10 frames is one sample, whichever way the log is read, and to the digit."""
+    path, out = tmp_path / 'a.bbl', tmp_path / 'bag'
+    rows = quad(6000, refresh=10)
+    path.write_bytes(b''.join(blackbox(rows)))
+    assert main(['convert', str(path), str(out), *options]) == 0
+    found = analyzed(path, tmp_path / 'a.json')
+    assert found == analyzed(out, tmp_path / 'a.json')
+    assert found['n'] == 600 and found['rate_hz'] == pytest.approx(50.0)
+    log, bag = read_recording(path), read_recording(out)
+    for one, other in ((log.t, bag.t), (log.voltage, bag.voltage),
+                       (log.throttle, bag.throttle), (log.current, bag.current)):
+        np.testing.assert_array_equal(one, other)
+    pieces = list(read_pieces(out, samples=250))
+    assert [piece.n for piece in pieces] == [250, 250, 100]
+    np.testing.assert_array_equal(np.concatenate([piece.t for piece in pieces]), bag.t)
+    # Both keep the throttle that held at the reading, of those between.
+    share = (rows[:, 5:7].mean(axis=1) - 100) / 2000
+    np.testing.assert_array_equal(log.throttle, share.astype(np.float32)[::10])
+
+
+def test_a_signal_of_a_log_and_of_its_bag_is_one(tmp_path):
+    """The supply beside the signal is the one that `analyze` gets."""
+    path, out = tmp_path / 'a.bbl', tmp_path / 'bag'
+    fields = ('loopIteration', 'time', 'rcCommand[3]', 'vbatLatest', 'amperageLatest',
+              'motor[0]', 'motor[1]', *(f'gyroADC[{k}]' for k in range(3)))
+    rows = np.column_stack([quad(3000, refresh=10),
+                            np.random.default_rng(2).integers(0, 900, (3000, 3))])
+    path.write_bytes(b''.join(blackbox(rows, fields, {'gyro_scale': '0x3f800000'})))
+    assert main(['convert', str(path), str(out)]) == 0
+    (log, own), (bag, converted) = (
+        read_beside(one, '/imu/angular_velocity.y') for one in (path, out))
+    np.testing.assert_array_equal(log.t, read_recording(path).t)
+    np.testing.assert_array_equal(log.voltage, bag.voltage)
+    np.testing.assert_array_equal(log.current, bag.current)
+    assert own.n == 3000 and own.unit == converted.unit == 'rad/s'
+    np.testing.assert_allclose(own.t, converted.t, rtol=0.0, atol=1e-9)
+    np.testing.assert_array_equal(own.values, converted.values)
 
 
 def test_a_fleet_is_grouped_by_the_vehicle_of_its_logs(tmp_path, one_process):

@@ -1,10 +1,12 @@
 """
-Read a CSV: `time_s`, `voltage_v` and, where there are such, `throttle` and `current_a`.
+Read a CSV: `time_s`, `voltage_v` and, where present, `throttle` and `current_a`.
 
 Limits first: one header line is required; the decimal mark is a point.  Other
-columns are ignored, as are blank lines and lines that begin with '#'; commas,
-semicolons or tabs separate.  A line with more cells than the header has names is
-refused: with decimal commas 5,01 would be the two numbers 5 and 1.
+columns are ignored unless they are named, as are blank lines and lines that begin
+with '#'; commas, semicolons or tabs separate.  A line with more cells than the
+header has names is refused: with decimal commas 5,01 would be the two numbers 5
+and 1.  `convert` takes the stamps from `time_s` as they stand, and values as V,
+0..1 and A.
 """
 
 from __future__ import annotations
@@ -12,15 +14,19 @@ from __future__ import annotations
 from array import array
 from collections.abc import Iterator, Sequence
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import io
 from pathlib import Path
 from typing import TextIO
 
 import numpy as np
 from ou_monitor.errors import InputError, nearest
+from ou_monitor.recordings.importers import log as logs
+from ou_monitor.recordings.importers.log import (
+    ANY, Log, one_flight, RawColumns, Request, Series)
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.files import open_regular
+from ou_monitor.text import printable
 
 TIME, VOLTAGE, THROTTLE, CURRENT = 'time_s', 'voltage_v', 'throttle', 'current_a'
 
@@ -33,6 +39,10 @@ _MARK = ': the decimal mark is a point'
 _LONGEST = 40
 # A log of 1000 columns has lines of some 10 000 characters.
 MOST_OF_LINE = 65536
+# RawColumns listed at most; loggers of autopilots write some hundred.
+MOST_COLUMNS = 300
+# Column -> quantity, when no name is given.
+_KNOWN = {VOLTAGE: logs.VOLTAGE, THROTTLE: logs.THROTTLE, CURRENT: logs.CURRENT}
 # Share of steps back in what is no time; a supply is not read less often, s.
 _BACK, _LONGEST_STEP = 0.25, 100.0
 
@@ -66,9 +76,8 @@ VOLTAGE_UNITS = {'V': 1.0, 'mV': 1e-3}
 TIME_UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 
 
-def read_csv(path: Path, columns: CsvColumns | None = None,
-             ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return time, s, voltage, V, throttle and current, A, unsorted and with NaN kept."""
+def read_csv(path: Path, columns: CsvColumns | None = None) -> RawColumns:
+    """Read the samples of a supply, unsorted and with NaN kept."""
     wanted = columns or CsvColumns()
     time, voltage = wanted.time or TIME, wanted.voltage or VOLTAGE
     # A column that was named must be there.
@@ -80,8 +89,43 @@ def read_csv(path: Path, columns: CsvColumns | None = None,
     optional = throttle[1] if CURRENT in named else (*throttle[1], CURRENT)
     t, v, u, *current = _columns(path, (time, voltage, *throttle[0]), optional)
     _check_time(path, t * TIME_UNITS[wanted.time_unit], v, (time, voltage))
-    return (t * TIME_UNITS[wanted.time_unit], v * VOLTAGE_UNITS[wanted.unit], u,
-            current[0] if current else np.full(t.shape, np.nan))
+    name = printable(path.name)
+    return RawColumns(t * TIME_UNITS[wanted.time_unit], v * VOLTAGE_UNITS[wanted.unit], u,
+                      current[0] if current else np.full(t.shape, np.nan), name,
+                      {'file': name, 'format': 'csv'})
+
+
+def read(path: Path, request: Request) -> Log:
+    """Read the columns known by name, and those asked for."""
+    one_flight(path, request)
+    header = [name for name in column_names(path, TIME) if name and name != TIME]
+    wanted = [name for name in dict.fromkeys(header) if name in _KNOWN or name in request.names]
+    t, *columns = read_columns(path, [TIME, *wanted])
+    if not t.size:
+        raise InputError(f'{path} holds a header and no line below it')
+    series = [Series(name, _KNOWN.get(name, ANY), t, values, '1', 'column',
+                     0 if name in _KNOWN else None)
+              for name, values in zip(wanted, columns)]
+    notes = []
+    late = int(np.count_nonzero(np.diff(t) < 0.0))
+    if late:
+        notes.append(f'{late} line{"s" * (late != 1)} came before the stamp ahead of them: '
+                     'sorted by stamp.')
+        order = np.argsort(t, kind='stable')
+        series = [replace(one, t=t[order], values=one.values[order]) for one in series]
+    if request.everything:
+        others = [name for name in dict.fromkeys(header) if name not in wanted]
+        if len(others) > MOST_COLUMNS:
+            notes.append(f'{len(others) - MOST_COLUMNS} more columns are not listed.')
+        # One pass each: a column of text ends the reading of its pass only.
+        for name in others[:MOST_COLUMNS]:
+            try:
+                values = read_columns(path, [TIME, name])[1]
+            except InputError:
+                notes.append(f"Column '{name}' does not hold numbers.")
+                continue
+            series.append(Series(name, ANY, t, values, '1', 'column'))
+    return Log('csv', tuple(series), {}, tuple(notes), names=tuple(header))
 
 
 def _check_time(path: Path, t: FloatArray, voltage: FloatArray, names: tuple[str, str]) -> None:
