@@ -95,17 +95,17 @@ def test_a_log_and_its_bag_give_one_json(tmp_path, options):
     assert main(['convert', str(path), str(out), *options]) == 0
     found = analyzed(path, tmp_path / 'a.json')
     assert found == analyzed(out, tmp_path / 'a.json')
-    assert found['n'] == 600 and found['rate_hz'] == pytest.approx(50.0)
+    assert found['n'] == 599 and found['rate_hz'] == pytest.approx(50.0)
     log, bag = read_recording(path), read_recording(out)
     for one, other in ((log.t, bag.t), (log.voltage, bag.voltage),
                        (log.throttle, bag.throttle), (log.current, bag.current)):
         np.testing.assert_array_equal(one, other)
     pieces = list(read_pieces(out, samples=250))
-    assert [piece.n for piece in pieces] == [250, 250, 100]
+    assert [piece.n for piece in pieces] == [250, 250, 99]
     np.testing.assert_array_equal(np.concatenate([piece.t for piece in pieces]), bag.t)
-    # Both keep the throttle that held at the reading, of those between.
+    # Of those between, the throttle at the reading; since when the first one held is not known.
     share = (rows[:, 5:7].mean(axis=1) - 100) / 2000
-    np.testing.assert_array_equal(log.throttle, share.astype(np.float32)[::10])
+    np.testing.assert_array_equal(log.throttle, share.astype(np.float32)[10::10])
 
 
 def test_a_signal_of_a_log_and_of_its_bag_is_one(tmp_path):
