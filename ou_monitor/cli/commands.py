@@ -146,7 +146,8 @@ _CONVERT = Command(
     ('flight.ulg --list', 'flight.bbl flight.mcap --drop-held',
      'flight.bin flight.mcap --signal RCOU.C3'),
     'Read: PX4 ULog (.ulg), ArduPilot dataflash (.bin, .log), Betaflight and INAV blackbox '
-    '(.bbl, .bfl), CSV with the column time_s; the first bytes decide, not the ending.')
+    '(.bbl, .bfl), Crazyflie micro-SD logs, CSV with the column time_s; the first bytes decide, '
+    'not the ending.')
 
 _COUPLING = Command(
     'coupling', 'gain from the supply voltage to a signal, such as a gyro axis',

@@ -22,7 +22,7 @@ from ou_monitor.recordings.columns import batches, join
 from ou_monitor.recordings.importers.choose import (
     choose as choose_series, columns_of, drop_held, NONE, signal_of)
 from ou_monitor.recordings.importers.csv_table import CsvColumns, read_column, read_csv
-from ou_monitor.recordings.importers.formats import import_log, is_csv, is_log
+from ou_monitor.recordings.importers.formats import BAG, CSV, import_log, is_csv, is_log
 from ou_monitor.recordings.importers.log import (
     Log, RawColumns, Request, Series, SIGNAL, UNKNOWN, VOLTAGE)
 from ou_monitor.recordings.samples import (
@@ -156,7 +156,7 @@ def _refreshed(recording: Recording) -> Recording:
 def _is_logged(source: Mapping[str, str]) -> bool:
     """Whether a recording is a log, or a bag of all samples of one, by its source."""
     return ('held_samples' not in source
-            and source.get('log_format', source['format']) not in ('csv', 'mcap'))
+            and source.get('log_format', source['format']) not in (BAG, CSV))
 
 
 def _samples(recording: Recording, which: slice | npt.NDArray[np.bool_], notes: tuple[str, ...],

@@ -1,7 +1,7 @@
 """
-The table of log formats, told by their first bytes, and the way into them.
+The table of formats, told by their first bytes, and the way into those of logs.
 
-To add a format: a module with ``read(path, request) -> Log``, and a line here.
+To add a format: a module here with ``read(path, request) -> Log``, and a line in the table.
 """
 
 from __future__ import annotations
@@ -32,28 +32,17 @@ BLACKBOX = b'H Product:Blackbox flight data recorder'
 
 
 class Format(NamedTuple):
-    """
-    One log format.
+    """One format."""
 
-    Attributes
-    ----------
-    name : str
-        Short name.
-    words : str
-        What it is, with its usual ending.
-    fits : callable
-        Whether a file that begins with these bytes is one.
-    module : str
-        Importer.
-    package, extra : str
-        What it needs beyond the core, and the extra of setup.py that brings it.
-
-    """
-
+    # Short name.
     name: str
+    # What it is, with its usual ending.
     words: str
+    # Whether a file that begins with these bytes is one.
     fits: Callable[[bytes], bool]
+    # Name of the module that reads it, beside this one; empty: not a log.
     module: str
+    # Package that it needs beyond the core, and the extra of setup.py that brings it.
     package: str = ''
     extra: str = ''
 
@@ -64,20 +53,27 @@ def _is_text(head: bytes) -> bool:
         byte >= 0x20 or byte in b'\t\n\r\f' for byte in head)
 
 
+def _is_crazyflie(head: bytes) -> bool:
+    # 0xBC, version 1 or 2, and the number of events, of which the firmware has 20 at most.
+    return len(head) > 5 and head[0] == 0xBC and head[1:3] in (b'\1\0', b'\2\0') and (
+        0 < int.from_bytes(head[3:5], 'little') <= 255)
+
+
+BAG, CSV = 'mcap', 'csv'
 # The first that fits is taken.
 FORMATS = (
-    Format('ulog', 'PX4 ULog (.ulg)', lambda head: head.startswith(ULOG),
-           'ou_monitor.recordings.importers.ulog', 'pyulog', 'ulog'),
+    Format(BAG, 'MCAP bag (.mcap)', lambda head: head.startswith(MCAP_MAGIC), ''),
+    Format('ulog', 'PX4 ULog (.ulg)', lambda head: head.startswith(ULOG), 'ulog', 'pyulog',
+           'ulog'),
     Format('dataflash', 'ArduPilot dataflash (.bin)', lambda head: head.startswith(DATAFLASH),
-           'ou_monitor.recordings.importers.dataflash', 'pymavlink', 'dataflash'),
+           'dataflash', 'pymavlink', 'dataflash'),
     Format('dataflash_text', 'ArduPilot dataflash as text (.log)',
            lambda head: _is_text(head) and (head.startswith(b'FMT,') or b'\nFMT,' in head),
-           'ou_monitor.recordings.importers.dataflash', 'pymavlink', 'dataflash'),
+           'dataflash', 'pymavlink', 'dataflash'),
     Format('blackbox', 'Betaflight or INAV blackbox (.bbl, .bfl)',
-           lambda head: head.startswith(BLACKBOX),
-           'ou_monitor.recordings.importers.blackbox', 'orangebox', 'blackbox'),
-    Format('csv', 'CSV with the column time_s (.csv)', _is_text,
-           'ou_monitor.recordings.importers.csv_table'),
+           lambda head: head.startswith(BLACKBOX), 'blackbox', 'orangebox', 'blackbox'),
+    Format('crazyflie', 'Crazyflie micro-SD log', _is_crazyflie, 'crazyflie'),
+    Format(CSV, 'CSV with the column time_s (.csv)', _is_text, 'csv_table'),
 )
 
 
@@ -94,13 +90,11 @@ def detect(path: Path) -> Format:
         raise InputError(f'cannot read {path}: {error.strerror}') from error
     if not head:
         raise InputError(f"'{path}' is empty: there is nothing to convert")
-    if head.startswith(MCAP_MAGIC):
-        raise InputError(f"'{path}' is an MCAP bag already: analyze, discover and replay take it")
     for one in FORMATS:
         if one.fits(head):
             return one
     raise InputError(f"'{path}' cannot be converted: it begins like none of the formats read "
-                     'today: ' + '; '.join(one.words for one in FORMATS))
+                     'today: ' + '; '.join(one.words for one in FORMATS if one.module))
 
 
 def is_csv(path: Path) -> bool:
@@ -118,14 +112,17 @@ def is_log(path: Path) -> bool:
     except OSError:
         # Whoever reads it says why it cannot be read.
         return False
-    return bool(head) and any(one.fits(head) for one in FORMATS if one.package)
+    found = next((one.name for one in FORMATS if head and one.fits(head)), CSV)
+    return found not in (BAG, CSV)
 
 
 def import_log(path: Path, request: Request) -> Log:
     """Read a log."""
     form = detect(path)
+    if form.name == BAG:
+        raise InputError(f"'{path}' is an MCAP bag already: analyze, discover and replay take it")
     try:
-        module = import_module(form.module)
+        module = import_module(f'{__package__}.{form.module}')
     except ImportError as error:
         # Only what the importer itself loads is an extra; a fault of ours is not hidden.
         if not form.package or (error.name or '').split('.')[0] != form.package:
@@ -136,7 +133,7 @@ def import_log(path: Path, request: Request) -> Log:
     if request.progress is not None:
         request = replace(request, progress=_shown(request.progress))
     # Broken bytes make numbers that no cast takes, and fields of any shape.
-    with np.errstate(all='ignore'), quiet(path, form.package or 'the reader of CSV'):
+    with np.errstate(all='ignore'), quiet(path, form.package or 'ou_monitor'):
         log: Log = module.read(path, request)
     # Names in a log reach messages, tables and bags.
     return replace(

@@ -2,10 +2,12 @@
 Logs written byte by byte from the published formats, independently of any parser.
 
 ULog: docs.px4.io "ULog File Format".  Dataflash: libraries/AP_Logger/LogStructure.h
-of ArduPilot.  Blackbox: "Blackbox logging internals" of Betaflight.
+of ArduPilot.  Blackbox: "Blackbox logging internals" of Betaflight.  Crazyflie:
+src/deck/drivers/src/usddeck.c of crazyflie-firmware.
 """
 
 import struct
+import zlib
 
 import numpy as np
 
@@ -212,3 +214,48 @@ def quad(n=600, step_us=2000, start_us=17_000_000, refresh=5):
         np.arange(n), start_us + step_us * np.arange(n), rng.integers(1000, 2000, n), volts,
         rng.integers(500, 3000, n), rng.integers(100, 2100, n),
         rng.integers(100, 2100, n)]).astype(np.int64)
+
+
+# --- Crazyflie micro-SD deck -------------------------------------------------------------------
+
+FIXED = 0xFFFF
+
+
+def crazyflie(events, records, version=2):
+    """
+    Return a log as pieces: the header, one record each, the checksum.
+
+    `events` is a list of (number, name, ['group.name(type)']), `records` of (number, stamp in ms
+    of version 1 and us of version 2, values).
+    """
+    head = struct.pack('<BHH', 0xBC, version, len(events))
+    layouts = {}
+    for number, name, variables in events:
+        head += struct.pack('<H', number) + name.encode() + b'\0' + struct.pack(
+            '<H', len(variables)) + b''.join(one.encode() + b'\0' for one in variables)
+        layouts[number] = '<H' + 'IQ'[version - 1] + ''.join(one[-2] for one in variables)
+    pieces = [head, *(struct.pack(layouts[number], number, stamp, *values)
+                      for number, stamp, values in records)]
+    return [*pieces, struct.pack('<I', zlib.crc32(b''.join(pieces)))]
+
+
+CRAZYFLIE = ['pm.vbat(f)', 'motor.m1(I)', 'motor.m2(I)', 'motor.m3(I)', 'motor.m4(I)',
+             'gyro.x(f)', 'gyro.y(f)', 'gyro.z(f)', 'acc.x(f)', 'acc.y(f)', 'acc.z(f)',
+             'pm.state(b)']
+
+
+def hover(n=300, refresh=1):
+    """Return events and records at 500 Hz, with another event, and the table that is in them."""
+    rng = np.random.default_rng(11)
+    volts = np.repeat(3.8 + 0.02 * rng.standard_normal(n // refresh + 1), refresh)[:n]
+    table = np.column_stack([np.float32(volts), rng.integers(0, 65536, (n, 4)),
+                             np.float32(rng.standard_normal((n, 6))), rng.integers(-1, 3, n)])
+    records = []
+    for k, row in enumerate(table):
+        whole = [int(value) if 1 <= j <= 4 or j == 11 else value for j, value in enumerate(row)]
+        records.append((FIXED, 1_000_000 + 2000 * k, whole))
+        if k % 7 == 0:
+            records.append((3, 1_000_900 + 2000 * k, (k, 0.5, 4.0)))
+    events = [(FIXED, 'fixedFrequency', CRAZYFLIE),
+              (3, 'estTDOA', ['id(H)', 'x(e)', 'pm.vbat(f)'])]
+    return events, records, table

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from made_logs import blackbox, copter, px4_flight, quad, ulog
+from made_logs import blackbox, copter, crazyflie, hover, px4_flight, quad, ulog
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.importers.formats import detect, FORMATS, import_log
@@ -19,10 +19,11 @@ def made(name):
     return {'ulog': lambda: b''.join(ulog(px4_flight(3)[0])),
             'dataflash': lambda: copter(3)[0].binary,
             'dataflash_text': lambda: copter(3)[0].text,
-            'blackbox': lambda: b''.join(blackbox(quad(40))), 'csv': lambda: CSV}[name]()
+            'blackbox': lambda: b''.join(blackbox(quad(40))), 'csv': lambda: CSV,
+            'crazyflie': lambda: b''.join(crazyflie(*hover(40)[:2]))}[name]()
 
 
-@pytest.mark.parametrize('name', [one.name for one in FORMATS])
+@pytest.mark.parametrize('name', [one.name for one in FORMATS if one.module])
 @pytest.mark.parametrize('ending', ['.ulg', '.bin', '.log', '.bbl', '.csv', ''])
 def test_the_first_bytes_decide(tmp_path, name, ending):
     """A wrong ending with the right contents is read as what it is."""

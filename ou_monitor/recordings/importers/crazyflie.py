@@ -1,0 +1,182 @@
+"""
+Crazyflie logs of the micro-SD deck, read without a parser of others.
+
+Limits first: the battery is read at 100 Hz or less, so a faster log repeats it.  The format has
+one checksum over the whole file: where it does not match, the wrong bytes are not located, and a
+note says so.  Events of the firmware's own are taken by name only.
+
+As bitcraze/crazyflie-firmware writes it (src/deck/drivers/src/usddeck.c; decoded by
+tools/usdlog/cfusdlog.py), little-endian: byte 0xBC, version and number of events (2 x uint16);
+of each event its number (uint16), name (ending in 0), number of variables (uint16), and each
+variable as ``group.name(type)`` (ending in 0), the type a letter of Python's `struct`; then
+records of the number of an event, a stamp (version 1: uint32, ms; 2: uint64, us) and its
+variables; at the end the CRC-32 of all before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+import struct
+from typing import NamedTuple
+from zlib import crc32
+
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.log import (
+    CURRENT, DEGREE, from_start, GRAVITY, Inertial, Log, one_flight, Request, Series, SIGNAL,
+    start_of, THROTTLE, UNKNOWN, VOLTAGE)
+from ou_monitor.records import FloatArray
+from ou_monitor.stream.files import open_regular
+from ou_monitor.text import counted
+
+# Version -> type of the stamp, and s in its unit.
+_STAMPS = {1: ('<u4', 1e-3), 2: ('<u8', 1e-6)}
+_TYPES = frozenset('bBhHiIqQefd')
+# Event of the variables that are logged at a steady rate; their names stand without it.
+_STEADY = 'fixedFrequency'
+
+# Variable -> quantity, factor, rank, words, group.  Log groups `pm`, `motor` and `stabilizer`.
+_PLAIN = {
+    'pm.vbat': (VOLTAGE, 1.0, 0, 'battery', 'pm'),
+    'pm.vbatMV': (VOLTAGE, 1e-3, 1, 'battery', 'pm'),
+    'pm.extVbat': (VOLTAGE, 1.0, None, 'external voltage of a BigQuad deck', 'pm.ext'),
+    'pm.extVbatMV': (VOLTAGE, 1e-3, None, 'external voltage of a BigQuad deck', 'pm.ext'),
+    'pm.extCurr': (CURRENT, 1.0, None, 'external current of a BigQuad deck', 'pm.ext'),
+    'stabilizer.thrust': (THROTTLE, 1.0 / 65535.0, 1, 'thrust asked of the mixer', ''),
+    **{f'motor.m{k}': (THROTTLE, 1.0 / 65535.0, None, 'one motor', '') for k in range(1, 5)},
+}
+# Groups of three axes: forwards, left, up, as in `base_link`.
+_GYRO, _FORCE = 'gyro', 'acc'
+_UNITS = {**{f'{_GYRO}.{axis}': ('rad/s', DEGREE) for axis in 'xyz'},
+          **{f'{_FORCE}.{axis}': ('m/s^2', GRAVITY) for axis in 'xyz'}}
+
+
+class _Event(NamedTuple):
+    """What a record of one event holds."""
+
+    name: str
+    row: np.dtype[np.void]
+    variables: tuple[str, ...]
+
+
+def read(path: Path, request: Request) -> Log:
+    """Read a log."""
+    one_flight(path, request)
+    with open_regular(path) as file:
+        data = file.read()
+    version, number = struct.unpack_from('<HH', data, 1)
+    stamp, unit = _STAMPS[version]
+    events, begin = _events(path, data, number, stamp)
+    sound = len(data) >= begin + 4 and crc32(data[:-4]) == int.from_bytes(data[-4:], 'little')
+    end = len(data) - 4 if sound else len(data)
+    found, read_to = _places(data, begin, end, events)
+    notes = []
+    if not sound:
+        notes.append('The checksum does not match: the log was cut off or is damaged, and wrong '
+                     'values cannot be told from right ones.')
+    # Bytes that are too few for a record are the checksum, or its beginning.
+    if end - read_to > (0 if sound else 4):
+        notes.append(f'{counted(end - read_to, "byte")} from byte {read_to} on were not read: no '
+                     'record of this log.')
+    series: list[Series] = []
+    inertial: list[Inertial] = []
+    for key, event in events.items():
+        size = event.row.itemsize
+        rows = np.frombuffer(b''.join(data[at:at + size] for at in found[key]), dtype=event.row)
+        t = rows['stamp'].astype(np.float64) * unit
+        columns = {name: rows[f'v{k}'].astype(np.float64)
+                   for k, name in enumerate(event.variables)}
+        prefix = '' if event.name == _STEADY else f'{event.name}.'
+        series += _series(prefix, t, columns)
+        inertial += _inertial(prefix, t, columns)
+    start = start_of(series)
+    return Log('crazyflie', from_start(series, start), {}, tuple(notes),
+               from_start(inertial, start), None, tuple(one.name for one in series))
+
+
+def _events(path: Path, data: bytes, number: int, stamp: str) -> tuple[dict[int, _Event], int]:
+    """Return the events by their number, and the byte where their records begin."""
+    at = 5
+    events: dict[int, _Event] = {}
+
+    def take(size: int) -> int:
+        nonlocal at
+        at += size
+        if at > len(data):
+            raise InputError(f'{path}: the header does not end: the log was cut off')
+        return int.from_bytes(data[at - size:at], 'little')
+
+    def text() -> str:
+        nonlocal at
+        begin, at = at, data.find(b'\0', at) + 1
+        if not at:
+            raise InputError(f'{path}: the header does not end: the log was cut off')
+        return data[begin:at - 1].decode('utf-8', 'replace')
+
+    for _ in range(number):
+        key, name = take(2), text()
+        fields: list[tuple[str, str]] = [('id', '<u2'), ('stamp', stamp)]
+        names = []
+        for k in range(take(2)):
+            variable = text()
+            if variable[-3:-2] != '(' or variable[-2:-1] not in _TYPES or variable[-1:] != ')':
+                raise InputError(f"{path}: the header has no type for '{variable}': it is damaged")
+            names.append(variable[:-3])
+            fields.append((f'v{k}', f'<{variable[-2]}'))
+        if key in events:
+            raise InputError(f'{path}: the header has two events {key}: it is damaged')
+        events[key] = _Event(name, np.dtype(fields), tuple(names))
+    return events, at
+
+
+def _places(data: bytes, begin: int, end: int, events: dict[int, _Event],
+            ) -> tuple[dict[int, list[int]], int]:
+    """Return where the records of each event begin, and where the last one ends."""
+    found: dict[int, list[int]] = {key: [] for key in events}
+    sizes = {key: event.row.itemsize for key, event in events.items()}
+    at = begin
+    while at + 2 <= end:
+        key = data[at] | data[at + 1] << 8
+        size = sizes.get(key)
+        if size is None or at + size > end:
+            break
+        found[key].append(at)
+        at += size
+    return found, at
+
+
+def _series(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Iterator[Series]:
+    """Yield each variable in SI, and the mean of the motors."""
+    # What an event holds is no battery to be taken unasked: it has no steady rate.
+    ranked = not prefix
+    motors = [f'motor.m{k}' for k in range(1, 5)]
+    if all(name in columns for name in motors):
+        values = np.mean([columns[name] for name in motors], axis=0) / 65535.0
+        yield Series(f'{prefix}motors', THROTTLE, t, values, 'mean of motor.m1..m4 / 65535',
+                     'mean of 4 motors', 0 if ranked else None)
+    for name, values in columns.items():
+        if name in _PLAIN:
+            quantity, scale, rank, words, group = _PLAIN[name]
+            yield Series(f'{prefix}{name}', quantity, t, values * scale, f'{scale:.6g}', words,
+                         rank if ranked else None, group and prefix + group)
+        else:
+            own, scale = _UNITS.get(name, (UNKNOWN, 1.0))
+            yield Series(f'{prefix}{name}', SIGNAL, t, values * scale, f'{scale:.6g}',
+                         'as logged' if own == UNKNOWN else name.partition('.')[0], own_unit=own)
+
+
+def _inertial(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Iterator[Inertial]:
+    """Yield the gyro with the accelerometer."""
+    def three(group: str) -> FloatArray | None:
+        names = [f'{group}.{axis}' for axis in 'xyz']
+        if not all(name in columns for name in names):
+            return None
+        return np.column_stack([columns[name] * _UNITS[name][1] for name in names])
+
+    rates, forces = three(_GYRO), three(_FORCE)
+    if rates is not None:
+        yield Inertial(f'{prefix}{_GYRO}', t, rates, forces,
+                       f'{_GYRO} {DEGREE:.6g}' + ('' if forces is None else
+                                                  f', {_FORCE} {GRAVITY:g}'),
+                       "gyro after the autopilot's filters", None if prefix else 0)
