@@ -39,23 +39,14 @@ MOST = 4
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """
-    What is taken from a log.
+    """What is taken from a log."""
 
-    Attributes
-    ----------
-    voltage : Series
-        At least one sample.
-    throttle, current : Series or None
-        None where the log has none, or none is wanted.
-    notes : tuple of str
-        What was dropped, and what else could have been taken.
-
-    """
-
+    # At least one sample.
     voltage: Series
+    # None where the log has none, or none is wanted.
     throttle: Series | None
     current: Series | None
+    # What was dropped, and what else could have been taken.
     notes: tuple[str, ...]
 
 
@@ -245,25 +236,15 @@ _GAP = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Extras:
-    """
-    What is taken from a log beside voltage, throttle and current.
+    """What is taken from a log beside voltage, throttle and current."""
 
-    Attributes
-    ----------
-    inertial : dict of str to Inertial
-        By topic, without the slash.
-    speeds : MotorSpeeds or None
-        Of the motors.
-    signals : dict of str to Series
-        By topic, without the slash.
-    notes : tuple of str
-        What was dropped, and what the log does not hold.
-
-    """
-
+    # By topic, without the slash.
     inertial: dict[str, Inertial]
+    # Of the motors.
     speeds: MotorSpeeds | None
+    # By topic, without the slash.
     signals: dict[str, Series]
+    # What was dropped, and what the log does not hold.
     notes: tuple[str, ...]
 
 

@@ -49,24 +49,15 @@ _BACK, _LONGEST_STEP = 0.25, 100.0
 
 @dataclass(frozen=True)
 class CsvColumns:
-    """
-    Which columns of a CSV are meant, and what their numbers are.
+    """Which columns of a CSV are meant, and what their numbers are."""
 
-    Attributes
-    ----------
-    time, voltage, throttle : str or None
-        Names of columns; None: ``time_s``, ``voltage_v`` and ``throttle``, if it is there.
-    unit : str
-        Unit of the voltage: V or mV.
-    time_unit : str
-        Unit of the time: s, ms, us or ns.
-
-    """
-
+    # Names of columns; None: ``time_s``, ``voltage_v`` and ``throttle``, if it is there.
     time: str | None = None
     voltage: str | None = None
     throttle: str | None = None
+    # Unit of the voltage: V or mV.
     unit: str = 'V'
+    # Unit of the time: s, ms, us or ns.
     time_unit: str = 's'
 
 

@@ -35,55 +35,34 @@ RPM = 2.0 * math.pi / 60.0
 
 @dataclass(frozen=True, eq=False)
 class Inertial:
-    """
-    A gyro, an accelerometer, or both.
+    """A gyro, an accelerometer, or both."""
 
-    Attributes
-    ----------
-    name : str
-        How the user names it.
-    t : ndarray, shape (n,)
-        Stamps, s from the start of the log.
-    angular_velocity, acceleration : ndarray, shape (n, 3), or None
-        rad/s and m/s^2 along the axes of `base_link`, the acceleration with
-        what holds against gravity; None where the log has none.
-    scale, words : str
-        How the values were made; what it is.
-    rank : int or None
-        Taken when nothing of a smaller rank is there; None: only by name.
-
-    """
-
+    # How the user names it.
     name: str
+    # Stamps, s from the start of the log; shape (n,).
     t: FloatArray
+    # rad/s and m/s^2 along the axes of `base_link`, the acceleration with what holds against
+    # gravity; None where the log has none; shape (n, 3).
     angular_velocity: FloatArray | None
     acceleration: FloatArray | None
+    # How the values were made; what it is.
     scale: str
     words: str
+    # Taken when nothing of a smaller rank is there; None: only by name.
     rank: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class MotorSpeeds:
-    """
-    Speeds of all motors at the same stamps.
+    """Speeds of all motors at the same stamps."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of the m motors, as in the message: ``motor_0``.
-    t : ndarray, shape (n,)
-        Stamps, s from the start of the log.
-    values : ndarray, shape (n, m)
-        Of the rotor, rad/s.
-    scale, words : str
-        How the values were made, poles included; what they are.
-
-    """
-
+    # Of the m motors, as in the message: ``motor_0``.
     names: tuple[str, ...]
+    # Stamps, s from the start of the log; shape (n,).
     t: FloatArray
+    # Of the rotor, rad/s; shape (n, m).
     values: FloatArray
+    # How the values were made, poles included; what they are.
     scale: str
     words: str
 
@@ -107,41 +86,26 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """
-    One quantity over time, in SI units.
+    """One quantity over time, in SI units."""
 
-    Attributes
-    ----------
-    name : str
-        How the user names it, unique in the log: ``BAT[0].Volt``.
-    quantity : {'voltage', 'throttle', 'current', 'signal', 'any'}
-        What it is.
-    t : ndarray, shape (n,)
-        Stamps, s from the start of the log.
-    values : ndarray, shape (n,)
-        V, 0..1, or A (positive when the battery is drained); NaN where the
-        log says "unknown".
-    scale : str
-        How the value was made from what is logged.
-    words : str
-        What it is, for people.
-    rank : int or None
-        Taken when nothing of a smaller rank is there; None: only by name.
-    group : str
-        The sensor; a voltage and a current of one sensor share it.
-    own_unit : str
-        Unit of a signal, ``?`` when the log does not state it.
-
-    """
-
+    # How the user names it, unique in the log: ``BAT[0].Volt``.
     name: str
+    # VOLTAGE, THROTTLE, CURRENT, SIGNAL or ANY.
     quantity: str
+    # Stamps, s from the start of the log; shape (n,).
     t: FloatArray
+    # V, 0..1, or A (positive when the battery is drained); NaN where the log says "unknown";
+    # shape (n,).
     values: FloatArray
+    # How the value was made from what is logged.
     scale: str
+    # What it is, for people.
     words: str = ''
+    # Taken when nothing of a smaller rank is there; None: only by name.
     rank: int | None = None
+    # The sensor; a voltage and a current of one sensor share it.
     group: str = ''
+    # Unit of a signal, ``?`` when the log does not state it.
     own_unit: str = UNKNOWN
 
     @property
@@ -183,34 +147,21 @@ class Flight:
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """
-    What a log file holds.
+    """What a log file holds."""
 
-    Attributes
-    ----------
-    format : str
-        Name of the format.
-    series : tuple of Series
-        Candidates.
-    facts : dict of str to str
-        Vehicle, firmware, number of the flight: what is known.
-    notes : tuple of str
-        What was dropped or could not be read, one sentence each.
-    inertial : tuple of Inertial
-        Gyros and accelerometers.
-    speeds : MotorSpeeds or None
-        Of the motors.
-    names : tuple of str
-        Of all series of the file, those that were not read included.
-
-    """
-
+    # Name of the format.
     format: str  # noqa: A003
+    # Candidates.
     series: tuple[Series, ...]
+    # Vehicle, firmware, number of the flight: what is known.
     facts: dict[str, str] = field(default_factory=dict)
+    # What was dropped or could not be read, one sentence each.
     notes: tuple[str, ...] = ()
+    # Gyros and accelerometers.
     inertial: tuple[Inertial, ...] = ()
+    # Of the motors.
     speeds: MotorSpeeds | None = None
+    # Of all series of the file, those that were not read included.
     names: tuple[str, ...] = ()
 
 
@@ -238,28 +189,17 @@ class RawColumns:
 
 @dataclass(frozen=True)
 class Request:
-    """
-    What an importer is asked for.
+    """What an importer is asked for."""
 
-    Attributes
-    ----------
-    flight : int or None
-        Which flight of a file with several.
-    names : frozenset of str
-        Series the user named, for formats that read only what is asked for.
-    poles : int or None
-        Magnets of a motor's rotor, where the log does not say; eRPM needs it.
-    everything : bool
-        Whether all candidates are wanted (``--list``).
-    progress : callable or None
-        Called with the share done, 0..1.
-
-    """
-
+    # Which flight of a file with several.
     flight: int | None = None
+    # Series the user named, for formats that read only what is asked for.
     names: frozenset[str] = frozenset()
+    # Magnets of a motor's rotor, where the log does not say; eRPM needs it.
     poles: int | None = None
+    # Whether all candidates are wanted (``--list``).
     everything: bool = False
+    # Called with the share done, 0..1.
     progress: Progress | None = None
 
 
