@@ -39,6 +39,11 @@ def refusal(error: OSError) -> str:
     return printable(why if error.filename is None else f"cannot use '{error.filename}': {why}")
 
 
+def how_to_install(extra: str) -> str:
+    """Return how to install an extra of this package, which is in no registry."""
+    return f"run pip install '.[{extra}]' in the folder of its source"
+
+
 def nearest(word: str, valid: Iterable[str]) -> str:
     """Return a hint that names the valid word nearest to a misspelt one."""
     choices = [printable(word, 60) for word in itertools.islice(valid, _MOST_CHOICES)]

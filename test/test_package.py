@@ -10,18 +10,23 @@ import signal
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import time
+import tomllib
 import venv
 import xml.etree.ElementTree as ElementTree
+import zipfile
 
 from catkin_pkg.changelog import get_changelog_from_path
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
-from project import project_files, ROOT
+from project import metadata, project_files, ROOT
 import pytest
 import yaml
 
+PYPROJECT = tomllib.loads((ROOT / 'pyproject.toml').read_text(encoding='utf-8'))
 EXECUTABLES = ['adaptive_filter', 'adc', 'estimator', 'ou-monitor', 'replay']
+SHARED = ('msg_config', 'launch', 'config', 'layouts', 'security', 'deploy')
 # Starting Python, ROS and DDS on a busy machine.
 START_TIMEOUT = 60.0
 DOMAIN = '60'
@@ -91,7 +96,7 @@ def test_colcon_installs_what_ros2_looks_for(installed):
     assert sorted(os.listdir(installed / 'lib' / 'ou_monitor')) == EXECUTABLES
     share = installed / 'share'
     assert (share / 'ament_index/resource_index/packages/ou_monitor').exists()
-    for folder in ('msg_config', 'launch', 'config', 'layouts', 'security', 'deploy'):
+    for folder in SHARED:
         expected = {path.name for path in (ROOT / folder).iterdir() if path.is_file()}
         assert expected and set(os.listdir(share / 'ou_monitor' / folder)) == expected
 
@@ -163,6 +168,105 @@ def offline(tree, tmp_path_factory) -> Path:
     return folder / 'venv/bin'
 
 
+def contents(archive: Path) -> set[str]:
+    """Return the files of a wheel, or of an sdist without its leading folder."""
+    if archive.suffix == '.whl':
+        return set(zipfile.ZipFile(archive).namelist())
+    with tarfile.open(archive) as file:
+        return {name.partition('/')[2] for name in file.getnames()}
+
+
+def check_archives(folder: Path, tree: Path) -> None:
+    """Check an sdist and the wheel that was made of it: all that is needed, and no tests."""
+    (wheel,), (sdist,) = folder.glob('*.whl'), folder.glob('*.tar.gz')
+    own = {str(path.relative_to(tree)) for path in (tree / 'ou_monitor').rglob('*')
+           if path.is_file() and '__pycache__' not in path.parts}
+    shared = {f'{name}/{path.name}' for name in SHARED for path in (tree / name).iterdir()
+              if path.is_file()}
+    made, source = contents(wheel), contents(sdist)
+    data = f'{wheel.name.rsplit("-", 3)[0]}.data/data/share'
+    assert own == {name for name in made if name.startswith('ou_monitor/')}
+    assert made >= {f'{data}/ou_monitor/{name}' for name in {*shared, 'package.xml'}}
+    assert f'{data}/ament_index/resource_index/packages/ou_monitor' in made
+    assert source >= own | shared | {'package.xml', 'pyproject.toml', 'setup.py', 'setup.cfg',
+                                     'README.md', 'LICENSE', 'resource/ou_monitor'}
+    assert not any(name.startswith('test') for name in made)
+    with zipfile.ZipFile(wheel) as file:
+        (points,) = (name for name in made if name.endswith('entry_points.txt'))
+        assert sorted(re.findall(r'^([\w-]+) =', file.read(points).decode(), re.M)) == EXECUTABLES
+        (about,) = (name for name in made if name.endswith('METADATA'))
+        said = file.read(about).decode()
+    assert 'License: Apache-2.0' in said and 'Requires-Python: >=3.11' in said
+
+
+def test_sdist_and_wheel(tree, tmp_path):
+    """The hooks that pip and `python -m build` call; the wheel is made of the sdist."""
+    hook = 'import sys, setuptools.build_meta as b; getattr(b, sys.argv[1])(sys.argv[2])'
+    source = tmp_path / 'source'
+    shutil.copytree(tree, source)
+    done = run(sys.executable, '-c', hook, 'build_sdist', tmp_path, cwd=source)
+    assert done.returncode == 0, done.stderr
+    (sdist,) = tmp_path.glob('*.tar.gz')
+    with tarfile.open(sdist) as file:
+        file.extractall(tmp_path / 'unpacked', filter='data')
+    (unpacked,) = (tmp_path / 'unpacked').iterdir()
+    done = run(sys.executable, '-c', hook, 'build_wheel', tmp_path, cwd=unpacked)
+    assert done.returncode == 0, done.stderr
+    check_archives(tmp_path, tree)
+
+
+def python311() -> str:
+    """Return a Python 3.11, the one of Debian 12; the test is skipped where there is none."""
+    found = [sys.executable] if sys.version_info[:2] == (3, 11) else []
+    root = Path(os.environ.get('PYENV_ROOT', Path.home() / '.pyenv'))
+    found += [*map(str, sorted(root.glob('versions/3.11.*/bin/python3.11'))),
+              shutil.which('python3.11') or '']
+    for one in filter(None, found):
+        if run(one, '-c', 'import ensurepip, venv').returncode == 0:
+            return one
+    pytest.skip('no Python 3.11 with venv')
+
+
+def fetched(python: Path, *packages: str) -> None:
+    """Install packages from the registry; the test is skipped where there is none."""
+    done = run(python, '-m', 'pip', '--disable-pip-version-check', 'install', '--quiet',
+               '--retries', '1', '--timeout', '20', *packages)
+    if done.returncode and re.search('NewConnectionError|No matching distribution|timed out',
+                                     done.stdout + done.stderr):
+        pytest.skip('no package registry is reachable')
+    assert done.returncode == 0, done.stderr
+
+
+def test_pip_of_debian_12_puts_the_command_on_the_path(tree, tmp_path):
+    """Python 3.11, pip 23.0, no wheel: `pip install .` as the README has it."""
+    assert run(python311(), '-m', 'venv', tmp_path / 'venv').returncode == 0
+    python = tmp_path / 'venv/bin/python'
+    fetched(python, 'pip==23.0.*')
+    done = run(python, '-c', 'import wheel')
+    assert done.returncode == 1, 'wheel is there'
+    source = tmp_path / 'source'
+    shutil.copytree(tree, source)
+    done = run(python, '-m', 'pip', 'install', '--no-deps', '.', cwd=source)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert set(EXECUTABLES) <= set(os.listdir(tmp_path / 'venv/bin'))
+    assert not (tmp_path / 'venv/lib/ou_monitor').exists()
+    assert (tmp_path / 'venv/share/ou_monitor/msg_config').is_dir()
+    shown = run(python, '-c', 'import ou_monitor; print(ou_monitor.__file__)', cwd=tmp_path)
+    assert Path(shown.stdout.strip()).is_relative_to(tmp_path / 'venv/lib'), shown.stderr
+
+
+def test_python_m_build(tree, tmp_path):
+    """As a packager runs it, in an environment of its own."""
+    venv.create(tmp_path / 'venv', with_pip=True, symlinks=True)
+    python = tmp_path / 'venv/bin/python'
+    fetched(python, 'build')
+    source = tmp_path / 'source'
+    shutil.copytree(tree, source)
+    done = run(python, '-m', 'build', '--outdir', tmp_path / 'dist', source)
+    assert done.returncode == 0, done.stdout + done.stderr
+    check_archives(tmp_path / 'dist', tree)
+
+
 def test_pip_gives_the_offline_half(offline, tmp_path):
     """The command and the import work where there is no ROS."""
     shown = run(offline / 'ou-monitor', '--help', cwd=tmp_path)
@@ -221,28 +325,27 @@ def test_offline_analyze(offline, tmp_path):
     assert 'class="plot-data"' in html and 'class LivePlot' in html and '.live-view' in html
 
 
-def test_package_xml_agrees_with_setup_py(tree):
+def test_package_xml_agrees_with_the_metadata(tree):
     """Name, version, licence and maintainer are the same for ROS and for pip."""
     package = ElementTree.parse(ROOT / 'package.xml').getroot()
     asked = run(sys.executable, 'setup.py', '--quiet', '--name', '--version', '--license',
-                '--maintainer-email', cwd=tree)
+                cwd=tree)
     maintainer = package.find('maintainer').get('email')
     assert asked.stdout.split() == [
         package.findtext('name'), package.findtext('version'), package.findtext('license'),
-        maintainer], asked.stderr
+    ], asked.stderr
+    assert [one['email'] for one in metadata()['maintainers']] == [maintainer]
     assert parseaddr(maintainer)[1] == maintainer and re.fullmatch(r'[^@\s]+@[^@\s]+\.\w+',
                                                                    maintainer)
     assert package.findtext('license') == 'Apache-2.0'
     assert 'Version 2.0, January 2004' in (ROOT / 'LICENSE').read_text(encoding='utf-8')
 
 
-def test_requirements_agree_with_setup_py():
+def test_requirements_agree_with_the_metadata():
     """The demo's requirements are the package's requirements."""
-    setup = (ROOT / 'setup.py').read_text(encoding='utf-8')
     listed = [line for line in (ROOT / 'scripts/requirements-run.txt').read_text().splitlines()
               if line and not line.startswith('#')]
-    declared = re.search(r'install_requires=\[(.*?)\]', setup, re.DOTALL).group(1)
-    assert sorted(re.findall(r"'(.+?)'", declared)) == sorted(listed)
+    assert sorted(metadata()['dependencies']) == sorted(listed)
     assert all('>=' in line and ',<' in line for line in listed)
     # What apt installs for a colcon workspace has the same bounds.
     names = {'numpy': 'numpy', 'scipy': 'scipy', 'PyYAML': 'yaml'}
@@ -306,12 +409,13 @@ def test_locks_have_hashes_and_no_host(level):
 
 
 def test_extras_have_the_bounds_of_the_test_list():
-    """What setup.py bounds as an extra the tests install within the same bounds."""
-    setup = (ROOT / 'setup.py').read_text(encoding='utf-8')
+    """What pyproject.toml bounds as an extra the tests install within the same bounds."""
     listed = {one.name: one.specifier for one in requirements('requirements-test.txt')}
-    declared = [Requirement(text) for text in re.findall(r"'([\w.-]+[<>=][^']*)'", setup)
-                if not text.startswith('python')]
+    extras = metadata()['optional-dependencies']
+    declared = [Requirement(text) for name in extras for text in extras[name] if name != 'logs']
     found = {one.name: one.specifier for one in declared}
+    (build,) = map(Requirement, PYPROJECT['build-system']['requires'])
+    assert build in requirements('requirements-build.txt')
     assert {'pyulog', 'orangebox', 'dask', 'distributed', 'pyarrow', 'pytest'} <= set(found)
     assert all({s.operator for s in specifier} == {'>=', '<'} for specifier in found.values())
     for name in set(found) & set(listed):

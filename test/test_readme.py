@@ -9,7 +9,7 @@ import sys
 
 from ou_monitor.cli.arguments import brownout_limit, CELL_LIMIT
 from ou_monitor.cli.commands import COMMANDS
-from project import ROOT
+from project import metadata, ROOT
 import pytest
 
 README = (ROOT / 'README.md').read_text(encoding='utf-8')
@@ -135,9 +135,9 @@ def test_no_command_is_missing():
 
 def test_executables_exist():
     """Each executable that is named is an entry point, and replay has the options named."""
-    setup = (ROOT / 'setup.py').read_text(encoding='utf-8')
+    scripts = metadata()['scripts']
     for name in re.findall(r'ros2 run ou_monitor (\w+)', README):
-        assert f"'{name} = ou_monitor.nodes.{name}:main'" in setup
+        assert scripts[name] == f'ou_monitor.nodes.{name}:main'
     line = next(line for line in README.splitlines() if 'run ou_monitor replay' in line)
     shown = run('-m', 'ou_monitor.nodes.replay', '--help')
     assert shown.returncode == 0, shown.stderr

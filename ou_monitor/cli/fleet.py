@@ -15,7 +15,7 @@ from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
     brownout_limit, positive_number, repeated, throttle_levels)
 from ou_monitor.cli.output import Progress
-from ou_monitor.errors import InputError
+from ou_monitor.errors import how_to_install, InputError
 
 if TYPE_CHECKING:
     from ou_monitor.fleet.fleet import Fleet
@@ -79,7 +79,7 @@ def _check_installed(args: argparse.Namespace) -> None:
     missing = [name for name in needed if find_spec(name) is None]
     if missing:
         raise InputError(f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} not "
-                         "installed: pip install 'ou_monitor[fleet]'")
+                         f"installed: {how_to_install('fleet')}")
     if args.scheduler is not None:
         from ou_monitor.fleet.cluster import check_address
         check_address(args.scheduler, args.insecure)

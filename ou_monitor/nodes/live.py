@@ -19,7 +19,7 @@ import secrets
 from threading import Thread
 from typing import Any
 
-from ou_monitor.errors import InputError
+from ou_monitor.errors import how_to_install, InputError
 from ou_monitor.nodes.run import make_executor, NAP, run as run_ros
 
 NAME = 'ou_live'
@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         import tornado.web  # noqa: F401
     except ImportError as error:
-        raise InputError("live needs tornado: pip install 'ou_monitor[live]'") from error
+        raise InputError(f"live needs tornado: {how_to_install('live')}") from error
     # A name of a node, as ROS writes it.
     names = [f"/{name.strip('/')}" for name in (args.estimator, args.filter)]
     return run_ros(NAME, lambda: _serve(args.host, port, *names), [])

@@ -12,6 +12,7 @@ from ou_monitor.nodes.base import LOCK, PUBLISH_RATE
 from ou_monitor.nodes.estimator_node import STATE_FILE
 from ou_monitor.nodes.sources import SOURCE_PARAMETERS
 from ou_monitor.online.settings import ESTIMATOR_PARAMETERS
+from project import metadata
 import pytest
 import yaml
 
@@ -125,14 +126,14 @@ def test_the_nodes_are_found_on_this_machine_alone(described):
 
 
 def test_launch_nodes(described):
-    """Executables that setup.py makes, names that the file has, sigma wired to the estimator."""
+    """Executables of the package, names that the file has, sigma wired to the estimator."""
     nodes = of_kind(described, 'Node')
     assert [n.kwargs['name'] for n in nodes] == list(DECLARED)
-    setup = ast.unparse(ast.parse((ROOT / 'setup.py').read_text()))
+    scripts = metadata()['scripts']
     for node in nodes:
         name = node.kwargs['executable']
         assert node.kwargs['package'] == 'ou_monitor'
-        assert f'{name} = ou_monitor.nodes.{name}:main' in setup
+        assert scripts[name] == f'ou_monitor.nodes.{name}:main'
         assert node.kwargs['namespace'].args == ('namespace',)
         assert node.kwargs['ros_arguments'][:3] == [
             '--enclave', f'/ou_monitor/{name}', '--log-level']

@@ -2,11 +2,18 @@
 
 from pathlib import Path
 import subprocess
+import tomllib
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 # What running the project makes; in an unpacked archive there is no git to say so.
 GENERATED = {'.venv', '.venv-noble', 'build', 'install', 'log', 'out', '__pycache__', '.git',
              '.hypothesis', '.pytest_cache', '.mypy_cache', 'ou_monitor.egg-info'}
+
+
+def metadata() -> dict[str, Any]:
+    """Return the table [project] of pyproject.toml."""
+    return tomllib.loads((ROOT / 'pyproject.toml').read_text(encoding='utf-8'))['project']
 
 
 def project_files() -> list[Path]:

@@ -16,7 +16,7 @@ import sys
 from typing import NamedTuple
 
 import numpy as np
-from ou_monitor.errors import InputError
+from ou_monitor.errors import how_to_install, InputError
 from ou_monitor.recordings.importers.log import Log, Progress, quiet, Request
 from ou_monitor.recordings.mcap_records import MAGIC as MCAP_MAGIC
 from ou_monitor.recordings.rosbag2_metadata import plain_texts
@@ -42,7 +42,7 @@ class Format(NamedTuple):
     fits: Callable[[bytes], bool]
     # Name of the module that reads it, beside this one; empty: not a log.
     module: str
-    # Package that it needs beyond the core, and the extra of setup.py that brings it.
+    # Package that it needs beyond the core, and the extra of pyproject.toml that brings it.
     package: str = ''
     extra: str = ''
 
@@ -129,7 +129,7 @@ def import_log(path: Path, request: Request) -> Log:
             raise
         raise InputError(
             f"'{path}' is {form.words}: reading it needs {form.package}: "
-            f"pip install 'ou_monitor[{form.extra}]'") from error
+            f'{how_to_install(form.extra)}') from error
     if request.progress is not None:
         request = replace(request, progress=_shown(request.progress))
     # Broken bytes make numbers that no cast takes, and fields of any shape.

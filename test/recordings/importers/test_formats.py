@@ -8,7 +8,8 @@ from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.importers.formats import detect, FORMATS, import_log
 from ou_monitor.recordings.importers.log import Request
-from project import ROOT
+from packaging.requirements import Requirement
+from project import metadata, ROOT
 import pytest
 
 CSV = b'time_s,voltage_v,throttle\n0.5,5.0,0.1\n0.6,5.1,0.1\n'
@@ -91,16 +92,15 @@ def test_a_missing_extra_is_named(tmp_path, name):
                           text=True, timeout=120)
     assert done.returncode == 2, done.stderr
     assert done.stderr.count('\n') == 1
-    assert f"pip install 'ou_monitor[{form.extra}]'" in done.stderr
+    assert f"pip install '.[{form.extra}]'" in done.stderr
     assert form.package in done.stderr
 
 
-def test_the_extras_are_in_setup():
+def test_the_extras_are_in_the_metadata():
     """Each extra named to users installs the package that it names, and 'logs' all of them."""
-    text = (ROOT / 'setup.py').read_text(encoding='utf-8')
-    extras = {}
-    exec(text[text.index('LOGS'):text.index('setup(')], extras)
+    extras = metadata()['optional-dependencies']
     for form in FORMATS:
         if form.extra:
-            assert any(form.package in one for one in extras['LOGS'][form.extra])
-    assert 'logs' in text
+            assert any(form.package in one for one in extras[form.extra])
+    (every,) = map(Requirement, extras['logs'])
+    assert every.extras == {form.extra for form in FORMATS if form.extra}
