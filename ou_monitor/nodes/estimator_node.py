@@ -33,7 +33,7 @@ from ou_monitor.nodes.clocks import IN_BURSTS, SendClock
 from ou_monitor.nodes.console import Console, PublisherWatch
 from ou_monitor.nodes.inputs import Arrivals, PolledInput, Silence, Stamper, types_on, within
 from ou_monitor.nodes.latch_file import LatchFile
-from ou_monitor.nodes.model_choice import ModelChoice, PATIENCE
+from ou_monitor.nodes.model_choice import ModelChoice
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.report import MonitorReport
@@ -89,7 +89,7 @@ class EstimatorNode(MonitorNode):
         self._settled = 0
         self._console = Console(self)
         # When the next estimate is due, and the load of pushing samples as a share of the time.
-        self._due = -math.inf
+        self._due = self._published = self._diagnosed = -math.inf
         self._load, self._loaded = 0.0, self.steady_now()
         self._throttle_heard = Silence(self.steady_now)
         self._problems: dict[str, str] = {}
@@ -136,8 +136,18 @@ class EstimatorNode(MonitorNode):
     def check(self, values: Mapping[str, Any]) -> None:
         """Raise `ValueError` when the parameters contradict each other."""
         path = monitor_settings(_of_monitor(values)).model_file
-        # At the start there is nothing to be kept waiting.
-        self._models.check(path, PATIENCE if self.running else None)
+        self._models.check(path, self._meanwhile)
+
+    def _meanwhile(self) -> None:
+        """Do the work of the timers while a callback waits for a file."""
+        if not self.running:
+            return
+        now = self.steady_now()
+        self._poll()
+        if now - self._published >= 1.0 / self.values()[PUBLISH_RATE.name]:
+            self._publish(*self._report())
+        if now - self._diagnosed >= 1.0:
+            self._diagnose()
 
     def apply(self, values: Mapping[str, Any]) -> None:
         """Bring checked parameters into force; no sample in the window is lost."""
@@ -331,7 +341,6 @@ class EstimatorNode(MonitorNode):
     def _report(self) -> tuple[MonitorReport, Level, str]:
         """Return the monitor's report, with what only the node can know put first."""
         self._poll()
-        self._monitor_model()
         now = self.steady_now()
         bursts = self._send_clock is not None and self._send_clock.in_bursts
         self._monitor.distrust(IN_BURSTS if bursts else '')
@@ -374,7 +383,7 @@ class EstimatorNode(MonitorNode):
 
     def _notes(self) -> list[str]:
         """Return what is to be said of the input whatever else is."""
-        notes = [self._models.problem] if self._models.problem else []
+        notes = []
         if self._stream.thin > 1:
             notes.append(f'Overload: one of {self._stream.thin} samples is estimated from; the '
                          'floor judges all.')
@@ -391,12 +400,6 @@ class EstimatorNode(MonitorNode):
             self._watched.look(self.get_publishers_info_by_topic(self._topic('voltage')),
                                voltage.publishers, self.steady_now())
 
-    def _monitor_model(self) -> None:
-        """Bring a model file into force that has been read meanwhile."""
-        model = self._models.now()
-        if model is not self._monitor.model:
-            self._monitor.set_model(model)
-
     def _useless(self) -> str:
         """Say why messages that arrive do not count as a voltage."""
         if self._stamper.waiting and self._stream.unplaced:
@@ -411,6 +414,7 @@ class EstimatorNode(MonitorNode):
 
     def _publish(self, report: MonitorReport, level: Level, summary: str) -> None:
         """Publish a report on every topic but the diagnostics."""
+        self._published = self.steady_now()
         values = {'alpha': report.estimate.alpha, 'sigma': report.estimate.sigma,
                   'var_inf': report.estimate.var_inf, 'brownout_risk': report.risk,
                   'throttle_budget': report.budget}
@@ -422,6 +426,7 @@ class EstimatorNode(MonitorNode):
         self._state.publish(self._message('state', report, level, summary, report.estimate.t))
 
     def _diagnose(self) -> None:
+        self._diagnosed = self.steady_now()
         found = self._report()
         if found[0].flag.low:
             # A dip is told in one report; without a hold the next one knows nothing of it.

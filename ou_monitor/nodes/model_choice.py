@@ -6,7 +6,9 @@ No ROS here: the nodes hand over the parameter.
 
 from __future__ import annotations
 
-from concurrent.futures import Future, ThreadPoolExecutor, TimeoutError as NotReadyError
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, TimeoutError as NotReadyError
+import time
 from typing import TYPE_CHECKING
 
 from ou_monitor.errors import InputError
@@ -15,8 +17,10 @@ from ou_monitor.stream.files import open_regular, path_words
 if TYPE_CHECKING:
     from ou_monitor.model.supply import SupplyModel
 
-# How long a callback waits for a file, s: most take 10 ms, the largest 5 s.
-PATIENCE = 0.25
+# Maximum time to read a file, s: most take 10 ms, the largest that is read at all 5 s.
+PATIENCE = 20.0
+# Time between calls of what the node must do meanwhile, s.
+PAUSE = 0.02
 
 
 class ModelChoice:
@@ -24,53 +28,45 @@ class ModelChoice:
     Model of the parameter `model_file`.
 
     A file is read when the path changes, not again when another parameter does: give an empty path
-    and then the old one to have it read anew.  It is read in a thread.  What is not read within
-    `PATIENCE` comes into force later, or becomes the `problem`, one line.
+    and then the old one to have it read anew.  It is read in a thread, and whoever has it checked
+    waits for it, so that the answer is true.
     """
 
     def __init__(self) -> None:
-        self.problem = ''
         self._used: tuple[str, SupplyModel | None] = '', None
-        self._checked: tuple[str, Future[SupplyModel] | None] = '', None
-        self._wanted = ''
+        self._checked: tuple[str, SupplyModel | None] = '', None
         self._reader = ThreadPoolExecutor(1, 'model_file')
 
-    def check(self, path: str, wait: float | None = PATIENCE) -> None:
-        """Have the file read, unless it is the one wanted; wait so many s for it (None: all)."""
-        if path == self._wanted:
-            return
-        if not path:
-            self._checked = path, None
+    def check(self, path: str, meanwhile: Callable[[], object] = lambda: None) -> None:
+        """
+        Read the file, unless it is the one in force; `ValueError` says why it cannot be used.
+
+        `meanwhile` is called every `PAUSE` until it has been read.
+        """
+        if not path or path == self._used[0]:
+            self._checked = self._used if path else ('', None)
             return
         future = self._reader.submit(_read, path)
-        self._checked = path, future
-        try:
-            future.result(wait)
-        except NotReadyError:
-            return
-        except InputError as error:
-            raise ValueError(f'model_file: {error}') from error
+        until = time.monotonic() + PATIENCE
+        while True:
+            try:
+                self._checked = path, future.result(PAUSE)
+                return
+            except NotReadyError as error:
+                if time.monotonic() > until:
+                    future.cancel()
+                    raise ValueError(f'model_file: {path_words(path)} was not read within '
+                                     f'{PATIENCE:g} s') from error
+                meanwhile()
+            except InputError as error:
+                raise ValueError(f'model_file: {error}') from error
 
     def use(self, path: str) -> SupplyModel | None:
-        """Want a path that was checked last; return the model in force by now."""
-        if path != self._wanted:
+        """Bring a path into force that was checked last; return its model."""
+        if path != self._used[0]:
             if path != self._checked[0]:
                 raise ValueError(f'model_file {path} has not been checked')
-            self._wanted, self.problem = path, ''
-        return self.now()
-
-    def now(self) -> SupplyModel | None:
-        """Return the model in force: the one wanted, as soon as it has been read."""
-        path, future = self._checked
-        if self._wanted != self._used[0] and path == self._wanted and not self.problem:
-            if future is None:
-                self._used = path, None
-            elif future.done():
-                error = future.exception()
-                if error is None:
-                    self._used = path, future.result()
-                else:
-                    self.problem = f'model_file {path} is not used: {error}'
+            self._used = self._checked
         return self._used[1]
 
     @property
@@ -83,7 +79,7 @@ class ModelChoice:
 def _read(path: str) -> SupplyModel:
     """Read a model file; the terms and their fits are loaded only where there is one."""
     try:
-        # Loading those takes longer than a callback waits on a busy machine; this does not.
+        # Loading those takes a second on a busy machine; this is told at once.
         open_regular(path).close()
     except (OSError, ValueError) as error:
         why = (error.strerror if isinstance(error, OSError) else None) or 'it is no path'

@@ -149,6 +149,17 @@ def test_model_files_that_are_none_hang_nothing(rig, tmp_path):
         wait_until(lambda n=states: len(rig.states) > n + 2, what='states')
 
 
+def test_a_model_file_that_takes_long_to_refuse_is_answered_with_the_reason(rig, tmp_path):
+    """Numbers where terms belong, read for a second or more; states go on meanwhile."""
+    path = tmp_path / 'long.yaml'
+    path.write_text('model:\n' + '- 0.12345678901234567890123456789012345678\n' * 15_000)
+    for _ in range(2):
+        states = len(rig.states)
+        result = rig.probe.set_parameter(rig.node, 'model_file', str(path))
+        assert not result.successful and 'a term needs' in result.reason
+        assert len(rig.states) > states and rig.field('model_terms') == ''
+
+
 def test_what_comes_as_a_parameter_kills_nothing(rig):
     """Limits that no budget can keep are refused together, with their range."""
     request = SetParameters.Request(parameters=[
