@@ -28,8 +28,8 @@ from mcap.reader import make_reader  # noqa: E402
 from mcap.writer import CompressionType, IndexType, Writer  # noqa: E402
 from mcap_ros2.decoder import DecoderFactory  # noqa: E402
 import numpy as np  # noqa: E402
-from ou_monitor.recordings.bag import BagReader, BagWriter  # noqa: E402
-from ou_monitor.recordings.columns import batches, join  # noqa: E402
+from ou_monitor.recordings.bag import BagReader, BagWriter, batches  # noqa: E402
+from ou_monitor.recordings.cdr import join  # noqa: E402
 from ou_monitor.recordings.read import read_pieces, read_recording  # noqa: E402
 from ou_monitor.recordings.standard_types import (  # noqa: E402
     BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, SCHEMAS)
@@ -198,7 +198,7 @@ def unpacked(path: Path) -> int:
     """Read and unpack the chunks, their checksums verified: what every reader has to do."""
     file = BagReader(path)._files[0]
     with path.open('rb') as stream:
-        return sum(len(file.span_data(stream, span)) for span in file.spans)
+        return sum(len(file._data(stream, span)) for span in file.spans)
 
 
 def ours(path: Path, case: Case) -> Columns:

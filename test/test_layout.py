@@ -21,7 +21,7 @@ LEVEL = {
 FACADE_LEVEL = 8.5
 PLOTTING = {'matplotlib', 'plotly', 'seaborn', 'bokeh', 'PIL'}
 MCAP = {'mcap', 'mcap_ros2', 'rosbags', 'rosbag2_py', 'zstandard', 'lz4'}
-MCAP_MODULES = {'ou_monitor.recordings.bag', 'ou_monitor.recordings.bag_reader'}
+MCAP_MODULES = {'ou_monitor.recordings.bag', 'ou_monitor.recordings.mcap_file'}
 # Parsers of logs: optional, each in one importer.
 PARSERS = {'pyulog': 'ulog', 'pymavlink': 'dataflash', 'orangebox': 'blackbox'}
 CORE = {'numpy', 'scipy'}

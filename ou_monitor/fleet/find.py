@@ -17,7 +17,7 @@ from pathlib import Path
 import stat
 
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.rosbag2_metadata import FILE, is_part
+from ou_monitor.recordings.bag import FILE, is_part
 from ou_monitor.stream.files import open_regular
 from ou_monitor.text import printable
 

@@ -22,7 +22,7 @@ import signal
 import threading
 from typing import Any
 
-from ou_monitor.recordings.limits import usable_memory
+from ou_monitor.recordings.mcap_file import usable_memory
 
 # Several processes with several threads of linear algebra each are slower than with one.
 _ONE_THREAD = dict.fromkeys(

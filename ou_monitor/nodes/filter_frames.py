@@ -1,7 +1,7 @@
 """
 Messages of `adaptive_filter` as the middleware has them.
 
-Signals are read and replaced where the layout of a message has them (`recordings.layout`): of an
+Signals are read and replaced where the layout of a message has them (`recordings.cdr`): of an
 Imu that costs a sixth of what decoding and encoding do.  A message without a layout, and one
 that becomes another in a derivative, is decoded.
 """
@@ -15,8 +15,8 @@ from typing import Any
 from ou_monitor.nodes.filter_channels import Channels, Group
 from ou_monitor.nodes.inputs import decode
 from ou_monitor.nodes.sources import definition_of, message_class
-from ou_monitor.recordings.columns import MOST_LAYOUTS
-from ou_monitor.recordings.layout import Layout, layout_of, parse_definition, Place, short_name
+from ou_monitor.recordings.cdr import (
+    Layout, layout_of, MOST_LAYOUTS, parse_definition, Place, short_name)
 from ou_monitor.stream.config import FieldPath
 
 _STAMP: tuple[FieldPath, ...] = (('header', 'stamp', 'sec'), ('header', 'stamp', 'nanosec'))

@@ -19,8 +19,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode
 from ou_monitor.nodes.clocks import SendClock, SimClockMap
 from ou_monitor.nodes.sources import definition_of
-from ou_monitor.recordings.columns import FieldReader
-from ou_monitor.recordings.mcap_records import Table
+from ou_monitor.recordings.cdr import FieldReader, Table
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.arrival import Publishers
 from ou_monitor.stream.config import FieldSpec

@@ -1,30 +1,545 @@
 """
-MCAP bags: written here by `BagWriter`, read by `BagReader`.
+Bags: an .mcap file, or a rosbag2 directory of several with its `metadata.yaml`.
 
-This module and `bag_reader.py` are the only ones that import mcap; all others
-take both classes from here.
+`BagReader` reads messages one by one, and `batches` fields of topics as arrays, in the order of
+log times; memory holds the chunks that overlap in time.  A bag that is cut off or damaged is
+refused with the byte and the recording time where the trouble begins or, when asked, read as
+far as it is intact.  `BagWriter` writes bags, metadata.yaml as of version 9 (ROS 2 Jazzy); every
+version is read, for only the list of files, the QoS and the custom data are used.
+
+This module and `mcap_file.py` are the only ones that import mcap.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
-from dataclasses import replace
-from pathlib import Path
+import bisect
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import redirect_stderr, suppress
+from dataclasses import dataclass, replace
+import functools
+import io
+from pathlib import Path, PurePosixPath
 import shutil
 from types import TracebackType
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 from mcap.writer import CompressionType, Writer
-from ou_monitor.errors import InputError
-from ou_monitor.recordings.bag_reader import BagReader, DecodedMessage
-from ou_monitor.recordings.mcap_file import RawMessage
-from ou_monitor.recordings.mcap_index import ABOUT, ORIGIN, SAMPLE_RATE
-from ou_monitor.recordings.rosbag2_metadata import qos_profile, TopicInfo, write_metadata
+from mcap_ros2._dynamic import _for_each_msgdef
+from mcap_ros2.decoder import DecoderFactory
+import numpy as np
+from ou_monitor.errors import InputError, nearest
+from ou_monitor.recordings.cdr import (
+    Broken, check_extent, Column, DEFAULTS, Definitions, endless, Field, FieldReader, join,
+    parse_definition, short_name, Table)
+from ou_monitor.recordings.mcap_file import (
+    ABOUT, custom_data, McapFile, moment, MOST_BYTES, MOST_NODES, ORIGIN, SAMPLE_RATE, Span)
 from ou_monitor.recordings.standard_types import SCHEMAS, TYPE_HASHES
+from ou_monitor.stream.config import FieldSpec
+from ou_monitor.stream.files import one_line, parse_yaml, path_words, read_yaml
+from ou_monitor.text import printable, some
 import yaml
 
-__all__ = ['BagReader', 'BagWriter', 'DecodedMessage', 'RawMessage', 'TopicInfo']
+FILE = 'metadata.yaml'
+_ROOT = 'rosbag2_bagfile_information'
+
+# rosbag2 writes "for ever" of the middleware as the greatest duration.
+_FOR_EVER = {'sec': 9223372036, 'nsec': 854775807}
+
+# Before version 9 policies were numbers (rmw/types.h).
+_RELIABILITY: dict[int, str] = {1: 'reliable', 2: 'best_effort'}
+_DURABILITY: dict[int, str] = {1: 'transient_local', 2: 'volatile'}
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """
+    One topic of a bag.
+
+    Attributes
+    ----------
+    name : str
+        Topic name, absolute.
+    type : str
+        Message type, 'package/msg/Type'.
+    count : int
+        Number of messages.
+    reliability, durability : str
+        QoS that the publisher offered.
+    depth : int
+        Depth of the publisher's history, messages.
+
+    """
+
+    name: str
+    type: str  # noqa: A003
+    count: int
+    reliability: str = 'reliable'
+    durability: str = 'volatile'
+    depth: int = 10
+
+
+class BagFiles(NamedTuple):
+    """
+    What a path to a bag stands for.
+
+    Attributes
+    ----------
+    paths : list of pathlib.Path
+        MCAP files in recorded order.
+    qos : dict of str to object
+        Topic name -> offered QoS.
+    about : dict of str to str
+        Custom data of the recording, such as its vehicle.
+    missing : str
+        What is missing; '' when nothing is.
+
+    """
+
+    paths: list[Path]
+    qos: dict[str, Any]
+    about: dict[str, str]
+    missing: str
+
+
+def qos_profile(topic: TopicInfo) -> list[dict[str, Any]]:
+    """Return the offered QoS of a topic as rosbag2 writes it."""
+    return [{
+        'history': 'keep_last', 'depth': topic.depth, 'reliability': topic.reliability,
+        'durability': topic.durability, 'deadline': dict(_FOR_EVER),
+        'lifespan': dict(_FOR_EVER), 'liveliness': 'automatic',
+        'liveliness_lease_duration': dict(_FOR_EVER),
+        'avoid_ros_namespace_conventions': False,
+    }]
+
+
+def parse_qos(text_or_list: Any) -> tuple[str, str, int]:
+    """Return (reliability, durability, depth) of a recorded QoS."""
+    profiles = text_or_list
+    if isinstance(profiles, str):
+        try:
+            profiles = parse_yaml(profiles, 'QoS', most_bytes=100_000)
+        except InputError:
+            # A QoS nobody can read is no reason to refuse the messages.
+            profiles = None
+    first: dict[str, Any] = {}
+    if isinstance(profiles, list) and profiles and isinstance(profiles[0], dict):
+        first = profiles[0]
+    depth = first.get('depth')
+    return (_policy(first.get('reliability'), _RELIABILITY, 'reliable'),
+            _policy(first.get('durability'), _DURABILITY, 'volatile'),
+            depth if isinstance(depth, int) and 0 < depth < 2**31 else 10)
+
+
+def _policy(value: Any, numbers: Mapping[int, str], default: str) -> str:
+    """Return a policy by its name or number."""
+    name = numbers.get(value) if isinstance(value, int) else value
+    return str(name) if name in list(numbers.values()) else default
+
+
+def read_metadata(folder: Path) -> BagFiles:
+    """Return the MCAP files of a rosbag2 directory, and what is said of them."""
+    with one_line():
+        return _metadata(folder)
+
+
+def _metadata(folder: Path) -> BagFiles:
+    path = folder / FILE
+    where = path_words(path)
+    content = read_yaml(path, 'the metadata', most_bytes=MOST_BYTES, most_nodes=MOST_NODES)
+    info = content.get(_ROOT) if isinstance(content, dict) else None
+    if not isinstance(info, dict):
+        raise InputError(f"{where} has no '{_ROOT}': it is not the metadata of a rosbag2")
+    storage = info.get('storage_identifier')
+    if storage != 'mcap':
+        raise InputError(
+            f"{path_words(folder)}: the storage is '{printable(storage, 40)}', only mcap is read: "
+            "convert it with 'ros2 bag convert' to the storage mcap")
+    names = info.get('relative_file_paths')
+    if not isinstance(names, list) or not names:
+        raise InputError(f"{where} names no file in 'relative_file_paths'")
+    # Old versions wrote the folder before the name.
+    files = [folder / name for name in dict.fromkeys(
+        PurePosixPath(str(name)).name for name in names)]
+    for file in files:
+        if not file.is_file():
+            raise InputError(f"{where} names '{printable(file.name, 60)}', which is not in its "
+                             'folder')
+    qos: dict[str, Any] = {}
+    entries = info.get('topics_with_message_count')
+    for entry in entries if isinstance(entries, list) else ():
+        topic = entry.get('topic_metadata') if isinstance(entry, dict) else None
+        if isinstance(topic, dict):
+            qos[str(topic.get('name'))] = topic.get('offered_qos_profiles')
+    return BagFiles(files, qos, custom_data(info), '')
+
+
+def is_part(file: Path, folder: Path) -> bool:
+    """Return whether an .mcap file has the name that rosbag2 gives it in its folder."""
+    begin = folder.name + '_'
+    return file.stem.startswith(begin) and file.stem[len(begin):].isdigit()
+
+
+def find_files(path: Path, partial: bool) -> BagFiles:
+    """Return what a path to a bag stands for."""
+    if path.name == FILE and path.is_file():
+        path = path.parent
+    if not path.exists():
+        raise InputError(f'{path} is a link that leads nowhere' if path.is_symlink()
+                         else f'there is no bag {path}: check the path')
+    if not path.is_dir():
+        return BagFiles([path], {}, {}, '')
+    if (path / FILE).exists():
+        return read_metadata(path)
+    # NAME_0.mcap .. NAME_10.mcap: the shorter name is the earlier one.
+    files = sorted(path.glob('*.mcap'), key=lambda file: (len(file.name), file.name))
+    if not files:
+        raise InputError(f'{path} is not a bag: it holds neither {FILE} nor an .mcap file'
+                         + ("; name one of the bags in it, or give all to 'ou-monitor fleet'"
+                            if any(path.glob(f'*/{FILE}')) else
+                            "; 'ou-monitor fleet' takes folders of recordings"))
+    missing = f'{FILE} is missing: the recording was cut off'
+    if not partial:
+        if not all(is_part(file, path) for file in files):
+            raise InputError(
+                f'{path}: {FILE} is missing: name one of the .mcap files in it; if they are one '
+                'recording that was cut off, use --partial')
+        raise InputError(f'{path}: {missing}; use --partial to take what it still holds')
+    return BagFiles(files, {}, {}, missing)
+
+
+class RawMessage(NamedTuple):
+    """One message as recorded; `data` is CDR, `log_time_ns` in ns."""
+
+    topic: str
+    type: str  # noqa: A003
+    log_time_ns: int
+    data: bytes
+
+
+class DecodedMessage(NamedTuple):
+    """One message with its fields as attributes."""
+
+    topic: str
+    type: str  # noqa: A003
+    log_time_ns: int
+    message: Any
+
+
+class Part(NamedTuple):
+    """The messages of one chunk or run."""
+
+    #: Topic -> its messages, in the order of the file.
+    tables: dict[str, Table]
+    #: Log time that no message of a later part is before, ns; None after the last part.
+    later_ns: int | None
+    #: Share of the bytes to be read that are read, 0..1.
+    done: float
+
+
+class BagReader:
+    """
+    Reads a bag, .mcap file or rosbag2 directory; with `partial` as far as a damaged one holds.
+
+    max_chunk: bytes that a chunk may unpack to; else OU_MONITOR_MAX_CHUNK_MB, or 256 times the
+    file, at least 64 MiB and at most an eighth of the memory.  By topic: message types in
+    `topics`, number and QoS in `info`, rate of the samples within blocks, Hz, in `sample_rates`,
+    and where values came from in `origins`, as far as the bag states it.  `about` is the custom
+    data of metadata.yaml or of the files; `start_ns`, `end_ns` the log times of the first and last
+    message; `damage` where and how the bag is damaged, else None; `notes` topics left out, and the
+    like.  InputError: missing, empty, foreign, without messages, or damaged and not `partial`.
+    """
+
+    def __init__(self, path: Path | str, *, partial: bool = False,
+                 max_chunk: int | None = None) -> None:
+        """Index the bag; messages are read later, and no file stays open between reads."""
+        self.path = Path(path)
+        self.partial = partial
+        paths, qos, about, missing = find_files(self.path, partial)
+        self._files = [McapFile(file, partial, max_chunk) for file in paths]
+        # The table of the directory is what a person edits: it holds.
+        self.about = {key: value for known in (*(file.about for file in self._files), about)
+                      for key, value in known.items()}
+        held = [file for file in self._files if file.spans]
+        self.start_ns = min((file.start_ns for file in held), default=0)
+        self.end_ns = max((file.end_ns for file in held), default=0)
+        for file in self._files:
+            file.origin_ns = self.start_ns
+        damages = [f'{file.path.name} is damaged {file.damage}'
+                   for file in self._files if file.damage]
+        if damages and not partial:
+            broken = next(file for file in self._files if file.damage)
+            raise InputError(f'{broken.path} is damaged {broken.damage}; use --partial to take '
+                             'what it still holds')
+        self.damage = '; '.join(([missing] if missing else []) + damages) or None
+        self.info: dict[str, TopicInfo] = {}
+        self.sample_rates: dict[str, float] = {}
+        self.origins: dict[str, dict[str, str]] = {}
+        self._schemas: dict[str, Any] = {}
+        self._collect(qos)
+        self.notes = tuple(dict.fromkeys(note for file in self._files for note in file.notes))
+        self.topics = {name: info.type for name, info in self.info.items()}
+        self.message_count = sum(info.count for info in self.info.values())
+        if self.message_count == 0:
+            why = self.damage or ' '.join(self.notes) or (
+                'topics: ' + (some(self.topics) or 'none'))
+            raise InputError(f'{self.path} holds no messages ({why})')
+
+    def _collect(self, qos: Mapping[str, Any]) -> None:
+        """Bring together what the files say of each topic."""
+        spent = 0
+        for file in self._files:
+            for key, topic in file.topics.items():
+                if topic.sample_rate is not None:
+                    self.sample_rates[topic.name] = topic.sample_rate
+                if topic.origin:
+                    self.origins[topic.name] = topic.origin
+                known = self.info.get(topic.name)
+                if known is None:
+                    profiles = qos.get(topic.name) or topic.qos
+                    spent += len(profiles) if isinstance(profiles, str) else 0
+                    known = TopicInfo(topic.name, topic.type, 0, *parse_qos(
+                        profiles if spent < MOST_BYTES else None))
+                if known.type != topic.type:
+                    raise InputError(f"{self.path}: topic '{topic.name}' has two types, "
+                                     f'{known.type} and {topic.type}')
+                schema = self._schemas.setdefault(topic.type, topic.schema)
+                if schema.data != topic.schema.data and _fields(schema) != _fields(topic.schema):
+                    raise InputError(f'{self.path}: type {topic.type} has two definitions, which '
+                                     'differ: read the files of the bag one by one')
+                self.info[topic.name] = replace(
+                    known, count=known.count + file.counts.get(key, 0))
+
+    def _spans(self, wanted: set[str]) -> list[tuple[Span, McapFile]]:
+        """Return where topics are, in the order of the first log times."""
+        spans: list[tuple[Span, McapFile]] = []
+        for file in self._files:
+            channels = file.channels_of(wanted).keys()
+            spans += [(span, file) for span in file.spans
+                      if span.channels is None or span.channels & channels]
+        return sorted(spans, key=lambda pair: pair[0].start_ns)
+
+    def tables(
+        self, topics: Iterable[str], *, start_ns: int | None = None, end_ns: int | None = None,
+    ) -> Iterator[Part]:
+        """
+        Yield where the messages are, chunk by chunk, for reading them in bulk.
+
+        start_ns, end_ns in ns.
+        """
+        wanted = self._wanted(topics)
+        spans = [(span, file) for span, file in self._spans(wanted)
+                 if (start_ns is None or span.end_ns >= start_ns)
+                 and (end_ns is None or span.start_ns < end_ns)]
+        total = sum(span.length for span, _ in spans)
+        read = place = 0
+        while place < len(spans):
+            file, first, size = spans[place][1], place, 0
+            # Small chunks are read together.
+            while place < len(spans) and spans[place][1] is file and (
+                    place == first or size + spans[place][0].unpacked <= _TOGETHER):
+                size += spans[place][0].unpacked
+                read += spans[place][0].length
+                place += 1
+            tables = file.tables([span for span, _ in spans[first:place]], wanted)
+            later = None if place == len(spans) else spans[place][0].start_ns
+            yield Part(_within(tables, start_ns, end_ns), later, read / total)
+
+    def tables_before(self, topic: str, before_ns: int) -> Iterator[tuple[Table, int]]:
+        """
+        Yield the messages of a topic before a log time, the chunk that ends last first.
+
+        before_ns in ns; with each the log time that all later ones are before.
+        """
+        wanted = self._wanted([topic])
+        spans = [pair for pair in self._spans(wanted) if pair[0].start_ns < before_ns]
+        spans.sort(key=lambda pair: pair[0].end_ns, reverse=True)
+        for place, (span, file) in enumerate(spans):
+            older = spans[place + 1][0].end_ns if place + 1 < len(spans) else 0
+            for table in _within(file.tables([span], wanted), None, before_ns).values():
+                yield table, older
+
+    def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
+        """Yield the messages in the order of their log times."""
+        pending: list[RawMessage] = []
+        for part in self.tables(self.topics if topics is None else topics):
+            # Of one time, in the order of the file.
+            rows = sorted((begin, end, log_time, name) for name, table in part.tables.items()
+                          for begin, end, log_time in zip(
+                              table.begin.tolist(), table.end.tolist(), table.log_time.tolist()))
+            pending += [RawMessage(name, self.topics[name], log_time,
+                                   part.tables[name].data[begin:end])
+                        for begin, end, log_time, name in rows]
+            pending.sort(key=lambda message: message.log_time_ns)
+            # What is older than all that is still to be read can go.
+            ready = len(pending) if part.later_ns is None else bisect.bisect_left(
+                pending, part.later_ns, key=lambda message: message.log_time_ns)
+            yield from pending[:ready]
+            del pending[:ready]
+
+    def definition(self, kind: str) -> str:
+        """Return the ros2msg text of a type in the bag."""
+        return _text(self._schemas[kind])
+
+    def decoded(self, topics: Iterable[str] | None = None) -> Iterator[DecodedMessage]:
+        """Yield the messages with their fields as attributes, in log-time order."""
+        decoder = functools.cache(self.decoder)
+        for topic, kind, log_time, data in self.raw_messages(topics):
+            yield DecodedMessage(topic, kind, log_time, decoder(kind)(data))
+
+    def decoder(self, kind: str) -> Callable[[bytes], Any]:
+        """Return the function from CDR bytes to a message of one type in the bag."""
+        def complain(error: Exception) -> InputError:
+            return InputError(f'{self.path}: a message of type {kind} cannot be decoded '
+                              f'({type(error).__name__}: {printable(error, 200)})')
+        try:
+            # The library tells a definition that it cannot read on standard error as well.
+            with redirect_stderr(io.StringIO()):
+                decode = DecoderFactory().decoder_for('cdr', self._schemas[kind])
+                definitions = _definitions(kind, self.definition(kind))
+        except Exception as error:
+            raise complain(error) from error
+        if decode is None:
+            raise InputError(f'{self.path}: type {kind} has no ros2msg definition')
+        name = short_name(kind)
+        unsafe = endless(name, definitions)
+
+        def checked(data: bytes) -> Any:
+            try:
+                if data[:1] != b'\0' or data[1:2] > b'\1':
+                    # The library would read the other encodings as this one.
+                    raise ValueError('it is not plain CDR')
+                if unsafe:
+                    check_extent(data, name, definitions)
+                return decode(data)
+            except Exception as error:
+                raise complain(error) from error
+        return checked
+
+    def _wanted(self, topics: Iterable[str]) -> set[str]:
+        wanted = set(topics)
+        for topic in sorted(wanted):
+            if topic not in self.topics:
+                raise InputError(f"{self.path}: no topic '{topic}': "
+                                 f'{nearest(topic, self.topics)}')
+        return wanted
+
+
+def _text(schema: Any) -> str:
+    return str(schema.data.decode('utf-8', 'replace'))
+
+
+def _fields(schema: Any) -> object:
+    """Return the fields of a type; its text where it cannot be parsed."""
+    return parse_definition(schema.name, _text(schema)) or schema.data
+
+
+def _definitions(kind: str, text: str) -> Definitions:
+    """Return the fields of a type and of those in it, as the library understands them."""
+    found = dict(DEFAULTS)
+
+    def add(_: str, name: str, parsed: Any) -> None:
+        found[name] = tuple(
+            Field(field.name, field.type.type if field.type.is_primitive_type()
+                  else f'{field.type.pkg_name}/{field.type.type}', bool(field.type.is_array),
+                  field.type.array_size if field.type.is_fixed_size_array() else None)
+            for field in parsed.fields)
+
+    _for_each_msgdef(kind, text, add)
+    return found
+
+
+def _within(tables: dict[str, Table], start_ns: int | None, end_ns: int | None,
+            ) -> dict[str, Table]:
+    """Return what is in a span of log times of each table, and only tables with messages."""
+    if start_ns is not None:
+        tables = {name: table.where(table.log_time >= np.uint64(start_ns))
+                  for name, table in tables.items()}
+    if end_ns is not None:
+        tables = {name: table.where(table.log_time < np.uint64(end_ns))
+                  for name, table in tables.items()}
+    return {name: table for name, table in tables.items() if table.n}
+
+
+def field_reader(bag: BagReader, spec: FieldSpec, broken: Broken | None = None) -> FieldReader:
+    """Return the reader of a field of a topic of a bag; `broken` as of `batches`."""
+    def refuse(log_time: int, error: InputError) -> None:
+        raise InputError(f'{error} ({moment(log_time, bag.start_ns)}); use --partial to leave it '
+                         'out') from error
+
+    return FieldReader(spec, bag.definition(spec.type), functools.partial(bag.decoder, spec.type),
+                       broken or refuse)
+
+
+def batches(
+    bag: BagReader, specs: Mapping[str, FieldSpec], *, start_ns: int | None = None,
+    end_ns: int | None = None, progress: Callable[[float], None] | None = None,
+    broken: Broken | None = None,
+) -> Iterator[dict[str, Column]]:
+    """Yield fields of a bag, batch by batch (start_ns, end_ns in ns, progress 0..1)."""
+    readers = {name: field_reader(bag, spec, broken) for name, spec in specs.items()}
+    pending: dict[str, list[Column]] = {name: [] for name in specs}
+    counts = dict.fromkeys(specs, 0)
+    topics = [spec.topic for spec in specs.values()]
+    for part in bag.tables(topics, start_ns=start_ns, end_ns=end_ns):
+        ready = {}
+        for name, reader in readers.items():
+            table = part.tables.get(reader.spec.topic)
+            if table is not None:
+                counts[name] += table.n
+                pending[name].append(reader.read(table))
+            if not pending[name]:
+                continue
+            column = join(pending[name]).in_time_order()
+            if part.later_ns is not None:
+                until = np.searchsorted(column.log_time, np.uint64(part.later_ns), 'left')
+                column, left = column.split(int(until))
+                pending[name] = [left] if left.n else []
+            if column.n:
+                ready[name] = column
+        if progress is not None:
+            progress(part.done)
+        if ready:
+            yield ready
+    if start_ns is None and end_ns is None:
+        for name, spec in specs.items():
+            _check_count(bag, spec.topic, counts[name])
+
+
+def _check_count(bag: BagReader, topic: str, found: int) -> None:
+    stated = bag.info[topic].count
+    if found < stated:
+        raise InputError(
+            f"{bag.path} is damaged: it states {stated} messages of topic '{topic}', {found} were "
+            'found; use --partial to take what it still holds')
+
+
+def last_before(bag: BagReader, spec: FieldSpec, before_ns: int,
+                broken: Broken | None = None) -> Column:
+    """
+    Return messages of a topic up to the last one before a log time that says something.
+
+    before_ns in ns.
+    """
+    reader = field_reader(bag, spec, broken)
+    found: list[Column] = []
+    newest = -1
+    for table, older in bag.tables_before(spec.topic, before_ns):
+        column = reader.read(table)
+        found.append(column)
+        says = column.count > 0
+        if spec.nan == 'drop':
+            finite = np.add.reduceat(np.append(np.isfinite(column.values), False),
+                                     np.cumsum(column.count) - column.count) > 0
+            says &= finite
+        if says.any():
+            newest = max(newest, int(column.log_time[says].max()))
+        if newest > older:
+            break
+    return join(found[::-1]).in_time_order()
+
+
+# Chunks are read together up to this size, bytes unpacked.
+_TOGETHER = 1024 * 1024
 
 # Small chunks: a recording cut off by the brown-out it was made for loses what
 # is in the last one, here about a second at 1 kHz.
@@ -189,3 +704,40 @@ class BagWriter:
 
 def _as_text(value: str) -> str:
     return value.encode('utf-8', 'backslashreplace').decode()
+
+
+def write_metadata(
+    folder: Path, file: str, topics: Iterable[TopicInfo], hashes: dict[str, str],
+    start_ns: int, end_ns: int, custom: Mapping[str, str] | None = None,
+) -> None:
+    """Write metadata.yaml (version 9) of a directory with one MCAP file."""
+    infos = list(topics)
+    count = sum(topic.count for topic in infos)
+    content = {_ROOT: {
+        'version': 9,
+        'storage_identifier': 'mcap',
+        'duration': {'nanoseconds': end_ns - start_ns},
+        'starting_time': {'nanoseconds_since_epoch': start_ns},
+        'message_count': count,
+        'topics_with_message_count': [{
+            'topic_metadata': {
+                'name': topic.name, 'type': topic.type, 'serialization_format': 'cdr',
+                'offered_qos_profiles': qos_profile(topic),
+                'type_description_hash': hashes.get(topic.type, ''),
+            },
+            'message_count': topic.count,
+        } for topic in infos],
+        'compression_format': '',
+        'compression_mode': '',
+        'relative_file_paths': [file],
+        'files': [{
+            'path': file,
+            'starting_time': {'nanoseconds_since_epoch': start_ns},
+            'duration': {'nanoseconds': end_ns - start_ns},
+            'message_count': count,
+        }],
+        'custom_data': dict(custom) if custom else None,
+        'ros_distro': 'jazzy',
+    }}
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=False)
+    (folder / FILE).write_text(text, encoding='utf-8')

@@ -1,32 +1,87 @@
 """
-One .mcap file, read span by span, and the messages of several in the order of log times.
+One .mcap file, by the MCAP library: its topics, where their messages are, and its damage.
 
-Knows the frame and what a damaged file still holds; the contents of records are left
-to the MCAP library, reached through a `Codec` (`bag_reader.py` has the only one).
-Memory holds only the chunks that overlap in time.
+A file with an intact summary is read by it; any other, and each that is read with `partial`,
+is walked record by record.  Each stated size is compared with its limit before anything is
+read or unpacked, and the message indexes behind a chunk are used only if the records that they
+name fill the chunk.  Damage is reported by chunk.  https://mcap.dev/spec
+
+Limits: without checksums in the file, a wrong byte within a message goes unnoticed, and a lost
+message is only missed where the summary counts the messages or the walk stumbles.
 """
 
 from __future__ import annotations
 
+from array import array
 import bisect
-from collections.abc import Callable, Iterable, Iterator
-from operator import itemgetter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+import io
+import math
 import os
 from pathlib import Path
+import resource
 import shlex
+import struct
 from typing import Any, BinaryIO, NamedTuple
+import zlib
 
+import lz4.frame
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, Metadata, Schema
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.limits import chunk_limit, file_limit, MOST_METADATA, over_limit
-from ou_monitor.recordings.mcap_index import Break, Codec, McapIndex, MOST_BREAKS, TopicRecord
-from ou_monitor.recordings.mcap_records import (
-    check_passed_over, crc_of, Damage, find_by_index, find_messages, FOOTER_LENGTH, inner_records,
-    MAGIC, MESSAGE_HEAD, moment, Op, record_at, RECORD_HEAD, Span, Table)
-from ou_monitor.recordings.mcap_scan import scan
-from ou_monitor.stream.files import open_regular, path_words
-from ou_monitor.text import printable
+from ou_monitor.recordings.cdr import gather, IntArray, Table
+from ou_monitor.stream.files import open_regular, parse_yaml, path_words
+from ou_monitor.text import counted, printable
+import zstandard
+
+MAGIC = b'\x89MCAP0\r\n'
+# Opcode and length of a record; channel, sequence, log time and publish time of a message.
+_HEAD, _MESSAGE = struct.Struct('<BQ'), struct.Struct('<HIQQ')
+_FOOTER = _HEAD.size + 20 + len(MAGIC)
+# Where the message in a record begins.
+_DATA = _HEAD.size + _MESSAGE.size
+# Opcodes from here on are private to a writer.
+_PRIVATE = 0x80
+# Records that may stand before the end of the data, and after it: a record whose opcode has a
+# wrong bit must not be skipped as another kind.
+_IN_DATA = {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK,
+            Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END,
+            Opcode.FOOTER}
+_IN_SUMMARY = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX,
+               Opcode.STATISTICS, Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER}
+_LENGTHS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
+
+# Where a channel's metadata holds the rate of the samples within a block, Hz, and what its keys
+# begin with that say where the values came from.
+SAMPLE_RATE, ORIGIN = 'sample_rate_hz', 'origin.'
+# Metadata records that say where the recording came from: written here, and by rosbag2, whose
+# record holds the text of a metadata.yaml of at most so many bytes and values (2000 topics).
+ABOUT, ROSBAG2 = 'ou_monitor', 'rosbag2'
+MOST_BYTES, MOST_NODES = 8_000_000, 200_000
+# A metadata record, and all together; bytes.  rosbag2 writes two tables of contents.
+_MOST_METADATA, _MOST_TABLES = 10_000_000, 3
+# A definition has some kB; DDS has no names beyond 256 characters.
+_MOST_DEFINITION, _MOST_OF_NAME = 256 * 1024, 256
+# Damages after which the walk ends, topics left out that are named, and records of a chunk
+# beside its messages: one schema and one channel for each number.
+_MOST_BREAKS, _MOST_NOTES, _MOST_OTHERS = 10_000, 20, 2 * 65536
+# Messages outside of chunks are read in blocks of so many bytes.
+_BLOCK = 64 * 1024
+# Of more channels only those in a chunk are looked for.
+_FEW_CHANNELS = 8
+
+# Ratio of what the chunks unpack to and the file: 20 to 30 for logs of a constant voltage, and
+# 30 000 for zeros.
+_MOST_RATIO = 256
+# Least limit of a chunk in bytes, and its greatest share of the memory.
+_LEAST_LIMIT, _CHUNKS_AT_ONCE = 64 * 1024 * 1024, 8
+_VARIABLE = 'OU_MONITOR_MAX_CHUNK_MB'
 
 # First bytes of the logs that `ou-monitor convert` reads; CSV is read as it is.
 _LOGS = (
@@ -34,74 +89,151 @@ _LOGS = (
     (b'FMT,', 'an ArduPilot log'), (b'H Product:Blackbox', 'a blackbox log'))
 
 
-# Of more channels only those in a chunk are looked for.
-_FEW_CHANNELS = 8
+class Damage(Exception):
+    """A part of the file that makes no sense."""
 
 
-class RawMessage(NamedTuple):
-    """One message as recorded; `data` is CDR, `log_time_ns` in ns."""
+class Break(NamedTuple):
+    """A damage: the byte where it begins, and the reason."""
 
-    topic: str
+    offset: int
+    why: str
+
+
+class Span(NamedTuple):
+    """A part of the file that holds messages and is read in one go."""
+
+    #: Log times of its first and last message, ns.
+    start_ns: int
+    end_ns: int
+    #: Bytes of the file: the content of a chunk, or messages outside of chunks.
+    offset: int
+    length: int
+    chunk: bool
+    #: Channels with messages in it; None: not known.
+    channels: frozenset[int] | None = None
+    #: Bytes of message indexes right behind it.
+    index_length: int = 0
+    #: Bytes that the chunk unpacks to, as stated; 0: not stated.
+    unpacked: int = 0
+
+
+class Topic(NamedTuple):
+    """A channel of ROS 2 messages."""
+
+    name: str
     type: str  # noqa: A003
-    log_time_ns: int
-    data: bytes
+    schema: Any
+    #: QoS offered, as written.
+    qos: str
+    #: Rate of the samples within a block, Hz.
+    sample_rate: float | None
+    #: Where its values came from.
+    origin: dict[str, str]
 
 
-class McapFile(McapIndex):
-    """
-    One .mcap file: its channels, and where its messages are (see `McapIndex`).
+def usable_memory() -> int:
+    """Return the least of the machine's, the control group's and the process's memory, bytes."""
+    limits = [os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')]
+    for file in ('/sys/fs/cgroup/memory.max', '/sys/fs/cgroup/memory/memory.limit_in_bytes'):
+        # Not there, or the word "max".
+        with suppress(OSError, ValueError):
+            limits.append(int(Path(file).read_text(encoding='ascii')))
+    allowed = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return min(limits if allowed == resource.RLIM_INFINITY else [*limits, allowed])
 
-    `partial`: the whole file is walked for damage, whatever its summary says; `max_chunk`: bytes
-    that a chunk may unpack to, else as of `chunk_limit`; `origin_ns`: first message of the bag.
-    InputError when it is missing, empty or foreign.
-    """
 
-    def __init__(self, path: Path, partial: bool, codec: Codec,
-                 max_chunk: int | None = None) -> None:
-        """Index the file."""
-        super().__init__(path, codec)
+def _chunk_limit(size: int, stated: int | None) -> int:
+    """Return the bytes that a chunk of a file of `size` bytes may unpack to."""
+    if stated is not None:
+        return stated
+    text = os.environ.get(_VARIABLE, '')
+    if text:
         try:
-            with open_regular(path) as file:
-                size = file.seek(0, os.SEEK_END)
-                self.chunk_limit = chunk_limit(size, max_chunk)
-                self.file_limit = file_limit(size, self.chunk_limit)
-                self._check_magic(file, size)
-                summary = self._read_summary(file, size)
-                # The summary is trusted when whole; a partial reading trusts nothing.
-                if partial or summary is None or not self._use_summary(summary, size):
-                    scan(self, file, size, summary)
-                else:
-                    self._read_about(file, summary, size)
-        except OSError as error:
-            raise InputError(f'cannot read {path}: {error.strerror}') from error
+            return max(1, int(float(text) * 1e6))
+        except (ValueError, OverflowError):
+            raise InputError(f'{_VARIABLE} must be a number of MB, got '
+                             f"'{printable(text, 40)}'") from None
+    return min(max(_LEAST_LIMIT, _MOST_RATIO * size),
+               max(_LEAST_LIMIT, usable_memory() // _CHUNKS_AT_ONCE))
+
+
+def _over_limit(what: str, length: int, limit: int) -> str:
+    return (f'{what} {length / 1e6:.4g} MB, and {limit / 1e6:.4g} MB is the limit: set '
+            f'{_VARIABLE} if that is meant')
+
+
+def moment(log_time_ns: int, origin_ns: int) -> str:
+    """Return a log time in words, also counted from the start of the recording."""
+    return (f'{(log_time_ns - origin_ns) / 1e9:.3f} s into the recording, log time '
+            f'{log_time_ns // 10**9}.{log_time_ns % 10**9:09d} s')
+
+
+class McapFile:
+    """
+    One .mcap file, its `topics` by channel, `counts` of messages, `spans` that hold them.
+
+    `partial`: walk the whole file; `max_chunk`: bytes that a chunk may unpack to.  `about` is what
+    the file says of itself, `start_ns` and `end_ns` the log times of the first and last message,
+    `origin_ns` that of the first message of the bag.  InputError: missing, empty or foreign.
+    """
+
+    def __init__(self, path: Path, partial: bool, max_chunk: int | None = None) -> None:
+        """Index the file."""
+        self.path = path
+        self.topics: dict[int, Topic] = {}
+        self.counts: dict[int, int] = {}
+        self.spans: list[Span] = []
+        self.breaks: list[Break] = []
+        self.about: dict[str, str] = {}
+        self.notes: list[str] = []
+        self.start_ns = self.end_ns = 0
+        # Definitions by number, those of topics left out included.
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._unpacked = self._tables = self._metadata = 0
+        with self._open() as file:
+            self._size = file.seek(0, os.SEEK_END)
+            self._limit = _chunk_limit(self._size, max_chunk)
+            self._limit_of_all = max(16 * self._limit, _MOST_RATIO * self._size)
+            self._check_magic(file)
+            self._summary = self._read_summary(file)
+            # A partial reading trusts nothing.
+            if partial or not self._use_summary(file):
+                self._walk(file)
+            else:
+                self._read_metadata(file)
         self.origin_ns = self.start_ns
 
-    def where(self, found: Break) -> str:
-        """Return the byte, the reason and the time of a damage in words."""
-        newest = max((span.end_ns for span in self.spans if span.offset <= found.offset),
-                     default=None)
-        return self._when(found.why, newest)
-
-    def _when(self, why: str, after_ns: int | None) -> str:
-        if after_ns is None:
-            return f'{why} (before the first message)'
-        return f'{why} ({moment(after_ns, self.origin_ns)})'
+    @contextmanager
+    def _open(self) -> Iterator[BinaryIO]:
+        try:
+            with open_regular(self.path) as file:
+                yield file
+        except OSError as error:
+            raise InputError(f'cannot read {self.path}: {error.strerror}') from error
 
     @property
-    def damage(self) -> str | None:
-        """Where the file is damaged, in words; None when it is not."""
+    def damage(self) -> str:
+        """Where the file is damaged, in words; '' when it is not."""
         if not self.breaks:
-            return None
-        rest = len(self.breaks) - 1
-        more = '' if not rest else (
-            f'; and at {rest} more places, where the search was given up'
-            if rest + 1 >= MOST_BREAKS else
-            f'; and at {rest} more place{"s" * (rest > 1)}, the last at byte '
-            f'{self.breaks[-1].offset}')
-        return self.where(self.breaks[0]) + more
+            return ''
+        first, rest = self.breaks[0], len(self.breaks) - 1
+        newest = max((span.end_ns for span in self.spans if span.offset <= first.offset),
+                     default=None)
+        words = f'at byte {first.offset}: {first.why} (' + (
+            'before the first message' if newest is None else
+            moment(newest, self.origin_ns)) + ')'
+        if rest + 1 >= _MOST_BREAKS:
+            return f'{words}; and at {rest} more places, where the search was given up'
+        return words + (f'; and at {counted(rest, "more place")}, the last at byte '
+                        f'{self.breaks[-1].offset}' if rest else '')
 
-    def _check_magic(self, file: BinaryIO, size: int) -> None:
-        if size == 0:
+    def _break(self, offset: int, why: object) -> None:
+        bisect.insort(self.breaks, Break(offset, str(why)))
+
+    def _check_magic(self, file: BinaryIO) -> None:
+        if self._size == 0:
             raise InputError(f'{self.path} is empty (0 bytes)')
         file.seek(0)
         head = file.read(64)
@@ -109,243 +241,562 @@ class McapFile(McapIndex):
             raise InputError(
                 f'{self.path} is not an MCAP file: {kind_of_foreign(head, self.path)}')
 
-    def _read_summary(self, file: BinaryIO, size: int) -> Any:
-        """Return the summary section when it is whole, else None."""
-        if size < len(MAGIC) + FOOTER_LENGTH:
+    def _read_summary(self, file: BinaryIO) -> Any:
+        """Return the summary section, or None where it is missing or damaged."""
+        file.seek(max(0, self._size - _FOOTER))
+        footer = file.read(_FOOTER)
+        if not (footer.startswith(_HEAD.pack(Opcode.FOOTER, 20)) and footer.endswith(MAGIC)):
             return None
-        file.seek(size - FOOTER_LENGTH)
-        footer = file.read(FOOTER_LENGTH)
-        start = int.from_bytes(footer[9:17], 'little')
-        stated = int.from_bytes(footer[25:29], 'little')
-        whole = (footer.startswith(RECORD_HEAD.pack(Op.FOOTER, 20)) and footer.endswith(MAGIC)
-                 and len(MAGIC) < start < size and size - start <= self.chunk_limit)
-        if not whole:
+        start, _, stated = struct.unpack_from('<QQI', footer, _HEAD.size)
+        if start == 0:
             return None
-        file.seek(start)
-        if stated and crc_of(file, size - start - len(MAGIC) - 4) != stated:
-            self.notes.append(f'The summary of {self.path.name} is damaged from byte {start}: '
-                              'the whole file was scanned.')
-            return None
-        file.seek(0)
         try:
-            return self._codec.summary(file)
+            if not len(MAGIC) < start < self._size or self._size - start > self._limit:
+                raise Damage(f'it should begin at byte {start}')
+            file.seek(start)
+            if stated and _crc(file, self._size - start - len(MAGIC) - 4) != stated:
+                raise Damage('its checksum is wrong')
+            file.seek(0)
+            return make_reader(file).get_summary()
         # The library lets every kind of error through; each means the same here.
         except Exception as error:
-            self.notes.append(f'The summary of {self.path.name} cannot be read '
-                              f'({printable(error, 200)}): the whole file was scanned.')
+            self.notes.append(f'The summary of {printable(self.path.name)} is damaged '
+                              f'({printable(error, 200) or type(error).__name__}): the whole file '
+                              'was scanned, without a count of its messages to compare with.')
             return None
 
-    def _use_summary(self, summary: Any, size: int) -> bool:
-        """Take channels and chunks from the summary; False when that cannot be done."""
-        if summary.statistics is None:
+    def _use_summary(self, file: BinaryIO) -> bool:
+        """Take topics and chunks from the summary; False when that cannot be done."""
+        summary, size = self._summary, self._size
+        if summary is None or summary.statistics is None:
             return False
-        if summary.statistics.message_count and not summary.chunk_indexes:
-            return False
-        indexes = sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
-        end, unpacked = len(MAGIC), 0
-        for index in indexes:
-            # A chunk that is listed twice, or within another, would be read twice.
-            if index.chunk_start_offset < end or index.chunk_length < RECORD_HEAD.size:
-                return False
-            end = index.chunk_start_offset + index.chunk_length
-            unpacked += index.uncompressed_size
-        if end > size:
-            return False
-        if unpacked > self.file_limit:
-            raise InputError(f'{path_words(self.path)}: ' + over_limit(
-                'its chunks hold', unpacked, self.file_limit))
-        self.schemas.update(summary.schemas)
-        for channel in summary.channels.values():
-            self.add_channel(channel)
         counts = summary.statistics.channel_message_counts
+        indexes = sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
+        if (bool(indexes) != bool(summary.statistics.message_count)
+                or sum(counts.values()) != summary.statistics.message_count):
+            return False
+        end = len(MAGIC)
+        for index in indexes:
+            # A chunk that is listed twice, or within another, would be read twice; what is
+            # listed nowhere would be lost.
+            begin = index.chunk_start_offset
+            if (begin < end or index.chunk_length < _HEAD.size
+                    or _messages_between(file, end, begin)):
+                return False
+            end = begin + index.chunk_length + index.message_index_length
+        if end > size or _messages_between(file, end, size):
+            return False
+        unpacked = sum(index.uncompressed_size for index in indexes)
+        if unpacked > self._limit_of_all:
+            raise InputError(f'{path_words(self.path)}: ' + _over_limit(
+                'its chunks hold', unpacked, self._limit_of_all))
+        self._schemas.update(summary.schemas)
+        for channel in summary.channels.values():
+            self._add_channel(channel)
         self.counts = {key: counts.get(key, 0) for key in self.topics}
         # Chunks without messages have no index; files written without any index
         # do not say which chunks those are.
-        indexed = any(index.message_index_offsets for index in summary.chunk_indexes)
+        indexed = any(index.message_index_offsets for index in indexes)
         self.spans = [
             Span(index.message_start_time, index.message_end_time,
-                 index.chunk_start_offset + RECORD_HEAD.size,
-                 index.chunk_length - RECORD_HEAD.size, True,
+                 index.chunk_start_offset + _HEAD.size, index.chunk_length - _HEAD.size, True,
                  frozenset(index.message_index_offsets) or None,
                  # A message of 31 bytes or more has 16 in the index, beside its head.
-                 min(index.message_index_length, index.uncompressed_size + 15 * 65536,
-                     size - index.chunk_start_offset - index.chunk_length),
-                 index.uncompressed_size)
-            for index in summary.chunk_indexes if index.message_index_offsets or not indexed]
+                 index.message_index_length if index.message_index_length
+                 <= index.uncompressed_size + 15 * 65536 else 0, index.uncompressed_size)
+            for index in indexes if index.message_index_offsets or not indexed]
         self.start_ns = summary.statistics.message_start_time
         self.end_ns = summary.statistics.message_end_time
         return True
 
-    def _read_about(self, file: BinaryIO, summary: Any, size: int) -> None:
+    def _read_metadata(self, file: BinaryIO) -> None:
         """Read the metadata records that the summary lists; a broken one is noted."""
-        left = 2 * MOST_METADATA
-        for index in summary.metadata_indexes:
+        for index in self._summary.metadata_indexes:
             try:
-                record = record_at(file, index.offset, size, True)
-                check_passed_over(file, record)
-                left -= record.end - record.offset
-                if left < 0:
-                    raise Damage(record.offset, 'the metadata records before it are too many')
-                file.seek(record.content)
-                self.learn_about(file.read(record.length), record.offset)
+                op, length = _frame(file, index.offset, self._size, True)
+                if op != Opcode.METADATA:
+                    raise Damage(f'at byte {index.offset} is none')
+                self._learn_about(file, length)
             except Damage as error:
                 self.notes.append(f'Metadata of {printable(self.path.name)} cannot be read '
                                   f'({error}).')
                 break
 
-    def channels_of(self, wanted: set[str]) -> dict[int, TopicRecord]:
-        """Return the channels of some topics."""
-        return {key: topic for key, topic in self.topics.items() if topic.name in wanted}
+    def _walk(self, file: BinaryIO) -> None:
+        """Read the whole file once, noting where its messages are and where it breaks."""
+        summary = self._summary
+        starts = [] if summary is None else sorted(
+            index.chunk_start_offset for index in summary.chunk_indexes)
+        counted_there = None if summary is None else summary.statistics
+        private: list[Break] = []
+        at, op, in_data = len(MAGIC), 0, True
+        while op != Opcode.FOOTER and len(self.breaks) < _MOST_BREAKS:
+            try:
+                op, length = _frame(file, at, self._size, in_data)
+            except Damage as error:
+                self._break(at, error)
+                # An intact summary says where the next chunk begins.
+                place = bisect.bisect_right(starts, at)
+                if place == len(starts):
+                    break
+                at, in_data = starts[place], True
+                continue
+            end = at + _HEAD.size + length
+            try:
+                if op == Opcode.MESSAGE:
+                    end = self._walk_messages(file, at, end)
+                elif op == Opcode.CHUNK:
+                    self._walk_chunk(file, length)
+                elif op == Opcode.DATA_END:
+                    # What follows repeats schemas and channels for the summary.
+                    in_data = False
+                    stated = int.from_bytes(file.read(4), 'little')
+                    file.seek(0)
+                    if stated and not self.breaks and _crc(file, at) != stated:
+                        self._break(len(MAGIC), f'the checksum of the data up to byte {at} is '
+                                    'wrong: something in it was changed')
+                elif op in (Opcode.SCHEMA, Opcode.CHANNEL):
+                    if in_data:
+                        self._learn(op, self._content(file, length, self._limit))
+                elif op == Opcode.METADATA:
+                    self._learn_about(file, length)
+                elif op == Opcode.ATTACHMENT:
+                    _check_attachment(file, length)
+                elif op == Opcode.MESSAGE_INDEX:
+                    self._walk_index(file, at, length)
+                elif op >= _PRIVATE and len(private) < _MOST_NOTES:
+                    private.append(Break(at, f'a record of a private kind (0x{op:02x}, {length} '
+                                         'bytes)'))
+            except Damage as error:
+                # The frame is whole: what comes after it may be good.
+                self._break(at, error)
+            at = end
+        if op == Opcode.FOOTER:
+            file.seek(at)
+            if file.read(len(MAGIC)) != MAGIC:
+                self._break(at, 'the file ends without its closing mark')
+            elif at + len(MAGIC) < self._size:
+                self._break(at + len(MAGIC), f'{self._size - at - len(MAGIC)} bytes follow the '
+                            'end of the recording, which may be another one')
+        for one in private:
+            if self.breaks or counted_there is None:
+                # Nothing says that these were not messages once.
+                self._break(one.offset, f'{one.why}, and no count of the messages to tell that '
+                            'none is missing')
+            else:
+                self.notes.append(f'{one.why.capitalize()} at byte {one.offset} of '
+                                  f'{printable(self.path.name)} was passed over.')
+        if counted_there is not None and not self.breaks:
+            for key, stated in counted_there.channel_message_counts.items():
+                found = self.counts.get(key, 0)
+                if found != stated and (key in self.topics or key not in self._channels):
+                    self._break(len(MAGIC), f'somewhere before byte {self._size} messages were '
+                                f'changed: the summary counts {stated} of channel {key}, {found} '
+                                'were found')
+                    break
+        self.start_ns = min((span.start_ns for span in self.spans), default=0)
+        self.end_ns = max((span.end_ns for span in self.spans), default=0)
 
-    def read(self, span: Span, wanted: set[str]) -> list[RawMessage]:
-        """Return the messages of a span in file order."""
-        found: list[RawMessage] = []
-        channels = {key: (topic.name, topic.type)
-                    for key, topic in self.channels_of(wanted).items()}
-        try:
-            with open_regular(self.path) as file:
-                data = self.span_data(file, span)
-            for opcode, begin, end in inner_records(data):
-                if opcode == Op.MESSAGE:
-                    channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, begin)
-                    if channel in channels:
-                        name, kind = channels[channel]
-                        found.append(RawMessage(
-                            name, kind, log_time, data[begin + MESSAGE_HEAD.size:end]))
-        except OSError as error:
-            raise InputError(f'cannot read {self.path}: {error.strerror}') from error
-        except Damage as error:
-            raise self._refusal(span, error) from error
-        return found
+    def _content(self, file: BinaryIO, length: int, limit: int) -> bytes:
+        """Return the content of the record whose head was just read."""
+        if length > limit:
+            raise Damage(f'a record of {length} bytes is longer than the {limit} that it may have')
+        return file.read(length)
 
-    def tables(self, span: Span, wanted: set[str]) -> dict[str, Table]:
-        """Return where the messages of a span are, by topic, in file order."""
+    def _learn(self, op: int, content: bytes) -> None:
+        """Take a schema or a channel; Damage where it cannot be read, or was another before."""
+        kind: Any = Schema if op == Opcode.SCHEMA else Channel
+        found = _parse(kind, content)
+        known = (self._schemas if kind is Schema else self._channels).get(found.id, found)
+        if known != found:
+            raise Damage(f'{kind.__name__.lower()} {found.id} is defined a second time, '
+                         'differently')
+        if kind is Schema:
+            self._schemas[found.id] = found
+        else:
+            self._add_channel(found)
+
+    def _learn_all(self, data: bytes, others: Sequence[tuple[int, int, int]]) -> None:
+        """Take the schemas and channels of a chunk."""
+        for op, begin, end in others:
+            if op in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._learn(op, data[begin:end])
+
+    def _learn_about(self, file: BinaryIO, length: int) -> None:
+        """Take what the metadata record whose head was just read says of the recording."""
+        self._metadata += length
+        if self._metadata > 2 * _MOST_METADATA:
+            raise Damage('the metadata records before it are too many')
+        record = _parse(Metadata, self._content(file, length, _MOST_METADATA))
+        if record.name == ABOUT:
+            self.about |= plain_texts(record.metadata)
+        elif record.name == ROSBAG2 and self._tables < _MOST_TABLES:
+            self._tables += 1
+            # Ignore an unreadable table: the messages do not need it.
+            with suppress(InputError):
+                self.about |= custom_data(parse_yaml(
+                    record.metadata.get('serialized_metadata', ''), ROSBAG2,
+                    most_bytes=MOST_BYTES, most_nodes=MOST_NODES))
+
+    def _add_channel(self, channel: Channel) -> None:
+        """Take a channel, once."""
+        if channel.id in self._channels:
+            return
+        self._channels[channel.id] = channel
+        schema = self._schemas.get(channel.schema_id)
+        if schema is None and self._summary is not None:
+            # Its definition was in a broken part.
+            schema = self._summary.schemas.get(channel.schema_id)
+        encoding = 'none' if schema is None else schema.encoding
+        why = ''
+        if schema is None or channel.message_encoding != 'cdr' or encoding != 'ros2msg':
+            why = (f"it is not ROS 2 (messages '{printable(channel.message_encoding, 40)}', "
+                   f"schema '{printable(encoding, 40)}')")
+        elif len(channel.topic) > _MOST_OF_NAME or len(schema.name) > _MOST_OF_NAME:
+            why = f'ROS 2 has no names of more than {_MOST_OF_NAME} characters'
+        elif len(schema.data) > _MOST_DEFINITION:
+            why = f'its definition has more than {_MOST_DEFINITION // 1024} kB'
+        # Names reach messages, tables and pages: here they become plain text.
+        name = printable(channel.topic, _MOST_OF_NAME)
+        if why:
+            left_out = len(self._channels) - len(self.topics)
+            if left_out <= _MOST_NOTES:
+                self.notes.append(f"Topic '{name}' was left out: {why}."
+                                  if left_out < _MOST_NOTES else 'More topics were left out.')
+            return
+        assert schema is not None
+        self.topics[channel.id] = Topic(
+            name, printable(schema.name), schema,
+            channel.metadata.get('offered_qos_profiles', ''),
+            _rate(channel.metadata.get(SAMPLE_RATE, '')),
+            plain_texts({key.removeprefix(ORIGIN): value for key, value
+                         in channel.metadata.items() if key.startswith(ORIGIN)}))
+
+    def _walk_chunk(self, file: BinaryIO, length: int) -> None:
+        """Count the messages of a chunk, and learn its channels."""
+        span = Span(0, 0, file.tell(), length, True)
         try:
-            with open_regular(self.path) as file:
-                data = self.span_data(file, span)
-                file.seek(span.offset + span.length)
-                index = file.read(span.index_length)
-            table = find_by_index(data, index) if index else None
-            if table is None:
-                table, _, _ = find_messages(data)
-        except OSError as error:
-            raise InputError(f'cannot read {self.path}: {error.strerror}') from error
+            data = self._data(file, span)
+            self._unpacked += len(data)
+            if self._unpacked > self._limit_of_all:
+                raise Damage(_over_limit('it and those before it hold', self._unpacked,
+                                         self._limit_of_all))
+            places, others = _all_records(data)
+            self._learn_all(data, others)
         except Damage as error:
-            raise self._refusal(span, error) from error
+            raise Damage(f'the chunk there is broken ({error})') from error
+        self._add_span(_table(data, places), span._replace(unpacked=len(data)))
+
+    def _walk_messages(self, file: BinaryIO, at: int, end: int) -> int:
+        """Count messages outside of chunks, from one that ends at `end` on; return their end."""
+        if end - at > self._limit:
+            raise Damage(_over_limit('a message has', end - at, self._limit))
+        file.seek(at)
+        data = file.read(max(end - at, _BLOCK))
+        places, _, length = _records(data, messages_only=True)
+        if not places.size:
+            raise Damage('a message is shorter than its own head')
+        self._add_span(_table(data, places), Span(0, 0, at, length, False))
+        return at + length
+
+    def _walk_index(self, file: BinaryIO, at: int, length: int) -> None:
+        """Count a message index to the chunk right before it."""
+        size = int.from_bytes(file.read(6)[2:], 'little')
+        if length < 6 or size % 16 or size != length - 6:
+            raise Damage(f'a message index of {length} bytes does not hold what it should')
+        last = self.spans[-1] if self.spans else None
+        if last is not None and last.chunk and (
+                last.offset + last.length + last.index_length == at):
+            self.spans[-1] = last._replace(index_length=last.index_length + _HEAD.size + length)
+
+    def _add_span(self, table: Table, span: Span) -> None:
+        """Add the messages of a span to what is known."""
+        keys, counts = np.unique(table.channel, return_counts=True)
+        for key, n in zip(keys.tolist(), counts.tolist()):
+            if key not in self._channels and self._summary is not None and (
+                    key in self._summary.channels):
+                self._add_channel(self._summary.channels[key])
+            if key in self.topics:
+                self.counts[key] = self.counts.get(key, 0) + n
+            elif key not in self._channels:
+                self._break(span.offset, f'{counted(n, "message")} of channel {key}, which is not '
+                            'defined')
+        found = frozenset(keys.tolist()) & self.topics.keys()
+        if found:
+            times = table.log_time[np.isin(table.channel, list(found))]
+            self.spans.append(span._replace(start_ns=int(times.min()), end_ns=int(times.max()),
+                                            channels=found))
+
+    def _data(self, file: BinaryIO, span: Span) -> bytes:
+        """Return the records of a span, unpacked and with its checksum verified."""
+        if not 0 <= span.length <= self._limit:
+            raise Damage(_over_limit('it has', span.length, self._limit))
+        file.seek(span.offset)
+        content = file.read(span.length)
+        if len(content) < span.length:
+            raise Damage(f'it is cut off after {len(content)} bytes')
+        if not span.chunk:
+            return content
+        chunk = _parse(Chunk, content)
+        stated = chunk.uncompressed_size
+        if stated > self._limit:
+            raise Damage(_over_limit('it unpacks to', stated, self._limit))
+        try:
+            data = _decompressed(chunk.compression, chunk.data, stated)
+        # zstd and lz4 have errors of their own.
+        except Exception as error:
+            raise Damage(printable(error, 200) or type(error).__name__) from error
+        if len(data) != stated or span.unpacked not in (0, stated):
+            raise Damage(f'{len(data)} bytes in place of {span.unpacked or stated}')
+        if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+            raise Damage('its checksum is wrong')
+        return data
+
+    def _check_times(self, data: bytes, places: IntArray, span: Span) -> None:
+        """Check that a chunk is of the time by which its index has it found."""
+        times = gather(data, places + _HEAD.size + 6, '<u8')
+        if span.unpacked and times.size and (
+                int(times.max()) > span.end_ns or int(times.min()) < span.start_ns):
+            raise Damage('its messages are not of the time that its index states')
+
+    def channels_of(self, wanted: set[str]) -> dict[int, str]:
+        """Return channel -> topic of some topics."""
+        return {key: topic.name for key, topic in self.topics.items() if topic.name in wanted}
+
+    def tables(self, spans: Sequence[Span], wanted: set[str]) -> dict[str, Table]:
+        """Return the messages of some spans by topic, in the order of the file."""
+        blocks: list[bytes] = []
+        places: list[IntArray] = []
+        size = 0
+        with self._open() as file:
+            for span in spans:
+                try:
+                    data = self._data(file, span)
+                    file.seek(span.offset + span.length)
+                    index = file.read(span.index_length)
+                    found, others = _by_index(data, index) or _all_records(data)
+                    self._check_times(data, found, span)
+                    self._learn_all(data, others)
+                except Damage as error:
+                    raise InputError(
+                        f'{self.path} is damaged at byte {span.offset - _HEAD.size}: the chunk '
+                        f'there is broken ({error}) ({moment(span.start_ns, self.origin_ns)}); '
+                        'use --partial to take what it still holds') from error
+                blocks.append(data)
+                places.append(found + size)
+                size += len(data)
+        # One table of many small chunks costs what one of them does.
+        table = _table(b''.join(blocks), np.concatenate(places))
         topics: dict[str, npt.NDArray[np.bool_]] = {}
         channels = self.channels_of(wanted)
         if len(channels) > _FEW_CHANNELS:
-            there = np.unique(table.channel).tolist()
-            channels = {key: channels[key] for key in there if key in channels}
-        for key, topic in channels.items():
-            mine = table.channel == key
+            channels = {key: channels[key] for key in np.unique(table.channel).tolist()
+                        if key in channels}
+        for key, name in channels.items():
             # Two publishers of one topic are two channels.
-            topics[topic.name] = topics.get(topic.name, False) | mine
-        found = {name: table.where(mine) for name, mine in topics.items()}
-        return {name: part for name, part in found.items() if part.n}
-
-    def _refusal(self, span: Span, error: Damage) -> InputError:
-        """Return the error for a chunk that turned out to be broken."""
-        why = self._when(f'at byte {span.offset}: the chunk there is broken ({error.why})',
-                         span.start_ns)
-        return InputError(f'{self.path} is damaged {why}; use --partial to take what it still '
-                          'holds')
+            topics[name] = topics.get(name, False) | (table.channel == key)
+        parts = {name: table.where(mine) for name, mine in topics.items()}
+        return {name: part for name, part in parts.items() if part.n}
 
 
-class Part(NamedTuple):
+class _Strict(ReadDataStream):
+    """The library's stream, which does not take the rest of a record for all of a text."""
+
+    def read(self, length: int) -> bytes:
+        """Return bytes, exactly so many."""
+        data: bytes = super().read(length)
+        if len(data) < length:
+            raise EndOfFile
+        return data
+
+
+def _parse(kind: Any, content: bytes) -> Any:
+    """Return a record as the library reads it."""
+    stream = _Strict(io.BytesIO(content))
+    try:
+        found = kind.read(stream)
+    except Exception as error:
+        raise Damage(f'a {kind.__name__.lower()} record cannot be read ({error!r})') from error
+    if stream.count < len(content):
+        raise Damage(f'a {kind.__name__.lower()} record cannot be read: it ends before its record')
+    return found
+
+
+def _rate(text: str) -> float | None:
+    """Return a stated rate, Hz; None when there is none that makes sense."""
+    with suppress(ValueError):
+        if 0.0 < (rate := float(text)) < math.inf:
+            return rate
+    return None
+
+
+def plain_texts(found: Any) -> dict[str, str]:
+    """Return what a recording says of itself as names and texts of one line each."""
+    return {printable(key, 100): printable(value, 1000)
+            for key, value in list(found.items())[:1000]}
+
+
+def custom_data(content: Any) -> dict[str, str]:
+    """Return the custom data in the content of a metadata.yaml."""
+    info = content.get('rosbag2_bagfile_information', content) if isinstance(
+        content, dict) else None
+    custom = info.get('custom_data') if isinstance(info, dict) else None
+    if not isinstance(custom, dict):
+        return {}
+    return plain_texts({key: value for key, value in custom.items()
+                        if isinstance(value, (str, int, float))})
+
+
+def _frame(file: BinaryIO, at: int, size: int, in_data: bool) -> tuple[int, int]:
+    """Return opcode and length of a record that may stand there."""
+    file.seek(min(at, size))
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        raise Damage('the file ends without a footer')
+    op, length = _HEAD.unpack(head)
+    if op == 0 or Opcode.DATA_END < op < _PRIVATE:
+        raise Damage(f'no record begins with 0x{op:02x}')
+    if at + _HEAD.size + length > size:
+        raise Damage(f'a record of {length} bytes is cut off after {size - at - _HEAD.size}')
+    if op < _PRIVATE and (op not in (_IN_DATA if in_data else _IN_SUMMARY)
+                          or (op == Opcode.HEADER and at != len(MAGIC))
+                          or length != _LENGTHS.get(Opcode(op), length)):
+        raise Damage(f'a record 0x{op:02x} of {length} bytes does not belong there')
+    return op, length
+
+
+def _messages_between(file: BinaryIO, at: int, end: int) -> bool:
+    """Return whether a part of the data holds messages or chunks, or cannot be walked."""
+    op = 0
+    while at < end and op != Opcode.DATA_END:
+        try:
+            op, length = _frame(file, at, end, True)
+        except Damage:
+            return True
+        if op in (Opcode.MESSAGE, Opcode.CHUNK):
+            return True
+        at += _HEAD.size + length
+    return at > end
+
+
+def _check_attachment(file: BinaryIO, length: int) -> None:
+    """Check the checksum of an attachment, whose head was just read."""
+    found = _crc(file, length - 4)
+    if length < 36 or int.from_bytes(file.read(4), 'little') not in (0, found):
+        raise Damage(f'an attachment of {length} bytes does not hold what it should')
+
+
+def _crc(file: BinaryIO, length: int) -> int:
+    """Return the checksum of the next bytes of a file, as many as there are."""
+    found = 0
+    while length > 0 and (block := file.read(min(1 << 20, length))):
+        found = zlib.crc32(block, found)
+        length -= len(block)
+    return found
+
+
+def _decompressed(compression: str, data: bytes, stated: int) -> bytes:
+    """Return the content of a chunk; never more memory than it states, whatever it holds."""
+    if compression == 'zstd':
+        size = zstandard.frame_content_size(data)
+        if size not in (-1, stated):
+            raise Damage(f'{size} bytes in place of {stated}')
+        plain: bytes = zstandard.decompress(data, stated)
+    elif compression == 'lz4':
+        # The library would unpack a frame of any size.
+        frame = lz4.frame.LZ4FrameDecompressor()
+        plain = frame.decompress(data, stated)
+        if not frame.eof:
+            raise Damage(f'more than {stated} bytes, or not all of them')
+    elif compression == '':
+        plain = data
+    else:
+        # The library takes what it does not know for plain bytes.
+        raise Damage(f"unknown compression '{compression}'")
+    return plain
+
+
+def _records(data: bytes, *, messages_only: bool = False, at: int = 0, end: int | None = None,
+             ) -> tuple[IntArray, list[tuple[int, int, int]], int]:
     """
-    The messages of one chunk or run.
+    Return where records of messages begin in a block, the others, and where whole ones end.
 
-    Attributes
-    ----------
-    tables : dict of str to Table
-        Topic -> its messages, in the order of the file.
-    later_ns : int or None
-        Log time that no message of a later part is before, ns; None after the
-        last part.
-    done : float
-        Share of the bytes to be read that are read, 0..1.
-
+    The others are (opcode, begin, end) of the content.
     """
-
-    tables: dict[str, Table]
-    later_ns: int | None
-    done: float
-
-
-def _spans(files: Iterable[McapFile], wanted: set[str]) -> list[tuple[Span, McapFile]]:
-    """Return where the wanted topics are, in the order of the first log times."""
-    spans: list[tuple[Span, McapFile]] = []
-    for file in files:
-        channels = set(file.channels_of(wanted))
-        spans += [(span, file) for span in file.spans
-                  if span.channels is None or span.channels & channels]
-    return sorted(spans, key=lambda pair: pair[0].start_ns)
-
-
-def in_parts(
-    files: Iterable[McapFile], wanted: set[str], start_ns: int | None = None,
-    end_ns: int | None = None,
-) -> Iterator[Part]:
-    """Yield the messages of several files part by part."""
-    spans = [(span, file) for span, file in _spans(files, wanted)
-             if (start_ns is None or span.end_ns >= start_ns)
-             and (end_ns is None or span.start_ns < end_ns)]
-    total = sum(span.length for span, _ in spans)
-    read = 0
-    for place, (span, file) in enumerate(spans):
-        tables = file.tables(span, wanted)
-        if start_ns is not None and span.start_ns < start_ns:
-            tables = _cut(tables, lambda table: table.log_time >= np.uint64(start_ns))
-        if end_ns is not None and span.end_ns >= end_ns:
-            tables = _cut(tables, lambda table: table.log_time < np.uint64(end_ns))
-        read += span.length
-        later = None if place + 1 == len(spans) else spans[place + 1][0].start_ns
-        yield Part(tables, later, read / total)
+    places = array('q')
+    others: list[tuple[int, int, int]] = []
+    end = len(data) if end is None else end
+    unpack, head, shortest, message = _HEAD.unpack_from, _HEAD.size, _MESSAGE.size, Opcode.MESSAGE
+    while at + head <= end:
+        op, length = unpack(data, at)
+        behind = at + head + length
+        if behind > end:
+            break
+        if op == message:
+            if length < shortest:
+                if messages_only:
+                    break
+                raise Damage('a message in it is shorter than its own head')
+            places.append(at)
+        elif messages_only:
+            break
+        else:
+            if len(others) == _MOST_OTHERS:
+                raise Damage(f'more than {_MOST_OTHERS} records in it are no messages')
+            others.append((op, at + head, behind))
+        at = behind
+    return np.frombuffer(places, np.int64) if places else np.empty(0, np.int64), others, at
 
 
-def _cut(
-    tables: dict[str, Table], inside: Callable[[Table], npt.NDArray[np.bool_]],
-) -> dict[str, Table]:
-    """Return what is inside of each table, and only tables that hold something."""
-    parts = {name: table.where(inside(table)) for name, table in tables.items()}
-    return {name: table for name, table in parts.items() if table.n}
+def _all_records(data: bytes) -> tuple[IntArray, list[tuple[int, int, int]]]:
+    """Return the records of a chunk as `_records`."""
+    places, others, end = _records(data)
+    if end < len(data):
+        raise Damage('a record within it is cut off')
+    return places, others
 
 
-def backwards(
-    files: Iterable[McapFile], wanted: set[str], before_ns: int,
-) -> Iterator[tuple[Table, int]]:
+def _by_index(data: bytes, index: bytes) -> tuple[IntArray, list[tuple[int, int, int]]] | None:
     """
-    Yield the messages of a topic before a log time, the chunk that ends last first.
+    Return the records of a chunk as `_records`, by the message indexes behind it.
 
-    before_ns in ns.
+    None where the messages that these name and records of other kinds do not fill the chunk from
+    end to end: then the indexes do not tell what the chunk holds.
     """
-    spans = [pair for pair in _spans(files, wanted) if pair[0].start_ns < before_ns]
-    spans.sort(key=lambda pair: pair[0].end_ns, reverse=True)
-    for place, (span, file) in enumerate(spans):
-        older = spans[place + 1][0].end_ns if place + 1 < len(spans) else 0
-        tables = _cut(file.tables(span, wanted),
-                      lambda table: table.log_time < np.uint64(before_ns))
-        yield from ((table, older) for table in tables.values())
+    parts: list[IntArray] = []
+    at = 0
+    while at < len(index):
+        if at + _HEAD.size + 6 > len(index):
+            return None
+        op, length = _HEAD.unpack_from(index, at)
+        count, odd = divmod(length - 6, 16)
+        if op != Opcode.MESSAGE_INDEX or odd or count < 0 or at + _HEAD.size + length > len(index):
+            return None
+        parts.append(np.frombuffer(index, '<i8', 2 * count, at + _HEAD.size + 6)[1::2])
+        at += _HEAD.size + length
+    places = np.sort(np.concatenate([np.empty(0, np.int64), *parts]), kind='stable')
+    if not places.size or places[0] < 0 or places[-1] > len(data) - _DATA:
+        return None
+    ends = places + _HEAD.size + gather(data, places + 1, '<i8')
+    # A length of 2^63 or more is negative here; one beyond the chunk is too long.
+    if not ((gather(data, places, 'u1') == Opcode.MESSAGE) & (ends >= places + _DATA)
+            & (ends <= len(data))).all():
+        return None
+    behind, ahead = np.append(0, ends), np.append(places, len(data))
+    others: list[tuple[int, int, int]] = []
+    for gap in np.nonzero(behind != ahead)[0].tolist():
+        inside, more, end = _records(data, at=int(behind[gap]), end=int(ahead[gap]))
+        if end != ahead[gap] or inside.size:
+            return None
+        others += more
+    return places, others
 
 
-def in_time_order(files: Iterable[McapFile], wanted: set[str]) -> Iterator[RawMessage]:
-    """
-    Yield the messages of several files in the order of their log times.
-
-    Holds in memory only spans that overlap in time.
-    """
-    spans = _spans(files, wanted)
-    pending: list[RawMessage] = []
-    for place, (span, file) in enumerate(spans):
-        pending += file.read(span, wanted)
-        pending.sort(key=itemgetter(2))
-        # What is older than all that is still to be read can go.
-        ready = len(pending)
-        if place + 1 < len(spans):
-            ready = bisect.bisect_left(pending, spans[place + 1][0].start_ns, key=itemgetter(2))
-        yield from pending[:ready]
-        del pending[:ready]
+def _table(data: bytes, at: IntArray) -> Table:
+    """Return the messages whose records begin at given offsets."""
+    length = gather(data, at + 1, '<u8').astype(np.int64)
+    return Table(data, gather(data, at + _HEAD.size, '<u2'), gather(data, at + _HEAD.size + 6,
+                 '<u8'), at + _DATA, at + _HEAD.size + length)
 
 
 def kind_of_foreign(head: bytes, path: Path = Path('LOG')) -> str:

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.recordings.bag import BagReader
-from ou_monitor.recordings.columns import batches, join
+from ou_monitor.recordings.bag import BagReader, batches
+from ou_monitor.recordings.cdr import join
 from ou_monitor.recordings.importers.choose import (
     choose as choose_series, columns_of, drop_held, NONE, signal_of)
 from ou_monitor.recordings.importers.csv_table import CsvColumns, read_column, read_csv

@@ -16,9 +16,9 @@ import re
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.bag import BagReader
-from ou_monitor.recordings.columns import batches, Column, last_before
-from ou_monitor.recordings.mcap_records import IntArray, moment, TimeArray
+from ou_monitor.recordings.bag import BagReader, batches, last_before
+from ou_monitor.recordings.cdr import Column, IntArray, TimeArray
+from ou_monitor.recordings.mcap_file import moment
 from ou_monitor.recordings.topic_choice import choose
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.blocks import BlockClock

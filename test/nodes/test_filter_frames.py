@@ -11,7 +11,7 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.filter_channels import CHANNELS, channels_of
 from ou_monitor.nodes.filter_frames import Frames
-from ou_monitor.recordings.columns import MOST_LAYOUTS
+from ou_monitor.recordings.cdr import MOST_LAYOUTS
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature

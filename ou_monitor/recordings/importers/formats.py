@@ -18,8 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from ou_monitor.errors import how_to_install, InputError
 from ou_monitor.recordings.importers.log import Log, Progress, quiet, Request
-from ou_monitor.recordings.mcap_records import MAGIC as MCAP_MAGIC
-from ou_monitor.recordings.rosbag2_metadata import plain_texts
+from ou_monitor.recordings.mcap_file import MAGIC as MCAP_MAGIC, plain_texts
 from ou_monitor.stream.files import open_regular
 from ou_monitor.text import printable
 

@@ -10,9 +10,8 @@ from mcap_ros2.decoder import DecoderFactory
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings import standard_types as cdr
-from ou_monitor.recordings.columns import FieldReader, join, seconds
-from ou_monitor.recordings.layout import Field, parse_definition
-from ou_monitor.recordings.mcap_records import Table
+from ou_monitor.recordings.cdr import (
+    Field, FieldReader, join, parse_definition, seconds, Table)
 from ou_monitor.recordings.standard_types import SCHEMAS
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.stream.extract import Extractor

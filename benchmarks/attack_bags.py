@@ -1,0 +1,350 @@
+"""
+Damage bags at random and craft hostile ones: the reader returns what is true, or reports damage.
+
+Each voltage belongs to its stamp by a formula, so a wrong value shows itself.  A mutated file may
+be refused in one line, or read with a note that it is damaged, or read whole; anything else is
+counted and its seed printed.  The exit status is 1 when something was found.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+import resource
+import signal
+import struct
+import sys
+import tempfile
+import time
+import traceback
+from typing import Any
+import zlib
+
+import lz4.frame
+from mcap.opcode import Opcode
+from mcap.writer import CompressionType, IndexType, Writer
+import numpy as np
+import zstandard
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from ou_monitor.errors import InputError  # noqa: E402, I100
+from ou_monitor.recordings.mcap_file import MAGIC  # noqa: E402
+from ou_monitor.recordings.read import read_recording  # noqa: E402
+from ou_monitor.recordings.standard_types import (  # noqa: E402
+    BATTERY_STATE, encode_battery, encode_scalars, FLOAT32, FLOAT64, SCHEMAS)
+
+START = 1_704_067_200_000_000_000
+MS = 1_000_000
+COUNT = 400
+# Longest time of one reading, s, on a loaded machine; a hang takes for ever.
+PATIENCE = 60
+LIES = (0, 1, 2, 7, 8, 0x7f, 0xff, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63,
+        2**64 - 1)
+WAYS: dict[str, dict[str, Any]] = {
+    'zstd': {}, 'lz4': {'compression': CompressionType.LZ4},
+    'plain': {'compression': CompressionType.NONE},
+    'no message index': {'index_types': IndexType.CHUNK},
+    'no summary': {'index_types': IndexType.NONE, 'use_statistics': False,
+                   'use_summary_offsets': False, 'repeat_channels': False,
+                   'repeat_schemas': False},
+    'no chunks': {'use_chunking': False, 'enable_data_crcs': True},
+}
+
+
+def volts(k: Any) -> Any:
+    """Return the voltage of the k-th sample, exact in float32."""
+    return 12.0 + (np.asarray(k) * 37 % 1024) / 256
+
+
+def written(path: Path, stamped: bool, **options: Any) -> bytes:
+    """Return a sound file."""
+    k = np.arange(COUNT)
+    kind = BATTERY_STATE if stamped else FLOAT64
+    data = (encode_battery(START + k * MS, volts(k)) if stamped
+            else encode_scalars(FLOAT64, volts(k)))
+    with path.open('wb') as file:
+        writer = Writer(file, **{'chunk_size': 4000, **options})
+        writer.start(profile='ros2', library='attack')
+        channels = [writer.register_channel(topic, 'cdr', writer.register_schema(
+            of, 'ros2msg', SCHEMAS[of].encode())) for topic, of in (
+                ('/voltage', kind), ('/throttle', FLOAT32))]
+        writer.add_attachment(0, 0, 'note', 'text/plain', b'hello')
+        writer.add_metadata('ou_monitor', {'vehicle': 'one'})
+        for i, message in enumerate(data):
+            at = START + i * MS
+            writer.add_message(channels[0], at, message, at)
+            if i % 10 == 0:
+                writer.add_message(channels[1], at, encode_scalars(FLOAT32, [0.5])[0], at)
+        writer.finish()
+    return path.read_bytes()
+
+
+def records(data: bytes) -> list[tuple[int, int]]:
+    """Return begin and end of every record."""
+    found, at = [], len(MAGIC)
+    while at + 9 <= len(data) - len(MAGIC):
+        end = at + 9 + int.from_bytes(data[at + 1:at + 9], 'little')
+        found.append((at, end))
+        at = end
+    return found
+
+
+def mutated(sound: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
+    """Return the kind of an attack, and a file after it."""
+    data = bytearray(sound)
+    parts = records(sound)
+    # A record that is gone without a trace from a file that counts nothing cannot be missed.
+    if not any(sound[begin] == Opcode.STATISTICS for begin, _ in parts):
+        parts = [part for part in parts if sound[part[0]] != Opcode.CHUNK]
+    kind = str(rng.choice(['bits', 'bytes', 'zeros', 'cut', 'hole', 'more', 'swap', 'twice',
+                           'lost', 'length', 'word', 'kind', 'tail']))
+    at = int(rng.integers(len(MAGIC), len(data)))
+    one, other = (parts[int(k)] for k in rng.integers(len(parts), size=2))
+    if kind == 'bits':
+        for place in rng.integers(len(data), size=int(rng.integers(1, 9))).tolist():
+            data[place] ^= 1 << int(rng.integers(8))
+    elif kind == 'bytes':
+        size = int(rng.integers(1, 300))
+        data[at:at + size] = rng.bytes(len(data[at:at + size]))
+    elif kind == 'zeros':
+        size = int(rng.integers(1, 5000))
+        data[at:at + size] = bytes(len(data[at:at + size]))
+    elif kind == 'cut':
+        del data[at:]
+    elif kind == 'hole':
+        del data[at:at + int(rng.integers(1, 3000))]
+    elif kind == 'more':
+        data[at:at] = rng.bytes(int(rng.integers(1, 300)))
+    elif kind == 'swap':
+        first, last = sorted((one, other))
+        if first != last:
+            data[:] = (data[:first[0]] + data[slice(*last)] + data[first[1]:last[0]]
+                       + data[slice(*first)] + data[last[1]:])
+    elif kind == 'twice':
+        data[other[0]:other[0]] = data[slice(*one)]
+    elif kind == 'lost':
+        del data[slice(*one)]
+    elif kind == 'length':
+        data[one[0] + 1:one[0] + 9] = struct.pack('<Q', int(rng.choice(np.array(LIES, object))))
+    elif kind == 'word':
+        # Within a record: a count, the length of a text, a size.
+        place = int(rng.integers(one[0] + 9, max(one[1], one[0] + 10)))
+        data[place:place + 4] = struct.pack('<I', int(rng.choice(LIES[:11])))
+    elif kind == 'kind':
+        data[one[0]] = int(rng.choice([*range(16), 0x80, 0xff]))
+    else:
+        data += data[at:]
+    return kind, bytes(data)
+
+
+def text(value: str | bytes) -> bytes:
+    """Return a text as a record holds it."""
+    data = value.encode() if isinstance(value, str) else value
+    return struct.pack('<I', len(data)) + data
+
+
+def record(op: int, *parts: bytes, length: int | None = None) -> bytes:
+    """Return a record, whose stated length may be a lie."""
+    content = b''.join(parts)
+    return struct.pack('<BQ', op, len(content) if length is None else length) + content
+
+
+class Crafted:
+    """A file made by hand, of chunks that are sound and of parts that lie."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        """Choose what lies."""
+        self.rng, self.kinds = rng, []
+        self.count = 0
+
+    def lies(self, kind: str, chance: float = 0.12) -> bool:
+        """Return whether a part of that kind lies."""
+        if self.rng.random() < chance:
+            self.kinds.append(kind)
+            return True
+        return False
+
+    def lie(self) -> int:
+        """Return a number that is wrong nearly everywhere."""
+        return int(self.rng.choice(np.array(LIES, object)))
+
+    def definitions(self) -> bytes:
+        """Return a schema and a channel, and some that nobody needs or that differ."""
+        name, definition = FLOAT64, 'float64 data\n'
+        out = record(Opcode.SCHEMA, struct.pack('<H', 1), text(name), text('ros2msg'),
+                     text(definition))
+        out += record(Opcode.CHANNEL, struct.pack('<HH', 1, 1), text('/voltage'), text('cdr'),
+                      text(b''))
+        if self.lies('endless text'):
+            out += record(Opcode.SCHEMA, struct.pack('<HI', 2, 2**32 - 1), b'x' * 50)
+        if self.lies('second definition'):
+            out += record(Opcode.SCHEMA, struct.pack('<H', 1), text(name), text('ros2msg'),
+                          text('float32 data\nfloat32 more\n'))
+        if self.lies('long names'):
+            out += b''.join(record(Opcode.CHANNEL, struct.pack('<HH', k + 2, 1), text(
+                f'/x{k}' * 200), text('cdr'), text(b'')) for k in range(300))
+        if self.lies('json'):
+            out += record(Opcode.CHANNEL, struct.pack('<HH', 999, 0), text('/j'), text('json'),
+                          text(b''))
+        return out
+
+    def messages(self, n: int) -> bytes:
+        """Return messages of the voltage."""
+        out = b''
+        for data in encode_scalars(FLOAT64, volts(np.arange(self.count, self.count + n))):
+            at = START + self.count * MS
+            out += record(Opcode.MESSAGE, struct.pack('<HIQQ', 1, self.count, at, at), data)
+            self.count += 1
+        if self.lies('short message', 0.03):
+            out += record(Opcode.MESSAGE, bytes(int(self.rng.integers(22))))
+        if self.lies('unknown channel', 0.05):
+            out += record(Opcode.MESSAGE, struct.pack('<HIQQ', 77, 0, START, START), bytes(12))
+        if self.lies('cut within', 0.03):
+            out += record(Opcode.MESSAGE, bytes(30), length=self.lie())
+        return out
+
+    def chunk(self, content: bytes, first: int) -> bytes:
+        """Return a chunk; what it states of itself may be a lie."""
+        way = str(self.rng.choice(['', 'zstd', 'lz4']))
+        packed, size, crc = content, len(content), zlib.crc32(content)
+        if self.lies('bomb', 0.05):
+            content = bytes(int(self.rng.choice([10**6, 2 * 10**8])))
+        if way == 'zstd':
+            one = zstandard.ZstdCompressor(
+                level=1, write_content_size=bool(self.rng.integers(2))).compressobj()
+            packed = one.compress(content) + one.flush()
+        elif way == 'lz4':
+            packed = lz4.frame.compress(content)
+        else:
+            packed = content[:10**6]
+        if self.lies('chunk size', 0.05):
+            size = self.lie()
+        if self.lies('chunk checksum', 0.05):
+            crc = 12345
+        if self.lies('compression', 0.03):
+            way = str(self.rng.choice(['lz4', 'zstd', '', 'gzip', 'x' * 5000]))
+        length = self.lie() if self.lies('length of data', 0.03) else len(packed)
+        return record(Opcode.CHUNK, struct.pack(
+            '<QQQI', START + first * MS, START + max(first, self.count - 1) * MS, size, crc),
+            text(way), struct.pack('<Q', length), packed)
+
+    def file(self) -> bytes:
+        """Return the whole of it."""
+        data = MAGIC + record(Opcode.HEADER, text('ros2'), text(''))
+        indexes = b''
+        chunks = int(self.rng.integers(1, 6))
+        for k in range(chunks):
+            first = self.count
+            # Messages may also stand outside of chunks.
+            if self.rng.random() < 0.1 and k:
+                data += self.messages(int(self.rng.integers(1, 50)))
+                continue
+            content = self.definitions() if k == 0 else b''
+            content += self.messages(int(self.rng.integers(1, 100)))
+            one = self.chunk(content, first)
+            numbers = [START + first * MS, START + (self.count - 1) * MS, len(data), len(one)]
+            size = len(content)
+            if self.lies('index', 0.1):
+                numbers[int(self.rng.integers(4))] = self.lie()
+            if self.lies('size of index', 0.05):
+                size = self.lie()
+            entry = record(
+                Opcode.CHUNK_INDEX, struct.pack('<QQQQ', *numbers),
+                text(struct.pack('<HQ', 1, len(data) + len(one))), struct.pack('<Q', 0),
+                text(''), struct.pack('<QQ', size, size))
+            data += one
+            indexes += entry * (0 if self.lies('chunk unlisted', 0.05) else
+                                int(self.rng.integers(2, 40)) if self.lies('listed twice', 0.05)
+                                else 1)
+            if self.lies('private record', 0.05):
+                data += record(0x90, bytes(30))
+            if self.lies('junk', 0.03):
+                data += self.rng.bytes(40)
+        data += record(Opcode.DATA_END, bytes(4))
+        start = len(data)
+        if self.rng.random() < 0.3:
+            start = 0
+        else:
+            counted = self.count + (self.lies('count') and int(self.rng.integers(-5, 6)))
+            data += self.definitions() + indexes + record(
+                Opcode.STATISTICS, struct.pack(
+                    '<QHIIIIQQ', max(counted, 0), 1, 1, 0, 0, chunks, START,
+                    START + self.count * MS), text(struct.pack('<HQ', 1, max(counted, 0))))
+        return data + record(Opcode.FOOTER, struct.pack('<QQI', start, 0, 0)) + MAGIC
+
+
+def verdict(path: Path, count: int, partial: bool) -> str:
+    """Read a file; return what came of it, '!' first where it is a fault."""
+    def hang(*_: object) -> None:
+        raise TimeoutError
+
+    signal.signal(signal.SIGALRM, hang)
+    signal.alarm(PATIENCE)
+    try:
+        found = read_recording(path, partial=partial)
+    except InputError as error:
+        return 'refused' if str(error).isprintable() else '! a refusal with control characters'
+    except TimeoutError:
+        return '! hang'
+    except Exception:
+        traceback.print_exc()
+        return '! traceback'
+    finally:
+        signal.alarm(0)
+    told = any(word in note for note in found.notes for word in ('damaged', 'left out', 'dropped'))
+    k = np.rint((found.t - START * 1e-9) * 1e3)
+    if not np.array_equal(found.voltage, volts(k)):
+        return 'wrong, and reported as damaged' if told else '! wrong value'
+    if found.n != count and not told:
+        return '! silent loss'
+    return 'read, reported as damaged' if told else 'read whole'
+
+
+def attacks(given: argparse.Namespace, path: Path) -> Iterator[tuple[str, int, bytes, int]]:
+    """Yield the kind of each attack, its seed, the file and the samples in it."""
+    sound = [written(path, stamped, **options) for options in WAYS.values()
+             for stamped in (True, False)]
+    for seed in range(given.seed, given.seed + given.mutated):
+        rng = np.random.default_rng(seed)
+        kind, data = mutated(sound[int(rng.integers(len(sound)))], rng)
+        yield kind, seed, data, COUNT
+    for seed in range(given.seed, given.seed + given.crafted):
+        crafted = Crafted(np.random.default_rng([seed, 1]))
+        data = crafted.file()
+        yield 'crafted', seed, data, crafted.count
+
+
+def main() -> int:
+    """Attack, and count."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument('--mutated', type=int, default=2200, help='damaged bags')
+    parser.add_argument('--crafted', type=int, default=560, help='bags made by hand')
+    parser.add_argument('--seed', type=int, default=1)
+    given = parser.parse_args()
+    tally: Counter[tuple[str, str]] = Counter()
+    faults, slowest = 0, 0.0
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / 'attack.mcap'
+        for kind, seed, data, count in attacks(given, path):
+            path.write_bytes(data)
+            for partial in (False, True):
+                began = time.process_time()
+                said = verdict(path, count, partial)
+                slowest = max(slowest, time.process_time() - began)
+                tally[kind, said] += 1
+                if said.startswith('!'):
+                    faults += 1
+                    print(f'{said}: {kind}, seed {seed}, partial {partial}', file=sys.stderr)
+    for (kind, said), n in sorted(tally.items()):
+        print(f'{kind:10} {said:32} {n}')
+    print(f'{faults} faults in {sum(tally.values())} readings; slowest {slowest:.2f} s of CPU; '
+          f'peak '
+          f'{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB resident')
+    return 1 if faults else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

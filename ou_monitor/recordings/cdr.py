@@ -1,0 +1,705 @@
+"""
+CDR messages as arrays: the layout of one message, verified in all others.
+
+CDR has no fixed places: a text or a sequence moves all that comes after it.  But in a
+recording the same texts and lengths come again and again.  So the layout is worked out
+once on one message, with every length word that it rests on, and holds for all messages
+of the same size with the same words there: their fields are columns.  What remains goes
+to the general decoder one by one, and so does everything that it would refuse; the
+outcome is the same, bit for bit.
+
+Plain CDR version 1, little endian (OMG DDS-XTypes 7.4.3): alignment is counted
+from after the 4-byte header.  The fields come from the definition of the type
+(ros2msg text) as `rosidl` writes it into bags; one with anything else in it gives
+no layout.  https://docs.ros.org/en/jazzy/Concepts/Basic/About-Interfaces.html
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+import re
+import struct
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.errors import InputError
+from ou_monitor.records import FloatArray
+from ou_monitor.stream.config import FieldPath, FieldSpec, parse_field_path
+from ou_monitor.stream.extract import Extracted, Extractor, ZeroRule
+
+IntArray = npt.NDArray[np.int64]
+TimeArray = npt.NDArray[np.uint64]
+
+# ROS name -> NumPy type, little endian, as the general decoder reads it.
+PRIMITIVES = {
+    'bool': '?', 'byte': 'u1', 'char': 'i1', 'int8': 'i1', 'uint8': 'u1', 'int16': '<i2',
+    'uint16': '<u2', 'int32': '<i4', 'uint32': '<u4', 'int64': '<i8', 'uint64': '<u8',
+    'float32': '<f4', 'float64': '<f8',
+}
+TEXT = 'string'
+
+_SEPARATOR = re.compile(r'^={3,}$', re.MULTILINE)
+_NAME = re.compile(r'MSG:\s+([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)')
+_CONSTANT = re.compile(r'\w+(?:<=\d+)?\s+[A-Z]\w*\s*=')
+_FIELD = re.compile(
+    r'(?:([A-Za-z]\w*)/)?([A-Za-z]\w*)(?:<=\d+)?(\[(?:<=\d+|\d*)\])?\s+([a-z]\w*)'
+    r'(?:\s+[^=\s][^=]*)?')
+
+Rows = npt.NDArray[np.uint8]
+
+# Representation identifier CDR_LE; the two bytes after it are options.
+_LITTLE_ENDIAN = b'\x00\x01'
+_HEADER = 4
+
+# Beyond these the general decoder is as quick, and no message can make the walk long.
+_MOST_STEPS = 2000
+_MOST_WORDS = 64
+_MOST_DEPTH = 50
+
+
+@dataclass(frozen=True)
+class Field:
+    """
+    One field of a message.
+
+    Attributes
+    ----------
+    name : str
+        Its name.
+    type : str
+        A key of `PRIMITIVES`, `TEXT`, or 'package/Type'.
+    array : bool
+        Whether it is an array.
+    size : int or None
+        Elements of an array of fixed size; None when a message states them.
+
+    """
+
+    name: str
+    type: str  # noqa: A003
+    array: bool = False
+    size: int | None = None
+
+
+# package/Type -> its fields.
+Definitions = dict[str, tuple[Field, ...]]
+
+# What the general decoder takes where a bag does not carry these.
+_TIME = (Field('sec', 'uint32'), Field('nanosec', 'uint32'))
+DEFAULTS: Definitions = {
+    'builtin_interfaces/Time': _TIME, 'builtin_interfaces/Duration': _TIME}
+
+
+def short_name(kind: str) -> str:
+    """Return 'package/Type' for 'package/msg/Type'."""
+    words = kind.split('/')
+    return f'{words[0]}/{words[-1]}'
+
+
+def parse_definition(kind: str, text: str) -> Definitions | None:
+    """Return the fields of a type and of those that it uses."""
+    found = dict(DEFAULTS)
+    name = short_name(kind)
+    for part in _SEPARATOR.split(text.replace('\r', '')):
+        lines = [line.strip() for line in part.splitlines()]
+        lines = [line for line in lines if line]
+        if lines and (match := _NAME.fullmatch(lines[0])):
+            name = f'{match[1]}/{match[2]}'
+            lines = lines[1:]
+        fields = []
+        for line in lines:
+            if '#' in line and ('"' in line or "'" in line.partition('#')[0]):
+                return None
+            line = line.partition('#')[0].strip()
+            if not line or _CONSTANT.match(line):
+                continue
+            field = _field(line, name.partition('/')[0])
+            if field is None:
+                return None
+            fields.append(field)
+        found[name] = tuple(fields)
+    return found if short_name(kind) in found else None
+
+
+def _field(line: str, package: str) -> Field | None:
+    match = _FIELD.fullmatch(line)
+    if match is None:
+        return None
+    other, kind, array, name = match.groups()
+    if other is not None:
+        kind = f'{other}/{kind}'
+    elif kind[0].isupper():
+        kind = f'{package}/{kind}'
+    elif kind not in PRIMITIVES and kind != TEXT:
+        return None
+    if array is None:
+        return Field(name, kind)
+    inside = array[1:-1]
+    return Field(name, kind, True, int(inside) if inside.isdigit() else None)
+
+
+class _NoLayoutError(Exception):
+    """The message is for the general decoder."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """
+    Where numbers are in a message.
+
+    Attributes
+    ----------
+    offset : int
+        Byte of the first one.
+    kind : str
+        NumPy type of each.
+    size : int or None
+        How many; None for a single number that is not an array.
+
+    """
+
+    offset: int
+    kind: str
+    size: int | None = None
+
+    def column(self, rows: Rows) -> FloatArray:
+        """Return the numbers of many messages."""
+        kind = np.dtype('u1' if self.kind == '?' else self.kind)
+        shape = rows.shape[:1] if self.size is None else (rows.shape[0], self.size)
+        if not rows.shape[0] or self.size == 0:
+            return np.empty(shape)
+        strides = (rows.shape[1], kind.itemsize)[:len(shape)]
+        raw: npt.NDArray[np.generic] = np.ndarray(shape, kind, rows, self.offset, strides)
+        return (raw != 0 if self.kind == '?' else raw).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """
+    The layout of one message.
+
+    Attributes
+    ----------
+    length : int
+        Bytes of the message.
+    words : tuple of (int, int)
+        (offset, value) of every uint32 that states a length.
+    texts : tuple of (int, int)
+        (offset, bytes) of every text, its closing zero left out.
+    places : dict of FieldPath to Place
+        Where the fields asked for are.
+
+    """
+
+    length: int
+    words: tuple[tuple[int, int], ...]
+    texts: tuple[tuple[int, int], ...]
+    places: dict[FieldPath, Place]
+
+    def holds_for(self, rows: Rows) -> npt.NDArray[np.bool_]:
+        """Return which messages have this layout."""
+        same: npt.NDArray[np.bool_] = (rows[:, 0] == 0) & (rows[:, 1] == 1)
+        for offset, value in self.words:
+            word: npt.NDArray[np.uint32] = np.ndarray(
+                rows.shape[:1], '<u4', rows, offset, rows.strides[:1])
+            same &= word == value
+        for offset, size in self.texts:
+            same &= (rows[:, offset:offset + size] < 0x80).all(axis=1)
+        return same
+
+
+def layout_of(
+    message: bytes, kind: str, definitions: Definitions, wanted: Iterable[FieldPath],
+) -> Layout | None:
+    """Return the layout of one message."""
+    if message[:2] != _LITTLE_ENDIAN or len(message) < _HEADER:
+        return None
+    walk = _Walk(message, definitions, frozenset(wanted))
+    try:
+        walk.message(kind, (), 0)
+    except _NoLayoutError:
+        return None
+    return Layout(len(message), tuple(walk.words), tuple(walk.texts), walk.places)
+
+
+class _Walk:
+    """Reads one message from front to back, noting where things are."""
+
+    def __init__(
+        self, data: bytes, definitions: Definitions, wanted: frozenset[FieldPath],
+    ) -> None:
+        self.words: list[tuple[int, int]] = []
+        self.texts: list[tuple[int, int]] = []
+        self.places: dict[FieldPath, Place] = {}
+        self._data = data
+        self._definitions = definitions
+        self._wanted = wanted
+        self._at = _HEADER
+        self._steps = 0
+
+    def message(self, kind: str, path: FieldPath, depth: int) -> None:
+        fields = self._definitions.get(kind)
+        if fields is None or depth > _MOST_DEPTH:
+            raise _NoLayoutError
+        if not fields:
+            # A message without fields is sent as one byte.
+            self._take(1, 1)
+        for field in fields:
+            self._field(field, (*path, field.name), depth)
+
+    def _field(self, field: Field, path: FieldPath, depth: int) -> None:
+        self._steps += 1
+        if self._steps > _MOST_STEPS:
+            raise _NoLayoutError
+        if not field.array:
+            self._one(field.type, path, depth)
+            return
+        size = self._word() if field.size is None else field.size
+        if field.type in PRIMITIVES:
+            self._numbers(field.type, size, path)
+            return
+        if size > _MOST_STEPS:
+            raise _NoLayoutError
+        for k in range(size):
+            self._steps += 1
+            self._one(field.type, (*path, k), depth)
+
+    def _one(self, kind: str, path: FieldPath, depth: int) -> None:
+        if kind == TEXT:
+            self._text()
+        elif kind in PRIMITIVES:
+            item = PRIMITIVES[kind]
+            width = np.dtype(item).itemsize
+            begin = self._take(width, width)
+            if path in self._wanted:
+                self.places[path] = Place(begin, item)
+        else:
+            self.message(kind, path, depth + 1)
+
+    def _numbers(self, kind: str, size: int, path: FieldPath) -> None:
+        item = PRIMITIVES[kind]
+        width = np.dtype(item).itemsize
+        # An empty array is not aligned.
+        begin = self._take(size * width, width if size else 1)
+        for wanted in self._wanted:
+            # Arrays of bytes are bytes to the general decoder, not numbers.
+            if wanted == path and item != 'u1':
+                self.places[wanted] = Place(begin, item, size)
+            elif len(wanted) == len(path) + 1 and wanted[:-1] == path:
+                k = wanted[-1]
+                if isinstance(k, int) and k < size:
+                    self.places[wanted] = Place(begin + k * width, item)
+
+    def _text(self) -> None:
+        length = self._word()
+        begin = self._take(length, 1)
+        if length > 1:
+            self.texts.append((begin, length - 1))
+
+    def _word(self) -> int:
+        begin = self._take(4, 4)
+        if len(self.words) == _MOST_WORDS:
+            raise _NoLayoutError
+        (value,) = struct.unpack_from('<I', self._data, begin)
+        self.words.append((begin, value))
+        return int(value)
+
+    def _take(self, size: int, align: int) -> int:
+        """Pass over some bytes; return where they begin."""
+        begin = self._at + (_HEADER - self._at) % align
+        self._at = begin + size
+        if self._at > len(self._data):
+            raise _NoLayoutError
+        return begin
+
+
+# Arrays that the general decoder slices, without a look whether so many bytes are there.
+_SLICED = frozenset(('uint8', 'byte'))
+_FREE_STEPS = 1000
+
+
+def endless(kind: str, definitions: Definitions) -> bool:
+    """
+    Whether a few bytes of a type can keep the general decoder busy for ever.
+
+    It reads elements of a type that takes no bytes, or none that it checks, as often as a
+    length word says; identifiers such as ``uint8[16] uuid`` are of that kind.
+    """
+    least: dict[str, int] = {}
+
+    def bytes_checked(name: str) -> int:
+        if name not in least:
+            # A type within itself ends by its own depth.
+            least[name] = 1
+            fields = definitions.get(name, ())
+            least[name] = sum(map(of_field, fields)) if fields else 1
+        return least[name]
+
+    def of_field(field: Field) -> int:
+        one = 1 if field.type in PRIMITIVES or field.type == TEXT else bytes_checked(field.type)
+        if not field.array:
+            return one
+        if field.size is None:
+            return 4
+        return 0 if field.type in _SLICED else one * field.size
+
+    bytes_checked(kind)
+    return any(count == 0 for name, count in least.items() if name != kind)
+
+
+def check_extent(message: bytes, kind: str, definitions: Definitions) -> None:
+    """Raise ValueError where a message of a type as of `endless` goes on beyond its end."""
+    word = struct.Struct('<I' if message[1:2] in (b'\x01', b'\x03') else '>I')
+    left = len(message) + _FREE_STEPS
+    at = _HEADER
+
+    def take(size: int, align: int) -> int:
+        nonlocal at
+        begin = at + (_HEADER - at) % align
+        at = begin + size
+        if at > len(message):
+            raise ValueError('it is shorter than what it says of itself')
+        return begin
+
+    def length() -> int:
+        (value,) = word.unpack_from(message, take(4, 4))
+        return int(value)
+
+    def one(name: str) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise ValueError('it states more elements than it has bytes')
+        if name == TEXT:
+            take(length(), 1)
+        elif name in PRIMITIVES:
+            width = np.dtype(PRIMITIVES[name]).itemsize
+            take(width, width)
+        elif name not in definitions:
+            raise ValueError('a type in it is not defined')
+        elif not definitions[name]:
+            take(1, 1)
+        else:
+            for field in definitions[name]:
+                if field.array:
+                    several(field)
+                else:
+                    one(field.type)
+
+    def several(field: Field) -> None:
+        count = length() if field.size is None else field.size
+        if field.type in PRIMITIVES:
+            width = np.dtype(PRIMITIVES[field.type]).itemsize
+            take(count * width, width if count else 1)
+            return
+        for _ in range(count):
+            one(field.type)
+
+    one(kind)
+
+
+# Layouts that are tried for messages of one length; a topic with more of them
+# is not one whose messages are alike.
+MOST_LAYOUTS = 16
+
+Broken = Callable[[int, InputError], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Messages in a block of bytes, in the order of the file."""
+
+    #: The block.
+    data: bytes
+    #: Channel of each message.
+    channel: npt.NDArray[np.uint16]
+    #: Log times, ns.
+    log_time: TimeArray
+    #: Where the serialized messages begin and end in `data`.
+    begin: IntArray
+    end: IntArray
+
+    @property
+    def n(self) -> int:
+        """Return the number of messages."""
+        return int(self.begin.size)
+
+    def where(self, mask: npt.NDArray[np.bool_]) -> Table:
+        """Return the messages for which `mask`, shape (n,), is true."""
+        if mask.all():
+            return self
+        return Table(self.data, self.channel[mask], self.log_time[mask], self.begin[mask],
+                     self.end[mask])
+
+    def rows(self, picked: IntArray, length: int) -> Rows:
+        """Return messages of one length in bytes as rows."""
+        return gather(self.data, self.begin[picked], f'V{length}').view(np.uint8).reshape(
+            -1, length)
+
+
+def gather(data: bytes, at: IntArray, kind: str) -> npt.NDArray[Any]:
+    """Return items of a kind from anywhere in a block of bytes."""
+    size = np.dtype(kind).itemsize
+    if not at.size:
+        return np.empty(0, kind)
+    # One item at every byte: NumPy picks from such a view far faster than it
+    # puts single bytes together.
+    everywhere: npt.NDArray[Any] = np.ndarray(
+        (len(data) - size + 1,), kind, data, 0, (1,))
+    return everywhere[at]
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """
+    A field of many messages.
+
+    Attributes
+    ----------
+    log_time : ndarray of uint64, shape (m,)
+        Log times, ns.
+    stamp : ndarray, shape (m,)
+        Stamps of the messages (of the LAST sample of a block), s; the log
+        time where a message has none.
+    stamped : ndarray of bool, shape (m,)
+        Whether the message carries its stamp.
+    count : ndarray of int64, shape (m,)
+        Values in each message; 0 where the field's array is too short.
+    values : ndarray, shape (count.sum(),)
+        Values in SI units; NaN where one is not a finite number.
+
+    """
+
+    log_time: TimeArray
+    stamp: FloatArray
+    stamped: npt.NDArray[np.bool_]
+    count: IntArray
+    values: FloatArray
+
+    @property
+    def n(self) -> int:
+        """Return the number of messages."""
+        return int(self.stamp.size)
+
+    def take(self, order: IntArray) -> Column:
+        """Return the messages of given indices, shape (k,), in their order."""
+        if (self.count == 1).all():
+            values = self.values[order]
+        else:
+            begins = np.cumsum(self.count) - self.count
+            values = self.values[_spread(begins[order], self.count[order])]
+        return Column(self.log_time[order], self.stamp[order], self.stamped[order],
+                      self.count[order], values)
+
+    def split(self, at: int) -> tuple[Column, Column]:
+        """Return the first `at` messages, and the rest."""
+        cut = int(self.count[:at].sum())
+        return (Column(self.log_time[:at], self.stamp[:at], self.stamped[:at], self.count[:at],
+                       self.values[:cut]),
+                Column(self.log_time[at:], self.stamp[at:], self.stamped[at:], self.count[at:],
+                       self.values[cut:]))
+
+    def in_time_order(self) -> Column:
+        """Return the messages by log time; those of one time as they are."""
+        if (self.log_time[1:] >= self.log_time[:-1]).all():
+            return self
+        return self.take(np.argsort(self.log_time, kind='stable'))
+
+
+def join(parts: Sequence[Column]) -> Column:
+    """Return columns one after another; an empty one for none."""
+    if len(parts) == 1:
+        return parts[0]
+    return Column(
+        np.concatenate([np.empty(0, np.uint64), *(part.log_time for part in parts)]),
+        np.concatenate([np.empty(0), *(part.stamp for part in parts)]),
+        np.concatenate([np.empty(0, np.bool_), *(part.stamped for part in parts)]),
+        np.concatenate([np.empty(0, np.int64), *(part.count for part in parts)]),
+        np.concatenate([np.empty(0), *(part.values for part in parts)]))
+
+
+def seconds(log_time: TimeArray) -> FloatArray:
+    """Return ns as s; whole seconds apart, for an epoch in ns does not fit a float64."""
+    whole, rest = np.divmod(log_time, np.uint64(1_000_000_000))
+    return whole + rest * 1e-9
+
+
+def _spread(begin: IntArray, count: IntArray) -> IntArray:
+    """Return begin[0], begin[0] + 1, ..., `count` of each, one after another."""
+    ends = np.cumsum(count)
+    places: IntArray = np.repeat(begin - (ends - count), count)
+    return places + np.arange(places.size)
+
+
+class FieldReader:
+    """
+    Reads one field, and its stamp, of messages of one type (ros2msg text `definition`).
+
+    The `nan` rule of `spec` is not applied: what is not finite is NaN.  `decoder` returns the
+    general decoder, and is asked only when needed; `broken` is called with the log time, ns, of a
+    message that cannot be decoded and the error.  `general` counts messages that went that way.
+    """
+
+    def __init__(
+        self, spec: FieldSpec, definition: str, decoder: Callable[[], Callable[[bytes], Any]],
+        broken: Callable[[int, InputError], None] | None = None,
+    ) -> None:
+        """Parse the definition; layouts are learned from messages."""
+        self.spec = spec
+        self.general = 0
+        self._extractor = Extractor(replace(spec, nan='unknown', zero='value'))
+        self._zero = ZeroRule(spec.zero)
+        self._decoder = decoder
+        self._broken = broken
+        self._decode: Callable[[bytes], Any] | None = None
+        self._kind = short_name(spec.type)
+        self._definitions = parse_definition(spec.type, definition)
+        self._value = parse_field_path(spec.field)
+        self._stamp: FieldPath | None = None
+        self._paths = [self._value]
+        if spec.stamp_field is not None:
+            self._stamp = parse_field_path(spec.stamp_field)
+            self._paths += [self._stamp, (*self._stamp, 'sec'), (*self._stamp, 'nanosec')]
+        # Length of the message -> layouts met.
+        self._layouts: dict[int, list[Layout]] = {}
+
+    def read(self, table: Table) -> Column:
+        """Return the field of the messages of a table, in its order."""
+        # A damaged message may hold a signalling NaN, of which NumPy would warn.
+        with np.errstate(invalid='ignore'):
+            column = self._read(table)
+        return replace(column, values=self._zero.apply(column.values))
+
+    def _read(self, table: Table) -> Column:
+        """Return the field with zeros as they are."""
+        logged = seconds(table.log_time)
+        stamp = np.full(table.n, np.nan)
+        count = np.ones(table.n, np.int64)
+        bulk: list[tuple[IntArray, FloatArray]] = []
+        rest: list[IntArray] = []
+        lengths = table.end - table.begin
+        for length in np.unique(lengths).tolist():
+            left = np.nonzero(lengths == length)[0]
+            if self._definitions is not None and length:
+                left = self._in_bulk(table, left, length, stamp, bulk)
+            rest.append(left)
+        for picked, block in bulk:
+            count[picked] = block.shape[1]
+        single = {}
+        broken: list[int] = []
+        for k in np.sort(np.concatenate([np.empty(0, np.int64), *rest])).tolist():
+            found = self._one(
+                bytes(table.data[table.begin[k]:table.end[k]]), int(table.log_time[k]))
+            if found is None:
+                broken.append(k)
+                count[k] = 0
+                continue
+            single[k] = found.values
+            count[k] = found.values.size
+            if found.stamp is not None:
+                stamp[k] = found.stamp
+        self.general += len(single)
+        stamped = ~np.isnan(stamp)
+        stamp = np.where(stamped, stamp, logged)
+        if not single and not broken and len(bulk) == 1:
+            # All alike, and in order.
+            return Column(table.log_time, stamp, stamped, count, bulk[0][1].reshape(-1))
+        begin = np.cumsum(count) - count
+        values = np.empty(int(count.sum()))
+        for picked, block in bulk:
+            values[begin[picked][:, None] + np.arange(block.shape[1])] = block
+        for k, block in single.items():
+            values[begin[k]:begin[k] + block.size] = block
+        if not broken:
+            return Column(table.log_time, stamp, stamped, count, values)
+        kept = np.ones(table.n, dtype=bool)
+        kept[broken] = False
+        return Column(table.log_time[kept], stamp[kept], stamped[kept], count[kept], values)
+
+    def _in_bulk(
+        self, table: Table, left: IntArray, length: int, stamp: FloatArray,
+        bulk: list[tuple[IntArray, FloatArray]],
+    ) -> IntArray:
+        """Read messages of one length by layouts; return those that have none."""
+        known = self._layouts.setdefault(length, [])
+        rows = table.rows(left, length)
+        for layout in known:
+            left, rows = self._by_layout(layout, left, rows, stamp, bulk)
+            if not left.size:
+                return left
+        strange: list[IntArray] = []
+        while left.size and len(known) < MOST_LAYOUTS and len(strange) < MOST_LAYOUTS:
+            found = self._learn(rows[0].tobytes())
+            if found is None or not found.holds_for(rows[:1])[0]:
+                strange.append(left[:1])
+                left, rows = left[1:], rows[1:]
+                continue
+            known.append(found)
+            left, rows = self._by_layout(found, left, rows, stamp, bulk)
+        return np.concatenate([*strange, left])
+
+    def _by_layout(
+        self, layout: Layout, left: IntArray, rows: Rows, stamp: FloatArray,
+        bulk: list[tuple[IntArray, FloatArray]],
+    ) -> tuple[IntArray, Rows]:
+        """Read the messages with a layout; return the others."""
+        fits = layout.holds_for(rows)
+        if not fits.any():
+            return left, rows
+        everything = bool(fits.all())
+        picked, mine = (left, rows) if everything else (left[fits], rows[fits])
+        own = self._stamps(layout, mine)
+        if own is not None:
+            known = np.isfinite(own) & (own != 0.0)
+            stamp[picked[known]] = own[known]
+        block = layout.places[self._value].column(mine).reshape(picked.size, -1)
+        block *= self.spec.sign * self.spec.unit_factor
+        block += self.spec.offset
+        finite = np.isfinite(block)
+        if not finite.all():
+            block[~finite] = np.nan
+        bulk.append((picked, block))
+        return (left[:0], rows[:0]) if everything else (left[~fits], rows[~fits])
+
+    def _stamps(self, layout: Layout, rows: Rows) -> FloatArray | None:
+        """Return the stamps in messages, s, by the formulas of `Extractor`."""
+        if self._stamp is None:
+            return None
+        whole = layout.places.get((*self._stamp, 'sec'))
+        if whole is None:
+            return layout.places[self._stamp].column(rows) * self.spec.stamp_factor
+        return whole.column(rows) + 1e-9 * layout.places[(*self._stamp, 'nanosec')].column(rows)
+
+    def _learn(self, message: bytes) -> Layout | None:
+        """Return the layout of a message when it gives all that is asked for."""
+        assert self._definitions is not None
+        layout = layout_of(message, self._kind, self._definitions, self._paths)
+        if layout is None:
+            return None
+        found = layout.places
+        value = found.get(self._value)
+        # An array is a block of samples, or a mistake that the general way names.
+        if value is None or (value.size is not None and self.spec.sample_rate is None):
+            return None
+        if self._stamp is not None:
+            number = found.get(self._stamp)
+            time = [found.get((*self._stamp, part)) for part in ('sec', 'nanosec')]
+            if any(place is None or place.size is not None
+                   for place in ([number] if number is not None else time)):
+                return None
+        return layout
+
+    def _one(self, message: bytes, log_time: int) -> Extracted | None:
+        """Return the field of one message the general way; None: it is to be left out."""
+        if self._decode is None:
+            self._decode = self._decoder()
+        try:
+            decoded = self._decode(message)
+        except InputError as error:
+            if self._broken is None:
+                raise
+            self._broken(log_time, error)
+            return None
+        return self._extractor.extract(decoded)
