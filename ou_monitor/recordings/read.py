@@ -89,7 +89,18 @@ def read_recording(
         left.
 
     """
-    path = Path(path)
+    return refreshed(_read(
+        Path(path), msg_config=msg_config, voltage_topic=voltage_topic,
+        throttle_topic=throttle_topic, partial=partial, start=start, end=end, flight=flight,
+        columns=columns, progress=progress))
+
+
+def _read(
+    path: Path, *, msg_config: str | Path | None, voltage_topic: str | None,
+    throttle_topic: str | None, partial: bool, start: float | None, end: float | None,
+    flight: int | None, columns: CsvColumns | None, progress: Callable[[float], None] | None,
+) -> Recording:
+    """Read a recording with what its logger repeats."""
     _check_part(start, end)
     topics = {'--msg-config': msg_config, '--voltage-topic': voltage_topic,
               '--throttle-topic': throttle_topic}
@@ -112,7 +123,7 @@ def read_recording(
     whole = reader.take()
     if not whole.n:
         raise InputError(_nothing(reader, start, end))
-    return _refreshed(replace(whole, notes=(*reader.bag_notes(), *reader.sample_notes())))
+    return replace(whole, notes=(*reader.bag_notes(), *reader.sample_notes()))
 
 
 def _refuse_topics(path: Path, kind: str, topics: Mapping[str, object]) -> None:
@@ -137,10 +148,10 @@ def _of_log(path: Path, names: frozenset[str], columns: CsvColumns | None, fligh
     if chosen.throttle is None and named.throttle != NONE:
         whole = replace(whole, notes=(*whole.notes, 'The throttle is unknown: the log holds '
                                                     'none (--throttle-column NAME).'))
-    return _cut(_refreshed(whole), start, end), log
+    return _cut(whole, start, end), log
 
 
-def _refreshed(recording: Recording) -> Recording:
+def refreshed(recording: Recording) -> Recording:
     """Drop what a logger repeats between two readings: of a log, and of a bag made of one."""
     source = recording.source
     if not _is_logged(source):
@@ -327,7 +338,12 @@ def read_beside(
     start: float | None = None, end: float | None = None, flight: int | None = None,
     columns: CsvColumns | None = None, progress: Callable[[float], None] | None = None,
 ) -> tuple[Recording, Series]:
-    """Read a recording as `read_recording`, and the whole of one scalar; a log is read once."""
+    """
+    Read a recording, and the whole of one scalar beside it; options as for `read_recording`.
+
+    What its logger repeats is kept, for between two readings of the voltage the throttle goes on:
+    see `refreshed`.  A log is read once.
+    """
     path = Path(path)
     if is_log(path):
         _check_part(start, end)
@@ -338,7 +354,7 @@ def read_beside(
                                  progress)
         series, said = signal_of(path, log, signal)
         return replace(recording, notes=(*recording.notes, *said)), series
-    recording = read_recording(
+    recording = _read(
         path, msg_config=msg_config, voltage_topic=voltage_topic, throttle_topic=throttle_topic,
         partial=partial, start=start, end=end, flight=flight, columns=columns, progress=progress)
     t, values = read_signal(path, signal, partial=partial, columns=columns)

@@ -11,7 +11,8 @@ from made_logs import blackbox, copter, px4_flight, quad, ulog
 from mcap.reader import make_reader
 import numpy as np
 from ou_monitor.cli.main import main
-from ou_monitor.recordings.read import read_beside, read_pieces, read_recording, read_signal
+from ou_monitor.recordings.read import (
+    read_beside, read_pieces, read_recording, read_signal, refreshed)
 from project import ROOT
 import pytest
 from rosbags.highlevel import AnyReader
@@ -109,7 +110,7 @@ def test_a_log_and_its_bag_give_one_json(tmp_path, options):
 
 
 def test_a_signal_of_a_log_and_of_its_bag_is_one(tmp_path):
-    """The supply beside the signal is the one that `analyze` gets."""
+    """Beside a signal the throttle keeps its rate, and `refreshed` gives what `analyze` reads."""
     path, out = tmp_path / 'a.bbl', tmp_path / 'bag'
     fields = ('loopIteration', 'time', 'rcCommand[3]', 'vbatLatest', 'amperageLatest',
               'motor[0]', 'motor[1]', *(f'gyroADC[{k}]' for k in range(3)))
@@ -119,7 +120,11 @@ def test_a_signal_of_a_log_and_of_its_bag_is_one(tmp_path):
     assert main(['convert', str(path), str(out)]) == 0
     (log, own), (bag, converted) = (
         read_beside(one, '/imu/angular_velocity.y') for one in (path, out))
-    np.testing.assert_array_equal(log.t, read_recording(path).t)
+    assert log.n == bag.n == 3000
+    np.testing.assert_array_equal(refreshed(log).t, read_recording(path).t)
+    share = (rows[:, 5:7].mean(axis=1) - 100) / 2000
+    np.testing.assert_array_equal(log.throttle, share.astype(np.float32))
+    np.testing.assert_array_equal(log.throttle, bag.throttle)
     np.testing.assert_array_equal(log.voltage, bag.voltage)
     np.testing.assert_array_equal(log.current, bag.current)
     assert own.n == 3000 and own.unit == converted.unit == 'rad/s'
