@@ -12,6 +12,7 @@ indices, and a scan is padded to a multiple of its largest element.  Volts are
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import os
@@ -113,8 +114,10 @@ class Scan:
 
 
 STAMP = 'in_timestamp'
-# An interval of more than so many is a hole: samples that the buffer had no room for.
+# An interval of more than this many usual ones is a hole: samples the buffer had no room for.
 HOLE = 1.5
+# Newest intervals whose median is the usual one.
+INTERVALS = 64
 # Blocks that the kernel's buffer holds: what may pass before samples are lost.
 BLOCKS = 64
 # Longest wait for samples, s: bounds how late an end is noticed.
@@ -164,6 +167,9 @@ class IioBuffer:
                              'polled, give polled:=true')
         self.channel = _choose(folder, channel)
         self.holes = 0
+        # Of the kernel's stamps, ns: the newest, and the newest intervals.
+        self._newest: int | None = None
+        self._intervals: deque[int] = deque(maxlen=INTERVALS)
         sysfs.write(folder / 'buffer/enable', 0)
         if trigger:
             sysfs.write(folder / 'trigger/current_trigger', trigger)
@@ -271,12 +277,19 @@ class IioBuffer:
         # Nanoseconds since 1970 need all 64 bits: the difference of the clocks is added to them.
         apart = 0 if self._clock == time.CLOCK_REALTIME else (
             time.time_ns() - time.clock_gettime_ns(self._clock))
-        stamps = self._scan.integers(data, STAMP) + apart
-        steps = np.diff(stamps)
-        typical = float(np.median(steps)) if steps.size else float('nan')
-        cuts = np.flatnonzero(steps > HOLE * typical) + 1 if steps.size else np.empty(0, np.int64)
-        self.holes += cuts.size
-        for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), volts.size], strict=True):
+        kernel = self._scan.integers(data, STAMP)
+        stamps = kernel + apart
+        # The first sample of all follows nothing.
+        before = int(kernel[0]) if self._newest is None else self._newest
+        steps = np.diff(kernel, prepend=before)
+        self._intervals += steps[1 if self._newest is None else 0:].tolist()
+        self._newest = int(kernel[-1])
+        typical = float(np.median(self._intervals)) if self._intervals else float('nan')
+        holes = np.flatnonzero(steps > HOLE * typical)
+        self.holes += holes.size
+        # One before the first sample splits nothing.
+        cuts = holes[holes > 0].tolist()
+        for first, last in zip([0, *cuts], [*cuts, volts.size], strict=True):
             yield Block(float(stamps[last - 1]) * 1e-9, volts[first:last], 1e-9 * typical)
 
     def close(self) -> None:

@@ -2,7 +2,8 @@
 `ou-monitor live`: a page to watch while flying, served from the topics of the nodes.
 
 Limits first: read-only, and on 127.0.0.1 unless another address is given, which then wants the
-token that is printed; it speaks HTTP without encryption.
+token that is printed; it speaks HTTP without encryption.  Of more than `CONNECTIONS` at once the
+further ones are closed, and one without a whole request after `PATIENCE`.
 """
 
 from __future__ import annotations
@@ -25,6 +26,14 @@ from ou_monitor.nodes.run import make_executor, NAP, run as run_ros
 NAME = 'ou_live'
 # Time between looks for new rows and at the context, s.
 _STEP = 0.1
+# Connections at once: a browser takes up to six, and each page that is open holds one.
+CONNECTIONS = 64
+# Longest wait for a request on an open connection, s.
+PATIENCE = 10.0
+# Largest header and body of a request, bytes; browsers send some 1000, and no body.
+_HEADER, _BODY = 16384, 0
+# Most digits of a number that is read at all; Python refuses some thousand with an error.
+_DIGITS = 18
 # A line that keeps the connection open, s, when there is nothing to say.
 _ALIVE = 5.0
 
@@ -42,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _port(text: str) -> int:
-    if not text.isascii() or not text.isdigit() or int(text) > 65535:
+    if not (text.isascii() and text.isdigit() and len(text) <= _DIGITS and int(text) <= 65535):
         raise InputError(f"--port: '{text}' is not a port, 0 to 65535 (0: any that is free)")
     return int(text)
 
@@ -86,9 +95,9 @@ def _local(host: str) -> bool:
 async def _page(node: Any, host: str, port: int) -> None:
     """Serve until the context of the node ends."""
     token = '' if _local(host) else secrets.token_urlsafe(16)
-    app = application(node, token)
+    server = make_server(application(node, token))
     try:
-        server = app.listen(port, address=host)
+        server.listen(port, address=host)
     except OSError as error:
         raise InputError(f'cannot listen on {host}:{port}: {error.strerror or error}; '
                          'give another --port or --host') from error
@@ -101,6 +110,25 @@ async def _page(node: Any, host: str, port: int) -> None:
             await asyncio.sleep(_STEP)
     finally:
         server.stop()
+
+
+def make_server(app: Any, patience: float = PATIENCE) -> Any:
+    """Return the server of an application; `patience` in s."""
+    from tornado.httpserver import HTTPServer
+
+    class Bounded(HTTPServer):
+        """Closes connections beyond `CONNECTIONS`."""
+
+        def handle_stream(self, stream: Any, address: Any) -> None:
+            """Take a connection."""
+            if len(self._connections) >= CONNECTIONS:
+                stream.close()
+            else:
+                super().handle_stream(stream, address)
+
+    # Both times run from the last request: a page that streams rows is within one.
+    return Bounded(app, idle_connection_timeout=patience, body_timeout=patience,
+                   max_header_size=_HEADER, max_body_size=_BODY)
 
 
 def application(node: Any, token: str) -> Any:
@@ -144,7 +172,8 @@ def application(node: Any, token: str) -> Any:
             self.set_header('Content-Type', 'text/event-stream')
             # A browser that comes back says which row it had last.
             last = self.request.headers.get('Last-Event-ID', '')
-            sent = int(last) if last.isascii() and last.isdigit() else 0
+            known = last.isascii() and last.isdigit() and len(last) <= _DIGITS
+            sent = int(last) if known else 0
             newest = node.rows(0)
             if newest and sent > newest[-1]['k']:
                 # Of another process: from the beginning.

@@ -71,6 +71,20 @@ def test_a_hole_splits_a_block(tmp_path):
     buffer.close()
 
 
+@pytest.mark.parametrize('block', [1, 2, 25, 100])
+def test_samples_lost_between_two_blocks_are_a_hole(tmp_path, block):
+    """50 of them, at every length of a block; a clock that is set back is none."""
+    folder, character = iio_device(tmp_path)
+    places = np.concatenate([np.arange(100), np.arange(150, 250), np.arange(-1000, -900)])
+    done = feed(character, scans(np.arange(300), T0 + 100_000 * places))
+    buffer = IioBuffer(folder, character, 'in_voltage1', block=block)
+    found = take(buffer, 300 // block)
+    done.set()
+    assert buffer.holes == 1 and {b.volts.size for b in found} == {block}
+    assert found[-1].interval == pytest.approx(1e-4)
+    buffer.close()
+
+
 def test_a_monotonic_clock_is_brought_to_1970(tmp_path):
     """By the difference of the clocks when the block is read."""
     folder, character = iio_device(tmp_path, clock='monotonic')

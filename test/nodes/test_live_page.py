@@ -1,10 +1,12 @@
 """The live page: in a real browser while a bag plays, and who is let in."""
 
+import asyncio
+from contextlib import suppress
 import re
 
 from browser import Browser, find_browser
-from live import BAGS, wait_until
-from ou_monitor.nodes.live import application
+from live import BAGS, DEADLINE, wait_until
+from ou_monitor.nodes.live import application, CONNECTIONS, make_server
 from ou_monitor.nodes.live_node import known
 import pytest
 from tornado.testing import AsyncHTTPTestCase
@@ -100,6 +102,13 @@ class TestLocal(AsyncHTTPTestCase):
         assert self.fetch('/etc/passwd').code == 404
         assert self.fetch('/', method='POST', body='').code == 405
 
+    def test_any_last_row_is_taken(self):
+        """A number of 5 000 digits, or what is none: all rows, from the beginning."""
+        for last in ('9' * 5000, '9' * 19, '-1', 'x', '\u00b2'):
+            Rows.context.left = 2
+            found = self.fetch('/rows', headers={'Last-Event-ID': last})
+            assert found.code == 200 and '"k": 1' in found.body.decode(), last[:20]
+
     def test_another_name_that_resolves_to_here_is_refused(self):
         """A page of elsewhere cannot read it by way of its own name."""
         assert self.fetch('/', headers={'Host': 'evil.example:80'}).code == 403
@@ -111,6 +120,7 @@ class TestOpen(TestLocal):
 
     token = 'secret'
     test_page_and_rows = test_another_name_that_resolves_to_here_is_refused = None
+    test_any_last_row_is_taken = None
 
     def test_the_token_is_wanted(self):
         """Without it, and with a wrong one, nothing; by any name with it."""
@@ -119,8 +129,54 @@ class TestOpen(TestLocal):
         assert self.fetch('/?token=secret', headers={'Host': 'drone.local'}).code == 200
 
 
+async def attacked(count, patience, expected):
+    """Open connections that never finish a request; return those closed, and then the page."""
+    server = make_server(application(Rows(), ''), patience)
+    server.listen(0, '127.0.0.1')
+    port = next(iter(server._sockets.values())).getsockname()[1]
+
+    async def request(text):
+        reader, writer = await asyncio.open_connection('127.0.0.1', port)
+        # Closed before the request was written: no answer.
+        with suppress(ConnectionError):
+            try:
+                writer.write(text)
+                return await reader.read()
+            finally:
+                writer.close()
+                await writer.wait_closed()
+        return b''
+
+    half = b'GET / HTTP/1.1\r\nHost: local'
+    waiting = {asyncio.ensure_future(request(half)) for _ in range(count)}
+    ended = set()
+    async with asyncio.timeout(DEADLINE):
+        while len(ended) < expected:
+            done, waiting = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+            ended |= done
+    for one in waiting:
+        one.cancel()
+    await asyncio.gather(*waiting, return_exceptions=True)
+    page = b'' if waiting else await request(half + b'host\r\nConnection: close\r\n\r\n')
+    server.stop()
+    await server.close_all_connections()
+    return len(ended), page
+
+
+def test_half_open_connections_are_limited():
+    """Of 600 that wait for ever all but the first 64 are closed at once."""
+    assert asyncio.run(attacked(600, 3600.0, 600 - CONNECTIONS))[0] == 600 - CONNECTIONS
+
+
+def test_half_open_connections_end_by_themselves():
+    """After the patience of the server; then the page is there again."""
+    ended, page = asyncio.run(attacked(CONNECTIONS, 0.2, CONNECTIONS))
+    assert ended == CONNECTIONS and page.startswith(b'HTTP/1.1 200')
+
+
 @pytest.mark.parametrize('arguments,words', [
-    (['--port', '70000'], 'is not a port'), (['--port', 'x'], 'is not a port'),
+    (['--port', '9' * 5000], 'is not a port'), (['--port', '70000'], 'is not a port'),
+    (['--port', 'x'], 'is not a port'),
     (['--host', 'no.such.host.invalid'], 'cannot listen on no.such.host.invalid')])
 def test_bad_options(world, arguments, words):
     """One line that says what is wrong; status 2."""
