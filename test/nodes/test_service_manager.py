@@ -76,6 +76,17 @@ def test_the_unit_is_accepted(tmp_path):
     assert done.returncode == 0, done.stdout[-200:]
 
 
+def test_the_unit_has_the_scheduling_that_was_measured():
+    """A real-time priority that is bounded, and no quota, which would stretch each report."""
+    lines = (ROOT / 'deploy/ou_monitor@.service').read_text().splitlines()
+    said = dict(line.split('=', 1) for line in lines if re.match(r'\w+=', line))
+    assert (said['CPUSchedulingPolicy'], said['CPUSchedulingPriority']) == ('rr', '1')
+    assert said['LimitRTTIME'] == '10s' and int(said['WatchdogSec']) > 10
+    assert 'CPUQuota' not in said and int(said['CPUWeight']) > 100
+    (share,) = re.findall(r'--cpus ([\d.]+) ', (ROOT / 'deploy/Containerfile').read_text())
+    assert float(share) >= 1.0
+
+
 @pytest.mark.parametrize('name, names', [
     ('estimator', []), ('adaptive_filter', ['sigma:=ou_estimator/sigma',
                                             'state:=ou_estimator/state', 'input:=imu'])])
