@@ -83,11 +83,6 @@ _MOST_RATIO = 256
 _LEAST_LIMIT, _CHUNKS_AT_ONCE = 64 * 1024 * 1024, 8
 _VARIABLE = 'OU_MONITOR_MAX_CHUNK_MB'
 
-# First bytes of the logs that `ou-monitor convert` reads; CSV is read as it is.
-_LOGS = (
-    (b'ULog', 'a PX4 ULog'), (b'\xa3\x95\x80', 'an ArduPilot dataflash log'),
-    (b'FMT,', 'an ArduPilot log'), (b'H Product:Blackbox', 'a blackbox log'))
-
 
 class Damage(Exception):
     """A part of the file that makes no sense."""
@@ -808,10 +803,12 @@ def kind_of_foreign(head: bytes, path: Path = Path('LOG')) -> str:
         return "it is a ROS 1 bag: convert it with 'rosbags-convert'"
     if head.startswith(b'\x28\xb5\x2f\xfd'):
         return "it is compressed as a whole: unpack it with 'zstd -d' first"
-    for begin, log in _LOGS:
-        if head.startswith(begin):
-            command = shlex.join(['ou-monitor', 'convert', str(path), path.stem])
-            return f'it is {log}, not a recording: convert it first, with {command}'
+    # Here, for the table of formats has the bag in it, and so needs this module.
+    from ou_monitor.recordings.importers.formats import BAG, CSV, format_of
+    log = format_of(head)
+    if log is not None and log.name not in (BAG, CSV):
+        command = shlex.join(['ou-monitor', 'convert', str(path), path.stem])
+        return f'it is a log, {log.words}, not a recording: convert it first, with {command}'
     if head[:1] and all(byte in b'\t\n\r' or 32 <= byte < 127 for byte in head):
         return 'it is text'
     return 'its first bytes are ' + (head[:8].hex(' ') or 'missing')

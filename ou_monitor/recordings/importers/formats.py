@@ -76,6 +76,11 @@ FORMATS = (
 )
 
 
+def format_of(head: bytes) -> Format | None:
+    """Return the format of a file that begins with these bytes."""
+    return next((one for one in FORMATS if head and one.fits(head)), None)
+
+
 def detect(path: Path) -> Format:
     """Return the format of a file, whatever its name ends in."""
     if path.is_dir():
@@ -89,9 +94,9 @@ def detect(path: Path) -> Format:
         raise InputError(f'cannot read {path}: {error.strerror}') from error
     if not head:
         raise InputError(f"'{path}' is empty: there is nothing to convert")
-    for one in FORMATS:
-        if one.fits(head):
-            return one
+    found = format_of(head)
+    if found is not None:
+        return found
     raise InputError(f"'{path}' cannot be converted: it begins like none of the formats read "
                      'today: ' + '; '.join(one.words for one in FORMATS if one.module))
 
@@ -111,8 +116,8 @@ def is_log(path: Path) -> bool:
     except OSError:
         # Whoever reads it says why it cannot be read.
         return False
-    found = next((one.name for one in FORMATS if head and one.fits(head)), CSV)
-    return found not in (BAG, CSV)
+    found = format_of(head)
+    return found is not None and found.name not in (BAG, CSV)
 
 
 def import_log(path: Path, request: Request) -> Log:
