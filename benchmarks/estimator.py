@@ -20,12 +20,9 @@ import sys
 import time
 from typing import Any
 
-# Before NumPy is loaded: one thread for all, so that CPU times compare; and
-# accuracy on the NumPy path, which the compiled one equals to 1e-9.
+# Before NumPy is loaded: one thread for all, so that CPU times compare.
 for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
     os.environ[_name] = '1'
-_ASKED = os.environ.get('OU_MONITOR_COMPILED', '1')
-os.environ['OU_MONITOR_COMPILED'] = '0'
 _HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(_HERE.parent))
 
@@ -234,11 +231,10 @@ def load(seed: int, windows: int) -> dict[str, Any]:
     return out
 
 
-def speed(quick: bool, compiled: bool) -> dict[str, Any]:
-    """Measure speed in a fresh process, with or without compiled code."""
+def speed(quick: bool) -> dict[str, Any]:
+    """Measure speed in a fresh process."""
     command = [sys.executable, str(_HERE / 'speed.py'), *(['--quick'] if quick else [])]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env={
-        **os.environ, 'OU_MONITOR_COMPILED': '1' if compiled else '0'})
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
 
@@ -256,15 +252,8 @@ def measure(windows: int, slow: int, quick: bool, parts: str) -> dict[str, Any]:
         say('throttle steps')
         out['load'] = load(SEED + 2, windows)
     if 's' in parts:
-        say('speed, NumPy')
-        out['speed'] = {'NumPy': speed(quick, compiled=False)}
-        if _ASKED != '0':
-            say('speed, compiled')
-            found = speed(quick, compiled=True)
-            if found['compiled']:
-                out['speed']['Numba'] = found
-            else:
-                say('  no compiled path here')
+        say('speed')
+        out['speed'] = speed(quick)
     return out
 
 
@@ -289,9 +278,10 @@ def accuracy_report(results: dict[str, Any]) -> str:
 def speed_report(results: dict[str, Any]) -> str:
     """Return the tables of speed as Markdown; empty when that part was not run."""
     parts = []
-    for name, found in results.get('speed', {}).items():
-        parts += [f'### Throughput, {name}\n', tables.throughput(found['throughput']),
-                  f'### Latency of `estimate()` after pushes of 100 at 1 kHz, {name}\n',
+    if 'speed' in results:
+        found = results['speed']
+        parts += ['### Throughput\n', tables.throughput(found['throughput']),
+                  '### Latency of `estimate()` after pushes of 100 at 1 kHz\n',
                   tables.latency(found['latency'])]
     return _with_setting(results, '', parts)
 

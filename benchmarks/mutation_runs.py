@@ -102,10 +102,9 @@ _running: set[int] = set()
 
 
 def _environment(tree: Path, **more: str) -> dict[str, str]:
-    # No byte code: a mutant may have the size and the second of the source before it. No
-    # compiled code: coverage cannot see into it.
+    # No byte code: a mutant may have the size and the second of the source before it.
     return {**os.environ, 'PYTHONPATH': str(tree / 'benchmarks'), 'PYTHONDONTWRITEBYTECODE': '1',
-            'OU_MONITOR_COMPILED': '0', 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1',
+            'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1',
             **more}
 
 

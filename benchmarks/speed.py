@@ -47,13 +47,6 @@ def main(quick: bool) -> None:
     from ou_monitor.online.estimator.estimator import SlidingEstimator
     import windows as simulated
 
-    compiled = False
-    if os.environ.get('OU_MONITOR_COMPILED', '1') != '0':
-        try:
-            from ou_monitor.online.estimator.compiled import kernels
-            compiled = kernels(wait=True) is not None
-        except ImportError:
-            pass
     scale = 10 if quick else 1
     rng = np.random.default_rng(5)
 
@@ -157,7 +150,7 @@ def main(quick: bool) -> None:
                 'wall_p50_us': float(np.percentile(wall[2:], 50)) * 1e-3,
                 'wall_p99_us': float(np.percentile(wall[2:], 99)) * 1e-3}
 
-    out: dict[str, Any] = {'compiled': compiled, 'throughput': {}, 'latency': {}}
+    out: dict[str, Any] = {'throughput': {}, 'latency': {}}
     for name, dt in STEPS.items():
         out['throughput'][name] = {str(b): throughput(dt, b) for b in BLOCKS}
         print(f'  throughput at {name} done', file=sys.stderr, flush=True)

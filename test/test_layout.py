@@ -115,9 +115,6 @@ def wrong_imports(source: str, module: str) -> list[str]:
             continue
         elif top in PLOTTING and module.startswith(f'{PACKAGE}.report'):
             continue
-        elif top == 'numba' and module.split('.')[1] in ('model', 'online') and \
-                module.split('.')[-1].startswith('compiled'):
-            continue
         elif top not in ALLOWED.get(part, set()):
             wrong.append(f'{where}: {part} may not import {top}')
     return wrong
@@ -181,7 +178,6 @@ def test_a_wrong_import_is_found(module, source):
     ('ou_monitor.model.ou', 'import math\nimport numpy as np\nfrom scipy import optimize'),
     ('ou_monitor.model.ou', 'from . import passage\nfrom .passage import x'),
     ('ou_monitor.model.__init__', 'from .ou import x\nfrom . import ou'),
-    ('ou_monitor.model.compiled_kalman', 'import numba'),
     ('ou_monitor.online.monitor', 'from ou_monitor.model.passage.law import x'),
     ('ou_monitor.recordings.bag', 'import mcap.reader\nfrom mcap_ros2.decoder import D'),
     ('ou_monitor.recordings.importers.ulog', 'from pyulog import ULog'),

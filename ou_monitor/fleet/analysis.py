@@ -12,7 +12,6 @@ from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.overview import Overview
 from ou_monitor.errors import InputError
-from ou_monitor.online.estimator.compiled import kernels
 from ou_monitor.online.risk.first_passage import brownout_probability
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import NAN, Recording
@@ -78,9 +77,6 @@ def is_result(found: Mapping[str, Any]) -> bool:
 
 def work(path: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """Analyse one recording; whatever is wrong with it is in the result."""
-    # A run that is taken up again must give the same digits, and the compiled sums differ from
-    # NumPy's in the last ones: not some of each, as the compiler gets ready.
-    kernels(wait=True)
     try:
         return _analysed(path, Options(**options))
     except InputError as error:

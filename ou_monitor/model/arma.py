@@ -14,10 +14,6 @@ matrix of its inverse autocovariances, which fall as theta^k (so K lags do when
 theta^K is small).  The level, and other regressors of the mean through `tilt`, are
 integrated out.  No data is touched.
 
-The same functions run in plain Python and, where Numba is installed, compiled
-(`ou_monitor.online.estimator.compiled`): scalars and loops only, hence no classes,
-and one file, for Numba's cache sees changes of no other.
-
 Source of the block autocovariances: the double sums of phi^(|i-j|/m), closed
 by the geometric series; Hamilton, Time Series Analysis (1994), ch. 3, for the
 ARMA identities.

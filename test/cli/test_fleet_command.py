@@ -67,8 +67,8 @@ def command(*arguments: object) -> list[str]:
 
 
 def environment() -> dict[str, str]:
-    """Return an environment with the package of this checkout; compiling would only cost time."""
-    return {**os.environ, 'PYTHONPATH': str(ROOT), 'OU_MONITOR_COMPILED': '0'}
+    """Return an environment with the package of this checkout."""
+    return {**os.environ, 'PYTHONPATH': str(ROOT)}
 
 
 def run(*arguments: object, **options: object) -> subprocess.CompletedProcess:
@@ -174,7 +174,6 @@ def test_the_numbers_are_those_of_analyze(rows, logs):
     mine = [row for row in rows if row['path'] == str(path.resolve())]
     for row, level in zip(mine, alone.levels, strict=True):
         for name in ('alpha', 'alpha_se', 'sigma', 'sigma_se', 'var_inf', 'u0'):
-            # Sums of compiled code and of NumPy differ in their order.
             assert row[name] == pytest.approx(getattr(level.estimate, name), rel=1e-7)
         assert 0.0 <= row['risk'] <= 1.0
 
@@ -254,7 +253,6 @@ def test_killed_and_resumed_gives_the_same(logs, rows, tmp_path, one_process):
     assert len(other) == len(rows)
     for mine, one in zip(rows, other):
         for name, value in one.items():
-            # Sums of compiled code and of NumPy differ in their order.
             assert mine[name] == (pytest.approx(value, rel=1e-7, abs=1e-12)
                                   if isinstance(value, float) else value), name
     assert (again / 'fleet.html').read_text().startswith('<!DOCTYPE html>')

@@ -6,7 +6,7 @@ from dense import block_autocovariances, fisher, restricted
 import numpy as np
 from ou_monitor.model import arma
 from ou_monitor.model.ou import simulate
-from ou_monitor.online.estimator.irregular import fit_exact
+from ou_monitor.online.estimator.irregular import fit_exact, Likelihood
 import pytest
 from scipy.linalg import toeplitz
 from scipy.optimize import minimize
@@ -119,7 +119,7 @@ def test_optimum_is_that_of_the_exact_likelihood():
         differences = []
         for seed in range(24):
             y = made(seed, n, a=0.2, share=0.3)
-            exact = fit_exact(np.arange(float(n)), y, np.ones((n, 1)))
+            exact = fit_exact(Likelihood(np.arange(float(n)), y, np.ones((n, 1))), 1)
             log_a, theta, _, _, _ = optimum(y)
             own = (arma.theta_at(exact.alpha, 1, exact.noise_var / exact.sigma ** 2))
             differences.append((log_a - math.log(exact.alpha), theta - own))

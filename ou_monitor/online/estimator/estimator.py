@@ -17,21 +17,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model import arma
-from ou_monitor.online.estimator.compiled import COMPILED
 from ou_monitor.online.estimator.fit import fit_window, Fitted, from_window, TREND_SCORE
 from ou_monitor.online.estimator.intake import as_column, BATCH, Intake, Thinner
 from ou_monitor.online.estimator.irregular import fit_irregular, MOST
 from ou_monitor.online.estimator.quality import (
     examine, input_flags, judge, Quality, recount, TAIL)
 from ou_monitor.online.estimator.series import T, U, Y
-from ou_monitor.online.estimator.window import FACTOR, FEWEST, LAGS, Resolution, Sums
+from ou_monitor.online.estimator.window import FACTOR, FEWEST, LAGS, LOST, Resolution, Sums
 from ou_monitor.records import Counters, Estimate, FloatArray, NAN, Status
 from ou_monitor.timeline.refresh import Batch, refresh_period, Repeats, whole
 
 # Samples from which a fit is tried.
 MIN_SAMPLES = 20
-# theta^LAGS beyond this: the lags no longer hold the noise, go coarser.
-_LOST = 0.05
 # Share of samples with a partner at the longest lag below which the window
 # counts as uneven.
 _EVEN = 0.5
@@ -86,7 +83,6 @@ class SlidingEstimator:
         self._start: tuple[float, float] | None = None
         self._cached: Estimate | None = None
         self._last: Estimate | None = None
-        COMPILED.start()
 
     @property
     def window(self) -> float:
@@ -189,7 +185,7 @@ class SlidingEstimator:
         """Move what has been pushed into the window."""
         if not self._intake.waiting:
             return
-        for batch in self._intake.work_off(self._window, self._thinner.step):
+        for batch in self._intake.work_off(self._window):
             if batch.restart:
                 self._forget()
             raw = batch.y
@@ -318,7 +314,7 @@ class SlidingEstimator:
                 return fit_irregular(series.all_columns(), moves), NAN
         # Coarser where noise, or an ADC step, hides what the lags can hold.
         while fit.correlated and resolution.series.size >= FACTOR * FEWEST and (
-                fit.theta ** LAGS > _LOST
+                fit.theta ** LAGS > LOST
                 or step < (_DITHER * quality.step) ** 2 * step / fit.scale):
             resolution = resolution.coarser()
             m *= FACTOR

@@ -11,14 +11,12 @@ sums over lags, so no sample is read again.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 import enum
 import math
 
 import numpy as np
 from ou_monitor.model import arma
-from ou_monitor.online.estimator.compiled import COMPILED
 from ou_monitor.online.estimator.window import Sums
 from ou_monitor.records import FloatArray
 
@@ -185,7 +183,7 @@ TREND_SCORE = 4.0
 # in every fifth window rather than in every twelfth.
 _FEW = 6.0
 # From this score on a trend is looked into (by chance once in 22 windows).
-_SUSPECT = 2.0
+SUSPECT = 2.0
 
 
 @dataclass(slots=True)
@@ -244,7 +242,7 @@ def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None) -> 
         fit = _fit_moving(sums, m, start, trend=False)
     else:
         fit = _fit_still(sums, m, start)
-    if fit.correlated and (abs(fit.trend_score) > _SUSPECT
+    if fit.correlated and (abs(fit.trend_score) > SUSPECT
                            or fit.a * sums.n < arma.DOUBTFUL):
         # To a rail without restoring force any drift is chance: so the drift is
         # judged by the fit that knows it.
@@ -258,11 +256,7 @@ def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None) -> 
 def _fit_still(sums: Sums, m: int, start: tuple[float, float] | None) -> WindowFit:
     """Fit a window whose mean is a constant."""
     log_a, theta = start or (math.nan, math.nan)
-    fast = COMPILED.ready
-    if fast is not None:
-        end = fast.fit_sums(sums.row, sums.pairs.size, log_a, theta, m)
-    else:
-        end = arma.fit_sums(sums.row.tolist(), sums.pairs.size, log_a, theta, m)
+    end = arma.fit_sums(sums.row.tolist(), sums.pairs.size, log_a, theta, m)
     level, c0 = np.array(end[:1]), end[1]
     if end[2] != end[2]:
         return _uncorrelated(level, _EMPTY, False, c0)
@@ -292,7 +286,6 @@ def _uncorrelated(level: FloatArray, beta: FloatArray, trend: bool, c0: float) -
 def _fit_moving(sums: Sums, m: int, start: tuple[float, float] | None, trend: bool
                 ) -> WindowFit:
     """Fit noise and mean in turn; the mean hardly moves, so two rounds are usual."""
-    search, finish = _functions()
     moments = Moments(sums, trend)
     at = start
     # Without a start: ordinary least squares, as the fastest OU is as good as white.
@@ -305,8 +298,8 @@ def _fit_moving(sums: Sums, m: int, start: tuple[float, float] | None, trend: bo
         log_a, theta = at or arma.guess(c0, c.tolist())
         tilt = mean.tilt if at else (0.0, 0.0)
         before = log_a, theta
-        log_a, theta, on_bound = search(c0, c, sums.n - 1.0 - moments.rank, log_a, theta, m,
-                                        *tilt)
+        log_a, theta, on_bound = arma.search(
+            c0, c.tolist(), sums.n - 1.0 - moments.rank, log_a, theta, m, *tilt)
         settled = at is not None and max(
             abs(log_a - before[0]), abs(theta - before[1])) < arma.STEADY
         at = log_a, theta
@@ -314,20 +307,11 @@ def _fit_moving(sums: Sums, m: int, start: tuple[float, float] | None, trend: bo
         if settled:
             break
     c0, c = moments.residual(mean.beta)
-    end = finish(c0, c, sums.n, sums.n - 1.0 - moments.rank, log_a, theta, on_bound, m)
+    end = arma.finish(c0, c.tolist(), sums.n, sums.n - 1.0 - moments.rank, log_a, theta, on_bound,
+                      m)
     return WindowFit(end[0], end[1], end[3], end[4], end[5], (end[6], end[7], end[8]),
                      moments.mean, mean.beta, mean.cov * (end[2] / sums.n), trend,
                      moments.trend_score(mean), _found(end), c0)
-
-
-def _functions() -> tuple[Callable[..., tuple[float, float, bool]],
-                          Callable[..., tuple[float, ...]]]:
-    """Return search and finish, compiled where they are ready."""
-    fast = COMPILED.ready
-    if fast is not None:
-        return fast.search, fast.finish
-    return (lambda c0, c, *rest: arma.search(c0, c.tolist(), *rest),
-            lambda c0, c, *rest: arma.finish(c0, c.tolist(), *rest))
 
 
 class Outcome(enum.Enum):

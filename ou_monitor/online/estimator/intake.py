@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.online.estimator.compiled import COMPILED
 from ou_monitor.online.estimator.series import IntArray
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Counters, FloatArray, NAN
@@ -245,19 +244,14 @@ class Intake:
         """Take the next sample as the first one."""
         self.newest = -math.inf
 
-    def work_off(self, window: float, step: float) -> list[Batch]:
-        """Empty the buffer (window in s, step in s)."""
+    def work_off(self, window: float) -> list[Batch]:
+        """Empty the buffer (window in s)."""
         n = self._fill
         self._fill = 0
         t, y = self._t[:n], self._y[:n]
         u = self._u[:n] if self._loaded else None
         self._loaded = False
         self.count(pushed=n)
-        fast = COMPILED.ready
-        if fast is not None and (1.0 + UNEVEN) * step < window and fast.check(
-                t, y, self.newest, (1.0 - UNEVEN) * step, (1.0 + UNEVEN) * step):
-            self._accept(t)
-            return [Batch(t, y, u, step, step, restart=False)]
         # One pass says whether all is finite: a sum of finite stamps and volts is.
         if not math.isfinite(np.add.reduce(t) + np.add.reduce(y)):
             good = np.isfinite(t) & np.isfinite(y)

@@ -2,11 +2,12 @@
 The fit for windows whose stamps are not evenly spaced: the exact Gaussian likelihood.
 
 Dearer than the sums over lags, so only for windows that need it: irregular sources, and windows
-with many holes.  The inverse covariance of a sampled OU is tridiagonal, so the likelihood costs
-O(n): K = K_ou + nu I with A = I + nu K_ou^-1 tridiagonal, K^-1 = K_ou^-1 A^-1 and log|K| =
-log|K_ou| + log|A|.  It is the likelihood of the Kalman filter, restricted to the contrasts of the
-regressors (REML: Harville, J. Am. Stat. Assoc. 72 (1977) 320).  Without SciPy, which would cost
-the nodes 45 MB.
+with many holes.  The inverse covariance Q of a sampled OU is tridiagonal, so the likelihood costs
+O(n): K = Q^-1 + nu I with A = I + nu Q tridiagonal, K^-1 = Q A^-1 and log|K| = log|A| - log|Q|.
+It is the likelihood of the Kalman filter, restricted to the contrasts of the regressors (REML:
+Harville, J. Am. Stat. Assoc. 72 (1977) 320).  Its gradient needs no more than the elimination
+and the three diagonals of A^-1, so a search that begins where the samples would be if they were
+even takes a handful of evaluations.  Without SciPy, which would cost the nodes 45 MB.
 """
 
 from __future__ import annotations
@@ -17,198 +18,283 @@ import math
 
 import numpy as np
 from ou_monitor.model import arma
-from ou_monitor.online.estimator.fit import Fitted, independent, Outcome, TREND_SCORE
+from ou_monitor.online.estimator.fit import Fitted, independent, Outcome, SUSPECT, TREND_SCORE
 from ou_monitor.online.estimator.series import FAST, SLOW, T, U, Y
+from ou_monitor.online.estimator.window import FACTOR, FEWEST, LAGS, LOST
 from ou_monitor.records import FloatArray
 
-# Search range of the noise share nu / mean step: ten thousand times the
+# Relaxations between two samples beyond which they are independent: exp(2 * 300) is a double.
+_FAR = 300.0
+# Unknowns of a tridiagonal system that are eliminated at once: fewer steps of NumPy calls.
+_DENSE = 24
+# A step that gains less than this, nats, is not taken: the optimum is then within a hundredth of
+# a standard error.
+_SETTLED = 1e-5
+# Evaluations that a fit may take after the first; 4 to 8 are usual, more where nothing tells
+# alpha from noise.
+_MOST_POINTS = 24
+# Step of the differences of slopes, in ln a and z: of a curvature of one they are then
+# right to 1e-4 and rounded to 1e-7.
+_STEP = 1e-4
+# Curvature below which a direction counts as this much curved, nats; longest step.
+_FLAT, _LONGEST = 1e-3, 1.5
+# Share of noise up to which the search is linear in it; noise of more than ten thousand times the
 # diffusion of one step hides any OU.
-_MOST_NOISE = 1e4
+_SMALL = 0.05
+_LOUDEST = math.log1p(1e4 / _SMALL)
+
+
+@dataclass(frozen=True, slots=True)
+class _Point:
+    """The likelihood at one choice of ln a and z, see `Likelihood.at`."""
+
+    # Minus the restricted log-likelihood, nats, and its slopes by the two.
+    value: float
+    slopes: FloatArray
+    # Scale sigma^2, V^2/s; coefficients, V per unit of each regressor, and their covariance, V^2.
+    scale: float
+    beta: FloatArray
+    cov: FloatArray
+    # Products x' K^-1 z of all columns at scale 1: regressors, then the voltage.
+    gram: FloatArray
+
+
+class Likelihood:
+    """Restricted likelihood of one data set, profiled over scale and mean (t in s, y in V)."""
+
+    def __init__(self, t: FloatArray, y: FloatArray, regressors: FloatArray) -> None:
+        self.steps = np.diff(t)
+        self.n = t.size
+        self.step = float(t[-1] - t[0]) / (self.n - 1)
+        self.shift = float(y.mean())
+        self._table = np.concatenate([regressors.T, [y - self.shift]])
+        # Slowest rate worth a name: one relaxation in ten windows; fastest: the correlation of
+        # neighbours is below 1e-4.
+        self.low, self.high = math.log(0.1 / (self.n - 1)), arma.HIGH
+
+    def at(self, log_a: float, z: float, used: int) -> _Point:
+        """
+        Return the likelihood with the first `used` regressors.
+
+        a is alpha times the mean step; z, 0 or more, is `noise_scale` of the white noise.
+        """
+        a, share = math.exp(log_a), _SMALL * math.expm1(z)
+        # Q over 2 alpha: its diagonal and the one beside it.
+        x = np.minimum(a / self.step * self.steps, _FAR)
+        h = 1.0 / np.expm1(2.0 * x)
+        off = -np.sqrt(h * (1.0 + h))
+        diag = np.ones(self.n)
+        diag[1:] += h
+        diag[:-1] += h
+        double = 2.0 * a / self.step
+        nu = 2.0 * a * share
+        log_det, w, inner, beside = solve_tridiagonal(1.0 + nu * diag, nu * off, self._table)
+        log_det -= self.n * math.log(double) + float(np.log1p(h).sum())
+        q = diag * w
+        q[:, 1:] += off * w[:, :-1]
+        q[:, :-1] += off * w[:, 1:]
+        gram = double * (self._table @ q.T)
+        # The same by ln alpha at constant noise, and by the noise: of the products and of log|K|.
+        d_h = -2.0 * x * off * off
+        d_diag = diag.copy()
+        d_diag[1:] += d_h
+        d_diag[:-1] += d_h
+        d_off = off * (1.0 - x * (1.0 + 2.0 * h))
+        side = (w[:, :-1] * d_off) @ w[:, 1:].T
+        slow = double * ((w * d_diag) @ w.T + side + side.T)
+        white = -(double * double) * (q @ q.T)
+        log_slow = nu * float(inner @ d_diag + 2.0 * (beside @ d_off)) - self.n - float(
+            np.sum(d_h / (1.0 + h)))
+        log_white = double * float(inner @ diag + 2.0 * (beside @ off))
+        # Profiled over mean and scale.
+        free = self.n - used
+        own = gram[:used, :used]
+        inverse = np.linalg.pinv(own, hermitian=True)
+        beta = inverse @ gram[:used, -1]
+        c = np.zeros(len(gram))
+        c[:used], c[-1] = -beta, 1.0
+        rest = max(float(c @ gram @ c), np.finfo(float).tiny)
+        by_rate, by_noise = (0.5 * (
+            free * float(c @ change @ c) / rest + log_change
+            + float(np.vdot(inverse, change[:used, :used])))
+            for change, log_change in ((slow, log_slow), (white, log_white)))
+        value = 0.5 * (free * math.log(rest / free) + log_det + float(np.linalg.slogdet(own)[1])
+                       + free * (1.0 + math.log(2.0 * math.pi)))
+        slopes = np.array([by_rate, (_SMALL + share) * self.step * by_noise])
+        return _Point(value, slopes, rest / free, beta, inverse * (rest / free), gram)
+
+    def start(self, used: int) -> FloatArray:
+        """Return ln a and z by the quasi-likelihood of the samples taken as even."""
+        x, y = self._table[:used], self._table[-1]
+        r, m = y - np.linalg.lstsq(x.T, y, rcond=None)[0] @ x, 1
+        log_a, z = self.high, 0.0
+        while True:
+            c0, c = _variogram(r)
+            if not c0 > 0.0:
+                break
+            log_a, theta, _ = arma.search(c0, c, r.size - used, *arma.guess(c0, c), m, 0.0, 0.0)
+            a = math.exp(log_a)
+            z = noise_scale(max(arma.noise_share(a, theta, m), 0.0) * m * m)
+            log_a -= math.log(m)
+            # Coarser where noise hides what the lags can hold, as in even windows.
+            if theta ** LAGS <= LOST or r.size < FACTOR * FEWEST:
+                break
+            r = r[:r.size // FACTOR * FACTOR].reshape(-1, FACTOR).mean(axis=1)
+            m *= FACTOR
+        return np.clip([log_a, z], [self.low, 0.0], [self.high, _LOUDEST])
+
+
+def noise_scale(share: float) -> float:
+    """Return z of the white noise over sigma^2 times the mean step: linear, then logarithmic."""
+    return math.log1p(share / _SMALL)
+
+
+def _variogram(r: FloatArray) -> tuple[float, list[float]]:
+    """Return the variance of residuals, and their autocovariances by the variogram, V^2."""
+    c0, c = float(r @ r) / r.size, []
+    for k in range(1, min(LAGS, r.size - 1) + 1):
+        d = r[k:] - r[:-k]
+        c.append(c0 - 0.5 * float(d @ d) / d.size)
+    return c0, c
+
+
+def solve_tridiagonal(diag: FloatArray, off: FloatArray, right: FloatArray
+                      ) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+    """
+    Solve a symmetric positive system for rows of right sides, shape (k, n).
+
+    Cyclic reduction: every second unknown is eliminated, again and again.  Returns the
+    log-determinant, the solutions, and of the inverse the diagonal and the one beside it.
+    """
+    halves, pivots = [], []
+    while diag.size > _DENSE:
+        # Each odd one has a neighbour before it and, but for the last of an even number, after it.
+        pivot, before, after, w = diag[1::2], off[0::2], off[1::2], right[:, 1::2]
+        m, k = pivot.size, after.size
+        inverse = 1.0 / pivot
+        back, ahead = before * inverse, after * inverse[:k]
+        pivots.append(pivot)
+        halves.append((inverse, back, ahead, w))
+        diag, right = diag[0::2].copy(), right[:, 0::2].copy()
+        diag[:m] -= back * before
+        diag[1:k + 1] -= ahead * after
+        right[:, :m] -= back * w
+        right[:, 1:k + 1] -= ahead * w[:, :k]
+        off = -back[:k] * after
+    dense = np.diag(diag) + np.diag(off, 1) + np.diag(off, -1)
+    log_det = float(np.linalg.slogdet(dense)[1]) + sum(float(np.log(p).sum()) for p in pivots)
+    dense = np.linalg.inv(dense)
+    x, own, beside = right @ dense, dense.diagonal(), dense.diagonal(1)
+    for inverse, back, ahead, w in reversed(halves):
+        m, k = inverse.size, ahead.size
+        odd = inverse * w - back * x[:, :m]
+        odd[:, :k] -= ahead * x[:, 1:k + 1]
+        left, right_of = -back * own[:m], -ahead * own[1:k + 1] - back[:k] * beside[:k]
+        left[:k] -= ahead * beside[:k]
+        inner = inverse - back * left
+        inner[:k] -= ahead * right_of
+        x, own, beside = _woven(x, odd), _woven(own, inner), _woven(left, right_of)
+    return log_det, x, own, beside
+
+
+def _woven(even: FloatArray, odd: FloatArray) -> FloatArray:
+    """Return an array whose last axis takes turns from two."""
+    both = np.empty((*even.shape[:-1], even.shape[-1] + odd.shape[-1]))
+    both[..., 0::2], both[..., 1::2] = even, odd
+    return both
 
 
 @dataclass(frozen=True)
 class ExactFit:
-    """
-    Result of `fit_exact`.
+    """Result of `fit_exact`; no bias correction."""
 
-    Attributes
-    ----------
-    alpha : float
-        Relaxation rate, 1/s, at the maximum (no bias correction).
-    sigma : float
-        Noise intensity, V/sqrt(s).
-    noise_var : float
-        Variance of the white noise, V^2.
-    beta, beta_cov : ndarray
-        Coefficients of the regressors (V per unit of each) and covariance.
-    log_likelihood : float
-        Restricted log-likelihood at the maximum, nats.
-    edge : int
-        -1, 0 or 1: alpha ran into the slow end of the search (no restoring
-        force visible), settled inside, or ran into the fast end (no
-        correlation visible).
-
-    """
-
+    # Relaxation rate, 1/s; noise intensity, V/sqrt(s); variance of the white noise, V^2.
     alpha: float
     sigma: float
     noise_var: float
+    # Coefficients of the regressors (V per unit of each) and covariance.
     beta: FloatArray
     beta_cov: FloatArray
+    # Restricted log-likelihood at the maximum, nats.
     log_likelihood: float
+    # -1, 0 or 1: alpha ran into the slow end of the search (no restoring force visible), settled
+    # inside, or ran into the fast end (no correlation visible).
     edge: int
+    # alpha times the mean step, and noise_var over sigma^2 times the mean step.
+    a: float
+    share: float
+    # Products of all columns at the maximum, see `_Point`.
+    gram: FloatArray
 
 
-class _Likelihood:
-    """Restricted likelihood of one data set, profiled over scale and mean."""
-
-    def __init__(self, t: FloatArray, y: FloatArray, regressors: FloatArray) -> None:
-        self.dt = np.diff(t)
-        self.step = float(self.dt.mean())
-        self.shift = float(y.mean())
-        self.table = np.column_stack([regressors, y - self.shift])
-        self.n, self.p = regressors.shape
-
-    def solve(self, log_alpha: float, share: float
-              ) -> tuple[float, float, FloatArray, FloatArray]:
-        """
-        Return minus the log-likelihood, sigma^2, beta and its covariance.
-
-        `share` is the noise variance in units of sigma^2 times the mean step.
-        """
-        alpha, nu = math.exp(log_alpha), share * self.step
-        rho = np.exp(-alpha * self.dt)
-        rest = -np.expm1(-2.0 * alpha * self.dt)
-        diag = np.ones(self.n)
-        diag[1:] /= rest
-        diag[:-1] += rho * rho / rest
-        diag *= 2.0 * alpha
-        off = -2.0 * alpha * rho / rest
-        log_det = float(np.log(rest).sum()) - self.n * math.log(2.0 * alpha)
-        w = self.table
-        if nu > 0.0:
-            more, w = solve_tridiagonal(1.0 + nu * diag, nu * off, self.table)
-            log_det += more
-        kw = diag[:, None] * w
-        kw[1:] += off[:, None] * w[:-1]
-        kw[:-1] += off[:, None] * w[1:]
-        gram = self.table.T @ kw
-        xx, xy = gram[:self.p, :self.p], gram[:self.p, self.p]
-        inverse = np.linalg.pinv(xx, hermitian=True)
-        beta = inverse @ xy
-        free = self.n - self.p
-        scale = max(float(gram[self.p, self.p] - xy @ beta) / free, np.finfo(float).tiny)
-        value = 0.5 * (free * math.log(scale) + log_det + float(np.linalg.slogdet(xx)[1])
-                       + free * (1.0 + math.log(2.0 * math.pi)))
-        return value, scale, beta, inverse * scale
-
-
-def solve_tridiagonal(diag: FloatArray, off: FloatArray, right: FloatArray
-                      ) -> tuple[float, FloatArray]:
-    """
-    Return the log-determinant and the solutions (n, k) of a symmetric positive system.
-
-    Cyclic reduction: every second unknown is eliminated, again and again.
-    """
-    log_det, halves = 0.0, []
-    while diag.size > 1:
-        # Each odd one has a neighbour before it and, but for the last of an even number, after it.
-        pivots, before, after, w = diag[1::2], off[0::2], off[1::2], right[1::2]
-        m, k = pivots.size, after.size
-        halves.append((pivots, before, after, w))
-        log_det += float(np.log(pivots).sum())
-        back, ahead = before / pivots, after / pivots[:k]
-        diag, right = diag[0::2].copy(), right[0::2].copy()
-        diag[:m] -= back * before
-        diag[1:k + 1] -= ahead * after
-        right[:m] -= back[:, None] * w
-        right[1:k + 1] -= ahead[:, None] * w[:k]
-        off = -back[:k] * after
-    log_det += math.log(diag.item(0))
-    x = right / diag[:, None]
-    for pivots, before, after, w in reversed(halves):
-        odd = w - before[:, None] * x[:pivots.size]
-        odd[:after.size] -= after[:, None] * x[1:after.size + 1]
-        both = np.empty((pivots.size + len(x), x.shape[1]))
-        both[0::2], both[1::2] = x, odd / pivots[:, None]
-        x = both
-    return log_det, x
-
-
-# Step of the differences, in ln alpha and in the root of the noise share: truncation and rounding
-# are then alike, 1e-7 of a curvature of one.
-_STEP = 1e-3
-# A step that gains less than this, nats, is the last: it ends a thousandth of a standard error
-# from the optimum at most, and a logarithm of 4096 densities is rounded to 1e-9.
-_SETTLED = 1e-6
-
-
-def _least(f: Callable[[float, float], float], start: tuple[float, float],
-           low: tuple[float, float], high: tuple[float, float]) -> tuple[float, float]:
-    """
-    Return where f is least within a box.
-
-    Newton's method with derivatives by differences, damped (Levenberg) where f is not convex
-    or a step leads up.
-    """
-    here, value, damping, h = np.array(start), f(*start), 0.0, _STEP
-    for _ in range(60):
-        a, x = here.tolist()
-        up, down, right, left = f(a + h, x), f(a - h, x), f(a, x + h), f(a, x - h)
-        gradient = np.array([up - down, right - left]) / (2.0 * h)
-        mixed = f(a + h, x + h) + f(a - h, x - h) + 2.0 * value - up - down - right - left
-        curved = np.array([[up + down - 2.0 * value, 0.5 * mixed],
-                           [0.5 * mixed, right + left - 2.0 * value]]) / (h * h)
-        # On an end beyond which f falls, only the other is left.
-        stays = ((here <= low) & (gradient > 0.0)) | ((here >= high) & (gradient < 0.0))
-        gradient[stays] = 0.0
-        curved[stays] = curved[:, stays] = 0.0
-        least = float(np.linalg.eigvalsh(curved)[0])
-        while True:
-            lift = max(damping, 1e-3 - 1.1 * least if least < 1e-3 else 0.0)
-            step = np.linalg.solve(curved + lift * np.eye(2), -gradient)
-            there = np.clip(here + step, low, high)
-            new = f(*there.tolist())
-            if new <= value or not -float(gradient @ step) >= _SETTLED:
-                break
-            damping = max(10.0 * damping, 1.0)
-        gain = value - new
-        if gain > 0.0:
-            here, value, damping = there, new, 0.1 * damping if damping > 1e-2 else 0.0
-        if gain < _SETTLED:
-            break
-    return float(here[0]), float(here[1])
-
-
-def fit_exact(t: FloatArray, y: FloatArray, regressors: FloatArray) -> ExactFit:
-    """Fit alpha, sigma, the white noise and the mean by restricted likelihood (t in s, y in V)."""
-    likelihood = _Likelihood(t, y, regressors)
-    # Slowest rate worth a name: one relaxation in ten windows; fastest: the
-    # correlation of neighbours is below 1e-4.
-    low = math.log(0.1 / float(t[-1] - t[0]))
-    high = math.log(9.2 / likelihood.step)
-    # lam = x^2 keeps the noise share positive and smooth at zero.
-    starts = [(a, x) for a in np.linspace(low, high, 7)[1:-1] for x in (0.1, 1.0)]
-    values = [likelihood.solve(a, x * x)[0] for a, x in starts]
-    # Less noise than by the step of the differences is none, see below.
-    log_alpha, root = _least(lambda a, x: likelihood.solve(a, x * x)[0],
-                             starts[int(np.argmin(values))], (low, _STEP),
-                             (high, math.sqrt(_MOST_NOISE)))
-    share = root * root
-    value, scale, beta, cov = likelihood.solve(log_alpha, share)
-    clean = likelihood.solve(log_alpha, 0.0)
-    if clean[0] <= value:
-        share, (value, scale, beta, cov) = 0.0, clean
-    beta = beta.copy()
+def fit_exact(likelihood: Likelihood, used: int) -> ExactFit:
+    """Fit alpha, sigma, the white noise and the mean, of the first `used` regressors."""
+    low, high = np.array([likelihood.low, 0.0]), np.array([likelihood.high, _LOUDEST])
+    (log_a, z), at = _least(lambda p: likelihood.at(p.item(0), p.item(1), used),
+                            likelihood.start(used), low, high)
+    beta = at.beta.copy()
     beta[0] += likelihood.shift
-    # The likelihood is flat there: within 5 % of the end is at the end.
-    edge = -1 if log_alpha < low + 0.05 else 1 if log_alpha > high - 0.05 else 0
-    return ExactFit(math.exp(log_alpha), math.sqrt(scale), share * scale * likelihood.step,
-                    beta, cov, -value, edge)
+    a, share = math.exp(log_a), _SMALL * math.expm1(z)
+    # The likelihood is flat at the slow end: within 5 % of the end is at the end.
+    edge = -1 if log_a < low[0] + 0.05 else 1 if a > arma.FASTEST else 0
+    return ExactFit(a / likelihood.step, math.sqrt(at.scale),
+                    share * at.scale * likelihood.step, beta, at.cov, -at.value, edge, a, share,
+                    at.gram)
 
 
-# Samples up to which the exact likelihood is used (some 50 ms).
+def _least(f: Callable[[FloatArray], _Point], here: FloatArray, low: FloatArray,
+           high: FloatArray) -> tuple[list[float], _Point]:
+    """
+    Return where f is least within a box, and its point.
+
+    Newton's method: the curvature is by differences of the slopes at first and after a step that
+    had to be shortened, else by the change of the slopes over the last step (BFGS).
+    """
+    at, curved = f(here), None
+    left = _MOST_POINTS
+    while left > 0:
+        if curved is None:
+            left -= 2
+            curved = np.stack([(f(here + step).slopes - at.slopes) / _STEP
+                               for step in _STEP * np.eye(2)])
+            curved = 0.5 * (curved + curved.T)
+        # On an end beyond which f falls, only the other is left.
+        free = ~(((here <= low) & (at.slopes > 0.0)) | ((here >= high) & (at.slopes < 0.0)))
+        slopes = np.where(free, at.slopes, 0.0)
+        values, vectors = np.linalg.eigh(np.where(np.outer(free, free), curved, np.eye(2)))
+        step = -vectors @ ((slopes @ vectors) / np.maximum(np.abs(values), _FLAT))
+        step *= min(1.0, _LONGEST / max(float(np.abs(step).max()), 1e-300))
+        gain = -float(slopes @ step)
+        if gain < 2.0 * _SETTLED:
+            break
+        whole = True
+        while left > 0:
+            left -= 1
+            there = np.clip(here + step, low, high)
+            new = f(there)
+            if new.value <= at.value:
+                break
+            # To the least point of the parabola through both values and the slope here.
+            whole = False
+            step *= min(max(0.5 * gain / (new.value - at.value + gain), 0.1), 0.5)
+            gain = -float(slopes @ step)
+        else:
+            break
+        moved, turned = there - here, new.slopes - at.slopes
+        here, at = there, new
+        along, pushed = float(moved @ turned), curved @ moved
+        if whole and along > 0.0 and float(moved @ pushed) > 0.0:
+            curved = curved + np.outer(turned, turned) / along - np.outer(
+                pushed, pushed) / float(moved @ pushed)
+        else:
+            curved = None
+    return here.tolist(), at
+
+
+# Samples up to which the exact likelihood is used.
 MOST = 4096
+# Share of its variance that time must keep beside the load to be told from it.
+_APART = 1e-5
 
 
 def fit_irregular(columns: FloatArray, moves: bool) -> Fitted:
@@ -218,33 +304,40 @@ def fit_irregular(columns: FloatArray, moves: bool) -> Fitted:
     if moves:
         u, fast, slow = columns[[U, FAST, SLOW]]
         load = np.stack([u, u * u, fast, slow])
+    level = load.mean(axis=1)
+    centred = load - level[:, None]
+    basis = independent(centred @ centred.T / t.size)
+    known = basis.T @ centred
     time = t / t[-1] - 0.5
-    fit, basis, level = _fit(t, y, load)
-    trend = False
-    with_time, wide, wide_level = _fit(t, y, np.concatenate([load, [time]]))
-    slope = float((wide @ with_time.beta[1:])[-1])
-    spread = float((wide @ with_time.beta_cov[1:, 1:] @ wide.T)[-1, -1])
-    if slope * slope > TREND_SCORE ** 2 * spread:
-        fit, basis, level, trend = with_time, wide, wide_level, True
+    # Time beside the load: what of it the load does not explain.
+    within = known @ time / t.size
+    time -= time.mean() + within @ known
+    likelihood = Likelihood(t, y, np.column_stack([np.ones(t.size), known.T, time]))
+    used = 1 + len(known)
+    fit, trend = fit_exact(likelihood, used), False
+    if float(time @ time) > _APART * t.size / 12.0 and (
+            abs(_score(fit.gram, used, t.size)) > SUSPECT or fit.a * t.size < arma.DOUBTFUL):
+        drifting = fit_exact(likelihood, used + 1)
+        if drifting.beta[-1] ** 2 > TREND_SCORE ** 2 * drifting.beta_cov[-1, -1]:
+            fit, trend = drifting, True
+            basis = np.block([[basis, -(basis @ within)[:, None]],
+                              [np.zeros((1, len(known))), np.ones((1, 1))]])
+            level = np.append(level, 0.0)
     beta = basis @ fit.beta[1:]
     cov = basis @ fit.beta_cov[1:, 1:] @ basis.T
-    means = np.concatenate(([fit.beta[0]], level))
     variance = fit.sigma ** 2 / (2.0 * fit.alpha) + fit.noise_var
     outcome = {-1: Outcome.UNBOUND, 0: Outcome.FOUND, 1: Outcome.UNCORRELATED}[fit.edge]
-    step = float(t[-1]) / (t.size - 1)
-    a = fit.alpha * step
-    share = fit.noise_var / (fit.sigma ** 2 * step) if fit.sigma > 0.0 else math.inf
-    theta = arma.theta_at(a, 1, share)
-    return Fitted(outcome, fit.alpha, fit.sigma, fit.noise_var, math.inf if share else 0.0,
-                  arma.log_covariance(a, theta, 1, t.size), variance, means, beta, cov, trend,
-                  t.size, a)
+    return Fitted(outcome, fit.alpha, fit.sigma, fit.noise_var,
+                  math.inf if fit.share else 0.0,
+                  arma.log_covariance(fit.a, arma.theta_at(fit.a, 1, fit.share), 1, t.size),
+                  variance, np.concatenate(([fit.beta[0]], level)), beta, cov, trend, t.size,
+                  fit.a)
 
 
-def _fit(t: FloatArray, y: FloatArray, load: FloatArray
-         ) -> tuple[ExactFit, FloatArray, FloatArray]:
-    """Fit with independent combinations of the load, centred."""
-    mean = load.mean(axis=1)
-    centred = load - mean[:, None]
-    basis = independent(centred @ centred.T / t.size)
-    regressors = np.column_stack([np.ones(t.size), centred.T @ basis])
-    return fit_exact(t, y, regressors), basis, mean
+def _score(gram: FloatArray, used: int, n: int) -> float:
+    """Return the coefficient of the regressor after the first `used`, in standard errors."""
+    others = np.linalg.pinv(gram[:used, :used], hermitian=True) @ gram[:used, used:]
+    rest = gram[used:, used:] - gram[used:, :used] @ others
+    xx, xy, yy = rest.item(0, 0), rest.item(0, -1), rest.item(-1, -1)
+    left = (xx * yy - xy * xy) / (n - used - 1)
+    return xy / math.sqrt(left) if left > 0.0 else 0.0

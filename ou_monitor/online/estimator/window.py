@@ -20,7 +20,6 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.online.estimator.compiled import COMPILED, Kernels
 from ou_monitor.online.estimator.series import IntArray, Series, T, Y
 from ou_monitor.records import FloatArray
 
@@ -121,33 +120,12 @@ class LagSums:
         if self._reference is None and series.size:
             self._reference = float(series.column(Y)[0])
         self._summed = max(self._summed, series.first)
-        fast = COMPILED.ready
-        if fast is not None and self._c == 1:
-            self._last = self._parts(self._slide(fast))
-            return self._last
         while self._head < self._tail and self._begins[self._head] < series.first:
             self._head += 1
         if self._summed < series.end:
             self._take()
         self._last = self._parts(self._added())
         return self._last
-
-    def _slide(self, fast: Kernels) -> FloatArray:
-        """Take what is new, and add, in one compiled call."""
-        series, begin = self._series, self._summed
-        main, run, at, end = series.store(begin)
-        if at < end:
-            newest = main.item(T, end - 1)
-            self._make_room(min(end - at, int((newest - main.item(T, at)) / self._slot) + 2))
-        else:
-            newest = math.nan
-        back = min(self._lags, begin - series.first + series.behind)
-        self._head, self._tail, row = fast.slide(
-            main, run, at, end, back, self.reference, self.origin, self._slot, self._open, begin,
-            self._lags, self._rows, self._begins, self._head, self._tail, series.first)
-        if at < end:
-            self._summed, self._open = series.end, float(self.slot_of(newest))
-        return row
 
     def _take(self) -> None:
         """Sum what is new; the first part of it may go on in the slot that is open."""
@@ -160,12 +138,7 @@ class LagSums:
         if back < lags:
             runs = np.minimum(runs, back + np.arange(end - begin)).astype(np.int8)
             z = np.concatenate([np.zeros((self._c, lags - back)), z], axis=1)
-        fast = COMPILED.ready
-        if fast is not None:
-            self._tail = fast.take_slots(z, runs, t, self.origin, self._slot, self._open, begin,
-                                         lags, self._rows, self._begins, self._head, self._tail)
-        else:
-            self._take_plain(z, runs, t, begin)
+        self._take_slots(z, runs, t, begin)
         self._summed, self._open = end, float(self.slot_of(float(t[-1])))
 
     def _make_room(self, more: int) -> None:
@@ -196,9 +169,9 @@ class LagSums:
         np.multiply(z[1], z[1], out=z[2])
         return z
 
-    def _take_plain(self, z: FloatArray, runs: npt.NDArray[np.int8], t: FloatArray, begin: int
+    def _take_slots(self, z: FloatArray, runs: npt.NDArray[np.int8], t: FloatArray, begin: int
                     ) -> None:
-        """Do what the kernel `take_slots` does."""
+        """Sum new samples into the rows of the slots."""
         slots = self.slots_of(t)
         cuts = np.flatnonzero(slots[1:] != slots[:-1]) + 1
         edges = [0, *cuts.tolist(), t.size]
@@ -256,10 +229,6 @@ class LagSums:
         """Return the sum over the slots, in one row."""
         _, at_first, at_place, *_ = self._ends
         kept = slice(self._head, self._tail)
-        fast = COMPILED.ready
-        if fast is not None:
-            return fast.add_slots(self._rows[kept], self._begins[kept], self._series.first,
-                                  self._c)
         rows = self._rows[kept]
         total: FloatArray = np.add.reduce(rows, axis=0)
         offsets = self._begins[kept] - float(self._series.first)
@@ -282,6 +251,8 @@ class LagSums:
 # Lags of the sums: enough while theta^24 is small; beyond, a coarser
 # resolution is used (doc/estimation.md).
 LAGS = 24
+# theta^LAGS beyond this: the lags no longer hold the noise, go coarser.
+LOST = 0.05
 # Slots per window: the window is resolved to this share.
 SLOTS = 40
 # Samples of one resolution that make one of the next.

@@ -9,7 +9,7 @@ of the bias, so that a constant wrong by a fifth is found thirty times over.
 import math
 
 import numpy as np
-from ou_monitor.online.estimator.irregular import fit_exact
+from ou_monitor.online.estimator.irregular import fit_exact, Likelihood
 from ou_monitor.records import Flag, Status
 import pytest
 from simulated_windows import (
@@ -61,7 +61,7 @@ def test_rmse_is_that_of_the_exact_likelihood(noise):
     ours, exact = [], []
     for y in paths(rng, 80, N) + noise * rng.standard_normal((80, N)):
         ours.append(estimate(T, y))
-        fit = fit_exact(T, y, np.ones((N, 1)))
+        fit = fit_exact(Likelihood(T, y, np.ones((N, 1))), 1)
         alpha = fit.alpha - 1.5 / (T[-1] - T[0])
         exact.append((alpha, fit.sigma, fit.sigma ** 2 / (2.0 * alpha)))
     mine, theirs = errors(ours), np.array(exact) / TRUTH - 1.0

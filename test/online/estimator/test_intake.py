@@ -10,12 +10,12 @@ import pytest
 DT = 1e-3
 
 
-def batches(t, y=None, window=1.0, step=math.nan, intake=None, u=None):
+def batches(t, y=None, window=1.0, intake=None, u=None):
     """Return the batches of one push, and the intake."""
     intake = intake or Intake()
     t = np.asarray(t, dtype=float)
     assert intake.put(t, np.zeros(t.size) if y is None else np.asarray(y, dtype=float), u)
-    return intake.work_off(window, step), intake
+    return intake.work_off(window), intake
 
 
 def taken(thinner, t, y=None, u=None, window=1e9):
@@ -42,7 +42,7 @@ def test_throttle_does_not_leak_into_the_next_batch():
     assert got[0].u.tolist() == [0.7, 0.7]
     intake.put(np.array([0.2]), np.zeros(1), 0.1)
     intake.put(np.array([0.3]), np.zeros(1), None)
-    u = intake.work_off(1.0, math.nan)[0].u
+    u = intake.work_off(1.0)[0].u
     assert u[0] == 0.1 and math.isnan(u[1])
     got, _ = batches([0.4], intake=intake)
     assert got[0].u is None or np.isnan(got[0].u).all()
@@ -60,7 +60,7 @@ def test_any_array_of_doubles_is_copied():
         assert intake.put(np.empty(0), np.empty(0), np.empty(0))
         assert intake.put(0.1 * plain, y, y)
         assert intake.put(0.1 * plain + 1.0, np.broadcast_to(2.0, 4), np.broadcast_to(0.5, 4))
-        batch = intake.work_off(2.0, math.nan)[0]
+        batch = intake.work_off(2.0)[0]
         assert batch.y.tolist() == [1.0, 2.0, 3.0, 4.0, 2.0, 2.0, 2.0, 2.0]
         assert batch.u.tolist() == [1.0, 2.0, 3.0, 4.0, 0.5, 0.5, 0.5, 0.5]
 
@@ -72,8 +72,8 @@ def test_a_copy_has_buffers_of_its_own():
     other = copy.deepcopy(intake)
     intake.put(np.array([0.2]), np.array([2.0]), None)
     other.put(np.array([0.3]), np.array([3.0]), 0.5)
-    assert intake.work_off(1.0, math.nan)[0].y.tolist() == [1.0, 2.0]
-    batch = other.work_off(1.0, math.nan)[0]
+    assert intake.work_off(1.0)[0].y.tolist() == [1.0, 2.0]
+    batch = other.work_off(1.0)[0]
     assert batch.y.tolist() == [1.0, 3.0] and batch.t.tolist() == [0.1, 0.3]
     assert math.isnan(batch.u[0]) and batch.u[1] == 0.5
 

@@ -2,8 +2,6 @@
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.model import arma
-from ou_monitor.online.estimator import compiled
 from ou_monitor.online.estimator.series import Series
 from ou_monitor.online.estimator.window import LAGS, Resolution, SLOTS
 import pytest
@@ -97,37 +95,6 @@ def test_joint_sums_while_throttle_moves():
         d = z[:, k:] - z[:, :-k]
         assert sums.spread[k - 1] == pytest.approx(d @ d.T, rel=1e-9, abs=1e-12)
         assert sums.change[k - 1] == pytest.approx(d.sum(axis=1), abs=1e-10)
-
-
-@pytest.mark.parametrize('variables', [1, 5])
-def test_compiled_sums_are_those_of_numpy(variables, monkeypatch):
-    """
-    The same sums with and without the kernels, to 1e-9: whole slots, gaps, a slot that goes on.
-
-    Without Numba the text of the kernels runs as Python.
-    """
-    rng = np.random.default_rng(3)
-    n = 420
-    t, y = np.arange(n) * DT, 2.0 + rng.standard_normal(n)
-    u = 0.3 + 0.4 * (np.floor(t / 0.1) % 2) if variables > 1 else None
-    text = compiled.Kernels(arma.fit_sums, arma.search, arma.finish, compiled.take_slots,
-                            compiled.add_slots, compiled.slide, compiled.check)
-    results = []
-    for ready in (compiled.kernels(wait=True) or text, None):
-        monkeypatch.setattr(compiled.COMPILED, 'ready', ready)
-        # Slots of 50 samples, larger than the lags.
-        resolution = Resolution(2.0)
-        for begin in range(0, n, 70):
-            part = slice(begin, begin + 70)
-            breaks = [0] if not begin else [60] if begin == 140 else []
-            resolution.add(t[part], y[part], None if u is None else u[part],
-                           np.array(breaks, dtype=np.int64))
-            resolution.sums.total()
-        results.append(resolution.sums.total())
-    one, two = results
-    assert one.second.shape == (variables, variables)
-    for name in ('n', 'first', 'place', 'second', 'pairs', 'change', 'spread'):
-        assert getattr(one, name) == pytest.approx(getattr(two, name), rel=1e-9, abs=1e-10)
 
 
 def test_coarser_samples_are_means_of_four():
