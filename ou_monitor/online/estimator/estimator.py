@@ -19,7 +19,7 @@ import numpy.typing as npt
 from ou_monitor.model import arma
 from ou_monitor.online.estimator.fit import fit_window, Fitted, from_window, TREND_SCORE
 from ou_monitor.online.estimator.intake import as_column, BATCH, Intake, Thinner
-from ou_monitor.online.estimator.irregular import fit_irregular, MOST
+from ou_monitor.online.estimator.irregular import ExactFit, fit_irregular, MOST
 from ou_monitor.online.estimator.quality import (
     examine, input_flags, judge, Quality, recount, TAIL)
 from ou_monitor.online.estimator.series import T, U, Y
@@ -81,6 +81,9 @@ class SlidingEstimator:
         self._jitter = 0.0
         self._looked = -math.inf
         self._start: tuple[float, float] | None = None
+        # The last fit at the stamps as they are, and the number of the sample after its last.
+        self._exact: ExactFit | None = None
+        self._exact_end = 0
         self._cached: Estimate | None = None
         self._last: Estimate | None = None
 
@@ -235,7 +238,7 @@ class SlidingEstimator:
         self._finest.clear()
         self._tail = np.empty(0)
         self._looked = -math.inf
-        self._start = None
+        self._start = self._exact = None
 
     def _look(self, t: float) -> Quality:
         """Examine the raw samples, now and then."""
@@ -296,7 +299,7 @@ class SlidingEstimator:
         sums = self._finest.sums.total()
         if self._thinner.m == 1 and series.size <= MOST and (
                 sums.pairs[-1] < _EVEN * (sums.n - LAGS)):
-            return fit_irregular(series.all_columns(), moves), NAN
+            return self._fit_irregular(moves), NAN
         resolution, m = self._finest, self._thinner.m
         step = duration / (series.size - 1) if series.even else self._step(series.column(T))
         fit = fit_window(sums, m, self._start)
@@ -311,7 +314,7 @@ class SlidingEstimator:
                 # Load and trend leave nothing but rounding.
                 fit = replace(fit, correlated=False)
             if m == 1 and series.size <= MOST and self._jitter * fit.a / step > _JITTER:
-                return fit_irregular(series.all_columns(), moves), NAN
+                return self._fit_irregular(moves), NAN
         # Coarser where noise, or an ADC step, hides what the lags can hold.
         while fit.correlated and resolution.series.size >= FACTOR * FEWEST and (
                 fit.theta ** LAGS > LOST
@@ -326,6 +329,16 @@ class SlidingEstimator:
             fit = coarse
         found = from_window(fit, step, m, sums.n, resolution.sums.reference)
         return replace(found, trend=True) if drifts else found, smoothness
+
+    def _fit_irregular(self, moves: bool) -> Fitted:
+        """Fit at the stamps as they are, from where the last such fit ended."""
+        end = self._finest.series.end
+        # Of two windows that share half of their samples one is near the other.
+        near = end - self._exact_end < self._finest.series.size // 2
+        fit, self._exact = fit_irregular(
+            self._finest.series.all_columns(), moves, self._exact if near else None)
+        self._exact_end = end
+        return fit
 
     def _step(self, t: FloatArray) -> float:
         """Return the mean step between evenly spaced samples, s."""

@@ -225,13 +225,23 @@ class ExactFit:
     share: float
     # Products of all columns at the maximum, see `_Point`.
     gram: FloatArray
+    # ln a and z at the maximum, and the curvature there, nats: where the next window begins.
+    place: FloatArray
+    curved: FloatArray | None
 
 
-def fit_exact(likelihood: Likelihood, used: int) -> ExactFit:
-    """Fit alpha, sigma, the white noise and the mean, of the first `used` regressors."""
+def fit_exact(likelihood: Likelihood, used: int, before: ExactFit | None = None) -> ExactFit:
+    """
+    Fit alpha, sigma, the white noise and the mean, of the first `used` regressors.
+
+    before: the fit of a window that is nearly this one.
+    """
     low, high = np.array([likelihood.low, 0.0]), np.array([likelihood.high, _LOUDEST])
-    (log_a, z), at = _least(lambda p: likelihood.at(p.item(0), p.item(1), used),
-                            likelihood.start(used), low, high)
+    place, at, curved = _least(
+        lambda p: likelihood.at(p.item(0), p.item(1), used),
+        likelihood.start(used) if before is None else np.clip(before.place, low, high),
+        None if before is None else before.curved, low, high)
+    log_a, z = place.tolist()
     beta = at.beta.copy()
     beta[0] += likelihood.shift
     a, share = math.exp(log_a), _SMALL * math.expm1(z)
@@ -239,18 +249,18 @@ def fit_exact(likelihood: Likelihood, used: int) -> ExactFit:
     edge = -1 if log_a < low[0] + 0.05 else 1 if a > arma.FASTEST else 0
     return ExactFit(a / likelihood.step, math.sqrt(at.scale),
                     share * at.scale * likelihood.step, beta, at.cov, -at.value, edge, a, share,
-                    at.gram)
+                    at.gram, place, curved)
 
 
-def _least(f: Callable[[FloatArray], _Point], here: FloatArray, low: FloatArray,
-           high: FloatArray) -> tuple[list[float], _Point]:
+def _least(f: Callable[[FloatArray], _Point], here: FloatArray, curved: FloatArray | None,
+           low: FloatArray, high: FloatArray) -> tuple[FloatArray, _Point, FloatArray | None]:
     """
-    Return where f is least within a box, and its point.
+    Return where f is least within a box, its point, and the curvature.
 
-    Newton's method: the curvature is by differences of the slopes at first and after a step that
-    had to be shortened, else by the change of the slopes over the last step (BFGS).
+    Newton's method: where the curvature is not given, and after a step that had to be shortened,
+    it is by differences of the slopes, else by their change over the last step (BFGS).
     """
-    at, curved = f(here), None
+    at = f(here)
     left = _MOST_POINTS
     while left > 0:
         if curved is None:
@@ -288,7 +298,7 @@ def _least(f: Callable[[FloatArray], _Point], here: FloatArray, low: FloatArray,
                 pushed, pushed) / float(moved @ pushed)
         else:
             curved = None
-    return here.tolist(), at
+    return here, at, curved
 
 
 # Samples up to which the exact likelihood is used.
@@ -297,8 +307,13 @@ MOST = 4096
 _APART = 1e-5
 
 
-def fit_irregular(columns: FloatArray, moves: bool) -> Fitted:
-    """Fit the OU, the noise and the mean at the stamps as they are."""
+def fit_irregular(columns: FloatArray, moves: bool, before: ExactFit | None = None
+                  ) -> tuple[Fitted, ExactFit | None]:
+    """
+    Fit the OU, the noise and the mean at the stamps as they are.
+
+    before: the second thing returned for a window that is nearly this one.
+    """
     t, y = columns[T] - columns[T, 0], columns[Y]
     load = np.empty((0, t.size))
     if moves:
@@ -314,10 +329,13 @@ def fit_irregular(columns: FloatArray, moves: bool) -> Fitted:
     time -= time.mean() + within @ known
     likelihood = Likelihood(t, y, np.column_stack([np.ones(t.size), known.T, time]))
     used = 1 + len(known)
-    fit, trend = fit_exact(likelihood, used), False
+    fit, trend = fit_exact(likelihood, used, before), False
+    doubtful = fit.a * t.size < arma.DOUBTFUL
+    # Where there may be another optimum the next search begins anew.
+    again = None if doubtful or fit.edge else fit
     if float(time @ time) > _APART * t.size / 12.0 and (
-            abs(_score(fit.gram, used, t.size)) > SUSPECT or fit.a * t.size < arma.DOUBTFUL):
-        drifting = fit_exact(likelihood, used + 1)
+            doubtful or abs(_score(fit.gram, used, t.size)) > SUSPECT):
+        drifting = fit_exact(likelihood, used + 1, again)
         if drifting.beta[-1] ** 2 > TREND_SCORE ** 2 * drifting.beta_cov[-1, -1]:
             fit, trend = drifting, True
             basis = np.block([[basis, -(basis @ within)[:, None]],
@@ -327,11 +345,10 @@ def fit_irregular(columns: FloatArray, moves: bool) -> Fitted:
     cov = basis @ fit.beta_cov[1:, 1:] @ basis.T
     variance = fit.sigma ** 2 / (2.0 * fit.alpha) + fit.noise_var
     outcome = {-1: Outcome.UNBOUND, 0: Outcome.FOUND, 1: Outcome.UNCORRELATED}[fit.edge]
-    return Fitted(outcome, fit.alpha, fit.sigma, fit.noise_var,
-                  math.inf if fit.share else 0.0,
-                  arma.log_covariance(fit.a, arma.theta_at(fit.a, 1, fit.share), 1, t.size),
-                  variance, np.concatenate(([fit.beta[0]], level)), beta, cov, trend, t.size,
-                  fit.a)
+    return Fitted(
+        outcome, fit.alpha, fit.sigma, fit.noise_var, math.inf if fit.share else 0.0,
+        arma.log_covariance(fit.a, arma.theta_at(fit.a, 1, fit.share), 1, t.size), variance,
+        np.concatenate(([fit.beta[0]], level)), beta, cov, trend, t.size, fit.a), again
 
 
 def _score(gram: FloatArray, used: int, n: int) -> float:
