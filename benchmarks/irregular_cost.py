@@ -16,13 +16,13 @@ import sys
 import time
 
 import numpy as np
-from tables import table
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from ou_monitor.model.ou import simulate  # noqa: E402
 from ou_monitor.online.monitor import SupplyMonitor  # noqa: E402
 from ou_monitor.online.settings import MonitorSettings  # noqa: E402
+from tables import table  # noqa: E402
 
 CASES = ('even', '20 % missing', '30 % missing', 'jitter of 30 % of a step')
 # The window has filled, and the first fit is made, s.

@@ -5,7 +5,8 @@ What a message costs the nodes, beside a node that only counts it and one that r
 
 All nodes listen to the same publisher at the same time, each a process of its own with the same
 executor, so a busy machine is equally busy for all: read the ratios, not the microseconds.  CPU
-time is that of the whole process, timers and all, from /proc, over messages taken.
+time is that of the whole process, timers and all, from /proc, over voltages taken.  The voltage is
+an OU rail that sags under a throttle of 50 Hz, so the estimator finds alpha, load and risk.
 """
 
 from __future__ import annotations
@@ -20,9 +21,13 @@ import time
 from typing import Any
 
 import numpy as np
-from tables import put, table
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from ou_monitor.model.ou import simulate  # noqa: E402
+from tables import put, table  # noqa: E402
+
 DOMAIN = '63'
 # What listens on a topic and publishes how many it has had, 10 times a second as the nodes do.
 _LISTENER = """
@@ -55,13 +60,15 @@ executor.add_node(node)
 while rclpy.ok():
     executor.spin_once(timeout_sec=1.0)
 """
-ROS = ['--ros-args', '-r']
+# Throttle messages a second, beside the voltages.
+STICK = 50.0
 # Label, kind and rate of the messages, command.
 CASES: tuple[tuple[str, list[tuple[str, list[str]]]], ...] = (
     ('Float64', [
         ('counts', ['-c', _LISTENER, 'Float64', 'voltage', 'counts', 'n0']),
         ('reads its field', ['-c', _LISTENER, 'Float64', 'voltage', 'reads', 'n1']),
-        ('`estimator`', ['-m', 'ou_monitor.nodes.estimator'])]),
+        ('`estimator`', ['-m', 'ou_monitor.nodes.estimator', '--ros-args', '-p',
+                         'brownout.voltage:=13.0'])]),
     ('Imu', [
         ('counts', ['-c', _LISTENER, 'Imu', 'input', 'counts', 'n0']),
         ('changes and publishes', ['-c', _LISTENER, 'Imu', 'input', 'echoes', 'n1']),
@@ -81,6 +88,20 @@ def memory(pid: int) -> float:
     return int(line.split()[1]) / 1024.0
 
 
+def rail(rate: float) -> tuple[list[float], list[float]]:
+    """Return 40 s of an OU rail under load (40 1/s, 0.3 V/sqrt(s), 4 mV), and its throttle."""
+    rng = np.random.default_rng(1)
+    n = round(40.0 * rate)
+    walk = np.zeros(round(40.0 * STICK))
+    for k in range(1, walk.size):
+        walk[k] = 0.97 * walk[k - 1] + 0.05 * rng.standard_normal()
+    sticks = np.clip(0.4 + walk, 0.0, 1.0)
+    load = sticks[np.minimum((np.arange(n) * STICK / rate).astype(int), sticks.size - 1)]
+    volts = (15.0 - load + simulate(np.arange(n) / rate, 40.0, 0.3, rng)
+             + 4e-3 * rng.standard_normal(n))
+    return volts.tolist(), sticks.tolist()
+
+
 def trial(kind: str, nodes: list[tuple[str, list[str]]], rate: float, seconds: float
           ) -> list[list[str]]:
     """Return one row for each node: all of them on one topic at once."""
@@ -93,7 +114,9 @@ def trial(kind: str, nodes: list[tuple[str, list[str]]], rate: float, seconds: f
     topic = 'voltage' if kind == 'Float64' else 'input'
     output = node.create_publisher(type(message), topic, QoSProfile(
         depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT))
-    values = (5.0 + 0.03 * np.random.default_rng(1).standard_normal(4096)).tolist()
+    stick = node.create_publisher(Float64, 'throttle', 10)
+    values, sticks = rail(rate)
+    moved = 0
     processes, begun = [], []
     try:
         for number, (_, command) in enumerate(nodes, 1):
@@ -112,10 +135,13 @@ def trial(kind: str, nodes: list[tuple[str, list[str]]], rate: float, seconds: f
             while sent < due:
                 stamp = 1_000_000_000 + round(sent * 1e9 / rate)
                 if kind == 'Float64':
-                    message.data = values[sent % 4096]
+                    if sent * STICK / rate >= moved:
+                        stick.publish(Float64(data=sticks[moved % len(sticks)]))
+                        moved += 1
+                    message.data = values[sent % len(values)]
                 else:
                     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-                    message.angular_velocity.x = values[sent % 4096]
+                    message.angular_velocity.x = values[sent % len(values)]
                 output.publish(message)
                 sent += 1
             if not first and now > 3.0:
@@ -135,7 +161,7 @@ def trial(kind: str, nodes: list[tuple[str, list[str]]], rate: float, seconds: f
         node.destroy_node()
     each = [1e6 * cpu / (sent - first) for cpu in used]
     return [[f'{kind}, {rate:g} Hz', name, f'{cost:.0f}', f'{cost / each[0]:.1f}',
-             f'{cost / each[1]:.1f}', f'{start_up:.2f}', f'{mb:.0f}']
+             f'{cost / each[1]:.1f}', f'{1e-4 * cost * rate:.1f}', f'{start_up:.2f}', f'{mb:.0f}']
             for (name, _), cost, start_up, mb in zip(nodes, each, begun, rss)]
 
 
@@ -150,10 +176,12 @@ def main() -> int:
     import rclpy
     rclpy.init()
     rows = []
-    for (kind, nodes), rate in ((CASES[0], 1000.0), (CASES[0], 5000.0), (CASES[1], 1000.0)):
+    for (kind, nodes), rate in ((CASES[0], 100.0), (CASES[0], 1000.0), (CASES[0], 5000.0),
+                                (CASES[1], 1000.0)):
         rows += trial(kind, nodes, rate, args.seconds)
     rclpy.shutdown()
     text = table(['messages', 'node', 'us of CPU a message', 'times counting', 'times typed',
+                  '% of a core',
                   'start-up, s of CPU', 'RSS, MB'], rows)
     text += (f'\nPython {sys.version.split()[0]}, NumPy {np.__version__}, '
              f'{args.seconds:g} s each, all nodes of a block at the same time.\n')
