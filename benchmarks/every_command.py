@@ -1,7 +1,7 @@
 """
 Run every command on every recording of a folder: no traceback, status 0, or 2 with one line.
 
-python benchmarks/every_command.py FOLDER [--quick] [--only NAME ...] [--markdown FILE.md]
+python benchmarks/every_command.py FOLDER [--quick] [--only NAME ...]
 
 One process at a time.  `--quick` leaves out discover, compare, fleet and reproduce (hours of a
 core for 30 flights, beside minutes).  It also looks into each JSON for an interval that spans
@@ -14,6 +14,7 @@ import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import json
+import os
 from pathlib import Path
 import resource
 import subprocess
@@ -21,10 +22,12 @@ import sys
 import tempfile
 from typing import Any
 
-from ou_monitor.records import determined
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)]
+
+from ou_monitor.records import determined  # noqa: E402
 
 ENDINGS = ('.csv', '.bbl', '.bfl', '.txt', '.bin', '.ulg', '.mcap')
-SLOW = ('compare', 'discover', 'fleet', 'reproduce')
 # Longest that one command may take, s: discover of a long flight, on a busy machine.
 MOST = 3600.0
 
@@ -51,7 +54,8 @@ def run(*words: object, cwd: Path) -> Run:
     try:
         done = subprocess.run(
             ['nice', sys.executable, '-m', 'ou_monitor.cli.main', *map(str, words)], cwd=cwd,
-            capture_output=True, text=True, errors='replace', timeout=MOST, check=False)
+            capture_output=True, text=True, errors='replace', timeout=MOST, check=False,
+            env={**os.environ, 'PYTHONPATH': str(ROOT)})
     except subprocess.TimeoutExpired:
         return Run(shown, -1, MOST, f'not done after {MOST:g} s')
     after = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -72,7 +72,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--seconds', type=float, default=10.0)
     args = parser.parse_args()
-    print('| scheduling | busy loops in | late by, median | 99 % | longest |\n|---|---|---:|---:|---:|')
+    print('| scheduling | busy loops in | late by, median | 99 % | longest |')
+    print('|---|---|---:|---:|---:|')
     for own in (False, True):
         for setting in SETTINGS:
             late = 1e3 * np.array(measured(setting, own, args.seconds))
