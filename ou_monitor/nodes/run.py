@@ -14,6 +14,7 @@ import atexit
 from collections.abc import Callable
 import gc
 import os
+from pathlib import Path
 import signal
 import socket
 import sys
@@ -34,6 +35,9 @@ NAP = 1.0
 # shared two cores.  But Fast DDS waits 10 s, and then aborts, for a lock in shared memory that
 # another process held when it was stopped, and while it waits nothing of Python runs.
 END = 1.0
+# How Fast DDS is told where its profiles are (the older name first), or its transports.
+PROFILES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
+TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
 # Set while a signal may end the process at once, and while it may break off the making of a node.
 _loading, _making = threading.Event(), threading.Event()
 
@@ -152,8 +156,29 @@ def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: li
             binding.rclpy_logging_fini()
 
 
+def _choose_queues() -> None:
+    """
+    Have Fast DDS keep what arrives without CPU, unless the user has chosen otherwise.
+
+    Its own queue holds 512 messages of all topics together, and is given up after 1 s.  Other
+    middlewares do not read these variables.  Where discovery is limited to this machine,
+    rmw_fastrtps adds transports of its own, and which of two takes a message is left to chance.
+    """
+    beside = (Path('DEFAULT_FASTRTPS_PROFILES.xml'), Path('DEFAULT_FASTDDS_PROFILES.xml'))
+    local = (os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() in ('LOCALHOST', 'OFF')
+             or os.environ.get('ROS_LOCALHOST_ONLY') == '1')
+    if (local or any(name in os.environ for name in PROFILES)
+            or any(path.exists() for path in beside)
+            or os.environ.get(TRANSPORTS, 'DEFAULT') != 'DEFAULT'):
+        return
+    from ou_monitor.stream.config import msg_config_dir
+    path = str(msg_config_dir().parent / 'config' / 'fastdds.xml')
+    os.environ.update(dict.fromkeys(PROFILES, path))
+
+
 def _init(rclpy: Any, binding: Any, args: list[str] | None) -> None:
     """Initialise rclpy; a command line or parameter file it cannot read is bad input."""
+    _choose_queues()
     try:
         rclpy.init(args=args)
     except (binding.RCLError, binding.RCLInvalidROSArgsError,

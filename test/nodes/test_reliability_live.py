@@ -4,6 +4,7 @@ import json
 import os
 import re
 import resource
+import signal
 import subprocess
 import sys
 import threading
@@ -11,7 +12,7 @@ import time
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from live import memory_of, ou_path, ROOT, Starved, values_of, wait_until
+from live import memory_of, ou_path, ROOT, Starved, unused_domain, values_of, wait_until
 import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
@@ -259,6 +260,51 @@ def test_a_latch_that_the_disk_refused_is_written_later(world, tmp_path):
     again = Rig(world, 'full', *arguments)
     wait_until(lambda: again.field('brownout_level') == 'CRITICAL', what='the latch')
     assert again.process.stop() == 0 and list(tmp_path.glob('.latch*')) == []
+
+
+@pytest.mark.parametrize('profile, number, dip, kept', [
+    # The promise: 2000 messages, when the publisher takes the same file.
+    (True, 1500, (700, 800), 1500),
+    # Else the newest 512 less those of other topics: a dip at the end of 5 s is seen.
+    (False, 5000, (4800, 4900), 300)])
+def test_what_is_sent_to_a_stopped_node_waits_for_it(world, profile, number, dip, kept):
+    """As many messages as its queue holds, and the dip in them."""
+    # The default of ROS; limited to this machine it has Fast DDS's own queues.
+    world.domain, world.reach = unused_domain(), 'SUBNET'
+    rig = Rig(world, 'stopped', '-p', 'brownout.hold:=0.0')
+    env = {**os.environ, 'ROS_DOMAIN_ID': str(world.domain),
+           'ROS_AUTOMATIC_DISCOVERY_RANGE': world.reach}
+    if profile:
+        env['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(ROOT / 'config/fastdds.xml')
+    sender = subprocess.Popen(
+        [sys.executable, ROOT / 'test/support/burst.py', '/stopped/voltage'], env=env, text=True,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+
+    def send(*what):
+        print(*what, file=sender.stdin, flush=True)
+        assert sender.stdout.readline() == 'sent\n'
+    try:
+        assert sender.stdout.readline() == 'ready\n'
+        # Behind a gap messages are told apart by their numbers, of several publishers.
+        rig.probe.node.destroy_publisher(rig.output)
+        wait_until(lambda: 'burst' in rig.field('publishers')
+                   and 'probe' not in rig.field('publishers'), what='one publisher')
+        wait_until(lambda: (send(20, 0, 0), int(rig.field('messages')))[1] > 100, what='messages')
+        # All that was sent before has been taken.
+        wait_until(lambda: float(rig.field('arrival_age')) > 0.5, what='quiet')
+        before = int(rig.field('messages'))
+        rig.process.popen.send_signal(signal.SIGSTOP)
+        send(number, *dip)
+        rig.process.popen.send_signal(signal.SIGCONT)
+        wait_until(lambda: int(rig.field('messages')) >= before + kept, what='what had waited')
+        wait_until(lambda: int(rig.field('floor_dips')) == 1, what='the dip')
+        send(20, 0, 0)
+        wait_until(lambda: int(rig.field('messages')) + int(rig.field('messages_lost'))
+                   >= before + number + 20, what='all counted')
+    finally:
+        # Killed, it would leave its queues in shared memory.
+        sender.communicate()
+    assert rig.process.stop() == 0
 
 
 @pytest.mark.parametrize('rate', [5000.0, 20000.0])

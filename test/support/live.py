@@ -43,6 +43,20 @@ def new_domain() -> int:
     pytest.fail('every ROS domain from 10 to 99 is in use')
 
 
+def unused_domain() -> int:
+    """
+    Return a ROS domain in which no killed program has left a queue in shared memory.
+
+    A node takes such a queue as it is, with the size that its maker chose.
+    """
+    # `new_domain` gives none of these, so that they stay as they are.
+    for domain in range(1, 10):
+        ports = range(7400 + 250 * domain, 7650 + 250 * domain)
+        if not any(Path(f'/dev/shm/fastrtps_port{port}').exists() for port in ports):
+            return domain
+    pytest.fail('every ROS domain from 1 to 9 is in use, or killed programs left queues there')
+
+
 def wait_until(predicate: Callable[[], Any], timeout: float = DEADLINE, what: str = '') -> Any:
     """Return what the predicate returns once it is true; fail after the timeout, s."""
     until = time.monotonic() + timeout
@@ -58,7 +72,8 @@ def wait_until(predicate: Callable[[], Any], timeout: float = DEADLINE, what: st
 class Process:
     """One executable of the package, or any other module of it, its output in files."""
 
-    def __init__(self, name: str, arguments: list[str], domain: int, folder: Path) -> None:
+    def __init__(self, name: str, arguments: list[str], domain: int, folder: Path,
+                 reach: str = 'LOCALHOST') -> None:
         self.name = name
         self._out = folder / f'{name}_{next(_counter)}.out'
         self._err = self._out.with_suffix('.err')
@@ -66,7 +81,7 @@ class Process:
         inherited = {key: value for key, value in os.environ.items()
                      if key != '_ROS_WHEELS_BOOTSTRAP_COMPLETE'}
         env = {**inherited, 'ROS_DOMAIN_ID': str(domain), 'PYTHONUNBUFFERED': '1',
-               'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_LOG_DIR': str(folder),
+               'ROS_AUTOMATIC_DISCOVERY_RANGE': reach, 'ROS_LOG_DIR': str(folder),
                'PYTHONPATH': os.pathsep.join(
                    [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])])}
         with self._out.open('w') as out, self._err.open('w') as err:
@@ -242,6 +257,8 @@ class World:
 
     def __init__(self, folder: Path) -> None:
         self.domain = new_domain()
+        # The range of discovery of its processes.
+        self.reach = 'LOCALHOST'
         self.folder = folder
         self._processes: list[Process] = []
         self._probes: list[Probe] = []
@@ -252,7 +269,7 @@ class World:
     def start(self, name: str, *arguments: str) -> Process:
         """Start an executable."""
         self._processes.append(Process(name, [str(a) for a in arguments], self.domain,
-                                       self.folder))
+                                       self.folder, self.reach))
         return self._processes[-1]
 
     def probe(self) -> Probe:

@@ -1,0 +1,39 @@
+"""
+A program that sends voltages of 5 V at once, as many as each line on its input says.
+
+    python burst.py TOPIC    then lines of: NUMBER of messages, FIRST and LAST of those at 3 V
+"""
+
+import sys
+import time
+
+from builtin_interfaces.msg import Time
+import rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import BatteryState
+
+
+def main(topic):
+    """Send, with stamps 1 ms apart, and say when it is done."""
+    rclpy.init()
+    node = rclpy.create_node('burst')
+    output = node.create_publisher(BatteryState, topic, QoSProfile(
+        depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
+    while not output.get_subscription_count():
+        time.sleep(0.01)
+    print('ready', flush=True)
+    for line in sys.stdin:
+        number, first, last = map(int, line.split())
+        begin = time.time_ns() - number * 10**6
+        for k in range(number):
+            message = BatteryState(voltage=3.0 if first <= k < last else 5.0)
+            stamp = begin + k * 10**6
+            message.header.stamp = Time(sec=stamp // 10**9, nanosec=stamp % 10**9)
+            output.publish(message)
+        print('sent', flush=True)
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+if __name__ == '__main__':
+    main(sys.argv[1])
