@@ -16,7 +16,8 @@ geometry_msgs/AccelStamped or Vector3Stamped), `~/cutoff` (Hz) and `~/lag`
 Limits: of an IMU the angular velocity is filtered, with `input.acceleration` the
 linear acceleration too, and the covariances as those of white noise; of a BatteryState the
 voltage, unless `input.field` names another; the rest passes through; a message
-with a non-finite signal is counted and not passed on.
+with a non-finite signal is counted and not passed on.  Messages whose stamps stand still or go
+back are placed by their arrival, and the diagnostics say so.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ from ou_monitor.online.notch.notch import AdaptiveNotch
 from ou_monitor.online.notch.settings import notch_options, NOTCH_PARAMETERS, NotchSettings
 from ou_monitor.online.settings import (
     FILTER_PARAMETERS, filter_settings, FilterSettings, Parameter)
+from ou_monitor.online.trust import InputClock, SLOW_MISSED, SourceInterval, Stamps
 from ou_monitor.records import Level
 from std_msgs.msg import Float64
 
@@ -86,6 +88,8 @@ class AdaptiveFilterNode(MonitorNode):
             self.resolve_topic_name('sigma'), self.resolve_topic_name('state')))
         self._input_silence = Silence(self.steady_now)
         self._dropped = self._passed = 0
+        self._input_clock = InputClock()
+        self._input_interval = SourceInterval()
         self._found: list[str] = []
         self._unplaced = False
         self._console = Console(self)
@@ -170,7 +174,9 @@ class AdaptiveFilterNode(MonitorNode):
             f"filtering {self._topic} ({kind}, {', '.join(channels.names)})")
 
     def _take_input(self, data: bytes, info: Any) -> None:
-        self._input_silence.heard()
+        arrived = self.steady_now()
+        self._input_silence.heard(arrived)
+        self._input_interval.push_one(arrived)
         try:
             frame = self._frames.open(data)
         except InputError:
@@ -182,6 +188,7 @@ class AdaptiveFilterNode(MonitorNode):
         if not values or not all(map(math.isfinite, (stamp, *values))):
             self._dropped += 1
             return
+        stamp = self._input_clock.time_of(stamp, arrived)
         supply = self._known()
         values = self._notched(stamp, values, supply)
         self._output.publish(frame.put([
@@ -247,6 +254,8 @@ class AdaptiveFilterNode(MonitorNode):
             'passed': self._passed, 'dropped': self._dropped,
             'repeated': counters.repeated, 'back': counters.back, 'gaps': counters.gaps,
             'sigma_age': self._supply.age, 'state_age': self._supply.state_age,
+            'stamps': self._input_clock.stamps.name,
+            'placed_by_arrival': self._input_clock.by_arrival,
             'input_age': self._input_silence.age, 'callback_errors': self.faults}
         fields = {key: repr(value) if isinstance(value, float) else str(value)
                   for key, value in values.items()}
@@ -287,11 +296,13 @@ class AdaptiveFilterNode(MonitorNode):
                 f"{', '.join(CHANNELS)} only, or name its signal with input.field.")
         if self._channels is None:
             return Level.STALE, f'Waiting for a publisher on {self._topic}.'
-        if age is None or age > s.stale_after:
+        if age is None or age > max(s.stale_after, SLOW_MISSED * self._input_interval.value):
             return Level.STALE, f'No message on {self._topic}' + (
                 ' yet.' if age is None else f' for {age:.1f} s.')
         if self._stamper.waiting and self._unplaced:
             return Level.WARN, 'use_sim_time is set, but nothing comes on /clock (any more).'
+        if self._input_clock.stamps is not Stamps.GOOD:
+            return Level.WARN, f'{self._topic}: {self._input_clock.stamps.by_arrival}'
         if _not_a_voltage(self._type, s):
             return Level.WARN, (
                 f'Law {s.law} without {_of_signal(s)} takes {self._topic} of type {self._type} '
@@ -301,10 +312,10 @@ class AdaptiveFilterNode(MonitorNode):
             return Level.WARN, (
                 f'The cutoff goes to the fallback, {s.fallback:g} Hz, because '
                 f'{self._unknown(supply)}.')
-        if self.low_pass.cutoff < s.lowest:
+        if self.low_pass.highest < s.lowest:
             return Level.WARN, (
-                f'The messages on {self._topic} come too slowly: the cutoff is 0.45 of their '
-                f'rate, {self.low_pass.cutoff:.4g} Hz, below fmin ({s.lowest:.4g} Hz).')
+                f'The messages on {self._topic} come too slowly: 0.45 of their rate is '
+                f'{self.low_pass.highest:.4g} Hz, below fmin ({s.lowest:.4g} Hz), which stays.')
         shadow = 'Shadow, the signal passes unfiltered: ' if s.shadow else ''
         of = f'throttle {supply.throttle:.2f}' if s.law == 'throttle' else (
             f'sigma {supply.sigma:.4g} V/sqrt(s)')

@@ -363,7 +363,7 @@ class EstimatorNode(MonitorNode):
                              and self._monitor.settings.brownout_latch, report.flag.reason)
         level, summary = report.level, report.summary
         problem = self._problems.get('voltage')
-        limit = self._monitor.settings.stale_after
+        limit = max(self._monitor.settings.stale_after, report.patience)
         silent = not report.fresh
         if level is Level.ERROR:
             # A flag that is set comes before what is wrong with the input.

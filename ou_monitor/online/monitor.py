@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.estimator.estimator import SlidingEstimator
-from ou_monitor.online.estimator.intake import patience, readings, Stamps, StampWatch
+from ou_monitor.online.estimator.intake import readings
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.report import MonitorReport
@@ -22,6 +22,7 @@ from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
 from ou_monitor.online.risk.forecast import Forecast
 from ou_monitor.online.risk.outlook import Ahead, look_ahead, Outlook, risk_of_all
 from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.online.trust import Doubt, InputTrust, patience, Stamps
 from ou_monitor.records import Counters, Estimate, Flag, Level, NAN, Status
 
 if TYPE_CHECKING:
@@ -55,8 +56,9 @@ class SupplyMonitor:
         self._background = background
         self._model = model
         self._flag = BrownoutFlag(self._settings)
-        self._stamps = StampWatch()
-        self._distrusted = ''
+        self._trust = InputTrust()
+        # As the last report judged them.
+        self._stamps, self._doubt = Stamps.GOOD, Doubt.NONE
         self._reset_reason = ''
         self._restarts, self._fault, self._faulty = 0, '', False
         # Of samples that are thinned: how many were left out, and where the next one is.
@@ -147,8 +149,8 @@ class SupplyMonitor:
             np.asarray(throttle, dtype=np.float64), volts.shape)
         times = None if arrival is None else np.atleast_1d(np.asarray(arrival, dtype=np.float64))
         stamps, volts, load = readings(stamps, volts, load)
-        self._flag.push(stamps, volts, times)
-        self._stamps.push(stamps, times)
+        self._trust.push(stamps, volts, load, times)
+        self._flag.push(stamps, volts, times, self._trust.interval)
         part = slice(-self._phase % thin, None, thin)
         self._phase = (self._phase + stamps.size) % thin
         self._thinned += stamps.size - stamps[part].size
@@ -172,7 +174,9 @@ class SupplyMonitor:
         """
         volts = np.atleast_1d(np.asarray(voltage, dtype=np.float64))
         unknown, volts, _ = readings(np.full_like(volts, NAN), volts, None)
-        self._flag.push(unknown, volts, arrival)
+        times = np.atleast_1d(np.asarray(arrival, dtype=np.float64))
+        self._trust.push_readings(times, volts)
+        self._flag.push(unknown, volts, times, self._trust.interval)
 
     def restart(self, error: BaseException) -> None:
         """Begin with nothing known because of an error; the flag stays held, and it is told."""
@@ -195,7 +199,7 @@ class SupplyMonitor:
 
         The floor holds all the same.
         """
-        self._distrusted = reason
+        self._trust.outside = reason
 
     def clear_brownout(self) -> str:
         """
@@ -223,7 +227,7 @@ class SupplyMonitor:
         """Clear the window, and remember why for the next reports; the flag stays held."""
         self._estimator.reset()
         self._flag.new_time_line()
-        self._stamps.start_anew()
+        self._trust.start_anew()
         self._outlook.new_time_line()
         self._load_filter.new_time_line()
         self._forecast.new_time_line()
@@ -258,10 +262,16 @@ class SupplyMonitor:
         here = silent if arrived is None else max(arrived, 0.0)
         try:
             e = self._estimate() if again else self._newest
-            limit = patience(self._settings, e.rate, e.n)
-            stamps = self._stamps.judge(limit, 1.0 / e.rate if e.rate > 0.0 else NAN)
-            fresh = (silent <= limit and e.status is not Status.NO_DATA
-                     and stamps is Stamps.GOOD and not self._distrusted)
+            limit = patience(self._settings, e.rate, e.n, self._trust.interval)
+            stamps = self._trust.stamps(limit, 1.0 / e.rate if e.rate > 0.0 else NAN)
+            doubt, why = self._trust.doubt(stamps, self._settings.brownout_voltage)
+            if self._doubt is Doubt.UNIT is not doubt:
+                # What was learned is of the other unit.
+                self._counted = self._counters()
+                self._begin()
+                e = self._estimate()
+            self._stamps, self._doubt = stamps, doubt
+            fresh = (silent <= limit and e.status is not Status.NO_DATA and doubt is Doubt.NONE)
             if again or not fresh:
                 self._load = self._load_filter.load()
                 self._ahead = look_ahead(self._outlook, self._forecast, e, self._load,
@@ -272,20 +282,22 @@ class SupplyMonitor:
             self.restart(error)
             e = Estimate(counters=self._counters())
             limit, stamps, fresh = self._settings.stale_after, Stamps.GOOD, False
+            doubt, why = Doubt.NONE, ''
             self._ahead, left_out = Ahead(), ()
         self._newest = e
         ahead = self._ahead
         risk = ahead.outcome.risk
         self._faulty = self._faulty and not e.usable
-        arriving = here <= self._settings.stale_after
+        arriving = here <= max(self._settings.stale_after, limit)
         flag = self._flag.update(e.t + silent if now is None else now, risk, fresh=fresh,
                                  arriving=arriving)
-        silence = '' if fresh else self._silence(
-            age, e, limit, stamps, arriving, late=silent - here > limit)
-        level, summary = self._judge(e, risk, flag, silence)
+        silence = '' if fresh else why if arriving and why else self._silence(
+            age, e, limit, late=silent - here > limit)
+        wrong = doubt if silence and silence == why else Doubt.NONE
+        level, summary = self._judge(e, risk, flag, silence, wrong)
         return MonitorReport(
             e, risk, ahead.budget, ahead.budget_reason, left_out, flag, level, summary, silent,
-            limit, stamps, fresh, self._thinned, self._restarts, self._fault, self._load,
+            limit, stamps, doubt, fresh, self._thinned, self._restarts, self._fault, self._load,
             ahead.outcome.basis, ahead.outcome.cause, ahead.curve)
 
     def risk(self, voltage: float | None = None, horizon: float | None = None) -> float:
@@ -302,8 +314,8 @@ class SupplyMonitor:
         Returns
         -------
         float
-            Probability, the pilot's throttle to come included; NaN without voltage and in the
-            first second.
+            Probability, the pilot's throttle to come included; NaN without voltage, in the first
+            second, and where the input is not trusted.
 
         Raises
         ------
@@ -311,8 +323,11 @@ class SupplyMonitor:
             When the voltage is not finite, or the horizon not positive.
 
         """
+        asked = self._asked(voltage, horizon)
+        if not self._trusted:
+            return NAN
         return risk_of_all(self._outlook, self._forecast, self._newest, self._settings,
-                           *self._asked(voltage, horizon)).risk
+                           *asked).risk
 
     def risk_if(self, throttle: float, dwell: float, voltage: float | None = None,
                 horizon: float | None = None) -> float:
@@ -331,7 +346,7 @@ class SupplyMonitor:
         Returns
         -------
         float
-            Probability; NaN where the load is not known.
+            Probability; NaN where the load is not known or the input not trusted.
 
         Raises
         ------
@@ -344,7 +359,14 @@ class SupplyMonitor:
             raise ValueError(f'throttle must lie within 0..1, got {throttle}')
         if not (math.isfinite(dwell) and dwell >= 0.0):
             raise ValueError(f'dwell must be a number of seconds, not negative, got {dwell}')
+        if not self._trusted:
+            return NAN
         return float(self._forecast.risk_if(throttle, dwell, level, ahead)[0])
+
+    @property
+    def _trusted(self) -> bool:
+        """Whether the readings are trusted, whatever limit is asked for."""
+        return self._trust.doubt(self._stamps, math.inf)[0] is Doubt.NONE
 
     def _asked(self, voltage: float | None, horizon: float | None) -> tuple[float, float]:
         level = self._settings.brownout_voltage if voltage is None else voltage
@@ -369,15 +391,10 @@ class SupplyMonitor:
             return e
         return replace(e, flags=flags, counters=counters)
 
-    def _silence(self, age: float | None, e: Estimate, limit: float, stamps: Stamps,
-                 arriving: bool, late: bool) -> str:
-        if arriving and self._distrusted:
-            return self._distrusted
-        if arriving and stamps is not Stamps.GOOD:
-            return str(stamps.value)
+    def _silence(self, age: float | None, e: Estimate, limit: float, late: bool) -> str:
         if age is not None and age > limit:
             why = f'stale_after = {self._settings.stale_after:g} s'
-            if limit < self._settings.stale_after:
+            if limit != self._settings.stale_after:
                 why = f'a source of {float(f"{e.rate:.3g}"):g} Hz is stale after {limit:.2g} s'
             if late:
                 return (f'Voltages arrive late: the newest is {age:.1f} s old by its stamp '
@@ -390,7 +407,7 @@ class SupplyMonitor:
             return f'The window was cleared ({self._reset_reason}) and is filling again.'
         return Status.NO_DATA.value
 
-    def _judge(self, e: Estimate, risk: float, flag: FlagState, silence: str
+    def _judge(self, e: Estimate, risk: float, flag: FlagState, silence: str, doubt: Doubt
                ) -> tuple[Level, str]:
         """Return the level of the diagnostics and the line for the pilot."""
         critical = flag.level is FlagLevel.CRITICAL
@@ -403,7 +420,8 @@ class SupplyMonitor:
             return Level.ERROR, f'{self._of_risk(e, risk, flag)} {silence}'
         if silence:
             still = f' The brown-out flag is still set: {flag.reason}.' if critical else ''
-            return Level.STALE, silence + still
+            wrong = doubt in (Doubt.UNIT, Doubt.LIMIT)
+            return (Level.ERROR if wrong else Level.STALE), silence + still
         if critical:
             return Level.ERROR, self._of_risk(e, risk, flag)
         if flag.level is FlagLevel.WARN and flag.brownout is not None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ou_monitor.online.estimator.intake import Stamps
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.risk.flag import FlagState
+from ou_monitor.online.trust import Doubt, Stamps
 from ou_monitor.records import Estimate, Level
 
 # Throttles of `risk_curve`.
@@ -40,11 +40,14 @@ class MonitorReport:
     age : float
         Age of the newest voltage, s; inf when none ever came.
     patience : float
-        Age from which the input is stale, s: `stale_after`, or less for a fast source.
+        Age from which the input is stale, s: `stale_after`, less for a fast source, more for a
+        slow one.
     stamps : Stamps
         What the stamps are good for.
+    doubt : Doubt
+        Why the input is not trusted.
     fresh : bool
-        Whether the numbers rest on samples that are not too old.
+        Whether the numbers rest on samples that are trusted and not too old.
     thinned : int
         Samples that only the floor has judged, because there were more than could be estimated
         from.
@@ -75,6 +78,7 @@ class MonitorReport:
     age: float
     patience: float
     stamps: Stamps
+    doubt: Doubt
     fresh: bool
     thinned: int
     restarts: int
@@ -118,6 +122,7 @@ class MonitorReport:
         values['age'] = self.age
         values['patience'] = self.patience
         values['stamps'] = self.stamps.name
+        values['doubt'] = self.doubt.value
         values['samples_thinned'] = self.thinned
         values['restarts'] = self.restarts
         values['fault'] = self.fault

@@ -55,7 +55,8 @@ ESTIMATOR_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('window', 2.0, 'Length of the sliding window, s.', 0.05, 3600.0),
     Parameter('stale_after', 1.0,
               'Age of the newest sample from which the input counts as stale, s; of a fast source '
-              'less: 300 of its intervals, but not below 0.3 s.', 0.01, 3600.0),
+              'less: 300 of its intervals, but not below 0.3 s; of a slow one 2.5 intervals.',
+              0.01, 3600.0),
     Parameter('brownout.voltage', 4.5,
               'Supply voltage that must not be undershot, V (default: the lower limit of PX4 for '
               'a 5 V rail).', 0.0, 1000.0),

@@ -231,7 +231,7 @@ def test_a_slow_input_warns(rig):
             rig.send((0.0, 0.0, 0.0), dt=0.1)
             time.sleep(0.001)
         rig.sigma.publish(Float64(data=0.6))
-        return 'come too slowly: the cutoff is 0.45 of their rate, 4.5 Hz' in rig.status.message
+        return 'come too slowly: 0.45 of their rate is 4.5 Hz' in rig.status.message
     wait_until(told, what='WARN')
     assert rig.status.level == b'\x01'
     # The sample rate is averaged over 100 samples: back to what the other tests use.
@@ -350,6 +350,25 @@ def test_the_law_kalman_goes_where_the_offline_filter_goes(rig):
     wait_until(there, what=f'noise of {wanted:.4f} rad/s')
     wait_until(lambda: there() and values_of(rig.status).get('law') == 'kalman')
     assert rig.probe.set_parameter(NODE, 'law', 'constant_noise').successful
+
+
+@pytest.mark.parametrize('step', [0.0, -0.002, -0.5])
+def test_stamps_that_are_no_time_do_not_hold_the_output(rig, step):
+    """Frozen or steadily backward: the output follows the input by arrival, and that is said."""
+    aim = 5.0 - 40.0 * step
+
+    def there():
+        for _ in range(20):
+            rig.send((aim, 0.0, 0.0), dt=step)
+            time.sleep(0.002)
+        return rig.output[-1].angular_velocity.x == pytest.approx(aim, abs=1e-3)
+    wait_until(lambda: there() and values_of(rig.status)['stamps'] != 'GOOD', what='by arrival')
+    assert rig.status.level == b'\x01' and int(values_of(rig.status)['placed_by_arrival']) > 0
+
+    def good():
+        drive(rig, 0.6, 0.2)
+        return values_of(rig.status)['stamps'] == 'GOOD'
+    wait_until(good, what='good stamps again')
 
 
 def test_silence_is_stale(rig):

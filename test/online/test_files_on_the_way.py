@@ -16,7 +16,7 @@ from ou_monitor.stream.samples import SampleStream
 import pytest
 
 ROOT = str(Path(ou_monitor.__file__).parent)
-MOST = 24
+MOST = 26
 
 
 def files_of(calls):

@@ -6,11 +6,11 @@ import tracemalloc
 from hypothesis import given, settings as hypothesis_settings, strategies as st
 import numpy as np
 from ou_monitor.model.ou import simulate
-from ou_monitor.online.estimator.intake import Stamps, StampWatch
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.risk.forecast import Forecast
 from ou_monitor.online.settings import monitor_settings, MonitorSettings
+from ou_monitor.online.trust import Stamps, StampWatch
 from ou_monitor.records import Flag, Level
 import pytest
 

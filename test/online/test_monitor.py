@@ -112,7 +112,7 @@ def test_distrusted_stamps_leave_the_floor():
     monitor = SupplyMonitor(MonitorSettings(brownout_voltage=4.5, brownout_floor=4.3))
     t = 0.001 * np.arange(2000)
     monitor.distrust('They come in bursts.')
-    monitor.push(t, np.full(t.size, 4.0))
+    monitor.push(t, 4.0 + 0.01 * np.random.default_rng(4).standard_normal(t.size))
     report = monitor.report(0.0)
     assert not report.fresh and math.isnan(report.risk) and report.brownout is True
     assert 'They come in bursts.' in report.summary

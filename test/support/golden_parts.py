@@ -11,11 +11,12 @@ from ou_monitor.criticism.samples import choose_samples, events_between, lines_b
 from ou_monitor.criticism.spectral_start import from_spectrum
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.online.estimator.intake import patience, readings, StampWatch
+from ou_monitor.online.estimator.intake import readings
 from ou_monitor.online.risk.curve_filters import Wander
 from ou_monitor.online.risk.curves import LearnedCurves
 from ou_monitor.online.risk.flag import BrownoutFlag
 from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.online.trust import patience, StampWatch
 from ou_monitor.records import Estimate, Flag, Status
 from scipy.signal import lfilter
 from term_examples import EXAMPLES, OU, term

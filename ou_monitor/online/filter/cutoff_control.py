@@ -2,7 +2,8 @@
 From the cutoff that a law wants to the cutoff in force.
 
 limits -> dead band -> smoothing in ln(fc), fast for a certain sigma -> slew
-limit -> 0.45 of the sample rate.  What is not known asks for the fallback.
+limit -> 0.45 of the sample rate, but not below fmin.  What is not known asks for the fallback.
+Nothing in force lies outside fmin..fmax, whatever the rate is.
 
 Over many samples: the distance to the aim, in ln(cutoff), falls on a line while it slews and as
 exp(-t / constant) behind: where the one gives way to the other is found by search, and the samples
@@ -223,15 +224,17 @@ class CutoffControl:
 
     @property
     def wanted(self) -> float:
-        """Cutoff that the law wants, Hz; NaN when it does not know."""
-        return self._wanted
+        """Cutoff that the law wants, within fmin..fmax, Hz; NaN when it does not know."""
+        return self._clip(self._wanted)
 
     @property
     def bound(self) -> Bound:
         """Return what decides the cutoff in force."""
         s = self._settings
         if self._cutoff < self._moving:
-            return Bound.RATE
+            if self._cutoff > self._lowest:
+                return Bound.RATE
+            return Bound.LAG if s.max_lag else Bound.LOWEST
         if self._moving != self._aim:
             return Bound.SLEW if self._slewing else Bound.SMOOTHING
         if self._wanted != self._wanted:
@@ -248,7 +251,7 @@ class CutoffControl:
         self._lowest = settings.lowest
         self._moving = self._clip(self._moving)
         self._aim = self._clip(self._aim)
-        self._cutoff = min(self._cutoff, self._moving) if self._started else self._moving
+        self._cutoff = self._clip(min(self._cutoff, self._moving))
         self._follow_exactly = True
         if not self._started:
             self._aim = self._moving = self._cutoff = settings.fallback
@@ -264,19 +267,17 @@ class CutoffControl:
             self._started, self._moving = True, self._aim
         elif self._moving != self._aim and dt > 0.0:
             self._move(error, dt)
-        self._cutoff = self._moving
-        if interval > 0.0:
-            self._cutoff = min(self._cutoff, OF_RATE / interval)
+        self._limit(interval)
         return self._cutoff
 
     def run(self, begin: list[int], wanted: list[float], error: list[float],
-            dt: FloatArray) -> FloatArray:
+            dt: FloatArray, interval: FloatArray) -> FloatArray:
         """
-        Take what the law wants from some samples on; return what `update` would have moved to.
+        Take what the law wants from some samples on; return what `update` would have returned.
 
         begin: where each wanted cutoff begins, the first 0.
 
-        wanted in Hz, dt in s, shape (n,); result in Hz, the share of the sample rate left out.
+        wanted in Hz, dt and interval in s, shape (n,), result in Hz.
         """
         s = self._settings
         elapsed = np.concatenate(([0.0], np.cumsum(dt)))
@@ -293,7 +294,10 @@ class CutoffControl:
         if way.slewing is not None:
             self._slewing = way.slewing
         self._moving = self._aim * math.exp(-gap) if gap else self._aim
-        return way.cutoff()
+        cutoff = np.minimum(way.cutoff(), OF_RATE / interval)
+        np.clip(cutoff, self._lowest, s.fmax, out=cutoff)
+        self._limit(float(interval[-1]))
+        return cutoff
 
     def _choose(self, wanted: float) -> None:
         """Set the aim: the wanted cutoff once it is outside the dead band around the old aim."""
@@ -323,9 +327,13 @@ class CutoffControl:
         arrived = abs(gap - step) < ARRIVED
         self._moving = self._aim if arrived else self._moving * math.exp(step)
 
-    def limit(self, interval: float) -> None:
-        """Keep what a run ended with below its share of the sample rate (interval in s)."""
-        self._cutoff = min(self._moving, OF_RATE / interval)
+    def _limit(self, interval: float) -> None:
+        """Bring the moving cutoff into force (interval in s; 0: not known)."""
+        most = OF_RATE / interval if interval > 0.0 else math.inf
+        self._cutoff = self._clip(min(self._moving, most))
 
     def _clip(self, cutoff: float) -> float:
+        """Return a cutoff within fmin..fmax, Hz; NaN stays."""
+        if cutoff != cutoff:
+            return cutoff
         return min(max(cutoff, self._lowest), self._settings.fmax)

@@ -79,6 +79,9 @@ _CHUNK = 16384
 # Angle of a block: exp(100) is far from the largest number, and 100 rounds by 1e-14.
 _SPAN = 100.0
 _LEAST = 1e-4
+# Angle of a step, above which only fmin holds the cutoff above 0.45 of the sample rate: so much
+# of the state decays that sums over many lose it.
+_MOST = 2.0 * math.pi * OF_RATE * ODD
 # After so much angle nothing of a state is left: exp(-75 / sqrt(2)) < 1e-23.
 _FORGOTTEN = 75.0
 # Angles that differ by less, as a share, count as one; a biquad of less angle would round more.
@@ -96,11 +99,11 @@ def filter_sequence(state: LowPassState, order: int, angle: FloatArray, start: F
     for k in range(0, angle.size, _CHUNK):
         at = slice(k, k + _CHUNK)
         lowest, highest = float(angle[at].min()), float(angle[at].max())
-        if order == 2 and lowest > _SMALL and highest - lowest < _SAME * lowest:
-            out[at] = _even(state, 0.5 * (lowest + highest), start[at], end[at])
-        elif lowest < _LEAST:
+        if lowest < _LEAST or highest > _MOST:
             out[at] = [state.advance(order, *one) for one in zip(
                 angle[at].tolist(), start[at].tolist(), end[at].tolist(), strict=True)]
+        elif order == 2 and lowest > _SMALL and highest - lowest < _SAME * lowest:
+            out[at] = _even(state, 0.5 * (lowest + highest), start[at], end[at])
         else:
             out[at] = _uneven(state, order, angle[at], start[at], end[at])
     return out
@@ -263,10 +266,3 @@ def changes(heard: list[FloatArray], size: int) -> list[int]:
     for one in heard:
         moved |= (one[1:] != one[:-1]) & ~(np.isnan(one[1:]) & np.isnan(one[:-1]))
     return [0, *(np.flatnonzero(moved) + 1).tolist()]
-
-
-def within_rate(cutoff: FloatArray, mean: FloatArray) -> FloatArray:
-    """Return a cutoff, Hz, below its share of the sample rate."""
-    if float(cutoff.max()) * float(mean.max()) < OF_RATE:
-        return cutoff
-    return np.minimum(cutoff, OF_RATE / mean)

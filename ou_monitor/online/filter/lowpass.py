@@ -26,7 +26,7 @@ import numpy.typing as npt
 from ou_monitor.online.filter.cutoff_control import Bound, CutoffControl, OF_RATE, SampleInterval
 from ou_monitor.online.filter.cutoff_laws import wanted_cutoff, wanted_cutoffs
 from ou_monitor.online.filter.filter_state import (
-    changes, filter_sequence, LowPassState, sound_piece, within_rate, WORTH)
+    changes, filter_sequence, LowPassState, sound_piece, WORTH)
 from ou_monitor.online.filter.lag import cutoff_for_lag, delay, most_lag, phase_lag
 from ou_monitor.online.filter.learned_wiener import LearnedWiener
 from ou_monitor.online.filter.voltage_kalman import VoltageKalman
@@ -121,15 +121,28 @@ class AdaptiveLowPass:
 
     @property
     def cutoff(self) -> float:
-        """Cutoff in force, Hz; of a shadow the one that would be, of `kalman` that of its lag."""
+        """
+        Cutoff in force, within fmin..fmax, Hz.
+
+        Of a shadow the one that would be; of `kalman` the one of its lag, as far as it is within.
+        """
         told = self._of_its_lag()
-        return told if told == told else self._control.cutoff
+        return self._within(told) if told == told else self._control.cutoff
 
     @property
     def wanted(self) -> float:
         """Cutoff that the law wants, within fmin..fmax, Hz; NaN when it does not know."""
         told = self._of_its_lag()
-        return told if told == told else self._control.wanted
+        return self._within(told) if told == told else self._control.wanted
+
+    @property
+    def highest(self) -> float:
+        """Highest cutoff that the sample rate allows, Hz; inf while it is not known."""
+        return OF_RATE / self._interval.mean if self._interval.mean > 0.0 else math.inf
+
+    def _within(self, cutoff: float) -> float:
+        s = self._settings
+        return min(max(cutoff, s.lowest), s.fmax)
 
     @property
     def bound(self) -> Bound:
@@ -137,8 +150,10 @@ class AdaptiveLowPass:
         if self._kalman is not None and self._known:
             if self._kalman.mixed:
                 return Bound.LAG if self._settings.max_lag else Bound.LOWEST
-            within = self.cutoff * self._interval.mean < OF_RATE * (1.0 - 1e-9)
-            return Bound.NONE if within else Bound.RATE
+            told = self._of_its_lag()
+            if told >= self._settings.fmax:
+                return Bound.HIGHEST
+            return Bound.NONE if told < self.highest * (1.0 - 1e-9) else Bound.RATE
         return self._control.bound
 
     @property
@@ -162,7 +177,9 @@ class AdaptiveLowPass:
         Of the law `kalman` that of the low-pass of its lag; 1 for a shadow and until the
         sample rate is known.
         """
-        angle = _TWO_PI * self.cutoff * self._interval.mean
+        told = self._of_its_lag()
+        cutoff = told if told == told else self._control.cutoff
+        angle = _TWO_PI * cutoff * self._interval.mean
         if self._settings.shadow or not angle > 0.0:
             return 1.0
         return noise_left(self._settings.order, round(100.0 * math.log(angle)))
@@ -296,9 +313,7 @@ class AdaptiveLowPass:
             heard[:, column] = one[at][begin] if one.ndim else one
         wanted = wanted_cutoffs(s, heard[:, [0, 2, 3]], asked)
         error = np.where(heard[:, 1] >= 0.0, heard[:, 1], NAN)
-        cutoff = within_rate(
-            self._control.run(begin, wanted.tolist(), error.tolist(), dt), mean)
-        self._control.limit(float(mean[-1]))
+        cutoff = self._control.run(begin, wanted.tolist(), error.tolist(), dt, mean)
         self._asked = None
         angle = _TWO_PI * cutoff * dt
         start, end = np.concatenate(([self._x], x[at][:-1])), x[at]

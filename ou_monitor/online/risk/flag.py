@@ -25,6 +25,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.online.trust import SLOW_MISSED
 from ou_monitor.records import FloatArray, NAN
 
 # Samples that decide when fewer lie within the time: the median of three outvotes one.
@@ -35,7 +36,7 @@ _BACK = 1.0
 _USUAL = 200
 # Samples kept at most: the longest floor_time, 10 s, at 20 kHz.
 _MOST = 200_000
-# A step forward counts as so many `stale_after` at most: twice what is judged together.  Or stamps
+# A step forward counts as so many `patience` at most: twice what is judged together.  Or stamps
 # at random would move the time line on until a float no longer tells its milliseconds.
 _FAR = 4.0
 
@@ -44,12 +45,14 @@ class FloorWatch:
     """
     Whether the voltage is at or below the floor; `dips`: how often it has gone down to it.
 
-    Three samples further apart than twice `stale_after` are not judged together.
+    Three samples further apart than twice `stale_after` are not judged together, unless their
+    source is slower: `interval`, s, between its samples, 0 for a fast one.
     """
 
     def __init__(self, settings: MonitorSettings) -> None:
         self.settings = settings
         self.dips = 0
+        self.interval = 0.0
         self._usual = math.nan
         self.reset()
 
@@ -102,7 +105,7 @@ class FloorWatch:
         steps = np.diff(t, prepend=self._newest)
         # The comparison is false for NaN too: no stamp is as good as a late one.
         late = ~(steps > 0.0)
-        far = _FAR * self.settings.stale_after
+        far = _FAR * self._together
         at = t + self._shift
         if arrival is not None or late.any() or (steps[np.isfinite(steps)] > far).any():
             elapsed = np.cumsum(np.where(late, self._waits(arrival), np.minimum(steps, far)))
@@ -118,6 +121,11 @@ class FloorWatch:
             self._learn(t, self._newest)
         self._newest = float(t[-1])
         return at, v
+
+    @property
+    def _together(self) -> float:
+        """Longest time, s, between two of three samples that are judged together."""
+        return max(self.settings.stale_after, SLOW_MISSED * self.interval)
 
     def _waits(self, arrival: FloatArray | None) -> FloatArray | float:
         """Return how far late samples move the time line on, s."""
@@ -145,7 +153,7 @@ class FloorWatch:
         if not n:
             return
         span = float(times[-1]) - (before if known else float(times[0]))
-        most = 2.0 * self._usual if self._usual > 0.0 else self.settings.stale_after
+        most = 2.0 * self._usual if self._usual > 0.0 else self._together
         interval = min(max(span / n, 0.0), most)
         share = 1.0 if math.isnan(self._usual) else min(1.0, n / _USUAL)
         usual = 0.0 if math.isnan(self._usual) else self._usual
@@ -158,7 +166,7 @@ class FloorWatch:
         t, v = np.concatenate([self._t, t]), np.concatenate([self._v, v])
         ends = np.arange(old, t.size)
         begin = np.searchsorted(t, t[ends] - s.brownout_floor_time, 'right')
-        near = np.searchsorted(t, t[ends] - 2.0 * s.stale_after, 'left')
+        near = np.searchsorted(t, t[ends] - 2.0 * self._together, 'left')
         begin = np.minimum(begin, np.maximum(ends - _FEWEST + 1, near))
         below = np.concatenate([[0], np.cumsum(v <= s.floor)])
         count = below[ends + 1] - below[begin]
@@ -262,8 +270,9 @@ class BrownoutFlag:
         self._settings = self._floor.settings = settings
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
-             arrival: npt.ArrayLike | None = None) -> None:
-        """Hold samples against the floor; see `FloorWatch.push`."""
+             arrival: npt.ArrayLike | None = None, interval: float = 0.0) -> None:
+        """Hold samples against the floor; see `FloorWatch` (interval in s)."""
+        self._floor.interval = interval
         self._floor.push(t, voltage, arrival)
 
     def new_time_line(self) -> None:

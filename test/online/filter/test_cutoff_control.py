@@ -46,10 +46,10 @@ def test_the_lowest_cutoff_follows_from_the_lag():
     assert line(made, [1.0]) == [pytest.approx(10.0)] and made.bound is Bound.LAG
 
 
-def test_the_sample_rate_bounds_even_the_lowest():
+def test_the_sample_rate_bounds_down_to_the_lowest():
     made = control()
     assert line(made, [100.0], interval=0.01) == [45.0] and made.bound is Bound.RATE
-    assert line(made, [100.0], interval=0.05) == [9.0]
+    assert line(made, [100.0], interval=0.05) == [20.0] and made.bound is Bound.LOWEST
     assert line(made, [100.0], interval=0.001) == [100.0]
 
 

@@ -1,0 +1,376 @@
+"""
+Whether an input can be trusted: stamps against arrival, readings against each other, the unit.
+
+`SupplyMonitor` asks `InputTrust`, and so do the node and the bench; the adaptive filter judges its
+own messages by the same `StampWatch` and goes on by arrival (`InputClock`).
+
+Limits: a source with few late samples (below a tenth), or one that repeats messages, has good
+stamps.  A stuck sensor and a coarse one read alike until the first change; both are UNKNOWN until
+then.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+import enum
+import math
+
+import numpy as np
+from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.records import FloatArray, NAN
+
+# A source of so many Hz or more that has missed so many samples is silent, whatever
+# `stale_after` is; not before so many s: a busy machine pauses that long.
+MISSED, LEAST_PATIENCE = 300, 0.3
+# Samples from which an interval is known well enough to say that.
+_MEASURED = 20
+# A slow source is silent after so many of its intervals: two messages missed, and half an interval
+# of jitter.
+SLOW_MISSED = 2.5
+# Steps between arrivals, s, that can make a source slow: shorter ones lie within LEAST_PATIENCE.
+_SLOW_STEP = LEAST_PATIENCE / SLOW_MISSED
+# Slow steps whose median is the interval, the fewest of them, and their least share of the time.
+_SLOW_KEPT, _SLOW_FEWEST, _SLOW_SHARE = 5, 2, 0.5
+# Messages looked at for the share of late ones; a judgement needs the fewest.
+_LOOK, _FEWEST = 200, 20
+_IRREGULAR = 0.1
+# A stamp this far behind the newest, s, begins a new time line (as in `stream.samples`).
+BACK = 0.1
+# Stamps of the filter's input are frozen after this time, s: 10 ticks of a clock of 10 ms.
+FROZEN_AFTER = 0.1
+
+
+def patience(settings: MonitorSettings, rate: float, n: int, interval: float = 0.0) -> float:
+    """
+    Return the silence after which a source is stale, s.
+
+    rate, Hz: of its n samples in the window; interval, s: between arrivals of a slow source, else
+    0.
+    """
+    limit = settings.stale_after
+    if n >= _MEASURED and rate > 0.0:
+        limit = min(limit, max(LEAST_PATIENCE, MISSED / rate))
+    return max(limit, SLOW_MISSED * interval)
+
+
+class SourceInterval:
+    """
+    Interval between the arrivals of a slow source, s; 0 for a fast one, and while unknown.
+
+    A slow source spends most of its time in steps above 0.12 s; pauses of a fast one do not count.
+    """
+
+    def __init__(self) -> None:
+        self.value = 0.0
+        self._last = NAN
+        # Begin and length of each of the last slow steps, s.
+        self._steps: deque[tuple[float, float]] = deque(maxlen=_SLOW_KEPT)
+
+    def push(self, times: FloatArray) -> None:
+        """Take times in order of arrival, s; steps back begin anew."""
+        steps = np.diff(times, prepend=self._last)
+        for k in np.flatnonzero(steps > _SLOW_STEP)[-_SLOW_KEPT:].tolist():
+            self._steps.append((float(times[k] - steps[k]), float(steps[k])))
+        self._end(float(times[-1]))
+
+    def push_one(self, time: float) -> None:
+        """Take one time, s."""
+        if time - self._last > _SLOW_STEP:
+            self._steps.append((self._last, time - self._last))
+        self._end(time)
+
+    def _end(self, now: float) -> None:
+        if now < self._last:
+            self._steps.clear()
+        self._last = now
+        lengths = sorted(length for _, length in self._steps)
+        slow = len(lengths) >= _SLOW_FEWEST and (
+            sum(lengths) >= _SLOW_SHARE * (now - self._steps[0][0]))
+        self.value = lengths[(len(lengths) - 1) // 2] if slow else 0.0
+
+
+class Stamps(enum.Enum):
+    """What the stamps are good for; the value is the sentence for the pilot."""
+
+    GOOD = 'The stamps increase.'
+    FROZEN = (
+        'Samples arrive, but their stamps do not advance: no estimate can be made of them; the '
+        'driver must set header.stamp for every message.')
+    IRREGULAR = (
+        'The stamps of the samples go back and forth: no estimate can be made of them; look for '
+        'a second source of the topic, or a driver with two clocks.')
+
+    @property
+    def by_arrival(self) -> str:
+        """Return the sentence where samples are placed by their arrival."""
+        found, _, advice = self.value.partition(': no estimate can be made of them')
+        return f'{found}: their arrival counts{advice}'
+
+
+class StampWatch:
+    """Whether the stamps of arriving samples advance; `newest`: of the present time line, s."""
+
+    def __init__(self) -> None:
+        self.newest = -math.inf
+        # Of the last batches: samples, and how many of them were late or began anew.
+        self._batches: deque[tuple[int, int]] = deque()
+        self._looked = self._late = 0
+        # Samples since the newest stamp, and since when, by arrival.
+        self._since = 0
+        self._advanced = self._arrived = NAN
+
+    def push(self, t: FloatArray, arrival: FloatArray | None = None) -> None:
+        """Take stamps in order of arrival (t in s, arrival in s on a monotonic clock)."""
+        good = np.isfinite(t)
+        if not good.all():
+            t, arrival = t[good], None if arrival is None else arrival[good]
+        if not t.size:
+            return
+        highest = np.maximum.accumulate(np.concatenate(([self.newest], t)))
+        late = t <= highest[:-1]
+        # Repeats of the newest message are no disorder.
+        self._count(t.size, int(np.count_nonzero(t < highest[:-1])))
+        fresh = np.flatnonzero(~late)
+        if fresh.size:
+            self._since = t.size - 1 - int(fresh[-1])
+            self._advanced = NAN if arrival is None else float(arrival[fresh[-1]])
+        else:
+            self._since += t.size
+        self._arrived = NAN if arrival is None else float(arrival[-1])
+        self.newest = float(highest[-1])
+
+    def push_one(self, t: float, arrival: float) -> None:
+        """Take one stamp, as `push`."""
+        self._count(1, int(t < self.newest))
+        self._arrived = arrival
+        if t <= self.newest:
+            self._since += 1
+        else:
+            self._since, self._advanced, self.newest = 0, arrival, t
+
+    def _count(self, n: int, late: int) -> None:
+        self._batches.append((n, late))
+        self._looked += n
+        self._late += late
+        while self._looked - self._batches[0][0] >= _LOOK:
+            n, late = self._batches.popleft()
+            self._looked -= n
+            self._late -= late
+
+    def start_anew(self) -> None:
+        """Take stamps that start anew: a step back counts as one that is late."""
+        self.newest = -math.inf
+        self._count(1, 1)
+
+    def judge(self, limit: float, interval: float) -> Stamps:
+        """Return what the stamps are good for (limit of what is fresh and interval in s)."""
+        if self._since >= _FEWEST:
+            stopped = self._arrived - self._advanced
+            if math.isnan(stopped):
+                stopped = self._since * interval
+            # Where no interval was ever known the stamps never advanced.
+            if not stopped <= limit:
+                return Stamps.FROZEN
+        if self._looked >= _FEWEST and self._late > _IRREGULAR * self._looked:
+            return Stamps.IRREGULAR
+        return Stamps.GOOD
+
+
+class InputClock:
+    """
+    Time of messages that must all be used: their stamps, or their arrival where these are no time.
+
+    `stamps`: what the stamps are good for; `by_arrival`: messages placed by their arrival.
+    """
+
+    def __init__(self) -> None:
+        self.stamps = Stamps.GOOD
+        self.by_arrival = 0
+        self._watch = StampWatch()
+        # Arrival and time of the last message, and what is added to stamps, s.
+        self._arrived = self._time = NAN
+        self._shift = 0.0
+
+    def time_of(self, stamp: float, arrived: float) -> float:
+        """Return the time of a message, s (stamp in s, arrived in s on a monotonic clock)."""
+        if stamp < self._watch.newest - BACK:
+            self._watch.start_anew()
+        self._watch.push_one(stamp, arrived)
+        before, self.stamps = self.stamps, self._watch.judge(FROZEN_AFTER, NAN)
+        if self.stamps is not Stamps.GOOD:
+            self.by_arrival += 1
+        if Stamps.GOOD is before is self.stamps or math.isnan(self._time):
+            self._time = stamp + self._shift
+        else:
+            # Where the stamps are good again they go on from here.
+            self._time += max(arrived - self._arrived, 0.0)
+            self._shift = self._time - stamp
+        self._arrived = arrived
+        return self._time
+
+
+# A reading that stands still for this long, s, and for so many readings is stuck; one that has
+# never changed, from so many readings on.  The longest
+# still readings of sources that worked: 2.81 s (139 readings) on the ground, in_xr_141340; 1.70 s
+# (172) in flight, cf_solo_large; 3 readings at 1 Hz in flight, ac_jd_2004.
+_STUCK, _STUCK_READINGS = 5.0, 10
+# While throttle stands still too, so many times the longest still time that ended by one step of
+# the ADC: a coarse ADC on a slow discharge.
+_QUIET = 4.0
+# Throttle stands still within this, of 1 (cf_solo_large: 0.019 within 1.06 s of hover).
+_STILL = 0.05
+# A change of up to so many smallest changes is one step: printed digits round them (5 or 6 mV).
+_ONE_STEP = 1.5
+# Longest step between two readings that counts, s: a gap is not a reading that stands still.
+_COUNTED = 1.0
+# Smallest change, as a share of the reading: float32 rounds by 6e-8.
+_CHANGE = 1e-6
+
+
+class StillReading:
+    """How long the newest reading has been repeated, and how long a working source repeats one."""
+
+    def __init__(self) -> None:
+        self.value = NAN
+        self.changed = False
+        # The present run: readings, time in s, lowest and highest throttle (NaN: unknown).
+        self._n, self._time = 0, 0.0
+        self._throttle = (NAN, NAN)
+        # Smallest change, V, and longest run that ended by it, s.
+        self._step, self._quiet = math.inf, 0.0
+        self._at = NAN
+
+    def push(self, t: FloatArray, voltage: FloatArray, throttle: FloatArray | None) -> None:
+        """Take finite readings in order of arrival (t in s, of arrival where it is known)."""
+        if not voltage.size:
+            return
+        steps = np.diff(t, prepend=self._at)
+        elapsed = np.cumsum(np.where(steps > 0.0, np.minimum(steps, _COUNTED), 0.0))
+        self._at = float(t[-1])
+        size = np.abs(np.diff(voltage, prepend=self.value))
+        moved = np.flatnonzero(size > _CHANGE * np.abs(voltage))
+        begin = 0
+        if moved.size:
+            self.changed = True
+            size = size[moved]
+            lasted = np.diff(elapsed[moved], prepend=-self._time)
+            self._step = min(self._step, float(size.min()))
+            self._quiet = max(self._quiet, float(np.max(
+                lasted, where=size <= _ONE_STEP * self._step, initial=0.0)))
+            begin = int(moved[-1])
+            self._n, self._time, self._throttle = 0, -float(elapsed[begin]), (NAN, NAN)
+        self._n += voltage.size - begin
+        self._time += float(elapsed[-1])
+        self.value = float(voltage[-1])
+        if throttle is not None:
+            self._throttle = (float(np.fmin.reduce(throttle[begin:], initial=self._throttle[0])),
+                              float(np.fmax.reduce(throttle[begin:], initial=self._throttle[1])))
+
+    @property
+    def why(self) -> str:
+        """Return why the reading may be stuck; empty while it is alive."""
+        if self._n < _STUCK_READINGS:
+            return ''
+        if not self.changed:
+            return (f'The voltage has been {self.value:g} V in all {self._n} readings since the '
+                    'start: the sensor is stuck, or its step is larger than what the supply '
+                    'moves; move the throttle, or check the sensor.')
+        limit = _STUCK
+        low, high = self._throttle
+        if high - low <= _STILL:
+            limit = max(limit, _QUIET * self._quiet)
+        if self._time <= limit:
+            return ''
+        return (f'The sensor is stuck: the voltage has been {self.value:g} V for '
+                f'{self._time:.1f} s ({self._n} readings; accepted: {limit:.1f} s).')
+
+
+# Readings whose median is held against unit and limit.
+_RECENT = 21
+# No supply here has more, V: the highest brownout.voltage that can be set.
+MOST_SUPPLY = 1000.0
+# Readings of so many times the limit are of another unit, or the limit guards nothing.  Above a
+# full pack of 24 cells beside the default limit (22), below hundredths of a volt (100).
+_UNIT = 50.0
+
+
+class Doubt(enum.Enum):
+    """Why the input is not trusted."""
+
+    NONE = ''
+    STAMPS = 'stamps'
+    STUCK = 'stuck'
+    UNIT = 'unit'
+    LIMIT = 'limit'
+    OTHER = 'other'
+
+
+class InputTrust:
+    """Every reason for which an input is not trusted, in one place."""
+
+    def __init__(self) -> None:
+        self._stamps = StampWatch()
+        self._interval = SourceInterval()
+        self._still = StillReading()
+        self._recent = np.empty(0)
+        #: A reason from outside; empty: none.
+        self.outside = ''
+
+    def push(self, t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
+             arrival: FloatArray | None) -> None:
+        """Take samples in order of arrival (t in s, V, 0..1, arrival in s); NaN: no reading."""
+        self._stamps.push(t, arrival)
+        times = t if arrival is None else arrival
+        placed = np.isfinite(times)
+        if placed.any():
+            self._interval.push(times if placed.all() else times[placed])
+        self.push_readings(times, voltage, throttle)
+
+    def push_readings(self, times: FloatArray, voltage: FloatArray,
+                      throttle: FloatArray | None = None) -> None:
+        """Take readings without stamps (times in s, by arrival where it is known)."""
+        good = np.isfinite(voltage) & np.isfinite(times)
+        if not good.all():
+            times, voltage = times[good], voltage[good]
+            throttle = None if throttle is None else throttle[good]
+        self._still.push(times, voltage, throttle)
+        self._recent = np.concatenate([self._recent, voltage[-_RECENT:]])[-_RECENT:]
+
+    def start_anew(self) -> None:
+        """Take stamps that start anew."""
+        self._stamps.start_anew()
+
+    @property
+    def interval(self) -> float:
+        """Interval between arrivals of a slow source, s; 0 for a fast one."""
+        return self._interval.value
+
+    def stamps(self, limit: float, interval: float) -> Stamps:
+        """Return what the stamps are good for; see `StampWatch.judge`."""
+        return self._stamps.judge(limit, interval)
+
+    def doubt(self, stamps: Stamps, limit: float) -> tuple[Doubt, str]:
+        """Return why the input is not trusted beside a voltage limit, V, and the sentence."""
+        if self.outside:
+            return Doubt.OTHER, self.outside
+        if stamps is not Stamps.GOOD:
+            return Doubt.STAMPS, stamps.value
+        if limit <= 0.0:
+            return Doubt.LIMIT, (
+                f'brownout.voltage is {limit:g} V: no voltage undershoots it, and the floor is '
+                'off; set the lowest voltage that the load bears.')
+        usual = float(np.median(np.abs(self._recent))) if self._recent.size else NAN
+        if usual > MOST_SUPPLY or usual > _UNIT * limit:
+            return Doubt.UNIT, (
+                f'The voltage reads {usual:.4g} V, {usual / limit:.3g} times brownout.voltage '
+                f'({limit:g} V){_unit_of(usual / limit)}: set unit_factor in the msg_config, '
+                'or brownout.voltage.')
+        why = self._still.why
+        return (Doubt.STUCK, why) if why else (Doubt.NONE, '')
+
+
+def _unit_of(ratio: float) -> str:
+    """Name the unit that readings of so many times the limit may have."""
+    if ratio < 0.5 * _UNIT * 10.0:
+        return ', as hundredths of a volt would'
+    return ', as millivolts would' if ratio < 1e4 else ''
