@@ -58,10 +58,17 @@ def test_gains_as_text():
 @pytest.mark.parametrize('value, error, text', [
     (1.0, 9.99, '1.0 +- 10'), (1.0, 0.1, '1.00 +- 0.10'), (100.0, 0.1, '100.00 +- 0.10'),
     (123456.0, 1e-3, '123456 +- 0.0010'), (0.0, 0.1, '0 +- 0.10'), (1.0, 0.0, '1.000'),
-    (1.0, 10010.0, '1.0 (not determined)'),
-    (-1.0, 10010.0, '-1.0 (not determined)'), (1.0, 9000.0, '1.0 +- 9000')])
+    (-1.0, 9000.0, '-1.0 +- 9000')])
 def test_digits_follow_the_error(value, error, text):
     assert with_error(value, error) == text
+
+
+@pytest.mark.parametrize('error, text', [
+    (1.17, '1.0 +- 1.2'), (1.18, 'not determined'), (1e300, 'not determined')])
+def test_what_is_positive_is_known_to_a_factor_of_10(error, text):
+    """A coefficient of either sign is shown with any error: it is known to be that small."""
+    assert with_error(1.0, error, positive=True) == text
+    assert '+-' in with_error(1.0, error)
 
 
 @pytest.mark.parametrize('chance, text', [
