@@ -29,9 +29,9 @@ ROOT = Path(__file__).resolve().parents[1]
 # Name, file below OU_MONITOR_REALDATA, options of `convert` for a log.
 FLIGHTS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ('gecko', 'bf_gecko_a.csv', ()),
-    ('nazgul', 'raw/bf_nazgul_4s.bbl', ('--flight', '1', '--drop-held')),
-    ('roma', 'raw/bf_roma_6s.bbl', ('--flight', '3', '--drop-held')),
-    ('bf3s', 'raw/bf_3s_erpm2.bbl', ('--flight', '2', '--drop-held')),
+    ('nazgul', 'raw/bf_nazgul_4s.bbl', ('--flight', '1')),
+    ('roma', 'raw/bf_roma_6s.bbl', ('--flight', '3')),
+    ('bf3s', 'raw/bf_3s_erpm2.bbl', ('--flight', '2')),
     ('erle', 'raw/ac_erle_althold2.BIN', ()),
     ('jd', 'raw/ac_jd_2004.bin', ()),
     ('cf_solo', 'cf_solo_large.csv', ()),

@@ -298,6 +298,8 @@ class Recording:
         What was dropped or mended on the way in, one sentence each.
     current : ndarray, shape (n,), or None
         Current drawn, A, the last value known at each stamp, NaN where unknown; None without.
+    held : int
+        Samples left out because the logger repeated a reading in them.
 
     """
 
@@ -308,6 +310,7 @@ class Recording:
     source: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     current: FloatArray | None = None
+    held: int = 0
 
     def __post_init__(self) -> None:
         """Refuse arrays that cannot be one recording."""

@@ -20,9 +20,10 @@ import math
 import numpy as np
 from ou_monitor.analysis.levels import GAP_STEPS, SETTLE
 from ou_monitor.analysis.relaxation import Relaxation
-from ou_monitor.online.estimator.quality import examine, TAIL
+from ou_monitor.online.estimator.quality import examine
 from ou_monitor.records import Estimate, Flag, Recording, Status
 from ou_monitor.text import counted, Z95
+from ou_monitor.timeline.line import TAIL
 
 # Flags that inform; the others make numbers doubtful.
 _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
@@ -182,11 +183,10 @@ def _of_samples(recording: Recording) -> list[QualityItem]:
         items.append(QualityItem('ADC_STEP', Severity.INFO, (
             f'Voltages lie on a lattice of {1e3 * step:.3g} mV, {step / rms:.2g} times the '
             'scatter from sample to sample.')))
-    held = max((look.held for look in looks), default=1.0)
-    if held > 1.0:
+    if recording.held:
         items.append(QualityItem('REPEATS', Severity.INFO, (
-            f'The source is refreshed every {held:.3g} samples; the logger repeats it in '
-            'between.')))
+            f'The logger repeats each reading {(n + recording.held) / n:.3g} times; the repeats '
+            'were left out.')))
     clipped = sum(look.saturated for look in looks)
     if clipped:
         items.append(QualityItem('CLIPPED', Severity.WARNING, (

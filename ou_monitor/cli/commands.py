@@ -136,14 +136,10 @@ _CONVERT = Command(
             help='magnets of a rotor, for eRPM (default: as the log says)'),
      Option('--flight', metavar='N', type=flight_number,
             help='which flight of a file with several, from 1 (default: the largest)'),
-     (Option('--drop-held', action='store_true',
-             help='drop voltages that a logger repeats until the ADC is read again'),
-      Option('--drop-repeats', action='store_true',
-             help='as --drop-held; where no steady refresh is found, drop every repeat')),
      Option('--type', choices=TYPES, default='battery_state',
             help='message of the voltage (default %(default)s; adc_block needs a steady 10 kHz)'),
      JSON, FORCE),
-    ('flight.ulg --list', 'flight.bbl flight.mcap --drop-held',
+    ('flight.ulg --list', 'flight.bbl flight.mcap --flight 2',
      'flight.bin flight.mcap --signal RCOU.C3'),
     'Read: PX4 ULog (.ulg), ArduPilot dataflash (.bin, .log), Betaflight and INAV blackbox '
     '(.bbl, .bfl), Crazyflie micro-SD logs, CSV with the column time_s; the first bytes decide, '

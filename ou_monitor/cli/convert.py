@@ -46,29 +46,21 @@ def _check_place(out: Path, force: bool) -> None:
 
 
 def _convert(args: argparse.Namespace, log: Any) -> int:
-    from dataclasses import replace
-
-    from ou_monitor.recordings.importers.choose import choose, choose_extras, drop_held
+    from ou_monitor.recordings.importers.choose import choose, choose_extras
     from ou_monitor.recordings.write import write_log
 
     chosen = choose(args.log, log, voltage=args.voltage, throttle=args.throttle,
                     current=args.current)
     extras = choose_extras(args.log, log, imus=args.imu, signals=args.signal)
-    held: tuple[str, ...] = ()
-    if args.drop_held or args.drop_repeats:
-        voltage, sentence = drop_held(chosen.voltage, every=args.drop_repeats)
-        chosen, held = replace(chosen, voltage=voltage), (sentence,)
     about = {'log_file': args.log.name, 'log_format': log.format,
              'log_time': 'as in the file, s' if log.format == 'csv' else
              's from the start of the log',
              **{f'log_{key}': value for key, value in log.facts.items()}}
-    if held:
-        about['held_samples'] = held[0]
     with Progress('writing', args.json == output.STDOUT) as progress, \
             output.replacing(args.out, args.force):
         topics, moved = write_log(chosen, args.out, about, kind=args.type, extras=extras,
                                   progress=progress)
-    notes = (*log.notes, *chosen.notes, *extras.notes, *held, *moved)
+    notes = (*log.notes, *chosen.notes, *extras.notes, *moved)
     volts = chosen.voltage
     duration = float(volts.t[-1] - volts.t[0])
     taken = _taken(chosen, extras)

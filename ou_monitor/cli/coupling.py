@@ -27,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ou_monitor.analysis.overview import answers, known_lines, overview
     from ou_monitor.recordings.importers.log import UNKNOWN
-    from ou_monitor.recordings.read import refreshed
+    from ou_monitor.timeline.refresh import readings_of
 
     recording, series = read_given_beside(args, start, end)
     t, values = series.t, series.values
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     except InputError as error:
         raise InputError(f"'{args.recording}', signal '{args.signal}': {error}") from error
     # From here on as `analyze` reads it.
-    recording = refreshed(recording)
+    recording = readings_of(recording)
     seen = overview(recording, math.nan if limit is None else limit, cells=args.cells or 0)
     known = known_lines(seen)
     if args.report is not None:

@@ -27,6 +27,7 @@ from ou_monitor.model.terms.saturation import Saturation
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted
+from ou_monitor.timeline.refresh import reading_places, reading_times
 
 # Fewer samples than this are not fitted.
 LEAST = 100
@@ -82,13 +83,16 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
         return Integrity(None, (), tuple(notes), reason)
     report(0.2)
     exact: list[Term] = []
+    # A recording from Python may still hold the steady repeats of a logger: no score counts them.
+    places, period = reading_places(v)
+    t, v, u = reading_times(t[places], period), v[places], None if u is None else u[places]
     logged = (t, v, u)
-    t, v, u, period = without_repeats(t, v, u)
-    if period > 1.0:
+    t, v, u, held = without_repeats(t, v, u)
+    if period > 1.0 or recording.held or held > 1.0:
         fresh = (v.size - 1) / float(t[-1] - t[0])
         exact.append(HeldSamples(fresh))
-        notes.append(f'The logger repeats its last value: the source refreshes at {fresh:.4g} Hz; '
-                     f'{logged[0].size - v.size} repeats were dropped.')
+        notes.append(f'The logger repeats its last value: the voltage was read at {fresh:.4g} Hz; '
+                     f'{recording.held + recording.n - v.size} repeats were left out.')
     report(0.4)
     rate = (v.size - 1) / float(t[-1] - t[0])
     which, note = choose_samples(v, rate)
@@ -134,7 +138,9 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
                      'were kept as well.')
     samples = samples.spread(samples.voltage, cell, np.random.default_rng(0))
     report(1.0)
-    return Integrity(samples, tuple(exact), tuple(notes), raw=_as_logged(*logged, exact),
+    raw = _as_logged(*logged) if held > 1.0 or any(
+        term.NAME in ('saturation', 'clock_jitter') for term in exact) else None
+    return Integrity(samples, tuple(exact), tuple(notes), raw=raw,
                      drawn=drawn)
 
 
@@ -193,10 +199,7 @@ def _useful(u: FloatArray | None, recorded: bool, notes: list[str]) -> FloatArra
     return None
 
 
-def _as_logged(t: FloatArray, v: FloatArray, u: FloatArray | None, exact: list[Term]
-               ) -> Samples | None:
+def _as_logged(t: FloatArray, v: FloatArray, u: FloatArray | None) -> Samples:
     """Return the first samples as logged, where the fit works on others."""
-    if not any(term.NAME in ('held_samples', 'saturation', 'clock_jitter') for term in exact):
-        return None
     part = slice(0, min(v.size, _LOOK))
     return Samples(t[part], v[part], None)

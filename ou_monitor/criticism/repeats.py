@@ -14,9 +14,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import find_step, usual_change
-from ou_monitor.criticism.stamps import on_grid
 from ou_monitor.records import FloatArray
-from ou_monitor.timeline.refresh import reading_places
+from ou_monitor.timeline.refresh import reading_places, reading_times
 
 # Repeats, or runs of them, that are called so, at least; and the share of ties by chance up to
 # which the size of the changes says how many there are.
@@ -37,16 +36,15 @@ _LOOK = 200_000
 
 def without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
                     ) -> tuple[FloatArray, FloatArray, FloatArray | None, float]:
-    """Return the refreshes, and the samples a refresh: 1 where none repeats."""
+    """Return readings, and samples a reading: 1 where none repeats."""
     places, period = reading_places(v)
-    if period <= 1.0:
-        first = max(0, (v.size - _LOOK) // 2)
-        held = v[1:] == v[:-1] if _ties(v[first:first + _LOOK]) else _stuck(v)
-        if not held.any():
-            return t, v, u, 1.0
-        fresh = np.concatenate(([True], ~held))
-        return t[fresh], v[fresh], None if u is None else u[fresh], v.size / fresh.sum()
-    return (_refreshed(t[places], period), v[places], None if u is None else u[places], period)
+    t, v, u = reading_times(t[places], period), v[places], None if u is None else u[places]
+    if period > 1.0:
+        return t, v, u, period
+    first = max(0, (v.size - _LOOK) // 2)
+    held = v[1:] == v[:-1] if _ties(v[first:first + _LOOK]) else _stuck(v)
+    fresh = np.concatenate(([True], ~held))
+    return t[fresh], v[fresh], None if u is None else u[fresh], v.size / int(fresh.sum())
 
 
 def _ties(v: FloatArray) -> bool:
@@ -162,13 +160,3 @@ def _alike_again(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
     """Return the share of values that come back after the period at which most do."""
     return max((float(np.mean(v[k:][inner[k - 1:]] == v[:-k][inner[k - 1:]]))
                 for k in _PERIODS if k < v.size // 2), default=0.0)
-
-
-def _refreshed(t: FloatArray, period: float) -> FloatArray:
-    """Return when a source with a clock of its own was read, from when that was logged."""
-    if abs(period - round(period)) < 0.02:
-        return t
-    usual = (t[-1] - t[0]) / (t.size - 1)
-    grid = on_grid(t, np.maximum(1.0, np.rint(np.diff(t) / usual)))
-    # The logger is late by up to one of its own steps, 1/period of those here.
-    return grid if float(np.abs(t - grid).max()) < 1.5 * usual / period else t

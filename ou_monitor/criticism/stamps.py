@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from ou_monitor.records import FloatArray
 from ou_monitor.text import counted
+from ou_monitor.timeline.refresh import on_grid
 
 # Scatter below this share of a step is put onto the grid: it changes nothing else.
 _SMALL = 0.02
@@ -84,15 +85,6 @@ def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
         notes.append(f'Steps between stamps scatter by {100.0 * uneven:.2g} %: taken as they '
                      'are.')
     return Stamps(t, 0.0, tuple(notes))
-
-
-def on_grid(t: FloatArray, number: FloatArray) -> FloatArray:
-    """Return the even grid nearest to stamps (t in s, result in s)."""
-    k = np.concatenate(([0.0], np.cumsum(number)))
-    k -= k.mean()
-    middle = float(t.mean())
-    grid: FloatArray = middle + float(k @ (t - middle)) / float(k @ k) * k
-    return grid
 
 
 def _wrong(step: FloatArray, number: FloatArray, voltage: FloatArray) -> bool:

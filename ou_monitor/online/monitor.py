@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.estimator.estimator import SlidingEstimator
-from ou_monitor.online.estimator.intake import readings
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.report import MonitorReport
@@ -24,6 +23,7 @@ from ou_monitor.online.risk.outlook import Ahead, look_ahead, Outlook, risk_of_a
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.online.trust import Doubt, InputTrust, patience, Stamps
 from ou_monitor.records import Counters, Estimate, Flag, Level, NAN, Status
+from ou_monitor.timeline.line import MOST_CURRENT, plausible, plausible_samples, TimeLine
 
 if TYPE_CHECKING:
     from ou_monitor.model.supply import SupplyModel
@@ -71,7 +71,8 @@ class SupplyMonitor:
 
     def _begin(self) -> None:
         """Begin with nothing known of the supply."""
-        self._estimator = SlidingEstimator(self._settings.window)
+        self._line = TimeLine()
+        self._estimator = SlidingEstimator(self._settings.window, line=self._line)
         self._load_filter, self._load = LoadFilter(), SupplyLoad()
         self._load_filter.begin_with(None if self._model is None else self._model.load)
         self._outlook = Outlook(background=self._background)
@@ -148,20 +149,23 @@ class SupplyMonitor:
         load = None if throttle is None else np.broadcast_to(
             np.asarray(throttle, dtype=np.float64), volts.shape)
         times = None if arrival is None else np.atleast_1d(np.asarray(arrival, dtype=np.float64))
-        stamps, volts, load = readings(stamps, volts, load)
+        stamps, volts, load = plausible_samples(stamps, volts, load)
         self._trust.push(stamps, volts, load, times)
         self._flag.push(stamps, volts, times, self._trust.interval)
         part = slice(-self._phase % thin, None, thin)
         self._phase = (self._phase + stamps.size) % thin
         self._thinned += stamps.size - stamps[part].size
         load = None if load is None else load[part]
-        drawn = None if current is None else np.broadcast_to(
-            np.asarray(current, dtype=np.float64), stamps.shape)[part]
+        drawn = None if current is None else plausible(np.broadcast_to(
+            np.asarray(current, dtype=np.float64), stamps.shape)[part], MOST_CURRENT)
+        came = math.inf if times is None or not times.size else float(times[-1])
         try:
-            self._forecast.push(stamps[part], volts[part], load, drawn,
-                                None if times is None else times[part])
-            self._estimator.push(stamps[part], volts[part], load)
-            self._outlook.push(stamps[part], volts[part], load, self._newest)
+            for batch in self._line.take(stamps[part], volts[part], load, drawn,
+                                         self._settings.window):
+                self._estimator.take(batch)
+                if not batch.again:
+                    self._forecast.take(batch, came)
+                    self._outlook.push(batch.t, batch.y, batch.u, self._newest)
         except Exception as error:
             # Whatever it is: a monitor that ends with it says nothing any more.
             self.restart(error)
@@ -173,7 +177,7 @@ class SupplyMonitor:
         Voltage in V and arrival in s, shape (n,), as of `push`.
         """
         volts = np.atleast_1d(np.asarray(voltage, dtype=np.float64))
-        unknown, volts, _ = readings(np.full_like(volts, NAN), volts, None)
+        unknown, volts, _ = plausible_samples(np.full_like(volts, NAN), volts, None)
         times = np.atleast_1d(np.asarray(arrival, dtype=np.float64))
         self._trust.push_readings(times, volts)
         self._flag.push(unknown, volts, times, self._trust.interval)

@@ -20,9 +20,9 @@ from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagReader, batches
 from ou_monitor.recordings.cdr import join
 from ou_monitor.recordings.importers.choose import (
-    choose as choose_series, columns_of, drop_held, NONE, signal_of)
+    choose as choose_series, columns_of, NONE, signal_of)
 from ou_monitor.recordings.importers.csv_table import CsvColumns, read_column, read_csv
-from ou_monitor.recordings.importers.formats import BAG, CSV, import_log, is_csv, is_log
+from ou_monitor.recordings.importers.formats import import_log, is_csv, is_log
 from ou_monitor.recordings.importers.log import (
     Log, RawColumns, Request, Series, SIGNAL, UNKNOWN, VOLTAGE)
 from ou_monitor.recordings.samples import (
@@ -31,6 +31,9 @@ from ou_monitor.recordings.samples import (
 from ou_monitor.recordings.standard_types import IMU
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.config import FieldSpec
+from ou_monitor.timeline.line import (
+    hold, MOST_CURRENT, plausible, plausible_samples, TimeLine)
+from ou_monitor.timeline.refresh import readings_of
 
 # Samples of a piece, where the caller does not say.
 PIECE = 1_000_000
@@ -89,7 +92,7 @@ def read_recording(
         left.
 
     """
-    return refreshed(_read(
+    return readings_of(_read(
         Path(path), msg_config=msg_config, voltage_topic=voltage_topic,
         throttle_topic=throttle_topic, partial=partial, start=start, end=end, flight=flight,
         columns=columns, progress=progress))
@@ -151,25 +154,6 @@ def _of_log(path: Path, names: frozenset[str], columns: CsvColumns | None, fligh
     return _cut(whole, start, end), log
 
 
-def refreshed(recording: Recording) -> Recording:
-    """Drop what a logger repeats between two readings: of a log, and of a bag made of one."""
-    source = recording.source
-    if not _is_logged(source):
-        # `convert` did it already, and wrote what it did.
-        told = [source['held_samples']] if 'held_samples' in source else []
-        return replace(recording, notes=(*recording.notes, *told))
-    volts = Series(source.get('voltage', source.get('voltage_field', VOLTAGE)), VOLTAGE,
-                   recording.t, recording.voltage, '1')
-    kept, words = drop_held(volts)
-    return _samples(recording, np.isin(recording.t, kept.t), (*recording.notes, words))
-
-
-def _is_logged(source: Mapping[str, str]) -> bool:
-    """Whether a recording is a log, or a bag of all samples of one, by its source."""
-    return ('held_samples' not in source
-            and source.get('log_format', source['format']) not in (BAG, CSV))
-
-
 def _samples(recording: Recording, which: slice | npt.NDArray[np.bool_], notes: tuple[str, ...],
              ) -> Recording:
     """Return some samples of a recording."""
@@ -228,7 +212,7 @@ def read_pieces(
         reader = SampleReader(
             BagReader(path, partial=partial), msg_config=msg_config, voltage_topic=voltage_topic,
             throttle_topic=throttle_topic, start=start, end=end)
-        if _is_logged(reader.source):
+        if True:
             whole = read_recording(path, msg_config=msg_config, voltage_topic=voltage_topic,
                                    throttle_topic=throttle_topic, partial=partial, start=start,
                                    end=end, progress=progress)
@@ -267,31 +251,29 @@ def _taken(
 
 
 def tidy(raw: RawColumns) -> Recording:
-    """Return a `Recording`: finite, in order, each stamp once; notes say what that took."""
-    t, voltage, throttle, current = raw.t, raw.voltage, raw.throttle, raw.current
+    """Return a `Recording`: in order, each reading once; notes say what that took."""
     name, notes = raw.name, list(raw.notes)
-    check_throttle(name, throttle, voltage)
-    good = usable_voltage(t, voltage)
+    check_throttle(name, raw.throttle, raw.voltage)
+    # A blank cell is no message: what was commanded last holds.
+    t, voltage, throttle = plausible_samples(raw.t, raw.voltage, hold(raw.throttle))
+    good = np.isfinite(t) & np.isfinite(voltage)
     if not good.all():
-        notes.append(dropped_words(t.size - int(good.sum()), voltage[~good]))
-        t, voltage, throttle, current = t[good], voltage[good], throttle[good], current[good]
-    late = int(np.count_nonzero(np.diff(t) < 0.0))
-    if late:
-        notes.append(late_words(late, *overlap(t)))
-        order = np.argsort(t, kind='stable')
-        t, voltage, throttle, current = t[order], voltage[order], throttle[order], current[order]
-    fresh = np.ones(t.size, dtype=bool)
-    fresh[1:] = np.diff(t) > 0.0
-    if not fresh.all():
-        notes.append(repeated_words(t.size - int(fresh.sum())))
-        t, voltage, throttle, current = t[fresh], voltage[fresh], throttle[fresh], current[fresh]
-    throttle = np.where(np.isfinite(throttle), throttle, np.nan)
-    if not t.size:
+        notes.append(dropped_words(t.size - int(good.sum()), raw.voltage[~good]))
+    if (late := int(np.count_nonzero(np.diff(t[good]) < 0.0))):
+        notes.append(late_words(late, *overlap(t[good])))
+    line = TimeLine()
+    batches = line.order(t, voltage, throttle, plausible(raw.current, MOST_CURRENT), math.inf)
+    if line.counters.late:
+        notes.append(repeated_words(line.counters.late))
+    if not batches:
         raise InputError(_unusable(name, notes))
-    if t.size > 2 and (spacing := float(np.median(np.diff(t)))) >= _SPARSE:
+    (batch,) = batches
+    if batch.t.size > 2 and (spacing := float(np.median(np.diff(batch.t)))) >= _SPARSE:
         notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '
                      '--time-unit says so of a CSV.')
-    return Recording(t, voltage, throttle, name, raw.source, tuple(notes), known_current(current))
+    _, _, u, i = batch.columns()
+    return readings_of(Recording(batch.t, batch.y, u, name, raw.source, tuple(notes),
+                                 known_current(i)))
 
 
 def _unusable(name: str, notes: Sequence[str]) -> str:
@@ -342,7 +324,7 @@ def read_beside(
     Read a recording, and the whole of one scalar beside it; options as for `read_recording`.
 
     What its logger repeats is kept, for between two readings of the voltage the throttle goes on:
-    see `refreshed`.  A log is read once.
+    see `readings_of`.  A log is read once.
     """
     path = Path(path)
     if is_log(path):

@@ -25,47 +25,48 @@ from ou_monitor.stream.blocks import BlockClock
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.stream.samples import BoolArray, ThrottleHold
 from ou_monitor.text import counted, printable
+from ou_monitor.timeline.line import MOST_CURRENT, MOST_THROTTLE, MOST_VOLTAGE, plausible
 
 VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
-# Squares and cubes of what is beyond this overflow; no supply comes near it.
-LARGEST = 1e9  # V
 # So many samples behind for each step back are not a few that came late.
 _STRETCH = 20
-# A throttle beyond this is none in 0..1, however generous its ends.
-MOST_THROTTLE = 2.0
+# Share of implausible throttles up to which they are errors of single samples.
+_WILD = 0.05
 
 
 def usable_voltage(t: FloatArray, voltage: FloatArray) -> npt.NDArray[np.bool_]:
     """Return which samples are finite, and of a voltage that there is."""
-    usable: npt.NDArray[np.bool_] = np.isfinite(t) & (np.abs(voltage) <= LARGEST)
+    usable: npt.NDArray[np.bool_] = np.isfinite(t) & (np.abs(voltage) <= MOST_VOLTAGE)
     return usable
 
 
 def dropped_words(count: int, voltage: FloatArray) -> str:
     """Return the note on samples that are not usable; `voltage`: theirs."""
-    beyond = bool((np.isfinite(voltage) & (np.abs(voltage) > LARGEST)).any())
+    beyond = bool((np.isfinite(voltage) & (np.abs(voltage) > MOST_VOLTAGE)).any())
     return (f'{counted(count)} dropped: not a finite number'
-            + (f', or beyond {LARGEST:g} V.' if beyond else '.'))
+            + (f', or beyond {MOST_VOLTAGE:g} V.' if beyond else '.'))
 
 
 def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None = None) -> None:
     """Refuse a throttle in percent, microseconds or counts, or one that is the voltage."""
     known = throttle[np.isfinite(throttle)]
-    if known.size and float(np.abs(known).max()) > MOST_THROTTLE:
-        if voltage is not None and float(np.nanmax(np.abs(voltage), initial=0.0)) <= 1.0 \
-                and float(np.median(known)) < 100.0:
-            raise InputError(
-                f'{name}: the voltage stays within 0 to 1 and throttle runs from '
-                f'{known.min():g} to {known.max():g}: are the two columns swapped?')
+    # A few wild values are no unit: they are unknown, here as in the node.
+    if float(np.count_nonzero(np.abs(known) > MOST_THROTTLE)) <= _WILD * known.size:
+        return
+    if voltage is not None and float(np.nanmax(np.abs(voltage), initial=0.0)) <= 1.0 \
+            and float(np.median(known)) < 100.0:
         raise InputError(
-            f'{name}: throttle runs from {known.min():g} to {known.max():g}, and 0 to 1 is '
-            'expected: divide a percentage by 100 (of a bag: unit_factor of a msg config), turn '
-            'a pulse of w microseconds into (w - 1000) / 1000')
+            f'{name}: the voltage stays within 0 to 1 and throttle runs from '
+            f'{known.min():g} to {known.max():g}: are the two columns swapped?')
+    raise InputError(
+        f'{name}: throttle runs from {known.min():g} to {known.max():g}, and 0 to 1 is '
+        'expected: divide a percentage by 100 (of a bag: unit_factor of a msg config), turn '
+        'a pulse of w microseconds into (w - 1000) / 1000')
 
 
 def known_current(current: FloatArray) -> FloatArray | None:
     """Return a current with NaN for what is not finite; None where none is known."""
-    known = np.abs(current) <= LARGEST
+    known = np.abs(current) <= MOST_CURRENT
     return np.where(known, current, np.nan) if known.any() else None
 
 
@@ -310,7 +311,7 @@ class SampleReader:
             if t.size:
                 hold.forget_before(self._taken)
         current = known_current(held[CURRENT]) if CURRENT in held else None
-        return Recording(t, voltage, held[THROTTLE], self.name, dict(self.source),
+        return Recording(t, voltage, plausible(held[THROTTLE], MOST_THROTTLE), self.name, dict(self.source),
                          current=current)
 
     def bag_notes(self) -> tuple[str, ...]:

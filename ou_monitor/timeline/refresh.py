@@ -15,12 +15,12 @@ a period (standard deviation).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.records import FloatArray, NAN
+from ou_monitor.records import FloatArray, NAN, Recording
 
 # Gaps that may differ from the pattern: lost samples, a logger that was late.
 _ODD = 0.05
@@ -36,6 +36,8 @@ _KEEP = 0.8
 _FEWEST = 8
 # Sizes of steps that differ by less than this share are one (rounding of float32).
 _SAME = 1e-3
+# Periods nearer than this to a whole number are whole.
+_WHOLE = 0.02
 # Times a period is refined: the numbers of periods in the gaps follow from it.
 _REFINED = 3
 # Shortest gaps tried as the period.
@@ -54,9 +56,27 @@ class Batch:
     t: FloatArray  # stamps, s, strictly increasing, shape (n,)
     y: FloatArray  # voltage, V, shape (n,)
     u: FloatArray | None  # throttle, NaN where unknown; None: unknown throughout
+    i: FloatArray | None  # current, A, NaN where unknown; None: unknown throughout
     shortest: float  # least step, from the sample before on, s
     longest: float  # largest step, s
     restart: bool  # whether everything before this batch is to be forgotten
+    again: bool = False  # whether this batch holds, without repeats, what was passed on before
+
+    @classmethod
+    def of(cls, columns: FloatArray, restart: bool, *, again: bool = False,
+           before: float = -math.inf) -> Batch:
+        """Return columns t, V, throttle, current, shape (4, n), n > 0; `before`: last stamp, s."""
+        t, y, u, i = columns
+        steps = np.diff(t, prepend=before)
+        # The first sample of all follows nothing: no pause lies before it.
+        rest = steps if steps[0] < math.inf or t.size == 1 else steps[1:]
+        return cls(t, y, *(None if np.isnan(x).all() else x for x in (u, i)),
+                   float(steps.min()), float(rest.max()), restart, again)
+
+    def columns(self) -> FloatArray:
+        """Return stamps, voltage, throttle and current, shape (4, n); NaN where unknown."""
+        return np.stack([self.t, self.y, *(
+            np.full(self.t.size, NAN) if x is None else x for x in (self.u, self.i))])
 
 
 def refresh_period(y: FloatArray, known: float = 1.0) -> float:
@@ -96,6 +116,9 @@ def _evidence(gaps: FloatArray, period: float) -> float:
     # Whole samples: less than one is one of two neighbouring lengths.
     if width >= 1.0 and width > _WIDEST * period:
         return 0.0
+    if abs(period - round(period)) > _WHOLE:
+        # Of a period that is not whole the gaps are off by half a sample and more.
+        width = max(width, 0.5)
     return gaps.size * _divergence(1.0 - _ODD, _chance(period, width, int(gaps.max())))
 
 
@@ -157,24 +180,19 @@ class Repeats:
 
     def forget(self) -> None:
         """Take the next sample as the first one; the period stays known."""
-        self._waiting = np.empty((3, 0))
+        self._waiting = np.empty((4, 0))
         self._value = math.nan
         self._place = 0
         self._last = -math.inf
 
     def drop(self, batch: Batch) -> Batch | None:
         """Return the refreshes among samples; None when there are none."""
-        u = np.full(batch.t.size, NAN) if batch.u is None else batch.u
-        columns = np.concatenate([self._waiting, np.stack([batch.t, batch.y, u])], axis=1)
-        t, y, u = columns[:, self.fresh(columns)]
-        if not t.size:
+        columns = np.concatenate([self._waiting, batch.columns()], axis=1)
+        columns = columns[:, self.fresh(columns)]
+        if not columns.size:
             return None
-        steps = np.diff(t, prepend=self._last)
-        self._last = float(t[-1])
-        # The first sample of all follows nothing: no pause lies before it.
-        rest = steps if steps[0] < math.inf or t.size == 1 else steps[1:]
-        return Batch(t, y, None if batch.u is None else u, float(steps.min()),
-                     float(rest.max()), batch.restart)
+        before, self._last = self._last, float(columns[0, -1])
+        return Batch.of(columns, batch.restart, again=batch.again, before=before)
 
     def fresh(self, columns: FloatArray) -> npt.NDArray[np.bool_]:
         """Return which samples are refreshes; those not known yet are kept waiting."""
@@ -202,16 +220,6 @@ class Repeats:
         return fresh
 
 
-def whole(columns: FloatArray) -> Batch | None:
-    """Return a window as one batch; None when it is empty (columns in s)."""
-    t, y, u = columns[:3]
-    if not t.size:
-        return None
-    steps = np.diff(t) if t.size > 1 else np.array([math.inf])
-    return Batch(t, y, None if np.isnan(u).all() else u, float(steps.min()),
-                 float(steps.max()), restart=False)
-
-
 def reading_places(y: FloatArray) -> tuple[npt.NDArray[np.intp], float]:
     """Return where a recorded voltage, V, was read anew, and samples per reading (1: all)."""
     first = max(0, (y.size - _LOOK) // 2)
@@ -227,4 +235,44 @@ def reading_places(y: FloatArray) -> tuple[npt.NDArray[np.intp], float]:
 def refreshes(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, float]:
     """Return a series where its source was read, and samples per reading (t in s)."""
     places, period = reading_places(y)
-    return t[places], y[places], period
+    return reading_times(t[places], period), y[places], period
+
+
+def reading_times(t: FloatArray, period: float) -> FloatArray:
+    """
+    Return when a source was read, from when that was logged first, s.
+
+    A logger is late by up to one of its own steps: where the source keeps a clock of its own, of
+    no whole number of these steps, its readings lie on the even grid nearest to their stamps.
+    """
+    if t.size < 2 or abs(period - round(period)) < _WHOLE:
+        return t
+    usual = (t[-1] - t[0]) / (t.size - 1)
+    grid = on_grid(t, np.maximum(1.0, np.rint(np.diff(t) / usual)))
+    # The logger's step is 1/period of those here.
+    return grid if float(np.abs(t - grid).max()) < 1.5 * usual / period else t
+
+
+def on_grid(t: FloatArray, number: FloatArray) -> FloatArray:
+    """Return the even grid nearest to stamps (t in s, number of steps between them, result s)."""
+    k = np.concatenate(([0.0], np.cumsum(number)))
+    k -= k.mean()
+    middle = float(t.mean())
+    grid: FloatArray = middle + float(k @ (t - middle)) / float(k @ k) * k
+    return grid
+
+
+def readings_of(recording: Recording) -> Recording:
+    """Return a recording with each reading of its source once; a note says what that took."""
+    places, period = reading_places(recording.voltage)
+    if period <= 1.0:
+        return recording
+    t = reading_times(recording.t[places], period)
+    held = recording.n - t.size
+    logged = (recording.n - 1) / recording.duration
+    note = (f'The voltage was read at {(t.size - 1) / float(t[-1] - t[0]):.4g} Hz and logged at '
+            f'{logged:.4g} Hz: {held} repeats were left out.')
+    return replace(
+        recording, t=t, voltage=recording.voltage[places], throttle=recording.throttle[places],
+        current=None if recording.current is None else recording.current[places],
+        notes=(*recording.notes, note), held=recording.held + held)

@@ -71,7 +71,6 @@ def test_json(log, tmp_path, capsys):
     (GOOD, ['log.csv', 'out', '--flight', '0'], ["'0'"]),
     (GOOD, ['log.csv', 'out', '--voltage', 'volts'], ["no voltage 'volts'", 'voltage_v']),
     (GOOD, ['log.csv', 'out', '--voltage', 'throttle'], ['is a throttle']),
-    (GOOD, ['log.csv', 'out', '--drop-held', '--drop-repeats'], ['not allowed with']),
     ('time_s,volts\n0,5\n1,5\n', ['log.csv', 'out', '--list', 'x'], ['further argument']),
     ('time_s,voltage_v\n', ['log.csv', 'out'], ['no line below']),
     ('time_s,voltage_v\n1.7e12,5\n1.8e12,5\n', ['log.csv', 'out'],

@@ -5,8 +5,8 @@ import math
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor import SlidingEstimator
-from ou_monitor.records import Counters, Flag, Status
-from ou_monitor.timeline.refresh import Batch, refresh_period, Repeats, whole
+from ou_monitor.records import Counters, Flag, Recording, Status
+from ou_monitor.timeline.refresh import Batch, readings_of, refresh_period, Repeats
 import pytest
 from scipy.signal import lfilter
 from simulated_windows import ALPHA, DT, errors, estimate, LEVEL, paths, SIGMA, stamps
@@ -145,7 +145,7 @@ def test_a_known_period_is_kept_until_contradicted():
 def batch(y, first=0):
     """Return samples at 1, 2, 3..."""
     t = 1.0 + first + np.arange(len(y))
-    return Batch(t, np.asarray(y, dtype=np.float64), None, 1.0, 1.0, False)
+    return Batch(t, np.asarray(y, dtype=np.float64), None, None, 1.0, 1.0, False)
 
 
 def dropped_to(y, period, sizes=()):
@@ -191,13 +191,12 @@ def test_steps_and_throttle_of_refreshes():
     first = repeats.drop(batch(y[:8]))
     assert (first.shortest, first.longest, first.u) == (4.0, 4.0, None)
     part = batch(y[8:], 8)
-    second = repeats.drop(Batch(part.t, part.y, np.arange(8.0), 1.0, 1.0, False))
+    second = repeats.drop(Batch(part.t, part.y, np.arange(8.0), None, 1.0, 1.0, False))
     assert second.t.tolist() == [9.0, 13.0] and second.u.tolist() == [0.0, 4.0]
     assert (second.shortest, second.longest) == (4.0, 4.0)
     assert repeats.drop(batch([4.0], 16)) is None
     repeats.forget()
     assert repeats.drop(batch([4.0], 30)).t.tolist() == [31.0]
-    assert whole(np.empty((5, 0))) is None
 
 
 @pytest.mark.parametrize('factor', FACTORS + RATIOS[:2])
@@ -283,3 +282,34 @@ def test_a_source_that_stops_repeating():
             assert Flag.HELD_SAMPLES in e.flags and e.n <= 105
     assert Flag.HELD_SAMPLES not in e.flags and e.status is Status.OK
     assert e.n >= 970 and e.rate == pytest.approx(1000.0, rel=0.01)
+
+
+@pytest.mark.parametrize('period', [2, 2.5, 3.3, 10])
+def test_a_recording_holds_each_reading_once(period):
+    """
+    Each but the first, also one that repeats the value before; throttle and current beside it.
+
+    A logger of 500 Hz is up to 2 ms late; where its source has a clock of its own the stamps are
+    put on the even grid of that, which is true to the mean of that.
+    """
+    rng = np.random.default_rng(12)
+    fresh = np.rint(rng.standard_normal(400) * 5) / 100 + 5
+    place = np.floor(np.arange(int(400 * period)) / period).astype(int)
+    t = 0.002 * np.arange(place.size)
+    found = readings_of(Recording(t, fresh[place], 0.1 * t, current=2.0 * t))
+    assert int((np.diff(fresh) == 0).sum()) > 10
+    np.testing.assert_array_equal(found.voltage, fresh[1:1 + found.n])
+    assert found.n >= 398 and found.held == t.size - found.n
+    read = 0.002 * period * np.arange(1, 1 + found.n)
+    assert np.abs(found.t - read - np.median(found.t - read)).max() < 0.002
+    np.testing.assert_allclose(found.throttle, 0.1 * found.t, atol=2.1e-4)
+    np.testing.assert_allclose(found.current, 20.0 * found.throttle)
+    assert readings_of(found) is found
+
+
+def test_ties_without_a_period_are_readings():
+    """Where repeats come at no steady distance nothing is left out."""
+    rng = np.random.default_rng(13)
+    values = np.rint(rng.standard_normal(3000)) / 100 + 5
+    one = Recording(0.01 * np.arange(3000), values, np.full(3000, math.nan))
+    assert readings_of(one) is one and one.held == 0

@@ -18,14 +18,15 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.model import arma
 from ou_monitor.online.estimator.fit import fit_window, Fitted, from_window, TREND_SCORE
-from ou_monitor.online.estimator.intake import as_column, BATCH, Intake, Thinner
 from ou_monitor.online.estimator.irregular import ExactFit, fit_irregular, MOST
 from ou_monitor.online.estimator.quality import (
-    examine, input_flags, judge, Quality, recount, TAIL)
+    examine, input_flags, judge, Quality, recount)
 from ou_monitor.online.estimator.series import T, U, Y
+from ou_monitor.online.estimator.thinner import Thinner
 from ou_monitor.online.estimator.window import FACTOR, FEWEST, LAGS, LOST, Resolution, Sums
 from ou_monitor.records import Counters, Estimate, FloatArray, NAN, Status
-from ou_monitor.timeline.refresh import Batch, refresh_period, Repeats, whole
+from ou_monitor.timeline.line import as_column, BATCH, TAIL, TimeLine
+from ou_monitor.timeline.refresh import Batch
 
 # Samples from which a fit is tried.
 MIN_SAMPLES = 20
@@ -44,8 +45,6 @@ _EXACT = 1e-14
 _RAMP = 1e-9
 # The quality of the input is looked at this many times per window.
 _LOOKS = 4
-# Where repeats are looked for: a third of the samples repeat at two a refresh, or more.
-_TIED = 0.25
 _DOUBLE = np.dtype(np.float64)
 
 
@@ -69,12 +68,12 @@ class SlidingEstimator:
 
     """
 
-    def __init__(self, window: float = 2.0, *, fastest: float = 1.0e4) -> None:
+    def __init__(self, window: float = 2.0, *, fastest: float = 1.0e4,
+                 line: TimeLine | None = None) -> None:
         self._window = _positive('window', window, 's')
-        self._intake = Intake()
+        self._line = TimeLine() if line is None else line
         self._fastest = _positive('fastest', fastest, 'Hz')
         self._thinner = Thinner(self._fastest)
-        self._repeats = Repeats()
         self._finest = Resolution(self._window)
         self._tail = np.empty(0)
         self._quality = Quality()
@@ -103,8 +102,8 @@ class SlidingEstimator:
     def reset(self) -> None:
         """Clear the window; the counters go on."""
         self._work_off()
-        self._intake.forget()
-        self._intake.count(resets=1)
+        self._line.forget()
+        self._line.count(resets=1)
         self._forget()
         self._cached = self._last = None
 
@@ -138,9 +137,9 @@ class SlidingEstimator:
                 is volts.dtype and stamps.ndim == 1 == volts.ndim):
             if isinstance(stamps, float) and isinstance(volts, float) and (
                     throttle is None or isinstance(throttle, (float, int))):
-                if not self._intake.put_one(stamps, volts, throttle):
+                if not self._line.put_one(stamps, volts, throttle):
                     self._work_off()
-                    self._intake.put_one(stamps, volts, throttle)
+                    self._line.put_one(stamps, volts, throttle)
                 return
             stamps, volts = as_column(stamps), as_column(volts)
         if len(stamps) != len(volts) or stamps.ndim != 1 or volts.ndim != 1:
@@ -158,7 +157,7 @@ class SlidingEstimator:
                 raise ValueError(
                     f'throttle must be one number or have the shape of t, {stamps.shape}: got '
                     f'{load.shape}')
-        put = self._intake.put
+        put = self._line.put
         if put(stamps, volts, load):
             return
         for begin in range(0, stamps.size, BATCH):
@@ -169,11 +168,11 @@ class SlidingEstimator:
     def estimate(self) -> Estimate:
         """Return the estimate for the window that ends at the newest sample."""
         if self._cached is None:
-            used = self._intake.used
+            used = self._line.used
             self._work_off()
-            if self._last is not None and self._intake.used == used == self._last.counters.used:
+            if self._last is not None and self._line.used == used == self._last.counters.used:
                 # Nothing new in the window: the same numbers, not merely close ones.
-                self._last = recount(self._last, self._intake.counters)
+                self._last = recount(self._last, self._line.counters)
             else:
                 self._last = self._estimate()
             self._cached = self._last
@@ -182,59 +181,38 @@ class SlidingEstimator:
     @property
     def counters(self) -> Counters:
         """Return what became of the samples worked off so far."""
-        return self._intake.counters
+        return self._line.counters
 
     def _work_off(self) -> None:
         """Move what has been pushed into the window."""
-        if not self._intake.waiting:
+        if not self._line.waiting:
             return
-        for batch in self._intake.work_off(self._window):
-            if batch.restart:
-                self._forget()
-            raw = batch.y
-            self._tail = raw[-TAIL:].copy() if raw.size >= TAIL else np.concatenate(
-                [self._tail, raw])[-TAIL:]
-            if self._looked == -math.inf and self._tail.size >= TAIL and (
-                    self._repeats.period == 1.0) and _ties(self._tail) > _TIED:
-                # Before the first estimate: where the source is thinned it would be too late.
-                self._refresh(refresh_period(self._tail))
-            self._add(batch)
+        for batch in self._line.work_off(self._window):
+            self.take(batch)
 
-    def _add(self, batch: Batch | None) -> None:
-        """Add samples to the window, less repeats of a source known to repeat."""
-        if batch is not None and self._repeats.period > 1.0:
-            size = batch.t.size
-            batch = self._repeats.drop(batch)
-            dropped = size - (0 if batch is None else batch.t.size)
-            self._intake.count(held=dropped, used=-dropped)
-        if batch is not None:
-            t, y, u, breaks, restart = self._thinner.take(batch)
-            if restart:
-                # Block means of another size do not go with the old ones.
-                self._intake.count(resets=1)
-                self._finest.clear()
-                self._start = None
-            self._finest.add(t, y, u, breaks)
-
-    def _refresh(self, period: float) -> None:
-        """Take the window again, less repeats, when a source is found to repeat its last value."""
-        before, self._repeats.period = self._repeats.period, period
-        if period == 1.0:
-            self._repeats.forget()
-        if before > 1.0 or period == 1.0:
-            return
-        again = whole(self._finest.series.all_columns()) if self._thinner.m == 1 else None
-        if again is None and self._finest.series.size:
-            # Means of repeats and refreshes cannot be told apart.
-            self._intake.count(resets=1)
-        self._finest.clear()
-        self._thinner = Thinner(self._fastest)
-        self._start = None
-        self._add(again)
+    def take(self, batch: Batch) -> None:
+        """Take readings in order, as `TimeLine` gives them."""
+        self._cached = None
+        if batch.restart:
+            self._forget()
+        if batch.again:
+            # Means of repeats and readings cannot be told apart.
+            self._finest.clear()
+            self._thinner = Thinner(self._fastest)
+            self._tail = np.empty(0)
+            self._start = None
+        self._tail = batch.y[-TAIL:].copy() if batch.y.size >= TAIL else np.concatenate(
+            [self._tail, batch.y])[-TAIL:]
+        t, y, u, breaks, restart = self._thinner.take(batch)
+        if restart:
+            # Block means of another size do not go with the old ones.
+            self._line.count(resets=1)
+            self._finest.clear()
+            self._start = None
+        self._finest.add(t, y, u, breaks)
 
     def _forget(self) -> None:
         self._thinner.forget()
-        self._repeats.forget()
         self._finest.clear()
         self._tail = np.empty(0)
         self._looked = -math.inf
@@ -243,9 +221,7 @@ class SlidingEstimator:
     def _look(self, t: float) -> Quality:
         """Examine the raw samples, now and then."""
         if not 0.0 <= t - self._looked < self._window / _LOOKS:
-            self._quality = examine(self._tail, self._repeats.period)
-            if self._quality.held != self._repeats.period:
-                self._refresh(self._quality.held)
+            self._quality = examine(self._tail, self._line.period)
             steps = np.diff(self._finest.series.column(T)[-TAIL:])
             self._jitter = float(np.std(steps)) if steps.size else 0.0
             self._looked = t
@@ -253,16 +229,16 @@ class SlidingEstimator:
 
     def _estimate(self) -> Estimate:
         """Fit the window."""
-        series, intake = self._finest.series, self._intake
-        quality = self._look(intake.newest) if series.size else self._quality
-        counters = intake.counters
+        series, line = self._finest.series, self._line
+        quality = self._look(line.newest) if series.size else self._quality
+        counters = line.counters
         if not series.size:
-            waiting = self._thinner.waiting(intake.newest - self._window)
+            waiting = self._thinner.waiting(line.newest - self._window)
             n = waiting.size
             if not n:
                 return Estimate(counters=counters)
-            duration = intake.newest - waiting.item(0)
-            return Estimate(t=intake.newest, voltage=float(self._tail[-1]), n=n,
+            duration = line.newest - waiting.item(0)
+            return Estimate(t=line.newest, voltage=float(self._tail[-1]), n=n,
                             duration=duration, rate=(n - 1) / duration if duration else NAN,
                             counters=counters, status=Status.TOO_FEW_SAMPLES,
                             flags=tuple(input_flags(counters, quality, NAN)))
@@ -270,7 +246,7 @@ class SlidingEstimator:
         duration = main.item(T, end - 1) - main.item(T, at)
         m, n = self._thinner.m, end - at
         measured: dict[str, Any] = {
-            't': intake.newest, 'voltage': self._tail.item(-1), 'throttle': series.last(U),
+            't': line.newest, 'voltage': self._tail.item(-1), 'throttle': series.last(U),
             'n': n * m, 'duration': duration, 'counters': counters,
             'rate': (n - 1) * m / duration if duration > 0.0 else NAN}
         status = None
@@ -382,11 +358,6 @@ def _increments(sums: Sums, lag: int) -> tuple[float, float]:
     pairs = max(sums.pairs.item(lag - 1), 1.0)
     square = sums.spread.item(lag - 1, 0, 0) / pairs
     return square, square - (sums.change.item(lag - 1, 0) / pairs) ** 2
-
-
-def _ties(y: FloatArray) -> float:
-    """Return the share of samples that are equal to the one before."""
-    return float(np.count_nonzero(y[1:] == y[:-1])) / y.size
 
 
 def _positive(name: str, value: float, unit: str) -> float:

@@ -21,10 +21,7 @@ from typing import Any
 import numpy as np
 from ou_monitor.online.estimator.fit import Fitted, Outcome
 from ou_monitor.records import Counters, Estimate, Flag, FloatArray, NAN, Status
-from ou_monitor.timeline.refresh import refresh_period
 
-# Raw samples looked at.
-TAIL = 1024
 # Fewest samples from which anything is told.
 _ENOUGH = 64
 # A lattice needs this many different steps, all whole multiples of one, and
@@ -42,7 +39,7 @@ _CLIPPED_EXCESS = 3.0
 @dataclass(frozen=True)
 class Quality:
     """
-    Findings about raw samples.
+    Findings about readings.
 
     Attributes
     ----------
@@ -63,21 +60,18 @@ class Quality:
     rms_increment: float = math.nan
 
 
-def examine(y: FloatArray, known: float = 1.0) -> Quality:
-    """Return what the raw samples show (y in V)."""
+def examine(y: FloatArray, held: float = 1.0) -> Quality:
+    """Return what readings show (y in V, samples a reading before repeats were left out)."""
     if y.size < _ENOUGH:
-        return Quality(held=known)
+        return Quality(held=held)
     steps = np.diff(y)
     changes = np.flatnonzero(steps)
     if changes.size < _FEWEST_STEPS:
-        return Quality(held=known)
-    sizes = np.abs(steps[changes])
-    held = refresh_period(y, known)
-    fresh = sizes if held > 1.0 else steps
+        return Quality(held=held)
     # Where many neighbours are equal, a few different steps are a lattice, too.
-    tied = held == 1.0 and changes.size < _TIED * steps.size
-    return Quality(lattice(sizes, 1 if tied else _FEWEST_STEPS), held, _piles_up(y, held),
-                   float(np.sqrt(np.mean(fresh * fresh))))
+    tied = changes.size < _TIED * steps.size
+    return Quality(lattice(np.abs(steps[changes]), 1 if tied else _FEWEST_STEPS), held,
+                   _piles_up(y), float(np.sqrt(np.mean(steps * steps))))
 
 
 def lattice(sizes: FloatArray, fewest: int = _FEWEST_STEPS) -> float:
@@ -99,12 +93,12 @@ def lattice(sizes: FloatArray, fewest: int = _FEWEST_STEPS) -> float:
     return unit if bool((np.abs(ordered - multiples * unit) < 0.02 * unit).all()) else 0.0
 
 
-def _piles_up(y: FloatArray, held: float) -> bool:
+def _piles_up(y: FloatArray) -> bool:
     """Whether one extreme is far more common than the value next to it."""
     values, counts = np.unique(y, return_counts=True)
     if values.size < _FEWEST_STEPS:
         return False
-    least = max(10.0 * held, _CLIPPED_SHARE * y.size)
+    least = max(10.0, _CLIPPED_SHARE * y.size)
     for edge, beside in ((0, 1), (-1, -2)):
         if counts[edge] >= least and counts[edge] > _CLIPPED_EXCESS * counts[beside]:
             return True

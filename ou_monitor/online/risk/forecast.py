@@ -27,7 +27,6 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-import numpy.typing as npt
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import LoadState
 from ou_monitor.online.risk.first_passage import Passage
@@ -35,6 +34,7 @@ from ou_monitor.online.risk.futures import (
     BLOCK, excursion_risk, excursions, Flown, flown, Futures, held, lowest, mean_now, Past, pilot,
     Sampling)
 from ou_monitor.records import FloatArray, NAN
+from ou_monitor.timeline.refresh import Batch
 
 # Degrees of freedom: tails of a model that is wrong now and then.
 FREEDOM = 5.0
@@ -269,50 +269,31 @@ class Forecast:
             rung.looks.clear()
             rung.next = rung.learned = -math.inf
 
-    def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike, throttle: npt.ArrayLike | None,
-             current: npt.ArrayLike | None = None, arrival: npt.ArrayLike | None = None
-             ) -> None:
-        """
-        Add samples, s, V, 0..1, A; NaN is unknown.
-
-        arrival: when each came, s, on a monotonic clock, where they come one after another.
-        """
-        stamps, volts = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in (t, voltage))
-        u, drawn = (np.broadcast_to(np.asarray(NAN if x is None else x, dtype=np.float64),
-                                    stamps.shape) for x in (throttle, current))
-        came = np.full(stamps.shape, math.inf) if arrival is None else np.asarray(
-            arrival, dtype=np.float64)
-        begin, n = 0, stamps.size
+    def take(self, batch: Batch, came: float = math.inf) -> None:
+        """Take readings; the last came at a time, s, on a monotonic clock; inf: not known."""
+        t, v, u, drawn = batch.columns()
+        if t[0] < self._newest - _BACKWARDS:
+            self.new_time_line()
+        begin, n = 0, t.size
         while begin < n:
-            # As far as the next look; stamps that go back are looked at one by one.
-            ahead = np.flatnonzero((stamps[begin:] >= self._next) & (came[begin:] >= self._rested))
-            back = np.flatnonzero(np.diff(stamps[begin:]) < -_BACKWARDS)
-            end = min([begin + int(ahead[0]) + 1] if ahead.size else [n],
-                      [begin + int(back[0]) + 1] if back.size else [n])[0]
+            # As far as the next look.
+            ahead = np.flatnonzero(t[begin:] >= self._next) if came >= self._rested else ()
+            end = begin + int(ahead[0]) + 1 if len(ahead) else n
             part = slice(begin, end)
-            self._loads.push(stamps[part], volts[part], u[part], drawn[part])
-            self._take(stamps[part], volts[part], u[part], came.item(end - 1))
+            self._loads.push(t[part], v[part], u[part], drawn[part])
+            self._take(t[part], v[part], np.clip(u[part], 0.0, 1.0))
+            if self._newest >= self._next and came >= self._rested:
+                self._next = self._newest + LOOK
+                self._rested = came + _REST if math.isfinite(came) else -math.inf
+                self._look()
             begin = end
 
-    def _take(self, t: FloatArray, v: FloatArray, u: FloatArray, came: float) -> None:
-        """Take samples up to a look; the last came at a time, s, inf where that is not known."""
-        good = np.isfinite(t) & np.isfinite(v)
-        t, v, u = t[good], v[good], np.clip(u[good], 0.0, 1.0)
-        if t.size and t[0] < self._newest - _BACKWARDS:
-            self.new_time_line()
-        rises = t > np.maximum.accumulate(np.concatenate(([self._newest], t)))[:-1]
-        t, v, u = t[rises], v[rises], u[rises]
-        if not t.size:
-            return
+    def _take(self, t: FloatArray, v: FloatArray, u: FloatArray) -> None:
         self._begun = t.item(0) if math.isnan(self._begun) else self._begun
         self._samples += t.size
         self._newest = t.item(-1)
         self._last = np.concatenate((self._last, v))[-3:]
         self._past.push(t, v, u)
-        if self._newest >= self._next and came >= self._rested:
-            self._next = self._newest + LOOK
-            self._rested = came + _REST if math.isfinite(came) else -math.inf
-            self._look()
 
     @property
     def flown(self) -> tuple[float, float]:

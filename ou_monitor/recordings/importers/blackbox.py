@@ -2,7 +2,7 @@
 Betaflight and INAV blackbox, read by orangebox.
 
 Limits first: the ADC is read more slowly than is logged, so most voltages are
-repeats (``--drop-held``).  Frames that were predicted from damaged ones are
+repeats.  Frames that were predicted from damaged ones are
 left out up to the next key frame.  orangebox is under GPL-3; nothing of it is
 loaded for other formats.  The axes are Betaflight's own (x forwards, y left, z up),
 which are those of `base_link`.

@@ -5,10 +5,6 @@ The battery is meant when nothing is said, never a rail behind a regulator; of
 several batteries the user chooses.  For the throttle the smallest rank is
 taken: what goes to the motors before what the stick asks for.
 
-Limits of dropping repeats: where they come at no steady distance, those of the logger
-are not told from two readings that agree; then nothing is dropped, unless every
-repeat is to go, which selects changes and makes noise look larger.
-
 Of gyro and accelerometer, rows with a number that is not finite are dropped whole.
 """
 
@@ -28,7 +24,6 @@ from ou_monitor.recordings.importers.log import (
 from ou_monitor.recordings.samples import check_throttle
 from ou_monitor.records import FloatArray
 from ou_monitor.text import printable
-from ou_monitor.timeline.refresh import refreshes
 
 # What leaves a quantity out.
 NONE = 'none'
@@ -202,27 +197,6 @@ def _also(log: Log, chosen: tuple[Series, Series | None], option: str) -> list[s
             notes.append(f'Also in the log: {_listed(others)} '
                          f'({option.format(quantity)} NAME).')
     return notes
-
-
-def drop_held(series: Series, *, every: bool = False) -> tuple[Series, str]:
-    """Return a series without repeats, and one sentence on what was done."""
-    share = series.repeats
-    t, values, period = refreshes(series.t, series.values)
-    if period > 1.0:
-        kept = replace(series, t=t, values=values)
-        words = (f'refreshed every {period:.4g} samples: {series.n - kept.n} of {series.n} '
-                 'held samples dropped')
-    elif every and share > 0.0:
-        fresh = np.ones(series.n, dtype=bool)
-        fresh[1:] = np.diff(series.values) != 0.0
-        kept = replace(series, t=series.t[fresh], values=series.values[fresh])
-        words = (f'{series.n - kept.n} of {series.n} repeats dropped; they come at no steady '
-                 'distance, so readings that agree went too')
-    else:
-        kept = series
-        words = (f'nothing dropped: {share:.0%} of the increments are zero, at no steady distance'
-                 if share > 0.0 else 'nothing dropped: no sample repeats the one before')
-    return kept, f'{series.name}: {words}.'
 
 
 IMU, SPEEDS = 'imu', 'motor_speed'

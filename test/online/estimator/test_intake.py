@@ -4,7 +4,8 @@ import copy
 import math
 
 import numpy as np
-from ou_monitor.online.estimator.intake import as_column, BATCH, Intake, Thinner
+from ou_monitor.online.estimator.thinner import Thinner
+from ou_monitor.timeline.line import as_column, BATCH, TimeLine
 import pytest
 
 DT = 1e-3
@@ -12,7 +13,7 @@ DT = 1e-3
 
 def batches(t, y=None, window=1.0, intake=None, u=None):
     """Return the batches of one push, and the intake."""
-    intake = intake or Intake()
+    intake = intake or TimeLine()
     t = np.asarray(t, dtype=float)
     assert intake.put(t, np.zeros(t.size) if y is None else np.asarray(y, dtype=float), u)
     return intake.work_off(window), intake
@@ -27,7 +28,7 @@ def taken(thinner, t, y=None, u=None, window=1e9):
 
 def test_room_is_limited():
     """A full buffer refuses, and has not changed."""
-    intake = Intake()
+    intake = TimeLine()
     assert intake.put(np.zeros(BATCH - 1), np.zeros(BATCH - 1), None)
     assert not intake.put(np.zeros(2), np.zeros(2), None)
     assert intake.waiting == BATCH - 1
@@ -37,7 +38,7 @@ def test_room_is_limited():
 
 
 def test_throttle_does_not_leak_into_the_next_batch():
-    intake = Intake()
+    intake = TimeLine()
     got, _ = batches([0.0, 0.1], intake=intake, u=0.7)
     assert got[0].u.tolist() == [0.7, 0.7]
     intake.put(np.array([0.2]), np.zeros(1), 0.1)
@@ -56,7 +57,7 @@ def test_any_array_of_doubles_is_copied():
     fixed = plain.copy()
     fixed.setflags(write=False)
     for y in (np.repeat(plain, 3)[::3], plain[::-1].copy()[::-1], fixed, records['y']):
-        intake = Intake()
+        intake = TimeLine()
         assert intake.put(np.empty(0), np.empty(0), np.empty(0))
         assert intake.put(0.1 * plain, y, y)
         assert intake.put(0.1 * plain + 1.0, np.broadcast_to(2.0, 4), np.broadcast_to(0.5, 4))
@@ -67,7 +68,7 @@ def test_any_array_of_doubles_is_copied():
 
 def test_a_copy_has_buffers_of_its_own():
     """Both go on from what had been pushed, apart."""
-    intake = Intake()
+    intake = TimeLine()
     intake.put(np.array([0.1]), np.array([1.0]), None)
     other = copy.deepcopy(intake)
     intake.put(np.array([0.2]), np.array([2.0]), None)
@@ -152,7 +153,7 @@ def test_uneven_steps_break_runs(factor, broken):
 
 def test_a_gap_between_pushes_breaks_runs():
     thinner = Thinner(1e4)
-    intake = Intake()
+    intake = TimeLine()
     for begin, expected in ((0.0, [0]), (0.1, []), (0.3, [0])):
         got, _ = batches(begin + np.arange(100) * DT, intake=intake)
         assert thinner.take(got[0])[3].tolist() == expected
@@ -162,7 +163,7 @@ def test_a_gap_between_pushes_breaks_runs():
 def test_a_new_rate_is_learnt_when_steps_are_off(factor, learnt):
     """Steps within half of the usual are jitter; beyond, the median of a batch counts."""
     thinner = Thinner(1e4)
-    intake = Intake()
+    intake = TimeLine()
     thinner.take(batches(np.arange(100) * DT, intake=intake)[0][0])
     thinner.take(batches(0.1 + np.arange(100) * DT * factor, intake=intake)[0][0])
     assert thinner.step == pytest.approx(factor * DT if learnt else DT)
@@ -172,7 +173,7 @@ def test_a_new_rate_is_learnt_when_steps_are_off(factor, learnt):
 def test_a_slightly_other_rate_is_the_same(factor, learnt):
     """A gap makes the rate looked at; below 1.3 times the usual step it is kept."""
     thinner = Thinner(1e4)
-    intake = Intake()
+    intake = TimeLine()
     thinner.take(batches(np.arange(100) * DT, intake=intake)[0][0])
     thinner.take(batches(0.2 + np.arange(300) * DT * factor, intake=intake)[0][0])
     assert thinner.step == pytest.approx(factor * DT if learnt else DT)
@@ -180,7 +181,7 @@ def test_a_slightly_other_rate_is_the_same(factor, learnt):
 
 def test_a_lone_gap_does_not_change_the_rate():
     thinner = Thinner(1e4)
-    intake = Intake()
+    intake = TimeLine()
     thinner.take(batches(np.arange(100) * DT, intake=intake)[0][0])
     thinner.take(batches([0.5], intake=intake)[0][0])
     thinner.take(batches([0.9], intake=intake)[0][0])
@@ -190,7 +191,7 @@ def test_a_lone_gap_does_not_change_the_rate():
 def test_block_size_that_changes_restarts():
     """From 100 kHz to 1 MHz blocks of ten become blocks of a hundred."""
     thinner = Thinner(1e4)
-    intake = Intake()
+    intake = TimeLine()
     kept = thinner.take(batches(np.arange(1000) * 1e-5, intake=intake)[0][0])
     assert not kept[4] and thinner.m == 10
     kept = thinner.take(batches(0.01 + np.arange(1000) * 1e-6, intake=intake)[0][0])

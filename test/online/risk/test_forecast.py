@@ -13,6 +13,7 @@ from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.risk.forecast import Forecast
 from ou_monitor.online.risk.futures import held, lowest, mean_now
 from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.timeline.refresh import Batch
 from project import ROOT
 import pytest
 from scipy.signal import lfilter
@@ -21,6 +22,11 @@ from scipy.stats import t as student
 RATE, SECONDS, FLOWN = 50.0, 80.0, 3000
 DT = 1.0 / RATE
 LOOK = round(0.4 * RATE)
+
+
+def batch(t, v):
+    """Return readings without throttle."""
+    return Batch.of(np.stack((t, v, *np.full((2, t.size), math.nan))), restart=False)
 
 
 def telegraph(rng, n):
@@ -297,7 +303,7 @@ def test_first_passage_by_its_odds():
     """19 to 1 before any horizon has spoken, and a twentieth of it to the excursions."""
     _, v, _ = flight('telegraph')
     forecast = Forecast(LoadFilter(), lambda horizon: None)
-    forecast.push(np.arange(300) * DT, v[:300], None)
+    forecast.take(batch(np.arange(300) * DT, v[:300]))
     far = forecast.risk(15.0, 1.0)
     assert far.basis == 'excursions' and 0.0 < far.risk < 1.0
     both = forecast.risk(15.0, 1.0, 0.9)
@@ -319,7 +325,7 @@ def test_the_leg_that_predicts_better_stands(wrong):
     supply = Supply(15.0 + 4.0 * deviation * wrong, 0.0, math.log(alpha), 0.0, log_sigma, 0.0)
     forecast = Forecast(LoadFilter(), lambda horizon: Passage(supply, newest[0], 0.0))
     for k in range(0, 3000, 10):
-        forecast.push((k + np.arange(10)) * DT, v[k:k + 10], None)
+        forecast.take(batch((k + np.arange(10)) * DT, v[k:k + 10]))
         newest[0] = float(v[k + 9])
     assert forecast.risk(14.0, 1.0, 0.3).basis == ('excursions' if wrong else 'first_passage')
 

@@ -3,9 +3,10 @@
 from made_logs import blackbox, END, quad
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.importers.choose import choose, drop_held
+from ou_monitor.recordings.importers.choose import choose
 from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import Request
+from ou_monitor.recordings.read import read_recording
 import pytest
 
 TIME, STICK, VOLTS, AMPERES = 1, 2, 3, 4
@@ -126,13 +127,13 @@ def test_frames_before_the_first_key_frame(tmp_path):
     assert 'without a sound key frame before them dropped' in log.notes[0]
 
 
-def test_held_samples(tmp_path):
-    """The refreshes of the ADC are found again, but for the first: its beginning is not logged."""
+def test_readings_of_the_adc(tmp_path):
+    """They are found again, but for the first: its beginning is not logged."""
     rows = quad(2000, refresh=5)
-    path, log = load(tmp_path, blackbox(rows))
-    kept, sentence = drop_held(choose(path, log).voltage)
-    assert '1601 of 2000 held samples dropped' in sentence
-    np.testing.assert_allclose(kept.values, rows[5::5, VOLTS] / 100)
+    path, _ = load(tmp_path, blackbox(rows))
+    found = read_recording(path)
+    assert found.held == 1601
+    np.testing.assert_allclose(found.voltage, rows[5::5, VOLTS] / 100, rtol=1e-6)
 
 
 def test_cut_anywhere(tmp_path):

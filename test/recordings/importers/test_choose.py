@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.importers.choose import choose, drop_held
+from ou_monitor.recordings.importers.choose import choose
 from ou_monitor.recordings.importers.log import (
     clean, CURRENT, from_start, Log, Series, start_of, THROTTLE, VOLTAGE)
 import pytest
@@ -128,30 +128,3 @@ def test_from_start():
     t = np.concatenate(([0.0], 1e5 + np.arange(100.0)))
     broken = series(t=t, values=t)
     assert from_start([broken], start_of([broken]))[0].t[1] == 0.0
-
-
-@pytest.mark.parametrize('period', [2, 2.5, 3.3, 10])
-def test_held_samples_are_dropped_by_their_period(period):
-    """Each refresh but the first is kept once, also one that repeats the value before."""
-    rng = np.random.default_rng(12)
-    fresh = np.rint(rng.standard_normal(400) * 5) / 100 + 5
-    place = np.floor(np.arange(int(400 * period)) / period).astype(int)
-    t = 0.002 * np.arange(place.size)
-    kept, sentence = drop_held(series(t=t, values=fresh[place]))
-    ties = int((np.diff(fresh) == 0).sum())
-    assert ties > 10
-    np.testing.assert_array_equal(kept.values, fresh[1:1 + kept.n])
-    assert kept.n >= 398 and 'held samples dropped' in sentence
-
-
-def test_ties_without_a_period():
-    """Where repeats come at no steady distance nothing is dropped, unless all are to go."""
-    rng = np.random.default_rng(13)
-    values = np.rint(rng.standard_normal(3000)) / 100 + 5
-    one = series(t=0.01 * np.arange(3000), values=values)
-    kept, sentence = drop_held(one)
-    assert kept.n == 3000 and 'no steady distance' in sentence
-    kept, sentence = drop_held(one, every=True)
-    assert (np.diff(kept.values) != 0).all() and 'readings that agree went too' in sentence
-    kept, sentence = drop_held(series())
-    assert kept.n == 3 and 'no sample repeats' in sentence

@@ -32,8 +32,7 @@ def test_blackbox_gives_the_table_that_others_made_of_it(folder, tmp_path):
 
     """
     out = tmp_path / 'gecko'
-    assert main(['convert', str(folder / 'raw' / 'ie_btfl_002.bbl'), str(out),
-                 '--drop-held']) == 0
+    assert main(['convert', str(folder / 'raw' / 'ie_btfl_002.bbl'), str(out)]) == 0
     table = np.loadtxt(folder / 'bf_gecko_a.csv', delimiter=',', skiprows=1)
     back = read_recording(out)
     assert back.source['log_vehicle'] == back.source['vehicle'] == 'Gecko'
