@@ -30,7 +30,7 @@ from mcap_ros2.decoder import DecoderFactory  # noqa: E402
 import numpy as np  # noqa: E402
 from ou_monitor.recordings.bag import BagReader, BagWriter, batches  # noqa: E402
 from ou_monitor.recordings.cdr import join  # noqa: E402
-from ou_monitor.recordings.read import read_pieces, read_recording  # noqa: E402
+from ou_monitor.recordings.read import read_recording  # noqa: E402
 from ou_monitor.recordings.standard_types import (  # noqa: E402
     BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, SCHEMAS)
 from ou_monitor.recordings.topic_choice import choose  # noqa: E402
@@ -290,7 +290,7 @@ def files(given: argparse.Namespace, folder: Path) -> str:
 
 
 def memory(given: argparse.Namespace, folder: Path) -> str:
-    """Peak memory of a process that reads a long bag, whole and in pieces."""
+    """Peak memory of a process that reads a long bag."""
     path = folder / 'long.mcap'
     rng = np.random.default_rng(1)
     blocks = [encode_block(row) for row in rng.normal(5.0, 0.1, (997, BLOCK))]
@@ -304,8 +304,7 @@ def memory(given: argparse.Namespace, folder: Path) -> str:
             bag.write('voltage', at, blocks[k % len(blocks)])
     rows = []
     for words, how in (('nothing read (Python, NumPy, mcap)', 'none'),
-                       ('whole', 'whole'), ('in pieces of 1 000 000 samples', '1000000'),
-                       ('in pieces of 100 000 samples', '100000')):
+                       ('whole', 'whole')):
         print(words, file=sys.stderr)
         done = subprocess.run([sys.executable, __file__, 'child', str(path), how], check=True,
                               capture_output=True, text=True)
@@ -323,9 +322,6 @@ def child(path: str, how: str) -> None:
     begin, count = time.process_time(), 0
     if how == 'whole':
         count = read_recording(path).n
-    elif how != 'none':
-        for piece in read_pieces(path, samples=int(how)):
-            count += piece.n
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 * 1.048576
     print(count, peak, time.process_time() - begin)
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ou_monitor.online.notch.notch import AdaptiveNotch
     from ou_monitor.online.risk.first_passage import brownout_probability
     from ou_monitor.online.settings import MonitorSettings
-    from ou_monitor.recordings.read import read_pieces, read_recording
+    from ou_monitor.recordings.read import read_recording
     from ou_monitor.records import Estimate, Flag, Recording, Status
 
 __version__ = '0.2.0'
@@ -40,14 +40,13 @@ _HOMES = {
     'brownout_probability': 'ou_monitor.online.risk.first_passage',
     'compare': 'ou_monitor.comparison.compare',
     'discover': 'ou_monitor.discovery.discover',
-    'read_pieces': 'ou_monitor.recordings.read',
     'read_recording': 'ou_monitor.recordings.read',
 }
 
 __all__ = [
     'AdaptiveLowPass', 'AdaptiveNotch', 'Estimate', 'Flag', 'InputError', 'MonitorSettings',
     'Recording', 'SlidingEstimator', 'Status', 'SupplyMonitor', '__version__',
-    'brownout_probability', 'compare', 'discover', 'read_pieces', 'read_recording',
+    'brownout_probability', 'compare', 'discover', 'read_recording',
 ]
 
 

@@ -106,8 +106,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f'{where}: {refusal(error)}', file=sys.stderr)
         return BAD_INPUT
     except MemoryError:
-        print(f'{where}: not enough memory: take a part of the recording (--from, --to), or read '
-              'it in pieces (read_pieces in Python)', file=sys.stderr)
+        print(f'{where}: not enough memory: take a part of the recording (--from, --to)',
+              file=sys.stderr)
         return BAD_INPUT
 
 

@@ -9,7 +9,7 @@ with the other kind is off by the delay of the transmission.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 import math
 from pathlib import Path
@@ -26,17 +26,13 @@ from ou_monitor.recordings.importers.formats import import_log, is_csv, is_log
 from ou_monitor.recordings.importers.log import (
     Log, RawColumns, Request, Series, SIGNAL, UNKNOWN, VOLTAGE)
 from ou_monitor.recordings.samples import (
-    check_throttle, dropped_words, known_current, late_words, overlap, part_words,
-    repeated_words, SampleReader, span_words, usable_voltage)
+    check_throttle, dropped_words, known_current, late_words, outside_words, overlap, part_words,
+    read_bag, repeated_words)
 from ou_monitor.recordings.standard_types import IMU
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.config import FieldSpec
-from ou_monitor.timeline.line import (
-    hold, MOST_CURRENT, plausible, plausible_samples, TimeLine)
+from ou_monitor.timeline.line import MOST_CURRENT, plausible, plausible_samples, TimeLine
 from ou_monitor.timeline.refresh import readings_of
-
-# Samples of a piece, where the caller does not say.
-PIECE = 1_000_000
 
 # Samples further apart, s, are more likely of another unit of time than of a slow logger.
 _SPARSE = 5.0
@@ -118,15 +114,9 @@ def _read(
     if flight is not None or columns is not None:
         raise InputError(f'{path} is a bag: --flight is for logs, names and units of columns are '
                          'for logs and CSVs')
-    reader = SampleReader(
+    return tidy(read_bag(
         BagReader(path, partial=partial), msg_config=msg_config, voltage_topic=voltage_topic,
-        throttle_topic=throttle_topic, start=start, end=end)
-    for _ in reader.batches(progress):
-        pass
-    whole = reader.take()
-    if not whole.n:
-        raise InputError(_nothing(reader, start, end))
-    return replace(whole, notes=(*reader.bag_notes(), *reader.sample_notes()))
+        throttle_topic=throttle_topic, start=start, end=end, progress=progress))
 
 
 def _refuse_topics(path: Path, kind: str, topics: Mapping[str, object]) -> None:
@@ -162,100 +152,11 @@ def _samples(recording: Recording, which: slice | npt.NDArray[np.bool_], notes: 
                    current=None if recording.current is None else recording.current[which])
 
 
-def read_pieces(
-    path: str | Path, *, samples: int = PIECE, msg_config: str | Path | None = None,
-    voltage_topic: str | None = None, throttle_topic: str | None = None, partial: bool = False,
-    start: float | None = None, end: float | None = None,
-    progress: Callable[[float], None] | None = None,
-) -> Iterator[Recording]:
-    """
-    Read a recording that need not fit into memory, piece by piece.
-
-    One after another the pieces are what `read_recording` returns, as long as
-    no sample comes more than `samples` samples late; one that does is dropped,
-    and a note of its piece says so.  A CSV, a log and a bag made of one by
-    `convert` are read whole all the same.
-
-    Parameters
-    ----------
-    path, msg_config, voltage_topic, throttle_topic, partial, start, end, progress :
-        As in `read_recording`.
-    samples : int
-        Samples of a piece; memory holds about twice as many, and the chunks
-        that overlap in time.
-
-    Yields
-    ------
-    Recording
-        Pieces in the order of time, each with its stamps after those of the
-        one before, and the throttle held from piece to piece.  Notes on the
-        bag are in the first piece, notes on all samples in the last.
-
-    Raises
-    ------
-    ValueError
-        When `samples` is not positive.
-    InputError
-        As `read_recording`.
-
-    """
-    if samples < 1:
-        raise ValueError(f'a piece must hold at least 1 sample, got {samples}')
-    path = Path(path)
-    whole: Recording | None = None
-    if is_csv(path) or is_log(path):
-        whole = read_recording(path, msg_config=msg_config, voltage_topic=voltage_topic,
-                               throttle_topic=throttle_topic, start=start, end=end,
-                               progress=progress)
-    else:
-        _check_part(start, end)
-        reader = SampleReader(
-            BagReader(path, partial=partial), msg_config=msg_config, voltage_topic=voltage_topic,
-            throttle_topic=throttle_topic, start=start, end=end)
-        if True:
-            whole = read_recording(path, msg_config=msg_config, voltage_topic=voltage_topic,
-                                   throttle_topic=throttle_topic, partial=partial, start=start,
-                                   end=end, progress=progress)
-    if whole is not None:
-        for first in range(0, whole.n, samples):
-            yield _samples(whole, slice(first, first + samples),
-                           whole.notes if first == 0 else ())
-        return
-    notes = reader.bag_notes()
-    # One piece is kept back, so that the last one can carry the notes on all.
-    ready: Recording | None = None
-    for piece in _taken(reader, samples, progress):
-        if ready is not None:
-            yield replace(ready, notes=notes)
-            notes = ()
-        ready = piece
-    if ready is None:
-        raise InputError(_nothing(reader, start, end))
-    yield replace(ready, notes=(*notes, *reader.sample_notes()))
-
-
-def _taken(
-    reader: SampleReader, samples: int, progress: Callable[[float], None] | None,
-) -> Iterator[Recording]:
-    """Yield pieces that hold something."""
-    for _ in reader.batches(progress):
-        # As many again stay held, for what comes late.
-        while reader.held >= 2 * samples:
-            piece = reader.take(samples)
-            if piece.n:
-                yield piece
-    while reader.held:
-        piece = reader.take(samples)
-        if piece.n:
-            yield piece
-
-
 def tidy(raw: RawColumns) -> Recording:
-    """Return a `Recording`: in order, each reading once; notes say what that took."""
+    """Return a `Recording`: in order, each stamp once; notes say what that took."""
     name, notes = raw.name, list(raw.notes)
     check_throttle(name, raw.throttle, raw.voltage)
-    # A blank cell is no message: what was commanded last holds.
-    t, voltage, throttle = plausible_samples(raw.t, raw.voltage, hold(raw.throttle))
+    t, voltage, throttle = plausible_samples(raw.t, raw.voltage, raw.throttle)
     good = np.isfinite(t) & np.isfinite(voltage)
     if not good.all():
         notes.append(dropped_words(t.size - int(good.sum()), raw.voltage[~good]))
@@ -272,21 +173,12 @@ def tidy(raw: RawColumns) -> Recording:
         notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '
                      '--time-unit says so of a CSV.')
     _, _, u, i = batch.columns()
-    return readings_of(Recording(batch.t, batch.y, u, name, raw.source, tuple(notes),
-                                 known_current(i)))
+    return Recording(batch.t, batch.y, u, name, raw.source, tuple(notes), known_current(i))
 
 
 def _unusable(name: str, notes: Sequence[str]) -> str:
     why = ' '.join(note for note in notes if 'dropped' in note)
     return f'{name} holds no usable sample' + (f': {why}' if why else '')
-
-
-def _nothing(reader: SampleReader, start: float | None, end: float | None) -> str:
-    """Return why a bag gave no sample."""
-    notes = reader.sample_notes()
-    if (start is None and end is None) or any('dropped' in note for note in notes):
-        return _unusable(reader.name, notes)
-    return _outside(reader.name, start, end, reader.duration)
 
 
 def _check_part(start: float | None, end: float | None) -> None:
@@ -306,12 +198,8 @@ def _cut(recording: Recording, start: float | None, end: float | None) -> Record
     t = recording.t - recording.t[0]
     part = (t >= (start or 0.0)) & (t < (math.inf if end is None else end))
     if not part.any():
-        raise InputError(_outside(recording.name, start, end, float(t[-1])))
+        raise InputError(outside_words(recording.name, start, end, float(t[-1])))
     return _samples(recording, part, (*recording.notes, part_words(start, end)))
-
-
-def _outside(name: str, start: float | None, end: float | None, length: float) -> str:
-    return f'{name} holds no sample {span_words(start, end)}: it lasts {length:.3f} s'
 
 
 def read_beside(

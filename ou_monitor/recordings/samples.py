@@ -1,43 +1,35 @@
 """
-The samples of a bag: batches of messages -> stamps, voltage and throttle in order.
+The samples of a bag, as its messages hold them, with the throttle and the current of each.
 
-Limits first: stamps are put in order among the samples held; one that comes
-later than that is dropped, counted and noted.
+Limits first: a bag is read whole; an hour at 1 kHz takes 150 MB.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-import math
 from pathlib import Path
 import re
 
 import numpy as np
-import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagReader, batches, last_before
-from ou_monitor.recordings.cdr import Column, IntArray, TimeArray
+from ou_monitor.recordings.cdr import Column, IntArray, join
+from ou_monitor.recordings.importers.log import RawColumns
 from ou_monitor.recordings.mcap_file import moment
-from ou_monitor.recordings.topic_choice import choose
-from ou_monitor.records import FloatArray, Recording
+from ou_monitor.recordings.topic_choice import choose, Choice
+from ou_monitor.records import FloatArray
 from ou_monitor.stream.blocks import BlockClock
 from ou_monitor.stream.config import FieldSpec
-from ou_monitor.stream.samples import BoolArray, ThrottleHold
+from ou_monitor.stream.samples import ThrottleHold
 from ou_monitor.text import counted, printable
-from ou_monitor.timeline.line import MOST_CURRENT, MOST_THROTTLE, MOST_VOLTAGE, plausible
+from ou_monitor.timeline.line import MOST_CURRENT, MOST_THROTTLE, MOST_VOLTAGE
 
 VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
 # So many samples behind for each step back are not a few that came late.
 _STRETCH = 20
 # Share of implausible throttles up to which they are errors of single samples.
 _WILD = 0.05
-
-
-def usable_voltage(t: FloatArray, voltage: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return which samples are finite, and of a voltage that there is."""
-    usable: npt.NDArray[np.bool_] = np.isfinite(t) & (np.abs(voltage) <= MOST_VOLTAGE)
-    return usable
 
 
 def dropped_words(count: int, voltage: FloatArray) -> str:
@@ -70,13 +62,13 @@ def known_current(current: FloatArray) -> FloatArray | None:
     return np.where(known, current, np.nan) if known.any() else None
 
 
-def overlap(t: FloatArray, highest: float = -math.inf) -> tuple[int, float]:
+def overlap(t: FloatArray) -> tuple[int, float]:
     """
     Return how many samples lie before one that came earlier, and how far at most, s.
 
-    t in s, highest in s.
+    t in s.
     """
-    ahead = np.maximum(np.maximum.accumulate(t), highest) - t
+    ahead = np.maximum.accumulate(t) - t
     behind = ahead > 0.0
     return int(np.count_nonzero(behind)), float(ahead[behind].max(initial=0.0))
 
@@ -102,25 +94,14 @@ def span_words(start: float | None, end: float | None) -> str:
     return f"from {start or 0.0:g} s to {'the end' if end is None else f'{end:g} s'}"
 
 
+def outside_words(name: str, start: float | None, end: float | None, length: float) -> str:
+    """Return that a recording of a length, s, holds nothing in a part."""
+    return f'{name} holds no sample {span_words(start, end)}: it lasts {length:.3f} s'
+
+
 def part_words(start: float | None, end: float | None) -> str:
     """Return the note on a part."""
     return f'Only the part {span_words(start, end)} of the recording was read.'
-
-
-class _Series:
-    """Stamps and values of one field, as its messages come."""
-
-    def __init__(self, spec: FieldSpec) -> None:
-        self.clock = None if spec.sample_rate is None else BlockClock(spec.sample_rate)
-
-    def samples(self, column: Column) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Return stamps (s), values (NaN where a message holds none), and samples a message."""
-        if self.clock is not None:
-            return (self.clock.stamps_of_many(column.stamp, column.count), column.values,
-                    column.count)
-        values = np.full(column.n, np.nan)
-        values[column.count > 0] = column.values
-        return column.stamp, values, np.ones(column.n, np.int64)
 
 
 def _has_field(bag: BagReader, spec: FieldSpec) -> bool:
@@ -129,215 +110,132 @@ def _has_field(bag: BagReader, spec: FieldSpec) -> bool:
     return re.search(rf'^\s*\S+\s+{re.escape(spec.field)}\b', own, re.M) is not None
 
 
-class SampleReader:
+def read_bag(
+    bag: BagReader, *, msg_config: str | Path | None, voltage_topic: str | None,
+    throttle_topic: str | None, start: float | None, end: float | None,
+    progress: Callable[[float], None] | None,
+) -> RawColumns:
     """
-    Reads voltage and throttle of a bag, keeping only what has not been taken.
+    Read voltage, throttle and current of a bag in the order of the log.
 
-    Topics as in `read_recording`, `start` and `end` in s after the first message.  `duration`, s,
-    is that of the whole bag, `source` topics, types, files and what the bag says of itself, `held`
-    samples read and not taken.  InputError: the topics cannot be told, or there is no voltage.
+    Topics as in `read_recording`, `start` and `end` in s after the first message.  InputError:
+    the topics cannot be told, or there is no voltage.
     """
+    choice = choose(bag.path, bag.topics, msg_config=msg_config, voltage_topic=voltage_topic,
+                    throttle_topic=throttle_topic)
+    specs = _specs(bag, choice)
+    notes = [*bag.notes, *choice.notes]
+    if bag.damage is not None:
+        notes.append(f'The bag is damaged; what it still holds was read: {bag.damage}.')
+    if start is not None or end is not None:
+        notes.append(part_words(start, end))
+    broken: list[str] = []
 
-    def __init__(
-        self, bag: BagReader, *, msg_config: str | Path | None, voltage_topic: str | None,
-        throttle_topic: str | None, start: float | None, end: float | None,
-    ) -> None:
-        """Choose the topics; nothing is read yet but the throttle before the part."""
-        choice = choose(bag.path, bag.topics, msg_config=msg_config, voltage_topic=voltage_topic,
-                        throttle_topic=throttle_topic)
-        self._bag = bag
-        self._notes = [*bag.notes, *choice.notes]
-        if bag.damage is not None:
-            self._notes.append(
-                f'The bag is damaged; what it still holds was read: {bag.damage}.')
-        if start is not None or end is not None:
-            self._notes.append(part_words(start, end))
-        self.name = printable(bag.path.name)
-        self.duration = (bag.end_ns - bag.start_ns) * 1e-9
-        self.source = {
-            **bag.about, 'file': self.name, 'format': 'mcap', 'msg_config': choice.config.name,
-            'voltage_topic': choice.voltage.topic, 'voltage_type': choice.voltage.type,
-            'voltage_field': choice.voltage.field,
-            **bag.origins.get(choice.voltage.topic, {})}
-        spec = choice.voltage
-        stated = bag.sample_rates.get(spec.topic)
-        if spec.sample_rate is not None and stated is not None:
-            # The bag knows better than a config that is made for many.
-            spec = replace(spec, sample_rate=stated)
-        self._specs = {VOLTAGE: spec}
-        # Throttle and current hold until the next value.
-        self._holds = {THROTTLE: ThrottleHold(spec.sample_rate)}
-        self._series = {VOLTAGE: _Series(spec)}
-        if choice.throttle is not None:
-            self.source |= {'throttle_topic': choice.throttle.topic,
-                            'throttle_type': choice.throttle.type,
-                            'throttle_field': choice.throttle.field,
-                            **bag.origins.get(choice.throttle.topic, {})}
-            self._specs[THROTTLE] = choice.throttle
-            self._series[THROTTLE] = _Series(choice.throttle)
-        if choice.current is not None and _has_field(bag, choice.current):
-            self._specs[CURRENT] = choice.current
-            self._holds[CURRENT] = ThrottleHold(spec.sample_rate)
-            self._series[CURRENT] = _Series(choice.current)
-        # `ou-monitor convert` keeps what the log says apart from what people say of the bag.
-        vehicle = self.source.get('vehicle') or self.source.get('log_vehicle')
-        if vehicle:
-            self.source['vehicle'] = vehicle
-        self._start_ns, self._end_ns = self._limits(start), self._limits(end)
-        self._t: list[FloatArray] = []
-        self._voltage: list[FloatArray] = []
-        self.held = 0
-        self._newest = self._highest = self._taken = -math.inf
-        self._largest = self._back = 0.0
-        # What no voltage has followed yet: stamps, values, whether stamped, log times.
-        self._waiting: dict[str, list[tuple[FloatArray, FloatArray, BoolArray, TimeArray]]] = {
-            name: [] for name in self._holds}
-        self._tally = dict.fromkeys((
-            'dropped', 'late', 'mixed', 'repeated', 'too_late', 'throttle', 'undecodable'), 0)
-        self._undecodable = ''
-        self._broken = self._leave_out if bag.partial else None
-        if self._start_ns is not None:
-            for name in self._holds:
-                # The current of a message of the voltage comes with it.
-                if name in self._specs and self._specs[name].topic != spec.topic:
-                    self._add_held(name, last_before(bag, self._specs[name], self._start_ns,
-                                                     self._broken))
-                    self._series[name] = _Series(self._specs[name])
-            self._tally['throttle'] = 0
+    def leave_out(log_time: int, error: InputError) -> None:
+        broken.append('' if broken else f'{error} ({moment(log_time, bag.start_ns)})')
 
-    def _limits(self, at: float | None) -> int | None:
-        """Return a time of the recording as log time, ns."""
-        if at is None:
-            return None
-        # Beyond the bag every time is the same.
-        after = min(at * 1e9, float(self._bag.end_ns - self._bag.start_ns + 1))
-        return self._bag.start_ns + round(after)
+    first, last = (_limit(bag, at) for at in (start, end))
+    parts: dict[str, list[Column]] = {name: [] for name in specs}
+    if first is not None:
+        for name in specs.keys() - {VOLTAGE}:
+            # The current of a message of the voltage comes with it.
+            if specs[name].topic != specs[VOLTAGE].topic:
+                parts[name].append(last_before(
+                    bag, specs[name], first, leave_out if bag.partial else None))
+    for batch in batches(bag, specs, start_ns=first, end_ns=last, progress=progress,
+                         broken=leave_out if bag.partial else None):
+        for name, column in batch.items():
+            parts[name].append(column)
+    columns = {name: join(found) for name, found in parts.items() if found}
+    if broken:
+        notes.append(f"{counted(len(broken), 'message')} dropped, the first: {broken[0]}.")
+    name = printable(bag.path.name)
+    if VOLTAGE not in columns or not columns[VOLTAGE].values.size:
+        why = ' '.join(note for note in notes if 'dropped' in note)
+        if (start is None and end is None) or why:
+            raise InputError(f'{name} holds no usable sample' + (f': {why}' if why else ''))
+        raise InputError(outside_words(name, start, end, (bag.end_ns - bag.start_ns) * 1e-9))
+    return _paired(name, specs, columns, _source(bag, choice, name), notes)
 
-    def batches(self, progress: Callable[[float], None] | None) -> Iterator[int]:
-        """Read on; yield the number of samples held after each batch (progress 0..1)."""
-        for batch in batches(self._bag, self._specs, start_ns=self._start_ns,
-                             end_ns=self._end_ns, progress=progress,
-                             broken=self._broken):
-            for name in self._holds:
-                if name in batch:
-                    self._add_held(name, batch[name])
-            if VOLTAGE in batch:
-                self._add_voltage(batch[VOLTAGE])
-            yield self.held
 
-    def _leave_out(self, log_time: int, error: InputError) -> None:
-        """Count a message that cannot be decoded."""
-        self._tally['undecodable'] += 1
-        self._undecodable = self._undecodable or (
-            f'{error} ({moment(log_time, self._bag.start_ns)})')
+def _specs(bag: BagReader, choice: Choice) -> dict[str, FieldSpec]:
+    """Return what is read, by its name."""
+    spec = choice.voltage
+    stated = bag.sample_rates.get(spec.topic)
+    if spec.sample_rate is not None and stated is not None:
+        # The bag knows better than a config that is made for many.
+        spec = replace(spec, sample_rate=stated)
+    specs = {VOLTAGE: spec}
+    if choice.throttle is not None:
+        specs[THROTTLE] = choice.throttle
+    if choice.current is not None and _has_field(bag, choice.current):
+        specs[CURRENT] = choice.current
+    return specs
 
-    def _add_voltage(self, column: Column) -> None:
-        t, voltage, sizes = self._series[VOLTAGE].samples(column)
-        for name in self._holds:
-            self._place(name, t[np.cumsum(sizes)[sizes > 0] - 1], column.stamped[sizes > 0],
-                        column.log_time[sizes > 0])
-        good = usable_voltage(t, voltage)
-        if not good.all():
-            self._tally['dropped'] += t.size - int(good.sum())
-            lost = np.abs(voltage[~good])
-            self._largest = max(self._largest, float(lost[np.isfinite(lost)].max(initial=0.0)))
-            t, voltage = t[good], voltage[good]
-        if not t.size:
-            return
-        self._tally['late'] += int(np.count_nonzero(np.diff(t) < 0.0)) + int(t[0] < self._newest)
-        mixed, back = overlap(t, self._highest)
-        self._tally['mixed'] += mixed
-        self._back = max(self._back, back)
-        self._newest, self._highest = float(t[-1]), max(self._highest, float(t.max()))
-        self._t.append(t)
-        self._voltage.append(voltage)
-        self.held += t.size
 
-    def _add_held(self, name: str, column: Column) -> None:
-        t, values, sizes = self._series[name].samples(column)
-        known = np.isfinite(t)
-        if self._specs[name].nan == 'drop':
-            finite = np.isfinite(values)
-            known &= finite
-            if name == THROTTLE:
-                self._tally['throttle'] += int(np.count_nonzero(~finite))
-        if name == THROTTLE:
-            check_throttle(self.name, values[known])
-        self._waiting[name].append((
-            t[known], values[known], np.repeat(column.stamped, sizes)[known],
-            np.repeat(column.log_time, sizes)[known]))
+def _source(bag: BagReader, choice: Choice, name: str) -> dict[str, str]:
+    """Return topics, types, files and what the bag says of itself."""
+    source = {
+        **bag.about, 'file': name, 'format': 'mcap', 'msg_config': choice.config.name,
+        'voltage_topic': choice.voltage.topic, 'voltage_type': choice.voltage.type,
+        'voltage_field': choice.voltage.field, **bag.origins.get(choice.voltage.topic, {})}
+    if choice.throttle is not None:
+        source |= {'throttle_topic': choice.throttle.topic, 'throttle_type': choice.throttle.type,
+                   'throttle_field': choice.throttle.field,
+                   **bag.origins.get(choice.throttle.topic, {})}
+    # `ou-monitor convert` keeps what the log says apart from what people say of the bag.
+    vehicle = source.get('vehicle') or source.get('log_vehicle')
+    return {**source, 'vehicle': vehicle} if vehicle else source
 
-    def _place(self, name: str, stamps: FloatArray, stamped: BoolArray, log_time: TimeArray
-               ) -> None:
-        """Place what waits beside voltage messages (stamps in s)."""
-        waiting, hold = self._waiting[name], self._holds[name]
-        if not (waiting and (stamps.size or self._newest > -math.inf)):
-            # Nothing to place, or no voltage to place it beside.
-            none = np.empty(0)
-            hold.take(none, none, none > 0.0, stamps, stamped, none.astype(np.int64))
-            return
-        own, values, carried, logged = (
-            np.concatenate([part[k] for part in waiting]) for k in range(4))
-        self._waiting[name] = []
+
+def _limit(bag: BagReader, at: float | None) -> int | None:
+    """Return a time of the recording, s, as log time, ns."""
+    if at is None:
+        return None
+    # Beyond the bag every time is the same.
+    return bag.start_ns + round(min(at * 1e9, float(bag.end_ns - bag.start_ns + 1)))
+
+
+def _paired(name: str, specs: dict[str, FieldSpec], columns: dict[str, Column],
+            source: dict[str, str], notes: list[str]) -> RawColumns:
+    """Place throttle and current beside each voltage."""
+    volts = columns[VOLTAGE]
+    t, voltage, sizes, gaps = _samples(specs[VOLTAGE], volts)
+    some = sizes > 0
+    ends = t[np.cumsum(sizes)[some] - 1]
+    held = {}
+    for which in (THROTTLE, CURRENT):
+        hold = ThrottleHold(specs[VOLTAGE].sample_rate)
+        held[which] = np.full(t.size, np.nan)
+        if which not in columns:
+            continue
+        column = columns[which]
+        at, values, counts, _ = _samples(specs[which], column)
+        known = np.isfinite(at)
+        if specs[which].nan == 'drop':
+            unknown = int(np.count_nonzero(~np.isfinite(values)))
+            known &= np.isfinite(values)
+            if which == THROTTLE and unknown:
+                notes.append(f"{counted(unknown, 'throttle value')} dropped: not a finite number.")
+        if which == THROTTLE:
+            check_throttle(name, values[known])
         # Of a voltage and a throttle logged at one time, the throttle counts as first.
-        hold.take(own, values, carried, stamps, stamped,
-                  np.searchsorted(log_time, logged, 'left'))
+        before = np.searchsorted(volts.log_time[some],
+                                 np.repeat(column.log_time, counts)[known], 'left')
+        hold.take(at[known], values[known], np.repeat(column.stamped, counts)[known], ends,
+                  volts.stamped[some], before)
+        held[which] = hold.at(t)
+    if gaps:
+        notes.append(f'{counted(gaps, "gap")} between blocks of samples.')
+    return RawColumns(t, voltage, held[THROTTLE], held[CURRENT], name, source, tuple(notes))
 
-    def take(self, most: int | None = None) -> Recording:
-        """Return the first samples held, in order, each stamp once; they are held no longer."""
-        t = np.concatenate([np.empty(0), *self._t])
-        voltage = np.concatenate([np.empty(0), *self._voltage])
-        if (np.diff(t) < 0.0).any():
-            order = np.argsort(t, kind='stable')
-            t, voltage = t[order], voltage[order]
-        cut = t.size
-        if most is not None and most < cut:
-            cut = int(np.searchsorted(t, t[most - 1], 'right'))
-        self._t, self._voltage, self.held = [t[cut:]], [voltage[cut:]], t.size - cut
-        t, voltage = t[:cut], voltage[:cut]
-        fresh = np.ones(t.size, dtype=bool)
-        fresh[1:] = np.diff(t) > 0.0
-        old = t < self._taken
-        fresh &= t > self._taken
-        self._tally['too_late'] += int(np.count_nonzero(old))
-        self._tally['repeated'] += int(np.count_nonzero(~fresh & ~old))
-        t, voltage = t[fresh], voltage[fresh]
-        if t.size:
-            self._taken = float(t[-1])
-        held = {}
-        for name, hold in self._holds.items():
-            self._place(name, np.empty(0), np.empty(0, np.bool_), np.empty(0, np.uint64))
-            held[name] = hold.at(t)
-            if t.size:
-                hold.forget_before(self._taken)
-        current = known_current(held[CURRENT]) if CURRENT in held else None
-        return Recording(t, voltage, plausible(held[THROTTLE], MOST_THROTTLE), self.name, dict(self.source),
-                         current=current)
 
-    def bag_notes(self) -> tuple[str, ...]:
-        """Return what is to be said before any sample is read."""
-        return tuple(self._notes)
-
-    def sample_notes(self) -> tuple[str, ...]:
-        """Return what was dropped or mended so far, one sentence each."""
-        notes = []
-        tally = self._tally
-        if tally['undecodable']:
-            notes.append(f"{counted(tally['undecodable'], 'message')} dropped, the first: "
-                         f'{self._undecodable}.')
-        if tally['dropped']:
-            notes.append(dropped_words(tally['dropped'], np.array([self._largest])))
-        if tally['throttle']:
-            notes.append(f"{counted(tally['throttle'], 'throttle value')} dropped: not a finite "
-                         'number.')
-        clock = self._series[VOLTAGE].clock
-        if clock is not None and clock.gaps:
-            notes.append(f'{counted(clock.gaps, "gap")} between blocks of samples.')
-        if tally['late']:
-            notes.append(late_words(tally['late'], tally['mixed'], self._back))
-        if tally['too_late']:
-            notes.append(f"{counted(tally['too_late'])} dropped: they came more than a piece "
-                         'late.')
-        if tally['repeated']:
-            notes.append(repeated_words(tally['repeated']))
-        return tuple(notes)
+def _samples(spec: FieldSpec, column: Column) -> tuple[FloatArray, FloatArray, IntArray, int]:
+    """Return stamps (s), values (NaN where a message holds none), samples a message, and gaps."""
+    if spec.sample_rate is not None:
+        clock = BlockClock(spec.sample_rate)
+        t = clock.stamps_of_many(column.stamp, column.count)
+        return t, column.values, column.count, clock.gaps
+    values = np.full(column.n, np.nan)
+    values[column.count > 0] = column.values
+    return column.stamp, values, np.ones(column.n, np.int64), 0

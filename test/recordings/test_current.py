@@ -2,7 +2,7 @@
 
 import numpy as np
 from ou_monitor.recordings.bag import BagWriter
-from ou_monitor.recordings.read import read_pieces, read_recording
+from ou_monitor.recordings.read import read_recording
 from ou_monitor.recordings.standard_types import (
     BATTERY_STATE, encode_battery, encode_scalars, FLOAT32)
 import pytest
@@ -33,9 +33,6 @@ def test_the_current_of_a_battery_is_drawn_when_negative(tmp_path):
     """Discharge is negative in a BatteryState, and NaN as not measured."""
     path = bag(tmp_path / 'a.mcap', [-1.0, np.nan, -3.0, -4.0, 5.0])
     np.testing.assert_array_equal(read_recording(path).current, [1.0, np.nan, 3.0, 4.0, -5.0])
-    pieces = list(read_pieces(path, samples=2))
-    np.testing.assert_array_equal(np.concatenate([piece.current for piece in pieces]),
-                                  [1.0, np.nan, 3.0, 4.0, -5.0])
     np.testing.assert_array_equal(read_recording(path, start=0.15).current, [3.0, 4.0, -5.0])
 
 

@@ -9,7 +9,7 @@ from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagReader, BagWriter
 from ou_monitor.recordings.mcap_file import MAGIC
-from ou_monitor.recordings.read import read_pieces, read_recording
+from ou_monitor.recordings.read import read_recording
 from ou_monitor.recordings.standard_types import encode_scalars, FLOAT64
 import pytest
 import yaml
@@ -107,8 +107,7 @@ def test_a_broken_chunk(tmp_path, way, spot):
         data[(begin + 60 + end) // 2 if spot == 'content' else begin + 9 + 24] ^= 0x40
     path.write_bytes(data)
     before, lost = sum(c[2] for c in chunks[:4]), chunks[4][2]
-    for call in (read, lambda p: list(read_pieces(p, samples=50)),
-                 lambda p: list(BagReader(p).raw_messages())):
+    for call in (read, lambda p: list(BagReader(p).raw_messages())):
         line = refusal(lambda call=call: call(path))
         assert f'at byte {chunks[4][0]}:' in line and at_time(ROWS[before][2]) in line
     found = read(path, partial=True)
@@ -157,17 +156,12 @@ def test_messages_that_do_not_fit_their_type(tmp_path):
             for k, (topic, kind, t, data) in enumerate(
                 row for row in ROWS if row[0] == '/voltage')]
     path = write(tmp_path / 'bag.mcap', rows)
-    for call in (read, lambda path: list(read_pieces(path))):
-        line = refusal(lambda call=call: call(path))
-        assert 'cannot be decoded' in line and at_time(START + 100 * MS) in line
+    line = refusal(lambda: read(path))
+    assert 'cannot be decoded' in line and at_time(START + 100 * MS) in line
     whole = read(path, partial=True)
-    pieces = list(read_pieces(path, samples=50, partial=True))
-    kept = np.delete(volts(), [100, 200, 300])
-    for voltage, notes in ((whole.voltage, whole.notes), (
-            np.concatenate([piece.voltage for piece in pieces]), pieces[-1].notes)):
-        np.testing.assert_array_equal(voltage, kept)
-        assert any('3 messages dropped' in note and at_time(START + 100 * MS) in note
-                   for note in notes)
+    np.testing.assert_array_equal(whole.voltage, np.delete(volts(), [100, 200, 300]))
+    assert any('3 messages dropped' in note and at_time(START + 100 * MS) in note
+               for note in whole.notes)
 
 
 def test_definitions_from_the_summary(tmp_path):

@@ -27,6 +27,7 @@ from ou_monitor.recordings.importers.log import (
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.files import open_regular
 from ou_monitor.text import printable
+from ou_monitor.timeline.line import hold
 
 TIME, VOLTAGE, THROTTLE, CURRENT = 'time_s', 'voltage_v', 'throttle', 'current_a'
 
@@ -81,7 +82,8 @@ def read_csv(path: Path, columns: CsvColumns | None = None) -> RawColumns:
     t, v, u, *current = _columns(path, (time, voltage, *throttle[0]), optional)
     _check_time(path, t * TIME_UNITS[wanted.time_unit], v, (time, voltage))
     name = printable(path.name)
-    return RawColumns(t * TIME_UNITS[wanted.time_unit], v * VOLTAGE_UNITS[wanted.unit], u,
+    # A blank cell is no message: what was commanded last holds.
+    return RawColumns(t * TIME_UNITS[wanted.time_unit], v * VOLTAGE_UNITS[wanted.unit], hold(u),
                       current[0] if current else np.full(t.shape, np.nan), name,
                       {'file': name, 'format': 'csv'})
 

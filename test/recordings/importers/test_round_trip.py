@@ -12,8 +12,9 @@ from mcap.reader import make_reader
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.recordings.read import (
-    read_beside, read_pieces, read_recording, read_signal, refreshed)
+    read_beside, read_recording, read_signal)
 from project import ROOT
+from ou_monitor.timeline.refresh import readings_of
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_typestore, Stores
@@ -100,16 +101,13 @@ def test_a_log_and_its_bag_give_one_json(tmp_path):
     for one, other in ((log.t, bag.t), (log.voltage, bag.voltage),
                        (log.throttle, bag.throttle), (log.current, bag.current)):
         np.testing.assert_array_equal(one, other)
-    pieces = list(read_pieces(out, samples=250))
-    assert [piece.n for piece in pieces] == [250, 250, 99]
-    np.testing.assert_array_equal(np.concatenate([piece.t for piece in pieces]), bag.t)
     # Of those between, the throttle at the reading; since when the first one held is not known.
     share = (rows[:, 5:7].mean(axis=1) - 100) / 2000
     np.testing.assert_array_equal(log.throttle, share.astype(np.float32)[10::10])
 
 
 def test_a_signal_of_a_log_and_of_its_bag_is_one(tmp_path):
-    """Beside a signal the throttle keeps its rate, and `refreshed` gives what `analyze` reads."""
+    """Beside a signal the throttle keeps its rate, and `readings_of` gives what `analyze` reads."""
     path, out = tmp_path / 'a.bbl', tmp_path / 'bag'
     fields = ('loopIteration', 'time', 'rcCommand[3]', 'vbatLatest', 'amperageLatest',
               'motor[0]', 'motor[1]', *(f'gyroADC[{k}]' for k in range(3)))
@@ -120,7 +118,7 @@ def test_a_signal_of_a_log_and_of_its_bag_is_one(tmp_path):
     (log, own), (bag, converted) = (
         read_beside(one, '/imu/angular_velocity.y') for one in (path, out))
     assert log.n == bag.n == 3000
-    np.testing.assert_array_equal(refreshed(log).t, read_recording(path).t)
+    np.testing.assert_array_equal(readings_of(log).t, read_recording(path).t)
     share = (rows[:, 5:7].mean(axis=1) - 100) / 2000
     np.testing.assert_array_equal(log.throttle, share.astype(np.float32))
     np.testing.assert_array_equal(log.throttle, bag.throttle)

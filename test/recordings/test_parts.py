@@ -1,4 +1,4 @@
-"""Bags written in every way, read whole, in pieces and in part: always the same samples."""
+"""Bags written in every way, read whole and in part: always the same samples."""
 
 import itertools
 
@@ -7,11 +7,10 @@ from mcap.writer import CompressionType, IndexType, Writer
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings import bag as bag_module
-from ou_monitor.recordings.bag import BagWriter
 from ou_monitor.recordings.mcap_file import McapFile
-from ou_monitor.recordings.read import read_pieces, read_recording
+from ou_monitor.recordings.read import read_recording
 from ou_monitor.recordings.standard_types import (
-    BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, SCHEMAS)
+    BATTERY_STATE, encode_battery, encode_scalars, FLOAT32, SCHEMAS)
 import pytest
 
 START = 1_704_067_200_000_000_000
@@ -118,59 +117,6 @@ def test_several_files(bag, rows, tmp_path):
         f'{names}\n')
     whole = read_recording(bag)
     same(read_recording(folder), whole)
-    same(join(read_pieces(folder, samples=500)), whole)
-
-
-def join(pieces):
-    """Return pieces as one recording."""
-    pieces = list(pieces)
-    whole = pieces[0]
-    return type(whole)(*(np.concatenate([getattr(p, name) for p in pieces])
-                         for name in ('t', 'voltage', 'throttle')), whole.name, whole.source,
-                       tuple(itertools.chain.from_iterable(p.notes for p in pieces)))
-
-
-@pytest.mark.parametrize('samples', [60, 500, 2900, 10**6])
-@pytest.mark.parametrize('start, end', [(None, None), (0.7, None), (None, 1.1), (1.234, 2.5)])
-def test_pieces_make_the_whole(bag, samples, start, end):
-    """One after another they are the recording, notes included; none is empty or too long."""
-    pieces = list(read_pieces(bag, samples=samples, start=start, end=end))
-    whole = read_recording(bag, start=start, end=end)
-    same(join(pieces), whole)
-    assert join(pieces).notes == whole.notes
-    assert all(0 < piece.n <= samples for piece in pieces)
-    assert len(pieces) >= whole.n / samples
-    assert all(piece.source == whole.source for piece in pieces)
-
-
-def test_what_comes_later_than_a_piece(bag, monkeypatch):
-    """It is dropped and counted: the sum is that of the whole."""
-    monkeypatch.setattr(bag_module, '_TOGETHER', 1)
-    pieces = list(read_pieces(bag, samples=2))
-    whole = read_recording(bag)
-    (note,) = [note for note in pieces[-1].notes if 'more than a piece late' in note]
-    lost = int(note.split()[0])
-    again = sum(int(note.split()[0]) for note in pieces[-1].notes if 'was there before' in note)
-    first = sum(int(note.split()[0]) for note in whole.notes if 'was there before' in note)
-    assert 0 < lost
-    assert sum(piece.n for piece in pieces) + lost + again == whole.n + first
-    t = join(pieces).t
-    assert (np.diff(t) > 0).all()
-
-
-def test_pieces_of_blocks(tmp_path):
-    """The time line of the samples goes on from piece to piece."""
-    rng = np.random.default_rng(4)
-    with BagWriter(tmp_path / 'bag.mcap') as bag:
-        bag.add_topic('voltage', FLOAT32_ARRAY, sample_rate=1000.0)
-        bag.add_topic('throttle', FLOAT32)
-        for k in range(400):
-            bag.write('voltage', (k * 100 + int(rng.integers(5))) * MS,
-                      encode_block(rng.normal(size=100)))
-            bag.write('throttle', k * 100 * MS + 7, encode_scalars(FLOAT32, [k / 400])[0])
-    whole = read_recording(tmp_path / 'bag.mcap')
-    assert whole.n == 40_000
-    same(join(read_pieces(tmp_path / 'bag.mcap', samples=3333)), whole)
 
 
 @pytest.mark.parametrize('stamped', [True, False])
@@ -223,25 +169,19 @@ def test_only_the_chunks_needed_are_read(bag, monkeypatch):
     (50.0, 60.0, 'no sample from 50 s to 60 s')])
 def test_parts_that_are_none(bag, start, end, words):
     """One line says why."""
-    for read in (read_recording, lambda *a, **k: list(read_pieces(*a, **k))):
-        with pytest.raises(InputError, match=words):
-            read(bag, start=start, end=end)
+    with pytest.raises(InputError, match=words):
+        read_recording(bag, start=start, end=end)
 
 
 def test_csv(tmp_path):
-    """A CSV is read in part and in pieces too."""
+    """A CSV is read in part, too."""
     path = tmp_path / 'log.csv'
     path.write_text('time_s,voltage_v\n' + ''.join(f'{5 + k},{k}\n' for k in range(10)))
     part = read_recording(path, start=2.0, end=5.0)
     assert part.voltage.tolist() == [2.0, 3.0, 4.0]
     assert 'from 2 s to 5 s' in part.notes[-1]
-    pieces = list(read_pieces(path, samples=4))
-    assert [piece.n for piece in pieces] == [4, 4, 2]
-    same(join(pieces), read_recording(path))
     with pytest.raises(InputError, match='no sample from 20 s'):
         read_recording(path, start=20.0)
-    with pytest.raises(ValueError, match='at least 1'):
-        next(read_pieces(path, samples=0))
 
 
 def test_progress_ends_at_one(bag, monkeypatch):
@@ -269,20 +209,6 @@ def test_fewer_messages_than_stated(bag, tmp_path):
         read_recording(path)
     assert any('the summary counts 3001' in note for note in read_recording(
         path, partial=True).notes)
-
-
-def test_the_first_piece_does_not_wait_for_the_last_chunk(bag, monkeypatch):
-    """Memory is that of the pieces: chunks are read as pieces are taken."""
-    monkeypatch.setattr(bag_module, '_TOGETHER', 1)
-    read = []
-    original = McapFile.tables
-    monkeypatch.setattr(McapFile, 'tables', lambda self, spans, wanted: read.extend(spans)
-                        or original(self, spans, wanted))
-    pieces = read_pieces(bag, samples=100)
-    next(pieces)
-    early = len(read)
-    rest = list(pieces)
-    assert early <= len(read) / 3 and len(rest) > 20
 
 
 def test_two_publishers_of_one_topic(tmp_path):
