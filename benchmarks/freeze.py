@@ -51,7 +51,7 @@ SIGNALS = {'gecko_log': 'gyroADC[0]', 'nazgul': 'gyroADC[0]', 'roma': 'gyroADC[0
 BENCHMARKS = {'injected': ('discover.py', 'injected'), 'risk': ('risk_real.py',),
               'load': ('real_flights.py',)}
 # The node's code over a recording, one message at a time, and its report at the end.
-MONITOR = '''
+MONITOR = """
 import dataclasses, enum, json, math, sys
 import numpy as np
 from ou_monitor import MonitorSettings, SupplyMonitor, read_recording
@@ -71,7 +71,7 @@ print(json.dumps({
     'load': {'known': load.known, 'level': load.level, 'resistance': load.resistance,
              'sag': [float(load.sag(u)) for u in (0.0, 0.5, 1.0)],
              'noise': [float(load.noise(u)) for u in (0.0, 0.5, 1.0)]}}))
-'''
+"""
 # Numbers that differ by less than this share are the same.
 SAME = 1e-6
 _NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')

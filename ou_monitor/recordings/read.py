@@ -24,7 +24,7 @@ from ou_monitor.recordings.importers.choose import (
 from ou_monitor.recordings.importers.csv_table import CsvColumns, read_column, read_csv
 from ou_monitor.recordings.importers.formats import import_log, is_csv, is_log
 from ou_monitor.recordings.importers.log import (
-    Log, RawColumns, Request, Series, SIGNAL, UNKNOWN, VOLTAGE)
+    Log, RawColumns, Request, Series, SIGNAL, UNKNOWN)
 from ou_monitor.recordings.samples import (
     check_throttle, dropped_words, known_current, late_words, outside_words, overlap, part_words,
     read_bag, repeated_words)
