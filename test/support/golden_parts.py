@@ -11,13 +11,13 @@ from ou_monitor.criticism.samples import choose_samples, events_between, lines_b
 from ou_monitor.criticism.spectral_start import from_spectrum
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.online.estimator.intake import readings
 from ou_monitor.online.risk.curve_filters import Wander
 from ou_monitor.online.risk.curves import LearnedCurves
 from ou_monitor.online.risk.flag import BrownoutFlag
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.online.trust import patience, StampWatch
 from ou_monitor.records import Estimate, Flag, Status
+from ou_monitor.timeline.line import plausible_samples
 from scipy.signal import lfilter
 from term_examples import EXAMPLES, OU, term
 
@@ -127,7 +127,7 @@ def stamps():
     settings = MonitorSettings(stale_after=0.8)
     found.append(table([patience(settings, rate, n) for rate in (0.0, 10.0, 500.0, 1500.0)
                         for n in (19, 20, 5000)]))
-    found.append(table(readings(np.array([1.0, 1e9, 1e19, np.nan]), np.array(
+    found.append(table(plausible_samples(np.array([1.0, 1e9, 1e19, np.nan]), np.array(
         [5.0, 1e6, 1.0001e6, -1e7]), np.array([2.0, 2.01, -2.0, np.nan]))))
     return found
 

@@ -27,6 +27,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import LoadState
 from ou_monitor.online.risk.first_passage import Passage

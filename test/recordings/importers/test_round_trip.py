@@ -107,7 +107,7 @@ def test_a_log_and_its_bag_give_one_json(tmp_path):
 
 
 def test_a_signal_of_a_log_and_of_its_bag_is_one(tmp_path):
-    """Beside a signal the throttle keeps its rate, and `readings_of` gives what `analyze` reads."""
+    """Beside a signal throttle keeps its rate; `readings_of` gives what `analyze` reads."""
     path, out = tmp_path / 'a.bbl', tmp_path / 'bag'
     fields = ('loopIteration', 'time', 'rcCommand[3]', 'vbatLatest', 'amperageLatest',
               'motor[0]', 'motor[1]', *(f'gyroADC[{k}]' for k in range(3)))
