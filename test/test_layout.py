@@ -35,7 +35,8 @@ ALLOWED = {
     'errors': set(), 'text': set(), 'stream': CORE | {'yaml'}, 'recordings': CORE | {'yaml'},
     'cli': CORE | {'yaml'}, **dict.fromkeys((
         'records', 'timeline', 'model', 'online', 'adc', 'simulation', 'criticism',
-        'analysis', 'comparison', 'discovery', 'coupling', 'paper', 'fleet', 'report', '__init__'), CORE),
+        'analysis', 'comparison', 'discovery', 'coupling', 'paper', 'fleet', 'report',
+        '__init__'), CORE),
 }
 
 
