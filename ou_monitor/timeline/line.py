@@ -202,7 +202,7 @@ class TimeLine:
         if not math.isfinite(np.add.reduce(t) + np.add.reduce(y)):
             good = np.isfinite(t) & np.isfinite(y)
             self.count(non_finite=t.size - int(good.sum()))
-            t, y, u, i = (None if x is None else x[good] for x in (t, y, u, i))
+            t, y, u, i = _picked(good, t, y, u, i)
         if not t.size:
             return []
         first = float(t[0]) - self.newest
@@ -239,8 +239,7 @@ class TimeLine:
             later = jumps[jumps > 0]
             end = begin + int(later[0]) if later.size else t.size
             part = slice(begin, end)
-            batch = self._ordered(
-                t[part], y[part], *(None if x is None else x[part] for x in (u, i)), restart)
+            batch = self._ordered(*_picked(part, t, y, u, i), restart)
             if batch is not None:
                 batches.append(batch)
             begin = end
@@ -257,11 +256,10 @@ class TimeLine:
         if restart:
             self.newest = -math.inf
             self.count(resets=1)
-        order = np.argsort(t, kind='stable')
-        t, y, u, i = (None if x is None else x[order] for x in (t, y, u, i))
+        t, y, u, i = _picked(np.argsort(t, kind='stable'), t, y, u, i)
         keep = (np.diff(t, prepend=self.newest) > 0.0) & (t > self.newest)
         self.count(late=t.size - int(keep.sum()))
-        t, y, u, i = (None if x is None else x[keep] for x in (t, y, u, i))
+        t, y, u, i = _picked(keep, t, y, u, i)
         if not t.size:
             return None
         steps = np.diff(t, prepend=self.newest)
@@ -298,6 +296,13 @@ class TimeLine:
         if known == 1.0 and float(np.mean(y[1:] == y[:-1])) <= _TIED:
             return 1.0
         return refresh_period(y, known)
+
+
+def _picked(which: Any, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,
+            ) -> tuple[FloatArray, FloatArray, FloatArray | None, FloatArray | None]:
+    """Return some of the samples."""
+    return (t[which], y[which], None if u is None else u[which],
+            None if i is None else i[which])
 
 
 def as_column(values: npt.ArrayLike) -> FloatArray:

@@ -70,7 +70,7 @@ class Batch:
         steps = np.diff(t, prepend=before)
         # The first sample of all follows nothing: no pause lies before it.
         rest = steps if steps[0] < math.inf or t.size == 1 else steps[1:]
-        return cls(t, y, *(None if np.isnan(x).all() else x for x in (u, i)),
+        return cls(t, y, None if np.isnan(u).all() else u, None if np.isnan(i).all() else i,
                    float(steps.min()), float(rest.max()), restart, again)
 
     def columns(self) -> FloatArray:

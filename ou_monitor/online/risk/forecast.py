@@ -278,8 +278,8 @@ class Forecast:
         begin, n = 0, t.size
         while begin < n:
             # As far as the next look.
-            ahead = np.flatnonzero(t[begin:] >= self._next) if came >= self._rested else ()
-            end = begin + int(ahead[0]) + 1 if len(ahead) else n
+            ahead = np.flatnonzero(t[begin:] >= self._next)
+            end = begin + int(ahead[0]) + 1 if ahead.size and came >= self._rested else n
             part = slice(begin, end)
             self._loads.push(t[part], v[part], u[part], drawn[part])
             self._take(t[part], v[part], np.clip(u[part], 0.0, 1.0))
