@@ -68,10 +68,12 @@ class SourceInterval:
 
     def push(self, times: FloatArray) -> None:
         """Take times in order of arrival, s; steps back begin anew."""
-        steps = np.diff(times, prepend=self._last)
-        for k in np.flatnonzero(steps > _SLOW_STEP)[-_SLOW_KEPT:].tolist():
-            self._steps.append((float(times[k] - steps[k]), float(steps[k])))
-        self._end(float(times[-1]))
+        now = float(times[-1])
+        if not 0.0 <= now - self._last <= _SLOW_STEP:
+            steps = np.diff(times, prepend=self._last)
+            for k in np.flatnonzero(steps > _SLOW_STEP)[-_SLOW_KEPT:].tolist():
+                self._steps.append((float(times[k] - steps[k]), float(steps[k])))
+        self._end(now)
 
     def push_one(self, time: float) -> None:
         """Take one time, s."""
@@ -83,6 +85,9 @@ class SourceInterval:
         if now < self._last:
             self._steps.clear()
         self._last = now
+        if not self._steps:
+            self.value = 0.0
+            return
         lengths = sorted(length for _, length in self._steps)
         slow = len(lengths) >= _SLOW_FEWEST and (
             sum(lengths) >= _SLOW_SHARE * (now - self._steps[0][0]))
@@ -244,27 +249,32 @@ class StillReading:
         """Take finite readings in order of arrival (t in s, of arrival where it is known)."""
         if not voltage.size:
             return
-        steps = np.diff(t, prepend=self._at)
-        elapsed = np.cumsum(np.where(steps > 0.0, np.minimum(steps, _COUNTED), 0.0))
-        self._at = float(t[-1])
-        size = np.abs(np.diff(voltage, prepend=self.value))
-        moved = np.flatnonzero(size > _CHANGE * np.abs(voltage))
+        # Where the runs of one reading begin; the first may be the present one.
+        before = np.concatenate(([self.value], voltage))
+        size = np.abs(before[1:] - before[:-1])
+        moved = (size > _CHANGE * np.abs(voltage)).nonzero()[0]
+        times = np.concatenate(([self._at], t))
+        steps = times[1:] - times[:-1]
+        # NaN of the first reading counts as 0.
+        elapsed = np.fmin(np.fmax(steps, 0.0), _COUNTED).cumsum()
+        self._at, self.value = float(t[-1]), float(voltage[-1])
         begin = 0
         if moved.size:
             self.changed = True
             size = size[moved]
-            lasted = np.diff(elapsed[moved], prepend=-self._time)
             self._step = min(self._step, float(size.min()))
-            self._quiet = max(self._quiet, float(np.max(
-                lasted, where=size <= _ONE_STEP * self._step, initial=0.0)))
+            ends = np.concatenate(([-self._time], elapsed[moved]))
+            lasted = (ends[1:] - ends[:-1])[size <= _ONE_STEP * self._step]
+            if lasted.size:
+                self._quiet = max(self._quiet, float(lasted.max()))
             begin = int(moved[-1])
             self._n, self._time, self._throttle = 0, -float(elapsed[begin]), (NAN, NAN)
         self._n += voltage.size - begin
         self._time += float(elapsed[-1])
-        self.value = float(voltage[-1])
         if throttle is not None:
-            self._throttle = (float(np.fmin.reduce(throttle[begin:], initial=self._throttle[0])),
-                              float(np.fmax.reduce(throttle[begin:], initial=self._throttle[1])))
+            load = throttle[begin:]
+            self._throttle = (float(np.fmin.reduce(load, initial=self._throttle[0])),
+                              float(np.fmax.reduce(load, initial=self._throttle[1])))
 
     @property
     def why(self) -> str:
@@ -322,19 +332,22 @@ class InputTrust:
         self._stamps.push(t, arrival)
         times = t if arrival is None else arrival
         placed = np.isfinite(times)
-        if placed.any():
-            self._interval.push(times if placed.all() else times[placed])
+        if placed.all():
+            self._interval.push(times)
+        elif placed.any():
+            self._interval.push(times[placed])
         self.push_readings(times, voltage, throttle)
 
     def push_readings(self, times: FloatArray, voltage: FloatArray,
                       throttle: FloatArray | None = None) -> None:
         """Take readings without stamps (times in s, by arrival where it is known)."""
-        good = np.isfinite(voltage) & np.isfinite(times)
+        good = np.isfinite(voltage + times)
         if not good.all():
             times, voltage = times[good], voltage[good]
             throttle = None if throttle is None else throttle[good]
         self._still.push(times, voltage, throttle)
-        self._recent = np.concatenate([self._recent, voltage[-_RECENT:]])[-_RECENT:]
+        self._recent = (voltage[-_RECENT:].copy() if voltage.size >= _RECENT else
+                        np.concatenate((self._recent, voltage))[-_RECENT:])
 
     def start_anew(self) -> None:
         """Take stamps that start anew."""
