@@ -111,5 +111,5 @@ def test_the_estimator_publishes_nothing_of_it(seed):
     estimator = SlidingEstimator(window=10.0)
     estimator.push(recording.t, recording.voltage)
     e = estimator.estimate()
-    assert e.status is Status.BURIED
+    assert e.status in (Status.BURIED, Status.NO_RELAXATION)
     assert all(math.isnan(getattr(e, name)) for name in NAMES)
