@@ -193,10 +193,15 @@ def _as_read(t: FloatArray, voltage: FloatArray, notes: list[str],
     return t, voltage
 
 
+# Least rms of a segment of the signal, as a share of the loudest.
+_QUIET = 1e-9
+
+
 def _weighted(pieces: list[ComplexArray]) -> tuple[ComplexArray, ComplexArray, FloatArray]:
     """Return voltage and signal, causes out and segments weighted, and the rest of the signal."""
     weight = np.sqrt(np.mean(np.abs(pieces[1])**2, axis=1))
-    weight[weight == 0.0] = weight[weight > 0.0].min()
+    # What is quieter is rounding, or a signal that decays after it stood still.
+    weight = np.maximum(weight, _QUIET * weight.max())
     scaled = [one / weight[:, None] for one in pieces]
     basis = basis_of(scaled[2:])
     v, x = without(scaled[0], basis), without(scaled[1], basis)

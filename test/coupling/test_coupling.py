@@ -185,3 +185,15 @@ def test_what_cannot_be_told_is_refused(signal_t, signal, options, words):
     voltage = 5.0 + np.random.default_rng(9).standard_normal(T.size)
     with pytest.raises(InputError, match=words):
         estimate_coupling(T, voltage, signal_t, signal, **options)
+
+
+@pytest.mark.parametrize('tail', [0.0, 1e-160])
+def test_a_signal_that_stands_still_most_of_the_time(tail):
+    """A flag of 0 and 1: what is left of it elsewhere by rounding does not decide."""
+    rng = np.random.default_rng(1)
+    t = np.arange(12_000) / 50.0
+    signal = np.zeros(t.size)
+    signal[2000:6000] = 1.0
+    signal[7000:] = tail * rng.standard_normal(5000)
+    found = estimate_coupling(t, 12.0 + rng.normal(0.0, 0.1, t.size), t, signal)
+    assert not found.seen and np.isfinite(found.limit)
