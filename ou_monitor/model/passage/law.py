@@ -222,17 +222,18 @@ def spline_at(coefficients: FloatArray, at: FloatArray) -> FloatArray:
     first = np.floor(at).astype(np.intp)
     x = at - first
     left = 1.0 - x
-    weights = np.stack((left**3, 4.0 - 3.0 * x * x * (2.0 - x),
-                        4.0 - 3.0 * left * left * (2.0 - left), x**3), axis=-1) / 6.0
-    # Rows of four neighbours along the last axis, and which of them are near a place.
-    rows = np.lib.stride_tricks.sliding_window_view(coefficients.ravel(), 4)
-    near = np.zeros((x.shape[1], 1), np.intp)
-    for axis, size in enumerate(coefficients.shape[:-1]):
-        near = (size * near + first[axis][:, None] - 1)[..., None] + np.arange(4)
-        near = near.reshape(x.shape[1], 4 ** (axis + 1))
-    value = rows[coefficients.shape[-1] * near + first[-1][:, None] - 1]
-    for axis in reversed(range(len(weights))):
-        value = value.reshape(x.shape[1], 4**axis, 4) @ weights[axis][..., None]
+    weights = np.stack((left * left * left, 4.0 - 3.0 * x * x * (2.0 - x),
+                        4.0 - 3.0 * left * left * (2.0 - left), x * x * x)) / 6.0
+    # Places in the store of the four neighbours along each axis; the places asked for come last,
+    # where NumPy is fastest.
+    corner, offsets, size = np.zeros(x.shape[1], np.intp), np.zeros(1, np.intp), 1
+    for axis in reversed(range(coefficients.ndim)):
+        corner += size * (first[axis] - 1)
+        offsets = (size * np.arange(4)[:, None] + offsets).ravel()
+        size *= coefficients.shape[axis]
+    value = coefficients.ravel()[offsets[:, None] + corner]
+    for axis in reversed(range(coefficients.ndim)):
+        value = (value.reshape(4**axis, 4, -1) * weights[:, axis]).sum(axis=1)
     return np.asarray(value.ravel())
 
 

@@ -11,6 +11,7 @@ passages between them and adds the noise of the sensor.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import functools
 import math
 import threading
 from typing import TYPE_CHECKING
@@ -125,16 +126,17 @@ def brownout_probability(e: Estimate, voltage: float, horizon: float,
     return as_sampled(e, supply, voltage, horizon, now, risk)
 
 
-def risk_of(supply: Supply, voltage: float, horizon: float, now: float | None = None,
+def risk_of(supply: Supply, voltage: npt.ArrayLike, horizon: float, now: float | None = None,
             noise_std: float = 0.0, *, coarse: bool = False) -> FloatArray:
     """
     Return the probability that the continuous path goes below `voltage` within `horizon`.
 
-    voltage in V, horizon in s, now in V, noise_std in V.
+    voltage in V, of the shape of the supply or, of one supply, any; horizon in s, now in V,
+    noise_std in V.
     """
     u0, ln_alpha, ln_sigma, weight = _nodes(supply, *(_FEW if coarse else _MANY))
     sd = np.exp(ln_sigma - 0.5 * ln_alpha) / math.sqrt(2.0)
-    barrier = (u0 - voltage) / sd
+    barrier = (u0 - np.asarray(voltage, dtype=np.float64)[..., None]) / sd
     span = np.exp(ln_alpha) * horizon
     if now is None:
         start = np.zeros_like(barrier)
@@ -161,10 +163,10 @@ class Passage:
         sd = math.exp(float(np.asarray(self.supply.ln_sigma)) - 0.5 * float(
             np.asarray(self.supply.ln_alpha))) / math.sqrt(2.0)
         half = max(self.noise_std, 0.1 * sd)
-        above, below = (1.0 if at >= self.now else float(risk_of(
-            self.supply, at, horizon, self.now, self.noise_std, coarse=True))
-            for at in (low + half, low - half))
-        return (above - below) / (2.0 * half)
+        levels = np.array([low + half, low - half])
+        above, below = np.where(levels >= self.now, 1.0, risk_of(
+            self.supply, levels, horizon, self.now, self.noise_std, coarse=True)).tolist()
+        return float((above - below) / (2.0 * half))
 
 
 def as_sampled(e: Estimate, supply: Supply, voltage: float, horizon: float,
@@ -228,6 +230,7 @@ def _error(value: float) -> float:
     return value if math.isfinite(value) else 0.0
 
 
+@functools.cache
 def _hermite(count: int) -> tuple[FloatArray, FloatArray]:
     """Return nodes and weights of averages over N(0, 1)."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(count)
