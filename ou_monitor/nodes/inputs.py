@@ -173,6 +173,10 @@ class PolledInput:
         self._kind = kind
         self.publishers = Publishers()
         self.unreadable = 0
+        # Fetched, not yet read: messages, by which clocks (wall, monotonic, s), and their size.
+        self._fetched: list[tuple[bytes, dict[str, Any]]] = []
+        self._when: list[tuple[float, float]] = []
+        self._bytes = 0
 
     def _decode(self, data: bytes) -> Any:
         return decode(data, self._kind, self._topic)
@@ -181,27 +185,38 @@ class PolledInput:
         """Leave out a message that cannot be read."""
         self.unreadable += 1
 
-    def take(self, most: int = MOST_TAKEN) -> Arrivals | None:
-        """Return what waits, of the publisher followed; None when nothing does."""
-        taken: list[tuple[bytes, dict[str, Any]]] = []
+    @property
+    def full(self) -> bool:
+        """Whether as much has been fetched as is to be read at a time."""
+        return len(self._fetched) >= MOST_TAKEN or self._bytes >= MOST_BYTES
+
+    def fetch(self) -> None:
+        """Fetch what waits in the middleware, which would drop it; `take` reads it."""
         handle = self._input.handle
-        left = MOST_BYTES
+        wall, now = time.time(), self._node.steady_now()
         with handle:
-            while len(taken) < most and left > 0:
+            while not self.full:
                 found = handle.take_message(self._input.msg_type, True)
                 if found is None:
                     break
-                taken.append(found)
-                left -= len(found[0])
+                self._fetched.append(found)
+                self._when.append((wall, now))
+                self._bytes += len(found[0])
+
+    def take(self) -> Arrivals | None:
+        """Return what waits, of the publisher followed; None when nothing does."""
+        self.fetch()
+        taken = self._fetched
         if not taken:
             return None
+        wall, now = np.array(self._when).T
+        self._fetched, self._when, self._bytes = [], [], 0
         infos = [info for _, info in taken]
         sent = np.array([info['source_timestamp'] for info in infos], dtype=np.uint64)
-        wall = time.time()
         received = np.array([info['received_timestamp'] for info in infos]) * 1e-9
         received = np.where(received > 0.0, np.minimum(received, wall), wall)
         # What waited in the middleware arrived before now; the wall clock may have been set.
-        arrived: FloatArray = np.maximum.accumulate(self._node.steady_now() - np.clip(
+        arrived: FloatArray = np.maximum.accumulate(now - np.clip(
             wall - received, 0.0, MOST_WAIT))
         times: FloatArray = sent.astype(np.float64) * 1e-9
         kept = self.publishers.follow(
