@@ -3,7 +3,6 @@
 import json
 import math
 import re
-import shlex
 
 import numpy as np
 from ou_monitor.cli.main import main
@@ -164,15 +163,6 @@ def test_levels_need_a_throttle(tmp_path, capsys):
     path = tmp_path / 'plain.csv'
     write(path, np.arange(100) / 100.0, 5.0 + 0.01 * np.sin(np.arange(100)))
     assert 'no throttle' in failure(capsys, 'analyze', path, '--levels', '0.1')
-
-
-@pytest.mark.parametrize('name', ['flight.ulg', 'my log.BIN', 'a.bbl'])
-def test_a_log_is_to_be_converted_first(tmp_path, name, capsys):
-    """One line with the command, quoted for a shell."""
-    path = tmp_path / name
-    path.write_bytes(b'ULog')
-    said = failure(capsys, 'analyze', path)
-    assert f'ou-monitor convert {shlex.quote(str(path))} {shlex.quote(path.stem)}' in said
 
 
 def test_text_says_which_voltage_must_not_be_undershot(flight, capsys):
