@@ -262,15 +262,23 @@ def test_a_latch_that_the_disk_refused_is_written_later(world, tmp_path):
     assert again.process.stop() == 0 and list(tmp_path.glob('.latch*')) == []
 
 
+@pytest.fixture
+def own_domain():
+    """Give a ROS domain that is left as it was once the nodes have ended."""
+    with unused_domain() as domain:
+        yield domain
+
+
 @pytest.mark.parametrize('profile, number, dip, kept', [
     # The promise: 2000 messages, when the publisher takes the same file.
     (True, 1500, (700, 800), 1500),
     # Else the newest 512 less those of other topics: a dip at the end of 5 s is seen.
     (False, 5000, (4800, 4900), 300)])
-def test_what_is_sent_to_a_stopped_node_waits_for_it(world, profile, number, dip, kept):
+def test_what_is_sent_to_a_stopped_node_waits_for_it(
+        own_domain, world, profile, number, dip, kept):
     """As many messages as its queue holds, and the dip in them."""
     # The default of ROS; limited to this machine it has Fast DDS's own queues.
-    world.domain, world.reach = unused_domain(), 'SUBNET'
+    world.domain, world.reach = own_domain, 'SUBNET'
     rig = Rig(world, 'stopped', '-p', 'brownout.hold:=0.0')
     env = {**os.environ, 'ROS_DOMAIN_ID': str(world.domain),
            'ROS_AUTOMATIC_DISCOVERY_RANGE': world.reach}

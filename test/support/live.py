@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 import inspect
 import itertools
 import math
@@ -43,18 +44,34 @@ def new_domain() -> int:
     pytest.fail('every ROS domain from 10 to 99 is in use')
 
 
-def unused_domain() -> int:
-    """
-    Return a ROS domain in which no killed program has left a queue in shared memory.
+# `new_domain` gives none of these; each is given once in a run.
+_UNUSED = [*range(1, 10), 100, 101]
 
-    A node takes such a queue as it is, with the size that its maker chose.
+
+@contextmanager
+def unused_domain() -> Iterator[int]:
     """
-    # `new_domain` gives none of these, so that they stay as they are.
-    for domain in range(1, 10):
-        ports = range(7400 + 250 * domain, 7650 + 250 * domain)
-        if not any(Path(f'/dev/shm/fastrtps_port{port}').exists() for port in ports):
-            return domain
-    pytest.fail('every ROS domain from 1 to 9 is in use, or killed programs left queues there')
+    Give a ROS domain in which no killed program has left a queue in shared memory.
+
+    A node takes such a queue as it is, with the size that its maker chose.  What the test's own
+    programs leave in that domain goes with it.
+    """
+    while _UNUSED:
+        domain = _UNUSED.pop(0)
+        ports = [Path(f'/dev/shm/fastrtps_port{port}')
+                 for port in range(7400 + 250 * domain, 7650 + 250 * domain)]
+        if not any(port.exists() for port in ports):
+            break
+    else:
+        pytest.fail('every ROS domain of 1 to 9, 100 and 101 is in use, or killed programs left '
+                    'queues there')
+    try:
+        yield domain
+    finally:
+        for port in ports:
+            for left in (port, port.with_name(port.name + '_el'),
+                         port.with_name(f'sem.{port.name}_mutex')):
+                left.unlink(missing_ok=True)
 
 
 def wait_until(predicate: Callable[[], Any], timeout: float = DEADLINE, what: str = '') -> Any:
