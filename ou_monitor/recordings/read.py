@@ -172,8 +172,9 @@ def tidy(raw: RawColumns) -> Recording:
     if batch.t.size > 2 and (spacing := float(np.median(np.diff(batch.t)))) >= _SPARSE:
         notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '
                      '--time-unit says so of a CSV.')
-    _, _, u, i = batch.columns()
-    return Recording(batch.t, batch.y, u, name, raw.source, tuple(notes), known_current(i))
+    throttle = np.full(batch.t.size, math.nan) if batch.u is None else batch.u
+    return Recording(batch.t, batch.y, throttle, name, raw.source, tuple(notes),
+                     None if batch.i is None else known_current(batch.i))
 
 
 def _unusable(name: str, notes: Sequence[str]) -> str:

@@ -135,18 +135,26 @@ def read_bag(
         broken.append('' if broken else f'{error} ({moment(log_time, bag.start_ns)})')
 
     first, last = (_limit(bag, at) for at in (start, end))
+    # Where the messages of the voltage hold the current, each is that of its own.
+    together = CURRENT in specs and specs[CURRENT].topic == specs[VOLTAGE].topic
     parts: dict[str, list[Column]] = {name: [] for name in specs}
     if first is not None:
-        for name in specs.keys() - {VOLTAGE}:
-            # The current of a message of the voltage comes with it.
-            if specs[name].topic != specs[VOLTAGE].topic:
-                parts[name].append(last_before(
-                    bag, specs[name], first, leave_out if bag.partial else None))
+        for name in specs.keys() - {VOLTAGE} - ({CURRENT} if together else set()):
+            parts[name].append(last_before(
+                bag, specs[name], first, leave_out if bag.partial else None))
+    beside: list[FloatArray] = []
     for batch in batches(bag, specs, start_ns=first, end_ns=last, progress=progress,
                          broken=leave_out if bag.partial else None):
+        current = batch.pop(CURRENT, None) if together else None
+        if together and VOLTAGE in batch:
+            beside.append(_beside(batch[VOLTAGE], current))
         for name, column in batch.items():
             parts[name].append(column)
-    columns = {name: join(found) for name, found in parts.items() if found}
+    columns = {}
+    while parts:
+        which, found = parts.popitem()
+        if found:
+            columns[which] = join(found)
     if broken:
         notes.append(f"{counted(len(broken), 'message')} dropped, the first: {broken[0]}.")
     name = printable(bag.path.name)
@@ -155,7 +163,8 @@ def read_bag(
         if (start is None and end is None) or why:
             raise InputError(f'{name} holds no usable sample' + (f': {why}' if why else ''))
         raise InputError(outside_words(name, start, end, (bag.end_ns - bag.start_ns) * 1e-9))
-    return _paired(name, specs, columns, _source(bag, choice, name), notes)
+    return _paired(name, specs, columns, np.concatenate(beside) if together else None,
+                   _source(bag, choice, name), notes)
 
 
 def _specs(bag: BagReader, choice: Choice) -> dict[str, FieldSpec]:
@@ -196,20 +205,40 @@ def _limit(bag: BagReader, at: float | None) -> int | None:
     return bag.start_ns + round(min(at * 1e9, float(bag.end_ns - bag.start_ns + 1)))
 
 
+def _beside(volts: Column, other: Column | None) -> FloatArray:
+    """Return another field of each message of the voltage; NaN where it holds none."""
+    found = np.full(volts.n, np.nan)
+    if other is not None:
+        single = other.count == 1
+        values = other.values[(np.cumsum(other.count) - 1)[single]]
+        if other.n == volts.n:
+            found[single] = values
+        elif values.size:
+            # Of a damaged bag not every message gives both.
+            at = np.searchsorted(other.log_time[single], volts.log_time).clip(0, values.size - 1)
+            same = other.log_time[single][at] == volts.log_time
+            found[same] = values[at][same]
+    return found
+
+
 def _paired(name: str, specs: dict[str, FieldSpec], columns: dict[str, Column],
-            source: dict[str, str], notes: list[str]) -> RawColumns:
-    """Place throttle and current beside each voltage."""
-    volts = columns[VOLTAGE]
+            beside: FloatArray | None, source: dict[str, str], notes: list[str]) -> RawColumns:
+    """Place throttle and current beside each voltage; `beside`: the current of each message."""
+    volts = columns.pop(VOLTAGE)
     t, voltage, sizes, gaps = _samples(specs[VOLTAGE], volts)
-    some = sizes > 0
-    ends = t[np.cumsum(sizes)[some] - 1]
-    held = {}
+    logged, stamped, ends = volts.log_time, volts.stamped, t
+    if specs[VOLTAGE].sample_rate is not None:
+        some = sizes > 0
+        logged, stamped, ends = logged[some], stamped[some], t[np.cumsum(sizes)[some] - 1]
+        beside = None if beside is None else np.repeat(beside, sizes)
+    del volts
+    held = {} if beside is None else {CURRENT: beside}
     for which in (THROTTLE, CURRENT):
-        hold = ThrottleHold(specs[VOLTAGE].sample_rate)
-        held[which] = np.full(t.size, np.nan)
         if which not in columns:
+            held.setdefault(which, np.full(t.size, np.nan))
             continue
-        column = columns[which]
+        hold = ThrottleHold(specs[VOLTAGE].sample_rate)
+        column = columns.pop(which)
         at, values, counts, _ = _samples(specs[which], column)
         known = np.isfinite(at)
         if specs[which].nan == 'drop':
@@ -220,10 +249,9 @@ def _paired(name: str, specs: dict[str, FieldSpec], columns: dict[str, Column],
         if which == THROTTLE:
             check_throttle(name, values[known])
         # Of a voltage and a throttle logged at one time, the throttle counts as first.
-        before = np.searchsorted(volts.log_time[some],
-                                 np.repeat(column.log_time, counts)[known], 'left')
+        before = np.searchsorted(logged, np.repeat(column.log_time, counts)[known], 'left')
         hold.take(at[known], values[known], np.repeat(column.stamped, counts)[known], ends,
-                  volts.stamped[some], before)
+                  stamped, before)
         held[which] = hold.at(t)
     if gaps:
         notes.append(f'{counted(gaps, "gap")} between blocks of samples.')
@@ -236,6 +264,8 @@ def _samples(spec: FieldSpec, column: Column) -> tuple[FloatArray, FloatArray, I
         clock = BlockClock(spec.sample_rate)
         t = clock.stamps_of_many(column.stamp, column.count)
         return t, column.values, column.count, clock.gaps
+    if (column.count == 1).all():
+        return column.stamp, column.values, column.count, 0
     values = np.full(column.n, np.nan)
     values[column.count > 0] = column.values
     return column.stamp, values, np.ones(column.n, np.int64), 0

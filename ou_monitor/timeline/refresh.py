@@ -208,6 +208,9 @@ class Repeats:
         length = np.repeat(np.diff(np.append(begins, n)), sizes)
         number = np.rint(place / self.period)
         due = np.rint(number * self.period) == place
+        if math.isnan(self._value):
+            # Since when the first value of a time line had been there is not known.
+            due[0] = False
         sure = (number == 0.0) | (length >= (number + 0.5) * self.period)
         last = int(starts[-1])
         unsure = np.flatnonzero(due[last:] & ~sure[last:])
@@ -227,9 +230,7 @@ def reading_places(y: FloatArray) -> tuple[npt.NDArray[np.intp], float]:
     repeats.period = refresh_period(y[first:first + _LOOK])
     if repeats.period <= 1.0:
         return np.arange(y.size), 1.0
-    fresh = repeats.fresh(np.stack([np.empty(y.size), y]))
-    # Since when the first one had been there is not known.
-    return np.flatnonzero(fresh)[1:], repeats.period
+    return np.flatnonzero(repeats.fresh(np.stack([np.empty(y.size), y]))), repeats.period
 
 
 def refreshes(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, float]:

@@ -3,7 +3,7 @@
 import math
 import tracemalloc
 
-from hypothesis import given, settings as hypothesis_settings, strategies as st
+from hypothesis import example, given, settings as hypothesis_settings, strategies as st
 import numpy as np
 from ou_monitor.model.ou import simulate
 from ou_monitor.online.monitor import SupplyMonitor
@@ -180,6 +180,7 @@ STEPS = st.one_of(st.sampled_from([0.001, 0.0, -0.001, 1e-9, 1e-300, 1.0]), ANY)
 
 @given(st.lists(st.tuples(STEPS, LEVELS, st.one_of(st.none(), ANY, st.floats(0.0, 1.0)),
                           st.integers(1, 60), st.floats(0.0, 1e-3)), min_size=1, max_size=12))
+@example([(0.001, 0.0, None, 1, 0.0), (-1.0, 0.0, None, 1, 0.0)])
 @hypothesis_settings(max_examples=150, deadline=None)
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
 def test_arbitrary_floats(history):

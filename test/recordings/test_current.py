@@ -60,3 +60,10 @@ def test_a_column_of_a_csv(tmp_path, header, row):
     recording = read_recording(path)
     np.testing.assert_array_equal(recording.current, [0.0, 10.0, 20.0])
     assert recording.has_throttle is ('throttle' in header)
+
+
+def test_each_message_of_a_battery_has_a_current_of_its_own(tmp_path, monkeypatch):
+    """Of two with one stamp the first is kept, and its current, as the node pairs them."""
+    monkeypatch.setattr('test_current.STAMPS', STAMPS // 2 * 2 // 200_000_000 * 200_000_000)
+    recording = read_recording(bag(tmp_path / 'a.mcap', [-1.0, -2.0, -3.0, -4.0, -5.0]))
+    np.testing.assert_array_equal(recording.current, [1.0, 3.0, 5.0])

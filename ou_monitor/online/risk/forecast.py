@@ -154,8 +154,6 @@ LOOK, _LOOK_SHARE = 0.2, 0.2
 _REST = 0.05
 # The window's own tests have found the OU: odds, and horizons that it counts as right.
 _ODDS = 20.0
-# A voltage so late, s, begins a new time line.
-_BACKWARDS = 1.0
 # What may make most of a risk.
 DOMINANT = ('noise', 'load now', 'throttle to come')
 
@@ -273,8 +271,10 @@ class Forecast:
     def take(self, batch: Batch, came: float = math.inf) -> None:
         """Take readings; the last came at a time, s, on a monotonic clock; inf: not known."""
         t, v, u, drawn = batch.columns()
-        if t[0] < self._newest - _BACKWARDS:
+        if t[0] < self._newest:
+            # Readings rise within one time line: another one has begun.
             self.new_time_line()
+            self._loads.new_time_line()
         begin, n = 0, t.size
         while begin < n:
             # As far as the next look.
