@@ -8,9 +8,9 @@ Keep what every command says of recorded runs, and print what moved between two 
 
 `keep` runs the commands of a checkout on the recordings of `RUNS` (`OU_MONITOR_REALDATA`; runs
 that are not there are left out, with a word on stderr) and writes one JSON a run and command,
-about ten minutes; parts that are kept already are not run again.  `--parts` adds what takes longer: the
-examination (`--exam FOLDER`, with `examine.py`), effects hidden in recorded runs, the risk and the
-load on recorded flights.  `moved` compares two such folders, number by number.
+about ten minutes; parts that are kept already are not run again.  `--parts` adds what takes
+longer: the examination (`--exam FOLDER`, with `examine.py`), effects hidden in recorded runs, the
+risk and the load on recorded flights.  `moved` compares two such folders, number by number.
 """
 
 from __future__ import annotations

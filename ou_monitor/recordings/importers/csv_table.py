@@ -17,7 +17,7 @@ import csv
 from dataclasses import dataclass, replace
 import io
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import numpy as np
 from ou_monitor.errors import InputError, nearest
@@ -213,16 +213,35 @@ def _read(path: Path, file: TextIO, needed: Sequence[str], optional: Sequence[st
     names = [name for name in (*needed, *optional) if name in header]
     places = [header.index(name) for name in names]
     columns = [array('d') for _ in names]
-    for row in csv.reader(texts, delimiter=delimiter):
-        if len(row) > len(header) and any(cell.strip() for cell in row[len(header):]):
-            raise InputError(
-                f'{path}:{lines.number}: {len(row)} cells, and the header names {len(header)} '
-                'columns: mend the line; the decimal mark is a point')
+    for row in _rows(path, lines, csv.reader(texts, delimiter=delimiter, strict=True), header,
+                     delimiter):
         for name, place, column in zip(names, places, columns):
             column.append(_cell(row, place, name, path, lines.number))
     found = {name: np.array(column, dtype=np.float64) for name, column in zip(names, columns)}
     missing = np.full(found[names[0]].shape, np.nan)
     return [found.get(name, missing) for name in (*needed, *optional)]
+
+
+def _rows(path: Path, lines: _Lines, reader: Any, header: list[str], delimiter: str,
+          ) -> Iterator[list[str]]:
+    """Yield rows that fit the header, none of which holds another one in a quote."""
+    before = 0
+    try:
+        for row in reader:
+            if reader.line_num - before > 1 and any(
+                    line.count(delimiter) >= len(header) - 1
+                    for cell in row for line in cell.splitlines()[1:]):
+                raise InputError(f'{path}:{lines.number}: whole lines before this one are within '
+                                 'a quote: close each quote in its line')
+            before = reader.line_num
+            if len(row) > len(header) and any(cell.strip() for cell in row[len(header):]):
+                raise InputError(
+                    f'{path}:{lines.number}: {len(row)} cells, and the header names '
+                    f'{len(header)} columns: mend the line; the decimal mark is a point')
+            yield row
+    except csv.Error as error:
+        raise InputError(
+            f'{path}:{lines.number}: {error}: close each quote in its line') from error
 
 
 def _header(path: Path, lines: _Lines, first: str | None, needed: Sequence[str],
@@ -245,6 +264,9 @@ def _cell(row: list[str], place: int, name: str, path: Path, number: int) -> flo
         raise InputError(f"{path}:{number}: the line ends before column '{name}'")
     text = row[place]
     try:
+        if '_' in text or not text.isascii():
+            # To Python 5_01 is 501.
+            raise ValueError(text)
         return float(text)
     except ValueError:
         if text.strip().lower() in _MISSING:

@@ -1,9 +1,10 @@
 """
-Damage bags at random and craft hostile ones: the reader returns what is true, or reports damage.
+Damage bags and CSVs at random, craft hostile ones: the reader returns what is true, or reports it.
 
-Each voltage belongs to its stamp by a formula, so a wrong value shows itself.  A mutated file may
-be refused in one line, or read with a note that it is damaged, or read whole; anything else is
-counted and its seed printed.  The exit status is 1 when something was found.
+In a bag each voltage belongs to its stamp by a formula, so a wrong value shows itself; of a CSV
+each value must stand in the line of its stamp.  A mutated file may be refused in one line, or read
+with notes that count what was dropped, or read whole; anything else is a fault, and its seed is
+printed.  The exit status is 1 when something was found.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Iterator
+import math
 from pathlib import Path
+import re
 import resource
 import signal
 import struct
@@ -20,6 +23,7 @@ import tempfile
 import time
 import traceback
 from typing import Any
+import warnings
 import zlib
 
 import lz4.frame
@@ -35,6 +39,7 @@ from ou_monitor.recordings.mcap_file import MAGIC  # noqa: E402
 from ou_monitor.recordings.read import read_recording  # noqa: E402
 from ou_monitor.recordings.standard_types import (  # noqa: E402
     BATTERY_STATE, encode_battery, encode_scalars, FLOAT32, FLOAT64, SCHEMAS)
+from ou_monitor.records import Recording  # noqa: E402
 
 START = 1_704_067_200_000_000_000
 MS = 1_000_000
@@ -276,6 +281,128 @@ class Crafted:
         return data + record(Opcode.FOOTER, struct.pack('<QQI', start, 0, 0)) + MAGIC
 
 
+# What a cell of a CSV may hold in place of its number.
+CELLS = ('', ' ', 'nan', 'NaN', 'null', 'inf', '-inf', '1e308', '-1e308', '1e400', '1e-320',
+         '5,01', '0x10', '1_000', '\u0661\u0662', '--5', '+5', ' 5 ', '5V', '9' * 400, '1e5',
+         '"5"', '"5', '\0', '\x1b[31m5', '\u2028', '#5', '1;2', '5\t', '=1+1')
+# A number of a CSV, in full; `float` takes more than that.
+_NUMBER = re.compile(r'[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?', re.ASCII)
+
+
+def sheet() -> bytes:
+    """Return a sound CSV; a blank throttle holds the last, and nobody reads the note."""
+    lines = ['time_s,voltage_v,throttle,current_a,note']
+    lines += [f'{k / 1000},{float(volts(k))},{k % 90 / 100 if k % 7 else ""},{k % 31 / 8},n{k}'
+              for k in range(COUNT)]
+    return ('\n'.join(lines) + '\n').encode()
+
+
+def mutated_sheet(sound: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
+    """Return the kind of an attack, and a CSV after it."""
+    kind = str(rng.choice(['bits', 'bytes', 'zeros', 'cut', 'hole', 'swap', 'twice', 'less',
+                           'more', 'cell', 'quote', 'endless', 'ends', 'marks', 'text', 'header',
+                           'short']))
+    data = bytearray(sound)
+    lines = sound.decode().splitlines()
+    at = int(rng.integers(len(data)))
+    one, other = (int(k) for k in rng.integers(1, len(lines), size=2))
+    cells = lines[one].split(',')
+    which = int(rng.integers(len(cells)))
+    if kind == 'bits':
+        for place in rng.integers(len(data), size=int(rng.integers(1, 9))).tolist():
+            data[place] ^= 1 << int(rng.integers(8))
+    elif kind in ('bytes', 'zeros'):
+        size = int(rng.integers(1, 60))
+        data[at:at + size] = rng.bytes(size) if kind == 'bytes' else bytes(size)
+    elif kind == 'cut':
+        del data[at:]
+    elif kind == 'hole':
+        del data[at:at + int(rng.integers(1, 300))]
+    if kind in ('bits', 'bytes', 'zeros', 'cut', 'hole'):
+        return kind, bytes(data)
+    end = '\n'
+    if kind == 'swap':
+        lines[one], lines[other] = lines[other], lines[one]
+    elif kind == 'twice':
+        lines[other:other] = lines[one:one + int(rng.integers(1, 50))]
+    elif kind == 'less':
+        lines[one] = ','.join(cells[:which] + cells[which + 1:])
+    elif kind == 'more':
+        lines[one] = ','.join(cells[:which] + [str(rng.choice(CELLS))] + cells[which:])
+    elif kind == 'cell':
+        cells[which] = str(rng.choice(CELLS))
+        lines[one] = ','.join(cells)
+    elif kind == 'quote':
+        for line in {one, other} if rng.random() < 0.5 else {one}:
+            cells = lines[line].split(',')
+            cells[which] = '"' + cells[which]
+            lines[line] = ','.join(cells)
+    elif kind == 'endless':
+        lines[one] += str(rng.choice(['x', '0', ',', '"', ' '])) * int(
+            rng.choice([1000, 100_000, 3_000_000]))
+    elif kind == 'ends':
+        end = str(rng.choice(['\r', '\r\n', '\n\n', '\r\r\n', '\n\r', '\x0b', '\u2028']))
+        if rng.random() < 0.5:
+            lines[one] += end
+            end = '\n'
+    elif kind == 'marks':
+        old, new = str(rng.choice(['.,', ',;', ',\t', ', ', ',|', '.;']))
+        lines[:] = [line.replace(old, new) for line in lines[:one]] + lines[one:]
+    elif kind == 'header':
+        names = lines[0].split(',')
+        change = int(rng.integers(5))
+        if change == 0:
+            names[which] = str(rng.choice(names))
+        elif change == 1:
+            names[which] = '"' + names[which]
+        elif change == 2:
+            names[which] = str(rng.choice(CELLS))
+        elif change == 3:
+            rng.shuffle(names)
+        lines[0] = ','.join(names)
+        if change == 4:
+            lines.insert(one, lines[0])
+    elif kind == 'short':
+        lines = [[], ['#'], [''], lines[:1], lines[:2], lines[1:], lines[:1] * 3, ['"'], ['\0']][
+            int(rng.integers(9))]
+    text = end.join([*lines, ''])
+    if kind == 'text':
+        return kind, text.encode(str(rng.choice(
+            ['utf-8-sig', 'utf-16', 'utf-16-le', 'utf-32', 'cp037'])))
+    return kind, text.encode()
+
+
+def numbers(line: str) -> list[float]:
+    """Return the numbers that stand in a line of a CSV."""
+    cells = (cell.strip(' "') for cell in re.split('[,;\t]', line))
+    return [float(cell) for cell in cells if _NUMBER.fullmatch(cell)]
+
+
+def verdict_of_sheet(data: bytes, found: Recording) -> str:
+    """Return what came of a CSV that was read."""
+    lines = [line for line in re.split('\r\n|\n|\r', data.decode('utf-8-sig'))
+             if line.strip() and not line.lstrip().startswith('#')][1:]
+    stand: dict[float, list[list[float]]] = {}
+    everything = {math.nan}
+    for line in lines:
+        values = numbers(line)
+        everything.update(values)
+        for value in values:
+            stand.setdefault(value, []).append(values)
+    current = np.full(found.n, np.nan) if found.current is None else found.current
+    for t, v, u, i in zip(found.t.tolist(), found.voltage.tolist(), found.throttle.tolist(),
+                          current.tolist()):
+        if not any(v in line and (math.isnan(i) or i in line) for line in stand.get(t, ())):
+            return '! wrong value'
+        if not math.isnan(u) and u not in everything:
+            return '! wrong throttle'
+    said = [re.match(r'(\d+) samples? dropped', note) for note in found.notes]
+    dropped = found.held + sum(int(one[1]) for one in said if one)
+    if found.n + dropped != len(lines):
+        return '! silent loss'
+    return 'read, reported as damaged' if found.notes else 'read whole'
+
+
 def verdict(path: Path, count: int, partial: bool) -> str:
     """Read a file; return what came of it, '!' first where it is a fault."""
     def hang(*_: object) -> None:
@@ -294,6 +421,8 @@ def verdict(path: Path, count: int, partial: bool) -> str:
         return '! traceback'
     finally:
         signal.alarm(0)
+    if path.suffix == '.csv':
+        return verdict_of_sheet(path.read_bytes(), found)
     told = any(word in note for note in found.notes for word in ('damaged', 'left out', 'dropped'))
     k = np.rint((found.t - START * 1e-9) * 1e3)
     if not np.array_equal(found.voltage, volts(k)):
@@ -315,6 +444,10 @@ def attacks(given: argparse.Namespace, path: Path) -> Iterator[tuple[str, int, b
         crafted = Crafted(np.random.default_rng([seed, 1]))
         data = crafted.file()
         yield 'crafted', seed, data, crafted.count
+    plain = sheet()
+    for seed in range(given.seed, given.seed + given.sheets):
+        kind, data = mutated_sheet(plain, np.random.default_rng([seed, 2]))
+        yield f'csv {kind}', seed, data, COUNT
 
 
 def main() -> int:
@@ -322,15 +455,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument('--mutated', type=int, default=2200, help='damaged bags')
     parser.add_argument('--crafted', type=int, default=560, help='bags made by hand')
+    parser.add_argument('--sheets', type=int, default=1250, help='damaged CSVs')
     parser.add_argument('--seed', type=int, default=1)
     given = parser.parse_args()
     tally: Counter[tuple[str, str]] = Counter()
     faults, slowest = 0, 0.0
     with tempfile.TemporaryDirectory() as name:
-        path = Path(name) / 'attack.mcap'
-        for kind, seed, data, count in attacks(given, path):
+        bag, table = Path(name) / 'attack.mcap', Path(name) / 'attack.csv'
+        # A warning of NumPy is a number that was not thought of.
+        warnings.simplefilter('error')
+        for kind, seed, data, count in attacks(given, bag):
+            path = table if kind.startswith('csv') else bag
             path.write_bytes(data)
-            for partial in (False, True):
+            for partial in (False, True) if path == bag else (False,):
                 began = time.process_time()
                 said = verdict(path, count, partial)
                 slowest = max(slowest, time.process_time() - began)
@@ -339,7 +476,7 @@ def main() -> int:
                     faults += 1
                     print(f'{said}: {kind}, seed {seed}, partial {partial}', file=sys.stderr)
     for (kind, said), n in sorted(tally.items()):
-        print(f'{kind:10} {said:32} {n}')
+        print(f'{kind:12} {said:32} {n}')
     print(f'{faults} faults in {sum(tally.values())} readings; slowest {slowest:.2f} s of CPU; '
           f'peak '
           f'{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB resident')
