@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from ou_monitor.analysis.supply import supply_facts, SupplyFacts
     from ou_monitor.comparison.compare import compare
     from ou_monitor.discovery.discover import discover
     from ou_monitor.errors import InputError
@@ -36,17 +37,19 @@ _HOMES = {
     'Recording': 'ou_monitor.records',
     'SlidingEstimator': 'ou_monitor.online.estimator.estimator',
     'Status': 'ou_monitor.records',
+    'SupplyFacts': 'ou_monitor.analysis.supply',
     'SupplyMonitor': 'ou_monitor.online.monitor',
     'brownout_probability': 'ou_monitor.online.risk.first_passage',
     'compare': 'ou_monitor.comparison.compare',
     'discover': 'ou_monitor.discovery.discover',
     'read_recording': 'ou_monitor.recordings.read',
+    'supply_facts': 'ou_monitor.analysis.supply',
 }
 
 __all__ = [
     'AdaptiveLowPass', 'AdaptiveNotch', 'Estimate', 'Flag', 'InputError', 'MonitorSettings',
-    'Recording', 'SlidingEstimator', 'Status', 'SupplyMonitor', '__version__',
-    'brownout_probability', 'compare', 'discover', 'read_recording',
+    'Recording', 'SlidingEstimator', 'Status', 'SupplyFacts', 'SupplyMonitor', '__version__',
+    'brownout_probability', 'compare', 'discover', 'read_recording', 'supply_facts',
 ]
 
 

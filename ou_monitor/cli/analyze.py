@@ -9,6 +9,7 @@ import shlex
 from ou_monitor.analysis.analyze import Analysis, analyze
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.relaxation import Relaxation
+from ou_monitor.analysis.supply import supply_facts
 from ou_monitor.analysis.words import (
     as_data, brownout_sentence, caution, facts, headline, in_short, relaxation_sentence)
 from ou_monitor.cli import output
@@ -48,7 +49,8 @@ def run(args: argparse.Namespace) -> int:
         from ou_monitor.report.analysis_page import analysis_page
         output.write_text(analysis_page(analysis, command_line(args)), args.report)
     if args.json is not None:
-        output.write_json(as_data(analysis), args.json)
+        output.write_json({**as_data(analysis), 'supply': supply_facts(
+            recording, voltage).to_dict()}, args.json)
     if args.json != output.STDOUT:
         output.say(render(analysis))
         output.summary(*in_short(analysis), report=args.report, json=args.json)

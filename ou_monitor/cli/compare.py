@@ -28,6 +28,7 @@ def run(args: argparse.Namespace) -> int:
                   **{'--msg-config': args.msg_config, '--model': args.model})
 
     import numpy as np
+    from ou_monitor.analysis.supply import supply_facts
     from ou_monitor.comparison.compare import compare
     from ou_monitor.comparison.judgement import in_short
     from ou_monitor.recordings.model_file import read_model
@@ -42,7 +43,8 @@ def run(args: argparse.Namespace) -> int:
         from ou_monitor.report.comparison_page import comparison_page
         output.write_text(comparison_page(found, command_line(args)), args.report)
     if args.json is not None:
-        output.write_json(found.as_data(), args.json)
+        output.write_json({**found.as_data(), 'supply': supply_facts(
+            recording, limit).to_dict()}, args.json)
     if args.json != output.STDOUT:
         output.say(render(found))
         output.summary(*in_short(found), report=args.report, json=args.json)

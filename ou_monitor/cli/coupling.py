@@ -26,6 +26,7 @@ def run(args: argparse.Namespace) -> int:
     start, end = part_of_recording(args.start, args.end)
 
     from ou_monitor.analysis.overview import answers, known_lines, overview
+    from ou_monitor.analysis.supply import supply_facts
     from ou_monitor.recordings.importers.log import UNKNOWN
     from ou_monitor.timeline.refresh import readings_of
 
@@ -50,8 +51,9 @@ def run(args: argparse.Namespace) -> int:
         output.write_text(coupling_page(found, recording, (t, values), args.signal, unit, known,
                                         seen, command_line(args)), args.report)
     if args.json is not None:
-        output.write_json(as_data(found, recording.name, args.signal, unit, recording.notes),
-                          args.json)
+        output.write_json({
+            **as_data(found, recording.name, args.signal, unit, recording.notes),
+            'supply': supply_facts(recording, limit).to_dict()}, args.json)
     if args.json != output.STDOUT:
         output.say(render(found, recording.name, args.signal, unit, recording.notes, known))
         output.summary(headline(found, args.signal, unit),

@@ -34,6 +34,7 @@ def run(args: argparse.Namespace) -> int:
 
     import numpy as np
     from ou_monitor.analysis.overview import known_lines, overview
+    from ou_monitor.analysis.supply import supply_facts
     from ou_monitor.discovery.discover import discover
     from ou_monitor.discovery.plain_names import in_short
 
@@ -51,7 +52,8 @@ def run(args: argparse.Namespace) -> int:
             text = discovery_page(finding, command_line(args), progress, known)
         output.write_text(text, args.report)
     if args.json is not None:
-        output.write_json(finding.as_data(), args.json)
+        output.write_json({**finding.as_data(), 'supply': supply_facts(
+            recording, limit).to_dict()}, args.json)
     if args.json != output.STDOUT:
         output.say(render(finding, known))
         saved = args.save_model if args.force or not finding.refused else None

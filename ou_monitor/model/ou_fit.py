@@ -1,0 +1,391 @@
+"""
+An Ornstein-Uhlenbeck process beside white noise in what the load leaves of a voltage.
+
+`regress` takes a flexible level (linear hats every 5 s), throttle and measured current, each at
+once and after a bank of lags, out of the voltage; `fit_ou` fits the noise jointly with them.
+
+The noise is white noise, the OU, and a random walk of the level, whose size has a narrow prior:
+without it, what the hats leave of the level would pass for a slow OU.  The fit is a restricted
+likelihood in the frequency domain, in bins in which the spectrum hardly changes.  Each ordinate
+has its expectation in a window of this length (the debiased Whittle likelihood: Sykulski et al.,
+Biometrika 106 (2019) 251).  Intervals are quantiles by importance sampling; prior: flat in
+ln(alpha), arcsine in the share of the OU.
+
+Limits: samples count as evenly spaced within a stretch without gaps; a relaxation slower than
+2.5 s (a sixth of a window below 15 s) is the level's; noise whose size changes with throttle
+counts as of its mean size; a load that neither throttle nor current shows, and noise of another
+spectrum (a filtered sensor), pass for the OU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.model.load import CELL
+from ou_monitor.records import determined, FloatArray, NAN
+from scipy.ndimage import zoom
+from scipy.optimize import minimize
+from scipy.signal import lfilter
+
+# Evidence against white noise alone from which a relaxation is visible, nats: more than white
+# noise showed in any window of 60 simulated recordings (test_ou_fit.py repeats a part).
+VISIBLE = 12.0
+# Distance of the level's knots, s; parts between them at least.
+_HATS, _PARTS = 5.0, 3
+# Lags, s, of throttle and current: from an ESC to polarisation.
+_LAGS = (0.004, 0.02, 0.06, 0.3, 1.0, 4.0)
+# Samples by which throttle and current are tried late or early, and readings for that.
+_DELAYS, _DELAY_READINGS = 4, 8000
+# A throttle that spans less does not move.
+_MOVED = 0.01
+# A gap is a step of this many usual ones; stretches of fewer readings are left out.
+_GAP, _STRETCH = 1.6, 16
+# Fewest readings beyond the number of regressors from which anything is fitted.
+FEWEST = 40
+# Ordinates taken one by one; relative width of the bins above.
+_SINGLE, _WIDTH = 12, 0.06
+# Points of the likelihood's first grid in ln(alpha), logit(share) and ln(walk); largest logit.
+_GRID, _LOGIT = (24, 13, 5), 7.0
+# Values of the walk tried for bounds.
+_WALKS = 15
+# Draws about the maximum in each round, and rounds.
+_DRAWS, _ROUNDS = 1000, 4
+# The level's walk, V per sqrt(s) and cell, and the deviation of its logarithm: .0015 to .015
+# follow the recordings (doc/load.md).
+_WALK, _WALK_SD = 0.004, 0.8
+# Largest alpha D tried: beyond, neighbouring readings are uncorrelated.
+_FASTEST = 5.0
+# Profile log-likelihood that an end of a 97.5 % bound lies below the maximum, nats.
+_DROP = 1.92
+# Share of the variance which an OU slower than `tau_below_s` stays below.
+_QUARTER = 0.25
+# Relative size below which a direction of the regressors is spanned by the others.
+_SPANNED = 1e-5
+# Exponent of the load over throttle.
+_POWER = 1.8
+
+
+@dataclass(frozen=True)
+class OuFacts:
+    """
+    The relaxation beside white noise, or bounds.
+
+    `not_visible`: a relaxation slower than `tau_below_s`, but faster than the level, has a
+    variance below `var_inf_below` (97.5 %); a faster one may be all of the noise.
+    """
+
+    status: str  # ok, not_visible, too_short or no_data
+    window_s: float = NAN  # the readings used end the recording, s
+    alpha: float = NAN  # 1/s
+    alpha_95: tuple[float, float] = (NAN, NAN)  # 1/s
+    sigma: float = NAN  # V/sqrt(s)
+    sigma_95: tuple[float, float] = (NAN, NAN)  # V/sqrt(s)
+    var_inf: float = NAN  # V^2
+    var_inf_95: tuple[float, float] = (NAN, NAN)  # V^2
+    tau_below_s: float = NAN  # s
+    var_inf_below: float = NAN  # V^2
+
+
+def _stretches(t: FloatArray) -> list[slice]:
+    """Return the stretches without a gap; all in one where the stamps are uneven throughout."""
+    steps = np.diff(t)
+    gaps = np.flatnonzero(steps > _GAP * np.median(steps))
+    if gaps.size > 0.05 * steps.size:
+        gaps = np.flatnonzero(steps > 5.0 * np.median(steps))
+    edges = [0, *(gaps + 1).tolist(), t.size]
+    return [slice(a, b) for a, b in zip(edges, edges[1:]) if b - a >= _STRETCH]
+
+
+def _lagged(x: FloatArray, share: float) -> FloatArray:
+    """Return a first-order lag that goes `share` of the way with each sample."""
+    return np.asarray(lfilter([share], [1.0, share - 1.0], x, zi=[x[0] * (1.0 - share)])[0])
+
+
+def _filled(t: FloatArray, x: FloatArray | None) -> FloatArray | None:
+    """Return a load without its gaps; None: it is not known, or does not move."""
+    if x is None:
+        return None
+    known = np.isfinite(x)
+    if known.sum() < 0.5 * x.size:
+        return None
+    full = np.interp(t, t[known], x[known])
+    return full if np.ptp(full) > _MOVED * max(1.0, float(np.abs(full).max())) else None
+
+
+def _basis(columns: Sequence[FloatArray]) -> FloatArray:
+    """Return an orthonormal basis of the columns, which stand in order of importance."""
+    X = np.stack(columns, axis=1)
+    size = np.sqrt(np.mean(X * X, axis=0))
+    X = X[:, size > 0.0] / size[size > 0.0]
+    Q, R = np.linalg.qr(X)
+    spanned = np.abs(R.diagonal()) < _SPANNED * math.sqrt(X.shape[0])
+    return np.asarray(Q[:, ~spanned])
+
+
+def _moved(x: FloatArray, late: int) -> FloatArray:
+    """Return what `x` is `late` samples later; its ends hold."""
+    if not late:
+        return x
+    moved = np.roll(x, -late)
+    moved[slice(-late, None) if late > 0 else slice(0, -late)] = x[-1 if late > 0 else 0]
+    return moved
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """What level and load leave of a voltage, and what was taken out."""
+
+    dt: float  # mean step within the stretches, s
+    places: npt.NDArray[np.intp]  # of the readings in stretches without gaps, shape (n,)
+    voltage: FloatArray  # V, what the regressors leave, shape (n,)
+    basis: FloatArray  # orthonormal regressors, shape (n, p)
+    lengths: list[int]  # of the stretches
+    walk: float  # usual walk of the level, V per sqrt(s)
+    slowest: float  # half the distance of the level's knots, s: slower is the level
+
+    @property
+    def free(self) -> int:
+        """Return the readings beyond the number of regressors."""
+        return int(self.basis.shape[0] - self.basis.shape[1])
+
+
+def regress(t: FloatArray, v: FloatArray, u: FloatArray | None,
+            i: FloatArray | None) -> Regression:
+    """Take level and load out of a voltage, V; stamps in s, throttle 0..1, current in A."""
+    stretches = _stretches(t)
+    dt = float(np.median(np.diff(t)))
+    if stretches:
+        dt = sum(t[s.stop - 1] - t[s.start] for s in stretches) / max(
+            1, sum(s.stop - s.start - 1 for s in stretches))
+    span = float(t[-1] - t[0])
+    knots = np.linspace(t[0], t[-1], max(_PARTS, math.ceil(span / _HATS)) + 1)
+    level = [np.interp(t, knots, row) for row in np.eye(knots.size)]
+    taus = [tau for tau in _LAGS if 0.5 * dt < tau < span / 3.0]
+    u, i = _filled(t, u), _filled(t, i)
+
+    def answers(x: FloatArray) -> list[FloatArray]:
+        return [x, *(_lagged(x, -math.expm1(-dt / tau)) for tau in taus)]
+
+    def of_throttle(x: FloatArray) -> list[FloatArray]:
+        x = np.clip(np.abs(x), 0.0, 2.0)
+        return [x, x ** 3, *answers(x ** _POWER)]
+
+    columns = level
+    last = slice(-_DELAY_READINGS, None)
+
+    def best(x: FloatArray, regressors: Any) -> list[FloatArray]:
+        """Return the regressors of a load at the delay that leaves least."""
+        left = {}
+        for late in sorted(range(-_DELAYS, _DELAYS + 1), key=abs):
+            Q = _basis([c[last] for c in (*columns, *regressors(_moved(x, late))[:5])])
+            left[late] = float(v[last] @ v[last] - np.sum((Q.T @ v[last]) ** 2))
+        least = min(left, key=left.__getitem__)
+        # A delay must pay, or noise would choose it.
+        late = least if left[least] < left[0] * (1.0 - 10.0 / v[last].size) else 0
+        found: list[FloatArray] = regressors(_moved(x, late))
+        return found
+
+    walk = _WALK * max(abs(float(v.mean())), 1e-3) / CELL
+    v = v - v.mean()
+    if i is not None:
+        columns = [*columns, *best(i, answers)]
+    if u is not None:
+        columns = [*columns, *best(u, of_throttle)]
+        if i is not None:
+            columns.append(u * i)
+    places = np.concatenate([np.arange(s.start, s.stop) for s in stretches] or [
+        np.zeros(0)]).astype(np.intp)
+    basis, v = _basis([c[places] for c in columns]), v[places]
+    # Twice, against rounding.
+    for _ in range(2):
+        v = v - basis @ (basis.T @ v)
+    return Regression(dt, places, v, basis, [s.stop - s.start for s in stretches], walk,
+                      0.5 * float(knots[1] - knots[0]))
+
+
+class _Likelihood:
+    """Restricted log-likelihood of an OU beside white noise, and what it integrates out."""
+
+    def __init__(self, part: Regression) -> None:
+        self.free = part.free
+        Z = np.column_stack([part.basis, part.voltage])
+        crosses, counts, omegas, lengths = [], [], [], []
+        for n, rows in zip(part.lengths, np.split(Z, np.cumsum(part.lengths)[:-1])):
+            F = np.fft.rfft(rows, axis=0) / math.sqrt(n)
+            weight = np.full(F.shape[0], 2.0)
+            weight[0] = 1.0
+            if n % 2 == 0:
+                weight[-1] = 1.0
+            omega = 2.0 * np.pi * np.arange(F.shape[0]) / n
+            edges = [*range(min(_SINGLE, F.shape[0]))]
+            while edges[-1] < F.shape[0]:
+                edges.append(min(F.shape[0], edges[-1] + max(1, int(_WIDTH * edges[-1]))))
+            for a, b in zip(edges, edges[1:]):
+                G = F[a:b] * np.sqrt(weight[a:b, None])
+                crosses.append(G.real.T @ G.real + G.imag.T @ G.imag)
+                counts.append(weight[a:b].sum())
+                omegas.append(omega[a:b].mean())
+                lengths.append(n)
+        self._p = Z.shape[1] - 1
+        self._cross = np.array(crosses).reshape(len(crosses), -1)
+        self._count, self._omega = np.array(counts), np.array(omegas)
+        self._n = np.array(lengths, dtype=np.float64)
+        # A random walk has the inverse of this for its spectrum; the mean is a regressor.
+        self._walk = 4.0 * np.sin(0.5 * np.maximum(self._omega, np.pi / self._n)) ** 2
+
+    def at(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """
+        Return minus the log-likelihood, and the variance, V^2, of OU and white noise together.
+
+        Points of shape (k, 3): ln(alpha D), logit(share of the OU), and ln of the variance of a
+        step of the level beside that of the noise.
+        """
+        a = np.exp(points[:, :1])
+        share = 1.0 / (1.0 + np.exp(-points[:, 1:2]))
+        w = np.exp(-a - 1j * self._omega)
+        # Expectation of an ordinate: sum of (1 - |l|/n) phi^|l| exp(-i omega l).
+        rest = -np.expm1(-a * self._n)
+        one = w / (1.0 - w) - w * rest / (self._n * (1.0 - w) ** 2)
+        S = (share * (1.0 + 2.0 * one.real) + 1.0 - share
+             + np.exp(points[:, 2:]) / self._walk)
+        size = self._p + 1
+        G = ((1.0 / S) @ self._cross).reshape(-1, size, size)
+        # Rounding must not make it indefinite.
+        G[:, range(size), range(size)] *= 1.0 + 1e-10
+        L = np.linalg.cholesky(G)
+        d = np.log(np.diagonal(L, axis1=1, axis2=2))
+        left = 2.0 * d[:, -1]
+        value = (0.5 * self.free * left + 0.5 * np.log(S) @ self._count
+                 + d[:, :-1].sum(axis=1))
+        return value, np.exp(left) / self.free
+
+
+def _points(*axes: FloatArray) -> FloatArray:
+    """Return the points of a grid, shape (k, 3)."""
+    return np.stack([x.ravel() for x in np.meshgrid(*axes, indexing='ij')], axis=1)
+
+
+def fit_ou(part: Regression, span: float) -> OuFacts:
+    """Fit the noise to a window of so many s."""
+    dt = part.dt
+    total = float(part.voltage @ part.voltage)
+    if not total > 1e-18 * part.voltage.size:
+        # A constant signal: no noise, thus no relaxation.
+        return OuFacts('not_visible', span, tau_below_s=dt, var_inf_below=0.0)
+    likelihood = _Likelihood(part)
+    # ln of the variance of the level's step beside that of the noise, by the prior.
+    usual = math.log(dt * part.walk ** 2 * part.free / total)
+    low = np.array([math.log(dt / part.slowest), -_LOGIT, usual - 6.0 * _WALK_SD])
+    high = np.array([math.log(_FASTEST), _LOGIT, usual + 6.0 * _WALK_SD])
+
+    def costs(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return minus the log-posterior, flat in share, and the variance, V^2."""
+        value, variance = likelihood.at(points)
+        off = 0.5 * (points[:, 2] + np.log(variance / dt)) - math.log(part.walk)
+        return value + 0.5 * (off / _WALK_SD) ** 2, variance
+
+    def cost(point: FloatArray) -> float:
+        inside = np.clip(point, low, high)
+        return float(costs(inside[None])[0][0] + 10.0 * np.sum((point - inside) ** 2))
+
+    points = _points(*(np.linspace(*ends) for ends in zip(low, high, _GRID)))
+    value, variance = costs(points)
+    white = float(costs(_points(np.zeros(1), np.full(1, -60.0),
+                                np.linspace(low[2], high[2], 40)))[0].min())
+    start = points[np.argmin(value)]
+    top = minimize(cost, start, method='Nelder-Mead', options={
+        'xatol': 0.02, 'fatol': 0.01, 'maxiter': 200,
+        'initial_simplex': start + 0.7 * np.vstack([np.zeros(3), np.eye(3)])})
+    least = min(float(top.fun), white)
+    if white - least < VISIBLE:
+        return _unseen(costs, low, high, least, dt, span)
+    # Points from a wide law about maximum and grid, weighted by their likelihood; the next law
+    # has the moments of the last points.
+    weight = np.exp(least - value)
+    peak = np.clip(top.x, low, high)
+    centre = (peak + weight @ points) / (1.0 + weight.sum())
+    off, root = points - centre, _curvature(cost, peak)
+    root = np.linalg.cholesky(root @ root.T + (
+        (off * weight[:, None]).T @ off + np.outer(peak - centre, peak - centre)) / (
+        1.0 + weight.sum()))
+    rng = np.random.default_rng(0)
+    for _ in range(_ROUNDS):
+        z = rng.standard_normal((_DRAWS, 3)) / np.sqrt(rng.chisquare(5.0, (_DRAWS, 1)) / 5.0)
+        points = centre + z @ root.T
+        inside = np.all((points >= low) & (points <= high), axis=1)
+        points, z = points[inside], z[inside]
+        value, variance = costs(points)
+        share = 1.0 / (1.0 + np.exp(-points[:, 1]))
+        # 4: (5 + 3) / 2 of Student's t with 5 degrees of freedom.
+        log_weight = (4.0 * np.log1p(np.sum(z * z, axis=1) / 5.0) - value
+                      + 0.5 * np.log(share * (1.0 - share)))
+        weight = np.exp(log_weight - log_weight.max())
+        weight /= weight.sum()
+        centre = weight @ points
+        off = points - centre
+        root = np.linalg.cholesky((off * weight[:, None]).T @ off + 1e-4 * np.eye(3))
+    log_alpha, log_var = points[:, 0] - math.log(dt), np.log(share * variance)
+    spread = math.sqrt(2.0 / part.free)
+    alpha, *alpha_95 = np.exp(_quantiles(log_alpha, weight, 0.0))
+    var_inf, *var_inf_95 = np.exp(_quantiles(log_var, weight, spread))
+    ends = np.exp(_quantiles(0.5 * (log_alpha + log_var + math.log(2.0)), weight, 0.5 * spread))
+    sigma = math.sqrt(2.0 * alpha * var_inf)
+    sigma_95 = min(ends[1], sigma), max(ends[2], sigma)
+    found = OuFacts('ok', span, float(alpha), _pair(alpha_95), sigma, _pair(sigma_95),
+                    float(var_inf), _pair(var_inf_95))
+    return found if all(determined(middle, *around) for middle, around in (
+        (found.alpha, found.alpha_95), (found.sigma, found.sigma_95),
+        (found.var_inf, found.var_inf_95))) else _unseen(
+            costs, low, high, least, dt, span)
+
+
+def _pair(ends: Sequence[float]) -> tuple[float, float]:
+    return float(ends[0]), float(ends[1])
+
+
+def _curvature(cost: Callable[[FloatArray], float], centre: FloatArray) -> FloatArray:
+    """Return a root of the covariance that the curvature of a cost says, at most 2 a direction."""
+    step = 0.15 * np.eye(3)
+    H = np.array([[cost(centre + a + b) - cost(centre + a - b) - cost(centre - a + b)
+                   + cost(centre - a - b) for b in step] for a in step]) / (4.0 * 0.15 ** 2)
+    values, vectors = np.linalg.eigh(0.5 * (H + H.T))
+    return np.asarray(vectors / np.sqrt(np.clip(values, 0.25, None)) * 1.2)
+
+
+def _quantiles(log: FloatArray, weight: FloatArray, extra: float) -> FloatArray:
+    """Return median, 2.5 and 97.5 % quantile of points, blurred by a normal of sd extra."""
+    if extra:
+        nodes, w = np.polynomial.hermite_e.hermegauss(7)
+        log = (log[:, None] + extra * nodes).ravel()
+        weight = (weight[:, None] * w).ravel()
+    order = np.argsort(log)
+    mass = np.cumsum(weight[order])
+    mass = (mass - 0.5 * weight[order]) / mass[-1]
+    return np.interp((0.5, 0.025, 0.975), mass, log[order])
+
+
+def _unseen(costs: Callable[[FloatArray], tuple[FloatArray, FloatArray]], low: FloatArray,
+            high: FloatArray, least: float, dt: float, span: float) -> OuFacts:
+    """Return tau and Var_inf such that no slower OU has a larger variance."""
+    shape = (*_GRID[:2], _WALKS)
+    axes = [np.linspace(*ends) for ends in zip(low, high, shape)]
+    value, variance = (x.reshape(shape) for x in costs(_points(*axes)))
+    best = np.argmin(value, axis=2)[:, :, None]
+    # At the best walk, between the points of the grid; roots, as a parabola's are straight.
+    lost = np.take_along_axis(value, best, 2)[:, :, 0] - min(least, float(value.min()))
+    fine = zoom(np.sqrt(np.maximum(lost, 0.0)), 8, order=1) ** 2
+    size = zoom(np.log(np.take_along_axis(variance, best, 2)[:, :, 0]), 8, order=1)
+    tau = dt * np.exp(-np.linspace(low[0], high[0], fine.shape[0]))
+    share = 1.0 / (1.0 + np.exp(-np.linspace(low[1], high[1], fine.shape[1])))
+    fits = fine < _DROP
+    strong = fits[:, share > _QUARTER].any(axis=1)
+    longest = float(tau[strong].max()) if strong.any() else float(tau.min())
+    slower = fits & (tau > longest)[:, None]
+    variance = share * np.exp(size)
+    return OuFacts('not_visible', span, tau_below_s=longest, var_inf_below=float(
+        variance[slower].max() if slower.any() else _QUARTER * np.exp(size.min())))
