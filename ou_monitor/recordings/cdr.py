@@ -140,8 +140,8 @@ def _field(line: str, package: str) -> Field | None:
     return Field(name, kind, True, int(inside) if inside.isdigit() else None)
 
 
-class _NoLayoutError(Exception):
-    """The message is for the general decoder."""
+class _NoLayoutError(ValueError):
+    """The message goes on beyond its end, or beyond what a walk through it may take."""
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,8 @@ class _Walk:
     """Reads one message from front to back, noting where things are."""
 
     def __init__(
-        self, data: bytes, definitions: Definitions, wanted: frozenset[FieldPath],
+        self, data: bytes, definitions: Definitions, wanted: frozenset[FieldPath], *,
+        most_steps: int = _MOST_STEPS, most_words: int = _MOST_WORDS,
     ) -> None:
         self.words: list[tuple[int, int]] = []
         self.texts: list[tuple[int, int]] = []
@@ -237,12 +238,15 @@ class _Walk:
         self._definitions = definitions
         self._wanted = wanted
         self._at = _HEADER
-        self._steps = 0
+        self._left, self._most_words = most_steps, most_words
+        self._length = struct.Struct('<I' if data[1:2] in (b'\x01', b'\x03') else '>I')
 
     def message(self, kind: str, path: FieldPath, depth: int) -> None:
         fields = self._definitions.get(kind)
-        if fields is None or depth > _MOST_DEPTH:
-            raise _NoLayoutError
+        if fields is None:
+            raise _NoLayoutError('a type in it is not defined')
+        if depth > _MOST_DEPTH:
+            raise _NoLayoutError('its types are nested too deep')
         if not fields:
             # A message without fields is sent as one byte.
             self._take(1, 1)
@@ -250,9 +254,7 @@ class _Walk:
             self._field(field, (*path, field.name), depth)
 
     def _field(self, field: Field, path: FieldPath, depth: int) -> None:
-        self._steps += 1
-        if self._steps > _MOST_STEPS:
-            raise _NoLayoutError
+        self._step(1)
         if not field.array:
             self._one(field.type, path, depth)
             return
@@ -260,11 +262,14 @@ class _Walk:
         if field.type in PRIMITIVES:
             self._numbers(field.type, size, path)
             return
-        if size > _MOST_STEPS:
-            raise _NoLayoutError
+        self._step(size)
         for k in range(size):
-            self._steps += 1
             self._one(field.type, (*path, k), depth)
+
+    def _step(self, number: int) -> None:
+        self._left -= number
+        if self._left < 0:
+            raise _NoLayoutError('it states more elements than it has bytes')
 
     def _one(self, kind: str, path: FieldPath, depth: int) -> None:
         if kind == TEXT:
@@ -300,9 +305,9 @@ class _Walk:
 
     def _word(self) -> int:
         begin = self._take(4, 4)
-        if len(self.words) == _MOST_WORDS:
-            raise _NoLayoutError
-        (value,) = struct.unpack_from('<I', self._data, begin)
+        if len(self.words) == self._most_words:
+            raise _NoLayoutError('it states too many lengths')
+        (value,) = self._length.unpack_from(self._data, begin)
         self.words.append((begin, value))
         return int(value)
 
@@ -311,7 +316,7 @@ class _Walk:
         begin = self._at + (_HEADER - self._at) % align
         self._at = begin + size
         if self._at > len(self._data):
-            raise _NoLayoutError
+            raise _NoLayoutError('it is shorter than what it says of itself')
         return begin
 
 
@@ -351,53 +356,8 @@ def endless(kind: str, definitions: Definitions) -> bool:
 
 def check_extent(message: bytes, kind: str, definitions: Definitions) -> None:
     """Raise ValueError where a message of a type as of `endless` goes on beyond its end."""
-    word = struct.Struct('<I' if message[1:2] in (b'\x01', b'\x03') else '>I')
-    left = len(message) + _FREE_STEPS
-    at = _HEADER
-
-    def take(size: int, align: int) -> int:
-        nonlocal at
-        begin = at + (_HEADER - at) % align
-        at = begin + size
-        if at > len(message):
-            raise ValueError('it is shorter than what it says of itself')
-        return begin
-
-    def length() -> int:
-        (value,) = word.unpack_from(message, take(4, 4))
-        return int(value)
-
-    def one(name: str) -> None:
-        nonlocal left
-        left -= 1
-        if left < 0:
-            raise ValueError('it states more elements than it has bytes')
-        if name == TEXT:
-            take(length(), 1)
-        elif name in PRIMITIVES:
-            width = np.dtype(PRIMITIVES[name]).itemsize
-            take(width, width)
-        elif name not in definitions:
-            raise ValueError('a type in it is not defined')
-        elif not definitions[name]:
-            take(1, 1)
-        else:
-            for field in definitions[name]:
-                if field.array:
-                    several(field)
-                else:
-                    one(field.type)
-
-    def several(field: Field) -> None:
-        count = length() if field.size is None else field.size
-        if field.type in PRIMITIVES:
-            width = np.dtype(PRIMITIVES[field.type]).itemsize
-            take(count * width, width if count else 1)
-            return
-        for _ in range(count):
-            one(field.type)
-
-    one(kind)
+    _Walk(message, definitions, frozenset(), most_steps=4 * len(message) + _FREE_STEPS,
+          most_words=len(message)).message(kind, (), 0)
 
 
 # Layouts that are tried for messages of one length; a topic with more of them
