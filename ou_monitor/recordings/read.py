@@ -24,14 +24,13 @@ from ou_monitor.recordings.importers.choose import (
 from ou_monitor.recordings.importers.csv_table import CsvColumns, read_column, read_csv
 from ou_monitor.recordings.importers.formats import import_log, is_csv, is_log
 from ou_monitor.recordings.importers.log import (
-    Log, RawColumns, Request, Series, SIGNAL, UNKNOWN)
+    in_order, Log, RawColumns, Request, Series, SIGNAL, UNKNOWN)
 from ou_monitor.recordings.samples import (
-    check_throttle, dropped_words, known_current, late_words, outside_words, overlap, part_words,
-    read_bag, repeated_words)
+    check_throttle, known_current, outside_words, part_words, read_bag)
 from ou_monitor.recordings.standard_types import IMU
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.config import FieldSpec
-from ou_monitor.timeline.line import MOST_CURRENT, plausible, plausible_samples, TimeLine
+from ou_monitor.timeline.line import MOST_VOLTAGE, plausible_samples
 from ou_monitor.timeline.refresh import readings_of
 
 # Samples further apart, s, are more likely of another unit of time than of a slow logger.
@@ -154,27 +153,19 @@ def _samples(recording: Recording, which: slice | npt.NDArray[np.bool_], notes: 
 
 def tidy(raw: RawColumns) -> Recording:
     """Return a `Recording`: in order, each stamp once; notes say what that took."""
-    name, notes = raw.name, list(raw.notes)
+    name = raw.name
     check_throttle(name, raw.throttle, raw.voltage)
-    t, voltage, throttle = plausible_samples(raw.t, raw.voltage, raw.throttle)
-    good = np.isfinite(t) & np.isfinite(voltage)
-    if not good.all():
-        notes.append(dropped_words(t.size - int(good.sum()), raw.voltage[~good]))
-    if (late := int(np.count_nonzero(np.diff(t[good]) < 0.0))):
-        notes.append(late_words(late, *overlap(t[good])))
-    line = TimeLine()
-    batches = line.order(t, voltage, throttle, plausible(raw.current, MOST_CURRENT), math.inf)
-    if line.counters.late:
-        notes.append(repeated_words(line.counters.late))
-    if not batches:
+    t, _, throttle = plausible_samples(raw.t, raw.voltage, raw.throttle)
+    which, said = in_order(t, raw.voltage[:, None], MOST_VOLTAGE, ' V')
+    notes, t = [*raw.notes, *said], t[which]
+    if not t.size:
         raise InputError(_unusable(name, notes))
-    (batch,) = batches
-    if batch.t.size > 2 and (spacing := float(np.median(np.diff(batch.t)))) >= _SPARSE:
+    if t.size > 2 and (spacing := float(np.median(np.diff(t)))) >= _SPARSE:
         notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '
                      '--time-unit says so of a CSV.')
-    throttle = np.full(batch.t.size, math.nan) if batch.u is None else batch.u
-    return Recording(batch.t, batch.y, throttle, name, raw.source, tuple(notes),
-                     None if batch.i is None else known_current(batch.i))
+    assert throttle is not None
+    return Recording(t, raw.voltage[which], throttle[which], name, raw.source, tuple(notes),
+                     known_current(raw.current[which]))
 
 
 def _unusable(name: str, notes: Sequence[str]) -> str:

@@ -23,20 +23,11 @@ from ou_monitor.stream.blocks import BlockClock
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.stream.samples import ThrottleHold
 from ou_monitor.text import counted, printable
-from ou_monitor.timeline.line import MOST_CURRENT, MOST_THROTTLE, MOST_VOLTAGE
+from ou_monitor.timeline.line import MOST_CURRENT, MOST_THROTTLE
 
 VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
-# So many samples behind for each step back are not a few that came late.
-_STRETCH = 20
 # Share of implausible throttles up to which they are errors of single samples.
 _WILD = 0.05
-
-
-def dropped_words(count: int, voltage: FloatArray) -> str:
-    """Return the note on samples that are not usable; `voltage`: theirs."""
-    beyond = bool((np.isfinite(voltage) & (np.abs(voltage) > MOST_VOLTAGE)).any())
-    return (f'{counted(count)} dropped: not a finite number'
-            + (f', or beyond {MOST_VOLTAGE:g} V.' if beyond else '.'))
 
 
 def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None = None) -> None:
@@ -60,33 +51,6 @@ def known_current(current: FloatArray) -> FloatArray | None:
     """Return a current with NaN for what is not finite; None where none is known."""
     known = np.abs(current) <= MOST_CURRENT
     return np.where(known, current, np.nan) if known.any() else None
-
-
-def overlap(t: FloatArray) -> tuple[int, float]:
-    """
-    Return how many samples lie before one that came earlier, and how far at most, s.
-
-    t in s.
-    """
-    ahead = np.maximum.accumulate(t) - t
-    behind = ahead > 0.0
-    return int(np.count_nonzero(behind)), float(ahead[behind].max(initial=0.0))
-
-
-def late_words(count: int, mixed: int, back: float) -> str:
-    """Return the note on samples out of order: steps back, samples behind, and how far, s."""
-    if mixed < _STRETCH * count:
-        return f'{counted(count)} came before the stamp ahead of them: sorted by stamp.'
-    times = 'once' if count == 1 else f'{count} times'
-    return (f'The clock went back {times}, by {back:.3g} s at most: {counted(mixed)} lie where '
-            'others were before, and were mixed with them; take a part before or after, or mend '
-            'the stamps.')
-
-
-def repeated_words(count: int) -> str:
-    """Return the note on stamps that are there twice."""
-    return (f'{counted(count)} dropped: the stamp was there before; the first of each was '
-            'kept.')
 
 
 def span_words(start: float | None, end: float | None) -> str:

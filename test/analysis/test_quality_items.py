@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 from ou_monitor.analysis.quality import quality_list, Severity
-from ou_monitor.recordings.samples import late_words
+from ou_monitor.recordings.importers.log import in_order
 from ou_monitor.records import Estimate, Flag, Recording, Status
 import pytest
 from simulated_recordings import recording
 
 GOOD = Estimate(alpha=63.0, sigma=0.3, var_inf=7e-4, u0=5.0, noise_std=0.0, status=Status.OK)
+# A clock that went back once, by 2 s of 900 samples.
+BACK = np.concatenate((np.arange(900.0), np.arange(900.0) - 1.5)) / 450.0
 
 
 def listed(simulated, estimates=(GOOD,), notes=((),)):
@@ -48,7 +50,7 @@ def test_worst_comes_first_and_levels_share_an_entry():
     ('1 sample dropped: not a finite number.', 'NON_FINITE', Severity.WARNING),
     ('3 messages dropped, the first: x.mcap: a message of type y cannot be decoded (z).',
      'DAMAGED_FILE', Severity.WARNING),
-    (late_words(1, 900, 2.0), 'UNORDERED', Severity.WARNING),
+    (*in_order(BACK, BACK[:, None], 1e6)[1][:1], 'UNORDERED', Severity.WARNING),
     ('Something else.', 'READER', Severity.INFO)])
 def test_what_the_reader_noted_is_in_it(note, name, severity):
     """As the reader words it."""

@@ -16,11 +16,10 @@ from pathlib import Path
 import re
 
 import numpy as np
-import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers.log import (
-    ANY, clean, CURRENT, Inertial, LARGEST, Log, MotorSpeeds, near, RawColumns, rising, Series,
-    SIGNAL, THROTTLE, UNKNOWN, VOLTAGE)
+    ANY, clean, CURRENT, Inertial, Log, MotorSpeeds, RawColumns, Series, SIGNAL, sound, THROTTLE,
+    UNKNOWN, VOLTAGE)
 from ou_monitor.recordings.samples import check_throttle
 from ou_monitor.records import FloatArray
 from ou_monitor.text import printable
@@ -363,32 +362,17 @@ def _inertial(path: Path, log: Log, names: Sequence[str]) -> list[Inertial]:
 def clean_inertial(one: Inertial) -> tuple[Inertial, tuple[str, ...]]:
     """Return finite rows with rising stamps, and what that took."""
     columns = [part for part in (one.angular_velocity, one.acceleration) if part is not None]
-    good, notes = _good(one.t, np.hstack(columns))
-    gyro, acc = (None if part is None else part[good]
+    which, notes = sound(one.t, np.hstack(columns))
+    gyro, acc = (None if part is None else part[which]
                  for part in (one.angular_velocity, one.acceleration))
-    kept = replace(one, t=one.t[good], angular_velocity=gyro, acceleration=acc)
+    kept = replace(one, t=one.t[which], angular_velocity=gyro, acceleration=acc)
     return kept, (*notes, *pace_notes(kept.t))
 
 
 def clean_speeds(one: MotorSpeeds) -> tuple[MotorSpeeds, tuple[str, ...]]:
     """Return finite rows with rising stamps, and what that took."""
-    good, notes = _good(one.t, one.values)
-    return replace(one, t=one.t[good], values=one.values[good]), notes
-
-
-def _good(t: FloatArray, values: FloatArray,
-          ) -> tuple[npt.NDArray[np.intp], tuple[str, ...]]:
-    """Return the places of usable rows in the order of the log."""
-    usable = np.isfinite(t) & (np.abs(values) <= LARGEST).all(axis=1) & near(t)
-    places = np.flatnonzero(usable)
-    notes = []
-    if places.size < t.size:
-        notes.append(f'{t.size - places.size} rows dropped: no finite numbers, or a stamp far '
-                     'off.')
-    ahead = rising(t[places])
-    if not ahead.all():
-        notes.append(f'{int((~ahead).sum())} rows dropped: their stamps do not rise.')
-    return places[ahead], tuple(notes)
+    which, notes = sound(one.t, one.values)
+    return replace(one, t=one.t[which], values=one.values[which]), tuple(notes)
 
 
 def pace_notes(t: FloatArray) -> tuple[str, ...]:

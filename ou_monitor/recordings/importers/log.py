@@ -8,7 +8,7 @@ time is not kept.  Importers know nothing of how a log is written as a bag.
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
@@ -24,7 +24,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import FloatArray
-from ou_monitor.text import printable
+from ou_monitor.text import counted, printable
+from ou_monitor.timeline.line import TimeLine
 
 # Front, right, down -> front, left, up.
 FRD_TO_FLU = np.array([1.0, -1.0, -1.0])
@@ -80,7 +81,11 @@ LARGEST = 1e9
 # Stamps that only broken bytes make: further ahead than this, by so few samples.
 _FAR = 3600.0  # s
 _FEW = 16
+# So many samples behind for each step back are not a few that came late.
+_STRETCH = 20
 
+# Places of samples; all of them as a slice.
+Picked = npt.NDArray[np.intp] | slice
 Progress = Callable[[float], None]
 
 
@@ -209,31 +214,72 @@ def one_flight(path: Path, request: Request) -> None:
         raise InputError(f'{path} holds one flight: --flight {request.flight} is not there')
 
 
+def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
+             ) -> tuple[Picked, list[str]]:
+    """
+    Return which samples the time line takes, in its order, and notes of what that took.
+
+    t in s, rows of shape (n, m), each of which counts as a whole, with values up to `most`.
+    """
+    sizes = np.abs(rows)
+    # The comparison is false for NaN too.
+    good = np.isfinite(t) & (sizes <= most).all(axis=1)
+    notes = []
+    if not good.all():
+        beyond = bool((np.isfinite(sizes) & (sizes > most)).any())
+        notes.append(f'{counted(t.size - int(good.sum()))} dropped: not a finite number'
+                     + (f', or beyond {most:g}{unit}.' if beyond else '.'))
+    if (steps := int(np.count_nonzero(np.diff(t[good]) < 0.0))):
+        notes.append(_late_words(steps, t[good]))
+    line = TimeLine()
+    batches = line.order(t[good], np.flatnonzero(good).astype(np.float64), None, None, math.inf)
+    if line.counters.late:
+        notes.append(f'{counted(line.counters.late)} dropped: the stamp was there before; the '
+                     'first of each was kept.')
+    if line.used == t.size and not notes:
+        # All as they are, without a copy.
+        return slice(None), notes
+    return (batches[0].y if batches else np.empty(0)).astype(np.intp), notes
+
+
+def _late_words(steps: int, t: FloatArray) -> str:
+    """Return the note on samples out of order, `steps` of which go back (t in s)."""
+    ahead = np.maximum.accumulate(t) - t
+    behind = int(np.count_nonzero(ahead))
+    if behind < _STRETCH * steps:
+        return f'{counted(steps)} came before the stamp ahead of them: sorted by stamp.'
+    times = 'once' if steps == 1 else f'{steps} times'
+    return (f'The clock went back {times}, by {float(ahead.max()):.3g} s at most: '
+            f'{counted(behind)} lie where others were before, and were mixed with them; take a '
+            'part before or after, or mend the stamps.')
+
+
+def sound(t: FloatArray, rows: FloatArray) -> tuple[Picked, list[str]]:
+    """Return samples as `in_order`, without those whose stamps only broken bytes make."""
+    notes = []
+    places = np.flatnonzero(np.isfinite(t) & np.isfinite(rows).all(axis=1))
+    if places.size < t.size:
+        notes.append(f'{counted(t.size - places.size)} dropped: not a finite number.')
+    for good_of, why in ((near, f'the stamp is over {_FAR:g} s away from all others'),
+                         (rising, 'the stamp goes back')):
+        good = good_of(t[places])
+        if not good.all():
+            notes.append(f'{counted(int((~good).sum()))} dropped: {why}.')
+            places = places[good]
+    which, said = in_order(t[places], rows[places], LARGEST)
+    return places[which], notes + said
+
+
 def clean(series: Series) -> tuple[Series, tuple[str, ...]]:
     """Return a series with finite values and stamps that increase, and notes of what that took."""
-    notes: list[str] = []
-    t, values = series.t, series.values
-
-    def keep(good: npt.NDArray[np.bool_], why: str) -> None:
-        nonlocal t, values
-        dropped = int(good.size - good.sum())
-        if dropped:
-            notes.append(f'{dropped} sample{"s" * (dropped != 1)} dropped: {why}.')
-            t, values = t[good], values[good]
-
-    keep(np.isfinite(t) & np.isfinite(values), 'not a finite number')
-    keep(np.abs(values) <= LARGEST, f'beyond {LARGEST:g}')
-    keep(near(t), f'the stamp is over {_FAR:g} s away from all others')
-    fresh = np.ones(t.size, dtype=bool)
-    fresh[1:] = np.diff(t) != 0.0
-    keep(fresh, 'the stamp was there before; the first of each was kept')
-    keep(rising(t), 'the stamp goes back')
+    which, notes = sound(series.t, series.values[:, None])
+    values = series.values[which]
     if series.quantity == THROTTLE:
         outside = int(((values < -0.01) | (values > 1.01)).sum())
         if outside:
-            notes.append(f'{outside} value{"s" * (outside != 1)} outside 0..1 set to its end.')
+            notes.append(f'{counted(outside, "value")} outside 0..1 set to its end.')
         values = np.clip(values, 0.0, 1.0)
-    return replace(series, t=t, values=values), tuple(notes)
+    return replace(series, t=series.t[which], values=values), tuple(notes)
 
 
 def near(t: FloatArray) -> npt.NDArray[np.bool_]:
@@ -251,15 +297,15 @@ def near(t: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def rising(t: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return a longest part of the stamps that increases."""
+    """Return a longest part of the stamps that does not go back."""
     good = np.ones(t.size, dtype=bool)
-    if t.size < 2 or (np.diff(t) > 0.0).all():
+    if (t[1:] >= t[:-1]).all():
         return good
     ends: list[float] = []
     places: list[int] = []
     before = np.full(t.size, -1, dtype=np.int64)
     for k, stamp in enumerate(t.tolist()):
-        length = bisect_left(ends, stamp)
+        length = bisect_right(ends, stamp)
         if length == len(ends):
             ends.append(stamp)
             places.append(k)

@@ -207,7 +207,7 @@ def test_bad_rows_gaps_and_jumps_of_rate():
     gyro[5, 1], t[50] = np.nan, 0.02
     one, notes = clean_inertial(Inertial('g', t, gyro, None, '1', ''))
     assert one.t.size == 198 and one.acceleration is None and (np.diff(one.t) > 0.0).all()
-    assert any('1 rows dropped: no finite' in note for note in notes)
+    assert any('1 sample dropped: not a finite' in note for note in notes)
     assert any('1 gap of up to 0.401 s' in note for note in notes)
     assert any('between 250 and 1000 Hz' in note for note in notes)
     assert pace_notes(np.arange(100) * 0.01) == ()
