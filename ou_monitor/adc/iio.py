@@ -32,28 +32,17 @@ _TYPE = re.compile(r'(be|le):([su])(\d+)/(\d+)(?:X(\d+))?(?:>>(\d+))?')
 
 @dataclass(frozen=True)
 class Element:
-    """
-    One element of a scan.
+    """One element of a scan."""
 
-    Attributes
-    ----------
-    name : str
-        'in_voltage0', 'in_timestamp'.
-    index : int
-        Its place among the elements.
-    order : str
-        '<' or '>'.
-    signed : bool
-        Whether two's complement.
-    bits, storage, shift : int
-        Valid bits, bits in memory, and bits below the valid ones.
-
-    """
-
+    # 'in_voltage0', 'in_timestamp'.
     name: str
+    # Its place among the elements.
     index: int
+    # '<' or '>'.
     order: str
+    # Whether two's complement.
     signed: bool
+    # Valid bits, bits in memory, and bits below the valid ones.
     bits: int
     storage: int
     shift: int
@@ -131,22 +120,13 @@ _CLOCKS: dict[str, int] = {
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """
-    Samples at an even spacing.
+    """Samples at an even spacing."""
 
-    Attributes
-    ----------
-    stamp : float
-        Time of the last sample, s since 1970.
-    volts : ndarray, shape (n,)
-        Voltages, V.
-    interval : float
-        Spacing by the kernel's stamps, s; NaN where there are none.
-
-    """
-
+    # Time of the last sample, s since 1970.
     stamp: float
+    # Voltages, V; shape (n,).
     volts: FloatArray
+    # Spacing by the kernel's stamps, s; NaN where there are none.
     interval: float
 
 

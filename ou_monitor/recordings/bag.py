@@ -52,52 +52,31 @@ _DURABILITY: dict[int, str] = {1: 'transient_local', 2: 'volatile'}
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """
-    One topic of a bag.
+    """One topic of a bag."""
 
-    Attributes
-    ----------
-    name : str
-        Topic name, absolute.
-    type : str
-        Message type, 'package/msg/Type'.
-    count : int
-        Number of messages.
-    reliability, durability : str
-        QoS that the publisher offered.
-    depth : int
-        Depth of the publisher's history, messages.
-
-    """
-
+    # Topic name, absolute.
     name: str
+    # Message type, 'package/msg/Type'.
     type: str  # noqa: A003
+    # Number of messages.
     count: int
+    # QoS that the publisher offered.
     reliability: str = 'reliable'
     durability: str = 'volatile'
+    # Depth of the publisher's history, messages.
     depth: int = 10
 
 
 class BagFiles(NamedTuple):
-    """
-    What a path to a bag stands for.
+    """What a path to a bag stands for."""
 
-    Attributes
-    ----------
-    paths : list of pathlib.Path
-        MCAP files in recorded order.
-    qos : dict of str to object
-        Topic name -> offered QoS.
-    about : dict of str to str
-        Custom data of the recording, such as its vehicle.
-    missing : str
-        What is missing; '' when nothing is.
-
-    """
-
+    # MCAP files in recorded order.
     paths: list[Path]
+    # Topic name -> offered QoS.
     qos: dict[str, Any]
+    # Custom data of the recording, such as its vehicle.
     about: dict[str, str]
+    # What is missing; '' when nothing is.
     missing: str
 
 

@@ -61,25 +61,13 @@ _MOST_DEPTH = 50
 
 @dataclass(frozen=True)
 class Field:
-    """
-    One field of a message.
-
-    Attributes
-    ----------
-    name : str
-        Its name.
-    type : str
-        A key of `PRIMITIVES`, `TEXT`, or 'package/Type'.
-    array : bool
-        Whether it is an array.
-    size : int or None
-        Elements of an array of fixed size; None when a message states them.
-
-    """
+    """One field of a message."""
 
     name: str
+    # A key of `PRIMITIVES`, `TEXT`, or 'package/Type'.
     type: str  # noqa: A003
     array: bool = False
+    # Elements of an array of fixed size; None when a message states them.
     size: int | None = None
 
 
@@ -146,22 +134,13 @@ class _NoLayoutError(ValueError):
 
 @dataclass(frozen=True)
 class Place:
-    """
-    Where numbers are in a message.
+    """Where numbers are in a message."""
 
-    Attributes
-    ----------
-    offset : int
-        Byte of the first one.
-    kind : str
-        NumPy type of each.
-    size : int or None
-        How many; None for a single number that is not an array.
-
-    """
-
+    # Byte of the first one.
     offset: int
+    # NumPy type of each.
     kind: str
+    # How many; None for a single number that is not an array.
     size: int | None = None
 
     def column(self, rows: Rows) -> FloatArray:
@@ -177,25 +156,15 @@ class Place:
 
 @dataclass(frozen=True)
 class Layout:
-    """
-    The layout of one message.
+    """The layout of one message."""
 
-    Attributes
-    ----------
-    length : int
-        Bytes of the message.
-    words : tuple of (int, int)
-        (offset, value) of every uint32 that states a length.
-    texts : tuple of (int, int)
-        (offset, bytes) of every text, its closing zero left out.
-    places : dict of FieldPath to Place
-        Where the fields asked for are.
-
-    """
-
+    # Bytes of the message.
     length: int
+    # (offset, value) of every uint32 that states a length.
     words: tuple[tuple[int, int], ...]
+    # (offset, bytes) of every text, its closing zero left out.
     texts: tuple[tuple[int, int], ...]
+    # Where the fields asked for are.
     places: dict[FieldPath, Place]
 
     def holds_for(self, rows: Rows) -> npt.NDArray[np.bool_]:
@@ -413,29 +382,18 @@ def gather(data: bytes, at: IntArray, kind: str) -> npt.NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """
-    A field of many messages.
+    """A field of many messages."""
 
-    Attributes
-    ----------
-    log_time : ndarray of uint64, shape (m,)
-        Log times, ns.
-    stamp : ndarray, shape (m,)
-        Stamps of the messages (of the LAST sample of a block), s; the log
-        time where a message has none.
-    stamped : ndarray of bool, shape (m,)
-        Whether the message carries its stamp.
-    count : ndarray of int64, shape (m,)
-        Values in each message; 0 where the field's array is too short.
-    values : ndarray, shape (count.sum(),)
-        Values in SI units; NaN where one is not a finite number.
-
-    """
-
+    # Log times, ns; shape (m,).
     log_time: TimeArray
+    # Stamps of the messages (of the LAST sample of a block), s; the log time where a message has
+    # none; shape (m,).
     stamp: FloatArray
+    # Whether the message carries its stamp; shape (m,).
     stamped: npt.NDArray[np.bool_]
+    # Values in each message; 0 where the field's array is too short; shape (m,).
     count: IntArray
+    # Values in SI units; NaN where one is not a finite number; shape (count.sum(),).
     values: FloatArray
 
     @property

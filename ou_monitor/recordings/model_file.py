@@ -31,23 +31,14 @@ _EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d{1,3}')
 
 @dataclass(frozen=True)
 class ModelFile:
-    """
-    What a model file holds.
+    """What a model file holds."""
 
-    Attributes
-    ----------
-    model : SupplyModel
-        The terms.
-    se : tuple of dict
-        Standard errors by parameter, one dict a term, empty where not known;
-        in the unit of the parameter.
-    provenance : dict
-        Recording, commit, date, held-out score; free text.
-
-    """
-
+    # The terms.
     model: SupplyModel
+    # Standard errors by parameter, one dict a term, empty where not known; in the unit of the
+    # parameter.
     se: tuple[dict[str, Any], ...] = ()
+    # Recording, commit, date, held-out score; free text.
     provenance: dict[str, Any] = field(default_factory=dict)
 
 

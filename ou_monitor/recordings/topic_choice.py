@@ -19,24 +19,15 @@ from ou_monitor.text import some
 
 @dataclass(frozen=True)
 class Choice:
-    """
-    What is read from a bag.
+    """What is read from a bag."""
 
-    Attributes
-    ----------
-    config : MsgConfig
-        The source.
-    voltage, throttle, current : FieldSpec
-        With the topics of this bag; throttle and current are None where there is none.
-    notes : tuple of str
-        One sentence for each thing that was not as expected.
-
-    """
-
+    # The source.
     config: MsgConfig
+    # With the topics of this bag; throttle and current are None where there is none.
     voltage: FieldSpec
     throttle: FieldSpec | None
     current: FieldSpec | None
+    # One sentence for each thing that was not as expected.
     notes: tuple[str, ...]
 
 

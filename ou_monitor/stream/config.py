@@ -32,92 +32,58 @@ _TOPIC = re.compile(r'[~/]?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
 
 @dataclass(frozen=True)
 class FieldSpec:
-    """
-    Where one quantity is found: value = sign * unit_factor * raw + offset.
+    """Where one quantity is found: value = sign * unit_factor * raw + offset."""
 
-    Attributes
-    ----------
-    topic : str
-        Topic; relative ones ('voltage') are for remapping.
-    type : str
-        Message type, 'package/msg/Type'.
-    field : str
-        Field path, 'data', 'channels[0].value'.
-    unit_factor : float
-        SI units per unit of the field (1e-3 for mV).
-    sign : int
-        1 or -1.
-    offset : float
-        Added after scaling, SI units.
-    nan : {'drop', 'unknown'}
-        What NaN or infinity in the field means: noise of the transmission, to
-        be ignored and counted, or the driver saying "not measured".
-    zero : {'value', 'unknown', 'unknown_at_first'}
-        What an exact 0 means: a value; the driver saying "not measured"; or
-        that, as long as there was nothing else.
-    sample_rate : float or None
-        Hz; when given the field is an array, a block of samples at this rate,
-        and the stamp is that of the LAST sample of the block.
-    stamp_field : str or None
-        Path of a builtin_interfaces/Time ('header.stamp') or of a number
-        ('timestamp'); None takes the source timestamp of the middleware.
-    stamp_factor : float
-        Seconds per unit of a numeric stamp (1e-6 for microseconds).
-
-    """
-
+    # Topic; relative ones ('voltage') are for remapping.
     topic: str
+    # Message type, 'package/msg/Type'.
     type: str  # noqa: A003
+    # Field path, 'data', 'channels[0].value'.
     field: str
+    # SI units per unit of the field (1e-3 for mV).
     unit_factor: float = 1.0
+    # 1 or -1.
     sign: int = 1
+    # Added after scaling, SI units.
     offset: float = 0.0
+    # What NaN or infinity in the field means: noise of the transmission, to be ignored and
+    # counted ('drop'), or the driver saying "not measured" ('unknown').
     nan: str = 'drop'
+    # What an exact 0 means: a value; the driver saying "not measured" ('unknown'); or that, as
+    # long as there was nothing else ('unknown_at_first').
     zero: str = 'value'
+    # Hz; when given the field is an array, a block of samples at this rate, and the stamp is that
+    # of the LAST sample of the block.
     sample_rate: float | None = None
+    # Path of a builtin_interfaces/Time ('header.stamp') or of a number ('timestamp'); None takes
+    # the source timestamp of the middleware.
     stamp_field: str | None = None
+    # Seconds per unit of a numeric stamp (1e-6 for microseconds).
     stamp_factor: float = 1.0
 
 
 @dataclass(frozen=True)
 class MsgConfig:
-    """
-    One source of voltage, and of throttle where it has one.
+    """One source of voltage, and of throttle where it has one."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the file without its ending.
-    description : str
-        One sentence for people, limits included.
-    package : str
-        ROS package that defines the voltage's type.
-    install : str
-        What to install when that package is missing.
-    generic : bool
-        Whether the topics are ours (relative, to be remapped) rather than
-        those of a certain driver.
-    voltage : FieldSpec
-        Where the voltage is, V.
-    throttle : FieldSpec or None
-        Where the throttle is, 0..1.
-    current : FieldSpec or None
-        Where in the messages of the voltage the current drawn is, A.
-    rpm : FieldSpec or None
-        Where the speeds of the motors are, 1/min of the shaft unless
-        `notch.rpm_unit` says otherwise; the field may be an array, or name
-        each element of one, 'esc[].esc_rpm'.
-
-    """
-
+    # Name of the file without its ending.
     name: str
+    # One sentence for people, limits included.
     description: str
+    # ROS package that defines the voltage's type.
     package: str
+    # What to install when that package is missing.
     install: str
+    # Whether the topics are ours (relative, to be remapped) rather than those of a certain driver.
     generic: bool
+    # Where the voltage is, V.
     voltage: FieldSpec
+    # Where the throttle is, 0..1.
     throttle: FieldSpec | None
+    # Where in the messages of the voltage the current drawn is, A.
     current: FieldSpec | None = None
+    # Where the speeds of the motors are, 1/min of the shaft unless `notch.rpm_unit` says
+    # otherwise; the field may be an array, or name each element of one, 'esc[].esc_rpm'.
     rpm: FieldSpec | None = None
 
 

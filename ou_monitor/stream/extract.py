@@ -39,25 +39,16 @@ class ZeroRule:
 
 @dataclass(frozen=True, eq=False)
 class Extracted:
-    """
-    What one message said.
+    """What one message said."""
 
-    Attributes
-    ----------
-    stamp : float or None
-        Stamp, s (of the LAST sample of a block); None when the message has
-        none, or a zero one: take the source timestamp of the middleware.
-    values : ndarray, shape (n,)
-        Values in SI units, in order.  With the rule ``drop`` a number that is
-        not finite is left out (n may be 0); with ``unknown``, and in blocks
-        (where every sample holds its place on the time line), it is NaN.
-    missing : int
-        Numbers that were not finite, or not there.
-
-    """
-
+    # Stamp, s (of the LAST sample of a block); None when the message has none, or a zero one: take
+    # the source timestamp of the middleware.
     stamp: float | None
+    # Values in SI units, in order.  With the rule ``drop`` a number that is not finite is left out
+    # (n may be 0); with ``unknown``, and in blocks (where every sample holds its place on the time
+    # line), it is NaN; shape (n,).
     values: FloatArray
+    # Numbers that were not finite, or not there.
     missing: int
 
 
