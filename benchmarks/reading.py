@@ -29,11 +29,11 @@ from mcap.writer import CompressionType, IndexType, Writer  # noqa: E402
 from mcap_ros2.decoder import DecoderFactory  # noqa: E402
 import numpy as np  # noqa: E402
 from ou_monitor.recordings.bag import BagReader, BagWriter, batches  # noqa: E402
+from ou_monitor.recordings.bag_samples import choose  # noqa: E402
 from ou_monitor.recordings.cdr import join  # noqa: E402
 from ou_monitor.recordings.read import read_recording  # noqa: E402
 from ou_monitor.recordings.standard_types import (  # noqa: E402
     BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, SCHEMAS)
-from ou_monitor.recordings.topic_choice import choose  # noqa: E402
 from ou_monitor.records import Recording  # noqa: E402
 from rosbags.highlevel import AnyReader  # noqa: E402
 from rosbags.typesys import get_typestore, Stores  # noqa: E402

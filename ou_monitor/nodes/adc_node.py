@@ -22,8 +22,7 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from ou_monitor.adc.iio import Block, IioBuffer
-from ou_monitor.adc.sysfs import find_device, PolledChannel
+from ou_monitor.adc.devices import Block, find_device, IioBuffer, PolledChannel
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import diagnostic, MonitorNode, to_time
 from ou_monitor.nodes.inputs import Silence

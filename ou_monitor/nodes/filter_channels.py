@@ -14,8 +14,7 @@ from typing import Any
 
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.nodes.sources import message_class
-from ou_monitor.stream.config import FieldPath, FieldSpec, parse_field_path
-from ou_monitor.stream.extract import Extractor
+from ou_monitor.stream.config import Extractor, FieldPath, FieldSpec, parse_field_path
 
 IMU = 'sensor_msgs/msg/Imu'
 # Of a derivative: angular acceleration (rad/s^2); any other of a message with a stamp, as x,

@@ -19,8 +19,8 @@ from typing import Any
 
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.online.settings import Parameter
-from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
-from ou_monitor.stream.extract import Extractor, ManyExtractor
+from ou_monitor.stream.config import (
+    Extractor, FieldSpec, list_msg_configs, load_msg_config, ManyExtractor, MsgConfig)
 
 AUTO = 'auto'
 

@@ -26,8 +26,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import FloatArray
-from ou_monitor.stream.config import FieldPath, FieldSpec, parse_field_path
-from ou_monitor.stream.extract import Extracted, Extractor, ZeroRule
+from ou_monitor.stream.config import (
+    Extracted, Extractor, FieldPath, FieldSpec, parse_field_path, ZeroRule)
 
 IntArray = npt.NDArray[np.int64]
 TimeArray = npt.NDArray[np.uint64]

@@ -18,6 +18,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagReader, batches
+from ou_monitor.recordings.bag_samples import (
+    check_throttle, known_current, outside_words, part_words, read_bag)
 from ou_monitor.recordings.cdr import join
 from ou_monitor.recordings.importers.choose import (
     choose as choose_series, columns_of, NONE, signal_of)
@@ -25,8 +27,6 @@ from ou_monitor.recordings.importers.csv_table import CsvColumns, read_column, r
 from ou_monitor.recordings.importers.formats import import_log, is_csv, is_log
 from ou_monitor.recordings.importers.log import (
     in_order, Log, RawColumns, Request, Series, SIGNAL, UNKNOWN)
-from ou_monitor.recordings.samples import (
-    check_throttle, known_current, outside_words, part_words, read_bag)
 from ou_monitor.recordings.standard_types import IMU
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.config import FieldSpec

@@ -6,7 +6,7 @@ where ROS is not installed.  Texts and hashes are those of ROS 2 Jazzy's
 common_interfaces, comments left out; a test compares them with an independent
 library.  The hash (REP-2016, RIHS01) is what rosbag2 writes beside the type.
 Encoding is plain CDR version 1, little endian (OMG DDS-XTypes 7.4.3), alignment counted
-from after the 4-byte header.  `layout.py` is the way back, for any type.
+from after the 4-byte header.  `cdr.py` is the way back, for any type.
 """
 
 from __future__ import annotations

@@ -6,8 +6,7 @@ import time
 
 from made_devices import attributes, iio_device, scans, volts
 import numpy as np
-from ou_monitor.adc.iio import BLOCKS, IioBuffer
-from ou_monitor.adc.sysfs import find_device, PolledChannel, USUAL_RATE
+from ou_monitor.adc.devices import BLOCKS, find_device, IioBuffer, PolledChannel, USUAL_RATE
 from ou_monitor.errors import InputError
 import pytest
 

@@ -1,7 +1,7 @@
 """Layouts of IIO scans: types, alignment, signs and bytes."""
 
 import numpy as np
-from ou_monitor.adc.iio import parse_element, Scan
+from ou_monitor.adc.devices import parse_element, Scan
 from ou_monitor.errors import InputError
 import pytest
 

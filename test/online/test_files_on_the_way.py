@@ -10,8 +10,7 @@ import ou_monitor
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Status
-from ou_monitor.stream.config import FieldSpec
-from ou_monitor.stream.extract import Extractor
+from ou_monitor.stream.config import Extractor, FieldSpec
 from ou_monitor.stream.samples import SampleStream
 import pytest
 

@@ -13,8 +13,7 @@ from ou_monitor.recordings import standard_types as cdr
 from ou_monitor.recordings.cdr import (
     Field, FieldReader, join, parse_definition, seconds, Table)
 from ou_monitor.recordings.standard_types import SCHEMAS
-from ou_monitor.stream.config import FieldSpec
-from ou_monitor.stream.extract import Extractor
+from ou_monitor.stream.config import Extractor, FieldSpec
 import pytest
 from rosbags.typesys import get_typestore, Stores
 

@@ -1,7 +1,7 @@
 """The time line of samples that travel in blocks."""
 
 import numpy as np
-from ou_monitor.stream.blocks import BlockClock, FOLLOW
+from ou_monitor.stream.samples import BlockClock, FOLLOW
 import pytest
 
 RATE = 10_000.0

@@ -5,8 +5,7 @@ from types import SimpleNamespace as Message
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.stream.config import FieldSpec, parse_field_path
-from ou_monitor.stream.extract import Extractor, ManyExtractor
+from ou_monitor.stream.config import Extractor, FieldSpec, ManyExtractor, parse_field_path
 import pytest
 
 

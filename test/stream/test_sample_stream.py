@@ -4,8 +4,7 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
-from ou_monitor.stream.config import FieldSpec
-from ou_monitor.stream.extract import Extractor
+from ou_monitor.stream.config import Extractor, FieldSpec
 from ou_monitor.stream.samples import SampleStream
 import pytest
 

@@ -7,8 +7,7 @@ from hypothesis import example, given, HealthCheck, settings, strategies as st
 import numpy as np
 from ou_monitor.recordings.bag import BagWriter
 from ou_monitor.recordings.read import read_recording
-from ou_monitor.stream.config import load_msg_config
-from ou_monitor.stream.extract import Extractor
+from ou_monitor.stream.config import Extractor, load_msg_config
 from ou_monitor.stream.samples import APART, APART_MIXED, SampleStream, ThrottleHold
 import pytest
 

@@ -17,10 +17,10 @@ import re
 
 import numpy as np
 from ou_monitor.errors import InputError, nearest
+from ou_monitor.recordings.bag_samples import check_throttle
 from ou_monitor.recordings.importers.log import (
     ANY, clean, CURRENT, Inertial, Log, MotorSpeeds, RawColumns, Series, SIGNAL, sound, THROTTLE,
     UNKNOWN, VOLTAGE)
-from ou_monitor.recordings.samples import check_throttle
 from ou_monitor.records import FloatArray
 from ou_monitor.text import printable
 

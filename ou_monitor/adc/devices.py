@@ -1,8 +1,12 @@
 """
-An IIO device with a buffer: set up, read in blocks, stamped by the kernel, scans to volts.
+The voltage of a Linux device: found by name, read when asked for, or in blocks from a buffer.
 
-Limits: one channel; no more than one program can use a buffer.  Without a timestamp channel a
-block has the time at which it was read, which is late by what the scheduler took.
+Limits: what may be read and written is decided by the rights on the files; errors say what to do.
+A voltage that is asked for (hwmon `inN_input`, or an IIO channel without a buffer, `_raw`) is as
+old as the driver's last conversion, which many drivers keep for `update_interval`; asking more
+often gives the same number again.  Of a buffer one channel is read; no more than one program can
+use it.  Without a timestamp channel a block has the time at which it was read, which is late by
+what the scheduler took.
 
 The kernel's ABI (Documentation/ABI/testing/sysfs-bus-iio, iio_devbuf): an element of a scan is
 `[be|le]:[s|u]bits/storagebits[>>shift]`, lies at a multiple of its own size, in the order of the
@@ -15,6 +19,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+import errno
 import os
 from pathlib import Path
 import re
@@ -23,9 +28,131 @@ import time
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.adc import sysfs
 from ou_monitor.errors import InputError
 from ou_monitor.records import FloatArray
+
+IIO, HWMON = 'bus/iio/devices', 'class/hwmon'
+
+
+def read_attribute(path: Path) -> str:
+    """Return the content of an attribute, without blanks around it."""
+    try:
+        return path.read_text(encoding='ascii', errors='replace').strip()
+    except OSError as error:
+        raise InputError(f'cannot read {path}: {why(error)}') from error
+
+
+def number_of(path: Path) -> float:
+    """Return the number in an attribute."""
+    text = read_attribute(path)
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"{path} holds '{text[:40]}', not a number") from error
+
+
+def write_attribute(path: Path, value: object) -> None:
+    """Set an attribute."""
+    try:
+        # Not created where it is missing: sysfs would refuse, and a plain folder would not.
+        handle = os.open(path, os.O_WRONLY | os.O_TRUNC)
+        try:
+            os.write(handle, f'{value}\n'.encode('ascii', 'replace'))
+        finally:
+            os.close(handle)
+    except OSError as error:
+        raise InputError(f"cannot set {path} to '{value}': {why(error)}") from error
+
+
+def why(error: OSError) -> str:
+    """Return what went wrong with a file, and what to do, in words."""
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return ('not permitted; give the user of this node the right by a udev rule or a group '
+                '(doc/deploy.md)')
+    if error.errno == errno.EBUSY:
+        return 'the device is in use by another program'
+    return error.strerror or str(error)
+
+
+def find_device(device: str, sysfs: Path) -> Path:
+    """
+    Return the folder of a device.
+
+    device: a path, or under `sysfs` the name of a folder ('iio:device0', 'hwmon2') or what the
+    driver calls it ('ads1015').
+    """
+    if not device:
+        raise InputError(f'device is not given; there are: {_known(sysfs)}')
+    if '/' in device:
+        path = Path(device)
+        if not path.is_dir():
+            raise InputError(f'no such device: {path} is no folder; there are: {_known(sysfs)}')
+        return path
+    found = [path for path in _all(sysfs) if device in (path.name, _name(path))]
+    if not found:
+        raise InputError(f"no such device: '{device}'; there are: {_known(sysfs)}")
+    if len(found) > 1:
+        raise InputError(f"several devices are called '{device}': give one of "
+                         f"{', '.join(path.name for path in found)}")
+    return found[0]
+
+
+def _all(sysfs: Path) -> list[Path]:
+    return [path for folder, pattern in ((IIO, 'iio:device*'), (HWMON, 'hwmon*'))
+            for path in sorted((sysfs / folder).glob(pattern))]
+
+
+def _name(path: Path) -> str:
+    try:
+        return (path / 'name').read_text(encoding='ascii', errors='replace').strip()
+    except OSError:
+        return ''
+
+
+def _known(sysfs: Path) -> str:
+    return ', '.join(f'{path.name} ({_name(path)})' for path in _all(sysfs)) or 'none'
+
+
+# Asked so often where the driver does not say how often it converts, Hz.
+USUAL_RATE = 10.0
+
+
+class PolledChannel:
+    """
+    One channel ('in1', 'in_voltage0'; empty: the only one) of a hwmon or IIO device.
+
+    `rate` is how often the driver converts, Hz, or 10 where it does not say.
+    """
+
+    def __init__(self, folder: Path, channel: str = '') -> None:
+        ends = {'_input': 'in[0-9]*_input', '_raw': 'in_voltage*_raw'}
+        known = {path.name.removesuffix(end): path for end, pattern in ends.items()
+                 for path in sorted(folder.glob(pattern))}
+        if channel and channel not in known or not channel and len(known) != 1:
+            asked = f"no channel '{channel}'" if channel else f'{len(known)} voltage channels'
+            names = ', '.join(known) or 'none'
+            raise InputError(f'{folder.name} has {asked}: give channel:= one of {names}')
+        self.channel = channel or next(iter(known))
+        self._path = known[self.channel]
+        self._scale, self._offset = 1.0, 0.0
+        if self._path.name.endswith('_raw'):
+            self._scale = self._attribute(folder, 'scale', 1.0)
+            self._offset = self._attribute(folder, 'offset', 0.0)
+        interval = folder / 'update_interval'
+        spacing = number_of(interval) if interval.exists() else 0.0
+        self.rate = 1e3 / spacing if spacing > 0.0 else USUAL_RATE
+        self.read()
+
+    def _attribute(self, folder: Path, what: str, default: float) -> float:
+        for name in (f'{self.channel}_{what}', f'in_voltage_{what}'):
+            if (folder / name).exists():
+                return number_of(folder / name)
+        return default
+
+    def read(self) -> float:
+        """Return the voltage now, V (both kinds count in mV)."""
+        return (number_of(self._path) + self._offset) * self._scale * 1e-3
+
 
 _TYPE = re.compile(r'(be|le):([su])(\d+)/(\d+)(?:X(\d+))?(?:>>(\d+))?')
 
@@ -150,23 +277,23 @@ class IioBuffer:
         # Of the kernel's stamps, ns: the newest, and the newest intervals.
         self._newest: int | None = None
         self._intervals: deque[int] = deque(maxlen=INTERVALS)
-        sysfs.write(folder / 'buffer/enable', 0)
+        write_attribute(folder / 'buffer/enable', 0)
         if trigger:
-            sysfs.write(folder / 'trigger/current_trigger', trigger)
+            write_attribute(folder / 'trigger/current_trigger', trigger)
         if rate > 0.0:
-            sysfs.write(self._attribute('sampling_frequency'), f'{rate:g}')
+            write_attribute(self._attribute('sampling_frequency'), f'{rate:g}')
         own = self._attribute('sampling_frequency')
-        self.rate = sysfs.number(own) if own.exists() else float('nan')
+        self.rate = number_of(own) if own.exists() else float('nan')
         self.block = block or (max(round(0.01 * self.rate), 1) if self.rate > 0.0 else 1)
-        self._scale = sysfs.number(self._needed('scale'))
+        self._scale = number_of(self._needed('scale'))
         shift = self._attribute('offset')
-        self._offset = sysfs.number(shift) if shift.exists() else 0.0
+        self._offset = number_of(shift) if shift.exists() else 0.0
         self._elements = self._enable()
         self._scan = Scan(self._elements)
         self._clock = self._stamp_clock()
-        sysfs.write(folder / 'buffer/length', self.block * BLOCKS)
+        write_attribute(folder / 'buffer/length', self.block * BLOCKS)
         if (folder / 'buffer/watermark').exists():
-            sysfs.write(folder / 'buffer/watermark', self.block)
+            write_attribute(folder / 'buffer/watermark', self.block)
         self._handle = self._open()
 
     def _attribute(self, what: str) -> Path:
@@ -190,10 +317,10 @@ class IioBuffer:
         for path in sorted(scan.glob('*_en')):
             name = path.name.removesuffix('_en')
             chosen = name in (self.channel, STAMP)
-            sysfs.write(path, int(chosen))
+            write_attribute(path, int(chosen))
             if chosen:
-                wanted.append(parse_element(name, int(sysfs.number(scan / f'{name}_index')),
-                                            sysfs.read(scan / f'{name}_type')))
+                wanted.append(parse_element(name, int(number_of(scan / f'{name}_index')),
+                                            read_attribute(scan / f'{name}_type')))
         return wanted
 
     def _stamp_clock(self) -> int | None:
@@ -201,7 +328,7 @@ class IioBuffer:
         if all(element.name != STAMP for element in self._elements):
             return None
         path = self._folder / 'current_timestamp_clock'
-        name = sysfs.read(path) if path.exists() else 'realtime'
+        name = read_attribute(path) if path.exists() else 'realtime'
         if name not in _CLOCKS:
             raise InputError(f"{path} is '{name}': one of {', '.join(_CLOCKS)} can be used")
         return _CLOCKS[name]
@@ -210,9 +337,9 @@ class IioBuffer:
         try:
             handle = os.open(self._character, os.O_RDONLY | os.O_NONBLOCK)
         except OSError as error:
-            raise InputError(f'cannot open {self._character}: {sysfs.why(error)}') from error
+            raise InputError(f'cannot open {self._character}: {why(error)}') from error
         try:
-            sysfs.write(self._folder / 'buffer/enable', 1)
+            write_attribute(self._folder / 'buffer/enable', 1)
         except InputError:
             os.close(handle)
             raise
@@ -238,7 +365,7 @@ class IioBuffer:
             except BlockingIOError:
                 continue
             except OSError as error:
-                raise InputError(f'cannot read {self._character}: {sysfs.why(error)}') from error
+                raise InputError(f'cannot read {self._character}: {why(error)}') from error
             if not data:
                 # A device that is gone, or a writer that has closed its end.
                 time.sleep(NAP)
@@ -275,7 +402,7 @@ class IioBuffer:
     def close(self) -> None:
         """Stop the buffer."""
         os.close(self._handle)
-        sysfs.write(self._folder / 'buffer/enable', 0)
+        write_attribute(self._folder / 'buffer/enable', 0)
 
 
 def _names(known: list[str]) -> str:
