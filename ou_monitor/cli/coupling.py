@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
     from ou_monitor.analysis.overview import answers, known_lines, overview
     from ou_monitor.analysis.supply import supply_facts
     from ou_monitor.recordings.importers.log import UNKNOWN
-    from ou_monitor.timeline.refresh import readings_of
+    from ou_monitor.timeline.line import readings_of
 
     recording, series = read_given_beside(args, start, end)
     t, values = series.t, series.values

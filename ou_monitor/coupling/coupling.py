@@ -31,7 +31,7 @@ from ou_monitor.coupling.common_grid import Grid, on_grid
 from ou_monitor.errors import InputError
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.text import chance, number, p_words
-from ou_monitor.timeline.refresh import refreshes
+from ou_monitor.timeline.line import refreshes
 from scipy import stats
 from scipy.signal.windows import hann
 

@@ -27,7 +27,7 @@ from ou_monitor.model.terms.saturation import Saturation
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted
-from ou_monitor.timeline.refresh import reading_places, reading_times
+from ou_monitor.timeline.line import reading_places, reading_times
 
 # Fewer samples than this are not fitted.
 LEAST = 100

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import find_step, usual_change
 from ou_monitor.records import FloatArray
-from ou_monitor.timeline.refresh import reading_places, reading_times
+from ou_monitor.timeline.line import reading_places, reading_times
 
 # Repeats, or runs of them, that are called so, at least; and the share of ties by chance up to
 # which the size of the changes says how many there are.

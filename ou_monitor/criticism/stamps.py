@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from ou_monitor.records import FloatArray
 from ou_monitor.text import counted
-from ou_monitor.timeline.refresh import on_grid
+from ou_monitor.timeline.line import on_grid
 
 # Scatter below this share of a step is put onto the grid: it changes nothing else.
 _SMALL = 0.02

@@ -30,8 +30,7 @@ from ou_monitor.recordings.importers.log import (
 from ou_monitor.recordings.standard_types import IMU
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.config import FieldSpec
-from ou_monitor.timeline.line import MOST_VOLTAGE, plausible_samples
-from ou_monitor.timeline.refresh import readings_of
+from ou_monitor.timeline.line import MOST_VOLTAGE, plausible_samples, readings_of
 
 # Samples further apart, s, are more likely of another unit of time than of a slow logger.
 _SPARSE = 5.0

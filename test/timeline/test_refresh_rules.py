@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from ou_monitor.timeline.refresh import Batch, reading_places, refresh_period, Repeats
+from ou_monitor.timeline.line import Batch, reading_places, refresh_period, Repeats
 import pytest
 
 

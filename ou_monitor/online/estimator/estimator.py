@@ -25,8 +25,7 @@ from ou_monitor.online.estimator.series import T, U, Y
 from ou_monitor.online.estimator.thinner import Thinner
 from ou_monitor.online.estimator.window import FACTOR, FEWEST, LAGS, LOST, Resolution, Sums
 from ou_monitor.records import Counters, Estimate, FloatArray, NAN, Status
-from ou_monitor.timeline.line import as_column, BATCH, TAIL, TimeLine
-from ou_monitor.timeline.refresh import Batch
+from ou_monitor.timeline.line import as_column, BATCH, Batch, TAIL, TimeLine
 
 # Samples from which a fit is tried.
 MIN_SAMPLES = 20

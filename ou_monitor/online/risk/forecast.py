@@ -35,7 +35,7 @@ from ou_monitor.online.risk.futures import (
     BLOCK, excursion_risk, excursions, Flown, flown, Futures, held, lowest, mean_now, Past, pilot,
     Sampling)
 from ou_monitor.records import FloatArray, NAN
-from ou_monitor.timeline.refresh import Batch
+from ou_monitor.timeline.line import Batch
 
 # Degrees of freedom: tails of a model that is wrong now and then.
 FREEDOM = 5.0

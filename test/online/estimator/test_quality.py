@@ -3,7 +3,7 @@
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.online.estimator.quality import examine, lattice, Quality
-from ou_monitor.timeline.refresh import refresh_period
+from ou_monitor.timeline.line import refresh_period
 import pytest
 from simulated_windows import DT, paths
 

@@ -13,7 +13,7 @@ from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.risk.forecast import Forecast
 from ou_monitor.online.risk.futures import held, lowest, mean_now
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.timeline.refresh import Batch
+from ou_monitor.timeline.line import Batch
 from project import ROOT
 import pytest
 from scipy.signal import lfilter

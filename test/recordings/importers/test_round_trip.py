@@ -13,8 +13,8 @@ import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.recordings.read import (
     read_beside, read_recording, read_signal)
+from ou_monitor.timeline.line import readings_of
 from project import ROOT
-from ou_monitor.timeline.refresh import readings_of
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_typestore, Stores
