@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted, number
+from ou_monitor.timeline.line import in_order
 
 # Far from the others: so many times their spread, and so many times as far as they go.
 _FAR, _GAP = 50.0, 5.0
@@ -39,19 +40,9 @@ def usable(recording: Recording, notes: list[str]
     """Return the readings of a recording, in order."""
     t, v = recording.t, recording.voltage
     u: FloatArray | None = recording.throttle if recording.has_throttle else None
-    good = np.isfinite(t) & np.isfinite(v)
-    if not good.all():
-        notes.append(f'{counted(int(good.size - good.sum()), "sample")} dropped: not a finite '
-                     'number.')
-        t, v, u = t[good], v[good], None if u is None else u[good]
-    # Not by differences: they would take as much memory as the stamps.
-    rising = t[1:] > t[:-1]
-    if not rising.all():
-        order = np.argsort(t, kind='stable')
-        order = order[np.concatenate(([True], np.diff(t[order]) > 0.0))]
-        notes.append(f'{counted(int((~rising).sum()), "stamp")} did not rise: sorted; '
-                     f'{t.size - order.size} dropped, whose stamp was there before.')
-        t, v, u = t[order], v[order], None if u is None else u[order]
+    which, said = in_order(t, v[:, None], float(np.finfo(np.float64).max))
+    notes += said
+    t, v, u = t[which], v[which], None if u is None else u[which]
     bad = find_bad(v)
     if bad.any():
         notes += _bad_notes(t, v, bad)

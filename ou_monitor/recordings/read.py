@@ -26,11 +26,11 @@ from ou_monitor.recordings.importers.choose import (
 from ou_monitor.recordings.importers.csv_table import CsvColumns, read_column, read_csv
 from ou_monitor.recordings.importers.formats import import_log, is_csv, is_log
 from ou_monitor.recordings.importers.log import (
-    in_order, Log, RawColumns, Request, Series, SIGNAL, UNKNOWN)
+    Log, RawColumns, Request, Series, SIGNAL, UNKNOWN)
 from ou_monitor.recordings.standard_types import IMU
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.config import FieldSpec
-from ou_monitor.timeline.line import MOST_VOLTAGE, plausible_samples, readings_of
+from ou_monitor.timeline.line import in_order, MOST_VOLTAGE, plausible_samples, readings_of
 
 # Samples further apart, s, are more likely of another unit of time than of a slow logger.
 _SPARSE = 5.0

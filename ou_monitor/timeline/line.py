@@ -34,6 +34,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import Counters, FloatArray, NAN, Recording
+from ou_monitor.text import counted
 
 # Gaps that may differ from the pattern: lost samples, a logger that was late.
 _ODD = 0.05
@@ -305,6 +306,10 @@ _MOST_STAMP = 1.0e12
 BATCH = 32768
 # Samples looked at for repeats, the fewest, and new ones from one look to the next.
 TAIL, _ENOUGH, _LOOK = 1024, 64, 256
+# So many samples behind for each step back are not a few that came late.
+_STRETCH = 20
+# Places of samples; all of them as a slice.
+Picked = npt.NDArray[np.intp] | slice
 # Where repeats are looked for: a third of the samples repeat at two a reading, or more.
 _TIED = 0.25
 
@@ -571,6 +576,46 @@ def _picked(which: Any, t: FloatArray, y: FloatArray, u: FloatArray | None, i: F
     """Return some of the samples."""
     return (t[which], y[which], None if u is None else u[which],
             None if i is None else i[which])
+
+
+def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
+             ) -> tuple[Picked, list[str]]:
+    """
+    Return which samples the time line takes, in its order, and notes of what that took.
+
+    t in s, rows of shape (n, m), each of which counts as a whole, with values up to `most`.
+    """
+    # The comparisons are false for NaN too.
+    good = np.isfinite(t) & ((rows <= most) & (rows >= -most)).all(axis=1)
+    notes = []
+    if not good.all():
+        beyond = bool((np.isfinite(rows[~good]) & (np.abs(rows[~good]) > most)).any())
+        notes.append(f'{counted(t.size - int(good.sum()))} dropped: not a finite number'
+                     + (f', or beyond {most:g}{unit}.' if beyond else '.'))
+    stamps = t[good]
+    if (steps := int(np.count_nonzero(stamps[1:] < stamps[:-1]))):
+        notes.append(_late_words(steps, stamps))
+    line = TimeLine()
+    batches = line.order(stamps, np.flatnonzero(good).astype(np.float64), None, None, math.inf)
+    if line.counters.late:
+        notes.append(f'{counted(line.counters.late)} dropped: the stamp was there before; the '
+                     'first of each was kept.')
+    if line.used == t.size and not notes:
+        # All as they are, without a copy.
+        return slice(None), notes
+    return (batches[0].y if batches else np.empty(0)).astype(np.intp), notes
+
+
+def _late_words(steps: int, t: FloatArray) -> str:
+    """Return the note on samples out of order, `steps` of which go back (t in s)."""
+    ahead = np.maximum.accumulate(t) - t
+    behind = int(np.count_nonzero(ahead))
+    if behind < _STRETCH * steps:
+        return f'{counted(steps)} came before the stamp ahead of them: sorted by stamp.'
+    times = 'once' if steps == 1 else f'{steps} times'
+    return (f'The clock went back {times}, by {float(ahead.max()):.3g} s at most: '
+            f'{counted(behind)} lie where others were before, and were mixed with them; take a '
+            'part before or after, or mend the stamps.')
 
 
 def as_column(values: npt.ArrayLike) -> FloatArray:

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 from ou_monitor.analysis.quality import quality_list, Severity
-from ou_monitor.recordings.importers.log import in_order
 from ou_monitor.records import Estimate, Flag, Recording, Status
+from ou_monitor.timeline.line import in_order
 import pytest
 from simulated_recordings import recording
 

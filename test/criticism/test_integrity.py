@@ -162,7 +162,7 @@ def test_what_is_not_finite_or_not_in_order():
     assert found.samples.throttle[0] == u[1] and np.isfinite(found.samples.throttle).all()
     assert found.samples.throttle[499] == u[499]
     text = ' '.join(found.notes)
-    assert '1 sample dropped' in text and 'did not rise' in text and 'unknown at 2' in text
+    assert '1 sample dropped' in text and 'sorted by stamp' in text and 'unknown at 2' in text
 
 
 @pytest.mark.parametrize('n, value', [(2, None), (LEAST - 1, None), (5000, 3.3), (0, None)])

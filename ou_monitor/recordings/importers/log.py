@@ -25,7 +25,7 @@ import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import FloatArray
 from ou_monitor.text import counted, printable
-from ou_monitor.timeline.line import TimeLine
+from ou_monitor.timeline.line import in_order, Picked
 
 # Front, right, down -> front, left, up.
 FRD_TO_FLU = np.array([1.0, -1.0, -1.0])
@@ -81,11 +81,6 @@ LARGEST = 1e9
 # Stamps that only broken bytes make: further ahead than this, by so few samples.
 _FAR = 3600.0  # s
 _FEW = 16
-# So many samples behind for each step back are not a few that came late.
-_STRETCH = 20
-
-# Places of samples; all of them as a slice.
-Picked = npt.NDArray[np.intp] | slice
 Progress = Callable[[float], None]
 
 
@@ -212,46 +207,6 @@ def one_flight(path: Path, request: Request) -> None:
     """Refuse a flight other than the first for formats that hold one flight a file."""
     if request.flight not in (None, 1):
         raise InputError(f'{path} holds one flight: --flight {request.flight} is not there')
-
-
-def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
-             ) -> tuple[Picked, list[str]]:
-    """
-    Return which samples the time line takes, in its order, and notes of what that took.
-
-    t in s, rows of shape (n, m), each of which counts as a whole, with values up to `most`.
-    """
-    sizes = np.abs(rows)
-    # The comparison is false for NaN too.
-    good = np.isfinite(t) & (sizes <= most).all(axis=1)
-    notes = []
-    if not good.all():
-        beyond = bool((np.isfinite(sizes) & (sizes > most)).any())
-        notes.append(f'{counted(t.size - int(good.sum()))} dropped: not a finite number'
-                     + (f', or beyond {most:g}{unit}.' if beyond else '.'))
-    if (steps := int(np.count_nonzero(np.diff(t[good]) < 0.0))):
-        notes.append(_late_words(steps, t[good]))
-    line = TimeLine()
-    batches = line.order(t[good], np.flatnonzero(good).astype(np.float64), None, None, math.inf)
-    if line.counters.late:
-        notes.append(f'{counted(line.counters.late)} dropped: the stamp was there before; the '
-                     'first of each was kept.')
-    if line.used == t.size and not notes:
-        # All as they are, without a copy.
-        return slice(None), notes
-    return (batches[0].y if batches else np.empty(0)).astype(np.intp), notes
-
-
-def _late_words(steps: int, t: FloatArray) -> str:
-    """Return the note on samples out of order, `steps` of which go back (t in s)."""
-    ahead = np.maximum.accumulate(t) - t
-    behind = int(np.count_nonzero(ahead))
-    if behind < _STRETCH * steps:
-        return f'{counted(steps)} came before the stamp ahead of them: sorted by stamp.'
-    times = 'once' if steps == 1 else f'{steps} times'
-    return (f'The clock went back {times}, by {float(ahead.max()):.3g} s at most: '
-            f'{counted(behind)} lie where others were before, and were mixed with them; take a '
-            'part before or after, or mend the stamps.')
 
 
 def sound(t: FloatArray, rows: FloatArray) -> tuple[Picked, list[str]]:
