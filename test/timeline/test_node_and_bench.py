@@ -7,8 +7,7 @@ from ou_monitor.recordings.bag import BagWriter
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.recordings.standard_types import (
     BATTERY_STATE, encode_battery, encode_scalars, FLOAT32)
-from ou_monitor.stream.config import load_msg_config
-from ou_monitor.stream.extract import Extractor
+from ou_monitor.stream.config import Extractor, load_msg_config
 from ou_monitor.stream.samples import SampleStream
 import pytest
 
