@@ -11,7 +11,7 @@ import math
 import numpy as np
 from ou_monitor.online.estimator.series import IntArray
 from ou_monitor.records import FloatArray, NAN
-from ou_monitor.timeline.line import Batch, BATCH
+from ou_monitor.timeline.line import BATCH, Batch
 
 # Samples from which the rate is known.
 MIN_FOR_RATE = 8
