@@ -25,7 +25,7 @@ from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import FloatArray, NAN, Recording
-from ou_monitor.timeline.refresh import readings_of
+from ou_monitor.timeline.line import readings_of
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 # Throttles at which sag and noise are given.
