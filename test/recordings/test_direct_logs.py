@@ -1,12 +1,16 @@
 """Logs and any CSV are read without a detour: as `convert` and a bag would have it."""
 
+import json
 import os
 from pathlib import Path
 
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.choose import choose, columns_of
 from ou_monitor.recordings.importers.csv_table import CsvColumns
+from ou_monitor.recordings.importers.formats import import_log
+from ou_monitor.recordings.importers.log import Request
 from ou_monitor.recordings.read import read_recording
 import pytest
 
@@ -32,6 +36,48 @@ def test_a_log_is_what_its_bag_would_be(file, package, voltage, tmp_path):
     assert found.name == file and found.source['format'] in ('blackbox', 'dataflash', 'ulog')
     part = read_recording(log, start=1.0, end=2.0, columns=columns)
     assert 0 < part.n < found.n and part.duration < 1.0
+
+
+@pytest.mark.skipif(REAL is None, reason='OU_MONITOR_REALDATA names no folder of recordings')
+@pytest.mark.parametrize('file,rate', [('in_xr_141340.TXT', 49.47), ('ie_btfl_002.bbl', 199.1)])
+def test_one_flight_as_log_csv_and_bag_is_one_recording(file, rate, tmp_path):
+    """With every repeat of its logger in each: the same readings, and the same analysis."""
+    pytest.importorskip('orangebox')
+    path = Path(REAL) / 'raw' / file
+    log = import_log(path, Request())
+    raw = columns_of(path, log, choose(path, log))
+    sheet, bag = tmp_path / 'flight.csv', tmp_path / 'flight.mcap'
+    sheet.write_text('time_s,voltage_v,throttle,current_a\n' + ''.join(
+        '{!r},{!r},{!r},{!r}\n'.format(*line) for line in np.stack(
+            [raw.t, raw.voltage, raw.throttle, raw.current], axis=1).tolist()))
+    assert main(['convert', str(path), str(bag)]) == 0
+    wanted = read_recording(path)
+    assert wanted.held > 0 and wanted.n + wanted.held == raw.t.size
+    for one in (sheet, bag):
+        found = read_recording(one)
+        assert found.held == wanted.held
+        assert (found.n - 1) / found.duration == pytest.approx(rate, rel=1e-3)
+        for name in ('t', 'voltage', 'throttle', 'current'):
+            np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
+    if wanted.n > 5000:
+        return
+    answers = []
+    for one in (path, sheet, bag):
+        assert main(['analyze', str(one), '--json', str(tmp_path / 'out.json'), '--force']) == 0
+        answers.append(json.loads((tmp_path / 'out.json').read_text()))
+        # How the file was read differs (`quality` holds the notes on that too), nothing else.
+        for name in ('recording', 'source', 'notes', 'quality'):
+            del answers[-1][name]
+    assert answers[0] == answers[1] == answers[2]
+    assert 'sag' in json.dumps(answers[0])
+
+
+@pytest.mark.skipif(REAL is None, reason='OU_MONITOR_REALDATA names no folder of recordings')
+def test_a_csv_refreshed_slower_than_logged_has_the_rate_of_its_readings():
+    """A Crazyflie logged at 500 Hz reads its battery at 100 Hz."""
+    found = read_recording(Path(REAL) / 'cf_bl00.csv')
+    assert found.n == 924 and found.held == 3710
+    assert (found.n - 1) / found.duration == pytest.approx(100.0, rel=0.02)
 
 
 def test_columns_and_units_of_a_csv(tmp_path):
