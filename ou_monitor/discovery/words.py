@@ -77,7 +77,8 @@ def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
     """
     if isinstance(value, list):
         errors = error if isinstance(error, list) else [None] * len(value)
-        return '[' + ', '.join(with_error(v, e) for v, e in zip(value, errors)) + ']'
+        return '[' + ', '.join(with_error(
+            v, e, positive=positive) for v, e in zip(value, errors)) + ']'
     if isinstance(error, float) and math.isfinite(error) and error > 0.0:
         if positive and 0.0 < LARGEST_LOG_SE * value < error:
             return 'not determined'
@@ -102,7 +103,8 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
     parts = [term.MEANING, f'Estimate: {parameters(term, se)}.']
     if exact:
         parts.append('The samples themselves show it, without a model.')
-    parts.append(gain_words(gain, gain_se, why))
+    if not exact or gain != 0.0:
+        parts.append(gain_words(gain, gain_se, why))
     if together > 1 and math.isfinite(gain):
         parts.append(f'That is the gain of all {together} terms {term.NAME} together.')
     if not exact:

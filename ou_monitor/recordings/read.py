@@ -155,6 +155,10 @@ def tidy(raw: RawColumns) -> Recording:
     name = raw.name
     check_throttle(name, raw.throttle, raw.voltage)
     t, _, throttle = plausible_samples(raw.t, raw.voltage, raw.throttle)
+    stamps = raw.t[np.isfinite(raw.t)]
+    if stamps.size and not np.isfinite(t).any():
+        raise InputError(f'{name}: its stamps, {stamps[0]:.4g} s, are those of no clock: is the '
+                         'time in ms, us or ns? --time-unit says so of a CSV')
     which, said = in_order(t, raw.voltage[:, None], MOST_VOLTAGE, ' V')
     notes, t = [*raw.notes, *said], t[which]
     if not t.size:

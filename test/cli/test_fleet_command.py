@@ -304,7 +304,7 @@ def test_a_fleet_of_bad_files_alone_is_refused(tmp_path, one_process, capsys):
 
 
 def test_a_strange_clock_and_a_strange_name(tmp_path, one_process):
-    """Stamps in milliseconds since 1970 have no date; a name that is no text is still told."""
+    """Stamps in milliseconds since 1970 are refused; a name that is no text is still told."""
     made = flight(1, n=3000)
     logs = tmp_path / 'logs'
     logs.mkdir()
@@ -314,7 +314,8 @@ def test_a_strange_clock_and_a_strange_name(tmp_path, one_process):
     rows = parquet.read_table(tmp_path / 'out' / 'fleet.parquet').to_pylist()
     assert {row['recording']: row['start'] for row in rows} == {
         'ms.csv': None, '\\udcff.csv': None}
-    assert not any(row['error'] for row in rows)
+    assert {row['recording']: 'ms, us or ns' in (row['error'] or '') for row in rows} == {
+        'ms.csv': True, '\\udcff.csv': False}
 
 
 def test_missing_extra_is_named(logs, tmp_path, capsys, monkeypatch):

