@@ -19,6 +19,7 @@ from ou_monitor.analysis.replay import by_throttle, ByThrottle, slide, Sliding
 from ou_monitor.analysis.steps import find_steps
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import NAN, Recording
+from ou_monitor.timeline.line import readings_of
 
 Progress = Callable[[float], None]
 
@@ -84,6 +85,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     if not (np.diff(recording.t) > 0.0).all():
         raise ValueError('stamps must be finite and increase, as read_recording leaves them')
     report: Progress = progress or (lambda share: None)
+    recording = readings_of(recording)
     voltage = _default_voltage(recording) if brownout_voltage is None else brownout_voltage
     found = find_levels(recording.t, recording.throttle, levels)
     still = replace(recording, voltage=without_jitter(recording, found))

@@ -183,10 +183,6 @@ def _of_samples(recording: Recording) -> list[QualityItem]:
         items.append(QualityItem('ADC_STEP', Severity.INFO, (
             f'Voltages lie on a lattice of {1e3 * step:.3g} mV, {step / rms:.2g} times the '
             'scatter from sample to sample.')))
-    if recording.held:
-        items.append(QualityItem('REPEATS', Severity.INFO, (
-            f'The logger repeats each reading {(n + recording.held) / n:.3g} times; the repeats '
-            'were left out.')))
     clipped = sum(look.saturated for look in looks)
     if clipped:
         items.append(QualityItem('CLIPPED', Severity.WARNING, (

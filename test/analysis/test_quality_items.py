@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from ou_monitor.analysis.quality import quality_list, Severity
 from ou_monitor.records import Estimate, Flag, Recording, Status
-from ou_monitor.timeline.line import in_order
+from ou_monitor.timeline.line import in_order, readings_of
 import pytest
 from simulated_recordings import recording
 
@@ -92,8 +92,9 @@ def test_the_samples_show_the_step_of_the_adc():
     simulated = recording(3, ((0.1, 0.3),))
     step = listed(replace(simulated, voltage=0.005 * np.round(simulated.voltage / 0.005)))
     assert names(step) == {'ADC_STEP': Severity.INFO} and 'of 5 mV' in step[0].text
-    held = listed(replace(simulated, voltage=np.repeat(simulated.voltage[::4], 4)))
-    assert names(held) == {'REPEATS': Severity.INFO} and 'every 4' in held[0].text
+    held = listed(readings_of(replace(
+        simulated, voltage=np.repeat(simulated.voltage[::4], 4))))
+    assert names(held) == {'READER': Severity.INFO} and 'repeats were left' in held[0].text
     clipped = listed(replace(simulated, voltage=np.minimum(simulated.voltage, 4.98)))
     assert names(clipped) == {'CLIPPED': Severity.WARNING}
     late = simulated.throttle.copy()

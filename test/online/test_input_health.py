@@ -132,8 +132,8 @@ def test_what_is_no_reading_is_counted_as_none(volts, throttle, wrong):
     assert math.isfinite(report.estimate.sigma) and not report.estimate.throttle > 1.0
 
 
-@pytest.mark.parametrize('where', ['_estimator', '_outlook'])
-def test_an_error_restarts_the_estimator_and_is_told(where, monkeypatch):
+@pytest.mark.parametrize('where, name', [('_estimator', 'take'), ('_outlook', 'push')])
+def test_an_error_restarts_the_estimator_and_is_told(where, name, monkeypatch):
     """Unknown, ERROR with the cause, counted; counters go on, and the flag is held."""
     monitor, t = good(brownout_hold=60.0)
     low = t + DT * np.arange(1, 101)
@@ -143,7 +143,7 @@ def test_an_error_restarts_the_estimator_and_is_told(where, monkeypatch):
     def fails(*_):
         raise ZeroDivisionError('float\ndivision')
 
-    monkeypatch.setattr(getattr(monitor, where), 'push', fails)
+    monkeypatch.setattr(getattr(monitor, where), name, fails)
     later = 3.1 + DT * np.arange(1, 51)
     monitor.push(later, ou(50), 0.4, arrival=later)
     report = monitor.report(0.0, now=3.15)

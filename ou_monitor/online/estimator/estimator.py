@@ -166,7 +166,7 @@ class SlidingEstimator:
 
     def estimate(self) -> Estimate:
         """Return the estimate for the window that ends at the newest sample."""
-        if self._cached is None:
+        if self._cached is None or self._cached.counters != self._line.counters:
             used = self._line.used
             self._work_off()
             if self._last is not None and self._line.used == used == self._last.counters.used:
