@@ -202,8 +202,7 @@ def signal_of(bag: str) -> tuple[str, str]:
     """Return what the filter shall filter: an IMU, else the busiest scalar but the throttle."""
     from ou_monitor.nodes.filter_channels import CHANNELS
     from ou_monitor.recordings.bag import BagReader
-    with BagReader(bag) as reader:
-        known = [topic for topic in reader.info.values() if topic.type in CHANNELS]
+    known = [topic for topic in BagReader(bag).info.values() if topic.type in CHANNELS]
     if not known:
         raise DemoError(f'{bag} has no topic that the filter takes ({", ".join(CHANNELS)})')
     best = max(known, key=lambda topic: (

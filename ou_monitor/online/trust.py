@@ -329,6 +329,8 @@ class InputTrust:
     def push(self, t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
              arrival: FloatArray | None) -> None:
         """Take samples in order of arrival (t in s, V, 0..1, arrival in s); NaN: no reading."""
+        if not t.size:
+            return
         self._stamps.push(t, arrival)
         times = t if arrival is None else arrival
         placed = np.isfinite(times)

@@ -4,8 +4,8 @@ import os
 import time
 
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.bag import find_files, parse_qos
+from ou_monitor.recordings.model_file import read_model
 from ou_monitor.stream.config import load_msg_config
 from ou_monitor.stream.files import (
     MOST_ALIASES, MOST_CHARACTERS, MOST_DIGITS, MOST_NODES, open_regular, parse_yaml)
