@@ -279,7 +279,8 @@ class SupplyMonitor:
             if again or not fresh:
                 self._load = self._load_filter.load()
                 self._ahead = look_ahead(self._outlook, self._forecast, e, self._load,
-                                         self._settings) if fresh else Ahead()
+                                         self._settings) if fresh else Ahead(
+                                             budget_reason=why)
             left_out = () if self._outlook.events is None else self._outlook.events.left_out
         except Exception as error:
             # As in `push`.

@@ -82,7 +82,7 @@ def test_without_a_fit_the_budget_says_why():
     assert math.isnan(short.budget) and short.budget_reason
     t = np.arange(3000) / 500.0
     stuck = analyze(Recording(t, np.full(t.size, 5.0), np.full(t.size, 0.1))).by_throttle
-    assert math.isnan(stuck.budget) and 'not moved' in stuck.budget_reason
+    assert math.isnan(stuck.budget) and 'sensor is stuck' in stuck.budget_reason
 
 
 def test_the_voltage_is_the_nodes_unless_asked_for():
