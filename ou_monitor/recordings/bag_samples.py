@@ -4,7 +4,7 @@ The samples of a bag, as its messages hold them, with the throttle and the curre
 A msg config fits by name when the bag has its topic (or one that ends with it, as in a namespace)
 with its type; a generic one fits by type alone when there is only one topic of that type.  One
 choice is taken, several are put to the user.  Limits: a bag is read whole; an hour at 1 kHz takes
-150 MB.
+up to 420 MB.
 """
 
 from __future__ import annotations

@@ -30,7 +30,8 @@ from ou_monitor.recordings.importers.log import (
 from ou_monitor.recordings.standard_types import IMU
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.config import FieldSpec
-from ou_monitor.timeline.line import in_order, MOST_VOLTAGE, plausible_samples, readings_of
+from ou_monitor.timeline.line import (
+    in_order, MOST_THROTTLE, MOST_VOLTAGE, plausible, plausible_samples, readings_of)
 
 # Samples further apart, s, are more likely of another unit of time than of a slow logger.
 _SPARSE = 5.0
@@ -154,7 +155,8 @@ def tidy(raw: RawColumns) -> Recording:
     """Return a `Recording`: in order, each stamp once; notes say what that took."""
     name = raw.name
     check_throttle(name, raw.throttle, raw.voltage)
-    t, _, throttle = plausible_samples(raw.t, raw.voltage, raw.throttle)
+    t, _, _ = plausible_samples(raw.t, raw.voltage, None)
+    throttle = plausible(raw.throttle, MOST_THROTTLE)
     stamps = raw.t[np.isfinite(raw.t)]
     if stamps.size and not np.isfinite(t).any():
         raise InputError(f'{name}: its stamps, {stamps[0]:.4g} s, are those of no clock: is the '
@@ -166,7 +168,6 @@ def tidy(raw: RawColumns) -> Recording:
     if t.size > 2 and (spacing := float(np.median(np.diff(t)))) >= _SPARSE:
         notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '
                      '--time-unit says so of a CSV.')
-    assert throttle is not None
     return Recording(t, raw.voltage[which], throttle[which], name, raw.source, tuple(notes),
                      known_current(raw.current[which]))
 
