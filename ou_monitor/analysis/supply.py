@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import find_step
-from ou_monitor.model.ou_fit import FEWEST, fit_ou, OuFacts, regress, Regression
+from ou_monitor.model.ou_fit import FEWEST, known_ou, OuFacts, regress, Regression
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.monitor import SupplyMonitor
@@ -30,8 +30,6 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 # Throttles at which sag and noise are given.
 THROTTLES = tuple(k / 10.0 for k in range(11))
-# Windows at the end of the recording, s: the shortest in which a relaxation is known counts.
-WINDOWS = (2.0, 8.0, 30.0, 60.0)
 # Part, s, of a recording of which the noise is the residual of one regression.
 _PART = 60.0
 # Throttle is steady while it spans at most this for so long, s.
@@ -190,7 +188,8 @@ def supply_facts(recording: Recording, limit: float | None = None) -> SupplyFact
         None if limit is None else _dips(t, v, u, limit, noise),
         Sag(load.known, flown, THROTTLES, _tuple(load.sag(THROTTLES)),
             _tuple(load.sag_se(THROTTLES))),
-        noise, Resistance(load.resistance, load.resistance_se), _ou(recording), budget)
+        noise, Resistance(load.resistance, load.resistance_se),
+        known_ou(t, v, u, recording.current), budget)
 
 
 def _tuple(values: FloatArray) -> tuple[float, ...]:
@@ -282,21 +281,3 @@ def _over_throttle(u: FloatArray, square: FloatArray, flown: tuple[float, float]
             at.append(float(throttle))
             rms.append(math.sqrt(float(square[near].mean())))
     return _tuple(np.interp(THROTTLES, at, rms)) if at else (NAN,) * len(THROTTLES)
-
-
-def _ou(recording: Recording) -> OuFacts:
-    """Return the relaxation in the shortest window in which it is known."""
-    t = recording.t
-    span = recording.duration
-    found = OuFacts('too_short', span)
-    for window in (*(w for w in WINDOWS if w < span), min(span, WINDOWS[-1])):
-        begin = int(np.searchsorted(t, t[-1] - window))
-        if t.size - begin < FEWEST:
-            continue
-        part = _cut(recording, begin, t.size)
-        if part.free < FEWEST:
-            continue
-        found = fit_ou(part, window)
-        if found.status == 'ok':
-            return found
-    return found

@@ -1,8 +1,9 @@
 """
 An Ornstein-Uhlenbeck process beside white noise in what the load leaves of a voltage.
 
-`regress` takes a flexible level (linear hats every 5 s), throttle and measured current, each at
-once and after a bank of lags, out of the voltage; `fit_ou` fits the noise jointly with them.
+`known_ou` fits the shortest window in which a relaxation is known.  `regress` takes a flexible
+level (linear hats every 5 s), throttle and measured current, each at once and after a bank of
+lags, out of the voltage; `fit_ou` fits the noise jointly with them.
 
 The noise is white noise, the OU, and a random walk of the level, whose size has a narrow prior:
 without it, what the hats leave of the level would pass for a slow OU.  The fit is a restricted
@@ -47,6 +48,8 @@ _DELAYS, _DELAY_READINGS = 4, 8000
 _MOVED = 0.01
 # A gap is a step of this many usual ones; stretches of fewer readings are left out.
 _GAP, _STRETCH = 1.6, 16
+# Windows, s: the shortest in which a relaxation is known counts.
+WINDOWS = (2.0, 8.0, 30.0, 60.0)
 # Fewest readings beyond the number of regressors from which anything is fitted.
 FEWEST = 40
 # Ordinates taken one by one; relative width of the bins above.
@@ -344,6 +347,26 @@ def fit_ou(part: Regression, span: float) -> OuFacts:
         (found.alpha, found.alpha_95), (found.sigma, found.sigma_95),
         (found.var_inf, found.var_inf_95))) else _unseen(
             costs, low, high, least, dt, span)
+
+
+def known_ou(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | None) -> OuFacts:
+    """Fit the shortest of WINDOWS, at the end of the readings, in which a relaxation is known."""
+    if not t.size:
+        return OuFacts('no_data')
+    span = float(t[-1] - t[0])
+    found = OuFacts('too_short', span)
+    for window in (*(w for w in WINDOWS if w < span), min(span, WINDOWS[-1])):
+        begin = int(np.searchsorted(t, t[-1] - window))
+        if t.size - begin < FEWEST:
+            continue
+        part = regress(t[begin:], v[begin:], None if u is None else u[begin:],
+                       None if i is None else i[begin:])
+        if part.free < FEWEST:
+            continue
+        found = fit_ou(part, window)
+        if found.status == 'ok':
+            return found
+    return found
 
 
 def _pair(ends: Sequence[float]) -> tuple[float, float]:
