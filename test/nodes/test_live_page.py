@@ -56,7 +56,11 @@ def test_a_browser_shows_a_flight_and_outlives_both_ends(world, tmp_path):
         assert page.stop() == 0
         tab.until("document.getElementById('words').textContent.includes('lost')")
         before = tab.run('rows[rows.length - 1].k')
-        world.start('ou_monitor.cli.main', 'live', '--port', where.rstrip('/').rpartition(':')[2])
+        again = world.start('ou_monitor.cli.main', 'live', '--port',
+                            where.rstrip('/').rpartition(':')[2])
+        # Not at once: of two nodes that begin together while others run, Fast DDS has at times
+        # one that does not hear what is sent in shared memory.
+        assert address(again) == where
         world.start('estimator')
         tab.until(f'rows.length && rows[0].k < {before} && {LAMP} === "OK"')
         assert not [error for error in tab.errors if 'Content' in error], tab.errors

@@ -26,6 +26,8 @@ BAGS = ROOT / 'bags'
 # A deadline is only ever reached by a failure: what takes 2 s alone takes 20 s where ten share
 # two cores, and a start of a process, its imports and its discovery, five times that.
 DEADLINE = 120.0
+# What has not ended by itself so long after a test, s, is killed.
+_END = 10.0
 _counter = itertools.count()
 
 
@@ -44,6 +46,20 @@ def new_domain() -> int:
     pytest.fail('every ROS domain from 10 to 99 is in use')
 
 
+def queues(domain: int) -> list[Path]:
+    """Return where Fast DDS keeps its queues of a domain in shared memory."""
+    return [Path(f'/dev/shm/fastrtps_port{port}')
+            for port in range(7400 + 250 * domain, 7650 + 250 * domain)]
+
+
+def remove_queues(domain: int) -> None:
+    """Remove what killed programs have left of a domain that was ours alone."""
+    for port in queues(domain):
+        for left in (port, port.with_name(port.name + '_el'),
+                     port.with_name(f'sem.{port.name}_mutex')):
+            left.unlink(missing_ok=True)
+
+
 # `new_domain` gives none of these; each is given once in a run.
 _UNUSED = [*range(1, 10), 100, 101]
 
@@ -58,9 +74,7 @@ def unused_domain() -> Iterator[int]:
     """
     while _UNUSED:
         domain = _UNUSED.pop(0)
-        ports = [Path(f'/dev/shm/fastrtps_port{port}')
-                 for port in range(7400 + 250 * domain, 7650 + 250 * domain)]
-        if not any(port.exists() for port in ports):
+        if not any(port.exists() for port in queues(domain)):
             break
     else:
         pytest.fail('every ROS domain of 1 to 9, 100 and 101 is in use, or killed programs left '
@@ -68,10 +82,7 @@ def unused_domain() -> Iterator[int]:
     try:
         yield domain
     finally:
-        for port in ports:
-            for left in (port, port.with_name(port.name + '_el'),
-                         port.with_name(f'sem.{port.name}_mutex')):
-                left.unlink(missing_ok=True)
+        remove_queues(domain)
 
 
 def wait_until(predicate: Callable[[], Any], timeout: float = DEADLINE, what: str = '') -> Any:
@@ -134,6 +145,12 @@ class Process:
         if self.popen.poll() is None:
             self.popen.kill()
             self.popen.wait()
+
+    def ask_to_end(self) -> None:
+        """Send SIGINT, also to what was stopped."""
+        if self.popen.poll() is None:
+            self.popen.send_signal(signal.SIGINT)
+            self.popen.send_signal(signal.SIGCONT)
 
 
 class Starved:
@@ -295,11 +312,23 @@ class World:
         return self._probes[-1]
 
     def close(self) -> None:
-        """End everything; a traceback anywhere is a failure, whatever the test looked at."""
+        """
+        End everything; a traceback anywhere is a failure, whatever the test looked at.
+
+        A killed process leaves its queues in shared memory, and what comes next in that domain
+        may lose messages in them.
+        """
+        for process in self._processes:
+            process.ask_to_end()
+        until = time.monotonic() + _END
+        while (any(process.popen.poll() is None for process in self._processes)
+               and time.monotonic() < until):
+            time.sleep(0.02)
         for process in self._processes:
             process.kill()
         for probe in self._probes:
             probe.close()
+        remove_queues(self.domain)
         for process in self._processes:
             assert 'Traceback' not in process.err, process.err
 
