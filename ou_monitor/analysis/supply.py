@@ -4,7 +4,8 @@ What is known of a supply, once for all commands: `supply_facts`.
 Sag, resistance and budget are those that the node has at the end of the recording.  Noise, alpha,
 sigma and Var_inf come from one regression of the voltage on level, throttle and current
 (`ou_monitor.model.ou_fit`): noise is its residual; alpha, sigma and Var_inf are those of the
-shortest window at the end of the recording in which they are known.
+shortest window at the end of the recording in which alpha is known within a factor of 1.5, else of
+the longest.
 
 Limits: those of that fit and of the node's filter.  The filter takes most of the time: 1.6 CPU s
 for 130 s at 200 Hz, and 4 s with a limit, for the budget.

@@ -1,23 +1,27 @@
 """
 An Ornstein-Uhlenbeck process beside white noise in what the load leaves of a voltage.
 
-`known_ou` fits the shortest window in which a relaxation is known.  `regress` takes a flexible
+`known_ou` fits the shortest window in which alpha is known well.  `regress` takes a flexible
 level (linear hats every 5 s), throttle and measured current, each at once and after a bank of
-lags, out of the voltage; `fit_ou` fits the noise jointly with them.
+lags whose state at the beginning is free, out of the voltage; `fit_ou` fits the noise jointly
+with them.
 
-The noise is white noise, the OU, and a random walk of the level, whose size has a narrow prior:
-without it, what the hats leave of the level would pass for a slow OU.  The fit is a restricted
-likelihood in the frequency domain, in bins in which the spectrum hardly changes.  Each ordinate
-has its expectation in a window of this length (the debiased Whittle likelihood: Sykulski et al.,
-Biometrika 106 (2019) 251).  Intervals are quantiles by importance sampling; prior: flat in
+The size of the noise follows a law of the load and of its changes, and each reading counts by it:
+what a load model misses while the load moves would otherwise pass for a fast OU. The noise is
+white noise, the OU, and a random walk of the level, which may be nil and has a usual size that it
+hardly exceeds: without it, what the hats leave of the level would pass for a slow OU. The fit is a
+restricted likelihood in the frequency domain, in bins in which the spectrum hardly changes. Each
+ordinate has its expectation in a window of this length (the debiased Whittle likelihood: Sykulski
+et al., Biometrika 106 (2019) 251). Intervals are quantiles by importance sampling; prior: flat in
 ln(alpha), arcsine in the share of the OU.
 
-Limits: samples count as evenly spaced within a stretch without gaps; a relaxation slower than
-2.5 s (a sixth of a window below 15 s) is the level's; noise whose size changes with throttle
-counts as of its mean size; a load that neither throttle nor current shows, and noise of another
-spectrum (a filtered sensor), pass for the OU.  On 240 simulated rails under a quad's throttle
-(alpha 2 to 500 1/s, 50 to 1000 Hz, white noise to 30 mV) 92 % of the 95 % intervals held alpha,
-93 % sigma, 89 % Var_inf, and 86 % of the 97.5 % bounds held.
+Limits: samples count as evenly spaced within a stretch without gaps; a relaxation slower than 2.5
+s (a sixth of a window below 15 s) is the level's; OU and white noise change their size together,
+and are told at their mean size; repeats or rounding of slow changes, a load that neither throttle
+nor current shows, and noise of another spectrum (a filtered sensor), pass for the OU. On 240
+simulated rails under a quad's throttle (alpha 2 to 500 1/s, 50 to 1000 Hz, white noise to 30 mV)
+92 % of the 95 % intervals held alpha, 95 % sigma, 92 % Var_inf, and 97 % of the 97.5 % bounds
+held.
 """
 
 from __future__ import annotations
@@ -48,20 +52,27 @@ _DELAYS, _DELAY_READINGS = 4, 8000
 _MOVED = 0.01
 # A gap is a step of this many usual ones; stretches of fewer readings are left out.
 _GAP, _STRETCH = 1.6, 16
-# Windows, s: the shortest in which a relaxation is known counts.
-WINDOWS = (2.0, 8.0, 30.0, 60.0)
+# Windows, s: the shortest in which alpha is known within this factor counts, else the longest.
+# Precision stops the search, not visibility: whether chance makes a relaxation visible in a short
+# window depends on its estimate, which would then be biased.
+WINDOWS, PRECISE = (2.0, 8.0, 30.0, 60.0), 1.5
 # Fewest readings beyond the number of regressors from which anything is fitted.
 FEWEST = 40
 # Ordinates taken one by one; relative width of the bins above.
 _SINGLE, _WIDTH = 12, 0.06
 # Points of the likelihood's first grid in ln(alpha), logit(share) and ln(walk); largest logit.
 _GRID, _LOGIT = (24, 13, 5), 7.0
-# Values of the walk tried for bounds.
-_WALKS = 15
+# Bounds: distances in logit(share) from the best of the grid that are tried beside the grid's,
+# and steps by which the walk is refined.
+_ASIDE = np.linspace(-1.2, 1.2, 17)
+_REFINE = (1.2, 0.6, 0.3, 0.15)
+# Law of the noise's size: lags of the load whose differences enter, s; deviation of its
+# coefficients by the prior; rounds.
+_CHANGES, _SIZE_SD, _SIZE_ROUNDS = (0.03, 0.2, 1.0), 0.5, 12
 # Draws about the maximum in each round, and rounds.
 _DRAWS, _ROUNDS = 1000, 4
-# The level's walk, V per sqrt(s) and cell, and the deviation of its logarithm: .0015 to .015
-# follow the recordings (doc/load.md).
+# The level's usual walk, V per sqrt(s) and cell, and the deviation of its logarithm above that:
+# .0015 to .015 follow the recordings (doc/load.md).
 _WALK, _WALK_SD = 0.004, 0.8
 # Largest alpha D tried: beyond, neighbouring readings are uncorrelated.
 _FASTEST = 5.0
@@ -148,7 +159,8 @@ class Regression:
     dt: float  # mean step within the stretches, s
     places: npt.NDArray[np.intp]  # of the readings in stretches without gaps, shape (n,)
     voltage: FloatArray  # V, what the regressors leave, shape (n,)
-    basis: FloatArray  # orthonormal regressors, shape (n, p)
+    size: FloatArray  # of the noise beside its rms, shape (n,)
+    basis: FloatArray  # orthonormal regressors, in units of the size, shape (n, p)
     lengths: list[int]  # of the stretches
     walk: float  # usual walk of the level, V per sqrt(s)
     slowest: float  # half the distance of the level's knots, s: slower is the level
@@ -205,12 +217,48 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None,
             columns.append(u * i)
     places = np.concatenate([np.arange(s.start, s.stop) for s in stretches] or [
         np.zeros(0)]).astype(np.intp)
-    basis, v = _basis([c[places] for c in columns]), v[places]
-    # Twice, against rounding.
-    for _ in range(2):
-        v = v - basis @ (basis.T @ v)
-    return Regression(dt, places, v, basis, [s.stop - s.start for s in stretches], walk,
-                      0.5 * float(knots[1] - knots[0]))
+    if u is not None or i is not None:
+        # What the load was before the window is unknown.
+        columns = [*columns, *(np.exp((t[0] - t) / tau) for tau in taus)]
+    columns, v = [c[places] for c in columns], v[places]
+    size = np.ones(v.size)
+    signs = [sign[places] for x in (u, i) if x is not None for sign in _activity(x, dt)]
+    # First all readings count alike, then each by the size of its noise.
+    for _ in range(3 if signs and v.size else 1):
+        basis, left = _basis([c / size for c in columns]), v / size
+        # Twice, against rounding.
+        for _ in range(2):
+            left = left - basis @ (basis.T @ left)
+        found, left = size, left * size
+        size = _size(left, signs)
+    return Regression(dt, places, left, found, basis, [s.stop - s.start for s in stretches],
+                      walk, 0.5 * float(knots[1] - knots[0]))
+
+
+def _activity(x: FloatArray, dt: float) -> list[FloatArray]:
+    """Return the size of a load and of its changes over several times, each at least 0."""
+    held = [x, *(_lagged(x, -math.expm1(-dt / tau)) for tau in _CHANGES)]
+    return [np.abs(one) for one in (
+        x, np.diff(x, prepend=x[0]), *(a - b for a, b in zip(held, held[1:])))]
+
+
+def _size(left: FloatArray, signs: list[FloatArray]) -> FloatArray:
+    """Return the noise's size beside its rms: a law, linear in its logarithm, of the signs."""
+    mean = float(left @ left) / max(1, left.size)
+    if not signs or not mean > 1e-18:
+        return np.ones(left.size)
+    laws = [np.log1p(sign / (0.3 * math.sqrt(float(sign @ sign) / sign.size)))
+            for sign in signs if sign.any()]
+    X = np.stack([np.ones(left.size), *(law - law.mean() for law in laws)], axis=1)
+    square = left * left / mean
+    prior = np.append(0.0, np.full(X.shape[1] - 1, 2.0 / _SIZE_SD ** 2))
+    beta, H = np.zeros(X.shape[1]), X.T @ X + np.diag(prior)
+    for _ in range(_SIZE_ROUNDS):
+        # A score of the Gamma law of squares.
+        score = X.T @ (square * np.exp(-np.clip(X @ beta, -6.0, 6.0)) - 1.0) - prior * beta
+        beta = beta + np.clip(np.linalg.solve(H, score), -1.0, 1.0)
+    variance = np.exp(np.clip(X @ beta, -6.0, 6.0))
+    return np.asarray(np.sqrt(variance / variance.mean()))
 
 
 class _Likelihood:
@@ -218,7 +266,7 @@ class _Likelihood:
 
     def __init__(self, part: Regression) -> None:
         self.free = part.free
-        Z = np.column_stack([part.basis, part.voltage])
+        Z = np.column_stack([part.basis, part.voltage / part.size])
         crosses, counts, omegas, lengths = [], [], [], []
         for n, rows in zip(part.lengths, np.split(Z, np.cumsum(part.lengths)[:-1])):
             F = np.fft.rfft(rows, axis=0) / math.sqrt(n)
@@ -292,7 +340,7 @@ def fit_ou(part: Regression, span: float) -> OuFacts:
         """Return minus the log-posterior, flat in share, and the variance, V^2."""
         value, variance = likelihood.at(points)
         off = 0.5 * (points[:, 2] + np.log(variance / dt)) - math.log(part.walk)
-        return value + 0.5 * (off / _WALK_SD) ** 2, variance
+        return value + 0.5 * np.maximum(off / _WALK_SD, 0.0) ** 2, variance
 
     def cost(point: FloatArray) -> float:
         inside = np.clip(point, low, high)
@@ -350,7 +398,7 @@ def fit_ou(part: Regression, span: float) -> OuFacts:
 
 
 def known_ou(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | None) -> OuFacts:
-    """Fit the shortest of WINDOWS, at the end of the readings, in which a relaxation is known."""
+    """Fit the shortest of WINDOWS, at the end of the readings, that is precise enough."""
     if not t.size:
         return OuFacts('no_data')
     span = float(t[-1] - t[0])
@@ -364,7 +412,7 @@ def known_ou(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray |
         if part.free < FEWEST:
             continue
         found = fit_ou(part, window)
-        if found.status == 'ok':
+        if found.status == 'ok' and found.alpha_95[1] < PRECISE ** 2 * found.alpha_95[0]:
             return found
     return found
 
@@ -397,18 +445,33 @@ def _quantiles(log: FloatArray, weight: FloatArray, extra: float) -> FloatArray:
 def _unseen(costs: Callable[[FloatArray], tuple[FloatArray, FloatArray]], low: FloatArray,
             high: FloatArray, least: float, dt: float, span: float) -> OuFacts:
     """Return tau and Var_inf such that no slower OU has a larger variance."""
-    shape = (*_GRID[:2], _WALKS)
-    axes = [np.linspace(*ends) for ends in zip(low, high, shape)]
-    value, variance = (x.reshape(shape) for x in costs(_points(*axes)))
-    best = np.argmin(value, axis=2)[:, :, None]
-    # At the best walk, between the points of the grid; roots, as a parabola's are straight.
-    lost = np.take_along_axis(value, best, 2)[:, :, 0] - min(least, float(value.min()))
+    axes = [np.linspace(*ends) for ends in zip(low, high, _GRID)]
+    first = costs(_points(*axes))[0].reshape(_GRID).reshape(_GRID[0], -1).argmin(axis=1)
+    best, walk = np.unravel_index(first, _GRID[1:])
+    logits = np.sort(np.hstack([
+        np.clip(axes[1][best][:, None] + _ASIDE, -_LOGIT, _LOGIT),
+        np.broadcast_to(axes[1], _GRID[:2])]), axis=1)
+    shape = logits.shape
+    points = np.stack(np.broadcast_arrays(
+        axes[0][:, None], logits, axes[2][walk][:, None]), axis=2).reshape(-1, 3)
+    value, variance = costs(points)
+    for step in _REFINE:
+        for way in (-step, step):
+            other = points + np.array([0.0, 0.0, way])
+            cost, size = costs(other)
+            better = (cost < value)[:, None]
+            points = np.where(better, other, points)
+            value, variance = (np.where(better[:, 0], x, y)
+                               for x, y in ((cost, value), (size, variance)))
+    # Between the points, at the best walk; roots, as a parabola's are straight.
+    lost = (value - min(least, float(value.min()))).reshape(shape)
     fine = zoom(np.sqrt(np.maximum(lost, 0.0)), 8, order=1) ** 2
-    size = zoom(np.log(np.take_along_axis(variance, best, 2)[:, :, 0]), 8, order=1)
+    size, logit = (zoom(x.reshape(shape), 8, order=1)
+                   for x in (np.log(variance), points[:, 1]))
     tau = dt * np.exp(-np.linspace(low[0], high[0], fine.shape[0]))
-    share = 1.0 / (1.0 + np.exp(-np.linspace(low[1], high[1], fine.shape[1])))
+    share = 1.0 / (1.0 + np.exp(-logit))
     fits = fine < _DROP
-    strong = fits[:, share > _QUARTER].any(axis=1)
+    strong = (fits & (share > _QUARTER)).any(axis=1)
     longest = float(tau[strong].max()) if strong.any() else float(tau.min())
     slower = fits & (tau > longest)[:, None]
     variance = share * np.exp(size)

@@ -69,6 +69,39 @@ def test_buried_relaxations_lie_within_the_bounds():
     assert inside >= 17
 
 
+def test_slow_relaxations_lie_within_the_bounds():
+    """
+    Of 16 rails with a slow OU beside fast readings, the intervals or bounds hold 13.
+
+    95 % and 97.5 %; fewer than 13 of 16 has a chance of 0.7 %.
+    """
+    inside = 0
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        alpha = rng.uniform(2.0, 5.0)
+        t, v, u = rail(rng, 600.0, alpha, 0.012, 0.016, 16.0)
+        found = fit_ou(regress(t, v, u, None), 16.0)
+        inside += (found.alpha_95[0] < alpha < found.alpha_95[1] if found.status == 'ok' else
+                   found.tau_below_s > 1.0 / alpha or found.var_inf_below > 0.012 ** 2)
+    assert inside >= 13
+
+
+def test_noise_that_grows_with_changes_of_throttle():
+    """
+    Of 16 rails whose white noise is as large again while throttle moves, intervals hold 13.
+
+    95 %; fewer than 13 of 16 has a chance of 0.7 %.
+    """
+    inside = 0
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        t, v, u = rail(rng, 200.0, 20.0, 0.015, 0.01)
+        moves = np.abs(lfilter([0.1], [1.0, -0.9], np.gradient(u, t)))
+        found = fit_ou(regress(t, v + 0.03 * moves * rng.standard_normal(t.size), u, None), 30.0)
+        inside += found.alpha_95[0] < 20.0 < found.alpha_95[1]
+    assert inside >= 13
+
+
 def test_current_takes_its_load_out():
     """A load that only the measured current shows is no OU: alpha is that of the noise."""
     rng = np.random.default_rng(1)
