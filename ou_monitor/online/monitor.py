@@ -294,8 +294,8 @@ class SupplyMonitor:
         risk = ahead.outcome.risk
         self._faulty = self._faulty and not e.usable
         arriving = here <= max(self._settings.stale_after, limit)
-        flag = self._flag.update(e.t + silent if now is None else now, risk, fresh=fresh,
-                                 arriving=arriving)
+        flag = self._flag.update(e.t + silent if now is None else now, risk, ahead.soon,
+                                 ahead.tight, fresh=fresh, arriving=arriving)
         silence = '' if fresh else why if arriving and why else self._silence(
             age, e, limit, late=silent - here > limit)
         wrong = doubt if silence and silence == why else Doubt.NONE

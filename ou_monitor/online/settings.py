@@ -47,10 +47,6 @@ class Parameter:
     choices: tuple[str, ...] = ()
 
 
-# Where the floor is when only brownout.voltage is given, V below it: the step from the 4.5 V at
-# which PX4 calls a 5 V rail low to the 4.3 V below which ArduPilot does not arm.
-FLOOR_BELOW = 0.2
-
 ESTIMATOR_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('window', 2.0, 'Length of the sliding window, s.', 0.05, 3600.0),
     Parameter('stale_after', 1.0,
@@ -62,34 +58,35 @@ ESTIMATOR_PARAMETERS: tuple[Parameter, ...] = (
               'a 5 V rail).', 0.0, 1000.0),
     Parameter('brownout.horizon', 5.0, 'Time ahead for which the risk is told, s.',
               0.001, 3600.0),
-    Parameter('brownout.warn', 0.01, 'Risk from which the diagnostics warn, 0..1.', 0.0, 1.0),
-    Parameter('brownout.critical', 0.1, 'Risk from which the brown-out flag is set, 0..1.',
-              0.0, 1.0),
+    Parameter('brownout.warn', 0.1, 'Risk from which the diagnostics warn, 0..1.', 0.0, 1.0),
+    Parameter('brownout.critical', 0.5,
+              'Risk within 1 s, throttle held as it is, from which the brown-out flag is set, '
+              '0..1.', 0.0, 1.0),
     Parameter('brownout.leave', 0.5,
               'A level is left when the risk falls below this share of what it is entered at, '
               '0.001..1, less than 1 (default: half, our choice).', 0.001, 1.0),
-    Parameter('brownout.hold', 2.0,
+    Parameter('brownout.hold', 1.0,
               'Time for which WARN and CRITICAL stay at least, and outlast an unknown risk, s '
-              '(default: the length of the default window, after which a dip is forgotten).',
+              '(default: on five recorded quads 2 s set the flag twice as long where nothing '
+              'dipped).',
               0.0, 3600.0),
-    Parameter('brownout.delay', 0.0,
-              'Time for which a risk must last before its level is entered, s (default: none; '
-              'ArduPilot waits 10 s before a voltage failsafe).', 0.0, 3600.0),
+    Parameter('brownout.delay', 0.05,
+              'Time for which a risk must last before its level is entered, s (default: two '
+              'reports; ArduPilot waits 10 s before a voltage failsafe).', 0.0, 3600.0),
     Parameter('brownout.latch', False,
               'Whether CRITICAL stays until ~/clear_brownout is called or this is switched off '
               '(default: no; PX4 latches its battery warning while armed).'),
     Parameter('brownout.floor', -1.0,
               'Voltage at or below which the flag is CRITICAL whatever the model says, V; 0: off; '
-              'negative: 0.2 V below brownout.voltage (with the default of that 4.3 V, the '
-              'BRD_VBUS_MIN of ArduPilot for a 5 V rail).', -1.0, 1000.0),
-    Parameter('brownout.floor_time', 0.02,
+              'negative: brownout.voltage itself (default).', -1.0, 1000.0),
+    Parameter('brownout.floor_time', 0.01,
               'Time over which the median of the voltage is held against the floor, s, three '
-              'samples at least (default: shorter than the 40 ms dips of real inrush, longer than '
-              'a bad sample).', 0.0, 10.0),
+              'samples at least (default: shorter than the dips of recorded quads, from 10 ms on, '
+              'longer than a bad sample).', 0.0, 10.0),
     Parameter('brownout.watch', 'continuous',
               'Whether the risk is that of the voltage at all times or only at its samples.',
               choices=('continuous', 'sampled')),
-    Parameter('brownout.budget_limit', 0.0,
+    Parameter('brownout.budget_limit', 0.01,
               'Risk that the throttle budget keeps under, 0..1; 0: brownout.warn.', 0.0, 1.0),
     Parameter('model_file', '',
               'Model file of the supply (discover --save-model); empty: none.'),
@@ -169,7 +166,8 @@ class MonitorSettings:
     brownout_horizon : float
         Time ahead of the risk, s.
     brownout_warn, brownout_critical : float
-        Risks from which the diagnostics warn and the flag is set, 0..1.
+        Risk from which the diagnostics warn, and risk within 1 s, throttle held as it is, from
+        which the flag is set, 0..1.
     brownout_leave : float
         Share of these risks below which a level is left, less than 1.
     brownout_hold, brownout_delay : float
@@ -177,8 +175,7 @@ class MonitorSettings:
     brownout_latch : bool
         Whether CRITICAL stays until it is cleared.
     brownout_floor : float
-        Voltage at or below which the flag is CRITICAL, V; 0: off; negative: 0.2 V below
-        `brownout_voltage`.
+        Voltage at or below which the flag is CRITICAL, V; 0: off; negative: `brownout_voltage`.
     brownout_floor_time : float
         Time over which the median of the voltage is held against the floor, s.
     brownout_watch : str
@@ -194,16 +191,16 @@ class MonitorSettings:
     stale_after: float = 1.0
     brownout_voltage: float = 4.5
     brownout_horizon: float = 5.0
-    brownout_warn: float = 0.01
-    brownout_critical: float = 0.1
+    brownout_warn: float = 0.1
+    brownout_critical: float = 0.5
     brownout_leave: float = 0.5
-    brownout_hold: float = 2.0
-    brownout_delay: float = 0.0
+    brownout_hold: float = 1.0
+    brownout_delay: float = 0.05
     brownout_latch: bool = False
     brownout_floor: float = -1.0
-    brownout_floor_time: float = 0.02
+    brownout_floor_time: float = 0.01
     brownout_watch: str = 'continuous'
-    brownout_budget_limit: float = 0.0
+    brownout_budget_limit: float = 0.01
     model_file: str = ''
 
     def __post_init__(self) -> None:
@@ -220,7 +217,7 @@ class MonitorSettings:
         if self.brownout_floor > self.brownout_voltage:
             raise ValueError(
                 f'brownout.floor ({self.brownout_floor} V) must not exceed brownout.voltage '
-                f'({self.brownout_voltage} V): lower it, or set 0 (off) or -1 (0.2 V below)')
+                f'({self.brownout_voltage} V): lower it, or set 0 (off) or -1 (the same)')
         if self.brownout_budget_limit > self.brownout_critical:
             raise ValueError(
                 f'brownout.budget_limit ({self.brownout_budget_limit}) must not exceed '
@@ -237,7 +234,7 @@ class MonitorSettings:
     def floor(self) -> float:
         """Return the voltage floor in force, V; 0: off."""
         if self.brownout_floor < 0.0:
-            return max(self.brownout_voltage - FLOOR_BELOW, 0.0)
+            return max(self.brownout_voltage, 0.0)
         return self.brownout_floor
 
     @cached_property

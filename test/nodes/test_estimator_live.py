@@ -191,7 +191,7 @@ def test_bad_parameters_are_refused(rig, name, value, words):
     from rcl_interfaces.srv import GetParameters
     answer = rig.probe.call(GetParameters, f'{rig.node}/get_parameters',
                             GetParameters.Request(names=['window', 'brownout.warn']))
-    assert [v.double_value for v in answer.values] == [2.0, 0.01]
+    assert [v.double_value for v in answer.values] == [2.0, 0.1]
 
 
 def test_publish_rate_changes_at_run_time(rig):

@@ -144,7 +144,7 @@ def test_latch_off_clears(rig):
 @pytest.mark.parametrize('name, value, words', [
     ('brownout.floor', 4.6, 'must not exceed brownout.voltage'),
     ('brownout.leave', 1.0, 'must be less than 1'),
-    ('brownout.budget_limit', 0.5, 'must not exceed brownout.critical'),
+    ('brownout.budget_limit', 0.6, 'must not exceed brownout.critical'),
     ('brownout.critical', 0.005, 'must be less than brownout.critical'),
     ('brownout.watch', 'both', 'brownout.watch'),
     ('brownout.horizon', 0.0, 'out of range'),

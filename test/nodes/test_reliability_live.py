@@ -164,9 +164,10 @@ def test_a_model_file_that_takes_long_to_refuse_is_answered_with_the_reason(rig,
 def test_what_comes_as_a_parameter_kills_nothing(rig):
     """Limits that no budget can keep are refused together, with their range."""
     request = SetParameters.Request(parameters=[
-        Parameter('brownout.warn', value=0.0).to_parameter_msg()])
+        Parameter(f'brownout.{name}', value=0.0).to_parameter_msg()
+        for name in ('budget_limit', 'warn')])
     answer = rig.probe.call(SetParameters, f'{rig.node}/set_parameters', request)
-    assert 'above 0 and below 1' in answer.results[0].reason
+    assert 'above 0 and below 1' in answer.results[1].reason
     rig.live([1e30] * 14 + [1e-30] * 100 + [5.0] * 100)
     states = len(rig.states)
     wait_until(lambda: len(rig.states) > states + 3, what='states')

@@ -113,7 +113,8 @@ def test_a_fast_source_is_stale_after_300_missed_samples():
 
 
 @pytest.mark.parametrize('values', [
-    {'brownout.warn': 0.0}, {'brownout.critical': 1.0, 'brownout.budget_limit': 1.0}])
+    {'brownout.warn': 0.0, 'brownout.budget_limit': 0.0},
+    {'brownout.critical': 1.0, 'brownout.budget_limit': 1.0}])
 def test_limits_that_no_budget_can_keep_are_refused_with_the_range(values):
     with pytest.raises(ValueError, match='budget_limit .* above 0 and below 1'):
         monitor_settings(values)

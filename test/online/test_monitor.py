@@ -64,10 +64,11 @@ def test_low_supply_raises_the_flag_even_without_a_model():
 
 def test_risk_levels_follow_the_parameters():
     """56 mV rms, 0.17 V above the barrier: b = 3, passages every ~150 tau."""
-    critical = filled(brownout_voltage=4.83).report(0.0)
+    critical = filled(brownout_voltage=4.83, brownout_warn=0.01, brownout_critical=0.1,
+                      brownout_delay=0.0).report(0.0)
     assert critical.brownout is True and critical.level is Level.ERROR
     warned = filled(brownout_voltage=4.83, brownout_warn=0.1,
-                    brownout_critical=1.0).report(0.0)
+                    brownout_critical=1.0, brownout_delay=0.0).report(0.0)
     assert warned.brownout is (warned.risk >= 1.0) and warned.level is not Level.OK
 
 

@@ -35,9 +35,9 @@ class Feed:
 
 def test_summary_says_why():
     """Risk, horizon, level, throttle, what the flag does and since when."""
-    report = Feed(brownout_voltage=4.93).feed(5.0)
+    report = Feed(brownout_voltage=4.93, brownout_delay=0.0).feed(5.0)
     assert report.level is Level.ERROR and report.flag.level is FlagLevel.CRITICAL
-    for words in ('Brown-out risk', 'within 5 s of 4.93 V', 'critical from 0.1',
+    for words in ('Brown-out risk', 'within 5 s of 4.93 V', 'critical from 0.5',
                   'at throttle 0.62', 'CRITICAL for 0.0 s', 'brownout.critical'):
         assert words in report.summary
     assert report.fields['brownout_level'] == 'CRITICAL'
@@ -47,7 +47,8 @@ def test_summary_says_why():
 def test_held_after_a_dip():
     """The rail is well again, the flag is still held, and says so; then it is not."""
     # What has just gone down by 0.6 V may do so again: not below 0.01 yet.
-    feed = Feed(brownout_hold=5.0, window=1.0, brownout_warn=0.05)
+    feed = Feed(brownout_hold=5.0, window=1.0, brownout_warn=0.05, brownout_floor=4.3,
+                brownout_delay=0.0)
     assert feed.feed(4.4).level is Level.ERROR
     held = feed.feed(5.0, 3.0)
     assert held.risk < 0.025 and held.level is Level.ERROR and held.brownout is True
@@ -110,7 +111,7 @@ def test_a_dip_is_told_though_the_source_is_silent_since():
     monitor.push([0.0, 0.001, 0.002], [4.2] * 3)
     report = monitor.report(1.1)
     assert report.brownout is True and report.level is Level.ERROR
-    assert 'brownout.floor (4.3 V)' in report.summary and 'No voltage for 1.1 s' in report.summary
+    assert 'brownout.floor (4.5 V)' in report.summary and 'No voltage for 1.1 s' in report.summary
     assert report.fields['floor_dips'] == '1'
     silent = monitor.report(1.2)
     assert silent.brownout is None and silent.level is Level.STALE
@@ -132,7 +133,7 @@ def test_floor_without_an_estimate():
     report = monitor.report(0.0)
     assert math.isnan(report.risk) and not report.estimate.usable
     assert report.level is Level.ERROR and report.brownout is True
-    assert 'brownout.floor (4.3 V)' in report.summary and 'risk unknown' in report.summary
+    assert 'brownout.floor (4.5 V)' in report.summary and 'risk unknown' in report.summary
 
 
 def test_silence_keeps_a_flag_that_is_set_for_the_hold():
@@ -213,7 +214,7 @@ def test_never_silently_fine(history):
 
 
 @pytest.mark.parametrize('values, words', [
-    ({'brownout.warn': 0.1}, r'brownout.warn \(0.1\) must be less than brownout.critical'),
+    ({'brownout.warn': 0.5}, r'brownout.warn \(0.5\) must be less than brownout.critical'),
     ({'brownout.leave': 1.0}, r'brownout.leave \(1.0\) must be less than 1'),
     ({'brownout.leave': 0.0}, 'brownout.leave must lie within 0.001..1.0'),
     ({'brownout.hold': -1.0}, 'brownout.hold must lie within'),
@@ -224,7 +225,7 @@ def test_never_silently_fine(history):
     ({'brownout.floor': 4.0, 'brownout.voltage': 3.0}, 'lower it'),
     ({'brownout.floor_time': -0.1}, 'brownout.floor_time'),
     ({'brownout.watch': 'sample'}, "did you mean 'sampled'"),
-    ({'brownout.budget_limit': 0.2}, 'brownout.budget_limit .* brownout.critical'),
+    ({'brownout.budget_limit': 0.6}, 'brownout.budget_limit .* brownout.critical'),
     ({'brownout.horizon': -1.0}, 'brownout.horizon'),
     ({'brownout.voltage': math.nan}, 'brownout.voltage'),
     ({'model_file': 3}, 'model_file must be text'),
@@ -245,8 +246,9 @@ def test_what_does_not_contradict_is_taken(values):
     assert made.floor <= made.brownout_voltage
 
 
-def test_the_budget_keeps_under_the_warning_unless_told_otherwise():
-    assert MonitorSettings().budget_limit == MonitorSettings().brownout_warn
+def test_the_budget_keeps_under_the_warning_when_told_so():
+    made = MonitorSettings(brownout_budget_limit=0.0)
+    assert made.budget_limit == made.brownout_warn
     assert MonitorSettings(brownout_budget_limit=0.05).budget_limit == 0.05
 
 

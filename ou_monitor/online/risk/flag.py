@@ -1,7 +1,10 @@
 """
-The brown-out flag: from a risk, and a voltage floor, to a level that can be acted on.
+The brown-out flag: from risks, and a voltage floor, to a level that can be acted on.
 
-Rising is immediate (after `brownout.delay`, 0 by default); falling waits for
+CRITICAL: the limit is undershot, or will be within 1 s with throttle as it is now.  WARN: the risk
+over `brownout.horizon` is high, or the throttle budget is below what is flown.
+
+Rising takes `brownout.delay`, two reports by default; falling waits for
 `brownout.hold` and for the risk to fall below `brownout.leave` times the
 probability at which the level is entered; `brownout.latch` keeps CRITICAL until it is
 cleared.  Limits: a flag is as good as its risk; an unknown risk is UNKNOWN,
@@ -298,20 +301,23 @@ class BrownoutFlag:
         """Report UNKNOWN for this reason in place of OK and WARN, from now on."""
         self._doubt = reason
 
-    def update(self, t: float, risk: float, *, fresh: bool = True,
-               arriving: bool | None = None) -> FlagState:
+    def update(self, t: float, risk: float, soon: float | None = None, tight: bool = False, *,
+               fresh: bool = True, arriving: bool | None = None) -> FlagState:
         """
-        Judge (t in s, risk 0..1).
+        Judge (t in s; risk, and that of the next second with throttle as it is, 0..1).
 
-        `fresh`: the risk rests on samples that are not too old; `arriving`: samples still come,
-        whatever their stamps say, and a last one at the floor holds (as `fresh` when left out).
+        `soon` left out, or NaN: as `risk`.  `tight`: the budget is below what is flown.  `fresh`:
+        the risk rests on samples that are not too old; `arriving`: samples still come, whatever
+        their stamps say, and a last one at the floor holds (as `fresh` when left out).
         """
-        if risk < 0.0 or risk > 1.0:
-            raise ValueError(f'a risk must lie within 0..1 or be NaN, got {risk}')
+        soon = risk if soon is None or math.isnan(soon) else soon
+        for one in (risk, soon):
+            if one < 0.0 or one > 1.0:
+                raise ValueError(f'a risk must lie within 0..1 or be NaN, got {one}')
         self._go_to(t)
         low = self._floor.take(fresh if arriving is None else arriving)
         known = fresh and not math.isnan(risk)
-        wanted, reason = self._wanted(risk, known, low)
+        wanted, reason = self._wanted(risk, soon, tight, known, low)
         level, reason = self._held(wanted, reason, known or low)
         if level is not self._level:
             self._enter(level)
@@ -346,29 +352,34 @@ class BrownoutFlag:
             return True
         return False if known and self._level is not FlagLevel.UNKNOWN else None
 
-    def _wanted(self, risk: float, known: bool, low: bool) -> tuple[FlagLevel, str]:
-        """Return the level that risk and floor ask for, hold and latch aside."""
+    def _wanted(self, risk: float, soon: float, tight: bool, known: bool, low: bool
+                ) -> tuple[FlagLevel, str]:
+        """Return the level that risks and floor ask for, hold and latch aside."""
         s = self._settings
-        enter = {FlagLevel.WARN: s.brownout_warn, FlagLevel.CRITICAL: s.brownout_critical}
-        above = [level for level, at in enter.items() if known and risk >= at]
+        asks = {FlagLevel.CRITICAL: (soon, s.brownout_critical, f'risk {soon:.2g} within 1 s, '
+                                     'throttle as it is'),
+                FlagLevel.WARN: (risk, s.brownout_warn, f'risk {risk:.2g}')}
+        above = [level for level, (found, enter, _) in asks.items() if known and found >= enter]
+        if tight and known and FlagLevel.WARN not in above:
+            above.append(FlagLevel.WARN)
         self._above = {level: self._above.get(level, self._now) for level in above}
         if low:
             return FlagLevel.CRITICAL, (
                 f'the voltage is at or below brownout.floor ({s.floor:g} V)')
         if not known:
             return FlagLevel.UNKNOWN, 'the risk is not known'
-        waited = [level for level in above if not self._waits(level)]
-        for level in (FlagLevel.CRITICAL, FlagLevel.WARN):
+        for level, (found, enter, words) in asks.items():
             word = level.name.lower()
-            if level in waited:
-                return level, f'risk {risk:.2g} (brownout.{word}: {enter[level]:g})'
-            leave = s.brownout_leave * enter[level]
-            if self._level.value >= level.value and risk >= leave:
-                return level, (f'risk {risk:.2g} has not fallen below {leave:.2g} '
+            if level in above and not self._waits(level):
+                return level, (f'{words} (brownout.{word}: {enter:g})' if found >= enter else
+                               'the throttle budget is below what is flown')
+            leave = s.brownout_leave * enter
+            if self._level.value >= level.value and found >= leave:
+                return level, (f'{words}, has not fallen below {leave:.2g} '
                                f'(brownout.leave x brownout.{word})')
         if above:
             # The level is UNKNOWN or OK: a higher one would have been returned.
-            return self._level, (f'risk {risk:.2g} waits for brownout.delay '
+            return self._level, (f'risk {max(risk, soon):.2g} waits for brownout.delay '
                                  f'({s.brownout_delay:g} s)')
         return FlagLevel.OK, f'risk {risk:.2g} (brownout.warn: {s.brownout_warn:g})'
 

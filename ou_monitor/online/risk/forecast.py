@@ -154,6 +154,8 @@ LOOK, _LOOK_SHARE = 0.2, 0.2
 _REST = 0.05
 # The window's own tests have found the OU: odds, and horizons that it counts as right.
 _ODDS = 20.0
+# Time, s, of which the throttle used is taken.
+_USED = 30.0
 # What may make most of a risk.
 DOMINANT = ('noise', 'load now', 'throttle to come')
 
@@ -302,6 +304,11 @@ class Forecast:
         return self._past.flown()
 
     @property
+    def used(self) -> float:
+        """Return the throttle that was passed for a tenth of the last 30 s; NaN without any."""
+        return self._past.used(_USED, 0.1)
+
+    @property
     def voltage(self) -> float:
         """Where the supply is now, V: the middle one of the last three samples; NaN of one."""
         return float(np.median(self._last)) if self._last.size > 1 else NAN
@@ -385,6 +392,12 @@ class Forecast:
             if share > 0.5:
                 basis, cause = 'first_passage', DOMINANT[0]
         return Outcome(min(max(risk, 0.0), 1.0), 'none' if math.isnan(risk) else basis, cause)
+
+    def risk_held(self, voltage: float, horizon: float) -> float:
+        """Return the risk with throttle as it is now; NaN where the load is not known."""
+        state = self._state()
+        return NAN if state is None else float(
+            self.risk_if(state.throttle, horizon, voltage, horizon)[0])
 
     def risk_if(self, throttle: npt.ArrayLike, dwell: float, voltage: float, horizon: float
                 ) -> FloatArray:

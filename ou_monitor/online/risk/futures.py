@@ -250,6 +250,12 @@ class Past:
         known = self.table[2:, np.isfinite(self.table[2])]
         return (float(known[0].min()), float(known[1].max())) if known.size else (NAN, NAN)
 
+    def used(self, seconds: float, share: float) -> float:
+        """Return the throttle that was passed for a share of the last seconds; NaN without any."""
+        high = self.table[3, -round(seconds / BLOCK):]
+        high = high[np.isfinite(high)]
+        return float(np.quantile(high, 1.0 - share)) if high.size else NAN
+
     def activity(self) -> float:
         """Return the usual sqrt|du| from one block to the next in the last minute."""
         change = np.abs(np.diff(self.table[2, -round(60.0 / BLOCK):]))

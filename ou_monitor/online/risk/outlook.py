@@ -154,6 +154,10 @@ _LARGEST = 1.0
 _NEWEST = 3
 
 
+# Time ahead, s, for which the flag asks what happens if throttle stays as it is.
+SOON = 1.0
+
+
 class Outlook:
     """Risk and throttle budget of one supply; tables for a model are made in a thread, or not."""
 
@@ -310,6 +314,10 @@ class Ahead:
         What ends it, or why it is not known.
     curve : tuple of float
         Risk if throttle goes to each tenth and stays for the horizon; empty when not known.
+    soon : float
+        Risk within `SOON` with throttle as it is now; NaN when not known.
+    tight : bool
+        Whether the budget is below the throttle that was passed for a tenth of the last 30 s.
 
     """
 
@@ -317,6 +325,8 @@ class Ahead:
     budget: float = NAN
     budget_reason: str = ''
     curve: tuple[float, ...] = ()
+    soon: float = NAN
+    tight: bool = False
 
 
 def look_ahead(outlook: Outlook, forecast: Forecast, e: Estimate, load: SupplyLoad,
@@ -325,6 +335,9 @@ def look_ahead(outlook: Outlook, forecast: Forecast, e: Estimate, load: SupplyLo
     s = settings
     voltage, horizon = s.brownout_voltage, s.brownout_horizon
     outcome = risk_of_all(outlook, forecast, e, s, voltage, horizon)
+    soon = forecast.risk_held(voltage, SOON) if outcome.basis == 'load' else NAN
+    if math.isnan(soon):
+        soon = risk_of_all(outlook, forecast, e, s, voltage, min(SOON, horizon)).risk
     risks = forecast.risk_if(_GRID, horizon, voltage, horizon)
     known = not np.isnan(risks).any()
     if known and outcome.basis != 'first_passage':
@@ -336,11 +349,13 @@ def look_ahead(outlook: Outlook, forecast: Forecast, e: Estimate, load: SupplyLo
                 budget = load_budget(risks, forecast.flown, s.budget_limit, voltage, horizon)
             elif not e.usable and load.status is not LoadStatus.NO_DATA:
                 return Ahead(outcome, NAN, load.status.value if not load.known else
-                             'Less than a second has been flown.')
+                             'Less than a second has been flown.', soon=soon)
         elif budget.risks.size:
             # Elsewhere it is the prior's.
             risks = np.where(budget.known, budget.risks, NAN)
-    return Ahead(outcome, budget.throttle, budget.reason, _tenths(risks))
+    # NaN is not below.
+    return Ahead(outcome, budget.throttle, budget.reason, _tenths(risks), soon,
+                 budget.throttle < forecast.used)
 
 
 def _tenths(risks: FloatArray) -> tuple[float, ...]:

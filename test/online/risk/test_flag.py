@@ -1,5 +1,6 @@
 """The flag as time lines: risk and voltage at each time, and the level that must follow."""
 
+from dataclasses import replace
 import math
 
 from hypothesis import given, settings as hypothesis_settings, strategies as st
@@ -15,7 +16,9 @@ LETTER = {'o': OK, 'w': WARN, 'c': CRITICAL, 'u': UNKNOWN}
 
 def made(**changes):
     """Return a flag with warn 0.01, critical 0.1, leave 0.5; no hold unless it is given."""
-    return BrownoutFlag(MonitorSettings(**{'brownout_hold': 0.0, **changes}))
+    return BrownoutFlag(MonitorSettings(**{
+        'brownout_warn': 0.01, 'brownout_critical': 0.1, 'brownout_hold': 0.0,
+        'brownout_delay': 0.0, 'brownout_floor': 4.3, **changes}))
 
 
 def line(flag, risks, step=1.0, start=0.0):
@@ -114,10 +117,10 @@ def test_latch_switched_off_ends_it_and_on_begins_it():
     """Hysteresis and hold go on as they are."""
     flag = made(brownout_latch=True)
     check(line(flag, [0.5, 0.0]), 'c c')
-    flag.configure(MonitorSettings(brownout_hold=0.0))
+    flag.configure(replace(flag.settings, brownout_latch=False))
     check(line(flag, [0.06, 0.0], start=2.0), 'c o')
     check(line(flag, [0.5], start=4.0), 'c')
-    flag.configure(MonitorSettings(brownout_hold=0.0, brownout_latch=True))
+    flag.configure(replace(flag.settings, brownout_latch=True))
     check(line(flag, [0.0], start=5.0), 'c')
 
 
@@ -155,7 +158,8 @@ def test_a_single_gap_does_not_flicker():
 def test_parameters_do_not_reset_it():
     flag = made(brownout_hold=5.0)
     line(flag, [0.5, 0.0])
-    flag.configure(MonitorSettings(brownout_hold=5.0, brownout_critical=0.2))
+    flag.configure(MonitorSettings(brownout_hold=5.0, brownout_critical=0.2,
+                                   brownout_delay=0.0))
     state = flag.update(2.0, 0.0)
     assert state.level is CRITICAL and state.since == 0.0
     flag.configure(MonitorSettings(brownout_hold=2.5))
@@ -244,6 +248,15 @@ def test_reason_names_the_parameter():
     assert 'brownout.warn: 0.01' in flag.update(2.0, 0.0).reason
 
 
+def test_critical_is_of_the_next_second_and_warn_of_the_horizon():
+    """Throttle held as it is decides what must be done now; the rest is a caution."""
+    flag = made()
+    cases = [(0.9, 0.05, False), (0.0, 0.2, False), (0.0, 0.0, True), (0.0, 0.0, False),
+             (0.3, NAN, False)]
+    check([flag.update(float(k), *case) for k, case in enumerate(cases)], 'w c w o c')
+    assert 'budget' in made().update(0.0, 0.0, 0.0, True).reason
+
+
 events = st.lists(st.tuples(
     st.floats(-3.0, 5.0), st.one_of(st.just(NAN), st.floats(0.0, 1.0)), st.booleans(),
     st.one_of(st.none(), st.floats(3.0, 6.0)), st.booleans()), max_size=60)
@@ -262,7 +275,7 @@ def test_whatever_happens_it_is_never_silently_fine(changes, happened):
 
     Time steps back and forth, data stop, the voltage passes the floor, it is cleared.
     """
-    flag = BrownoutFlag(MonitorSettings(**changes))
+    flag = made(**changes)
     t, known = 0.0, -math.inf
     for step, risk, fresh, voltage, clear in happened:
         t += step

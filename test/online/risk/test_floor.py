@@ -11,7 +11,8 @@ import pytest
 
 def watch(**changes):
     """Return a watch at 4.3 V and 20 ms."""
-    return FloorWatch(MonitorSettings(**changes))
+    return FloorWatch(MonitorSettings(**{
+        'brownout_floor': 4.3, 'brownout_floor_time': 0.02, **changes}))
 
 
 def push(floor, voltages, rate=1000.0, start=0.0):
@@ -69,8 +70,8 @@ def test_at_the_floor_counts(voltage, low):
 
 
 @pytest.mark.parametrize('settings, floor', [
-    ({}, 4.3), ({'brownout_voltage': 3.0}, 2.8), ({'brownout_floor': 4.0}, 4.0),
-    ({'brownout_floor': 0.0}, 0.0), ({'brownout_voltage': 0.1}, 0.0)])
+    ({}, 4.5), ({'brownout_voltage': 3.0}, 3.0), ({'brownout_floor': 4.0}, 4.0),
+    ({'brownout_floor': 0.0}, 0.0), ({'brownout_voltage': 0.0}, 0.0)])
 def test_where_the_floor_is(settings, floor):
     assert MonitorSettings(**settings).floor == pytest.approx(floor, abs=1e-12)
 
