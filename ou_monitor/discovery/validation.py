@@ -96,7 +96,12 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
             known[b] = False
             continue
         step = np.clip(-inverse @ score[b].sum(axis=0), -_FAR, _FAR)
-        there = evaluate(data, with_mean(_moved(terms, free, step), beta), events, inside=True)
+        try:
+            there = evaluate(data, with_mean(_moved(terms, free, step), beta), events, inside=True)
+        except ValueError:
+            # The rest leads to a model whose covariance cannot be computed.
+            known[b] = False
+            continue
         density[b] += there.density[b] - base.density[b]
     laws = model.free - sum(len(term.free()) + len(term.LINEAR) for term in terms) - 1
     density -= (laws + model.search) / samples.n

@@ -5,11 +5,13 @@ import math
 import numpy as np
 from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
+from ou_monitor.criticism.structure import evaluate
+from ou_monitor.discovery import validation
 from ou_monitor.discovery.errors import standard_errors
 from ou_monitor.discovery.gain import (
     BLOCKS, cause_gain, crossing_level, crossing_rates, crossings, if_known, mean_difference,
     mean_score, without)
-from ou_monitor.discovery.validation import covered, held_out
+from ou_monitor.discovery.validation import blocks_of, covered, held_out
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_sag import LoadSag
@@ -97,6 +99,28 @@ def test_a_cause_that_is_not_there_gains_nothing():
         chances.append(chance)
     # The smallest of 20 is below 1e-3 with chance 2 %; doubling makes it rarer.
     assert min(chances) > 1e-4 and np.median(chances) > 0.1
+
+
+def test_a_block_whose_rest_gives_no_model_is_not_known(monkeypatch):
+    """The step to the other blocks may end at a covariance that is singular."""
+    samples = simulated(3)
+    model = fit_composite(samples, [OU(50.0, 0.3, 5.0)], slice(0, samples.n))
+    whole = held_out(samples, model)
+    calls = []
+
+    def fails_once(*given, **more):
+        calls.append(None)
+        # One of the model, one a parameter, then one a block.
+        if len(calls) == 1 + 2 + 3:
+            raise ValueError('singular')
+        return evaluate(*given, **more)
+
+    monkeypatch.setattr(validation, 'evaluate', fails_once)
+    part = held_out(samples, model)
+    third = blocks_of(samples.n)[2]
+    assert not part.known[third].any()
+    kept = np.delete(np.arange(samples.n), np.arange(samples.n)[third])
+    assert part.known[kept].all() and (part.density[kept] == whole.density[kept]).all()
 
 
 def test_errors_of_the_mean_are_its_scatter():
