@@ -26,12 +26,12 @@ from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted, number
 
 # Readings that a part needs, and seconds; simulations for a verdict at 5 %.
-_LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 1.0, 20, 10_000
+_LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 0.2, 20, 10_000
 # Points of the band that a page draws, at most.
 _POINTS = 2000
 # Seconds whose level a model from a file takes from the recording.
 _ALIGNED = 2.0
-# Current that is missing for longer, s, or for some samples, is no load to simulate with.
+# Current that is farther from a reading, s, is no load to simulate with.
 _GAP = 1.0
 
 
@@ -144,12 +144,14 @@ def _current(recording: Recording, t: FloatArray) -> FloatArray | None:
     if recording.current is None:
         return None
     known = np.isfinite(recording.current) & np.isfinite(recording.t)
-    gap = max(_GAP, 3.0 * float(np.median(np.diff(t))))
-    if not known.any() or recording.t[known].max() < t[-1] - gap:
+    if not known.any():
         return None
     order = np.argsort(recording.t[known], kind='stable')
     stamps, current = recording.t[known][order], recording.current[known][order]
-    if np.diff(stamps, prepend=stamps[0]).max() > gap or stamps[0] > t[0] + gap:
+    after = np.searchsorted(stamps, t)
+    near = np.minimum(np.abs(t - stamps[np.minimum(after, stamps.size - 1)]),
+                      np.abs(t - stamps[np.maximum(after - 1, 0)]))
+    if near.max() > max(_GAP, 3.0 * float(np.median(np.diff(t)))):
         return None
     return np.asarray(np.interp(t, stamps, current), dtype=np.float64)
 
@@ -172,18 +174,22 @@ def _begin(samples: Readings, fit_until: float | None, fitted: bool) -> int:
 
 
 def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
-    if samples.throttle is None:
+    if model.load is not None:
+        found = []
+        if model.load.model.full_current:
+            found.append('Current explains the voltage better than throttle: it is the load that '
+                         'is simulated.' if samples.throttle is not None else
+                         'Current is the load that is simulated.')
+        if math.isfinite(model.load.model.stands):
+            found.append('No discharge is seen: the level stands.')
+        return found
+    if samples.current is None and samples.throttle is None:
         return ['Throttle is not recorded: only level and noise are simulated.']
-    if not np.ptp(samples.throttle) >= MOVES:
+    if samples.current is None and samples.throttle is not None and not np.ptp(
+            samples.throttle) >= MOVES:
         return ['Throttle does not move: only level and noise are simulated.']
-    if model.load is None:
-        return ['Throttle does not predict the voltage of parts that were left out of the fit: '
-                'only level and noise are simulated.']
-    found = []
-    if model.load.model.full_current:
-        found.append('Current predicts the voltage better than throttle: it is the load that is '
-                     'simulated.')
-    return found
+    return ['Neither throttle nor current explains the voltage: only level and noise are '
+            'simulated.']
 
 
 def _check_throttle(model: SupplyModel, samples: Readings) -> None:

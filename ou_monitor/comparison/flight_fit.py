@@ -8,13 +8,13 @@ the part fitted is not foreseen; what has memory is one OU, whatever made it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
 from ou_monitor.comparison.flight_model import Damping, FlightModel, Readings
 from ou_monitor.model.load import lowpass
-from ou_monitor.model.load_fit import fit_load, LoadFit
+from ou_monitor.model.load_fit import fit_load, level_evidence, LoadFit
 from ou_monitor.model.residual import fit_noise_law, fit_residual_ou, innovations, SLOW_TIME
 from ou_monitor.records import FloatArray
 
@@ -22,6 +22,8 @@ from ou_monitor.records import FloatArray
 _PARTS = 4
 # Throttle that moves less than this says nothing.
 MOVES = 0.01
+# Log evidence, nat, below which the simpler of two loads is taken: odds of less than e to 1.
+_CLEAR = 1.0
 # Readings that a fit of the load looks at: means of neighbours beyond it.
 _MOST = 40_000
 # Time constants below which changes of the path may be damped, s.
@@ -34,20 +36,14 @@ def fit_flight(samples: Readings, progress: Callable[[float], None] | None = Non
     """Fit a model to samples: at least 100, over more than some seconds."""
     report = progress or (lambda share: None)
     mean, lsb = float(samples.voltage.mean()), samples.lsb
-    total = float(np.sum((samples.voltage - mean) ** 2))
-    candidates = _loads(samples)
-    tried: list[_Load] = []
-    for k, current in enumerate(candidates):
-        whole, parts = _fit(samples, current, None), []
+    best = _best(samples, lambda share: report(0.4 * share))
+    if best is not None:
+        parts = []
         for j, part in enumerate(_parts(samples)):
-            fit = _fit(samples, current, part, whole)
-            parts.append((fit, samples.voltage[part] - _path(samples, fit, current)[part]))
-            report((k + (j + 2.0) / (_PARTS + 1.0)) / (len(candidates) + 0.3))
-        tried.append(_Load(whole, current, tuple(parts)))
-    level = _sum_of_squares(_left_out_means(samples))
-    best = _better(tried)
-    if best is not None and not best.left < level:
-        best = None
+            fit = _fit(samples, best.current, best.stands, part, best.fit)
+            parts.append((fit, samples.voltage[part] - _path(samples, fit, best.current)[part]))
+            report(0.4 + 0.5 * (j + 1.0) / _PARTS)
+        best = replace(best, parts=tuple(parts))
     load = None if best is None else best.fit
     path = np.full(samples.t.size, mean) if best is None else _path(
         samples, best.fit, best.current)
@@ -66,7 +62,7 @@ def fit_flight(samples: Readings, progress: Callable[[float], None] | None = Non
         _spread(samples, best), _sag_error(samples, best))
     return FlightModel(
         load, mean, math.sqrt(level_var), damped, spread, sag_error, noise, ou,
-        float(samples.t[-1]), 1.0 - (level if best is None else best.left) / max(total, 1e-300))
+        float(samples.t[-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,34 +71,32 @@ class _Load:
 
     fit: LoadFit
     current: FloatArray | None
-    parts: tuple[tuple[LoadFit, FloatArray], ...]
-
-    @property
-    def left(self) -> float:
-        """Return the sum of squares of all parts, V^2."""
-        return _sum_of_squares([errors for _, errors in self.parts])
+    stands: bool
+    parts: tuple[tuple[LoadFit, FloatArray], ...] = ()
 
 
-def _better(tried: list[_Load]) -> _Load | None:
-    """Return throttle, or current where that predicts better by more than a standard error."""
-    if not tried:
-        return None
-    for other in tried[1:]:
-        # Relative, so that the part that moves most does not decide alone.
-        ratios = np.array([math.log(float(e @ e) / float(own @ own)) for (_, e), (_, own) in zip(
-            other.parts, tried[0].parts)])
-        if ratios.mean() < -float(ratios.std(ddof=1)) / math.sqrt(ratios.size):
-            return other
-    return tried[0]
+def _best(samples: Readings, report: Callable[[float], None]) -> _Load | None:
+    """Return the load, and the law of its level, with most evidence; None: no load has any."""
+    found: _Load | None = None
+    most = level_evidence(samples.t, samples.voltage)
+    # The simpler ones first: throttle before current, a level that stands before a pack's.
+    tried = [(current, stands) for current in _loads(samples) for stands in (True, False)]
+    for k, (current, stands) in enumerate(tried):
+        fit = _fit(samples, current, stands)
+        if fit.evidence > most + _CLEAR:
+            found, most = _Load(fit, current, stands), fit.evidence
+        report((k + 1.0) / len(tried))
+    return found
 
 
 def _loads(samples: Readings) -> list[FloatArray | None]:
-    """Return the loads to try: throttle (None) and current; none where throttle stands still."""
-    if samples.throttle is None or not np.ptp(samples.throttle) >= MOVES:
-        return []
-    current = samples.current
-    moves = current is not None and np.isfinite(current).all() and bool(np.ptp(current) > 0.0)
-    return [None, current] if moves else [None]
+    """Return the loads to try that move: throttle (None), and current."""
+    found: list[FloatArray | None] = []
+    if samples.throttle is not None and np.ptp(samples.throttle) >= MOVES:
+        found.append(None)
+    if samples.current is not None and np.ptp(samples.current) > 0.0:
+        found.append(samples.current)
+    return found
 
 
 def _parts(samples: Readings) -> list[slice]:
@@ -110,40 +104,24 @@ def _parts(samples: Readings) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in zip(edges, edges[1:])]
 
 
-def _left_out_means(samples: Readings) -> list[FloatArray]:
-    """Return the errors of each part, V, about the mean of the others."""
-    total, n = float(samples.voltage.sum()), samples.t.size
-    errors = []
-    for part in _parts(samples):
-        own = samples.voltage[part]
-        errors.append(own - (total - float(own.sum())) / (n - own.size))
-    return errors
-
-
-def _sum_of_squares(errors: list[FloatArray]) -> float:
-    return float(sum(float(e @ e) for e in errors))
-
-
-def _fit(samples: Readings, current: FloatArray | None, without: slice | None,
-         near: LoadFit | None = None) -> LoadFit:
+def _fit(samples: Readings, current: FloatArray | None, stands: bool,
+         without: slice | None = None, near: LoadFit | None = None) -> LoadFit:
     """Fit the load, to means of neighbours where there are very many."""
     width = -(-samples.t.size // _MOST)
     n = samples.t.size // width * width
 
-    def mean(x: FloatArray | None) -> FloatArray | None:
-        return None if x is None else x[:n].reshape(-1, width).mean(axis=1)
+    def mean(x: FloatArray) -> FloatArray:
+        return np.asarray(x[:n].reshape(-1, width).mean(axis=1), dtype=np.float64)
 
     left_out = None if without is None else (
         float(samples.t[without.start]), float(samples.t[without.stop - 1]))
-    t, v, u = mean(samples.t), mean(samples.voltage), mean(samples.throttle)
-    if t is None or v is None or u is None:
-        raise ValueError('a fit of the load needs throttle')
-    return fit_load(t, v, u, mean(current), left_out, near)
+    return fit_load(
+        mean(samples.t), mean(samples.voltage),
+        None if samples.throttle is None else mean(samples.throttle),
+        None if current is None else mean(current), stands=stands, left_out=left_out, near=near)
 
 
 def _path(samples: Readings, fit: LoadFit, current: FloatArray | None) -> FloatArray:
-    if samples.throttle is None:
-        raise ValueError('a fit of the load needs throttle')
     return fit.model.path(samples.t, samples.throttle, current)
 
 
@@ -179,8 +157,6 @@ def _sag_error(samples: Readings, load: _Load) -> float:
 
 def _spread(samples: Readings, load: _Load) -> float:
     """Return how much larger the variance of slow errors is than the fit says."""
-    if samples.throttle is None:
-        return 1.0
     rng = np.random.default_rng(0)
     ratios = []
     for (fit, errors), part in zip(load.parts, _parts(samples)):

@@ -120,8 +120,6 @@ class FlightModel:
         What has memory in the residuals.
     until : float
         End of the part fitted, s.
-    explained : float
-        Share of variance explained of parts that were left out of the fit.
 
     """
 
@@ -134,14 +132,14 @@ class FlightModel:
     noise: NoiseLaw
     ou: ResidualOU
     until: float
-    explained: float
 
     @property
     def names(self) -> list[str]:
         """Return the names of its terms, as in a model file."""
         found = ['ou']
         if self.load is not None:
-            found += ['load_sag', 'load_transient', 'drift']
+            found += ['load_sag', 'load_transient',
+                      *(['drift'] if math.isnan(self.load.model.stands) else [])]
         follows = self.noise.limits[0] < self.noise.limits[1]
         return [*found, 'measurement_noise', *(['load_dependent_noise'] if follows else [])]
 
@@ -152,7 +150,7 @@ class FlightModel:
 
     def path(self, samples: Readings) -> FloatArray:
         """Return the mean voltage, V."""
-        if self.load is None or samples.throttle is None:
+        if self.load is None:
             return np.full(samples.t.size, self.level)
         return self.damping.of(
             self.load.model.path(samples.t, samples.throttle, samples.current), samples.t)
@@ -162,13 +160,14 @@ class FlightModel:
         n = samples.t.size
         throttle = np.zeros(n) if samples.throttle is None else samples.throttle
         slow = 0.0
-        if self.load is None or samples.throttle is None:
+        if self.load is None:
             voltage = np.full(n, self.level + self.level_se * rng.standard_normal())
         else:
             load = self.load.draw(rng)
-            path = load.path(samples.t, throttle, samples.current)
+            path = load.path(samples.t, samples.throttle, samples.current)
             size = load.size * math.exp(self.sag_error * float(rng.standard_normal()))
-            other = replace(load, size=size).path(samples.t, throttle, samples.current)
+            other = replace(load, size=size).path(
+                samples.t, samples.throttle, samples.current)
             # Over the part fitted the mean is known: a larger sag goes with a higher level.
             path = other - float((other - path)[samples.t <= self.until].mean())
             voltage = self.damping.of(path, samples.t)

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.records import FloatArray
+from ou_monitor.records import FloatArray, NAN
 
 Number = TypeVar('Number', float, FloatArray)
 
@@ -117,7 +117,12 @@ class LoadModel:
     before : float
         Load before the first sample, relative to the mean load.
     full_current : float
-        Current that counts as full load, A; 0 where throttle is the load.
+        Current that counts as full load, A, negative where discharge is; 0 where throttle is
+        the load.
+    delay : float
+        How late the load is read behind the voltage that answers to it, s.
+    stands : float
+        Level that stands, V; NaN where a lithium pack of that charge empties.
 
     """
 
@@ -135,6 +140,8 @@ class LoadModel:
     endurance: float = 350.0
     before: float = 0.3
     full_current: float = 0.0
+    delay: float = 0.0
+    stands: float = NAN
 
     def sag(self, throttle: npt.ArrayLike, cell: float = CELL) -> FloatArray:
         """Return the sag, V, of a throttle that is held; of cold cells at that voltage, V."""
@@ -145,33 +152,38 @@ class LoadModel:
         return np.asarray(
             self.size * CELL * self.cells * (1.0 + self.fast_share + self.slow_share) * x)
 
-    def path(self, t: FloatArray, throttle: FloatArray,
+    def path(self, t: FloatArray, throttle: FloatArray | None,
              current: FloatArray | None = None) -> FloatArray:
         """Return the mean voltage, V, at stamps, s, from throttle, 0..1, or current, A."""
-        if not (np.isfinite(throttle).all() and (throttle >= 0.0).all()
-                and (throttle <= 1.0).all()):
-            raise ValueError('throttle must lie within 0..1')
+        read = current if self.full_current else throttle
+        if read is None:
+            what = 'a current, A,' if self.full_current else 'throttle'
+            raise ValueError(f'the load of this model is {what} and none was given')
+        if not (np.isfinite(read).all() and (self.full_current or (
+                (read >= 0.0) & (read <= 1.0)).all())):
+            raise ValueError('throttle must lie within 0..1, and current be finite, A')
         dt = np.diff(t, prepend=t[0])
         full = self.mean_load * self.endurance
-        lagged = lowpass(throttle, t, self.lag)
-        if self.full_current:
-            if current is None:
-                raise ValueError('the load of this model is a current, A, and none was given')
-            x = lowpass(np.maximum(current, 0.0) / self.full_current, t, self.lag)
-        else:
+        lagged = lowpass(np.interp(t + self.delay, t, read), t, self.lag)
+        x = lagged / (self.full_current or 1.0)
+        if not self.full_current:
             # A propeller draws the less the lower the voltage: I ~ u (u V)^(p - 1).
             x = lagged ** self.power
-            level = open_circuit(np.clip(self.charge - np.cumsum(x * dt) / full, 0.0, 1.0))
-            x = x * (level / CELL) ** (self.power - 1.0)
-        # Ohmic heat warms the pack, and a warm pack has less resistance.
-        total = self.size * (1.0 + self.fast_share + self.slow_share)
-        x = x * np.exp(-_HEATING * np.cumsum(total * x * x * dt / full))
+            if math.isnan(self.stands):
+                level = open_circuit(np.clip(self.charge - np.cumsum(x * dt) / full, 0.0, 1.0))
+                x = x * (level / CELL) ** (self.power - 1.0)
+        rest: FloatArray | float = self.stands
+        if math.isnan(self.stands):
+            # Ohmic heat warms the pack, and a warm pack has less resistance.
+            total = self.size * (1.0 + self.fast_share + self.slow_share)
+            x = x * np.exp(-_HEATING * np.cumsum(total * x * x * dt / full))
+            rest = self.cells * open_circuit(np.maximum(
+                self.charge - np.cumsum(x * dt) / full, -1.0))
         answer = x + self.fast_share * lowpass(x, t, self.fast_time)
         answer += self.slow_share * lowpass(x, t, self.slow_time, self.before * self.mean_load)
-        answer += self.inrush * np.maximum(lagged - lowpass(lagged, t, INRUSH_TIME), 0.0)
-        charge = np.maximum(self.charge - np.cumsum(x * dt) / full, -1.0)
-        return np.asarray(
-            self.cells * (open_circuit(charge) - self.size * CELL * answer), dtype=np.float64)
+        if not self.full_current:
+            answer += self.inrush * np.maximum(lagged - lowpass(lagged, t, INRUSH_TIME), 0.0)
+        return np.asarray(rest - self.size * CELL * self.cells * answer, dtype=np.float64)
 
 
 # Coefficients of x, u, u^3, x after three lags, and inrush, with x = u^1.8 (load/load_filter.py).

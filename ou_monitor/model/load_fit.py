@@ -8,12 +8,14 @@ Residuals are white noise and an Ornstein-Uhlenbeck process of 20 s and of a few
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 import math
 from typing import Any
 
 import numpy as np
-from ou_monitor.model.load import CELL, cells_in_series, charge_at, LoadModel
+import numpy.typing as npt
+from ou_monitor.model.load import CELL, cells_in_series, charge_at, LoadModel, lowpass
 from ou_monitor.records import determined, FloatArray, log_interval, NAN
 from scipy.linalg import solve_banded
 from scipy.optimize import least_squares
@@ -29,15 +31,26 @@ _PRIOR = {
 }
 _NAMES = tuple(_PRIOR)
 _LINEAR = {'charge': (0.0, 1.05), 'before': (0.0, 1.5)}
+# Deviations where the load is a current: neither its scale nor what it feeds is known.
+_OF_CURRENT = {'size': 2.0, 'fast_share': 0.7, 'slow_share': 0.7, 'endurance': 1.0}
+_CENTRE = {'endurance': math.log(2000.0)}
+# A level that stands, in the place of the charge: deviation, V a cell.
+_STANDS = 0.2
+# Delay of the load: steps tried either way at most, and s; share of the rest that another one
+# must leave; what is slower than this, s, is no answer.
+_SHIFTS, _LATEST, _PAYS, _SLOWER, _LATE = 10, 0.2, 0.95, 1.0, 0.06
 # Bounds of the others: prior deviations from the centre.
 _REACH = 3.0
-# Mean of the data over this time, s, before the fit: OU and polarisation are slower.
-_BIN = 0.05
+# Mean of the data over this time, s, before the fit: OU and polarisation are slower;
+# but of a short recording this share, and fewest samples.
+_BIN, _BIN_SHARE, _LEAST = 0.05, 0.01, 20
 # Time constant of the residual OU, s, and the deviations tried, V a cell (cap: doc/load.md).
 _SLOW_TIME = 20.0
 _SLOW_STDS = np.geomspace(0.001, 0.00464, 5)
 # White and slow noise at the start, V a cell: the order of the recordings.
 _WHITE_START, _SLOW_START = 0.02, 0.01
+# Sizes of standardised innovations tried, where their law has heavy tails.
+_SIZES = np.geomspace(0.05, 2.0, 40).tolist()
 # Rounds of fit and noise; evaluations of the model in each.
 _ROUNDS, _EVALUATIONS = 4, 30
 
@@ -59,6 +72,8 @@ class LoadFit:
         White noise of a 50 ms mean, V.
     slow_std : float
         Standard deviation of the OU of 20 s, V.
+    evidence : float
+        Log evidence (Laplace) for the load and the law of the level, nat.
 
     """
 
@@ -67,26 +82,20 @@ class LoadFit:
     condition: float
     noise_std: float
     slow_std: float
+    evidence: float
 
     def draw(self, rng: np.random.Generator) -> LoadModel:
         """Return a model within the errors of this one."""
-        low, high, _, _ = _bounds(self.model.charge)
-        moved = rng.multivariate_normal(self._theta, self.covariance)
-        fixed = {'cells': self.model.cells, 'mean_load': self.model.mean_load,
-                 'full_current': self.model.full_current}
-        return _model(np.clip(moved, low, high), fixed)
-
-    @property
-    def _theta(self) -> FloatArray:
-        """Return the parameters as fitted."""
-        return np.array([getattr(self.model, name) if name in _LINEAR
-                         else math.log(getattr(self.model, name)) for name in _NAMES])
+        low, high, _, _ = _bounds(self.model)
+        moved = rng.multivariate_normal(_theta(self.model), self.covariance)
+        return _moved(self.model, np.clip(moved, low, high))
 
     @property
     def at_bounds(self) -> tuple[str, ...]:
         """Return the parameters that stand at a bound."""
-        low, high, centre, deviation = _bounds(self.model.charge)
-        edge = np.minimum(self._theta - low, high - self._theta) < 1e-3 * deviation
+        low, high, _, deviation = _bounds(self.model)
+        theta = _theta(self.model)
+        edge = np.minimum(theta - low, high - theta) < 1e-3 * deviation
         return tuple(name for name, there in zip(_NAMES, edge) if there)
 
     @property
@@ -94,19 +103,63 @@ class LoadFit:
         """Return the resistance, Ohm, and its 95 % interval, statistical only; NaN without I."""
         if not self.model.full_current:
             return NAN, NAN, NAN
-        value = self.model.size * self.model.cells * CELL / self.model.full_current
+        value = self.model.size * self.model.cells * CELL / abs(self.model.full_current)
         low, high = log_interval(value, math.sqrt(self.covariance[0, 0]))
         return value if determined(value, low, high) else NAN, low, high
 
 
-def _bounds(charge: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return lower and upper bounds, prior centre and deviation; charge centred as given."""
-    centre = np.array([charge if name == 'charge' else _PRIOR[name][0] for name in _NAMES])
-    deviation = np.array([_PRIOR[name][1] for name in _NAMES])
+def _theta(model: LoadModel) -> FloatArray:
+    """Return the parameters as they are fitted: a level that stands, V a cell, is the charge."""
+    return np.array([
+        model.stands / model.cells if name == 'charge' and math.isfinite(model.stands)
+        else getattr(model, name) if name in _LINEAR
+        else math.log(getattr(model, name)) for name in _NAMES])
+
+
+def _moved(model: LoadModel, theta: FloatArray) -> LoadModel:
+    """Return a model with other parameters."""
+    values: dict[str, Any] = {name: float(x) if name in _LINEAR else math.exp(x)
+                              for name, x in zip(_NAMES, theta)}
+    if math.isfinite(model.stands):
+        values['stands'] = values.pop('charge') * model.cells
+    return replace(model, **values)
+
+
+def _bounds(model: LoadModel) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return lower and upper bounds, prior centre and deviation; the level is as the model's."""
+    wide = _OF_CURRENT if model.full_current else {}
+    other = _CENTRE if model.full_current else {}
+    centre = np.array([other.get(name, _PRIOR[name][0]) for name in _NAMES])
+    deviation = np.array([wide.get(name, _PRIOR[name][1]) for name in _NAMES])
+    level = _NAMES.index('charge')
+    centre[level] = _theta(model)[level]
+    stands = math.isfinite(model.stands)
+    if stands:
+        deviation[level] = _STANDS
     low, high = centre - _REACH * deviation, centre + _REACH * deviation
     for name, (least, most) in _LINEAR.items():
-        low[_NAMES.index(name)], high[_NAMES.index(name)] = least, most
+        if not (stands and name == 'charge'):
+            low[_NAMES.index(name)], high[_NAMES.index(name)] = least, most
     return low, high, centre, deviation
+
+
+def _timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float]:
+    """Return how late a load is read, s, and 1 where the voltage falls with it, else -1."""
+    dt = float(np.median(np.diff(t)))
+    slow = min(_SLOWER, 0.3 * float(t[-1] - t[0]))
+    left = v - lowpass(v, t, slow)
+    late = lowpass(load, t, _LATE)
+    loads = np.stack((load, late)) - lowpass(load, t, slow)
+    reach = min(_SHIFTS, int(_LATEST / dt))
+    found = {}
+    for shift in sorted(range(-reach, reach + 1), key=abs):
+        X = np.stack([np.interp(t + shift * dt, t, row) for row in loads])
+        product = X @ left
+        found[shift] = float(left @ left - product @ np.linalg.lstsq(
+            X @ X.T, product, rcond=1e-9)[0]), float(product[0])
+    best = min(found, key=lambda shift: found[shift][0])
+    best = best if found[best][0] < _PAYS * found[0][0] else 0
+    return best * dt, -1.0 if found[best][1] > 0.0 else 1.0
 
 
 class _Noise:
@@ -146,6 +199,13 @@ class _Noise:
             self._found = (white, q), (variance, bands, self._keep * gain[:-1])
         return self._found[1]
 
+    def evidence(self, residuals: FloatArray) -> float:
+        """Return the log-likelihood, nat, of innovations with Student's t of 4 degrees."""
+        z, variance, _ = self.whiten(residuals)
+        # As few punch-outs would decide by their squares: their law has heavy tails.
+        return float(max(np.sum(-2.5 * np.log1p(0.25 * (z / size) ** 2)) + z.size * math.log(
+            0.375 / size) for size in _SIZES) - 0.5 * np.log(variance).sum())
+
     def learn(self, residuals: FloatArray) -> None:
         """Fit both variances to residuals, V, of the model."""
         for _ in range(2):
@@ -157,59 +217,82 @@ class _Noise:
             self.slow = float(self._tried[int(np.argmin(scores))])
 
 
-def _model(theta: FloatArray, fixed: dict[str, Any]) -> LoadModel:
-    values: dict[str, Any] = {name: float(x) if name in _LINEAR else math.exp(x)
-                              for name, x in zip(_NAMES, theta)}
-    return LoadModel(**values, **fixed)
+def _template(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
+              current: FloatArray | None, stands: bool) -> LoadModel:
+    """Return what of a model is not fitted: cells, the load's scale, sign and delay."""
+    load = throttle if current is None else current
+    if load is None:
+        raise ValueError('a fit of the load needs throttle or current')
+    full = delay = 0.0
+    if current is None:
+        # 1.6: below the prior's exponent, as the level takes a part; a scale of `endurance`.
+        moving = load > 0.05
+        mean = float((load[moving] ** 1.6).mean()) if moving.any() else 0.1
+    else:
+        delay, sign = _timing(t, voltage, load)
+        full = sign * max(float(np.quantile(np.abs(current), 0.99)), 1e-9)
+        mean = max(1e-3, float(np.maximum(current / full, 0.0).mean()))
+    return LoadModel(cells_in_series(float(np.quantile(voltage, 0.99))), mean, full_current=full,
+                     delay=delay, stands=0.0 if stands else NAN)
 
 
-def fit_load(t: FloatArray, voltage: FloatArray, throttle: FloatArray,
-             current: FloatArray | None = None,
+def _bins(t: FloatArray) -> tuple[Callable[[FloatArray], FloatArray], npt.NDArray[np.intp]]:
+    """Return what takes means of bins of samples, and the first sample of each."""
+    width = min(_BIN, _BIN_SHARE * float(t[-1] - t[0]))
+    index = np.floor((t - t[0]) / width + 1e-9).astype(int)
+    starts = np.concatenate(([0], np.flatnonzero(np.diff(index)) + 1))
+    counts = np.diff(np.append(starts, t.size))
+    return lambda x: np.asarray(np.add.reduceat(x, starts) / counts, dtype=np.float64), starts
+
+
+def level_evidence(t: FloatArray, voltage: FloatArray) -> float:
+    """Return the log evidence for a level that stands without a load, as in `LoadFit`."""
+    mean, _ = _bins(t)
+    cells = cells_in_series(float(np.quantile(voltage, 0.99)))
+    noise, left = _Noise(mean(t), cells), mean(voltage - np.median(voltage))
+    for _ in range(_ROUNDS):
+        noise.learn(left)
+        one = noise.whiten(np.ones(left.size))[0]
+        left = left - float(one @ noise.whiten(left)[0]) / float(one @ one)
+    # Laplace, with one parameter, at the centre of its prior.
+    return noise.evidence(left) - 0.5 * math.log(float(one @ one) * (_STANDS * cells) ** 2)
+
+
+def fit_load(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
+             current: FloatArray | None = None, *, stands: bool = False,
              left_out: tuple[float, float] | None = None, near: LoadFit | None = None) -> LoadFit:
     """
     Fit the load model; with current, A, that is the load instead of throttle.
 
-    t in s, voltage in V, throttle in 0..1; all finite, stamps rising.  Voltage between the stamps
-    left_out, s, is not looked at.  A fit that is near by, as of all the voltage, saves most of the
-    work.
+    t in s, voltage in V, throttle in 0..1; all finite, stamps rising.  The level is that of a
+    lithium pack, or stands.  Voltage between the stamps left_out, s, is not looked at.  A fit
+    that is near by, as of all the voltage, saves most of the work, and decides the rest.
     """
-    if t.size < 2 or not t[-1] - t[0] > 20 * _BIN:
-        raise ValueError(f'a fit of the load needs more than {20 * _BIN:g} s')
+    if t.size < _LEAST:
+        raise ValueError(f'a fit of the load needs {_LEAST} samples, got {t.size}')
     if not (np.isfinite(voltage).all() and (np.diff(t) > 0.0).all()):
         raise ValueError('voltage must be finite, V, and stamps must rise, s')
     seen = np.ones(t.size, dtype=np.bool_) if left_out is None else (
         (t < left_out[0]) | (t > left_out[1]))
     if not seen.any():
         raise ValueError('no voltage is left for the fit')
-    top = float(np.quantile(voltage[seen], 0.99))
-    fixed: dict[str, Any] = {'cells': cells_in_series(top)}
-    # 1.6: below the prior's exponent, as the level takes a part; a scale of `endurance`.
-    moving = throttle > 0.05
-    fixed['mean_load'] = float((throttle[moving] ** 1.6).mean()) if moving.any() else 0.1
-    if current is not None:
-        fixed['full_current'] = max(float(np.quantile(current, 0.99)), 1e-9)
-        fixed['mean_load'] = max(
-            1e-3, float(np.maximum(current, 0.0).mean()) / fixed['full_current'])
-    low, high, centre, deviation = _bounds(
-        charge_at(float(np.quantile(voltage[seen], 0.98)) / fixed['cells']))
-    index = np.floor((t - t[0]) / _BIN + 1e-9).astype(int)
-    starts = np.concatenate(([0], np.flatnonzero(np.diff(index)) + 1))
-    counts = np.diff(np.append(starts, t.size))
-
-    def mean(x: FloatArray) -> FloatArray:
-        return np.asarray(np.add.reduceat(x, starts) / counts, dtype=np.float64)
-
+    model = _template(t, voltage, throttle, current, stands) if near is None else near.model
+    top = float(np.quantile(voltage[seen], 0.98))
+    centred = replace(model, stands=top) if math.isfinite(model.stands) else replace(
+        model, charge=charge_at(top / model.cells))
+    low, high, centre, deviation = _bounds(centred)
+    mean, starts = _bins(t)
     used = seen[starts]
-    noise = _Noise(mean(t)[used], fixed['cells'])
+    noise = _Noise(mean(t)[used], model.cells)
     binned = mean(voltage)[used]
 
     def residuals(theta: FloatArray) -> FloatArray:
-        return binned - mean(_model(theta, fixed).path(t, throttle, current))[used]
+        return binned - mean(_moved(model, theta).path(t, throttle, current))[used]
 
     def cost(theta: FloatArray) -> FloatArray:
         return np.concatenate((noise.whiten(residuals(theta))[0], (theta - centre) / deviation))
 
-    start = centre if near is None else near._theta
+    start = centre if near is None else _theta(near.model)
     theta = np.clip(start, low + 1e-6, high - 1e-6)
     if near is not None:
         noise.white, noise.slow = near.noise_std ** 2, near.slow_std ** 2
@@ -221,5 +304,8 @@ def fit_load(t: FloatArray, voltage: FloatArray, throttle: FloatArray,
     scaled = found.jac * deviation
     sizes = np.linalg.svd(scaled, compute_uv=False)
     covariance = np.linalg.inv(scaled.T @ scaled) * np.outer(deviation, deviation)
-    return LoadFit(_model(theta, fixed), covariance, float(sizes[0] / sizes[-1]),
-                   math.sqrt(noise.white), math.sqrt(noise.slow))
+    off = (theta - centre) / deviation
+    evidence = noise.evidence(residuals(theta)) - 0.5 * float(off @ off) - float(
+        np.log(sizes).sum())
+    return LoadFit(_moved(model, theta), covariance, float(sizes[0] / sizes[-1]),
+                   math.sqrt(noise.white), math.sqrt(noise.slow), evidence)

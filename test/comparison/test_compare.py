@@ -136,6 +136,53 @@ def test_without_throttle_there_is_level_and_noise():
     assert differ <= 1
 
 
+def robot(seed: int, seconds: float = 40.0, rate: float = 50.0) -> Recording:
+    """Return 12 V at 20 mOhm that do not discharge, their current 60 ms late and negative."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(int(seconds * rate)) / rate
+    steps = rng.choice([0.0, 20.0, 60.0, 90.0], 41)
+    drawn_now = 5.0 + lowpass(steps[(t * 40.0 / seconds).astype(int)], t, seconds / 2000.0)
+    v = 12.5 - 0.02 * drawn_now + 0.02 * rng.standard_normal(t.size)
+    enabled = np.where(t > 0.1 * seconds, 1.0, 0.0)
+    late = 3 if rate < 100.0 else 0
+    return Recording(t, v, enabled, 'robot', current=-np.concatenate((
+        np.full(late, drawn_now[0]), drawn_now[:t.size - late])))
+
+
+@pytest.mark.parametrize('seconds, rate', [(40.0, 50.0), (0.8, 1000.0)])
+def test_a_measured_current_is_the_load(seconds, rate):
+    """With its sign, its offset at rest and its delay; a level that stands does not discharge."""
+    found = compare(robot(1, seconds, rate), seeds=20)
+    # Sag 1.2 V, a step a second: a variance of some 0.4 V^2 beside 4e-4 V^2 of noise.
+    assert found.explained > 0.97
+    assert abs(found.bias) < 0.02
+    assert 'load_sag' in found.model and 'drift' not in found.model
+
+
+def test_a_current_without_some_readings_is_one():
+    """A gap of the logger is no current that is missing; a current that ends is."""
+    whole = robot(2)
+    off = (whole.t < 3.0) | (whole.t > 4.2)
+    gap = Recording(whole.t[off], whole.voltage[off], whole.throttle[off], 'gap',
+                    current=whole.current[off])
+    assert compare(gap, seeds=20).explained > 0.97
+    ends = Recording(whole.t, whole.voltage, whole.throttle, 'ends', current=np.where(
+        whole.t < 35.0, whole.current, np.nan))
+    assert not compare(ends, seeds=20).explained > 0.5
+
+
+def test_a_bench_supply_does_not_discharge():
+    """A staircase of throttle at a level that stands; then all of it at once."""
+    rng = np.random.default_rng(4)
+    t = np.arange(4000) / 50.0
+    u = np.minimum(np.floor(t / 4.0), 19.0 - np.floor(t / 4.0)) / 10.0
+    u = np.clip(u, 0.0, 1.0)
+    v = 16.6 - 1.2 * u ** 1.7 + 0.01 * rng.standard_normal(t.size)
+    found = compare(Recording(t, v, u, 'bench'), fit_until=30.0, seeds=20)
+    assert found.explained > 0.95
+    assert any('the level stands' in note for note in found.notes)
+
+
 def test_held_samples_count_once():
     """A logger five times as fast as its source tells the same."""
     slow = flight(2, 800)
