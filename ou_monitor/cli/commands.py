@@ -25,35 +25,16 @@ class _Help(argparse.HelpFormatter):
 
 @dataclass(frozen=True)
 class Command:
-    """
-    One command.
+    """One command."""
 
-    Attributes
-    ----------
-    name : str
-        As on the command line.
-    job : str
-        One line.
-    module : str
-        Where its function ``run(args) -> exit status`` is.
-    description : str
-        Begin of its help.
-    options : tuple
-        Options; a tuple of two or more is a choice of at most one of them.
-    examples : tuple of str
-        Command lines, without ``ou-monitor`` and its name.
-    epilog : str
-        What stands before the examples at the end of its help.
-
-    """
-
-    name: str
-    job: str
-    module: str
-    description: str
+    name: str  # As on the command line
+    job: str  # One line
+    module: str  # Where its function ``run(args) -> exit status`` is
+    description: str  # Begin of its help
+    # Options; a tuple of two or more is a choice of at most one of them.
     options: tuple[Option | tuple[Option, ...], ...]
-    examples: tuple[str, ...]
-    epilog: str = ''
+    examples: tuple[str, ...]  # Command lines, without ``ou-monitor`` and its name
+    epilog: str = ''  # What stands before the examples at the end of its help
 
     def add_to(self, subparsers: Any) -> None:
         """Add the parser of this command."""

@@ -52,37 +52,19 @@ _LINE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Coherence:
-    """
-    What a voltage explains of a signal, bin by bin, and how surely.
+    """What a voltage explains of a signal, bin by bin, and how surely."""
 
-    Attributes
-    ----------
-    p_value : float
-        Family-wise: of the sum over bins and the largest bin, each at half the level.
-    squared : ndarray, shape (m,)
-        Squared partial coherence, 0..1.
-    response : ndarray, shape (m,)
-        Signal units per volt.
-    ratio : ndarray, shape (m,)
-        Power of the voltage over that of the rest of the signal, 1 / gain^2, as
-        far as the test can use it.
-    threshold : float
-        Coherence that the largest bin must exceed.
-    segments, spare : float
-        Segments averaged, overlap counted out; those less what was fitted.
-    narrow : bool
-        Whether a few bins make the finding, and the others contradict their gain.
-
-    """
-
-    p_value: float
-    squared: FloatArray
-    response: ComplexArray
+    p_value: float  # Family-wise: of the sum over bins and the largest bin, each at half the level
+    squared: FloatArray  # Squared partial coherence, 0..1; shape (m,)
+    response: ComplexArray  # Signal units per volt; shape (m,)
+    # Power of the voltage over that of the rest of the signal, 1 / gain^2, as far as the test can
+    # use it; shape (m,).
     ratio: FloatArray
-    threshold: float
+    threshold: float  # Coherence that the largest bin must exceed
+    # Segments averaged, overlap counted out; those less what was fitted.
     segments: float
     spare: float
-    narrow: bool
+    narrow: bool  # Whether a few bins make the finding, and the others contradict their gain
 
     def limit(self, level: float, power: float) -> float:
         """Return the gain that the sum would have shown with probability `power`."""

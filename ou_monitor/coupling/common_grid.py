@@ -29,36 +29,17 @@ _SHORTEST = 4
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """
-    Series on one grid.
+    """Series on one grid."""
 
-    Attributes
-    ----------
-    rate : float
-        Of the grid, Hz.
-    usable : float
-        Highest frequency at which all series are what they were, Hz.
-    runs : list of tuple of ndarray, each of shape (n,)
-        Stretches without a gap in any series, the series in the order given.
-    rates : tuple of float
-        Usual rate of each series, Hz.
-    lost : tuple of int
-        Samples of each series that were dropped: not finite, or a stamp not
-        after the one before.
-    gaps : int
-        Gaps between the stretches.
-    shared : float
-        From the first to the last moment that all series have, s.
-
-    """
-
-    rate: float
-    usable: float
+    rate: float  # Of the grid, Hz
+    usable: float  # Highest frequency at which all series are what they were, Hz
+    # Stretches without a gap in any series, the series in the order given; shape (n,).
     runs: list[tuple[FloatArray, ...]]
-    rates: tuple[float, ...]
+    rates: tuple[float, ...]  # Usual rate of each series, Hz
+    # Samples of each series that were dropped: not finite, or a stamp not after the one before.
     lost: tuple[int, ...]
-    gaps: int
-    shared: float
+    gaps: int  # Gaps between the stretches
+    shared: float  # From the first to the last moment that all series have, s
 
     @property
     def duration(self) -> float:

@@ -50,64 +50,30 @@ POWER = 0.9
 
 @dataclass(frozen=True, eq=False)
 class Coupling:
-    """
-    What was found.
+    """What was found."""
 
-    Attributes
-    ----------
-    seen : bool
-        Whether there is coupling, at the family-wise `level`.
-    p_value : float
-        Family-wise.
-    gain, gain_ci95 : float, tuple of float
-        Signal units per volt, signed, lag taken out; NaN when none was seen.
-    lag, lag_se : float
-        Of the signal behind the voltage, s; NaN when none was seen.
-    limit : float
-        Gain that would have been seen with probability `POWER`, signal units
-        per volt.
-    narrow : bool
-        Whether what was seen is in a few bins only: a line that both share.
-    signal_leads : bool
-        Whether the signal is surely ahead of the voltage.
-    noise_share : float
-        Share of the signal's power in the band that the voltage explains.
-    frequency, coherence, response : ndarray, shape (m,)
-        Bins of the band, Hz; squared partial coherence; signal units per volt.
-    threshold : float
-        Coherence that the largest bin must exceed.
-    level : float
-        Family-wise probability of a false alarm.
-    segments : float
-        Segments averaged, overlap counted out.
-    partial : bool
-        Whether throttle was taken out.
-    grid : Grid
-        Resampled series.
-    notes : tuple of str
-        Cautions, one sentence each.
-
-    """
-
-    seen: bool
-    p_value: float
+    seen: bool  # Whether there is coupling, at the family-wise `level`
+    p_value: float  # Family-wise
+    # Signal units per volt, signed, lag taken out; NaN when none was seen.
     gain: float
     gain_ci95: tuple[float, float]
+    # Of the signal behind the voltage, s; NaN when none was seen.
     lag: float
     lag_se: float
-    limit: float
-    narrow: bool
-    signal_leads: bool
-    noise_share: float
+    limit: float  # Gain that would have been seen with probability `POWER`, signal units per volt
+    narrow: bool  # Whether what was seen is in a few bins only: a line that both share
+    signal_leads: bool  # Whether the signal is surely ahead of the voltage
+    noise_share: float  # Share of the signal's power in the band that the voltage explains
+    # Bins of the band, Hz; squared partial coherence; signal units per volt; shape (m,).
     frequency: FloatArray
     coherence: FloatArray
     response: ComplexArray
-    threshold: float
-    level: float
-    segments: float
-    partial: bool
-    grid: Grid
-    notes: tuple[str, ...]
+    threshold: float  # Coherence that the largest bin must exceed
+    level: float  # Family-wise probability of a false alarm
+    segments: float  # Segments averaged, overlap counted out
+    partial: bool  # Whether throttle was taken out
+    grid: Grid  # Resampled series
+    notes: tuple[str, ...]  # Cautions, one sentence each
 
 
 def estimate_coupling(

@@ -47,35 +47,16 @@ _AFTER = (1, 4, 16, 64, 256, 1024)
 
 @dataclass(frozen=True, eq=False)
 class Covariates:
-    """
-    The series that the scores of a recording are correlated with.
+    """The series that the scores of a recording are correlated with."""
 
-    Attributes
-    ----------
-    state : ndarray, shape (n,)
-        Deviation of the sample before, V.
-    at : ndarray, shape (n,)
-        Time, s.
-    throttle : ndarray, shape (n,), or None
-        0..1.
-    rate : float
-        Samples per second, Hz.
-    keep : float
-        Share of the state that remains from one sample to the next.
-    large : ndarray, shape (n,), or None
-        Where large errors begin, as `large_ones` returns them.
-    paths : tuple of (str, ndarray of shape (n,))
-        As `throttle_paths` yields them.
-
-    """
-
-    state: FloatArray
-    at: FloatArray
-    throttle: FloatArray | None
-    rate: float
-    keep: float
+    state: FloatArray  # Deviation of the sample before, V; shape (n,)
+    at: FloatArray  # Time, s; shape (n,)
+    throttle: FloatArray | None  # 0..1; shape (n,)
+    rate: float  # Samples per second, Hz
+    keep: float  # Share of the state that remains from one sample to the next
+    # Where large errors begin, as `large_ones` returns them; shape (n,).
     large: FloatArray | None = None
-    paths: tuple[tuple[str, FloatArray], ...] = ()
+    paths: tuple[tuple[str, FloatArray], ...] = ()  # As `throttle_paths` yields them; shape (n,)
 
 
 def statistics(z: FloatArray, given: Covariates, *, lines: bool = True) -> dict[str, float]:

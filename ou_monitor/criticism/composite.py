@@ -35,44 +35,18 @@ LAW_COST = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Composite:
-    """
-    A fitted model.
+    """A fitted model."""
 
-    Attributes
-    ----------
-    terms : tuple of Term
-        All, laws included, with parameters.
-    se : tuple of dict
-        Standard errors, a dict a term.
-    gaussian : GaussianFit
-        Its Gaussian part.
-    z : ndarray, shape (n,)
-        Normal scores of the one-step predictions.
-    density : ndarray, shape (n,)
-        Log predictive density of each sample, nats.
-    free : int
-        Free parameters.
-    search : float
-        Penalty for what was searched beside them, nats.
-    events : Events, optional
-        What the laws found, as the Gaussian part was fitted with it.
-    offset : ndarray, shape (n,), optional
-        Likewise, V.
-    cost : float
-        Processor time of the fits, s, estimated from filters and laws.
-
-    """
-
-    terms: tuple[Term, ...]
-    se: tuple[dict[str, float], ...]
-    gaussian: GaussianFit
-    z: FloatArray
-    density: FloatArray
-    free: int
-    search: float
-    events: Events | None = None
-    offset: FloatArray | None = None
-    cost: float = 0.0
+    terms: tuple[Term, ...]  # All, laws included, with parameters
+    se: tuple[dict[str, float], ...]  # Standard errors, a dict a term
+    gaussian: GaussianFit  # Its Gaussian part
+    z: FloatArray  # Normal scores of the one-step predictions; shape (n,)
+    density: FloatArray  # Log predictive density of each sample, nats; shape (n,)
+    free: int  # Free parameters
+    search: float  # Penalty for what was searched beside them, nats
+    events: Events | None = None  # What the laws found, as the Gaussian part was fitted with it
+    offset: FloatArray | None = None  # Likewise, V; shape (n,)
+    cost: float = 0.0  # Processor time of the fits, s, estimated from filters and laws
 
     def score(self, samples: Samples) -> float:
         """Return evidence, nats: of the part fitted, less its price, and of the part kept."""

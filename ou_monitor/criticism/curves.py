@@ -31,33 +31,21 @@ _Curve = tuple[tuple[str, str, str], FloatArray, Curve, tuple[bool, bool, bool]]
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """
-    A curve of the data, and what simulations make of it.
+    """A curve of the data, and what simulations make of it."""
 
-    Attributes
-    ----------
-    title, x_label, y_label : str
-        For people.
-    x, data : ndarray, shape (p,)
-        The curve; NaN where nothing is known.
-    bands : tuple of pair of ndarray, shape (p,)
-        Lowest and highest of the simulations, for each model.
-    log_x, log_y : bool
-        Axes.
-    points : bool
-        Separate values, between which there is nothing to draw a line through.
-
-    """
-
+    # For people.
     title: str
     x_label: str
     y_label: str
+    # The curve; NaN where nothing is known; shape (p,).
     x: FloatArray
     data: FloatArray
+    # Lowest and highest of the simulations, for each model; shape (p,).
     bands: tuple[tuple[FloatArray, FloatArray], ...]
+    # Axes.
     log_x: bool = False
     log_y: bool = False
-    points: bool = False
+    points: bool = False  # Separate values, between which there is nothing to draw a line through
 
 
 def compare_curves(samples: Samples, models: Sequence[SupplyModel], rng: np.random.Generator,

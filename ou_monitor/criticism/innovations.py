@@ -50,23 +50,12 @@ _NO_NOISE = 1e-6
 
 @dataclass(frozen=True)
 class OtherPole:
-    """
-    What the spectrum of innovations shows of a pole beside the fitted one.
+    """What the spectrum of innovations shows of a pole beside the fitted one."""
 
-    Attributes
-    ----------
-    second_p : float
-        Probability that noise looks as much like a second relaxation; NaN without enough samples.
-    second_share : float
-        Its variance, over Var_inf.
-    coupling_p : float
-        Probability that noise looks as much like an AC-coupled instrument.
-
-    """
-
+    # Probability that noise looks as much like a second relaxation; NaN without enough samples.
     second_p: float = NAN
-    second_share: float = NAN
-    coupling_p: float = NAN
+    second_share: float = NAN  # Its variance, over Var_inf
+    coupling_p: float = NAN  # Probability that noise looks as much like an AC-coupled instrument
 
     @property
     def second(self) -> bool:

@@ -41,32 +41,16 @@ _LOOK = 200_000
 
 @dataclass(frozen=True, eq=False)
 class Integrity:
-    """
-    What a recording is, before any model.
+    """What a recording is, before any model."""
 
-    Attributes
-    ----------
-    samples : Samples or None
-        For the fit; None when there is nothing to fit.
-    exact : tuple of Term
-        What was found, with parameters.
-    notes : tuple of str
-        What was dropped or left out, one sentence each.
-    reason : str
-        Why there is nothing to fit; empty when there is.
-    raw : Samples or None
-        The samples as logged, repeats included, where those differ from
-        `samples` by an exact finding: for the score of the plain model.
-    drawn : ndarray of bool, shape (samples.n,), or None
-        Samples that were drawn and not measured: they take no part in scores.
-
-    """
-
-    samples: Samples | None
-    exact: tuple[Term, ...]
-    notes: tuple[str, ...]
-    reason: str = ''
+    samples: Samples | None  # For the fit; None when there is nothing to fit
+    exact: tuple[Term, ...]  # What was found, with parameters
+    notes: tuple[str, ...]  # What was dropped or left out, one sentence each
+    reason: str = ''  # Why there is nothing to fit; empty when there is
+    # The samples as logged, repeats included, where those differ from `samples` by an exact
+    # finding: for the score of the plain model.
     raw: Samples | None = None
+    # Samples that were drawn and not measured: they take no part in scores; shape (samples.n,).
     drawn: npt.NDArray[np.bool_] | None = None
 
 

@@ -61,29 +61,13 @@ EFFECT = {
 
 @dataclass(frozen=True)
 class TestResult:
-    """
-    One test of one level.
+    """One test of one level."""
 
-    Attributes
-    ----------
-    name : str
-        Key of `EFFECT`.
-    p_value : float
-        Probability of as much under the model; NaN when it could not be done.
-    effect : float
-        How large what was found is, see `EFFECT`.
-    p_adjusted : float
-        After Holm, over all tests of all levels of the recording.
-    why_not : str
-        Why it could not be done; empty when it was.
-
-    """
-
-    name: str
-    p_value: float = NAN
-    effect: float = NAN
-    p_adjusted: float = NAN
-    why_not: str = ''
+    name: str  # Key of `EFFECT`
+    p_value: float = NAN  # Probability of as much under the model; NaN when it could not be done
+    effect: float = NAN  # How large what was found is, see `EFFECT`
+    p_adjusted: float = NAN  # After Holm, over all tests of all levels of the recording
+    why_not: str = ''  # Why it could not be done; empty when it was
 
     # Not a class of pytest's.
     __test__ = False
@@ -96,33 +80,18 @@ class TestResult:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """
-    What the innovations of a level look like.
+    """What the innovations of a level look like."""
 
-    Attributes
-    ----------
-    tests : tuple of TestResult
-        In the order of `EFFECT`.
-    n : int
-        Innovations.
-    skewness, kurtosis : float
-        Of the innovations over the standard deviation of their block; kurtosis is in excess.
-    impulses : int
-        Innovations beyond what the largest of as many normal ones stays under with 99 %.
-    impulse_rate : tuple of float
-        Their rate, 1/s, and its 95 % interval (Poisson).
-    coupling_p : float
-        Probability that noise looks as much like an AC-coupled instrument, after Holm over all
-        levels; NaN when it could not be tested.
-
-    """
-
-    tests: tuple[TestResult, ...]
-    n: int
+    tests: tuple[TestResult, ...]  # In the order of `EFFECT`
+    n: int  # Innovations
+    # Of the innovations over the standard deviation of their block; kurtosis is in excess.
     skewness: float
     kurtosis: float
+    # Innovations beyond what the largest of as many normal ones stays under with 99 %.
     impulses: int
-    impulse_rate: tuple[float, float, float]
+    impulse_rate: tuple[float, float, float]  # Their rate, 1/s, and its 95 % interval (Poisson)
+    # Probability that noise looks as much like an AC-coupled instrument, after Holm over all
+    # levels; NaN when it could not be tested.
     coupling_p: float = NAN
 
     def __getitem__(self, name: str) -> TestResult:

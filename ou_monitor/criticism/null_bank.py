@@ -35,16 +35,9 @@ _FREEDOM = (SIZE - 1) * ((SIZE + _PRIOR) / SIZE) ** 2
 
 @dataclass(frozen=True)
 class NullBank:
-    """
-    Means and spreads of the statistics under the baseline.
+    """Means and spreads of the statistics under the baseline."""
 
-    Attributes
-    ----------
-    mean, std : dict of str to float
-        By statistic.
-
-    """
-
+    # By statistic.
     mean: dict[str, float]
     std: dict[str, float]
 

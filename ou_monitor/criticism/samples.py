@@ -51,30 +51,17 @@ _EVEN, _CHUNK = 0.1, 500_000
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """
-    Clean samples in order.
+    """Clean samples in order."""
 
-    Attributes
-    ----------
-    t, voltage : ndarray, shape (n,)
-        Stamps, s, rising, and V.
-    throttle : ndarray, shape (n,), or None
-        0..1; None when it says nothing (unknown, or constant).
-    longer : Samples, or None
-        Samples that begin with these.
-    codes : ndarray, shape (n,), or None
-        V, as logged, where `voltage` is those codes spread over their cells.
-    cell : float
-        Width of a cell, V; 0 where nothing was spread.
-
-    """
-
+    # Stamps, s, rising, and V; shape (n,).
     t: FloatArray
     voltage: FloatArray
+    # 0..1; None when it says nothing (unknown, or constant); shape (n,).
     throttle: FloatArray | None
-    longer: Samples | None = None
+    longer: Samples | None = None  # Samples that begin with these
+    # V, as logged, where `voltage` is those codes spread over their cells; shape (n,).
     codes: FloatArray | None = None
-    cell: float = 0.0
+    cell: float = 0.0  # Width of a cell, V; 0 where nothing was spread
 
     @property
     def n(self) -> int:

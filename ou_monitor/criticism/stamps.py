@@ -28,23 +28,11 @@ _TINY = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Stamps:
-    """
-    What became of the stamps.
+    """What became of the stamps."""
 
-    Attributes
-    ----------
-    t : ndarray, shape (n,)
-        Stamps to use, s.
-    error : float
-        Standard deviation of stamps that are wrong, s; 0: none are.
-    notes : tuple of str
-        Sentences.
-
-    """
-
-    t: FloatArray
-    error: float
-    notes: tuple[str, ...]
+    t: FloatArray  # Stamps to use, s; shape (n,)
+    error: float  # Standard deviation of stamps that are wrong, s; 0: none are
+    notes: tuple[str, ...]  # Sentences
 
 
 def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:

@@ -44,21 +44,12 @@ _RNG = np.random.default_rng(0)
 
 @dataclass(frozen=True, eq=False)
 class Events:
-    """
-    Variance that events add, V^2, and by what the noise is more or less.
+    """Variance that events add, V^2, and by what the noise is more or less."""
 
-    Attributes
-    ----------
-    push, error : ndarray, shape (n,)
-        To the state, and to the measurement.
-    power : ndarray, shape (n,)
-        Factor on what the noise of the `ou` adds to the state.
-
-    """
-
+    # To the state, and to the measurement; shape (n,).
     push: FloatArray
     error: FloatArray
-    power: FloatArray
+    power: FloatArray  # Factor on what the noise of the `ou` adds to the state; shape (n,)
 
     def part(self, part: slice) -> Events:
         """Return a part."""
@@ -67,37 +58,18 @@ class Events:
 
 @dataclass(frozen=True, eq=False)
 class GaussianFit:
-    """
-    A fitted Gaussian model.
+    """A fitted Gaussian model."""
 
-    Attributes
-    ----------
-    terms : tuple of Term
-        With their parameters; the first is the `ou`.
-    se : tuple of dict
-        Standard errors by parameter, a dict a term.
-    mean : ndarray, shape (n,)
-        Of the voltage, V.
-    innovation, variance : ndarray, shape (n,)
-        One-step errors, V, and their predictive variances, V^2, events not
-        counted at their own sample.
-    density : ndarray, shape (n,)
-        Log predictive density of each sample, nats.
-    phi : ndarray, shape (n,)
-        Coefficient of the OU in each step.
-    cost : float
-        Processor time of the fit, s, estimated from its filters.
-
-    """
-
-    terms: tuple[Term, ...]
-    se: tuple[dict[str, float], ...]
-    mean: FloatArray
+    terms: tuple[Term, ...]  # With their parameters; the first is the `ou`
+    se: tuple[dict[str, float], ...]  # Standard errors by parameter, a dict a term
+    mean: FloatArray  # Of the voltage, V; shape (n,)
+    # One-step errors, V, and their predictive variances, V^2, events not counted at their own
+    # sample; shape (n,).
     innovation: FloatArray
     variance: FloatArray
-    density: FloatArray
-    phi: FloatArray
-    cost: float
+    density: FloatArray  # Log predictive density of each sample, nats; shape (n,)
+    phi: FloatArray  # Coefficient of the OU in each step; shape (n,)
+    cost: float  # Processor time of the fit, s, estimated from its filters
 
     @property
     def z(self) -> FloatArray:

@@ -36,51 +36,24 @@ _DRAWS = 16
 
 @dataclass(frozen=True)
 class Worth:
-    """
-    What the model loses without a group of terms.
+    """What the model loses without a group of terms."""
 
-    Attributes
-    ----------
-    gain, error : float
-        nats per sample.
-    chance : float
-        As `gain.cause_gain` has it.
-    size : int
-        Terms of the group.
-    less : HeldOut, or None
-        The model without it.
-
-    """
-
+    # nats per sample.
     gain: float = NAN
     error: float = NAN
-    chance: float = NAN
-    size: int = 1
-    less: HeldOut | None = None
+    chance: float = NAN  # As `gain.cause_gain` has it
+    size: int = 1  # Terms of the group
+    less: HeldOut | None = None  # The model without it
 
 
 @dataclass(eq=False)
 class Earned:
-    """
-    The model that is left, and what each of its causes is worth.
+    """The model that is left, and what each of its causes is worth."""
 
-    Attributes
-    ----------
-    full : HeldOut
-        The model.
-    names : list of str
-        Its causes, in the order of acceptance.
-    worth : list of Worth
-        One for each.
-    out : list of str
-        Causes that were left out.
-
-    """
-
-    full: HeldOut
-    names: list[str]
-    worth: list[Worth] = field(default_factory=list)
-    out: list[str] = field(default_factory=list)
+    full: HeldOut  # The model
+    names: list[str]  # Its causes, in the order of acceptance
+    worth: list[Worth] = field(default_factory=list)  # One for each
+    out: list[str] = field(default_factory=list)  # Causes that were left out
 
 
 def earned(samples: Samples, model: Composite, names: Sequence[str], plain: HeldOut,

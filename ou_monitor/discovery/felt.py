@@ -31,31 +31,19 @@ _MADE = 0.5
 
 @dataclass(frozen=True)
 class Felt:
-    """
-    A model in units that a pilot feels.
+    """A model in units that a pilot feels."""
 
-    Attributes
-    ----------
-    low, high : float
-        Throttle before and after a punch-out.
-    dip, after : float
-        Deepest point of the mean after it, V below the voltage before, and when, s.
-    recovered, within : float
-        What comes back while throttle is held, V, and 90 % of it within, s; 0 and NaN for none.
-    level : float
-        Voltage, V, below which dips are counted.
-    dips, made : int
-        Dips, and those of which throttle made more than half.
-
-    """
-
+    # Throttle before and after a punch-out.
     low: float = NAN
     high: float = NAN
+    # Deepest point of the mean after it, V below the voltage before, and when, s.
     dip: float = NAN
     after: float = NAN
+    # What comes back while throttle is held, V, and 90 % of it within, s; 0 and NaN for none.
     recovered: float = 0.0
     within: float = NAN
-    level: float = NAN
+    level: float = NAN  # Voltage, V, below which dips are counted
+    # Dips, and those of which throttle made more than half.
     dips: int = 0
     made: int = 0
 

@@ -30,28 +30,17 @@ class Verdict(enum.Enum):
 
 @dataclass(frozen=True)
 class Criticism:
-    """
-    One statistic of the data, and where simulations put it.
+    """One statistic of the data, and where simulations put it."""
 
-    Attributes
-    ----------
-    statistic : str
-        Name.
-    before, after : float
-        Normal score of the data under the plain and under the extended model.
-    low, high : float
-        Band that simulations of the right model leave once in a hundred
-        recordings, all statistics taken together.
-    p_before, p_after : float
-        Chance that any statistic of a right model is as far off.
-
-    """
-
-    statistic: str
+    statistic: str  # Name
+    # Normal score of the data under the plain and under the extended model.
     before: float
     after: float
+    # Band that simulations of the right model leave once in a hundred recordings, all statistics
+    # taken together.
     low: float
     high: float
+    # Chance that any statistic of a right model is as far off.
     p_before: float
     p_after: float
 
@@ -68,36 +57,17 @@ class Criticism:
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """
-    A cause that was named.
+    """A cause that was named."""
 
-    Attributes
-    ----------
-    term : Term
-        With its parameters.
-    se : dict of str to float or list
-        Standard errors, in the units of the parameters; NaN where not known.
-    gain, gain_se : float
-        What is lost of the held-out score without it, nats per sample.
-    p_value : float
-        See `gain.cause_gain`; 0 for exact findings, which have no chance at all.
-    alternatives : tuple of str
-        Causes that this recording cannot separate from it.
-    explanation : str
-        For people.
-    exact : bool
-        Found without a model.
-
-    """
-
-    term: Term
-    se: Mapping[str, Any]
+    term: Term  # With its parameters
+    se: Mapping[str, Any]  # Standard errors, in the units of the parameters; NaN where not known
+    # What is lost of the held-out score without it, nats per sample.
     gain: float
     gain_se: float
-    p_value: float
-    alternatives: tuple[str, ...]
-    explanation: str
-    exact: bool
+    p_value: float  # See `gain.cause_gain`; 0 for exact findings, which have no chance at all
+    alternatives: tuple[str, ...]  # Causes that this recording cannot separate from it
+    explanation: str  # For people
+    exact: bool  # Found without a model
 
     @property
     def name(self) -> str:
@@ -112,25 +82,14 @@ class Cause:
 
 @dataclass(frozen=True)
 class CrossingRate:
-    """
-    How often the voltage falls through a level, on the part kept.
+    """How often the voltage falls through a level, on the part kept."""
 
-    Attributes
-    ----------
-    level : float
-        V.
-    observed, baseline, extended : float
-        Crossings per minute in the data and on average in simulations.
-    observed_se, baseline_se, extended_se : float
-        Standard errors: of the count, as if crossings were independent, and of
-        the averages.
-
-    """
-
-    level: float = NAN
+    level: float = NAN  # V
+    # Crossings per minute in the data and on average in simulations.
     observed: float = NAN
     baseline: float = NAN
     extended: float = NAN
+    # Standard errors: of the count, as if crossings were independent, and of the averages.
     observed_se: float = NAN
     baseline_se: float = NAN
     extended_se: float = NAN
@@ -138,71 +97,32 @@ class CrossingRate:
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """
-    Result of `discover`.
+    """Result of `discover`."""
 
-    Attributes
-    ----------
-    recording : str
-        Name.
-    n : int
-        Samples of the recording.
-    duration : float
-        s.
-    verdict : Verdict
-        What became of it.
-    sentence : str
-        The same in a sentence.
-    baseline : OU or None
-        The plain model, fitted on everything.
-    baseline_score : float
-        Mean log predictive density of blocks kept back in turn, nats per sample.
-    criticism : tuple of Criticism
-        All statistics.
-    causes : tuple of Cause
-        As accepted.
-    model : SupplyModel or None
-        The extended model, fitted on everything.
-    se : tuple of dict
-        Its standard errors, a dict a term.
-    score, gain, gain_se : float
-        Of the extended model on blocks kept back in turn, nats per sample.
-    crossing : CrossingRate
-        What a pilot feels.
-    notes : tuple of str
-        What was dropped, left out or cannot be decided.
-    samples : Samples or None
-        What was fitted.
-    simulated : SupplyModel or None
-        The extended model as it makes `samples`: without what was undone in
-        them, such as repeats.
-    refused : str
-        Why the extended model has not earned its place, in words; empty where it has.
-    seed : int
-        Of all randomness.
-
-    """
-
-    recording: str
-    n: int
-    duration: float
-    verdict: Verdict
-    sentence: str
-    baseline: OU | None = None
+    recording: str  # Name
+    n: int  # Samples of the recording
+    duration: float  # s
+    verdict: Verdict  # What became of it
+    sentence: str  # The same in a sentence
+    baseline: OU | None = None  # The plain model, fitted on everything
+    # Mean log predictive density of blocks kept back in turn, nats per sample.
     baseline_score: float = NAN
-    criticism: tuple[Criticism, ...] = ()
-    causes: tuple[Cause, ...] = ()
-    model: SupplyModel | None = None
-    se: tuple[Mapping[str, Any], ...] = ()
+    criticism: tuple[Criticism, ...] = ()  # All statistics
+    causes: tuple[Cause, ...] = ()  # As accepted
+    model: SupplyModel | None = None  # The extended model, fitted on everything
+    se: tuple[Mapping[str, Any], ...] = ()  # Its standard errors, a dict a term
+    # Of the extended model on blocks kept back in turn, nats per sample.
     score: float = NAN
     gain: float = NAN
     gain_se: float = NAN
-    crossing: CrossingRate = field(default_factory=CrossingRate)
-    notes: tuple[str, ...] = ()
-    samples: Samples | None = None
+    crossing: CrossingRate = field(default_factory=CrossingRate)  # What a pilot feels
+    notes: tuple[str, ...] = ()  # What was dropped, left out or cannot be decided
+    samples: Samples | None = None  # What was fitted
+    # The extended model as it makes `samples`: without what was undone in them, such as repeats.
     simulated: SupplyModel | None = None
+    # Why the extended model has not earned its place, in words; empty where it has.
     refused: str = ''
-    seed: int = 0
+    seed: int = 0  # Of all randomness
 
     @property
     def discrepancies(self) -> tuple[Criticism, ...]:

@@ -35,52 +35,25 @@ _ALIKE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """
-    A candidate, fitted beside what was accepted before.
+    """A candidate, fitted beside what was accepted before."""
 
-    Attributes
-    ----------
-    name : str
-        Of the cause.
-    composite : Composite
-        The model with it.
-    evidence : float
-        nats.
-    left : dict of str to float, or None
-        Statistics of the model with it; None where its evidence is not clear.
-    shown : frozenset of str
-        Causes that the score test of another pole shows beside it; empty where `left` is None.
-    beside : str
-        Name of a cause that comes with it; empty where none does.
-
-    """
-
-    name: str
-    composite: Composite
-    evidence: float
+    name: str  # Of the cause
+    composite: Composite  # The model with it
+    evidence: float  # nats
+    # Statistics of the model with it; None where its evidence is not clear.
     left: dict[str, float] | None = None
+    # Causes that the score test of another pole shows beside it; empty where `left` is None.
     shown: frozenset[str] = frozenset()
-    beside: str = ''
+    beside: str = ''  # Name of a cause that comes with it; empty where none does
 
 
 @dataclass(eq=False)
 class Fitter:
-    """
-    Fits of models to one recording, and an account of what they cost.
+    """Fits of models to one recording, and an account of what they cost."""
 
-    Attributes
-    ----------
-    samples : Samples
-        The recording.
-    cost : float
-        Processor time of the fits, s, estimated from their filters.
-    throttles : set of str
-        Latent laws with clear evidence, most of which a free law of throttle explains.
-
-    """
-
-    samples: Samples
-    cost: float = 0.0
+    samples: Samples  # The recording
+    cost: float = 0.0  # Processor time of the fits, s, estimated from their filters
+    # Latent laws with clear evidence, most of which a free law of throttle explains.
     throttles: set[str] = field(default_factory=set)
 
     def evidence(self, composite: Composite) -> float:

@@ -68,23 +68,11 @@ def load_terms(samples: Samples) -> tuple[Term, ...]:
 
 @dataclass(frozen=True)
 class Answer:
-    """
-    Terms of the mean, and what each is worth.
+    """Terms of the mean, and what each is worth."""
 
-    Attributes
-    ----------
-    terms : tuple of Term
-        In the order of what is lost without them, the largest first.
-    worth : tuple of float
-        Evidence lost without each, nats.
-    rivals : tuple of tuple of str
-        For each, the other causes that do as well in its place.
-
-    """
-
-    terms: tuple[Term, ...]
-    worth: tuple[float, ...]
-    rivals: tuple[tuple[str, ...], ...]
+    terms: tuple[Term, ...]  # In the order of what is lost without them, the largest first
+    worth: tuple[float, ...]  # Evidence lost without each, nats
+    rivals: tuple[tuple[str, ...], ...]  # For each, the other causes that do as well in its place
 
 
 def mean_answer(samples: Samples, composite: Composite, view: View,

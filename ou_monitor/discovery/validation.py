@@ -40,23 +40,12 @@ _BEYOND, _STILL = 0.05, 0.01
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """
-    A model, scored on what it was not fitted on.
+    """A model, scored on what it was not fitted on."""
 
-    Attributes
-    ----------
-    model : Composite
-        Fitted on everything.
-    density : ndarray, shape (n,)
-        Log predictive density of each sample, its block kept back, nats.
-    known : ndarray of bool, shape (n,)
-        Where the other blocks determine the parameters.
-
-    """
-
-    model: Composite
+    model: Composite  # Fitted on everything
+    # Log predictive density of each sample, its block kept back, nats; shape (n,).
     density: FloatArray
-    known: npt.NDArray[np.bool_]
+    known: npt.NDArray[np.bool_]  # Where the other blocks determine the parameters; shape (n,)
 
 
 def blocks_of(n: int) -> list[slice]:

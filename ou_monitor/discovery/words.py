@@ -280,41 +280,17 @@ def unmeasured_words(fewest: int, scored: int, throttle: bool) -> str:
 
 @dataclass(frozen=True)
 class CauseRow:
-    """
-    One row: a cause, or several terms of one kind that share a gain.
+    """One row: a cause, or several terms of one kind that share a gain."""
 
-    Attributes
-    ----------
-    name : str
-        Of the cause.
-    label : str
-        The same, and how many terms there are when more than one.
-    family : str
-        Of the catalogue.
-    gain : str
-        mnat per sample with its standard error, or that it is not known.
-    remark : str
-        What to make of the gain, and why the cause is named; empty when it is one.
-    chance : str
-        p, ``exact``, or that it is not known.
-    alternatives : tuple of str
-        Causes that the recording cannot separate from it.
-    estimates : tuple of str
-        Parameters of each term, with units and standard errors.
-    explanation : str
-        For people; lists the parameters of each term.
-
-    """
-
-    name: str
-    label: str
-    family: str
-    gain: str
-    remark: str
-    chance: str
-    alternatives: tuple[str, ...]
-    estimates: tuple[str, ...]
-    explanation: str
+    name: str  # Of the cause
+    label: str  # The same, and how many terms there are when more than one
+    family: str  # Of the catalogue
+    gain: str  # mnat per sample with its standard error, or that it is not known
+    remark: str  # What to make of the gain, and why the cause is named; empty when it is one
+    chance: str  # p, ``exact``, or that it is not known
+    alternatives: tuple[str, ...]  # Causes that the recording cannot separate from it
+    estimates: tuple[str, ...]  # Parameters of each term, with units and standard errors
+    explanation: str  # For people; lists the parameters of each term
 
 
 def cause_rows(causes: Sequence[Cause]) -> list[CauseRow]:

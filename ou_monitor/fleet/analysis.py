@@ -24,38 +24,21 @@ _EPOCH, _LATEST = 946684800.0, 4102444800.0
 
 @dataclass(frozen=True)
 class Options:
-    """
-    How every recording of the fleet is analysed.
+    """How every recording of the fleet is analysed."""
 
-    Attributes
-    ----------
-    levels : tuple of float or None
-        Throttles of the load levels; found in each recording when None.
-    window : float
-        Window of the sliding estimate, s.
-    brownout_voltage, brownout_horizon : float
-        Of the risk, V and s; a voltage of NaN leaves the risk unknown.
-    msg_config, voltage_topic, throttle_topic : str or None
-        As of `read_recording`.
-    partial : bool
-        Whether damaged bags are read as far as they hold.
-    discover : bool
-        Whether causes are looked for, which takes some seconds a recording.
-    seed : int
-        Of `discover`.
-
-    """
-
+    # Throttles of the load levels; found in each recording when None.
     levels: tuple[float, ...] | None = None
-    window: float = 2.0
+    window: float = 2.0  # Window of the sliding estimate, s
+    # Of the risk, V and s; a voltage of NaN leaves the risk unknown.
     brownout_voltage: float = NAN
     brownout_horizon: float = 5.0
+    # As of `read_recording`.
     msg_config: str | None = None
     voltage_topic: str | None = None
     throttle_topic: str | None = None
-    partial: bool = False
-    discover: bool = False
-    seed: int = 0
+    partial: bool = False  # Whether damaged bags are read as far as they hold
+    discover: bool = False  # Whether causes are looked for, which takes some seconds a recording
+    seed: int = 0  # Of `discover`
 
     def as_data(self) -> dict[str, Any]:
         """Return the options as JSON holds them."""

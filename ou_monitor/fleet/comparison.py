@@ -41,24 +41,14 @@ _PIECES, _ROWS, _APART = 8, 12, 0.03
 
 @dataclass(frozen=True)
 class Curve:
-    """
-    The common curve over throttle of the logarithm of a quantity: straight between knots.
+    """The common curve over throttle of the logarithm of a quantity: straight between knots."""
 
-    Attributes
-    ----------
-    reference : float
-        Throttle that all recordings are brought to; NaN when none has any.
-    knots, heights : tuple of float
-        Throttles, and the logarithm there above that at the reference; empty
-        for a flat curve.
-    covariance : ndarray, shape (k - 1, k - 1)
-        Of the slopes between k knots; recordings, not levels, count as independent.
-
-    """
-
-    reference: float
+    reference: float  # Throttle that all recordings are brought to; NaN when none has any
+    # Throttles, and the logarithm there above that at the reference; empty for a flat curve.
     knots: tuple[float, ...] = ()
     heights: tuple[float, ...] = ()
+    # Of the slopes between k knots; recordings, not levels, count as independent; shape (k - 1, k
+    # - 1).
     covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __call__(self, throttle: FloatArray) -> FloatArray:
@@ -78,37 +68,19 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Values:
-    """
-    One quantity of every recording that has it.
+    """One quantity of every recording that has it."""
 
-    Attributes
-    ----------
-    name : str
-        Quantity.
-    paths : tuple of str
-        Recordings.
-    vehicles : tuple of str
-        Of each; empty where unknown.
-    flights : ndarray, shape (n,)
-        Number of the flight; 0 where there is none.
-    value, error : ndarray, shape (n,)
-        Logarithm at the reference throttle (sag: V at full throttle) and its standard error,
-        with that of the move from its own throttle rather than from the usual one.
-    curve : Curve
-        What was taken out.
-    measured, throttle : ndarray, shape (n,)
-        In the unit of the quantity, as measured, and at which throttle; the mean over the
-        levels (by time; of the logarithm); NaN where throttle is unknown.
-
-    """
-
-    name: str
-    paths: tuple[str, ...]
-    vehicles: tuple[str, ...]
-    flights: IntArray
+    name: str  # Quantity
+    paths: tuple[str, ...]  # Recordings
+    vehicles: tuple[str, ...]  # Of each; empty where unknown
+    flights: IntArray  # Number of the flight; 0 where there is none; shape (n,)
+    # Logarithm at the reference throttle (sag: V at full throttle) and its standard error, with
+    # that of the move from its own throttle rather than from the usual one; shape (n,).
     value: FloatArray
     error: FloatArray
-    curve: Curve
+    curve: Curve  # What was taken out
+    # In the unit of the quantity, as measured, and at which throttle; the mean over the levels (by
+    # time; of the logarithm); NaN where throttle is unknown; shape (n,).
     measured: FloatArray
     throttle: FloatArray
 

@@ -30,44 +30,20 @@ _MOST_DEPTH = 50
 
 @dataclass(frozen=True)
 class Source:
-    """
-    One recording on disk.
+    """One recording on disk."""
 
-    Attributes
-    ----------
-    path : pathlib.Path
-        File, or folder of a bag; absolute, links resolved.
-    files : tuple of pathlib.Path
-        Its files of data, in order of name.
-    size : int
-        Bytes in them.
-    stamp : tuple of int
-        Times of their last change, ns.
-
-    """
-
-    path: Path
-    files: tuple[Path, ...]
-    size: int
-    stamp: tuple[int, ...]
+    path: Path  # File, or folder of a bag; absolute, links resolved
+    files: tuple[Path, ...]  # Its files of data, in order of name
+    size: int  # Bytes in them
+    stamp: tuple[int, ...]  # Times of their last change, ns
 
 
 @dataclass(frozen=True)
 class Found:
-    """
-    What a search gave.
+    """What a search gave."""
 
-    Attributes
-    ----------
-    sources : tuple of Source
-        In order of path, each once.
-    notes : tuple of str
-        What was passed over, one sentence each.
-
-    """
-
-    sources: tuple[Source, ...]
-    notes: tuple[str, ...]
+    sources: tuple[Source, ...]  # In order of path, each once
+    notes: tuple[str, ...]  # What was passed over, one sentence each
 
 
 def find_recordings(given: Sequence[str], leave_out: Path | None = None) -> Found:

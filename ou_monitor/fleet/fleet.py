@@ -76,32 +76,15 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, eq=False)
 class Fleet:
-    """
-    A fleet, analysed.
+    """A fleet, analysed."""
 
-    Attributes
-    ----------
-    rows : list of dict
-        The table, in order of vehicle, flight, path and level.
-    judgement : Judgement
-        What stands out.
-    notes : tuple of str
-        Where the names of the vehicles are from, what was passed over, and the like.
-    recordings : int
-        Recordings found.
-    kept : int
-        Of these, done by an earlier run.
-    limit : float
-        Voltage that dips are counted below, V; NaN when none was given.
-
-    """
-
-    rows: list[Row]
-    judgement: Judgement
+    rows: list[Row]  # The table, in order of vehicle, flight, path and level
+    judgement: Judgement  # What stands out
+    # Where the names of the vehicles are from, what was passed over, and the like.
     notes: tuple[str, ...]
-    recordings: int
-    kept: int
-    limit: float = NAN
+    recordings: int  # Recordings found
+    kept: int  # Of these, done by an earlier run
+    limit: float = NAN  # Voltage that dips are counted below, V; NaN when none was given
 
     @property
     def vehicles(self) -> list[str]:

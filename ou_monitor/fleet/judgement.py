@@ -41,39 +41,22 @@ LEAST_FLIGHTS = 5
 
 @dataclass(frozen=True)
 class Trend:
-    """
-    Trend of one quantity of one vehicle.
+    """Trend of one quantity of one vehicle."""
 
-    Attributes
-    ----------
-    quantity, vehicle : str
-        Of what.
-    flights : int
-        How many were used.
-    slope, low, high : float
-        Change a flight (of the logarithm, or V for sag) and its 95 % interval.
-    start : float
-        Value of the line at flight 0.
-    first, last : int
-        Numbers of the first and the last flight used.
-    p_value : float
-        Of the test alone.
-    p_family : float
-        After Holm, over all tests of the fleet.
-
-    """
-
+    # Of what.
     quantity: str
     vehicle: str
-    flights: int
+    flights: int  # How many were used
+    # Change a flight (of the logarithm, or V for sag) and its 95 % interval.
     slope: float
     low: float
     high: float
-    start: float
+    start: float  # Value of the line at flight 0
+    # Numbers of the first and the last flight used.
     first: int
     last: int
-    p_value: float
-    p_family: float = NAN
+    p_value: float  # Of the test alone
+    p_family: float = NAN  # After Holm, over all tests of the fleet
 
     def line(self, flight: FloatArray) -> FloatArray:
         """Return the line at some flights."""
@@ -132,35 +115,18 @@ _UPPER = 1.2815515655446004
 
 @dataclass(frozen=True, eq=False)
 class Outliers:
-    """
-    How far each value is off.
+    """How far each value is off."""
 
-    Attributes
-    ----------
-    score : ndarray, shape (n,)
-        Distance from the group in standard deviations; NaN where the group is
-        too small.
-    chance : ndarray, shape (n,)
-        Chance that any value of a fleet with nothing wrong is as far off; NaN
-        where there is no score.
-    centre : ndarray, shape (n,)
-        What each was compared with.
-    scatter : float
-        Standard deviation between recordings of one group, beside their
-        errors; NaN when unknown.
-    bound : float
-        Score that is reached with chance `rate` in a fleet with nothing wrong.
-    rate : float
-        That chance.
-
-    """
-
+    # Distance from the group in standard deviations; NaN where the group is too small; shape (n,).
     score: FloatArray
+    # Chance that any value of a fleet with nothing wrong is as far off; NaN where there is no
+    # score; shape (n,).
     chance: FloatArray
-    centre: FloatArray
+    centre: FloatArray  # What each was compared with; shape (n,)
+    # Standard deviation between recordings of one group, beside their errors; NaN when unknown.
     scatter: float
-    bound: float
-    rate: float
+    bound: float  # Score that is reached with chance `rate` in a fleet with nothing wrong
+    rate: float  # That chance
 
     @property
     def found(self) -> npt.NDArray[np.bool_]:
@@ -246,51 +212,25 @@ _MEDIAN_ERROR = 1.2533141373155
 
 @dataclass(frozen=True, eq=False)
 class VehicleValues:
-    """
-    One quantity of every vehicle: the medians of its recordings.
+    """One quantity of every vehicle: the medians of its recordings."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Vehicles.
-    value, error : ndarray, shape (v,)
-        Medians on the scale of `Values.value`, and their standard errors.
-    outliers : Outliers
-        How far each is off the fleet.
-
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # Vehicles
+    # Medians on the scale of `Values.value`, and their standard errors; shape (v,).
     value: FloatArray
     error: FloatArray
-    outliers: Outliers
+    outliers: Outliers  # How far each is off the fleet
 
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """
-    What stands out in a fleet.
+    """What stands out in a fleet."""
 
-    Attributes
-    ----------
-    values : dict of str to Values
-        Quantity -> recordings.
-    trends : tuple of Trend
-        All that were tested, least likely first.
-    recordings : dict of str to Outliers
-        Quantity -> each recording beside those of its vehicle.
-    vehicles : dict of str to VehicleValues
-        Quantity -> each vehicle beside the others.
-    rate : float
-        Chance of any false alarm in one of these comparisons, such that it is
-        `OUTLIER_RATE` in all together.
-
-    """
-
-    values: dict[str, Values]
-    trends: tuple[Trend, ...]
-    recordings: dict[str, Outliers]
-    vehicles: dict[str, VehicleValues]
+    values: dict[str, Values]  # Quantity -> recordings
+    trends: tuple[Trend, ...]  # All that were tested, least likely first
+    recordings: dict[str, Outliers]  # Quantity -> each recording beside those of its vehicle
+    vehicles: dict[str, VehicleValues]  # Quantity -> each vehicle beside the others
+    # Chance of any false alarm in one of these comparisons, such that it is `OUTLIER_RATE` in all
+    # together.
     rate: float
 
     @property

@@ -16,23 +16,11 @@ HEADS = ('recording', 'lowest V', 'at s', 'dips', 'below s', 'sag V', 'at thrott
 
 @dataclass(frozen=True)
 class Dips:
-    """
-    Dips of a vehicle or of the whole fleet.
+    """Dips of a vehicle or of the whole fleet."""
 
-    Attributes
-    ----------
-    count : int
-        Dips below the limit.
-    below : float
-        Time below it, s.
-    recordings : int
-        Recordings with dips.
-
-    """
-
-    count: int = 0
-    below: float = 0.0
-    recordings: int = 0
+    count: int = 0  # Dips below the limit
+    below: float = 0.0  # Time below it, s
+    recordings: int = 0  # Recordings with dips
 
 
 def once(fleet: Fleet) -> list[Row]:

@@ -21,27 +21,13 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Column:
-    """
-    One column.
+    """One column."""
 
-    Attributes
-    ----------
-    name : str
-        Name in the table.
-    kind : str
-        ``text``, ``texts`` (a list), ``number`` (unknown: null), ``count`` or
-        ``time`` (UTC).
-    unit : str
-        SI unit; empty where there is none.
-    meaning : str
-        One line.
-
-    """
-
-    name: str
+    name: str  # Name in the table
+    # ``text``, ``texts`` (a list), ``number`` (unknown: null), ``count`` or ``time`` (UTC).
     kind: str
-    unit: str
-    meaning: str
+    unit: str  # SI unit; empty where there is none
+    meaning: str  # One line
 
 
 _LOG = 'standard error of its logarithm'

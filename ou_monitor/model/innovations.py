@@ -27,27 +27,15 @@ from scipy.signal import lfilter
 
 @dataclass(frozen=True)
 class StateSpace:
-    """
-    A model over n samples with d states.
+    """A model over n samples with d states."""
 
-    Attributes
-    ----------
-    f : ndarray, shape (n, d, d)
-        Transition into each sample; that into the first one is not used.
-    q : ndarray, shape (n, d, d)
-        Covariance of what the noise adds in that step, V^2; for the first
-        sample that of the state itself.
-    h : ndarray, shape (d,)
-        What is observed.
-    r : ndarray, shape (n,)
-        Variance of the measurement noise, V^2, > 0.
-
-    """
-
+    # Transition into each sample; that into the first one is not used; shape (n, d, d).
     f: FloatArray
+    # Covariance of what the noise adds in that step, V^2; for the first sample that of the state
+    # itself; shape (n, d, d).
     q: FloatArray
-    h: FloatArray
-    r: FloatArray
+    h: FloatArray  # What is observed; shape (d,)
+    r: FloatArray  # Variance of the measurement noise, V^2, > 0; shape (n,)
 
 
 class Filter:

@@ -89,59 +89,28 @@ def lowpass(x: FloatArray, t: FloatArray, tau: float, start: float | None = None
 
 @dataclass(frozen=True)
 class LoadModel:
-    """
-    The parameters of the voltage under load.
+    """The parameters of the voltage under load."""
 
-    Attributes
-    ----------
-    cells : int
-        Cells in series, N.
-    mean_load : float
-        Mean of x over the recording, which gives `endurance` its meaning.
-    charge : float
-        Charge at the first sample, s0, 0..1.
-    size : float
-        Relative sag at full throttle at once, S/(3.8 N).
-    power : float
-        Exponent p of current over throttle.
-    fast_share, fast_time : float
-        Polarisation f1, relative to the sag, and its time constant t1, s.
-    slow_share, slow_time : float
-        Polarisation f2 and its time constant t2, s.
-    inrush : float
-        Inrush at a step from rest to full throttle, K, relative to the sag.
-    lag : float
-        Lag of the sag behind throttle, s.
-    endurance : float
-        Time at the mean load that would empty a full pack, T, s.
-    before : float
-        Load before the first sample, relative to the mean load.
-    full_current : float
-        Current that counts as full load, A, negative where discharge is; 0 where throttle is
-        the load.
-    delay : float
-        How late the load is read behind the voltage that answers to it, s.
-    stands : float
-        Level that stands, V; NaN where a lithium pack of that charge empties.
-
-    """
-
-    cells: int
-    mean_load: float
-    charge: float = 0.7
-    size: float = 0.12
-    power: float = 1.8
+    cells: int  # Cells in series, N
+    mean_load: float  # Mean of x over the recording, which gives `endurance` its meaning
+    charge: float = 0.7  # Charge at the first sample, s0, 0..1
+    size: float = 0.12  # Relative sag at full throttle at once, S/(3.8 N)
+    power: float = 1.8  # Exponent p of current over throttle
+    # Polarisation f1, relative to the sag, and its time constant t1, s.
     fast_share: float = 0.2
     fast_time: float = 1.0
+    # Polarisation f2 and its time constant t2, s.
     slow_share: float = 0.3
     slow_time: float = 20.0
-    inrush: float = 0.5
-    lag: float = 0.01
-    endurance: float = 350.0
-    before: float = 0.3
+    inrush: float = 0.5  # Inrush at a step from rest to full throttle, K, relative to the sag
+    lag: float = 0.01  # Lag of the sag behind throttle, s
+    endurance: float = 350.0  # Time at the mean load that would empty a full pack, T, s
+    before: float = 0.3  # Load before the first sample, relative to the mean load
+    # Current that counts as full load, A, negative where discharge is; 0 where throttle is the
+    # load.
     full_current: float = 0.0
-    delay: float = 0.0
-    stands: float = NAN
+    delay: float = 0.0  # How late the load is read behind the voltage that answers to it, s
+    stands: float = NAN  # Level that stands, V; NaN where a lithium pack of that charge empties
 
     def sag(self, throttle: npt.ArrayLike, cell: float = CELL) -> FloatArray:
         """Return the sag, V, of a throttle that is held; of cold cells at that voltage, V."""

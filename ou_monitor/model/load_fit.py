@@ -57,32 +57,16 @@ _ROUNDS, _EVALUATIONS = 4, 30
 
 @dataclass(frozen=True)
 class LoadFit:
-    """
-    A fitted load model, and how well it is known.
+    """A fitted load model, and how well it is known."""
 
-    Attributes
-    ----------
-    model : LoadModel
-        The parameters.
-    covariance : ndarray, shape (11, 11)
-        Covariance of the parameters as fitted (logarithms, but for charge and before).
-    condition : float
-        Condition number of the Jacobian in prior deviations.
-    noise_std : float
-        White noise of a 50 ms mean, V.
-    slow_std : float
-        Standard deviation of the OU of 20 s, V.
-    evidence : float
-        Log evidence (Laplace) for the load and the law of the level, nat.
-
-    """
-
-    model: LoadModel
+    model: LoadModel  # The parameters
+    # Covariance of the parameters as fitted (logarithms, but for charge and before); shape (11,
+    # 11).
     covariance: FloatArray
-    condition: float
-    noise_std: float
-    slow_std: float
-    evidence: float
+    condition: float  # Condition number of the Jacobian in prior deviations
+    noise_std: float  # White noise of a 50 ms mean, V
+    slow_std: float  # Standard deviation of the OU of 20 s, V
+    evidence: float  # Log evidence (Laplace) for the load and the law of the level, nat
 
     def draw(self, rng: np.random.Generator) -> LoadModel:
         """Return a model within the errors of this one."""

@@ -47,32 +47,17 @@ def changes(t: FloatArray, throttle: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class NoiseLaw:
-    """
-    White noise that follows throttle.
+    """White noise that follows throttle."""
 
-    Attributes
-    ----------
-    b : ndarray, shape (3,)
-        Coefficients of the variance, V^2.
-    covariance : ndarray, shape (3, 3)
-        Their covariance.
-    limits : tuple of float
-        Least and most throttle, and most change of it, in the fit.
-    intensities : ndarray, shape (n,)
-        ln variance at the samples of the fit, rising.
-    errors : ndarray, shape (n,)
-        Errors there, V, less what is not the noise's: the shape of the law, tails included.
-    memory : float
-        Correlation of neighbouring samples, as of a filter before the ADC.
-
-    """
-
-    b: FloatArray
-    covariance: FloatArray
+    b: FloatArray  # Coefficients of the variance, V^2; shape (3,)
+    covariance: FloatArray  # Their covariance; shape (3, 3)
+    # Least and most throttle, and most change of it, in the fit.
     limits: tuple[float, float, float]
-    intensities: FloatArray
+    intensities: FloatArray  # ln variance at the samples of the fit, rising; shape (n,)
+    # Errors there, V, less what is not the noise's: the shape of the law, tails included; shape
+    # (n,).
     errors: FloatArray
-    memory: float = 0.0
+    memory: float = 0.0  # Correlation of neighbouring samples, as of a filter before the ADC
 
     def variance(self, t: FloatArray, throttle: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the variance, V^2, and how ln of it changes with the coefficients, (n, 3)."""
@@ -178,29 +163,13 @@ _DRAWN = 2.0
 
 @dataclass(frozen=True, eq=False)
 class ResidualOU:
-    """
-    What is in a series beside a slow process that is given.
+    """What is in a series beside a slow process that is given."""
 
-    Attributes
-    ----------
-    white : float
-        Variance of white noise, V^2.
-    variance : float
-        Stationary variance of the OU, V^2; 0 where none is visible.
-    tau : float
-        Its relaxation time, s.
-    gain : float
-        What it adds to the log-likelihood of parts left out, nats a sample.
-    covariance : ndarray, shape (3, 3)
-        Covariance of the logarithms of white, variance and tau.
-
-    """
-
-    white: float
-    variance: float
-    tau: float
-    gain: float
-    covariance: FloatArray
+    white: float  # Variance of white noise, V^2
+    variance: float  # Stationary variance of the OU, V^2; 0 where none is visible
+    tau: float  # Its relaxation time, s
+    gain: float  # What it adds to the log-likelihood of parts left out, nats a sample
+    covariance: FloatArray  # Covariance of the logarithms of white, variance and tau; shape (3, 3)
 
     def draw(self, rng: np.random.Generator) -> tuple[float, float, float]:
         """Return white, variance and tau within their errors."""

@@ -64,80 +64,39 @@ _PHASES, _TRIED = 64, 32
 
 @dataclass(frozen=True)
 class Line:
-    """
-    A line in the spectrum.
+    """A line in the spectrum."""
 
-    Attributes
-    ----------
-    frequency : float
-        Hz, below half the sampling rate.
-    resolution : float
-        Width of a bin, Hz: what the frequency is known to.
-    rms, rms_low, rms_high : float
-        Its root mean square and the 95 % interval, V.
-    share : float
-        Share of the variance of the level.
-    p_value : float
-        Of an ordinate so large, times the ordinates tested at all levels.
-
-    """
-
-    frequency: float
-    resolution: float
+    frequency: float  # Hz, below half the sampling rate
+    resolution: float  # Width of a bin, Hz: what the frequency is known to
+    # Its root mean square and the 95 % interval, V.
     rms: float
     rms_low: float
     rms_high: float
-    share: float
-    p_value: float
+    share: float  # Share of the variance of the level
+    p_value: float  # Of an ordinate so large, times the ordinates tested at all levels
 
 
 @dataclass(frozen=True)
 class LineSearch:
-    """
-    What was looked for and found.
+    """What was looked for and found."""
 
-    Attributes
-    ----------
-    lines : tuple of Line
-        Strongest first.
-    tested : int
-        Ordinates tested at this level.
-    lowest, highest : float
-        Frequencies looked at, Hz.
-    detectable : float
-        RMS of a line that is found with 90 % probability where the noise is at its median, V.
-    why_not : str
-        Why nothing was looked for; empty when it was.
-
-    """
-
-    lines: tuple[Line, ...] = ()
-    tested: int = 0
+    lines: tuple[Line, ...] = ()  # Strongest first
+    tested: int = 0  # Ordinates tested at this level
+    # Frequencies looked at, Hz.
     lowest: float = NAN
     highest: float = NAN
+    # RMS of a line that is found with 90 % probability where the noise is at its median, V.
     detectable: float = NAN
-    why_not: str = ''
+    why_not: str = ''  # Why nothing was looked for; empty when it was
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """
-    Samples on an even clock, those that are missing put in on straight lines.
+    """Samples on an even clock, those that are missing put in on straight lines."""
 
-    Attributes
-    ----------
-    values : ndarray
-        Samples.
-    where : ndarray of int
-        Which of them were given.
-    rate : float
-        Samples per second, Hz.
-
-    """
-
-    values: FloatArray
-    where: npt.NDArray[np.intp]
-    rate: float
+    values: FloatArray  # Samples
+    where: npt.NDArray[np.intp]  # Which of them were given
+    rate: float  # Samples per second, Hz
 
 
 def on_grid(t: FloatArray, values: FloatArray) -> Grid:
@@ -342,23 +301,11 @@ def without_lines(voltage: FloatArray, rate: float, lines: Sequence[Line]) -> Fl
 
 @dataclass(frozen=True)
 class Sinusoid:
-    """
-    A line as it runs through a piece.
+    """A line as it runs through a piece."""
 
-    Attributes
-    ----------
-    amplitude : float
-        Peak, V.
-    frequency : float
-        Hz.
-    phase : float
-        Of its sine at the first sample, rad.
-
-    """
-
-    amplitude: float
-    frequency: float
-    phase: float
+    amplitude: float  # Peak, V
+    frequency: float  # Hz
+    phase: float  # Of its sine at the first sample, rad
 
     def sampled(self, t: FloatArray) -> FloatArray:
         """Return its voltage, V, at times since the first sample, s."""

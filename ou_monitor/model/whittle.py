@@ -27,23 +27,12 @@ _DAMPED, _STUCK = 1e-3, 1e4
 
 @dataclass(frozen=True, eq=False)
 class Ordinates:
-    """
-    The periodogram of scores, in bins.
+    """The periodogram of scores, in bins."""
 
-    Attributes
-    ----------
-    power : ndarray, shape (k,)
-        Mean of the ordinates of each bin; 1 for white scores of variance 1.
-    count : ndarray, shape (k,)
-        Ordinates of each.
-    omega : ndarray, shape (k,)
-        Middle, radians per sample.
-
-    """
-
+    # Mean of the ordinates of each bin; 1 for white scores of variance 1; shape (k,).
     power: FloatArray
-    count: FloatArray
-    omega: FloatArray
+    count: FloatArray  # Ordinates of each; shape (k,)
+    omega: FloatArray  # Middle, radians per sample; shape (k,)
 
     @classmethod
     def of(cls, z: FloatArray) -> Ordinates:

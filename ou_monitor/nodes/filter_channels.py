@@ -26,48 +26,25 @@ _NONE = (math.nan, math.nan, math.nan)
 
 @dataclass(frozen=True)
 class Group:
-    """
-    Numbers of a message that it holds together or not at all.
+    """Numbers of a message that it holds together or not at all."""
 
-    Attributes
-    ----------
-    fields : tuple of FieldPath
-        One for each signal.
-    covariance : FieldPath or None
-        A matrix that shrinks with their noise; -1 as its first element says that the message does
-        not hold them, all 0 that it is not known.
-    needed : bool
-        Whether a message that does not hold them is left out; else they are 0 to the filter, and
-        stay in the message as they are.
-
-    """
-
-    fields: tuple[FieldPath, ...]
+    fields: tuple[FieldPath, ...]  # One for each signal
+    # A matrix that shrinks with their noise; -1 as its first element says that the message does
+    # not hold them, all 0 that it is not known.
     covariance: FieldPath | None = None
+    # Whether a message that does not hold them is left out; else they are 0 to the filter, and
+    # stay in the message as they are.
     needed: bool = True
 
 
 @dataclass(frozen=True)
 class Channels:
-    """
-    The signals of one message type.
+    """The signals of one message type."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Signals, one low-pass each.
-    groups : tuple of Group
-        Where they are.
-    output : str
-        Type of what goes out; empty: that of the input.
-    make : callable or None
-        Message and filtered values to a message of that type; None: they take the signals' places.
-
-    """
-
-    names: tuple[str, ...]
-    groups: tuple[Group, ...]
-    output: str = ''
+    names: tuple[str, ...]  # Signals, one low-pass each
+    groups: tuple[Group, ...]  # Where they are
+    output: str = ''  # Type of what goes out; empty: that of the input
+    # Message and filtered values to a message of that type; None: they take the signals' places.
     make: Callable[[Any, Sequence[float]], Any] | None = None
 
     def take(self, message: Any) -> Sequence[float]:

@@ -24,33 +24,18 @@ _USABLE = (Status.OK.name, Status.SHORT_WINDOW.name)
 
 
 class Supply(NamedTuple):
-    """
-    The supply as it is known.
+    """The supply as it is known."""
 
-    Attributes
-    ----------
-    sigma, sigma_se : float
-        Noise intensity, V/sqrt(s), and the standard error of its logarithm; NaN: not known.
-    alpha : float
-        Relaxation rate, 1/s; NaN: not known.
-    throttle : float
-        Throttle, 0..1; NaN: not known.
-    level, level_se : float
-        Level at the present throttle and its standard error, V; NaN: not known.
-    why : str
-        Why sigma is not known; empty when it is.
-    source : str
-        'relaxation': the estimator's sigma; 'load': the noise beside the load; 'none'.
-
-    """
-
+    # Noise intensity, V/sqrt(s), and the standard error of its logarithm; NaN: not known.
     sigma: float = NAN
     sigma_se: float = NAN
-    alpha: float = NAN
-    throttle: float = NAN
+    alpha: float = NAN  # Relaxation rate, 1/s; NaN: not known
+    throttle: float = NAN  # Throttle, 0..1; NaN: not known
+    # Level at the present throttle and its standard error, V; NaN: not known.
     level: float = NAN
     level_se: float = NAN
-    why: str = ''
+    why: str = ''  # Why sigma is not known; empty when it is
+    # 'relaxation': the estimator's sigma; 'load': the noise beside the load; 'none'.
     source: str = 'none'
 
 

@@ -108,34 +108,17 @@ class Stamper:
 
 @dataclass(frozen=True, eq=False)
 class Arrivals:
-    """
-    Messages of one publisher, in order of arrival.
+    """Messages of one publisher, in order of arrival."""
 
-    Attributes
-    ----------
-    ends : ndarray, shape (m,)
-        Stamps (of the last sample of a block), s; the time of sending where a message has none.
-    own : ndarray of bool, shape (m,)
-        Whether the stamp is the message's own.
-    counts : ndarray of int64, shape (m,)
-        Values in each.
-    values : ndarray, shape (counts.sum(),)
-        Values in SI units; NaN where one is not finite.
-    received : ndarray, shape (m,)
-        When the middleware received each, by the wall clock, s.
-    arrived : ndarray, shape (m,)
-        The same by the monotonic clock, s.
-    beside : ndarray, shape (m,)
-        A second field of each message, SI units; NaN where there is none.
-
-    """
-
+    # Stamps (of the last sample of a block), s; the time of sending where a message has none;
+    # shape (m,).
     ends: FloatArray
-    own: npt.NDArray[np.bool_]
-    counts: npt.NDArray[np.int64]
-    values: FloatArray
-    received: FloatArray
-    arrived: FloatArray
+    own: npt.NDArray[np.bool_]  # Whether the stamp is the message's own; shape (m,)
+    counts: npt.NDArray[np.int64]  # Values in each; shape (m,)
+    values: FloatArray  # Values in SI units; NaN where one is not finite; shape (counts.sum()
+    received: FloatArray  # When the middleware received each, by the wall clock, s; shape (m,)
+    arrived: FloatArray  # The same by the monotonic clock, s; shape (m,)
+    # A second field of each message, SI units; NaN where there is none; shape (m,).
     beside: FloatArray
 
     @property

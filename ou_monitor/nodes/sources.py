@@ -57,35 +57,15 @@ _ARRAYS = ('std_msgs/msg/Float32MultiArray', 'std_msgs/msg/Float64MultiArray')
 
 @dataclass(frozen=True)
 class Source:
-    """
-    One quantity: either known, or to be found out from its publisher.
+    """One quantity: either known, or to be found out from its publisher."""
 
-    Attributes
-    ----------
-    quantity : str
-        'voltage', 'throttle' or 'rpm'.
-    topic : str
-        Topic, relative or absolute.
-    spec : FieldSpec or None
-        Where the quantity is; None until a publisher shows its type.
-    config : str
-        Which msg_config said so.
-    install : str
-        What to install when the package of the type is missing.
-    candidates : tuple of Source
-        What may be chosen, in auto mode.
-    current : FieldSpec or None
-        Of a voltage: where in its messages the current is.
-
-    """
-
-    quantity: str
-    topic: str
-    spec: FieldSpec | None
-    config: str
-    install: str = ''
-    candidates: tuple[Source, ...] = ()
-    current: FieldSpec | None = None
+    quantity: str  # 'voltage', 'throttle' or 'rpm'
+    topic: str  # Topic, relative or absolute
+    spec: FieldSpec | None  # Where the quantity is; None until a publisher shows its type
+    config: str  # Which msg_config said so
+    install: str = ''  # What to install when the package of the type is missing
+    candidates: tuple[Source, ...] = ()  # What may be chosen, in auto mode
+    current: FieldSpec | None = None  # Of a voltage: where in its messages the current is
 
     def choose(self, types: Sequence[str]) -> Source | None:
         """Return the candidate for one of the types on offer; None when there is none."""

@@ -14,25 +14,15 @@ _HUGE = 1e100
 
 @dataclass(frozen=True)
 class Scale:
-    """
-    One axis: data to pixels.
+    """One axis: data to pixels."""
 
-    Attributes
-    ----------
-    low, high : float
-        Ends in data units, low < high; both positive on a log axis.
-    start, stop : float
-        Ends in pixels.
-    log : bool
-        Whether the axis is logarithmic.
-
-    """
-
+    # Ends in data units, low < high; both positive on a log axis.
     low: float
     high: float
+    # Ends in pixels.
     start: float
     stop: float
-    log: bool = False
+    log: bool = False  # Whether the axis is logarithmic
 
     def __call__(self, values: FloatArray | float) -> FloatArray:
         """Return pixels; NaN for what a log axis cannot show."""

@@ -31,30 +31,16 @@ _LEGEND = 18
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """
-    One series.
+    """One series."""
 
-    Attributes
-    ----------
-    x, y : ndarray, shape (n,)
-        Points; the lower edge where there is an upper one.
-    high : ndarray, shape (n,), or None
-        Upper edge of a band, upper ends of bars.
-    label : str
-        Name in the legend; none when empty.
-    style : str
-        CSS classes; the first is ``s0`` .. ``s7``, the colour.
-    kind : str
-        ``line``, ``steps``, ``band``, ``markers`` or ``bars``.
-
-    """
-
+    # Points; the lower edge where there is an upper one; shape (n,).
     x: FloatArray
     y: FloatArray
-    high: FloatArray | None
-    label: str
+    high: FloatArray | None  # Upper edge of a band, upper ends of bars; shape (n,)
+    label: str  # Name in the legend; none when empty
+    # CSS classes; the first is ``s0`` .. ``s7``, the colour.
     style: str
-    kind: str
+    kind: str  # ``line``, ``steps``, ``band``, ``markers`` or ``bars``
 
 
 class Plot:

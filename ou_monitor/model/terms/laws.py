@@ -22,47 +22,22 @@ _EDGE = 1e-15
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """
-    What a candidate may look at before it is fitted.
+    """What a candidate may look at before it is fitted."""
 
-    Attributes
-    ----------
-    z : ndarray, shape (n,)
-        Normal scores of the one-step innovations under the model so far.
-    variance : ndarray, shape (n,)
-        Predictive variance of each sample, V^2.
-    phi : ndarray, shape (n,)
-        Coefficient of the OU in the step before each sample.
-    state : ndarray, shape (n,)
-        Deviation of the sample before from its mean, V; 0 at the first.
-    residual : ndarray, shape (n,)
-        Voltage less its mean, V.
-    at : ndarray, shape (n,)
-        Time since the first sample, s.
-    step : ndarray, shape (n,)
-        Time since the sample before, s.
-    throttle : ndarray, shape (n,), or None
-        0..1.
-    train : slice
-        The part that parameters are fitted on.
-    trust : ndarray, shape (n,), or float
-        Share of each error that the filter takes for the rail's: 1 without white noise.
-    driven : ndarray, shape (n,), or float
-        Share of each variance that the noise of the `ou` adds in the step before: 1 without white
-        noise and other states.
-
-    """
-
-    z: FloatArray
-    variance: FloatArray
-    phi: FloatArray
+    z: FloatArray  # Normal scores of the one-step innovations under the model so far; shape (n,)
+    variance: FloatArray  # Predictive variance of each sample, V^2; shape (n,)
+    phi: FloatArray  # Coefficient of the OU in the step before each sample; shape (n,)
+    # Deviation of the sample before from its mean, V; 0 at the first; shape (n,).
     state: FloatArray
-    residual: FloatArray
-    at: FloatArray
-    step: FloatArray
-    throttle: FloatArray | None
-    train: slice
+    residual: FloatArray  # Voltage less its mean, V; shape (n,)
+    at: FloatArray  # Time since the first sample, s; shape (n,)
+    step: FloatArray  # Time since the sample before, s; shape (n,)
+    throttle: FloatArray | None  # 0..1; shape (n,)
+    train: slice  # The part that parameters are fitted on
+    # Share of each error that the filter takes for the rail's: 1 without white noise; shape (n,).
     trust: FloatArray | float = 1.0
+    # Share of each variance that the noise of the `ou` adds in the step before: 1 without white
+    # noise and other states; shape (n,).
     driven: FloatArray | float = 1.0
 
     @property
@@ -73,43 +48,21 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class LawFit:
-    """
-    A law of the innovations, fitted.
+    """A law of the innovations, fitted."""
 
-    Attributes
-    ----------
-    term : Term
-        With its parameters.
-    se : dict of str to float
-        Their standard errors, where known.
-    z : ndarray, shape (n,)
-        Normal scores under the law: independent N(0, 1) when it is right.
-    gain : ndarray, shape (n,)
-        Log predictive density of each sample over that of N(0, 1) for
-        `View.z`, nats.
-    free : int
-        Parameters fitted.
-    push : ndarray, shape (n,), or None
-        Variance that events add to the state, V^2.
-    error : ndarray, shape (n,), or None
-        Variance that events add to the measurement, V^2.
-    power : ndarray, shape (n,), or None
-        Factor on the variance of what the noise adds in the step before each
-        sample, as the law believes it was: the inverse of the mean precision.
-    offset : ndarray, shape (n,), or None
-        What the law believes to be added to the level, V: the Gaussian part
-        is fitted to what is left without it.
-
-    """
-
-    term: Term
-    se: dict[str, float]
-    z: FloatArray
+    term: Term  # With its parameters
+    se: dict[str, float]  # Their standard errors, where known
+    z: FloatArray  # Normal scores under the law: independent N(0, 1) when it is right; shape (n,)
+    # Log predictive density of each sample over that of N(0, 1) for `View.z`, nats; shape (n,).
     gain: FloatArray
-    free: int
-    push: FloatArray | None = None
-    error: FloatArray | None = None
+    free: int  # Parameters fitted
+    push: FloatArray | None = None  # Variance that events add to the state, V^2; shape (n,)
+    error: FloatArray | None = None  # Variance that events add to the measurement, V^2; shape (n,)
+    # Factor on the variance of what the noise adds in the step before each sample, as the law
+    # believes it was: the inverse of the mean precision; shape (n,).
     power: FloatArray | None = None
+    # What the law believes to be added to the level, V: the Gaussian part is fitted to what is
+    # left without it; shape (n,).
     offset: FloatArray | None = None
 
 

@@ -32,56 +32,26 @@ class Stage(enum.IntEnum):
 
 @dataclass
 class Segment:
-    """
-    Consecutive samples in the making; terms change it in place.
+    """Consecutive samples in the making; terms change it in place."""
 
-    Attributes
-    ----------
-    t : ndarray, shape (n,)
-        Stamps, s.
-    at : ndarray, shape (n,)
-        Instants at which the samples are really taken, s.
-    step : ndarray, shape (n,)
-        Time since the sample before, s; infinite before the first one, which
-        is drawn from the stationary law.
-    throttle : ndarray, shape (n,)
-        0..1, held from the stamp before to its own stamp.
-    origin : float
-        Stamp of the first sample of all, s.
-    alpha, sigma : ndarray, shape (n,)
-        Rate, 1/s, and intensity, V/sqrt(s), over the step before each sample.
-    power : ndarray, shape (n,)
-        Factor on the variance of what the noise adds in that step.
-    push : ndarray, shape (n,)
-        Added to the state at the end of the step, V.
-    bend : tuple of float
-        Coefficients of x^2, 1/(V s), and x^3, 1/(V^2 s), in the restoring
-        force, beside alpha x.
-    x : ndarray, shape (n,)
-        OU deviation, V.
-    level : ndarray, shape (n,)
-        All else that the rail does, V.
-    noise : ndarray, shape (n,)
-        Factor on the deviation of the white noise of the measurement.
-    voltage : ndarray, shape (n,)
-        What is logged, V.
-
-    """
-
-    t: FloatArray
-    at: FloatArray
+    t: FloatArray  # Stamps, s; shape (n,)
+    at: FloatArray  # Instants at which the samples are really taken, s; shape (n,)
+    # Time since the sample before, s; infinite before the first one, which is drawn from the
+    # stationary law; shape (n,).
     step: FloatArray
-    throttle: FloatArray
-    origin: float
+    throttle: FloatArray  # 0..1, held from the stamp before to its own stamp; shape (n,)
+    origin: float  # Stamp of the first sample of all, s
+    # Rate, 1/s, and intensity, V/sqrt(s), over the step before each sample; shape (n,).
     alpha: FloatArray
     sigma: FloatArray
-    power: FloatArray
-    push: FloatArray
+    power: FloatArray  # Factor on the variance of what the noise adds in that step; shape (n,)
+    push: FloatArray  # Added to the state at the end of the step, V; shape (n,)
+    # Coefficients of x^2, 1/(V s), and x^3, 1/(V^2 s), in the restoring force, beside alpha x.
     bend: tuple[float, float]
-    x: FloatArray
-    level: FloatArray
-    noise: FloatArray
-    voltage: FloatArray
+    x: FloatArray  # OU deviation, V; shape (n,)
+    level: FloatArray  # All else that the rail does, V; shape (n,)
+    noise: FloatArray  # Factor on the deviation of the white noise of the measurement; shape (n,)
+    voltage: FloatArray  # What is logged, V; shape (n,)
 
 
 Effect = Callable[[Segment], None]

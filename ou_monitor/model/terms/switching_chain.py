@@ -53,29 +53,16 @@ def step_chances(x: FloatArray, step: float, states: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """
-    Scores that a chain is fitted to.
+    """Scores that a chain is fitted to."""
 
-    Attributes
-    ----------
-    z, phi : ndarray, shape (n,)
-        As in `View`.
-    unit : ndarray, shape (n,)
-        How much of a score the median standard deviation is.
-    trust : ndarray, shape (n,)
-        Share of the error before each that the filter has taken for the rail's.
-    step : float
-        From sample to sample, s.
-    followed : ndarray, shape (n,)
-        What the filter has followed of the states up to two samples ago, in states.
-
-    """
-
+    # As in `View`; shape (n,).
     z: FloatArray
     phi: FloatArray
-    unit: FloatArray
+    unit: FloatArray  # How much of a score the median standard deviation is; shape (n,)
+    # Share of the error before each that the filter has taken for the rail's; shape (n,).
     trust: FloatArray
-    step: float
+    step: float  # From sample to sample, s
+    # What the filter has followed of the states up to two samples ago, in states; shape (n,).
     followed: FloatArray
 
     @classmethod

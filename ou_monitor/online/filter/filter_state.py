@@ -220,19 +220,10 @@ WORTH = 48
 
 
 class Piece(NamedTuple):
-    """
-    Samples that can be worked on together.
+    """Samples that can be worked on together."""
 
-    Attributes
-    ----------
-    size : int
-        Number.
-    dt, mean : ndarray, shape (size,)
-        Interval before each, and mean interval at each, s.
-
-    """
-
-    size: int
+    size: int  # Number
+    # Interval before each, and mean interval at each, s; shape (size,).
     dt: FloatArray
     mean: FloatArray
 

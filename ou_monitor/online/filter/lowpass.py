@@ -51,29 +51,14 @@ _Maybe = npt.ArrayLike | None
 
 @dataclass
 class FilterCounters:
-    """
-    Samples that came, and those that were not used.
+    """Samples that came, and those that were not used."""
 
-    Attributes
-    ----------
-    samples : int
-        Samples used.
-    non_finite : int
-        Samples that were NaN, infinite or beyond 1e150, or whose stamp was or lay beyond 1e18 s.
-    repeated : int
-        Samples with the stamp of the one before, or less than 1 ps later.
-    back : int
-        Samples with an earlier stamp; time goes on from there.
-    gaps : int
-        Steps of more than five mean intervals.
-
-    """
-
-    samples: int = 0
+    samples: int = 0  # Samples used
+    # Samples that were NaN, infinite or beyond 1e150, or whose stamp was or lay beyond 1e18 s.
     non_finite: int = 0
-    repeated: int = 0
-    back: int = 0
-    gaps: int = 0
+    repeated: int = 0  # Samples with the stamp of the one before, or less than 1 ps later
+    back: int = 0  # Samples with an earlier stamp; time goes on from there
+    gaps: int = 0  # Steps of more than five mean intervals
 
 
 class AdaptiveLowPass:

@@ -41,36 +41,17 @@ _LARGEST = 1e60
 
 
 class Known(NamedTuple):
-    """
-    What is known of the supply.
+    """What is known of the supply."""
 
-    Attributes
-    ----------
-    sigma : float
-        Noise intensity, V/sqrt(s).
-    alpha : float
-        Relaxation rate, 1/s.
-    level_se : float
-        Standard error of the level, V; NaN: there is no level.
-
-    """
-
-    sigma: float
-    alpha: float
-    level_se: float
+    sigma: float  # Noise intensity, V/sqrt(s)
+    alpha: float  # Relaxation rate, 1/s
+    level_se: float  # Standard error of the level, V; NaN: there is no level
 
 
 class Step(NamedTuple):
-    """
-    The model over one step: transition, driving and stationary variance of each state.
+    """The model over one step: transition, driving and stationary variance of each state."""
 
-    Attributes
-    ----------
-    phi, drive, still : ndarray, shape (2,)
-        All covariances are diagonal.
-
-    """
-
+    # All covariances are diagonal; shape (2,).
     phi: FloatArray
     drive: FloatArray
     still: FloatArray

@@ -90,40 +90,18 @@ _TINY = 1e-300
 
 
 class Family(NamedTuple):
-    """
-    Notches but for their width.
+    """Notches but for their width."""
 
-    Attributes
-    ----------
-    source : str
-        'rpm' or 'throttle'.
-    many : bool
-        Whether each motor has its own.
-    times : int
-        How often the same notch.
-
-    """
-
-    source: str
-    many: bool
-    times: int
+    source: str  # 'rpm' or 'throttle'
+    many: bool  # Whether each motor has its own
+    times: int  # How often the same notch
 
 
 class Candidate(NamedTuple):
-    """
-    Some notches.
+    """Some notches."""
 
-    Attributes
-    ----------
-    family : Family
-        Which.
-    width : float
-        Bandwidth over frequency.
-
-    """
-
-    family: Family
-    width: float
+    family: Family  # Which
+    width: float  # Bandwidth over frequency
 
 
 def families(count: int) -> tuple[Family, ...]:

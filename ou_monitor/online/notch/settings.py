@@ -37,32 +37,14 @@ NOTCH_PARAMETERS: tuple[Parameter, ...] = (
 
 @dataclass(frozen=True)
 class NotchSettings:
-    """
-    Settings of `AdaptiveNotch`; see `NOTCH_PARAMETERS`.
+    """Settings of `AdaptiveNotch`; see `NOTCH_PARAMETERS`."""
 
-    Attributes
-    ----------
-    count : int
-        Most notches, up to 4; 0: none, what is in force fades.
-    fmin : float
-        Lowest frequency of a notch, Hz.
-    cutoff : float
-        Cutoff of the low-pass behind, Hz.
-    rpm_unit : {'rpm', 'erpm', 'hz', 'rad_s'}
-        Unit of the motor speeds.
-    poles : int
-        Magnets of a motor, for erpm.
-    stale_after : float
-        Age after which motor speeds are not used, s.
-
-    """
-
-    count: int = 4
-    fmin: float = 60.0
-    cutoff: float = 80.0
-    rpm_unit: str = 'rpm'
-    poles: int = 0
-    stale_after: float = 0.25
+    count: int = 4  # Most notches, up to 4; 0: none, what is in force fades
+    fmin: float = 60.0  # Lowest frequency of a notch, Hz
+    cutoff: float = 80.0  # Cutoff of the low-pass behind, Hz
+    rpm_unit: str = 'rpm'  # Unit of the motor speeds
+    poles: int = 0  # Magnets of a motor, for erpm
+    stale_after: float = 0.25  # Age after which motor speeds are not used, s
 
     def __post_init__(self) -> None:
         """Refuse values out of range and contradictions."""

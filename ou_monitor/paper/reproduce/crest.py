@@ -33,20 +33,11 @@ _SAMPLES, _AT_ONCE, _WHITE = 100, 100, 200
 
 @dataclass(frozen=True, eq=False)
 class Crests:
-    """
-    Crest factors of simulated screens.
+    """Crest factors of simulated screens."""
 
-    Attributes
-    ----------
-    by_screen : dict of int to ndarray, shape (paths, k)
-        Vpp/Vrms of every screen, by its length in ms; rows are independent.
-    white : ndarray, shape (k,)
-        Of white Gaussian noise, on a screen of 100 ms.
-
-    """
-
+    # Vpp/Vrms of every screen, by its length in ms; rows are independent; shape (paths, k).
     by_screen: dict[int, FloatArray]
-    white: FloatArray
+    white: FloatArray  # Of white Gaussian noise, on a screen of 100 ms; shape (k,)
 
     def mean(self, screen: int) -> tuple[float, float]:
         """Return mean and standard error on screens of that many ms."""

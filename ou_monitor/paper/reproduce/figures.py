@@ -26,61 +26,31 @@ _SPECTRUM, _PER_DECADE = 2.0, 12
 
 @dataclass(frozen=True, eq=False)
 class Screen:
-    """
-    One simulated oscilloscope screen.
+    """One simulated oscilloscope screen."""
 
-    Attributes
-    ----------
-    state : LoadState
-        The row of Table 1 it stands for.
-    t, u : ndarray, shape (n,)
-        s and V, in steps of the oscilloscope.
-
-    """
-
-    state: published.LoadState
+    state: published.LoadState  # The row of Table 1 it stands for
+    # s and V, in steps of the oscilloscope; shape (n,).
     t: FloatArray
     u: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """
-    One-sided density of a load state.
+    """One-sided density of a load state."""
 
-    Attributes
-    ----------
-    state : LoadState
-        The row of Table 1 it stands for.
-    frequency, density : ndarray, shape (k,)
-        Hz and V^2/Hz, of a simulated recording at 1 MHz.
-    coupled : ndarray, shape (k,)
-        Of the same OU through an AC coupling of 10 Hz, V^2/Hz.
-
-    """
-
-    state: published.LoadState
+    state: published.LoadState  # The row of Table 1 it stands for
+    # Hz and V^2/Hz, of a simulated recording at 1 MHz; shape (k,).
     frequency: FloatArray
     density: FloatArray
-    coupled: FloatArray
+    coupled: FloatArray  # Of the same OU through an AC coupling of 10 Hz, V^2/Hz; shape (k,)
 
 
 @dataclass(frozen=True, eq=False)
 class Figures:
-    """
-    All series.
+    """All series."""
 
-    Attributes
-    ----------
-    screens : tuple of Screen
-        One a load state.
-    spectra : tuple of Spectrum
-        Of 10 and 40 %.
-
-    """
-
-    screens: tuple[Screen, ...]
-    spectra: tuple[Spectrum, ...]
+    screens: tuple[Screen, ...]  # One a load state
+    spectra: tuple[Spectrum, ...]  # Of 10 and 40 %
 
 
 def sigma_shown(state: published.LoadState) -> float:

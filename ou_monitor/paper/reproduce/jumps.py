@@ -26,33 +26,16 @@ _SAMPLING = 20e3
 
 @dataclass(frozen=True)
 class JumpCrest:
-    """
-    Crest factors of an OU with jumps that relax at its alpha.
+    """Crest factors of an OU with jumps that relax at its alpha."""
 
-    Attributes
-    ----------
-    screen : int
-        Length, ms.
-    rate : float
-        Jumps per second.
-    share : float
-        Their share of the variance.
-    mean, error : float
-        Mean Vpp/Vrms and its standard error.
-    band : tuple of float
-        5 % and 95 % of the screens.
-    kurtosis : float
-        Excess kurtosis of the stationary law.
-
-    """
-
-    screen: int
-    rate: float
-    share: float
+    screen: int  # Length, ms
+    rate: float  # Jumps per second
+    share: float  # Their share of the variance
+    # Mean Vpp/Vrms and its standard error.
     mean: float
     error: float
-    band: Range
-    kurtosis: float
+    band: Range  # 5 % and 95 % of the screens
+    kurtosis: float  # Excess kurtosis of the stationary law
 
     def size(self, vrms: float) -> float:
         """Return the standard deviation of the jumps, in the unit of `vrms`."""

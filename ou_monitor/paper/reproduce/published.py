@@ -13,28 +13,15 @@ from ou_monitor.paper.reproduce.row import Printed
 
 @dataclass(frozen=True)
 class LoadState:
-    """
-    One row of Table 1.
+    """One row of Table 1."""
 
-    Attributes
-    ----------
-    load : float
-        Share of full throttle, 0..1.
-    label : str
-        Name.
-    vpp, amp, vrms : Printed
-        Peak to peak, peak amplitude and rms, mV.
-    called : str
-        Type of process according to the paper.
-
-    """
-
-    load: float
-    label: str
+    load: float  # Share of full throttle, 0..1
+    label: str  # Name
+    # Peak to peak, peak amplitude and rms, mV.
     vpp: Printed
     amp: Printed
     vrms: Printed
-    called: str
+    called: str  # Type of process according to the paper
 
 
 TABLE_1 = (

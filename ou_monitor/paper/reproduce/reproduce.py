@@ -36,26 +36,12 @@ _ORDER = ('Section 3.1', 'Section 3.3', 'Section 4.1', 'Section 4.2', 'Section 4
 
 @dataclass(frozen=True)
 class Point:
-    """
-    One point.
+    """One point."""
 
-    Attributes
-    ----------
-    number : int
-        1 to 8.
-    title : str
-        What it is about.
-    text : str
-        What was found, with numbers.
-    rows : tuple of Row
-        The rows it rests on.
-
-    """
-
-    number: int
-    title: str
-    text: str
-    rows: tuple[Row, ...]
+    number: int  # 1 to 8
+    title: str  # What it is about
+    text: str  # What was found, with numbers
+    rows: tuple[Row, ...]  # The rows it rests on
 
     @property
     def outcome(self) -> str:
@@ -243,32 +229,14 @@ def _jumps(crests: Crests, found: list[JumpCrest]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Reproduction:
-    """
-    Result of `reproduce`.
+    """Result of `reproduce`."""
 
-    Attributes
-    ----------
-    seed : int
-        Of all random numbers.
-    rows : tuple of Row
-        In the order of the paper.
-    points : tuple of Point
-        The eight points.
-    crests : Crests
-        Simulated crest factors.
-    spreading : Spreading
-        Variance of the integral of telegraph noise.
-    figures : Figures
-        Further series to draw.
-
-    """
-
-    seed: int
-    rows: tuple[Row, ...]
-    points: tuple[Point, ...]
-    crests: Crests
-    spreading: Spreading
-    figures: Figures
+    seed: int  # Of all random numbers
+    rows: tuple[Row, ...]  # In the order of the paper
+    points: tuple[Point, ...]  # The eight points
+    crests: Crests  # Simulated crest factors
+    spreading: Spreading  # Variance of the integral of telegraph noise
+    figures: Figures  # Further series to draw
 
     def parts(self) -> list[tuple[str, list[Row]]]:
         """Return the rows by table, figure and whole section of the paper, none of them empty."""

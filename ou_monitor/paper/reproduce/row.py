@@ -30,22 +30,13 @@ class Verdict(enum.Enum):
 
 @dataclass(frozen=True)
 class Printed:
-    """
-    A number or a bound, as the paper has it.
+    """A number or a bound, as the paper has it."""
 
-    Attributes
-    ----------
-    text : str
-        As printed, with all of its digits (``63.0``, ``315.6e-3``), or a claim
-        as a bound (``> 0``, ``< 0``).
-    half_unit : float
-        Half a unit of the last printed digit, which is how far rounding may
-        have moved it; follows from the text unless given (``~0`` has no
-        digits).
-
-    """
-
+    # As printed, with all of its digits (``63.0``, ``315.6e-3``), or a claim as a bound (``> 0``,
+    # ``< 0``).
     text: str
+    # Half a unit of the last printed digit, which is how far rounding may have moved it; follows
+    # from the text unless given (``~0`` has no digits).
     half_unit: float = math.nan
 
     def __post_init__(self) -> None:

@@ -35,23 +35,13 @@ _SWING = np.array([1.3, 0.7])
 
 @dataclass(frozen=True, eq=False)
 class Spreading:
-    """
-    Variance of the integral of telegraph noise, from Monte Carlo.
+    """Variance of the integral of telegraph noise, from Monte Carlo."""
 
-    Attributes
-    ----------
-    t : ndarray, shape (k,)
-        Times, s.
-    variance, error : ndarray, shape (k,)
-        V^2, with standard errors.
-    correct, printed : float
-        Rates of formula (6) with the 2 and without, V^2/s.
-
-    """
-
-    t: FloatArray
+    t: FloatArray  # Times, s; shape (k,)
+    # V^2, with standard errors; shape (k,).
     variance: FloatArray
     error: FloatArray
+    # Rates of formula (6) with the 2 and without, V^2/s.
     correct: float
     printed: float
 

@@ -17,25 +17,13 @@ _FINEST = 64
 
 @dataclass(frozen=True)
 class Step:
-    """
-    The largest step of which all readings are multiples, within their rounding.
+    """The largest step of which all readings are multiples, within their rounding."""
 
-    Attributes
-    ----------
-    low, high : float
-        Where it lies, in the unit of the readings.
-    multiples : tuple of int
-        How many steps each reading is.
-    chance : float
-        Probability, about, that readings without any steps would have one this
-        large.
-
-    """
-
+    # Where it lies, in the unit of the readings.
     low: float
     high: float
-    multiples: tuple[int, ...]
-    chance: float
+    multiples: tuple[int, ...]  # How many steps each reading is
+    chance: float  # Probability, about, that readings without any steps would have one this large
 
     @property
     def size(self) -> float:

@@ -40,28 +40,16 @@ VALUE = np.array([p.value for p in published.FIG_5_MV])
 
 @dataclass(frozen=True, eq=False)
 class LogLine:
-    """
-    ln|U| against time by least squares, as the paper fits it.
+    """ln|U| against time by least squares, as the paper fits it."""
 
-    Attributes
-    ----------
-    alpha, alpha_se : float
-        Rate and standard error, 1/s.
-    start, start_se : float
-        |U(0)| and standard error, in the unit of the points.
-    scatter : float
-        Standard deviation of ln|U| about the line.
-    quantile : float
-        Student's t of the 95 % interval for its degrees of freedom.
-
-    """
-
+    # Rate and standard error, 1/s.
     alpha: float
     alpha_se: float
+    # |U(0)| and standard error, in the unit of the points.
     start: float
     start_se: float
-    scatter: float
-    quantile: float
+    scatter: float  # Standard deviation of ln|U| about the line
+    quantile: float  # Student's t of the 95 % interval for its degrees of freedom
 
     @property
     def half_width(self) -> float:
@@ -83,26 +71,12 @@ def fit_log_line(time: FloatArray, value: FloatArray) -> LogLine:
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """
-    start exp(-alpha t) + offset by least squares of the voltages.
+    """start exp(-alpha t) + offset by least squares of the voltages."""
 
-    Attributes
-    ----------
-    parameters : ndarray, shape (2,) or (3,)
-        start, alpha, 1/s, and the offset if there is one.
-    errors : ndarray, shape (2,) or (3,)
-        Standard errors.
-    rss : float
-        Residual sum of squares.
-    quantile : float
-        Student's t of the 95 % interval for its degrees of freedom.
-
-    """
-
-    parameters: FloatArray
-    errors: FloatArray
-    rss: float
-    quantile: float
+    parameters: FloatArray  # start, alpha, 1/s, and the offset if there is one; shape (2,) or (3,)
+    errors: FloatArray  # Standard errors; shape (2,) or (3,)
+    rss: float  # Residual sum of squares
+    quantile: float  # Student's t of the 95 % interval for its degrees of freedom
 
     def __call__(self, time: FloatArray) -> FloatArray:
         """Return the curve at times, s."""

@@ -73,20 +73,10 @@ def _times(matrix: FloatArray, u: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class AffineSystem:
-    """
-    du/dt = A u + a.
+    """du/dt = A u + a."""
 
-    Attributes
-    ----------
-    matrix : ndarray, shape (d, d)
-        A, 1/s.
-    offset : ndarray, shape (d,)
-        a, unit of u per second.
-
-    """
-
-    matrix: FloatArray
-    offset: FloatArray
+    matrix: FloatArray  # A, 1/s; shape (d, d)
+    offset: FloatArray  # a, unit of u per second; shape (d,)
 
     def __post_init__(self) -> None:
         """Check the shapes."""

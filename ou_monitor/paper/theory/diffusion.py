@@ -35,26 +35,12 @@ CORRECT_FACTOR = 2.0
 
 @dataclass(frozen=True, eq=False)
 class LinearDiffusion:
-    """
-    du = (M u + m) dt + sum_k (G_k u + g_k) dW_k, in the sense of Ito.
+    """du = (M u + m) dt + sum_k (G_k u + g_k) dW_k, in the sense of Ito."""
 
-    Attributes
-    ----------
-    matrix : ndarray, shape (d, d)
-        M, 1/s.
-    offset : ndarray, shape (d,)
-        m, unit of u per second.
-    noise_matrices : ndarray, shape (r, d, d)
-        G_k, 1/sqrt(s).
-    noise_offsets : ndarray, shape (r, d)
-        g_k, unit of u per sqrt(s).
-
-    """
-
-    matrix: FloatArray
-    offset: FloatArray
-    noise_matrices: FloatArray
-    noise_offsets: FloatArray
+    matrix: FloatArray  # M, 1/s; shape (d, d)
+    offset: FloatArray  # m, unit of u per second; shape (d,)
+    noise_matrices: FloatArray  # G_k, 1/sqrt(s); shape (r, d, d)
+    noise_offsets: FloatArray  # g_k, unit of u per sqrt(s); shape (r, d)
 
     def intensity(self, u: npt.ArrayLike) -> FloatArray:
         """Return B(u), shape (d, d): the rate at which the covariance grows at u."""

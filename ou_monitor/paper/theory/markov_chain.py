@@ -29,17 +29,10 @@ ROW_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Generator:
-    """
-    Generator of an irreducible Markov chain on a finite number of states.
+    """Generator of an irreducible Markov chain on a finite number of states."""
 
-    Attributes
-    ----------
-    q : ndarray, shape (n, n)
-        Rates, 1/s; read-only. The diagonal is set to minus the sum of the
-        row's other rates, to the last digit.
-
-    """
-
+    # Rates, 1/s; read-only. The diagonal is set to minus the sum of the row's other rates, to the
+    # last digit; shape (n, n).
     q: FloatArray
 
     def __post_init__(self) -> None:

@@ -36,24 +36,13 @@ COMPONENTS = ('amplitude', 'phase', 'power')
 
 @dataclass(frozen=True)
 class Stability:
-    """
-    What the matrix does to each component at one moment.
+    """What the matrix does to each component at one moment."""
 
-    Attributes
-    ----------
-    rates : dict of str to float
-        Diagonal entry of each component, 1/s; the matrix is triangular, so
-        these are its eigenvalues.
-    growing : tuple of str
-        Components that grow exponentially.
-    text : str
-        One sentence: ``stable`` or ``unstable: ...`` with the rates.
-
-    """
-
+    # Diagonal entry of each component, 1/s; the matrix is triangular, so these are its
+    # eigenvalues.
     rates: dict[str, float]
-    growing: tuple[str, ...]
-    text: str
+    growing: tuple[str, ...]  # Components that grow exponentially
+    text: str  # One sentence: ``stable`` or ``unstable: ...`` with the rates
 
     @property
     def stable(self) -> bool:
@@ -63,34 +52,18 @@ class Stability:
 
 @dataclass(frozen=True)
 class MatrixModel:
-    """
-    The matrix model with constant or time-varying coefficients.
+    """The matrix model with constant or time-varying coefficients."""
 
-    Attributes
-    ----------
-    alpha : float or callable
-        Damping of the amplitude, 1/s, >= 0; a callable is given the time, s.
-    omega : float or callable
-        Angular frequency of the carrier, rad/s.
-    beta : float or callable
-        Coupling of the amplitude to the power, unit of P per unit of A per
-        second.
-    alpha_p : float or callable
-        Relaxation rate of the power, 1/s, > 0: the alpha of the
-        Ornstein-Uhlenbeck supply voltage. With ``power_sign='printed'`` it is
-        the paper's gamma, of any sign, put on the diagonal as it is.
-    power_sign : {'decaying', 'printed'}
-        Diagonal entry of the power: -alpha_p, or +gamma as printed.
-    phase : {'carrier', 'printed'}
-        dphi/dt = omega, or dphi/dt = omega phi as printed.
-
-    """
-
-    alpha: Coefficient
-    omega: Coefficient
-    beta: Coefficient
+    alpha: Coefficient  # Damping of the amplitude, 1/s, >= 0; a callable is given the time, s
+    omega: Coefficient  # Angular frequency of the carrier, rad/s
+    beta: Coefficient  # Coupling of the amplitude to the power, unit of P per unit of A per second
+    # Relaxation rate of the power, 1/s, > 0: the alpha of the Ornstein-Uhlenbeck supply voltage.
+    # With ``power_sign='printed'`` it is the paper's gamma, of any sign, put on the diagonal as it
+    # is.
     alpha_p: Coefficient
+    # Diagonal entry of the power: -alpha_p, or +gamma as printed.
     power_sign: Literal['decaying', 'printed'] = 'decaying'
+    # dphi/dt = omega, or dphi/dt = omega phi as printed.
     phase: Literal['carrier', 'printed'] = 'carrier'
 
     def __post_init__(self) -> None:

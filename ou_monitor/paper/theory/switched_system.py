@@ -45,29 +45,15 @@ def _left_out() -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class SwitchedSystem:
-    """
-    An affine system with a matrix and an offset for every state of the chain.
+    """An affine system with a matrix and an offset for every state of the chain."""
 
-    Attributes
-    ----------
-    generator : Generator
-        The chain, n states.
-    matrices : ndarray, shape (n, d, d)
-        A_x, 1/s.
-    offsets : ndarray, shape (n, d), optional
-        a_x, unit of u per second; zeros when left out.
-    drift_matrix : ndarray, shape (d, d), optional
-        D, 1/s: not switched, not sped up; zeros when left out.
-    drift_offset : ndarray, shape (d,), optional
-        d, likewise.
-
-    """
-
-    generator: Generator
-    matrices: FloatArray
+    generator: Generator  # The chain, n states
+    matrices: FloatArray  # A_x, 1/s; shape (n, d, d)
+    # a_x, unit of u per second; zeros when left out; shape (n, d).
     offsets: FloatArray = field(default_factory=_left_out)
+    # D, 1/s: not switched, not sped up; zeros when left out; shape (d, d).
     drift_matrix: FloatArray = field(default_factory=_left_out)
-    drift_offset: FloatArray = field(default_factory=_left_out)
+    drift_offset: FloatArray = field(default_factory=_left_out)  # d, likewise; shape (d,)
 
     def __post_init__(self) -> None:
         """Check the shapes and fill in the zeros."""
