@@ -30,10 +30,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np  # noqa: E402
 from ou_monitor.model.supply import SEGMENT, Simulation, SupplyModel  # noqa: E402
 from ou_monitor.model.terms.ac_coupling import ACCoupling  # noqa: E402
-from ou_monitor.model.terms.flicker_noise import FlickerNoise  # noqa: E402
-from ou_monitor.model.terms.jumps import Jumps  # noqa: E402
 from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring  # noqa: E402
 from ou_monitor.model.terms.ou import OU  # noqa: E402
+from ou_monitor.model.terms.shocks import Jumps  # noqa: E402
+from ou_monitor.model.terms.slow import FlickerNoise  # noqa: E402
 from ou_monitor.model.terms.term import Term  # noqa: E402
 from ou_monitor.simulation import PRESETS, PROFILES  # noqa: E402
 from tables import put, table  # noqa: E402

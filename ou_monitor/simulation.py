@@ -17,13 +17,11 @@ from typing import Any
 import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.model.supply import SEGMENT, Simulation, SupplyModel
-from ou_monitor.model.terms.drift import Drift
-from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.load_transient import LoadTransient
-from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
+from ou_monitor.model.terms.load_dependent import LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.quantization import Quantization
+from ou_monitor.model.terms.reading import MeasurementNoise, Quantization
+from ou_monitor.model.terms.slow import Drift
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import FloatArray, Recording
 

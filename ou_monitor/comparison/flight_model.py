@@ -12,7 +12,7 @@ from ou_monitor.model.load import lowpass
 from ou_monitor.model.load_fit import LoadFit
 from ou_monitor.model.residual import NoiseLaw, ResidualOU, SLOW_TIME
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.quantization import Quantization
+from ou_monitor.model.terms.reading import Quantization
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
 

@@ -21,9 +21,7 @@ from ou_monitor.criticism.samples import (
 from ou_monitor.criticism.stamps import judge_stamps
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.clock_jitter import ClockJitter
-from ou_monitor.model.terms.held_samples import HeldSamples
-from ou_monitor.model.terms.quantization import Quantization
-from ou_monitor.model.terms.saturation import Saturation
+from ou_monitor.model.terms.reading import HeldSamples, Quantization, Saturation
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted

@@ -22,7 +22,7 @@ from ou_monitor.model.terms.ac_coupling import ACCoupling, bridge
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.segment import Segment
 from ou_monitor.model.terms.term import Role, Term
-from ou_monitor.model.terms.tone import Tone
+from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import FloatArray
 
 # Measurement noise that stands for none, as a share of what a step adds.

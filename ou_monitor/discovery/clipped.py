@@ -14,7 +14,7 @@ import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import driven, white_noise
-from ou_monitor.model.terms.saturation import Saturation
+from ou_monitor.model.terms.reading import Saturation
 from ou_monitor.records import FloatArray
 from scipy.special import log_ndtr, ndtr, ndtri
 

@@ -17,10 +17,8 @@ from ou_monitor.criticism.battery import is_sign
 from ou_monitor.criticism.innovations import OtherPole
 from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.drift import Drift
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.load_transient import LoadTransient
-from ou_monitor.model.terms.second_relaxation import SecondRelaxation
+from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
+from ou_monitor.model.terms.slow import Drift, SecondRelaxation
 from ou_monitor.model.terms.term import Role, Term
 
 Statistics = Mapping[str, float]

@@ -35,7 +35,7 @@ from ou_monitor.discovery.words import (
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.saturation import Saturation
+from ou_monitor.model.terms.reading import Saturation
 from ou_monitor.model.terms.term import Role
 from ou_monitor.records import Recording
 

@@ -21,9 +21,9 @@ from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.free_law import free_law
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.drift import Drift
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.slow import Drift
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray
 

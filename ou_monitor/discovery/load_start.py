@@ -19,12 +19,10 @@ from ou_monitor.discovery.search_state import Search
 from ou_monitor.discovery.throttle_laws import compare_laws
 from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.load_dependent_noise import LoadDependentNoise
-from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.load_transient import LoadTransient
-from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
+from ou_monitor.model.terms.load_dependent import LoadDependentNoise, LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.term import Role, Term
 
 # Rate, 1/s, from which a fit finds what the load leaves: minutes and tenths of a second are both

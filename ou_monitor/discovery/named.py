@@ -22,13 +22,11 @@ from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.load_start import under_load
 from ou_monitor.discovery.search import kinds_of, name_causes, position, Progress
 from ou_monitor.discovery.search_state import Search
-from ou_monitor.model.terms.drift import Drift
 from ou_monitor.model.terms.lines import prominence
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.resonance import Resonance
-from ou_monitor.model.terms.second_relaxation import SecondRelaxation
+from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.slow import Drift, SecondRelaxation
 from ou_monitor.model.terms.term import Role, Term
-from ou_monitor.model.terms.tone import Tone
+from ou_monitor.model.terms.tones import Resonance, Tone
 
 # Note where the search was cut short.
 STOPPED = ('The search for causes was cut short where the next ones would have taken long; there '

@@ -22,9 +22,9 @@ from ou_monitor.discovery.load_start import choose_answer
 from ou_monitor.discovery.search_state import Search
 from ou_monitor.discovery.throttle_laws import compare_laws, LAWS, OTHER_CURVE, worth
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
+from ou_monitor.model.terms.load_dependent import LoadDependentSigma
 from ou_monitor.model.terms.term import Role, Term
-from ou_monitor.model.terms.tone import lines_of, Tone
+from ou_monitor.model.terms.tones import lines_of, Tone
 
 Progress = Callable[[float], None]
 

@@ -14,9 +14,8 @@ from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.search_state import Search
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.load_dependent_alpha import LoadDependentAlpha
-from ou_monitor.model.terms.load_dependent_noise import LoadDependentNoise
-from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
+from ou_monitor.model.terms.load_dependent import (
+    LoadDependentAlpha, LoadDependentNoise, LoadDependentSigma)
 from ou_monitor.model.terms.term import Term
 
 LAWS: tuple[type[Term], ...] = (LoadDependentSigma, LoadDependentNoise, LoadDependentAlpha)

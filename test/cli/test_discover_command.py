@@ -16,11 +16,11 @@ from ou_monitor.discovery.plain_names import (
 from ou_monitor.discovery.words import explain, parameters
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.drift import Drift
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.tone import Tone
+from ou_monitor.model.terms.reading import MeasurementNoise
+from ou_monitor.model.terms.slow import Drift
+from ou_monitor.model.terms.tones import Tone
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.read import read_recording

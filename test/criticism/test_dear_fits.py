@@ -6,9 +6,9 @@ from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.errors import standard_errors
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.flicker_noise import FlickerNoise
-from ou_monitor.model.terms.measurement_noise import MeasurementNoise
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.reading import MeasurementNoise
+from ou_monitor.model.terms.slow import FlickerNoise
 
 
 def test_what_suits_a_part_is_not_taken_where_it_is_worse_for_all(monkeypatch):

@@ -27,12 +27,11 @@ from ou_monitor.model.spectral_lines import FALSE_ALARM
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.load_dependent_alpha import LoadDependentAlpha
-from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
-from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.load_dependent import LoadDependentAlpha, LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.second_relaxation import SecondRelaxation
-from ou_monitor.model.terms.tone import lines_of
+from ou_monitor.model.terms.reading import MeasurementNoise
+from ou_monitor.model.terms.slow import SecondRelaxation
+from ou_monitor.model.terms.tones import lines_of
 from ou_monitor.recordings.importers.csv_table import CsvColumns
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import NAN, Recording

@@ -8,7 +8,7 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.spectral_start import from_spectrum
 from ou_monitor.discovery.gain import guess
 from ou_monitor.model.ou import simulate
-from ou_monitor.model.terms.second_relaxation import SecondRelaxation
+from ou_monitor.model.terms.slow import SecondRelaxation
 from ou_monitor.model.whittle import Ordinates
 import pytest
 

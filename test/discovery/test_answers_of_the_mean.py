@@ -7,9 +7,8 @@ import numpy as np
 from ou_monitor.discovery import decision, regression
 from ou_monitor.discovery.regression import _candidates, _lost, _nearby, _Regression, _there, FOLDS
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.drift import Drift
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.load_transient import LoadTransient
+from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
+from ou_monitor.model.terms.slow import Drift
 from ou_monitor.model.terms.term import Role
 import pytest
 

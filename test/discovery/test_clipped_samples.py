@@ -8,11 +8,10 @@ from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.clipped import redrawn
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_dependent import LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.saturation import Saturation
+from ou_monitor.model.terms.reading import MeasurementNoise, Saturation
 import pytest
 
 RATE, N = 200.0, 8000

@@ -12,9 +12,9 @@ from ou_monitor.discovery.words import (
     with_error)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.tone import Tone
+from ou_monitor.model.terms.tones import Tone
 import pytest
 
 OFF = Criticism('throttle', -20.0, 1.0, -3.7, 3.7, 0.0, 1.0)

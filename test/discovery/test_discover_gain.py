@@ -14,9 +14,9 @@ from ou_monitor.discovery.gain import (
 from ou_monitor.discovery.validation import blocks_of, covered, held_out
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.quantization import Quantization
+from ou_monitor.model.terms.reading import Quantization
 import pytest
 from scipy.signal import lfilter
 

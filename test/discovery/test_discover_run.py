@@ -16,12 +16,10 @@ from ou_monitor.discovery.finding import Verdict
 from ou_monitor.discovery.plain_names import headline
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.drift import Drift
-from ou_monitor.model.terms.held_samples import HeldSamples
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.quantization import Quantization
+from ou_monitor.model.terms.reading import HeldSamples, MeasurementNoise, Quantization
+from ou_monitor.model.terms.slow import Drift
 from ou_monitor.records import Recording
 from ou_monitor.report.discovery_page import discovery_page
 from pages import parsed, self_contained

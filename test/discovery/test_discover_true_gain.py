@@ -10,14 +10,13 @@ from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery.gain import crossing_rates, crossings, gain_of
 from ou_monitor.discovery.validation import blocks_of, covered, held_out
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.drift import Drift
-from ou_monitor.model.terms.jumps import Jumps
-from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_dependent import LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.second_relaxation import SecondRelaxation
-from ou_monitor.model.terms.tone import Tone
+from ou_monitor.model.terms.reading import MeasurementNoise
+from ou_monitor.model.terms.shocks import Jumps
+from ou_monitor.model.terms.slow import Drift, SecondRelaxation
+from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import Recording
 import pytest
 

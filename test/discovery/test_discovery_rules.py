@@ -14,7 +14,7 @@ from ou_monitor.discovery.words import cause_rows, coupling_note, verdict_senten
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role
-from ou_monitor.model.terms.tone import Tone
+from ou_monitor.model.terms.tones import Tone
 import pytest
 from scipy.signal import lfilter
 

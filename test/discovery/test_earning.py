@@ -6,11 +6,10 @@ import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import earning
 from ou_monitor.discovery.earning import Earned, earned, group_of, MANY, refusal, Worth
-from ou_monitor.model.terms.drift import Drift
-from ou_monitor.model.terms.measurement_noise import MeasurementNoise
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.second_relaxation import SecondRelaxation
-from ou_monitor.model.terms.tone import Tone
+from ou_monitor.model.terms.reading import MeasurementNoise
+from ou_monitor.model.terms.slow import Drift, SecondRelaxation
+from ou_monitor.model.terms.tones import Tone
 import pytest
 
 BASE = OU(50.0, 0.5, 5.0)

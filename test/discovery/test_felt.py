@@ -6,10 +6,9 @@ import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.earning import refusal
 from ou_monitor.discovery.felt import felt
-from ou_monitor.model.terms.glitches import Glitches
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.load_transient import LoadTransient
+from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.shocks import Glitches
 import pytest
 
 N, RATE = 6000, 100.0

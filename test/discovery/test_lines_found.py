@@ -18,11 +18,9 @@ from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.named import _in_doubt, _kept_beside, _other
 from ou_monitor.discovery.search_state import Search
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.load_transient import LoadTransient
+from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.resonance import Resonance
-from ou_monitor.model.terms.tone import Tone
+from ou_monitor.model.terms.tones import Resonance, Tone
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import NAN, Recording
 import pytest

@@ -8,14 +8,12 @@ from ou_monitor.discovery import decision, fitting, search as rules
 from ou_monitor.discovery.fitting import Fitter, Trial
 from ou_monitor.discovery.search_state import Search
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.drift import Drift
-from ou_monitor.model.terms.load_dependent_noise import LoadDependentNoise
-from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_dependent import LoadDependentNoise, LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.second_relaxation import SecondRelaxation
-from ou_monitor.model.terms.tone import Tone
+from ou_monitor.model.terms.reading import MeasurementNoise
+from ou_monitor.model.terms.slow import Drift, SecondRelaxation
+from ou_monitor.model.terms.tones import Tone
 import pytest
 
 BASE = OU(50.0, 0.5, 5.0)

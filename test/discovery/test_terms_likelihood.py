@@ -16,7 +16,7 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, Events
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.term import Role
 import pytest
 from scipy.special import kolmogorov, ndtri

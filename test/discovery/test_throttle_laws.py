@@ -9,12 +9,11 @@ from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.search_state import Search
 from ou_monitor.discovery.throttle_laws import compare_laws
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_dependent_alpha import LoadDependentAlpha
-from ou_monitor.model.terms.load_dependent_noise import LoadDependentNoise
-from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_dependent import (
+    LoadDependentAlpha, LoadDependentNoise, LoadDependentSigma)
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.reading import MeasurementNoise
 import pytest
 
 WHITE = MeasurementNoise(0.01)

@@ -17,7 +17,7 @@ from ou_monitor.discovery.words import (
     verdict_sentence,
     why_named, with_error)
 from ou_monitor.model.ou import simulate
-from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.ou import OU
 import pytest
 from scipy.stats import chi2, norm

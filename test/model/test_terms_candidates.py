@@ -4,10 +4,9 @@ from dataclasses import replace
 import math
 
 import numpy as np
-from ou_monitor.model.terms.flicker_noise import FlickerNoise
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import order_power
-from ou_monitor.model.terms.second_relaxation import SecondRelaxation
+from ou_monitor.model.terms.slow import FlickerNoise, SecondRelaxation
 from ou_monitor.model.terms.switching_chain import relaxing
 import pytest
 from scipy.linalg import dft

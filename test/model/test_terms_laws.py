@@ -4,9 +4,9 @@ from itertools import combinations
 import math
 
 import numpy as np
-from ou_monitor.model.terms.glitches import _best_runs
 from ou_monitor.model.terms.laws import (
     climb, curvature_se, mixture_cdf, normal_scores, refine)
+from ou_monitor.model.terms.shocks import _best_runs
 import pytest
 from scipy.stats import norm
 

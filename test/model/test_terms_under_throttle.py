@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.load_dependent_sigma import LoadDependentSigma
+from ou_monitor.model.terms.load_dependent import LoadDependentSigma
 from ou_monitor.model.terms.regime_switching import _SLOW_AHEAD, _slow_levels, RegimeSwitching
 from ou_monitor.model.terms.segment import first_order
 import pytest

@@ -3,7 +3,7 @@
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SEGMENT, SupplyModel
-from ou_monitor.model.terms.load_sag import LoadSag
+from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.simulation import constant, read_profile, simulated

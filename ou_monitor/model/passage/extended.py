@@ -20,9 +20,9 @@ from ou_monitor.model.passage.law import passage_probability, prepare
 from ou_monitor.model.passage.with_events import (
     build, Chain, EventTable, Jump, longest, without_event)
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.jumps import Jumps
 from ou_monitor.model.terms.regime_switching import RegimeSwitching
 from ou_monitor.model.terms.segment import Stage
+from ou_monitor.model.terms.shocks import Jumps
 from ou_monitor.model.terms.term import Live, Term
 from ou_monitor.model.terms.volatility import Volatility
 from ou_monitor.records import FloatArray

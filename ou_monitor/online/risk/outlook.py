@@ -178,7 +178,7 @@ class Outlook:
         if model is None:
             return
         # Here, for without a model the nodes need none of it: it costs them 60 MB.
-        from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+        from ou_monitor.model.terms.reading import MeasurementNoise
         self._events = EventRisk(model, background=self._background)
         self._noise = math.sqrt(sum(
             term.std**2 for term in model.terms if isinstance(term, MeasurementNoise)))

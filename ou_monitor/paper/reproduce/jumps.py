@@ -9,8 +9,8 @@ import math
 import numpy as np
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.jumps import Jumps
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.shocks import Jumps
 from ou_monitor.paper.reproduce import published
 from ou_monitor.paper.reproduce.crest import crest, crest_of, Crests, TAIL, TYPICAL_MS
 from ou_monitor.paper.reproduce.row import Printed, Range, Row

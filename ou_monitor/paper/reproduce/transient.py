@@ -14,8 +14,7 @@ import math
 import numpy as np
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ac_coupling import ACCoupling
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.load_transient import LoadTransient
+from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.paper.reproduce import published
 from ou_monitor.paper.reproduce.row import Printed, Range, Row

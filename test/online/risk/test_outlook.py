@@ -7,11 +7,11 @@ import time
 import numpy as np
 from ou_monitor.model.passage import law as passage_law
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.jumps import Jumps
-from ou_monitor.model.terms.load_sag import LoadSag
-from ou_monitor.model.terms.measurement_noise import MeasurementNoise
+from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.tone import Tone
+from ou_monitor.model.terms.reading import MeasurementNoise
+from ou_monitor.model.terms.shocks import Jumps
+from ou_monitor.model.terms.tones import Tone
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
 import pytest

@@ -1,4 +1,4 @@
-"""1/f noise: no single relaxation time."""
+"""Slow parts beside the OU: a trend, a second relaxation, 1/f noise."""
 
 from __future__ import annotations
 
@@ -11,8 +11,113 @@ import numpy as np
 from ou_monitor.model.terms.ac_coupling import bridge
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
-from ou_monitor.model.terms.term import parameter, Role, Term
+from ou_monitor.model.terms.term import by_parameters, NEXT_TO_ZERO, parameter, Role, Term
 from ou_monitor.records import FloatArray
+
+
+@dataclass(frozen=True)
+class Drift(Term):
+    """
+    Add rate * t + curvature * t^2, t counted from the first sample.
+
+    A curvature of exactly 0 stands for a straight line, in a fit too.
+    """
+
+    NAME: ClassVar[str] = 'drift'
+    FAMILY: ClassVar[str] = 'slow'
+    STAGE: ClassVar[Stage] = Stage.LEVEL
+    ROLE: ClassVar[Role] = Role.MEAN
+    # The curvature is left out of a fit where it is 0.
+    LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
+        ('rate', 'curvature'),
+        lambda term: ('rate', 'curvature') if term.curvature else ('rate',))
+    SIGNS: ClassVar[tuple[str, ...]] = ('time', 'band 0')
+    MEASURED: ClassVar[bool] = True
+    # Time mends a little of whatever the form of a larger effect leaves.
+    LEAST_SHARE: ClassVar[float] = 0.02
+    MEANING: ClassVar[str] = 'The mean moves slowly with time: discharge or warming.'
+    REMEDY: ClassVar[str] = 'Use a window short beside the drift, or take the trend out first.'
+    SEPARATED_BY: ClassVar[str] = 'a recording several times as long'
+
+    rate: float = parameter('V/s', 'slope at the first sample')
+    curvature: float = parameter('V/s^2', 'coefficient of t^2')
+
+    def start(self, rng: np.random.Generator) -> Effect:
+        """Begin a simulation."""
+        def effect(s: Segment) -> None:
+            t = s.at - s.origin
+            s.level += (self.rate + self.curvature * t) * t
+
+        return effect
+
+    @classmethod
+    def candidates(cls, view: View) -> Sequence[Term]:
+        """Return a straight line and a parabola."""
+        return cls(0.0, 0.0), cls(0.0, NEXT_TO_ZERO)
+
+
+# Relaxation times in a recording, at least.
+_LEAST = 3.0
+
+
+@dataclass(frozen=True)
+class SecondRelaxation(Term):
+    """Add an independent OU."""
+
+    NAME: ClassVar[str] = 'second_relaxation'
+    FAMILY: ClassVar[str] = 'slow'
+    STAGE: ClassVar[Stage] = Stage.LEVEL
+    ROLE: ClassVar[Role] = Role.BLOCK
+    FREE: ClassVar[tuple[str, ...]] = ('alpha', 'sigma')
+    DEAR: ClassVar[bool] = True
+    BROAD: ClassVar[bool] = True
+    SIGNS: ClassVar[tuple[str, ...]] = ('band', 'autocorrelation')
+    STATES: ClassVar[int] = 1
+    IMITATES: ClassVar[tuple[str, ...]] = ('flicker_noise', 'regime_switching')
+    SEVERAL: ClassVar[bool] = True
+    RECURS: ClassVar[bool] = True
+    MEANING: ClassVar[str] = (
+        'A second relaxation of its own rate adds to the first: a second storage element.')
+    REMEDY: ClassVar[str] = 'Keep both in the model; one alpha alone describes neither.'
+    SEPARATED_BY: ClassVar[str] = 'a recording ten times as long, throttle held still'
+
+    alpha: float = parameter('1/s', 'its relaxation rate', 0.0, above=True)
+    sigma: float = parameter('V/sqrt(s)', 'its noise intensity', 0.0)
+
+    def start(self, rng: np.random.Generator) -> Effect:
+        """Begin a simulation."""
+        before = 0.0
+
+        def effect(s: Segment) -> None:
+            nonlocal before
+            phi = np.exp(-self.alpha * s.step)
+            var = -np.expm1(-2.0 * self.alpha * s.step) / (2.0 * self.alpha)
+            x = first_order(phi, self.sigma * np.sqrt(var) * rng.standard_normal(s.t.size), before)
+            before = float(x[-1])
+            s.level += x
+
+        return effect
+
+    @classmethod
+    def candidates(cls, view: View) -> Sequence[Term]:
+        """Return poles slower and faster than that of the ou, of less variance."""
+        rate = -math.log(max(float(np.median(view.phi[1:])), 1e-300)) * view.rate
+        spread = float(np.std(view.residual))
+        slowest = _LEAST / float(view.at[-1])
+        found = [cls(a, 0.5 * spread * math.sqrt(2.0 * a))
+                 for a in (rate / 60.0, rate / 15.0, rate / 4.0) if a > slowest]
+        return [*found, cls(6.0 * rate, 0.3 * spread * math.sqrt(12.0 * rate))]
+
+    def holds(self, view: View) -> bool:
+        """Return whether it relaxes within the recording: else it is a trend."""
+        return self.alpha * float(view.at[-1]) > _LEAST
+
+    def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return its one state."""
+        phi = np.exp(-self.alpha * s.step)
+        q = self.sigma * self.sigma * -np.expm1(-2.0 * self.alpha * s.step) / (2.0 * self.alpha)
+        return phi[:, None, None], q[:, None, None], np.ones(1)
+
 
 # Octaves from pole to pole: 1/f within 0.2 %, and within 6 %.
 _FINE, _COARSE = 0.5, 3.0
@@ -20,7 +125,7 @@ _FINE, _COARSE = 0.5, 3.0
 # low-pass has taken 1.5 %, and where the poles end most of the rest.
 _LADDER, _CORNER = 4.5, 8.0
 # Corner over lower end below which it is one relaxation, or two.
-_LEAST = 30.0
+_LEAST_SPAN = 30.0
 
 
 @dataclass(frozen=True)
@@ -114,14 +219,14 @@ class FlickerNoise(Term):
     def candidates(cls, view: View) -> Sequence[Term]:
         """Return noise over all frequencies of the recording, of a third of its variance."""
         low, high = 1.0 / float(view.at[-1]), 0.2 * view.rate / _CORNER
-        if _CORNER * high < _LEAST * low:
+        if _CORNER * high < _LEAST_SPAN * low:
             return ()
         spread = float(np.std(view.residual))
         return (cls(spread * math.sqrt(0.3 / math.log(_CORNER * high / low)), low, high),)
 
     def holds(self, view: View) -> bool:
         """Return whether 1/f goes on for so long that it is not a relaxation."""
-        return bool(_CORNER * self.high > _LEAST * self.low)
+        return bool(_CORNER * self.high > _LEAST_SPAN * self.low)
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return one state a pole, and the low-pass; for a fit few poles are enough."""
