@@ -7,7 +7,7 @@ from typing import Any
 
 from ou_monitor.nodes.base import MonitorNode
 from ou_monitor.online.risk.flag import FlagLevel, FlagState
-from ou_monitor.stream.arrival import Publishers
+from ou_monitor.stream.samples import Publishers
 
 # How often it is said that a topic has no publisher, and how long one may be silent, s.
 AGAIN = 60.0

@@ -40,8 +40,7 @@ from ou_monitor.online.report import MonitorReport
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.settings import ESTIMATOR_PARAMETERS, monitor_settings, Parameter
 from ou_monitor.records import FloatArray, Level
-from ou_monitor.stream.arrival import SourceClock
-from ou_monitor.stream.samples import SampleStream
+from ou_monitor.stream.samples import SampleStream, SourceClock
 from rclpy.logging import get_logging_directory
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import Trigger

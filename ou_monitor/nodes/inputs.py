@@ -21,8 +21,8 @@ from ou_monitor.nodes.clocks import SendClock, SimClockMap
 from ou_monitor.nodes.sources import definition_of
 from ou_monitor.recordings.cdr import FieldReader, Table
 from ou_monitor.records import FloatArray
-from ou_monitor.stream.arrival import Publishers
 from ou_monitor.stream.config import FieldSpec
+from ou_monitor.stream.samples import Publishers
 from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy

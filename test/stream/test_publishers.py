@@ -1,7 +1,7 @@
 """Who sent a message, what was lost, and how old the newest sample is."""
 
 import numpy as np
-from ou_monitor.stream.arrival import Publishers, SourceClock
+from ou_monitor.stream.samples import Publishers, SourceClock
 import pytest
 
 
