@@ -67,7 +67,7 @@ def fly(recording: Recording, cells: int) -> list[tuple[str, np.ndarray]]:
     for name, limit in limits.items():
         if np.mean(middle[t >= SETTLED] <= limit) > 0.3:
             continue
-        monitor = SupplyMonitor(MonitorSettings(brownout_voltage=float(limit)))
+        monitor = SupplyMonitor(MonitorSettings(window=2.0, brownout_voltage=float(limit)))
         levels, before = [], 0
         for k in looks:
             part, before = slice(before, k + 1), k + 1

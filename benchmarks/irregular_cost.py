@@ -47,7 +47,7 @@ class Rail:
              + 4e-3 * rng.standard_normal(n))
         keep = rng.random(n) >= (float(case[:2]) / 100.0 if 'missing' in case else 0.0)
         self.t, self.y, self.u = t[keep], y[keep], u[keep]
-        self.monitor = SupplyMonitor(MonitorSettings(brownout_voltage=13.0))
+        self.monitor = SupplyMonitor(MonitorSettings(window=2.0, brownout_voltage=13.0))
         self.costs: list[float] = []
 
     def step(self, begin: float, end: float) -> None:

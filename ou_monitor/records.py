@@ -277,6 +277,32 @@ class Estimate:
         return log_interval(getattr(self, name), getattr(self, name + '_se'), z)
 
 
+# Windows at the end of the readings in which a relaxation is looked for, s, and how many readings
+# at most: a minute at 1 kHz.
+OU_WINDOWS, MOST_READINGS = (2.0, 8.0, 30.0, 60.0), 65536
+
+
+@dataclass(frozen=True)
+class OuFacts:
+    """
+    The relaxation beside white noise, or bounds.
+
+    `not_visible`: a relaxation slower than `tau_below_s`, but faster than the level, has a
+    variance below `var_inf_below` (97.5 %, nominal); a faster one may be all of the noise.
+    """
+
+    status: str  # ok, not_visible, too_short or no_data
+    window_s: float = NAN  # the readings used end the recording, s
+    alpha: float = NAN  # 1/s
+    alpha_95: tuple[float, float] = (NAN, NAN)  # 1/s
+    sigma: float = NAN  # V/sqrt(s)
+    sigma_95: tuple[float, float] = (NAN, NAN)  # V/sqrt(s)
+    var_inf: float = NAN  # V^2
+    var_inf_95: tuple[float, float] = (NAN, NAN)  # V^2
+    tau_below_s: float = NAN  # s
+    var_inf_below: float = NAN  # V^2
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """

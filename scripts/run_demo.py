@@ -165,7 +165,7 @@ class Listener:
         cells = [
             (self.number('t') - self._first, 6, '.1f'), (self.number('throttle'), 8, '.2f'),
             (self.number('load_level'), 7, '.3f'), (1e3 * self.number('load_noise'), 6, '.1f'),
-            (self.number('load_sag'), 6, '.2f'), (self.number('load_sag_se'), 6, '.2f'),
+            (self.number('sag'), 6, '.2f'), (self.number('sag_se'), 6, '.2f'),
             (self.number('alpha'), 7, '.1f'),
             (self.number('brownout_risk'), 7, '.2g'), (self.cutoff, 7, '.1f')]
         text = ' '.join(f'{value:{width}{form}}' if math.isfinite(value) else f'{"-":>{width}}'

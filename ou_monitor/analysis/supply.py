@@ -20,12 +20,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import find_step
-from ou_monitor.model.ou_fit import FEWEST, known_ou, OuFacts, regress, Regression
+from ou_monitor.model.ou_fit import FEWEST, known_ou, regress, Regression
+from ou_monitor.online.estimator.estimator import SLIDING
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.records import FloatArray, NAN, Recording
+from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
 from ou_monitor.timeline.line import readings_of
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
@@ -204,7 +205,8 @@ def _at_the_end(recording: Recording, limit: float | None) -> tuple[SupplyLoad, 
         load = LoadFilter()
         load.push(recording.t, recording.voltage, throttle, recording.current)
         return load.load(), None
-    settings = MonitorSettings(brownout_voltage=limit)
+    # The fit of `window: auto` is none of the budget's.
+    settings = MonitorSettings(window=SLIDING, brownout_voltage=limit)
     monitor = SupplyMonitor(settings)
     monitor.push(recording.t, recording.voltage, throttle, current=recording.current)
     last = monitor.report(0.0)

@@ -34,10 +34,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import CELL
-from ou_monitor.records import determined, FloatArray, NAN
-from scipy.ndimage import zoom
-from scipy.optimize import minimize
-from scipy.signal import lfilter
+from ou_monitor.records import determined, FloatArray, MOST_READINGS, OU_WINDOWS, OuFacts
 
 # Evidence against white noise alone from which a relaxation is visible, nats: more than white
 # noise showed in any window of 120 simulated recordings (test_ou_fit.py repeats a part).
@@ -52,16 +49,18 @@ _DELAYS, _DELAY_READINGS = 4, 8000
 _MOVED = 0.01
 # A gap is a step of this many usual ones; stretches of fewer readings are left out.
 _GAP, _STRETCH = 1.6, 16
-# Windows, s: the shortest in which alpha is known within this factor counts, else the longest.
+# The shortest of OU_WINDOWS in which alpha is known within this factor counts, else the longest.
 # Precision stops the search, not visibility: whether chance makes a relaxation visible in a short
 # window depends on its estimate, which would then be biased.
-WINDOWS, PRECISE = (2.0, 8.0, 30.0, 60.0), 1.5
+PRECISE = 1.5
 # Fewest readings beyond the number of regressors from which anything is fitted.
 FEWEST = 40
 # Ordinates taken one by one; relative width of the bins above.
 _SINGLE, _WIDTH = 12, 0.06
-# Points of the likelihood's first grid in ln(alpha), logit(share) and ln(walk); largest logit.
-_GRID, _LOGIT = (24, 13, 5), 7.0
+# Points of the likelihood's first grid in ln(alpha), logit(share) and ln(walk); ends of the logit:
+# white noise of 1e-3 of the variance is half of the spectrum at the highest frequency of an OU of
+# alpha D = 0.004.
+_GRID, _LOGIT = (24, 16, 5), (-7.0, 12.0)
 # Bounds: distances in logit(share) from the best of the grid that are tried beside the grid's,
 # and steps by which the walk is refined.
 _ASIDE = np.linspace(-1.2, 1.2, 17)
@@ -69,6 +68,8 @@ _REFINE = (1.2, 0.6, 0.3, 0.15)
 # Law of the noise's size: lags of the load whose differences enter, s; deviation of its
 # coefficients by the prior; rounds.
 _CHANGES, _SIZE_SD, _SIZE_ROUNDS = (0.03, 0.2, 1.0), 0.5, 12
+# Steps towards the maximum at most, and the size of a step that ends them.
+_LOOKS, _NEAR = 40, 0.05
 # Draws about the maximum in each round, and rounds.
 _DRAWS, _ROUNDS = 1000, 4
 # The level's usual walk, V per sqrt(s) and cell, and the deviation of its logarithm above that:
@@ -86,27 +87,6 @@ _SPANNED = 1e-5
 _POWER = 1.8
 
 
-@dataclass(frozen=True)
-class OuFacts:
-    """
-    The relaxation beside white noise, or bounds.
-
-    `not_visible`: a relaxation slower than `tau_below_s`, but faster than the level, has a
-    variance below `var_inf_below` (97.5 %, nominal); a faster one may be all of the noise.
-    """
-
-    status: str  # ok, not_visible, too_short or no_data
-    window_s: float = NAN  # the readings used end the recording, s
-    alpha: float = NAN  # 1/s
-    alpha_95: tuple[float, float] = (NAN, NAN)  # 1/s
-    sigma: float = NAN  # V/sqrt(s)
-    sigma_95: tuple[float, float] = (NAN, NAN)  # V/sqrt(s)
-    var_inf: float = NAN  # V^2
-    var_inf_95: tuple[float, float] = (NAN, NAN)  # V^2
-    tau_below_s: float = NAN  # s
-    var_inf_below: float = NAN  # V^2
-
-
 def _stretches(t: FloatArray) -> list[slice]:
     """Return the stretches without a gap; all in one where the stamps are uneven throughout."""
     steps = np.diff(t)
@@ -119,7 +99,13 @@ def _stretches(t: FloatArray) -> list[slice]:
 
 def _lagged(x: FloatArray, share: float) -> FloatArray:
     """Return a first-order lag that goes `share` of the way with each sample."""
-    return np.asarray(lfilter([share], [1.0, share - 1.0], x, zi=[x[0] * (1.0 - share)])[0])
+    # 1 / (1 - r z) is the product of all 1 + (r z)^(2^k).
+    lagged = share * (x - x[0])
+    step, rest = 1, 1.0 - share
+    while step < x.size and rest > 1e-17:
+        lagged[step:] = lagged[step:] + rest * lagged[:-step]
+        step, rest = 2 * step, rest * rest
+    return np.asarray(x[0] + lagged)
 
 
 def _filled(t: FloatArray, x: FloatArray | None) -> FloatArray | None:
@@ -333,8 +319,8 @@ def fit_ou(part: Regression, span: float) -> OuFacts:
     likelihood = _Likelihood(part)
     # ln of the variance of the level's step beside that of the noise, by the prior.
     usual = math.log(dt * part.walk ** 2 * part.free / total)
-    low = np.array([math.log(dt / part.slowest), -_LOGIT, usual - 6.0 * _WALK_SD])
-    high = np.array([math.log(_FASTEST), _LOGIT, usual + 6.0 * _WALK_SD])
+    low = np.array([math.log(dt / part.slowest), _LOGIT[0], usual - 6.0 * _WALK_SD])
+    high = np.array([math.log(_FASTEST), _LOGIT[1], usual + 6.0 * _WALK_SD])
 
     def costs(points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return minus the log-posterior, flat in share, and the variance, V^2."""
@@ -342,25 +328,23 @@ def fit_ou(part: Regression, span: float) -> OuFacts:
         off = 0.5 * (points[:, 2] + np.log(variance / dt)) - math.log(part.walk)
         return value + 0.5 * np.maximum(off / _WALK_SD, 0.0) ** 2, variance
 
-    def cost(point: FloatArray) -> float:
-        inside = np.clip(point, low, high)
-        return float(costs(inside[None])[0][0] + 10.0 * np.sum((point - inside) ** 2))
+    def cost(points: FloatArray) -> FloatArray:
+        inside = np.clip(points, low, high)
+        return costs(inside)[0] + 10.0 * np.sum((points - inside) ** 2, axis=1)
 
     points = _points(*(np.linspace(*ends) for ends in zip(low, high, _GRID)))
     value, variance = costs(points)
     white = float(costs(_points(np.zeros(1), np.full(1, -60.0),
                                 np.linspace(low[2], high[2], 40)))[0].min())
     start = points[np.argmin(value)]
-    top = minimize(cost, start, method='Nelder-Mead', options={
-        'xatol': 0.02, 'fatol': 0.01, 'maxiter': 200,
-        'initial_simplex': start + 0.7 * np.vstack([np.zeros(3), np.eye(3)])})
-    least = min(float(top.fun), white)
+    top, lowest = _minimum(cost, start, (high - low) / (np.array(_GRID) - 1))
+    least = min(lowest, white)
     if white - least < VISIBLE:
         return _unseen(costs, low, high, least, dt, span)
     # Points from a wide law about maximum and grid, weighted by their likelihood; the next law
     # has the moments of the last points.
     weight = np.exp(least - value)
-    peak = np.clip(top.x, low, high)
+    peak = np.clip(top, low, high)
     centre = (peak + weight @ points) / (1.0 + weight.sum())
     off, root = points - centre, _curvature(cost, peak)
     root = np.linalg.cholesky(root @ root.T + (
@@ -398,12 +382,15 @@ def fit_ou(part: Regression, span: float) -> OuFacts:
 
 
 def known_ou(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | None) -> OuFacts:
-    """Fit the shortest of WINDOWS, at the end of the readings, that is precise enough."""
+    """Fit the shortest of OU_WINDOWS, at the end of the readings, that is precise enough."""
     if not t.size:
         return OuFacts('no_data')
+    t, v = t[-MOST_READINGS:], v[-MOST_READINGS:]
+    u, i = (None if x is None else x[-MOST_READINGS:] for x in (u, i))
     span = float(t[-1] - t[0])
+    longest = min(span, OU_WINDOWS[-1])
     found = OuFacts('too_short', span)
-    for window in (*(w for w in WINDOWS if w < span), min(span, WINDOWS[-1])):
+    for window in (*(w for w in OU_WINDOWS if w < longest), longest):
         begin = int(np.searchsorted(t, t[-1] - window))
         if t.size - begin < FEWEST:
             continue
@@ -421,11 +408,31 @@ def _pair(ends: Sequence[float]) -> tuple[float, float]:
     return float(ends[0]), float(ends[1])
 
 
-def _curvature(cost: Callable[[FloatArray], float], centre: FloatArray) -> FloatArray:
+def _minimum(cost: Callable[[FloatArray], FloatArray], point: FloatArray, step: FloatArray,
+             ) -> tuple[FloatArray, float]:
+    """Return the lowest point about one, and its cost: of 27 the lowest, then of half the step."""
+    around = _points(*(np.array([-1.0, 0.0, 1.0]),) * 3)
+    lowest = math.inf
+    for _ in range(_LOOKS):
+        values = cost(point + step * around)
+        best = int(np.argmin(values))
+        lowest = min(lowest, float(values[best]))
+        point = point + step * around[best]
+        if not around[best].any():
+            step = 0.5 * step
+        if (step < _NEAR).all():
+            break
+    return point, lowest
+
+
+def _curvature(cost: Callable[[FloatArray], FloatArray], centre: FloatArray) -> FloatArray:
     """Return a root of the covariance that the curvature of a cost says, at most 2 a direction."""
     step = 0.15 * np.eye(3)
-    H = np.array([[cost(centre + a + b) - cost(centre + a - b) - cost(centre - a + b)
-                   + cost(centre - a - b) for b in step] for a in step]) / (4.0 * 0.15 ** 2)
+    signs = ((1, 1, 1.0), (1, -1, -1.0), (-1, 1, -1.0), (-1, -1, 1.0))
+    H = np.zeros((3, 3))
+    for one, other, sign in signs:
+        points = centre + one * step[:, None, :] + other * step[None, :, :]
+        H += sign * cost(points.reshape(-1, 3)).reshape(3, 3) / (4.0 * 0.15 ** 2)
     values, vectors = np.linalg.eigh(0.5 * (H + H.T))
     return np.asarray(vectors / np.sqrt(np.clip(values, 0.25, None)) * 1.2)
 
@@ -449,7 +456,7 @@ def _unseen(costs: Callable[[FloatArray], tuple[FloatArray, FloatArray]], low: F
     first = costs(_points(*axes))[0].reshape(_GRID).reshape(_GRID[0], -1).argmin(axis=1)
     best, walk = np.unravel_index(first, _GRID[1:])
     logits = np.sort(np.hstack([
-        np.clip(axes[1][best][:, None] + _ASIDE, -_LOGIT, _LOGIT),
+        np.clip(axes[1][best][:, None] + _ASIDE, *_LOGIT),
         np.broadcast_to(axes[1], _GRID[:2])]), axis=1)
     shape = logits.shape
     points = np.stack(np.broadcast_arrays(
@@ -465,8 +472,8 @@ def _unseen(costs: Callable[[FloatArray], tuple[FloatArray, FloatArray]], low: F
                                for x, y in ((cost, value), (size, variance)))
     # Between the points, at the best walk; roots, as a parabola's are straight.
     lost = (value - min(least, float(value.min()))).reshape(shape)
-    fine = zoom(np.sqrt(np.maximum(lost, 0.0)), 8, order=1) ** 2
-    size, logit = (zoom(x.reshape(shape), 8, order=1)
+    fine = _finer(np.sqrt(np.maximum(lost, 0.0))) ** 2
+    size, logit = (_finer(x.reshape(shape))
                    for x in (np.log(variance), points[:, 1]))
     tau = dt * np.exp(-np.linspace(low[0], high[0], fine.shape[0]))
     share = 1.0 / (1.0 + np.exp(-logit))
@@ -477,3 +484,12 @@ def _unseen(costs: Callable[[FloatArray], tuple[FloatArray, FloatArray]], low: F
     variance = share * np.exp(size)
     return OuFacts('not_visible', span, tau_below_s=longest, var_inf_below=float(
         variance[slower].max() if slower.any() else _QUARTER * np.exp(size.min())))
+
+
+def _finer(values: FloatArray) -> FloatArray:
+    """Return values on a grid with 8 times the points each way, by linear interpolation."""
+    for _ in range(2):
+        at = np.linspace(0.0, values.shape[0] - 1.0, 8 * values.shape[0])
+        low = np.minimum(at.astype(np.intp), values.shape[0] - 2)
+        values = (values[low] + (at - low)[:, None] * (values[low + 1] - values[low])).T
+    return values

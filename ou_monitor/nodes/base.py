@@ -74,7 +74,6 @@ class MonitorNode(Node):
         self._fixed = {parameter.name for parameter in fixed}
         declared = [*table, *fixed, LOCK]
         self._widen_overrides(declared)
-        self._floats = {p.name for p in declared if isinstance(p.default, float)}
         for parameter in declared:
             self.declare_parameter(parameter.name, parameter.default, _descriptor(
                 parameter, read_only=not managed and parameter.name not in self._table))
@@ -265,9 +264,9 @@ class MonitorNode(Node):
 
     def _widen_overrides(self, declared: Sequence[Parameter]) -> None:
         """Take `-p window:=2` for 2.0: YAML writes whole numbers without a point."""
-        floats = {p.name for p in declared if isinstance(p.default, float)}
+        self._floats = {p.name for p in declared if isinstance(p.default, float) or p.mixed}
         overrides = self._parameter_overrides
-        for name in floats & overrides.keys():
+        for name in self._floats & overrides.keys():
             overrides[name] = _as_double(overrides[name])
 
     def _widen(self, parameters: list[RosParameter]) -> list[RosParameter]:
@@ -327,7 +326,12 @@ def _descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
     """Return what `ros2 param describe` shows."""
     descriptor = ParameterDescriptor(
         description=parameter.description, read_only=read_only,
-        additional_constraints=' | '.join(parameter.choices))
+        additional_constraints=' | '.join((
+            *parameter.choices, *([f'{parameter.low:g}..{parameter.high:g}']
+                                  if parameter.mixed else []))),
+        dynamic_typing=parameter.mixed)
+    if parameter.mixed:
+        return descriptor
     if parameter.low is not None and parameter.high is not None:
         if isinstance(parameter.default, int):
             descriptor.integer_range = [IntegerRange(

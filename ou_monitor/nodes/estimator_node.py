@@ -7,7 +7,8 @@ default), best effort.  Outputs at `publish_rate` of real time, reliable:
 (std_msgs/Float64, NaN when not known), `~/brownout` (std_msgs/Bool, published
 only while it is known, so that it is never silently false), `~/state`
 (DiagnosticArray, every field of one estimate, stamped with the estimate's
-newest sample), and `/diagnostics` at 1 Hz.  Messages wait in the middleware, which keeps the
+newest sample), and `/diagnostics` at 1 Hz.  alpha, sigma and Var_inf are those of `window`, whose
+fits of up to a minute are made in a thread.  Messages wait in the middleware, which keeps the
 newest 2000, and are fetched 50 times a second and read before each report, so that no flood of
 them delays an output.  Service `~/clear_brownout` (std_srvs/Trigger): drops a flag that is
 latched or held, unless `lock_parameters` is set.  Hold, delay and latch count real time, under
@@ -22,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 import math
 from pathlib import Path
+import sys
 import time
 from typing import Any
 
@@ -55,6 +57,9 @@ HAND_OVER = 0.25
 SHARE = 0.25
 # An estimate that takes longer than this, s of CPU, is not made at each report.
 HEAVY = 0.02
+# Longest time for which the thread of the fits keeps the interpreter from the executor, s: at
+# Python's 5 ms each of the executor's calls would wait so long.
+SWITCH = 2e-4
 # Samples are thinned to one of so many at most.
 MOST_THIN = 1024
 # Throttle messages placed among the voltages at each hand-over; of more, evenly many of them.
@@ -79,6 +84,7 @@ class EstimatorNode(MonitorNode):
 
     def start(self) -> None:
         """Begin with nothing known but a flag that was latched."""
+        sys.setswitchinterval(SWITCH)
         settings = monitor_settings(_of_monitor(self.values()))
         self._monitor = SupplyMonitor(settings, self._models.use(settings.model_file),
                                       background=True)

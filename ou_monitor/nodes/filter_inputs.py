@@ -20,6 +20,8 @@ from ou_monitor.records import Status
 NAN = math.nan
 # Fields of the state that the filter uses as they are.
 _FIELDS = ('alpha', 'throttle', 'u0', 'u0_se', 'load_noise')
+# A sigma of a window longer than the sliding one by this is that of a fit.
+_LONGER = 1.1
 _USABLE = (Status.OK.name, Status.SHORT_WINDOW.name)
 
 
@@ -116,6 +118,10 @@ class SupplyInput:
         status = self._state.get('status', Status.OK.name)
         if fresh and status not in _USABLE:
             return f'the estimator says {status}'
+        window = _number(self._state, 'window_s')
+        if fresh and window > _LONGER * _number(self._state, 'duration'):
+            # It does not follow the throttle.
+            return f'sigma is of the last {window:g} s, too long for the filter'
         return ''
 
 

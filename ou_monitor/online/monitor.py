@@ -13,14 +13,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.online.estimator.estimator import SlidingEstimator
+from ou_monitor.online.estimator.estimator import (
+    of_estimate, Relaxation, SLIDING, SlidingEstimator)
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.report import MonitorReport
 from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
 from ou_monitor.online.risk.forecast import Forecast
 from ou_monitor.online.risk.outlook import Ahead, look_ahead, Outlook, risk_of_all
-from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.online.settings import AUTO, MonitorSettings
 from ou_monitor.online.trust import Doubt, InputTrust, patience, Stamps
 from ou_monitor.records import Counters, Estimate, Flag, Level, NAN, Status
 from ou_monitor.timeline.line import MOST_CURRENT, plausible, plausible_samples, TimeLine
@@ -45,8 +46,9 @@ class SupplyMonitor:
     model : SupplyModel, optional
         Terms of the supply, as `discover` found them; none when left out.
     background : bool
-        Whether tables for these terms are made in a thread, so that reports never wait;
-        until they are there the risk is unknown.
+        Whether tables for these terms, and with window ``auto`` the fits of alpha, sigma and
+        Var_inf, are made in a thread, so that reports never wait; until the tables are there
+        the risk is unknown.
 
     """
 
@@ -72,7 +74,8 @@ class SupplyMonitor:
     def _begin(self) -> None:
         """Begin with nothing known of the supply."""
         self._line = TimeLine()
-        self._estimator = SlidingEstimator(self._settings.window, line=self._line)
+        self._estimator = SlidingEstimator(self._sliding, line=self._line)
+        self._relaxation = Relaxation(background=self._background)
         self._load_filter, self._load = LoadFilter(), SupplyLoad()
         self._load_filter.begin_with(None if self._model is None else self._model.load)
         self._outlook = Outlook(background=self._background)
@@ -90,11 +93,17 @@ class SupplyMonitor:
         """Return the settings in force."""
         return self._settings
 
+    @property
+    def _sliding(self) -> float:
+        """Length of the sliding window, s."""
+        window = self._settings.window
+        return SLIDING if isinstance(window, str) else window
+
     def configure(self, settings: MonitorSettings) -> None:
         """Change settings; no sample inside the new window is lost."""
-        if settings.window != self._settings.window:
-            self._estimator.window = settings.window
         self._settings = settings
+        if self._sliding != self._estimator.window:
+            self._estimator.window = self._sliding
         self._flag.configure(settings)
 
     @property
@@ -161,8 +170,9 @@ class SupplyMonitor:
         came = math.inf if times is None or not times.size else float(times[-1])
         try:
             for batch in self._line.take(stamps[part], volts[part], load, drawn,
-                                         self._settings.window):
+                                         self._sliding):
                 self._estimator.take(batch)
+                self._relaxation.take(batch)
                 if not batch.again:
                     self._forecast.take(batch, came)
                     self._outlook.push(batch.t, batch.y, batch.u, self._newest)
@@ -230,6 +240,7 @@ class SupplyMonitor:
     def reset(self, reason: str) -> None:
         """Clear the window, and remember why for the next reports; the flag stays held."""
         self._estimator.reset()
+        self._relaxation.forget()
         self._flag.new_time_line()
         self._trust.start_anew()
         self._outlook.new_time_line()
@@ -266,6 +277,8 @@ class SupplyMonitor:
         here = silent if arrived is None else max(arrived, 0.0)
         try:
             e = self._estimate() if again else self._newest
+            if again and self._settings.window == AUTO:
+                self._relaxation.update()
             limit = patience(self._settings, e.rate, e.n, self._trust.interval)
             stamps = self._trust.stamps(limit, 1.0 / e.rate if e.rate > 0.0 else NAN)
             doubt, why = self._trust.doubt(stamps, self._settings.brownout_voltage)
@@ -274,6 +287,8 @@ class SupplyMonitor:
                 self._counted = self._counters()
                 self._begin()
                 e = self._estimate()
+            told, ou, ou_age = self._relaxation.in_force(e) if (
+                self._settings.window == AUTO) else (e, of_estimate(e), 0.0)
             self._stamps, self._doubt = stamps, doubt
             fresh = (silent <= limit and e.status is not Status.NO_DATA and doubt is Doubt.NONE)
             if again or not fresh:
@@ -289,7 +304,9 @@ class SupplyMonitor:
             limit, stamps, fresh = self._settings.stale_after, Stamps.GOOD, False
             doubt, why = Doubt.NONE, ''
             self._ahead, left_out = Ahead(), ()
-        self._newest = e
+            told, ou, ou_age = e, of_estimate(e), 0.0
+        # Of the last seconds, whatever the window: what risk and curves learn from.
+        self._newest, e = e, told
         ahead = self._ahead
         risk = ahead.outcome.risk
         self._faulty = self._faulty and not e.usable
@@ -303,7 +320,7 @@ class SupplyMonitor:
         return MonitorReport(
             e, risk, ahead.budget, ahead.budget_reason, left_out, flag, level, summary, silent,
             limit, stamps, doubt, fresh, self._thinned, self._restarts, self._fault, self._load,
-            ahead.outcome.basis, ahead.outcome.cause, ahead.curve)
+            ahead.outcome.basis, ahead.outcome.cause, ahead.curve, ou, ou_age)
 
     def risk(self, voltage: float | None = None, horizon: float | None = None) -> float:
         """
@@ -390,7 +407,7 @@ class SupplyMonitor:
         if odd > self._odd:
             self._odd, self._odd_at = odd, e.t
         flags = e.flags
-        if e.t - self._odd_at > self._settings.window:
+        if e.t - self._odd_at > self._sliding:
             flags = tuple(flag for flag in flags if flag is not Flag.IRREGULAR)
         if flags == e.flags and counters == e.counters:
             return e

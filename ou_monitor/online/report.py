@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.risk.flag import FlagState
 from ou_monitor.online.trust import Doubt, Stamps
-from ou_monitor.records import Estimate, Level
+from ou_monitor.records import Estimate, Level, OuFacts
 
 # Throttles of `risk_curve`.
 RISK_CURVE = tuple(k / 10.0 for k in range(11))
@@ -21,7 +21,7 @@ class MonitorReport:
     Attributes
     ----------
     estimate : Estimate
-        Newest estimate.
+        Newest estimate; its alpha, sigma and var_inf are those of `ou`.
     risk : float
         Probability of a brown-out within the horizon; NaN when not known.
     budget : float
@@ -64,6 +64,10 @@ class MonitorReport:
     risk_curve : tuple of float
         Risk if throttle goes to each of `RISK_CURVE` and stays for the horizon; empty or NaN:
         not known.
+    ou : OuFacts
+        Relaxation, or its bounds, and the window that it is of.
+    ou_age : float
+        How long before the newest sample that window ended, s.
 
     """
 
@@ -87,6 +91,8 @@ class MonitorReport:
     risk_basis: str = 'none'
     risk_cause: str = ''
     risk_curve: tuple[float, ...] = ()
+    ou: OuFacts = OuFacts('no_data')
+    ou_age: float = 0.0
 
     @property
     def brownout(self) -> bool | None:
@@ -98,13 +104,21 @@ class MonitorReport:
         """
         Return every field as text, for diagnostics; numbers round-trip.
 
-        SI units; `alpha_se`, `sigma_se` and `var_inf_se` are of the logarithm, `u0_se` in V.
+        SI units; intervals are two numbers with a blank between them; `alpha_se`, `sigma_se` and
+        `var_inf_se` are of the logarithm, `u0_se` in V.
         """
         e = self.estimate
         values: dict[str, object] = {
             name: getattr(e, name) for name in (
                 't', 'alpha', 'alpha_se', 'sigma', 'sigma_se', 'var_inf', 'var_inf_se', 'tau',
-                'u0', 'u0_se', 'noise_std', 'sag', 'voltage', 'throttle', 'n', 'duration', 'rate')}
+                'u0', 'u0_se', 'noise_std', 'voltage', 'throttle', 'n', 'duration', 'rate')}
+        for field in fields(self.ou):
+            found = getattr(self.ou, field.name)
+            if isinstance(found, tuple):
+                values[field.name] = ' '.join(repr(float(end)) for end in found)
+            elif field.name not in values:
+                values['ou_status' if field.name == 'status' else field.name] = found
+        values['ou_age'] = self.ou_age
         values |= self.load.fields(e.throttle)
         values['brownout_risk'] = self.risk
         values['risk_basis'] = self.risk_basis

@@ -35,7 +35,7 @@ class Parameter:
     low, high : float or None
         Range, inclusive; None where the type has none.
     choices : tuple of str
-        Accepted words; empty when free.
+        Accepted words; empty when free.  With a range, numbers within it are accepted too.
 
     """
 
@@ -46,9 +46,19 @@ class Parameter:
     high: float | None = None
     choices: tuple[str, ...] = ()
 
+    @property
+    def mixed(self) -> bool:
+        """Whether both a word and a number are accepted."""
+        return bool(self.choices) and self.low is not None
+
+
+# Window as long as it takes.
+AUTO = 'auto'
 
 ESTIMATOR_PARAMETERS: tuple[Parameter, ...] = (
-    Parameter('window', 2.0, 'Length of the sliding window, s.', 0.05, 3600.0),
+    Parameter('window', AUTO,
+              'Length of the sliding window, s; auto: the shortest of 2, 8, 30 and 60 s in which '
+              'alpha is known within a factor of 1.5, else the longest.', 0.05, 3600.0, (AUTO,)),
     Parameter('stale_after', 1.0,
               'Age of the newest sample from which the input counts as stale, s; of a fast source '
               'less: 300 of its intervals, but not below 0.3 s; of a slow one 2.5 intervals.',
@@ -157,8 +167,9 @@ class MonitorSettings:
 
     Attributes
     ----------
-    window : float
-        Length of the sliding window, s.
+    window : float or str
+        Length of the sliding window, s; ``auto``: the shortest of 2, 8, 30 and 60 s in which
+        alpha is known within a factor of 1.5, else the longest.
     stale_after : float
         Silence after which the input counts as stale, s.
     brownout_voltage : float
@@ -187,7 +198,7 @@ class MonitorSettings:
 
     """
 
-    window: float = 2.0
+    window: float | str = AUTO
     stale_after: float = 1.0
     brownout_voltage: float = 4.5
     brownout_horizon: float = 5.0
@@ -398,20 +409,21 @@ def check_values(table: tuple[Parameter, ...], settings: object, prefix: str = '
     """Raise `ValueError` for a field that its parameter does not allow."""
     for parameter in table:
         value = getattr(settings, parameter.name.removeprefix(prefix).replace('.', '_'))
-        if parameter.choices:
+        if parameter.choices and not (parameter.mixed and not isinstance(value, str)):
             if value not in parameter.choices:
                 raise ValueError(
                     f"{parameter.name}: unknown '{value}': "
                     f'{nearest(str(value), parameter.choices)}')
-        elif isinstance(parameter.default, (bool, str)):
+        elif isinstance(parameter.default, (bool, str)) and not parameter.mixed:
             if not isinstance(value, type(parameter.default)):
                 word = 'true or false' if isinstance(parameter.default, bool) else 'text'
                 raise ValueError(f'{parameter.name} must be {word}, got {value!r}')
         else:
             whole = isinstance(parameter.default, int)
             if not _is_number(value) or (whole and value != int(value)):
+                word = 'an integer' if whole else 'a finite number'
                 raise ValueError(
-                    f"{parameter.name} must be {'an integer' if whole else 'a finite number'}, "
+                    f"{parameter.name} must be {' or '.join((word, *parameter.choices))}, "
                     f'got {value!r}')
             low, high = parameter.low, parameter.high
             if (low is not None and value < low) or (high is not None and value > high):

@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 GECKO = np.genfromtxt(ROOT / 'bags/recorded/gecko.csv', delimiter=',', names=True)
 
 
-def rail(rng, rate, alpha, deviation, white, seconds=30.0):
+def rail(rng, rate, alpha, deviation, white, seconds=30.0, sag=1.5):
     """Return stamps, voltage, throttle of a rail under gecko's throttle: OU and white noise, V."""
     n = int(seconds * rate)
     t = np.arange(n) / rate
@@ -18,7 +18,7 @@ def rail(rng, rate, alpha, deviation, white, seconds=30.0):
     e = rng.standard_normal(n)
     e[1:] *= np.sqrt(1.0 - phi * phi)
     x = deviation * lfilter([1.0], [1.0, -phi], e)
-    sag = 1.5 * lfilter([1.0 - np.exp(-20.0 / rate)], [1.0, -np.exp(-20.0 / rate)], u ** 1.8)
+    sag = sag * lfilter([1.0 - np.exp(-20.0 / rate)], [1.0, -np.exp(-20.0 / rate)], u ** 1.8)
     return t, 16.0 - 0.004 * t - sag + x + white * rng.standard_normal(n), u
 
 
@@ -127,6 +127,16 @@ def test_gaps_and_short_stretches_change_little():
     found = fit_ou(part, 30.0)
     assert part.places.size == (~lost).sum() - 5
     assert whole.alpha_95[0] < found.alpha < whole.alpha_95[1]
+
+
+def test_a_rail_without_white_noise_sampled_fast():
+    """Of alpha D = 0.006 white noise of a thousandth of the variance would hide the OU's own."""
+    inside = 0
+    for seed in range(4):
+        t, v, _ = rail(np.random.default_rng(seed), 10000.0, 63.0, 0.0047, 0.0, 2.0, sag=0.0)
+        found = fit_ou(regress(t, v, None, None), 2.0)
+        inside += found.alpha_95[0] < 63.0 < found.alpha_95[1]
+    assert inside >= 3
 
 
 def test_a_constant_signal_has_no_noise():

@@ -193,7 +193,7 @@ def test_the_file_is_taken_in_any_namespace(world):
     from live import wait_until
     from rcl_interfaces.srv import GetParameters
     changed = world.folder / 'changed.yaml'
-    changed.write_text(FILE.read_text().replace('window: 2.0', 'window: 7.5').replace(
+    changed.write_text(FILE.read_text().replace('window: auto', 'window: 7.5').replace(
         'fmax: 150.0', 'fmax: 111.0'))
     probe = world.probe()
     processes = [

@@ -94,9 +94,9 @@ def test_a_signal_while_it_ends_is_only_noted(tmp_path):
 
 
 @pytest.mark.parametrize('name, arguments, words', [
-    ('estimator', ['-p', 'window:=-1.0'], 'window out of range'),
-    ('estimator', ['-p', 'window:=long'], "'window' to 'long'"),
-    ('estimator', ['-p', 'window:=.nan'], 'window out of range'),
+    ('estimator', ['-p', 'window:=-1.0'], 'window must lie within 0.05..3600'),
+    ('estimator', ['-p', 'window:=long'], "window: unknown 'long'"),
+    ('estimator', ['-p', 'window:=.nan'], 'window must be a finite number or auto'),
     ('estimator', ['-p', 'brownout.warn:=0.5'], 'must be less than brownout.critical'),
     ('estimator', ['-p', 'msg_config:=std_flaot64'], "did you mean 'std_float64'?"),
     ('estimator', ['-p', 'msg_config:=px4'], 'clone https://github.com/PX4/px4_msgs'),

@@ -97,6 +97,13 @@ def test_time_line_of_the_supply():
     assert supply.now(1.0).source == 'none'
     supply.take_state(state_of(sigma=0.5, sigma_se=0.01, status='SHORT_WINDOW'))
     assert supply.now(1.0).sigma == 0.5
+    # Of a minute: not for the filter, beside a sliding window of 2 s; of 60 s by a parameter, yes.
+    state = {'sigma': 0.5, 'sigma_se': 0.01, 'status': 'OK', 'window_s': 60.0, 'load_noise': 0.02}
+    supply.take_state(state_of(**state, duration=2.0))
+    assert 'the last 60 s' in supply.now(1.0).why and math.isnan(supply.now(1.0).sigma)
+    assert supply.now(1.0, 63.0).source == 'load'
+    supply.take_state(state_of(**state, duration=59.9))
+    assert supply.now(1.0).sigma == 0.5
     clock.now = 2.0
     assert supply.now(1.0).why == 'sigma on /sigma is stale, 1.1 s old'
     supply.take_sigma(math.nan)

@@ -75,7 +75,7 @@ def test_risk_levels_follow_the_parameters():
 def test_a_parameter_change_keeps_the_samples():
     monitor = filled()
     before = monitor.report(0.0).estimate
-    monitor.configure(MonitorSettings(window=2.0, brownout_voltage=4.0))
+    monitor.configure(MonitorSettings(brownout_voltage=4.0))
     assert monitor.report(0.0).estimate == before
     monitor.configure(MonitorSettings(window=1.0))
     assert monitor.report(0.0).estimate.n == 1001

@@ -83,7 +83,7 @@ def test_what_needs_no_alpha_is_told_first(flight):
         'The relaxation is not visible at 50 Hz: only a higher rate can show it.')
     fields = report.fields
     assert fields['load_status'] == 'KNOWN' and fields['load_basis'] == 'THROTTLE'
-    assert float(fields['load_sag']) == sag and float(fields['load_sag_se']) == error
+    assert float(fields['sag']) == sag and float(fields['sag_se']) == error
     assert float(fields['load_level']) == report.load.level
     assert float(fields['load_noise']) == float(report.load.noise(report.estimate.throttle))
     assert fields['load_resistance'] == 'nan' and fields['load_delay'] == '0.0'

@@ -150,7 +150,8 @@ def risk():
         t, v, u = made(np.random.default_rng(41), n)
         u[5000:5600] = np.nan
         monitor = SupplyMonitor(MonitorSettings(
-            brownout_voltage=level, brownout_horizon=1.0, brownout_budget_limit=0.05, **more))
+            brownout_voltage=level, brownout_horizon=1.0, brownout_budget_limit=0.05,
+            **{'window': 2.0, **more}))
         every = 1500 if made is flight else 300
         for k in range(0, n, every):
             for begin in range(k, k + every, 50 if every == 300 else 250):

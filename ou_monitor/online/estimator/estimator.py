@@ -1,30 +1,44 @@
 """
-The sliding-window OU estimator, used by the node and by the offline tools.
+Alpha, sigma and Var_inf online: `SlidingEstimator`, and `Relaxation` in as long as it takes.
 
 voltage = level + response to throttle + OU(alpha, sigma) + white noise, all
 estimated together.  Limits: one relaxation (no second pole, no resonance);
 sigma constant within the window; alpha known no better than sqrt(2/(alpha T));
 sources faster than `fastest` are averaged down to it.  Measured accuracy and
 cost: doc/estimation.md.
+
+`Relaxation` is `window: auto`: it keeps the readings of a minute, and `known_ou` of `ou_fit`,
+which serves `supply_facts` too, fits the shortest of 2, 8, 30 and 60 s in which alpha is known
+well.  A fit costs 50 to 400 ms of CPU, so it is made anew only after an eighth of its window, 1 s
+at least; in the background it runs in a thread, which takes 5 % of a core at most.
+
+Between two fits of a window of 2 s the sliding estimate of 2 s goes on from the fit as long as
+their intervals overlap.  Limits: those of that fit; of a source above 1 kHz the last 65 536
+readings are kept; a change of the supply is followed a window late.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 import math
+import threading
+import time
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model import arma
+from ou_monitor.model.ou_fit import known_ou
 from ou_monitor.online.estimator.fit import fit_window, Fitted, from_window, TREND_SCORE
 from ou_monitor.online.estimator.irregular import ExactFit, fit_irregular, MOST
 from ou_monitor.online.estimator.quality import (
     examine, input_flags, judge, Quality, recount)
-from ou_monitor.online.estimator.series import T, U, Y
-from ou_monitor.online.estimator.thinner import Thinner
+from ou_monitor.online.estimator.series import T, Thinner, U, Y
 from ou_monitor.online.estimator.window import FACTOR, FEWEST, LAGS, LOST, Resolution, Sums
-from ou_monitor.records import Counters, Estimate, FloatArray, NAN, Status
+from ou_monitor.records import (
+    Counters, Estimate, Flag, FloatArray, LARGEST_LOG_SE, MOST_READINGS, NAN, OU_WINDOWS, OuFacts,
+    Status)
+from ou_monitor.text import Z95
 from ou_monitor.timeline.line import as_column, BATCH, Batch, TAIL, TimeLine
 
 # Samples from which a fit is tried.
@@ -45,6 +59,16 @@ _RAMP = 1e-9
 # The quality of the input is looked at this many times per window.
 _LOOKS = 4
 _DOUBLE = np.dtype(np.float64)
+# Length of the sliding estimate beside the fit, s.
+SLIDING = OU_WINDOWS[0]
+# A fit is made anew after this share of its window, and no sooner than so many s.
+_SHARE, _SOONEST = 0.125, 1.0
+# Share of one core that fits in the background may take.
+_CPU = 0.05
+# What an estimate without a relaxation is called where the window is too short for a fit.
+_SHORT = (Status.TOO_FEW_SAMPLES, Status.TOO_SHORT)
+# Cautions about the model of the sliding estimate, which the fit does not share.
+_SLIDING_ONLY = frozenset({Flag.TREND, Flag.SLOW_RATE})
 
 
 class SlidingEstimator:
@@ -364,3 +388,143 @@ def _positive(name: str, value: float, unit: str) -> float:
     if not (math.isfinite(number) and number > 0.0):
         raise ValueError(f'{name} must be a positive number of {unit}, got {value}')
     return number
+
+
+class Relaxation:
+    """Readings of the last minute, and the newest fit of them; `end`: its last stamp, s."""
+
+    def __init__(self, *, background: bool) -> None:
+        self._background = background
+        self._thread: threading.Thread | None = None
+        # What the thread has found: of which time line, and the fit or what went wrong.
+        self._found: tuple[int, OuFacts | Exception, float] | None = None
+        self._line = 0
+        self._rest = -math.inf
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin with no readings."""
+        # Stamp, voltage, throttle and current of each reading.
+        self._kept = np.empty((4, 1024))
+        self._size = 0
+        self._line += 1
+        self.facts: OuFacts | None = None
+        self.end = self._due = NAN
+
+    @property
+    def readings(self) -> FloatArray:
+        """Return stamps, s, V, throttle and A of the readings kept, shape (4, n)."""
+        return self._kept[:, :self._size]
+
+    def take(self, batch: Batch) -> None:
+        """Take readings in order."""
+        t = self.readings[0]
+        if batch.again:
+            # The newest of those kept, without repeats.
+            self._size = int(np.searchsorted(t, batch.t[0]))
+        elif t.size and batch.t[0] <= t[-1]:
+            self.forget()
+        columns = batch.columns()[:, -MOST_READINGS:]
+        if self._size + columns.shape[1] > self._kept.shape[1]:
+            self._make_room(columns)
+        begin, self._size = self._size, self._size + columns.shape[1]
+        self._kept[:, begin:self._size] = columns
+
+    def _make_room(self, columns: FloatArray) -> None:
+        """Drop what no window reaches; of a pause nothing is dropped but what lies before it."""
+        t = self.readings[0]
+        # One more, so that a recording which is longer is known to be.
+        first = max(0, int(np.searchsorted(t, columns[0, -1] - OU_WINDOWS[-1])) - 1,
+                    self._size + columns.shape[1] - MOST_READINGS - 1)
+        old = self._kept[:, first:self._size]
+        self._size -= first
+        self._kept = np.empty((4, 2 * (self._size + columns.shape[1])))
+        self._kept[:, :self._size] = old
+
+    def update(self) -> None:
+        """Fit where that is due; in the background, take what the thread has found."""
+        if self._found is not None:
+            (line, found, end), self._found = self._found, None
+            if line == self._line:
+                self._put(found, end)
+        # The comparison is false for NaN.
+        if not self._size or self.readings[0, -1] < self._due:
+            return
+        if not self._background:
+            self._put(known_ou(*self.readings), float(self.readings[0, -1]))
+        elif time.monotonic() >= self._rest and (
+                self._thread is None or not self._thread.is_alive()):
+            self._thread = threading.Thread(
+                target=self._fit, args=(self.readings.copy(), self._line), name='relaxation',
+                daemon=True)
+            self._thread.start()
+
+    def _fit(self, readings: FloatArray, line: int) -> None:
+        """Fit in the thread."""
+        begin = time.thread_time()
+        found: OuFacts | Exception
+        try:
+            found = known_ou(*readings)
+        except Exception as error:
+            found = error
+        self._rest = time.monotonic() + (time.thread_time() - begin) * (1.0 / _CPU - 1.0)
+        self._found = line, found, float(readings[0, -1])
+
+    def _put(self, found: OuFacts | Exception, end: float) -> None:
+        if isinstance(found, Exception):
+            # The monitor begins anew, and says why.
+            raise found
+        self.facts, self.end = found, end
+        self._due = end + max(_SOONEST, _SHARE * found.window_s)
+
+    def in_force(self, e: Estimate) -> tuple[Estimate, OuFacts, float]:
+        """Return the sliding estimate with what is known of the relaxation, and its age, s."""
+        facts, age = self.facts, e.t - self.end
+        sliding = of_estimate(e)
+        # Newer readings than those fitted.
+        later = not self._size or self.readings[0, -1] > self.end
+        if facts is None or e.status is Status.NO_DATA or (
+                later and sliding.status == 'ok' and facts.window_s < sliding.window_s):
+            # In the first seconds the sliding window is the longer one.
+            return e, sliding, 0.0
+        if facts.status in ('no_data', 'too_short'):
+            return _unknown(e, Status.TOO_SHORT), facts, age
+        if age > max(facts.window_s, SLIDING):
+            # The fits cannot keep up.
+            return _unknown(e, Status.TOO_SHORT), OuFacts('no_data'), age
+        if facts.status == 'not_visible':
+            return _unknown(e, Status.NO_RELAXATION), facts, age
+        if later and facts.window_s <= SLIDING and sliding.status == 'ok' and (
+                _overlap(facts.alpha_95, sliding.alpha_95)
+                and _overlap(facts.sigma_95, sliding.sigma_95)):
+            return e, sliding, 0.0
+        return replace(
+            e, alpha=facts.alpha, sigma=facts.sigma, var_inf=facts.var_inf,
+            alpha_se=_log_se(facts.alpha_95), sigma_se=_log_se(facts.sigma_95),
+            var_inf_se=_log_se(facts.var_inf_95),
+            status=Status.OK if math.isfinite(e.u0) else e.status,
+            flags=tuple(flag for flag in e.flags if flag not in _SLIDING_ONLY)), facts, age
+
+
+def of_estimate(e: Estimate) -> OuFacts:
+    """Return what a sliding estimate knows of the relaxation; it has no bounds."""
+    if e.usable:
+        return OuFacts('ok', e.duration, e.alpha, e.interval('alpha'), e.sigma,
+                       e.interval('sigma'), e.var_inf, e.interval('var_inf'))
+    return OuFacts('no_data' if e.status is Status.NO_DATA else
+                   'too_short' if e.status in _SHORT else 'not_visible', e.duration)
+
+
+def _unknown(e: Estimate, status: Status) -> Estimate:
+    """Return an estimate without a relaxation; why the input has none goes before `status`."""
+    return replace(e, alpha=NAN, alpha_se=NAN, sigma=NAN, sigma_se=NAN, var_inf=NAN,
+                   var_inf_se=NAN, status=status if e.usable else e.status)
+
+
+def _overlap(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    return one[0] <= other[1] and other[0] <= one[1]
+
+
+def _log_se(ends: tuple[float, float]) -> float:
+    """Return the standard error of a logarithm by its 95 % interval."""
+    return min(math.log(ends[1] / ends[0]) / (2.0 * Z95), LARGEST_LOG_SE)

@@ -125,8 +125,8 @@ class SupplyLoad:
         """Return what is published, noise at a throttle; V, Ohm, s."""
         return {
             'load_status': self.status.name, 'load_status_text': self.status.value,
-            'load_level': self.level, 'load_sag': float(self.sag(1.0)),
-            'load_sag_se': float(self.sag_se(1.0)), 'load_noise': self._noise_at(throttle),
+            'load_level': self.level, 'sag': float(self.sag(1.0)),
+            'sag_se': float(self.sag_se(1.0)), 'load_noise': self._noise_at(throttle),
             'load_resistance': self.resistance, 'load_resistance_se': self.resistance_se,
             'load_delay': self.delay, 'load_basis': self.basis.name}
 
