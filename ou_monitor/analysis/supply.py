@@ -179,16 +179,12 @@ def supply_facts(recording: Recording, limit: float | None = None) -> SupplyFact
             Noise(THROTTLES, unknown, unknown, nowhere), Resistance(NAN, NAN),
             OuFacts('no_data'), None)
     k = int(np.argmin(v))
-    known = u[np.isfinite(u)]
-    flown = (NAN, NAN)
-    if known.size:
-        flown = float(np.quantile(known, 0.01)), float(np.quantile(known, 0.99))
-    noise = _noise(recording, flown)
+    noise = noise_of(recording)
     load, budget = _at_the_end(recording, limit)
     return SupplyFacts(
         Lowest(float(v[k]), float(t[k] - t[0]), float(u[k])),
         None if limit is None else _dips(t, v, u, limit, noise),
-        Sag(load.known, flown, THROTTLES, _tuple(load.sag(THROTTLES)),
+        Sag(load.known, noise.flown, THROTTLES, _tuple(load.sag(THROTTLES)),
             _tuple(load.sag_se(THROTTLES))),
         noise, Resistance(load.resistance, load.resistance_se),
         known_ou(t, v, u, recording.current), budget)
@@ -216,20 +212,29 @@ def _at_the_end(recording: Recording, limit: float | None) -> tuple[SupplyLoad, 
 
 def _dips(t: FloatArray, v: FloatArray, u: FloatArray, limit: float, noise: Noise) -> Dips:
     """Count dips as runs."""
-    below = v < limit
-    if not below.any():
+    begins = dip_begins(v, limit, rise_that_ends(v, u, noise))
+    if not begins.size:
         return Dips(limit, 0, 0.0, 0.0)
-    steady = np.nan_to_num(np.interp(np.nan_to_num(u), THROTTLES, noise.steady_rms_v))
-    over = v > limit + np.maximum(find_step(v), steady)
     # Each reading stands for the time to the next, but not for a gap.
     spacing = np.diff(t)
     usual = float(np.median(spacing)) if spacing.size else 0.0
-    held = np.where(below, np.append(np.minimum(spacing, 10.0 * usual), usual), 0.0)
-    # Of the readings that decide, each one below after one above begins a dip.
-    decides = np.flatnonzero(below | over)
-    begins = decides[below[decides] & np.append(True, over[decides[:-1]])]
+    held = np.where(v < limit, np.append(np.minimum(spacing, 10.0 * usual), usual), 0.0)
     seconds = np.add.reduceat(held, begins)
     return Dips(limit, int(begins.size), float(seconds.sum()), float(seconds.max()))
+
+
+def rise_that_ends(v: FloatArray, u: FloatArray, noise: Noise) -> FloatArray:
+    """Return how far above a limit a dip ends, V, at each reading: ADC step or steady noise."""
+    steady = np.nan_to_num(np.interp(np.nan_to_num(u), THROTTLES, noise.steady_rms_v))
+    return np.asarray(np.maximum(find_step(v), steady))
+
+
+def dip_begins(v: FloatArray, limit: float, rise: FloatArray) -> npt.NDArray[np.intp]:
+    """Return where dips begin: readings below a limit that come first, or after one above."""
+    below = v < limit
+    # Of the readings that decide, each one below after one above begins a dip.
+    decides = np.flatnonzero(below | (v > limit + rise))
+    return np.asarray(decides[below[decides] & np.append(True, ~below[decides[:-1]])])
 
 
 def _cut(recording: Recording, begin: int, end: int) -> Regression:
@@ -238,9 +243,12 @@ def _cut(recording: Recording, begin: int, end: int) -> Regression:
     return regress(recording.t[part], recording.voltage[part], recording.throttle[part], current)
 
 
-def _noise(recording: Recording, flown: tuple[float, float]) -> Noise:
+def noise_of(recording: Recording) -> Noise:
     """Return the noise over throttle from the residuals of all parts."""
     t, u = recording.t, recording.throttle
+    known, flown = u[np.isfinite(u)], (NAN, NAN)
+    if known.size:
+        flown = float(np.quantile(known, 0.01)), float(np.quantile(known, 0.99))
     edges = np.searchsorted(t, np.linspace(
         t[0], t[-1], 1 + max(1, round(float(t[-1] - t[0]) / _PART)))[1:-1])
     square = np.full(t.size, NAN)

@@ -104,12 +104,12 @@ class Agreement:
         Of the mean path: share of the variance explained, V, V.
     bias_by_third : tuple of float
         V.
-    lowest : Band
-        Least voltage, V.
+    lowest, mean : Band
+        Least and mean voltage, V.
     levels : tuple of float
         Levels, V.
     falls : tuple of Band
-        Falls through each per minute.
+        Dips below each per minute, as runs.
     spectrum : tuple of SpectrumBand
         By band of frequency.
     dip, recovery : Band or None
@@ -142,6 +142,7 @@ class Agreement:
     bias: float
     bias_by_third: tuple[float, float, float]
     lowest: Band
+    mean: Band
     levels: tuple[float, ...]
     falls: tuple[Band, ...]
     spectrum: tuple[SpectrumBand, ...]

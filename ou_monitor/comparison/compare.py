@@ -11,11 +11,10 @@ from collections.abc import Callable
 import math
 
 import numpy as np
-from ou_monitor.comparison.agreement import Agreement, SpectrumBand, Traces, Verdict
+from ou_monitor.comparison.agreement import Agreement, SpectrumBand, Traces
 from ou_monitor.comparison.flight_fit import fit_flight, MOVES
 from ou_monitor.comparison.flight_model import Drawn, FiledModel, FlightModel, Readings
-from ou_monitor.comparison.judgement import (
-    band, differences, distance, judge, LEVEL)
+from ou_monitor.comparison.judgement import band, differences, distance, judge
 from ou_monitor.comparison.yardstick import Measures, Yardstick
 from ou_monitor.criticism.curves import stray
 from ou_monitor.criticism.readings import usable, why_nothing
@@ -222,9 +221,11 @@ def _agreement(recording: Recording, samples: Readings, own: Readings, yardstick
     real = yardstick.measure(own.voltage)
     spread = float(np.ptp(own.voltage))
     found = differences(yardstick, real, measured, spread)
-    p, worst = judge(found)
-    verdict = Verdict.DIFFERS if p < LEVEL else Verdict.LOOKS_LIKE_IT
     error = path - own.voltage
+    explained = 1.0 - float(error @ error) / float(
+        np.sum((own.voltage - own.voltage.mean()) ** 2))
+    p, verdict, words = judge(found, explained, own.throttle is not None and bool(
+        np.ptp(own.throttle) >= MOVES))
     pooled = np.mean([m.distribution for m in measured], axis=0)
     answers = np.array([m.answer for m in measured])
     dips = [one.band for one in found if one.kind == 'answer']
@@ -235,17 +236,16 @@ def _agreement(recording: Recording, samples: Readings, own: Readings, yardstick
                                else (empty, empty))
     return Agreement(
         recording.name, fitted, simulated, tuple(drawn.names),
-        1.0 - float(error @ error) / float(np.sum((own.voltage - own.voltage.mean()) ** 2)),
-        math.sqrt(float(np.mean(error ** 2))), float(error.mean()),
+        explained, math.sqrt(float(np.mean(error ** 2))), float(error.mean()),
         tuple(float(part.mean()) for part in np.array_split(error, 3)),  # type: ignore[arg-type]
-        band(real.lowest, np.array([m.lowest for m in measured])), tuple(yardstick.levels),
+        band(real.lowest, np.array([m.lowest for m in measured])),
+        band(real.mean, np.array([m.mean for m in measured])), tuple(yardstick.levels),
         tuple(one.band for one in found if one.kind == 'falls'),
         tuple(SpectrumBand(float(a), float(b), band(
             float(real.power[k]), np.array([m.power[k] for m in measured])))
             for k, (a, b) in enumerate(zip(yardstick.bands, yardstick.bands[1:]))),
         dips[0] if dips else None, dips[1] if dips else None, int(yardstick.rises.size),
-        distance(real, pooled), seeds, p, verdict, worst.words(worst.band),
-        tuple(notes),
+        distance(real, pooled), seeds, p, verdict, words, tuple(notes),
         Traces(own.t + offset, own.voltage,
                np.full(own.t.size, np.nan) if own.throttle is None else own.throttle, first,
                own.t[::stride] + offset, low, high, yardstick.after if answers.size else empty,

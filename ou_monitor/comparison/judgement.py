@@ -152,14 +152,28 @@ def _fall(v: float) -> str:
     return f'{number(-1e3 * v, 2)} mV'
 
 
-def judge(found: Sequence[Difference]) -> tuple[float, Difference]:
-    """Return the share of simulations as odd as the recording, and its worst difference."""
+def judge(found: Sequence[Difference], explained: float, moved: bool
+          ) -> tuple[float, Verdict, str]:
+    """
+    Return the share of simulations as odd as the recording, verdict and what is most wrong.
+
+    explained: share of the variance by the mean path; moved: whether throttle did.
+    """
     scores = np.array([one.scores() for one in found])
     # A simulation that is at once the recording and its own judge would be flattered by its own
     # place in the band; with the recording it is one of seeds + 1.
     largest = scores.max(axis=0)
     p = float(np.mean(largest >= largest[0]))
-    return p, found[int(np.argmax(scores[:, 0]))]
+    worst = int(np.argmax(scores[:, 0]))
+    level = next(k for k, one in enumerate(found) if one.kind == 'level')
+    verdict = Verdict.DIFFERS if p < LEVEL else Verdict.LOOKS_LIKE_IT
+    if verdict is Verdict.LOOKS_LIKE_IT and moved and explained < 0.0:
+        return p, Verdict.DIFFERS, (
+            f'the mean path explains {number(100.0 * explained, 2)} % of the variance, less than '
+            'a constant would')
+    if verdict is Verdict.LOOKS_LIKE_IT and scores[level, 0] > _WEIGHTS['level']:
+        verdict, worst = Verdict.DIFFERS, level
+    return p, verdict, found[worst].words(found[worst].band)
 
 
 # What a model can be fitted to.
@@ -172,7 +186,7 @@ def headline(found: Agreement) -> str:
     lowest = (f'lowest voltage is {number(low.median, 4)} V ({number(low.low, 4)} to '
               f'{number(low.high, 4)}), measured {number(low.measured, 4)} V')
     if found.verdict is Verdict.LOOKS_LIKE_IT:
-        # Without throttle the path is a level, which explains nothing.
+        # Without throttle the path is a level, which may explain nothing.
         path = '' if not found.explained > 0.0 else (
             f', and its mean path explains {100.0 * found.explained:.0f} % of the variance')
         return f'{found.verdict.value}: its {lowest}{path}.'
@@ -207,7 +221,7 @@ def rows(found: Agreement) -> list[tuple[str, str, str, str]]:
                 f'{number(factor * of.median, digits)} [{number(low, digits)}, '
                 f'{number(high, digits)}]', '' if of.inside else 'outside')
 
-    out = [row('lowest voltage, V', found.lowest, 4)]
+    out = [row('lowest voltage, V', found.lowest, 4), row('mean voltage, V', found.mean, 4)]
     out += [row(f'falls through {number(level, 4)} V, 1/min', falls, 3)
             for level, falls in zip(found.levels, found.falls)]
     if found.dip is not None and found.recovery is not None:

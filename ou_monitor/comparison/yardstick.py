@@ -1,7 +1,8 @@
 """
 What is measured of a voltage, recorded or simulated alike.
 
-Levels lie half-way between two codes of the ADC, so that no reading is on them.
+Levels lie half-way between two codes of the ADC, so that no reading is on them.  A fall is a dip
+as `supply_facts` counts them: a run, however its noise crosses the level.
 """
 
 from __future__ import annotations
@@ -10,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.analysis.supply import dip_begins, noise_of, rise_that_ends
 from ou_monitor.comparison.flight_model import Readings
-from ou_monitor.records import FloatArray
+from ou_monitor.records import FloatArray, NAN, Recording
 from scipy.signal import welch
 
 # Shares of the measured samples below the two low levels.
@@ -40,7 +42,7 @@ class Measures:
     lowest : float
         Least voltage, V.
     falls : ndarray, shape (levels,)
-        Falls through each level per minute.
+        Dips below each level per minute, as `supply_facts` counts them.
     power : ndarray, shape (bands,)
         Power in each band, V^2.
     answer : ndarray, shape (points,)
@@ -72,6 +74,9 @@ class Yardstick:
         self.minutes = float(t[-1] - t[0]) / 60.0
         low = [float(np.quantile(v, share)) for share in LOW_SHARES]
         self.levels = [*limits, *(between_codes(level, lsb) for level in low)]
+        u = np.full(t.size, NAN) if samples.throttle is None else samples.throttle
+        noise = noise_of(Recording(t, v, u, current=samples.current))
+        self._rise = rise_that_ends(v, u, noise)
         self._rate = 1.0 / samples.spacing
         self._segment = int(min(v.size, max(64, min(_SEGMENT * self._rate, v.size / 4))))
         lowest, highest = self._rate / self._segment, 0.5 * self._rate
@@ -83,8 +88,7 @@ class Yardstick:
 
     def measure(self, v: FloatArray) -> Measures:
         """Measure a voltage at the stamps of the part, V."""
-        falls = [float(np.count_nonzero((v[:-1] >= level) & (v[1:] < level))) / self.minutes
-                 for level in self.levels]
+        falls = [dip_begins(v, level, self._rise).size / self.minutes for level in self.levels]
         f, density = welch(v, self._rate, nperseg=self._segment)
         at = np.clip(np.searchsorted(self.bands, f, side='right') - 1, -1, _BANDS - 1)
         power = np.array([density[at == k].sum() for k in range(_BANDS)]) * (f[1] - f[0])

@@ -1,10 +1,14 @@
 """What is measured of a voltage, against closed forms; and which difference is the worst."""
 
 import numpy as np
+from ou_monitor.analysis.supply import supply_facts
+from ou_monitor.comparison.agreement import Verdict
 from ou_monitor.comparison.flight_model import Readings
 from ou_monitor.comparison.judgement import band, Difference, judge
 from ou_monitor.comparison.yardstick import between_codes, Yardstick
+from ou_monitor.records import Recording
 import pytest
+from scipy.stats import norm
 
 RATE, N = 100.0, 20_000
 
@@ -16,13 +20,28 @@ def white(seed: int) -> Readings:
 
 
 def test_falls_of_white_noise():
-    """A share p of the samples below a level: p (1 - p) falls a sample."""
+    """Of independent samples p below and q above by the noise: p q / (p + q) falls a sample."""
     noise = white(1)
     found = Yardstick(noise, 0.0).measure(noise.voltage)
     for share, falls in zip((0.01, 0.05), found.falls):
-        expected = share * (1.0 - share) * RATE * 60.0
+        above = norm.sf(norm.ppf(share) + 1.0)
+        expected = share * above / (share + above) * RATE * 60.0
         # The count is nearly Poisson; the level is the sample's own quantile, which helps.
         assert falls == pytest.approx(expected, abs=4.0 * np.sqrt(expected * 60.0 * RATE / N))
+
+
+def test_a_fall_is_a_dip_of_the_facts():
+    """Both count the same runs: of noise about the level a crossing is none."""
+    samples = white(4).part(slice(0, 4000))
+    u = (samples.t % 4.0 > 2.0).astype(float)
+    v = samples.voltage - 0.3 * u
+    own = Recording(samples.t, v, u)
+    levels = (4.75, 5.0)
+    yardstick = Yardstick(Readings(own.t, v, u), 0.0, levels)
+    counts = yardstick.measure(v).falls[:2] * yardstick.minutes
+    assert counts.tolist() == pytest.approx([supply_facts(own, x).dips.count for x in levels])
+    crossings = [np.count_nonzero((v[:-1] >= x) & (v[1:] < x)) for x in levels]
+    assert np.all(counts < 0.8 * np.array(crossings)) and np.all(counts > 0)
 
 
 def test_power_of_white_noise():
@@ -66,16 +85,36 @@ def test_the_worst_is_the_farthest_in_half_bands():
     def of(kind: str, measured: float, least: float = 1e-9) -> Difference:
         return Difference(kind, measured, seeds, least, lambda b: kind)
 
-    p, worst = judge([of('lowest', 4.0), of('spectrum', 6.0)])
+    level = of('level', 0.0)
+    p, _, worst = judge([of('lowest', 4.0), of('spectrum', 6.0), level], 0.9, True)
     # 6 at half the weight is less than 4.
-    assert worst.kind == 'lowest'
+    assert worst == 'lowest'
     assert p == pytest.approx(1.0 / 401.0)
-    p, _ = judge([of('lowest', 0.0)])
+    p, _, _ = judge([of('lowest', 0.0), level], 0.9, True)
     assert p > 0.9
     # A band that is wide by what a pilot would not notice.
-    p, _ = judge([of('lowest', 4.0, least=100.0)])
-    assert 1.0 / 401.0 == pytest.approx(p)
-    assert judge([of('lowest', 4.0, least=100.0)])[1].scores()[0] == pytest.approx(0.04, rel=0.1)
+    wide = of('lowest', 4.0, least=100.0)
+    assert judge([wide, of('level', 0.0, least=100.0)], 0.9, True)[0] == pytest.approx(1.0 / 401.0)
+    assert wide.scores()[0] == pytest.approx(0.04, rel=0.1)
     found = band(2.5, seeds)
     assert (found.low, found.high) == pytest.approx((-1.96, 1.96), abs=0.35)
     assert not found.inside
+
+
+def test_the_verdict_follows_from_path_and_level():
+    """Nothing looks alike whose path is worse than a constant, or whose mean is off its band."""
+    seeds = np.random.default_rng(5).standard_normal(400)
+
+    def of(kind: str, measured: float) -> Difference:
+        return Difference(kind, measured, seeds, 1e-9, lambda b: kind)
+
+    # Twelve others at once: at 1.1 half-bands from the median the level alone is no oddity.
+    others = [Difference('lowest', 0.0, np.random.default_rng(k).standard_normal(400), 1e-9,
+                         lambda b: 'lowest') for k in range(12)]
+    looks, differs = Verdict.LOOKS_LIKE_IT, Verdict.DIFFERS
+    at = [(0.0, 0.1, True, looks), (0.0, -0.1, False, looks), (0.0, -0.1, True, differs),
+          (2.2, 0.1, True, differs)]
+    for level, explained, moved, verdict in at:
+        p, said, words = judge([*others, of('level', level)], explained, moved)
+        assert p > 0.05 and said is verdict
+    assert words == 'level'
