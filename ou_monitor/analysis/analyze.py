@@ -11,9 +11,9 @@ from ou_monitor.analysis.cause import Cause, judge_cause
 from ou_monitor.analysis.level_comparison import alpha_constancy, AlphaTest
 from ou_monitor.analysis.level_result import fit_level, judge_levels, LevelResult
 from ou_monitor.analysis.levels import find_levels, LoadLevel, without_jitter
-from ou_monitor.analysis.overview import Overview, overview
+from ou_monitor.analysis.overview import other_scale, Overview, overview
 from ou_monitor.analysis.quality import (
-    coupling_items, line_item, quality_list, QualityItem, second_items, unsettled)
+    coupling_items, line_item, quality_list, QualityItem, scale_items, second_items, unsettled)
 from ou_monitor.analysis.relaxation import fit_relaxation, Relaxation
 from ou_monitor.analysis.replay import by_throttle, ByThrottle, slide, Sliding
 from ou_monitor.analysis.steps import find_steps
@@ -107,16 +107,20 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
         wanders or level.doubted or level.throttle in moving for level in judged])
     sliding = slide(recording, window, voltage, brownout_horizon,
                     lambda share: report(0.5 + 0.5 * share))
+    seen = overview(recording, None if math.isnan(voltage) else voltage, judged, cells)
     return Analysis(
         recording, judged, relaxations, tuple(judge_cause(r, alpha) for r in relaxations), alpha,
         by_throttle(sliding, recording.has_throttle), sliding,
         quality_list(recording, throttles, estimates, [level.notes for level in judged],
                      settling + lines + second_items(
                          [level.throttle for level in judged if level.wanders])
-                     + coupling_items([level.throttle for level in judged if level.coupled])),
+                     + coupling_items([level.throttle for level in judged if level.coupled])
+                     + scale_items([
+                         level.throttle for level, e in zip(judged, estimates) if e.usable
+                         and other_scale(seen.facts.ou, e.alpha, e.alpha_se, e.sigma,
+                                         e.sigma_se)])),
         brownout_voltage is None, recording.notes + _left_out(recording, found),
-        overview(recording, voltage, judged,
-                 None if sliding.last is None else sliding.last.load, cells))
+        seen)
 
 
 def _default_voltage(recording: Recording) -> float:

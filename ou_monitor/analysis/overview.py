@@ -1,9 +1,7 @@
 """
-What is always known of a recording: its lowest voltage, its dips, its sag and its noise.
+The facts of a supply in words, with the strongest spectral line: what every command says first.
 
-Limits first: sag and noise are those of `LoadFilter` at the end of the recording, with its limits
-(doc/load.md); a sag beyond the throttles flown is a guess and is called so; dips are counted in
-the samples as they were recorded, so that one bad sample counts as a dip.
+Every number is one of `supply_facts`, with its limits; only the line comes from the load levels.
 """
 
 from __future__ import annotations
@@ -14,15 +12,15 @@ import math
 
 import numpy as np
 from ou_monitor.analysis.level_result import LevelResult
-from ou_monitor.online.load.load_filter import LoadFilter
-from ou_monitor.online.load.supply_load import LoadStatus, SupplyLoad
-from ou_monitor.records import FloatArray, NAN, Recording
-from ou_monitor.text import number, volts
+from ou_monitor.analysis.supply import facts_and_load, SupplyFacts, THROTTLES
+from ou_monitor.online.load.supply_load import SupplyLoad
+from ou_monitor.records import NAN, OuFacts, Recording
+from ou_monitor.text import number, volts, Z95
 
-# Undershoots that are closer than that, s, are one dip: an ESC answers within some 100 ms.
-_APART = 0.2
 # The noise follows throttle when it differs by more than that factor between its ends.
 _GROWS = 1.25
+# Less noise, V, is rounding.
+_NOTHING = 1e-9
 # Lines are part of the answer when they make more than that share of the noise at their level.
 _LOUD = 0.25
 
@@ -56,24 +54,16 @@ class Line:
 @dataclass(frozen=True)
 class Overview:
     """
-    What is always known of a recording.
+    What every command says first of a recording.
 
     Attributes
     ----------
-    lowest, lowest_at, lowest_throttle : float
-        Lowest voltage, V; when, s from the first sample; at which throttle, NaN if unknown.
-    limit : float
-        Voltage that dips are counted below, V; NaN when none was given.
-    dips : int
-        Undershoots of the limit; those less than 0.2 s apart are one.
-    below : float
-        Time below the limit, s.
+    facts : SupplyFacts
+        What is known of the supply.
     duration : float
         Of the recording, s.
     load : SupplyLoad
-        Sag, noise and level at the end of the recording.
-    flown : tuple of float
-        Throttles between which 98 % of the samples lie; NaN without throttle.
+        The load at the end, of which the facts hold eleven points.
     highest : float
         Highest throttle; NaN without throttle.
     line : Line or None
@@ -83,65 +73,45 @@ class Overview:
 
     """
 
-    lowest: float
-    lowest_at: float
-    lowest_throttle: float
-    limit: float
-    dips: int
-    below: float
+    facts: SupplyFacts
     duration: float
     load: SupplyLoad
-    flown: tuple[float, float]
     highest: float
     line: Line | None = None
     cells: int = 0
 
     @property
-    def sag(self) -> tuple[float, float, float]:
-        """Return throttle, sag there and its standard error, V, at the highest throttle flown."""
-        at = self.highest
-        return at, float(self.load.sag(at)), float(self.load.sag_se(at))
+    def limit(self) -> float:
+        """Return the voltage that dips are counted below, V; NaN without one."""
+        return NAN if self.facts.dips is None else self.facts.dips.limit_v
 
     @property
-    def noise(self) -> tuple[float, float]:
-        """Return the noise of one sample, V, at the lowest and the highest throttle flown."""
-        low, high = self.flown if math.isfinite(self.flown[0]) else (0.0, 0.0)
-        return float(self.load.noise(low)), float(self.load.noise(high))
+    def sag(self) -> tuple[float, float, float]:
+        """Return throttle, sag there and its error, V, at the point next to the highest flown."""
+        sag = self.facts.sag
+        k = _next_to(sag.flown[1])
+        return THROTTLES[k], sag.sag_v[k], sag.se_v[k]
+
+    @property
+    def noise(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return throttle and noise, V, at the points next to the ends of what was flown."""
+        low, high = (_next_to(u) for u in self.facts.noise.flown)
+        rms = self.facts.noise.rms_v
+        return (THROTTLES[low], rms[low]), (THROTTLES[high], rms[high])
 
 
-def overview(recording: Recording, limit: float = NAN, levels: Sequence[LevelResult] = (),
-             load: SupplyLoad | None = None, cells: int = 0) -> Overview:
-    """
-    Return what is always known of a recording.
-
-    limit in V, of so many cells; levels: where lines were found; load: that of the end, found
-    when left out.
-    """
-    t, v, u = recording.t, recording.voltage, recording.throttle
-    if not recording.n:
-        return Overview(NAN, NAN, NAN, limit, 0, 0.0, 0.0, SupplyLoad(), (NAN, NAN), NAN)
-    k = int(np.argmin(v))
-    dips, below = count_dips(t, v, limit)
-    known = u[np.isfinite(u)]
-    flown = (NAN, NAN)
-    if known.size:
-        flown = float(np.quantile(known, 0.01)), float(np.quantile(known, 0.99))
-    return Overview(
-        float(v[k]), float(t[k] - t[0]), float(u[k]), limit, dips, below, recording.duration,
-        load or _load(recording), flown, float(known.max()) if known.size else NAN,
-        _strongest(levels), cells)
+def _next_to(throttle: float) -> int:
+    """Return the place of the nearest of THROTTLES; 0 when it is not known."""
+    return round(10.0 * min(max(throttle, 0.0), 1.0)) if math.isfinite(throttle) else 0
 
 
-def count_dips(t: FloatArray, voltage: FloatArray, limit: float) -> tuple[int, float]:
-    """Return the dips below a limit, V, and the time below it, s; stamps in s."""
-    under = np.flatnonzero(voltage < limit)
-    if not under.size:
-        return 0, 0.0
-    # Each sample stands for the time to the next, but not for a gap.
-    spacing = np.diff(t)
-    usual = float(np.median(spacing)) if spacing.size else 0.0
-    held = np.append(np.minimum(spacing, 10.0 * usual), usual)
-    return 1 + int((np.diff(t[under]) > _APART).sum()), float(held[under].sum())
+def overview(recording: Recording, limit: float | None = None,
+             levels: Sequence[LevelResult] = (), cells: int = 0) -> Overview:
+    """Return what is known; limit in V, of so many cells; levels: where lines were found."""
+    facts, load = facts_and_load(recording, limit)
+    known = recording.throttle[np.isfinite(recording.throttle)]
+    return Overview(facts, recording.duration if recording.n else 0.0, load,
+                    float(known.max()) if known.size else NAN, _strongest(levels), cells)
 
 
 def _strongest(levels: Sequence[LevelResult]) -> Line | None:
@@ -151,7 +121,7 @@ def _strongest(levels: Sequence[LevelResult]) -> Line | None:
     line, level = max(found, key=lambda pair: pair[0].rms)
     lines = level.lines.lines
     return Line(line.frequency, line.rms, line.share, level.label, len(lines),
-                sum(each.share for each in lines))
+                min(1.0, sum(each.share for each in lines)))
 
 
 def headline(found: Overview) -> str:
@@ -162,15 +132,15 @@ def headline(found: Overview) -> str:
 
 def answers(found: Overview) -> list[str]:
     """Return the parts of the answer: the lowest voltage, then sag and lines."""
-    parts = []
-    if math.isfinite(found.limit):
-        lowest = f'the lowest was {number(found.lowest, 4)} V at {number(found.lowest_at)} s'
-        parts.append(f'The voltage stayed above {found.limit:g} V: {lowest}' if not found.dips else
-                     f'{_dips(found)}: {lowest}')
-    elif math.isfinite(found.lowest):
-        parts.append(f'The voltage fell to {number(found.lowest, 4)} V at '
-                     f'{number(found.lowest_at)} s')
-    if found.load.known:
+    parts, least = [], found.facts.lowest
+    if math.isfinite(found.limit) and math.isfinite(least.voltage_v):
+        lowest = f'the lowest was {number(least.voltage_v, 4)} V at {number(least.time_s)} s'
+        parts.append(f'{dips}: {lowest}' if (dips := _dips(found)) else
+                     f'The voltage stayed above {found.limit:g} V: {lowest}')
+    elif math.isfinite(least.voltage_v):
+        parts.append(f'The voltage fell to {number(least.voltage_v, 4)} V at '
+                     f'{number(least.time_s)} s')
+    if found.facts.sag.known:
         at, sag, _ = found.sag
         parts.append(f'the rail sags by {volts(sag)} at {100.0 * at:.0f} % throttle')
     if found.line is not None and found.line.all_share > _LOUD:
@@ -184,20 +154,22 @@ def answers(found: Overview) -> list[str]:
 
 def known_lines(found: Overview) -> list[tuple[str, str]]:
     """Return what is known: pairs of name and words."""
-    if not math.isfinite(found.lowest):
+    least, resistance = found.facts.lowest, found.facts.resistance
+    if not math.isfinite(least.voltage_v):
         return []
-    where = (f', at {100.0 * found.lowest_throttle:.0f} % throttle'
-             if math.isfinite(found.lowest_throttle) else '')
+    where = (f', at {100.0 * least.throttle:.0f} % throttle'
+             if math.isfinite(least.throttle) else '')
     lines = [('Lowest voltage',
-              f'{number(found.lowest, 4)} V at {number(found.lowest_at)} s{where}')]
+              f'{number(least.voltage_v, 4)} V at {number(least.time_s)} s{where}')]
     if math.isfinite(found.limit):
         cells = f'; {found.limit / found.cells:.3g} V a cell' if found.cells else ''
         lines.append((f'Below {found.limit:g} V',
-                      (_dips(found) if found.dips else 'never') + cells))
+                      (_dips(found) or 'never') + cells))
     lines += [('Sag', _sag_words(found)), ('Noise', _noise_words(found))]
-    if math.isfinite(found.load.resistance):
-        lines.append(('Resistance', f'{number(1e3 * found.load.resistance)} mOhm (+- '
-                      f'{number(2e3 * found.load.resistance_se, 2)})'))
+    if math.isfinite(resistance.ohm):
+        lines.append(('Resistance', f'{number(1e3 * resistance.ohm)} mOhm (+- '
+                      f'{number(2e3 * resistance.se_ohm, 2)})'))
+    lines.append(('Relaxation', _ou_words(found.facts.ou)))
     if found.line is not None:
         line = found.line
         where = '' if line.level == 'all' else f' at {line.level} throttle'
@@ -208,36 +180,39 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
 
 
 def _dips(found: Overview) -> str:
-    share = 100.0 * found.below / found.duration if found.duration > 0.0 else 100.0
-    return (f'{found.dips} dip{"" if found.dips == 1 else "s"} below {found.limit:g} V, '
-            f'{number(found.below, 2)} s in all ({share:.2g} % of the time)')
+    """Return the dips in words; empty when there is none."""
+    dips = found.facts.dips
+    if dips is None or not dips.count:
+        return ''
+    share = 100.0 * dips.seconds / found.duration if found.duration > 0.0 else 100.0
+    return (f'{dips.count} dip{"" if dips.count == 1 else "s"} below {dips.limit_v:g} V, '
+            f'{number(dips.seconds, 2)} s in all ({share:.2g} % of the time)')
 
 
 def _sag_words(found: Overview) -> str:
-    load = found.load
-    if math.isnan(found.flown[0]):
+    sag = found.facts.sag
+    if math.isnan(sag.flown[0]):
         return 'unknown: the recording has no throttle'
-    if not load.known:
-        return f'unknown. {load.status.value}'
-    at, sag, se = found.sag
-    words = f'{volts(sag)} (+- {volts(2.0 * se)}) at {100.0 * at:.0f} % throttle'
-    if at < 0.95:
-        full = float(load.sag(1.0))
-        words += (f', the highest flown; some {volts(full)} (+- '
-                  f'{volts(2.0 * float(load.sag_se(1.0)))}) at full throttle, if its form holds')
+    if not sag.known:
+        return f'unknown. {found.load.status.value}'
+    at, there, se = found.sag
+    words = f'{volts(there)} (+- {volts(2.0 * se)}) at {100.0 * at:.0f} % throttle'
+    if at < 1.0:
+        words += (f'; about {volts(sag.sag_v[-1])} (+- {volts(2.0 * sag.se_v[-1])}) extrapolated '
+                  'to full throttle')
     return words
 
 
 def _noise_words(found: Overview) -> str:
-    low, high = found.noise
-    if not math.isfinite(low):
+    (first, low), (last, high) = found.noise
+    if not (math.isfinite(low) and math.isfinite(high)):
         return 'unknown'
-    first, last = (f'{100.0 * u:.0f} %' for u in (
-        found.flown if math.isfinite(found.flown[0]) else (0.0, 0.0)))
-    if found.load.status in (LoadStatus.STILL, LoadStatus.NO_THROTTLE) or (
-            first == last):
-        return f'{number(1e3 * low)} mV rms from sample to sample'
-    pair = f'{number(1e3 * low)} mV rms at {first} throttle, {number(1e3 * high)} mV at {last}'
+    if low < _NOTHING and high < _NOTHING:
+        return 'none'
+    if first == last:
+        return f'{number(1e3 * low)} mV rms'
+    pair = (f'{number(1e3 * low)} mV rms at {100.0 * first:.0f} % throttle, '
+            f'{number(1e3 * high)} mV at {100.0 * last:.0f} %')
     if high > _GROWS * low:
         return f'{pair}: it grows with throttle'
     if low > _GROWS * high:
@@ -245,7 +220,25 @@ def _noise_words(found: Overview) -> str:
     return f'{pair}: throttle hardly matters'
 
 
-def _load(recording: Recording) -> SupplyLoad:
-    load = LoadFilter()
-    load.push(recording.t, recording.voltage, recording.throttle, recording.current)
-    return load.load()
+def other_scale(ou: OuFacts, alpha: float, ln_alpha_se: float, sigma: float, ln_sigma_se: float,
+                ) -> bool:
+    """Whether alpha and sigma of another fit are not those of the facts, by both intervals."""
+    return ou.status == 'ok' and any(
+        x * math.exp(Z95 * se) < low or x * math.exp(-Z95 * se) > high
+        for x, se, (low, high) in ((alpha, ln_alpha_se, ou.alpha_95),
+                                   (sigma, ln_sigma_se, ou.sigma_95)) if math.isfinite(x))
+
+
+def _ou_words(ou: OuFacts) -> str:
+    window = f'last {number(ou.window_s)} s'
+    if ou.status == 'ok':
+        alpha, sigma = (f'{number(x)} (95 % {number(low)} to {number(high)})'
+                        for x, (low, high) in ((ou.alpha, ou.alpha_95), (ou.sigma, ou.sigma_95)))
+        return (f'alpha {alpha} 1/s, sigma {sigma} V/sqrt(s), '
+                f'{number(1e3 * math.sqrt(ou.var_inf))} mV rms, beside level and load; {window}')
+    if ou.status == 'not_visible':
+        if not ou.var_inf_below:
+            return f'none: no noise; {window}'
+        return (f'not visible: slower than {number(1e3 * ou.tau_below_s)} ms it stays below '
+                f'{number(1e3 * math.sqrt(ou.var_inf_below))} mV rms; {window}')
+    return 'unknown: too few readings'

@@ -266,6 +266,14 @@ def second_items(throttles: Sequence[float]) -> list[QualityItem]:
         ] if throttles else []
 
 
+def scale_items(throttles: Sequence[float]) -> list[QualityItem]:
+    """Say at which levels alpha and sigma are not those beside level and load (0..1)."""
+    return [QualityItem('OTHER_TIME_SCALE', Severity.INFO, (
+        'Alpha and sigma of the level describe another time scale than the relaxation beside '
+        'level and load: they hold slow changes of the level, too.'),
+        tuple(throttles))] if throttles else []
+
+
 def coupling_items(throttles: Sequence[float]) -> list[QualityItem]:
     """Say where the noise shows an AC-coupled instrument (throttles 0..1)."""
     return [QualityItem('AC_COUPLING', Severity.WARNING, (

@@ -166,6 +166,12 @@ def supply_facts(recording: Recording, limit: float | None = None) -> SupplyFact
         When the limit is not finite.
 
     """
+    return facts_and_load(recording, limit)[0]
+
+
+def facts_and_load(recording: Recording, limit: float | None = None,
+                   ) -> tuple[SupplyFacts, SupplyLoad]:
+    """Return the facts, and the load at the end, of which they hold eleven points."""
     if limit is not None and not math.isfinite(limit):
         raise ValueError(f'the limit must be finite, got {limit} V')
     recording = readings_of(recording) if recording.n > 1 else recording
@@ -177,7 +183,7 @@ def supply_facts(recording: Recording, limit: float | None = None) -> SupplyFact
             Lowest(NAN, NAN, NAN), None if limit is None else Dips(limit, 0, 0.0, 0.0),
             Sag(False, nowhere, THROTTLES, unknown, unknown),
             Noise(THROTTLES, unknown, unknown, nowhere), Resistance(NAN, NAN),
-            OuFacts('no_data'), None)
+            OuFacts('no_data'), None), SupplyLoad()
     k = int(np.argmin(v))
     noise = noise_of(recording)
     load, budget = _at_the_end(recording, limit)
@@ -187,7 +193,7 @@ def supply_facts(recording: Recording, limit: float | None = None) -> SupplyFact
         Sag(load.known, noise.flown, THROTTLES, _tuple(load.sag(THROTTLES)),
             _tuple(load.sag_se(THROTTLES))),
         noise, Resistance(load.resistance, load.resistance_se),
-        known_ou(t, v, u, recording.current), budget)
+        known_ou(t, v, u, recording.current), budget), load
 
 
 def _tuple(values: FloatArray) -> tuple[float, ...]:

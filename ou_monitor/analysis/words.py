@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import math
 from typing import Any
 
@@ -20,25 +19,20 @@ from ou_monitor.criticism.innovations import FAMILY_WISE
 from ou_monitor.criticism.level_tests import EFFECT, LEAST
 from ou_monitor.model.spectral_lines import FALSE_ALARM
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.records import Estimate, NAN, Status
+from ou_monitor.records import NAN, OuFacts
 from ou_monitor.text import counted, number
 
 # What changes the meaning of the numbers in the headline itself.
 _BEWARE = {
     'VOLTAGE_UNIT': 'Beware: the voltages seem to be millivolts or counts, not volts.',
-    'TIME_UNIT': 'Beware: the time seems to be in ms or us, not in s.',
-    'SECOND_RELAXATION': ('Beware: the noise shows a second relaxation, so tau is that of a '
-                          'mixture.'),
-    'NOT_SETTLED': ('Beware: the levels, and so tau, include the settling after changes of '
-                    'throttle.')}
+    'TIME_UNIT': 'Beware: the time seems to be in ms or us, not in s.'}
 
 
 def headline(analysis: Analysis) -> str:
     """Return what the recording says: what was seen, then sigma and tau where they are known."""
-    good = _fitted(analysis)
     beware = ''.join(f' {words}' for name, words in _BEWARE.items()
                      if any(item.name == name for item in analysis.quality))
-    numbers = f' {_numbers(good)}' if good else ''
+    numbers = _numbers(analysis.overview.facts.ou) + _change(analysis)
     curves = analysis.by_throttle
     safe = '' if math.isnan(curves.budget) else (
         f' Safe up to {100.0 * curves.budget:.0f} % throttle.' if curves.budget > 0.0 else
@@ -73,61 +67,40 @@ def _budget_words(curves: ByThrottle) -> str:
     return words
 
 
-def _fitted(analysis: Analysis) -> list[LevelResult]:
-    """Return the levels whose sigma and tau may be quoted."""
-    return ([level for level in analysis.levels if level.estimate.status is Status.OK]
-            or [level for level in analysis.levels if level.estimate.usable])
-
-
 def facts(analysis: Analysis) -> list[tuple[str, str]]:
-    """Return what is always known, and why sigma and tau are not, as names and words."""
+    """Return what is always known, as names and words."""
     found = known_lines(analysis.overview)
     curves = analysis.by_throttle
     if math.isfinite(curves.budget):
         found.insert(-1, ('Safe up to', _budget_words(curves)))
-    time: dict[Status, float] = {}
-    for level in analysis.levels:
-        time[level.estimate.status] = time.get(level.estimate.status, 0.0) + level.time
-    if time and not _fitted(analysis):
-        why = max(time, key=lambda status: time[status]).value
-        found.append(('Sigma, tau', f'not given. {why}'))
     return found
 
 
-def _numbers(good: Sequence[LevelResult]) -> str:
-    """Return how sigma goes with throttle, and tau."""
+def _numbers(ou: OuFacts) -> str:
+    """Return sigma and tau, where they are known."""
+    if ou.status != 'ok':
+        return ''
+    low, high = ou.alpha_95
+    return (f' Beside level and load the supply wanders with sigma = {number(ou.sigma)} (95 % '
+            f'{number(ou.sigma_95[0])} to {number(ou.sigma_95[1])}) V/sqrt(s) and relaxes in '
+            f'tau = {number(1e3 / ou.alpha)} (95 % {number(1e3 / high)} to {number(1e3 / low)}) '
+            f'ms: a standard deviation of {number(1e3 * math.sqrt(ou.var_inf))} mV.')
+
+
+def _change(analysis: Analysis) -> str:
+    """Return how sigma goes with throttle."""
+    good = [level for level in analysis.levels if level.estimate.usable]
+    if len(good) < 2:
+        return ''
     low, high = good[0], good[-1]
-    if len(good) == 1:
-        e = low.estimate
-        where = '' if math.isnan(low.throttle) else f' at {low.label} throttle'
-        return (f'The supply{where} wanders with sigma = {_ci(e)} V/sqrt(s) and '
-                f'relaxes in tau = {_tau(e)} ms: a standard deviation of '
-                f'{number(1e3 * math.sqrt(e.var_inf))} mV.')
     found = sigma_change(low.estimate, high.estimate)
-    factor = 'by a factor that is not determined' if math.isnan(found.ratio) else (
-        f'factor {number(found.ratio)}, 95 % {number(found.ratio_low)} to '
-        f'{number(found.ratio_high)}')
-    if not found.differs:
-        change = (f'sigma does not change measurably from {low.label} to {high.label} throttle '
-                  f'({factor})')
-    else:
-        verb = 'grows' if found.ratio_low > 1.0 else 'falls'
-        change = (f'sigma {verb} from {number(low.estimate.sigma)} to '
-                  f'{number(high.estimate.sigma)} V/sqrt(s) from {low.label} to {high.label} '
-                  f'throttle ({factor})')
-    return (f'{change[0].upper()}{change[1:]}. At {high.label} the supply relaxes in tau = '
-            f'{_tau(high.estimate)} ms, with a standard deviation of '
-            f'{number(1e3 * math.sqrt(high.estimate.var_inf))} mV.')
-
-
-def _ci(e: Estimate) -> str:
-    low, high = e.interval('sigma')
-    return f'{number(e.sigma)} (95 % {number(low)} to {number(high)})'
-
-
-def _tau(e: Estimate) -> str:
-    low, high = e.interval('alpha')
-    return f'{number(1e3 / e.alpha)} (95 % {number(1e3 / high)} to {number(1e3 / low)})'
+    if math.isnan(found.ratio):
+        return ''
+    verb = 'does not change measurably' if not found.differs else (
+        'grows' if found.ratio_low > 1.0 else 'falls')
+    return (f' Sigma {verb} from {low.label} to {high.label} throttle (factor '
+            f'{number(found.ratio)}, 95 % {number(found.ratio_low)} to '
+            f'{number(found.ratio_high)}).')
 
 
 def cautions(analysis: Analysis, least: Severity = Severity.INFO) -> list[str]:
@@ -218,18 +191,10 @@ def as_data(analysis: Analysis) -> dict[str, Any]:
 
 
 def _overview(found: Overview) -> dict[str, Any]:
-    at, sag, sag_se = found.sag
-    low, high = found.noise
     line = found.line
     return {
-        'lowest_v': found.lowest, 'lowest_at_s': found.lowest_at,
-        'lowest_throttle': found.lowest_throttle,
-        'limit_v': found.limit, 'dips': found.dips, 'below_s': found.below,
-        'load_known': found.load.known, 'load_status': found.load.status.name,
-        'level_v': found.load.level, 'highest_throttle': at, 'sag_v': sag, 'sag_se_v': sag_se,
-        'sag_full_v': float(found.load.sag(1.0)), 'sag_full_se_v': float(found.load.sag_se(1.0)),
-        'resistance_ohm': found.load.resistance,
-        'flown_throttle': list(found.flown), 'noise_v': [low, high],
+        'load_status': found.load.status.name, 'level_v': found.load.level,
+        'highest_throttle': found.highest,
         'strongest_line': None if line is None else {
             'frequency_hz': line.frequency, 'rms_v': line.rms, 'share_of_variance': line.share,
             'level': line.level},

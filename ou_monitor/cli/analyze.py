@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 import math
 import shlex
 
 from ou_monitor.analysis.analyze import Analysis, analyze
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.relaxation import Relaxation
-from ou_monitor.analysis.supply import supply_facts
 from ou_monitor.analysis.words import (
     as_data, brownout_sentence, caution, facts, headline, in_short, relaxation_sentence)
 from ou_monitor.cli import output
@@ -49,8 +49,11 @@ def run(args: argparse.Namespace) -> int:
         from ou_monitor.report.analysis_page import analysis_page
         output.write_text(analysis_page(analysis, command_line(args)), args.report)
     if args.json is not None:
-        output.write_json({**as_data(analysis), 'supply': supply_facts(
-            recording, voltage).to_dict()}, args.json)
+        found = analysis.overview.facts
+        if analysis.brownout_default:
+            # As other commands without a limit.
+            found = replace(found, dips=None, budget=None)
+        output.write_json({**as_data(analysis), 'supply': found.to_dict()}, args.json)
     if args.json != output.STDOUT:
         output.say(render(analysis))
         output.summary(*in_short(analysis), report=args.report, json=args.json)

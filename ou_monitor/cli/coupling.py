@@ -26,7 +26,6 @@ def run(args: argparse.Namespace) -> int:
     start, end = part_of_recording(args.start, args.end)
 
     from ou_monitor.analysis.overview import answers, known_lines, overview
-    from ou_monitor.analysis.supply import supply_facts
     from ou_monitor.recordings.importers.log import UNKNOWN
     from ou_monitor.timeline.line import readings_of
 
@@ -44,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"'{args.recording}', signal '{args.signal}': {error}") from error
     # From here on as `analyze` reads it.
     recording = readings_of(recording)
-    seen = overview(recording, math.nan if limit is None else limit, cells=args.cells or 0)
+    seen = overview(recording, limit, cells=args.cells or 0)
     known = known_lines(seen)
     if args.report is not None:
         from ou_monitor.report.coupling_page import coupling_page
@@ -53,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json is not None:
         output.write_json({
             **as_data(found, recording.name, args.signal, unit, recording.notes),
-            'supply': supply_facts(recording, limit).to_dict()}, args.json)
+            'supply': seen.facts.to_dict()}, args.json)
     if args.json != output.STDOUT:
         output.say(render(found, recording.name, args.signal, unit, recording.notes, known))
         output.summary(headline(found, args.signal, unit),

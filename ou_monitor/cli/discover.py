@@ -33,8 +33,7 @@ def run(args: argparse.Namespace) -> int:
                   **{'--msg-config': args.msg_config})
 
     import numpy as np
-    from ou_monitor.analysis.overview import known_lines, overview
-    from ou_monitor.analysis.supply import supply_facts
+    from ou_monitor.analysis.overview import known_lines, other_scale, overview
     from ou_monitor.discovery.discover import discover
     from ou_monitor.discovery.plain_names import in_short
 
@@ -44,16 +43,19 @@ def run(args: argparse.Namespace) -> int:
     with Progress('discovering', args.json == output.STDOUT) as progress, \
             np.errstate(all='ignore'):
         finding = discover(recording, seed=args.seed, progress=progress)
-    known = known_lines(overview(recording, math.nan if limit is None else limit,
-                                 cells=args.cells or 0))
+    seen = overview(recording, limit, cells=args.cells or 0)
+    known = known_lines(seen)
+    plain = finding.baseline
+    if plain is not None and other_scale(seen.facts.ou, plain.alpha, 0.0, plain.sigma, 0.0):
+        known.append(('Plain OU', 'describes another time scale than this relaxation: level and '
+                      'load are in it'))
     if args.report is not None:
         from ou_monitor.report.discovery_page import discovery_page
         with Progress('drawing', args.json == output.STDOUT) as progress:
             text = discovery_page(finding, command_line(args), progress, known)
         output.write_text(text, args.report)
     if args.json is not None:
-        output.write_json({**finding.as_data(), 'supply': supply_facts(
-            recording, limit).to_dict()}, args.json)
+        output.write_json({**finding.as_data(), 'supply': seen.facts.to_dict()}, args.json)
     if args.json != output.STDOUT:
         output.say(render(finding, known))
         saved = args.save_model if args.force or not finding.refused else None

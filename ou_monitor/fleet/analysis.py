@@ -119,18 +119,15 @@ def _level(level: LevelResult, options: Options) -> dict[str, Any]:
 
 
 def _seen(found: Overview) -> dict[str, float]:
-    """Return the lowest voltage, the dips and the sag of a recording."""
-    limited, sag = math.isfinite(found.limit), (NAN, NAN, NAN)
-    full = full_se = NAN
-    if found.load.known:
-        sag = found.sag
-        full, full_se = float(found.load.sag(1.0)), float(found.load.sag_se(1.0))
+    """Return the facts that the table compares: lowest voltage, dips and sag."""
+    lowest, dips, sag = found.facts.lowest, found.facts.dips, found.facts.sag
+    there = found.sag if sag.known else (NAN, NAN, NAN)
     return {
-        'lowest': found.lowest, 'lowest_at': found.lowest_at,
-        'lowest_throttle': found.lowest_throttle,
-        'dips': found.dips if limited else NAN, 'below_s': found.below if limited else NAN,
-        'sag_throttle': sag[0], 'sag': sag[1], 'sag_se': sag[2],
-        'sag_full': full, 'sag_full_se': full_se}
+        'lowest': lowest.voltage_v, 'lowest_at': lowest.time_s, 'lowest_throttle': lowest.throttle,
+        'dips': dips.count if dips else NAN, 'below_s': dips.seconds if dips else NAN,
+        'sag_throttle': there[0], 'sag': there[1], 'sag_se': there[2],
+        'sag_full': sag.sag_v[-1] if sag.known else NAN,
+        'sag_full_se': sag.se_v[-1] if sag.known else NAN}
 
 
 def _discovered(recording: Recording, options: Options) -> dict[str, Any]:

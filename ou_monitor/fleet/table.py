@@ -76,8 +76,8 @@ COLUMNS = (
     Column('dips', 'count', '', 'dips below the limit, those less than 0.2 s apart as one; needs '
            '--brownout-voltage or --cells'),
     Column('below_s', 'number', 's', 'time below the limit; needs the same'),
-    Column('sag_throttle', 'number', '1', 'highest throttle flown, 0..1; null where the sag is '
-           'unknown'),
+    Column('sag_throttle', 'number', '1', 'highest throttle flown, to a tenth; null where the sag '
+           'is unknown'),
     Column('sag', 'number', 'V', 'sag there, positive, as analyze tells it'),
     Column('sag_se', 'number', 'V', 'standard error of sag'),
     Column('sag_full', 'number', 'V', 'sag at full throttle, if its form holds up to there; '

@@ -72,7 +72,7 @@ class Line:
     rms: float
     rms_low: float
     rms_high: float
-    share: float  # Share of the variance of the level
+    share: float  # Share of the variance of the segments in which it is measured
     p_value: float  # Of an ordinate so large, times the ordinates tested at all levels
 
 
@@ -173,7 +173,9 @@ def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: flo
     background = raw[where] / np.maximum(white[where], 1e-300) * middle
     # The median of a gamma variable, in units of its mean.
     background /= float(gammaincinv(k, 0.5)) / k
-    total = float(sum(part @ part for part in parts) / sum(part.size for part in parts))
+    # Of the segments in which the line is measured, as short ones may be quieter.
+    held = [part for part in parts if part.size >= length]
+    total = float(sum(part @ part for part in held) / sum(part.size for part in held))
     lines = [_measure(raw, background, white[where], middle, where, group, p, df, total, k)
              for group in _groups(hits)]
     return lines, _detectable(float(np.median(background)), df, k, limit)
@@ -278,8 +280,8 @@ def _measure(raw: FloatArray, background: FloatArray, white: FloatArray, middle:
     reach = Z95 * se
     return Line(float((where[low:high] * excess).sum() / excess.sum() * df), df,
                 math.sqrt(max(power, 0.0)), math.sqrt(max(power - reach, 0.0)),
-                math.sqrt(max(power + reach, 0.0)), max(power, 0.0) / total if total else NAN,
-                float(p[group].min()))
+                math.sqrt(max(power + reach, 0.0)),
+                min(1.0, max(power, 0.0) / total) if total else NAN, float(p[group].min()))
 
 
 def _detectable(density: float, df: float, k: float, limit: float) -> float:

@@ -5,8 +5,9 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
-from ou_monitor.analysis.overview import count_dips, headline, known_lines, overview
-from ou_monitor.records import Recording
+from ou_monitor import supply_facts
+from ou_monitor.analysis.overview import headline, known_lines, other_scale, overview
+from ou_monitor.records import OuFacts, Recording
 import pytest
 
 RATE, SECONDS = 50.0, 80.0
@@ -28,43 +29,51 @@ def flight(seed=3, sag=SAG, throttle=True):
                      u if throttle else np.full(t.size, math.nan))
 
 
-@pytest.mark.parametrize('below,dips,seconds', [
-    ((), 0, 0.0), ((0,), 1, 0.01), ((5, 6, 7), 1, 0.03), ((5, 20, 40), 1, 0.03),
-    ((5, 27), 2, 0.02), ((99,), 1, 0.01)])
-def test_dips_are_apart_by_a_fifth_of_a_second(below, dips, seconds):
-    """At 100 Hz: neighbours and those within 0.2 s are one; the last sample counts, too."""
-    t = np.arange(100) / 100.0
-    v = np.full(100, 5.0)
-    v[list(below)] = 4.0
-    found, time = count_dips(t, v, 4.5)
-    assert found == dips and time == pytest.approx(seconds)
-    assert count_dips(t, v, math.nan) == (0, 0.0)
-
-
 def test_a_gap_after_a_low_sample_is_not_time_below():
     """A minute without samples counts as ten usual intervals at most."""
     t = np.concatenate((np.arange(50), 6000 + np.arange(50))) / 100.0
     v = np.full(100, 5.0)
     v[49] = 4.0
-    assert count_dips(t, v, 4.5) == (1, pytest.approx(0.1))
+    dips = supply_facts(Recording(t, v, np.full(100, math.nan)), 4.5).dips
+    assert (dips.count, dips.seconds) == (1, pytest.approx(0.1))
 
 
-def test_sag_and_noise_are_those_of_the_supply():
-    """The sag within three errors of the truth, themselves under a third; noise within 15 %."""
-    found = overview(flight(), 15.2)
-    assert found.load.known
+def test_words_are_those_of_the_facts():
+    """The sag within three errors of the truth; each number in words is one of `supply_facts`."""
+    found, facts = overview(flight(), 15.2), supply_facts(flight(), 15.2)
+    assert found.facts.to_dict() == facts.to_dict() and facts.sag.known
     at, sag, se = found.sag
-    assert at == pytest.approx(0.8, abs=0.01)
+    assert at == 0.8 and sag == facts.sag.sag_v[8]
     assert abs(sag - SAG * at ** 1.8) < 3.0 * se and se < 0.33 * SAG * at ** 1.8
-    low, high = found.noise
-    # Of the last 2000 samples at the ends of a line: some 5 %.
-    assert low == pytest.approx(deviation(found.flown[0]), rel=0.15)
-    assert high == pytest.approx(deviation(found.flown[1]), rel=0.15)
+    (low, first), (high, last) = found.noise
+    # A tenth of throttle changes the noise by up to 25 %.
+    assert (low, high) == (0.1, 0.8)
+    assert first == pytest.approx(deviation(low), rel=0.3)
+    assert last == pytest.approx(deviation(high), rel=0.15)
     words = dict(known_lines(found))
     assert words['Noise'].endswith('it grows with throttle')
-    assert 'the highest flown' in words['Sag'] and 'at full throttle' in words['Sag']
-    assert f'{found.dips} dips below 15.2 V' in headline(found)
-    assert f'{found.lowest:.2f} V' in words['Lowest voltage']
+    assert f'{1e3 * last:.1f} mV at 80 %' in words['Noise']
+    assert words['Sag'].startswith(f'{1e3 * sag:.0f} mV')
+    assert 'extrapolated to full throttle' in words['Sag']
+    assert f'{facts.dips.count} dips below 15.2 V' in headline(found)
+    assert f'{facts.lowest.voltage_v:.2f} V' in words['Lowest voltage']
+
+
+def test_a_constant_signal_has_no_noise():
+    """Neither noise nor relaxation."""
+    t = np.arange(1000) / 100.0
+    words = dict(known_lines(overview(Recording(t, np.full(1000, 12.0), np.full(1000, 0.5)))))
+    assert words['Noise'] == 'none' and words['Relaxation'].startswith('none')
+
+
+@pytest.mark.parametrize('alpha, se, other', [
+    (20.0, 0.0, False), (8.0, 0.1, True), (8.0, 0.3, False), (60.0, 0.1, True),
+    (math.nan, math.nan, False)])
+def test_another_time_scale_is_told_by_both_intervals(alpha, se, other):
+    """Of ln alpha; sigma agrees."""
+    ou = OuFacts('ok', 30.0, 20.0, (14.0, 28.0), 0.1, (0.08, 0.12), 2.5e-4, (2e-4, 3e-4))
+    assert other_scale(ou, alpha, se, 0.1, 0.1) is other
+    assert not other_scale(OuFacts('not_visible', 30.0), alpha, se, 0.1, 0.1)
 
 
 def test_what_is_not_known_is_said_and_the_rest_stands():
@@ -72,7 +81,7 @@ def test_what_is_not_known_is_said_and_the_rest_stands():
     blind = overview(flight(throttle=False))
     words = dict(known_lines(blind))
     assert words['Sag'] == 'unknown: the recording has no throttle'
-    assert 'mV rms from sample to sample' in words['Noise'] and 'Below' not in ' '.join(words)
+    assert words['Noise'].endswith(' mV rms') and 'Below' not in ' '.join(words)
     assert headline(blind).startswith('The voltage fell to ')
     idle = dict(known_lines(overview(flight(sag=0.0), 3.0)))
     assert idle['Sag'].startswith('unknown. ') and idle['Below 3 V'] == 'never'

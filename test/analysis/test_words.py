@@ -36,12 +36,11 @@ def test_headline_tells_growth_with_its_interval():
 def test_headline_of_one_level_and_of_none():
     """One level is described; without any the facts say why."""
     simulated = without_throttle(recording(4, ((0.1, 0.3),)))
-    assert ' The supply wanders with sigma = 0.' in headline(analyze(simulated))
+    assert ' the supply wanders with sigma = 0.' in headline(analyze(simulated))
     short = recording(5, ((0.1, 0.3),), seconds=0.012)
     analysis = analyze(short)
     assert headline(analysis).startswith('The voltage stayed above 4.5 V')
-    assert facts(analysis)[-1] == (
-        'Sigma, tau', f'not given. {analysis.levels[0].estimate.status.value}')
+    assert facts(analysis)[-1] == ('Relaxation', 'unknown: too few readings')
 
 
 def test_headline_warns_of_what_changes_its_own_numbers():

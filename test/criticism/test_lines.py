@@ -131,3 +131,12 @@ def test_short_levels_are_not_searched(parts):
 def test_a_constant_has_no_lines():
     """Nor warnings."""
     assert not find_lines([np.full(500, 5.0)], RATE).lines
+
+
+def test_a_line_is_at_most_all_of_the_noise():
+    """A slow line of one long segment among short quiet ones: nearly all of that segment."""
+    rng, k = np.random.default_rng(1), np.arange(4096)
+    parts = [np.sin(0.0105 * k) + 0.1 * rng.standard_normal(k.size),
+             *0.1 * rng.standard_normal((40, 300))]
+    (line,) = find_lines(parts, 100.0).lines
+    assert 0.9 < line.share <= 1.0
