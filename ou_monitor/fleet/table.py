@@ -73,8 +73,8 @@ COLUMNS = (
     Column('lowest', 'number', 'V', 'lowest voltage of the recording'),
     Column('lowest_at', 'number', 's', 'when, from the first sample'),
     Column('lowest_throttle', 'number', '1', 'throttle then, 0..1'),
-    Column('dips', 'count', '', 'dips below the limit, those less than 0.2 s apart as one; needs '
-           '--brownout-voltage or --cells'),
+    Column('dips', 'count', '', 'dips below the limit; one lasts until a reading is clearly above '
+           'it; needs --brownout-voltage or --cells'),
     Column('below_s', 'number', 's', 'time below the limit; needs the same'),
     Column('sag_throttle', 'number', '1', 'highest throttle flown, to a tenth; null where the sag '
            'is unknown'),
