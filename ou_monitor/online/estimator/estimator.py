@@ -33,8 +33,8 @@ from ou_monitor.online.estimator.fit import fit_window, Fitted, from_window, TRE
 from ou_monitor.online.estimator.irregular import ExactFit, fit_irregular, MOST
 from ou_monitor.online.estimator.quality import (
     examine, input_flags, judge, Quality, recount)
-from ou_monitor.online.estimator.series import T, Thinner, U, Y
-from ou_monitor.online.estimator.window import FACTOR, FEWEST, LAGS, LOST, Resolution, Sums
+from ou_monitor.online.estimator.window import (
+    FACTOR, FEWEST, LAGS, LOST, Resolution, Sums, T, Thinner, U, Y)
 from ou_monitor.records import (
     Counters, Estimate, Flag, FloatArray, LARGEST_LOG_SE, MOST_READINGS, NAN, OU_WINDOWS, OuFacts,
     Status)

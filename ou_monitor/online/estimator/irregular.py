@@ -19,8 +19,7 @@ import math
 import numpy as np
 from ou_monitor.model import arma
 from ou_monitor.online.estimator.fit import Fitted, independent, Outcome, SUSPECT, TREND_SCORE
-from ou_monitor.online.estimator.series import FAST, SLOW, T, U, Y
-from ou_monitor.online.estimator.window import FACTOR, FEWEST, LAGS, LOST
+from ou_monitor.online.estimator.window import FACTOR, FAST, FEWEST, LAGS, LOST, SLOW, T, U, Y
 from ou_monitor.records import FloatArray
 
 # Relaxations between two samples beyond which they are independent: exp(2 * 300) is a double.

@@ -4,7 +4,7 @@ import copy
 import math
 
 import numpy as np
-from ou_monitor.online.estimator.series import Thinner
+from ou_monitor.online.estimator.window import Thinner
 from ou_monitor.timeline.line import as_column, BATCH, TimeLine
 import pytest
 

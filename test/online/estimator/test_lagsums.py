@@ -2,8 +2,7 @@
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.online.estimator.series import Series
-from ou_monitor.online.estimator.window import LAGS, Resolution, SLOTS
+from ou_monitor.online.estimator.window import LAGS, Resolution, Series, SLOTS
 import pytest
 
 DT = 1e-3

@@ -4,7 +4,7 @@ import math
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.online.estimator.series import FAST, lagged, LOAD_LAGS, Series, SLOW, T, U, Y
+from ou_monitor.online.estimator.window import FAST, lagged, LOAD_LAGS, Series, SLOW, T, U, Y
 import pytest
 
 START = np.array([0], dtype=np.int64)
