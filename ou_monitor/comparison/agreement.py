@@ -18,19 +18,10 @@ class Verdict(enum.Enum):
 
 @dataclass(frozen=True)
 class Band:
-    """
-    A number of the recording beside those of the simulations.
+    """A number of the recording beside those of the simulations."""
 
-    Attributes
-    ----------
-    measured : float
-        Of the recording.
-    low, median, high : float
-        2.5 %, 50 % and 97.5 % of the simulations.
-
-    """
-
-    measured: float
+    measured: float  # Of the recording
+    # 2.5 %, 50 % and 97.5 % of the simulations.
     low: float
     median: float
     high: float
@@ -53,35 +44,23 @@ class SpectrumBand:
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """
-    What a page draws: the part compared, and simulations of it.
+    """What a page draws: the part compared, and simulations of it."""
 
-    Attributes
-    ----------
-    t, voltage, throttle : ndarray
-        The recording, s, V, 0..1 (NaN: not recorded).
-    simulated : ndarray
-        One simulation, V.
-    at, low, high : ndarray
-        Stamps, s, and 95 % of the simulations there, V.
-    after, answer, answer_low, answer_high : ndarray
-        Seconds about a rise of throttle, and the mean answer to it, V.
-    edges, distribution, simulated_distribution : ndarray
-        Voltages, V, and the share of the samples below.
-
-    """
-
+    # The recording, s, V, 0..1 (NaN: not recorded).
     t: FloatArray
     voltage: FloatArray
     throttle: FloatArray
-    simulated: FloatArray
+    simulated: FloatArray  # One simulation, V
+    # Stamps, s, and 95 % of the simulations there, V.
     at: FloatArray
     low: FloatArray
     high: FloatArray
+    # Seconds about a rise of throttle, and the mean answer to it, V.
     after: FloatArray
     answer: FloatArray
     answer_low: FloatArray
     answer_high: FloatArray
+    # Voltages, V, and the share of the samples below.
     edges: FloatArray
     distribution: FloatArray
     simulated_distribution: FloatArray
@@ -89,73 +68,35 @@ class Traces:
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """
-    A recording beside its simulations.
+    """A recording beside its simulations."""
 
-    Attributes
-    ----------
-    recording : str
-        Its name.
-    fitted, simulated : tuple of float
-        Parts, s after the first sample; (0, 0) where nothing was fitted.
-    model : tuple of str
-        Names of the terms.
-    explained, rmse, bias : float
-        Of the mean path: share of the variance explained, V, V.
-    bias_by_third : tuple of float
-        V.
-    lowest, mean : Band
-        Least and mean voltage, V.
-    levels : tuple of float
-        Levels, V.
-    falls : tuple of Band
-        Dips below each per minute, as runs.
-    spectrum : tuple of SpectrumBand
-        By band of frequency.
-    dip, recovery : Band or None
-        Deepest point of the mean answer to rises of throttle, and its value 1 s after, V.
-    rises : int
-        Rises of throttle.
-    ks_distance : float
-        Largest difference of the two distributions.
-    seeds : int
-        Simulations.
-    p_value : float
-        Share of the simulations that are as odd among the others.
-    verdict : Verdict
-        The verdict.
-    words : str
-        What the simulation gets wrong most, as a part of a sentence.
-    notes : tuple of str
-        What was left out or assumed.
-    traces : Traces
-        For a page.
-
-    """
-
-    recording: str
+    recording: str  # Its name
+    # Parts, s after the first sample; (0, 0) where nothing was fitted.
     fitted: tuple[float, float]
     simulated: tuple[float, float]
-    model: tuple[str, ...]
+    model: tuple[str, ...]  # Names of the terms
+    # Of the mean path: share of the variance explained, V, V.
     explained: float
     rmse: float
     bias: float
-    bias_by_third: tuple[float, float, float]
+    bias_by_third: tuple[float, float, float]  # V
+    # Least and mean voltage, V.
     lowest: Band
     mean: Band
-    levels: tuple[float, ...]
-    falls: tuple[Band, ...]
-    spectrum: tuple[SpectrumBand, ...]
+    levels: tuple[float, ...]  # Levels, V
+    falls: tuple[Band, ...]  # Dips below each per minute, as runs
+    spectrum: tuple[SpectrumBand, ...]  # By band of frequency
+    # Deepest point of the mean answer to rises of throttle, and its value 1 s after, V.
     dip: Band | None
     recovery: Band | None
-    rises: int
-    ks_distance: float
-    seeds: int
-    p_value: float
-    verdict: Verdict
-    words: str
-    notes: tuple[str, ...]
-    traces: Traces
+    rises: int  # Rises of throttle
+    ks_distance: float  # Largest difference of the two distributions
+    seeds: int  # Simulations
+    p_value: float  # Share of the simulations that are as odd among the others
+    verdict: Verdict  # The verdict
+    words: str  # What the simulation gets wrong most, as a part of a sentence
+    notes: tuple[str, ...]  # What was left out or assumed
+    traces: Traces  # For a page
 
     @property
     def worst(self) -> str:

@@ -19,20 +19,12 @@ from scipy.signal import lfilter
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """
-    What a comparison is about: each reading of the ADC once.
+    """What a comparison is about: each reading of the ADC once."""
 
-    Attributes
-    ----------
-    t, voltage : ndarray, shape (n,)
-        Stamps, s, and readings, V.
-    throttle, current : ndarray, shape (n,), or None
-        0..1, and A; None where not recorded.
-
-    """
-
+    # Stamps, s, and readings, V; shape (n,).
     t: FloatArray
     voltage: FloatArray
+    # 0..1, and A; None where not recorded; shape (n,).
     throttle: FloatArray | None
     current: FloatArray | None = None
 
@@ -76,18 +68,10 @@ class Damping:
 
     Throttle jitters, arrives at other moments than the voltage, and is no current: what is fast in
     the path is partly not in the voltage, and would be counted twice, in the path and as noise.
-
-    Attributes
-    ----------
-    share : float
-        Share of the fast part that is missing, 0..1.
-    time : float
-        What is faster than this time constant, s.
-
     """
 
-    share: float = 0.0
-    time: float = 0.02
+    share: float = 0.0  # Share of the fast part that is missing, 0..1
+    time: float = 0.02  # What is faster than this time constant, s
 
     def of(self, path: FloatArray, t: FloatArray) -> FloatArray:
         """Return a path, V, at stamps, s, damped."""
@@ -98,40 +82,20 @@ class Damping:
 
 @dataclass(frozen=True, eq=False)
 class FlightModel:
-    """
-    Load model, slow process, OU and white noise, as fitted to a part of a recording.
+    """Load model, slow process, OU and white noise, as fitted to a part of a recording."""
 
-    Attributes
-    ----------
-    load : LoadFit or None
-        The answer to the load; None where the level is all there is.
-    level, level_se : float
-        Level, V, without a load model, and its standard error.
-    damping : Damping
-        Of its path.
-    spread : float
-        Factor on the variance of the slow process: how much farther parts that were left out lay
-        from their prediction than the fit says.
-    sag_error : float
-        Relative error of the sag, as parts that were left out show it.
-    noise : NoiseLaw
-        White noise.
-    ou : ResidualOU
-        What has memory in the residuals.
-    until : float
-        End of the part fitted, s.
-
-    """
-
-    load: LoadFit | None
+    load: LoadFit | None  # The answer to the load; None where the level is all there is
+    # Level, V, without a load model, and its standard error.
     level: float
     level_se: float
-    damping: Damping
+    damping: Damping  # Of its path
+    # Factor on the variance of the slow process: how much farther parts that were left out lay
+    # from their prediction than the fit says.
     spread: float
-    sag_error: float
-    noise: NoiseLaw
-    ou: ResidualOU
-    until: float
+    sag_error: float  # Relative error of the sag, as parts that were left out show it
+    noise: NoiseLaw  # White noise
+    ou: ResidualOU  # What has memory in the residuals
+    until: float  # End of the part fitted, s
 
     @property
     def names(self) -> list[str]:
@@ -201,15 +165,9 @@ def _ou(dt: FloatArray, tau: float, rng: np.random.Generator) -> FloatArray:
 class FiledModel:
     """
     A model from a file; its terms are drawn at each reading of the ADC, so none is held twice.
-
-    Attributes
-    ----------
-    model : SupplyModel
-        As in the file.
-
     """
 
-    model: SupplyModel
+    model: SupplyModel  # As in the file
 
     @property
     def names(self) -> list[str]:

@@ -34,29 +34,13 @@ RECOVERED = 1.0
 
 @dataclass(frozen=True)
 class Difference:
-    """
-    One number, and what would be said of it.
+    """One number, and what would be said of it."""
 
-    Attributes
-    ----------
-    kind : str
-        Key of its weight.
-    measured : float
-        Of the recording.
-    simulated : ndarray, shape (seeds,)
-        Of each simulation.
-    least : float
-        Half of the narrowest band.
-    words : callable
-        Band -> sentence without its end.
-
-    """
-
-    kind: str
-    measured: float
-    simulated: FloatArray
-    least: float
-    words: Callable[[Band], str]
+    kind: str  # Key of its weight
+    measured: float  # Of the recording
+    simulated: FloatArray  # Of each simulation; shape (seeds,)
+    least: float  # Half of the narrowest band
+    words: Callable[[Band], str]  # Band -> sentence without its end
 
     @property
     def band(self) -> Band:

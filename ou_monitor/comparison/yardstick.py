@@ -30,35 +30,17 @@ _BINS = 2000
 
 @dataclass(frozen=True, eq=False)
 class Measures:
-    """
-    What was measured of one voltage.
+    """What was measured of one voltage."""
 
-    Attributes
-    ----------
-    mean : float
-        Mean, V.
-    thirds : ndarray, shape (3,)
-        Means of the thirds, V.
-    lowest : float
-        Least voltage, V.
-    falls : ndarray, shape (levels,)
-        Dips below each level per minute, as `supply_facts` counts them.
-    power : ndarray, shape (bands,)
-        Power in each band, V^2.
-    answer : ndarray, shape (points,)
-        Mean answer to rises of throttle, V; empty where there are too few.
-    distribution : ndarray, shape (bins,)
-        Share of the samples below each edge.
-
-    """
-
-    mean: float
-    thirds: FloatArray
-    lowest: float
+    mean: float  # Mean, V
+    thirds: FloatArray  # Means of the thirds, V; shape (3,)
+    lowest: float  # Least voltage, V
+    # Dips below each level per minute, as `supply_facts` counts them; shape (levels,).
     falls: FloatArray
-    power: FloatArray
+    power: FloatArray  # Power in each band, V^2; shape (bands,)
+    # Mean answer to rises of throttle, V; empty where there are too few; shape (points,).
     answer: FloatArray
-    distribution: FloatArray
+    distribution: FloatArray  # Share of the samples below each edge; shape (bins,)
 
 
 class Yardstick:

@@ -32,27 +32,14 @@ _ONE, _NO_TIME = np.ones(1), np.zeros(1)
 
 @dataclass(slots=True)
 class Regression:
-    """
-    The mean, fitted at one choice of noise.
+    """The mean, fitted at one choice of noise."""
 
-    Attributes
-    ----------
-    beta : ndarray, shape (c,)
-        Coefficients of load and time, V per unit.
-    cov : ndarray, shape (c, c)
-        Their covariance per unit innovation variance, times n.
-    tilt : tuple of float
-        Gradient of half the log-determinant of their information in ln a and
-        theta (see `arma.objective`).
-    gram : ndarray, shape (c + 1, c + 1)
-        Products x' K^-1 z over n of voltage, load and time.
-
-    """
-
-    beta: FloatArray
-    cov: FloatArray
+    beta: FloatArray  # Coefficients of load and time, V per unit; shape (c,)
+    cov: FloatArray  # Their covariance per unit innovation variance, times n; shape (c, c)
+    # Gradient of half the log-determinant of their information in ln a and theta (see
+    # `arma.objective`).
     tilt: tuple[float, float]
-    gram: FloatArray
+    gram: FloatArray  # Products x' K^-1 z over n of voltage, load and time; shape (c + 1, c + 1)
 
 
 class Moments:
@@ -188,52 +175,24 @@ SUSPECT = 2.0
 
 @dataclass(slots=True)
 class WindowFit:
-    """
-    What the sums of a window say.
+    """What the sums of a window say."""
 
-    Attributes
-    ----------
-    a, theta : float
-        alpha times the step, and the moving-average coefficient.
-    scale : float
-        sigma^2 times the step, V^2.
-    noise_share : float
-        Noise variance of one sample in units of `scale`.
-    noise_score : float
-        Distance of theta from "no noise" in standard errors.
-    log_var : tuple of float
-        Variances of ln(alpha), ln(sigma), ln(Var_inf).
-    level : ndarray, shape (c,)
-        Means of voltage (less its reference) and load variables.
-    beta : ndarray, shape (c,) or none
-        Coefficients of the load, V per unit, and of time (0 without `trend`).
-    beta_cov : ndarray
-        Their covariance, V^2.
-    trend : bool
-        Whether a trend was needed.
-    trend_score : float
-        Trend over its standard error.
-    correlated : bool
-        Whether neighbouring samples are correlated at all; if not, a to
-        log_var are NaN.
-    variance : float
-        Variance about the mean, V^2.
-
-    """
-
+    # alpha times the step, and the moving-average coefficient.
     a: float
     theta: float
-    scale: float
-    noise_share: float
-    noise_score: float
-    log_var: tuple[float, float, float]
-    level: FloatArray
+    scale: float  # sigma^2 times the step, V^2
+    noise_share: float  # Noise variance of one sample in units of `scale`
+    noise_score: float  # Distance of theta from "no noise" in standard errors
+    log_var: tuple[float, float, float]  # Variances of ln(alpha), ln(sigma), ln(Var_inf)
+    level: FloatArray  # Means of voltage (less its reference) and load variables; shape (c,)
+    # Coefficients of the load, V per unit, and of time (0 without `trend`); shape (c,).
     beta: FloatArray
-    beta_cov: FloatArray
-    trend: bool
-    trend_score: float
+    beta_cov: FloatArray  # Their covariance, V^2
+    trend: bool  # Whether a trend was needed
+    trend_score: float  # Trend over its standard error
+    # Whether neighbouring samples are correlated at all; if not, a to log_var are NaN.
     correlated: bool
-    variance: float
+    variance: float  # Variance about the mean, V^2
 
 
 def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None) -> WindowFit:
@@ -324,49 +283,23 @@ class Outcome(enum.Enum):
 
 @dataclass(slots=True)
 class Fitted:
-    """
-    Parameters before correction for the length of the window.
+    """Parameters before correction for the length of the window."""
 
-    Attributes
-    ----------
-    outcome : Outcome
-        How it ended; other than FOUND the numbers may be NaN.
-    alpha, sigma : float
-        1/s and V/sqrt(s), as maximised.
-    noise_var : float
-        Variance of the white noise of one raw sample, V^2.
-    noise_score : float
-        How many standard errors the noise is from none.
-    log_var : tuple of float
-        Variances of ln(alpha), ln(sigma), ln(Var_inf).
-    variance : float
-        Variance about the mean, V^2.
-    level : ndarray, shape (c,)
-        Means of voltage and load variables.
-    beta, beta_cov : ndarray
-        Load coefficients, V per unit, and covariance, V^2.
-    trend : bool
-        Whether the mean drifts.
-    n : int
-        Samples, or block means, fitted.
-    alpha_step : float
-        alpha times the step between them.
-
-    """
-
-    outcome: Outcome
+    outcome: Outcome  # How it ended; other than FOUND the numbers may be NaN
+    # 1/s and V/sqrt(s), as maximised.
     alpha: float
     sigma: float
-    noise_var: float
-    noise_score: float
-    log_var: tuple[float, float, float]
-    variance: float
-    level: FloatArray
+    noise_var: float  # Variance of the white noise of one raw sample, V^2
+    noise_score: float  # How many standard errors the noise is from none
+    log_var: tuple[float, float, float]  # Variances of ln(alpha), ln(sigma), ln(Var_inf)
+    variance: float  # Variance about the mean, V^2
+    level: FloatArray  # Means of voltage and load variables; shape (c,)
+    # Load coefficients, V per unit, and covariance, V^2.
     beta: FloatArray
     beta_cov: FloatArray
-    trend: bool
-    n: int
-    alpha_step: float
+    trend: bool  # Whether the mean drifts
+    n: int  # Samples, or block means, fitted
+    alpha_step: float  # alpha times the step between them
 
 
 def from_window(fit: WindowFit, step: float, m: int, n: int, reference: float) -> Fitted:

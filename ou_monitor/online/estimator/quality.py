@@ -38,26 +38,12 @@ _CLIPPED_EXCESS = 3.0
 
 @dataclass(frozen=True)
 class Quality:
-    """
-    Findings about readings.
+    """Findings about readings."""
 
-    Attributes
-    ----------
-    step : float
-        ADC step, V; 0 when the values lie on no lattice.
-    held : float
-        Samples per refresh of a source that repeats its last value; 1: none.
-    saturated : bool
-        Whether samples pile up at an extreme.
-    rms_increment : float
-        Root mean square of the steps between fresh samples, V.
-
-    """
-
-    step: float = 0.0
-    held: float = 1.0
-    saturated: bool = False
-    rms_increment: float = math.nan
+    step: float = 0.0  # ADC step, V; 0 when the values lie on no lattice
+    held: float = 1.0  # Samples per refresh of a source that repeats its last value; 1: none
+    saturated: bool = False  # Whether samples pile up at an extreme
+    rms_increment: float = math.nan  # Root mean square of the steps between fresh samples, V
 
 
 def examine(y: FloatArray, held: float = 1.0) -> Quality:

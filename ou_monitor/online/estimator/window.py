@@ -443,38 +443,17 @@ _ROOM = 128
 
 @dataclass(slots=True)
 class Sums:
-    """
-    Sums over the samples of a window, for c variables and K lags.
+    """Sums over the samples of a window, for c variables and K lags."""
 
-    Attributes
-    ----------
-    row : ndarray
-        All that follows, in one row.
-    n : int
-        Samples.
-    first : ndarray, shape (c,)
-        Sum of each variable (voltage less its reference).
-    place : ndarray, shape (c,)
-        Sum of variable times sample number, counted from the first sample.
-    second : ndarray, shape (c, c)
-        Sum of products of variables.
-    pairs : ndarray, shape (K,)
-        Pairs at each lag.
-    change : ndarray, shape (K, c)
-        Sum of z_j - z_{j-k}.
-    spread : ndarray, shape (K, c, c)
-        Sum of (z_j - z_{j-k}) (z_j - z_{j-k})'.
-
-    """
-
-    row: FloatArray
-    n: int
-    first: FloatArray
+    row: FloatArray  # All that follows, in one row
+    n: int  # Samples
+    first: FloatArray  # Sum of each variable (voltage less its reference); shape (c,)
+    # Sum of variable times sample number, counted from the first sample; shape (c,).
     place: FloatArray
-    second: FloatArray
-    pairs: FloatArray
-    change: FloatArray
-    spread: FloatArray
+    second: FloatArray  # Sum of products of variables; shape (c, c)
+    pairs: FloatArray  # Pairs at each lag; shape (K,)
+    change: FloatArray  # Sum of z_j - z_{j-k}; shape (K, c)
+    spread: FloatArray  # Sum of (z_j - z_{j-k}) (z_j - z_{j-k})'; shape (K, c, c)
 
 
 class LagSums:
