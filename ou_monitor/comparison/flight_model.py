@@ -163,9 +163,7 @@ def _ou(dt: FloatArray, tau: float, rng: np.random.Generator) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class FiledModel:
-    """
-    A model from a file; its terms are drawn at each reading of the ADC, so none is held twice.
-    """
+    """A model from a file, drawn at each reading of the ADC, so that none is held twice."""
 
     model: SupplyModel  # As in the file
 
