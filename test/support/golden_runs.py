@@ -115,7 +115,7 @@ def delays():
         t[1060:] += 0.2
         u = _sticks(t, rng, 4.0)
         v = _pack(t, u, rng, 0.15)
-        heard = u[np.maximum(np.arange(t.size) - round(late / 0.02), 0)]
+        heard = u[np.maximum(np.arange(t.size) - round(late / 0.02), 0)] ** 1.8
         delay, taken, related = LoadDelay(), [], []
         for k, one in enumerate(zip(t.tolist(), v.tolist(), heard.tolist())):
             if delay.take(*one):

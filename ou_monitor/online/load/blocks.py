@@ -21,7 +21,6 @@ import math
 
 import numpy as np
 from ou_monitor.model.load import ripple
-from ou_monitor.online.load.supply_load import POWER
 from ou_monitor.records import FloatArray, NAN
 
 # Width, s, of the bins: the motors and the pack answer more slowly than that.
@@ -157,9 +156,11 @@ _LONGEST = 0.15
 
 
 class LoadDelay:
-    """Running correlations of voltage and load at several delays."""
+    """Running correlations of voltage and load, relative to full load, at several delays."""
 
-    def __init__(self, delay: float = 0.0) -> None:
+    def __init__(self, delay: float = 0.0, *, either: bool = False) -> None:
+        # Whether the load may have either sign.
+        self._either = either
         self.delay = float(DELAYS[np.argmin(np.abs(DELAYS - delay))])
         self.forget()
 
@@ -175,16 +176,15 @@ class LoadDelay:
         self._filled, self._own = 0.0, np.zeros((3, DELAYS.size))
         self._pieces, self._sum, self._squares = 0.0, self._xv * 0.0, self._xv * 0.0
 
-    def take(self, t: float, v: float, u: float) -> bool:
-        """Take a block, s, V, 0..1 as it was heard; return whether the delay is another one."""
+    def take(self, t: float, v: float, x: float) -> bool:
+        """Take a block, s, V, load as it was heard; return whether the delay is another one."""
         dt = t - self._t
         if not 0.0 < dt <= _LONGEST:
             self.forget()
         if math.isnan(self._t):
-            self._t, self._load, self._slow_load, self._slow_volts = t, u ** POWER, u ** POWER, v
+            self._t, self._load, self._slow_load, self._slow_volts = t, x, x, v
             return False
         self._t = t
-        x = u ** POWER
         self._load = x + (self._load - x) * math.exp(-dt / _LAG)
         x += _SHARE * (self._load - x)
         keep = math.exp(-dt / _SLOW)
@@ -228,7 +228,8 @@ class LoadDelay:
         return bool(mean > -_SIGNIFICANT * math.sqrt(max(0.0, variance) / (self._pieces - 1.0)))
 
     def _choose(self, dt: float) -> bool:
-        left = 1.0 - np.minimum(self._xv, 0.0) ** 2 / np.maximum(self._xx * self._vv, 1e-300)
+        falls = self._xv if self._either else np.minimum(self._xv, 0.0)
+        left = 1.0 - falls ** 2 / np.maximum(self._xx * self._vv, 1e-300)
         best = int(np.argmin(left))
         now = int(np.searchsorted(DELAYS, self.delay - 1e-9))
         self._better = self._better + dt if left[best] < _BETTER * left[now] else 0.0
@@ -344,11 +345,6 @@ class LoadNoise:
             self._between += weight * (math.exp(float(f @ self.b)) - self._between)
 
 
-# Time, s, over which predictors are compared.
-_COMPARED = 30.0
-
-
-def scored(before: float, z: float, variance: float, dt: float) -> float:
-    """Return the running mean of the log density of one block, nat; a clipped z counts less."""
-    now = -0.5 * (z * z + math.log(variance))
-    return now if math.isnan(before) else before - math.expm1(-dt / _COMPARED) * (now - before)
+def log_density(z: float, variance: float) -> float:
+    """Return the log density of a block, nat, but for a constant; a clipped z counts less."""
+    return -0.5 * (z * z + math.log(variance))

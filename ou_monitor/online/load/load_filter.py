@@ -17,7 +17,7 @@ import numpy.typing as npt
 from ou_monitor.model.load import (
     CELL, cells_in_series, INRUSH_TIME, LEVELS, LoadStart, SLOPES, usual_coefficients)
 from ou_monitor.online.load.blocks import (
-    Block, CLIP, DIVERGED, LoadBlocks, LoadDelay, LoadNoise, scored)
+    Block, CLIP, DIVERGED, LoadBlocks, LoadDelay, LoadNoise, log_density)
 from ou_monitor.online.load.current import CurrentFilter
 from ou_monitor.online.load.supply_load import (
     Basis, LAGS, LoadState, LoadStatus, POWER, static, SupplyLoad, TABLE)
@@ -37,6 +37,8 @@ _FLOWN_MEMORY = 120.0
 # Known: the error of the sag over the throttle flown is below that share of it, or of the noise.
 # The share was widened from 0.25 so that one recording reached 95 %.
 _SAG_SHARE, _NOISE_SHARE = 0.33, 0.5
+# Time, s, over which throttle and current are compared.
+_COMPARED = 30.0
 # Throttle that spans less than this has not moved.
 _MOVED = 0.02
 # Least relative error of the sag: that of the filter does not count change over a flight, and
@@ -51,6 +53,8 @@ _OTHER_CRAFT = 1.6
 _OTHER_PACK, _OTHER_DAY = 1.3, 0.2 ** 2
 # Throttle that was unknown for so long, s, holds no more; beyond the second it is none.
 _HOLD, _MOST_THROTTLE = 1.0, 2.0
+# Largest current that is taken for one, in whatever unit.
+_MOST_CURRENT = 1e7
 # Bins of the throttle flown.
 _BINS = 50
 # dE/ds, V, of a cell at each 10 mV of open-circuit voltage from 3.4 V.
@@ -77,11 +81,11 @@ class LoadFilter:
         # None until a current has been measured.
         self._current: CurrentFilter | None = None
         self._delay = LoadDelay()
-        # Blocks that wait for their throttle, and throttle as it was heard: stamp and value.
+        # Blocks that wait for their load, and all that may still be asked for theirs.
         self._waiting: deque[Block] = deque()
-        self._sticks: deque[tuple[float, float]] = deque()
-        # Running log density of what throttle predicts.
-        self._score = NAN
+        self._heard_loads: deque[Block] = deque()
+        # Log density, nat, of the last block; by how much current predicts better, and since, s.
+        self._density, self._better, self._compared = NAN, NAN, 0.0
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
              throttle: npt.ArrayLike | None = None,
@@ -90,7 +94,8 @@ class LoadFilter:
         Add samples, s, V, 0..1, A.
 
         NaN voltage is no sample, and a stamp that does not rise is late; both are left out.
-        NaN throttle, or one beyond 2, is unknown: the last one holds for a second.  A stamp that
+        NaN throttle, or one beyond 2, is unknown: the last one holds for a second; so is a current
+        beyond 1e7 A, in whatever unit.  A stamp that
         is earlier by more than 1 s, or later by more than a minute, begins a new time line.
         """
         columns = np.stack(np.broadcast_arrays(*np.atleast_1d(*(
@@ -99,6 +104,7 @@ class LoadFilter:
         columns = columns[:, np.isfinite(columns[0]) & np.isfinite(columns[1])]
         u = columns[2]
         columns[2] = np.where(np.abs(u) <= _MOST_THROTTLE, np.clip(u, 0.0, 1.0), NAN)
+        columns[3] = np.where(np.abs(columns[3]) <= _MOST_CURRENT, columns[3], NAN)
         while columns.size:
             stamps = columns[0]
             highest = np.maximum.accumulate(np.concatenate(([self._newest], stamps)))
@@ -123,31 +129,40 @@ class LoadFilter:
         self._newest = -math.inf
         self._blocks.forget()
         self._waiting.clear()
-        self._sticks.clear()
+        self._heard_loads.clear()
         self._delay.forget()
+        if self._current is not None:
+            self._current.delay.forget()
         self._opening = math.isfinite(self._t)
 
     def _arrive(self, block: Block) -> None:
-        """Give each block the throttle that is heard `delay` after it."""
+        """Give each block the throttle and the current that are heard their `delay` after it."""
         if math.isfinite(block.throttle) and self._delay.take(
-                block.t, block.voltage, block.throttle):
+                block.t, block.voltage, block.throttle ** POWER):
             # What was learned from another delay is wrong, and certain of it.
             self._forget()
-        late = self._delay.delay
-        if not late and not self._waiting:
+        if self._current is None and math.isfinite(block.current):
+            self._current = CurrentFilter()
+        if self._current is not None:
+            self._current.time(block)
+        late = self._delay.delay, 0.0 if self._current is None else self._current.delay.delay
+        if not any(late) and not self._waiting:
             self._take(block)
             return
         self._waiting.append(block)
-        self._sticks.append((block.last, block.throttle))
-        while self._waiting and self._waiting[0].t + late <= block.last:
+        self._heard_loads.append(block)
+        while self._waiting and self._waiting[0].t + max(late) <= block.last:
             first = self._waiting.popleft()
-            while len(self._sticks) > 1 and self._sticks[1][0] <= first.t + late:
-                self._sticks.popleft()
-            self._take(replace(first, throttle=self._sticks[0][1]))
+            while len(self._heard_loads) > 1 and self._heard_loads[1].last <= first.t + min(late):
+                self._heard_loads.popleft()
+            throttle, current = (next(
+                one for one in reversed(self._heard_loads)
+                if one.last <= first.t + by or one is self._heard_loads[0]) for by in late)
+            self._take(replace(first, throttle=throttle.throttle, current=current.current))
 
     def _take(self, block: Block) -> None:
         """Take one block: the first of all, of a new time line, or what follows."""
-        u = block.throttle
+        u, before, self._density = block.throttle, self._t, NAN
         fresh = self._opening or not block.t - self._t <= _PAUSE
         if not math.isfinite(self._t):
             self._begin(block.voltage, u)
@@ -163,16 +178,25 @@ class LoadFilter:
                 if u != self._throttle and self._last > self._t:
                     # The last throttle held to the end of its block.
                     self._predict(self._last)
-                du, since = abs(u - self._throttle), block.t - self._t
+                du = abs(u - self._throttle)
                 self._throttle = u
                 self._predict(block.t)
-                self._correct(block, du, since)
-        if self._current is None and math.isfinite(block.current):
-            self._current = CurrentFilter()
+                self._correct(block, du)
         if self._current is not None:
             self._current.take(block, self._cells, fresh=fresh)
+            self._compare(self._current, block.t - before)
         self._t, self._last, self._throttle = block.t, block.last, u
         self._heard = block.last if math.isfinite(block.throttle) else self._heard
+
+    def _compare(self, current: CurrentFilter, dt: float) -> None:
+        """Follow by how much the log density of current is larger than that of throttle."""
+        if current.lost:
+            self._better, self._compared = NAN, 0.0
+        gain = current.density - self._density
+        if math.isfinite(gain):
+            self._compared += dt
+            share = max(-math.expm1(-dt / _COMPARED), dt / self._compared)
+            self._better = gain if share == 1.0 else self._better + share * (gain - self._better)
 
     def _begin(self, v: float, u: float) -> None:
         """Begin a flight with the prior, scaled by the first voltage."""
@@ -233,7 +257,7 @@ class LoadFilter:
         self._lags = [x, x, 0.5 * x]
         m, P = self._m, self._P
         h = self._regressors()
-        m[0] = v - h[2:] @ m[2:]
+        m[0] = self._rest = v - float(h[2:] @ m[2:])
         # The level follows from the voltage: it shares the errors of the coefficients.
         P[0, 1:] = P[1:, 0] = -P[1:, 1:] @ h[1:]
         P[0, 0] = (0.02 * self._volts) ** 2 + h[1:] @ P[1:, 1:] @ h[1:]
@@ -287,8 +311,8 @@ class LoadFilter:
         self._flown *= 1.0 - min(dt / _FLOWN_MEMORY, 1.0)
         self._flown[int(u * _BINS + 0.5)] += dt
 
-    def _correct(self, block: Block, du: float, since: float) -> None:
-        """Take a block, V, `since` s after the last one, whose throttle differs by du."""
+    def _correct(self, block: Block, du: float) -> None:
+        """Take a block, V, whose throttle differs by du from the last one's."""
         m, P, noise = self._m, self._P, self._noise
         u = 0.0 if math.isnan(self._throttle) else self._throttle
         du = 0.0 if math.isnan(du) else du
@@ -310,7 +334,7 @@ class LoadFilter:
         noise.learn(e, s, u, du, block.n, block.within)
         clipped = max(-CLIP, min(CLIP, score))
         noise.follow(clipped)
-        self._score = scored(self._score, clipped, s + R * scale, since)
+        self._density = log_density(clipped, s + R * scale)
         # Far out on one side for half a second: another battery, so the level is open again.
         self._bias += 0.1 * (max(-6.0, min(6.0, score)) - self._bias)
         if abs(self._bias) > 3.0:
@@ -318,6 +342,7 @@ class LoadFilter:
             self._bias = 0.0
         m += g * (e / total)
         P -= np.outer(g, g) / total
+        self._rest = block.voltage - float(h[2:] @ m[2:])
 
     def _between(self, share: float) -> tuple[float, float]:
         """Return the throttles flown, but for that share at each end."""
@@ -341,14 +366,15 @@ class LoadFilter:
         low, high = self._between(0.1)
         if high - low < _MOVED and self._start is not None:
             low, high = self._start.flown
-        basis, level = Basis.THROTTLE, float(self._m[0])
+        basis, level, rest = Basis.THROTTLE, float(self._m[0]), self._rest
         resistance = resistance_se = NAN
         if self._current is not None:
             resistance, resistance_se = self._current.resistance
-            if math.isfinite(resistance) and self._current.score > self._score:
-                basis, level = Basis.CURRENT, self._current.level
+            if math.isfinite(resistance) and self._better > 0.0:
+                basis, level, rest = Basis.CURRENT, self._current.level, self._current.rest
         load = SupplyLoad(
-            LoadStatus.STILL, level, resistance, resistance_se, basis=basis, flown=(low, high),
+            LoadStatus.STILL, level, rest, resistance, resistance_se, basis=basis,
+            flown=(low, high),
             _sag=tuple(sag.tolist()),
             _sag_se=tuple(np.maximum(error, _LEAST_ERROR * sag).tolist()),
             _log_variance=self._noise.log_variance, _range=self._between(0.02),
@@ -360,14 +386,28 @@ class LoadFilter:
         if high - low >= _MOVED:
             d = static(high) - static(low)
             swing, swing_se = float(d @ a), math.sqrt(max(0.0, float(d @ C @ d)))
-            limit = max(_SAG_SHARE * swing, _NOISE_SHARE * float(load.noise(0.5 * (low + high))))
+            most = _NOISE_SHARE * float(load.noise(0.5 * (low + high)))
+            limit = max(_SAG_SHARE * swing, most)
             status = LoadStatus.UNCERTAIN
             if swing < -2.0 * swing_se or swing_se < limit and swing < 2.0 * swing_se:
                 status = LoadStatus.NO_RELATION
             elif swing_se < limit:
                 status = LoadStatus.NO_RELATION if self._delay.unrelated else LoadStatus.KNOWN
             load = replace(load, status=status)
+            if status is not LoadStatus.KNOWN and basis is Basis.CURRENT and self._current:
+                load = self._by_current(load, self._current, most)
         return load
+
+    def _by_current(self, load: SupplyLoad, current: CurrentFilter, most: float) -> SupplyLoad:
+        """Return the sag by the current that goes with throttle."""
+        raw, se = current.sag(TABLE)
+        sag = np.maximum.accumulate(np.maximum(raw, 0.0))
+        error = np.maximum(np.hypot(se, sag - raw), _LEAST_ERROR * sag)
+        at = np.interp(load.flown, TABLE, error)
+        swing = np.diff(np.interp(load.flown, TABLE, sag))
+        known = float(np.max(at)) < max(_SAG_SHARE * float(swing[0]), most)
+        return replace(load, status=LoadStatus.KNOWN if known else LoadStatus.UNCERTAIN,
+                       _sag=tuple(sag.tolist()), _sag_se=tuple(error.tolist()))
 
     def state(self) -> LoadState | None:
         """Return what there is to look ahead from; None before any voltage or any throttle."""
@@ -390,26 +430,33 @@ class LoadFilter:
             tuple(tuple(row) for row in P.tolist()), max(0.0, float(self._m[1])),
             self._noise.of_blocks, load.flown, self._delay.delay)
 
-    def path(self, t: FloatArray, throttle: FloatArray) -> FloatArray:
+    def path(self, t: FloatArray, throttle: FloatArray | None,
+             current: FloatArray | None = None) -> FloatArray:
         """
         Return the mean voltage, V, ahead of the last sample, from throttle; changes nothing.
 
-        NaN while throttle is unknown: the level is then one under load.
+        With current, A, from that.  NaN while throttle is unknown, as the level is then one under
+        load, or while no current has been measured.
         """
         if not math.isfinite(self._t):
             raise ValueError('no voltage has arrived: there is nothing to start from')
-        if math.isnan(self._throttle):
+        load, delay = (throttle, self._delay.delay) if current is None else (
+            current, 0.0 if self._current is None else self._current.delay.delay)
+        if load is None:
+            raise ValueError('a path needs throttle or current')
+        # At each time works what is heard later; of the last ones what was heard last.
+        load = load[np.searchsorted(t, t + delay, 'right') - 1] if delay else load
+        if current is not None and self._current is not None:
+            return self._current.path(t, load)
+        if current is not None or math.isnan(self._throttle):
             return np.full(t.size, NAN)
-        if self._delay.delay:
-            # At each time works what is heard later; of the last ones what was heard last.
-            throttle = throttle[np.searchsorted(t, t + self._delay.delay, 'right') - 1]
         kept = self._lagged, self._settled, self._lags
         now, level = self._t, float(self._m[0])
         out = np.empty(t.size)
         for k in range(t.size):
             # What lies before the last sample is now.
             dt = max(0.0, float(t[k]) - now)
-            level -= self._m[1] * self._advance(dt, float(throttle[k])) * dt * self._fall(level)
+            level -= self._m[1] * self._advance(dt, float(load[k])) * dt * self._fall(level)
             out[k] = level + self._regressors()[2:] @ self._m[2:]
             now = max(now, float(t[k]))
         self._lagged, self._settled, self._lags = kept

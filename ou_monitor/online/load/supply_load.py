@@ -68,6 +68,8 @@ class SupplyLoad:
         Whether the sag is known, and why not.
     level : float
         Open-circuit voltage, V, or without throttle that under load; NaN without voltage.
+    rest : float
+        Last voltage with the load's answer taken out (sag-compensated), V; the level is its mean.
     resistance : float
         Resistance at once, Ohm; NaN without a current that moves the voltage.
     resistance_se : float
@@ -77,7 +79,7 @@ class SupplyLoad:
     delay : float
         How late throttle is heard behind the voltage that answers to it, s.
     basis : Basis
-        From what the level follows; the sag is always that of throttle.
+        From what the level follows; the sag too, where throttle does not give it.
     flown : tuple of float
         Throttles between which 80 % of the last two minutes were flown.
 
@@ -85,6 +87,7 @@ class SupplyLoad:
 
     status: LoadStatus = LoadStatus.NO_DATA
     level: float = NAN
+    rest: float = NAN
     resistance: float = NAN
     resistance_se: float = NAN
     time_constants: tuple[float, ...] = LAGS
@@ -125,7 +128,7 @@ class SupplyLoad:
         """Return what is published, noise at a throttle; V, Ohm, s."""
         return {
             'load_status': self.status.name, 'load_status_text': self.status.value,
-            'load_level': self.level, 'sag': float(self.sag(1.0)),
+            'load_level': self.level, 'load_rest': self.rest, 'sag': float(self.sag(1.0)),
             'sag_se': float(self.sag_se(1.0)), 'load_noise': self._noise_at(throttle),
             'load_resistance': self.resistance, 'load_resistance_se': self.resistance_se,
             'load_delay': self.delay, 'load_basis': self.basis.name}

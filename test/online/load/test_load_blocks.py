@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.testing import assert_allclose
 from ou_monitor.model.load import ripple
-from ou_monitor.online.load.blocks import LoadBlocks, LoadNoise, scored
+from ou_monitor.online.load.blocks import LoadBlocks, LoadNoise
 import pytest
 
 NAN = math.nan
@@ -180,12 +180,3 @@ def test_scatter_within_blocks_is_that_of_their_samples():
         noise.learn(0.0, 1e9, 0.0, 0.002, 20, 1.0)
     assert noise.variance(0.0, 0.0, 1) - noise.variance(0.0, 0.0, 20) == pytest.approx(
         before, rel=1e-4)
-
-
-def test_the_score_of_a_predictor_is_a_running_log_density():
-    """Over 30 s; the first stands alone."""
-    first = scored(NAN, 2.0, 0.04, 0.02)
-    assert first == pytest.approx(-0.5 * (4.0 + math.log(0.04)))
-    now = -0.5 * (1.0 + math.log(0.09))
-    keep = math.exp(-6.0 / 30.0)
-    assert scored(first, -1.0, 0.09, 6.0) == pytest.approx(keep * first + (1.0 - keep) * now)

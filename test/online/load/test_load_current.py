@@ -81,3 +81,33 @@ def test_a_current_that_pauses(flight):
     assert loads.load().basis is Basis.THROTTLE
     loads.push(t[~part], v[~part], u[~part], holed[~part])
     assert loads.load().resistance == pytest.approx(OHM, rel=0.1)
+
+
+def test_a_current_that_is_late_and_returns_charge():
+    """Three samples late, an offset at rest, and below zero a while: voltage a second ahead."""
+    rng = np.random.default_rng(5)
+    t = np.arange(0.0, 60.0, 0.02)
+    drawn = rng.choice([-20.0, 0.0, 40.0, 90.0], 121)[(2 * t).astype(int)]
+    v = 12.5 - 0.02 * drawn + 0.01 * rng.standard_normal(t.size)
+    measured = np.concatenate((np.full(3, drawn[0]), drawn[:-3])) + 38.0
+    enabled = np.where(t > 5.0, 1.0, 0.0)
+    load = loaded(t, v, enabled, measured)
+    assert load.basis is Basis.CURRENT
+    assert load.resistance == pytest.approx(0.02, rel=0.1)
+    # The offset is in the level: 0.02 Ohm times 38 A.
+    assert load.level == pytest.approx(12.5 + 0.76, abs=0.2)
+    assert load.rest == pytest.approx(load.level, abs=0.05)
+
+
+def test_the_sag_follows_from_the_current_where_throttle_hides_it():
+    """A switch draws 30 A, and other loads of up to 60 A come and go: 0.02 Ohm, 0.6 V."""
+    rng = np.random.default_rng(6)
+    t = np.arange(0.0, 120.0, 0.02)
+    switch = (t % 20.0 > 10.0).astype(float)
+    others = rng.choice([0.0, 0.0, 60.0], 241)[(2 * t).astype(int)]
+    current = 30.0 * switch + others
+    v = 12.5 - 0.02 * current + 0.01 * rng.standard_normal(t.size)
+    load = loaded(t, v, switch, current)
+    assert load.known and load.basis is Basis.CURRENT
+    assert abs(float(load.sag(1.0)) - 0.6) < 3.0 * float(load.sag_se(1.0))
+    assert float(load.sag_se(1.0)) < 0.2

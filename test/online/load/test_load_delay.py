@@ -49,10 +49,11 @@ def test_a_slow_source_cannot_tell():
     delay = LoadDelay()
     rng = np.random.default_rng(1)
     u = rng.random(300)
-    assert not any(delay.take(float(k), 16.0 - x, y) for k, (x, y) in enumerate(zip(u[1:], u)))
+    assert not any(delay.take(float(k), 16.0 - x, y ** 1.8)
+                   for k, (x, y) in enumerate(zip(u[1:], u)))
     assert not delay.unrelated
     for k in range(2000):
-        assert not delay.take(300.0 + 0.02 * k, 16.0 + 0.01 * rng.standard_normal(), 0.4)
+        assert not delay.take(300.0 + 0.02 * k, 16.0 + 0.01 * rng.standard_normal(), 0.4 ** 1.8)
     assert delay.delay == 0.0 and not delay.unrelated
 
 
