@@ -25,8 +25,12 @@ from ou_monitor.records import FloatArray, NAN
 
 # Lag, s, of all: half of what an ESC takes to follow.
 _LAG = 0.004
-# Level: V per sqrt(s) and cell, an OU of 4.6 mV and 20 s; the batch found it.
-_WALK = 0.0015
+# Level: V per sqrt(s) and cell, an OU of 4.6 mV and 20 s, which the batch found; and of a pack
+# that empties (chosen on bf_hiro_4s, where 0.02 to 0.05 do).
+_WALK, _FAST_WALK = 0.0015, 0.03
+# The faster level must predict this, s, ahead with so small a share of the mean square over that
+# memory, s; least time compared, s; from one prediction to the next, s.
+_AHEAD, _PAYS, _COMPARED, _LEAST_COMPARED, _EVERY = 1.0, 0.98, 30.0, 10.0, 0.1
 # The load's size may change by 25 % in 100 s; each coefficient by 2 % of full sag by itself.
 _WARMING, _CHANGE = 0.25 ** 2 / 100.0, 0.02 ** 2 / 100.0
 # Time, s, in which the load's scale follows the level: faster, the regressors of a held throttle
@@ -37,8 +41,6 @@ _FLOWN_MEMORY = 120.0
 # Known: the error of the sag over the throttle flown is below that share of it, or of the noise.
 # The share was widened from 0.25 so that one recording reached 95 %.
 _SAG_SHARE, _NOISE_SHARE = 0.33, 0.5
-# Time, s, over which throttle and current are compared.
-_COMPARED = 30.0
 # Throttle that spans less than this has not moved.
 _MOVED = 0.02
 # Least relative error of the sag: that of the filter does not count change over a flight, and
@@ -62,6 +64,53 @@ _LOWEST, _PER_VOLT = 3.4, 100.0
 _SLOPE_AT = np.interp(_LOWEST + np.arange(91) / _PER_VOLT, LEVELS, SLOPES).tolist()
 _MEAN, _COV, _SIZE = usual_coefficients()
 _STATES = 2 + _MEAN.size
+
+
+class FastLevel:
+    """
+    A level that walks faster than the filter's, taken once it predicts better.
+
+    It is followed from the voltage at rest; what the filter has learned stays as it is.
+    """
+
+    def __init__(self) -> None:
+        # Stamp, s; level, V, before what was drawn, V; its variance, V^2; time compared, s.
+        self._t = self._level = self._variance = NAN
+        self._drawn = self._since = 0.0
+        # Stamp, level of the filter and the faster one; mean square of their errors, V^2.
+        self._past: deque[tuple[float, float, float]] = deque()
+        self._errors = (0.0, 0.0)
+        self._better = False
+
+    def fall(self, volts: float) -> None:
+        """Let the level fall by charge that was drawn, V."""
+        self._drawn += volts
+
+    def take(self, t: float, rest: float, variance: float, level: float, walk: float) -> None:
+        """Take a voltage at rest, V, its variance, V^2, the level before, and V per sqrt(s)."""
+        rest, level = rest + self._drawn, level + self._drawn
+        if math.isnan(self._t):
+            self._t, self._level, self._variance = t, level, variance
+        dt, self._t = t - self._t, t
+        prior = self._variance + walk ** 2 * dt
+        gain = prior / (prior + variance)
+        self._level += gain * (rest - self._level)
+        self._variance = prior * (1.0 - gain)
+        past = self._past
+        if not past or t - past[-1][0] >= _EVERY:
+            past.append((t, level, self._level))
+        while len(past) > 1 and past[1][0] <= t - _AHEAD:
+            past.popleft()
+        if past[0][0] <= t - _AHEAD:
+            share = -math.expm1(-dt / _COMPARED)
+            slow, fast = (old + share * ((rest - one) ** 2 - old)
+                          for old, one in zip(self._errors, past[0][1:]))
+            self._errors, self._since = (slow, fast), self._since + dt
+            self._better = self._since > _LEAST_COMPARED and fast < _PAYS * slow
+
+    def of(self, level: float, variance: float) -> tuple[float, float]:
+        """Return the better level, V, and its variance, V^2, of the filter's and this."""
+        return (self._level - self._drawn, self._variance) if self._better else (level, variance)
 
 
 class LoadFilter:
@@ -250,6 +299,7 @@ class LoadFilter:
     def _settle(self, v: float, u: float) -> None:
         """Take the level from one voltage, V, and the coefficients."""
         self._opening, self._bias, self._throttle = False, 0.0, u
+        self._fast = FastLevel()
         held = u if math.isfinite(u) else 0.0
         self._lagged = self._settled = held
         x = held ** POWER
@@ -300,6 +350,7 @@ class LoadFilter:
         x = self._advance(dt, u)
         used = x * dt * self._fall(float(m[0]))
         m[0] -= used * m[1]
+        self._fast.fall(used * float(m[1]))
         P[0] -= P[1] * used
         P[:, 0] -= P[:, 1] * used
         # A pack recovers in a gap by more than it walks: up to 2 % in a minute.
@@ -340,6 +391,8 @@ class LoadFilter:
         if abs(self._bias) > 3.0:
             P[0, 0] += (0.05 * self._volts) ** 2
             self._bias = 0.0
+        self._fast.take(block.t, block.voltage - float(h[2:] @ m[2:]), total, float(m[0]),
+                        _FAST_WALK * self._cells)
         m += g * (e / total)
         P -= np.outer(g, g) / total
         self._rest = block.voltage - float(h[2:] @ m[2:])
@@ -366,7 +419,7 @@ class LoadFilter:
         low, high = self._between(0.1)
         if high - low < _MOVED and self._start is not None:
             low, high = self._start.flown
-        basis, level, rest = Basis.THROTTLE, float(self._m[0]), self._rest
+        basis, level, rest = Basis.THROTTLE, self._level, self._rest
         resistance = resistance_se = NAN
         if self._current is not None:
             resistance, resistance_se = self._current.resistance
@@ -398,6 +451,11 @@ class LoadFilter:
                 load = self._by_current(load, self._current, most)
         return load
 
+    @property
+    def _level(self) -> float:
+        """Return the level, V, of the rate that predicts better."""
+        return self._fast.of(float(self._m[0]), 0.0)[0]
+
     def _by_current(self, load: SupplyLoad, current: CurrentFilter, most: float) -> SupplyLoad:
         """Return the sag by the current that goes with throttle."""
         raw, se = current.sag(TABLE)
@@ -413,9 +471,11 @@ class LoadFilter:
         """Return what there is to look ahead from; None before any voltage or any throttle."""
         if not (math.isfinite(self._t) and math.isfinite(self._throttle)):
             return None
+        mean, covariance = self._m.copy(), self._P * max(1.0, self._noise.scale)
+        mean[0], covariance[0, 0] = self._fast.of(float(mean[0]), float(covariance[0, 0]))
         return LoadState(
-            self._t, self._throttle, self._m.copy(), self._P * max(1.0, self._noise.scale),
-            tuple(self._lags), self._factor, self._fall(float(self._m[0])),
+            self._t, self._throttle, mean, covariance, tuple(self._lags), self._factor,
+            self._fall(self._level),
             self._noise.log_variance, self._between(0.02))
 
     def learned(self) -> LoadStart | None:
@@ -451,7 +511,7 @@ class LoadFilter:
         if current is not None or math.isnan(self._throttle):
             return np.full(t.size, NAN)
         kept = self._lagged, self._settled, self._lags
-        now, level = self._t, float(self._m[0])
+        now, level = self._t, self._level
         out = np.empty(t.size)
         for k in range(t.size):
             # What lies before the last sample is now.

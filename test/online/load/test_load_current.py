@@ -100,14 +100,14 @@ def test_a_current_that_is_late_and_returns_charge():
 
 
 def test_the_sag_follows_from_the_current_where_throttle_hides_it():
-    """A switch draws 30 A, and other loads of up to 60 A come and go: 0.02 Ohm, 0.6 V."""
+    """A switch draws 30 A, and other loads of up to 200 A come and go: 0.02 Ohm, 0.6 V."""
     rng = np.random.default_rng(6)
     t = np.arange(0.0, 120.0, 0.02)
     switch = (t % 20.0 > 10.0).astype(float)
-    others = rng.choice([0.0, 0.0, 60.0], 241)[(2 * t).astype(int)]
+    others = rng.choice([0.0, 100.0, 200.0], 241)[(2 * t).astype(int)]
     current = 30.0 * switch + others
     v = 12.5 - 0.02 * current + 0.01 * rng.standard_normal(t.size)
     load = loaded(t, v, switch, current)
     assert load.known and load.basis is Basis.CURRENT
-    assert abs(float(load.sag(1.0)) - 0.6) < 3.0 * float(load.sag_se(1.0))
-    assert float(load.sag_se(1.0)) < 0.2
+    assert abs(float(load.sag(1.0)) - 0.6) < 2.0 * float(load.sag_se(1.0))
+    assert float(load.sag_se(1.0)) < 0.5
