@@ -1,6 +1,7 @@
 """What the jitter of the stick makes of the voltage of a level is taken out."""
 
 import numpy as np
+from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.levels import find_levels, without_jitter
 from ou_monitor.records import Recording
 
@@ -42,3 +43,14 @@ def test_without_throttle_the_voltage_is_as_it_was():
     blind = Recording(simulated.t, simulated.voltage, np.full(simulated.t.size, np.nan), 'made')
     assert np.array_equal(without_jitter(blind, find_levels(blind.t, blind.throttle)),
                           simulated.voltage)
+
+
+def test_loads_that_come_and_go_are_no_lines():
+    """10 A at 1.8 Hz through 0.1 Ohm, measured 50 ms late, at a throttle that stands still."""
+    rng = np.random.default_rng(3)
+    t = np.arange(int(40 * RATE)) / RATE
+    drawn = np.where((1.8 * t) % 1.0 < 0.3, 10.0, 2.0)
+    late = np.concatenate((np.full(10, drawn[0]), drawn[:-10]))
+    v = 12.0 - 0.1 * drawn + 0.02 * rng.standard_normal(t.size)
+    found = analyze(Recording(t, v, np.full(t.size, 0.5), 'made', current=late))
+    assert [line for level in found.levels for line in level.lines.lines] == []
