@@ -15,7 +15,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import (
-    CELL, cells_in_series, INRUSH_TIME, LEVELS, LoadStart, SLOPES, usual_coefficients)
+    CELL, cells_in_series, INRUSH_TIME, LEVELS, LoadStart, ripple, SLOPES, usual_coefficients)
 from ou_monitor.online.load.blocks import (
     Block, CLIP, DIVERGED, LoadBlocks, LoadDelay, LoadNoise, log_density)
 from ou_monitor.online.load.current import CurrentFilter
@@ -57,8 +57,8 @@ _OTHER_PACK, _OTHER_DAY = 1.3, 0.2 ** 2
 _HOLD, _MOST_THROTTLE = 1.0, 2.0
 # Largest current that is taken for one, in whatever unit.
 _MOST_CURRENT = 1e7
-# Bins of the throttle flown.
-_BINS = 50
+# Bins of the throttle flown, and how many are taken together for the noise: 0.1.
+_BINS, _NEAR = 50, 5
 # dE/ds, V, of a cell at each 10 mV of open-circuit voltage from 3.4 V.
 _LOWEST, _PER_VOLT = 3.4, 100.0
 _SLOPE_AT = np.interp(_LOWEST + np.arange(91) / _PER_VOLT, LEVELS, SLOPES).tolist()
@@ -261,7 +261,8 @@ class LoadFilter:
         # Whether the coefficients have met a throttle.
         self._loaded = math.isfinite(u)
         self._heard = -math.inf
-        self._flown = np.zeros(_BINS + 1)
+        # Of each bin of throttle: seconds, samples, and their squares about the prediction, V^2.
+        self._flown = np.zeros((3, _BINS + 1))
         self._m = np.zeros(_STATES)
         self._factor = 1.0
         self._forget()
@@ -360,7 +361,7 @@ class LoadFilter:
         P[2:, 2:] += (_WARMING * dt) * np.outer(m[2:], m[2:])
         P[range(2, _STATES), range(2, _STATES)] += _CHANGE * dt * (_SIZE * self._volts) ** 2
         self._flown *= 1.0 - min(dt / _FLOWN_MEMORY, 1.0)
-        self._flown[int(u * _BINS + 0.5)] += dt
+        self._flown[0, int(u * _BINS + 0.5)] += dt
 
     def _correct(self, block: Block, du: float) -> None:
         """Take a block, V, whose throttle differs by du from the last one's."""
@@ -383,6 +384,12 @@ class LoadFilter:
         total += noise.rounding
         total *= max(1.0, abs(e) / math.sqrt(total) / CLIP)
         noise.learn(e, s, u, du, block.n, block.within)
+        if math.isfinite(self._throttle):
+            # What the state does not know is not noise.
+            share = R / (s + R)
+            square = share * block.n * min(abs(e), self._volts) ** 2
+            square += (block.n - 1) * block.within if block.n > 1 else 0.0
+            self._flown[1:, int(u * _BINS + 0.5)] += share * block.n, share * square
         clipped = max(-CLIP, min(CLIP, score))
         noise.follow(clipped)
         self._density = log_density(clipped, s + R * scale)
@@ -397,9 +404,22 @@ class LoadFilter:
         P -= np.outer(g, g) / total
         self._rest = block.voltage - float(h[2:] @ m[2:])
 
+    def _deviations(self) -> tuple[float, ...]:
+        """Return the rms of what the load does not explain, V, at each bin of throttle."""
+        b, u = self._noise.log_variance, np.arange(_BINS + 1) / _BINS
+        if math.isnan(self._throttle):
+            return (math.exp(0.5 * b[0]),) * u.size
+        law = np.exp(b[0] + b[1] * ripple(u))
+        seconds, samples, squares = self._flown
+        # Where a throttle was flown for less than a second, that of one which stands still counts.
+        known = float(samples.sum()) / max(float(seconds.sum()), 1.0)
+        near = [np.convolve(one, np.ones(_NEAR), 'same') for one in (samples, squares)]
+        return tuple(np.sqrt((near[1] + known * law) / (near[0] + known)).tolist()) if known \
+            else tuple(np.sqrt(law).tolist())
+
     def _between(self, share: float) -> tuple[float, float]:
         """Return the throttles flown, but for that share at each end."""
-        total = np.cumsum(self._flown)
+        total = np.cumsum(self._flown[0])
         if not total[-1] > 0.0:
             return self._throttle, self._throttle
         low, high = np.searchsorted(total, (share * total[-1], (1.0 - share) * total[-1]))
@@ -430,7 +450,7 @@ class LoadFilter:
             flown=(low, high),
             _sag=tuple(sag.tolist()),
             _sag_se=tuple(np.maximum(error, _LEAST_ERROR * sag).tolist()),
-            _log_variance=self._noise.log_variance, _range=self._between(0.02),
+            _noise=self._deviations(), _range=self._between(0.02),
             delay=self._delay.delay)
         if math.isnan(self._throttle):
             load = replace(load, status=LoadStatus.NO_THROTTLE,
@@ -439,7 +459,8 @@ class LoadFilter:
         if high - low >= _MOVED:
             d = static(high) - static(low)
             swing, swing_se = float(d @ a), math.sqrt(max(0.0, float(d @ C @ d)))
-            most = _NOISE_SHARE * float(load.noise(0.5 * (low + high)))
+            b = self._noise.log_variance
+            most = _NOISE_SHARE * math.exp(0.5 * (b[0] + b[1] * ripple(0.5 * (low + high))))
             limit = max(_SAG_SHARE * swing, most)
             status = LoadStatus.UNCERTAIN
             if swing < -2.0 * swing_se or swing_se < limit and swing < 2.0 * swing_se:

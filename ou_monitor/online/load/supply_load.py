@@ -13,7 +13,6 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.load import ripple
 from ou_monitor.records import Estimate, FloatArray, NAN, Status
 
 # Lags, s, of the load: of the motors, and of polarisation (the batch's medians, rounded).
@@ -96,7 +95,7 @@ class SupplyLoad:
     flown: tuple[float, float] = (0.0, 1.0)
     _sag: tuple[float, ...] = ()
     _sag_se: tuple[float, ...] = ()
-    _log_variance: tuple[float, float, float] = (NAN, NAN, NAN)
+    _noise: tuple[float, ...] = (NAN, NAN)
     _range: tuple[float, float] = (0.0, 1.0)
 
     @property
@@ -117,12 +116,13 @@ class SupplyLoad:
         return self._read(throttle, self._sag_se)
 
     def noise(self, throttle: npt.ArrayLike) -> FloatArray:
-        """Return the deviation of one sample, V; beyond the throttles flown that of the edge."""
-        u = np.clip(np.asarray(throttle, dtype=np.float64), *self._range)
-        if self.status is LoadStatus.NO_THROTTLE:
-            u = 0.0 * np.asarray(throttle, dtype=np.float64)
-        b = self._log_variance
-        return np.asarray(np.exp(0.5 * (b[0] + b[1] * ripple(u))))
+        """
+        Return the rms of what the load does not explain, V, its changes as flown included.
+
+        Beyond the throttles flown that of the edge.
+        """
+        u = np.clip(np.asarray(throttle, dtype=np.float64), *np.nan_to_num(self._range))
+        return np.asarray(np.interp(u, np.linspace(0.0, 1.0, len(self._noise)), self._noise))
 
     def fields(self, throttle: float) -> dict[str, object]:
         """Return what is published, noise at a throttle; V, Ohm, s."""
