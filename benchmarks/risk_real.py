@@ -1,10 +1,11 @@
 """
 The brown-out risk on recorded flights, causally, beside simpler forecasts.
 
-Asked at 5 Hz of one monitor with a window of 2 s: levels that 1, 5 and 20 % of the horizons of the
-flight undershoot; the middle one of three samples, or single samples.  Horizons overlap: n of
-them count as n / (5 Hz x horizon).  Skill: 1 less the Brier score over that of the climatology
-so far.  Flights that are not there are left out, with a word on stderr.
+Asked at 5 Hz of one monitor with default window, whose fits count in the CPU of reports here:
+levels that 1, 5 and 20 % of the horizons of the flight undershoot; the middle one of three
+samples, or single samples.  Horizons overlap: n of them count as n / (5 Hz x horizon).  Skill: 1
+less the Brier score over that of the climatology so far.  Flights that are not there are left out,
+with a word on stderr.
 
     OU_MONITOR_REALDATA=... python benchmarks/risk_real.py --page doc/risk.md
 """
@@ -88,7 +89,7 @@ def fly(name: str, recording: Recording) -> tuple[list[Case], list[Case], dict[s
             lows[event, h], levels[event, h] = low, np.quantile(
                 low[late], SHARES, method='higher') + 0.5 * step
     monitor = SupplyMonitor(MonitorSettings(
-        window=2.0, brownout_voltage=float(levels['middle', 2.0][1]), brownout_horizon=2.0,
+        brownout_voltage=float(levels['middle', 2.0][1]), brownout_horizon=2.0,
         brownout_floor=0.0))
     past = Past()
     rows: dict[tuple[str, float], list[np.ndarray]] = {key: [] for key in levels}

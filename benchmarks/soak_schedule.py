@@ -157,7 +157,6 @@ def good_parameter(rng: random.Random, model: str) -> tuple[str, Any]:
         lambda: ('brownout.latch', rng.random() < 0.3),
         lambda: ('brownout.floor', rng.uniform(4.15, 4.35)),
         lambda: ('brownout.floor_time', rng.uniform(0.005, 0.03)),
-        lambda: ('brownout.watch', rng.choice(['continuous', 'sampled'])),
         lambda: ('brownout.budget_limit', rng.choice([0.0, 0.02])),
         lambda: ('model_file', rng.choice(['', model])),
     ])()
@@ -170,6 +169,6 @@ def bad_parameters(fifo: str) -> list[tuple[str, Any]]:
         ('publish_rate', 0.0), ('publish_rate', 1e9), ('publish_rate', math.inf),
         ('brownout.warn', 0.6), ('brownout.warn', -0.1), ('brownout.critical', 0.001),
         ('brownout.leave', 1.0), ('brownout.floor', 100.0), ('brownout.floor', math.nan),
-        ('brownout.watch', 'perhaps'), ('brownout.latch', 1), ('brownout.hold', -1.0),
+        ('brownout.latch', 1), ('brownout.hold', -1.0),
         ('model_file', fifo), ('model_file', '/dev/zero'), ('model_file', '/no/such.yaml'),
         ('voltage.topic', 'elsewhere'), ('lock_parameters', True), ('no_such_parameter', 1.0)]

@@ -110,7 +110,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     seen = overview(recording, None if math.isnan(voltage) else voltage, judged, cells)
     return Analysis(
         recording, judged, relaxations, tuple(judge_cause(r, alpha) for r in relaxations), alpha,
-        by_throttle(sliding, recording.has_throttle), sliding,
+        by_throttle(sliding), sliding,
         quality_list(recording, throttles, estimates, [level.notes for level in judged],
                      settling + lines + second_items(
                          [level.throttle for level in judged if level.wanders])

@@ -14,11 +14,11 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.report import MonitorReport, RISK_CURVE
-from ou_monitor.online.risk.outlook import Outlook
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.records import Estimate, FloatArray, LARGEST_LOG_SE, NAN, Recording
+from ou_monitor.records import Estimate, FloatArray, NAN, Recording
 from ou_monitor.text import Z95
 
 MAX_POINTS = 300
@@ -44,14 +44,12 @@ class Sliding:
         Probability of a brown-out within the horizon; NaN when unknown.
     brownout_voltage, brownout_horizon : float
         What the risk is of, V and s.
-    outlook : Outlook
-        What the node has learned by the end: curves over throttle, risk and budget.
     settings : MonitorSettings
         Of the node; its voltage is the default where none was asked for.
     last : MonitorReport or None
         What the node knows at the end; None of a recording too short for a window.
-    highest : float
-        Highest throttle of the recording, 0..1; NaN without throttle.
+    lowest, highest : float
+        Ends of the throttle of the recording, 0..1; NaN without throttle.
 
     """
 
@@ -61,9 +59,9 @@ class Sliding:
     risk: FloatArray
     brownout_voltage: float
     brownout_horizon: float
-    outlook: Outlook
     settings: MonitorSettings
     last: MonitorReport | None
+    lowest: float
     highest: float
 
     def series(self, name: str) -> FloatArray:
@@ -81,7 +79,7 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
           brownout_horizon: float = 5.0,
           progress: Callable[[float], None] | None = None) -> Sliding:
     """
-    Run the node's estimator and its outlook over a recording.
+    Run the node's monitor over a recording.
 
     window in s, brownout_voltage in V, brownout_horizon in s, progress 0..1.
     """
@@ -128,8 +126,9 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
     return Sliding(window, np.array([report.estimate.t for report in reports]),
                    tuple(report.estimate for report in reports),
                    np.array([report.risk if asked else NAN for report in reports]),
-                   brownout_voltage, brownout_horizon, monitor.outlook, settings, last,
-                   float(np.nanmax(throttle)) if known else NAN)
+                   brownout_voltage, brownout_horizon, settings, last,
+                   *((float(np.nanmin(throttle)), float(np.nanmax(throttle))) if known
+                     else (NAN, NAN)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,16 +141,13 @@ class ByThrottle:
     throttle : ndarray, shape (k,)
         0, 0.02, .. 1.
     known : ndarray of bool, shape (k,)
-        Whether that throttle was flown; the curves are NaN elsewhere.
-    level, level_se : ndarray, shape (k,)
-        Mean voltage at the end of the recording, and its standard error, V.
+        Whether the sag is known and that throttle was flown; sag and noise are NaN elsewhere.
     sag, sag_low, sag_high : ndarray, shape (k,)
-        How far the level lies below that of the lowest throttle flown, and its 95 % interval, V.
-        The errors of the two levels count as independent, which makes it too wide.
-    sigma, sigma_low, sigma_high : ndarray, shape (k,)
-        Noise intensity and its 95 % interval, V/sqrt(s).
+        Fall from throttle 0, before polarisation, and its 95 % interval, V.
+    noise : ndarray, shape (k,)
+        Rms of what the load does not explain, V.
     risk : ndarray, shape (k,)
-        Probability of a brown-out within the horizon, with the errors of the curves in it.
+        Probability of a brown-out within the horizon, with the errors of the load in it.
     budget : float
         Highest throttle that keeps the risk within `limit`; NaN when unknown.
     budget_reason : str
@@ -167,14 +163,10 @@ class ByThrottle:
 
     throttle: FloatArray
     known: npt.NDArray[np.bool_]
-    level: FloatArray
-    level_se: FloatArray
     sag: FloatArray
     sag_low: FloatArray
     sag_high: FloatArray
-    sigma: FloatArray
-    sigma_low: FloatArray
-    sigma_high: FloatArray
+    noise: FloatArray
     risk: FloatArray
     budget: float
     budget_reason: str
@@ -190,29 +182,22 @@ class ByThrottle:
         return float(np.interp(throttle, self.throttle, getattr(self, name)))
 
 
-def by_throttle(sliding: Sliding, has_throttle: bool) -> ByThrottle:
-    """Read the curves that were learned from a recording."""
-    outlook = sliding.outlook
+def by_throttle(sliding: Sliding) -> ByThrottle:
+    """Return what the node knows over throttle at the end of a recording."""
     grid = np.linspace(0.0, 1.0, _POINTS)
     asked = math.isfinite(sliding.brownout_voltage)
-    curves = outlook.curves
-    unknown = np.full(_POINTS, NAN)
-    # Without throttle all samples count as of throttle 0: that is no curve.
-    known = curves.seen_curve(grid) & has_throttle
-    level, level_se = (np.where(known, c, NAN) for c in curves.level_curve(grid))
-    ln_sigma, ln_sigma_se = curves.sigma_curve(grid)
-    ln_sigma = np.where(known & (ln_sigma_se <= LARGEST_LOG_SE), ln_sigma, NAN)
     last = sliding.last
-    risk = unknown
+    load = SupplyLoad() if last is None else last.load
+    flown = (grid >= sliding.lowest) & (grid <= sliding.highest)
+    known = flown & load.known
+    sag, error, noise = (np.where(known, values(grid), NAN)
+                         for values in (load.sag, load.sag_se, load.noise))
+    risk = np.full(_POINTS, NAN)
     if asked and last is not None and last.risk_curve:
         risk = np.interp(grid, RISK_CURVE, last.risk_curve)
         risk = np.where(grid <= sliding.highest, risk, NAN)
-    first = int(known.argmax())
-    sag = level[first] - level
-    reach = np.where(np.arange(_POINTS) == first, 0.0, Z95 * np.hypot(level_se, level_se[first]))
     return ByThrottle(
-        grid, known, level, level_se, sag, sag - reach, sag + reach, np.exp(ln_sigma),
-        np.exp(ln_sigma - Z95 * ln_sigma_se), np.exp(ln_sigma + Z95 * ln_sigma_se), risk,
+        grid, known, sag, np.maximum(sag - Z95 * error, 0.0), sag + Z95 * error, noise, risk,
         last.budget if asked and last is not None else NAN,
         _reason(last) if asked else 'No voltage was asked for.',
         sliding.settings.budget_limit, sliding.brownout_voltage, sliding.brownout_horizon,

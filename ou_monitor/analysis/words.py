@@ -292,10 +292,8 @@ def _by_throttle(analysis: Analysis) -> dict[str, Any]:
     curves = analysis.by_throttle
     return {
         'throttle': curves.throttle, 'known': curves.known,
-        'level': curves.level, 'level_se': curves.level_se,
         'sag': curves.sag, 'sag_low': curves.sag_low, 'sag_high': curves.sag_high,
-        'sigma': curves.sigma, 'sigma_low': curves.sigma_low, 'sigma_high': curves.sigma_high,
-        'brownout_risk': curves.risk}
+        'noise': curves.noise, 'brownout_risk': curves.risk}
 
 
 def _brownout(analysis: Analysis) -> dict[str, Any]:

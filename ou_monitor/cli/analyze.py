@@ -212,13 +212,12 @@ def _by_throttle(analysis: Analysis) -> str:
         rows = [[f'{10 * k} %',
                  _mv_interval(*(curves.at(0.1 * k, name) for name in ('sag', 'sag_low',
                                                                       'sag_high'))),
-                 '{} [{}, {}]'.format(*(number(curves.at(0.1 * k, name)) for name in (
-                     'sigma', 'sigma_low', 'sigma_high'))),
-                 chance(curves.at(0.1 * k, 'risk'))]
-                for k in range(11) if math.isfinite(curves.at(0.1 * k, 'sigma'))]
+                 _mv(curves.at(0.1 * k, 'noise')), chance(curves.at(0.1 * k, 'risk'))]
+                for k in range(11) if math.isfinite(curves.at(0.1 * k, 'sag'))]
     if not rows or not analysis.recording.has_throttle:
         return sentence
-    text = table(['throttle', 'sag mV [95 %]', 'sigma V/sqrt(s) [95 %]', 'brown-out risk'], rows)
+    text = table(['throttle', 'sag mV [95 %]',
+                  'sigma V/sqrt(s) [95 %]' if levels else 'noise mV', 'brown-out risk'], rows)
     return f'{text}\n\n{sentence}'
 
 

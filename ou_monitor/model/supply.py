@@ -75,6 +75,12 @@ class SupplyModel:
         return first
 
     @property
+    def left_out(self) -> tuple[str, ...]:
+        """Return names of terms that move the supply, and that a risk onboard knows not of."""
+        return tuple(term.NAME for term in self.terms
+                     if term.STAGE in (Stage.DRIVE, Stage.STATE, Stage.LEVEL) and not term.LIVE)
+
+    @property
     def needs_throttle(self) -> tuple[str, ...]:
         """Return the names of the terms that need throttle."""
         return tuple(term.NAME for term in self.terms if term.NEEDS_THROTTLE)

@@ -18,9 +18,9 @@ from ou_monitor.online.estimator.estimator import (
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.report import MonitorReport
+from ou_monitor.online.risk.budget import Ahead, look_ahead
 from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
 from ou_monitor.online.risk.forecast import Forecast
-from ou_monitor.online.risk.outlook import Ahead, look_ahead, Outlook, risk_of_all
 from ou_monitor.online.settings import AUTO, MonitorSettings
 from ou_monitor.online.trust import Doubt, InputTrust, patience, Stamps
 from ou_monitor.records import Counters, Estimate, Flag, Level, NAN, Status
@@ -28,7 +28,6 @@ from ou_monitor.timeline.line import MOST_CURRENT, plausible, plausible_samples,
 
 if TYPE_CHECKING:
     from ou_monitor.model.supply import SupplyModel
-    from ou_monitor.online.risk.first_passage import Passage
 
 # Cautions that make the numbers doubtful; the others only inform.
 _DOUBTFUL = frozenset({Flag.SLOW_RATE, Flag.QUANTIZED, Flag.LOWPASS_UPSTREAM, Flag.SATURATED,
@@ -46,9 +45,8 @@ class SupplyMonitor:
     model : SupplyModel, optional
         Terms of the supply, as `discover` found them; none when left out.
     background : bool
-        Whether tables for these terms, and with window ``auto`` the fits of alpha, sigma and
-        Var_inf, are made in a thread, so that reports never wait; until the tables are there
-        the risk is unknown.
+        Whether with window ``auto`` the fits of alpha, sigma and Var_inf are made in a thread,
+        so that reports never wait.
 
     """
 
@@ -78,15 +76,10 @@ class SupplyMonitor:
         self._relaxation = Relaxation(background=self._background)
         self._load_filter, self._load = LoadFilter(), SupplyLoad()
         self._load_filter.begin_with(None if self._model is None else self._model.load)
-        self._outlook = Outlook(background=self._background)
-        self._outlook.set_model(self._model)
         self._newest = Estimate()
-        self._forecast = Forecast(self._load_filter, self._passage)
+        self._forecast = Forecast(self._load_filter)
         # Risk and budget of the last report.
         self._ahead = Ahead()
-
-    def _passage(self, horizon: float) -> Passage | None:
-        return self._outlook.passage(self._newest, horizon)
 
     @property
     def settings(self) -> MonitorSettings:
@@ -107,11 +100,6 @@ class SupplyMonitor:
         self._flag.configure(settings)
 
     @property
-    def outlook(self) -> Outlook:
-        """Return what lies ahead: learned curves, risk and budget."""
-        return self._outlook
-
-    @property
     def load_filter(self) -> LoadFilter:
         """Return the voltage under load; a parameter never resets it, an error begins anew."""
         return self._load_filter
@@ -124,7 +112,6 @@ class SupplyMonitor:
     def set_model(self, model: SupplyModel | None) -> None:
         """Change the terms of the supply; window and flag stay."""
         self._model = model
-        self._outlook.set_model(model)
         self._load_filter.begin_with(None if model is None else model.load)
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
@@ -175,7 +162,6 @@ class SupplyMonitor:
                 self._relaxation.take(batch)
                 if not batch.again:
                     self._forecast.take(batch, came)
-                    self._outlook.push(batch.t, batch.y, batch.u, self._newest)
         except Exception as error:
             # Whatever it is: a monitor that ends with it says nothing any more.
             self.restart(error)
@@ -243,7 +229,6 @@ class SupplyMonitor:
         self._relaxation.forget()
         self._flag.new_time_line()
         self._trust.start_anew()
-        self._outlook.new_time_line()
         self._load_filter.new_time_line()
         self._forecast.new_time_line()
         self._reset_reason = reason
@@ -293,19 +278,21 @@ class SupplyMonitor:
             fresh = (silent <= limit and e.status is not Status.NO_DATA and doubt is Doubt.NONE)
             if again or not fresh:
                 self._load = self._load_filter.load()
-                self._ahead = look_ahead(self._outlook, self._forecast, e, self._load,
-                                         self._settings) if fresh else Ahead(
-                                             budget_reason=why)
-            left_out = () if self._outlook.events is None else self._outlook.events.left_out
+                # The better sigma of a longer window, but only where the short one sees an OU too:
+                # elsewhere the load tells more.
+                self._forecast.follow(*((told, ou.window_s, ou_age) if e.usable and told.usable
+                                        else (e, e.duration)))
+                self._ahead = look_ahead(self._forecast, self._load, self._settings) if (
+                    fresh) else Ahead(budget_reason=why)
         except Exception as error:
             # As in `push`.
             self.restart(error)
             e = Estimate(counters=self._counters())
             limit, stamps, fresh = self._settings.stale_after, Stamps.GOOD, False
             doubt, why = Doubt.NONE, ''
-            self._ahead, left_out = Ahead(), ()
+            self._ahead = Ahead()
             told, ou, ou_age = e, of_estimate(e), 0.0
-        # Of the last seconds, whatever the window: what risk and curves learn from.
+        # Of the last seconds, whatever the window: what the risk stands on.
         self._newest, e = e, told
         ahead = self._ahead
         risk = ahead.outcome.risk
@@ -317,6 +304,7 @@ class SupplyMonitor:
             age, e, limit, late=silent - here > limit)
         wrong = doubt if silence and silence == why else Doubt.NONE
         level, summary = self._judge(e, risk, flag, silence, wrong)
+        left_out = () if self._model is None else self._model.left_out
         return MonitorReport(
             e, risk, ahead.budget, ahead.budget_reason, left_out, flag, level, summary, silent,
             limit, stamps, doubt, fresh, self._thinned, self._restarts, self._fault, self._load,
@@ -348,8 +336,7 @@ class SupplyMonitor:
         asked = self._asked(voltage, horizon)
         if not self._trusted:
             return NAN
-        return risk_of_all(self._outlook, self._forecast, self._newest, self._settings,
-                           *asked).risk
+        return self._forecast.risk(*asked).risk
 
     def risk_if(self, throttle: float, dwell: float, voltage: float | None = None,
                 horizon: float | None = None) -> float:

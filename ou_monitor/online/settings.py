@@ -93,9 +93,6 @@ ESTIMATOR_PARAMETERS: tuple[Parameter, ...] = (
               'Time over which the median of the voltage is held against the floor, s, three '
               'samples at least (default: shorter than the dips of recorded quads, from 10 ms on, '
               'longer than a bad sample).', 0.0, 10.0),
-    Parameter('brownout.watch', 'continuous',
-              'Whether the risk is that of the voltage at all times or only at its samples.',
-              choices=('continuous', 'sampled')),
     Parameter('brownout.budget_limit', 0.01,
               'Risk that the throttle budget keeps under, 0..1; 0: brownout.warn.', 0.0, 1.0),
     Parameter('model_file', '',
@@ -189,8 +186,6 @@ class MonitorSettings:
         Voltage at or below which the flag is CRITICAL, V; 0: off; negative: `brownout_voltage`.
     brownout_floor_time : float
         Time over which the median of the voltage is held against the floor, s.
-    brownout_watch : str
-        ``continuous`` or ``sampled``: the risk at all times, or at the samples only.
     brownout_budget_limit : float
         Risk that the throttle budget keeps under, 0..1; 0: `brownout_warn`.
     model_file : str
@@ -210,7 +205,6 @@ class MonitorSettings:
     brownout_latch: bool = False
     brownout_floor: float = -1.0
     brownout_floor_time: float = 0.01
-    brownout_watch: str = 'continuous'
     brownout_budget_limit: float = 0.01
     model_file: str = ''
 

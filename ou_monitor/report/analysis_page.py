@@ -17,7 +17,6 @@ from ou_monitor.report import page
 from ou_monitor.report.page import probability, rounded, UNKNOWN
 from ou_monitor.report.scale import span
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import Z95
 
 # Changes drawn in one plot, and relaxation times of them.
 _MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
@@ -140,20 +139,13 @@ def curves(analysis: Analysis) -> list[str]:
     learned = analysis.by_throttle
     levels = [level for level in analysis.levels
               if math.isfinite(level.throttle) and level.n]
-    load, highest = analysis.overview.load, analysis.overview.highest
     parts = []
-    if levels or learned.known.any() or load.known:
+    if levels or learned.known.any():
         x = 100.0 * learned.throttle
         sag, sigma = _empty('Sag', 'mV'), _empty('Noise intensity \u03c3', 'V/\u221as')
-        answer = np.full(x.size, np.nan)
-        if load.known:
-            flown = learned.throttle <= highest
-            answer, error = (np.where(flown, 1e3 * values, np.nan) for values in (
-                load.sag(learned.throttle), load.sag_se(learned.throttle)))
-            sag.band(x, np.maximum(answer - Z95 * error, 0.0), answer + Z95 * error, '95 %', 0)
-            sag.line(x, answer, 'load filter', 0, 'thick')
-        sigma.band(x, learned.sigma_low, learned.sigma_high, '95 %', 0)
-        sigma.line(x, learned.sigma, 'learned as by the node', 0, 'thick')
+        answer = 1e3 * learned.sag
+        sag.band(x, 1e3 * learned.sag_low, 1e3 * learned.sag_high, '95 %', 0)
+        sag.line(x, answer, 'load filter', 0, 'thick')
         at = _column([100.0 * level.throttle for level in levels])
         _with_levels(sag, at, 1e3 * _column([level.sag.sag for level in levels]),
                      1e3 * _column([level.sag.interval for level in levels]))
@@ -172,7 +164,7 @@ def curves(analysis: Analysis) -> list[str]:
         _with_estimates(alpha, at, levels, 'alpha')
         drawn = [plot for plot, values in (
             (sag, [*answer, *(level.sag.sag for level in levels)]),
-            (sigma, [*learned.sigma, *(level.estimate.sigma for level in levels)]),
+            (sigma, [level.estimate.sigma for level in levels]),
             (risk, list(learned.risk)),
             (alpha, [level.estimate.alpha for level in levels])) if np.isfinite(values).any()]
         parts += [page.pair(*(page.figure(plot) for plot in drawn[k:k + 2]))

@@ -5,7 +5,6 @@ import math
 import numpy as np
 from ou_monitor.model.supply import Simulation, SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.term import Live
 import pytest
 from term_examples import EXAMPLES, OU, still, supply, term
 
@@ -272,8 +271,7 @@ def test_what_the_search_and_the_live_risk_know():
     assert {n for n, c in kinds.items() if c.MEASURED} == MEASURED
     assert {n: c.MAY_LEAVE for n, c in kinds.items() if c.MAY_LEAVE} == MAY_LEAVE
     assert {n: c.STATES for n, c in kinds.items() if c.STATES} == STATES
-    assert {n for n, c in kinds.items() if c.LIVE is Live.BY_THROTTLE} == BY_THROTTLE
-    assert {n for n, c in kinds.items() if c.LIVE is Live.BY_TIME} == {'volatility'}
+    assert {n for n, c in kinds.items() if c.LIVE} == BY_THROTTLE
     assert {n: dict(c.CLEAR_ABOVE) for n, c in kinds.items() if c.CLEAR_ABOVE} == {
         'throttle_tone': {'order line': 10.0}}
     assert {n: c.LEAST_SHARE for n, c in kinds.items() if c.LEAST_SHARE} == {'drift': 0.02}

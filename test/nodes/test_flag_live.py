@@ -146,7 +146,6 @@ def test_latch_off_clears(rig):
     ('brownout.leave', 1.0, 'must be less than 1'),
     ('brownout.budget_limit', 0.6, 'must not exceed brownout.critical'),
     ('brownout.critical', 0.005, 'must be less than brownout.critical'),
-    ('brownout.watch', 'both', 'brownout.watch'),
     ('brownout.horizon', 0.0, 'out of range'),
     ('brownout.latch', 1.5, 'Wrong parameter type'),
     ('model_file', '/no/such/model.yaml', 'cannot read the model file'),

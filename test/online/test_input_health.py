@@ -133,7 +133,7 @@ def test_what_is_no_reading_is_counted_as_none(volts, throttle, wrong):
     assert math.isfinite(report.estimate.sigma) and not report.estimate.throttle > 1.0
 
 
-@pytest.mark.parametrize('where, name', [('_estimator', 'take'), ('_outlook', 'push')])
+@pytest.mark.parametrize('where, name', [('_estimator', 'take'), ('_forecast', 'take')])
 def test_an_error_restarts_the_estimator_and_is_told(where, name, monkeypatch):
     """Unknown, ERROR with the cause, counted; counters go on, and the flag is held."""
     monitor, t = good(brownout_hold=60.0)

@@ -1,6 +1,5 @@
 """What parts of the online side and of the criticism find at their edges, for golden tables."""
 
-from dataclasses import replace
 
 from golden_models import samples_of, view_at
 from golden_runs import table
@@ -11,58 +10,12 @@ from ou_monitor.criticism.samples import choose_samples, events_between, lines_b
 from ou_monitor.criticism.spectral_start import from_spectrum
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.online.risk.curve_filters import Wander
-from ou_monitor.online.risk.curves import LearnedCurves
 from ou_monitor.online.risk.flag import BrownoutFlag
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.online.trust import patience, StampWatch
-from ou_monitor.records import Estimate, Flag, Status
 from ou_monitor.timeline.line import plausible_samples
 from scipy.signal import lfilter
 from term_examples import EXAMPLES, OU, term
-
-
-def curves():
-    """Return curves learned from throttle that steps, ramps, pauses, goes back and stays away."""
-    rng = np.random.default_rng(101)
-    n = 6000
-    t = np.arange(n) * 1e-3
-    u = np.clip(np.concatenate((np.repeat(rng.random(6), 500), np.linspace(0.1, 0.9, 1500),
-                                np.repeat([0.3, 1.4, -0.3], 500))), -0.5, 1.5)
-    noise = lfilter([1.0], [1.0, -np.exp(-0.063)], 0.02 * (1.0 + u) * rng.standard_normal(n))
-    v = 5.0 - 0.3 * u + noise
-    t[4000:] += 7.0
-    t[4200:4300] -= 0.05
-    v[100:110] = np.nan
-    u[2500:2600] = np.nan
-    plain = Estimate(alpha=63.0, sigma=0.632, var_inf=3.2e-3, u0=5.0, noise_std=0.004,
-                     alpha_se=0.1, sigma_se=0.02, var_inf_se=0.1, status=Status.OK, rate=1000.0)
-    found = []
-    for kind, e in (('plain', plain), ('held', replace(plain, flags=(Flag.HELD_SAMPLES,))),
-                    ('unknown', replace(plain, status=Status.NO_RELAXATION)),
-                    ('fast', replace(plain, alpha=900.0))):
-        one = LearnedCurves()
-        one.forgetting, one.shape_forgetting = 20.0, 200.0
-        for begin in range(0, n, 60):
-            part = slice(begin, begin + 60)
-            one.update(t[part], np.repeat(v[part][::3], 3) if kind == 'held' else v[part],
-                       u[part], e)
-            if begin % 1500 == 1440:
-                at = np.array([-0.2, 0.0, 0.15, 0.5, 0.82, 1.0])
-                found.append(table([kind, one.level_curve(at), one.sigma_curve(at),
-                                    one.seen_curve(at), one.scatter, one.extent,
-                                    [one.level_at(x) for x in (0.0, 0.33, 1.0)],
-                                    [one.wander.value, one.wander.variance, one.wander.speed]]))
-        # Set back by an hour: what was learned is older.
-        one.update(t[:300] - 3600.0, v[:300], u[:300], e)
-        found.append(table([one.level_at(0.5), one.sigma_at(0.5), one.throttle_known]))
-    wander = Wander()
-    for k in range(60):
-        wander.elapse(0.25 * (1 + k % 3))
-        wander.correct(0.3 * np.sin(0.2 * k), 0.01 + 0.02 * (k % 4))
-        if k % 9 == 0:
-            found.append(table([wander.value, wander.variance, wander.speed, wander.fast_speed]))
-    return found
 
 
 def flags():
@@ -242,4 +195,4 @@ def latent():
     return found
 
 
-RUNS = {run.__name__: run for run in (curves, flags, stamps, chains, long, latent)}
+RUNS = {run.__name__: run for run in (flags, stamps, chains, long, latent)}

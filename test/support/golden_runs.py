@@ -141,12 +141,11 @@ def _slow_flight(rng, n):
 
 
 def risk():
-    """Return reports, risks, budget and curves of monitors through flights."""
-    throttles, found = np.linspace(0.0, 1.0, 9), []
+    """Return reports and risks of monitors through flights."""
+    found = []
     for made, n, level, more in (
-            (flight, 9000, 4.55, {}), (flight, 3000, 4.6, {'brownout_watch': 'sampled'}),
-            (_slow_flight, 1200, 14.6, {'window': 10.0}),
-            (_slow_flight, 600, 14.6, {'brownout_watch': 'sampled', 'window': 10.0})):
+            (flight, 9000, 4.55, {}),
+            (_slow_flight, 1200, 14.6, {'window': 10.0})):
         t, v, u = made(np.random.default_rng(41), n)
         u[5000:5600] = np.nan
         monitor = SupplyMonitor(MonitorSettings(
@@ -158,20 +157,13 @@ def risk():
                 part = slice(begin, begin + (50 if every == 300 else 250))
                 monitor.push(t[part] + (30.0 if k >= 7500 else 0.0), v[part], u[part])
                 report = monitor.report(0.0)
-            curves = monitor.outlook.curves
             found.append(table({
                 'fields': {name: number(text) for name, text in report.fields.items()},
                 'flag': report.flag, 'level': report.level.name,
                 'risks': [monitor.risk(level + off, horizon) for off in (-0.25, -0.05, 0.25)
                           for horizon in (0.2, 1.0, 7.0)],
                 'if': [monitor.risk_if(throttle, dwell, level, 2.0) for throttle in (0.1, 0.9)
-                       for dwell in (0.1, 3.0)],
-                'budget': monitor.outlook.budget(report.estimate, monitor.settings),
-                'levels': curves.level_curve(throttles), 'sigmas': curves.sigma_curve(throttles),
-                'seen': curves.seen_curve(throttles), 'scatter': curves.scatter,
-                'extent': curves.extent, 'at': [*curves.level_at(0.35), *curves.sigma_at(0.85)],
-                'wander': [curves.wander.value, curves.wander.variance, curves.wander.speed,
-                           curves.wander.fast_speed]}))
+                       for dwell in (0.1, 3.0)]}))
     return found
 
 

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
-from ou_monitor.model.terms.term import by_parameters, Live, NEXT_TO_ZERO, parameter, Role, Term
+from ou_monitor.model.terms.term import by_parameters, NEXT_TO_ZERO, parameter, Role, Term
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class LoadSag(Term):
         ('linear', 'square'), lambda term: ('linear', 'square') if term.square else ('linear',))
     SIGNS: ClassVar[tuple[str, ...]] = ('throttle',)
     MEASURED: ClassVar[bool] = True
-    LIVE: ClassVar[Live] = Live.BY_THROTTLE
+    LIVE: ClassVar[bool] = True
     MEANING: ClassVar[str] = (
         'The mean falls with throttle: IR drop of battery, leads and regulator.')
     REMEDY: ClassVar[str] = (

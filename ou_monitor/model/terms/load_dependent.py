@@ -12,7 +12,7 @@ from ou_monitor.model.load import ripple
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
-from ou_monitor.model.terms.term import by_parameters, Live, parameter, parameters, Role, Term
+from ou_monitor.model.terms.term import by_parameters, parameter, parameters, Role, Term
 from ou_monitor.records import FloatArray
 
 
@@ -34,7 +34,7 @@ class LoadDependentSigma(Term):
     # Where it steps was searched for.
     SEARCH: ClassVar[float] = by_parameters(
         0.0, lambda term: _STEP_PRICE if term.steps() else 0.0)
-    LIVE: ClassVar[Live] = Live.BY_THROTTLE
+    LIVE: ClassVar[bool] = True
     MEANING: ClassVar[str] = 'The noise grows or shrinks with throttle.'
     REMEDY: ClassVar[str] = (
         'Let the estimator run while flying, so that filters and risk follow the load.')
@@ -191,7 +191,7 @@ class LoadDependentAlpha(Term):
     FREE: ClassVar[tuple[str, ...]] = ('slope',)
     SIGNS: ClassVar[tuple[str, ...]] = ('state throttle',)
     MEASURED: ClassVar[bool] = True
-    LIVE: ClassVar[Live] = Live.BY_THROTTLE
+    LIVE: ClassVar[bool] = True
     MEANING: ClassVar[str] = 'The relaxation rate depends on throttle.'
     REMEDY: ClassVar[str] = (
         'Fit each load level on its own (analyze); a single alpha is wrong at all levels but one.')

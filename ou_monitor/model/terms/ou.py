@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage, steady
-from ou_monitor.model.terms.term import Live, parameter, Term
+from ou_monitor.model.terms.term import parameter, Term
 from ou_monitor.records import FloatArray
 
 # With a force that is not linear, a step is cut into parts of at most this
@@ -33,7 +33,7 @@ class OU(Term):
     NAME: ClassVar[str] = 'ou'
     STAGE: ClassVar[Stage] = Stage.STATE
     FREE: ClassVar[tuple[str, ...]] = ('alpha', 'sigma')
-    LIVE: ClassVar[Live] = Live.BY_THROTTLE
+    LIVE: ClassVar[bool] = True
 
     alpha: float = parameter('1/s', 'relaxation rate', 0.0, above=True)
     sigma: float = parameter('V/sqrt(s)', 'noise intensity', 0.0)

@@ -46,17 +46,6 @@ class Role(enum.Enum):
     LAW = enum.auto()
 
 
-class Live(enum.Enum):
-    """How the live estimate of the node follows what a term does to alpha, sigma and u0."""
-
-    # Not: what a model file says of it is all that the risk knows.
-    NOT = enum.auto()
-    # At every throttle.
-    BY_THROTTLE = enum.auto()
-    # Because its window is short.
-    BY_TIME = enum.auto()
-
-
 def parameter(unit: str, text: str, low: float = -math.inf, high: float = math.inf, *,
               above: bool = False) -> Any:
     """Declare a parameter of a term."""
@@ -140,8 +129,9 @@ class Term:
         States that it adds to the linear system (`Role.BLOCK`).
     CHANGES : type of Term, or None
         The term that it changes and that a model needs beside it; None for the `ou`.
-    LIVE : Live
-        How the live estimate follows it.
+    LIVE : bool
+        Whether the live estimate has alpha, sigma or u0 as this term makes them at the present
+        throttle, so that the risk knows of it.
 
     Raises
     ------
@@ -171,7 +161,7 @@ class Term:
     BROAD: ClassVar[bool] = False
     STATES: ClassVar[int] = 0
     CHANGES: ClassVar[type[Term] | None] = None
-    LIVE: ClassVar[Live] = Live.NOT
+    LIVE: ClassVar[bool] = False
     MEANING: ClassVar[str] = ''
     REMEDY: ClassVar[str] = ''
     SEPARATED_BY: ClassVar[str] = ''

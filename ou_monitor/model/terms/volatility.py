@@ -11,7 +11,7 @@ import numpy as np
 from ou_monitor.model.terms.laws import (
     climb, curvature_se, LawFit, normal_scores, refine, View)
 from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
-from ou_monitor.model.terms.term import Live, parameter, Role, Term
+from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 from scipy.special import comb, digamma, ndtr
 
@@ -27,7 +27,6 @@ class Volatility(Term):
     DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('clustering', 'kurtosis')
     IMITATES: ClassVar[tuple[str, ...]] = ('heavy_tails', 'jumps', 'regime_switching')
-    LIVE: ClassVar[Live] = Live.BY_TIME
     MEANING: ClassVar[str] = 'The intensity of the noise wanders slowly, unrelated to throttle.'
     REMEDY: ClassVar[str] = 'Keep the window of the estimator short beside that time.'
     SEPARATED_BY: ClassVar[str] = (

@@ -287,6 +287,11 @@ class LoadNoise:
         return math.log(whole), float(self.b[1]), float(self.b[2])
 
     @property
+    def ripple_se(self) -> float:
+        """Return the standard error of the second b."""
+        return math.sqrt(max(float(self._covariance[1, 1]), 0.0))
+
+    @property
     def of_blocks(self) -> tuple[float, float, float]:
         """Return b of the mean of a block."""
         return float(self.b[0]), float(self.b[1]), float(self.b[2])

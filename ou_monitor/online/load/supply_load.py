@@ -176,6 +176,8 @@ class LoadState:
         Fall of the level, V per unit of charge.
     log_variance : tuple of float
         Coefficients of ln variance, V^2, of a sample: 1, ripple, sqrt|du|.
+    ripple_se : float
+        Standard error of the second of them.
     flown : tuple of float
         Throttles between which the noise is known.
 
@@ -189,4 +191,5 @@ class LoadState:
     size: float
     fall: float
     log_variance: tuple[float, float, float]
+    ripple_se: float
     flown: tuple[float, float]

@@ -3,9 +3,7 @@ First-passage risk: the probability that the supply goes below a voltage within 
 
 Limits: throttle is taken to stay as it is, and so are alpha and sigma; their
 errors, that of the level and that of the present voltage are averaged over.
-`watch` says what is meant: the continuous path (what the hardware feels, the
-default), or what is seen of it at the rate of the samples, which misses
-passages between them and adds the noise of the sensor.
+The continuous path is meant, which the hardware feels, not its samples.
 """
 
 from __future__ import annotations
@@ -13,23 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 import functools
 import math
-import threading
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.passage.law import passage_probability
-from ou_monitor.model.passage.sampled import sampled_passage_probability
 from ou_monitor.records import Estimate, FloatArray, NAN
-
-if TYPE_CHECKING:
-    from ou_monitor.model.supply import SupplyModel
 
 # Nodes over where the supply is now; those of the other averages are below.
 _START_NODES = 3
-WATCHES = ('continuous', 'sampled')
-# Probabilities this near to 0 or 1 are not told apart from them where laws are combined.
-_TINY = 1e-15
 
 
 @dataclass(frozen=True)
@@ -37,28 +26,26 @@ class Supply:
     """
     What a risk is computed from: the OU at one throttle, and how well it is known.
 
-    Fields are floats or arrays of one shape.
-
     Attributes
     ----------
-    u0, u0_se : float or ndarray
+    u0, u0_se : float
         Level and its standard error, V.
-    ln_alpha, ln_alpha_se : float or ndarray
+    ln_alpha, ln_alpha_se : float
         Logarithm of the relaxation rate (1/s) and its standard error.
-    ln_sigma, ln_sigma_se : float or ndarray
+    ln_sigma, ln_sigma_se : float
         Logarithm of the intensity (V/sqrt(s)) and its standard error.
-    covariance : float or ndarray
+    covariance : float
         Of the errors of `ln_alpha` and `ln_sigma`.
 
     """
 
-    u0: npt.ArrayLike
-    u0_se: npt.ArrayLike
-    ln_alpha: npt.ArrayLike
-    ln_alpha_se: npt.ArrayLike
-    ln_sigma: npt.ArrayLike
-    ln_sigma_se: npt.ArrayLike
-    covariance: npt.ArrayLike = 0.0
+    u0: float
+    u0_se: float
+    ln_alpha: float
+    ln_alpha_se: float
+    ln_sigma: float
+    ln_sigma_se: float
+    covariance: float = 0.0
 
     @classmethod
     def of(cls, e: Estimate) -> Supply:
@@ -73,7 +60,7 @@ class Supply:
 
 
 def brownout_probability(e: Estimate, voltage: float, horizon: float,
-                         now: float | None = None, *, watch: str = 'continuous') -> float:
+                         now: float | None = None) -> float:
     """
     Return the probability of going below `voltage` within `horizon`.
 
@@ -89,9 +76,6 @@ def brownout_probability(e: Estimate, voltage: float, horizon: float,
     now : float, optional
         Present voltage, V, with the noise of `e.noise_std` on it; the mean
         level when left out.
-    watch : {'continuous', 'sampled'}
-        Whether the path itself is meant, or its samples at `e.rate`, each
-        with noise of `e.noise_std`.
 
     Returns
     -------
@@ -103,27 +87,20 @@ def brownout_probability(e: Estimate, voltage: float, horizon: float,
     Raises
     ------
     ValueError
-        When the horizon is not positive, the voltage not finite, or `watch`
-        unknown.
+        When the horizon is not positive, or the voltage not finite.
 
     """
     if not (math.isfinite(horizon) and horizon > 0.0):
         raise ValueError(f'horizon must be a positive number of seconds, got {horizon}')
     if not math.isfinite(voltage):
         raise ValueError(f'brown-out voltage must be finite, got {voltage} V')
-    if watch not in WATCHES:
-        raise ValueError(f"watch must be 'continuous' or 'sampled', got '{watch}'")
     if now is not None and now <= voltage:
         return 1.0
     if not e.usable:
         return NAN
     if now is not None and math.isnan(now):
         now = None
-    supply = Supply.of(e)
-    risk = float(risk_of(supply, voltage, horizon, now, e.noise_std))
-    if watch == 'continuous':
-        return risk
-    return as_sampled(e, supply, voltage, horizon, now, risk)
+    return float(risk_of(Supply.of(e), voltage, horizon, now, e.noise_std))
 
 
 def risk_of(supply: Supply, voltage: npt.ArrayLike, horizon: float, now: float | None = None,
@@ -131,8 +108,7 @@ def risk_of(supply: Supply, voltage: npt.ArrayLike, horizon: float, now: float |
     """
     Return the probability that the continuous path goes below `voltage` within `horizon`.
 
-    voltage in V, of the shape of the supply or, of one supply, any; horizon in s, now in V,
-    noise_std in V.
+    voltage in V, of any shape; horizon in s, now and noise_std in V.
     """
     u0, ln_alpha, ln_sigma, weight = _nodes(supply, *(_FEW if coarse else _MANY))
     sd = np.exp(ln_sigma - 0.5 * ln_alpha) / math.sqrt(2.0)
@@ -167,28 +143,6 @@ class Passage:
         above, below = np.where(levels >= self.now, 1.0, risk_of(
             self.supply, levels, horizon, self.now, self.noise_std, coarse=True)).tolist()
         return float((above - below) / (2.0 * half))
-
-
-def as_sampled(e: Estimate, supply: Supply, voltage: float, horizon: float,
-               now: float | None, risk: float) -> float:
-    """Return the risk of being seen below, errors counted as for the continuous path."""
-    if not e.rate > 0.0:
-        return NAN
-    alpha = math.exp(float(np.asarray(supply.ln_alpha)))
-    sd = math.exp(float(np.asarray(supply.ln_sigma))) / math.sqrt(2.0 * alpha)
-    u0 = float(np.asarray(supply.u0))
-    barrier, noise = (u0 - voltage) / sd, (e.noise_std if e.noise_std > 0.0 else 0.0) / sd
-    start = 0.0
-    if now is not None:
-        start = (u0 - now) / sd / (1.0 + noise**2)
-    seen = sampled_passage_probability(
-        start, barrier, alpha / e.rate, max(int(horizon * e.rate), 1), noise)
-    certain = float(passage_probability(start, barrier, alpha * horizon))
-    chances = np.clip([seen, risk, certain], _TINY, 1.0 - _TINY)
-    odds = (chances / (1.0 - chances)).tolist()
-    # What errors do to the odds they do to both.
-    both = odds[0] * odds[1] / odds[2]
-    return both / (1.0 + both) if 0.0 < seen < 1.0 else float(seen)
 
 
 def _averaged(start: FloatArray, barrier: FloatArray, span: FloatArray, weight: FloatArray,
@@ -249,85 +203,3 @@ def _grid(*counts: int) -> tuple[FloatArray, FloatArray]:
 # Nodes over ln Var_inf, which counts most, over ln alpha given that, and over the level.
 _MANY = _grid(7, 3, 3)
 _FEW = _grid(5, 1, 3)
-
-# The live parameters may be so far from those prepared, in logarithms; further ones are
-# taken as if they were there.
-_NEAR = 0.1
-_NEARLY_ONE = 1.0 - 1e-12
-
-
-class EventRisk:
-    """
-    Risk that jumps and switching of a model add, kept ready beside the live parameters.
-
-    Tables for the present alpha and sigma are made in a thread of their own, a few tenths of a
-    second each, or waited for, and only looked up when a risk is asked for.  Limits: the state of
-    a regime is not followed, its stationary law is taken; sigma of the window is that of all
-    regimes together.
-    """
-
-    def __init__(self, model: SupplyModel, *, background: bool = True) -> None:
-        # Here, for without a model the nodes need none of it: it costs them 60 MB.
-        from ou_monitor.model.passage.extended import ExtendedPassage
-        from ou_monitor.model.supply import SupplyModel
-        from ou_monitor.model.terms.term import Live
-        kept = SupplyModel(tuple(term for term in model.terms if term.LIVE is not Live.BY_TIME))
-        self._passage = ExtendedPassage(kept)
-        self._background = background
-        self._thread: threading.Thread | None = None
-        self._at: tuple[float, float] | None = None
-        self._wanted: tuple[float, float] | None = None
-
-    @property
-    def used(self) -> tuple[str, ...]:
-        """Names of the terms that change the risk."""
-        return self._passage.used
-
-    @property
-    def left_out(self) -> tuple[str, ...]:
-        """Names of the terms that move the supply and that the risk does not know of."""
-        return self._passage.left_out
-
-    def follow(self, ln_alpha: float, ln_sigma: float) -> None:
-        """Have tables ready for parameters like these."""
-        if not (self.used and math.isfinite(ln_alpha) and math.isfinite(ln_sigma)):
-            return
-        at = self._at
-        if at is not None and max(abs(at[0] - ln_alpha), abs(at[1] - ln_sigma)) < 0.5 * _NEAR:
-            return
-        self._wanted = ln_alpha, ln_sigma
-        if not self._background:
-            self._make()
-        elif self._thread is None or not self._thread.is_alive():
-            self._thread = threading.Thread(target=self._make, name='risk tables', daemon=True)
-            self._thread.start()
-
-    def _make(self) -> None:
-        wanted = self._wanted
-        if wanted is not None:
-            self._passage.prepare(math.exp(wanted[0]), math.exp(wanted[1]))
-            self._at = wanted
-
-    def survival(self, start: npt.ArrayLike, level: float, horizon: float, *,
-                 ln_alpha: npt.ArrayLike, ln_sigma: npt.ArrayLike, u0: npt.ArrayLike
-                 ) -> FloatArray:
-        """
-        Return by what factor events lower the chance to get through the horizon.
-
-        start in V, level in V, horizon in s.
-        """
-        a, e, v, mean = np.broadcast_arrays(*(
-            np.asarray(x, dtype=np.float64) for x in (ln_alpha, ln_sigma, start, u0)))
-        if not self.used:
-            return np.zeros(a.shape)
-        if self._at is None:
-            return np.full(a.shape, math.nan)
-        alpha = np.exp(np.clip(a, self._at[0] - _NEAR, self._at[0] + _NEAR))
-        sigma = np.exp(np.clip(e, self._at[1] - _NEAR, self._at[1] + _NEAR))
-        with_events = self._passage.probability(v, level, horizon, alpha=alpha, sigma=sigma,
-                                                u0=mean)
-        sd = sigma / np.sqrt(2.0 * alpha)
-        without = passage_probability((mean - v) / sd, (mean - level) / sd, alpha * horizon)
-        found: FloatArray = np.log1p(-np.minimum(with_events, _NEARLY_ONE)) - np.log1p(
-            -np.minimum(without, _NEARLY_ONE))
-        return np.minimum(found, 0.0)

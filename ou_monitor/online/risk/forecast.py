@@ -22,19 +22,20 @@ all is interpolated.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.model.load import ripple
+from ou_monitor.model.passage.law import prepare
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import LoadState
-from ou_monitor.online.risk.first_passage import Passage
+from ou_monitor.online.risk.first_passage import Passage, risk_of, Supply
 from ou_monitor.online.risk.futures import (
     BLOCK, excursion_risk, excursions, Flown, flown, Futures, held, lowest, mean_now, Past, pilot,
     Sampling)
-from ou_monitor.records import FloatArray, NAN
+from ou_monitor.records import Estimate, FloatArray, NAN
 from ou_monitor.timeline.line import Batch
 
 # Degrees of freedom: tails of a model that is wrong now and then.
@@ -152,6 +153,8 @@ LOOK, _LOOK_SHARE = 0.2, 0.2
 # By arrival, s, no sooner: stamps may run, or jump, a thousand times too fast, and a look takes
 # 1 ms.  A replay at four times its speed is looked at as ever.
 _REST = 0.05
+# Largest error of ln sigma that is averaged over: beyond it sigma is unknown.
+_LARGEST_ERROR = 1.0
 # The window's own tests have found the OU: odds, and horizons that it counts as right.
 _ODDS = 20.0
 # Time, s, of which the throttle used is taken.
@@ -242,13 +245,16 @@ class _Rung:
 
 class Forecast:
     """
-    Risk with throttle to come, and what a throttle would do; `push` feeds the load filter.
+    Risk with throttle to come, and what a throttle would do.
 
-    `passage` gives the first-passage leg as it is now for a horizon, s; None when not known.
+    `take` feeds the load filter, `follow` tells the newest estimate.
     """
 
-    def __init__(self, loads: LoadFilter, passage: Callable[[float], Passage | None]) -> None:
-        self._loads, self._passage = loads, passage
+    def __init__(self, loads: LoadFilter) -> None:
+        # A third of a second, once: not while samples are coming.
+        prepare()
+        self._loads = loads
+        self.follow(Estimate(), 0.0)
         self._rungs = tuple(_Rung(horizon) for horizon in RUNGS)
         self.new_time_line()
         self._known = False
@@ -313,6 +319,32 @@ class Forecast:
         """Where the supply is now, V: the middle one of the last three samples; NaN of one."""
         return float(np.median(self._last)) if self._last.size > 1 else NAN
 
+    def follow(self, e: Estimate, window: float, ago: float = 0.0) -> None:
+        """Take the newest estimate; alpha and sigma are of a window, s, that ended so long ago."""
+        self.estimate, self._window = e, (window, ago)
+
+    def supply(self) -> Supply | None:
+        """Return the OU at the present throttle, by window and load; None when not known."""
+        if not self.estimate.usable:
+            return None
+        plain, state = Supply.of(self.estimate), self._loads.state()
+        if state is None:
+            return plain
+        # sigma is that of all throttles of the window; the load knows how noise goes with them.
+        flown = np.clip(np.append(self._past.throttles(*self._window), state.throttle),
+                        *state.flown)
+        apart = ripple(flown) - ripple(flown[-1])
+        less = 0.5 * math.log(float(np.exp(state.log_variance[1] * apart).mean()))
+        return replace(plain, ln_sigma=plain.ln_sigma - less, ln_sigma_se=min(math.hypot(
+            plain.ln_sigma_se, 0.5 * state.ripple_se * float(apart.mean())), _LARGEST_ERROR))
+
+    def passage(self, horizon: float) -> Passage | None:
+        """Return the law of the lowest voltage within a horizon, s; None when not known."""
+        supply, now = self.supply(), self.voltage
+        noise = self.estimate.noise_std
+        return None if supply is None or math.isnan(now) else Passage(
+            supply, now, noise if noise > 0.0 else 0.0)
+
     def _look(self) -> None:
         """Complete horizons, and begin new ones."""
         self._kept.clear()
@@ -337,7 +369,7 @@ class Forecast:
             rung.looks.append(_Look(
                 self._newest, self.voltage, mean, deviation, state,
                 None if state is None else pilot(done, state.throttle, rung.horizon),
-                self._passage(rung.horizon)))
+                self.passage(rung.horizon)))
 
     def _flight(self, horizon: float) -> tuple[float, float, Flown]:
         """Return excursions and futures of the flight, found once between two looks."""
@@ -355,14 +387,8 @@ class Forecast:
             self._laws[horizon] = (LowestLaw(values[:6]), *values[6:].tolist())
         return self._laws[horizon]
 
-    def risk(self, voltage: float, horizon: float, passage: float = NAN, *,
-             alone: bool = False) -> Outcome:
-        """
-        Return P(below `voltage`, V, within `horizon`, s), the throttle to come included.
-
-        passage: the risk of the first-passage leg; NaN when not known.  alone: where it is known
-        nothing else counts, as where a model file names events that no other leg knows of.
-        """
+    def risk(self, voltage: float, horizon: float) -> Outcome:
+        """Return P(below `voltage`, V, within `horizon`, s), the throttle to come included."""
         now = self.voltage
         state = self._state()
         law, _, wrong, missed, evidence = self._learned(horizon)
@@ -383,8 +409,11 @@ class Forecast:
                 np.array([0.0, *parts])))))]
         if now <= voltage:
             return Outcome(1.0, basis if not math.isnan(far) else 'none', cause or 'load now')
-        if not math.isnan(passage):
-            if alone or math.isnan(far):
+        supply = self.supply()
+        if supply is not None:
+            passage = float(risk_of(supply, voltage, horizon, None if math.isnan(now) else now,
+                                    self.estimate.noise_std))
+            if math.isnan(far):
                 return Outcome(passage, 'first_passage', DOMINANT[0])
             share = 0.5 + 0.5 * math.tanh(0.5 * (math.log(_ODDS - 1.0) + evidence))
             first = missed * far + (1.0 - missed) * passage

@@ -250,6 +250,12 @@ class Past:
         known = self.table[2:, np.isfinite(self.table[2])]
         return (float(known[0].min()), float(known[1].max())) if known.size else (NAN, NAN)
 
+    def throttles(self, seconds: float, ago: float) -> FloatArray:
+        """Return the mean throttle of each block of some seconds that ended so long ago, s."""
+        end = self.table.shape[1] - round(ago / BLOCK)
+        mean = self.table[2, max(0, end - round(seconds / BLOCK)):max(0, end)]
+        return np.asarray(mean[np.isfinite(mean)])
+
     def used(self, seconds: float, share: float) -> float:
         """Return the throttle that was passed for a share of the last seconds; NaN without any."""
         high = self.table[3, -round(seconds / BLOCK):]

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.monitor import SupplyMonitor
-from ou_monitor.online.risk.first_passage import Passage, Supply
+from ou_monitor.online.risk.first_passage import brownout_probability
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.risk.forecast import Forecast
 from ou_monitor.online.risk.futures import held, lowest, mean_now
 from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.records import Estimate, Status
 from ou_monitor.timeline.line import Batch
 from project import ROOT
 import pytest
@@ -299,18 +300,27 @@ def test_known_from_the_first_second_and_flag_hardly_unknown():
     assert math.isnan(report.budget) and 'Throttle has not moved' in report.budget_reason
 
 
+def estimated(u0, deviation, alpha):
+    """Return an estimate without errors."""
+    return Estimate(alpha=alpha, sigma=deviation * math.sqrt(2.0 * alpha), var_inf=deviation ** 2,
+                    u0=u0, alpha_se=0.0, sigma_se=0.0, var_inf_se=0.0, u0_se=0.0, rate=RATE,
+                    status=Status.OK)
+
+
 def test_first_passage_by_its_odds():
     """19 to 1 before any horizon has spoken, and a twentieth of it to the excursions."""
     _, v, _ = flight('telegraph')
-    forecast = Forecast(LoadFilter(), lambda horizon: None)
+    forecast = Forecast(LoadFilter())
     forecast.take(batch(np.arange(300) * DT, v[:300]))
     far = forecast.risk(15.0, 1.0)
     assert far.basis == 'excursions' and 0.0 < far.risk < 1.0
-    both = forecast.risk(15.0, 1.0, 0.9)
-    first = 0.05 * far.risk + 0.95 * 0.9
+    forecast.follow(estimated(15.2, 0.1, 5.0), 2.0)
+    passage = brownout_probability(forecast.estimate, 15.0, 1.0, forecast.voltage)
+    assert 0.1 < passage < 1.0
+    both = forecast.risk(15.0, 1.0)
+    first = 0.05 * far.risk + 0.95 * passage
     assert both.basis == 'first_passage'
     assert both.risk == pytest.approx(0.95 * first + 0.05 * far.risk)
-    assert forecast.risk(15.0, 1.0, 0.9, alone=True).risk == 0.9
 
 
 @pytest.mark.parametrize('wrong', [False, True])
@@ -319,15 +329,13 @@ def test_the_leg_that_predicts_better_stands(wrong):
     rng = np.random.default_rng(4)
     v = 15.0 + lfilter([0.1], [1.0, -0.9], rng.standard_normal(3000))
     # alpha = -50 ln 0.9; the deviation is 0.1 / sqrt(1 - 0.81).
-    deviation, alpha = 0.1 / math.sqrt(0.19), -RATE * math.log(0.9)
-    log_sigma = math.log(deviation * math.sqrt(2.0 * alpha))
-    newest = [15.0]
-    supply = Supply(15.0 + 4.0 * deviation * wrong, 0.0, math.log(alpha), 0.0, log_sigma, 0.0)
-    forecast = Forecast(LoadFilter(), lambda horizon: Passage(supply, newest[0], 0.0))
+    deviation = 0.1 / math.sqrt(0.19)
+    forecast = Forecast(LoadFilter())
+    forecast.follow(estimated(15.0 + 4.0 * deviation * wrong, deviation, -RATE * math.log(0.9)),
+                    2.0)
     for k in range(0, 3000, 10):
         forecast.take(batch((k + np.arange(10)) * DT, v[k:k + 10]))
-        newest[0] = float(v[k + 9])
-    assert forecast.risk(14.0, 1.0, 0.3).basis == ('excursions' if wrong else 'first_passage')
+    assert forecast.risk(14.0, 1.0).basis == ('excursions' if wrong else 'first_passage')
 
 
 @pytest.mark.parametrize('voltage', [12.5, 14.0, 14.6, 15.5])

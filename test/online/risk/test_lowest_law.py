@@ -22,7 +22,7 @@ def state(throttle=0.4, **changes):
     x = throttle ** 1.8
     return replace(LoadState(
         0.0, throttle, COEFFICIENTS, np.zeros((9, 9)), (x, x, x), 1.0, 0.0,
-        (2.0 * math.log(NOISE), 0.0, 0.0), (0.0, 1.0)), **changes)
+        (2.0 * math.log(NOISE), 0.0, 0.0), 0.0, (0.0, 1.0)), **changes)
 
 
 @pytest.mark.parametrize('n', [1, 2, 8, 64, 512])

@@ -59,16 +59,6 @@ def test_noise_on_the_present_voltage_is_averaged_over():
     assert near > 0.5 > brownout_probability(noisy, 4.85, 0.005, now=4.86)
 
 
-def test_what_is_sampled_sees_fewer_passages_and_more_with_noise():
-    e = replace(GOOD, rate=1000.0)
-    path = brownout_probability(e, 4.8, 2.0)
-    seen = brownout_probability(e, 4.8, 2.0, watch='sampled')
-    assert 0.4 * path < seen < 0.8 * path
-    assert brownout_probability(replace(e, noise_std=0.03), 4.8, 2.0, watch='sampled') > 2.0 * seen
-    with pytest.raises(ValueError, match='continuous'):
-        brownout_probability(e, 4.8, 2.0, watch='both')
-
-
 def test_monotone_in_horizon_level_and_present_voltage():
     low = brownout_probability(GOOD, 4.8, 1.0)
     assert low < brownout_probability(GOOD, 4.8, 5.0) < 1.0
