@@ -203,7 +203,7 @@ def test_scores_of_the_right_law_are_white(name, seed):
     ('regime_switching', 3, 0.5)])
 def test_a_law_with_a_wrong_parameter_shows(monkeypatch, name, coordinate, by):
     """What a fit has found, moved off by hand, makes scores that are off."""
-    module = import_module(f'ou_monitor.model.terms.{name}')
+    module = import_module(catalogue()[name].__module__)
     climb = module.climb
 
     def astray(*args, **others):
