@@ -1,5 +1,5 @@
 """
-Every term there is, found by looking: a new module in this folder is a new term.
+Every term there is, found by looking: a new class with a NAME in a module here is a term.
 
 The names are those of model files and of findings.
 """
