@@ -2,7 +2,7 @@
 The sliding-window estimator against what users would pick: one command.
 
     python benchmarks/estimator.py [--windows 500] [--quick] [--json FILE]
-        [--accuracy doc/estimation_accuracy.md] [--speed doc/estimation_cost.md]
+        [--accuracy doc/results/estimator.md] [--speed doc/results/estimator.md]
 
 See README.md beside this file.
 """

@@ -1,14 +1,16 @@
-"""
+r"""
 The adaptive low-pass against hindsight, against the truth, in a loop, as a node.
 
-    python benchmarks/filter.py error --table doc/filter_accuracy.md
-    python benchmarks/filter.py bags --table doc/filter_accuracy.md
-    python benchmarks/filter.py windows --table doc/filter_accuracy.md
-    python benchmarks/filter.py dterm --table doc/filter_dterm.md --figure doc/filter_dterm.svg
-    python benchmarks/filter.py loop --table doc/filter_dterm.md --figure doc/filter_loop.svg
-    python benchmarks/filter.py flight --figure doc/filter_flight.svg
-    python benchmarks/filter.py node --table doc/filter_dterm.md
-    python benchmarks/filter.py arrays --table doc/filter.md
+    python benchmarks/filter.py error --table doc/results/filter.md
+    python benchmarks/filter.py bags --table doc/results/filter.md
+    python benchmarks/filter.py windows --table doc/results/filter.md
+    python benchmarks/filter.py dterm --table doc/results/filter.md \
+        --figure doc/results/filter_dterm.svg
+    python benchmarks/filter.py loop --table doc/results/filter.md \
+        --figure doc/results/filter_loop.svg
+    python benchmarks/filter.py flight --figure doc/results/filter_flight.svg
+    python benchmarks/filter.py node --table doc/results/filter.md
+    python benchmarks/filter.py arrays --table doc/results/filter.md
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """
 Throughput of `ou-monitor fleet` against the number of workers.
 
-    python benchmarks/fleet.py --workers 1 2 --recordings 64 --markdown doc/fleet.md
+    python benchmarks/fleet.py --workers 1 2 --recordings 64 --markdown doc/results/fleet.md
 
 One run: recordings are simulated into a temporary folder, then analysed again
 and again with each number of workers in turn, and once in this process

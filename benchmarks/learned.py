@@ -1,7 +1,7 @@
 """
 Law `kalman` on recorded gyros: told the noise, and nothing of the signal.
 
-    OU_MONITOR_REALDATA=FOLDER python benchmarks/learned.py --page doc/filter.md
+    OU_MONITOR_REALDATA=FOLDER python benchmarks/learned.py --page doc/results/learned.md
 
 The truth is a gyro axis below 30 Hz (an eighth of the rate, if that is less) without phase, in
 stretches of 20 s from 8 s on; to it come supply noise (an OU of 63 1/s, 0.09 of the truth's

@@ -1,7 +1,7 @@
 """
 What a message costs the nodes, beside a node that only counts it and one that reads its field.
 
-    .venv/bin/python benchmarks/node_cost.py [--seconds 10] [--page doc/deploy.md]
+    .venv/bin/python benchmarks/node_cost.py [--seconds 10] [--page doc/results/node_cost.md]
 
 All nodes listen to the same publisher at the same time, each a process of its own with the same
 executor, so a busy machine is equally busy for all: read the ratios, not the microseconds.  CPU

@@ -1,7 +1,7 @@
 r"""
 Notches that follow the motors, against low-passes of the same lag, on recorded gyros.
 
-    OU_MONITOR_REALDATA=FOLDER python benchmarks/notch.py --page doc/filter.md
+    OU_MONITOR_REALDATA=FOLDER python benchmarks/notch.py --page doc/results/notch.md
 
 A D term is the difference quotient of the gyro through the filters.  Its noise is what of it
 lies above 60 Hz (Butterworth of order 4, forwards and backwards, so without phase), as rms over

@@ -1,9 +1,9 @@
 """
 Reading bags: against the libraries that decode message by message; and memory.
 
-    python benchmarks/reading.py peers --table doc/reading.md
-    python benchmarks/reading.py files --table doc/reading.md
-    python benchmarks/reading.py memory --table doc/reading.md
+    python benchmarks/reading.py peers --table doc/results/reading.md
+    python benchmarks/reading.py files --table doc/results/reading.md
+    python benchmarks/reading.py memory --table doc/results/reading.md
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ An hour of chaos for the real `estimator`.
 1 kHz with dips, wrong stamps, values and types, parameters, publishers that come and go, and a
 CPU that is taken away.
 
-    .venv/bin/python benchmarks/soak.py [--minutes 60] [--seed 1] [--markdown doc/reliability.md]
+    .venv/bin/python benchmarks/soak.py [--minutes 60] [--seed 1] [--markdown doc/results/soak.md]
 
 The node, the source and a busy loop are processes of their own; this one listens over DDS, sets
 parameters and stops the node in slices.  With a real-time priority (`chrt -r 1`) the node and the

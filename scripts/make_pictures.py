@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 """
-Write the pictures of doc/pages.md: the first screen of every page, in doc/pages/.
+Write the pictures in doc/pages/: the first screen of each report and of `ou-monitor live`.
 
 Each page is made by its own command from what is in bags/, and photographed in a headless Chromium
 or Chrome, 1000 px wide; that of `analyze` also 390 px wide and dark.  The live page is that of a

@@ -14,8 +14,11 @@ import pytest
 
 README = (ROOT / 'README.md').read_text(encoding='utf-8')
 PAGES = sorted((ROOT / 'doc').glob('*.md'))
+# Tables that benchmarks write.
+RESULTS = sorted((ROOT / 'doc/results').glob('*.md'))
 # Documents with relative links: what a reader clicks through.
-LINKED = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'benchmarks/README.md', *PAGES]
+LINKED = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'benchmarks/README.md', *PAGES,
+          *RESULTS]
 # What names a file that a reader makes or has, rather than one of the project.
 OTHERS = {'my_adc.yaml', 'flight.yaml', 'rail.yaml', 'metadata.yaml'}
 
@@ -96,17 +99,18 @@ def test_what_is_named_exists(path):
     assert not missing
 
 
-@pytest.mark.parametrize('mark', [
-    'accuracy', 'speed', 'blind', 'limits', 'error', 'bags', 'windows', 'dterm', 'loop', 'node',
-    'calibration', 'alarms', 'coupling', 'cost', 'peers', 'files', 'memory', 'flights', 'beside',
-    'notch', 'learned', 'soak', 'nodes', 'injected'])
-def test_tables_of_benchmarks_have_their_place(mark):
-    """The marks of a table are on one page, with numbers between them; the command names it."""
-    begin, end = f'<!-- {mark} begins -->', f'<!-- {mark} ends -->'
-    (path,) = [path for path in PAGES if begin in path.read_text(encoding='utf-8')]
-    assert '|' in path.read_text(encoding='utf-8').split(begin)[1].split(end)[0]
-    assert f'doc/{path.name}' in (ROOT / 'benchmarks/README.md').read_text(encoding='utf-8') + \
-        (ROOT / 'benchmarks/risk.py').read_text(encoding='utf-8')
+@pytest.mark.parametrize('path', RESULTS, ids=lambda path: path.name)
+def test_tables_of_benchmarks_have_their_place(path):
+    """The first lines name the program, numbers are between marks, and a page links the file."""
+    text = path.read_text(encoding='utf-8')
+    first = text.split('\n## ')[0].split('<!--')[0]
+    (program,) = set(re.findall(r'`benchmarks/(\w+)\.py', first))
+    assert (ROOT / f'benchmarks/{program}.py').is_file() and path.stem.startswith(program)
+    assert f'doc/results/{path.name}' in (ROOT / 'benchmarks/README.md').read_text('utf-8')
+    marks = re.findall(r'<!-- ([\w ]+) begins -->(.*?)<!-- \1 ends -->', text, re.DOTALL)
+    assert marks and len(marks) == text.count(' begins -->')
+    assert all('|' in table for _, table in marks)
+    assert any(f'results/{path.name}' in page.read_text(encoding='utf-8') for page in PAGES)
 
 
 def test_launch_file_exists():
