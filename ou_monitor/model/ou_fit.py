@@ -57,6 +57,8 @@ PRECISE = 1.5
 FEWEST = 40
 # Ordinates taken one by one; relative width of the bins above.
 _SINGLE, _WIDTH = 12, 0.06
+# Numbers in one array of the likelihood: 16 MB of complex ones.
+_AT_ONCE = 1 << 20
 # Points of the likelihood's first grid in ln(alpha), logit(share) and ln(walk); ends of the logit:
 # white noise of 1e-3 of the variance is half of the spectrum at the highest frequency of an OU of
 # alpha D = 0.004.
@@ -253,27 +255,40 @@ class _Likelihood:
     def __init__(self, part: Regression) -> None:
         self.free = part.free
         Z = np.column_stack([part.basis, part.voltage / part.size])
+        # Stretches of nearly one length share their bins: lost messages make hundreds of them.
+        groups: dict[int, list[FloatArray]] = {}
+        for rows in np.split(Z, np.cumsum(part.lengths)[:-1]):
+            groups.setdefault(round(math.log(len(rows)) / _WIDTH), []).append(rows)
         crosses, counts, omegas, lengths = [], [], [], []
-        for n, rows in zip(part.lengths, np.split(Z, np.cumsum(part.lengths)[:-1])):
-            F = np.fft.rfft(rows, axis=0) / math.sqrt(n)
-            weight = np.full(F.shape[0], 2.0)
-            weight[0] = 1.0
-            if n % 2 == 0:
-                weight[-1] = 1.0
-            omega = 2.0 * np.pi * np.arange(F.shape[0]) / n
-            edges = [*range(min(_SINGLE, F.shape[0]))]
-            while edges[-1] < F.shape[0]:
-                edges.append(min(F.shape[0], edges[-1] + max(1, int(_WIDTH * edges[-1]))))
-            for a, b in zip(edges, edges[1:]):
-                G = F[a:b] * np.sqrt(weight[a:b, None])
-                crosses.append(G.real.T @ G.real + G.imag.T @ G.imag)
-                counts.append(weight[a:b].sum())
-                omegas.append(omega[a:b].mean())
-                lengths.append(n)
+        for group in groups.values():
+            bins = max(map(len, group)) // 2 + 1
+            edges = [*range(min(_SINGLE, bins))]
+            while edges[-1] < bins:
+                edges.append(min(bins, edges[-1] + max(1, int(_WIDTH * edges[-1]))))
+            cross = np.zeros((len(edges) - 1, Z.shape[1], Z.shape[1]))
+            count, place = np.zeros(len(edges) - 1), np.zeros(len(edges) - 1)
+            for rows in group:
+                n = len(rows)
+                F = np.fft.rfft(rows, axis=0) / math.sqrt(n)
+                weight = np.full(F.shape[0], 2.0)
+                weight[0] = 1.0
+                if n % 2 == 0:
+                    weight[-1] = 1.0
+                omega = 2.0 * np.pi * np.arange(F.shape[0]) / n
+                for k, (a, b) in enumerate(zip(edges, edges[1:])):
+                    if a < F.shape[0]:
+                        G = F[a:b] * np.sqrt(weight[a:b, None])
+                        cross[k] += G.real.T @ G.real + G.imag.T @ G.imag
+                        count[k] += weight[a:b].sum()
+                        place[k] += weight[a:b].sum() * omega[a:b].mean()
+            crosses.extend(cross)
+            counts.extend(count)
+            omegas.extend(place / count)
+            lengths.extend([sum(map(len, group)) / len(group)] * len(count))
         self._p = Z.shape[1] - 1
         self._cross = np.array(crosses).reshape(len(crosses), -1)
         self._count, self._omega = np.array(counts), np.array(omegas)
-        self._n = np.array(lengths, dtype=np.float64)
+        self._n = np.array(lengths)
         # A random walk has the inverse of this for its spectrum; the mean is a regressor.
         self._walk = 4.0 * np.sin(0.5 * np.maximum(self._omega, np.pi / self._n)) ** 2
 
@@ -284,6 +299,10 @@ class _Likelihood:
         Points of shape (k, 3): ln(alpha D), logit(share of the OU), and ln of the variance of a
         step of the level beside that of the noise.
         """
+        half = points.shape[0] // 2
+        if half and points.shape[0] * max(self._count.size, self._cross.shape[1]) > _AT_ONCE:
+            value, variance = zip(self.at(points[:half]), self.at(points[half:]))
+            return np.concatenate(value), np.concatenate(variance)
         a = np.exp(points[:, :1])
         share = 1.0 / (1.0 + np.exp(-points[:, 1:2]))
         w = np.exp(-a - 1j * self._omega)
