@@ -259,7 +259,10 @@ class _Likelihood:
         groups: dict[int, list[FloatArray]] = {}
         for rows in np.split(Z, np.cumsum(part.lengths)[:-1]):
             groups.setdefault(round(math.log(len(rows)) / _WIDTH), []).append(rows)
-        crosses, counts, omegas, lengths = [], [], [], []
+        crosses: list[FloatArray] = []
+        counts: list[float] = []
+        omegas: list[float] = []
+        lengths: list[float] = []
         for group in groups.values():
             bins = max(map(len, group)) // 2 + 1
             edges = [*range(min(_SINGLE, bins))]
