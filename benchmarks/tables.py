@@ -24,6 +24,7 @@ text.light { fill: #ffffff; } .grid { stroke: #dde3e5; stroke-width: 1; }
 .s6 { stroke: #444444; } .s7 { stroke: #9aa5a9; }
 .band { stroke: none; opacity: .18; } .band.s0 { fill: #0072b2; } .band.s1 { fill: #d55e00; }
 .band.s7 { fill: #9aa5a9; }
+.shade { fill: #d55e00; opacity: .35; }
 .panel { fill: #ffffff; opacity: .8; } .right { fill: none; stroke: #1c2326; stroke-width: 1.2; }
 </style>"""
 

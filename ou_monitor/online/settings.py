@@ -80,9 +80,10 @@ ESTIMATOR_PARAMETERS: tuple[Parameter, ...] = (
               '(default: on five recorded quads 2 s set the flag twice as long where nothing '
               'dipped).',
               0.0, 3600.0),
-    Parameter('brownout.delay', 0.05,
-              'Time for which a risk must last before its level is entered, s (default: two '
-              'reports; ArduPilot waits 10 s before a voltage failsafe).', 0.0, 3600.0),
+    Parameter('brownout.delay', 0.15,
+              'Time for which a risk must last before its level is entered, s (default: three '
+              'reports, which on recorded quads halves the false rises of two; ArduPilot waits '
+              '10 s before a voltage failsafe).', 0.0, 3600.0),
     Parameter('brownout.latch', False,
               'Whether CRITICAL stays until ~/clear_brownout is called or this is switched off '
               '(default: no; PX4 latches its battery warning while armed).'),
@@ -201,7 +202,7 @@ class MonitorSettings:
     brownout_critical: float = 0.5
     brownout_leave: float = 0.5
     brownout_hold: float = 1.0
-    brownout_delay: float = 0.05
+    brownout_delay: float = 0.15
     brownout_latch: bool = False
     brownout_floor: float = -1.0
     brownout_floor_time: float = 0.01

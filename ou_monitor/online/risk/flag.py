@@ -4,7 +4,7 @@ The brown-out flag: from risks, and a voltage floor, to a level that can be acte
 CRITICAL: the limit is undershot, or will be within 1 s with throttle as it is now.  WARN: the risk
 over `brownout.horizon` is high, or the throttle budget is below what is flown.
 
-Rising takes `brownout.delay`, two reports by default; falling waits for
+Rising takes `brownout.delay`, three reports by default; falling waits for
 `brownout.hold` and for the risk to fall below `brownout.leave` times the
 probability at which the level is entered; `brownout.latch` keeps CRITICAL until it is
 cleared.  Limits: a flag is as good as its risk; an unknown risk is UNKNOWN,
