@@ -67,11 +67,6 @@ def stays(seed: int, sag: float = 0.0, tau: float = 0.03) -> Recording:
     return Recording(t, level + noise + rng.normal(0.0, 0.003, t.size), 0.5 * loaded)
 
 
-def drift(t: FloatArray, step: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return 10 mV/s."""
-    return 0.01 * t
-
-
 def tone(t: FloatArray, step: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return 1.4 mV rms at a random frequency."""
     return 0.002 * np.sin(2.0 * np.pi * rng.uniform(50.0, 450.0) * t)
@@ -126,17 +121,11 @@ def throttle_goes_up_and_down(count: int) -> None:
             text += (f'; {holds} of {len(shows)} intervals hold 30 ms; '
                      f'{sum(fit.badly_fitted for fit in shows)} called badly fitted')
         print(text)
-        said = sum(level.scatter_p < 0.01 for one in found for level in one.levels)
-        wide = sum(level.scatter > 1.5 for one in found for level in one.levels)
-        print(f'    levels called not one process: {said} of {2 * count} (their intervals widened '
-              f'by more than 1.5: {wide})')
 
 
 def power(count: int) -> None:
     """Print how often something that is there is found."""
     rows: tuple[tuple[str, Effect | None, Callable[[Analysis], bool], dict[str, object]], ...] = (
-        ('drift of 10 mV/s: quasi-stationary', drift,
-         lambda a: 'quasi-stationary' in kinds(a), {}),
         ('tone of 1.4 mV rms: a line', tone, line, {}),
         ('one sample in 1000 off by 8 steps: with impulses', glitches,
          lambda a: 'with impulses' in kinds(a), {}),
@@ -157,7 +146,7 @@ def costs() -> None:
     throttle = np.repeat(np.tile([0.1, 0.4, 0.25, 0.6], 15), 10_000)
     long = Recording(t, simulate(t, ALPHA, 0.2 + throttle, rng, u0=5.0 - 0.3 * throttle),
                      throttle, '10 minutes at 1 kHz')
-    parts = {'fit of the levels': (level_result, 'fit_segment'),
+    parts = {'fit of the levels': (level_result, 'fit_parts'),
              'tests': (level_result, 'examine_level'), 'lines': (level_result, 'find_lines'),
              'spectra': (level_result, 'level_spectrum'), 'transients': (module, '_relaxations'),
              'sliding window and curves': (module, 'slide')}

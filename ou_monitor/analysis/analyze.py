@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 
 import numpy as np
 from ou_monitor.analysis.cause import Cause, judge_cause
 from ou_monitor.analysis.level_comparison import alpha_constancy, AlphaTest
 from ou_monitor.analysis.level_result import fit_level, judge_levels, LevelResult
-from ou_monitor.analysis.levels import find_levels, LoadLevel, without_jitter
-from ou_monitor.analysis.overview import other_scale, Overview, overview
+from ou_monitor.analysis.levels import find_levels, LoadLevel
+from ou_monitor.analysis.overview import Overview, overview
 from ou_monitor.analysis.quality import (
-    coupling_items, line_item, quality_list, QualityItem, scale_items, second_items, unsettled)
+    coupling_items, line_item, quality_list, QualityItem, second_items)
 from ou_monitor.analysis.relaxation import fit_relaxation, Relaxation
 from ou_monitor.analysis.replay import by_throttle, ByThrottle, slide, Sliding
 from ou_monitor.analysis.steps import find_steps
+from ou_monitor.analysis.supply import remainder
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import NAN, Recording
 from ou_monitor.timeline.line import readings_of
@@ -45,7 +46,7 @@ class Analysis:
     alpha_test : AlphaTest
         Whether alpha is the same at all levels.
     by_throttle : ByThrottle
-        Curves and risk over throttle, as the node learns them.
+        Sag, noise and risk over throttle.
     sliding : Sliding
         What the node would have published.
     quality : tuple of QualityItem
@@ -88,39 +89,32 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     recording = readings_of(recording)
     voltage = _default_voltage(recording) if brownout_voltage is None else brownout_voltage
     found = find_levels(recording.t, recording.throttle, levels)
-    still = replace(recording, voltage=without_jitter(recording, found))
+    left = remainder(recording)
     results = []
     for k, level in enumerate(found):
-        results.append(fit_level(recording, still, level, len(found)))
+        results.append(fit_level(recording, left, level, len(found)))
         report(0.5 * (k + 1) / len(found))
-    judged = judge_levels(recording, results)
+    seen = overview(recording, None if math.isnan(voltage) else voltage, results, cells,
+                    left, brownout_horizon)
+    judged = judge_levels(results, seen.load)
     throttles = [level.throttle for level in judged]
     estimates = [level.estimate for level in judged]
-    relaxations = _relaxations(still, judged)
-    settling = unsettled(relaxations, throttles, estimates, [level.time for level in judged])
-    moving = {x for item in settling for x in item.throttles}
+    relaxations = _relaxations(recording, judged)
     lines = [line_item(level.throttle, level.estimate, level.with_lines) for level in judged
              if level.lines.lines]
     # A second relaxation is the supply's: where it is too faint to detect it still biases alpha.
     wanders = any(level.wanders for level in judged)
-    alpha = alpha_constancy(throttles, estimates, [
-        wanders or level.doubted or level.throttle in moving for level in judged])
+    alpha = alpha_constancy(throttles, estimates,
+                            [wanders or level.doubted for level in judged])
     sliding = slide(recording, window, voltage, brownout_horizon,
                     lambda share: report(0.5 + 0.5 * share))
-    seen = overview(recording, None if math.isnan(voltage) else voltage, judged, cells)
     return Analysis(
         recording, judged, relaxations, tuple(judge_cause(r, alpha) for r in relaxations), alpha,
-        by_throttle(sliding), sliding,
-        quality_list(recording, throttles, estimates, [level.notes for level in judged],
-                     settling + lines + second_items(
-                         [level.throttle for level in judged if level.wanders])
-                     + coupling_items([level.throttle for level in judged if level.coupled])
-                     + scale_items([
-                         level.throttle for level, e in zip(judged, estimates) if e.usable
-                         and other_scale(seen.facts.ou, e.alpha, e.alpha_se, e.sigma,
-                                         e.sigma_se)])),
-        brownout_voltage is None, recording.notes + _left_out(recording, found),
-        seen)
+        by_throttle(seen, voltage, brownout_horizon), sliding,
+        quality_list(recording, throttles, estimates,
+                     lines + second_items([level.throttle for level in judged if level.wanders])
+                     + coupling_items([level.throttle for level in judged if level.coupled])),
+        brownout_voltage is None, recording.notes + _left_out(recording, found), seen)
 
 
 def _default_voltage(recording: Recording) -> float:

@@ -1,29 +1,19 @@
 """
-What differs from load level to load level: the sag, sigma, and whether alpha is the same.
-
-Sag is how far the mean of a level lies below that of the lowest throttle.  Weighted least squares
-of the segment means fits a mean for each level and a polynomial of time that all levels share,
-for a battery discharges while it is flown.  The errors of the segment means follow from the
-noise; where the segments scatter more than that about the fit, all errors are widened.  Limits:
-a polynomial does not hold slow recovery after a load; with one stay at each level the data cannot
-separate the polynomial from the levels, and the fit leaves the polynomial out.
+What differs from load level to load level: sigma, and whether alpha is the same.
 
 The test of alpha, which the paper takes as the same at every load, is chi^2 of ln(alpha) of the
 levels about their weighted mean, each with its standard error; that error is carried over to the
 common alpha, for it grows with 1/sqrt(alpha T) and a level whose alpha came out high by chance
 would weigh too much.  The test withholds a level that one OU in white noise does not describe
-(more than one relaxation, lines beside impulses, the settling after a change of throttle): its
-alpha is that of a mixture, and the error of its fit does not cover that.  Limits: only levels
-with a usable fit count; a spectral line too faint for the finder stays in the fit; a test that
-does not reject proves nothing, so the ratio that it would have detected stands beside it.
+(more than one relaxation, or lines beside impulses): its alpha is that of a mixture, and the error
+of its fit does not cover that.  Limits: only levels with a usable fit count; a spectral line too
+faint for the finder stays in the fit; a test that does not reject proves nothing, so the ratio
+that it would have detected stands beside it.
 
 Alpha and sigma have one threshold, `LEVEL`, that of the intervals printed beside them.  The
 question is how much they change from level to level, each level fitted by itself.  `discover`
 fits one model to a whole recording, throttle held or not, and asks `alpha_score` and
-`sigma_score` (`ou_monitor.criticism.battery`) whether to let them go with throttle.  For alpha
-the slope over throttle that is fitted here and that score are one statistic to first order; for
-sigma the score is some 1.6 times larger, for it takes alpha and white noise as common to all
-levels, each of which has its own here.
+`sigma_score` (`ou_monitor.criticism.battery`) whether to let them go with throttle.
 """
 
 from __future__ import annotations
@@ -33,98 +23,17 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor.analysis.levels import Segment
-from ou_monitor.records import (
-    determined, Estimate, exp_or_inf, FloatArray, log_interval, NAN, Recording)
-from ou_monitor.text import p_words, Z95
+from ou_monitor.records import determined, Estimate, exp_or_inf, FloatArray, log_interval, NAN
+from ou_monitor.text import p_words
 from scipy import stats
 from scipy.special import chndtrinc
 
-# Highest power of time, and segments needed for each.
-_DEGREE, _SEGMENTS = 3, 4
 # Probability of "differs" where alpha or sigma is the same (what intervals of 95 % leave), and of
 # seeing `detectable_ratio`.
 LEVEL, POWER = 0.05, 0.9
 # A change by less than this factor changes no decision here: tau is known no better in most
 # recordings of a flight.
 NARROW = 1.5
-
-
-@dataclass(frozen=True)
-class LevelSag:
-    """
-    Sag of one level.
-
-    Attributes
-    ----------
-    sag, sag_se : float
-        How far the mean lies below that of the lowest throttle, and its standard error, V.
-
-    """
-
-    sag: float = NAN
-    sag_se: float = NAN
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Return the 95 % interval, V."""
-        return self.sag - Z95 * self.sag_se, self.sag + Z95 * self.sag_se
-
-
-def mean_variance(time: float, n: int, estimate: Estimate, rms: float) -> float:
-    """
-    Return the variance of the mean of a segment of OU in white noise.
-
-    time in s, rms in V, result in V^2.
-    """
-    if not estimate.usable:
-        return rms * rms / max(n, 1)
-    at = max(estimate.alpha * time, 1e-9)
-    # Papoulis, Probability, Random Variables and Stochastic Processes, ch. 9.
-    of_ou = 2.0 * estimate.var_inf * (at + math.expm1(-at)) / (at * at)
-    noise = estimate.noise_std if estimate.noise_std > 0.0 else 0.0
-    return of_ou + noise * noise / max(n, 1)
-
-
-def level_sags(recording: Recording, throttles: Sequence[float],
-               segments: Sequence[Sequence[Segment]], estimates: Sequence[Estimate],
-               rms: Sequence[float]) -> tuple[LevelSag, ...]:
-    """Return the sag of each level (rms in V)."""
-    rows = [(k, s) for k, stays in enumerate(segments) for s in stays]
-    flown = sorted({k for k, _ in rows})
-    unknown = [LevelSag()] * len(throttles)
-    if len(flown) < 2 or not all(rms[k] > 0.0 for k in flown):
-        return tuple(unknown)
-    t = recording.t
-    y = np.array([recording.voltage[s.start:s.stop].mean() for _, s in rows])
-    when = np.array([0.5 * (t[s.start] + t[s.stop - 1]) for _, s in rows])
-    variance = np.array([mean_variance(float(t[s.stop - 1] - t[s.start]), s.stop - s.start,
-                                       estimates[k], rms[k]) for k, s in rows])
-    spare = len(rows) - len(flown)
-    degree = min(_DEGREE, spare // _SEGMENTS)
-    span = max(float(np.ptp(when)), 1e-9)
-    age = (when - when.mean()) / span
-    columns = [np.array([float(k == j) for k, _ in rows]) for j in flown]
-    columns += [age ** power for power in range(1, degree + 1)]
-    x = np.column_stack(columns) / np.sqrt(variance)[:, None]
-    values, covariance, widen = _least_squares(x, y / np.sqrt(variance))
-    for place, k in enumerate(flown):
-        contrast = np.zeros(values.size)
-        contrast[0] += 1.0
-        contrast[place] -= 1.0
-        error = math.sqrt(max(0.0, float(contrast @ covariance @ contrast)) * widen)
-        unknown[k] = LevelSag(float(contrast @ values), error)
-    return tuple(unknown)
-
-
-def _least_squares(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return coefficients, covariance, and the factor by which the residuals widen it."""
-    values = np.linalg.lstsq(x, y, rcond=None)[0]
-    covariance = np.linalg.pinv(x.T @ x)
-    freedom = y.size - values.size
-    rest = y - x @ values
-    widen = max(1.0, float(rest @ rest) / freedom) if freedom > 0 else 1.0
-    return np.asarray(values), np.asarray(covariance), widen
 
 
 @dataclass(frozen=True)
@@ -181,7 +90,7 @@ class AlphaTest:
             return ''
         names = ', '.join('all' if math.isnan(x) else f'{100.0 * x:.3g} %' for x in self.withheld)
         return (f' Withheld: {names}; the level or another one shows more than one relaxation, '
-                'lines stand beside impulses, or a change of throttle still settles.')
+                'or lines stand beside impulses.')
 
     def _verdict(self) -> str:
         if self.levels < 2:

@@ -7,12 +7,6 @@ throttle leaves twice that, so that the jitter of a stick breaks none of them.  
 throttle is no stay at it.  Limits: throttle is a command, not a current, so two segments at one
 throttle can carry different loads; a segment is only as stationary as its throttle says; levels
 closer than the jitter of the stick are one.
-
-Where throttle does not stand still within a level, the supply sags with it, and that is neither
-noise nor a line of the supply.  The fit has throttle as a regressor; for tests, spectra and
-transients `without_jitter` takes that sag out, by least squares over the segments of each level,
-and with it the answer to a measured current: loads that come and go are no lines either.
-Limits: of throttle at once and in proportion; slow drifts that go along with a load go too.
 """
 
 from __future__ import annotations
@@ -23,8 +17,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.load import lowpass
-from ou_monitor.records import FloatArray, NAN, Recording
+from ou_monitor.records import FloatArray, NAN
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -49,8 +42,6 @@ MIN_TIME = 0.25
 # paper's rail.  A ramp that lingers here and there is no level where others are.
 MIN_STAY = 0.5
 MAX_LEVELS = 20
-# Delays, s, at which a measured current answers, and lags, s; readings for each at least.
-_DELAYS, _LAGS, _FEWEST = (0.0, 0.02, 0.05, 0.1), (0.02, 0.3, 2.0), 20
 # A segment shorter than this, s, through which throttle goes steadily is a passage: quarters at
 # its ends differ by more than this share of its range (of a ramp 0.75), and of the half width.
 _PASSAGE, _STEADY, _CROSSED = 3.0, 0.65, 0.75
@@ -307,43 +298,3 @@ def _settle(t: FloatArray, runs: Sequence[Segment], away: BoolArray,
         if start < run.stop - 1:
             kept.append(Segment(start, run.stop))
     return tuple(kept), lost
-
-
-def without_jitter(recording: Recording, levels: Sequence[LoadLevel]) -> FloatArray:
-    """Return the voltage with the answer to throttle and current within the levels taken out."""
-    voltage = recording.voltage.copy()
-    reach = 2.0 * half_width(recording.t, recording.throttle)
-    loads = np.stack([recording.throttle, *_current(recording)])
-    for level in levels:
-        if not np.isfinite(level.throttle):
-            continue
-        count = sum(s.stop - s.start for s in level.segments)
-        columns = loads if count > _FEWEST * len(loads) else loads[:1]
-        own, sagged = (np.concatenate([
-            x[..., s.start:s.stop] - x[..., s.start:s.stop].mean(axis=-1, keepdims=True)
-            for s in level.segments] or [x[..., :0]], axis=-1)
-            for x in (columns, recording.voltage))
-        size = np.sqrt(np.sum(own * own, axis=-1))
-        moved = size > 0.0
-        if not moved.any():
-            continue
-        slopes = np.zeros(size.size)
-        slopes[moved] = np.linalg.lstsq(
-            (own[moved] / size[moved, None]).T, sagged, rcond=1e-6)[0] / size[moved]
-        others = [abs(other.throttle - level.throttle) for other in levels if other is not level]
-        away = recording.throttle - level.throttle
-        near = np.abs(away) <= min([reach, *(0.5 * x for x in others)])
-        off = columns[:, near] - columns[:, near].mean(axis=1, keepdims=True)
-        off[0] = away[near]
-        voltage[near] -= slopes @ off
-    return voltage
-
-
-def _current(recording: Recording) -> list[FloatArray]:
-    """Return the measured current, A, some delays after its stamps, and after lags."""
-    known = None if recording.current is None else np.isfinite(recording.current)
-    if recording.current is None or known is None or not known.any():
-        return []
-    drawn = np.interp(recording.t, recording.t[known], recording.current[known])
-    return [*(np.interp(recording.t + late, recording.t, drawn) for late in _DELAYS),
-            *(lowpass(drawn, recording.t, lag) for lag in _LAGS)]

@@ -12,8 +12,9 @@ import math
 
 import numpy as np
 from ou_monitor.analysis.level_result import LevelResult
-from ou_monitor.analysis.supply import facts_and_load, SupplyFacts, THROTTLES
+from ou_monitor.analysis.supply import facts_and_end, Remainder, SupplyFacts, THROTTLES
 from ou_monitor.online.load.supply_load import SupplyLoad
+from ou_monitor.online.report import MonitorReport
 from ou_monitor.records import NAN, OuFacts, Recording
 from ou_monitor.text import number, volts, Z95
 
@@ -70,6 +71,8 @@ class Overview:
         Strongest spectral line; None when there is none.
     cells : int
         Cells in series that the limit is of; 0 when it is of the whole.
+    end : MonitorReport or None
+        What the node says at the end; None without a limit.
 
     """
 
@@ -79,6 +82,7 @@ class Overview:
     highest: float
     line: Line | None = None
     cells: int = 0
+    end: MonitorReport | None = None
 
     @property
     def limit(self) -> float:
@@ -106,12 +110,18 @@ def _next_to(throttle: float) -> int:
 
 
 def overview(recording: Recording, limit: float | None = None,
-             levels: Sequence[LevelResult] = (), cells: int = 0) -> Overview:
-    """Return what is known; limit in V, of so many cells; levels: where lines were found."""
-    facts, load = facts_and_load(recording, limit)
+             levels: Sequence[LevelResult] = (), cells: int = 0,
+             left: Remainder | None = None, horizon: float | None = None) -> Overview:
+    """
+    Return what is known.
+
+    limit in V, of so many cells; levels: where lines were found; left: the recording's
+    `remainder`, found when left out; horizon of the risk in s.
+    """
+    facts, load, end = facts_and_end(recording, limit, left, horizon)
     known = recording.throttle[np.isfinite(recording.throttle)]
     return Overview(facts, recording.duration if recording.n else 0.0, load,
-                    float(known.max()) if known.size else NAN, _strongest(levels), cells)
+                    float(known.max()) if known.size else NAN, _strongest(levels), cells, end)
 
 
 def _strongest(levels: Sequence[LevelResult]) -> Line | None:

@@ -1,13 +1,10 @@
 """
 The list of what is doubtful about a recording, worst first.
 
-The list gathers what the estimator flags at each level, what the reader dropped or mended, what
-the samples and stamps show by themselves, and what lines, a second relaxation and the settling
-after changes of throttle do to the fit of a level.
+The list gathers what is flagged at each level, what the reader dropped or mended, what the samples
+and stamps show by themselves, and what lines and a second relaxation do to the fit of a level.
 
-Limits: a list without warnings says that nothing was found, not that there is nothing.  Settling
-is known only from relaxations detected after changes between levels; its share of the variance
-assumes one exponential and is relative to a fit that includes the settling itself.
+Limits: a list without warnings says that nothing was found, not that there is nothing.
 """
 
 from __future__ import annotations
@@ -18,8 +15,7 @@ import enum
 import math
 
 import numpy as np
-from ou_monitor.analysis.levels import GAP_STEPS, SETTLE
-from ou_monitor.analysis.relaxation import Relaxation
+from ou_monitor.analysis.levels import GAP_STEPS
 from ou_monitor.online.estimator.quality import examine
 from ou_monitor.records import Estimate, Flag, Recording, Status
 from ou_monitor.text import counted, Z95
@@ -43,12 +39,6 @@ _READER = (('cannot be decoded', 'DAMAGED_FILE', True), ('damaged', 'DAMAGED_FIL
            ('gap', 'GAPS', True), ('sorted by stamp', 'UNORDERED', True),
            ('clock went back', 'UNORDERED', True), ('stamp was there', 'REPEATED_STAMPS', True),
            ('not a finite', 'NON_FINITE', True))
-
-NOISE_UNKNOWN = (
-    'The fit cannot separate white noise of the sensor from the supply here: if there is any, '
-    'alpha and sigma come out too high (Var_inf does not).')
-# Share of a level's variance that may be left of the settling: alpha is then off by about as much.
-SHARE = 0.02
 
 
 class Severity(enum.IntEnum):
@@ -84,13 +74,11 @@ class QualityItem:
 
 
 def quality_list(recording: Recording, throttles: Sequence[float], estimates: Sequence[Estimate],
-                 notes: Sequence[Sequence[str]], more: Sequence[QualityItem] = ()
-                 ) -> tuple[QualityItem, ...]:
+                 more: Sequence[QualityItem] = ()) -> tuple[QualityItem, ...]:
     """Gather what is doubtful."""
     found: dict[tuple[str, Severity, str], list[float]] = {}
-    for throttle, estimate, own in zip(throttles, estimates, notes):
-        for item in [*_of_estimate(estimate), *(('SEGMENTS', Severity.INFO, text)
-                                                for text in own)]:
+    for throttle, estimate in zip(throttles, estimates):
+        for item in _of_estimate(estimate):
             found.setdefault(item, []).append(throttle)
     items = [QualityItem(*key, tuple(where)) for key, where in found.items()]
     items += more
@@ -106,9 +94,6 @@ def _of_estimate(e: Estimate) -> list[tuple[str, Severity, str]]:
         items.append((e.status.name, severity, e.status.value))
     items += [(flag.name, Severity.INFO if flag in _INFORMS else Severity.WARNING, flag.value)
               for flag in e.flags]
-    # Measured at 20 mV of noise beside 56 mV of OU, 1 kHz: alpha +194 %.
-    if e.usable and math.isnan(e.noise_std):
-        items.append(('NOISE_UNKNOWN', Severity.WARNING, NOISE_UNKNOWN))
     return items
 
 
@@ -191,50 +176,6 @@ def _of_samples(recording: Recording) -> list[QualityItem]:
     return items
 
 
-def unsettled(relaxations: Sequence[Relaxation], throttles: Sequence[float],
-              estimates: Sequence[Estimate], times: Sequence[float]) -> list[QualityItem]:
-    """
-    Return a warning for each kind of change after which levels hold the settling too.
-
-    throttles 0..1, times in s.
-    """
-    items = []
-    for fit in relaxations:
-        shares = {x: _share(fit, x, e, time)
-                  for x, e, time in zip(throttles, estimates, times) if e.usable and time > 0.0}
-        where = tuple(x for x, share in shares.items() if share > SHARE)
-        if not where:
-            continue
-        what = {'release': 'falls', 'load': 'rises'}[fit.kind]
-        start = f'After throttle {what} the voltage '
-        end = (f'the levels leave out only {1e3 * SETTLE:.3g} ms: alpha and sigma here include '
-               'the settling')
-        if not fit.moves_on:
-            tau = f'= {1e3 * fit.tau:.3g}' if fit.detected else f'< {1e3 * fit.tau_high:.3g}'
-            most = 100.0 * min(1.0, max(shares[x] for x in where))
-            text = (f'{start}settles in tau {tau} ms, and {end} (up to '
-                    f'{most:.0f} % of the variance).')
-        else:
-            text = f'{start}keeps moving for the whole time observed, and {end}.'
-        items.append(QualityItem('NOT_SETTLED', Severity.WARNING, text, where))
-    return items
-
-
-def _share(fit: Relaxation, throttle: float, estimate: Estimate, time: float) -> float:
-    """Return the mean square of what is left of the settling, over Var_inf."""
-    changes = [change for change in fit.releases if change.throttle_after == throttle]
-    if not changes:
-        return 0.0
-    tau = fit.tau if fit.detected else fit.tau_high
-    if not tau < math.inf:
-        return math.inf if fit.moves_on else 0.0
-    # Of A exp(-t / tau), squared, from the end of what is left out to the end of what is watched.
-    left = sum(change.amplitude ** 2 * max(0.0, math.exp(-2.0 * SETTLE / tau)
-                                           - math.exp(-2.0 * change.duration / tau))
-               for change in changes if math.isfinite(change.amplitude))
-    return 0.5 * tau * left / (time * estimate.var_inf)
-
-
 def line_item(throttle: float, without: Estimate, with_lines: Estimate | None) -> QualityItem:
     """Say what the lines of a level do to its fit, or would have done (throttle 0..1)."""
     if with_lines is None:
@@ -264,14 +205,6 @@ def second_items(throttles: Sequence[float]) -> list[QualityItem]:
         'and Var_inf are those of a mixture, and their intervals hold for neither; the other '
         'levels may hide the same. `ou-monitor discover` fits both.'), tuple(throttles))
         ] if throttles else []
-
-
-def scale_items(throttles: Sequence[float]) -> list[QualityItem]:
-    """Say at which levels alpha and sigma are not those beside level and load (0..1)."""
-    return [QualityItem('OTHER_TIME_SCALE', Severity.INFO, (
-        'Alpha and sigma of the level describe another time scale than the relaxation beside '
-        'level and load: they hold slow changes of the level, too.'),
-        tuple(throttles))] if throttles else []
 
 
 def coupling_items(throttles: Sequence[float]) -> list[QualityItem]:

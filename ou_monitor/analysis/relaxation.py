@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor.analysis.level_comparison import mean_variance
+from ou_monitor.analysis.level_result import mean_variance
 from ou_monitor.analysis.steps import Step, Window
 from ou_monitor.records import determined, Estimate, FloatArray, NAN, Recording
 from ou_monitor.text import p_words, Z95

@@ -14,9 +14,10 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.online.load.supply_load import SupplyLoad
+from ou_monitor.analysis.overview import Overview
+from ou_monitor.analysis.supply import THROTTLES
 from ou_monitor.online.monitor import SupplyMonitor
-from ou_monitor.online.report import MonitorReport, RISK_CURVE
+from ou_monitor.online.report import MonitorReport
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
 from ou_monitor.text import Z95
@@ -24,7 +25,6 @@ from ou_monitor.text import Z95
 MAX_POINTS = 300
 # The node estimates at least so often, s; here, up to so many times in all.
 _STEP, _MOST = 0.5, 1200
-_POINTS = 51
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +44,6 @@ class Sliding:
         Probability of a brown-out within the horizon; NaN when unknown.
     brownout_voltage, brownout_horizon : float
         What the risk is of, V and s.
-    settings : MonitorSettings
-        Of the node; its voltage is the default where none was asked for.
-    last : MonitorReport or None
-        What the node knows at the end; None of a recording too short for a window.
-    lowest, highest : float
-        Ends of the throttle of the recording, 0..1; NaN without throttle.
 
     """
 
@@ -59,10 +53,6 @@ class Sliding:
     risk: FloatArray
     brownout_voltage: float
     brownout_horizon: float
-    settings: MonitorSettings
-    last: MonitorReport | None
-    lowest: float
-    highest: float
 
     def series(self, name: str) -> FloatArray:
         """Return one field of the estimates as an array."""
@@ -99,7 +89,6 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
                      current=None if drawn is None else drawn[part])
 
     reports: list[MonitorReport] = []
-    last = None
     step = max(0.25 * window, recording.duration / MAX_POINTS)
     # In between, reports are for what the monitor learns from its own estimates.
     parts = max(1, min(math.ceil(step / _STEP), _MOST // MAX_POINTS))
@@ -120,15 +109,10 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
         reports.append(last)
         if progress is not None:
             progress(k / count)
-    if done < t.size and reports:
-        push(slice(done, t.size))
-        last = monitor.report(0.0)
     return Sliding(window, np.array([report.estimate.t for report in reports]),
                    tuple(report.estimate for report in reports),
                    np.array([report.risk if asked else NAN for report in reports]),
-                   brownout_voltage, brownout_horizon, settings, last,
-                   *((float(np.nanmin(throttle)), float(np.nanmax(throttle))) if known
-                     else (NAN, NAN)))
+                   brownout_voltage, brownout_horizon)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,15 +123,15 @@ class ByThrottle:
     Attributes
     ----------
     throttle : ndarray, shape (k,)
-        0, 0.02, .. 1.
+        0, 0.1, .. 1.
     known : ndarray of bool, shape (k,)
-        Whether the sag is known and that throttle was flown; sag and noise are NaN elsewhere.
+        Whether that throttle was flown; beyond, sag and noise are extrapolated.
     sag, sag_low, sag_high : ndarray, shape (k,)
-        Fall from throttle 0, before polarisation, and its 95 % interval, V.
+        Sag of the facts and its 95 % interval, V; NaN where it is not known.
     noise : ndarray, shape (k,)
-        Rms of what the load does not explain, V.
+        Rms of what the load does not explain, of the facts, V.
     risk : ndarray, shape (k,)
-        Probability of a brown-out within the horizon, with the errors of the load in it.
+        Probability of a brown-out within the horizon; NaN well beyond the highest throttle.
     budget : float
         Highest throttle that keeps the risk within `limit`; NaN when unknown.
     budget_reason : str
@@ -182,30 +166,20 @@ class ByThrottle:
         return float(np.interp(throttle, self.throttle, getattr(self, name)))
 
 
-def by_throttle(sliding: Sliding) -> ByThrottle:
-    """Return what the node knows over throttle at the end of a recording."""
-    grid = np.linspace(0.0, 1.0, _POINTS)
-    asked = math.isfinite(sliding.brownout_voltage)
-    last = sliding.last
-    load = SupplyLoad() if last is None else last.load
-    flown = (grid >= sliding.lowest) & (grid <= sliding.highest)
-    known = flown & load.known
-    sag, error, noise = (np.where(known, values(grid), NAN)
-                         for values in (load.sag, load.sag_se, load.noise))
-    risk = np.full(_POINTS, NAN)
-    if asked and last is not None and last.risk_curve:
-        risk = np.interp(grid, RISK_CURVE, last.risk_curve)
-        risk = np.where(grid <= sliding.highest, risk, NAN)
+def by_throttle(found: Overview, voltage: float, horizon: float) -> ByThrottle:
+    """Return what the facts, and the node at the end, say over throttle (V, s)."""
+    grid, sag, last = np.array(THROTTLES), found.facts.sag, found.end
+    low, high = sag.flown
+    middle, reach = np.array(sag.sag_v), Z95 * np.array(sag.se_v)
+    if not sag.known:
+        middle = np.full(grid.size, NAN)
+    risk = np.full(grid.size, NAN)
+    if last is not None and last.risk_curve:
+        # RISK_CURVE has the same throttles; one beyond the highest, to interpolate.
+        risk = np.where(grid < found.highest + 0.1, last.risk_curve, NAN)
     return ByThrottle(
-        grid, known, sag, np.maximum(sag - Z95 * error, 0.0), sag + Z95 * error, noise, risk,
-        last.budget if asked and last is not None else NAN,
-        _reason(last) if asked else 'No voltage was asked for.',
-        sliding.settings.budget_limit, sliding.brownout_voltage, sliding.brownout_horizon,
-        last.estimate.t if last is not None else NAN)
-
-
-def _reason(last: MonitorReport | None) -> str:
-    """Return what ends the budget; what the risk is of stands beside it."""
-    if last is None:
-        return 'The recording is shorter than half a window.'
-    return last.budget_reason.split(' Brown-out:')[0]
+        grid, (grid >= low) & (grid <= high), middle, middle - reach, middle + reach,
+        np.array(found.facts.noise.rms_v), risk, NAN if last is None else last.budget,
+        'No voltage was asked for.' if last is None else
+        last.budget_reason.split(' Brown-out:')[0], MonitorSettings().budget_limit, voltage,
+        horizon, NAN if last is None else last.estimate.t)

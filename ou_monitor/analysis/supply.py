@@ -13,18 +13,19 @@ for 130 s at 200 Hz, and 4 s with a limit, for the budget.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 import math
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import find_step
-from ou_monitor.model.ou_fit import FEWEST, known_ou, regress, Regression
+from ou_monitor.model.ou_fit import FEWEST, known_ou, regress
 from ou_monitor.online.estimator.estimator import SLIDING
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.monitor import SupplyMonitor
+from ou_monitor.online.report import MonitorReport
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
 from ou_monitor.timeline.line import readings_of
@@ -34,6 +35,8 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 THROTTLES = tuple(k / 10.0 for k in range(11))
 # Part, s, of a recording of which the noise is the residual of one regression.
 _PART = 60.0
+# A current comes at most so much late or early, s.
+_LATE = 0.06
 # Throttle is steady while it spans at most this for so long, s.
 _STEADY, _STEADY_TIME = 0.02, 0.2
 # Half width of the band of throttle about each of THROTTLES; fewest readings in it.
@@ -166,15 +169,22 @@ def supply_facts(recording: Recording, limit: float | None = None) -> SupplyFact
         When the limit is not finite.
 
     """
-    return facts_and_load(recording, limit)[0]
+    return facts_and_end(recording, limit)[0]
 
 
-def facts_and_load(recording: Recording, limit: float | None = None,
-                   ) -> tuple[SupplyFacts, SupplyLoad]:
-    """Return the facts, and the load at the end, of which they hold eleven points."""
+def facts_and_end(recording: Recording, limit: float | None = None, left: Remainder | None = None,
+                  horizon: float | None = None,
+                  ) -> tuple[SupplyFacts, SupplyLoad, MonitorReport | None]:
+    """
+    Return the facts, and load and report of the node at the end; without a limit no report.
+
+    limit in V; left: the recording's `remainder`, found when left out; horizon of the report's
+    risk in s: the node's default when left out.
+    """
     if limit is not None and not math.isfinite(limit):
         raise ValueError(f'the limit must be finite, got {limit} V')
-    recording = readings_of(recording) if recording.n > 1 else recording
+    if left is None and recording.n > 1:
+        recording = readings_of(recording)
     t, v, u = recording.t, recording.voltage, recording.throttle
     if not recording.n:
         unknown = (NAN,) * len(THROTTLES)
@@ -183,37 +193,41 @@ def facts_and_load(recording: Recording, limit: float | None = None,
             Lowest(NAN, NAN, NAN), None if limit is None else Dips(limit, 0, 0.0, 0.0),
             Sag(False, nowhere, THROTTLES, unknown, unknown),
             Noise(THROTTLES, unknown, unknown, nowhere), Resistance(NAN, NAN),
-            OuFacts('no_data'), None), SupplyLoad()
+            OuFacts('no_data'), None), SupplyLoad(), None
     k = int(np.argmin(v))
-    noise = noise_of(recording)
-    load, budget = _at_the_end(recording, limit)
+    noise = noise_of(recording, left)
+    load, budget, last = _at_the_end(recording, limit, horizon)
     return SupplyFacts(
         Lowest(float(v[k]), float(t[k] - t[0]), float(u[k])),
         None if limit is None else _dips(t, v, u, limit, noise),
         Sag(load.known, noise.flown, THROTTLES, _tuple(load.sag(THROTTLES)),
             _tuple(load.sag_se(THROTTLES))),
         noise, Resistance(load.resistance, load.resistance_se),
-        known_ou(t, v, u, recording.current), budget), load
+        known_ou(t, v, u, recording.current), budget), load, last
 
 
 def _tuple(values: FloatArray) -> tuple[float, ...]:
     return tuple(float(x) for x in values)
 
 
-def _at_the_end(recording: Recording, limit: float | None) -> tuple[SupplyLoad, Budget | None]:
+def _at_the_end(recording: Recording, limit: float | None, horizon: float | None,
+                ) -> tuple[SupplyLoad, Budget | None, MonitorReport | None]:
     """Return what the node knows at the end."""
     throttle = recording.throttle if recording.has_throttle else None
     if limit is None:
         load = LoadFilter()
         load.push(recording.t, recording.voltage, throttle, recording.current)
-        return load.load(), None
+        return load.load(), None, None
     # The fit of `window: auto` is none of the budget's.
     settings = MonitorSettings(window=SLIDING, brownout_voltage=limit)
     monitor = SupplyMonitor(settings)
     monitor.push(recording.t, recording.voltage, throttle, current=recording.current)
     last = monitor.report(0.0)
-    return last.load, Budget(last.budget, limit, settings.brownout_horizon,
-                             settings.budget_limit)
+    budget = Budget(last.budget, limit, settings.brownout_horizon, settings.budget_limit)
+    if horizon is not None and horizon != settings.brownout_horizon:
+        monitor.configure(replace(settings, brownout_horizon=horizon))
+        last = monitor.report(0.0)
+    return last.load, budget, last
 
 
 def _dips(t: FloatArray, v: FloatArray, u: FloatArray, limit: float, noise: Noise) -> Dips:
@@ -243,27 +257,45 @@ def dip_begins(v: FloatArray, limit: float, rise: FloatArray) -> npt.NDArray[np.
     return np.asarray(decides[below[decides] & np.append(True, ~below[decides[:-1]])])
 
 
-def _cut(recording: Recording, begin: int, end: int) -> Regression:
-    part = slice(begin, end)
-    current = None if recording.current is None else recording.current[part]
-    return regress(recording.t[part], recording.voltage[part], recording.throttle[part], current)
+@dataclass(frozen=True, eq=False)
+class Remainder:
+    """What level and load leave of the voltage of a recording, `_PART` by `_PART`."""
+
+    voltage: FloatArray  # V, by the regressions' degrees of freedom larger; NaN beside a gap
+    size: FloatArray  # of the noise beside its rms in the part
+    dt: float  # usual step, s
+    walk: float  # usual walk of the level, V per sqrt(s)
+    above: float = 0.0  # slower noise than this is the level's, Hz
 
 
-def noise_of(recording: Recording) -> Noise:
-    """Return the noise over throttle from the residuals of all parts."""
-    t, u = recording.t, recording.throttle
+def remainder(recording: Recording) -> Remainder:
+    """Take level and load out of the voltage of a recording."""
+    t, n = recording.t, recording.n
+    left, size, steps, walks, above = np.full(n, NAN), np.ones(n), [], [], 0.0
+    edges: list[int] = [] if not n else np.searchsorted(t, np.linspace(
+        t[0], t[-1], 1 + max(1, round(float(t[-1] - t[0]) / _PART)))[1:-1]).tolist()
+    for begin, end in zip([0, *edges], [*edges, n]):
+        if end - begin < FEWEST:
+            continue
+        cut = slice(begin, end)
+        part = regress(t[cut], recording.voltage[cut], recording.throttle[cut],
+                       None if recording.current is None else recording.current[cut], _LATE)
+        if part.free >= FEWEST:
+            left[begin + part.places] = part.voltage * math.sqrt(part.places.size / part.free)
+            size[begin + part.places] = part.size
+            steps.append(part.dt)
+            walks.append(part.walk)
+            above = max(above, 0.5 / part.slowest)
+    return Remainder(left, size, float(np.median(steps)) if steps else NAN,
+                     float(np.median(walks)) if walks else NAN, above)
+
+
+def noise_of(recording: Recording, left: Remainder | None = None) -> Noise:
+    """Return the noise over throttle; left: the recording's `remainder`."""
+    u, square = recording.throttle, (left or remainder(recording)).voltage ** 2
     known, flown = u[np.isfinite(u)], (NAN, NAN)
     if known.size:
         flown = float(np.quantile(known, 0.01)), float(np.quantile(known, 0.99))
-    edges = np.searchsorted(t, np.linspace(
-        t[0], t[-1], 1 + max(1, round(float(t[-1] - t[0]) / _PART)))[1:-1])
-    square = np.full(t.size, NAN)
-    for begin, end in zip([0, *edges.tolist()], [*edges.tolist(), t.size]):
-        if end - begin < FEWEST:
-            continue
-        part = _cut(recording, begin, end)
-        if part.free >= FEWEST:
-            square[begin + part.places] = part.voltage ** 2 * (part.places.size / part.free)
     seen = np.isfinite(square)
     if not seen.any():
         unknown = (NAN,) * len(THROTTLES)
@@ -271,7 +303,7 @@ def noise_of(recording: Recording) -> Noise:
     if not math.isfinite(flown[0]):
         rms = (math.sqrt(float(square[seen].mean())),) * len(THROTTLES)
         return Noise(THROTTLES, rms, rms, flown)
-    still = _still(t, u)
+    still = _still(recording.t, u)
     return Noise(THROTTLES, _over_throttle(u[seen], square[seen], flown),
                  _over_throttle(u[seen & still], square[seen & still], flown), flown)
 

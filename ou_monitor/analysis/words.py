@@ -72,7 +72,8 @@ def facts(analysis: Analysis) -> list[tuple[str, str]]:
     found = known_lines(analysis.overview)
     curves = analysis.by_throttle
     if math.isfinite(curves.budget):
-        found.insert(-1, ('Safe up to', _budget_words(curves)))
+        after = 1 + [name for name, _ in found].index('Relaxation')
+        found.insert(after, ('Safe up to', _budget_words(curves)))
     return found
 
 
@@ -220,6 +221,7 @@ def _level(level: LevelResult) -> dict[str, Any]:
         'sigma': e.sigma, 'sigma_se': e.sigma_se, 'sigma_ci95': list(e.interval('sigma')),
         'var_inf': e.var_inf, 'var_inf_se': e.var_inf_se,
         'var_inf_ci95': list(e.interval('var_inf')),
+        'tau_below_s': level.ou.tau_below_s, 'var_inf_below': level.ou.var_inf_below,
         'sag': level.sag.sag, 'sag_se': level.sag.sag_se, 'sag_ci95': list(level.sag.interval),
         'u0': e.u0, 'u0_se': e.u0_se,
         'noise_std': e.noise_std,
@@ -248,8 +250,6 @@ def _level(level: LevelResult) -> dict[str, Any]:
         'status': e.status.name,
         'status_text': e.status.value,
         'flags': [{'name': flag.name, 'text': flag.value} for flag in e.flags],
-        'segment_scatter': level.scatter, 'segment_p_adjusted': level.scatter_p,
-        'notes': list(level.notes),
     }
 
 
@@ -293,7 +293,8 @@ def _by_throttle(analysis: Analysis) -> dict[str, Any]:
     return {
         'throttle': curves.throttle, 'known': curves.known,
         'sag': curves.sag, 'sag_low': curves.sag_low, 'sag_high': curves.sag_high,
-        'noise': curves.noise, 'brownout_risk': curves.risk}
+        'noise': curves.noise,
+        'brownout_risk': curves.risk}
 
 
 def _brownout(analysis: Analysis) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import math
 import shlex
 
+import numpy as np
 from ou_monitor.analysis.analyze import Analysis, analyze
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.relaxation import Relaxation
@@ -200,24 +201,24 @@ def _changes(fit: Relaxation, start: float) -> str:
 
 
 def _by_throttle(analysis: Analysis) -> str:
-    """Return sag and sigma, of the levels where there are some, and the risk."""
+    """Return the sag, sigma of the levels or noise where there are none, and the risk."""
     curves = analysis.by_throttle
     sentence = paragraph(brownout_sentence(analysis))
     levels = [level for level in analysis.levels if math.isfinite(level.throttle) and level.n]
+    heads = ['throttle', 'sag mV [95 %]', 'sigma V/sqrt(s) [95 %]', 'brown-out risk']
     if levels:
         rows = [[level.label, _mv_interval(level.sag.sag, *level.sag.interval),
                  _interval(level, 'sigma'), chance(curves.at(level.throttle, 'risk'))]
                 for level in levels]
     else:
-        rows = [[f'{10 * k} %',
-                 _mv_interval(*(curves.at(0.1 * k, name) for name in ('sag', 'sag_low',
-                                                                      'sag_high'))),
-                 _mv(curves.at(0.1 * k, 'noise')), chance(curves.at(0.1 * k, 'risk'))]
-                for k in range(11) if math.isfinite(curves.at(0.1 * k, 'sag'))]
+        heads[2] = 'noise mV rms'
+        rows = [[f'{100.0 * curves.throttle[k]:.0f} %',
+                 _mv_interval(curves.sag[k], curves.sag_low[k], curves.sag_high[k]),
+                 number(1e3 * curves.noise[k]), chance(curves.risk[k])]
+                for k in np.flatnonzero(curves.known)]
     if not rows or not analysis.recording.has_throttle:
         return sentence
-    text = table(['throttle', 'sag mV [95 %]',
-                  'sigma V/sqrt(s) [95 %]' if levels else 'noise mV', 'brown-out risk'], rows)
+    text = table(heads, rows)
     return f'{text}\n\n{sentence}'
 
 

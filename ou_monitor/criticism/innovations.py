@@ -1,9 +1,9 @@
 """
 One-step innovations of an OU in white noise, and what their spectrum shows of another pole.
 
-Both verbs whiten by `ou_monitor.model.innovations.Filter`: `analyze` the samples of a load level
-by the OU and the white noise that the onboard estimator found, `discover` a whole recording by
-all terms of its model.
+Both verbs whiten by `ou_monitor.model.innovations.Filter`: `analyze` what level and load leave of
+a load level by the OU and the white noise found there, `discover` a whole recording by all terms
+of its model.
 
 Under the right model the innovations are independent and standard normal, and the ordinates of
 their periodogram independent and exponential.  A second OU, slower or faster by a known factor,
@@ -29,7 +29,7 @@ import math
 
 import numpy as np
 from ou_monitor.model.innovations import Filter, StateSpace
-from ou_monitor.records import Estimate, Flag, FloatArray, NAN
+from ou_monitor.records import FloatArray, NAN
 from scipy import stats
 from scipy.signal import periodogram
 
@@ -66,13 +66,6 @@ class OtherPole:
     def coupled(self) -> bool:
         """Whether an AC-coupled instrument has taken out slow noise."""
         return self.coupling_p < FAMILY_WISE
-
-
-def fresh(voltage: FloatArray, estimate: Estimate) -> np.ndarray:
-    """Return which samples were measured, not repeated by the logger (voltage in V)."""
-    if Flag.HELD_SAMPLES not in estimate.flags or voltage.size < 2:
-        return np.ones(voltage.size, dtype=np.bool_)
-    return np.append(True, voltage[1:] != voltage[:-1])
 
 
 def steps_before(t: FloatArray) -> FloatArray:
@@ -119,13 +112,14 @@ def join(parts: Sequence[FloatArray]) -> FloatArray:
 
 
 def other_pole(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: float,
-               noise_var: float) -> OtherPole:
-    """Test innovations for a second relaxation and for an AC coupling (rate in Hz)."""
+               noise_var: float, above: float = 0.0) -> OtherPole:
+    """Test innovations for a second relaxation and for an AC coupling (rate, above in Hz)."""
     # The first innovation of a part has no past, and the trend is that of the rest.
     both = [periodogram(part, rate, detrend='linear') for part in parts if part.size >= _SHORTEST]
     # The ordinates at 0 and at half the rate are of another law.
     frequency = join([f[1:-1] if f[-1] == 0.5 * rate else f[1:] for f, _ in both])
     power = join([p[1:-1] if f[-1] == 0.5 * rate else p[1:] for f, p in both])
+    frequency, power = frequency[frequency > above], power[frequency > above]
     if frequency.size < _FEWEST:
         return OtherPole()
     power = power / power.mean() - 1.0

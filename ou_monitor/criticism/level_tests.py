@@ -99,8 +99,9 @@ class Shape:
         return next(test for test in self.tests if test.name == name)
 
 
-def examine_level(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estimate) -> Shape:
-    """Test one level (parts in s)."""
+def examine_level(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estimate,
+                  above: float = 0.0) -> Shape:
+    """Test one level (parts in s); what is slower than `above`, Hz, was taken out."""
     parts = [(t, v) for t, v in parts if t.size >= 2]
     n = sum(t.size for t, _ in parts)
     time = sum(float(t[-1] - t[0]) for t, _ in parts)
@@ -141,7 +142,7 @@ def examine_level(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Esti
     tests.append(correlated)
     pole = OtherPole()
     if model:
-        pole = other_pole(apart, (n - len(parts)) / time, alpha, var_inf, noise * noise)
+        pole = other_pole(apart, (n - len(parts)) / time, alpha, var_inf, noise * noise, above)
         tests += [_correlated('one_relaxation', [z], _LAGS_FITTED),
                   TestResult('second_relaxation', pole.second_p, pole.second_share,
                              why_not='' if math.isfinite(pole.second_p) else 'too few samples')]

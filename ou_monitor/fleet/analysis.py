@@ -88,13 +88,15 @@ def _analysed(path: str, options: Options) -> dict[str, Any]:
             window=options.window, brownout_voltage=options.brownout_voltage,
             brownout_horizon=options.brownout_horizon)
         start = float(recording.t[0])
+        facts = analysis.overview.facts
         known = analysis.sliding.risk[np.isfinite(analysis.sliding.risk)]
         return {
             'error': '', 'recording': recording.name,
             'vehicle': recording.source.get('vehicle', ''),
             'start': start if _EPOCH <= start < _LATEST else NAN, 'duration_s': recording.duration,
             'samples': recording.n, 'rate_hz': (recording.n - 1) / recording.duration,
-            **_seen(analysis.overview), 'risk_max': float(known.max()) if known.size else NAN,
+            **_seen(analysis.overview), 'supply': facts.to_dict(),
+            'risk_max': float(known.max()) if known.size else NAN,
             'alpha_p': analysis.alpha_test.p_value,
             'quality': [f'{item.severity.value}: {item.text}' for item in analysis.quality],
             'levels': [_level(level, options) for level in analysis.levels],
@@ -115,7 +117,7 @@ def _level(level: LevelResult, options: Options) -> dict[str, Any]:
         'excess_kurtosis': level.shape.kurtosis, 'impulses': level.shape.impulses,
         'line_hz': line.frequency if line else NAN, 'line_rms': line.rms if line else NAN,
         'process': level.kind.value, 'risk': risk, 'status': e.status.name,
-        'flags': [flag.name for flag in e.flags], 'level_notes': list(level.notes)}
+        'flags': [flag.name for flag in e.flags]}
 
 
 def _seen(found: Overview) -> dict[str, float]:

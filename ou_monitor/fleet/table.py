@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 import io
+import json
 import math
 import os
 from pathlib import Path
@@ -24,7 +25,8 @@ class Column:
     """One column."""
 
     name: str  # Name in the table
-    # ``text``, ``texts`` (a list), ``number`` (unknown: null), ``count`` or ``time`` (UTC).
+    # ``text``, ``texts`` (a list), ``json``, ``number`` (unknown: null), ``count`` or
+    # ``time`` (UTC).
     kind: str
     unit: str  # SI unit; empty where there is none
     meaning: str  # One line
@@ -66,7 +68,6 @@ COLUMNS = (
            'needs --brownout-voltage'),
     Column('status', 'text', '', 'what became of the fit: OK, SHORT_WINDOW, or why there is none'),
     Column('flags', 'texts', '', 'cautions about the input'),
-    Column('level_notes', 'texts', '', 'what to know about the level'),
     Column('duration_s', 'number', 's', 'length of the recording'),
     Column('samples', 'count', '', 'samples of the recording'),
     Column('rate_hz', 'number', 'Hz', 'mean rate of the recording'),
@@ -83,6 +84,7 @@ COLUMNS = (
     Column('sag_full', 'number', 'V', 'sag at full throttle, if its form holds up to there; '
            'recordings are compared by it'),
     Column('sag_full_se', 'number', 'V', 'standard error of sag_full'),
+    Column('supply', 'json', '', 'the facts that all commands share, as JSON'),
     Column('alpha_p', 'number', '1', 'p-value of alpha being the same at all levels'),
     Column('quality', 'texts', '', 'what to know about the recording, worst first'),
     Column('risk_max', 'number', '1', 'highest risk that the node would have published on the '
@@ -102,11 +104,11 @@ NAMES = tuple(column.name for column in COLUMNS)
 OF_LEVEL = ('level', 'throttle', 'time_s', 'n', 'mean', 'vpp', 'vrms', 'alpha', 'alpha_se',
             'sigma', 'sigma_se', 'var_inf', 'var_inf_se', 'u0', 'u0_se', 'noise_std',
             'excess_kurtosis', 'impulses', 'line_hz', 'line_rms', 'process', 'risk', 'status',
-            'flags', 'level_notes')
+            'flags')
 _OF_RECORDING = ('recording', 'duration_s', 'samples', 'rate_hz', 'lowest', 'lowest_at',
                  'lowest_throttle', 'dips', 'below_s', 'sag_throttle', 'sag', 'sag_se', 'sag_full',
-                 'sag_full_se', 'alpha_p', 'quality', 'risk_max', 'verdict', 'causes', 'gain',
-                 'gain_se', 'notes')
+                 'sag_full_se', 'supply', 'alpha_p', 'quality', 'risk_max', 'verdict', 'causes',
+                 'gain', 'gain_se', 'notes')
 
 
 def rows_of(source: Source, result: Mapping[str, Any], vehicle: Vehicle, flight: int | None,
@@ -134,9 +136,11 @@ def _known(value: Any) -> Any:
 
 
 def _as_text(value: Any) -> Any:
-    """Return texts without what is no text, such as bytes in a file name."""
+    """Return texts without what is no text, such as bytes in a file name; objects as JSON."""
     if isinstance(value, str):
         return value.encode('utf-8', 'backslashreplace').decode()
+    if isinstance(value, dict):
+        return json.dumps(value, allow_nan=False)
     return [_as_text(item) for item in value] if isinstance(value, list) else value
 
 
@@ -145,9 +149,9 @@ def write_table(rows: Sequence[Row], path: Path) -> None:
     import pyarrow
     from pyarrow import parquet
 
-    kinds = {'text': pyarrow.string(), 'texts': pyarrow.list_(pyarrow.string()),
-             'number': pyarrow.float64(), 'count': pyarrow.int64(),
-             'time': pyarrow.timestamp('us', tz='UTC')}
+    kinds = {'text': pyarrow.string(), 'json': pyarrow.string(),
+             'texts': pyarrow.list_(pyarrow.string()), 'number': pyarrow.float64(),
+             'count': pyarrow.int64(), 'time': pyarrow.timestamp('us', tz='UTC')}
     schema = pyarrow.schema([
         pyarrow.field(column.name, kinds[column.kind],
                       metadata={'unit': column.unit, 'meaning': column.meaning})

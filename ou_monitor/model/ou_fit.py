@@ -45,10 +45,14 @@ _HATS, _PARTS = 5.0, 3
 _LAGS = (0.004, 0.02, 0.06, 0.3, 1.0, 4.0)
 # Samples by which throttle and current are tried late or early, and readings for that.
 _DELAYS, _DELAY_READINGS = 4, 8000
+# ... and a current at most, where it is looked for.
+_FAR = 20
 # A throttle that spans less does not move.
 _MOVED = 0.01
 # A gap is a step of this many usual ones; stretches of fewer readings are left out.
 _GAP, _STRETCH = 1.6, 16
+# Share of the readings that pieces of one length must hold.
+_HELD = 0.8
 # The shortest of OU_WINDOWS in which alpha is known within this factor counts, else the longest.
 # Precision stops the search, not visibility: whether chance makes a relaxation visible in a short
 # window depends on its estimate, which would then be biased.
@@ -148,7 +152,9 @@ class Regression:
     places: npt.NDArray[np.intp]  # of the readings in stretches without gaps, shape (n,)
     voltage: FloatArray  # V, what the regressors leave, shape (n,)
     size: FloatArray  # of the noise beside its rms, shape (n,)
-    basis: FloatArray  # orthonormal regressors, in units of the size, shape (n, p)
+    # Orthonormal regressors, in units of the size, shape (n, p); without any each stretch has a
+    # mean of its own.
+    basis: FloatArray
     lengths: list[int]  # of the stretches
     walk: float  # usual walk of the level, V per sqrt(s)
     slowest: float  # half the distance of the level's knots, s: slower is the level
@@ -156,12 +162,16 @@ class Regression:
     @property
     def free(self) -> int:
         """Return the readings beyond the number of regressors."""
-        return int(self.basis.shape[0] - self.basis.shape[1])
+        return int(self.basis.shape[0] - (self.basis.shape[1] or len(self.lengths)))
 
 
-def regress(t: FloatArray, v: FloatArray, u: FloatArray | None,
-            i: FloatArray | None) -> Regression:
-    """Take level and load out of a voltage, V; stamps in s, throttle 0..1, current in A."""
+def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | None,
+            reach: float = 0.0) -> Regression:
+    """
+    Take level and load out of a voltage, V; stamps in s, throttle 0..1, current in A.
+
+    reach: the current is also tried late or early by up to so much, s.
+    """
     stretches = _stretches(t)
     dt = float(np.median(np.diff(t)))
     if stretches:
@@ -183,10 +193,10 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None,
     columns = level
     last = slice(-_DELAY_READINGS, None)
 
-    def best(x: FloatArray, regressors: Any) -> list[FloatArray]:
+    def best(x: FloatArray, regressors: Any, most: int = _DELAYS) -> list[FloatArray]:
         """Return the regressors of a load at the delay that leaves least."""
         left = {}
-        for late in sorted(range(-_DELAYS, _DELAYS + 1), key=abs):
+        for late in sorted(range(-most, most + 1), key=abs):
             Q = _basis([c[last] for c in (*columns, *regressors(_moved(x, late))[:5])])
             left[late] = float(v[last] @ v[last] - np.sum((Q.T @ v[last]) ** 2))
         least = min(left, key=left.__getitem__)
@@ -198,7 +208,7 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None,
     walk = _WALK * max(abs(float(v.mean())), 1e-3) / CELL
     v = v - v.mean()
     if i is not None:
-        columns = [*columns, *best(i, answers)]
+        columns = [*columns, *best(i, answers, max(_DELAYS, min(_FAR, round(reach / dt))))]
     if u is not None:
         columns = [*columns, *best(u, of_throttle)]
         if i is not None:
@@ -274,7 +284,8 @@ class _Likelihood:
                 n = len(rows)
                 F = np.fft.rfft(rows, axis=0) / math.sqrt(n)
                 weight = np.full(F.shape[0], 2.0)
-                weight[0] = 1.0
+                # Without regressors each stretch has a mean of its own.
+                weight[0] = 1.0 if part.basis.shape[1] else 0.0
                 if n % 2 == 0:
                     weight[-1] = 1.0
                 omega = 2.0 * np.pi * np.arange(F.shape[0]) / n
@@ -286,7 +297,7 @@ class _Likelihood:
                         place[k] += weight[a:b].sum() * omega[a:b].mean()
             crosses.extend(cross)
             counts.extend(count)
-            omegas.extend(place / count)
+            omegas.extend(place / np.maximum(count, 1e-9))
             lengths.extend([sum(map(len, group)) / len(group)] * len(count))
         self._p = Z.shape[1] - 1
         self._cross = np.array(crosses).reshape(len(crosses), -1)
@@ -401,6 +412,31 @@ def fit_ou(part: Regression, span: float) -> OuFacts:
         (found.alpha, found.alpha_95), (found.sigma, found.sigma_95),
         (found.var_inf, found.var_inf_95))) else _unseen(
             costs, low, high, least, dt, span)
+
+
+def fit_pieces(parts: Sequence[tuple[FloatArray, FloatArray]], dt: float, walk: float) -> OuFacts:
+    """
+    Fit the noise to parts of what a regression left: V, and the size of the noise beside its rms.
+
+    dt in s, usual walk of the level in V per sqrt(s); each piece has a mean of its own.
+    """
+    parts = [part for part in parts if part[0].size >= _STRETCH]
+    total = sum(part[0].size for part in parts)
+    # Pieces of one length: the longest, at most that of a hat, in which most readings are.
+    n = max([_STRETCH, *(part[0].size for part in parts)])
+    n = min(n, max(_STRETCH, round(_HATS / dt)))
+    while n > _STRETCH and sum(part[0].size // n * n for part in parts) < _HELD * total:
+        n = max(_STRETCH, 4 * n // 5)
+    cut = [[x[k:k + n] for x in part]
+           for part in parts for k in range(0, part[0].size - n + 1, n)]
+    span = dt * n * len(cut)
+    if (n - 1) * len(cut) < FEWEST:
+        return OuFacts('too_short', span)
+    voltage = np.concatenate([piece[0] - piece[0].mean() for piece in cut])
+    size = np.concatenate([piece[1] for piece in cut])
+    return fit_ou(Regression(
+        dt, np.arange(voltage.size), voltage, size / math.sqrt(float(size @ size) / size.size),
+        np.zeros((voltage.size, 0)), [n] * len(cut), walk, 0.5 * n * dt), span)
 
 
 def known_ou(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | None) -> OuFacts:

@@ -139,13 +139,18 @@ def curves(analysis: Analysis) -> list[str]:
     learned = analysis.by_throttle
     levels = [level for level in analysis.levels
               if math.isfinite(level.throttle) and level.n]
+    load, highest = analysis.overview.load, analysis.overview.highest
     parts = []
-    if levels or learned.known.any():
+    if levels or learned.known.any() or load.known:
         x = 100.0 * learned.throttle
         sag, sigma = _empty('Sag', 'mV'), _empty('Noise intensity \u03c3', 'V/\u221as')
-        answer = 1e3 * learned.sag
-        sag.band(x, 1e3 * learned.sag_low, 1e3 * learned.sag_high, '95 %', 0)
-        sag.line(x, answer, 'load filter', 0, 'thick')
+        answer = np.full(x.size, np.nan)
+        if load.known:
+            flown = learned.throttle <= highest
+            answer, least, most = (np.where(flown, 1e3 * values, np.nan) for values in (
+                learned.sag, learned.sag_low, learned.sag_high))
+            sag.band(x, np.maximum(least, 0.0), most, '95 %', 0)
+            sag.line(x, answer, 'load filter', 0, 'thick')
         at = _column([100.0 * level.throttle for level in levels])
         _with_levels(sag, at, 1e3 * _column([level.sag.sag for level in levels]),
                      1e3 * _column([level.sag.interval for level in levels]))

@@ -6,9 +6,11 @@ import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.process_type import ProcessType
 from ou_monitor.analysis.replay import slide
+from ou_monitor.model.ou import simulate
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.records import Recording, Status
 import pytest
+from scipy.signal import lfilter
 from simulated_recordings import ALPHA, recording, without_throttle
 
 TRUTH = ((0.1, 0.3156), (0.4, 0.632))
@@ -20,8 +22,9 @@ def test_two_levels_are_recovered():
 
     With T = 10 s: ln alpha and ln Var_inf scatter by sqrt(2/(alpha T)) =
     5.6 %, the mean by sqrt(2 Var_inf/(alpha T)), ln sigma by about
-    1/sqrt(2n) = 0.7 % (n = 10000; a little more because alpha is unknown).
-    The two sigmas are a factor 2 apart: mixing levels would be seen.
+    1/sqrt(2n) = 0.7 % (n = 10000) where white noise is known, and twice that
+    where it is not.  The two sigmas are a factor 2 apart: mixing levels would
+    be seen.
     """
     found = analyze(recording(1, TRUTH)).levels
     assert [level.throttle for level in found] == pytest.approx([0.1, 0.4])
@@ -30,7 +33,7 @@ def test_two_levels_are_recovered():
         var_inf = sigma ** 2 / (2.0 * ALPHA)
         scatter = math.sqrt(2.0 / (ALPHA * 10.0))
         assert e.status is Status.OK and level.kind is ProcessType.DIFFUSION
-        assert abs(math.log(e.sigma / sigma)) < 4.0 * 0.008
+        assert abs(math.log(e.sigma / sigma)) < 4.0 * 0.014
         assert abs(math.log(e.alpha / ALPHA)) < 4.0 * scatter
         assert abs(math.log(e.var_inf / var_inf)) < 4.0 * scatter
         assert level.vrms == pytest.approx(math.sqrt(var_inf), rel=2.0 * scatter)
@@ -91,6 +94,44 @@ def test_the_transient_after_a_step_is_not_noise():
     # Unsettled it would add 0.25 V^2 tau / (2 T) = 4e-4 V^2, 12 % of Var_inf,
     # and an offset of the peak of 0.5 V, nine standard deviations.
     assert high.peak < 5.0 * math.sqrt(var_inf)
+
+
+@pytest.mark.parametrize('tau', [0.016, 0.1, 0.2])
+def test_a_sag_that_settles_is_not_noise(tau):
+    """1 V times throttle follows with tau in stays of 2.5 s: alpha and sigma hold."""
+    t = np.arange(15000) / 1000.0
+    throttle = np.where(np.floor(t / 2.5) % 2 == 0, 0.2, 0.5)
+    phi = math.exp(-1e-3 / tau)
+    sag = lfilter([1.0 - phi], [1.0, -phi], throttle, zi=[phi * throttle[0]])[0]
+    rng = np.random.default_rng(1)
+    noise = simulate(t, ALPHA, 0.1 + 0.2 * throttle, rng) + rng.normal(0.0, 0.002, t.size)
+    levels = analyze(Recording(t, 5.0 - sag + noise, throttle)).levels
+    for level, sigma in zip(levels, (0.14, 0.2)):
+        for name, truth in (('alpha', ALPHA), ('sigma', sigma)):
+            low, high = level.estimate.interval(name, 4.0)
+            assert low < truth < high
+
+
+def test_a_swaying_stick_is_not_noise():
+    """0.5 V at full throttle and a sway of 1 %: 3.5 mV rms that are the load's."""
+    rng = np.random.default_rng(1)
+    t = np.arange(4000) / 200.0
+    throttle = np.where(t < 10.0, 0.2, 0.5) + 0.01 * np.sin(2.0 * np.pi * 1.7 * t)
+    voltage = 5.0 - 0.5 * throttle + rng.normal(0.0, 0.002, t.size)
+    for level in analyze(Recording(t, voltage, throttle)).levels:
+        assert level.vrms > 0.0036 and level.estimate.status is Status.NO_RELAXATION
+        assert math.sqrt(level.ou.var_inf_below) < 0.002
+
+
+def test_loads_that_come_and_go_are_no_lines():
+    """10 A at 1.8 Hz through 0.1 Ohm, measured 50 ms late, at a throttle that stands still."""
+    rng = np.random.default_rng(3)
+    t = np.arange(8000) / 200.0
+    drawn = np.where((1.8 * t) % 1.0 < 0.3, 10.0, 2.0)
+    late = np.concatenate((np.full(10, drawn[0]), drawn[:-10]))
+    v = 12.0 - 0.1 * drawn + 0.02 * rng.standard_normal(t.size)
+    found = analyze(Recording(t, v, np.full(t.size, 0.5), 'made', current=late))
+    assert [line for level in found.levels for line in level.lines.lines] == []
 
 
 def test_without_throttle_there_is_one_level_and_it_is_said():

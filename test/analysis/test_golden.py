@@ -118,16 +118,14 @@ def test_the_transient_is_that_of_the_bag(found):
 
 
 def test_sag_of_the_flight_is_that_of_the_bag(found):
-    """0.3 V at full throttle: each level within 3 standard errors, and the node's curve, too."""
+    """0.3 V at full throttle: each level and each throttle flown within 3 standard errors."""
     truth, analysis = found['flight']
     sag = truth['parameters']['sag']
     for level in analysis.levels[1:]:
         assert level.sag.sag == pytest.approx(sag * level.throttle, abs=3.0 * level.sag.sag_se)
     curves = analysis.by_throttle
-    inside = curves.known & (curves.throttle < 0.76)
-    assert inside.any()
-    assert np.all(curves.sag_low[inside] - 0.01 < sag * curves.throttle[inside])
-    assert np.all(curves.sag_high[inside] + 0.01 > sag * curves.throttle[inside])
+    off = np.abs(curves.sag - sag * curves.throttle)[curves.known]
+    assert np.all(off <= 3.0 * ((curves.sag_high - curves.sag_low) / 3.92)[curves.known])
 
 
 def test_no_bag_has_a_line_a_flag_of_shape_or_another_alpha(found):

@@ -14,9 +14,9 @@ GOOD = Estimate(alpha=63.0, sigma=0.3, var_inf=7e-4, u0=5.0, noise_std=0.0, stat
 BACK = np.concatenate((np.arange(900.0), np.arange(900.0) - 1.5)) / 450.0
 
 
-def listed(simulated, estimates=(GOOD,), notes=((),)):
+def listed(simulated, estimates=(GOOD,)):
     """Return the list of a recording of one level."""
-    return quality_list(simulated, [0.1] * len(estimates), estimates, notes)
+    return quality_list(simulated, [0.1] * len(estimates), estimates)
 
 
 def names(items):
@@ -33,11 +33,10 @@ def test_worst_comes_first_and_levels_share_an_entry():
     """An unusable level, a doubtful flag of two, one that only informs."""
     bad = Estimate(status=Status.BURIED)
     flagged = replace(GOOD, flags=(Flag.QUANTIZED, Flag.HELD_SAMPLES))
-    items = quality_list(recording(1, ((0.1, 0.3),)), [0.1, 0.2, 0.3], [flagged, bad, flagged],
-                         [(), (), ('Told.',)])
+    items = quality_list(recording(1, ((0.1, 0.3),)), [0.1, 0.2, 0.3], [flagged, bad, flagged])
     assert [(item.name, item.severity, item.throttles) for item in items] == [
         ('BURIED', Severity.ERROR, (0.2,)), ('QUANTIZED', Severity.WARNING, (0.1, 0.3)),
-        ('HELD_SAMPLES', Severity.INFO, (0.1, 0.3)), ('SEGMENTS', Severity.INFO, (0.3,))]
+        ('HELD_SAMPLES', Severity.INFO, (0.1, 0.3))]
 
 
 @pytest.mark.parametrize('note, name, severity', [

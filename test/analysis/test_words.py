@@ -4,7 +4,7 @@ from dataclasses import replace
 import math
 
 from ou_monitor.analysis.analyze import analyze
-from ou_monitor.analysis.quality import NOISE_UNKNOWN, quality_list
+from ou_monitor.analysis.quality import quality_list
 from ou_monitor.analysis.words import cautions, facts, headline
 from ou_monitor.records import Flag
 from ou_monitor.text import number
@@ -62,10 +62,9 @@ def test_the_same_caution_of_two_levels_is_said_once():
     def said(**changes):
         items = quality_list(
             analysis.recording, [level.throttle for level in analysis.levels],
-            [replace(level.estimate, **changes) for level in analysis.levels], [(), ()])
+            [replace(level.estimate, **changes) for level in analysis.levels])
         return cautions(replace(analysis, quality=items))
 
     assert said(flags=(Flag.QUANTIZED,), noise_std=0.001) == [
         f'10 %, 40 %: {Flag.QUANTIZED.value}']
     assert said(flags=(), noise_std=0.001) == []
-    assert said(flags=(), noise_std=math.nan) == [f'10 %, 40 %: {NOISE_UNKNOWN}']

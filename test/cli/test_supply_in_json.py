@@ -1,31 +1,119 @@
-"""One set of facts: `supply` in the JSON of `analyze`, `compare`, `coupling` and `discover`."""
+"""One set of facts: what two commands, a row of the fleet and the node give is the same number."""
 
 import json
+import math
+import os
+from pathlib import Path
 
+import numpy as np
+from ou_monitor import MonitorSettings, read_recording, SupplyMonitor
 from ou_monitor.cli.main import main
+from ou_monitor.fleet.analysis import work
 from project import ROOT
 import pytest
 
+REAL = Path(os.environ.get('OU_MONITOR_REALDATA', 'nowhere'))
+# Recording, limit in V, and the part of it that is taken, s.
+RECORDINGS = [
+    (ROOT / 'bags/recorded/gecko_gyro.csv', 15.5, (0, 6)),
+    (ROOT / 'bags/recorded/micromouse', 3.5, (0, 10)),
+    (ROOT / 'bags/flight', 4.7, (0, 3)),
+    *((REAL / f'{name}.csv', limit, part) for name, limit, part in (
+        ('as_f60', 14.5, (0, 20)), ('bf_gecko_a', 14.0, (20, 40)), ('cf_bl00', 3.6, (0, 20)),
+        ('cf_solo_large', 3.6, (0, 20)), ('euc_1', 60.0, (0, 60)), ('frc_ol_1', 11.0, (20, 60)),
+        ('hebi_x', 46.0, (0, 20)), ('js_11t_6s', 20.0, (0, 60)), ('regbot_81', 11.0, (0, 1))))]
+SIGNALS = {'gecko_gyro': 'gyro_x_deg_s', 'micromouse': '/throttle', 'flight': '/throttle'}
 
-@pytest.mark.parametrize('name, signal, limit, part', [
-    ('bags/recorded/gecko_gyro.csv', 'gyro_x_deg_s', '15.5', ('0', '6')),
-    ('bags/recorded/micromouse', '/throttle', '3.5', ('0', '10')),
-    ('bags/flight', '/throttle', '4.7', ('0', '3')),
-])
-def test_all_commands_give_the_same_object(name, signal, limit, part, tmp_path):
+
+def part_of(path, part, folder):
+    """Return the path of a part of a recording, as a table, and the recording read from there."""
+    whole = read_recording(path)
+    here = slice(*np.searchsorted(whole.t - whole.t[0], part))
+    columns = {'time_s': whole.t[here], 'voltage_v': whole.voltage[here]}
+    if whole.has_throttle:
+        columns['throttle'] = whole.throttle[here]
+    if whole.current is not None:
+        columns['current_a'] = whole.current[here]
+    table = folder / f'{path.stem}_part.csv'
+    np.savetxt(table, np.stack(list(columns.values()), axis=1), '%.17g', ',',
+               header=','.join(columns), comments='')
+    return table, read_recording(table)
+
+
+def said(command, path, limit, folder, *more):
+    """Return what a command says; None where it refuses so little in one line."""
+    target = folder / f'{command}.json'
+    status = main([command, str(path), '--brownout-voltage', str(limit), '--json', str(target),
+                   *more])
+    assert status == (0 if target.exists() else 2)
+    return json.loads(target.read_text()) if target.exists() else None
+
+
+@pytest.mark.parametrize('path, limit, part', RECORDINGS[:3], ids=lambda x: getattr(x, 'stem', ''))
+def test_all_commands_give_the_same_object(path, limit, part, tmp_path):
     """Equal to the last digit."""
-    path, found = str(ROOT / name), {}
-    for command in ('analyze', 'compare', 'coupling', 'discover'):
-        target = tmp_path / f'{command}.json'
-        more = ('--signal', signal) if command == 'coupling' else (
-            '--seeds', '20') if command == 'compare' else ()
-        status = main([command, path, '--brownout-voltage', limit, '--from', part[0], '--to',
-                       part[1], '--json', str(target), *more])
-        if target.exists():
-            found[command] = json.loads(target.read_text())['supply']
-        else:
-            # Less than a command needs: refused in one line, as the micromouse by two.
-            assert status == 2
-    assert {'analyze', 'discover'} <= set(found)
-    assert all(one == found['analyze'] for one in found.values())
-    assert found['analyze']['dips']['limit_v'] == float(limit)
+    ends = '--from', str(part[0]), '--to', str(part[1])
+    found = {command: said(command, path, limit, tmp_path, *ends, *more) for command, more in (
+        ('analyze', ()), ('compare', ('--seeds', '20')), ('discover', ()),
+        ('coupling', ('--signal', SIGNALS[path.stem])))}
+    assert found['analyze'] and found['discover']
+    assert all(one['supply'] == found['analyze']['supply'] for one in found.values() if one)
+    assert found['analyze']['supply']['dips']['limit_v'] == limit
+
+
+def near(found, wanted, tolerance=0.0):
+    """Whether two values or lists are the same, null among them."""
+    return np.allclose(np.array(found, dtype=float), np.array(wanted, dtype=float), tolerance,
+                       tolerance, equal_nan=True)
+
+
+@pytest.mark.parametrize('path, limit, part', RECORDINGS, ids=lambda x: getattr(x, 'stem', ''))
+def test_whoever_gives_a_number_gives_the_same(path, limit, part, tmp_path):
+    """`analyze`, `compare`, a row of the fleet, and the node at the end of twelve recordings."""
+    if not path.exists():
+        pytest.skip('OU_MONITOR_REALDATA is not set')
+    table, recording = part_of(path, part, tmp_path)
+    analysis = said('analyze', table, limit, tmp_path)
+    supply = analysis['supply']
+    compared = said('compare', table, limit, tmp_path, '--seeds', '5')
+    assert compared is None or compared['supply'] == supply
+    row = work(str(table), {'brownout_voltage': limit})
+    assert row['supply'] == supply
+    for column, wanted in (
+            ('lowest', supply['lowest']['voltage_v']), ('lowest_at', supply['lowest']['time_s']),
+            ('lowest_throttle', supply['lowest']['throttle']), ('dips', supply['dips']['count']),
+            ('below_s', supply['dips']['seconds'])):
+        assert near(row[column], wanted), column
+    sag = supply['sag']
+    if sag['known']:
+        assert near(analysis['by_throttle']['sag'], sag['sag_v'])
+        assert near(row['sag_full'], sag['sag_v'][-1])
+        for level in analysis['levels']:
+            if level['throttle'] is not None:
+                # Between two of the eleven throttles.
+                wanted = np.interp(level['throttle'], sag['throttle'], sag['sag_v'])
+                assert level['sag'] == pytest.approx(wanted, abs=0.02 * max(sag['sag_v']))
+    assert near(analysis['by_throttle']['noise'], supply['noise']['rms_v'])
+    # The node at the end.
+    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=limit))
+    monitor.push(recording.t, recording.voltage,
+                 recording.throttle if recording.has_throttle else None,
+                 current=recording.current)
+    report = monitor.report(0.0)
+    assert near(report.load.sag(sag['throttle']), sag['sag_v'], 1e-9)
+    assert near(report.load.resistance, supply['resistance']['ohm'], 1e-9)
+    assert near(report.budget, supply['budget']['throttle'], 1e-9)
+    for name, value in supply['ou'].items():
+        found = getattr(report.ou, name)
+        assert found == value if name == 'status' else near(found, value, 1e-6), name
+    assert near(analysis['brownout']['throttle_budget'], report.budget, 1e-9)
+    # A relaxation that most of the recording shows is that of its end, by both intervals.
+    ou = supply['ou']
+    for level in analysis['levels']:
+        if level['alpha'] is None or ou['alpha'] is None or (
+                level['time_s'] < 0.5 * recording.duration):
+            continue
+        low, high = level['alpha_ci95']
+        assert low < ou['alpha_95'][1] and high > ou['alpha_95'][0]
+        assert math.isclose(level['var_inf'], level['sigma'] ** 2 / (2.0 * level['alpha']),
+                            rel_tol=0.1)

@@ -3,15 +3,14 @@
 import math
 
 import numpy as np
-from ou_monitor.analysis.level_result import fit_segment
-from ou_monitor.criticism.innovations import fresh, innovations
+from ou_monitor.criticism.innovations import innovations
 from ou_monitor.criticism.level_tests import (
     adjusted, EFFECT, examine_level, FAMILY_WISE, holm, Shape, TestResult)
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Estimate, Flag, Recording, Status
 import pytest
 from scipy import stats
-from simulated_recordings import ALPHA
+from simulated_recordings import ALPHA, fitted
 
 SIGMA = 0.3156
 VAR_INF = SIGMA ** 2 / (2.0 * ALPHA)
@@ -66,7 +65,7 @@ def test_false_alarms_of_a_whole_recording():
     for seed in range(200):
         rng = np.random.default_rng(5000 + seed)
         voltage = ou(seed) + rng.normal(0.0, 0.003, T.size)
-        estimate = fit_segment(Recording(T, voltage, np.full(T.size, 0.1)), 0, T.size)
+        estimate = fitted(Recording(T, voltage, np.full(T.size, 0.1)), 0, T.size)
         found = examined(voltage, estimate)
         alarms += any(test.rejects for test in found.tests if test.name != 'correlated')
     assert alarms <= 7
@@ -162,13 +161,6 @@ def test_steps_of_the_adc_hide_the_shape():
     for name in ('gaussian', 'impulses'):
         assert math.isnan(found[name].p_value) and 'ADC' in found[name].why_not
     assert math.isfinite(found['mean_drift'].p_value)
-
-
-def test_repeats_of_a_logger_are_left_out():
-    """Only where the estimate says that there are some."""
-    v = np.array([1.0, 1.0, 2.0, 2.0, 3.0])
-    assert fresh(v, truth(flags=(Flag.HELD_SAMPLES,))).tolist() == [True, False, True, False, True]
-    assert fresh(v, truth()).all()
 
 
 @pytest.mark.parametrize('n', [0, 1, 2, 49])

@@ -1,7 +1,7 @@
 """
 `analyze` and `discover` see the same in the same samples: one whitening, one finder, one test.
 
-`analyze` takes a recording as one load level, fitted by the onboard estimator; `discover` scores
+`analyze` takes a recording as one load level, here with all of its level; `discover` scores
 the same model with its own filter of many terms.  The samples are those that `discover` keeps, of
 every bag and of every recorded run there is, tables and raw logs.
 """
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
-from ou_monitor.analysis.level_result import fit_level, fit_segment
+from ou_monitor.analysis.level_result import fit_level, fit_parts
 from ou_monitor.analysis.levels import LoadLevel, Segment
 from ou_monitor.criticism.battery import statistics
 from ou_monitor.criticism.composite import (
@@ -37,6 +37,7 @@ from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import NAN, Recording
 from project import ROOT
 import pytest
+from simulated_recordings import bare
 
 REAL = Path(os.environ.get('OU_MONITOR_REALDATA', 'nowhere'))
 PATHS = [*sorted(path.parent for path in (ROOT / 'bags').glob('**/metadata.yaml')),
@@ -49,7 +50,7 @@ CLEAR = 1e-3 * FALSE_ALARM
 def as_one_level(recording):
     """Return what `analyze` says of a recording as one load level."""
     whole = LoadLevel(NAN, (Segment(0, recording.n),))
-    return fit_level(recording, recording, whole, 1)
+    return fit_level(recording, bare(recording), whole, 1)
 
 
 @pytest.fixture(scope='module', params=PATHS, ids=lambda path: path.name)
@@ -186,7 +187,8 @@ def over_throttle(*terms, seed):
     samples, composite = fitted(*terms, throttle=throttle, seed=seed)
     found = statistics(composite.z, covariates_of(samples, composite))
     recording = Recording(samples.t, samples.voltage, throttle, 'levels')
-    low, high = (fit_segment(recording, *ends) for ends in ((0, N // 2), (N // 2, N)))
+    low, high = (fit_parts(recording, bare(recording), [Segment(*ends)])[1]
+                 for ends in ((0, N // 2), (N // 2, N)))
     alpha, sigma = alpha_constancy((0.2, 0.6), (low, high)), sigma_change(low, high)
     reach = math.log(sigma.ratio_high / sigma.ratio)
     return ((math.copysign(math.sqrt(alpha.statistic), math.log(alpha.ratio)),

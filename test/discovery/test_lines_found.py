@@ -24,6 +24,7 @@ from ou_monitor.model.terms.tones import Resonance, Tone
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import NAN, Recording
 import pytest
+from simulated_recordings import bare
 
 REAL = Path(os.environ.get('OU_MONITOR_REALDATA', 'nowhere'))
 RATE = 50.0
@@ -113,7 +114,7 @@ def test_analyze_and_discover_name_the_same_lines_of_a_comb():
     whole = read_recording(REAL / 'xt_pico_a.csv')
     n = 5_000
     part = replace(whole, t=whole.t[:n], voltage=whole.voltage[:n], throttle=np.full(n, NAN))
-    level = fit_level(part, part, LoadLevel(NAN, (Segment(0, n),)), 1)
+    level = fit_level(part, bare(part), LoadLevel(NAN, (Segment(0, n),)), 1)
     tones = [cause for cause in discover(part).causes if cause.name == 'tone']
     ours = [(line.frequency, line.p_value < 1e-5) for line in level.lines.lines]
     theirs = [(one.term.frequency, one.term.amplitude > 7.0 * one.se['amplitude'])

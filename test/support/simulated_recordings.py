@@ -1,8 +1,11 @@
 """Recordings with known truth, for the tests of the bench."""
 
 import numpy as np
+from ou_monitor.analysis.level_result import fit_parts
+from ou_monitor.analysis.levels import Segment
+from ou_monitor.analysis.supply import Remainder
 from ou_monitor.model.ou import simulate
-from ou_monitor.records import Recording
+from ou_monitor.records import Estimate, Recording
 
 ALPHA = 63.0
 
@@ -21,3 +24,14 @@ def recording(seed: int, levels=((0.1, 0.3156), (0.4, 0.632)), seconds: float = 
 def without_throttle(simulated: Recording) -> Recording:
     """Return the same recording with its throttle unknown."""
     return Recording(simulated.t, simulated.voltage, np.full(simulated.n, np.nan), simulated.name)
+
+
+def bare(simulated: Recording) -> Remainder:
+    """Return the deviation of a recording from its mean: neither level nor load are taken out."""
+    return Remainder(simulated.voltage - simulated.voltage.mean(), np.ones(simulated.n),
+                     float(np.median(np.diff(simulated.t))), 1e-3)
+
+
+def fitted(simulated: Recording, start: int, stop: int) -> Estimate:
+    """Return what a level of these samples would say."""
+    return fit_parts(simulated, bare(simulated), [Segment(start, stop)])[1]
