@@ -11,8 +11,7 @@ from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
-    from ou_monitor.recordings.importers.csv_table import CsvColumns
-    from ou_monitor.recordings.importers.log import Series
+    from ou_monitor.recordings.importers.log import CsvColumns, Series
     from ou_monitor.records import Recording
 
 _NAN = float('nan')
@@ -20,11 +19,12 @@ _NAN = float('nan')
 # default); none is ever charged to the other.
 CELL_LIMIT, _CELL_MOST = 3.3, 5.0
 # Options of the topics, by the names that the parser gives them.
-_TOPICS = ('msg_config', 'voltage_topic', 'throttle_topic', 'flight', 'time_column',
-           'voltage_column', 'throttle_column', 'unit', 'time_unit')
 # Fields of `CsvColumns`, and the options that give them.
 _COLUMNS = {'time': 'time_column', 'voltage': 'voltage_column', 'throttle': 'throttle_column',
-            'unit': 'unit', 'time_unit': 'time_unit'}
+            'current': 'current_column', **{name: name for name in (
+                'unit', 'time_unit', 'throttle_unit', 'sample_interval', 'delimiter', 'decimal',
+                'skip_rows')}}
+_TOPICS = ('msg_config', 'voltage_topic', 'throttle_topic', 'flight', *_COLUMNS.values())
 
 
 def check_outputs(args: argparse.Namespace, *names: str, **inputs: Any) -> None:
@@ -65,10 +65,10 @@ def _as_given(args: argparse.Namespace, start: float | None, end: float | None,
 
 def columns_given(args: argparse.Namespace) -> CsvColumns | None:
     """Return the columns of a CSV that were named; None when nothing was."""
-    from ou_monitor.recordings.importers.csv_table import CsvColumns
+    from ou_monitor.recordings.importers.log import CsvColumns
 
     given = {name: getattr(args, option) for name, option in _COLUMNS.items()
-             if getattr(args, option) is not None}
+             if getattr(args, option, None) is not None}
     return CsvColumns(**given) if given else None
 
 

@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import Any
 
 from ou_monitor.cli.options import (
-    estimate, FILES, flight_number, FORCE, JSON, levels, limit, Option, PART, pole_count,
+    CSV, estimate, FILES, flight_number, FORCE, JSON, levels, limit, Option, PART, pole_count,
     RECORDING, REPORT, seed, TOPICS, TYPES, WithoutOut)
 from ou_monitor.cli.output import path_argument
 
@@ -67,7 +67,7 @@ _ANALYZE = Command(
      *TOPICS, *FILES, JSON, REPORT, FORCE),
     ('flight.bbl --cells 4 --report flight.html',
      'flight.mcap --brownout-voltage 14 --from 10 --to 70',
-     'log.csv --time-column t --voltage-column vbat --unit mV'))
+     'log.csv --voltage-column CH2 --throttle-unit us'))
 
 _COMPARE = Command(
     'compare', 'a recording beside simulations of it: what the simulation gets wrong most',
@@ -119,11 +119,11 @@ _CONVERT = Command(
             help='which flight of a file with several, from 1 (default: the largest)'),
      Option('--type', choices=TYPES, default='battery_state',
             help='message of the voltage (default %(default)s; adc_block needs a steady 10 kHz)'),
-     JSON, FORCE),
+     *CSV, JSON, FORCE),
     ('flight.ulg --list', 'flight.bbl flight.mcap --flight 2',
      'flight.bin flight.mcap --signal RCOU.C3'),
     'Read: PX4 ULog (.ulg), ArduPilot dataflash (.bin, .log), Betaflight and INAV blackbox '
-    '(.bbl, .bfl), Crazyflie micro-SD logs, CSV with the column time_s; the first bytes decide, '
+    '(.bbl, .bfl), Crazyflie micro-SD logs, CSV; the first bytes decide, '
     'not the ending.')
 
 _COUPLING = Command(
@@ -148,9 +148,14 @@ _DESIGN = Command(
     'ou_monitor.cli.design',
     'Compute alpha, sigma, Var_inf and the brown-out risk of a rail from the components of its '
     'power network, over bulk capacitances, and the least one that meets a risk.',
-    (Option('--risk', metavar='X',
-            help='probability of a brown-out allowed within the horizon, 0..1'),
-     Option('--throttle', metavar='Y', help='throttle, 0..1'),
+    (Option('--from', metavar='RECORDING', dest='recording',
+            help='take level, sag, resistance and noise from a flight (any recording that analyze '
+            'reads); --set goes first'),
+     Option('--risk', metavar='X', default='1e-3',
+            help='probability of a brown-out allowed within the horizon, 0..1 (default: '
+            '%(default)s)'),
+     Option('--throttle', metavar='Y',
+            help='throttle, 0..1 (default with --from: the highest that was flown)'),
      Option('--rail', choices=('bus', 'regulated'), default='bus',
             help='the battery bus at the ESCs, or the regulated rail (default: %(default)s)'),
      Option('--voltage', metavar='V',
@@ -169,8 +174,8 @@ _DESIGN = Command(
      Option('--network', metavar='FILE.yaml',
             help='components as a YAML mapping of name to value; --set goes first'),
      Option('--list', action='store_true', help='list the components and their defaults'),
-     JSON, FORCE),
-    ('--risk 1e-3 --throttle 0.6', '--risk 1e-3 --throttle 0.6 --set battery_resistance=30mOhm',
+     *TOPICS, *FILES, JSON, FORCE),
+    ('--from flight.bbl --set cells=4', '--risk 1e-3 --throttle 0.6 --set cells=4',
      '--list'),
     'Values are in SI units, or with prefix and unit: 470uF, 40mOhm, 24kHz.')
 

@@ -26,13 +26,15 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         _check_place(args.out, args.force)
 
+    from ou_monitor.cli.arguments import columns_given
     from ou_monitor.recordings.importers.formats import import_log
     from ou_monitor.recordings.importers.log import Request
 
     names = frozenset(name for name in (args.voltage, args.throttle, args.current, *args.signal)
                       if name is not None)
     with Progress('reading', args.json == output.STDOUT) as progress:
-        log = import_log(args.log, Request(args.flight, names, args.poles, args.list, progress))
+        log = import_log(args.log, Request(args.flight, names, args.poles, args.list, progress,
+                                           columns_given(args)))
     return _list(args, log) if args.list else _convert(args, log)
 
 

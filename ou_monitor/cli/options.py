@@ -42,8 +42,8 @@ def pole_count(text: str) -> int:
 
 RECORDING = Option(
     'recording', metavar='RECORDING',
-    help='.mcap file, rosbag2 folder, CSV with columns time_s, voltage_v[, throttle], or a log '
-    'that convert reads (.bbl, .bin, .ulg)')
+    help='.mcap file, rosbag2 folder, CSV of any logger, or a log that convert reads (.bbl, .bin, '
+    '.ulg)')
 # Which part of a recording is read.
 PART = (
     Option('--from', metavar='S', dest='start',
@@ -57,19 +57,53 @@ TOPICS = (
     Option('--voltage-topic', metavar='TOPIC', help='topic of the voltage'),
     Option('--throttle-topic', metavar='TOPIC', help='topic of the throttle'),
     Option('--partial', action='store_true', help='use what a truncated file still holds'))
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < float('inf'):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a positive number")
+    return value
+
+
+def _row_count(text: str) -> int:
+    if not text.isascii() or not text.isdigit():
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of lines, 0 or more")
+    return int(text)
+
+
+# How a CSV is written, where it is not read as it should be.
+CSV = (
+    Option('--time-column', metavar='NAME', help='column of a CSV (default: found by its name)'),
+    Option('--unit', choices=('V', 'mV'), help='of the voltage in a CSV (default: found)'),
+    Option('--time-unit', choices=('s', 'ms', 'us', 'ns'),
+           help='of the time in a CSV (default: found)'),
+    Option('--throttle-unit', choices=('1', '%', 'us'),
+           help='of the throttle in a CSV: 0..1, percent, or a pulse of 1000 to 2000 us (default: '
+           'found)'),
+    Option('--sample-interval', metavar='S', type=_positive,
+           help='time from row to row of a CSV, s, in place of a column'),
+    Option('--delimiter', metavar='C',
+           help="what separates the cells of a CSV: a character, 'tab' or 'space' (default: "
+           'found)'),
+    Option('--decimal', choices=('.', ','), help='decimal mark of a CSV (default: found)'),
+    Option('--skip-rows', metavar='N', type=_row_count,
+           help='lines above the header of a CSV (default: found)'))
 # How a log or a CSV is read.
 FILES = (
     Option('--flight', metavar='N', type=flight_number,
            help='which flight of a log with several, from 1 (default: the largest)'),
-    Option('--time-column', metavar='NAME', help='column of a CSV (default: time_s)'),
     Option('--voltage-column', metavar='NAME',
-           help='column of a CSV (default: voltage_v), or series of a log (default: the battery)'),
+           help='column of a CSV (default: found by its name), or series of a log (default: the '
+           'battery)'),
     Option('--throttle-column', metavar='NAME',
-           help='column of a CSV, 0..1 (default: throttle, if it is there), or series of a '
-           'log'),
-    Option('--unit', choices=('V', 'mV'), help='of the voltage in a CSV (default: V)'),
-    Option('--time-unit', choices=('s', 'ms', 'us', 'ns'),
-           help='of the time in a CSV (default: s)'))
+           help="column of a CSV or series of a log, or 'none' (default: found)"),
+    Option('--current-column', metavar='NAME',
+           help="column of a CSV or series of a log, or 'none' (default: found)"),
+    *CSV)
 JSON = Option(
     '--json', metavar='FILE',
     help="write the result as JSON ('-': to standard output, alone)")

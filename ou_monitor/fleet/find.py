@@ -18,6 +18,7 @@ import stat
 
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import FILE, is_part
+from ou_monitor.recordings.importers.csv_table import holds_supply
 from ou_monitor.stream.files import open_regular
 from ou_monitor.text import printable
 
@@ -63,7 +64,7 @@ def find_recordings(given: Sequence[str], leave_out: Path | None = None) -> Foun
     if not search.paths:
         where = ', '.join(f"'{text}'" for text in given)
         raise InputError(f'no recording in {where}: expected .mcap files, rosbag2 folders, or '
-                         '.csv files with the columns time_s, voltage_v'
+                         '.csv files with columns of time and voltage'
                          + (f' ({" ".join(notes)})' if notes else ''))
     return Found(tuple(_source(path) for path in sorted(search.paths)),
                  tuple(map(printable, notes)))
@@ -120,7 +121,7 @@ class _Search:
         """Return what was passed over, one sentence a kind."""
         found = []
         if self._csv:
-            found.append(_passed(self._csv, '.csv file', 'without the columns time_s, voltage_v'))
+            found.append(_passed(self._csv, '.csv file', 'without columns of time and voltage'))
         if self._logs:
             found.append(_passed(self._logs, 'log', "in another format: 'ou-monitor convert' "
                                  'makes bags of them'))
@@ -157,15 +158,13 @@ def _is_bag(folder: Path) -> bool:
 
 
 def _has_columns(path: Path) -> bool:
-    """Return whether the first line of a file names time and voltage."""
+    """Return whether the first lines of a file hold time and voltage."""
     try:
-        with open_regular(path) as file:
-            head = file.readline(4096).decode('utf-8', 'replace')
+        open_regular(path).close()
     except OSError:
         # It is a recording as far as its name says; the reader tells what is wrong with it.
         return True
-    words = {word.strip().strip('"').lstrip('\ufeff') for word in head.split(',')}
-    return {'time_s', 'voltage_v'} <= words
+    return holds_supply(path)
 
 
 def _source(path: Path) -> Source:

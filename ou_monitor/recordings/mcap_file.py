@@ -794,6 +794,22 @@ def _table(data: bytes, at: IntArray) -> Table:
                  '<u8'), at + _DATA, at + _HEAD.size + length)
 
 
+# First bytes -> what it is, and what to do.
+_FOREIGN = {
+    b'PK\x03\x04': 'a ZIP archive, or a workbook of Excel (.xlsx): unpack it, or save it as CSV',
+    b'\xd0\xcf\x11\xe0': 'a workbook of Excel (.xls): save it as CSV',
+    b'\x1f\x8b': "compressed: unpack it with 'gunzip' first",
+    b'<SALEAE>': 'a binary export of Saleae Logic: export it as CSV',
+    b'AG10': 'a binary export of a Keysight oscilloscope: save it as CSV',
+    b'RG01': 'a binary export of a Rigol oscilloscope: save it as CSV',
+    b'PAR1': 'Parquet: save it as CSV', b'\x89HDF': 'HDF5: save it as CSV',
+    b'MATLAB 5.0': 'a MAT file of MATLAB: save it as CSV', b'{"': 'JSON: export a CSV',
+    b'<?xml': 'XML: export a CSV', b'%PDF': 'a PDF', b'\x89PNG': 'a picture',
+    b'\xff\xd8\xff': 'a picture', b'<!DOCTYPE': 'a web page, not the file behind it',
+    b'<!doctype': 'a web page, not the file behind it',
+    b'<html': 'a web page, not the file behind it'}
+
+
 def kind_of_foreign(head: bytes, path: Path = Path('LOG')) -> str:
     """Return what a file that is not MCAP seems to be, and what to do with it."""
     if head.startswith(b'SQLite format 3'):
@@ -803,6 +819,9 @@ def kind_of_foreign(head: bytes, path: Path = Path('LOG')) -> str:
         return "it is a ROS 1 bag: convert it with 'rosbags-convert'"
     if head.startswith(b'\x28\xb5\x2f\xfd'):
         return "it is compressed as a whole: unpack it with 'zstd -d' first"
+    for begin, words in _FOREIGN.items():
+        if head.lstrip(b'\xef\xbb\xbf \t\r\n').startswith(begin):
+            return f'it is {words}'
     # Here, for the table of formats has the bag in it, and so needs this module.
     from ou_monitor.recordings.importers.formats import BAG, CSV, format_of
     log = format_of(head)

@@ -23,10 +23,10 @@ from ou_monitor.recordings.bag_samples import (
 from ou_monitor.recordings.cdr import join
 from ou_monitor.recordings.importers.choose import (
     choose as choose_series, columns_of, NONE, signal_of)
-from ou_monitor.recordings.importers.csv_table import CsvColumns, read_column, read_csv
+from ou_monitor.recordings.importers.csv_table import read_column, read_csv
 from ou_monitor.recordings.importers.formats import import_log, is_csv, is_log
 from ou_monitor.recordings.importers.log import (
-    Log, RawColumns, Request, Series, SIGNAL, UNKNOWN)
+    CsvColumns, Log, RawColumns, Request, Series, SIGNAL, UNKNOWN)
 from ou_monitor.recordings.standard_types import IMU
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.stream.config import FieldSpec
@@ -52,8 +52,7 @@ def read_recording(
     Parameters
     ----------
     path : str or path
-        An .mcap file, a rosbag2 directory, a CSV with the columns
-        ``time_s, voltage_v[, throttle][, current_a]``, or a log of an autopilot that
+        An .mcap file, a rosbag2 directory, a CSV, or a log of an autopilot that
         `convert` reads (its extra installed).
     msg_config : str or path, optional
         Name of a msg config, or a YAML file; found out when the bag leaves
@@ -130,12 +129,13 @@ def _of_log(path: Path, names: frozenset[str], columns: CsvColumns | None, fligh
             progress: Callable[[float], None] | None) -> tuple[Recording, Log]:
     """Read the supply of a log, and the log with the series of these names."""
     named = columns or CsvColumns()
-    if named != CsvColumns(None, named.voltage, named.throttle):
+    if named != CsvColumns(None, named.voltage, named.throttle, named.current):
         raise InputError(f'{path} is a log: its time and units are known')
-    wanted = (name for name in (named.voltage, named.throttle) if name is not None)
+    wanted = (name for name in (named.voltage, named.throttle, named.current)
+              if name is not None)
     log = import_log(path, Request(flight, names.union(wanted), progress=progress))
     chosen = choose_series(path, log, voltage=named.voltage, throttle=named.throttle,
-                           option='--{}-column')
+                           current=named.current, option='--{}-column')
     whole = tidy(columns_of(path, log, chosen))
     if chosen.throttle is None and named.throttle != NONE:
         whole = replace(whole, notes=(*whole.notes, 'The throttle is unknown: the log holds '

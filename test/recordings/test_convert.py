@@ -60,7 +60,7 @@ def test_json(log, tmp_path, capsys):
     (GOOD, ['log.csv', 'out', '--json', 'no/x.json'], ['no/x.json']),
     (GOOD, ['log.csv', 'out', '--type', 'adc_block'], ['steady 10000 Hz']),
     (GOOD, ['log.csv', 'out', '--type', 'adc'], ['adc']),
-    ('time,voltage_v\n0,5\n', ['log.csv', 'out'], ["'time_s'"]),
+    ('when,voltage_v\n0,5\n', ['log.csv', 'out'], ["'time_s'"]),
     ('', ['log.csv', 'out'], ['empty']),
     ('', ['log.ulg', 'out'], ["'log.ulg' is empty"]),
     ('\0\1\2', ['log', 'out'], ['ULog', 'dataflash', 'blackbox', 'CSV', 'read today']),
@@ -74,10 +74,10 @@ def test_json(log, tmp_path, capsys):
     ('time_s,volts\n0,5\n1,5\n', ['log.csv', 'out', '--list', 'x'], ['further argument']),
     ('time_s,voltage_v\n', ['log.csv', 'out'], ['no line below']),
     ('time_s,voltage_v\n1.7e12,5\n1.8e12,5\n', ['log.csv', 'out'],
-     ["'voltage_v' has stamps up to 1.8e+12 s", 'in ms']),
-    ('time_s,voltage_v,throttle\n0,5,40\n1,5,50\n', ['log.csv', 'out'],
-     ['throttle runs from 40 to 50', 'percentage']),
-    ('time_s,volts\n0,5\n1,5\n', ['log.csv', 'out'], ["no column 'voltage_v'", '--voltage']),
+     ["1e+11 s apart by 'time_s'", 'in ms']),
+    ('time_s,voltage_v,throttle\n0,5,400\n1,5,500\n', ['log.csv', 'out'],
+     ['throttle runs from 400 to 500', 'percentage']),
+    ('time_s,bus\n0,5\n1,5\n', ['log.csv', 'out'], ["no column 'voltage_v'", '--voltage']),
 ])
 def test_bad_input(tmp_path, monkeypatch, capsys, log_text, arguments, words):
     """Exit status 2, one line on standard error, no bag."""

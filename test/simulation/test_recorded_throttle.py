@@ -62,8 +62,8 @@ def test_what_cannot_be_flown(flight, tmp_path, capsys):
         read_throttle(str(none))
     percent = tmp_path / 'percent.csv'
     percent.write_text(
-        'time_s,voltage_v,throttle\n0,5,10\n1,5,87\n', encoding='utf-8')
-    with pytest.raises(InputError, match='throttle runs from 10 to 87'):
+        'time_s,voltage_v,throttle\n0,5,400\n1,5,870\n', encoding='utf-8')
+    with pytest.raises(InputError, match='throttle runs from 400 to 870'):
         read_throttle(str(percent))
     assert main(['simulate', '--throttle', 'flight', '--from', '1', '--output',
                  str(tmp_path / 'x.mcap')]) == 2

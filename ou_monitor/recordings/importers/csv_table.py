@@ -1,105 +1,133 @@
 """
-Read a CSV: `time_s`, `voltage_v` and, where present, `throttle` and `current_a`.
+Read a table of text, such as a CSV: time, voltage and, where present, throttle and current.
 
-Limits first: one header line is required; the decimal mark is a point.  Other
-columns are ignored unless they are named, as are blank lines and lines that begin
-with '#'; commas, semicolons or tabs separate.  A line with more cells than the
-header has names is refused: with decimal commas 5,01 would be the two numbers 5
-and 1.  `convert` takes the stamps from `time_s` as they stand, and values as V,
-0..1 and A.
+Limits first: one file is one flight.  Columns and units are found by names and sizes, said in one
+note, and each is overruled by a field of `CsvColumns`.  A unit in a name or in a line of units is
+taken as stated; a unit that nothing states is guessed from the values.  `time_s`, `voltage_v`,
+`throttle` and `current_a` are taken first and need no note.
 """
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator, Sequence
-import csv
-from dataclasses import dataclass, replace
-import io
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from datetime import date
+from functools import lru_cache
+import math
 from pathlib import Path
-from typing import Any, TextIO
+import re
+from typing import NamedTuple
 
 import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers import log as logs
+from ou_monitor.recordings.importers.csv_form import (
+    AMPERE_WORDS, CHANNEL, CLOCK, CURRENT, CURRENT_UNITS, Form, form_of, is_clock, is_number,
+    is_value, MISSING, NONE, numbers, SHARE_WORDS, shown, swapped, THROTTLE, THROTTLE_UNITS,
+    TIME, TIME_UNITS, TIME_WORDS, unit_of, VOLT_WORDS, VOLTAGE, VOLTAGE_UNITS)
 from ou_monitor.recordings.importers.log import (
-    ANY, Log, one_flight, RawColumns, Request, Series)
+    ANY, CsvColumns, Log, one_flight, RawColumns, Request, Series)
 from ou_monitor.records import FloatArray
-from ou_monitor.stream.files import open_regular
 from ou_monitor.text import printable
-from ou_monitor.timeline.line import hold
+from ou_monitor.timeline.line import hold, MOST_THROTTLE
 
-TIME, VOLTAGE, THROTTLE, CURRENT = 'time_s', 'voltage_v', 'throttle', 'current_a'
 
-_DELIMITERS = ',;\t'
-# What loggers write for a number they do not have.
-_MISSING = frozenset(('', 'nan', 'null', 'none', 'na', 'n/a'))
-# Added where a cell looks like it.
-_MARK = ': the decimal mark is a point'
-# Characters of a cell that are shown.
-_LONGEST = 40
-# A log of 1000 columns has lines of some 10 000 characters.
-MOST_OF_LINE = 65536
-# RawColumns listed at most; loggers of autopilots write some hundred.
+# Columns listed at most; loggers of autopilots write some hundred.
 MOST_COLUMNS = 300
-# Column -> quantity, when no name is given.
-_KNOWN = {VOLTAGE: logs.VOLTAGE, THROTTLE: logs.THROTTLE, CURRENT: logs.CURRENT}
 # Share of steps back in what is no time; a supply is not read less often, s.
 _BACK, _LONGEST_STEP = 0.25, 100.0
+# A time without a unit is in the coarsest whose steps, and whose span, are at most these, s.
+_USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
+# A voltage without a unit beyond this is in mV: no pack of a craft has so many volts.
+_MOST_VOLTS = 1000.0
+# Share of wild values that are no unit, as `bag_samples.check_throttle` has it.
+_WILD = 0.05
 
 
-@dataclass(frozen=True)
-class CsvColumns:
-    """Which columns of a CSV are meant, and what their numbers are."""
+# Quantity -> patterns of the end of a column's name without its unit, the best first; small
+# letters, other characters as '_'.  From the exports named in test_csv_exports.py.
+_TIME_NAME, _INDEX_NAME = 'time', r'sequence|index|sample|no|n|x|point|'
+_PATTERNS = {
+    _TIME_NAME: (
+        r'time_s',
+        r'(?:__|_)?time|t|zeit|ms_today|millis|micros|elapsed(?:_time)?|x_axis|seconds?',
+        r'timestamp|date_?time|datum_?(?:und_)?(?:uhr)?zeit|temps|tiempo|tempo|uhrzeit',
+        r'.*(?:time|zeit|stamp).*', r'date|datum'),
+    logs.VOLTAGE: (
+        r'voltage_v',
+        r'v_?bat(?:t|tery)?(?:_?latest|_?filtered|_?voltage|_?v)?|batt?(?:ery)?_?(?:v|volt|volts|'
+        r'voltage)|pack_?voltage|(?:input|inp|bus|supply|rail|main|link)_?(?:v|volt|voltage)'
+        r'|v_?bus|rxbt|vfas|voltage_?(?:battery|batt?|raw)|bat_?spannung|akku_?spannung|pm_vbat',
+        r'u|v|volts?|voltage|spannung|tension|tensione|voltaje|[UVuv]\(.*\)',
+        r'volt(?:age)?_?filtered(?:_v)?',
+        r'(?!.*(?:axis|cell|temp|limit|zelle|motor|servo|rssi|phase|cpu|mcu|5v|sag)).*(?:volt|'
+        r'spannung|vbat).*'),
+    logs.THROTTLE: (
+        r'throttle', r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|gas|duty(?:_cycle)?|tho?o',
+        r'rc_?command_3', r'pwm|throttle.*|thrust|stick_throttle'),
+    logs.CURRENT: (
+        r'current_a', r'amperage(?:_?latest)?|current_in|i_?bat(?:t|tery)?|'
+        r'batt?(?:ery)?_?(?:i|curr(?:ent)?|amps?)|current_?batt?(?:ery)?|'
+        r'(?:bus|input|supply|main)_?current|curr',
+        r'i|amps?|current|strom|courant|corriente'),
+}
+# A table with this column -> units of its columns, which its maker does not write.  Betaflight's
+# blackbox explorer writes the numbers of the log: us, 0.01 V and 0.01 A from version 4.0 on.
+_MAKERS: dict[str, dict[str, tuple[float, str]]] = {
+    'loopIteration': {'time': (1e-6, 'us'), 'vbatLatest': (0.01, '0.01 V'),
+                      'amperageLatest': (0.01, '0.01 A'), 'rcCommand[3]': (0.0, 'us')}}
+_DAY = 86400.0  # s
 
-    # Names of columns; None: ``time_s``, ``voltage_v`` and ``throttle``, if it is there.
-    time: str | None = None
-    voltage: str | None = None
-    throttle: str | None = None
-    # Unit of the voltage: V or mV.
-    unit: str = 'V'
-    # Unit of the time: s, ms, us or ns.
-    time_unit: str = 's'
+
+class _Column(NamedTuple):
+    """A column that is taken."""
+
+    place: tuple[int, ...]  # Of its cells: two for a date and a time; none: rows are counted
+    name: str
+    unit: str  # As stated or given, '' where nothing is
+    scale: float  # What values are multiplied by, where a maker's is known; 0: by the unit
 
 
-# What to say of a column that is not there.
-_OPTIONS = {TIME: '--time-column', VOLTAGE: '--voltage-column'}
-VOLTAGE_UNITS = {'V': 1.0, 'mV': 1e-3}
-TIME_UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
+class _Table(NamedTuple):
+    """What is taken from a file, in SI units."""
+
+    form: Form
+    t: FloatArray
+    found: dict[str, tuple[_Column, FloatArray]]  # By quantity
+    named: dict[str, FloatArray]  # Other columns that were asked for, as they stand
+    note: str  # How the file was read; '' where nothing had to be found
 
 
 def read_csv(path: Path, columns: CsvColumns | None = None) -> RawColumns:
     """Read the samples of a supply, unsorted and with NaN kept."""
-    wanted = columns or CsvColumns()
-    time, voltage = wanted.time or TIME, wanted.voltage or VOLTAGE
-    # A column that was named must be there.
-    throttle = ((), (THROTTLE,)) if wanted.throttle is None else ((wanted.throttle,), ())
-    named = [time, voltage, *throttle[0]]
-    if len(set(named)) < len(named):
-        raise InputError(f'{path}: one column cannot be two of time, voltage and throttle: '
-                         f"{', '.join(named)}")
-    optional = throttle[1] if CURRENT in named else (*throttle[1], CURRENT)
-    t, v, u, *current = _columns(path, (time, voltage, *throttle[0]), optional)
-    _check_time(path, t * TIME_UNITS[wanted.time_unit], v, (time, voltage))
+    table = _table(path, columns or CsvColumns(), needed=True)
+    (column, volts), nothing = table.found[logs.VOLTAGE], np.full(table.t.shape, np.nan)
     name = printable(path.name)
+    held = {quantity: values for quantity, (_, values) in table.found.items()}
+    source = {'file': name, 'format': 'csv'}
+    if column.name != VOLTAGE:
+        source |= {quantity: printable(one.name) for quantity, (one, _) in table.found.items()
+                   if quantity != logs.CURRENT}
     # A blank cell is no message: what was commanded last holds.
-    return RawColumns(t * TIME_UNITS[wanted.time_unit], v * VOLTAGE_UNITS[wanted.unit], hold(u),
-                      current[0] if current else np.full(t.shape, np.nan), name,
-                      {'file': name, 'format': 'csv'})
+    return RawColumns(table.t, volts, hold(held.get(logs.THROTTLE, nothing)),
+                      held.get(logs.CURRENT, nothing), name, source,
+                      (table.note,) if table.note else ())
 
 
 def read(path: Path, request: Request) -> Log:
-    """Read the columns known by name, and those asked for."""
+    """Read the columns of a supply, and those asked for."""
     one_flight(path, request)
-    header = [name for name in column_names(path, TIME) if name and name != TIME]
-    wanted = [name for name in dict.fromkeys(header) if name in _KNOWN or name in request.names]
-    t, *columns = read_columns(path, [TIME, *wanted])
+    table = _table(path, request.columns or CsvColumns(), more=request.names)
+    header, t = [name for name in table.form.names if name], table.t
     if not t.size:
         raise InputError(f'{path} holds a header and no line below it')
-    series = [Series(name, _KNOWN.get(name, ANY), t, values, '1', 'column',
-                     0 if name in _KNOWN else None)
-              for name, values in zip(wanted, columns)]
-    notes = []
+    taken = {column.name: quantity for quantity, (column, _) in table.found.items()}
+    series = [Series(column.name, quantity, t, values, '1', 'column', 0)
+              for quantity, (column, values) in table.found.items()]
+    series += [Series(name, ANY, t, values, '1', 'column')
+               for name, values in table.named.items() if name not in taken]
+    notes = [table.note] if table.note else []
     late = int(np.count_nonzero(np.diff(t) < 0.0))
     if late:
         notes.append(f'{late} line{"s" * (late != 1)} came before the stamp ahead of them: '
@@ -107,13 +135,15 @@ def read(path: Path, request: Request) -> Log:
         order = np.argsort(t, kind='stable')
         series = [replace(one, t=t[order], values=one.values[order]) for one in series]
     if request.everything:
-        others = [name for name in dict.fromkeys(header) if name not in wanted]
+        known = {one.name for one in series} | {
+            table.form.names[place] for place in _time_of(path, table.form, CsvColumns()).place}
+        others = [name for name in dict.fromkeys(header) if name not in known]
         if len(others) > MOST_COLUMNS:
             notes.append(f'{len(others) - MOST_COLUMNS} more columns are not listed.')
         # One pass each: a column of text ends the reading of its pass only.
         for name in others[:MOST_COLUMNS]:
             try:
-                values = read_columns(path, [TIME, name])[1]
+                values, = numbers(path, table.form, [table.form.names.index(name)])
             except InputError:
                 notes.append(f"Column '{name}' does not hold numbers.")
                 continue
@@ -121,169 +151,345 @@ def read(path: Path, request: Request) -> Log:
     return Log('csv', tuple(series), {}, tuple(notes), names=tuple(header))
 
 
-def _check_time(path: Path, t: FloatArray, voltage: FloatArray, names: tuple[str, str]) -> None:
-    """Refuse a time that cannot be one in seconds, or that is the voltage (t in s)."""
-    step = np.diff(t)
-    step = step[np.isfinite(step)]
-    if not step.size:
-        return
-    if float(np.mean(step < 0.0)) > _BACK and (np.diff(voltage) > 0.0).all():
-        raise InputError(f"{path}: '{names[0]}' runs backwards, and '{names[1]}' only ever rises: "
-                         'are the two columns swapped?')
-    usual = float(np.median(step))
-    if usual > _LONGEST_STEP:
-        raise InputError(f"{path}: the samples are {usual:g} s apart by '{names[0]}': is it in "
-                         'ms, us or ns? --time-unit says so')
-
-
 def read_column(path: Path, name: str, columns: CsvColumns | None = None,
                 ) -> tuple[FloatArray, FloatArray]:
     """Return the stamps, s, and one column of a CSV as it stands, NaN kept."""
-    wanted = columns or CsvColumns()
-    time = wanted.time or TIME
-    if name == time:
-        raise InputError(f"{path}: '{time}' is the time, not a signal")
-    t, values = _columns(path, (time, name), ())
-    return t * TIME_UNITS[wanted.time_unit], values
+    table = _table(path, columns or CsvColumns(), more=(name,))
+    if name not in table.named:
+        raise InputError(f"{path}: '{name}' is the time, not a signal"
+                         if name in table.form.names else _absent(path, table.form, name))
+    return table.t, table.named[name]
 
 
-def column_names(path: Path, needed: str) -> list[str]:
-    """Return the names of the columns of a CSV (needed in A)."""
+def holds_supply(path: Path) -> bool:
+    """Return whether columns of time and voltage are found in the first lines of a file."""
     try:
-        with _open(path) as file:
-            lines = _Lines(path, file)
-            return _header(path, lines, next(iter(lines), None), (needed,))[0]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise _unreadable(path, error) from error
+        form = form_of(path, CsvColumns())
+        return bool(_time_of(path, form, CsvColumns()) and _choose(form, logs.VOLTAGE))
+    except InputError:
+        return False
 
 
-def read_columns(path: Path, names: Sequence[str]) -> list[FloatArray]:
-    """Return columns of a CSV as they stand, NaN kept."""
-    return _columns(path, names, ())
+def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: bool = False,
+           ) -> _Table:
+    """Read time, the columns of a supply, and others by name (needed: a voltage must be there)."""
+    form = form_of(path, wanted)
+    time = _time_of(path, form, wanted)
+    found = _supply_of(path, form, wanted, time, needed)
+    others = {name: form.names.index(name) for name in more
+              if name in form.names and form.names.index(name) not in time.place}
+    places = [*(one.place[0] for one in found.values()), *others.values()]
+    for place in places:
+        if form.names.count(form.names[place]) > 1:
+            raise InputError(f"{path}:{form.line}: column '{form.names[place]}' is there twice")
+    t, values = _read(path, form, time, places)
+    volts = next(zip(found, values), (None, t))[1] if logs.VOLTAGE in found else t
+    if time.place:
+        _check_backwards(path, t, volts, time.name, found)
+    t, words = _stamps(path, t, form, wanted, time)
+    units = {'voltage': wanted.unit, 'throttle': wanted.throttle_unit}
+    scaled, guesses = {}, {_TIME_NAME: words}
+    for (quantity, column), column_values in zip(found.items(), values):
+        si, guesses[quantity] = _in_si(quantity, column, column_values, units.get(quantity), volts)
+        scaled[quantity] = column, si
+    note = _how(form, time, found, guesses)
+    return _Table(form, t, scaled, dict(zip(others, values[len(found):])), note)
 
 
-def _columns(path: Path, needed: Sequence[str], optional: Sequence[str]) -> list[FloatArray]:
+def _absent(path: Path, form: Form, name: str, option: str = '') -> str:
+    """Return that a column is not there."""
+    hint = nearest(name, form.names) if form.line else (
+        f'the first line holds numbers; add a header line {TIME},{VOLTAGE}[,{THROTTLE}]')
+    return f"{path}:{form.line or form.skip + 1}: no column '{name}': {hint}" + option
+
+
+def _named(path: Path, form: Form, name: str, option: str) -> int:
+    if name not in form.names:
+        raise InputError(_absent(path, form, name, f' ({option} names another)'))
+    return form.names.index(name)
+
+
+def _choose(form: Form, quantity: str, taken: Sequence[int] = ()) -> list[int]:
+    """Return the columns that seem to be a quantity, the first of the best pattern first."""
+    plain = [re.sub(r'\W+', '_', unit_of(name)[0].strip().lower()).strip('_') if name else None
+             for name in form.names[:form.width]]
+    plain = [name if name is None else name or 'time' if form.names[k].strip('_% ') else name
+             for k, name in enumerate(plain)]
+    ends = [name if name is None else re.sub(r'\W+', '_', re.split(
+        r'[/.](?=[^/.])', form.names[k].strip().lower())[-1]).strip('_')
+        for k, name in enumerate(plain)]
+    kinds: dict[str, dict[str, str]] = {
+        _TIME_NAME: TIME_WORDS, logs.VOLTAGE: VOLT_WORDS, logs.CURRENT: AMPERE_WORDS}
+    right = kinds.get(quantity, {})
+    free = [k for k in range(len(plain)) if k not in taken and plain[k] is not None
+            and _of_kind(form, k, quantity == _TIME_NAME)]
+    for pattern in _PATTERNS[quantity]:
+        for texts in ([form.names[k].strip() for k in range(len(plain))], plain, ends):
+            found = [k for k in free if re.fullmatch(pattern, texts[k] or ' ')
+                     and (not right or form.units[k] in right or not form.units[k])]
+            if found:
+                return found
+    others = '|'.join(pattern for name, patterns in _PATTERNS.items() if name != quantity
+                      for pattern in patterns[:3])
+    found = [k for k in free if right and form.units[k] in right
+             and not re.fullmatch(others, plain[k] or ' ')]
+    if not found and quantity == logs.VOLTAGE:
+        found = [k for k in free if CHANNEL.fullmatch(plain[k] or ' ')]
+    return found
+
+
+def _of_kind(form: Form, place: int, clock: bool) -> bool:
+    """Return whether the first cells of a column are numbers (clock: or dates or times)."""
+    cells = [row[place] for row in form.rows if place < len(row) and row[place]
+             and row[place].lower() not in MISSING]
+    return not cells or any(is_value(cell) if clock else is_number(cell) for cell in cells)
+
+
+def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
+    """Return the column of the time, or that rows are counted."""
+    if wanted.sample_interval is not None:
+        return _Column((), '--sample-interval', 's', wanted.sample_interval)
+    if wanted.time is not None:
+        return _unit_column(form, _named(path, form, wanted.time, '--time-column'),
+                            wanted.time_unit)
+    numbered = bool(form.rows) and form.width > 1 and re.fullmatch(
+        _INDEX_NAME, unit_of(form.names[0])[0].strip('# ').lower()) is not None
+    found = [] if numbered and math.isfinite(form.step) else _choose(form, _TIME_NAME)
+    if found:
+        first = found[0]
+        beside = [k for k in _choose_days(form) if k != first]
+        cells = [row[first] for row in form.rows if first < len(row)]
+        if beside and cells and ':' in cells[0] and not _has_day(cells[0]):
+            return _Column((beside[0], first),
+                           f'{form.names[beside[0]]}, {form.names[first]}', 's', 0.0)
+        return _unit_column(form, first, wanted.time_unit)
+    filled = _unnamed(form)
+    if len(filled) == 2:
+        return _unit_column(form, filled[0], wanted.time_unit)
+    if not math.isfinite(form.step):
+        raise InputError(_absent(
+            path, form, TIME, ' (--time-column or --sample-interval)'))
+    return _Column((), form.stated, 's', form.step)
+
+
+def _unnamed(form: Form) -> list[int]:
+    """Return the columns without a name that hold a number in each of the first rows."""
+    return [] if form.line else [k for k in range(form.width) if form.rows and all(
+        k < len(row) and is_value(row[k]) for row in form.rows)]
+
+
+def _choose_days(form: Form) -> list[int]:
+    return [k for k in range(min(form.width, len(form.names))) if any(
+        k < len(row) and _has_day(row[k]) for row in form.rows[:3])]
+
+
+def _has_day(cell: str) -> bool:
+    found = CLOCK.fullmatch(swapped(cell)) if is_clock(cell) else None
+    return found is not None and (found[1] or found[4]) is not None
+
+
+def _unit_column(form: Form, place: int, unit: str | None) -> _Column:
+    name = form.names[place]
+    maker = next((units for column, units in _MAKERS.items() if column in form.names), {})
+    if unit is None and name in maker:
+        return _Column((place,), name, maker[name][1], maker[name][0])
+    return _Column((place,), name, unit or form.units[place], 0.0)
+
+
+def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed: bool,
+               ) -> dict[str, _Column]:
+    """Return the columns of voltage, throttle and current, as far as they are there."""
+    names = {logs.VOLTAGE: (wanted.voltage, '--voltage-column', wanted.unit),
+             logs.THROTTLE: (wanted.throttle, '--throttle-column', wanted.throttle_unit),
+             logs.CURRENT: (wanted.current, '--current-column', None)}
+    given = [name for name in (wanted.time, *(name for name, *_ in names.values()))
+             if name not in (None, NONE)]
+    if len(set(given)) < len(given):
+        raise InputError(f'{path}: one column cannot be two of time, voltage and throttle: '
+                         f"{', '.join(map(str, given))}")
+    taken = [*time.place, *(form.names.index(name) for name in given if name in form.names)]
+    found: dict[str, _Column] = {}
+    for quantity, (name, option, unit) in names.items():
+        if name == NONE and quantity != logs.VOLTAGE:
+            continue
+        if name is not None:
+            found[quantity] = _unit_column(form, _named(path, form, name, option), unit)
+            continue
+        places = _choose(form, quantity, taken)
+        if not places and quantity == logs.VOLTAGE:
+            rest = [k for k in _unnamed(form) if k not in taken]
+            places = rest if len(rest) == 1 else []
+        if places:
+            found[quantity] = _unit_column(form, places[0], unit)
+            taken.append(places[0])
+    if needed and logs.VOLTAGE not in found:
+        raise InputError(_absent(path, form, VOLTAGE, ' (--voltage-column names another)'))
+    return found
+
+
+def _read(path: Path, form: Form, time: _Column, places: list[int],
+          ) -> tuple[FloatArray, list[FloatArray]]:
+    """Return the time as it stands, days and clocks in s, and columns of numbers."""
+    sample = [row[time.place[-1]] for row in form.rows
+              if time.place and time.place[-1] < len(row) and row[time.place[-1]]]
+    if not time.place:
+        values = numbers(path, form, places or [0])
+        return time.scale * np.arange(float(values[0].size)) + form.start * (
+            time.name == form.stated), values
+    if sample and not is_number(sample[0]) and is_clock(sample[0]):
+        clocks: list[list[str]] = [[] for _ in time.place]
+        values = numbers(path, form, places, dict(zip(time.place, clocks)))
+        cells = [' '.join(pair) for pair in zip(*clocks)] if len(clocks) > 1 else clocks[0]
+        return _clock(path, [swapped(cell) for cell in cells], time.name), values
+    t, *values = numbers(path, form, [time.place[0], *places])
+    return t, values
+
+
+@lru_cache(maxsize=64)
+def _days(year: int, month: int, day: int) -> int:
+    return date(year + (2000 if year < 100 else 0), month, day).toordinal() - 719163
+
+
+def _clock(path: Path, cells: list[str], name: str) -> FloatArray:
+    """Return dates and times in s since 1970; without a date since the first midnight."""
+    found = [None if not cell.strip() else CLOCK.fullmatch(cell) for cell in cells]
+    bad = next((k for k, one in enumerate(found) if one is None and cells[k].strip()), None)
+    if bad is not None:
+        raise InputError(f"{path}: column '{name}' holds '{shown(cells[bad])}', not a date or "
+                         'a time')
     try:
-        with _open(path) as file:
-            return _read(path, file, needed, optional)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise _unreadable(path, error) from error
+        either = [_clock_seconds(found, first) for first in (True, False)]
+    except ValueError as error:
+        raise InputError(f"{path}: column '{name}': {error}") from error
+    spans = [float(np.nanmax(t) - np.nanmin(t)) if np.isfinite(t).any() else math.inf
+             for t in either]
+    # Of 04/05 either may be the day: the one in which the recording is the shorter.
+    t = either[0] if spans[0] <= spans[1] else either[1]
+    if any(one is not None and not (one[1] or one[4]) for one in found):
+        t = t + _DAY * np.concatenate(([0.0], np.cumsum(np.diff(t) < -0.5 * _DAY)))
+    return t
 
 
-def _unreadable(path: Path, error: Exception) -> InputError:
-    if isinstance(error, OSError):
-        return InputError(f'cannot read {path}: {error.strerror}')
-    if isinstance(error, UnicodeDecodeError):
-        return InputError(f'{path} is not text (byte {error.start} is not UTF-8)')
-    return InputError(f'{path} is not a CSV: {error}')
+def _clock_seconds(found: Sequence[re.Match[str] | None], day_first: bool) -> FloatArray:
+    seconds = array('d')
+    wrong = False
+    for one in found:
+        if one is None:
+            seconds.append(math.nan)
+            continue
+        year, month, day, a, mark, b, c, hour, minute, second, part, zone, half = one.groups()
+        days = 0
+        if year:
+            days = _days(int(year), int(month), int(day))
+        elif a:
+            x, y = (int(a), int(b)) if day_first or mark != '/' else (int(b), int(a))
+            wrong |= y > 12
+            days = _days(int(c), min(y, 12), x)
+        t = 60.0 * int(minute or 0) + int(second or 0) + (float(f'0.{part}') if part else 0.0)
+        hours = int(hour or 0)
+        if half:
+            hours = hours % 12 + 12 * (half.lower() == 'pm')
+        if zone and zone[0] in '+-':
+            shift = 3600 * int(zone[1:3]) + 60 * int(zone[-2:])
+            t -= math.copysign(shift, float(zone[0] + '1'))
+        seconds.append(_DAY * days + 3600.0 * hours + t)
+    return np.full(len(seconds), math.nan) if wrong else np.array(seconds, dtype=np.float64)
 
 
-def _open(path: Path) -> TextIO:
-    return io.TextIOWrapper(open_regular(path), encoding='utf-8-sig', newline='')
+def _check_backwards(path: Path, t: FloatArray, voltage: FloatArray, name: str,
+                     found: dict[str, _Column]) -> None:
+    """Refuse a time that is the voltage."""
+    step = np.diff(t)
+    step = step[np.isfinite(step)]
+    if step.size and logs.VOLTAGE in found and float(np.mean(step < 0.0)) > _BACK and (
+            np.diff(voltage) > 0.0).all():
+        raise InputError(f"{path}: '{name}' runs backwards, and '{found[logs.VOLTAGE].name}' only "
+                         'ever rises: are the two columns swapped?')
 
 
-class _Lines:
-    """The lines that count, and the number of the last one handed out."""
-
-    def __init__(self, path: Path, file: TextIO) -> None:
-        self._path = path
-        self._file = file
-        self.number = 0
-
-    def __iter__(self) -> Iterator[str]:
-        """Yield lines that are neither blank nor comments."""
-        read = self._file.readline
-        while line := read(MOST_OF_LINE + 1):
-            self.number += 1
-            if len(line) > MOST_OF_LINE:
-                raise InputError(f'{self._path}:{self.number}: the line has more than '
-                                 f'{MOST_OF_LINE} characters')
-            if line.strip() and not line.lstrip().startswith('#'):
-                yield line
-
-
-def _read(path: Path, file: TextIO, needed: Sequence[str], optional: Sequence[str],
-          ) -> list[FloatArray]:
-    lines = _Lines(path, file)
-    texts = iter(lines)
-    header, delimiter = _header(path, lines, next(texts, None), needed)
-    for name in (*needed, *optional):
-        if header.count(name) > 1:
-            raise InputError(f"{path}:{lines.number}: column '{name}' is there twice")
-    names = [name for name in (*needed, *optional) if name in header]
-    places = [header.index(name) for name in names]
-    columns = [array('d') for _ in names]
-    for row in _rows(path, lines, csv.reader(texts, delimiter=delimiter, strict=True), header,
-                     delimiter):
-        for name, place, column in zip(names, places, columns):
-            column.append(_cell(row, place, name, path, lines.number))
-    found = {name: np.array(column, dtype=np.float64) for name, column in zip(names, columns)}
-    missing = np.full(found[names[0]].shape, np.nan)
-    return [found.get(name, missing) for name in (*needed, *optional)]
+def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Column,
+            ) -> tuple[FloatArray, str]:
+    """Return the time in s, and its unit in words."""
+    if not time.place:
+        return t, f'{time.scale:g} s'
+    if len(time.place) > 1 or form.rows and time.place[0] < len(form.rows[0]) \
+            and not is_number(form.rows[0][time.place[0]]) \
+            and is_clock(form.rows[0][time.place[0]]):
+        return t, 'dates and times'
+    if time.scale:
+        return t * time.scale, time.unit
+    known = t[np.isfinite(t)]
+    usual = float(np.median(np.abs(np.diff(known)))) if known.size > 1 else 0.0
+    if time.unit:
+        unit, words = time.unit if wanted.time_unit else TIME_WORDS[time.unit], ''
+    else:
+        # Clocks that count from 1970 tell their unit by their size.
+        size = float(np.median(np.abs(known))) if known.size else 0.0
+        span = float(np.ptp(known)) if known.size else 0.0
+        unit = next((name for name, scale in TIME_UNITS.items() if (
+            8e8 < size * scale < 4e9 if size > 8e8 and usual < 1e-3 * size else
+            usual * scale <= _USUAL_STEP and span * scale <= _USUAL_SPAN)), 's')
+        words = '' if unit == 's' else ', a guess: --time-unit'
+    t = t * TIME_UNITS[unit]
+    if usual * TIME_UNITS[unit] > _LONGEST_STEP:
+        raise InputError(f'{path}: the samples are {usual * TIME_UNITS[unit]:g} s apart by '
+                         f"'{time.name}': is it in ms, us or ns? --time-unit says so")
+    return t, unit + words
 
 
-def _rows(path: Path, lines: _Lines, reader: Any, header: list[str], delimiter: str,
-          ) -> Iterator[list[str]]:
-    """Yield rows that fit the header, none of which holds another one in a quote."""
-    before = 0
-    try:
-        for row in reader:
-            if reader.line_num - before > 1 and any(
-                    line.count(delimiter) >= len(header) - 1
-                    for cell in row for line in cell.splitlines()[1:]):
-                raise InputError(f'{path}:{lines.number}: whole lines before this one are within '
-                                 'a quote: close each quote in its line')
-            before = reader.line_num
-            if len(row) > len(header) and any(cell.strip() for cell in row[len(header):]):
-                raise InputError(
-                    f'{path}:{lines.number}: {len(row)} cells, and the header names '
-                    f'{len(header)} columns: mend the line; the decimal mark is a point')
-            yield row
-    except csv.Error as error:
-        raise InputError(
-            f'{path}:{lines.number}: {error}: close each quote in its line') from error
+def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None,
+           volts: FloatArray) -> tuple[FloatArray, str]:
+    """Return values in V, 0..1 or A, and their unit in words."""
+    known = np.abs(values[np.isfinite(values)])
+    if quantity == logs.THROTTLE:
+        unit = given or SHARE_WORDS.get(column.unit) or ('us' if column.unit == 'us' else None)
+        words = ''
+        if unit is None:
+            unit = _throttle_unit(known, volts)
+            words = '' if unit == '1' else ', a guess: --throttle-unit'
+        zero, scale = THROTTLE_UNITS[unit]
+        return (values - zero) * scale if unit != '1' else values, (
+            '0..1' if unit == '1' else unit) + words
+    if column.scale:
+        return values * column.scale, column.unit
+    if quantity == logs.CURRENT:
+        unit = AMPERE_WORDS.get(column.unit, 'A')
+        return values * CURRENT_UNITS[unit] if unit != 'A' else values, unit
+    unit, words = given or VOLT_WORDS.get(column.unit) or '', ''
+    if not unit:
+        wild = known.size > 0 and float(np.median(known)) > _MOST_VOLTS
+        unit, words = ('mV', ', a guess: --unit') if wild else ('V', '')
+    return values * VOLTAGE_UNITS[unit] if unit != 'V' else values, unit + words
 
 
-def _header(path: Path, lines: _Lines, first: str | None, needed: Sequence[str],
-            ) -> tuple[list[str], str]:
-    """Return the names in the first line, and what separates them."""
-    if first is None:
-        raise InputError(f'{path} is empty: expected a header with {TIME},{VOLTAGE}[,{THROTTLE}]')
-    delimiter = max(_DELIMITERS, key=first.count)
-    header = [name.strip() for name in next(csv.reader([first], delimiter=delimiter))]
-    for name in needed:
-        if name not in header:
-            raise InputError(
-                f"{path}:{lines.number}: no column '{name}': {_hint(name, header)}"
-                + (f' ({_OPTIONS[name]} names another)' if name in _OPTIONS else ''))
-    return header, delimiter
+def _throttle_unit(known: FloatArray, volts: FloatArray) -> str:
+    """Return the unit that the sizes of a throttle speak for; '1' where none does."""
+    beyond = known[known > MOST_THROTTLE]
+    # Beside a voltage within 0 to 1 it may be the voltage: `check_throttle` says so.
+    if beyond.size <= _WILD * known.size or float(np.nanmax(np.abs(volts), initial=0.0)) <= 1.0:
+        return '1'
+    low, high = (float(np.quantile(known, q)) for q in (_WILD, 1.0 - 0.1 * _WILD))
+    if high <= 110.0:
+        return '%'
+    return 'us' if low >= 800.0 and high <= 2200.0 else '1'
 
 
-def _cell(row: list[str], place: int, name: str, path: Path, number: int) -> float:
-    if place >= len(row):
-        raise InputError(f"{path}:{number}: the line ends before column '{name}'")
-    text = row[place]
-    try:
-        if '_' in text or not text.isascii():
-            # To Python 5_01 is 501.
-            raise ValueError(text)
-        return float(text)
-    except ValueError:
-        if text.strip().lower() in _MISSING:
-            return float('nan')
-        raise InputError(f"{path}:{number}: column '{name}' holds '{_shown(text)}', not a "
-                         'number' + _MARK * (text.count(',') == 1)) from None
-
-
-def _shown(text: str) -> str:
-    """Return what fits in one line: an open quote makes the rest of a file one cell."""
-    shown = text.strip()
-    return shown if len(shown) <= _LONGEST else shown[:_LONGEST] + '...'
-
-
-def _hint(name: str, header: list[str]) -> str:
-    try:
-        [float(cell) for cell in header]
-    except ValueError:
-        return nearest(name, header)
-    return f'the first line holds numbers; add a header line {TIME},{VOLTAGE}[,{THROTTLE}]'
+def _how(form: Form, time: _Column, found: dict[str, _Column], units: dict[str, str]) -> str:
+    """Return in one line how a file was read; '' where nothing had to be found."""
+    if time.name == TIME and not form.comma and form.encoding in ('utf-8', 'utf-8-sig') and all(
+            column.name == {logs.VOLTAGE: VOLTAGE, logs.THROTTLE: THROTTLE,
+                            logs.CURRENT: CURRENT}[quantity] for quantity, column in found.items()
+    ) and not any('guess' in words for words in units.values()):
+        return ''
+    names = {',': 'commas', ';': 'semicolons', '\t': 'tabs', ' ': 'blanks'}
+    between = names.get(form.delimiter, f"'{form.delimiter}'")
+    parts = [f"time from '{time.name}' ({units[_TIME_NAME]})"]
+    parts += [f"{quantity} from '{column.name}' ({units[quantity]})"
+              for quantity, column in found.items()]
+    others = [form.names[k] for k in _choose(form, logs.VOLTAGE, time.place)[1:3]
+              if form.names[k] not in {column.name for column in found.values()}]
+    also = f'; also there: {", ".join(others)} (--voltage-column)' if others else ''
+    return (f"Read {', '.join(parts)}{also}; cells between {between}, decimal "
+            f"{'comma' if form.comma else 'point'}"
+            + (f', {form.encoding}' if form.encoding not in ('utf-8', 'utf-8-sig') else '')
+            + f', numbers from line {form.skip + 1} on.')

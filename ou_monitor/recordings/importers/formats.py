@@ -47,8 +47,11 @@ class Format(NamedTuple):
 
 
 def _is_text(head: bytes) -> bool:
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        # Spreadsheets write "Unicode text" so; their cells are of the first 256 characters.
+        head = head[2:].replace(b'\0', b'')
     # Text of other encodings than UTF-8 passes, so that its reader can name the byte.
-    return (head[0] < 0x80 or head.startswith(codecs.BOM_UTF8)) and all(
+    return bool(head) and (head[0] < 0x80 or head.startswith(codecs.BOM_UTF8)) and all(
         byte >= 0x20 or byte in b'\t\n\r\f' for byte in head)
 
 
@@ -72,7 +75,7 @@ FORMATS = (
     Format('blackbox', 'Betaflight or INAV blackbox (.bbl, .bfl)',
            lambda head: head.startswith(BLACKBOX), 'blackbox', 'orangebox', 'blackbox'),
     Format('crazyflie', 'Crazyflie micro-SD log', _is_crazyflie, 'crazyflie'),
-    Format(CSV, 'CSV with the column time_s (.csv)', _is_text, 'csv_table'),
+    Format(CSV, 'CSV (.csv, .txt, .tsv)', _is_text, 'csv_table'),
 )
 
 
@@ -101,22 +104,34 @@ def detect(path: Path) -> Format:
                      'today: ' + '; '.join(one.words for one in FORMATS if one.module))
 
 
+# Endings of tables of text; of the others the first bytes decide that none is one.
+_TABLES = ('.csv', '.tsv', '.tab', '.txt', '.dat', '.asc', '.log')
+
+
+def _begins_as(path: Path) -> Format | None:
+    """Return the format of a file by its first bytes; None: none, or it cannot be read."""
+    if not path.is_file():
+        return None
+    try:
+        with open_regular(path) as file:
+            return format_of(file.read(HEAD))
+    except OSError:
+        # Whoever reads it says why it cannot be read.
+        return None
+
+
 def is_csv(path: Path) -> bool:
-    """Return whether a path names a CSV: a recording, whatever its first bytes."""
-    return path.suffix.lower() == '.csv' and not path.is_dir()
+    """Return whether a file is a CSV by its ending, and nothing else by its first bytes."""
+    ending = path.suffix.lower()
+    if ending not in _TABLES or path.is_dir():
+        return False
+    found = _begins_as(path)
+    return found.name == CSV if found else ending == '.csv'
 
 
 def is_log(path: Path) -> bool:
     """Return whether a file is a log of an autopilot, by its first bytes."""
-    if not path.is_file():
-        return False
-    try:
-        with open_regular(path) as file:
-            head = file.read(HEAD)
-    except OSError:
-        # Whoever reads it says why it cannot be read.
-        return False
-    found = format_of(head)
+    found = _begins_as(path)
     return found is not None and found.name not in (BAG, CSV)
 
 

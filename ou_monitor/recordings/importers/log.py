@@ -188,6 +188,28 @@ class RawColumns:
 
 
 @dataclass(frozen=True)
+class CsvColumns:
+    """How a CSV is to be read; None: as it seems to be written."""
+
+    # Names of columns; 'none' leaves the throttle or the current out.
+    time: str | None = None
+    voltage: str | None = None
+    throttle: str | None = None
+    current: str | None = None
+    # Units: V or mV; s, ms, us or ns; 1, % or us.
+    unit: str | None = None
+    time_unit: str | None = None
+    throttle_unit: str | None = None
+    # What separates cells: a character, 'tab' or 'space'; the decimal mark: '.' or ','.
+    delimiter: str | None = None
+    decimal: str | None = None
+    # Lines above the header.
+    skip_rows: int | None = None
+    # Time from row to row, s, in place of a column of time.
+    sample_interval: float | None = None
+
+
+@dataclass(frozen=True)
 class Request:
     """What an importer is asked for."""
 
@@ -201,6 +223,8 @@ class Request:
     everything: bool = False
     # Called with the share done, 0..1.
     progress: Progress | None = None
+    # How a CSV is to be read.
+    columns: CsvColumns | None = None
 
 
 def one_flight(path: Path, request: Request) -> None:

@@ -1,0 +1,237 @@
+"""Tables as loggers, oscilloscopes and spreadsheets write them; made after their manuals."""
+
+from datetime import datetime, timedelta
+
+import numpy as np
+from ou_monitor.cli.main import main
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.choose import choose, columns_of
+from ou_monitor.recordings.importers.formats import import_log
+from ou_monitor.recordings.importers.log import CsvColumns, Request
+from ou_monitor.recordings.read import read_recording, tidy
+import pytest
+
+N = 60
+_RNG = np.random.default_rng(7)
+K = np.arange(N)
+U = np.round(0.3 + 0.2 * np.sin(K / 5.0), 3)
+V = np.round(15.6 - 1.2 * U + 0.02 * _RNG.standard_normal(N), 3)
+AMPS = np.round(2.0 + 30.0 * U, 2)
+BEGIN = datetime(2024, 5, 16, 8, 2, 6)
+
+
+def table(header, row, end='\n', more=''):
+    """Return a table of the lines above, and of a row for each sample."""
+    return end.join([*header, *(row(k) for k in range(N)), more])
+
+
+def german(value):
+    """Return a number with a decimal comma."""
+    return f'{value}'.replace('.', ',')
+
+
+def clock(k, pattern='%Y-%m-%d %H:%M:%S.%f'):
+    """Return the time of a sample, 10 ms apart."""
+    return (BEGIN + timedelta(milliseconds=10 * k)).strftime(pattern)
+
+
+# Name -> content, time from row to row (s), whether throttle and current are in it.
+FORMS = {
+    'plain': (table(['time_s,voltage_v,throttle,current_a'],
+                    lambda k: f'{0.01 * k:.2f},{V[k]},{U[k]},{AMPS[k]}'), 0.01, True, True),
+    # InfiniiVision: names, then units.
+    'keysight': (table(['x-axis,1', 'second,Volt'],
+                       lambda k: f'{1e-5 * (k - 30):.5E},{V[k]:+.4E}', '\r\n'), 1e-5, False,
+                 False),
+    # DS1000Z: rows are numbered, the step stands in the header.
+    'rigol_ds': (table(['X,CH1,Start,Increment,', 'Sequence,Volt,-6.000000e-04,1.000000e-05,'],
+                       lambda k: f'{k},{V[k]:.2e},,'.replace(f'{V[k]:.2e}', f'{V[k]:.4e}'),
+                       '\r\n'), 1e-5, False, False),
+    # MSO5000 without and with times.
+    'rigol_mso': (table(['CH1V,t0 = -5.0e-04, tInc = 1.0e-05,'], lambda k: f'{V[k]:.4f},'), 1e-5,
+                  False, False),
+    'rigol_dho': (table(['Time(s),CH1(V)'], lambda k: f'{1e-5 * k:.6e},{V[k]:.4e}'), 1e-5, False,
+                  False),
+    # TDS1000: facts beside the first rows, no header.
+    'tektronix_tds': ('\r\n'.join(
+        f'{facts},{1e-5 * (k - 30):.11f},{V[k]:.5f},' for k, facts in enumerate(
+            ['Record Length,2.500000e+03,', 'Sample Interval,1.000000e-05,',
+             'Trigger Point,3.0000000e+01,', ',,', ',,', ',,', 'Source,CH1,', 'Vertical Units,V,',
+             'Vertical Scale,2.0e+00,', 'Vertical Offset,0.0e+00,', 'Horizontal Units,s,',
+             'Horizontal Scale,2.5e-03,', 'Pt Fmt,Y,', 'Yzero,0.0e+00,', 'Probe Atten,1.0e+01,',
+             'Model Number,TDS1012B,', 'Serial Number,C0,', 'Firmware Version,FV:v22.11,',
+             *[',,'] * (N - 18)])), 1e-5, False, False),
+    'tektronix_mdo': (table(
+        ['Model,MDO3024', 'Firmware Version,1.26', '', 'Waveform Type,ANALOG', 'Point Format,Y',
+         'Horizontal Units,s', 'Horizontal Scale,4e-05', 'Sample Interval,1e-05',
+         'Record Length,60', 'Probe Attenuation,10', 'Vertical Units,V', 'Label,,', 'TIME,CH1'],
+        lambda k: f'{1e-5 * k:.6e},{V[k]:.4f}'), 1e-5, False, False),
+    'siglent': (table(['Record Length,Analog:60', 'Sample Interval,CH1:1.00E-5', 'Vertical Units,'
+                       'CH1:V', 'Model Number,SDS1104', 'Source,CH1', 'Second,Volt'],
+                      lambda k: f'{1e-5 * k:.7f},{V[k]:.3f}'), 1e-5, False, False),
+    'rohde': (table(['in s,CH1 in V'], lambda k: f'{1e-5 * k:.6E},{V[k]:.4E}'), 1e-5, False,
+              False),
+    'picoscope': (table(['Time,Channel A', '(ms),(mV)', ''],
+                        lambda k: f'{0.01 * k:.8f},{1e3 * V[k]:.8f}'), 1e-5, False, False),
+    'waveforms': (table(['#Digilent WaveForms Oscilloscope Acquisition', '#Sample rate: 100000Hz',
+                         'Time (s),Channel 1 (V)'], lambda k: f'{1e-5 * k:.7f},{V[k]:.4f}'), 1e-5,
+                  False, False),
+    'saleae': (table(['Time [s],Channel 0'], lambda k: f'{1e-5 * k:.9f},{V[k]:.6f}'), 1e-5, False,
+               False),
+    'joulescope': (table(['#time,current,voltage,power,charge,energy'],
+                         lambda k: f'{0.01 * k:.2f},{AMPS[k]},{V[k]},{AMPS[k] * V[k]:.4f},0,0'),
+                   0.01, False, True),
+    'otii': (table(['Timestamp(s),Main current (A),Main voltage (V)'],
+                   lambda k: f'{0.01 * k:.3f},{AMPS[k]},{V[k]}'), 0.01, False, True),
+    # Each topic at stamps of its own.
+    'plotjuggler': (table(
+        ['__time,/battery_state/voltage,/battery_state/current,/throttle/data,/imu/x'],
+        lambda k: f'{1.7e9 + 0.01 * k:.3f},{V[k]},{AMPS[k]},{U[k]},\n'
+                  f'{1.7e9 + 0.01 * k + 0.004:.3f},,,,0.1'), 0.01, True, True),
+    'excel_de': ('\ufeff' + table(['Zeit [s];Spannung [mV];Gas [%];Strom [A]'], lambda k: ';'.join(
+        map(german, (round(0.01 * k, 3), round(1e3 * V[k]), round(100 * U[k], 1), AMPS[k]))),
+        '\r\n'), 0.01, True, True),
+    'excel_unicode': (('\ufeff' + table(['Zeit\tSpannung in V'], lambda k: '\t'.join(
+        map(german, (clock(k, '%d.%m.%Y %H:%M:%S.') + f'{10 * k % 1000:03d}', V[k]))), '\r\n')
+                       ).encode('utf-16-le'), 0.01, False, False),
+    'blackbox_explorer': (table(
+        ['"Product","Blackbox flight data recorder by Nicholas Sherlock"', '"minthrottle",1070',
+         '"vbatcellvoltage","330,350,430"', '"looptime",125',
+         '"loopIteration","time","axisP[0]","rcCommand[0]","rcCommand[3]","vbatLatest",'
+         '"amperageLatest","motor[0]"'],
+        lambda k: f'{k},{81000000 + 125 * k},-3,5,{1000 + 1000 * U[k]:.0f},{100 * V[k]:.1f},'
+                  f'{100 * AMPS[k]:.0f},900'), 125e-6, True, True),
+    'blackbox_decode': (table(
+        ['loopIteration, time (us), axisP[0], rcCommand[3], vbatLatest (V), amperageLatest (A)'],
+        lambda k: f'{k}, {5000 + 500 * k}, 1, {1000 + 1000 * U[k]:.0f}, {V[k]}, {AMPS[k]}'),
+        500e-6, True, True),
+    'vesc_tool': (table(
+        ['ms_today;input_voltage;temp_mos_max;temp_motor;current_motor;current_in;d_axis_current;'
+         'erpm;duty_cycle;fault_code;d_axis_voltage;ms_today_setup;roll;'],
+        lambda k: f'{41000000 + 20 * k};{V[k]};31.5;30.2;40.1;{AMPS[k]};0.1;3000;{U[k]};0;0.5;'
+                  f'{41000000 + 20 * k};0.1;'), 0.02, True, True),
+    'wheellog': (table(
+        ['date,time,speed,voltage,phase_current,current,power,torque,pwm,battery_level,mode'],
+        lambda k: f"{clock(k, '%Y-%m-%d,%H:%M:%S.')}{10 * k % 1000:03d},20.1,{V[k]},9.1,{AMPS[k]},"
+                  f'700,0,{100 * U[k]:.1f},80,Drive'), 0.01, True, True),
+    'edgetx': (table(['Date,Time,1RSS(dB),RxBt(V),Curr(A),Capa(mAh),Ptch(rad),Thr,SA'],
+                     lambda k: f"{clock(k, '%Y-%m-%d,%H:%M:%S.')}{10 * k % 1000:03d},-60,{V[k]},"
+                               f'{AMPS[k]},0,0.1,{U[k]},1'), 0.01, True, True),
+    'ulog2csv': (table(
+        ['timestamp,voltage_v,voltage_filtered_v,current_a,current_filtered_a,voltage_cell_v[0]'],
+        lambda k: f'{112500000 + 10000 * k},{V[k]},{V[k]},{AMPS[k]},3,3.9'), 0.01, False, True),
+    'rostopic': (table(['%time,field.header.seq,field.voltage,field.current'],
+                       lambda k: f'{1700000000000000000 + 10000000 * k},{k},{V[k]},{AMPS[k]}'),
+                 0.01, False, True),
+    'arduino': (table(['millis;Ubat_mV'], lambda k: f'{4000 + 10 * k};{1e3 * V[k]:.0f}'), 0.01,
+                False, False),
+    'ltspice': (table(['time\tV(vbus)'], lambda k: f'{1e-5 * k:.6e}\t{V[k]:.4e}'), 1e-5, False,
+                False),
+    'iso': (table(['Timestamp,Battery Voltage'],
+                  lambda k: f"{clock(k, '%Y-%m-%dT%H:%M:%S.')}{10 * k % 1000:03d}Z,{V[k]}"), 0.01,
+            False, False),
+    'us_clock': (table(['Time,Volts'], lambda k: f"{clock(k, '%m/%d/%Y %I:%M:%S.')}"
+                                                 f'{10 * k % 1000:03d} AM,{V[k]}'), 0.01, False,
+                 False),
+    'no_header': (table([], lambda k: f'{0.01 * k:.3f},{V[k]},', '\r\n'), 0.01, False, False),
+    'hioki': (table(['"File name","WAVE0001.CSV","V 1.00"', '"Title comment",""', '"Trigger Time",'
+                     '"\'12-07-01 09:14:03"', '"Time","CH1[V]","Event"'],
+                    lambda k: f'{0.01 * k:.9E},{V[k]:.5E},0'), 0.01, False, False),
+}
+
+
+def written(tmp_path, content, name='export.csv'):
+    """Write a table."""
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+@pytest.mark.parametrize('form', FORMS)
+def test_an_export_is_read_without_an_option(form, tmp_path):
+    """Time in s, voltage in V, throttle 0..1 and current in A, as they were made."""
+    content, step, throttle, current = FORMS[form]
+    path = written(tmp_path, content)
+    found = read_recording(path)
+    of_1970 = float(found.t[0] > 1e9)
+    np.testing.assert_allclose(found.t - found.t[0], step * K, rtol=0.0,
+                               atol=1e-3 * step + 1e-6 * of_1970)
+    np.testing.assert_allclose(found.voltage, V, rtol=0.0, atol=6e-4)
+    assert found.has_throttle == throttle
+    if throttle:
+        np.testing.assert_allclose(found.throttle, U, rtol=0.0, atol=6e-4)
+    assert (found.current is not None) == current
+    if current:
+        np.testing.assert_allclose(found.current, AMPS, rtol=0.0, atol=6e-3)
+    said = [note for note in found.notes if note.startswith('Read time from')]
+    assert len(said) == (form != 'plain')
+    # The bag that `convert` writes holds the same samples.
+    log = import_log(path, Request())
+    again = tidy(columns_of(path, log, choose(path, log)))
+    np.testing.assert_allclose(again.voltage, found.voltage, rtol=2e-7)
+    np.testing.assert_allclose(again.t, found.t, rtol=0.0, atol=1e-9 + 3e-7 * of_1970)
+
+
+@pytest.mark.parametrize('content, columns, step, volts', [
+    ('time,voltage\n0,12\n1,13\n2,14\n', CsvColumns(time_unit='ms'), 1e-3, [12, 13, 14]),
+    ('time,voltage\n0,12000\n1,13000\n', CsvColumns(unit='V'), 1.0, [12000, 13000]),
+    ('time_s,voltage_v\n0,12\n1,13\n', CsvColumns(sample_interval=0.25), 0.25, [12, 13]),
+    ('12,5\n13,5\n13,7\n', CsvColumns(delimiter=';', decimal=',', sample_interval=0.1), 0.1,
+     [12.5, 13.5, 13.7]),
+    ('1 2 3\n4 5 6\nt U\n0 12\n1 13\n', CsvColumns(skip_rows=2, delimiter='space'), 1.0, [12, 13]),
+    ('t|U\n0|12\n1|13\n', CsvColumns(delimiter='|'), 1.0, [12, 13]),
+    ('t,V1,V2\n0,5,12\n1,5,13\n', CsvColumns(voltage='V2'), 1.0, [12, 13]),
+])
+def test_a_guess_is_overruled(content, columns, step, volts, tmp_path):
+    """Units, delimiter, decimal mark, lines above and the time from row to row."""
+    found = read_recording(written(tmp_path, content), columns=columns)
+    np.testing.assert_allclose(found.voltage, volts)
+    np.testing.assert_allclose(np.diff(found.t), step)
+
+
+def test_the_unit_of_a_throttle(tmp_path):
+    """Percent and pulses are found by their size, and overruled; none, and no current, by name."""
+    rows = 't,U,gas,I\n' + ''.join(f'{k},12,{g},3\n' for k, g in enumerate((1100, 1500, 1900)))
+    path = written(tmp_path, rows)
+    np.testing.assert_allclose(read_recording(path).throttle, [0.1, 0.5, 0.9])
+    percent = written(tmp_path, rows.replace('1100', '1').replace('1500', '2').replace(
+        '1900', '1.5'), 'b.csv')
+    found = read_recording(percent, columns=CsvColumns(throttle_unit='%', current='none'))
+    assert found.throttle[0] == pytest.approx(0.01) and found.current is None
+    assert not read_recording(path, columns=CsvColumns(throttle='none')).has_throttle
+
+
+def test_options_of_the_command_line(tmp_path, capsys):
+    """The same by options, for `analyze` and `convert`."""
+    path = written(tmp_path, 'x;U\n' + ''.join(f'{k};12,{k % 9}\n' for k in range(300)), 'a.txt')
+    given = ['--sample-interval', '0.01', '--delimiter', ';', '--decimal', ',', '--unit', 'mV']
+    assert main(['analyze', str(path), *given, '--json', str(tmp_path / 'a.json')]) == 0
+    assert "voltage from 'U' (mV)" in ' '.join(capsys.readouterr().out.split())
+    assert main(['convert', str(path), str(tmp_path / 'bag'), *given]) == 0
+    found = read_recording(tmp_path / 'bag')
+    np.testing.assert_allclose(found.t, 0.01 * np.arange(300), atol=1e-9)
+    np.testing.assert_allclose(found.voltage[:3], [0.012, 0.0121, 0.0122], rtol=1e-6)
+    assert main(['analyze', str(path), '--sample-interval', '0']) == 2
+
+
+@pytest.mark.parametrize('content, words', [
+    (b'PK\x03\x04' + bytes(50), 'workbook of Excel'), (b'<!DOCTYPE html><html>\n', 'a web page'),
+    (b'<SALEAE>' + bytes(50), 'export it as CSV'), (b'SQLite format 3\0', 'ros2 bag convert'),
+    (b'\x1f\x8b\x08\0' + bytes(50), 'gunzip'), (b'{"t": [0, 1]}\n', 'JSON'),
+    (b'\x7fELF' + bytes(50), 'is not text')])
+def test_a_wrong_file_is_named_for_what_it_is(content, words, tmp_path):
+    """Whatever its name ends in; a log of an autopilot in a .csv is read as the log it is."""
+    for name in ('a.csv', 'a'):
+        if (name, words) == ('a', 'is not text'):
+            words = 'first bytes are'
+        with pytest.raises(InputError, match=words):
+            read_recording(written(tmp_path, content, name))
+
+
+@pytest.mark.parametrize('content, words', [
+    ('Zeit;U\n04.05.2024 10:00:00;12,5\nnoon;12,6\n', "'noon'"), ('t,U\n0,12\n1,1_5\n', "'1_5'"),
+    ('date,U\n2024-13-01,12\n2024-13-02,12\n', 'month')])
+def test_what_is_no_time_or_number_is_refused(content, words, tmp_path):
+    """With the cell, and never misread."""
+    with pytest.raises(InputError, match=words):
+        read_recording(written(tmp_path, content))
