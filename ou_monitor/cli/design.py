@@ -9,15 +9,21 @@ from pathlib import Path
 import re
 from typing import Any
 
+import numpy as np
 from ou_monitor.cli import output
+from ou_monitor.cli.arguments import read_given
 from ou_monitor.cli.output import paragraph, table
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.paper.network.components import PowerNetwork, UNITS
+from ou_monitor.paper.network.components import (
+    cell_count, check_cells, completed, PowerNetwork, UNITS)
 from ou_monitor.paper.network.design import (
     answer, as_data, default_voltage, Design, design, effect, probability, remarks)
+from ou_monitor.paper.network.measured import Flight, network_of
 from ou_monitor.stream.files import read_yaml
 from ou_monitor.text import number
 
+# Quantile of the voltages that is that of the pack before the flight, but for glitches.
+_FULL = 0.995
 # One row of the printed table for this many rows of the calculation.
 _EVERY = 10
 # Options that are numbers, and their units.
@@ -51,17 +57,20 @@ def _shown(value: object, network: PowerNetwork) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    output.check_paths({'--network': args.network}, {'--json': args.json}, args.force)
+    output.check_paths({'--network': args.network, '--from': args.recording},
+                       {'--json': args.json}, args.force)
     if args.list:
         _list(args.json)
         return 0
-    for option, value in (('--risk', args.risk), ('--throttle', args.throttle)):
-        if value is None:
-            raise InputError(f'{option} is missing: ou-monitor design --risk 1e-3 --throttle 0.4 '
-                             'asks for a risk of 1e-3 at 40 %')
+    if args.throttle is None and args.recording is None:
+        raise InputError('--throttle is missing: ou-monitor design --throttle 0.4 asks for 40 %, '
+                         'and --from RECORDING for the throttle of a flight')
+    flight = None if args.recording is None else _flight(args)
+    if args.throttle is None and flight is not None:
+        args.throttle = flight.highest
     numbers = {name: quantity(f'--{name.replace("_", "-")}', getattr(args, name), unit)
                for name, unit in _OPTIONS.items()}
-    if numbers['throttle'] > 1.0:
+    if not numbers['throttle'] <= 1.0:
         raise InputError(f"--throttle: '{args.throttle}' is not between 0 and 1; write 40 % as "
                          '0.4')
     values = {} if args.network is None else read_network(args.network)
@@ -74,7 +83,12 @@ def run(args: argparse.Namespace) -> int:
     output.check_writable(args.json)
 
     try:
-        network = PowerNetwork(**values)
+        if flight is not None:
+            cells = values.setdefault('cells', cell_count(flight.full))
+            check_cells(flight.full, cells)
+            network = network_of(flight, numbers['throttle'], values)
+        else:
+            network = PowerNetwork(**completed(values))
         voltage, source = (
             default_voltage(network, args.rail) if args.voltage is None
             else (quantity('--voltage', args.voltage, 'V'), 'given'))
@@ -84,11 +98,41 @@ def run(args: argparse.Namespace) -> int:
             capacitances=(numbers['capacitance_min'], numbers['capacitance_max']))
     except ValueError as error:
         raise InputError(str(error)) from error
+    taken = '' if flight is None else _taken(flight, network, numbers['throttle'], values)
     if args.json is not None:
-        output.write_json(as_data(result, source), args.json)
+        output.write_json({**as_data(result, source), 'measured': taken or None}, args.json)
     if args.json != output.STDOUT:
-        output.say(render(result, source))
+        output.say(render(result, source) + ('\n' + paragraph(taken) if taken else ''))
     return 0
+
+
+def _flight(args: argparse.Namespace) -> Flight:
+    """Return what the recording says of its supply."""
+    from ou_monitor.analysis.supply import facts_and_load
+
+    recording = read_given(args, None, None)
+    facts, load = facts_and_load(recording)
+    if not recording.has_throttle:
+        raise InputError(f'--from {args.recording}: the recording has no throttle')
+    full = float(np.quantile(recording.voltage, _FULL))
+    return Flight(load.level, full, facts.sag.throttle, facts.sag.sag_v, facts.noise.rms_v,
+                  facts.noise.steady_rms_v, facts.noise.flown,
+                  min(1.0, float(np.nanmax(recording.throttle))), facts.resistance.ohm,
+                  facts.ou.alpha, facts.ou.var_inf)
+
+
+def _taken(flight: Flight, network: PowerNetwork, throttle: float, values: dict[str, Any]) -> str:
+    """Return what was taken from a flight, and what was not."""
+    known = flight.resistance > 0.0 and values.get('battery_resistance') is None
+    return (f'From the flight: {flight.level:.4g} V open at its end, {network.cells} cells '
+            f'({flight.full:.4g} V at most; --set cells=N), sag '
+            f'{float(np.interp(throttle, flight.throttle, flight.sag)):.3g} V and noise '
+            f'{1e3 * float(np.interp(throttle, flight.throttle, flight.noise)):.3g} mV rms at '
+            f'{throttle:.0%} throttle, resistance '
+            + (f'{1e3 * flight.resistance:.3g} mOhm.' if known else
+               f'{1e3 * network.battery_resistance:.3g} mOhm as given or assumed: the current is '
+               'scaled to the sag.')
+            + ' The bulk capacitor and its ESR cannot be seen: --set bulk_capacitance=470uF.')
 
 
 def render(result: Design, source: str) -> str:
@@ -111,7 +155,12 @@ def render(result: Design, source: str) -> str:
     lines = [
         paragraph(answer(result)), '', paragraph(given), '',
         table(['C uF', 'ESR mOhm', 'alpha 1/s', 'tau us', 'sigma V/sqrt(s)', 'Var_inf V^2',
-               'mean time', 'risk OU', 'crossing', ''], cells, left=[9]), '']
+               'mean time', 'risk OU', 'crossing', ''], cells, left=[9]), '',
+        table(['what', 'unit', 'present', 'tried', 'risk then', f'for {result.target:g}'],
+              [[lever.name, lever.unit, number(lever.present), number(lever.tried),
+                probability(lever.risk), number(lever.least)
+                if math.isfinite(lever.least) else 'out of reach'] for lever in result.levers],
+              left=[0, 1]), '']
     lines += [paragraph(text) for text in (effect(result), *remarks(result)) if text]
     return '\n'.join(lines)
 

@@ -3,6 +3,7 @@
 import json
 import re
 
+import numpy as np
 from ou_monitor.cli.design import quantity
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
@@ -99,8 +100,7 @@ def test_list(capsys):
     assert values.keys() == PowerNetwork.__dataclass_fields__.keys()
 
 
-@pytest.mark.parametrize('given, missing', [('--risk=1e-3', '--throttle'),
-                                            ('--throttle=0.4', '--risk')])
+@pytest.mark.parametrize('given, missing', [('--risk=1e-3', '--throttle')])
 def test_what_is_missing_is_named(capsys, given, missing):
     """Risk and throttle have no default."""
     assert main(['design', given]) == 2
@@ -162,3 +162,75 @@ def test_what_is_no_quantity(text):
     """Refused, with where it stands."""
     with pytest.raises(InputError, match='^here: '):
         quantity('here', text, 'F')
+
+
+@pytest.fixture(scope='module')
+def flight(tmp_path_factory):
+    """Return a flight of a 4S craft of 25 mOhm that draws 80 A at full throttle, noise 30 mV."""
+    rng = np.random.default_rng(5)
+    t = np.arange(5000) / 100.0
+    u = 0.45 + 0.35 * np.sin(t / 1.3) * np.sin(t / 7.1)
+    amps = 80.0 * u ** 1.5
+    volts = 16.2 - 0.025 * amps + 0.03 * rng.standard_normal(t.size)
+    path = tmp_path_factory.mktemp('flown') / 'flight.csv'
+    path.write_text('time_s,voltage_v,throttle,current_a\n' + ''.join(
+        f'{a:.4f},{b:.4f},{c:.4f},{d:.3f}\n' for a, b, c, d in zip(t, volts, u, amps)))
+    return path
+
+
+def asked(capsys, *words):
+    """Return the JSON of `design`."""
+    assert main(['design', *map(str, words), '--json', '-']) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_flight_gives_the_network(flight, capsys):
+    """Level, cells, resistance, current over throttle and noise are those that were flown."""
+    found = asked(capsys, '--from', flight)
+    network, present = found['network'], found['present']
+    assert network['cells'] == 4 and network['battery_voltage'] == pytest.approx(16.2, abs=0.1)
+    assert network['battery_resistance'] == pytest.approx(0.025, rel=0.1)
+    assert network['current_max'] == pytest.approx(80.0, rel=0.15)
+    assert network['current_exponent'] == pytest.approx(1.5, abs=0.2)
+    assert found['throttle'] == pytest.approx(0.8, abs=0.02)
+    assert present['var_inf'] == pytest.approx(0.03 ** 2, rel=0.2)
+    assert present['mean'] == pytest.approx(16.2 - 0.025 * 80.0 * 0.8 ** 1.5, abs=0.15)
+    assert found['brownout_voltage'] == pytest.approx(13.2) and '4 cells' in found['measured']
+
+
+def test_what_is_set_goes_before_the_flight(flight, capsys):
+    """Resistance and throttle; a number of cells that the voltage cannot have is refused."""
+    found = asked(capsys, '--from', flight, '--set', 'battery_resistance=50mOhm', '--throttle',
+                  '0.5')
+    assert found['network']['battery_resistance'] == 0.05
+    assert found['present']['sag'] == pytest.approx(0.025 * 80.0 * 0.5 ** 1.5, rel=0.15)
+    assert main(['design', '--from', str(flight), '--set', 'cells=3']) == 2
+    assert 'it is likely 4' in capsys.readouterr().err
+
+
+def test_cells_set_the_voltage(capsys):
+    """3.7 V a cell, unless the voltage is given; a rail below that of one cell."""
+    assert asked(capsys, '--throttle', '0.4', '--set', 'cells=4')['network'][
+        'battery_voltage'] == pytest.approx(14.8)
+    one = asked(capsys, '--throttle', '0.4', '--set', 'cells=1', '--set', 'current_max=5')
+    assert one['network']['regulator_voltage'] == 3.0
+    both = asked(capsys, '--throttle', '0.4', '--set', 'cells=4', '--set', 'battery_voltage=16')
+    assert both['network']['battery_voltage'] == 16.0
+
+
+def test_what_each_change_buys(flight, capsys):
+    """Packs, resistance and throttle meet a limit that no capacitor meets, or none does."""
+    found = asked(capsys, '--from', flight, '--voltage', '14.9')
+    levers = {one['name']: one for one in found['levers']}
+    assert found['verdict'] == 'level' and levers['bulk capacitance']['least'] is None
+    # 16.2 - 14.9 V of a sag of 1.43 V.
+    assert levers['packs in parallel']['least'] == 2
+    assert 0.7 < levers['battery and lead resistance']['least'] / 25.0 < 0.95
+    assert levers['packs in parallel']['risk'] < 1e-3 < found['present']['risk']
+    for name, option in (('throttle limit', '--throttle'),):
+        limit = levers[name]['least'] / 100.0
+        less = asked(capsys, '--from', flight, '--voltage', '14.9', option, f'{limit:.3f}')
+        assert less['present']['mean'] > 14.9
+    none = asked(capsys, '--from', flight, '--voltage', '16.15')
+    assert 'Nothing within reach' in none['answer']
+    assert all(one['least'] is None for one in none['levers'])

@@ -41,6 +41,9 @@ LEAST, MOST = 10e-6, 22e-3
 _GRID = 81
 # Rates below this are never, 1/s.
 _NEVER = 1e-300
+# What is within reach beside capacitors: packs in parallel, share of the resistance that new leads
+# and a fresh pack leave, share of the throttle that a limit leaves.
+_PACKS, _RESISTANCE, _THROTTLE = 3, 0.5, 0.5
 
 
 class Verdict(enum.Enum):
@@ -109,6 +112,34 @@ class DesignRow:
 
 
 @dataclass(frozen=True)
+class Lever:
+    """
+    What one change of the craft buys.
+
+    Parameters
+    ----------
+    name : str
+        What is changed.
+    unit : str
+        Its unit, of the values as shown.
+    present, tried : float
+        Value now, and one that is easily had.
+    risk : float
+        Risk with the one tried.
+    least : float
+        Smallest change that meets the target; NaN: none within reach.
+
+    """
+
+    name: str
+    unit: str
+    present: float
+    tried: float
+    risk: float
+    least: float
+
+
+@dataclass(frozen=True)
 class Design:
     """
     The answer for one network, throttle and target.
@@ -139,6 +170,8 @@ class Design:
     resistance : float
         Battery resistance at which the mean of the bus is at the level, Ohm;
         NaN when no resistance does that or the rail is regulated.
+    levers : tuple of Lever
+        What other capacitors, packs in parallel, leads and throttle limits buy.
 
     """
 
@@ -155,6 +188,7 @@ class Design:
     rows: tuple[DesignRow, ...]
     falls: bool
     resistance: float
+    levers: tuple[Lever, ...]
 
 
 def default_voltage(network: PowerNetwork, rail: str) -> tuple[float, str]:
@@ -237,7 +271,49 @@ def design(
         network=network, rail=rail, throttle=throttle, voltage=voltage, horizon=horizon,
         target=risk, esr_follows=esr_follows, verdict=verdict, present=present, least=least,
         rows=tuple(rows), falls=all(b <= a * (1.0 + 1e-9) for a, b in zip(risks, risks[1:])),
-        resistance=_resistance(network, throttle, voltage) if rail == 'bus' else math.nan)
+        resistance=_resistance(network, throttle, voltage) if rail == 'bus' else math.nan,
+        levers=_levers(network, throttle, voltage, horizon, risk, rail, at, least))
+
+
+def _levers(network: PowerNetwork, throttle: float, voltage: float, horizon: float, target: float,
+            rail: str, at: Callable[[float], DesignRow], least: DesignRow | None,
+            ) -> tuple[Lever, ...]:
+    def risk(changed: PowerNetwork, u: float = throttle) -> float:
+        try:
+            return row_of(rail_at(changed, u, rail), voltage, horizon).risk
+        except ValueError:
+            # Unstable, or more load than the battery gives.
+            return 1.0
+
+    def resistance(share: float) -> float:
+        return risk(replace(network, battery_resistance=share * network.battery_resistance))
+
+    def limit(share: float) -> float:
+        return risk(network, share * throttle)
+
+    bulk, ohm = network.bulk_capacitance, network.battery_resistance
+    packs = next((n for n in range(1, _PACKS + 1) if resistance(1.0 / n) <= target), math.nan)
+    return (
+        Lever('bulk capacitance', 'uF', 1e6 * bulk, 2e6 * bulk, at(2.0 * bulk).risk,
+              math.nan if least is None else 1e6 * max(least.capacitance, bulk)),
+        Lever('packs in parallel', '', 1.0, 2.0, resistance(0.5), packs),
+        Lever('battery and lead resistance', 'mOhm', 1e3 * ohm, 0.75e3 * ohm, resistance(0.75),
+              1e3 * ohm * _share(resistance, _RESISTANCE, target)),
+        Lever('throttle limit', '%', 100.0 * throttle, 80.0 * throttle, limit(0.8),
+              100.0 * throttle * _share(limit, _THROTTLE, target)))
+
+
+def _share(risk: Callable[[float], float], least: float, target: float) -> float:
+    """Return the largest share of 1 down to the least that meets the target; NaN: none."""
+    if risk(1.0) <= target:
+        return 1.0
+    if risk(least) > target:
+        return math.nan
+    low, high = least, 1.0
+    while high - low > 1e-3:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if risk(middle) <= target else (low, middle)
+    return low
 
 
 def _least(at: Callable[[float], DesignRow], rows: list[DesignRow],
@@ -282,6 +358,7 @@ def as_data(result: Design, source: str) -> dict[str, Any]:
         'esr_follows': result.esr_follows, 'verdict': result.verdict.name.lower(),
         'answer': answer(result), 'effect': effect(result), 'present': row(result.present),
         'least': row(result.least), 'resistance_at_level': result.resistance,
+        'levers': [asdict(lever) for lever in result.levers],
         'risk_falls_with_capacitance': result.falls, 'lc_corner_hz': result.network.lc_corner,
         'rows': [row(r) for r in result.rows]}
 
@@ -300,20 +377,29 @@ def answer(result: Design) -> str:
     if result.verdict is Verdict.OUT_OF_RANGE:
         return (f'No capacitance between {_uf(result.rows[0])} and {_uf(result.rows[-1])} brings '
                 f'the risk under {result.target:g}: with the largest it is still '
-                f'{probability(result.rows[-1].risk)}. A lower ESR, a lower battery resistance '
-                'or less throttle would.')
+                f'{probability(result.rows[-1].risk)}. {_others(result)}')
     text = (f'No capacitor helps: the mean, {present.mean:.4g} V, is at or below '
-            f'{result.voltage:g} V.')
+            f'{result.voltage:g} V. {_others(result)}')
     if math.isfinite(result.resistance):
-        text += (f' Lower battery_resistance from {1e3 * result.network.battery_resistance:.3g} '
-                 f'mOhm to less than {1e3 * result.resistance:.3g} mOhm, or fly with less '
-                 'throttle.')
-    elif result.rail == 'bus':
+        return (f'{text} The mean is above the level with less than '
+                f'{1e3 * result.resistance:.3g} mOhm.')
+    if result.rail == 'bus':
         text += (' That level is not below the open-circuit voltage: check cells and '
                  'battery_voltage, or lower the level.')
     else:
         text += ' Raise regulator_voltage or lower the level.'
     return text
+
+
+def _others(result: Design) -> str:
+    """Return what meets the target in place of a capacitor, in words."""
+    found = [f'{lever.name} {number(lever.least, 3)} {lever.unit}'.rstrip()
+             for lever in result.levers[1:] if math.isfinite(lever.least)]
+    if found:
+        return 'What would: ' + ', or '.join(found) + '.'
+    return (f'Nothing within reach would: not {_PACKS} packs in parallel, not '
+            f'{_RESISTANCE:.0%} of the resistance, not {_THROTTLE:.0%} of the throttle; land '
+            'before the battery is at this level, take more cells, or allow a lower voltage.')
 
 
 def effect(result: Design) -> str:
