@@ -108,10 +108,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _flight(args: argparse.Namespace) -> Flight:
     """Return what the recording says of its supply."""
-    from ou_monitor.analysis.supply import facts_and_load
+    from ou_monitor.analysis.supply import facts_and_end
 
     recording = read_given(args, None, None)
-    facts, load = facts_and_load(recording)
+    facts, load, _ = facts_and_end(recording)
     if not recording.has_throttle:
         raise InputError(f'--from {args.recording}: the recording has no throttle')
     full = float(np.quantile(recording.voltage, _FULL))
