@@ -20,7 +20,8 @@ RESULTS = sorted((ROOT / 'doc/results').glob('*.md'))
 LINKED = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'benchmarks/README.md', *PAGES,
           *RESULTS]
 # What names a file that a reader makes or has, rather than one of the project.
-OTHERS = {'my_adc.yaml', 'flight.yaml', 'rail.yaml', 'metadata.yaml'}
+OTHERS = {'my_adc.yaml', 'flight.yaml', 'rail.yaml', 'metadata.yaml', 'px4_motors.yaml',
+          'crazyflie.yaml', 'crazyflies.yaml', 'dds_topics.yaml'}
 
 
 def page(name: str) -> str:
