@@ -1,8 +1,7 @@
 """
-What `discover` makes of hidden effects, of none, and of real recordings: one command, five parts.
+What `discover` makes of hidden effects, of none, and of real recordings: one command, four parts.
 
     python benchmarks/discover.py blind [--each 10] [--lines FILE] [--table FILE]
-    python benchmarks/discover.py limits [--runs 40] [--lines FILE] [--figure FILE]
     python benchmarks/discover.py nulls [--each 40] [--elsewhere FILE] [--lines FILE]
     python benchmarks/discover.py flights [--table FILE] [NAME...]
     python benchmarks/discover.py injected [--table FILE] [--effects NAME...] [NAME...]
@@ -14,7 +13,8 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 import datetime
 import math
 import os
@@ -31,15 +31,13 @@ _ROOT = Path(__file__).resolve().parent.parent
 # What is tested, and what counts as right.
 sys.path[:0] = [str(_ROOT), *(str(_ROOT / 'test' / name) for name in ('support', 'hidden'))]
 
-from discover_injected import examine, HIDDEN, injected_table  # noqa: E402
-from discover_limits import CAUSES, DURATIONS, figure, limits_table, Point, Search  # noqa: E402
-from discover_nulls import nulls_of, nulls_table  # noqa: E402
+from blind_scores import confusion, from_data, Outcome  # noqa: E402
 import discover_runs as runs  # noqa: E402
-from discover_tables import heat_map, report  # noqa: E402
-from hidden_effects import causes, KINDS, pairs, unknowns, variants  # noqa: E402
+from hidden_effects import causes, KINDS, labels, pairs, unknowns, variants  # noqa: E402
 from injected import EFFECTS  # noqa: E402
 import numpy as np  # noqa: E402
-from tables import put, table  # noqa: E402
+from scipy.stats import binomtest  # noqa: E402
+from tables import number, put, table  # noqa: E402
 
 SEED = 20260131
 
@@ -112,29 +110,8 @@ def blind(given: argparse.Namespace) -> int:
                        'which the generator varies by 30 % either way')
     text = report(lines, setting)
     print(text)
-    _write(given, text, heat_map(lines, f'Hidden and named, seed {given.seed}'))
-    return 0
-
-
-def limits(given: argparse.Namespace) -> int:
-    """Run the detection limits; write their figure."""
-    points = [Point(cause, duration, given.rate, given.seed)
-              for duration in given.durations for cause in given.causes]
-    results = runs.Results(given.lines, _about())
-    search = Search(points, given.runs, results)
-    missing = sum(max(given.runs - len(lines), 0) for _, lines in search.state())
-    if missing and not given.no_run:
-        runs.warm_up()
-        work(search.next_task, missing, given, results)
-    lines = [line for _, found in search.state() for line in found]
-    if not lines:
-        say('no recording was run')
-        return 1
-    setting = _setting(given, lines, f'{len(lines)} recordings at {given.rate:g} Hz')
-    text = f'{setting}\n\n{limits_table(search)}'
-    print(text)
-    _write(given, text, figure(
-        search, f'Strength at which a cause is reported, seed {given.seed}'))
+    if given.table:
+        put(given.table, text, 'blind')
     return 0
 
 
@@ -178,8 +155,8 @@ def flights(given: argparse.Namespace) -> int:
 def nulls(given: argparse.Namespace) -> int:
     """Run recordings with nothing hidden; write their table."""
     lines = []
-    for line in nulls_of(given.each, given.seed, given.elsewhere, given.generators, given.lines,
-                         not given.no_run):
+    for line in runs.nulls_of(given.each, given.seed, given.elsewhere, given.generators,
+                              given.lines, not given.no_run):
         lines.append(line)
         said = ', '.join(line['false']) or 'nothing false'
         say(f'{line["generator"]} {line["number"]}: {line["rate"]:g} Hz, {line["duration"]:g} s, '
@@ -199,7 +176,7 @@ def injected(given: argparse.Namespace) -> int:
     folder = os.environ.get('OU_MONITOR_REALDATA')
     if folder is None:
         raise ValueError('OU_MONITOR_REALDATA is not set: it names the folder of the recordings')
-    results = examine(Path(folder), given.names, given.effects, given.seed, say)
+    results = runs.examine_injected(Path(folder), given.names, given.effects, given.seed, say)
     if not results:
         say('no recording was run')
         return 1
@@ -210,15 +187,247 @@ def injected(given: argparse.Namespace) -> int:
     return 0
 
 
-def _write(given: argparse.Namespace, text: str, svg: str) -> None:
-    """Write table and drawing where they are asked for; the table shows the drawing."""
-    if given.figure:
-        given.figure.write_text(svg)
-    if given.table:
-        if given.figure:
-            place = os.path.relpath(given.figure, given.table.parent)
-            text += f'\n![{given.part}: the drawing]({Path(place).as_posix()})\n'
-        put(given.table, text, given.part)
+# What the tables say.
+
+# Seconds that a recording may take, and MB.
+SECONDS, MEMORY = 15.0, 1000.0
+# Kind, what is counted, required share (negative: at most), and which recordings count.
+_LEVELS: tuple[tuple[str, str, float, Callable[[Outcome], bool]], ...] = (
+    ('single', 'named right, alone', 0.90, lambda o: o.alone),
+    ('single', 'named right or in the reported set', 0.95, lambda o: o.in_set),
+    ('none', 'false alarms', -0.05, lambda o: o.alarm),
+    ('pair', 'both named', 0.80, lambda o: o.all_named),
+    ('pair', 'both named and nothing else', 0.0, lambda o: o.alone),
+    ('pair', 'both in the reported set, nothing false', 0.0, lambda o: o.in_set),
+    ('variant', 'family right', 0.90, lambda o: o.family),
+    ('variant', 'name right or in the reported set', 0.80, lambda o: o.in_set),
+    ('variant', 'named right, alone', 0.0, lambda o: o.alone),
+    ('unknown', 'unexplained or partly explained', 0.90, lambda o: o.left_open),
+    ('unknown', 'the same, and no name that is wrong', 0.90,
+     lambda o: o.left_open and not o.misnamed),
+)
+
+
+@dataclass(frozen=True)
+class Level:
+    """
+    A share of recordings beside the one required.
+
+    Attributes
+    ----------
+    kind, what : str
+        Kind of recordings, and what is counted.
+    required : float
+        Share at least; negative: at most minus that; 0: not required.
+    hits, of : int
+        Recordings.
+
+    """
+
+    kind: str
+    what: str
+    required: float
+    hits: int
+    of: int
+
+    @property
+    def share(self) -> float:
+        """Return the share measured."""
+        return self.hits / self.of
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Return the 95 % interval of Wilson (1927)."""
+        found = binomtest(self.hits, self.of).proportion_ci(0.95, method='wilson')
+        return float(found.low), float(found.high)
+
+    @property
+    def met(self) -> str:
+        """Return whether the share reaches what is required, in a word."""
+        if self.required == 0.0:
+            return ''
+        good = self.share <= -self.required if self.required < 0.0 else \
+            self.share >= self.required
+        return 'yes' if good else 'no'
+
+
+def levels(lines: Sequence[dict[str, Any]]) -> list[Level]:
+    """Return all shares of which there are recordings."""
+    outcomes = [from_data(line) for line in lines]
+    found = []
+    for kind, what, required, counts in _LEVELS:
+        hits = [counts(one) for one in outcomes if one.kind == kind]
+        if hits:
+            found.append(Level(kind, what, required, sum(hits), len(hits)))
+    return found
+
+
+def report(lines: Sequence[dict[str, Any]], setting: str) -> str:
+    """
+    Return all tables as Markdown.
+
+    Parameters
+    ----------
+    lines : sequence of dict
+        Results, as `examine` of `discover_runs` gives them.
+    setting : str
+        Seed, date and what else the numbers depend on; one line.
+
+    Returns
+    -------
+    str
+
+    """
+    outcomes = [from_data(line) for line in lines]
+    parts = [f'{setting}\n', '### Levels\n', _levels(levels(lines)),
+             '### Time and memory of one recording\n', _cost(lines),
+             '### Effect by effect\n', _effects(outcomes)]
+    for kinds, title in ((('single', 'none', 'unknown'), 'One effect, none, and one outside'),
+                         (('variant',), 'The same causes in other shapes')):
+        part = [one for one in outcomes if one.kind in kinds]
+        if part:
+            parts += [f'### Confusion: {title}\n', _matrix(part)]
+    return '\n'.join(parts)
+
+
+def _levels(found: Sequence[Level]) -> str:
+    rows = []
+    for one in found:
+        low, high = one.interval
+        required = '' if one.required == 0.0 else (
+            f'{100 * abs(one.required):.0f} % at ' + ('least' if one.required > 0.0 else 'most'))
+        rows.append([f'{one.kind}: {one.what}', required, f'{100 * one.share:.1f} %',
+                     f'{100 * low:.1f}..{100 * high:.1f} %', f'{one.hits}/{one.of}', one.met])
+    return table(['', 'required', 'measured', '95 % interval', 'recordings', 'met'], rows)
+
+
+def _cost(lines: Sequence[dict[str, Any]]) -> str:
+    rows = []
+    for kind in ('single', 'variant', 'pair', 'none', 'unknown', 'all'):
+        part = [line for line in lines if kind in (line['kind'], 'all')]
+        if not part:
+            continue
+        done = [line for line in part if line['seconds'] is not None]
+        late = sum(line['failure'] == runs.TIME_LIMIT for line in part)
+        cells = ['-'] * 5
+        if done:
+            # A recording that was stopped took longer than all that were not.
+            wall = np.array([*(line['seconds'] for line in done), *[np.inf] * late])
+            cpu = [line['cpu_s'] for line in done]
+            cells = [*(number(float(q), '.1f') for q in (
+                *np.quantile(wall, [0.5, 0.9], method='higher'), wall.max())),
+                number(float(np.median(cpu)), '.1f'),
+                f"{max(line['memory_mb'] for line in done):.0f}"]
+        slow = late + sum(line['seconds'] > SECONDS for line in done)
+        rows.append([kind, str(len(part)), *cells[:4], str(slow), cells[4], str(late),
+                     str(len(part) - len(done) - late)])
+    return table(['kind', 'recordings', 'median s', '90 % s', 'max s', 'median CPU s',
+                  f'over {SECONDS:g} s', 'max MB', 'stopped', 'failed'], rows) + (
+        f'\nRequired: {SECONDS:g} s on two cores, {MEMORY:g} MB. A dash for a time is one of a '
+        'recording that was stopped.\n')
+
+
+def _effects(outcomes: Sequence[Outcome]) -> str:
+    groups: dict[tuple[str, str], list[Outcome]] = {}
+    for one in outcomes:
+        effect = one.kind if one.kind in ('none', 'pair') else one.effect
+        groups.setdefault((one.kind, effect), []).append(one)
+    order = ('single', 'variant', 'pair', 'none', 'unknown')
+    rows = []
+    for (kind, effect), part in sorted(groups.items(), key=lambda item: (
+            order.index(item[0][0]), item[0][1])):
+        right = (lambda o: not o.alarm) if kind == 'none' else (
+            lambda o: o.left_open and not o.misnamed) if kind == 'unknown' else (
+            lambda o: o.in_set)
+        wrong = Counter(_said(one) for one in part if not right(one))
+        rows.append([
+            effect if kind == 'single' else f'*{kind}*' if effect == kind else f'*{effect}*',
+            str(len(part)), *([str(sum(o.alone for o in part)), str(sum(o.in_set for o in part)),
+                               str(sum(o.family for o in part))]
+                              if kind not in ('none', 'unknown') else ['', '', '']),
+            str(sum(map(right, part))),
+            '; '.join(f'{text} {count}' if count > 1 else text
+                      for text, count in wrong.most_common(6))])
+    return table(['effect', 'recordings', 'alone', 'in the set', 'family', 'right',
+                  'what was said of the others'], rows)
+
+
+def _said(one: Outcome) -> str:
+    """Return what was reported, in few words."""
+    if not one.verdict:
+        return 'failed'
+    names = ' + '.join(sorted(one.named)) or 'nothing'
+    return names + ('' if one.verdict == 'explained' or not one.named else ' (partly)')
+
+
+def _rows(outcomes: Sequence[Outcome]) -> tuple[list[str], list[str], dict[str, dict[str, int]]]:
+    """Return truths and names in the order of the catalogue, and the counts."""
+    counts = confusion(outcomes)
+    order = [*labels, 'none', 'unknown']
+    truths = sorted(counts, key=order.index)
+    return truths, [*labels, 'nothing', 'failed'], counts
+
+
+def _matrix(outcomes: Sequence[Outcome]) -> str:
+    truths, names, counts = _rows(outcomes)
+    names = [name for name in names if any(name in row for row in counts.values())]
+    rows = [[f'{truth} ({counts[truth]["of"]})',
+             *(_cell(counts[truth].get(name, 0), truth == name) for name in names)]
+            for truth in truths]
+    return table(['hidden (recordings) \\ named', *(
+        name.replace('_', ' ') for name in names)], rows) + (
+        '\nA recording with several names is counted under each.\n')
+
+
+def _cell(count: int, diagonal: bool) -> str:
+    return '' if not count else f'**{count}**' if diagonal else str(count)
+
+
+def nulls_table(lines: Sequence[dict[str, Any]]) -> str:
+    """Return how many recordings had a false name, by generator."""
+    rows = []
+    for name in (*dict.fromkeys(line['generator'] for line in lines), 'all'):
+        of = [line for line in lines if name in (line['generator'], 'all')]
+        wrong = sum(bool(line['false']) for line in of)
+        low, high = Level('', '', 0.0, wrong, len(of)).interval
+        names = Counter(one for line in of for one in line['false'])
+        left = sum(line['verdict'] in ('partly_explained', 'unexplained') for line in of)
+        rows.append([name, f'{wrong} of {len(of)}', f'{100 * low:.1f}..{100 * high:.1f} %',
+                     ', '.join(f'{one} {many}' if many > 1 else one
+                               for one, many in names.items()) or '-', f'{left}',
+                     f'{np.median([line["cpu_s"] for line in of]):.1f}'])
+    return table(['base', 'with a false name', '95 % interval', 'false names',
+                  'something left', 'median CPU s'], rows)
+
+
+def injected_table(results: Sequence[runs.Injected]) -> str:
+    """Return the table: a row a recording, a column an effect, and what became of its causes."""
+    clean = {one.recording: one for one in results if not one.effect}
+    effects = list(dict.fromkeys(one.effect for one in results if one.effect))
+    rows, named, counted = [], Counter[str](), Counter[str]()
+    kept, had, false = np.zeros(3, dtype=int)
+    for name, bare in clean.items():
+        mine = {one.effect: one for one in results if one.recording == name and one.effect}
+        cells = []
+        for effect in effects:
+            if effect not in mine:
+                cells.append('-')
+                continue
+            outcome = mine[effect].outcome(bare)
+            named[effect] += outcome == 'yes'
+            counted[effect] += outcome != 'there'
+            cells.append(f'{outcome} ({mine[effect].strength:.1f})')
+        stays = np.sum([one.stays(bare) for one in mine.values()], axis=0)
+        wrong = [cause for one in mine.values() for cause in one.false(bare)]
+        kept, had, false = kept + stays[0], had + stays[1], false + len(wrong)
+        most = ', '.join(f'{cause} {many}' for cause, many in Counter(wrong).most_common())
+        rows.append([name, *cells, f'{stays[0]} of {stays[1]}', most or '-'])
+    rows.append(['named', *(f'{named[effect]} of {counted[effect]}' for effect in effects),
+                 f'{kept} of {had}', str(false)])
+    total, tried = sum(named.values()), sum(counted.values())
+    return table(['recording', *effects, 'own causes kept', 'named beside, times'], rows) + (
+        f'\nNamed: {total} of {tried}, {100.0 * total / max(tried, 1):.0f} %; '
+        f'own causes kept: {100.0 * kept / max(had, 1):.0f} %.\n')
 
 
 def _about() -> dict[str, str]:
@@ -259,23 +468,18 @@ def _count(text: str) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parts = parser.add_subparsers(dest='part', required=True)
-    for name, text, action in (('blind', 'hidden effects, drawn blind', blind),
-                               ('limits', 'strength against duration', limits)):
-        part = parts.add_parser(name, help=text, description=text)
-        part.set_defaults(action=action)
-        part.add_argument('--seed', type=_count, default=SEED, help='of all that is drawn')
-        part.add_argument('--rate', type=_positive, default=1000.0, help='Hz')
-        part.add_argument('--jobs', type=_count, default=2, help='recordings at once')
-        part.add_argument('--limit', type=_positive, default=60.0,
-                          help='s for one recording; more is a failure')
-        part.add_argument('--lines', type=Path, help='JSON lines: results, added one by one; '
-                          'what is in it is not run again')
-        part.add_argument('--no-run', action='store_true', help='only what is in --lines')
-        part.add_argument('--table', type=Path,
-                          help=f'write the tables here, between its marks "<!-- {name} begins '
-                          f'-->" and "<!-- {name} ends -->" if it has them')
-        part.add_argument('--figure', type=Path, help='write the drawing here, SVG')
-    part = parts.choices['blind']
+    part = parts.add_parser('blind', help='hidden effects, drawn blind',
+                            description='hidden effects, drawn blind')
+    part.set_defaults(action=blind)
+    part.add_argument('--seed', type=_count, default=SEED, help='of all that is drawn')
+    part.add_argument('--rate', type=_positive, default=1000.0, help='Hz')
+    part.add_argument('--jobs', type=_count, default=2, help='recordings at once')
+    part.add_argument('--limit', type=_positive, default=60.0,
+                      help='s for one recording; more is a failure')
+    part.add_argument('--lines', type=Path, help='JSON lines: results, added one by one; what is '
+                      'in it is not run again')
+    part.add_argument('--no-run', action='store_true', help='only what is in --lines')
+    part.add_argument('--table', type=Path, help='write the tables here, between its marks')
     part.add_argument('--each', type=_count, default=10, help='recordings of each effect')
     part.add_argument('--pairs', type=_count, help='recordings with two (default: 10 x each)')
     part.add_argument('--none', type=_count, help='recordings with none (default: 10 x each)')
@@ -307,14 +511,9 @@ def _parser() -> argparse.ArgumentParser:
                             description='effects hidden in recordings of real runs')
     part.set_defaults(action=injected)
     part.add_argument('names', nargs='*', help='recordings (default all)')
-    part.add_argument('--effects', nargs='+', choices=EFFECTS, default=list(HIDDEN))
+    part.add_argument('--effects', nargs='+', choices=EFFECTS, default=list(runs.HIDDEN))
     part.add_argument('--seed', type=_count, default=1, help='of all that is drawn')
     part.add_argument('--table', type=Path, help='write the table here, between its marks')
-    part = parts.choices['limits']
-    part.add_argument('--causes', nargs='+', choices=causes(), default=list(CAUSES))
-    part.add_argument('--durations', nargs='+', type=_positive, default=list(DURATIONS))
-    part.add_argument('--runs', type=_count, default=40,
-                      help='recordings of each cause and duration')
     return parser
 
 
@@ -322,7 +521,7 @@ def main() -> int:
     """Parse arguments, measure, write."""
     parser = _parser()
     given = parser.parse_args()
-    if given.part in ('blind', 'limits') and given.jobs < 1:
+    if given.part == 'blind' and given.jobs < 1:
         parser.error('--jobs needs 1 or more')
     if given.part == 'blind':
         given.pairs = 10 * given.each if given.pairs is None else given.pairs

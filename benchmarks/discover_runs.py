@@ -1,30 +1,40 @@
 """
-One hidden effect after the other, each in a process of its own with a time limit.
+What `discover.py` runs: hidden effects, each in a process of its own with a time limit; nothing.
 
-And recordings of real runs, whole and in halves, where `OU_MONITOR_REALDATA` names their folder.
+And recordings of real runs, whole, in halves, and with effects hidden in them, where
+`OU_MONITOR_REALDATA` names their folder.  Of recordings with nothing hidden, what every flight has
+may be in the base: a sag, noise that follows throttle, white noise, steps of the ADC.  Each of
+these that was put in is true, whatever is named beyond it is a false alarm.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
+import importlib.util
 import json
 import multiprocessing
 from multiprocessing.connection import Connection, wait
+import os
 from pathlib import Path
 import resource
 import signal
 import sys
 import time
 from typing import Any
+import zlib
 
 from blind_scores import hide, outcome
+from hidden_circuit import FINE_RATE, make_bench, UPDATE_RATE
 from hidden_effects import Hidden
+from hidden_registry import EFFECTS as BASES
+from injected import EFFECTS, noise_of
+import numpy as np
 from ou_monitor import discover
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Recording
-from real_flights import BENCHES, FLIGHTS
+from real_flights import BENCHES, FLIGHTS, flights
 
 _ROOT = Path(__file__).resolve().parent.parent
 TIME_LIMIT = 'time limit'
@@ -330,3 +340,244 @@ class Results:
     def of(self, tasks: Iterable[Task]) -> list[dict[str, Any]]:
         """Return the results that there are of these tasks."""
         return [self.by_key[task.key] for task in tasks if task.key in self.by_key]
+
+
+Draw = Callable[[np.random.Generator, float, float], tuple[Recording, tuple[str, ...]]]
+
+# What a base may have, each with a chance of one half.
+BASE = ('load_sag', 'load_dependent_sigma', 'measurement_noise', 'quantization')
+RATES, DURATIONS = (50, 100, 200, 500, 1000), (20.0, 60.0, 120.0)
+
+
+@dataclass(frozen=True)
+class Null:
+    """
+    One recording with nothing hidden.
+
+    Attributes
+    ----------
+    name : str
+        Of its generator.
+    number : int
+        Which of it.
+    rate, duration : float
+        Hz, s.
+    truth : tuple of str
+        What is in its base.
+    recording : Recording
+
+    """
+
+    name: str
+    number: int
+    rate: float
+    duration: float
+    truth: tuple[str, ...]
+    recording: Recording
+
+
+def plain(rng: np.random.Generator, rate: float, duration: float
+          ) -> tuple[Recording, tuple[str, ...]]:
+    """Draw a plain rail under made throttle."""
+    return _run(rng, rate, duration, None, ())
+
+
+def flown(rng: np.random.Generator, rate: float, duration: float
+          ) -> tuple[Recording, tuple[str, ...]]:
+    """Draw a base with what flights have under throttle, recorded where there is some."""
+    throttle = _recorded()
+    base = tuple(name for name in BASE if rng.random() < 0.5)
+    return _run(rng, rate, duration, throttle[rng.integers(len(throttle))] if throttle else None,
+                base)
+
+
+def _recorded(known: list[np.ndarray] = []) -> list[np.ndarray]:
+    """Return throttle of recorded flights at the rate of commands, read once."""
+    folder = os.environ.get('OU_MONITOR_REALDATA')
+    if folder is not None and not known:
+        for _, recording in flights(Path(folder), []):
+            if recording.throttle is not None and recording.n > 1000:
+                t = recording.t - recording.t[0]
+                at = np.arange(0.0, float(t[-1]), 1.0 / UPDATE_RATE)
+                known.append(np.clip(np.interp(at, t, recording.throttle), 0.0, 1.0))
+    return known
+
+
+def _run(rng: np.random.Generator, rate: float, duration: float, throttle: np.ndarray | None,
+         base: Iterable[str]) -> tuple[Recording, tuple[str, ...]]:
+    bench = make_bench(duration, rate, int(np.ceil(FINE_RATE / rate)), rng)
+    if throttle is not None:
+        need = bench.commands.size
+        again = np.concatenate((throttle, throttle[::-1]))
+        begin = int(rng.integers(again.size))
+        bench.commands = np.resize(np.roll(again, -begin), need)
+        bench.__post_init__()
+    truth: set[str] = set()
+    for name in base:
+        BASES[name].apply(bench, float(np.exp(rng.uniform(np.log(0.3), np.log(3.0)))))
+        truth.update(BASES[name].truth)
+    t, voltage, held = bench.run()
+    return Recording(t, voltage, held, 'null'), tuple(sorted(truth))
+
+
+def elsewhere(file: Path) -> Draw:
+    """Return a generator written elsewhere: `make('null', seed, T)` at 1 kHz, sigma(throttle)."""
+    spec = importlib.util.spec_from_file_location('elsewhere', file)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+    def draw(rng: np.random.Generator, rate: float, duration: float
+             ) -> tuple[Recording, tuple[str, ...]]:
+        every = round(1000.0 / rate)
+        t, throttle, voltage = module.make('null', int(rng.integers(2**31)), T=duration)
+        return (Recording(t[::every], voltage[::every], throttle[::every], 'null'),
+                ('load_dependent_sigma',))
+
+    return draw
+
+
+def draw(name: str, make: Draw, seed: int, number: int) -> Null:
+    """Draw one recording; all of it comes from seed, generator and number."""
+    word = int.from_bytes(sha256(name.encode()).digest()[:8], 'big')
+    rng = np.random.default_rng([seed, number, word])
+    rate, duration = float(rng.choice(RATES)), float(rng.choice(DURATIONS))
+    recording, truth = make(rng, rate, duration)
+    return Null(name, number, rate, duration, truth, recording)
+
+
+def examine_null(null: Null) -> dict[str, Any]:
+    """Discover a recording; return what was named, and what of it is false."""
+    began = time.process_time()
+    data = discover(null.recording).as_data()
+    named = [cause['name'] for cause in data['causes']]
+    false = sorted({name for name in named if name not in null.truth})
+    return {'generator': null.name, 'number': null.number, 'rate': null.rate,
+            'duration': null.duration, 'truth': null.truth, 'verdict': data['verdict'],
+            'named': named, 'false': false, 'cpu_s': time.process_time() - began}
+
+
+def nulls_of(each: int, seed: int, file: Path | None, chosen: Sequence[str] | None,
+             lines: Path | None, more: bool) -> Iterator[dict[str, Any]]:
+    """Yield the results of all recordings, those known already from their file first."""
+    makers: dict[str, Draw] = {'plain': plain, 'flown': flown}
+    if file is not None:
+        makers['elsewhere'] = elsewhere(file)
+    known: dict[tuple[Any, ...], dict[str, Any]] = {}
+    if lines is not None and lines.exists():
+        for text in lines.read_text().splitlines():
+            line = json.loads(text)
+            known[line['generator'], line['seed'], line['number']] = line
+    for number in range(each):
+        for name, make in makers.items():
+            if chosen is not None and name not in chosen:
+                continue
+            line = known.get((name, seed, number))
+            if line is None and more:
+                line = {**examine_null(draw(name, make, seed, number)), 'seed': seed}
+                if lines is not None:
+                    with lines.open('a') as out:
+                        out.write(json.dumps(line) + '\n')
+            if line is not None:
+                yield line
+
+
+# Seconds of each recording; what is shorter is taken whole, and so is jd, of one sample a second.
+PIECES = {'gecko': (30.0, 60.0), 'nazgul': (40.0, 80.0), 'roma': (40.0, 80.0),
+          'bf3s': (0.0, 40.0), 'jd': (0.0, 400.0), 'cf_solo': (10.0, 50.0),
+          'cf_pair': (10.0, 50.0), 'cf_takeoff': (0.0, 40.0), 'mm_bench_3': (0.0, 4.0),
+          'mm_bench_5': (0.0, 4.0), 'xt_pico_a': (2.0, 6.0)}
+# What is hidden; the others of `EFFECTS` are of the sensor, and there or not without a model.
+HIDDEN = ('tone', 'slow', 'levels', 'glitches', 'jumps', 'held', 'regimes', 'tails', 'dropouts')
+STRENGTHS = (1.0, 3.0)
+
+
+def pieces(folder: Path, names: Sequence[str]) -> Iterator[tuple[str, Recording]]:
+    """Yield the pieces of the recordings that are there."""
+    for name, file, options in (*FLIGHTS, *BENCHES):
+        if name not in PIECES or (names and name not in names) or not (folder / file).exists():
+            continue
+        flight = int(options[options.index('--flight') + 1]) if '--flight' in options else None
+        whole = read_recording(folder / file, flight=flight)
+        first, last = PIECES[name]
+        at = whole.t - whole.t[0]
+        part = (at >= first) & (at < last)
+        yield name, Recording(whole.t[part], whole.voltage[part],
+                              whole.throttle[part])
+
+
+@dataclass(frozen=True)
+class Injected:
+    """
+    What came of one.
+
+    Attributes
+    ----------
+    recording, effect : str
+        What was hidden where; no effect: the piece as it is.
+    strength : float
+        Of the effect.
+    named, alternatives : tuple of str
+        Causes that were named, and those that did as well.
+    seconds : float
+        CPU time, s.
+
+    """
+
+    recording: str
+    effect: str
+    strength: float
+    named: tuple[str, ...]
+    alternatives: tuple[str, ...]
+    seconds: float
+
+    def outcome(self, clean: Injected) -> str:
+        """
+        Return what came of an effect: 'yes', 'no', or 'there' where nothing can be said.
+
+        It is named where a name that is right for it is in the set and is not, or not as often,
+        in that of the piece as it is.
+        """
+        right = EFFECTS[self.effect][1]
+        if any(self.named.count(name) > clean.named.count(name) for name in right) or (
+                right & set(self.alternatives) - set(clean.named)):
+            return 'yes'
+        return 'there' if right & set(clean.named) & set(self.named) else 'no'
+
+    def stays(self, clean: Injected) -> tuple[int, int]:
+        """Return how many causes of the piece as it is are still named, and how many it has."""
+        return len(set(clean.named) & set(self.named)), len(set(clean.named))
+
+    def false(self, clean: Injected) -> tuple[str, ...]:
+        """Return what is named that neither was there nor is right."""
+        return tuple(sorted(set(self.named) - set(clean.named) - EFFECTS[self.effect][1]))
+
+
+def found_in(name: str, effect: str, strength: float, recording: Recording) -> Injected:
+    """Return what `discover` makes of a recording."""
+    began = time.process_time()
+    causes = discover(recording).causes
+    return Injected(name, effect, strength, tuple(cause.name for cause in causes),
+                  tuple(other for cause in causes for other in cause.alternatives),
+                  time.process_time() - began)
+
+
+def examine_injected(folder: Path, names: Sequence[str], effects: Sequence[str], seed: int,
+            say: Callable[[str], None]) -> list[Injected]:
+    """Hide each effect in each piece, and return what came of it, the piece as it is first."""
+    results = []
+    for name, piece in pieces(folder, names):
+        clean = found_in(name, '', 0.0, piece)
+        say(f'{name}: {", ".join(clean.named) or "nothing"}; {clean.seconds:.1f} s')
+        results.append(clean)
+        for effect in effects or HIDDEN:
+            rng = np.random.default_rng([seed, zlib.crc32(f'{name} {effect}'.encode())])
+            strength = float(rng.uniform(*STRENGTHS))
+            hidden = EFFECTS[effect][0](piece, strength * noise_of(piece.voltage), rng)
+            one = found_in(name, effect, strength, hidden)
+            kept, had = one.stays(clean)
+            say(f'{name} {effect} x{strength:.1f}: {one.outcome(clean)}; '
+                f'{", ".join(one.named) or "nothing"}; kept {kept} of {had}; '
+                f'{one.seconds:.1f} s')
+            results.append(one)
+    return results
