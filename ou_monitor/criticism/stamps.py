@@ -8,6 +8,7 @@ or wrong, and then they do not.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from ou_monitor.records import FloatArray
@@ -20,9 +21,6 @@ _SMALL = 0.02
 _LARGE = 0.45
 # Correlation of neighbouring errors up to which they count as independent.
 _WHITE = 0.3
-# The increments must be the rail's to at least this share, and follow the steps
-# to less than this, for the stamps to be called wrong.
-_RAIL, _FOLLOW, _SURE = 0.5, 0.25, 0.06
 _TINY = 1e-6
 
 
@@ -76,23 +74,30 @@ def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
 
 
 def _wrong(step: FloatArray, number: FloatArray, voltage: FloatArray) -> bool:
-    """Return whether increments do not follow the steps as those of a rail would."""
+    """
+    Return whether increments are likelier not to follow the steps than to follow them.
+
+    By a likelihood ratio above the price of a parameter, as causes are; white noise of the sensor
+    follows no step.
+    """
     change = np.diff(voltage)
     change = change - np.median(change)
     limit = 4.0 * float(np.median(np.abs(change))) / 0.6745
     use = (number == 1.0) & (np.abs(change) < limit)
-    if use.sum() < 200:
-        return False
-    # White noise of the sensor makes neighbouring increments undo each other; it
-    # follows no step.
     both = use[1:] & use[:-1]
+    if not both.any():
+        return False
+    # It makes neighbouring increments undo each other.
     power = float(np.mean(change[use] ** 2))
     noise = -2.0 * float(np.mean((change[1:] * change[:-1])[both])) / power
+    rail = min(max(1.0 - noise, 0.0), 1.0)
     square = change[use] ** 2 / power - 1.0
     x = step[use] - step[use].mean()
-    follow = float(x @ square) / float(x @ x)
-    error = float(square.std()) / float(np.sqrt(x @ x))
-    return 1.0 - noise > _RAIL and error < _SURE and follow < _FOLLOW
+    follow, weight = float(x @ square), float(x @ x)
+    # Of normal errors, with the spread of the squares.
+    ratio = 0.5 * ((follow - rail * weight) ** 2 - follow**2) / (
+        weight * float(square @ square) / square.size)
+    return bool(ratio > 0.5 * math.log(square.size))
 
 
 def _correlation(a: FloatArray, b: FloatArray) -> float:

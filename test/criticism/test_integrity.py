@@ -138,6 +138,16 @@ def test_wrong_stamps_differ_from_uneven_sampling():
     assert right.error == 0.0 and np.array_equal(right.t, stamps)
 
 
+@pytest.mark.parametrize('seed', range(3))
+def test_a_short_recording_tells_wrong_stamps_by_their_likelihood(seed):
+    """3000 samples, a tenth of a step: the slope is known to 0.2, and 0 and 1 lie apart."""
+    rng = np.random.default_rng(seed)
+    grid = np.arange(3000) / 1000.0
+    stamps = grid + 1e-4 * np.clip(rng.standard_normal(grid.size), -4.0, 4.0)
+    assert judge_stamps(stamps, simulate(grid, 63.0, 0.3, rng)).error > 0.0
+    assert judge_stamps(stamps, simulate(stamps, 63.0, 0.3, rng)).error == 0.0
+
+
 def test_gaps_stay():
     """Lost samples leave their gap, and the note counts it."""
     t, v = rail(8)
