@@ -13,6 +13,10 @@ from ou_monitor import __version__
 from ou_monitor.cli.commands import COMMANDS
 from ou_monitor.errors import InputError, nearest, refusal
 
+# Before NumPy is loaded.  Matrices here are small: threads of BLAS only wait for one another, and
+# on two busy cores a product of two series of 20 000 took 21 ms instead of 4 us.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
 PROGRAM = 'ou-monitor'
 BAD_INPUT = 2
 # What a shell reports for a program that Ctrl-C ended.
