@@ -83,6 +83,9 @@ def model_text(finding: Finding, recording: Recording | None = None) -> str:
     if finding.model is None:
         raise InputError(f"no model to save: '{finding.recording}' was not fitted. "
                          f'{finding.sentence}')
+    if finding.load == 'current':
+        raise InputError('no model saved: its load is the measured current, and a model file is '
+                         'for throttle')
 
     def known(value: float) -> float | None:
         return value if math.isfinite(value) else None
@@ -96,7 +99,9 @@ def model_text(finding: Finding, recording: Recording | None = None) -> str:
     if recording is not None:
         loads.push(recording.t, recording.voltage, recording.throttle, recording.current)
     model = replace(finding.model, load=loads.learned())
-    return as_yaml(ModelFile(model, tuple(dict(se) for se in finding.se), provenance))
+    return as_yaml(ModelFile(model, tuple(
+        {name: error for name, error in se.items() if error != math.inf}
+        for se in finding.se), provenance))
 
 
 def render(finding: Finding, known: Sequence[tuple[str, str]] = ()) -> str:

@@ -17,7 +17,7 @@ from ou_monitor.comparison.flight_model import Drawn, FiledModel, FlightModel, R
 from ou_monitor.comparison.judgement import band, differences, distance, judge
 from ou_monitor.comparison.yardstick import Measures, Yardstick
 from ou_monitor.criticism.curves import stray
-from ou_monitor.criticism.readings import usable, why_nothing
+from ou_monitor.criticism.readings import current_at, usable, why_nothing
 from ou_monitor.criticism.repeats import without_repeats
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
@@ -30,8 +30,6 @@ _LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 0.2, 20, 10_000
 _POINTS = 2000
 # Seconds whose level a model from a file takes from the recording.
 _ALIGNED = 2.0
-# Current that is farther from a reading, s, is no load to simulate with.
-_GAP = 1.0
 
 
 def compare(recording: Recording, model: SupplyModel | None = None, *,
@@ -135,24 +133,7 @@ def _samples(recording: Recording, notes: list[str]) -> tuple[Readings, float]:
                      'each reading is simulated and counted once.')
     if u is not None:
         u = np.clip(u, 0.0, 1.0)
-    return Readings(t - t[0], v, u, _current(recording, t)), float(t[0])
-
-
-def _current(recording: Recording, t: FloatArray) -> FloatArray | None:
-    """Return the current at some stamps, A; None where it is not known throughout."""
-    if recording.current is None:
-        return None
-    known = np.isfinite(recording.current) & np.isfinite(recording.t)
-    if not known.any():
-        return None
-    order = np.argsort(recording.t[known], kind='stable')
-    stamps, current = recording.t[known][order], recording.current[known][order]
-    after = np.searchsorted(stamps, t)
-    near = np.minimum(np.abs(t - stamps[np.minimum(after, stamps.size - 1)]),
-                      np.abs(t - stamps[np.maximum(after - 1, 0)]))
-    if near.max() > max(_GAP, 3.0 * float(np.median(np.diff(t)))):
-        return None
-    return np.asarray(np.interp(t, stamps, current), dtype=np.float64)
+    return Readings(t - t[0], v, u, current_at(recording, t)), float(t[0])
 
 
 def _begin(samples: Readings, fit_until: float | None, fitted: bool) -> int:

@@ -14,7 +14,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import find_knee, find_rails, find_step, redraw, usual_change
-from ou_monitor.criticism.readings import usable, why_nothing
+from ou_monitor.criticism.readings import load_of, usable, why_nothing
 from ou_monitor.criticism.repeats import without_repeats
 from ou_monitor.criticism.samples import (
     choose_samples, events_between, lines_between, Samples, without_tones)
@@ -48,6 +48,7 @@ class Integrity:
     # The samples as logged, repeats included, where those differ from `samples` by an exact
     # finding: for the score of the plain model.
     raw: Samples | None = None
+    current: bool = False  # Whether the load is the measured current, and not throttle
     # Samples that were drawn and not measured: they take no part in scores; shape (samples.n,).
     drawn: npt.NDArray[np.bool_] | None = None
 
@@ -70,6 +71,8 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     t, v, u = reading_times(t[places], period), v[places], None if u is None else u[places]
     logged = (t, v, u)
     t, v, u, held = without_repeats(t, v, u)
+    throttle, u = u, load_of(recording, t, v, u, notes)
+    current_is_load = u is not throttle
     if period > 1.0 or recording.held or held > 1.0:
         fresh = (v.size - 1) / float(t[-1] - t[0])
         exact.append(HeldSamples(fresh))
@@ -112,7 +115,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     notes += stamps.notes
     if stamps.error > 0.0:
         exact.append(ClockJitter(stamps.error))
-    useful = _useful(u, recording.has_throttle, notes)
+    useful = _useful(u, recording.has_throttle or current_is_load, notes)
     samples = Samples(stamps.t, v, useful)
     if between.size and drawn is None and stamps.error == 0.0:
         samples = _joined(samples, *events)
@@ -122,7 +125,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     report(1.0)
     raw = _as_logged(*logged) if held > 1.0 or any(
         term.NAME in ('saturation', 'clock_jitter') for term in exact) else None
-    return Integrity(samples, tuple(exact), tuple(notes), raw=raw,
+    return Integrity(samples, tuple(exact), tuple(notes), raw=raw, current=current_is_load,
                      drawn=drawn)
 
 

@@ -6,8 +6,12 @@ Each correction leaves a note.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.model.load import lowpass
+from ou_monitor.model.load_fit import timing
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted, number
 from ou_monitor.timeline.line import in_order
@@ -31,6 +35,9 @@ _MILLIVOLTS = 1000.0
 # Throttle: as 0..1 with what calibration adds; a percentage; microseconds of a servo pulse.
 _UNIT, _PERCENT, _PULSE = (-1.5, 1.5), (-1.0, 150.0), (700.0, 2400.0)
 _EDGE = 0.05
+# Longest hole in a current, s; share of its sizes below its scale; lags in which the mean answers
+# to a load, s.
+_HOLE, _FULL, _LAGS = 1.0, 0.99, np.array([0.02, 0.2, 2.0])
 # Second differences up to so many roundings are none.
 _ROUNDINGS = 16.0
 
@@ -55,6 +62,63 @@ def usable(recording: Recording, notes: list[str]
     if u is not None:
         u = _held(t, _as_share(u, notes), notes) if np.isfinite(u).any() else None
     return t, v, u
+
+
+def current_at(recording: Recording, t: FloatArray) -> FloatArray | None:
+    """Return the current at some stamps, A; None where it is not known throughout."""
+    if recording.current is None:
+        return None
+    known = np.isfinite(recording.current) & np.isfinite(recording.t)
+    if not known.any():
+        return None
+    order = np.argsort(recording.t[known], kind='stable')
+    stamps, current = recording.t[known][order], recording.current[known][order]
+    after = np.searchsorted(stamps, t)
+    near = np.minimum(np.abs(t - stamps[np.minimum(after, stamps.size - 1)]),
+                      np.abs(t - stamps[np.maximum(after - 1, 0)]))
+    if near.max() > max(_HOLE, 3.0 * float(np.median(np.diff(t)))):
+        return None
+    return np.asarray(np.interp(t, stamps, current), dtype=np.float64)
+
+
+def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | None,
+            notes: list[str]) -> FloatArray | None:
+    """
+    Return what moves the mean: throttle, or the measured current where it says more of it.
+
+    As a share of the current that is seldom exceeded, read when the voltage answers to it; t in s,
+    v in V.
+    """
+    current = current_at(recording, t)
+    if current is None or not float(np.ptp(current)) > 0.0:
+        return u
+    late, sign = timing(t, v, current)
+    full = sign * float(np.quantile(np.abs(current), _FULL))
+    if not full:
+        return u
+    load = np.interp(t + late, t, current) / full
+    gain = _said(t, v, load) - (0.0 if u is None else _said(t, v, u))
+    if not gain > 0.5 * _LAGS.size * math.log(v.size):
+        return u
+    notes.append(f'The measured current says more of the voltage than throttle (by {gain:.3g} '
+                 f'nats): it is the load, as a share of {full:.3g} A. What is said of throttle is '
+                 'said of it, and the model is for it.')
+    return np.asarray(load)
+
+
+def _said(t: FloatArray, v: FloatArray, load: FloatArray) -> float:
+    """Return what a load says of changes of the voltage, nats: by itself, its square, lags."""
+    lags = [lowpass(load, t, tau) for tau in _LAGS[_LAGS > float(np.median(np.diff(t)))].tolist()]
+    columns = np.diff(np.stack([load, load * load, *lags]))
+    change = np.diff(v)
+    spread = np.sqrt((columns * columns).sum(axis=1))
+    columns = columns[spread > 0.0] / spread[spread > 0.0, None]
+    if not columns.shape[0] or not change.any():
+        return 0.0
+    product = columns @ change
+    beta = np.linalg.lstsq(columns @ columns.T, product, rcond=1e-9)[0]
+    left = 1.0 - float(product @ beta) / float(change @ change)
+    return -0.5 * change.size * math.log(max(left, 1e-9))
 
 
 def find_bad(v: FloatArray) -> npt.NDArray[np.bool_]:

@@ -18,17 +18,17 @@ from ou_monitor.criticism.structure import evaluate, fit_gaussian
 from ou_monitor.discovery.clipped import redrawn
 from ou_monitor.discovery.decision import relaxes
 from ou_monitor.discovery.earning import Earned, earned, refusal
-from ou_monitor.discovery.errors import standard_errors
+from ou_monitor.discovery.errors import standard_errors, with_reach
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.gain import (
-    crossing_rates, gain_of, guess, mean_score, why_unknown, without)
+    crossing_rates, gain_of, guess, mean_score, shrink_of, why_unknown, without)
 from ou_monitor.discovery.load_start import whole_load
 from ou_monitor.discovery.named import INTERRUPTED, Named, named_causes
 from ou_monitor.discovery.regression import load_terms
 from ou_monitor.discovery.search import position, Progress
 from ou_monitor.discovery.validation import covered, held_out, HeldOut
-from ou_monitor.discovery.verdict import judge, NOTHING
+from ou_monitor.discovery.verdict import doubts, judge, NOTHING
 from ou_monitor.discovery.words import (
     coupling_found, coupling_note, explain, left_out_note, NO_OTHER, no_relaxation_note,
     throttles_note, VAGUE, verdict_sentence)
@@ -104,13 +104,13 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
     whole = left.full.model
     after = named.after if not left.out else criticise(samples, whole, named.bank)
     dropped = (*named.dropped, *left.out)
-    se = standard_errors(samples, whole, slice(0, samples.n))
+    se = tuple(with_reach(term, found, samples) for term, found in zip(
+        whole.terms, standard_errors(samples, whole, slice(0, samples.n)), strict=True))
     done(0.95)
     causes = _causes(samples, state, left, se, plain, scored, named.rivals)
     gain, gain_se = gain_of(left.full, plain, scored)
     unknown = why_unknown(left.full, plain, scored, bool(uncovered))
     why = unknown or ('' if math.isfinite(gain) else VAGUE)
-    verdict = judge(after, len(causes), len(named.dropped))
     criticism = _criticism(named.before, after)
     remaining = sorted((c for c in criticism if c.is_off), key=lambda c: -abs(c.after))
     refused = refusal(samples, whole.terms, gain, gain_se) if causes else ''
@@ -119,18 +119,22 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
     baseline = plain.model.terms[0]
     assert isinstance(baseline, OU)
     crossing = crossing_rates(samples, (baseline,), () if unknown else whole.terms, rng, scored)
+    against = doubts(whole.terms, crossing, recording.duration,
+                     float(np.median(samples.step[1:]))) if causes else ()
+    verdict = judge(after, len(causes), len(named.dropped), against)
     done(1.0)
     return Finding(
         recording=recording.name, n=recording.n, duration=recording.duration, verdict=verdict,
         sentence=verdict_sentence(verdict, causes, remaining, gain, gain_se, named.dropped, why,
-                                  uncovered, refused, named.failure == INTERRUPTED),
+                                  uncovered, refused, named.failure == INTERRUPTED, against),
         baseline=baseline, baseline_score=mean_score(plain.density, scored & plain.known),
         criticism=criticism, causes=causes, model=SupplyModel((*whole.terms, *undone)),
-        se=(*se, *({} for _ in undone)),
+        se=(*se, *(with_reach(term, {}, samples) for term in undone)),
         score=mean_score(left.full.density, scored & left.full.known),
-        gain=gain, gain_se=gain_se, crossing=crossing,
+        gain=gain, gain_se=gain_se, shrink=shrink_of(left.full, plain, scored), crossing=crossing,
         notes=_notes(state, named, whole, dropped, samples, uncovered),
-        samples=samples, simulated=SupplyModel(whole.terms), refused=refused, seed=seed)
+        samples=samples, simulated=SupplyModel(whole.terms), refused=refused,
+        load='current' if state.current else 'throttle', seed=seed)
 
 
 def _insufficient(recording: Recording, state: Integrity, reason: str, seed: int) -> Finding:
@@ -176,7 +180,7 @@ def _plain(samples: Samples, state: Integrity) -> HeldOut:
     # What keeping a block back costs it is what it costs the same process without repeats.
     density = gaussian.density + found.density - plain.density
     return HeldOut(replace(plain, terms=logged, gaussian=gaussian, density=density), density,
-                   found.known & np.isfinite(density))
+                   found.known & np.isfinite(density), gaussian.innovation)
 
 
 def _causes(samples: Samples, state: Integrity, left: Earned, se: tuple[dict[str, Any], ...],
@@ -210,8 +214,9 @@ def _causes(samples: Samples, state: Integrity, left: Earned, se: tuple[dict[str
             assert clean is not None
             gain, error = gain_of(held_out(samples, clean), plain, scored)
             why = '' if math.isfinite(gain) else VAGUE
-        found.append(Cause(term, {}, gain, error, 0.0, (),
-                           explain(term, {}, gain, error, (), True, why), True))
+        shown = with_reach(term, {}, samples)
+        found.append(Cause(term, shown, gain, error, 0.0, (),
+                           explain(term, shown, gain, error, (), True, why), True))
     for k, name in enumerate(left.names):
         worth, index = left.worth[k], position(model, left.names, k)
         why = '' if math.isfinite(worth.gain) else NO_OTHER if worth.less is None else (

@@ -12,6 +12,7 @@ from ou_monitor.criticism.mean_columns import coefficients
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.reading import Saturation
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray, NAN
 
@@ -22,6 +23,20 @@ def standard_errors(samples: Samples, model: Composite, part: slice) -> tuple[di
     for k, more in _of_mean(samples, model, part).items():
         found[k] = {**more, **found[k]}
     return tuple(found)
+
+
+def with_reach(term: Term, se: dict[str, Any], samples: Samples) -> dict[str, Any]:
+    """Return errors with an infinite one for each parameter that no such recording can show."""
+    duration = float(samples.t[-1] - samples.t[0])
+    values = term.values()
+    far = [name for name, value in values.items() if isinstance(value, float) and (
+        (term.unit(name) == 's' and value > duration)
+        or (term.unit(name) == '1/s' and 0.0 < value * duration < 1.0))]
+    if isinstance(term, Saturation):
+        far += [name for name, met in (('low', term.low >= float(samples.logged.min())),
+                                       ('high', term.high <= float(samples.logged.max())))
+                if not met]
+    return {**se, **dict.fromkeys(far, math.inf)}
 
 
 def _gathered(term: Term, se: dict[str, float]) -> dict[str, Any]:

@@ -94,6 +94,13 @@ class CrossingRate:
     baseline_se: float = NAN
     extended_se: float = NAN
 
+    @property
+    def worse(self) -> bool:
+        """Whether the extended model is wrong by its errors, and more so than the plain OU."""
+        off = abs(self.extended - self.observed)
+        return (off > Z95 * math.hypot(self.extended_se, self.observed_se)
+                and off > abs(self.baseline - self.observed))
+
 
 @dataclass(frozen=True, eq=False)
 class Finding:
@@ -115,6 +122,9 @@ class Finding:
     score: float = NAN
     gain: float = NAN
     gain_se: float = NAN
+    # Share by which the rms of its one-step errors on those blocks is smaller than that of the
+    # plain OU.
+    shrink: float = NAN
     crossing: CrossingRate = field(default_factory=CrossingRate)  # What a pilot feels
     notes: tuple[str, ...] = ()  # What was dropped, left out or cannot be decided
     samples: Samples | None = None  # What was fitted
@@ -122,7 +132,14 @@ class Finding:
     simulated: SupplyModel | None = None
     # Why the extended model has not earned its place, in words; empty where it has.
     refused: str = ''
+    # What is called throttle: 'throttle', or 'current' where the measured current is the load.
+    load: str = 'throttle'
     seed: int = 0  # Of all randomness
+
+    @property
+    def size_gain(self) -> float:
+        """Return what of the gain is not in smaller errors: their size is better known, nats."""
+        return self.gain + math.log1p(-self.shrink) if self.shrink < 1.0 else NAN
 
     @property
     def discrepancies(self) -> tuple[Criticism, ...]:
@@ -155,7 +172,8 @@ class Finding:
         """
         baseline = self.baseline
         found: dict[str, Any] = _plain({
-            'recording': self.recording, 'n': self.n, 'duration_s': self.duration,
+            'recording': self.recording, 'load': self.load, 'n': self.n,
+            'duration_s': self.duration,
             'verdict': self.verdict.value, 'sentence': self.sentence,
             'baseline': {
                 'params': dict.fromkeys(('alpha', 'sigma', 'u0')) if baseline is None
@@ -170,7 +188,8 @@ class Finding:
                 'explanation': cause.explanation} for cause in self.causes],
             'extended': {
                 **self._extended(), 'heldout_score': self.score, 'gain': self.gain,
-                'gain_se': self.gain_se,
+                'gain_se': self.gain_se, 'errors_shrink': self.shrink,
+                'size_gain': self.size_gain,
                 'crossing_rate': {
                     'observed': self.crossing.observed, 'baseline': self.crossing.baseline,
                     'extended': self.crossing.extended, 'level_v': self.crossing.level,

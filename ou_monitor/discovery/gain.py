@@ -114,6 +114,14 @@ def gain_of(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_]) -> tuple[
     return if_known(*mean_difference(new.density[both], old.density[both]))
 
 
+def shrink_of(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_]) -> float:
+    """Return the share by which the rms of one-step errors shrinks; NaN where it is not known."""
+    both = scored & new.known & old.known
+    if int(both.sum()) < BLOCKS or not old.error[both].any():
+        return NAN
+    return 1.0 - math.sqrt(float(np.mean(new.error[both] ** 2) / np.mean(old.error[both] ** 2)))
+
+
 def why_unknown(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_],
                 throttle: bool) -> str:
     """Return why a gain cannot be measured, for people; empty where it can."""

@@ -80,23 +80,22 @@ def in_short(finding: Finding) -> tuple[str, str]:
     more = len(names) - _FIRST
     others = [f'{more} more'] if more > 0 else []
     return (f'A plain simulation lacks {listed([*names[:_FIRST], *others])}.',
-            worth_words(finding.gain, finding.gain_se))
+            worth_words(finding.gain, finding.gain_se, finding.shrink, finding.size_gain))
 
 
-def worth_words(gain: float, gain_se: float) -> str:
+def worth_words(gain: float, gain_se: float, shrink: float, size_gain: float) -> str:
     """
-    Return a gain as that of smaller errors of prediction.
+    Return a gain in two parts: smaller errors of prediction, and their size better known.
 
-    Errors smaller by 1 - exp(-gain) and else alike would gain as much.
-
-    gain, gain_se in nats.
+    gain, gain_se and size_gain in nats; shrink is a share.
     """
-    if not (gain > Z95 * gain_se):
+    if not (gain > Z95 * gain_se) or not math.isfinite(size_gain):
         return gain_words(gain, gain_se)
-    best, low, high = (100.0 * -math.expm1(-max(g, 0.0)) for g in (
-        gain, gain - Z95 * gain_se, gain + Z95 * gain_se))
-    return ('Prediction errors on samples not used for the fit shrink by '
-            f'{number(best, 2)} % ({number(low, 2)} to {number(high, 2)} %).')
+    errors = ('shrink by ' if shrink > 0.0 else 'grow by ') + f'{number(100.0 * abs(shrink), 2)} %'
+    return (f'One-step errors on samples not used for the fit {errors} (rms), and their size is '
+            f'{"better" if size_gain >= 0.0 else "worse"} known, by '
+            f'{number(1e3 * abs(size_gain), 2)} of the {number(1e3 * gain)} +- '
+            f'{number(1e3 * gain_se, 2)} mnat gained per sample.')
 
 
 def both_names(name: str) -> str:

@@ -46,6 +46,7 @@ class HeldOut:
     # Log predictive density of each sample, its block kept back, nats; shape (n,).
     density: FloatArray
     known: npt.NDArray[np.bool_]  # Where the other blocks determine the parameters; shape (n,)
+    error: FloatArray  # Error of each prediction, its block kept back, V; shape (n,)
 
 
 def blocks_of(n: int) -> list[slice]:
@@ -76,6 +77,8 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
                      for b in blocks])
     gram = np.array([columns[b].T @ columns[b] for b in blocks])
     density, known = model.density.copy(), np.ones(samples.n, dtype=np.bool_)
+    # What a law believes of the level it has from what comes after, too.
+    error = e.copy() if model.offset is None else evaluate(samples, terms, events).innovation
     for b, own, mean in zip(blocks, info, gram, strict=True):
         others, rest = info.sum(axis=0) - own, gram.sum(axis=0) - mean
         inverse = np.linalg.pinv(others, rcond=1e-12, hermitian=True)
@@ -92,9 +95,11 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
             known[b] = False
             continue
         density[b] += there.density[b] - base.density[b]
+        if model.offset is None:
+            error[b] = there.innovation[b]
     laws = model.free - sum(len(term.free()) + len(term.LINEAR) for term in terms) - 1
     density -= (laws + model.search) / samples.n
-    return HeldOut(model, density, known & np.isfinite(density))
+    return HeldOut(model, density, known & np.isfinite(density), error)
 
 
 def _stepped(term: Term, name: str) -> tuple[Term, float]:

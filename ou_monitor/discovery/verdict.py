@@ -1,16 +1,19 @@
-"""The verdict on a recording, from the statistics that its causes leave."""
+"""The verdict on a recording: what its causes leave, its falls, and where parameters stand."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from ou_monitor.criticism.null_bank import family_chance
-from ou_monitor.discovery.finding import Verdict
+from ou_monitor.discovery.finding import CrossingRate, Verdict
+from ou_monitor.model.terms.load_answer import LoadTransient
+from ou_monitor.model.terms.term import Term
+from ou_monitor.text import listed, number
 
-# Chance of the largest statistic above which a model without causes passes.
+# Chance of the largest statistic above which a model passes.
 NOTHING = 0.01
-# The same for a model with causes: they were chosen to pass, so that a failure means more.
-PASSES = 0.001
+# Step, in a coordinate, that a parameter at the end of its range cannot take.
+_STEP = 1e-4
 
 
 def largest_chance(values: Mapping[str, float]) -> float:
@@ -19,11 +22,40 @@ def largest_chance(values: Mapping[str, float]) -> float:
     return family_chance(largest, max(len(values), 1))
 
 
-def judge(after: Mapping[str, float], causes: int, dropped: int) -> Verdict:
-    """Return the verdict on statistics after some causes, others withdrawn."""
-    chance = largest_chance(after)
+def judge(after: Mapping[str, float], causes: int, dropped: int, doubts: Sequence[str] = ()
+          ) -> Verdict:
+    """Return the verdict on statistics after some causes; others dropped, doubts beside them."""
+    passes = largest_chance(after) > NOTHING and not dropped
     if causes == 0:
-        return Verdict.NO_EFFECT if chance > NOTHING and not dropped else Verdict.UNEXPLAINED
-    if chance > PASSES and not dropped:
-        return Verdict.EXPLAINED
-    return Verdict.PARTLY_EXPLAINED
+        return Verdict.NO_EFFECT if passes else Verdict.UNEXPLAINED
+    return Verdict.EXPLAINED if passes and not doubts else Verdict.PARTLY_EXPLAINED
+
+
+def doubts(terms: Sequence[Term], crossing: CrossingRate, duration: float, step: float
+           ) -> tuple[str, ...]:
+    """Return what speaks against a model beside its statistics, for people (times in s)."""
+    found = []
+    if crossing.worse:
+        found.append(f'it falls through {number(crossing.level, 4)} V '
+                     f'{number(crossing.extended)} times a minute, where '
+                     f'{number(crossing.observed)} were measured and the plain OU says '
+                     f'{number(crossing.baseline)}')
+    ends = [f'{name} of {term.NAME}' for term in terms for name in _at_ends(term, duration, step)]
+    if ends:
+        found.append(f'{listed(ends)} {"stand" if ends[1:] else "stands"} at the end of the range')
+    return tuple(found)
+
+
+def _at_ends(term: Term, duration: float, step: float) -> list[str]:
+    """Return the parameters of a term that stand at the end of their range."""
+    if isinstance(term, LoadTransient) and not term.delay:
+        return [] if 2.0 * step < term.tau < 0.25 * duration else ['tau']
+    return [name for name in term.free()
+            if not (_moves(term, name, _STEP) and _moves(term, name, -_STEP))]
+
+
+def _moves(term: Term, name: str, by: float) -> bool:
+    try:
+        return term.moved(name, by) != term
+    except ValueError:
+        return False

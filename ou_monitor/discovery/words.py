@@ -63,10 +63,11 @@ def plain_words(statistic: str) -> str:
 
 
 def parameters(term: Term, se: Mapping[str, Any]) -> str:
-    """Return the estimates of a term with units and standard errors."""
+    """Return the estimates of a term with units and errors, as far as the recording shows them."""
     return '; '.join(
         f'{name} = {with_error(value, se.get(name), positive=term.positive(name))}'
-        f'{_unit(term, name)}' for name, value in term.values().items())
+        f'{_unit(term, name)}' for name, value in term.values().items()
+        if se.get(name) != math.inf)
 
 
 def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
@@ -79,6 +80,8 @@ def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
         errors = error if isinstance(error, list) else [None] * len(value)
         return '[' + ', '.join(with_error(
             v, e, positive=positive) for v, e in zip(value, errors)) + ']'
+    if error == math.inf:
+        return 'beyond what the recording shows'
     if isinstance(error, float) and math.isfinite(error) and error > 0.0:
         if positive and 0.0 < LARGEST_LOG_SE * value < error:
             return 'not determined'
@@ -171,18 +174,19 @@ def remaining_words(left: Sequence[Criticism]) -> str:
 def verdict_sentence(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism],
                      gain: float, gain_se: float, dropped: Sequence[str] = (),
                      why: str = '', uncovered: int = 0, refused: str = '',
-                     stopped: bool = False) -> str:
+                     stopped: bool = False, doubts: Sequence[str] = ()) -> str:
     """Return the verdict in a sentence or two (gain, gain_se in nats)."""
     if stopped and verdict is Verdict.UNEXPLAINED:
         rest = f': {remaining_words(left)}' if left else ''
         return ('The simulation deviates from the recording; the search was stopped before it '
                 f'found a cause{rest}.')
-    text = _verdict(verdict, causes, left, gain, gain_se, dropped, why, uncovered)
+    text = _verdict(verdict, causes, left, gain, gain_se, dropped, why, uncovered, doubts)
     return f'{text} {refused}: believe its names, not its numbers.' if refused else text
 
 
 def _verdict(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism], gain: float,
-             gain_se: float, dropped: Sequence[str], why: str, uncovered: int) -> str:
+             gain_se: float, dropped: Sequence[str], why: str, uncovered: int,
+             doubts: Sequence[str]) -> str:
     """Return the verdict without what speaks against the model."""
     names = _counted([cause.name for cause in causes])
     tried = (f' The nearest entries of the catalogue ({listed(list(dropped))}) fit in part only.'
@@ -204,9 +208,10 @@ def _verdict(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism
     if verdict is Verdict.EXPLAINED:
         return (f'What the plain OU gets wrong is explained by {listed(names)}. '
                 + gain_words(gain, gain_se, why))
-    rest = f': {remaining_words(left)}' if left else ''
+    rest = '; '.join([*([remaining_words(left)] if left else []), *doubts])
     return (f'{listed(names)} explain{"s" if len(names) == 1 else ""} a part of what the plain OU '
-            f'gets wrong; another part remains{rest}.{tried} ' + gain_words(gain, gain_se, why))
+            f'gets wrong; another part remains{": " if rest else ""}{rest}.{tried} '
+            + gain_words(gain, gain_se, why))
 
 
 def _counted(names: Sequence[str]) -> list[str]:

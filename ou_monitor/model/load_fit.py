@@ -127,7 +127,7 @@ def _bounds(model: LoadModel) -> tuple[FloatArray, FloatArray, FloatArray, Float
     return low, high, centre, deviation
 
 
-def _timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float]:
+def timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float]:
     """Return how late a load is read, s, and 1 where the voltage falls with it, else -1."""
     dt = float(np.median(np.diff(t)))
     slow = min(_SLOWER, 0.3 * float(t[-1] - t[0]))
@@ -213,7 +213,7 @@ def _template(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
         moving = load > 0.05
         mean = float((load[moving] ** 1.6).mean()) if moving.any() else 0.1
     else:
-        delay, sign = _timing(t, voltage, load)
+        delay, sign = timing(t, voltage, load)
         full = sign * max(float(np.quantile(np.abs(current), 0.99)), 1e-9)
         mean = max(1e-3, float(np.maximum(current / full, 0.0).mean()))
     return LoadModel(cells_in_series(float(np.quantile(voltage, 0.99))), mean, full_current=full,

@@ -147,7 +147,7 @@ def held(density, free=2, search=0.0, known=None):
     """Return a model that was scored, as far as a gain looks at it."""
     n = density.size
     return HeldOut(SimpleNamespace(density=density, free=free, search=search), density,
-                   np.ones(n, bool) if known is None else known)
+                   np.ones(n, bool) if known is None else known, np.zeros(n))
 
 
 @pytest.mark.parametrize('gain', (0.02, 0.0, -0.02))

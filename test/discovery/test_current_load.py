@@ -1,0 +1,65 @@
+"""The load of a recording is throttle, or the measured current where that says more."""
+
+import numpy as np
+from ou_monitor import discover, Recording
+from ou_monitor.cli.discover import model_text
+from ou_monitor.criticism.readings import load_of
+from ou_monitor.errors import InputError
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.ou import OU
+import pytest
+from scipy.signal import lfilter
+
+RATE, N = 100.0, 5000
+T = np.arange(N) / RATE
+RAIL = OU(8.0, 0.1, 15.0)
+
+
+def flown(seed):
+    """Return throttle that a pilot moves within tenths of a second."""
+    rng = np.random.default_rng([seed, 77])
+    held = np.repeat(rng.uniform(0.1, 0.9, N), rng.integers(20, 120, N))[:N]
+    return lfilter([0.3], [1.0, -0.7], held)
+
+
+def sagged(load, seed=4):
+    """Return the voltage of a rail that sags by half a volt under full load."""
+    return SupplyModel((RAIL, LoadSag(0.5, 0.0))).simulate(T, np.random.default_rng(seed), load)
+
+
+def test_the_measured_current_is_the_load_where_it_says_more():
+    """Throttle that moves on its own explains nothing; the model is not for throttle then."""
+    u, current = flown(4), 30.0 * flown(5)
+    v = sagged(current / 30.0)
+    recording = Recording(T, v, u, 'made', current=current)
+    found = discover(recording)
+    assert found.as_data()['load'] == 'current'
+    assert [cause.name for cause in found.causes] == ['load_sag']
+    assert any('current says more' in note for note in found.notes)
+    with pytest.raises(InputError, match='current'):
+        model_text(found, recording)
+    alone = discover(Recording(T, v, u, 'made'))
+    assert alone.load == 'throttle' and found.gain > alone.gain + 4.0 * found.gain_se > 0.0
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+@pytest.mark.parametrize('late', [0, 5])
+def test_a_current_is_taken_with_its_sign_and_its_delay(sign, late):
+    """Negative where discharge is, and read 50 ms after the voltage has answered."""
+    load = flown(5)
+    read = sign * 30.0 * np.roll(load, late)
+    notes = []
+    found = load_of(Recording(T, sagged(load), flown(4), '', current=read), T, sagged(load),
+                    flown(4), notes)
+    assert np.corrcoef(found[10:-10], load[10:-10])[0, 1] > 0.99 and len(notes) == 1
+
+
+def test_throttle_stays_the_load_where_current_is_noise_or_unknown():
+    """A current that says no more, or is not there throughout, changes nothing."""
+    u = flown(6)
+    v = sagged(u)
+    noise = 30.0 * np.random.default_rng(1).random(N)
+    gap = np.where((T > 10.0) & (T < 20.0), np.nan, 30.0 * u)
+    for current in (None, noise, gap, np.full(N, 3.0), np.full(N, np.nan)):
+        assert load_of(Recording(T, v, u, '', current=current), T, v, u, []) is u
