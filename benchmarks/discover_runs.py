@@ -558,12 +558,12 @@ def found_in(name: str, effect: str, strength: float, recording: Recording) -> I
     began = time.process_time()
     causes = discover(recording).causes
     return Injected(name, effect, strength, tuple(cause.name for cause in causes),
-                  tuple(other for cause in causes for other in cause.alternatives),
-                  time.process_time() - began)
+                    tuple(other for cause in causes for other in cause.alternatives),
+                    time.process_time() - began)
 
 
 def examine_injected(folder: Path, names: Sequence[str], effects: Sequence[str], seed: int,
-            say: Callable[[str], None]) -> list[Injected]:
+                     say: Callable[[str], None]) -> list[Injected]:
     """Hide each effect in each piece, and return what came of it, the piece as it is first."""
     results = []
     for name, piece in pieces(folder, names):
