@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from ou_monitor.analysis.analyze import Analysis
 from ou_monitor.analysis.cause import Cause
+from ou_monitor.analysis.crafts import craft_of
 from ou_monitor.analysis.level_comparison import LEVEL, sigma_change
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.overview import answers, headline as answer, known_lines, Overview
@@ -187,6 +188,7 @@ def as_data(analysis: Analysis) -> dict[str, Any]:
         'quality': [{'name': item.name, 'severity': item.severity.name.lower(),
                      'text': item.text, 'throttles': list(item.throttles)}
                     for item in analysis.quality],
+        'craft': craft_of(recording, analysis.overview.facts, analysis.overview.cells).to_dict(),
         'notes': list(analysis.notes),
     }
 

@@ -15,8 +15,8 @@ from ou_monitor.analysis.words import (
     as_data, brownout_sentence, caution, facts, headline, in_short, relaxation_sentence)
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    brownout_limit, check_outputs, part_of_recording, positive_number, read_given, repeated,
-    throttle_levels)
+    brownout_limit, check_outputs, limit_of, part_of_recording, positive_number, read_given,
+    repeated, throttle_levels)
 from ou_monitor.cli.output import facts_table, item, paragraph, Progress, table
 from ou_monitor.errors import InputError
 from ou_monitor.records import Recording
@@ -37,6 +37,7 @@ def run(args: argparse.Namespace) -> int:
     _in_range(voltage, horizon)
     start, end = part_of_recording(args.start, args.end)
     recording = read_given(args, start, end)
+    voltage = limit_of(args, recording, voltage)
     if recording.n < 2:
         raise InputError(f"'{args.recording}' holds {recording.n} usable sample"
                          f"{'' if recording.n == 1 else 's'}: nothing can be estimated from it")

@@ -110,6 +110,23 @@ def brownout_limit(args: argparse.Namespace) -> float | None:
     return float(args.cells * voltage)
 
 
+def limit_of(args: argparse.Namespace, recording: Recording, limit: float | None) -> float | None:
+    """
+    Return the limit that was given, V, else that of the log's header; None without either.
+
+    A number of cells that the voltage at rest cannot have is refused.
+    """
+    from ou_monitor.analysis.crafts import check_cells, full_voltage, stated_limit
+
+    if args.cells is not None:
+        check_cells(full_voltage(recording), args.cells)
+    stated = stated_limit(recording.source) if limit is None else None
+    if stated is None:
+        return limit
+    args.cells = stated[0]
+    return stated[1]
+
+
 def throttle_levels(text: str | None) -> tuple[float, ...] | None:
     """Return the levels of ``--levels 0,0.05,...``, in order; None when not given."""
     if text is None:

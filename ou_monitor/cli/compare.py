@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    brownout_limit, check_outputs, part_of_recording, read_given, repeated)
+    brownout_limit, check_outputs, limit_of, part_of_recording, read_given, repeated)
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
@@ -35,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
 
     model = None if args.model is None else read_model(args.model).model
     recording = read_given(args, start, end)
+    limit = limit_of(args, recording, limit)
     with Progress('comparing', args.json == output.STDOUT) as progress, \
             np.errstate(over='ignore', under='ignore'):
         found = compare(recording, model, fit_until=until, seeds=seeds, seed=args.seed,

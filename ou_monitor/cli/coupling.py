@@ -10,7 +10,7 @@ from typing import Any, TYPE_CHECKING
 
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    brownout_limit, check_outputs, part_of_recording, read_given_beside, repeated)
+    brownout_limit, check_outputs, limit_of, part_of_recording, read_given_beside, repeated)
 from ou_monitor.coupling.coupling import (
     Coupling, estimate_coupling, facts, headline, parts, remarks)
 from ou_monitor.errors import InputError
@@ -30,6 +30,7 @@ def run(args: argparse.Namespace) -> int:
     from ou_monitor.timeline.line import readings_of
 
     recording, series = read_given_beside(args, start, end)
+    limit = limit_of(args, recording, limit)
     t, values = series.t, series.values
     unit = '' if series.unit == UNKNOWN else series.unit
     if start is not None or end is not None:

@@ -10,20 +10,19 @@ import re
 from typing import Any
 
 import numpy as np
+from ou_monitor.analysis.crafts import check_cells
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import read_given
 from ou_monitor.cli.output import paragraph, table
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.paper.network.components import (
-    cell_count, check_cells, completed, PowerNetwork, UNITS)
+    completed, PowerNetwork, UNITS)
 from ou_monitor.paper.network.design import (
     answer, as_data, default_voltage, Design, design, effect, probability, remarks)
 from ou_monitor.paper.network.measured import Flight, network_of
 from ou_monitor.stream.files import read_yaml
 from ou_monitor.text import number
 
-# Quantile of the voltages that is that of the pack before the flight, but for glitches.
-_FULL = 0.995
 # One row of the printed table for this many rows of the calculation.
 _EVERY = 10
 # Options that are numbers, and their units.
@@ -84,7 +83,9 @@ def run(args: argparse.Namespace) -> int:
 
     try:
         if flight is not None:
-            cells = values.setdefault('cells', cell_count(flight.full))
+            cells = values.setdefault('cells', flight.cells)
+            if not cells:
+                raise InputError(f'{flight.full:.4g} V is no pack of cells: --set cells=N')
             check_cells(flight.full, cells)
             network = network_of(flight, numbers['throttle'], values)
         else:
@@ -108,14 +109,16 @@ def run(args: argparse.Namespace) -> int:
 
 def _flight(args: argparse.Namespace) -> Flight:
     """Return what the recording says of its supply."""
+    from ou_monitor.analysis.crafts import cells_of, full_voltage
     from ou_monitor.analysis.supply import facts_and_end
 
     recording = read_given(args, None, None)
     facts, load, _ = facts_and_end(recording)
     if not recording.has_throttle:
         raise InputError(f'--from {args.recording}: the recording has no throttle')
-    full = float(np.quantile(recording.voltage, _FULL))
-    return Flight(load.level, full, facts.sag.throttle, facts.sag.sag_v, facts.noise.rms_v,
+    full = full_voltage(recording)
+    return Flight(load.level, full, cells_of(recording)[0],
+                  facts.sag.throttle, facts.sag.sag_v, facts.noise.rms_v,
                   facts.noise.steady_rms_v, facts.noise.flown,
                   min(1.0, float(np.nanmax(recording.throttle))), facts.resistance.ohm,
                   facts.ou.alpha, facts.ou.var_inf)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from ou_monitor import __version__
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    brownout_limit, check_outputs, part_of_recording, read_given, repeated)
+    brownout_limit, check_outputs, limit_of, part_of_recording, read_given, repeated)
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
@@ -38,6 +38,7 @@ def run(args: argparse.Namespace) -> int:
     from ou_monitor.discovery.plain_names import in_short
 
     recording = read_given(args, start, end)
+    limit = limit_of(args, recording, limit)
     # What overflows on the way ends as not finite, which the search refuses: a user has no
     # use for the source line of it.
     with Progress('discovering', args.json == output.STDOUT) as progress, \

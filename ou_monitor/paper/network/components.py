@@ -34,24 +34,8 @@ UNITS = {
     'mcu_current': 'A', 'mcu_noise': 'A', 'mcu_noise_rate': '1/s', 'cells': '', 'escs': ''}
 # The noise of a telegraph vanishes at duty 0 and 1 and its rate is infinite there.
 LEAST_DUTY = 0.01
-# A lithium cell at rest, V: nominal, the highest that a charger leaves (LiHV 4.35 V, 0.1 V for
-# the sensor), and the lowest of one that is not destroyed.
-NOMINAL_CELL, HIGHEST_CELL, LOWEST_CELL = 3.7, 4.45, 2.0
-
-
-def cell_count(voltage: float) -> int:
-    """Return the fewest cells in series that have this voltage at rest, V."""
-    if not (math.isfinite(voltage) and voltage > 0.0):
-        raise ValueError(f'the number of cells cannot be told from {voltage} V')
-    return math.ceil(voltage / HIGHEST_CELL)
-
-
-def check_cells(voltage: float, cells: int) -> None:
-    """Refuse a number of cells that a voltage at rest, V, cannot have."""
-    cell = voltage / cells
-    if not LOWEST_CELL <= cell <= HIGHEST_CELL:
-        raise ValueError(f'{voltage:.4g} V at rest is {cell:.3g} V a cell with {cells} cells: it '
-                         f'is likely {round(voltage / NOMINAL_CELL) or 1}')
+# A lithium cell at rest, V.
+NOMINAL_CELL = 3.7
 
 
 def completed(values: dict[str, Any]) -> dict[str, Any]:

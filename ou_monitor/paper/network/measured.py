@@ -31,6 +31,7 @@ class Flight:
 
     level: float  # Open-circuit voltage at its end, V
     full: float  # Its highest voltage but for a few readings, V
+    cells: int  # In series; 0: unknown
     throttle: Sequence[float]  # 0..1, of the next three
     sag: Sequence[float]  # V
     noise: Sequence[float]  # Rms as flown, V

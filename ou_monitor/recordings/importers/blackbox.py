@@ -192,7 +192,23 @@ def _facts(headers: Headers) -> dict[str, str]:
         # Without a clock the date is that of the year 0.
         if value not in (None, '') and not str(value).startswith('0000-'):
             facts[fact] = str(value)
-    return facts
+    return facts | _cells(headers)
+
+
+def _cells(headers: Headers) -> dict[str, str]:
+    """Return cells and the lowest voltage of one, V, as the firmware counts them."""
+    words = [re.findall(r'\d+', str(headers.get(key, '')))
+             for key in ('vbatcellvoltage', 'vbatref')]
+    if len(words[0]) != 3 or len(words[1]) != 1:
+        return {}
+    low, _, high = (float(word) for word in words[0])
+    # 0.01 V from Betaflight 4.0 on, 0.1 V before; INAV has cells in 0.1 V and the pack in 0.01 V.
+    fine = high > 100.0
+    reference = float(words[1][0]) * (0.01 if fine or float(words[1][0]) >= 300.0 else 0.1)
+    low, high = (value * (0.01 if fine else 0.1) for value in (low, high))
+    if not 2.0 < low < high < 5.0 or reference < low:
+        return {}
+    return {'cells': f'{math.ceil(reference / high - 1e-9)}', 'cell_minimum': f'{low:g}'}
 
 
 def _version(headers: Headers) -> tuple[str, tuple[int, int, int]]:

@@ -104,7 +104,7 @@ def read(path: Path, request: Request) -> Log:
     start = start_of(series)
     speeds = _speeds(table)
     return Log('dataflash_text' if text else 'dataflash', from_start(series, start),
-               _facts(banner), tuple(notes), from_start(_gyros(table), start),
+               _facts(banner) | _cells(parameters), tuple(notes), from_start(_gyros(table), start),
                None if speeds is None else from_start([speeds], start)[0],
                tuple(dict.fromkeys((*(one.name for one in series), *names))))
 
@@ -235,6 +235,18 @@ def _lost_text(log: Any) -> list[str]:
     if not text.endswith('\n'):
         notes.append(f'The last line does not end: the log was cut off at byte {size}.')
     return notes
+
+
+def _cells(parameters: dict[str, float]) -> dict[str, str]:
+    """Return cells, of which thrust is scaled by the full pack, and the lowest voltage of one."""
+    full = parameters.get('MOT_BAT_VOLT_MAX', 0.0)
+    if not full > 3.0:
+        return {}
+    cells = round(full / 4.2)
+    low = next((parameters[name] / cells for name in (
+        'BATT_CRT_VOLT', 'BATT_LOW_VOLT', 'FS_BATT_VOLTAGE') if parameters.get(name, 0.0) > 0.0),
+        0.0)
+    return {'cells': f'{cells}', **({'cell_minimum': f'{low:.4g}'} if 2.0 < low < 4.0 else {})}
 
 
 def _facts(banner: list[str]) -> dict[str, str]:

@@ -226,6 +226,13 @@ def _facts(ulog: Any) -> dict[str, str]:
     elif board:
         # Many vehicles have the same; simulators say that their number is 0.
         facts['board'] = board
+    given = ulog.initial_parameters
+    cells = given.get('BAT1_N_CELLS', given.get('BAT_N_CELLS', 0))
+    empty = given.get('BAT1_V_EMPTY', given.get('BAT_V_EMPTY', 0.0))
+    if cells > 0:
+        facts['cells'] = f'{int(cells)}'
+        if 2.0 < empty < 4.0:
+            facts['cell_minimum'] = f'{empty:g}'
     return facts
 
 

@@ -197,3 +197,15 @@ def test_leftovers_after_the_end(tmp_path):
     assert log.notes == ()
     _, log = load(tmp_path, b''.join(blackbox(quad(64))) + b'I\x01' * 45)
     assert any('after the end mark' in note for note in log.notes)
+
+
+@pytest.mark.parametrize('cell, reference, cells, low', [
+    ('330,350,430', '2487', '6', '3.3'), ('330,350,430', '1653', '4', '3.3'),
+    ('33,35,43', '150', '4', '3.3'), ('33,35,42', '1513', '4', '3.3'),
+    ('330,350,430', '420', '1', '3.3'), ('330,350,430', '', None, None),
+    ('0,0,0', '1653', None, None)])
+def test_cells_of_the_header(cell, reference, cells, low):
+    """As the firmware counts them, in the units of Betaflight before and from 4.0, and INAV."""
+    from ou_monitor.recordings.importers.blackbox import _facts
+    found = _facts({'vbatcellvoltage': cell, 'vbatref': reference})
+    assert (found.get('cells'), found.get('cell_minimum')) == (cells, low)

@@ -1,0 +1,169 @@
+"""
+Sag, noise and resistance of a supply beside those of crafts that are known.
+
+Limits: a few crafts a class, each of one flight; noise depends on where and how fast the voltage
+was read, so that a slow or filtered sensor seems quiet.  "Usual" is within a factor of two of the
+median of its class, and says nothing of whether it is safe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+from ou_monitor.analysis.supply import SupplyFacts
+from ou_monitor.errors import InputError
+from ou_monitor.records import NAN, Recording
+
+# Throttle at which crafts are compared; it must be within what was flown by this much.
+_AT, _NEAR = 0.5, 0.15
+# Factor about the median that is usual.
+_USUAL = 2.0
+# A lithium cell at rest, V: the highest that a charger leaves (LiHV 4.35 V, 0.1 V for the sensor),
+# the lowest of one that is not destroyed, and the lowest with which a flight begins.
+HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.0, 3.0
+# The highest median of this time is the pack before the flight, glitches and noise left out, s.
+_FULL = 0.5
+
+MICRO, QUAD = '1S micro', 'quad, 2S and more'
+# Class -> craft -> cells, sag and noise at half throttle, V, and resistance at once, Ohm, of the
+# pack; by `supply_facts` in November 2026.
+KNOWN: dict[str, dict[str, tuple[float, float, float, float]]] = {
+    # Crazyflie in close flight and taking off (aerorobotics/neural-swarm).
+    MICRO: {'cf_solo': (1, 0.095, 0.0034, NAN), 'cf_takeoff': (1, 0.128, 0.0038, NAN)},
+    # Betaflight: fc-blackbox (gecko), gimbal-ghost (roma), gyroflow issue 72 (ar8), and public
+    # logs of a nazgul, a 3S and an older 4S, whose current is absent or wrongly scaled;
+    # ArduCopter: Erle-Copter in AltHold, and one of version 3.1.3 with current, read at 1 Hz.
+    QUAD: {'gecko': (4, 0.615, 0.080, NAN), 'nazgul': (4, 0.479, 0.565, NAN),
+           '3s_erpm2': (3, 0.280, 0.217, NAN), 'ar8': (6, 1.511, 0.051, 0.0248),
+           'hiro': (4, 0.504, 0.767, NAN), 'roma': (6, 0.968, 0.538, 0.0302),
+           'erle': (3, 0.625, 0.109, NAN), 'jd': (4, 0.394, NAN, 0.0168)}}
+# Measure, whether high -> (likely reason, remedy).
+_REASONS = {
+    ('sag', True): ('a small, aged or cold pack, thin or long leads, or a poor connector',
+                    'feel whether a connector is warm after a flight, then try a fresh or larger '
+                    'pack'),
+    ('sag', False): ('a large pack, or a voltage that the flight controller has corrected for sag',
+                     'nothing; see that sag compensation is off in what is logged'),
+    ('noise', True): ('no capacitor, or one of high ESR, at the ESCs, or an ESC that loses step',
+                      'a low-ESR capacitor of 470 to 1000 uF at the battery pads of the ESCs'),
+    ('noise', False): ('a sensor that is slow or filtered before it is logged',
+                       'raise its rate or its filter before noise is judged by it'),
+    ('resistance', True): ('an aged or cold pack, or a poor connector',
+                           'warm the pack, then try a fresh one and other leads'),
+    ('resistance', False): ('a large pack, or a current that is scaled too high',
+                            "compare the consumed mAh with the charger's")}
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One number of a supply beside that of known crafts."""
+
+    name: str  # sag, noise or resistance
+    value: float  # A cell: V, V, Ohm
+    usual: tuple[float, float]  # Likewise
+    verdict: str  # usual, high, low or unknown
+    reason: str  # Likely; '' where usual
+    remedy: str
+
+
+@dataclass(frozen=True)
+class Craft:
+    """Cells of a supply, the class that it is compared with, and how it stands there."""
+
+    cells: int  # 0: unknown
+    cells_from: str  # given, log, guessed or unknown
+    full_v: float  # Highest median of half a second, V
+    kind: str  # '' without a class
+    measures: tuple[Measure, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as strict JSON holds it."""
+        def plain(value: float) -> float | None:
+            return value if math.isfinite(value) else None
+
+        return {'cells': self.cells or None, 'cells_from': self.cells_from,
+                'full_v': plain(self.full_v), 'class': self.kind or None, 'measures': [
+                    {'name': one.name, 'value': plain(one.value), 'usual': list(one.usual),
+                     'verdict': one.verdict, 'reason': one.reason, 'remedy': one.remedy}
+                    for one in self.measures]}
+
+
+def full_voltage(recording: Recording) -> float:
+    """Return the highest median voltage of half a second, V; NaN without a sample."""
+    if recording.n < 2:
+        return float(recording.voltage[0]) if recording.n else NAN
+    size = min(recording.n, max(1, round(_FULL / float(np.median(np.diff(recording.t))))))
+    whole = recording.voltage[:recording.n - recording.n % size].reshape(-1, size)
+    return float(np.median(whole, axis=1).max())
+
+
+def cell_count(full: float) -> int:
+    """Return the fewest cells that have this voltage at rest, V; 0: it is no pack of cells."""
+    if not (math.isfinite(full) and full > 0.0):
+        return 0
+    cells = math.ceil(full / HIGHEST_CELL)
+    return cells if full / cells >= _BEGINS else 0
+
+
+def check_cells(full: float, cells: int) -> None:
+    """Refuse a number of cells that a pack of this voltage at rest, V, cannot have."""
+    if math.isfinite(full) and not LOWEST_CELL <= full / cells <= HIGHEST_CELL:
+        raise InputError(
+            f'--cells {cells}: {full:.4g} V at rest would be {full / cells:.3g} V a cell: it is '
+            f'likely {cell_count(full) or round(full / 3.7) or 1} cells')
+
+
+def cells_of(recording: Recording, given: int = 0) -> tuple[int, str]:
+    """Return the cells in series and who says so: what was given, the log, or the voltage."""
+    if given:
+        return given, 'given'
+    guess = cell_count(full_voltage(recording))
+    return stated_cells(recording.source) or (guess, 'guessed' if guess else 'unknown')
+
+
+def stated_cells(source: Mapping[str, str]) -> tuple[int, str] | None:
+    """Return the cells that the header of a log states."""
+    text = source.get('cells', source.get('log_cells', ''))
+    return (int(text), 'log') if text.isascii() and text.isdigit() and int(text) else None
+
+
+def stated_limit(source: Mapping[str, str]) -> tuple[int, float] | None:
+    """Return the cells, and the lowest voltage of the pack, V, that the header of a log states."""
+    cells = stated_cells(source)
+    text = source.get('cell_minimum', source.get('log_cell_minimum'))
+    return None if cells is None or text is None else (cells[0], cells[0] * float(text))
+
+
+def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
+    """Return how a supply stands among known crafts of its class."""
+    cells, source = cells_of(recording, given)
+    kind = '' if not cells else MICRO if cells == 1 else QUAD
+    if not kind or not recording.has_throttle:
+        return Craft(cells, source, full_voltage(recording), '', ())
+    low, high = facts.sag.flown
+    seen = low - _NEAR <= _AT <= high + _NEAR
+    values = {
+        'sag': float(np.interp(_AT, facts.sag.throttle, facts.sag.sag_v)) if seen else NAN,
+        'noise': float(np.interp(_AT, facts.noise.throttle, facts.noise.rms_v)) if seen else NAN,
+        'resistance': facts.resistance.ohm}
+    found = []
+    for k, (name, value) in enumerate(values.items()):
+        known = [row[1 + k] / row[0] for row in KNOWN[kind].values()
+                 if math.isfinite(row[1 + k])]
+        if known:
+            found.append(_measure(name, value / cells, float(np.median(known))))
+    return Craft(cells, source, full_voltage(recording), kind, tuple(found))
+
+
+def _measure(name: str, value: float, middle: float) -> Measure:
+    usual = middle / _USUAL, middle * _USUAL
+    if not math.isfinite(value):
+        return Measure(name, value, usual, 'unknown', '', '')
+    if usual[0] <= value <= usual[1]:
+        return Measure(name, value, usual, 'usual', '', '')
+    high = value > usual[1]
+    return Measure(name, value, usual, 'high' if high else 'low', *_REASONS[name, high])

@@ -1,0 +1,74 @@
+"""Cells of a pack, and how a supply stands among known crafts."""
+
+import json
+
+import numpy as np
+from ou_monitor.analysis.crafts import (
+    cell_count, cells_of, craft_of, KNOWN, MICRO, QUAD, stated_limit)
+from ou_monitor.analysis.supply import supply_facts
+from ou_monitor.cli.main import main
+from ou_monitor.records import NAN, Recording
+import pytest
+
+
+def flown(cells=4, sag=0.6, noise=0.08, source=None, n=1500):
+    """Return a recording of a pack with a sag and a noise at half throttle, V."""
+    rng = np.random.default_rng(3)
+    t = np.arange(n) / 50.0
+    u = np.repeat(rng.uniform(0.1, 0.85, n // 25), 25)
+    v = 4.1 * cells - 2.0 * sag * u + noise * rng.standard_normal(n)
+    return Recording(t, v, u, 'made', source or {}, (), None)
+
+
+@pytest.mark.parametrize('volts, cells', [
+    (4.2, 1), (3.6, 1), (8.4, 2), (11.1, 3), (12.6, 3), (16.8, 4), (15.2, 4), (17.4, 4),
+    (22.59, 6), (25.2, 6), (5.0, 0), (0.0, 0), (NAN, 0)])
+def test_cells_by_the_voltage(volts, cells):
+    """The fewest that no charger overfills; a 5 V rail is no pack."""
+    assert cell_count(volts) == cells
+
+
+def test_who_says_the_cells():
+    """What is given goes before the log, the log before the voltage."""
+    log = {'cells': '6', 'cell_minimum': '3.5'}
+    assert cells_of(flown(source=log), 3) == (3, 'given')
+    assert cells_of(flown(source=log)) == (6, 'log')
+    assert cells_of(flown()) == (4, 'guessed')
+    assert stated_limit(log) == (6, 21.0) and stated_limit({'log_cells': '4'}) is None
+
+
+def test_usual_high_and_low():
+    """Against the median of a class, a cell; a reason and a remedy where it is not usual."""
+    middle = {name: np.nanmedian([row[k] / row[0] for row in KNOWN[QUAD].values()])
+              for k, name in ((1, 'sag'), (2, 'noise'))}
+    for factor, verdict in ((1.0, 'usual'), (3.0, 'high'), (0.25, 'low')):
+        for name in ('sag', 'noise'):
+            quiet = {'sag': 4.0 * middle['sag'], 'noise': 0.4 * middle['noise']}
+            one = flown(**{**quiet, name: 4.0 * factor * middle[name]})
+            craft = craft_of(one, supply_facts(one))
+            assert (craft.cells, craft.cells_from, craft.kind) == (4, 'guessed', QUAD)
+            found = {measure.name: measure for measure in craft.measures}
+            assert found['resistance'].verdict == 'unknown'
+            assert found[name].verdict == verdict, (name, found[name])
+            assert found[name].value == pytest.approx(factor * middle[name], rel=0.25)
+            assert bool(found[name].remedy) == (verdict != 'usual')
+    micro = flown(cells=1, sag=0.1, noise=0.02)
+    found = craft_of(micro, supply_facts(micro))
+    assert found.kind == MICRO
+    assert {one.name: one.verdict for one in found.measures} == {'sag': 'usual', 'noise': 'high'}
+
+
+def test_the_limit_of_the_log_and_impossible_cells(tmp_path, capsys):
+    """Cells that the voltage cannot have are refused, with the likely number."""
+    path = tmp_path / 'a.csv'
+    one = flown(n=600)
+    path.write_text('time_s,voltage_v,throttle\n' + ''.join(
+        f'{a:.3f},{b:.4f},{c:.4f}\n' for a, b, c in zip(one.t, one.voltage, one.throttle)))
+    for cells in ('3', '9'):
+        assert main(['analyze', str(path), '--cells', cells]) == 2
+        assert 'it is likely 4 cells' in capsys.readouterr().err
+    assert main(['analyze', str(path), '--cells', '4', '--json', '-']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found['craft']['cells'] == 4 and found['craft']['cells_from'] == 'given'
+    assert [measure['name'] for measure in found['craft']['measures']] == [
+        'sag', 'noise', 'resistance']
