@@ -129,7 +129,8 @@ def _of_log(path: Path, names: frozenset[str], columns: CsvColumns | None, fligh
             progress: Callable[[float], None] | None) -> tuple[Recording, Log]:
     """Read the supply of a log, and the log with the series of these names."""
     named = columns or CsvColumns()
-    if named != CsvColumns(None, named.voltage, named.throttle, named.current):
+    if named != CsvColumns(voltage=named.voltage, throttle=named.throttle,
+                            current=named.current):
         raise InputError(f'{path} is a log: its time and units are known')
     wanted = (name for name in (named.voltage, named.throttle, named.current)
               if name is not None)

@@ -195,11 +195,12 @@ class CsvColumns:
     time: str | None = None
     voltage: str | None = None
     throttle: str | None = None
-    current: str | None = None
     # Units: V or mV; s, ms, us or ns; 1, % or us.
     unit: str | None = None
     time_unit: str | None = None
     throttle_unit: str | None = None
+    # Name of a column, as the throttle.
+    current: str | None = None
     # What separates cells: a character, 'tab' or 'space'; the decimal mark: '.' or ','.
     delimiter: str | None = None
     decimal: str | None = None
