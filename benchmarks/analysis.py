@@ -3,8 +3,7 @@
 How often `analyze` finds what is not there, and what is: `benchmarks/analysis.py [RECORDINGS]`.
 
 Recordings of three load levels, 5 s each at 1 kHz, with the paper's alpha, white noise of 3 mV and
-a sag; half of them with one thing added.  Also what each part of an analysis costs, as shares of
-the whole in one run.
+a sag; half of them with one thing added.
 """
 
 from __future__ import annotations
@@ -12,17 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 import sys
-import time
 
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from ou_monitor.analysis import analyze as module, level_result  # noqa: E402, I202
 from ou_monitor.analysis.analyze import Analysis, analyze  # noqa: E402
 from ou_monitor.model.ou import simulate  # noqa: E402, I100
-from ou_monitor.recordings.read import read_recording  # noqa: E402
 from ou_monitor.records import FloatArray, Recording  # noqa: E402
 from scipy.signal import lfilter  # noqa: E402
 
@@ -139,43 +135,6 @@ def power(count: int) -> None:
         print(f'  {name}: {share(count, effect, shows, 10_000, **options)}')
 
 
-def costs() -> None:
-    """Print the share of each part in the time of an analysis."""
-    rng = np.random.default_rng(1)
-    t = np.arange(600_000) / RATE
-    throttle = np.repeat(np.tile([0.1, 0.4, 0.25, 0.6], 15), 10_000)
-    long = Recording(t, simulate(t, ALPHA, 0.2 + throttle, rng, u0=5.0 - 0.3 * throttle),
-                     throttle, '10 minutes at 1 kHz')
-    parts = {'fit of the levels': (level_result, 'fit_parts'),
-             'tests': (level_result, 'examine_level'), 'lines': (level_result, 'find_lines'),
-             'spectra': (level_result, 'level_spectrum'), 'transients': (module, '_relaxations'),
-             'sliding window and curves': (module, 'slide')}
-    for recording in (read_recording(ROOT / 'bags' / 'flight'), long):
-        # The table of first passage is made once a process.
-        analyze(recording)
-        spent = dict.fromkeys(parts, 0.0)
-        originals = {label: getattr(*place) for label, place in parts.items()}
-
-        def timed(label: str, call: Callable[..., object]) -> Callable[..., object]:
-            def run(*args: object, **kwargs: object) -> object:
-                start = time.perf_counter()
-                try:
-                    return call(*args, **kwargs)
-                finally:
-                    spent[label] += time.perf_counter() - start
-            return run
-
-        for label, (where, name) in parts.items():
-            setattr(where, name, timed(label, originals[label]))
-        start = time.perf_counter()
-        analyze(recording)
-        whole = time.perf_counter() - start
-        for label, (where, name) in parts.items():
-            setattr(where, name, originals[label])
-        print(f'  {recording.name}: {whole:.2f} s, of which ' + ', '.join(
-            f'{label} {100.0 * s / whole:.0f} %' for label, s in spent.items()))
-
-
 if __name__ == '__main__':
     recordings = int(sys.argv[1]) if len(sys.argv) > 1 else 200
     print(f'False alarms in {recordings} recordings of plain OU levels (stated 1 %):')
@@ -184,5 +143,3 @@ if __name__ == '__main__':
     throttle_goes_up_and_down(recordings // 2)
     print('Found where it is there:')
     power(recordings // 4)
-    print('Cost:')
-    costs()

@@ -118,137 +118,63 @@ def _gain(smoothing: float) -> str:
 
 @dataclass(frozen=True)
 class Loop:
-    """
-    Vehicle, controller, supply, estimator and filter.
+    """Vehicle, controller, supply, estimator and filter."""
 
-    Attributes
-    ----------
-    hover : float
-        Collective throttle that holds the thrust at `nominal` volts, 0..1.
-    authority : float
-        Angular acceleration of a unit differential command, rad/s^2.
-    motor_lag : float
-        Time constant of the motors, s.
-    p, i, d : float
-        Gains on rad/s, rad and rad/s^2 to differential command; D on the
-        measurement.
-    gyro_noise : float
-        White noise of a sample, rad/s.
-    gust : float
-        White angular acceleration, rad/s^2/sqrt(Hz).
-    coupling : float
-        Supply noise in the gyro, rad/s per V.
-    nominal, sag : float
-        Voltage without load, V; its fall per unit load, V.
-    alpha, intensity, steepness : float
-        Of the supply: 1/s; sigma in a quiet hover, V/sqrt(s); power of the load.
-    adc_noise : float
-        White noise of a voltage sample, V.
-    rate, every : float
-        Samples per second, Hz; time between estimates, s.
-    window : float
-        Of the estimator, s.
-    filter : dict
-        Options of `AdaptiveLowPass` beside its mode.
-    closed : bool
-        Whether what the D term commands counts as load.
-
-    """
-
-    hover: float = 0.4
-    authority: float = 100.0
-    motor_lag: float = 0.03
+    hover: float = 0.4  # Collective throttle that holds the thrust at `nominal` volts, 0..1.
+    authority: float = 100.0  # Angular acceleration of a unit differential command, rad/s^2.
+    motor_lag: float = 0.03  # Time constant of the motors, s.
+    # Gains on rad/s, rad and rad/s^2 to differential command; D on the measurement.
     p: float = 0.4
     i: float = 0.8
     d: float = 0.01
-    gyro_noise: float = 0.005
-    gust: float = 0.3
-    coupling: float = 0.1
+    gyro_noise: float = 0.005  # White noise of a sample, rad/s.
+    gust: float = 0.3  # White angular acceleration, rad/s^2/sqrt(Hz).
+    coupling: float = 0.1  # Supply noise in the gyro, rad/s per V.
+    # Voltage without load, V; its fall per unit load, V.
     nominal: float = 5.0
     sag: float = 0.75
+    # Of the supply: 1/s; sigma in a quiet hover, V/sqrt(s); power of the load.
     alpha: float = 63.0
     intensity: float = 0.632
     steepness: float = 0.5
-    adc_noise: float = 0.002
+    adc_noise: float = 0.002  # White noise of a voltage sample, V.
+    # Samples per second, Hz; time between estimates, s.
     rate: float = 500.0
     every: float = 0.05
-    window: float = 2.0
+    window: float = 2.0  # Of the estimator, s.
+    # Options of `AdaptiveLowPass` beside its mode.
     filter: Mapping[str, Any] = field(default_factory=dict)  # noqa: A003
-    closed: bool = True
+    closed: bool = True  # Whether what the D term commands counts as load.
 
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """
-    What happened, at the estimates.
+    """What happened, at the estimates."""
 
-    Attributes
-    ----------
-    t : ndarray, shape (n,)
-        s.
-    cutoff : ndarray, shape (n,)
-        Hz.
-    sigma, seen : ndarray, shape (n,)
-        V/sqrt(s), of the supply and as estimated (NaN while unknown).
-    command : ndarray, shape (n,)
-        Rms of the differential command since the estimate before.
-    turn : ndarray, shape (n,)
-        Rms of the body rate since the estimate before, rad/s.
-
-    """
-
-    t: FloatArray
-    cutoff: FloatArray
+    t: FloatArray  # s.
+    cutoff: FloatArray  # Hz.
+    # V/sqrt(s), of the supply and as estimated (NaN while unknown).
     sigma: FloatArray
     seen: FloatArray
-    command: FloatArray
-    turn: FloatArray
+    command: FloatArray  # Rms of the differential command since the estimate before.
+    turn: FloatArray  # Rms of the body rate since the estimate before, rad/s.
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """
-    Whether the cutoff hunts.
+    """Whether the cutoff hunts."""
 
-    Attributes
-    ----------
-    cycle : bool
-        Whether it does.
-    swing, quiet : float
-        95 % less 5 % quantile of the cutoff, octaves, and the same with the
-        loop cut (NaN where the first is below `SWING`: no need).
-    period : float
-        s; NaN when there is no cycle.
-    command : float
-        Rms of the differential command, 0..1.
-
-    """
-
-    cycle: bool
+    cycle: bool  # Whether it does.
+    # 95 % less 5 % quantile of the cutoff, octaves, and the same with the loop cut (NaN
+    # where the first is below `SWING`: no need).
     swing: float
     quiet: float
-    period: float
-    command: float
+    period: float  # s; NaN when there is no cycle.
+    command: float  # Rms of the differential command, 0..1.
 
 
 def fly(loop: Loop, seconds: float, seed: int) -> Flight:
-    """
-    Simulate.
-
-    Parameters
-    ----------
-    loop : Loop
-        What is simulated.
-    seconds : float
-        Length, s.
-    seed : int
-        Same seed, same noise, whatever the loop.
-
-    Returns
-    -------
-    Flight
-
-    """
+    """Simulate."""
     dt = 1.0 / loop.rate
     n = round(seconds * loop.rate)
     block = max(1, round(loop.every * loop.rate))
@@ -299,25 +225,7 @@ def fly(loop: Loop, seconds: float, seed: int) -> Flight:
 
 
 def judge(loop: Loop, seconds: float = 40.0, seed: int = 1) -> Verdict:
-    """
-    Fly with the loop closed and cut, and compare the cutoffs.
-
-    Parameters
-    ----------
-    loop : Loop
-        What is judged.
-    seconds : float
-        Length of each flight, s; the first half settles.
-    seed : int
-        Of the noise.
-
-    Returns
-    -------
-    Verdict
-        A cycle swings by `SWING` octaves at least, and `FACTOR` times as much
-        as the scatter of the estimate makes the cutoff swing with the loop cut.
-
-    """
+    """Fly with the loop closed and cut, and compare the cutoffs."""
     closed = fly(replace(loop, closed=True), seconds, seed)
     half = closed.t.size // 2
     octaves = np.log2(closed.cutoff[half:])
@@ -353,18 +261,6 @@ def critical_gain(window: float, smoothing: float) -> float:
     The estimate is a moving average over the window, sinc(w W / 2)
     exp(-i w W / 2), the cutoff follows with one pole, 1 / (1 + i w smoothing).
     Negative feedback oscillates where both together lag by half a turn.
-
-    Parameters
-    ----------
-    window, smoothing : float
-        s.
-
-    Returns
-    -------
-    float
-        Gain; infinite without smoothing, for a moving average alone lags by
-        half a turn only where it is zero.
-
     """
     if smoothing <= 0.0:
         return math.inf

@@ -34,7 +34,7 @@ import windows as simulated  # noqa: E402
 from windows import Array, Fit, Fits, NAMES, rmse_ratio, SENSORS, TRUTH  # noqa: E402
 
 SEED = 20260131
-_PACKAGES = ('numpy', 'scipy', 'numba', 'statsmodels', 'celerite2', 'pymle-diffusion', 'pandas')
+_PACKAGES = ('numpy', 'scipy', 'numba', 'statsmodels', 'celerite2', 'pandas')
 OURS = 'ou_monitor SlidingEstimator'
 KALMAN = 'Kalman, restricted likelihood'
 CORRECTED = 'the same, corrected by 2/T'
@@ -114,22 +114,7 @@ def correct(plain: Fits, duration: float) -> Fits:
 
 
 def compare(seed: int, windows: int, slow: int) -> dict[str, Any]:
-    """
-    Compare all methods on 2 s windows at 1 kHz.
-
-    Parameters
-    ----------
-    seed : int
-        Of the random numbers.
-    windows, slow : int
-        Windows for each method, and for the slow ones (the first of the same).
-
-    Returns
-    -------
-    dict
-        Sensor -> method -> summary, and sensor -> RMSE ratio to the reference.
-
-    """
+    """Compare all methods on 2 s windows at 1 kHz."""
     rng = np.random.default_rng(seed)
     paths = simulated.simulate(rng, windows, round(simulated.WINDOW / simulated.DT))
     tables: dict[str, Any] = {}
@@ -162,21 +147,7 @@ def _ratios(results: dict[str, Fits]) -> dict[str, Any]:
 
 
 def small(seed: int, windows: int) -> dict[str, Any]:
-    """
-    Shorten the window.
-
-    Parameters
-    ----------
-    seed, windows : int
-        As in `compare`.
-
-    Returns
-    -------
-    dict
-        alpha T -> {'ours', 'kalman', 'kalman_all'}: ours where it publishes
-        alpha, the corrected reference on the same windows and on all.
-
-    """
+    """Shorten the window."""
     rng = np.random.default_rng(seed)
     out: dict[str, Any] = {}
     for relaxations in RELAXATIONS:
@@ -193,20 +164,7 @@ def small(seed: int, windows: int) -> dict[str, Any]:
 
 
 def load(seed: int, windows: int) -> dict[str, Any]:
-    """
-    Step the throttle within the window.
-
-    Parameters
-    ----------
-    seed, windows : int
-        As in `compare`.
-
-    Returns
-    -------
-    dict
-        Case -> summary, with the RMSE ratio to the same windows without steps.
-
-    """
+    """Step the throttle within the window."""
     rng = np.random.default_rng(seed)
     n = round(simulated.WINDOW / simulated.DT)
     still = SENSORS[SMALL_SENSOR](simulated.simulate(rng, windows, n), rng)

@@ -1,16 +1,12 @@
 r"""
-The adaptive low-pass against hindsight, against the truth, in a loop, as a node.
+The adaptive low-pass against hindsight, against the truth, in a loop.
 
     python benchmarks/filter.py error --table doc/results/filter.md
-    python benchmarks/filter.py bags --table doc/results/filter.md
-    python benchmarks/filter.py windows --table doc/results/filter.md
     python benchmarks/filter.py dterm --table doc/results/filter.md \
         --figure doc/results/filter_dterm.svg
     python benchmarks/filter.py loop --table doc/results/filter.md \
         --figure doc/results/filter_loop.svg
     python benchmarks/filter.py flight --figure doc/results/filter_flight.svg
-    python benchmarks/filter.py node --table doc/results/filter.md
-    python benchmarks/filter.py arrays --table doc/results/filter.md
 """
 
 from __future__ import annotations
@@ -28,17 +24,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import control_loop  # noqa: E402
 import filter_error  # noqa: E402
-import filter_methods as methods  # noqa: E402
-from filter_signals import CASES, fly, RATE  # noqa: E402
+from filter_error import CASES, fly, RATE  # noqa: E402
 import numpy as np  # noqa: E402
-from ou_monitor import AdaptiveLowPass  # noqa: E402
 from ou_monitor.report.svg import Plot  # noqa: E402
-import ros_throughput  # noqa: E402
-from scipy.signal import butter, sosfilt  # noqa: E402
-from tables import table  # noqa: E402
 
 SEED = 20261121
-BAGS = Path(__file__).resolve().parent.parent / 'bags'
 _COLOURS = ('#0072b2', '#d55e00', '#009e73', '#cc79a7', '#b07d00', '#3a9bd9', '#6b4fa0', '#5f6b6d')
 _STYLE = """<style>
 text { fill: #5d686c; font: 12px system-ui, -apple-system, "Segoe UI", sans-serif; }
@@ -76,16 +66,6 @@ def error(given: argparse.Namespace) -> tuple[str, str]:
         given.flights, given.seconds, given.seed, given.window, _tell())), ''
 
 
-def bags(given: argparse.Namespace) -> tuple[str, str]:
-    """Mean square error over the bags: their voltage in the noise of a poor ADC."""
-    return filter_error.render(filter_error.bags(BAGS, given.seed, given.window, _tell())), ''
-
-
-def windows(given: argparse.Namespace) -> tuple[str, str]:
-    """Cost of the window of the estimator to the filter."""
-    return filter_error.windows(given.flights, given.seconds, given.seed, _tell()), ''
-
-
 def dterm(given: argparse.Namespace) -> tuple[str, str]:
     """Noise of the D term against its lag."""
     text, plot = filter_error.render_dterm(filter_error.run_dterm(
@@ -109,12 +89,12 @@ def flight(given: argparse.Namespace) -> tuple[str, str]:
     flown = replace(many, **{
         name: getattr(many, name)[most:most + 1] for name in
         ('throttle', 'sigma', 'voltage', 'truth', 'slope', 'measured', 'noise')})
-    seen = methods.estimates(flown, given.window)
-    output, cutoff = methods.adaptive(methods.laws(case)['kalman'][0], flown, seen,
-                                      flown.measured)
+    seen = filter_error.estimates(flown, given.window)
+    output, cutoff = filter_error.adaptive(filter_error.laws(case)['kalman'][0], flown, seen,
+                                           flown.measured)
     fixed = np.geomspace(*case.limits, 41)
-    outputs = methods.sweep(flown.measured, fixed[:, None, None], case.order)
-    best = int(np.argmin(methods.error(outputs, flown.truth)[:, 0]))
+    outputs = filter_error.sweep(flown.measured, fixed[:, None, None], case.order)
+    best = int(np.argmin(filter_error.error(outputs, flown.truth)[:, 0]))
     t, every = flown.t, slice(None, None, 10)
 
     def plot(title: str, unit: str, height: int = 190, log_y: bool = False) -> Plot:
@@ -147,40 +127,6 @@ def flight(given: argparse.Namespace) -> tuple[str, str]:
                         'Voltage, sigma, cutoff and signal over a flight')
 
 
-def node(given: argparse.Namespace) -> tuple[str, str]:
-    """Cost and latency of the node at 1 kHz."""
-    return ros_throughput.filter_node(given.seconds), ''
-
-
-def arrays(given: argparse.Namespace) -> tuple[str, str]:
-    """CPU time of arrays over that of scipy's sosfilt, in one run."""
-    n, rng = round(given.seconds * RATE), np.random.default_rng(given.seed)
-    x = rng.standard_normal(n)
-    stamps = (np.arange(n) / RATE, np.cumsum(rng.uniform(0.5, 1.5, n)) / RATE)
-    sigmas = (0.6, np.repeat(rng.uniform(0.1, 2.0, n // 100 + 1), 100)[:n],
-              rng.uniform(0.1, 2.0, n))
-
-    def cost(work: Callable[[], object]) -> float:
-        spent = []
-        for _ in range(5):
-            begin = time.process_time()
-            work()
-            spent.append(time.process_time() - begin)
-        return min(spent)
-    sections = butter(2, 0.1, output='sos')
-    unit = cost(lambda: sosfilt(sections, x))
-    rows = []
-    for name, options in (
-            ('constant_noise', {}), ('its derivative', {'mode': 'derivative'}),
-            ('wiener', {'law': 'wiener', 'n0': 1e-5})):
-        ratios = [cost(lambda t=t, sigma=sigma, options=options: AdaptiveLowPass(
-            **options).filter(t, x, sigma)) / unit for sigma in sigmas for t in stamps]
-        rows.append([name, *(f'{ratio:.0f}' for ratio in ratios)])
-    head = [f'{sigma}, {t}' for sigma in ('one sigma', '10 a second', 'each its own')
-            for t in ('even', 'jitter')]
-    return table(['law', *head], rows), ''
-
-
 def _write(given: argparse.Namespace, text: str, drawing: str) -> None:
     if given.table and text:
         begin, end = f'<!-- {given.part} begins -->', f'<!-- {given.part} ends -->'
@@ -201,9 +147,8 @@ def main() -> int:
     """Parse arguments, measure, write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parts = parser.add_subparsers(dest='part', required=True)
-    for action, flights, seconds in ((error, 10, 40.0), (bags, 1, 40.0), (windows, 6, 40.0),
-                                     (dterm, 10, 40.0), (loop, 1, 30.0), (flight, 1, 30.0),
-                                     (node, 1, 20.0), (arrays, 1, 300.0)):
+    for action, flights, seconds in ((error, 10, 40.0), (dterm, 10, 40.0), (loop, 1, 30.0),
+                                     (flight, 1, 30.0)):
         part = parts.add_parser(action.__name__, help=action.__doc__)
         part.set_defaults(action=action)
         part.add_argument('--flights', type=int, default=flights)

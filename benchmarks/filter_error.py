@@ -1,31 +1,356 @@
 """
-Mean square error and lag: every law against hindsight and against the truth.
+Flights for the filter benchmark, the filters that are compared, and their mean square error.
 
-Run by `filter.py error` and `filter.py bags`.
+sigma follows throttle, which moves in steps and ramps: noise that steps with load.  A signal is a
+stochastic process with a state, and so has a best linear estimate: that of a Kalman filter which
+is told the true sigma at every sample.  Nothing of the package is used for these.  Many cutoffs at
+once are run by an implementation of our own; `agrees` holds it against the package.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import math
-from pathlib import Path
+from typing import Any
 
-import filter_methods as methods
-from filter_signals import ADC, Case, CASES, Flights, fly, kalman, RATE, SPREAD
 import numpy as np
+from ou_monitor import AdaptiveLowPass, SlidingEstimator
 from ou_monitor.online.filter.cutoff_laws import wanted_cutoff
 from ou_monitor.online.settings import FilterSettings
-from ou_monitor.recordings.read import read_recording
 from ou_monitor.report.svg import Plot
+from scipy.linalg import expm
 from tables import number, table
+
+RATE = 1000.0
+# Stationary deviation of the supply at half throttle, V, and that of the body rate, rad/s.
+SPREAD, BODY = 0.05, 1.0
+# Noise of an ADC that needs a filter, V; of a gyro, rad/s.
+ADC, GYRO = 0.03, 0.01
+# Supply noise in the gyro, rad/s per V: at half throttle as strong as the body rate.
+COUPLING = 20.0
+_DWELL, _RAMP = (2.0, 6.0), (0.5, 1.5)
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is filtered."""
+
+    name: str  # For the table.
+    # The voltage itself in noise of the ADC; a body rate with one pole, or with two
+    # (Butterworth), in supply noise and noise of the gyro.
+    kind: str
+    alpha: float  # Of the supply, 1/s.
+    bandwidth: float  # Of the body rate, Hz.
+    order: int  # Of the filters that are compared.
+    limits: tuple[float, float]  # fmin and fmax for all of them, Hz.
+    coupling: float = COUPLING  # Supply noise in the gyro, rad/s per V.
+
+    @property
+    def white(self) -> float:
+        """Deviation of the white noise of a sample."""
+        return ADC if self.kind == 'voltage' else GYRO
+
+
+CASES = (
+    Case('Voltage, alpha 10', 'voltage', 10.0, 0.0, 1, (2.0, 400.0)),
+    Case('Voltage, alpha 63', 'voltage', 63.0, 0.0, 1, (2.0, 400.0)),
+    Case('Body rate of one pole at 5 Hz, alpha 600', 'ou', 600.0, 5.0, 2, (1.0, 300.0)),
+    Case('Body rate of two poles at 5 Hz, alpha 600', 'smooth', 600.0, 5.0, 2, (1.0, 300.0)),
+    Case('Body rate of one pole at 5 Hz, alpha 63', 'ou', 63.0, 5.0, 2, (1.0, 300.0)),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Flights:
+    """Flights of one case, shape (flights, n) each."""
+
+    t: np.ndarray  # s.
+    # 0..1; V/sqrt(s).
+    throttle: np.ndarray
+    sigma: np.ndarray
+    voltage: np.ndarray  # What the estimator gets, V.
+    # The signal and its derivative (NaN for one pole), unit and unit/s.
+    truth: np.ndarray
+    slope: np.ndarray
+    # The signal with all noise, and the noise alone.
+    measured: np.ndarray
+    noise: np.ndarray
+
+
+def throttles(rng: np.random.Generator, flights: int, n: int) -> np.ndarray:
+    """Return throttle in steps and ramps, shape (flights, n)."""
+    out = np.empty((flights, n))
+    for row in out:
+        at, before = 0, float(rng.uniform(0.1, 0.9))
+        while at < n:
+            after = float(rng.uniform(0.1, 0.9))
+            ramp = int(rng.uniform(*_RAMP) * RATE) if rng.random() < 0.5 else 1
+            end = at + ramp + int(rng.uniform(*_DWELL) * RATE)
+            piece = np.concatenate((np.linspace(before, after, ramp + 1)[1:],
+                                    np.full(end - at - ramp, after)))
+            row[at:end] = piece[:n - at]
+            at, before = end, after
+    return out
+
+
+def _motion(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the transition over a sample, its noise and the stationary covariance."""
+    if case.kind != 'smooth':
+        rate = case.alpha if case.kind == 'voltage' else 2.0 * math.pi * case.bandwidth
+        phi = math.exp(-rate / RATE)
+        power = 1.0 if case.kind == 'voltage' else BODY**2
+        return (np.array([[phi]]), np.array([[power * (1.0 - phi * phi)]]),
+                np.array([[power]]))
+    w = 2.0 * math.pi * case.bandwidth
+    a = np.array([[0.0, 1.0], [-w * w, -math.sqrt(2.0) * w]])
+    still = np.diag([BODY**2, (w * BODY)**2])
+    phi = expm(a / RATE)
+    return phi, still - phi @ still @ phi.T, still
+
+
+def fly(case: Case, rng: np.random.Generator, flights: int, seconds: float) -> Flights:
+    """Simulate."""
+    n = int(seconds * RATE)
+    throttle = throttles(rng, flights, n)
+    # Flights show noise that grows 3 to 13 times from low to high throttle.
+    growth = np.exp(rng.uniform(math.log(3.0), math.log(13.0), (flights, 1)))
+    power = np.log(growth) / math.log(9.0)
+    sigma = SPREAD * math.sqrt(2.0 * case.alpha) * (throttle / 0.5)**power
+    decay = math.exp(-case.alpha / RATE)
+    supply = np.empty((flights, n))
+    kick = math.sqrt((1.0 - decay**2) / (2.0 * case.alpha)) * sigma
+    kick *= rng.standard_normal((flights, n))
+    u = sigma[:, 0] / math.sqrt(2.0 * case.alpha) * rng.standard_normal(flights)
+    for k in range(n):
+        u = decay * u + kick[:, k]
+        supply[:, k] = u
+    white = case.white * rng.standard_normal((flights, n))
+    t = np.arange(n) / RATE
+    if case.kind == 'voltage':
+        return Flights(t, throttle, sigma, 5.0 + supply + white, 5.0 + supply,
+                       np.full((flights, n), np.nan), 5.0 + supply + white, white)
+    phi, driven, still = _motion(case)
+    size = phi.shape[0]
+    state = np.linalg.cholesky(still) @ rng.standard_normal((size, flights))
+    root = np.linalg.cholesky(driven)
+    body = np.empty((size, flights, n))
+    for k in range(n):
+        state = phi @ state + root @ rng.standard_normal((size, flights))
+        body[:, :, k] = state
+    slope = body[1] if size == 2 else np.full((flights, n), np.nan)
+    noise = case.coupling * supply + white
+    voltage = 5.0 + supply + 0.002 * rng.standard_normal((flights, n))
+    return Flights(t, throttle, sigma, voltage, body[0], slope, body[0] + noise, noise)
+
+
+def kalman(case: Case, flights: Flights) -> tuple[np.ndarray, np.ndarray]:
+    """Return the estimates of signal and slope (NaN for one pole) that know sigma."""
+    count, n = flights.measured.shape
+    phi, driven, still = _motion(case)
+    decay = math.exp(-case.alpha / RATE)
+    grown = flights.sigma**2 * (1.0 - decay**2) / (2.0 * case.alpha)
+    if case.kind == 'voltage':
+        look, size = np.array([1.0]), 1
+    else:
+        size = phi.shape[0] + 1
+        wide = np.zeros((size, size))
+        wide[:-1, :-1], wide[-1, -1] = phi, decay
+        phi, look = wide, np.zeros(size)
+        look[0], look[-1] = 1.0, case.coupling
+    noise = np.zeros((count, size, size))
+    if case.kind != 'voltage':
+        noise[:, :-1, :-1] = driven
+    p = np.zeros((count, size, size))
+    p[:, :still.shape[0], :still.shape[0]] = still
+    p[:, -1, -1] = flights.sigma[:, 0]**2 / (2.0 * case.alpha)
+    x = np.zeros((count, size))
+    level = 5.0 if case.kind == 'voltage' else 0.0
+    out = np.full((2, count, n), np.nan)
+    for k in range(n):
+        if k:
+            x = x @ phi.T
+            noise[:, -1, -1] = grown[:, k]
+            p = phi @ p @ phi.T + noise
+        gain = p @ look
+        gain /= (gain @ look + case.white**2)[:, None]
+        x = x + gain * (flights.measured[:, k] - level - x @ look)[:, None]
+        p = p - gain[:, :, None] * (look @ p)[:, None, :]
+        out[0, :, k] = level + x[:, 0]
+        if case.kind == 'smooth':
+            out[1, :, k] = x[:, 1]
+    return out[0], out[1]
+
+
+# Seconds between estimates, and those at the beginning that are not scored.
+EVERY, SETTLE = 0.05, 3.0
+_ROOT2 = math.sqrt(2.0)
+
+
+def estimates(flights: Flights, window: float) -> np.ndarray:
+    """Return sigma, its error, alpha, u0 and its error at each sample, shape (5, flights, n)."""
+    count, n = flights.voltage.shape
+    block = int(EVERY * RATE)
+    out = np.full((5, count, n), np.nan)
+    for f in range(count):
+        estimator = SlidingEstimator(window=window)
+        for at in range(0, n, block):
+            piece = slice(at, at + block)
+            estimator.push(flights.t[piece], flights.voltage[f, piece],
+                           flights.throttle[f, piece])
+            e = estimator.estimate()
+            if e.usable:
+                # Known from the next sample on.
+                out[:, f, at + block:at + 2 * block] = np.array(
+                    [e.sigma, e.sigma_se, e.alpha, e.u0, e.u0_se])[:, None]
+    return out
+
+
+def adaptive(options: Mapping[str, Any], flights: Flights, seen: np.ndarray,
+             x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return output and cutoff of the package's filter, shape (flights, n) each."""
+    out, cutoff = np.empty(x.shape), np.empty(x.shape)
+    for f in range(x.shape[0]):
+        one = AdaptiveLowPass(**options)
+        sigma, error, alpha, level, level_se = (s[f].tolist() for s in seen)
+        rows = zip(flights.t.tolist(), x[f].tolist(), sigma, error, alpha,
+                   flights.throttle[f].tolist(), level, level_se)
+        for k, row in enumerate(rows):
+            out[f, k] = one.step(*row)
+            cutoff[f, k] = one.cutoff
+    return out, cutoff
+
+
+def sweep(x: np.ndarray, cutoff: np.ndarray, order: int, derivative: bool = False,
+          ) -> np.ndarray:
+    """Filter with given cutoffs, exactly for an input that is linear between samples."""
+    count, n = x.shape
+    shape = (cutoff.shape[0], count)
+    out = np.empty((*shape, n))
+    y = np.zeros(shape) if derivative else np.broadcast_to(x[:, 0], shape).copy()
+    slope = np.zeros(shape)
+    out[:, :, 0] = y
+    fixed = cutoff.shape[2] == 1
+    parts = _parts(cutoff[:, :, 0], order) if fixed else ()
+    for k in range(1, n):
+        if not fixed:
+            parts = _parts(cutoff[:, :, k], order)
+        a, b, c, d, e, g = parts
+        if derivative:
+            now = (x[:, k] - x[:, k - 1]) * RATE
+            off, rise = y - now, 0.0
+        else:
+            now = x[:, k]
+            off, rise = y - x[:, k - 1], x[:, k] - x[:, k - 1]
+        y = now + a * off + b * slope + c * rise
+        slope = d * slope + e * off + g * rise
+        out[:, :, k] = y
+    return out
+
+
+def _parts(cutoff: np.ndarray, order: int) -> tuple[np.ndarray, ...]:
+    """Return the coefficients of a step."""
+    angle = 2.0 * math.pi * np.minimum(cutoff, 0.45 * RATE) / RATE
+    zero = np.zeros_like(angle)
+    if order == 1:
+        lost = np.expm1(-angle)
+        return 1.0 + lost, zero, lost / angle, zero, zero, zero
+    p = angle / _ROOT2
+    s, c = np.exp(-p) * np.sin(p), np.exp(-p) * np.cos(p)
+    return (c + s, _ROOT2 * s, (c - 1.0) / p, c - s, -_ROOT2 * s, -(c - 1.0 + s) / angle)
+
+
+def agrees(case: Case, flights: Flights) -> float:
+    """Return the largest difference of the sweep to the package at one cutoff."""
+    x, off = flights.measured[:1, :3000], []
+    for mode in ('lowpass', 'derivative'):
+        ours = AdaptiveLowPass(order=case.order, fmin=1.0, fmax=30.0, fallback=20.0, mode=mode)
+        y = np.array([ours.step(t, v, math.nan)
+                      for t, v in zip(flights.t.tolist(), x[0].tolist())])
+        theirs = sweep(x, np.full((1, 1, 1), 20.0), case.order, mode == 'derivative')[0, 0]
+        off.append(float(np.abs(theirs - y).max() / np.abs(y).max()))
+    return max(off)
+
+
+def error(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return the mean square error of each flight behind `SETTLE`."""
+    first = int(SETTLE * RATE)
+    found: np.ndarray = np.mean((estimate[..., first:] - truth[..., first:])**2, axis=-1)
+    return found
+
+
+def lag_ms(output: np.ndarray, truth: np.ndarray) -> float:
+    """Return the delay of the output behind the truth by their cross-correlation, ms."""
+    first = int(SETTLE * RATE)
+    lags = []
+    for y, s in zip(output[:, first:], truth[:, first:]):
+        size = 1 << (2 * y.size - 1).bit_length()
+        both = np.fft.irfft(np.fft.rfft(y - y.mean(), size)
+                            * np.conj(np.fft.rfft(s - s.mean(), size)), size)
+        around = np.concatenate((both[-300:], both[:300]))
+        k = int(np.argmax(around[1:-1])) + 1
+        a, b, c = around[k - 1:k + 2]
+        lags.append(k - 300 + 0.5 * (a - c) / (a - 2.0 * b + c))
+    return float(np.mean(lags)) * 1e3 / RATE
+
+
+def laws(case: Case) -> dict[str, list[dict[str, Any]]]:
+    """
+    Return the options of each law for a case.
+
+    The first of a list is what one would set who knows the case; the others
+    are tried with it in hindsight.
+    """
+    fmin, fmax = case.limits
+    base = {'order': case.order, 'fmin': fmin, 'fmax': fmax, 'alpha': case.alpha,
+            'n0': case.white**2 / RATE}
+    wiener = {**base, 'law': 'wiener'}
+    constant = {**base, 'law': 'constant_noise'}
+    if case.kind == 'voltage':
+        middle = SPREAD * math.sqrt(2.0 * case.alpha)
+        return {'kalman': [{**base, 'law': 'kalman'}], 'wiener': [wiener], 'constant_noise': [
+            {**constant, 'sigma_ref': share * middle} for share in (0.5, 0.25, 1.0)]}
+    wiener |= {'signal_rms': BODY, 'coupling': case.coupling,
+               'signal_poles': 2 if case.kind == 'smooth' else 1}
+    constant |= {'coupling': case.coupling}
+    return {
+        'kalman': [{**base, 'law': 'kalman', 'coupling': case.coupling}],
+        'wiener': [{**wiener, 'signal_bandwidth': share * case.bandwidth}
+                   for share in (1.0, 0.5, 0.25, 0.1, 0.03)],
+        'constant_noise': [{**constant, 'noise_wanted': share * BODY}
+                           for share in (0.2, 0.1, 0.3, 0.4, 0.6)]}
+
+
+def mistaken(case: Case) -> dict[str, dict[str, Any]]:
+    """Return the options of `kalman` with each of what it is told wrong by a factor of 2."""
+    right = laws(case)['kalman'][0]
+    found = {}
+    for name in ('n0', 'coupling'):
+        for factor, word in ((0.5, 'half'), (2.0, 'twice')):
+            # The gyro's own noise is next to nothing beside the supply's.
+            if right.get(name) and not (name == 'n0' and case.kind != 'voltage'):
+                found[f'kalman, {name} {word} the true one'] = {
+                    **right, name: factor * right[name]}
+    return found
+
+
+def threshold(case: Case, best: float) -> dict[str, Any]:
+    """Return the paper's switch at the sigma of half throttle, an octave to both sides."""
+    return {'order': case.order, 'law': 'threshold',
+            'fmin': max(0.5 * best, case.limits[0]), 'fmax': min(2.0 * best, 450.0),
+            'sigma_ref': SPREAD * math.sqrt(2.0 * case.alpha)}
+
+
+def curve(throttle: np.ndarray, low: np.ndarray) -> np.ndarray:
+    """Return Betaflight's curve from `low` to twice that, expo 5, shape (candidates, ...)."""
+    share = throttle + 0.5 * throttle * (1.0 - throttle)
+    found: np.ndarray = low[:, None, None] * (1.0 + share[None])
+    return found
+
 
 TRUTH = 'Kalman filter that knows sigma'
 FIXED = 'best fixed cutoff in hindsight'
 CURVE = "Betaflight's curve, f..2 f, best f in hindsight"
-FORM = 'the same filter, best cutoff for each true sigma in hindsight'
-_LEVELS = 8
-WINDOWS = (0.25, 0.5, 1.0, 2.0)
 # Candidates of what is chosen in hindsight.
 _FIXED, _CURVES = 41, 21
 
@@ -42,28 +367,18 @@ _TOPS, _WANTED = (40.0, 70.0, 110.0, 150.0), (4.0, 7.0, 12.0, 20.0, 30.0)
 
 @dataclass(frozen=True)
 class Point:
-    """
-    One setting of one method.
+    """One setting of one method."""
 
-    Attributes
-    ----------
-    method, setting : str
-        What and how.
-    noise, loud, lag, rms_error : float
-        Rms of the noise that comes out and that of the loudest second in
-        twenty, rad/s^2; delay of the signal, ms; rms of output less the true
-        derivative, rad/s^2.
-    low, high : float
-        5 % and 95 % quantile of the cutoff, Hz.
-
-    """
-
+    # What and how.
     method: str
     setting: str
+    # Rms of the noise that comes out and that of the loudest second in twenty, rad/s^2;
+    # delay of the signal, ms; rms of output less the true derivative, rad/s^2.
     noise: float
     loud: float
     lag: float
     rms_error: float
+    # 5 % and 95 % quantile of the cutoff, Hz.
     low: float = math.nan
     high: float = math.nan
 
@@ -72,10 +387,10 @@ def run_dterm(flights: int, seconds: float, seed: int, window: float,
               tell: Callable[[str], None]) -> list[Point]:
     """Return the points of all methods."""
     flown = fly(CASE, np.random.default_rng([seed, 100]), flights, seconds)
-    off = methods.agrees(CASE, flown)
+    off = agrees(CASE, flown)
     if off > 1e-9:
         raise SystemExit(f'the vectorized filter is off by {off:g}: the comparison is void')
-    seen = methods.estimates(flown, window)
+    seen = estimates(flown, window)
     points = []
 
     def keep(method: str, setting: str, noise: np.ndarray, signal: np.ndarray,
@@ -85,10 +400,10 @@ def run_dterm(flights: int, seconds: float, seed: int, window: float,
     tell(FIXED_CUTOFF)
     for name, cutoffs, settings in (
             (FIXED_CUTOFF, _CUTOFFS[:, None, None], [f'{f:.0f} Hz' for f in _CUTOFFS]),
-            (CURVE_CUTOFF, methods.curve(flown.throttle, np.array(_BASES)),
+            (CURVE_CUTOFF, curve(flown.throttle, np.array(_BASES)),
              [f'{f:g}..{2 * f:g} Hz' for f in _BASES])):
-        noises = methods.sweep(flown.noise, cutoffs, 2, True)
-        signals = methods.sweep(flown.truth, cutoffs, 2, True)
+        noises = sweep(flown.noise, cutoffs, 2, True)
+        signals = sweep(flown.truth, cutoffs, 2, True)
         for k, setting in enumerate(settings):
             keep(name, setting, noises[k], signals[k], cutoffs[k])
         del noises, signals
@@ -102,9 +417,9 @@ def run_dterm(flights: int, seconds: float, seed: int, window: float,
         'coupling': CASE.coupling, 'noise_wanted': w}) for w in _WANTED]
     for name, setting, options in runs:
         tell(f'{name}, {setting}')
-        noise, cutoff = methods.adaptive(options, flown, seen, flown.noise)
+        noise, cutoff = adaptive(options, flown, seen, flown.noise)
         keep(name, setting, noise,
-             methods.sweep(flown.truth, cutoff[None], 2, True)[0], cutoff)
+             sweep(flown.truth, cutoff[None], 2, True)[0], cutoff)
     for limit in _LAGS:
         options = {**base, 'law': 'kalman', 'coupling': CASE.coupling, 'fmin': 5.0,
                    'fmax': 300.0, 'max_lag': limit, 'n0': CASE.white**2 / RATE}
@@ -112,27 +427,27 @@ def run_dterm(flights: int, seconds: float, seed: int, window: float,
         tell(f'{KALMAN}, {setting}')
         # It learns from powers, which are the same to sampling error with the noise turned over:
         # half the difference of both is the noise, half the sum the signal.
-        both, cutoff = methods.adaptive(options, flown, seen, flown.truth + flown.noise)
-        other, _ = methods.adaptive(options, flown, seen, flown.truth - flown.noise)
+        both, cutoff = adaptive(options, flown, seen, flown.truth + flown.noise)
+        other, _ = adaptive(options, flown, seen, flown.truth - flown.noise)
         keep(KALMAN, setting, 0.5 * (both - other), 0.5 * (both + other), cutoff)
     slope = kalman(CASE, flown)[1]
     points.append(Point('Kalman filter that knows sigma', '-', math.nan, math.nan,
-                        methods.lag_ms(slope, flown.slope),
-                        float(np.sqrt(methods.error(slope, flown.slope).mean()))))
+                        lag_ms(slope, flown.slope),
+                        float(np.sqrt(error(slope, flown.slope).mean()))))
     return points
 
 
 def _point(method: str, setting: str, flown: Flights, noise: np.ndarray, signal: np.ndarray,
            cutoff: np.ndarray) -> Point:
-    first, second = int(methods.SETTLE * RATE), int(RATE)
+    first, second = int(SETTLE * RATE), int(RATE)
     rest = noise[:, first:]
     pieces = rest[:, :rest.shape[1] // second * second].reshape(-1, second)
     settled = cutoff[..., first:] if cutoff.shape[-1] > 1 else cutoff
     return Point(
         method, setting, float(np.sqrt(np.mean(rest**2))),
         float(np.quantile(np.sqrt(np.mean(pieces**2, axis=1)), 0.95)),
-        methods.lag_ms(signal, flown.slope),
-        float(np.sqrt(methods.error(noise + signal, flown.slope).mean())),
+        lag_ms(signal, flown.slope),
+        float(np.sqrt(error(noise + signal, flown.slope).mean())),
         float(np.quantile(settled, 0.05)), float(np.quantile(settled, 0.95)))
 
 
@@ -170,72 +485,56 @@ def render_dterm(points: list[Point]) -> tuple[str, Plot]:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """
-    Of one case.
+    """Of one case."""
 
-    Attributes
-    ----------
-    name : str
-        Case.
-    errors : dict of str to ndarray, shape (flights,)
-        Mean square error.
-    lags : dict of str to float
-        ms.
-    cutoffs : dict of str to (float, float)
-        5 % and 95 % quantile, Hz.
-
-    """
-
-    name: str
-    errors: dict[str, np.ndarray]
-    lags: dict[str, float]
-    cutoffs: dict[str, tuple[float, float]]
+    name: str  # Case.
+    errors: dict[str, np.ndarray]  # Mean square error.
+    lags: dict[str, float]  # ms.
+    cutoffs: dict[str, tuple[float, float]]  # 5 % and 95 % quantile, Hz.
 
 
 def score(case: Case, flights: Flights, seen: np.ndarray, best: np.ndarray) -> Result:
     """Run every method on flights; `best` is the estimate that knows the truth."""
-    errors = {TRUTH: methods.error(best, flights.truth)}
-    lags = {TRUTH: methods.lag_ms(best, flights.truth)}
+    errors = {TRUTH: error(best, flights.truth)}
+    lags = {TRUTH: lag_ms(best, flights.truth)}
     cutoffs: dict[str, tuple[float, float]] = {}
 
     def keep(name: str, output: np.ndarray, cutoff: np.ndarray) -> None:
-        errors[name] = methods.error(output, flights.truth)
-        lags[name] = methods.lag_ms(output, flights.truth)
-        settled = cutoff[..., int(methods.SETTLE * RATE):] if cutoff.ndim > 1 else cutoff
+        errors[name] = error(output, flights.truth)
+        lags[name] = lag_ms(output, flights.truth)
+        settled = cutoff[..., int(SETTLE * RATE):] if cutoff.ndim > 1 else cutoff
         cutoffs[name] = (float(np.quantile(settled, 0.05)), float(np.quantile(settled, 0.95)))
 
     x, order, (fmin, fmax) = flights.measured, case.order, case.limits
     fixed = np.geomspace(fmin, fmax, _FIXED)
-    outputs = methods.sweep(x, fixed[:, None, None], order)
-    chosen = _least(methods.error(outputs, flights.truth))
+    outputs = sweep(x, fixed[:, None, None], order)
+    chosen = _least(error(outputs, flights.truth))
     keep(FIXED, _taken(outputs, chosen), fixed[chosen])
     middle = float(np.median(fixed[chosen]))
     # One octave is in the curve itself, so both may use the whole range.
-    curves = np.minimum(methods.curve(flights.throttle, np.geomspace(fmin, fmax / 2.0, _CURVES)),
+    curves = np.minimum(curve(flights.throttle, np.geomspace(fmin, fmax / 2.0, _CURVES)),
                         fmax)
-    outputs = methods.sweep(x, curves, order)
-    chosen = _least(methods.error(outputs, flights.truth))
+    outputs = sweep(x, curves, order)
+    chosen = _least(error(outputs, flights.truth))
     keep(CURVE, _taken(outputs, chosen), _taken(curves, chosen))
     del outputs, curves
     keep('threshold, an octave either side of it',
-         *methods.adaptive(methods.threshold(case, middle), flights, seen, x))
-    for law, variants in methods.laws(case).items():
-        runs = [methods.adaptive(options, flights, seen, x) for options in variants]
+         *adaptive(threshold(case, middle), flights, seen, x))
+    for law, variants in laws(case).items():
+        runs = [adaptive(options, flights, seen, x) for options in variants]
         keep(law, *runs[0])
         if len(runs) > 1:
-            chosen = _least(np.array([methods.error(y, flights.truth) for y, _ in runs]))
+            chosen = _least(np.array([error(y, flights.truth) for y, _ in runs]))
             keep(f'{law}, its parameter in hindsight',
                  *(_taken(np.array([run[k] for run in runs]), chosen) for k in range(2)))
-    for name, options in methods.mistaken(case).items():
-        keep(name, *methods.adaptive(options, flights, seen, x))
+    for name, options in mistaken(case).items():
+        keep(name, *adaptive(options, flights, seen, x))
     # The law alone, without estimator and smoothing: what its form is worth.
-    settings = FilterSettings.from_options(methods.laws(case)['wiener'][0])
+    settings = FilterSettings.from_options(laws(case)['wiener'][0])
     grid = np.geomspace(flights.sigma.min(), flights.sigma.max() * 1.0001, 200)
     wanted = [wanted_cutoff(settings, float(s), case.alpha, 0.5, 1.0 / RATE) for s in grid]
     exact = np.exp(np.interp(np.log(flights.sigma), np.log(grid), np.log(wanted)))
-    keep('wiener, told the true sigma', methods.sweep(x, exact[None], order)[0], exact)
-    # The form of the filter alone: of many cutoffs the best for each sigma, by trial.
-    keep(FORM, *_by_level(flights, methods.sweep(x, fixed[:, None, None], order), fixed, order))
+    keep('wiener, told the true sigma', sweep(x, exact[None], order)[0], exact)
     return Result(case.name, errors, lags, cutoffs)
 
 
@@ -250,25 +549,6 @@ def _taken(outputs: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     return taken
 
 
-def _by_level(flights: Flights, outputs: np.ndarray, fixed: np.ndarray, order: int,
-              ) -> tuple[np.ndarray, np.ndarray]:
-    """Return output and cutoff of a law found by trial: the best cutoff in each band of sigma."""
-    first = int(methods.SETTLE * RATE)
-    log = np.log(flights.sigma)
-    edges = np.quantile(log[:, first:], np.linspace(0.0, 1.0, _LEVELS + 1))
-    centres, best = [], []
-    for low, high in zip(edges, edges[1:]):
-        inside = (log >= low) & (log <= high)
-        inside[:, :first] = False
-        if inside.any():
-            lost = [np.mean((y[inside] - flights.truth[inside])**2) for y in outputs]
-            centres.append(float(log[inside].mean()))
-            best.append(math.log(fixed[int(np.argmin(lost))]))
-    places = np.argsort(centres)
-    cutoff = np.exp(np.interp(log, np.array(centres)[places], np.array(best)[places]))
-    return methods.sweep(flights.measured, cutoff[None], order)[0], cutoff
-
-
 def errors(flights: int, seconds: float, seed: int, window: float,
            tell: Callable[[str], None]) -> list[Result]:
     """Run all cases."""
@@ -276,64 +556,11 @@ def errors(flights: int, seconds: float, seed: int, window: float,
     for number_, case in enumerate(CASES):
         tell(case.name)
         flown = fly(case, np.random.default_rng([seed, number_]), flights, seconds)
-        off = methods.agrees(case, flown)
+        off = agrees(case, flown)
         if off > 1e-9:
             raise SystemExit(f'the vectorized filter is off by {off:g}: the comparison is void')
-        results.append(score(case, flown, methods.estimates(flown, window),
+        results.append(score(case, flown, estimates(flown, window),
                              kalman(case, flown)[0]))
-    return results
-
-
-def windows(flights: int, seconds: float, seed: int, tell: Callable[[str], None]) -> str:
-    """Return how the error of the law `kalman` depends on the estimator's window."""
-    rows = []
-    for place, case in enumerate(CASES):
-        flown = fly(case, np.random.default_rng([seed, place]), flights, seconds)
-        best = methods.error(kalman(case, flown)[0], flown.truth)
-        fixed = methods.error(methods.sweep(
-            flown.measured, np.geomspace(*case.limits, _FIXED)[:, None, None], case.order),
-            flown.truth).min(axis=0)
-        for window in WINDOWS:
-            tell(f'{case.name}, window {window:g} s')
-            seen = methods.estimates(flown, window)
-            known = float(np.isfinite(seen[0, :, int(methods.SETTLE * RATE):]).mean())
-            output, _ = methods.adaptive(methods.laws(case)['kalman'][0], flown, seen,
-                                         flown.measured)
-            found = methods.error(output, flown.truth)
-            rows.append([case.name, f'{window:g}', _ratio(found, best), _ratio(found, fixed),
-                         f'{100.0 * known:.0f} %'])
-    return table(['case', 'window, s', 'MSE over truth-knowing', 'MSE over best fixed',
-                  'sigma known'], rows)
-
-
-def bags(folder: Path, seed: int, window: float, tell: Callable[[str], None]) -> list[Result]:
-    """Filter the voltage of the bags, with the noise of a poor ADC added: the bag is the truth."""
-    import yaml
-    results = []
-    for name in ('flight', 'load_40'):
-        tell(name)
-        recording = read_recording(folder / name)
-        truth = yaml.safe_load((folder / name / 'truth.yaml').read_text())['parameters']
-        every = max(1, round((recording.n - 1) / recording.duration / RATE))
-        voltage = recording.voltage[::every][None]
-        throttle = np.nan_to_num(recording.throttle[::every])[None]
-        if 'sigma_by_throttle' in truth:
-            at, values = np.array(truth['sigma_by_throttle']).T
-            sigma = np.interp(throttle, at, values)
-            level = truth['u0'] - truth['sag'] * throttle
-        else:
-            sigma = np.full(throttle.shape, truth['sigma'])
-            level = np.full(throttle.shape, truth['u0'])
-        rng = np.random.default_rng([seed, len(name)])
-        white = ADC * rng.standard_normal(voltage.shape)
-        t = np.arange(voltage.shape[1]) / RATE
-        flown = Flights(t, throttle, sigma, voltage + white, voltage,
-                        np.full(voltage.shape, np.nan), voltage + white, white)
-        case = Case(f'bags/{name}', 'voltage', truth['alpha'], 0.0, 1, (2.0, 400.0))
-        centred = Flights(t, throttle, sigma, flown.voltage, voltage - level + 5.0, flown.slope,
-                          voltage + white - level + 5.0, white)
-        best = kalman(case, centred)[0] + level - 5.0
-        results.append(score(case, flown, methods.estimates(flown, window), best))
     return results
 
 

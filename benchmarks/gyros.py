@@ -32,33 +32,17 @@ SLOW = (('erle', 'raw/ac_erle_althold2.BIN', 1, 'IMU'), ('jd', 'raw/ac_jd_2004.b
 
 @dataclass(frozen=True, eq=False)
 class Gyro:
-    """
-    One flight.
+    """One flight."""
 
-    Attributes
-    ----------
-    name, kind : str
-        Name; the gyro of the log.
-    t : ndarray, shape (n,)
-        s.
-    rate : float
-        Mean sample rate, Hz.
-    signal : ndarray, shape (n, 3)
-        Angular velocity, degree/s.
-    throttle : ndarray, shape (n,)
-        As `convert` chooses it: where the log has them the mean of the motors' commands, 0..1.
-    rpm : ndarray, shape (n, 4), or None
-        Of the shafts.
-
-    """
-
+    # Name; the gyro of the log.
     name: str
     kind: str
-    t: np.ndarray
-    rate: float
-    signal: np.ndarray
+    t: np.ndarray  # s.
+    rate: float  # Mean sample rate, Hz.
+    signal: np.ndarray  # Angular velocity, degree/s.
+    # As `convert` chooses it: where the log has them the mean of the motors' commands, 0..1.
     throttle: np.ndarray
-    rpm: np.ndarray | None
+    rpm: np.ndarray | None  # Of the shafts.
 
 
 def folder() -> Path | None:

@@ -17,10 +17,8 @@ give them: on volts their optimisers stop early.
 from __future__ import annotations
 
 from collections.abc import Callable
-import contextlib
 from dataclasses import replace
 import importlib.util
-import io
 import math
 from typing import Any
 import warnings
@@ -111,22 +109,7 @@ def _log_errors(y: Array, log_a: float, log_scale: float, noise: float) -> Array
 
 
 def kalman_fit(y: Array, dt: float) -> Fit:
-    """
-    Return the restricted maximum-likelihood fit.
-
-    Parameters
-    ----------
-    y : ndarray, shape (n,)
-        Voltage, V.
-    dt : float
-        Step, s.
-
-    Returns
-    -------
-    Fit
-        Not corrected for the length of the window, see `corrected`.
-
-    """
+    """Return the restricted maximum-likelihood fit."""
     centred = y - y.mean()
 
     edge = minimize_scalar(lambda x: _deviance(centred, x, 0.0), bounds=(_LOW, _HIGH),
@@ -225,29 +208,6 @@ def arma(y: Array, dt: float) -> Fit:
     return _scaled(_delta(np.asarray(found.params)[1:], covariance, logs), float(y.std()))
 
 
-def components(y: Array, dt: float) -> Fit:
-    """Return the fit of statsmodels UnobservedComponents: AR(1) + irregular + fixed level."""
-    from statsmodels.tsa.statespace.structural import UnobservedComponents
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore')
-        # level as a string ('fixed intercept') would switch `irregular` off.
-        model = UnobservedComponents((y - y.mean()) / y.std(), level=True,
-                                     stochastic_level=False, irregular=True, autoregressive=1)
-        found = model.fit(disp=False, maxiter=200)
-        covariance = np.asarray(found.cov_params())
-    names = list(model.param_names)
-    order = [names.index('sigma2.ar'), names.index('ar.L1')]
-
-    def logs(p: Array) -> Array:
-        log_phi = np.log(p[1])
-        var_inf = p[0] / (1.0 - p[1] ** 2)
-        return np.array([np.log(-log_phi / dt), 0.5 * np.log(-2.0 * log_phi / dt * var_inf),
-                         np.log(var_inf)])
-
-    return _scaled(_delta(np.asarray(found.params)[order], covariance[np.ix_(order, order)],
-                          logs), float(y.std()))
-
-
 def celerite(y: Array, dt: float) -> tuple[Fit, Callable[[], Fit]]:
     """Return the fit of a celerite2 RealTerm with jitter, and how to get its errors."""
     import celerite2
@@ -296,21 +256,6 @@ def celerite(y: Array, dt: float) -> tuple[Fit, Callable[[], Fit]]:
     return _delta(found.x, np.zeros((4, 4)), logs), with_errors
 
 
-def pymle(y: Array, dt: float) -> Fit:
-    """Return the exact OU maximum likelihood of pymle-diffusion (no errors given)."""
-    from pymle.core.TransitionDensity import ExactDensity
-    from pymle.fit.AnalyticalMLE import AnalyticalMLE
-    from pymle.models import OrnsteinUhlenbeck
-    bounds = [(0.01, 2.0 / dt), (float(y.min()), float(y.max())), (1e-3, 50.0)]
-    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
-        warnings.simplefilter('ignore')
-        found = AnalyticalMLE(
-            sample=y, param_bounds=bounds, dt=dt, density=ExactDensity(OrnsteinUhlenbeck()),
-        ).estimate_params(np.array([50.0, float(y.mean()), 1.0]))
-    alpha, _, sigma = (float(p) for p in found.params)
-    return Fit(alpha, sigma, sigma ** 2 / (2.0 * alpha))
-
-
 def rolling(y: Array, dt: float) -> Fit:
     """Return pandas' rolling lag-1 correlation and standard deviation, as a user would."""
     import pandas as pd
@@ -328,9 +273,7 @@ PEERS: tuple[tuple[str, str, Callable[[Array, float], object], bool], ...] = (
     ('Kalman, restricted likelihood', 'scipy', kalman_fit, False),
     ('celerite2 RealTerm + jitter', 'celerite2', celerite, False),
     ('statsmodels ARMA(1,1)', 'statsmodels', arma, True),
-    ('statsmodels UnobservedComponents', 'statsmodels', components, True),
     ('statsmodels AutoReg(1)', 'statsmodels', autoreg, False),
-    ('pymle-diffusion exact OU', 'pymle', pymle, True),
     ('pandas rolling', 'pandas', rolling, False),
 )
 

@@ -47,26 +47,12 @@ Draw = Callable[[int], Any]
 
 @dataclass(frozen=True)
 class Row:
-    """
-    One way to make samples.
+    """One way to make samples."""
 
-    Attributes
-    ----------
-    name : str
-        For the table.
-    draw : callable
-        Makes n samples; returns them where they are of the plain OU, else None.
-    share : float
-        Samples, as a share of those of the fastest.
-    law : bool
-        Whether the variance is compared with that of the plain OU.
-
-    """
-
-    name: str
-    draw: Draw
-    share: float = 1.0
-    law: bool = False
+    name: str  # For the table.
+    draw: Draw  # Makes n samples; returns them where they are of the plain OU, else None.
+    share: float = 1.0  # Samples, as a share of those of the fastest.
+    law: bool = False  # Whether the variance is compared with that of the plain OU.
 
 
 def _supply(*more: Term) -> Draw:

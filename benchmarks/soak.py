@@ -32,9 +32,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test/support')]
 
 from live import memory_of, Probe, Process, Starved, values_of  # noqa: E402
-from soak_dips import Heard, IN_TIME, Said, State  # noqa: E402
-from soak_figures import as_table, figures  # noqa: E402
-from soak_machine import at_leisure, busy, deafen, Machine, set_priority  # noqa: E402
+from soak_figures import as_table, figures, Heard, IN_TIME, Said, State  # noqa: E402
+from soak_machine import at_leisure, busy, Machine, set_priority  # noqa: E402
 from soak_schedule import Event, events  # noqa: E402
 from tables import put  # noqa: E402
 
@@ -46,15 +45,11 @@ model:
 - term: measurement_noise
   params: {std: 0.002}
 """
-# A node that says nothing is asked where it is.
-ASKED = 'import faulthandler, signal; faulthandler.register(signal.SIGUSR1)'
 COUNTERS = ('messages', 'messages_lost', 'foreign_messages', 'pushed', 'used', 'non_finite',
             'late', 'resets', 'floor_dips', 'samples_thinned', 'restarts', 'callback_errors')
 # s: between looks at the memory, and at what is reported of the progress; patience with a
 # service, with the start of a node, and with its end.
 LOOK, PROGRESS, ANSWER, START, END = 2.0, 60.0, 20.0, 60.0, 20.0
-# Silence after which it is asked, s.
-SILENT = 1.2
 
 
 def steady(wall: float) -> float:
@@ -95,7 +90,6 @@ class Soak:
         self._busy: tuple[float, multiprocessing.Process] | None = None
         self._begin = self._start = time.monotonic()
         self._told: set[tuple[str, float]] = set()
-        self._asked = 0.0
 
     def _start_node(self) -> Process:
         node = Process('estimator', [
@@ -141,7 +135,6 @@ class Soak:
         pending = list(self._events)
         while self._source.poll() is None:
             now = time.monotonic()
-            self._ask(now)
             if now - looked >= LOOK:
                 looked = now
                 self._look(now)
@@ -167,18 +160,6 @@ class Soak:
         whole = self._log.read_text().rpartition('\n')[0]
         lines = [json.loads(line) for line in whole.splitlines()]
         return [line for line in lines if not kind or line['kind'] == kind]
-
-    def _ask(self, now: float) -> None:
-        """Have a node that is silent write where its threads are, once a second."""
-        silent = now - max(self.heard.states[-1].at, self._asked)
-        if self._starved is not None or silent < SILENT or self._node.popen.poll() is not None:
-            return
-        self._asked = now
-        threads = [f"{(task / 'comm').read_text().strip()} {(task / 'wchan').read_text()} "
-                   f"{(task / 'stat').read_text().split(')')[-1].split()[0]}"
-                   for task in Path(f'/proc/{self._node.popen.pid}/task').iterdir()]
-        self._node.popen.send_signal(signal.SIGUSR1)
-        print(f'silent for {silent:.1f} s at {now - self._start:.2f} s: {threads}', flush=True)
 
     def _look(self, now: float) -> None:
         """Look at the node's memory; start it anew where it is dead."""
@@ -323,7 +304,7 @@ class Soak:
         for name, (_, net, at) in found['silence'].items():
             print(f'{name} was silent for {net:.2f} s at {at - self._start:.2f} s; done: '
                   f'{self.heard.lately(at, at + net)}')
-        if 'Traceback' in self._node.err or 'Current thread' in self._node.err:
+        if 'Traceback' in self._node.err:
             print(self._node.err[-20000:], file=sys.stderr)
         return found
 
@@ -337,11 +318,8 @@ def main() -> None:
     parser.add_argument('--transport', default='DEFAULT', choices=('DEFAULT', 'UDPv4'),
                         help='of Fast DDS; DEFAULT: shared memory, and UDP beside it')
     parser.add_argument('--dense', action='store_true', help='dips as close as can be told apart')
-    parser.add_argument('--deafen', action='store_true', help='stop the listener now and then')
     parser.add_argument('--json', type=Path, help='file for all figures')
     parser.add_argument('--markdown', type=Path, help='page for the table')
-    parser.add_argument('--beside', type=Path, nargs='*', default=[],
-                        help='figures (--json) of other runs, as further columns')
     options = parser.parse_args()
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     os.environ['FASTDDS_BUILTIN_TRANSPORTS'] = options.transport
@@ -350,22 +328,17 @@ def main() -> None:
         signal.signal(number, signal.default_int_handler)
     with tempfile.TemporaryDirectory() as folder:
         os.environ['ROS_LOG_DIR'] = folder
-        (Path(folder) / 'sitecustomize.py').write_text(ASKED)
-        os.environ['PYTHONPATH'] = os.pathsep.join(
-            [folder, *filter(None, [os.environ.get('PYTHONPATH')])])
         soak = Soak(options.seed, 60.0 * options.minutes, Path(folder), options.domain,
                     options.dense)
         soak.run_by = f'seed {options.seed}, {options.transport}' + (
             ', dense' if options.dense else '')
-        if options.deafen:
-            multiprocessing.Process(target=deafen, args=(os.getpid(),), daemon=True).start()
         try:
             soak.run()
         except KeyboardInterrupt:
             print('ended by a signal: the figures so far', file=sys.stderr)
         finally:
             found = soak.close()
-    text = as_table(found, *(json.loads(path.read_text()) for path in options.beside))
+    text = as_table(found)
     print(text)
     for line in soak.wrong:
         print(f'answered wrongly: {line}')

@@ -6,28 +6,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
-import random
-import signal
 import threading
 import time
 
-from soak_dips import Span
+from soak_figures import Span
 
 REAL_TIME = (os.SCHED_FIFO, os.SCHED_RR)
-# A listener that is stopped on purpose: for so long at most, and so long apart, s.
-STOPPED, APART = 3.0, 6.0
 
 
 class Machine(threading.Thread):
     """
-    What the machine itself withholds, looked at 50 times a second.
+    What the machine itself withholds, looked at 50 times a second, by the monotonic clock, s.
 
-    Attributes
-    ----------
-    node, here : list of tuple of float
-        When the node's main thread was ready and had no CPU for more than WAIT s, by the
-        kernel's account, and when this process had none for PAUSE s; by the monotonic clock, s.
-
+    `node`: when the node's main thread was ready and had no CPU for more than WAIT s, by the
+    kernel's account; `here`: when this process had none for PAUSE s.
     """
 
     WAIT, PAUSE = 0.05, 0.1
@@ -80,13 +72,3 @@ def busy(core: int, priority: int) -> None:
     os.sched_setaffinity(0, {core})
     while True:
         pass
-
-
-def deafen(pid: int) -> None:
-    """Stop the listener every few seconds."""
-    rng = random.Random(pid)
-    while True:
-        time.sleep(rng.uniform(0.0, APART))
-        os.kill(pid, signal.SIGSTOP)
-        time.sleep(rng.uniform(0.0, STOPPED))
-        os.kill(pid, signal.SIGCONT)

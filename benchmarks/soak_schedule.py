@@ -51,24 +51,13 @@ class Phase:
 
 @dataclass(frozen=True)
 class Dip:
-    """
-    One dip.
+    """One dip."""
 
-    Attributes
-    ----------
-    begin, length : float
-        s.
-    voltage : float
-        V.
-    unseen : str
-        Why the node cannot see it; empty where it must.
-
-    """
-
+    # s.
     begin: float
     length: float
-    voltage: float
-    unseen: str
+    voltage: float  # V.
+    unseen: str  # Why the node cannot see it; empty where it must.
 
 
 @dataclass(frozen=True)

@@ -40,25 +40,15 @@ _RESAMPLES = 400
 
 @dataclass(frozen=True)
 class Fit:
-    """
-    One fit.
+    """One fit."""
 
-    Attributes
-    ----------
-    alpha, sigma, var_inf : float
-        1/s, V/sqrt(s), V^2; NaN when the method gave none.
-    log_se : tuple of float
-        Standard errors of the logarithms; NaN when the method gives none.
-    status : str
-        What the method says of it.
-
-    """
-
+    # 1/s, V/sqrt(s), V^2; NaN when the method gave none.
     alpha: float
     sigma: float
     var_inf: float
+    # Standard errors of the logarithms; NaN when the method gives none.
     log_se: tuple[float, ...] = (math.nan, math.nan, math.nan)
-    status: str = 'ok'
+    status: str = 'ok'  # What the method says of it.
 
     @staticmethod
     def failed(status: str) -> Fit:
@@ -68,20 +58,10 @@ class Fit:
 
 @dataclass
 class Fits:
-    """
-    Fits of one method to many windows.
+    """Fits of one method to many windows."""
 
-    Attributes
-    ----------
-    fits : list of Fit
-        One per window, in order.
-    seconds : list of float
-        CPU time of each.
-
-    """
-
-    fits: list[Fit] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
+    fits: list[Fit] = field(default_factory=list)  # One per window, in order.
+    seconds: list[float] = field(default_factory=list)  # CPU time of each.
 
     def relative(self, truth: dict[str, float]) -> Array:
         """Return relative errors, shape (windows, 3)."""
@@ -90,22 +70,7 @@ class Fits:
 
     def summary(self, truth: dict[str, float], only: npt.NDArray[np.bool_] | None = None
                 ) -> dict[str, object]:
-        """
-        Return bias, its Monte Carlo error, RMSE, coverage, time and outcomes.
-
-        Parameters
-        ----------
-        truth : dict
-            True parameters.
-        only : ndarray of bool, optional
-            Windows to count; default all with numbers.
-
-        Returns
-        -------
-        dict
-            Percentages; NaN where there is nothing to tell.
-
-        """
+        """Return bias, its Monte Carlo error, RMSE, coverage, time and outcomes."""
         errors = self.relative(truth)
         told = np.isfinite(errors)
         if only is not None:
@@ -135,22 +100,7 @@ class Fits:
 
 
 def rmse_ratio(one: Array, other: Array, paired: bool) -> tuple[float, float]:
-    """
-    Return the ratio of two root mean squares and its bootstrap error.
-
-    Parameters
-    ----------
-    one, other : ndarray, shape (n,)
-        Errors; NaN is left out.
-    paired : bool
-        Whether they are of the same windows, and are to be resampled together.
-
-    Returns
-    -------
-    ratio, error : float
-        Dimensionless.
-
-    """
+    """Return the ratio of two root mean squares and its bootstrap error."""
     both = np.isfinite(one) & np.isfinite(other)
     a, b = one[both] ** 2, other[both] ** 2
     if a.size < 2:
@@ -163,25 +113,7 @@ def rmse_ratio(one: Array, other: Array, paired: bool) -> tuple[float, float]:
 
 
 def simulate(rng: np.random.Generator, count: int, n: int, dt: float = DT) -> Array:
-    """
-    Return stationary OU paths about `LEVEL`, V.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of randomness.
-    count, n : int
-        Paths, and samples in each.
-    dt : float
-        Step, s.
-
-    Returns
-    -------
-    ndarray, shape (count, n)
-        Each path has its own level within one ADC code, so that rounding
-        does not meet the same thresholds every time.
-
-    """
+    """Return stationary OU paths about `LEVEL`, V."""
     phi = math.exp(-ALPHA * dt)
     shocks = rng.standard_normal((count, n)) * math.sqrt(VAR_INF)
     shocks[:, 1:] *= math.sqrt(-math.expm1(-2.0 * ALPHA * dt))
@@ -211,27 +143,7 @@ SENSORS = {
 
 def throttle_steps(rng: np.random.Generator, count: int, n: int, dt: float = DT
                    ) -> tuple[Array, Array]:
-    """
-    Return throttle that goes up and down again once in each window.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of randomness.
-    count, n : int
-        Windows, and samples in each.
-    dt : float
-        Step between samples, s.
-
-    Returns
-    -------
-    throttle : ndarray, shape (count, n)
-        0..1, as sampled.
-    times : ndarray, shape (count, 2)
-        When it moved, s after the first sample: uniform over the window, not
-        on the sampling grid.
-
-    """
+    """Return throttle that goes up and down again once in each window."""
     times = np.sort(rng.random((count, 2)) * (n - 1) * dt, axis=1)
     grid = np.arange(n) * dt
     up = (grid >= times[:, :1]) & (grid < times[:, 1:])
@@ -240,29 +152,7 @@ def throttle_steps(rng: np.random.Generator, count: int, n: int, dt: float = DT
 
 def sagging(throttle: Array, times: Array, lag: float, delay: float = 0.0, on_grid: bool = True,
             dt: float = DT) -> Array:
-    """
-    Return the mean that throttle causes, V.
-
-    Parameters
-    ----------
-    throttle, times : ndarray
-        See `throttle_steps`.
-    lag : float
-        Time constant of the first-order response, s; 0 for at once.
-    delay : float
-        Dead time before it, s.
-    on_grid : bool
-        Whether the response starts when the step is first sampled, or at the
-        step itself, up to `dt` earlier.
-    dt : float
-        Step between samples, s.
-
-    Returns
-    -------
-    ndarray, shape (count, n)
-        `SAG` times the throttle as the supply feels it.
-
-    """
+    """Return the mean that throttle causes, V."""
     grid = np.arange(throttle.shape[1]) * dt
     response = np.zeros_like(throttle)
     for sign, at in ((1.0, times[:, :1]), (-1.0, times[:, 1:])):

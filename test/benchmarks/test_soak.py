@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from soak_dips import dips_of, Heard, overlap, Said, State, unheard
-from soak_figures import false_of, growth, silence, unmatched
+from soak_figures import (
+    dips_of, false_of, growth, Heard, overlap, Said, silence, State, unheard, unmatched)
 from soak_schedule import (
     bad_parameters, DEPTH, Dip, dips, events, LEAVE, Phase, phases, SEEN, SETTLE, UNSEEN)
 
@@ -73,12 +73,12 @@ def test_a_dip_that_was_not_told_explains_itself():
     made.done = [(2.0, 'brownout.floor', '4.3'), (9.5, 'clear', ''), (10.5, 'window', '1.0'),
                  (15.0, 'busy', '')]
     why, = (dip['why'] for dip in dips_of(made)['unheard'])
-    for words in ('50 samples at 3.00 V within 50.0 ms, stamps and values: good',
-                  'the node counted 1 dips, 1197 messages of 1180, 3 lost', 'and not 2',
-                  'flags and not 1', '0.30 s apart', 'stopped 0.05 s',
-                  'in force: brownout.floor 4.3;',
-                  'done: clear at -0.50 s, window 1.0 at +0.50 s'):
-        assert words in why, why
+    assert why['counted'] == 1 and why['lost'] == 3
+    assert (why['came'], why['due']) == (1197, 1180)
+    assert (why['states_unheard'], why['flags_unheard']) == (2, 1)
+    assert why['gap'] == pytest.approx(0.3) and why['stopped'] == pytest.approx(0.05)
+    assert why['in_force'] == {'brownout.floor': '4.3'}
+    assert why['done'] == 'clear at -0.50 s, window 1.0 at +0.50 s'
     assert unheard(made.states) == 2
 
 

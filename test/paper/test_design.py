@@ -8,7 +8,7 @@ import numpy as np
 from ou_monitor.model.passage.law import mean_first_passage
 from ou_monitor.paper.network.components import PowerNetwork
 from ou_monitor.paper.network.design import (
-    answer, default_voltage, design, effect, remarks, row_of, Verdict, with_capacitance)
+    answer, default_voltage, design, DesignVerdict, effect, remarks, row_of, with_capacitance)
 from ou_monitor.paper.network.rail import rail_at
 import pytest
 
@@ -18,7 +18,7 @@ QUESTION = {'voltage': 19.8, 'horizon': 5.0, 'risk': 1e-3}
 def test_the_least_capacitance_meets_the_risk_and_less_does_not():
     network = PowerNetwork()
     result = design(network, 0.4, **QUESTION)
-    assert result.verdict is Verdict.FOUND
+    assert result.verdict is DesignVerdict.FOUND
     assert result.least.risk <= 1e-3
     assert result.least.risk == pytest.approx(1e-3, rel=1e-6)
     less = with_capacitance(network, 0.99 * result.least.capacitance)
@@ -59,14 +59,14 @@ def test_parallel_capacitors_keep_esr_times_capacitance():
 
 def test_enough():
     result = design(PowerNetwork(), 0.1, **QUESTION)
-    assert result.verdict is Verdict.ENOUGH
+    assert result.verdict is DesignVerdict.ENOUGH
     assert result.least.capacitance == pytest.approx(10e-6)
     assert 'No more capacitance is needed' in answer(result)
 
 
 def test_a_fixed_esr_may_leave_no_capacitance():
     result = design(PowerNetwork(), 0.4, esr_follows=False, **QUESTION)
-    assert result.verdict is Verdict.OUT_OF_RANGE and result.least is None
+    assert result.verdict is DesignVerdict.OUT_OF_RANGE and result.least is None
     assert 'What would: packs in parallel' in answer(result)
     wide = design(PowerNetwork(), 0.4, esr_follows=False, capacitances=(10e-6, 0.1), **QUESTION)
     assert 'alpha rises' in effect(wide)
@@ -76,7 +76,7 @@ def test_no_capacitor_helps_below_the_level_and_the_resistance_that_would_is_nam
     """At the resistance named the mean of the bus is the level."""
     for network in (PowerNetwork(), PowerNetwork(filter_inductance=10e-6)):
         result = design(network, 0.9, **QUESTION)
-        assert result.verdict is Verdict.LEVEL and result.least is None
+        assert result.verdict is DesignVerdict.LEVEL and result.least is None
         assert result.present.risk == 1.0 and result.present.mean_time == 0.0
         there = replace(network, battery_resistance=result.resistance)
         assert rail_at(there, 0.9).mean == pytest.approx(19.8, rel=1e-12)
@@ -85,15 +85,15 @@ def test_no_capacitor_helps_below_the_level_and_the_resistance_that_would_is_nam
 
 def test_a_level_above_the_battery_has_no_resistance():
     result = design(PowerNetwork(), 0.4, voltage=23.0, horizon=5.0, risk=1e-3)
-    assert result.verdict is Verdict.LEVEL and math.isnan(result.resistance)
+    assert result.verdict is DesignVerdict.LEVEL and math.isnan(result.resistance)
     assert 'open-circuit' in answer(result)
     regulated = design(PowerNetwork(), 0.4, rail='regulated', voltage=5.0, horizon=5.0, risk=1e-3)
-    assert regulated.verdict is Verdict.LEVEL and 'regulator_voltage' in answer(regulated)
+    assert regulated.verdict is DesignVerdict.LEVEL and 'regulator_voltage' in answer(regulated)
 
 
 def test_no_noise():
     result = design(PowerNetwork(), 0.0, **QUESTION)
-    assert result.verdict is Verdict.ENOUGH and result.present.risk == 0.0
+    assert result.verdict is DesignVerdict.ENOUGH and result.present.risk == 0.0
     assert math.isinf(result.present.mean_time) and result.present.sigma == 0.0
     assert effect(result) == 'There is no noise at this throttle.'
 
@@ -109,7 +109,7 @@ def test_a_capacitor_may_undo_the_damping_of_a_filter():
     stable = [row.stable for row in result.rows]
     assert stable[0] and not stable[-1] and sorted(stable, reverse=True) == stable
     assert all(row.risk == 1.0 for row in result.rows if not row.stable)
-    assert result.verdict is Verdict.ENOUGH and result.least is None and not result.falls
+    assert result.verdict is DesignVerdict.ENOUGH and result.least is None and not result.falls
     assert 'Var_inf rises' in effect(result)
     words = ' '.join(remarks(result))
     for part in ('unstable', 'more is not simply better', 'resonance at'):

@@ -4,7 +4,6 @@ from dataclasses import replace
 import math
 
 from hypothesis import given, settings, strategies as st
-from moments_and_paths import step_covariance
 import numpy as np
 from ou_monitor.model.passage.law import mean_first_passage
 from ou_monitor.paper.network.components import load_at, MAY_BE_ZERO, PowerNetwork, UNITS
@@ -286,7 +285,8 @@ def test_crossing_rate_of_a_smooth_rail_is_counted():
     rail = rail_at(RC, 0.4)
     d, dt, paths, steps = 2.0, 5e-7, 4000, 300
     transition = expm(rail.a * dt)
-    covariance = step_covariance(rail.a, rail.b @ rail.b.T, dt)
+    # What a step adds is what the stationary covariance has lost by it.
+    covariance = rail.covariance - transition @ rail.covariance @ transition.T
     rng = np.random.default_rng(3)
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))

@@ -6,7 +6,7 @@ import re
 import numpy as np
 from ou_monitor.paper.reproduce import (
     network, probability, published, switching, table1, table2, transient)
-from ou_monitor.paper.reproduce.row import Printed, Verdict
+from ou_monitor.paper.reproduce.row import Printed, RowVerdict
 import pytest
 from scipy.integrate import trapezoid
 from scipy.signal import lsim
@@ -76,8 +76,8 @@ def test_half_a_step_of_vrms(label, percent):
 def test_amp_is_no_peak_but_at_5_percent(first_table):
     """25 < 31.25, 75 < 112.5, 66.7 < 143.75; 62.5 >= 40.65."""
     verdicts = {q: r.verdict for q, r in first_table.items() if q.startswith('Amp')}
-    assert verdicts.pop('Amp, 5 %') is Verdict.AGREES
-    assert len(verdicts) == 3 and set(verdicts.values()) == {Verdict.DOES_NOT_HOLD}
+    assert verdicts.pop('Amp, 5 %') is RowVerdict.AGREES
+    assert len(verdicts) == 3 and set(verdicts.values()) == {RowVerdict.DOES_NOT_HOLD}
     assert first_table['Amp, 10 %'].recomputed == 112.5
 
 
@@ -85,7 +85,7 @@ def test_idle_reads_zero_below_one_step(first_table):
     """62.5/8.77 = 7.13 mV: above half a step, below one."""
     found = first_table['Vrms, motors off']
     assert found.recomputed == pytest.approx(7.127, abs=1e-3)
-    assert found.verdict is Verdict.ROUNDING
+    assert found.verdict is RowVerdict.ROUNDING
 
 
 def test_exponents_of_growth():
@@ -114,7 +114,7 @@ def test_alpha_by_least_squares(fig5):
     assert line.scatter == pytest.approx(math.sqrt(residual @ residual / 2.0))
     # The 97.5 % quantile of Student's t with 2 degrees of freedom, from tables.
     assert line.half_width == pytest.approx(4.303 * se, rel=1e-3)
-    assert fig5['alpha'].verdict is Verdict.AGREES
+    assert fig5['alpha'].verdict is RowVerdict.AGREES
     assert fig5['alpha'].recomputed == line.alpha
     assert fig5['|U(0)|'].recomputed == pytest.approx(math.exp(beta[0]))
 
@@ -126,7 +126,7 @@ def test_local_rates(fig5):
              math.log(40 / 6) / 0.015]
     assert [row.recomputed for row in found] == pytest.approx(exact)
     assert exact == pytest.approx([61.0, 61.1, 69.3, 126.5], abs=0.05)
-    assert [row.verdict for row in found] == [Verdict.AGREES] * 3 + [Verdict.DOES_NOT_HOLD]
+    assert [row.verdict for row in found] == [RowVerdict.AGREES] * 3 + [RowVerdict.DOES_NOT_HOLD]
 
 
 def test_exponential_with_offset():
@@ -190,7 +190,7 @@ def test_coupling_by_simulation(fig5):
     rails = np.log(transient.RAILS)
     exact = np.polyfit(rails, np.log([transient.fitted_rate(r) for r in transient.RAILS]), 1)[0]
     assert abs(slope.recomputed - exact) < 4.0 * slope.error
-    assert slope.verdict is Verdict.DOES_NOT_HOLD
+    assert slope.verdict is RowVerdict.DOES_NOT_HOLD
     assert slope.error < 0.05, 'so that 1 would be seen'
 
 
@@ -201,8 +201,8 @@ def test_table_2():
     assert rows['tau'].recomputed == pytest.approx(15.8730159)
     assert rows['sigma, 10 %'].recomputed == pytest.approx(0.3154217, abs=1e-6)
     assert rows['sigma, 40 %'].recomputed == pytest.approx(0.6319659, abs=1e-6)
-    assert rows['sigma, 10 %'].verdict is Verdict.ROUNDING
-    assert rows['sigma, 40 %'].verdict is Verdict.AGREES
+    assert rows['sigma, 10 %'].verdict is RowVerdict.ROUNDING
+    assert rows['sigma, 40 %'].verdict is RowVerdict.AGREES
     assert rows['Var_inf, 10 %'].recomputed == pytest.approx(0.3156 ** 2 / 126.0)
     assert rows['Var_inf, 40 %'].recomputed == pytest.approx(0.632 ** 2 / 126.0)
     # Half a step of 9.379 mV, and 5.359/63.046 of alpha, of which sigma feels half.
@@ -210,7 +210,7 @@ def test_table_2():
         width = sigma * math.hypot(4.6896 / vrms, 0.5 * 5.359 / 63.046)
         found = rows[f'implied error, {label}']
         assert found.recomputed == pytest.approx(width, rel=1e-3)
-        assert found.verdict is Verdict.DOES_NOT_HOLD
+        assert found.verdict is RowVerdict.DOES_NOT_HOLD
 
 
 @pytest.mark.parametrize('delta', [0.01, 0.1, 0.3])
@@ -256,7 +256,7 @@ def test_falls_by_first_passage():
     row = by_quantity(probability.rows(rng, 1000))['falls by 100 mV a second, 40 over 10 %']
     said = float(re.search(r'([0-9.]+) s at 40 %', row.sentence).group(1))
     assert abs(time.mean() - said) < 4.0 * time.std() / math.sqrt(2000) + 0.02 * said
-    assert row.verdict is Verdict.AGREES
+    assert row.verdict is RowVerdict.AGREES
 
 
 def test_capacitance():
@@ -265,9 +265,9 @@ def test_capacitance():
     assert alpha == pytest.approx(1e4) and var == pytest.approx(3e-6 * 0.05 / (2.0 * 2e-3))
     rows = by_quantity(network.rows())
     assert rows['d ln alpha / d ln C'].recomputed == pytest.approx(-1.0)
-    assert rows['d ln alpha / d ln C'].verdict is Verdict.DOES_NOT_HOLD
+    assert rows['d ln alpha / d ln C'].verdict is RowVerdict.DOES_NOT_HOLD
     assert rows['d ln Var_inf / d ln C'].recomputed == pytest.approx(-1.0)
-    assert rows['d ln Var_inf / d ln C'].verdict is Verdict.AGREES
+    assert rows['d ln Var_inf / d ln C'].verdict is RowVerdict.AGREES
     before, after = network.doubled(network.PowerNetwork())
     assert after.alpha < before.alpha and after.var_inf < before.var_inf
 
@@ -293,4 +293,4 @@ def test_matrix_as_printed_and_averaged():
     exact = (power[2] - power[1]) / (power[1] - power[0])
     found = rows['power: late over early decay']
     assert abs(found.recomputed - exact) < 4.0 * found.error + 0.005
-    assert found.verdict is Verdict.DOES_NOT_HOLD
+    assert found.verdict is RowVerdict.DOES_NOT_HOLD

@@ -3,7 +3,7 @@
 import math
 
 from hypothesis import given, strategies as st
-from ou_monitor.paper.reproduce.row import Printed, Row, Verdict
+from ou_monitor.paper.reproduce.row import Printed, Row, RowVerdict
 import pytest
 
 
@@ -31,17 +31,17 @@ def test_what_is_no_number_is_refused(text):
 
 
 @pytest.mark.parametrize('recomputed, verdict', [
-    (63.05, Verdict.AGREES), (62.95, Verdict.AGREES), (63.06, Verdict.DOES_NOT_HOLD),
-    (62.94, Verdict.DOES_NOT_HOLD)])
+    (63.05, RowVerdict.AGREES), (62.95, RowVerdict.AGREES), (63.06, RowVerdict.DOES_NOT_HOLD),
+    (62.94, RowVerdict.DOES_NOT_HOLD)])
 def test_arithmetic_must_round_to_the_printed_number(recomputed, verdict):
     """Half a unit is rounded rightly either way."""
     assert row('63.0', recomputed).verdict is verdict
 
 
 @pytest.mark.parametrize('text, recomputed, verdict', [
-    ('> 0', 1e-300, Verdict.AGREES), ('> 0', 0.0, Verdict.DOES_NOT_HOLD),
-    ('> 0', -1.0, Verdict.DOES_NOT_HOLD), ('< 1', 0.999, Verdict.AGREES),
-    ('< 1', 1.0, Verdict.DOES_NOT_HOLD)])
+    ('> 0', 1e-300, RowVerdict.AGREES), ('> 0', 0.0, RowVerdict.DOES_NOT_HOLD),
+    ('> 0', -1.0, RowVerdict.DOES_NOT_HOLD), ('< 1', 0.999, RowVerdict.AGREES),
+    ('< 1', 1.0, RowVerdict.DOES_NOT_HOLD)])
 def test_a_claim_is_a_bound(text, recomputed, verdict):
     """Strictly."""
     assert row(text, recomputed).verdict is verdict
@@ -49,14 +49,14 @@ def test_a_claim_is_a_bound(text, recomputed, verdict):
 
 def test_three_standard_errors_reach():
     """2.9 away agrees, 3.1 away does not hold."""
-    assert row('10', 10.5 + 2.9, error=1.0).verdict is Verdict.AGREES
-    assert row('10', 10.5 + 3.1, error=1.0).verdict is Verdict.DOES_NOT_HOLD
+    assert row('10', 10.5 + 2.9, error=1.0).verdict is RowVerdict.AGREES
+    assert row('10', 10.5 + 3.1, error=1.0).verdict is RowVerdict.DOES_NOT_HOLD
 
 
 def test_a_band_replaces_the_error():
     """A narrow band under a wide error decides, and the other way round."""
-    assert row('10', 12.0, error=5.0, band=(11.0, 13.0)).verdict is Verdict.DOES_NOT_HOLD
-    assert row('10', 12.0, error=0.1, band=(10.0, 13.0)).verdict is Verdict.AGREES
+    assert row('10', 12.0, error=5.0, band=(11.0, 13.0)).verdict is RowVerdict.DOES_NOT_HOLD
+    assert row('10', 12.0, error=0.1, band=(10.0, 13.0)).verdict is RowVerdict.AGREES
 
 
 @pytest.mark.parametrize('name', ['inputs', 'printed_inputs'])
@@ -64,15 +64,15 @@ def test_rounding_needs_the_range_of_an_input(name):
     """Apart as they are, together within the range; further apart not even so."""
     near = {'inputs': (10.4, 12.0), 'printed_inputs': (9.0, 11.5)}
     far = {'inputs': (10.6, 12.0), 'printed_inputs': (9.0, 10.9)}
-    assert row('10', 11.0).verdict is Verdict.DOES_NOT_HOLD
-    assert row('10', 11.0, **{name: near[name]}).verdict is Verdict.ROUNDING
-    assert row('10', 11.0, **{name: far[name]}).verdict is Verdict.DOES_NOT_HOLD
+    assert row('10', 11.0).verdict is RowVerdict.DOES_NOT_HOLD
+    assert row('10', 11.0, **{name: near[name]}).verdict is RowVerdict.ROUNDING
+    assert row('10', 11.0, **{name: far[name]}).verdict is RowVerdict.DOES_NOT_HOLD
 
 
 @given(st.floats(-1e6, 1e6), st.floats(0.0, 1e3), st.floats(0.0, 1e3), st.floats(0.0, 1e3))
 def test_wider_ranges_never_make_it_worse(recomputed, error, below, above):
     """More error or more rounding: agrees stays, does not hold may become better."""
-    order = [Verdict.DOES_NOT_HOLD, Verdict.ROUNDING, Verdict.AGREES]
+    order = [RowVerdict.DOES_NOT_HOLD, RowVerdict.ROUNDING, RowVerdict.AGREES]
     plain = order.index(row('100', recomputed).verdict)
     loose = row('100', recomputed, inputs=(recomputed - below, recomputed + above))
     wide = row('100', recomputed, error=error)
@@ -82,9 +82,9 @@ def test_wider_ranges_never_make_it_worse(recomputed, error, below, above):
 def test_the_verdict_cannot_be_given():
     """Neither at birth nor later."""
     with pytest.raises(TypeError):
-        row('1', 1.0, verdict=Verdict.AGREES)
+        row('1', 1.0, verdict=RowVerdict.AGREES)
     with pytest.raises(AttributeError):
-        row('1', 1.0).verdict = Verdict.AGREES
+        row('1', 1.0).verdict = RowVerdict.AGREES
 
 
 @pytest.mark.parametrize('recomputed, ranges', [

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 from ou_monitor.paper.reproduce import crest, jumps, published, switching
-from ou_monitor.paper.reproduce.row import Verdict
+from ou_monitor.paper.reproduce.row import RowVerdict
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
@@ -57,7 +57,7 @@ def test_intensity_is_twice_the_printed_one(formulas, name, system):
     assert row.printed.value == pytest.approx(0.5 * exact, rel=1e-3)
     assert abs(row.recomputed - exact) < 4.0 * row.error
     assert row.error < 0.04 * exact
-    assert row.verdict is Verdict.DOES_NOT_HOLD
+    assert row.verdict is RowVerdict.DOES_NOT_HOLD
 
 
 def test_telegraph_in_closed_form(formulas):
@@ -77,7 +77,7 @@ def test_drift_lacks_no_factor(formulas):
     exact = math.sqrt(1000.0 ** 2 + 100.0 ** 2) - 1000.0
     assert row.printed.value == pytest.approx(100.0 ** 2 / 2000.0)
     assert abs(row.recomputed - exact) < 4.0 * row.error
-    assert row.verdict is Verdict.AGREES
+    assert row.verdict is RowVerdict.AGREES
     assert 0.5 * exact > 8.0 * row.error, 'a factor of 2 would be seen'
 
 
@@ -86,13 +86,13 @@ def test_logarithm_does_not_grow(formulas):
     row = formulas['growth of ln U by (4) to (6)']
     assert row.printed.value == pytest.approx(2.5)
     assert abs(row.recomputed) < 4.0 * row.error < 1.0
-    assert row.verdict is Verdict.DOES_NOT_HOLD
+    assert row.verdict is RowVerdict.DOES_NOT_HOLD
 
 
 def test_potential(formulas):
     """1/(4 q) = 0.25 ms."""
     row = formulas['R0(0, 0) of a telegraph']
-    assert row.recomputed == pytest.approx(0.25) and row.verdict is Verdict.AGREES
+    assert row.recomputed == pytest.approx(0.25) and row.verdict is RowVerdict.AGREES
 
 
 def test_spreading_follows_the_closed_form():
@@ -143,12 +143,12 @@ def test_crest_of_white_noise(crests):
 def test_verdicts_on_the_crest_factors(crests):
     """40 % agrees, 5 % only within its rounding; 10 % by what the screens say, either way."""
     low, medium, high = crest.rows(crests)
-    assert (low.verdict, high.verdict) == (Verdict.ROUNDING, Verdict.AGREES)
+    assert (low.verdict, high.verdict) == (RowVerdict.ROUNDING, RowVerdict.AGREES)
     # (225 - 3.1) / (28.1 + 4.7), the least that the readings allow.
     least = (225.0 - 3.125) / (28.1 + 4.69)
     assert medium.printed_inputs[0] == pytest.approx(least, rel=1e-3)
     inside = crests.quantile(500, 0.95) >= medium.printed_inputs[0]
-    assert medium.verdict is (Verdict.ROUNDING if inside else Verdict.DOES_NOT_HOLD)
+    assert medium.verdict is (RowVerdict.ROUNDING if inside else RowVerdict.DOES_NOT_HOLD)
 
 
 def test_screen_that_a_crest_factor_takes():

@@ -5,7 +5,7 @@ import re
 
 from ou_monitor.paper.reproduce import published, reproduce as module
 from ou_monitor.paper.reproduce.reproduce import as_data, headline, recomputed
-from ou_monitor.paper.reproduce.row import Printed, Row, Verdict
+from ou_monitor.paper.reproduce.row import Printed, Row, RowVerdict
 from ou_monitor.report.reproduction_page import reproduction_page
 from pages import self_contained
 import pytest
@@ -63,7 +63,7 @@ def test_eight_points_rest_on_rows(result):
         assert point.rows and re.search(r'\d', point.text) and 'nan' not in point.text
     # Each point of THEORY is a claim of the paper that the rows refuse or cannot hold up.
     doubted = {point.number for point in result.points
-               if any(row.verdict is not Verdict.AGREES for row in point.rows)}
+               if any(row.verdict is not RowVerdict.AGREES for row in point.rows)}
     assert doubted == set(range(1, 9))
 
 
@@ -82,11 +82,11 @@ def test_headline_counts_the_rows(result):
     """72 rows or however many there are, each in one of three counts."""
     counts = Counter(row.verdict for row in result.rows)
     numbers = [int(n) for n in re.findall(r'\d+', headline(result))]
-    assert numbers == [len(result.rows), counts[Verdict.AGREES], counts[Verdict.ROUNDING],
-                       counts[Verdict.DOES_NOT_HOLD]]
+    assert numbers == [len(result.rows), counts[RowVerdict.AGREES], counts[RowVerdict.ROUNDING],
+                       counts[RowVerdict.DOES_NOT_HOLD]]
     assert sum(numbers[1:]) == numbers[0]
     data = as_data(result)
-    assert data['counts'] == {verdict.name: counts[verdict] for verdict in Verdict}
+    assert data['counts'] == {verdict.name: counts[verdict] for verdict in RowVerdict}
     assert len(data['rows']) == numbers[0] and len(data['points']) == 8
 
 
@@ -105,7 +105,7 @@ def test_page_shows_every_row_and_figure(result, tree):
     text = ' '.join(tree.itertext())
     assert headline(result) in text and 'ou-monitor reproduce --seed 3' in text
     cells = [[''.join(cell.itertext()) for cell in line] for line in tree.iter('tr')]
-    lines = [cell for cell in cells if cell[-1] in {v.value for v in Verdict}]
+    lines = [cell for cell in cells if cell[-1] in {v.value for v in RowVerdict}]
     assert len(lines) == len(result.rows)
     shown = [(cell[2], cell[-1]) for cell in lines]
     parts = [row for _, rows in result.parts() for row in rows]

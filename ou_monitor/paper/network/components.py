@@ -51,89 +51,54 @@ def completed(values: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class PowerNetwork:
-    """
-    Components in SI units; the defaults are a typical 6S multirotor.
+    """Components in SI units; the defaults are a typical 6S multirotor."""
 
-    Parameters
-    ----------
-    cells : int
-        LiPo cells in series; sets the default brown-out level of the bus.
-    battery_voltage : float
-        Open-circuit voltage, V (6 x 3.7 V nominal).
-    battery_resistance : float
-        Battery, connector and leads, Ohm (a 6S pack of 1.3..2.2 Ah has
-        20..60 mOhm; PX4 assumes 5 mOhm a cell).
-    bulk_capacitance, bulk_esr : float
-        Capacitor at the ESC's battery pads, F and Ohm (470 uF..1000 uF of a
-        low-ESR 35 V series have 20..40 mOhm).
-    current_max, current_exponent : float
-        Mean current of the motors is current_max * throttle**current_exponent,
-        A; 4 x 30 A, exponent 1..3 (typical values; 1.5 puts the most ripple
-        at a throttle of 2/3, recordings show 0.65..0.75).
-    escs : int
-        ESCs that switch independently.
-    esc_frequency : float
-        PWM frequency, Hz (24..48 kHz, the paper's section 4.5).
-    switching_scale : float
-        Measured rms of the random ESC current over that of the telegraph; 1
-        is the telegraph.
-    flutter, flutter_rate : float
-        Slow fluctuation of the motor current (control loop, gusts): rms as a
-        share of the mean, and its rate, 1/s (motor and propeller, 30 ms).
-        Left out by default.
-    filter_inductance, filter_resistance, filter_capacitance, filter_esr : float
-        Optional LC filter between bus and regulator, H, Ohm, F, Ohm; an
-        inductance of 0 leaves it out; the two resistances damp it.
-    regulator_voltage, regulator_resistance : float
-        Set voltage, V, and output resistance within the bandwidth, Ohm.
-    regulator_bandwidth, line_gain : float
-        The regulator rejects changes of its input slower than this, Hz, and
-        passes faster ones times `line_gain`; when that is None, the duty of a
-        buck converter, regulator_voltage over battery_voltage, which is its
-        open-loop gain (Erickson & Maksimovic, Fundamentals of Power
-        Electronics, section 8.2).
-    regulator_efficiency : float
-        Output power over input power, 0..1.
-    constant_power : bool
-        Let the regulator draw constant power: its input then has the
-        incremental resistance -V^2/P.
-    output_capacitance, output_esr : float
-        Capacitor of the regulated rail, F and Ohm (2 x 22 uF ceramic).
-    mcu_current, mcu_noise, mcu_noise_rate : float
-        Mean current of the regulated rail, rms of its fluctuation, A, and the
-        rate at which that relaxes, 1/s.
-
-    Raises
-    ------
-    ValueError
-        When a value is not finite or out of range; names field and unit.
-
-    """
-
-    cells: int = 6
-    battery_voltage: float = 22.2
+    cells: int = 6  # LiPo cells in series; sets the default brown-out level of the bus.
+    battery_voltage: float = 22.2  # Open-circuit voltage, V (6 x 3.7 V nominal).
+    # Battery, connector and leads, Ohm (a 6S pack of 1.3..2.2 Ah has 20..60 mOhm; PX4
+    # assumes 5 mOhm a cell).
     battery_resistance: float = 0.04
+    # Capacitor at the ESC's battery pads, F and Ohm (470 uF..1000 uF of a low-ESR 35 V
+    # series have 20..40 mOhm).
     bulk_capacitance: float = 470e-6
     bulk_esr: float = 0.03
+    # Mean current of the motors is current_max * throttle**current_exponent, A; 4 x 30 A,
+    # exponent 1..3 (typical values; 1.5 puts the most ripple at a throttle of 2/3,
+    # recordings show 0.65..0.75).
     current_max: float = 120.0
     current_exponent: float = 1.5
-    escs: int = 4
-    esc_frequency: float = 48e3
+    escs: int = 4  # ESCs that switch independently.
+    esc_frequency: float = 48e3  # PWM frequency, Hz (24..48 kHz, the paper's section 4.5).
+    # Measured rms of the random ESC current over that of the telegraph; 1 is the telegraph.
     switching_scale: float = 1.0
+    # Slow fluctuation of the motor current (control loop, gusts): rms as a share of the
+    # mean, and its rate, 1/s (motor and propeller, 30 ms). Left out by default.
     flutter: float = 0.0
     flutter_rate: float = 33.3
+    # Optional LC filter between bus and regulator, H, Ohm, F, Ohm; an inductance of 0 leaves
+    # it out; the two resistances damp it.
     filter_inductance: float = 0.0
     filter_resistance: float = 0.05
     filter_capacitance: float = 100e-6
     filter_esr: float = 0.1
+    # Set voltage, V, and output resistance within the bandwidth, Ohm.
     regulator_voltage: float = 5.0
     regulator_resistance: float = 0.03
+    # The regulator rejects changes of its input slower than this, Hz, and passes faster ones
+    # times `line_gain`; when that is None, the duty of a buck converter, regulator_voltage
+    # over battery_voltage, which is its open-loop gain (Erickson & Maksimovic, Fundamentals
+    # of Power Electronics, section 8.2).
     regulator_bandwidth: float = 20e3
-    regulator_efficiency: float = 0.9
+    regulator_efficiency: float = 0.9  # Output power over input power, 0..1.
     line_gain: float | None = None
+    # Let the regulator draw constant power: its input then has the incremental resistance
+    # -V^2/P.
     constant_power: bool = True
+    # Capacitor of the regulated rail, F and Ohm (2 x 22 uF ceramic).
     output_capacitance: float = 44e-6
     output_esr: float = 0.003
+    # Mean current of the regulated rail, rms of its fluctuation, A, and the rate at which
+    # that relaxes, 1/s.
     mcu_current: float = 0.5
     mcu_noise: float = 0.05
     mcu_noise_rate: float = 1e6
@@ -208,37 +173,20 @@ class PowerNetwork:
 
 @dataclass(frozen=True)
 class Load:
-    """
-    The load and the mean voltages at one throttle.
+    """The load and the mean voltages at one throttle."""
 
-    Parameters
-    ----------
-    throttle : float
-        0..1.
-    current : float
-        Mean current of the motors, A.
-    switching_rms, switching_rate : float
-        Random ESC current: rms, A, and rate of its exponential covariance, 1/s.
-    flutter_rms : float
-        Rms of the slow fluctuation of the current, A.
-    bus, regulated : float
-        Mean voltages, V.
-    sag : float
-        Battery voltage less the mean of the bus, V.
-    input_conductance : float
-        Incremental conductance P/V^2 of the constant-power load, 1/Ohm, counted
-        positive; 0 without.
-
-    """
-
-    throttle: float
-    current: float
+    throttle: float  # 0..1.
+    current: float  # Mean current of the motors, A.
+    # Random ESC current: rms, A, and rate of its exponential covariance, 1/s.
     switching_rms: float
     switching_rate: float
-    flutter_rms: float
+    flutter_rms: float  # Rms of the slow fluctuation of the current, A.
+    # Mean voltages, V.
     bus: float
     regulated: float
-    sag: float
+    sag: float  # Battery voltage less the mean of the bus, V.
+    # Incremental conductance P/V^2 of the constant-power load, 1/Ohm, counted positive; 0
+    # without.
     input_conductance: float
 
     def mean(self, rail: str) -> float:

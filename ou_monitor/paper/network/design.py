@@ -46,7 +46,7 @@ _NEVER = 1e-300
 _PACKS, _RESISTANCE, _THROTTLE = 3, 0.5, 0.5
 
 
-class Verdict(enum.Enum):
+class DesignVerdict(enum.Enum):
     """What the calculation comes to."""
 
     ENOUGH = 'the present capacitor is enough'
@@ -57,40 +57,25 @@ class Verdict(enum.Enum):
 
 @dataclass(frozen=True)
 class DesignRow:
-    """
-    The rail with one capacitor.
+    """The rail with one capacitor."""
 
-    Parameters
-    ----------
-    capacitance, esr : float
-        Of the bulk capacitor, F and Ohm.
-    alpha, tau : float
-        Relaxation rate, 1/s, and time, s; NaN without noise.
-    sigma, var_inf : float
-        Intensity, V/sqrt(s), and stationary variance, V^2; NaN and inf when
-        this capacitor makes the network unstable (the risk is then 1).
-    sag, mean : float
-        Sag of the bus and mean of the rail, V; the same with every capacitor.
-    mean_time : float
-        Mean time to brown-out of the OU from its mean level, s; may be inf.
-    crossing_rate : float
-        High-level crossing rate of the whole process, 1/s.
-    risk_ou, risk_crossing : float
-        Probability within the horizon, by the OU's mean first passage and by
-        the crossing rate.
-
-    """
-
+    # Of the bulk capacitor, F and Ohm.
     capacitance: float
     esr: float
+    # Relaxation rate, 1/s, and time, s; NaN without noise.
     alpha: float
     tau: float
+    # Intensity, V/sqrt(s), and stationary variance, V^2; NaN and inf when this capacitor
+    # makes the network unstable (the risk is then 1).
     sigma: float
     var_inf: float
+    # Sag of the bus and mean of the rail, V; the same with every capacitor.
     sag: float
     mean: float
-    mean_time: float
-    crossing_rate: float
+    mean_time: float  # Mean time to brown-out of the OU from its mean level, s; may be inf.
+    crossing_rate: float  # High-level crossing rate of the whole process, 1/s.
+    # Probability within the horizon, by the OU's mean first passage and by the crossing
+    # rate.
     risk_ou: float
     risk_crossing: float
 
@@ -113,81 +98,40 @@ class DesignRow:
 
 @dataclass(frozen=True)
 class Lever:
-    """
-    What one change of the craft buys.
+    """What one change of the craft buys."""
 
-    Parameters
-    ----------
-    name : str
-        What is changed.
-    unit : str
-        Its unit, of the values as shown.
-    present, tried : float
-        Value now, and one that is easily had.
-    risk : float
-        Risk with the one tried.
-    least : float
-        Smallest change that meets the target; NaN: none within reach.
-
-    """
-
-    name: str
-    unit: str
+    name: str  # What is changed.
+    unit: str  # Its unit, of the values as shown.
+    # Value now, and one that is easily had.
     present: float
     tried: float
-    risk: float
-    least: float
+    risk: float  # Risk with the one tried.
+    least: float  # Smallest change that meets the target; NaN: none within reach.
 
 
 @dataclass(frozen=True)
 class Design:
-    """
-    The answer for one network, throttle and target.
+    """The answer for one network, throttle and target."""
 
-    Parameters
-    ----------
-    network : PowerNetwork
-        Components.
-    rail : str
-        ``bus`` or ``regulated``.
-    throttle : float
-        0..1.
-    voltage, horizon, target : float
-        Brown-out level, V, time, s, and the risk allowed.
-    esr_follows : bool
-        Whether ESR is 1/C of the present one (capacitors in parallel).
-    verdict : Verdict
-        What it comes to.
-    present : DesignRow
-        With the present capacitor.
-    least : DesignRow or None
-        With the least capacitance that, with all larger ones looked at, meets
-        the target; None when there is none.
-    rows : tuple of DesignRow
-        A table over capacitances, rising.
-    falls : bool
-        Whether the risk falls, or stays, at each step of the capacitance.
-    resistance : float
-        Battery resistance at which the mean of the bus is at the level, Ohm;
-        NaN when no resistance does that or the rail is regulated.
-    levers : tuple of Lever
-        What other capacitors, packs in parallel, leads and throttle limits buy.
-
-    """
-
-    network: PowerNetwork
-    rail: str
-    throttle: float
+    network: PowerNetwork  # Components.
+    rail: str  # ``bus`` or ``regulated``.
+    throttle: float  # 0..1.
+    # Brown-out level, V, time, s, and the risk allowed.
     voltage: float
     horizon: float
     target: float
-    esr_follows: bool
-    verdict: Verdict
-    present: DesignRow
+    esr_follows: bool  # Whether ESR is 1/C of the present one (capacitors in parallel).
+    verdict: DesignVerdict  # What it comes to.
+    present: DesignRow  # With the present capacitor.
+    # With the least capacitance that, with all larger ones looked at, meets the target; None
+    # when there is none.
     least: DesignRow | None
-    rows: tuple[DesignRow, ...]
-    falls: bool
+    rows: tuple[DesignRow, ...]  # A table over capacitances, rising.
+    falls: bool  # Whether the risk falls, or stays, at each step of the capacitance.
+    # Battery resistance at which the mean of the bus is at the level, Ohm; NaN when no
+    # resistance does that or the rail is regulated.
     resistance: float
+    # What other capacitors, packs in parallel, leads and throttle limits buy.
     levers: tuple[Lever, ...]
 
 
@@ -261,11 +205,11 @@ def design(
     rows = [at(float(c)) for c in np.geomspace(low, high, _GRID)]
     least = None
     if present.mean <= voltage:
-        verdict = Verdict.LEVEL
+        verdict = DesignVerdict.LEVEL
     else:
         least = _least(at, rows, -math.log1p(-risk) / horizon)
-        verdict = (Verdict.ENOUGH if present.risk <= risk else
-                   Verdict.FOUND if least is not None else Verdict.OUT_OF_RANGE)
+        verdict = (DesignVerdict.ENOUGH if present.risk <= risk else
+                   DesignVerdict.FOUND if least is not None else DesignVerdict.OUT_OF_RANGE)
     risks = [row.risk for row in rows]
     return Design(
         network=network, rail=rail, throttle=throttle, voltage=voltage, horizon=horizon,
@@ -366,15 +310,15 @@ def as_data(result: Design, source: str) -> dict[str, Any]:
 def answer(result: Design) -> str:
     """Return the answer in words."""
     present, least = result.present, result.least
-    if result.verdict is Verdict.ENOUGH:
+    if result.verdict is DesignVerdict.ENOUGH:
         also = '' if least is None else f' From {_uf(least)} on the target is met.'
         return (f'No more capacitance is needed: with the present {_uf(present)} the risk is '
                 f'{probability(present.risk)}.{also}')
-    if result.verdict is Verdict.FOUND:
+    if result.verdict is DesignVerdict.FOUND:
         assert least is not None
         return (f'{_uf(least)} is the least capacitance that brings the risk under '
                 f'{result.target:g}.')
-    if result.verdict is Verdict.OUT_OF_RANGE:
+    if result.verdict is DesignVerdict.OUT_OF_RANGE:
         return (f'No capacitance between {_uf(result.rows[0])} and {_uf(result.rows[-1])} brings '
                 f'the risk under {result.target:g}: with the largest it is still '
                 f'{probability(result.rows[-1].risk)}. {_others(result)}')
@@ -407,9 +351,10 @@ def effect(result: Design) -> str:
     a = result.present
     if a.var_inf == 0.0:
         return 'There is no noise at this throttle.'
-    if result.verdict is Verdict.FOUND and result.least is not None:
+    if result.verdict is DesignVerdict.FOUND and result.least is not None:
         b = result.least
-    elif result.verdict is Verdict.OUT_OF_RANGE and result.rows[-1].capacitance > a.capacitance:
+    elif (result.verdict is DesignVerdict.OUT_OF_RANGE
+          and result.rows[-1].capacitance > a.capacitance):
         b = result.rows[-1]
     else:
         twice = with_capacitance(result.network, 2.0 * a.capacitance, result.esr_follows)

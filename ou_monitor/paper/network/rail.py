@@ -50,25 +50,12 @@ class UnstableNetworkError(ValueError):
 
 
 @dataclass(frozen=True)
-class Resonance:
-    """
-    A complex pair of poles.
+class RailResonance:
+    """A complex pair of poles."""
 
-    Parameters
-    ----------
-    frequency : float
-        |p| / (2 pi), Hz.
-    damping : float
-        Damping ratio -Re p / |p|, 0..1.
-    share : float
-        Its part of Var_inf; parts of overlapping modes may exceed 1 or be
-        negative.
-
-    """
-
-    frequency: float
-    damping: float
-    share: float
+    frequency: float  # |p| / (2 pi), Hz.
+    damping: float  # Damping ratio -Re p / |p|, 0..1.
+    share: float  # Its part of Var_inf; parts of overlapping modes may exceed 1 or be negative.
 
     @property
     def q(self) -> float:
@@ -78,32 +65,14 @@ class Resonance:
 
 @dataclass(frozen=True)
 class Rail:
-    """
-    One rail at one throttle, as `rail_at` returns it.
+    """One rail at one throttle, as `rail_at` returns it."""
 
-    Parameters
-    ----------
-    network : PowerNetwork
-        Components.
-    load : Load
-        Load and mean voltages.
-    name : str
-        ``bus`` or ``regulated``.
-    a : ndarray, shape (n, n)
-        Rates between the states (voltages, V, and currents, A), 1/s and mixed.
-    b : ndarray, shape (n, 3)
-        Intensities of the independent white noises that drive the sources.
-    c : ndarray, shape (n,)
-        The rail's deviation from its mean, V, is c x.
-
-    """
-
-    network: PowerNetwork
-    load: Load
-    name: str
-    a: FloatArray
-    b: FloatArray
-    c: FloatArray
+    network: PowerNetwork  # Components.
+    load: Load  # Load and mean voltages.
+    name: str  # ``bus`` or ``regulated``.
+    a: FloatArray  # Rates between the states (voltages, V, and currents, A), 1/s and mixed.
+    b: FloatArray  # Intensities of the independent white noises that drive the sources.
+    c: FloatArray  # The rail's deviation from its mean, V, is c x.
 
     @property
     def mean(self) -> float:
@@ -169,15 +138,16 @@ class Rail:
         return math.sqrt(2.0 * self.alpha * self.var_inf)
 
     @property
-    def resonance(self) -> Resonance | None:
+    def resonance(self) -> RailResonance | None:
         """Return the complex pair that carries most of Var_inf; None when all poles are real."""
         above = np.flatnonzero(self.poles.imag > 1e-9 * np.abs(self.poles))
         if not above.size:
             return None
         k = above[np.argmax(np.abs(self.shares[above]))]
         pole = self.poles[k]
-        return Resonance(frequency=float(abs(pole)) / (2.0 * math.pi),
-                         damping=float(-pole.real / abs(pole)), share=2.0 * float(self.shares[k]))
+        return RailResonance(frequency=float(abs(pole)) / (2.0 * math.pi),
+                             damping=float(-pole.real / abs(pole)),
+                             share=2.0 * float(self.shares[k]))
 
     def psd(self, frequency: npt.ArrayLike) -> FloatArray:
         """Return the one-sided power spectral density (frequency in Hz)."""

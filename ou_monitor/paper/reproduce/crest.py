@@ -103,7 +103,7 @@ def _draw(rng: np.random.Generator, paths: int) -> dict[int, FloatArray]:
     return found
 
 
-def crest(state: published.LoadState) -> tuple[float, Range]:
+def crest(state: published.PrintedLoad) -> tuple[float, Range]:
     """Return Vpp/Vrms of a load state and its range within half a step of either."""
     return (state.vpp.value / state.vrms.value, over(vpp_range(state), vrms_range(state)))
 

@@ -28,17 +28,17 @@ _SPECTRUM, _PER_DECADE = 2.0, 12
 class Screen:
     """One simulated oscilloscope screen."""
 
-    state: published.LoadState  # The row of Table 1 it stands for
+    state: published.PrintedLoad  # The row of Table 1 it stands for
     # s and V, in steps of the oscilloscope; shape (n,).
     t: FloatArray
     u: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class Spectrum:
+class DrawnSpectrum:
     """One-sided density of a load state."""
 
-    state: published.LoadState  # The row of Table 1 it stands for
+    state: published.PrintedLoad  # The row of Table 1 it stands for
     # Hz and V^2/Hz, of a simulated recording at 1 MHz; shape (k,).
     frequency: FloatArray
     density: FloatArray
@@ -50,10 +50,10 @@ class Figures:
     """All series."""
 
     screens: tuple[Screen, ...]  # One a load state
-    spectra: tuple[Spectrum, ...]  # Of 10 and 40 %
+    spectra: tuple[DrawnSpectrum, ...]  # Of 10 and 40 %
 
 
-def sigma_shown(state: published.LoadState) -> float:
+def sigma_shown(state: published.PrintedLoad) -> float:
     """Return the sigma to draw, V/sqrt(s); motors off, half a step of Vrms."""
     if state is published.IDLE:
         return 0.5e-3 * vrms_step().size * math.sqrt(2.0 * published.ALPHA.value)
@@ -77,13 +77,13 @@ def draw(rng: np.random.Generator) -> Figures:
         _spectrum(state, rng) for state in (published.MEDIUM, published.HIGH)))
 
 
-def _spectrum(state: published.LoadState, rng: np.random.Generator) -> Spectrum:
+def _spectrum(state: published.PrintedLoad, rng: np.random.Generator) -> DrawnSpectrum:
     """Return the spectrum of a simulated recording at 1 MHz, even on a log axis."""
     t = np.arange(round(_SPECTRUM * published.SAMPLING_HZ)) / published.SAMPLING_HZ
     ou = OU(published.ALPHA.value, sigma_of(state), 0.0)
     plain = _density(simulate(t, ou.alpha, ou.sigma, rng))
     coupled = _density(SupplyModel((ou, ACCoupling(CORNER_HZ, 0.0))).simulate(t, rng))
-    return Spectrum(state, plain[0], plain[1], coupled[1])
+    return DrawnSpectrum(state, plain[0], plain[1], coupled[1])
 
 
 def _density(u: FloatArray) -> tuple[FloatArray, FloatArray]:

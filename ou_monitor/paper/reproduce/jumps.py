@@ -85,7 +85,7 @@ def largest(found: list[JumpCrest], screen: int) -> JumpCrest:
     return max((c for c in found if c.screen == screen), key=lambda c: c.mean)
 
 
-def impulse_height(state: published.LoadState, crests: Crests) -> float:
+def impulse_height(state: published.PrintedLoad, crests: Crests) -> float:
     """Return by how much short impulses must widen an OU to its printed Vpp, mV."""
     return state.vpp.value - crests.mean(TYPICAL_MS)[0] * state.vrms.value
 

@@ -37,7 +37,7 @@ def beyond_by_quadrature(delta: float, var_inf: float) -> float:
 
 
 def count_beyond(
-    state: published.LoadState, deltas: tuple[float, ...], rng: np.random.Generator, draws: int,
+    state: published.PrintedLoad, deltas: tuple[float, ...], rng: np.random.Generator, draws: int,
 ) -> tuple[list[float], list[float]]:
     """
     Return the share of samples of a simulated OU beyond thresholds, and its standard error.

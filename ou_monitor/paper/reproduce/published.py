@@ -12,7 +12,7 @@ from ou_monitor.paper.reproduce.row import Printed
 
 
 @dataclass(frozen=True)
-class LoadState:
+class PrintedLoad:
     """One row of Table 1."""
 
     load: float  # Share of full throttle, 0..1
@@ -25,14 +25,14 @@ class LoadState:
 
 
 TABLE_1 = (
-    LoadState(0.0, 'motors off', Printed('62.5'), Printed('25.0'), Printed('~0'),
-              'quasi-stationary noise'),
-    LoadState(0.05, '5 %', Printed('81.3'), Printed('62.5'), Printed('9.38'),
-              'Gaussian process'),
-    LoadState(0.10, '10 %', Printed('225.0'), Printed('75.0'), Printed('28.1'),
-              'stationary stochastic process'),
-    LoadState(0.40, '40 %', Printed('287.5'), Printed('66.7'), Printed('56.3'),
-              'diffusion process'))
+    PrintedLoad(0.0, 'motors off', Printed('62.5'), Printed('25.0'), Printed('~0'),
+                'quasi-stationary noise'),
+    PrintedLoad(0.05, '5 %', Printed('81.3'), Printed('62.5'), Printed('9.38'),
+                'Gaussian process'),
+    PrintedLoad(0.10, '10 %', Printed('225.0'), Printed('75.0'), Printed('28.1'),
+                'stationary stochastic process'),
+    PrintedLoad(0.40, '40 %', Printed('287.5'), Printed('66.7'), Printed('56.3'),
+                'diffusion process'))
 IDLE, LOW, MEDIUM, HIGH = TABLE_1
 # Those with a Vrms.
 LOADED = (LOW, MEDIUM, HIGH)

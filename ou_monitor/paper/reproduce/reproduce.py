@@ -19,7 +19,7 @@ from ou_monitor.paper.reproduce.crest import (
     crest, Crests, mean_and_error, rows as crest_rows, simulate_crests)
 from ou_monitor.paper.reproduce.figures import draw, Figures
 from ou_monitor.paper.reproduce.jumps import JumpCrest
-from ou_monitor.paper.reproduce.row import Row, Verdict
+from ou_monitor.paper.reproduce.row import Row, RowVerdict
 from ou_monitor.paper.reproduce.switching import Spreading
 from ou_monitor.paper.reproduce.table1 import exponent, vpp_step, vrms_step
 from ou_monitor.paper.reproduce.table2 import sigma_half_width, sigma_of
@@ -49,16 +49,16 @@ class Point:
         return tally(self.rows)
 
 
-def count(rows: Sequence[Row]) -> dict[Verdict, int]:
+def count(rows: Sequence[Row]) -> dict[RowVerdict, int]:
     """Return how many rows have each verdict."""
-    return {verdict: sum(row.verdict is verdict for row in rows) for verdict in Verdict}
+    return {verdict: sum(row.verdict is verdict for row in rows) for verdict in RowVerdict}
 
 
 def tally(rows: Sequence[Row]) -> str:
     """Return the counts in words, without those that are zero."""
-    words = {Verdict.AGREES: ('agrees', 'agree'),
-             Verdict.ROUNDING: ('within rounding', 'within rounding'),
-             Verdict.DOES_NOT_HOLD: ('does not hold', 'do not hold')}
+    words = {RowVerdict.AGREES: ('agrees', 'agree'),
+             RowVerdict.ROUNDING: ('within rounding', 'within rounding'),
+             RowVerdict.DOES_NOT_HOLD: ('does not hold', 'do not hold')}
     return ', '.join(f'{n} {words[verdict][n > 1]}' for verdict, n in count(rows).items() if n)
 
 
@@ -128,7 +128,7 @@ def _exponential(rows: Sequence[Row]) -> str:
     test, p = transient.offset_test(plain, shifted)
     low, high = shifted.band(1)
     outside = [row.quantity.partition(', ')[2] for row in rows
-               if row.quantity.startswith('rate, ') and row.verdict is Verdict.DOES_NOT_HOLD]
+               if row.quantity.startswith('rate, ') and row.verdict is RowVerdict.DOES_NOT_HOLD]
     said = ('which excludes one exponential at 95 %' if p < 0.05 else
             'so the voltages of five points do not exclude one exponential at 95 %')
     return (f'The rates between the points are {", ".join(f"{r:.1f}" for r in rates)} 1/s, '
@@ -281,9 +281,9 @@ def headline(result: Reproduction) -> str:
     """Return what came out, in one sentence."""
     counts = count(result.rows)
     return (f'Of {len(result.rows)} numbers and claims of the paper, '
-            f'{counts[Verdict.AGREES]} agree with their recomputation, '
-            f'{counts[Verdict.ROUNDING]} differ from it by no more than rounding, and '
-            f'{counts[Verdict.DOES_NOT_HOLD]} do not hold.')
+            f'{counts[RowVerdict.AGREES]} agree with their recomputation, '
+            f'{counts[RowVerdict.ROUNDING]} differ from it by no more than rounding, and '
+            f'{counts[RowVerdict.DOES_NOT_HOLD]} do not hold.')
 
 
 def recomputed(row: Row) -> str:

@@ -20,7 +20,7 @@ STANDARD_ERRORS = 3.0
 _TIE = 1e-9
 
 
-class Verdict(enum.Enum):
+class RowVerdict(enum.Enum):
     """What became of a printed number; the value is how it is called."""
 
     AGREES = 'agrees'
@@ -77,55 +77,25 @@ class Printed:
 
 @dataclass(frozen=True)
 class Row:
-    """
-    One printed number, recomputed.
+    """One printed number, recomputed."""
 
-    Attributes
-    ----------
-    where : str
-        Table, figure or section of the paper.
-    quantity, unit : str
-        What it is; the unit is the paper's.
-    printed : Printed
-        As printed.
-    recomputed : float
-        The same from what it was computed from, finite.
-    how : str
-        How it was recomputed.
-    sentence : str
-        What this says.
-    error : float or None
-        Standard error of `recomputed`; None for arithmetic.
-    band : tuple of float or None
-        Where the recomputed number lies if it is one draw of something random,
-        or if its error is not normal; replaces 3 standard errors.
-    printed_inputs : tuple of float or None
-        Range of the printed number when what *it* was computed from is changed
-        within its rounding.
-    inputs : tuple of float or None
-        Likewise of the recomputed one.
-    point : int
-        Which of the eight points it belongs to; 0 for none.
-
-    Raises
-    ------
-    ValueError
-        When a number is not finite or a range is upside down.
-
-    """
-
-    where: str
+    where: str  # Table, figure or section of the paper.
+    # What it is; the unit is the paper's.
     quantity: str
     unit: str
-    printed: Printed
-    recomputed: float
-    how: str
-    sentence: str
-    error: float | None = None
+    printed: Printed  # As printed.
+    recomputed: float  # The same from what it was computed from, finite.
+    how: str  # How it was recomputed.
+    sentence: str  # What this says.
+    error: float | None = None  # Standard error of `recomputed`; None for arithmetic.
+    # Where the recomputed number lies if it is one draw of something random, or if its error
+    # is not normal; replaces 3 standard errors.
     band: Range | None = None
+    # Range of the printed number when what *it* was computed from is changed within its
+    # rounding.
     printed_inputs: Range | None = None
-    inputs: Range | None = None
-    point: int = 0
+    inputs: Range | None = None  # Likewise of the recomputed one.
+    point: int = 0  # Which of the eight points it belongs to; 0 for none.
 
     def __post_init__(self) -> None:
         """Refuse what would make the verdict meaningless."""
@@ -147,7 +117,7 @@ class Row:
         return self.recomputed - reach, self.recomputed + reach
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> RowVerdict:
         """
         Return what follows from the ranges.
 
@@ -156,11 +126,11 @@ class Row:
         from may move within its own rounding. `DOES_NOT_HOLD`: not even then.
         """
         if _meet(self.printed.ends, self.interval):
-            return Verdict.AGREES
+            return RowVerdict.AGREES
         if _meet(_join(self.printed.ends, self.printed_inputs),
                  _join(self.interval, self.inputs)):
-            return Verdict.ROUNDING
-        return Verdict.DOES_NOT_HOLD
+            return RowVerdict.ROUNDING
+        return RowVerdict.DOES_NOT_HOLD
 
 
 def _meet(a: Range, b: Range) -> bool:

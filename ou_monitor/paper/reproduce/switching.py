@@ -14,11 +14,9 @@ import numpy as np
 from ou_monitor.paper.reproduce import published
 from ou_monitor.paper.reproduce.crest import mean_and_error
 from ou_monitor.paper.reproduce.row import Printed, Row
-from ou_monitor.paper.theory.diffusion import (
-    CORRECT_FACTOR, diffusion_limit, PRINTED_FACTOR, switching_drift)
-from ou_monitor.paper.theory.markov_chain import Generator
-from ou_monitor.paper.theory.matrix_model import MatrixModel
-from ou_monitor.paper.theory.switched_system import SwitchedSystem
+from ou_monitor.paper.theory import (
+    CORRECT_FACTOR, diffusion_limit, Generator, MatrixModel, PRINTED_FACTOR, SwitchedSystem,
+    switching_drift)
 from ou_monitor.records import FloatArray
 from scipy.integrate import quad
 

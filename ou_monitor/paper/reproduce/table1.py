@@ -16,7 +16,7 @@ _FINEST = 64
 
 
 @dataclass(frozen=True)
-class Step:
+class ReadingStep:
     """The largest step of which all readings are multiples, within their rounding."""
 
     # Where it lies, in the unit of the readings.
@@ -31,7 +31,7 @@ class Step:
         return 0.5 * (self.low + self.high)
 
 
-def common_step(readings: Sequence[Printed]) -> Step:
+def common_step(readings: Sequence[Printed]) -> ReadingStep:
     """Find the step of an instrument from its readings."""
     first, *others = sorted(readings, key=lambda r: r.value)
     for tried in range(1, _FINEST + 1):
@@ -46,28 +46,28 @@ def common_step(readings: Sequence[Printed]) -> Step:
                 break
         else:
             size = 0.5 * (low + high)
-            return Step(low, high, tuple(round(r.value / size) for r in readings),
-                        min(chance, 1.0))
+            return ReadingStep(low, high, tuple(round(r.value / size) for r in readings),
+                               min(chance, 1.0))
     raise ValueError('the readings have no common step')
 
 
-def vpp_step() -> Step:
+def vpp_step() -> ReadingStep:
     """Return the step of Vpp, mV."""
     return common_step([state.vpp for state in published.TABLE_1])
 
 
-def vrms_step() -> Step:
+def vrms_step() -> ReadingStep:
     """Return the step of Vrms, mV."""
     return common_step([state.vrms for state in published.LOADED])
 
 
-def vrms_range(state: published.LoadState) -> Range:
+def vrms_range(state: published.PrintedLoad) -> Range:
     """Return Vrms of a load state, mV, half a step each way."""
     half = 0.5 * vrms_step().size
     return state.vrms.value - half, state.vrms.value + half
 
 
-def vpp_range(state: published.LoadState) -> Range:
+def vpp_range(state: published.PrintedLoad) -> Range:
     """Return Vpp of a load state, mV, half a step each way."""
     half = 0.5 * vpp_step().size
     return state.vpp.value - half, state.vpp.value + half
@@ -147,7 +147,7 @@ def _grades() -> list[Row]:
     return found
 
 
-def exponent(low: published.LoadState, high: published.LoadState) -> tuple[float, Range]:
+def exponent(low: published.PrintedLoad, high: published.PrintedLoad) -> tuple[float, Range]:
     """Return how sigma grows with load: d ln sigma / d ln load between two states."""
     span = math.log(high.load / low.load)
     ends = over(vrms_range(high), vrms_range(low))

@@ -13,12 +13,12 @@ from ou_monitor.paper.reproduce.transient import LogLine, paper_fit
 WHERE = 'Table 2'
 
 
-def sigma_of(state: published.LoadState) -> float:
+def sigma_of(state: published.PrintedLoad) -> float:
     """Return Vrms sqrt(2 alpha), V/sqrt(s), for the printed Vrms and alpha."""
     return 1e-3 * state.vrms.value * math.sqrt(2.0 * published.ALPHA.value)
 
 
-def sigma_half_width(state: published.LoadState, line: LogLine) -> float:
+def sigma_half_width(state: published.PrintedLoad, line: LogLine) -> float:
     """
     Return how well sigma is known, V/sqrt(s).
 
@@ -43,7 +43,7 @@ def rows() -> list[Row]:
     return found + _restated()
 
 
-def _of_load(state: published.LoadState) -> list[Row]:
+def _of_load(state: published.PrintedLoad) -> list[Row]:
     sigma, printed = sigma_of(state), published.SIGMA[state.label]
     half = 1e-3 * state.vrms.half_unit * math.sqrt(2.0 * published.ALPHA.value)
     step = vrms_step()

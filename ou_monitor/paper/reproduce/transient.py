@@ -69,7 +69,7 @@ def fit_log_line(time: FloatArray, value: FloatArray) -> LogLine:
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class DecayFit:
     """start exp(-alpha t) + offset by least squares of the voltages."""
 
     parameters: FloatArray  # start, alpha, 1/s, and the offset if there is one; shape (2,) or (3,)
@@ -88,7 +88,7 @@ class Curve:
         return float(self.parameters[k]) - reach, float(self.parameters[k]) + reach
 
 
-def fit_curve(time: FloatArray, value: FloatArray, offset: bool) -> Curve:
+def fit_curve(time: FloatArray, value: FloatArray, offset: bool) -> DecayFit:
     """Fit an exponential, with or without a constant offset, to the voltages."""
     line = fit_log_line(time, value)
     first = [line.start, line.alpha] + ([0.0] if offset else [])
@@ -101,8 +101,8 @@ def fit_curve(time: FloatArray, value: FloatArray, offset: bool) -> Curve:
     free = time.size - len(first)
     rss = 2.0 * float(found.cost)
     covariance = np.linalg.inv(found.jac.T @ found.jac) * rss / free
-    return Curve(np.asarray(found.x), np.sqrt(np.diag(covariance)), rss,
-                 float(stats.t.ppf(0.975, free)))
+    return DecayFit(np.asarray(found.x), np.sqrt(np.diag(covariance)), rss,
+                    float(stats.t.ppf(0.975, free)))
 
 
 def paper_fit() -> LogLine:
@@ -235,7 +235,7 @@ def _shape() -> list[Row]:
     return found
 
 
-def offset_test(plain: Curve, shifted: Curve) -> tuple[float, float]:
+def offset_test(plain: DecayFit, shifted: DecayFit) -> tuple[float, float]:
     """Return F and its p-value for the offset, of fits to the five points."""
     free = VALUE.size - 3
     test = (plain.rss - shifted.rss) / (shifted.rss / free)

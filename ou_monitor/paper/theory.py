@@ -1,0 +1,666 @@
+"""
+The paper's theory (section 3): matrix model, Markov switching, averaging and diffusion limits.
+
+A chain x(t) on n states has the generator Q: Q[x, y] is the rate of going from x to y, 1/s, and
+every row sums to zero.  All states must be reachable from all: then the stationary law pi (pi Q =
+0) is unique, and the potential R0 = integral_0^inf (exp(Q t) - Pi) dt exists.  Holding times are
+exponential and the next state comes from an alias table, so a jump costs the same for any number
+of states.
+
+A system switched by it is du/dt = D u + d + speed (A_x u + a_x), x = x(clock t).  Two scalings of
+the paper, both with a small eps; eps = 1 is the system as given, D and d are not sped up:
+
+- averaging (eq. 1): clock 1/eps, speed 1; u^eps -> the averaged system.
+- diffusion (eq. 3): clock 1/eps^2, speed 1/eps, for A, a of zero average: the paths tend in law to
+  the diffusion with generator b phi' + B phi'' / 2, where for C(u; x) = A_x u + a_x
+
+      b(u) = sum_xy pi(x) R0(x, y) A_y (A_x u + a_x),
+      B(u) = 2 sum_xy pi(x) R0(x, y) sym[C(u; x) C(u; y)'].
+
+  Equation (6) of the paper lacks the 2, which (4) as printed needs: the variance of the integral
+  of C(x(t)) grows at the rate of twice the integral of its autocovariance over positive lags
+  (Korolyuk & Limnios, Stochastic Systems in Merging Phase Space, 2005, give it with the 2).
+   is the printed one.
+
+Between two jumps a switched system is affine, its average is affine, and so are drift and noise of
+its diffusion limit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+import math
+from typing import get_args, Literal
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.records import FloatArray
+from scipy.linalg import expm
+from scipy.sparse.csgraph import connected_components
+
+# Beyond this many substeps of the series the matrix exponential is cheaper.
+_MOST_SUBSTEPS = 32.0
+
+
+def augmented(matrix: npt.ArrayLike, offset: npt.ArrayLike) -> FloatArray:
+    """Return [[A, a], [0, 0]], whose exponential carries u and the constant 1 (matrix in 1/s)."""
+    a = np.asarray(matrix, dtype=np.float64)
+    d = a.shape[-1]
+    full = np.zeros((*a.shape[:-2], d + 1, d + 1))
+    full[..., :d, :d] = a
+    full[..., :d, d] = offset
+    return full
+
+
+def flow(matrix: FloatArray, offset: FloatArray, tau: FloatArray, u: FloatArray) -> FloatArray:
+    """
+    Move m states along their affine systems, each for its own time.
+
+    Taylor series of the exponential acting on the state, in substeps of norm
+    at most 1, to the last digit; no eigenvectors, so a matrix that cannot be
+    diagonalised is as good as any. Very long steps use the matrix exponential.
+
+    matrix in 1/s, tau in s.
+    """
+    if not u.size:
+        return u.copy()
+    step = tau[:, None]
+    norm = np.abs(matrix).sum(axis=-1).max(axis=-1)
+    reach = float(np.max(np.abs(tau) * norm))
+    if not reach <= _MOST_SUBSTEPS:
+        power = expm(augmented(matrix, offset) * tau[:, None, None])
+        return np.asarray((power[:, :-1, :-1] @ u[:, :, None])[..., 0] + power[:, :-1, -1])
+    parts = max(1, math.ceil(reach))
+    step = step / parts
+    reach /= parts
+    for _ in range(parts):
+        term = step * (_times(matrix, u) + offset)
+        u = u + term
+        k, size = 1, reach
+        while size > 1e-17:
+            k += 1
+            term = (step / k) * _times(matrix, term)
+            u += term
+            size *= reach / k
+    return u
+
+
+def _times(matrix: FloatArray, u: FloatArray) -> FloatArray:
+    """Return A u for each of the m states."""
+    if matrix.ndim == 2:
+        return u @ matrix.T
+    if u.shape[1] == 1:
+        return matrix[:, :, 0] * u
+    return np.asarray(np.einsum('mij,mj->mi', matrix, u))
+
+
+@dataclass(frozen=True, eq=False)
+class AffineSystem:
+    """du/dt = A u + a."""
+
+    matrix: FloatArray  # A, 1/s; shape (d, d)
+    offset: FloatArray  # a, unit of u per second; shape (d,)
+
+    def __post_init__(self) -> None:
+        """Check the shapes."""
+        matrix = np.asarray(self.matrix, dtype=np.float64)
+        offset = np.asarray(self.offset, dtype=np.float64)
+        if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+            raise ValueError(f'matrix must have shape (d, d), got {matrix.shape}')
+        if offset.shape != matrix.shape[:1]:
+            raise ValueError(
+                f'offset must have shape ({matrix.shape[0]},) to fit the matrix, '
+                f'got {offset.shape}')
+        if not (np.isfinite(matrix).all() and np.isfinite(offset).all()):
+            raise ValueError('matrix and offset must be finite')
+        object.__setattr__(self, 'matrix', matrix)
+        object.__setattr__(self, 'offset', offset)
+
+    @property
+    def growth_rate(self) -> float:
+        """Return the largest real part of an eigenvalue of A, 1/s; >= 0 when nothing restores."""
+        return float(np.linalg.eigvals(self.matrix).real.max())
+
+    def solve(self, t: npt.ArrayLike, u0: npt.ArrayLike) -> FloatArray:
+        """Return the exact solution by the matrix exponential (t in s)."""
+        times = check_times(t)
+        state = check_state(u0, self.offset.size)
+        with np.errstate(all='ignore'):
+            power = expm(augmented(self.matrix, self.offset)
+                         * (times - times[0])[:, None, None])
+            path = np.asarray(power[:, :-1, :-1] @ state + power[:, :-1, -1])
+        if not np.isfinite(path).all():
+            raise ValueError(
+                f'unstable: the solution overflows; the largest eigenvalue of the matrix is '
+                f'{self.growth_rate:+.6g} 1/s')
+        return path
+
+
+def check_times(t: npt.ArrayLike) -> FloatArray:
+    """Return the times as an array (t in s)."""
+    times = np.asarray(t, dtype=np.float64)
+    if times.ndim != 1 or not times.size:
+        raise ValueError(f't must have shape (k,) with k >= 1, got {times.shape}')
+    if not np.isfinite(times).all() or (np.diff(times) < 0.0).any():
+        raise ValueError('t must be finite and must not decrease, s')
+    return times
+
+
+def check_state(u0: npt.ArrayLike, d: int) -> FloatArray:
+    """Return a first state as an array."""
+    state = np.atleast_1d(np.asarray(u0, dtype=np.float64))
+    if state.shape != (d,):
+        raise ValueError(f'u0 must have shape ({d},), got {state.shape}')
+    if not np.isfinite(state).all():
+        raise ValueError('u0 must be finite')
+    return state
+
+
+def check_starts(u0: npt.ArrayLike, paths: int, d: int) -> FloatArray:
+    """Return the first states of paths, shape (paths, d), of one for all or one for each."""
+    first = np.atleast_1d(np.asarray(u0, dtype=np.float64))
+    if first.shape not in ((d,), (paths, d)):
+        raise ValueError(f'u0 must have shape ({d},) or ({paths}, {d}), got {first.shape}')
+    return np.array(np.broadcast_to(first, (paths, d)))
+
+
+COMPONENTS = ('amplitude', 'phase', 'power')
+
+
+@dataclass(frozen=True)
+class Stability:
+    """What the matrix does to each component."""
+
+    # Diagonal entry of each component, 1/s; the matrix is triangular, so these are its
+    # eigenvalues.
+    rates: dict[str, float]
+    growing: tuple[str, ...]  # Components that grow exponentially
+    text: str  # One sentence: ``stable`` or ``unstable: ...`` with the rates
+
+    @property
+    def stable(self) -> bool:
+        """Tell whether no component grows exponentially."""
+        return not self.growing
+
+
+@dataclass(frozen=True)
+class MatrixModel:
+    """
+    The deterministic matrix model of amplitude, phase and power (paper, 3.1).
+
+    u = (A, phi, P), du/dt = C u.  Two entries of the printed matrix do not do what the text around
+    them says: with +gamma on the diagonal the power grows as exp(gamma t), it relaxes only with
+    -alpha_p there; and dphi/dt = omega phi is a phase that grows as exp(omega t), where a carrier
+    has dphi/dt = omega.  This takes both as the text means them; `as_printed` as printed.
+    """
+
+    alpha: float  # Damping of the amplitude, 1/s, >= 0
+    omega: float  # Angular frequency of the carrier, rad/s
+    beta: float  # Coupling of the amplitude to the power, unit of P per unit of A per second
+    # Relaxation rate of the power, 1/s, > 0: the alpha of the Ornstein-Uhlenbeck supply voltage;
+    # as printed the paper's gamma, of any sign.
+    alpha_p: float
+    printed: bool = False  # Whether the matrix is as the paper prints it
+
+    def __post_init__(self) -> None:
+        """Check the coefficients."""
+        for name in ('alpha', 'omega', 'beta', 'alpha_p'):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f'{name} must be finite, got {getattr(self, name)}')
+        if self.alpha < 0.0:
+            raise ValueError(f'alpha must be zero or positive, got {self.alpha} 1/s')
+        if not self.printed and not self.alpha_p > 0.0:
+            raise ValueError(
+                f'alpha_p must be positive, got {self.alpha_p} 1/s: the diagonal entry is '
+                "-alpha_p; `as_printed` puts the paper's +gamma there")
+
+    @classmethod
+    def as_printed(cls, alpha: float, omega: float, beta: float, gamma: float) -> MatrixModel:
+        """Return the model with the matrix exactly as the paper prints it (in 1/s)."""
+        return cls(alpha, omega, beta, gamma, printed=True)
+
+    @property
+    def affine(self) -> AffineSystem:
+        """Return du/dt = C u + c; c = (0, omega, 0) for a carrier, else zeros."""
+        turning, power = (self.omega, self.alpha_p) if self.printed else (0.0, -self.alpha_p)
+        return AffineSystem(
+            np.array([[-self.alpha, 0.0, 0.0], [0.0, turning, 0.0], [self.beta, 0.0, power]]),
+            np.array([0.0, 0.0 if self.printed else self.omega, 0.0]))
+
+    def stability(self) -> Stability:
+        """Say which components grow, and how fast; a carrier's phase advances, which is none."""
+        rates = dict(zip(COMPONENTS, np.diag(self.affine.matrix).tolist(), strict=True))
+        growing = tuple(name for name in COMPONENTS if rates[name] > 0.0)
+        if not growing:
+            return Stability(rates, (), 'stable')
+        said = ', '.join(f'{name} grows as exp({rates[name]:g} t)' for name in growing)
+        cure = []
+        if 'power' in growing:
+            cure.append('a power that relaxes needs -alpha_p on the diagonal')
+        if 'phase' in growing:
+            cure.append('a carrier of frequency omega has dphi/dt = omega')
+        return Stability(rates, growing, f'unstable: {said}; ' + '; '.join(cure))
+
+    def solve(self, t: npt.ArrayLike, u0: npt.ArrayLike) -> FloatArray:
+        """Return amplitude, phase and power at the given times, exactly (t in s)."""
+        return self.affine.solve(t, u0)
+
+
+IntArray = npt.NDArray[np.intp]
+
+# A row may miss zero by this share of the largest rate: rounding of the input.
+ROW_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Generator:
+    """Generator of an irreducible Markov chain on a finite number of states."""
+
+    # Rates, 1/s; read-only. The diagonal is set to minus the sum of the row's other rates, to the
+    # last digit; shape (n, n).
+    q: FloatArray
+
+    def __post_init__(self) -> None:
+        """Check that this is a generator with one stationary law."""
+        if np.iscomplexobj(self.q):
+            raise ValueError('rates must be real, 1/s')
+        q = np.array(self.q, dtype=np.float64)
+        check_rates(q)
+        np.fill_diagonal(q, 0.0)
+        check_classes(q)
+        np.fill_diagonal(q, -q.sum(axis=1))
+        q.setflags(write=False)
+        object.__setattr__(self, 'q', q)
+
+    @classmethod
+    def telegraph(cls, up: float, down: float) -> Generator:
+        """Return two states, off (0) and on (1)."""
+        return cls(np.array([[-up, up], [down, -down]]))
+
+    @property
+    def size(self) -> int:
+        """Return the number of states n."""
+        return len(self.q)
+
+    @property
+    def leaving(self) -> FloatArray:
+        """Return the rates q(x) of leaving each state, 1/s, shape (n,)."""
+        return -np.diag(self.q)
+
+    @cached_property
+    def stationary(self) -> FloatArray:
+        """
+        Return the stationary law pi, shape (n,).
+
+        Elimination without subtractions (Grassmann, Taksar & Heyman, Oper.
+        Res. 33 (1985) 1107): every entry to full relative precision, however
+        far apart the rates are.
+        """
+        p = self.q / np.abs(self.q).max()
+        np.fill_diagonal(p, 0.0)
+        for k in range(self.size - 1, 0, -1):
+            p[:k, k] /= p[k, :k].sum()
+            p[:k, :k] += np.outer(p[:k, k], p[k, :k])
+        law = np.ones(self.size)
+        for k in range(1, self.size):
+            law[k] = law[:k] @ p[:k, k]
+        law /= law.sum()
+        law.setflags(write=False)
+        return law
+
+    @cached_property
+    def potential(self) -> FloatArray:
+        """
+        Return R0 = integral_0^inf (exp(Q t) - Pi) dt, s, shape (n, n).
+
+        (s Pi - Q)^-1 - Pi / s is the same for every s > 0; the mean rate of
+        leaving keeps the matrix to invert well scaled.
+        """
+        rate = float(self.leaving.mean())
+        # Pi: every row is the stationary law.
+        projector = np.tile(self.stationary, (self.size, 1))
+        potential = np.asarray((np.linalg.inv(projector - self.q / rate) - projector) / rate)
+        potential.setflags(write=False)
+        return potential
+
+    @cached_property
+    def jump_probabilities(self) -> FloatArray:
+        """Return the kernel P of the embedded chain, shape (n, n), with a zero diagonal."""
+        p = self.q / self.leaving[:, None]
+        np.fill_diagonal(p, 0.0)
+        return np.asarray(p)
+
+    @cached_property
+    def _table(self) -> AliasTable:
+        """Return the alias table of the embedded chain."""
+        return AliasTable(self.jump_probabilities)
+
+    def sped_up(self, factor: float) -> Generator:
+        """Return the chain on the clock factor * t, with `factor` times the rates."""
+        if not 0.0 < factor < np.inf:
+            raise ValueError(f'factor must be positive and finite, got {factor}')
+        return Generator(self.q * factor)
+
+    def transition(self, t: float) -> FloatArray:
+        """Return exp(Q t), shape (n, n): the law at time t s, row by starting state."""
+        if not 0.0 <= t < np.inf:
+            raise ValueError(f't must be zero or positive and finite, got {t} s')
+        return np.asarray(expm(self.q * t))
+
+    def starts(
+        self, paths: int, rng: np.random.Generator, start: int | None = None,
+    ) -> IntArray:
+        """Return first states, from the stationary law unless one is given."""
+        if paths < 1:
+            raise ValueError(f'paths must be 1 or more, got {paths}')
+        if start is None:
+            return np.asarray(rng.choice(self.size, paths, p=self.stationary), dtype=np.intp)
+        if not isinstance(start, (int, np.integer)) or not 0 <= start < self.size:
+            raise ValueError(f'start must be a state 0..{self.size - 1}, got {start}')
+        return np.full(paths, start, dtype=np.intp)
+
+    def segments(
+        self, edges: FloatArray, state: IntArray, rng: np.random.Generator,
+    ) -> Iterator[tuple[int, IntArray | slice, IntArray, FloatArray]]:
+        """
+        Advance an ensemble of paths from jump to jump, stopping at every edge.
+
+        Yields interval, paths, their states and the time spent in them; at an edge all paths.
+
+        edges in s.
+        """
+        rates, everyone = self.leaving, slice(None)
+        hold = rng.standard_exponential(state.size) / rates[state]
+        for k, width in enumerate(np.diff(edges)):
+            left = np.full(state.size, width)
+            which = np.flatnonzero(hold < left)
+            while which.size:
+                held, at = hold[which], state[which]
+                yield k, which, at, held
+                rest = left[which] - held
+                at = self._table.draw(at, rng)
+                new = rng.standard_exponential(which.size) / rates[at]
+                left[which], state[which], hold[which] = rest, at, new
+                which = which[new < rest]
+            yield k, everyone, state.copy(), left
+            hold -= left
+
+
+class AliasTable:
+    """
+    Draws from the rows of a stochastic matrix in constant time.
+
+    Walker, ACM Trans. Math. Software 3 (1977) 253: `keep`, shape (n, n), the chance to keep the
+    column first chosen, `other` the column taken otherwise.
+    """
+
+    def __init__(self, probabilities: FloatArray) -> None:
+        """Build the table of a stochastic matrix of shape (n, n)."""
+        n = len(probabilities)
+        self.size = n
+        self.keep = np.zeros((n, n))
+        self.other = np.zeros((n, n), dtype=np.intp)
+        for row, law in enumerate(probabilities):
+            weight = (law * n).tolist()
+            # What rounding leaves of an impossible column goes to the likeliest one.
+            self.other[row] = int(np.argmax(law))
+            small = [k for k, w in enumerate(weight) if w < 1.0]
+            large = [k for k, w in enumerate(weight) if w >= 1.0]
+            while small and large:
+                less, more = small.pop(), large[-1]
+                self.keep[row, less], self.other[row, less] = weight[less], more
+                weight[more] -= 1.0 - weight[less]
+                if weight[more] < 1.0:
+                    small.append(large.pop())
+            for k in large + small:
+                self.keep[row, k] = 1.0 if law[k] > 0.0 else 0.0
+        self._flat_keep, self._flat_other = self.keep.ravel(), self.other.ravel()
+
+    def draw(self, rows: IntArray, rng: np.random.Generator) -> IntArray:
+        """Return one column for each of the given rows, any shape."""
+        u = rng.random(rows.shape) * self.size
+        column = u.astype(np.intp)
+        cell = rows * self.size + column
+        return np.where(u - column < self._flat_keep[cell], column, self._flat_other[cell])
+
+
+def _named(states: Sequence[int] | npt.NDArray[np.intp]) -> str:
+    """Return ``state 2`` or ``states 0, 3``, cut where there are many."""
+    names = [str(int(state)) for state in states]
+    said = ', '.join(names[:8]) + (', ...' if len(names) > 8 else '')
+    return ('state ' if len(names) == 1 else 'states ') + said
+
+
+def check_rates(q: FloatArray) -> None:
+    """Refuse what is no generator at all (q in 1/s)."""
+    if q.ndim != 2 or q.shape[0] != q.shape[1]:
+        raise ValueError(f'Q must be square, got shape {q.shape}')
+    if len(q) < 2:
+        raise ValueError('Q must have two states or more: one state never switches')
+    if not np.isfinite(q).all():
+        row, column = np.argwhere(~np.isfinite(q))[0]
+        raise ValueError(f'Q[{row}, {column}] is {q[row, column]}: rates must be finite, 1/s')
+    off = q - np.diag(np.diag(q))
+    if (off < 0.0).any():
+        row, column = np.unravel_index(np.argmin(off), q.shape)
+        raise ValueError(
+            f'Q[{row}, {column}] = {q[row, column]:g} 1/s is negative: only the diagonal may be')
+    largest = float(np.abs(q).max())
+    defect = q.sum(axis=1)
+    row = int(np.argmax(np.abs(defect)))
+    if abs(defect[row]) > ROW_TOLERANCE * largest:
+        raise ValueError(
+            f'row {row} of Q sums to {defect[row]:.6g} 1/s, not to 0 (tolerance '
+            f'{ROW_TOLERANCE * largest:.3g} 1/s): its diagonal entry should be '
+            f'{-off[row].sum():.6g}')
+
+
+def check_classes(rates: FloatArray) -> None:
+    """Refuse chains that do not visit every state for ever (rates in 1/s)."""
+    absorbing = np.flatnonzero(rates.sum(axis=1) == 0.0)
+    if absorbing.size:
+        raise ValueError(f'{_named(absorbing)} absorbing: no rate leaves, so the switching stops')
+    count, label = connected_components(rates > 0.0, directed=True, connection='strong')
+    if count == 1:
+        return
+    leaks = (rates > 0.0) & (label[:, None] != label[None, :])
+    closed = [c for c in range(count) if not leaks[label == c].any()]
+    if len(closed) > 1:
+        classes = '; '.join(_named(np.flatnonzero(label == c)) for c in closed[:4])
+        raise ValueError(
+            f'the chain falls apart into {len(closed)} closed classes ({classes}): it has no '
+            'single stationary law; give each class its own generator')
+    transient = np.flatnonzero(label != closed[0])
+    raise ValueError(
+        f'{_named(transient)} transient: left once and for all; give the generator of the '
+        'other states')
+
+
+Scaling = Literal['averaging', 'diffusion']
+
+
+def _left_out() -> FloatArray:
+    """Return an array without entries, which stands for zeros."""
+    return np.empty(0)
+
+
+@dataclass(frozen=True, eq=False)
+class SwitchedSystem:
+    """An affine system with a matrix and an offset for every state of the chain."""
+
+    generator: Generator  # The chain, n states
+    matrices: FloatArray  # A_x, 1/s; shape (n, d, d)
+    # a_x, unit of u per second; zeros when left out; shape (n, d).
+    offsets: FloatArray = field(default_factory=_left_out)
+    # D, 1/s: not switched, not sped up; zeros when left out; shape (d, d).
+    drift_matrix: FloatArray = field(default_factory=_left_out)
+    drift_offset: FloatArray = field(default_factory=_left_out)  # d, likewise; shape (d,)
+
+    def __post_init__(self) -> None:
+        """Check the shapes and fill in the zeros."""
+        n = self.generator.size
+        matrices = np.asarray(self.matrices, dtype=np.float64)
+        if matrices.ndim != 3 or matrices.shape[0] != n or \
+                matrices.shape[1] != matrices.shape[2]:
+            raise ValueError(
+                f'matrices must have shape ({n}, d, d), one for each state of the chain, got '
+                f'{matrices.shape}')
+        d = matrices.shape[1]
+        object.__setattr__(self, 'matrices', matrices)
+        for name, shape in (
+                ('offsets', (n, d)), ('drift_matrix', (d, d)), ('drift_offset', (d,))):
+            value = getattr(self, name)
+            array = np.asarray(value, dtype=np.float64) if len(value) else np.zeros(shape)
+            if array.shape != shape:
+                raise ValueError(f'{name} must have shape {shape}, got {array.shape}')
+            object.__setattr__(self, name, array)
+        for name in ('matrices', 'offsets', 'drift_matrix', 'drift_offset'):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f'{name} must be finite')
+
+    @classmethod
+    def of_matrix_model(
+        cls, generator: Generator, *, alpha: npt.ArrayLike, omega: npt.ArrayLike,
+        beta: npt.ArrayLike, alpha_p: npt.ArrayLike,
+    ) -> SwitchedSystem:
+        """Return the matrix model of 3.1 with switched coefficients."""
+        columns = []
+        for name, value in (
+                ('alpha', alpha), ('omega', omega), ('beta', beta), ('alpha_p', alpha_p)):
+            array = np.asarray(value, dtype=np.float64)
+            if array.shape not in ((), (generator.size,)):
+                raise ValueError(
+                    f'{name} must be one number or have shape ({generator.size},), got '
+                    f'{array.shape}')
+            columns.append(np.broadcast_to(array, (generator.size,)).tolist())
+        systems = [MatrixModel(*row).affine for row in zip(*columns, strict=True)]
+        return cls(generator, np.array([one.matrix for one in systems]),
+                   np.array([one.offset for one in systems]))
+
+    @property
+    def dimension(self) -> int:
+        """Return the number of components d of u."""
+        return int(self.matrices.shape[1])
+
+    def averaged(self) -> AffineSystem:
+        """Return the averaged system du/dt = C_hat(u) = sum_x pi(x) C(u; x)."""
+        pi = self.generator.stationary
+        return AffineSystem(
+            self.drift_matrix + np.tensordot(pi, self.matrices, 1),
+            self.drift_offset + pi @ self.offsets)
+
+    def balanced(self) -> SwitchedSystem:
+        """
+        Return the same system with the average moved to the unswitched part.
+
+        At eps = 1 nothing changes; the switched part meets the balance
+        condition, so the diffusion limit exists.
+        """
+        mean = self.averaged()
+        pi = self.generator.stationary
+        return replace(
+            self, drift_matrix=mean.matrix, drift_offset=mean.offset,
+            matrices=self.matrices - np.tensordot(pi, self.matrices, 1),
+            offsets=self.offsets - pi @ self.offsets)
+
+    def scaled(self, eps: float, scaling: Scaling) -> SwitchedSystem:
+        """Return the system at eps with clock and speed built in, nothing left unswitched."""
+        if not 0.0 < eps < np.inf:
+            raise ValueError(f'eps must be positive and finite, got {eps}')
+        if scaling not in get_args(Scaling):
+            raise ValueError(f"scaling must be 'averaging' or 'diffusion', got {scaling!r}")
+        clock, speed = (1.0 / eps, 1.0) if scaling == 'averaging' else (1.0 / eps**2, 1.0 / eps)
+        return SwitchedSystem(
+            self.generator.sped_up(clock), self.drift_matrix + speed * self.matrices,
+            self.drift_offset + speed * self.offsets)
+
+    def simulate(
+        self, t: npt.ArrayLike, u0: npt.ArrayLike, rng: np.random.Generator, *,
+        eps: float = 1.0, paths: int = 1, scaling: Scaling = 'averaging',
+        start: int | None = None,
+    ) -> FloatArray:
+        """Draw paths, exact between the jumps and exact in the jumps (t in s)."""
+        at_eps, times, d = self.scaled(eps, scaling), check_times(t), self.dimension
+        state = at_eps.generator.starts(paths, rng, start)
+        u = check_starts(u0, paths, d)
+        found = np.empty((paths, times.size, d))
+        found[:, 0] = u
+        with np.errstate(over='ignore', invalid='ignore'):
+            for k, which, at, dt in at_eps.generator.segments(times, state, rng):
+                u[which] = flow(at_eps.matrices[at], at_eps.offsets[at], dt, u[which])
+                if isinstance(which, slice):
+                    if not np.isfinite(u).all():
+                        raise ValueError(
+                            f'unstable: a path overflows before t = {times[k + 1]:g} s')
+                    found[:, k + 1] = u
+        return found
+
+
+# The average may miss zero by this share of the largest switched entry.
+BALANCE_TOLERANCE = 1e-9
+PRINTED_FACTOR = 1.0
+CORRECT_FACTOR = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class LinearDiffusion:
+    """du = (M u + m) dt + sum_k (G_k u + g_k) dW_k, in the sense of Ito."""
+
+    matrix: FloatArray  # M, 1/s; shape (d, d)
+    offset: FloatArray  # m, unit of u per second; shape (d,)
+    noise_matrices: FloatArray  # G_k, 1/sqrt(s); shape (r, d, d)
+    noise_offsets: FloatArray  # g_k, unit of u per sqrt(s); shape (r, d)
+
+    def intensity(self, u: npt.ArrayLike) -> FloatArray:
+        """Return B(u), shape (d, d): the rate at which the covariance grows at u."""
+        fields = self.noise_matrices @ check_state(u, self.offset.size) + self.noise_offsets
+        return np.asarray(fields.T @ fields)
+
+
+def require_balance(system: SwitchedSystem) -> None:
+    """Refuse a system whose switched part does not have zero average."""
+    pi = system.generator.stationary
+    matrix, offset = np.tensordot(pi, system.matrices, 1), pi @ system.offsets
+    cure = '; SwitchedSystem.balanced() moves the average to the unswitched drift'
+    worst = np.unravel_index(int(np.argmax(np.abs(matrix))), matrix.shape)
+    if abs(matrix[worst]) > BALANCE_TOLERANCE * float(np.abs(system.matrices).max()):
+        i, j = (int(k) for k in worst)
+        raise ValueError(
+            f'the balance condition does not hold: the averaged velocity of component {i} has '
+            f'{matrix[worst]:+.6g} 1/s times component {j}, not 0{cure}')
+    i = int(np.argmax(np.abs(offset)))
+    if abs(offset[i]) > BALANCE_TOLERANCE * float(np.abs(system.offsets).max()):
+        raise ValueError(
+            f'the balance condition does not hold: the averaged velocity of component {i} is '
+            f'{offset[i]:+.6g} per second at u = 0, not 0{cure}')
+
+
+def switching_drift(system: SwitchedSystem) -> AffineSystem:
+    """Return b(u), equation (5), of a balanced system."""
+    require_balance(system)
+    weight = system.generator.stationary[:, None] * system.generator.potential
+    # A_y after A_x: the chain is in x first.
+    after = np.tensordot(weight, system.matrices, 1)
+    return AffineSystem(
+        np.einsum('xij,xjk->ik', after, system.matrices),
+        np.einsum('xij,xj->i', after, system.offsets))
+
+
+def diffusion_limit(system: SwitchedSystem, factor: float = CORRECT_FACTOR) -> LinearDiffusion:
+    """Return the limit diffusion of a balanced system."""
+    if not 0.0 < factor < math.inf:
+        raise ValueError(f'factor must be positive and finite, got {factor}')
+    correction = switching_drift(system)
+    half = system.generator.stationary[:, None] * system.generator.potential
+    # Positive semidefinite: a spectral density of the chain at frequency 0.
+    value, vector = np.linalg.eigh(0.5 * factor * (half + half.T))
+    used = value > 1e-12 * value.max()
+    root = vector[:, used] * np.sqrt(value[used])
+    matrices = np.einsum('xk,xij->kij', root, system.matrices)
+    offsets = root.T @ system.offsets
+    felt = matrices.any(axis=(1, 2)) | offsets.any(axis=1)
+    return LinearDiffusion(
+        system.drift_matrix + correction.matrix, system.drift_offset + correction.offset,
+        matrices[felt], offsets[felt])
