@@ -32,7 +32,7 @@ from ou_monitor.nodes.base import diagnostic, MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.console import Console
 from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of, IMU
 from ou_monitor.nodes.filter_frames import Frames
-from ou_monitor.nodes.filter_inputs import MotorInputs, Supply, SupplyInput
+from ou_monitor.nodes.filter_inputs import KnownSupply, MotorInputs, SupplyInput
 from ou_monitor.nodes.inputs import INPUT_QOS, Silence, Stamper, types_on
 from ou_monitor.nodes.sources import message_class, MOTOR_PARAMETERS
 from ou_monitor.online.filter.cutoff_control import Bound
@@ -198,7 +198,8 @@ class AdaptiveFilterNode(MonitorNode):
             self.low_pass.noise_left))
         self._passed += 1
 
-    def _notched(self, stamp: float, values: Sequence[float], supply: Supply) -> Sequence[float]:
+    def _notched(self, stamp: float, values: Sequence[float], supply: KnownSupply
+                 ) -> Sequence[float]:
         """Return the signals behind the notches; of a shadow they are as they were."""
         if not self._notch.settings.count and not self._notch.active:
             return values
@@ -215,7 +216,7 @@ class AdaptiveFilterNode(MonitorNode):
         notched = 0.0 if s.shadow else max(self._notch.delays(s.lag_frequency), default=0.0)
         return self.low_pass.delay + notched
 
-    def _known(self) -> Supply:
+    def _known(self) -> KnownSupply:
         return self._supply.now(self.low_pass.settings.stale_after,
                                 self.low_pass.settings.alpha)
 
@@ -263,7 +264,7 @@ class AdaptiveFilterNode(MonitorNode):
             f'{self.get_fully_qualified_name()[1:]}: adaptive low-pass', level, summary, fields,
             self.stamp_now(), hardware_id=self._topic))
 
-    def _decided_by(self, supply: Supply) -> str:
+    def _decided_by(self, supply: KnownSupply) -> str:
         """Say in words what decides the cutoff now."""
         low_pass = self.low_pass
         s, bound = low_pass.settings, low_pass.bound
@@ -280,14 +281,14 @@ class AdaptiveFilterNode(MonitorNode):
             return f'{bound.value}, on the way to {aim}'
         return bound.value
 
-    def _unknown(self, supply: Supply) -> str:
+    def _unknown(self, supply: KnownSupply) -> str:
         """Say why what the law needs is not known."""
         s = self.low_pass.settings
         if s.law == 'throttle':
             return self._supply.why_no_throttle(s.stale_after)
         return supply.why or 'sigma was not known at the last message'
 
-    def _judge(self, supply: Supply) -> tuple[Level, str]:
+    def _judge(self, supply: KnownSupply) -> tuple[Level, str]:
         s = self.low_pass.settings
         age = self._input_silence.age
         if self._channels is None and self._found:

@@ -34,8 +34,7 @@ from ou_monitor.nodes.base import diagnostic, LOCK, MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.clocks import IN_BURSTS, SendClock
 from ou_monitor.nodes.console import Console, PublisherWatch
 from ou_monitor.nodes.inputs import Arrivals, PolledInput, Silence, Stamper, types_on, within
-from ou_monitor.nodes.latch_file import LatchFile
-from ou_monitor.nodes.model_choice import ModelChoice
+from ou_monitor.nodes.node_files import LatchFile, ModelChoice
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.report import MonitorReport

@@ -25,7 +25,7 @@ _LONGER = 1.1
 _USABLE = (Status.OK.name, Status.SHORT_WINDOW.name)
 
 
-class Supply(NamedTuple):
+class KnownSupply(NamedTuple):
     """The supply as it is known."""
 
     # Noise intensity, V/sqrt(s), and the standard error of its logarithm; NaN: not known.
@@ -80,7 +80,7 @@ class SupplyInput:
                 self._known = [_number(values, key) for key in _FIELDS]
                 return
 
-    def now(self, stale_after: float, rate: float = NAN) -> Supply:
+    def now(self, stale_after: float, rate: float = NAN) -> KnownSupply:
         """
         Return what is known, nothing of it older than `stale_after`, s.
 
@@ -93,10 +93,11 @@ class SupplyInput:
             (self._error, self._known) if fresh else (NAN, [NAN] * len(_FIELDS)))
         why = self._why(fresh, stale_after)
         if why and noise > 0.0 and rate > 0.0:
-            return Supply(noise * math.sqrt(2.0 * rate), throttle=throttle, source='load')
+            return KnownSupply(noise * math.sqrt(2.0 * rate), throttle=throttle, source='load')
         if why:
-            return Supply(throttle=throttle, why=why)
-        return Supply(self._sigma, error, alpha, throttle, level, level_se, source='relaxation')
+            return KnownSupply(throttle=throttle, why=why)
+        return KnownSupply(
+            self._sigma, error, alpha, throttle, level, level_se, source='relaxation')
 
     def why_no_throttle(self, stale_after: float) -> str:
         """Say why the throttle is not known."""

@@ -7,8 +7,8 @@ import stat
 import threading
 
 from live import wait_until
-from ou_monitor.nodes import latch_file
-from ou_monitor.nodes.latch_file import LatchFile
+from ou_monitor.nodes import node_files
+from ou_monitor.nodes.node_files import LatchFile
 import pytest
 
 GOOD = {'node': '/n', 'level': 'CRITICAL', 'reason': 'low', 'time': 1.7e9}
@@ -136,7 +136,7 @@ def test_a_write_that_fails_is_done_again(tmp_path, monkeypatch, call):
             tried.set()
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return right(*arguments)
-    monkeypatch.setattr(latch_file.os, call, fails)
+    monkeypatch.setattr(node_files.os, call, fails)
     full.set()
     latch.keep(True, 'low')
     wait_until(lambda: latch.problem, what='the problem')
@@ -154,7 +154,7 @@ def test_a_text_that_does_not_read_as_written_replaces_nothing(tmp_path, monkeyp
     latch = LatchFile(path, '/n')
     latch.read()
     right = os.write
-    monkeypatch.setattr(latch_file.os, 'write',
+    monkeypatch.setattr(node_files.os, 'write',
                         lambda handle, text: right(handle, text[:-1]))
     latch.keep(True, 'low')
     wait_until(lambda: latch.problem, what='the problem')

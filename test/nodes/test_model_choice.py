@@ -5,8 +5,8 @@ import sys
 from types import SimpleNamespace
 
 from ou_monitor.errors import InputError
-from ou_monitor.nodes import model_choice
-from ou_monitor.nodes.model_choice import ModelChoice
+from ou_monitor.nodes import node_files
+from ou_monitor.nodes.node_files import ModelChoice
 import pytest
 
 
@@ -62,6 +62,6 @@ def test_a_file_that_is_never_read_is_refused(tmp_path, monkeypatch):
     """Of a network that hangs, say: the answer comes, with that reason."""
     path = tmp_path / 'model.yaml'
     path.write_text('')
-    monkeypatch.setattr(model_choice, 'PATIENCE', 0.1)
+    monkeypatch.setattr(node_files, 'PATIENCE', 0.1)
     with pytest.raises(ValueError, match='was not read within 0.1 s'):
         ModelChoice().check(str(path), slow(monkeypatch, 50, lambda: None))

@@ -6,6 +6,8 @@ import time
 
 from live import BAGS, seconds, wait_until
 import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.nodes.replay import options
 from ou_monitor.recordings.bag import BagReader, BagWriter
 import pytest
 from rclpy.qos import QoSProfile
@@ -202,14 +204,8 @@ def test_times_that_the_clock_cannot_tell(world, numbered):
     ([foreign], 'not an MCAP file'),
     ([empty], 'no messages'),
     (['missing.mcap'], 'no bag missing.mcap'),
-    ([], 'required: bag'),
-    ([BAG, '--rate', '0'], '--rate must be a positive number'),
-    ([BAG, '--rate', 'nan'], '--rate must be a positive number'),
-    ([BAG, '--rate', 'fast'], "invalid float value: 'fast'"),
-    ([BAG, '--clock', '-1'], '--clock must lie within'),
-    ([BAG, '--wait', 'inf'], '--wait must be 0 or more'),
     ([BAG, '--topics', '/volage'], "did you mean '/voltage'?"),
-    ([BAG, '--lop'], 'unrecognized arguments: --lop'),
+    ([BAG, '--rate', '0'], '--rate must be a positive number'),
     ([BAG, '--ros-args', '-p', 'x'], 'cannot read the ROS arguments'),
 ], ids=lambda value: '' if isinstance(value, list) else value[:20])
 def test_what_is_refused(world, arguments, words):
@@ -219,6 +215,18 @@ def test_what_is_refused(world, arguments, words):
     assert process.wait() == 2
     lines = [line for line in process.err.strip().splitlines() if '[rcl]' not in line]
     assert len(lines) == 1 and words in lines[0], process.err
+
+
+@pytest.mark.parametrize('arguments, words', [
+    ([], 'required: bag'),
+    (['bag', '--rate', 'nan'], '--rate must be a positive number'),
+    (['bag', '--rate', 'fast'], "invalid float value: 'fast'"),
+    (['bag', '--clock', '-1'], '--clock must lie within'),
+    (['bag', '--wait', 'inf'], '--wait must be 0 or more'),
+    (['bag', '--lop'], 'unrecognized arguments: --lop')])
+def test_options_that_are_refused(arguments, words):
+    with pytest.raises(InputError, match=words):
+        options(arguments)
 
 
 def test_types_that_are_not_installed_are_left_out(world, tmp_path):
