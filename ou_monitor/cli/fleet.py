@@ -123,18 +123,20 @@ def render(fleet: Fleet) -> str:
     """Return the fleet for a terminal 100 columns wide."""
     from ou_monitor.fleet import lowest
     from ou_monitor.fleet.summary import (
-        comparison_words, failure_words, finding_words, headline, VEHICLE_HEADS, vehicle_rows)
+        comparison_words, failure_words, finding_words, headline, vehicle_table)
 
     lines = [output.paragraph(headline(fleet))]
     known = lowest.facts(fleet)
     if known:
+        heads, rows = lowest.table(fleet, _SHOWN)
+        left = [k for k, (head, _) in enumerate(heads) if head in ('vehicle', 'recording')]
         lines += ['', output.facts_table(known), '', output.table(
-            lowest.HEADS, [lowest.cells(row) for row in lowest.worst(fleet)[:_SHOWN]], left=[0])]
+            [head for head, _ in heads], rows, left=left)]
         if fleet.analysed > _SHOWN:
             lines.append(f'and {fleet.analysed - _SHOWN} more: see the report')
-    rows = vehicle_rows(fleet)
+    heads, rows = vehicle_table(fleet)
     if rows:
-        lines += ['', output.table([head for head, _ in VEHICLE_HEADS], rows[:2 * _SHOWN],
+        lines += ['', output.table([head for head, _ in heads], rows[:2 * _SHOWN],
                                    left=[0])]
         if len(rows) > 2 * _SHOWN:
             lines.append(f'and {len(rows) - 2 * _SHOWN} more vehicles: see the report')

@@ -40,7 +40,7 @@ _PIECES, _ROWS, _APART = 8, 12, 0.03
 
 
 @dataclass(frozen=True)
-class Curve:
+class CommonCurve:
     """The common curve over throttle of the logarithm of a quantity: straight between knots."""
 
     reference: float  # Throttle that all recordings are brought to; NaN when none has any
@@ -78,7 +78,7 @@ class Values:
     # that of the move from its own throttle rather than from the usual one; shape (n,).
     value: FloatArray
     error: FloatArray
-    curve: Curve  # What was taken out
+    curve: CommonCurve  # What was taken out
     # In the unit of the quantity, as measured, and at which throttle; the mean over the levels (by
     # time; of the logarithm); NaN where throttle is unknown; shape (n,).
     measured: FloatArray
@@ -112,7 +112,7 @@ def values_of(rows: Sequence[Row], name: str) -> Values:
     """Return one quantity of every recording."""
     if name == 'sag':
         once = list({row['path']: row for row in rows if row['sag_full'] is not None}.values())
-        return _values(name, once, Curve(NAN), *(
+        return _values(name, once, CommonCurve(NAN), *(
             np.array([_number(row[column]) for row in once])
             for column in ('sag_full', 'sag_full_se', 'sag', 'sag_throttle')))
     good = [row for row in rows if row['status'] in USABLE and row[name] is not None]
@@ -140,7 +140,7 @@ def values_of(rows: Sequence[Row], name: str) -> Values:
                    np.hypot(error, _move_error(np.array(place), curve)), measured, throttle)
 
 
-def _move_error(place: FloatArray, curve: Curve) -> FloatArray:
+def _move_error(place: FloatArray, curve: CommonCurve) -> FloatArray:
     """Return the error of the move of each recording from its throttle to the usual one."""
     if not curve.knots or not place.size:
         return np.zeros(len(place))
@@ -154,8 +154,8 @@ def _number(value: Any) -> float:
     return NAN if value is None else float(value)
 
 
-def _values(name: str, rows: Sequence[Row], curve: Curve, value: FloatArray, error: FloatArray,
-            measured: FloatArray, throttle: FloatArray) -> Values:
+def _values(name: str, rows: Sequence[Row], curve: CommonCurve, value: FloatArray,
+            error: FloatArray, measured: FloatArray, throttle: FloatArray) -> Values:
     return Values(name, tuple(row['path'] for row in rows),
                   tuple(row['vehicle'] or '' for row in rows),
                   np.array([row['flight'] or 0 for row in rows], dtype=np.intp),
@@ -169,11 +169,12 @@ def _pieces(u: FloatArray, knots: Sequence[float]) -> FloatArray:
     return np.column_stack(columns) if columns else np.zeros((u.size, 0))
 
 
-def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str], recordings: IntArray) -> Curve:
+def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str], recordings: IntArray
+           ) -> CommonCurve:
     """Return the common curve of levels; flat where throttle does not vary."""
     known = np.isfinite(u)
     if not known.any():
-        return Curve(NAN)
+        return CommonCurve(NAN)
     u, y = u[known], y[known]
     reference = float(np.median(u))
     knots = _knots(u)
@@ -182,7 +183,7 @@ def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str], recordings: In
     basis = _pieces(u, knots)
     parts = basis.shape[1]
     if not parts or y.size <= len(names) + parts:
-        return Curve(reference)
+        return CommonCurve(reference)
     weight = np.ones(y.size)
     slopes = np.zeros(parts)
     inner, rest = np.zeros((y.size, parts + 1)), y
@@ -205,9 +206,9 @@ def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str], recordings: In
     heights = np.concatenate(([0.0], np.cumsum(slopes * np.diff(knots))))
     heights -= np.interp(reference, knots, heights)
     if not np.isfinite(heights).all():
-        return Curve(reference)
+        return CommonCurve(reference)
     covariance = _jackknife(inner[:, :-1], rest, weight, recordings[known], of)
-    return Curve(reference, tuple(knots), tuple(heights.tolist()), covariance)
+    return CommonCurve(reference, tuple(knots), tuple(heights.tolist()), covariance)
 
 
 def _jackknife(inner: FloatArray, rest: FloatArray, weight: FloatArray, of: IntArray,

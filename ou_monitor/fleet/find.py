@@ -19,18 +19,21 @@ import stat
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import FILE, is_part
 from ou_monitor.recordings.importers.csv_table import holds_supply
+from ou_monitor.recordings.importers.formats import is_log
 from ou_monitor.stream.files import open_regular
 from ou_monitor.text import printable
 
-# What `convert` takes and this does not.
-_LOGS = ('.ulg', '.bin', '.bbl', '.bfl', '.db3')
+# Endings of logs of autopilots; what of these is one is told by its first bytes.
+_LOGS = ('', '.ulg', '.bin', '.log', '.bbl', '.bfl', '.db3')
+# Other files end so too: they are passed over without a word.
+_COMMON = ('', '.log')
 _BLOCK = 1 << 20
 # Folders within folders that are searched.
 _MOST_DEPTH = 50
 
 
 @dataclass(frozen=True)
-class Source:
+class FoundRecording:
     """One recording on disk."""
 
     path: Path  # File, or folder of a bag; absolute, links resolved
@@ -43,7 +46,7 @@ class Source:
 class Found:
     """What a search gave."""
 
-    sources: tuple[Source, ...]  # In order of path, each once
+    sources: tuple[FoundRecording, ...]  # In order of path, each once
     notes: tuple[str, ...]  # What was passed over, one sentence each
 
 
@@ -63,8 +66,8 @@ def find_recordings(given: Sequence[str], leave_out: Path | None = None) -> Foun
     notes = search.notes()
     if not search.paths:
         where = ', '.join(f"'{text}'" for text in given)
-        raise InputError(f'no recording in {where}: expected .mcap files, rosbag2 folders, or '
-                         '.csv files with columns of time and voltage'
+        raise InputError(f'no recording in {where}: expected .mcap files, rosbag2 folders, logs '
+                         'of autopilots, or .csv files with columns of time and voltage'
                          + (f' ({" ".join(notes)})' if notes else ''))
     return Found(tuple(_source(path) for path in sorted(search.paths)),
                  tuple(map(printable, notes)))
@@ -115,7 +118,10 @@ class _Search:
             else:
                 self._csv.append(path)
         elif kind in _LOGS:
-            self._logs.append(path)
+            if is_log(path):
+                self.add(path)
+            elif kind not in _COMMON:
+                self._logs.append(path)
 
     def notes(self) -> list[str]:
         """Return what was passed over, one sentence a kind."""
@@ -123,8 +129,8 @@ class _Search:
         if self._csv:
             found.append(_passed(self._csv, '.csv file', 'without columns of time and voltage'))
         if self._logs:
-            found.append(_passed(self._logs, 'log', "in another format: 'ou-monitor convert' "
-                                 'makes bags of them'))
+            found.append(_passed(self._logs, 'file', 'with the ending of a log, but not one that '
+                                 'can be read'))
         found += [f'The folder {text} cannot be searched.' for text in self._closed]
         return found
 
@@ -167,7 +173,7 @@ def _has_columns(path: Path) -> bool:
     return holds_supply(path)
 
 
-def _source(path: Path) -> Source:
+def _source(path: Path) -> FoundRecording:
     files = [path]
     if os.path.isdir(path):
         files = sorted(Path(folder) / name for folder, _, names in _walk(path) for name in names)
@@ -185,13 +191,13 @@ def _source(path: Path) -> Source:
         size += 0 if file.name == FILE else found.st_size
         stamps += [found.st_mtime_ns, found.st_size]
     data = tuple(file for file in files if file.name != FILE)
-    return Source(path, data, size, tuple(stamps))
+    return FoundRecording(path, data, size, tuple(stamps))
 
 
-def duplicates(sources: Sequence[Source],
+def duplicates(sources: Sequence[FoundRecording],
                progress: Callable[[float], None] | None = None) -> dict[Path, Path]:
     """Return the recordings whose data another one has too (progress 0..1)."""
-    sizes: dict[int, list[Source]] = {}
+    sizes: dict[int, list[FoundRecording]] = {}
     for source in sources:
         if source.size:
             sizes.setdefault(source.size, []).append(source)
@@ -214,7 +220,7 @@ def duplicates(sources: Sequence[Source],
     return found
 
 
-def _digest(source: Source) -> bytes | None:
+def _digest(source: FoundRecording) -> bytes | None:
     """Return a hash of the data; None where it cannot be read, which the reader tells."""
     digest = hashlib.blake2b()
     try:

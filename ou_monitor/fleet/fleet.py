@@ -18,7 +18,7 @@ from typing import Any
 
 from ou_monitor.errors import InputError
 from ou_monitor.fleet.analysis import is_result, Options, work
-from ou_monitor.fleet.find import duplicates, Found, Source
+from ou_monitor.fleet.find import duplicates, Found, FoundRecording
 from ou_monitor.fleet.judgement import judge, Judgement
 from ou_monitor.fleet.table import reason, Row, rows_of, write_whole
 from ou_monitor.fleet.vehicles import assign, match_paths, number_flights
@@ -51,12 +51,12 @@ class Parts:
         write_whole(probe, b' ' * 4096)
         probe.unlink()
 
-    def _path(self, source: Source) -> Path:
+    def _path(self, source: FoundRecording) -> Path:
         text = json.dumps([str(source.path), source.size, source.stamp, self._options])
         return self._folder / (hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
                                + '.json')
 
-    def load(self, source: Source) -> dict[str, Any] | None:
+    def load(self, source: FoundRecording) -> dict[str, Any] | None:
         """Return the result of a recording; None when there is none."""
         try:
             with open_regular(self._path(source)) as file:
@@ -66,7 +66,7 @@ class Parts:
             return None
         return found if isinstance(found, dict) and found.get('error') == '' else None
 
-    def save(self, source: Source, result: Mapping[str, Any]) -> None:
+    def save(self, source: FoundRecording, result: Mapping[str, Any]) -> None:
         """Keep the result of a recording."""
         write_whole(self._path(source), json.dumps(result).encode())
 
@@ -118,7 +118,7 @@ def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[]
     parts = Parts(folder, {**options.as_data(), **(stated_options or {}), 'version': version()})
     twice = duplicates(found.sources, comparing)
     results: dict[Path, dict[str, Any]] = {}
-    missing: list[Source] = []
+    missing: list[FoundRecording] = []
     for source in found.sources:
         if source.path in twice:
             continue
@@ -146,7 +146,7 @@ def _workers(count: int, scheduler: str | None, version: Callable[[], str], inse
     return ClusterWorkers(scheduler, version, insecure)
 
 
-def _work(missing: Sequence[Source], results: dict[Path, dict[str, Any]], parts: Parts,
+def _work(missing: Sequence[FoundRecording], results: dict[Path, dict[str, Any]], parts: Parts,
           options: Options, pool: Workers, progress: Progress | None) -> None:
     """Analyse what is missing, and keep each result as it comes."""
     kept = len(results)
@@ -164,7 +164,7 @@ def _work(missing: Sequence[Source], results: dict[Path, dict[str, Any]], parts:
         tell((kept + done + 1) / (kept + len(order)))
 
 
-def _table(sources: Sequence[Source], results: dict[Path, dict[str, Any]],
+def _table(sources: Sequence[FoundRecording], results: dict[Path, dict[str, Any]],
            twice: dict[Path, Path], pattern: re.Pattern[str] | None
            ) -> tuple[list[Row], list[str]]:
     """Return all rows, and notes on how vehicles and flights were named."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
@@ -10,12 +11,19 @@ from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.table import Row
 from ou_monitor.text import counted, number, volts
 
-# Heads of the table of recordings; what stands in a bracket is small on a page.
-HEADS = ('recording', 'lowest V', 'at s', 'dips', 'below s', 'sag V', 'at throttle')
+# Characters of the name of a vehicle in a table.
+_NAME = 30
+# Heads of the table of recordings for a terminal and for a page.
+HEADS = (('vehicle', 'Vehicle'), ('recording', 'Recording'), ('lowest V', 'Lowest, V'),
+         ('at s', 'at, s'), ('dips', 'Dips'), ('below s', 'Below, s'), ('sag V', 'Sag, V'),
+         ('at throttle', 'at throttle'))
+# Terminal and page.
+Heads = Sequence[tuple[str, str]]
+UNKNOWN = '-'
 
 
 @dataclass(frozen=True)
-class Dips:
+class DipCount:
     """Dips of a vehicle or of the whole fleet."""
 
     count: int = 0  # Dips below the limit
@@ -29,13 +37,13 @@ def once(fleet: Fleet) -> list[Row]:
     return list(rows.values())
 
 
-def dips_of(rows: Sequence[Row]) -> Dips | None:
+def dips_of(rows: Sequence[Row]) -> DipCount | None:
     """Return the dips of recordings; None where no limit was given."""
     known = [row for row in rows if row['dips'] is not None]
     if not known:
         return None
-    return Dips(sum(int(row['dips']) for row in known), sum(row['below_s'] for row in known),
-                sum(row['dips'] > 0 for row in known))
+    return DipCount(sum(int(row['dips']) for row in known), sum(row['below_s'] for row in known),
+                    sum(row['dips'] > 0 for row in known))
 
 
 def worst(fleet: Fleet) -> list[Row]:
@@ -50,7 +58,7 @@ def sentence(fleet: Fleet) -> str:
         return ''
     low = min(rows, key=lambda row: row['lowest'])
     lowest = (f'{number(low["lowest"], 4)} V at {number(low["lowest_at"])} s of '
-              f'{low["recording"]}')
+              f'{_name(low)}')
     found = dips_of(rows)
     if found is None:
         text = f'The lowest voltage was {lowest}'
@@ -60,7 +68,7 @@ def sentence(fleet: Fleet) -> str:
         most = worst(fleet)[0]
         where = f'in {found.recordings} of {counted(len(rows), "recording")}'
         if found.recordings > 1 and most['dips'] > 1:
-            where += f', most in {most["recording"]} ({most["dips"]})'
+            where += f', most in {_name(most)}, {most["dips"]}'
         text = (f'{counted(found.count, "dip")} below {fleet.limit:g} V {where}: the lowest was '
                 f'{lowest}')
     sags = [row for row in rows if row['sag'] is not None]
@@ -107,12 +115,31 @@ def _throttle(value: float | None) -> str:
     return '' if value is None else f', at {100.0 * value:.0f} % throttle'
 
 
-def cells(row: Row) -> list[str]:
-    """Return the cells of a recording under `HEADS`."""
-    def shown(value: float | None, digits: int = 3) -> str:
-        return '-' if value is None or math.isnan(value) else number(value, digits)
+def short_names(names: Sequence[str]) -> dict[str, str]:
+    """Return names as tables show them: long ones without their middle."""
+    short = {name: name if len(name) <= _NAME else f'{name[:13]}\u2026{name[13 - _NAME + 1:]}'
+             for name in names}
+    uses = Counter(short.values())
+    return {name: text if uses[text] == 1 else name for name, text in short.items()}
 
-    return [row['recording'], shown(row['lowest'], 4), shown(row['lowest_at']),
-            '-' if row['dips'] is None else f'{row["dips"]:g}', shown(row['below_s'], 2),
-            shown(row['sag']),
-            '-' if row['sag_throttle'] is None else f'{100.0 * row["sag_throttle"]:.0f} %']
+
+def table(fleet: Fleet, most: int) -> tuple[Heads, list[list[str]]]:
+    """Return the recordings with the lowest voltages: heads and cells, no column empty."""
+    names = short_names(fleet.vehicles)
+    return without_empty(HEADS, [_cells(row, names) for row in worst(fleet)[:most]])
+
+
+def without_empty(heads: Heads, rows: list[list[str]]) -> tuple[Heads, list[list[str]]]:
+    """Return a table without the columns in which no row knows anything."""
+    kept = [k for k in range(len(heads)) if any(row[k] != UNKNOWN for row in rows)]
+    return [heads[k] for k in kept], [[row[k] for k in kept] for row in rows]
+
+
+def _cells(row: Row, names: dict[str, str]) -> list[str]:
+    def shown(value: float | None, digits: int = 3) -> str:
+        return UNKNOWN if value is None or math.isnan(value) else number(value, digits)
+
+    return [names.get(row['vehicle'], UNKNOWN), row['recording'], shown(row['lowest'], 4),
+            shown(row['lowest_at']), UNKNOWN if row['dips'] is None else f'{row["dips"]:g}',
+            shown(row['below_s'], 2), shown(row['sag']),
+            UNKNOWN if row['sag_throttle'] is None else f'{100.0 * row["sag_throttle"]:.0f} %']

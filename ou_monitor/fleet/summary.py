@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 import math
 import re
 from typing import Any
@@ -17,8 +16,6 @@ from ou_monitor.fleet.judgement import (
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.text import chance, counted, number, p_words
 
-# Characters of the name of a vehicle in a table.
-_NAME = 30
 # Heads of the table of vehicles for a terminal and for a page.
 VEHICLE_HEADS = (
     ('vehicle', 'Vehicle'), ('flights', 'Flights'), ('lowest V', 'Lowest, V'), ('dips', 'Dips'),
@@ -183,19 +180,11 @@ def comparison_words(fleet: Fleet) -> list[str]:
     return notes
 
 
-def short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return names as tables show them: long ones without their middle."""
-    short = {name: name if len(name) <= _NAME else f'{name[:13]}\u2026{name[13 - _NAME + 1:]}'
-             for name in names}
-    uses = Counter(short.values())
-    return {name: text if uses[text] == 1 else name for name, text in short.items()}
-
-
-def vehicle_rows(fleet: Fleet) -> list[list[str]]:
-    """Return a row of cells for each vehicle, under `VEHICLE_HEADS`."""
+def vehicle_table(fleet: Fleet) -> tuple[lowest.Heads, list[list[str]]]:
+    """Return what is known of each vehicle: heads and cells, no column empty."""
     judged = fleet.judgement
     found, seen = [], lowest.once(fleet)
-    shown_as = short_names(fleet.vehicles)
+    shown_as = lowest.short_names(fleet.vehicles)
     for vehicle in fleet.vehicles:
         flights = {row['path'] for row in fleet.rows if row['vehicle'] == vehicle
                    and row['flight'] is not None}
@@ -203,17 +192,17 @@ def vehicle_rows(fleet: Fleet) -> list[list[str]]:
         dips = lowest.dips_of(mine)
         cells = [shown_as[vehicle], str(len(flights)),
                  number(min((row['lowest'] for row in mine), default=NAN), 4),
-                 '-' if dips is None else str(dips.count)]
+                 lowest.UNKNOWN if dips is None else str(dips.count)]
         for name in ('sag', 'sigma', 'alpha'):
             cells += [_median(judged, name, vehicle), _slope(judged, name, vehicle)]
         found.append(cells)
-    return found
+    return lowest.without_empty(VEHICLE_HEADS, found)
 
 
 def _median(judged: Judgement, name: str, vehicle: str) -> str:
     one = judged.vehicles[name]
     if vehicle not in one.names:
-        return '-'
+        return lowest.UNKNOWN
     k = one.names.index(vehicle)
     star = '*' if one.outliers.found[k] else ''
     values = judged.values[name]
@@ -225,7 +214,7 @@ def _slope(judged: Judgement, name: str, vehicle: str) -> str:
     for trend in judged.trends:
         if (trend.quantity, trend.vehicle) == (name, vehicle):
             return change(name, trend.slope) + ('*' if trend.p_family <= DRIFT_RATE else '')
-    return '-'
+    return lowest.UNKNOWN
 
 
 def quality_counts(fleet: Fleet) -> list[tuple[str, int]]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ou_monitor.errors import InputError
-from ou_monitor.fleet.find import Source
+from ou_monitor.fleet.find import FoundRecording
 from ou_monitor.fleet.vehicles import Vehicle
 from ou_monitor.text import printable
 
@@ -111,8 +111,8 @@ _OF_RECORDING = ('recording', 'duration_s', 'samples', 'rate_hz', 'lowest', 'low
                  'gain', 'gain_se', 'notes')
 
 
-def rows_of(source: Source, result: Mapping[str, Any], vehicle: Vehicle, flight: int | None,
-            duplicate_of: Path | None = None) -> list[Row]:
+def rows_of(source: FoundRecording, result: Mapping[str, Any], vehicle: Vehicle,
+            flight: int | None, duplicate_of: Path | None = None) -> list[Row]:
     """Return the rows of one recording: one a level, or one that says why there is none."""
     base: Row = dict.fromkeys(NAMES)
     base.update(

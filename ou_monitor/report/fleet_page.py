@@ -13,8 +13,8 @@ from ou_monitor.fleet.comparison import LOGARITHMIC, QUANTITIES, USABLE, Values
 from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import DRIFT_RATE, Trend
 from ou_monitor.fleet.summary import (
-    change, comparison_words, failure_words, finding_words, headline, quality_counts, short_names,
-    VEHICLE_HEADS, vehicle_rows)
+    change, comparison_words, failure_words, finding_words, headline, quality_counts,
+    vehicle_table)
 from ou_monitor.fleet.table import Row
 from ou_monitor.records import FloatArray
 from ou_monitor.report import page
@@ -44,7 +44,7 @@ def fleet_page(fleet: Fleet, command: str = '') -> str:
                      page.facts([(name, _sentence(words)) for name, words in lowest.facts(fleet)])]
     sections.append(page.section('What stands out', *_odd(fleet)))
     if rows:
-        sections.append(page.section('Lowest voltages', *_worst(rows)))
+        sections.append(page.section('Lowest voltages', *_worst(fleet)))
     if fleet.failed or fleet.duplicates:
         sections.append(page.section('Not in the comparison', *_left_out(fleet)))
     sections += [
@@ -75,7 +75,7 @@ def _lowest(fleet: Fleet, rows: list[Row]) -> Plot:
     under = np.array([bool(row['dips']) for row in rows])
     x = at + _side_by_side(at, np.array([float(row['flight'] or 0) for row in rows]))
     plot = Plot('Lowest voltage of every recording', 'vehicle', 'V', height=240).places(
-        list(short_names(names).values()))
+        list(lowest.short_names(names).values()))
     plot.markers(x[~under], low[~under], 'recordings' if under.any() else '', 0)
     if under.any():
         plot.markers(x[under], low[under], 'with dips', 1)
@@ -96,12 +96,13 @@ def _side_by_side(at: FloatArray, flights: FloatArray) -> FloatArray:
     return moved
 
 
-def _worst(rows: list[Row]) -> list[str]:
-    listed = [[typeset(cell) if k else cell for k, cell in enumerate(lowest.cells(row))]
-              for row in rows[:_WORST]]
-    more = len(rows) - len(listed)
-    return [page.table(['Recording', 'Lowest, V', 'at, s', 'Dips', 'Below, s', 'Sag, V',
-                        'at throttle'], listed, left=[0])] + (
+def _worst(fleet: Fleet) -> list[str]:
+    heads, rows = lowest.table(fleet, _WORST)
+    names = [k for k, (head, _) in enumerate(heads) if head in ('vehicle', 'recording')]
+    listed = [[cell if k in names else typeset(cell) for k, cell in enumerate(row)]
+              for row in rows]
+    more = len(lowest.once(fleet)) - len(listed)
+    return [page.table([head for _, head in heads], listed, left=names)] + (
         [page.paragraph(f'{more} more are below, under Recordings.', soft=True)] if more else [])
 
 
@@ -133,10 +134,10 @@ def _left_out(fleet: Fleet) -> list[str]:
 
 
 def _vehicles(fleet: Fleet) -> list[str]:
-    rows = vehicle_rows(fleet)
+    heads, rows = vehicle_table(fleet)
     if not rows:
         return [page.paragraph('No vehicle was identified.', soft=True)]
-    parts = [page.table([head for _, head in VEHICLE_HEADS],
+    parts = [page.table([head for _, head in heads],
                         [[row[0], *map(typeset, row[1:])] for row in rows], left=[0]),
              page.paragraph('The lowest of all flights, their dips together; the rest are medians '
                             'of what was measured, and the change a flight of what is compared. '
@@ -160,7 +161,7 @@ def _by_vehicle(fleet: Fleet, values: Values) -> Plot:
     y, odd = values.measured, out.found
     plot = Plot(f'{_TITLES[values.name]} of every recording', 'vehicle', _UNITS[values.name],
                 height=260, log_y=values.name in LOGARITHMIC)
-    plot.places(list(short_names(names).values()))
+    plot.places(list(lowest.short_names(names).values()))
     for k in range(0, len(names), 2):
         plot.shade(k + 0.5, k + 1.5, 7)
     plot.markers((x + spread)[~odd], y[~odd], 'recordings', 0)
@@ -286,7 +287,7 @@ def _recordings(fleet: Fleet) -> list[str]:
             continue
         once.setdefault(row['path'], row)
         flags.setdefault(row['path'], set()).update(row['flags'] or ())
-    rows, names = [], short_names(fleet.vehicles)
+    rows, names = [], lowest.short_names(fleet.vehicles)
     for path, first in list(once.items())[:_RECORDINGS]:
         cells = [names.get(first['vehicle'], UNKNOWN), str(first['flight'] or UNKNOWN),
                  f"{first['recording']}\n{_date(first)}",

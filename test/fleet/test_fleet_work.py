@@ -18,6 +18,8 @@ from ou_monitor.fleet.summary import failure_words
 from ou_monitor.fleet.table import write_whole
 from ou_monitor.fleet.vehicles import assign, natural, number_flights, read_pattern
 from ou_monitor.fleet.workers import LocalWorkers, LOST, usable_memory
+from ou_monitor.recordings.read import read_recording
+from project import ROOT
 import pytest
 
 
@@ -166,6 +168,25 @@ def test_bags_are_found_as_bags(tmp_path):
                             leave_out=tmp_path / 'out')
     assert [s.path.relative_to(tmp_path.resolve()).as_posix() for s in found.sources] == [
         'a/cut', 'a/whole', 'b/one.mcap', 'b/two.MCAP']
+
+
+def test_logs_are_read_as_analyze_reads_them(tmp_path, monkeypatch):
+    """Told by their first bytes, whatever their name; what cannot be read costs its own row."""
+    monkeypatch.syspath_prepend(str(ROOT / 'test/recordings/importers'))
+    from made_logs import crazyflie, hover
+    events, records, _ = hover(3000, refresh=5)
+    log = tmp_path / 'log00'
+    log.write_bytes(b''.join(crazyflie(events, records)))
+    cut = tmp_path / 'cut.bin'
+    cut.write_bytes(b''.join(crazyflie(events, records))[:40])
+    (tmp_path / 'notes').write_text('these are notes')
+    (tmp_path / 'other.bin').write_bytes(b'something else')
+    found = find_recordings([str(tmp_path)])
+    assert [source.path.name for source in found.sources] == ['cut.bin', 'log00']
+    assert len(found.notes) == 1 and 'other.bin' in found.notes[0]
+    results = {source.path.name: work(str(source.path), Options().as_data())
+               for source in found.sources}
+    assert results['log00']['samples'] == read_recording(log).n and results['cut.bin']['error']
 
 
 def test_copies_are_found_by_content_not_by_name(tmp_path):

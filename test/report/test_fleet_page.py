@@ -8,7 +8,7 @@ from ou_monitor.fleet import lowest
 from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import judge
 from ou_monitor.fleet.summary import (
-    as_data, change, finding_words, headline, short_names, vehicle_rows)
+    as_data, change, finding_words, headline, vehicle_table)
 from ou_monitor.fleet.table import NAMES
 from ou_monitor.report.fleet_page import fleet_page
 from ou_monitor.text import number
@@ -56,8 +56,11 @@ def test_the_page_tells_what_stands_out(odd):
 
 def test_stars_mark_what_stands(odd):
     """The drifting vehicle at its slope, the odd one at its median; no star elsewhere."""
-    cells = {row[0]: row for row in vehicle_rows(odd)}
-    assert cells['<b>uav2</b> & co'][7].endswith('*') and cells['uav4'][6].endswith('*')
+    heads, rows = vehicle_table(odd)
+    assert ('dips', 'Dips') not in heads
+    at = [head for head, _ in heads].index('sigma')
+    cells = {row[0]: row for row in rows}
+    assert cells['<b>uav2</b> & co'][at + 1].endswith('*') and cells['uav4'][at].endswith('*')
     assert sum('*' in cell for row in cells.values() for cell in row) == 2
 
 
@@ -105,8 +108,8 @@ def test_the_lowest_voltage_comes_first():
                  sag_throttle=0.95), seen('c', 'hexa', 13.4, 1)]
     known = replace(fleet(rows), limit=13.5)
     assert headline(known).startswith(
-        '4 dips below 13.5 V in 2 of 3 recordings, most in b (3): the lowest was 13.10 V at 12.0 '
-        's of b; the rail sags by up to 1.90 V, at 95 % throttle.')
+        '4 dips below 13.5 V in 2 of 3 recordings, most in b (quad), 3: the lowest was 13.10 V '
+        'at 12.0 s of b (quad); the rail sags by up to 1.90 V, at 95 % throttle.')
     assert lowest.facts(known) == [
         ('Lowest voltage', '13.10 V at 12.0 s of b (quad), at 80 % throttle'),
         ('Below 13.5 V', '4 dips, 0.40 s in all, in 2 of 3 recordings'),
@@ -115,15 +118,21 @@ def test_the_lowest_voltage_comes_first():
     assert [row['path'] for row in lowest.worst(known)] == ['b', 'c', 'a']
     text = page_text(known)
     assert text.index('4 dips below') < text.index('Lowest voltages') < text.index('Vehicles')
-    assert vehicle_rows(known)[0][:4] == ['hexa', '0', '13.40', '1']
+    heads, (first, *_) = vehicle_table(known)
+    assert [head for head, _ in heads] == ['vehicle', 'flights', 'lowest V', 'dips']
+    assert first == ['hexa', '0', '13.40', '1']
+    heads, rows = lowest.table(known, 2)
+    assert [dict(zip([head for head, _ in heads], row))['vehicle'] for row in rows] == [
+        'quad', 'hexa']
     assert as_data(known)['brownout_voltage'] == 13.5
 
 
 def test_without_a_limit_no_dip_is_counted():
-    """Not known is a dash, not 0; and where a limit was kept, that is said."""
+    """Not known is no column, not 0; and where a limit was kept, that is said."""
     assert headline(fleet([seen('a', 'quad', 14.2, None)])).startswith(
-        'The lowest voltage was 14.20 V at 12.0 s of a.')
-    assert vehicle_rows(fleet([seen('a', 'quad', 14.2, None)]))[0][3] == '-'
+        'The lowest voltage was 14.20 V at 12.0 s of a (quad).')
+    heads, _ = lowest.table(fleet([seen('a', 'quad', 14.2, None)]), 9)
+    assert [head for head, _ in heads] == ['vehicle', 'recording', 'lowest V', 'at s']
     kept = replace(fleet([seen('a', 'quad', 14.2, 0)]), limit=14.0)
     assert headline(kept).startswith('No recording fell below 14 V: the lowest was 14.20 V')
 
@@ -151,6 +160,6 @@ def test_long_names_are_cut_where_they_stay_apart():
     board = 'CUBEPILOT_CUBEORANGE 0006000000003836'
     names = ['uav1', board + '38393239510d', board + '38393239510e', board + 'x' + 'y' * 16,
              board + 'z' + 'y' * 16]
-    found = short_names(names)
+    found = lowest.short_names(names)
     assert found['uav1'] == 'uav1' and found[names[1]] == 'CUBEPILOT_CUB\u2026383638393239510d'
     assert len(set(found.values())) == 5 and found[names[3]] == names[3]
