@@ -32,41 +32,24 @@ _CLOSE = 1.5
 
 @dataclass(frozen=True)
 class Cause:
-    """
-    How tau compares with the noise, and whether the instrument explains it.
+    """How tau compares with the noise, and whether the instrument explains it."""
 
-    Attributes
-    ----------
-    noise : str
-        ``agrees`` (tau alpha within a factor of 1.5 of 1 with 95 %), ``differs`` or
-        ``undetermined``.
-    ratio, ratio_low, ratio_high : float
-        tau alpha, with alpha that of the noise, common to all levels, and its 95 % interval; that
-        is NaN where one exponential does not describe the transient.
-    p_value : float
-        Of a ratio so far from 1.
-    instrument : str
-        ``excluded``, ``possible`` or ``undetermined``.
-    corner : float
-        Of the high-pass that would explain it, 1/(2 pi tau), Hz.
-    step, step_se : float
-        Level after less level before in the direction of the transient, mean of the changes
-        that have an amplitude, V; NaN when none has.
-    sentence : str
-        Both verdicts in words.
-
-    """
-
+    # ``agrees`` (tau alpha within a factor of 1.5 of 1 with 95 %), ``differs`` or
+    # ``undetermined``.
     noise: str
+    # tau alpha, with alpha that of the noise, common to all levels, and its 95 % interval;
+    # that is NaN where one exponential does not describe the transient.
     ratio: float
     ratio_low: float
     ratio_high: float
-    p_value: float
-    instrument: str
-    corner: float
+    p_value: float  # Of a ratio so far from 1.
+    instrument: str  # ``excluded``, ``possible`` or ``undetermined``.
+    corner: float  # Of the high-pass that would explain it, 1/(2 pi tau), Hz.
+    # Level after less level before in the direction of the transient, mean of the changes
+    # that have an amplitude, V; NaN when none has.
     step: float
     step_se: float
-    sentence: str
+    sentence: str  # Both verdicts in words.
 
 
 def judge_cause(relaxation: Relaxation, alpha: AlphaTest) -> Cause:

@@ -66,25 +66,12 @@ def detectable_kurtosis(n: int) -> float:
 
 @dataclass(frozen=True)
 class Verdict:
-    """
-    What a level is called, and why.
+    """What a level is called, and why."""
 
-    Attributes
-    ----------
-    kind : ProcessType
-        Kind.
-    why : str
-        The reason without numbers, so that levels of one reason can stand together.
-    figures : str
-        The numbers behind it; may be empty.
-    within : ProcessType
-        For 'quasi-stationary' what the level is called apart from its changes; else `kind`.
-
-    """
-
-    kind: ProcessType
-    why: str
-    figures: str = ''
+    kind: ProcessType  # Kind.
+    why: str  # The reason without numbers, so that levels of one reason can stand together.
+    figures: str = ''  # The numbers behind it; may be empty.
+    # For 'quasi-stationary' what the level is called apart from its changes; else `kind`.
     within: ProcessType = ProcessType.UNDETERMINED
 
     @property

@@ -26,22 +26,11 @@ def _empty() -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """
-    One-sided power spectral density of a level.
+    """One-sided power spectral density of a level."""
 
-    Attributes
-    ----------
-    frequency : ndarray, shape (k,)
-        Hz, > 0, even on a log axis.
-    density : ndarray, shape (k,)
-        Measured, V^2/Hz.
-    fitted : ndarray, shape (k,)
-        Of the fitted OU in white noise, sampled as the data are, V^2/Hz; NaN without a fit.
-
-    """
-
-    frequency: FloatArray = field(default_factory=_empty)
-    density: FloatArray = field(default_factory=_empty)
+    frequency: FloatArray = field(default_factory=_empty)  # Hz, > 0, even on a log axis.
+    density: FloatArray = field(default_factory=_empty)  # Measured, V^2/Hz.
+    # Of the fitted OU in white noise, sampled as the data are, V^2/Hz; NaN without a fit.
     fitted: FloatArray = field(default_factory=_empty)
 
 

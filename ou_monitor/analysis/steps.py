@@ -31,26 +31,14 @@ _BESIDE = (0.25, 4.0)
 
 @dataclass(frozen=True)
 class Step:
-    """
-    A change of load level.
+    """A change of load level."""
 
-    Attributes
-    ----------
-    before, after : int
-        Numbers of the levels.
-    leave : int
-        Index of the first sample that is no longer at the level before.
-    enter : int
-        Index of the sample from which throttle stands still at the level after.
-    begin, stop : int
-        First sample of the stay before; one past the last that throttle stands still after.
-
-    """
-
+    # Numbers of the levels.
     before: int
     after: int
-    leave: int
-    enter: int
+    leave: int  # Index of the first sample that is no longer at the level before.
+    enter: int  # Index of the sample from which throttle stands still at the level after.
+    # First sample of the stay before; one past the last that throttle stands still after.
     begin: int
     stop: int
 

@@ -162,43 +162,19 @@ _COLUMNS = ('coefficients', 'covariance', 'log_variance', 'flown')
 
 @dataclass(frozen=True)
 class LoadStart:
-    """
-    The answer to throttle, as `LoadFilter` learned it.
+    """The answer to throttle, as `LoadFilter` learned it."""
 
-    Attributes
-    ----------
-    cells : float
-        Cells in series.
-    volts : float
-        Open-circuit voltage when it was learned, V.
-    coefficients : tuple of 7 float
-        Fall of the voltage at full throttle by x, u, u^3, x after 0.06, 2 and 15 s, and inrush, V.
-    covariance : tuple of 7 tuples of 7 float
-        Of the coefficients, V^2.
-    discharge : float
-        Charge drawn per time at full load, 1/s.
-    log_variance : tuple of 3 float
-        ln of the variance, V^2, of white noise: constant, ripple, and by sqrt|du|.
-    flown : tuple of 2 float
-        Throttles between which 80 % were flown.
-    delay : float
-        How late throttle was heard, s.
-
-    Raises
-    ------
-    ValueError
-        When a number is not finite, or the covariance is none.
-
-    """
-
-    cells: float
-    volts: float
+    cells: float  # Cells in series.
+    volts: float  # Open-circuit voltage when it was learned, V.
+    # Fall of the voltage at full throttle by x, u, u^3, x after 0.06, 2 and 15 s, and
+    # inrush, V.
     coefficients: tuple[float, ...]
-    covariance: tuple[tuple[float, ...], ...]
-    discharge: float
+    covariance: tuple[tuple[float, ...], ...]  # Of the coefficients, V^2.
+    discharge: float  # Charge drawn per time at full load, 1/s.
+    # ln of the variance, V^2, of white noise: constant, ripple, and by sqrt|du|.
     log_variance: tuple[float, float, float]
-    flown: tuple[float, float]
-    delay: float = 0.0
+    flown: tuple[float, float]  # Throttles between which 80 % were flown.
+    delay: float = 0.0  # How late throttle was heard, s.
 
     def __post_init__(self) -> None:
         """Check shapes and signs."""

@@ -29,7 +29,7 @@ from mcap_ros2.decoder import DecoderFactory
 import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.cdr import (
-    Broken, check_extent, Column, DEFAULTS, Definitions, endless, Field, FieldReader, join,
+    Broken, check_extent, DEFAULTS, Definitions, endless, Field, FieldColumn, FieldReader, join,
     parse_definition, short_name, Table)
 from ou_monitor.recordings.mcap_file import (
     ABOUT, custom_data, McapFile, moment, MOST_BYTES, MOST_NODES, ORIGIN, SAMPLE_RATE, Span)
@@ -453,10 +453,10 @@ def batches(
     bag: BagReader, specs: Mapping[str, FieldSpec], *, start_ns: int | None = None,
     end_ns: int | None = None, progress: Callable[[float], None] | None = None,
     broken: Broken | None = None,
-) -> Iterator[dict[str, Column]]:
+) -> Iterator[dict[str, FieldColumn]]:
     """Yield fields of a bag, batch by batch (start_ns, end_ns in ns, progress 0..1)."""
     readers = {name: field_reader(bag, spec, broken) for name, spec in specs.items()}
-    pending: dict[str, list[Column]] = {name: [] for name in specs}
+    pending: dict[str, list[FieldColumn]] = {name: [] for name in specs}
     counts = dict.fromkeys(specs, 0)
     topics = [spec.topic for spec in specs.values()]
     for part in bag.tables(topics, start_ns=start_ns, end_ns=end_ns):
@@ -493,14 +493,14 @@ def _check_count(bag: BagReader, topic: str, found: int) -> None:
 
 
 def last_before(bag: BagReader, spec: FieldSpec, before_ns: int,
-                broken: Broken | None = None) -> Column:
+                broken: Broken | None = None) -> FieldColumn:
     """
     Return messages of a topic up to the last one before a log time that says something.
 
     before_ns in ns.
     """
     reader = field_reader(bag, spec, broken)
-    found: list[Column] = []
+    found: list[FieldColumn] = []
     newest = -1
     for table, older in bag.tables_before(spec.topic, before_ns):
         column = reader.read(table)

@@ -17,7 +17,7 @@ import re
 import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagReader, batches, last_before
-from ou_monitor.recordings.cdr import Column, IntArray, join
+from ou_monitor.recordings.cdr import FieldColumn, IntArray, join
 from ou_monitor.recordings.importers.log import RawColumns
 from ou_monitor.recordings.mcap_file import moment
 from ou_monitor.records import FloatArray
@@ -28,7 +28,7 @@ from ou_monitor.timeline.line import MOST_CURRENT, MOST_THROTTLE
 
 
 @dataclass(frozen=True)
-class Choice:
+class TopicChoice:
     """What is read from a bag."""
 
     # The source.
@@ -44,7 +44,7 @@ class Choice:
 def choose(
     path: Path, topics: Mapping[str, str], *, msg_config: str | Path | None = None,
     voltage_topic: str | None = None, throttle_topic: str | None = None,
-) -> Choice:
+) -> TopicChoice:
     """Choose the config and the topics."""
     for topic in (voltage_topic, throttle_topic):
         if topic is not None and _absolute(topic) not in topics:
@@ -72,8 +72,8 @@ def choose(
     if voltage_topic is None and others:
         notes = (*notes, f'{topic} was taken for the voltage; {some(others)} would fit too: '
                          'choose with --voltage-topic.')
-    return Choice(config, replace(config.voltage, topic=topic), throttle,
-                  _current(config, topics, topic), notes)
+    return TopicChoice(config, replace(config.voltage, topic=topic), throttle,
+                       _current(config, topics, topic), notes)
 
 
 def listed(topics: Mapping[str, str]) -> str:
@@ -263,7 +263,7 @@ def read_bag(
     first, last = (_limit(bag, at) for at in (start, end))
     # Where the messages of the voltage hold the current, each is that of its own.
     together = CURRENT in specs and specs[CURRENT].topic == specs[VOLTAGE].topic
-    parts: dict[str, list[Column]] = {name: [] for name in specs}
+    parts: dict[str, list[FieldColumn]] = {name: [] for name in specs}
     if first is not None:
         for name in specs.keys() - {VOLTAGE} - ({CURRENT} if together else set()):
             parts[name].append(last_before(
@@ -293,7 +293,7 @@ def read_bag(
                    _source(bag, choice, name), notes)
 
 
-def _specs(bag: BagReader, choice: Choice) -> dict[str, FieldSpec]:
+def _specs(bag: BagReader, choice: TopicChoice) -> dict[str, FieldSpec]:
     """Return what is read, by its name."""
     spec = choice.voltage
     stated = bag.sample_rates.get(spec.topic)
@@ -308,7 +308,7 @@ def _specs(bag: BagReader, choice: Choice) -> dict[str, FieldSpec]:
     return specs
 
 
-def _source(bag: BagReader, choice: Choice, name: str) -> dict[str, str]:
+def _source(bag: BagReader, choice: TopicChoice, name: str) -> dict[str, str]:
     """Return topics, types, files and what the bag says of itself."""
     source = {
         **bag.about, 'file': name, 'format': 'mcap', 'msg_config': choice.config.name,
@@ -331,7 +331,7 @@ def _limit(bag: BagReader, at: float | None) -> int | None:
     return bag.start_ns + round(min(at * 1e9, float(bag.end_ns - bag.start_ns + 1)))
 
 
-def _beside(volts: Column, other: Column | None) -> FloatArray:
+def _beside(volts: FieldColumn, other: FieldColumn | None) -> FloatArray:
     """Return another field of each message of the voltage; NaN where it holds none."""
     found = np.full(volts.n, np.nan)
     if other is not None:
@@ -347,7 +347,7 @@ def _beside(volts: Column, other: Column | None) -> FloatArray:
     return found
 
 
-def _paired(name: str, specs: dict[str, FieldSpec], columns: dict[str, Column],
+def _paired(name: str, specs: dict[str, FieldSpec], columns: dict[str, FieldColumn],
             beside: FloatArray | None, source: dict[str, str], notes: list[str]) -> RawColumns:
     """Place throttle and current beside each voltage; `beside`: the current of each message."""
     volts = columns.pop(VOLTAGE)
@@ -384,7 +384,7 @@ def _paired(name: str, specs: dict[str, FieldSpec], columns: dict[str, Column],
     return RawColumns(t, voltage, held[THROTTLE], held[CURRENT], name, source, tuple(notes))
 
 
-def _samples(spec: FieldSpec, column: Column) -> tuple[FloatArray, FloatArray, IntArray, int]:
+def _samples(spec: FieldSpec, column: FieldColumn) -> tuple[FloatArray, FloatArray, IntArray, int]:
     """Return stamps (s), values (NaN where a message holds none), samples a message, and gaps."""
     if spec.sample_rate is not None:
         clock = BlockClock(spec.sample_rate)

@@ -381,7 +381,7 @@ def gather(data: bytes, at: IntArray, kind: str) -> npt.NDArray[Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class Column:
+class FieldColumn:
     """A field of many messages."""
 
     # Log times, ns; shape (m,).
@@ -401,36 +401,36 @@ class Column:
         """Return the number of messages."""
         return int(self.stamp.size)
 
-    def take(self, order: IntArray) -> Column:
+    def take(self, order: IntArray) -> FieldColumn:
         """Return the messages of given indices, shape (k,), in their order."""
         if (self.count == 1).all():
             values = self.values[order]
         else:
             begins = np.cumsum(self.count) - self.count
             values = self.values[_spread(begins[order], self.count[order])]
-        return Column(self.log_time[order], self.stamp[order], self.stamped[order],
-                      self.count[order], values)
+        return FieldColumn(self.log_time[order], self.stamp[order], self.stamped[order],
+                           self.count[order], values)
 
-    def split(self, at: int) -> tuple[Column, Column]:
+    def split(self, at: int) -> tuple[FieldColumn, FieldColumn]:
         """Return the first `at` messages, and the rest."""
         cut = int(self.count[:at].sum())
-        return (Column(self.log_time[:at], self.stamp[:at], self.stamped[:at], self.count[:at],
-                       self.values[:cut]),
-                Column(self.log_time[at:], self.stamp[at:], self.stamped[at:], self.count[at:],
-                       self.values[cut:]))
+        return (FieldColumn(self.log_time[:at], self.stamp[:at], self.stamped[:at],
+                            self.count[:at], self.values[:cut]),
+                FieldColumn(self.log_time[at:], self.stamp[at:], self.stamped[at:],
+                            self.count[at:], self.values[cut:]))
 
-    def in_time_order(self) -> Column:
+    def in_time_order(self) -> FieldColumn:
         """Return the messages by log time; those of one time as they are."""
         if (self.log_time[1:] >= self.log_time[:-1]).all():
             return self
         return self.take(np.argsort(self.log_time, kind='stable'))
 
 
-def join(parts: Sequence[Column]) -> Column:
+def join(parts: Sequence[FieldColumn]) -> FieldColumn:
     """Return columns one after another; an empty one for none."""
     if len(parts) == 1:
         return parts[0]
-    return Column(
+    return FieldColumn(
         np.concatenate([np.empty(0, np.uint64), *(part.log_time for part in parts)]),
         np.concatenate([np.empty(0), *(part.stamp for part in parts)]),
         np.concatenate([np.empty(0, np.bool_), *(part.stamped for part in parts)]),
@@ -483,14 +483,14 @@ class FieldReader:
         # Length of the message -> layouts met.
         self._layouts: dict[int, list[Layout]] = {}
 
-    def read(self, table: Table) -> Column:
+    def read(self, table: Table) -> FieldColumn:
         """Return the field of the messages of a table, in its order."""
         # A damaged message may hold a signalling NaN, of which NumPy would warn.
         with np.errstate(invalid='ignore'):
             column = self._read(table)
         return replace(column, values=self._zero.apply(column.values))
 
-    def _read(self, table: Table) -> Column:
+    def _read(self, table: Table) -> FieldColumn:
         """Return the field with zeros as they are."""
         stamp = np.full(table.n, np.nan)
         count = np.ones(table.n, np.int64)
@@ -525,7 +525,7 @@ class FieldReader:
             stamp[~stamped] = seconds(table.log_time[~stamped])
         if not single and not broken and len(bulk) == 1:
             # All alike, and in order.
-            return Column(table.log_time, stamp, stamped, count, bulk[0][1].reshape(-1))
+            return FieldColumn(table.log_time, stamp, stamped, count, bulk[0][1].reshape(-1))
         begin = np.cumsum(count) - count
         values = np.empty(int(count.sum()))
         for picked, block in bulk:
@@ -533,10 +533,10 @@ class FieldReader:
         for k, block in single.items():
             values[begin[k]:begin[k] + block.size] = block
         if not broken:
-            return Column(table.log_time, stamp, stamped, count, values)
+            return FieldColumn(table.log_time, stamp, stamped, count, values)
         kept = np.ones(table.n, dtype=bool)
         kept[broken] = False
-        return Column(table.log_time[kept], stamp[kept], stamped[kept], count[kept], values)
+        return FieldColumn(table.log_time[kept], stamp[kept], stamped[kept], count[kept], values)
 
     def _in_bulk(
         self, table: Table, left: IntArray, length: int, stamp: FloatArray,

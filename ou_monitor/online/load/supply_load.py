@@ -58,40 +58,22 @@ class Basis(enum.Enum):
 
 @dataclass(frozen=True)
 class SupplyLoad:
-    """
-    What is known of the voltage under load.
+    """What is known of the voltage under load."""
 
-    Attributes
-    ----------
-    status : LoadStatus
-        Whether the sag is known, and why not.
-    level : float
-        Open-circuit voltage, V, or without throttle that under load; NaN without voltage.
-    rest : float
-        Last voltage with the load's answer taken out (sag-compensated), V; the level is its mean.
-    resistance : float
-        Resistance at once, Ohm; NaN without a current that moves the voltage.
-    resistance_se : float
-        Its standard error, Ohm.
-    time_constants : tuple of float
-        Time constants of the answer, s; fixed.
-    delay : float
-        How late throttle is heard behind the voltage that answers to it, s.
-    basis : Basis
-        From what the level follows; the sag too, where throttle does not give it.
-    flown : tuple of float
-        Throttles between which 80 % of the last two minutes were flown.
-
-    """
-
-    status: LoadStatus = LoadStatus.NO_DATA
+    status: LoadStatus = LoadStatus.NO_DATA  # Whether the sag is known, and why not.
+    # Open-circuit voltage, V, or without throttle that under load; NaN without voltage.
     level: float = NAN
+    # Last voltage with the load's answer taken out (sag-compensated), V; the level is its
+    # mean.
     rest: float = NAN
+    # Resistance at once, Ohm; NaN without a current that moves the voltage.
     resistance: float = NAN
-    resistance_se: float = NAN
-    time_constants: tuple[float, ...] = LAGS
-    delay: float = 0.0
+    resistance_se: float = NAN  # Its standard error, Ohm.
+    time_constants: tuple[float, ...] = LAGS  # Time constants of the answer, s; fixed.
+    delay: float = 0.0  # How late throttle is heard behind the voltage that answers to it, s.
+    # From what the level follows; the sag too, where throttle does not give it.
     basis: Basis = Basis.NONE
+    # Throttles between which 80 % of the last two minutes were flown.
     flown: tuple[float, float] = (0.0, 1.0)
     _sag: tuple[float, ...] = ()
     _sag_se: tuple[float, ...] = ()
@@ -158,38 +140,19 @@ class SupplyLoad:
 
 @dataclass(frozen=True, eq=False)
 class LoadState:
-    """
-    What the load filter knows now, to look ahead from.
+    """What the load filter knows now, to look ahead from."""
 
-    Attributes
-    ----------
-    t, throttle : float
-        Stamp, s, and throttle now.
-    mean, covariance : ndarray, shape (9,) and (9, 9)
-        Of level, V, discharge per load, and the coefficients, V, of x, u, u^3, x after three
-        lags, and inrush; the covariance with what the scores of the innovations say of it.
-    lags : tuple of float
-        x after the three lags.
-    size : float
-        Load at this level over that at 3.8 V a cell.
-    fall : float
-        Fall of the level, V per unit of charge.
-    log_variance : tuple of float
-        Coefficients of ln variance, V^2, of a sample: 1, ripple, sqrt|du|.
-    ripple_se : float
-        Standard error of the second of them.
-    flown : tuple of float
-        Throttles between which the noise is known.
-
-    """
-
+    # Stamp, s, and throttle now.
     t: float
     throttle: float
+    # Of level, V, discharge per load, and the coefficients, V, of x, u, u^3, x after three
+    # lags, and inrush; the covariance with what the scores of the innovations say of it.
     mean: FloatArray
     covariance: FloatArray
-    lags: tuple[float, ...]
-    size: float
-    fall: float
+    lags: tuple[float, ...]  # x after the three lags.
+    size: float  # Load at this level over that at 3.8 V a cell.
+    fall: float  # Fall of the level, V per unit of charge.
+    # Coefficients of ln variance, V^2, of a sample: 1, ripple, sqrt|du|.
     log_variance: tuple[float, float, float]
-    ripple_se: float
-    flown: tuple[float, float]
+    ripple_se: float  # Standard error of the second of them.
+    flown: tuple[float, float]  # Throttles between which the noise is known.

@@ -24,55 +24,28 @@ SOON = 1.0
 
 @dataclass(frozen=True, eq=False)
 class ThrottleBudget:
-    """
-    The highest throttle that keeps the risk under a limit.
+    """The highest throttle that keeps the risk under a limit."""
 
-    Attributes
-    ----------
-    throttle : float
-        The budget, 0..1; NaN when unknown; 0 when even idle, flown, is above the limit.
-    reason : str
-        What ends the budget, or why it is unknown, in words.
-    risks : ndarray, shape (51,)
-        Risk at throttles from 0 to 1; empty when nothing could be computed.
-    known : ndarray of bool, shape (51,)
-        Whether that throttle lies within those flown.
-
-    """
-
+    # The budget, 0..1; NaN when unknown; 0 when even idle, flown, is above the limit.
     throttle: float
-    reason: str
+    reason: str  # What ends the budget, or why it is unknown, in words.
+    # Risk at throttles from 0 to 1; empty when nothing could be computed.
     risks: FloatArray = field(default_factory=lambda: np.empty(0))
+    # Whether that throttle lies within those flown.
     known: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
 
 
 @dataclass(frozen=True)
 class Ahead:
-    """
-    Risk and budget of one instant.
+    """Risk and budget of one instant."""
 
-    Attributes
-    ----------
-    outcome : Outcome
-        Risk, its leg, and what makes most of it.
-    budget : float
-        Throttle budget, 0..1; NaN when not known.
-    budget_reason : str
-        What ends it, or why it is not known.
-    curve : tuple of float
-        Risk if throttle goes to each tenth and stays for the horizon; empty when not known.
-    soon : float
-        Risk within `SOON` with throttle as it is now; NaN when not known.
-    tight : bool
-        Whether the budget is below the throttle that was passed for a tenth of the last 30 s.
-
-    """
-
-    outcome: Outcome = Outcome()
-    budget: float = NAN
-    budget_reason: str = ''
+    outcome: Outcome = Outcome()  # Risk, its leg, and what makes most of it.
+    budget: float = NAN  # Throttle budget, 0..1; NaN when not known.
+    budget_reason: str = ''  # What ends it, or why it is not known.
+    # Risk if throttle goes to each tenth and stays for the horizon; empty when not known.
     curve: tuple[float, ...] = ()
-    soon: float = NAN
+    soon: float = NAN  # Risk within `SOON` with throttle as it is now; NaN when not known.
+    # Whether the budget is below the throttle that was passed for a tenth of the last 30 s.
     tight: bool = False
 
 

@@ -23,29 +23,18 @@ _START_NODES = 3
 
 @dataclass(frozen=True)
 class Supply:
-    """
-    What a risk is computed from: the OU at one throttle, and how well it is known.
+    """What a risk is computed from: the OU at one throttle, and how well it is known."""
 
-    Attributes
-    ----------
-    u0, u0_se : float
-        Level and its standard error, V.
-    ln_alpha, ln_alpha_se : float
-        Logarithm of the relaxation rate (1/s) and its standard error.
-    ln_sigma, ln_sigma_se : float
-        Logarithm of the intensity (V/sqrt(s)) and its standard error.
-    covariance : float
-        Of the errors of `ln_alpha` and `ln_sigma`.
-
-    """
-
+    # Level and its standard error, V.
     u0: float
     u0_se: float
+    # Logarithm of the relaxation rate (1/s) and its standard error.
     ln_alpha: float
     ln_alpha_se: float
+    # Logarithm of the intensity (V/sqrt(s)) and its standard error.
     ln_sigma: float
     ln_sigma_se: float
-    covariance: float = 0.0
+    covariance: float = 0.0  # Of the errors of `ln_alpha` and `ln_sigma`.
 
     @classmethod
     def of(cls, e: Estimate) -> Supply:

@@ -165,22 +165,11 @@ DOMINANT = ('noise', 'load now', 'throttle to come')
 
 @dataclass(frozen=True)
 class Outcome:
-    """
-    A risk and what it stands on.
+    """A risk and what it stands on."""
 
-    Attributes
-    ----------
-    risk : float
-        Probability, 0..1; NaN when not known.
-    basis : str
-        ``first_passage``, ``load``, ``excursions`` or ``none``.
-    cause : str
-        What makes most of it: noise, load now, or throttle to come; empty when not known.
-
-    """
-
-    risk: float = NAN
-    basis: str = 'none'
+    risk: float = NAN  # Probability, 0..1; NaN when not known.
+    basis: str = 'none'  # ``first_passage``, ``load``, ``excursions`` or ``none``.
+    # What makes most of it: noise, load now, or throttle to come; empty when not known.
     cause: str = ''
 
 

@@ -84,20 +84,11 @@ _LN_N, _MEAN, _DEVIATION = _largest_medians()
 
 @dataclass(frozen=True, eq=False)
 class Futures:
-    """
-    Throttle to come, in k ways.
+    """Throttle to come, in k ways."""
 
-    Attributes
-    ----------
-    peak, rest : ndarray, shape (k,)
-        Throttle at first, and after that, 0..1.
-    dwell : ndarray, shape (k,)
-        Time at the peak, s.
-
-    """
-
+    # Throttle at first, and after that, 0..1.
     peak: FloatArray
-    dwell: FloatArray
+    dwell: FloatArray  # Time at the peak, s.
     rest: FloatArray
 
     def after(self, first: Futures) -> Futures:
