@@ -268,7 +268,7 @@ def refused(capsys, *arguments: object) -> str:
 
 
 @pytest.mark.parametrize('arguments, words', [
-    (['LOGS/empty', '--output', 'OUT'], ['no recording in', 'time_s']),
+    (['LOGS/empty', '--output', 'OUT'], ['no recording in', 'columns of time and voltage']),
     (['LOGS/none', '--output', 'OUT'], ['there is no recording or folder', 'none']),
     (['', '--output', 'OUT'], ['the path is empty']),
     (['LOGS', '--output', 'LOGS/uav1/bad.mcap'], ['is a file: name a folder']),
