@@ -27,6 +27,44 @@ LARGEST_LOG_SE = math.log(LARGEST_FACTOR) / Z95
 _INFINITE = 709.0
 
 
+def as_numbers(values: npt.ArrayLike) -> FloatArray:
+    """Return values as float64, masked ones as NaN; dates and text are a ValueError."""
+    if type(values) is np.ndarray and values.dtype == np.float64:
+        return values
+    data = np.asarray(np.ma.getdata(values))
+    if data.dtype.kind not in 'biufO':
+        raise ValueError(f'numbers are needed, got an array of {data.dtype}')
+    try:
+        found = np.asarray(data, dtype=np.float64)
+    except TypeError as error:
+        raise ValueError(f'numbers are needed: {error}') from error
+    return np.where(np.ma.getmaskarray(values), NAN, found) if np.ma.isMaskedArray(values) \
+        else found
+
+
+def as_seconds(values: npt.ArrayLike) -> FloatArray:
+    """
+    Return stamps in s: numbers as they are, dates since 1970 (UTC), NaT and masked as NaN.
+
+    Spans, and times with a zone, as pandas and xarray have them, are understood too.
+    """
+    if type(values) is np.ndarray and values.dtype == np.float64:
+        return values
+    data = np.asarray(np.ma.getdata(values))
+    if data.dtype.kind == 'O' and data.size and hasattr(data.flat[0], 'timestamp'):
+        if data.flat[0].tzinfo is not None:
+            return np.array([one.timestamp() for one in data.flat]).reshape(data.shape)
+        data = data.astype('datetime64[us]')
+    if data.dtype.kind not in 'mM':
+        return as_numbers(values)
+    if np.datetime_data(data.dtype)[0] == 'generic':
+        raise ValueError('stamps without a unit: timedelta64 needs one, such as [ns]')
+    count = data.astype(f'{data.dtype.kind}8[ns]').astype(np.int64)
+    # Whole seconds apart from the rest: 1.7e18 ns are beyond float64.
+    seconds = count // 10**9 + (count % 10**9) * 1e-9
+    return np.where(np.isnat(data) | np.ma.getmaskarray(values), NAN, seconds)
+
+
 def exp_or_inf(log: float) -> float:
     """Return ``exp(log)``, infinite where it is too large for a float."""
     return math.inf if log > _INFINITE else math.exp(log)
@@ -339,7 +377,11 @@ class Recording:
     held: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse arrays that cannot be one recording."""
+        """Take dates and masked values for what they are; refuse what cannot be one recording."""
+        object.__setattr__(self, 't', as_seconds(self.t))
+        for name in ('voltage', 'throttle', 'current'):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, as_numbers(getattr(self, name)))
         if not (self.t.shape == self.voltage.shape == self.throttle.shape and self.t.ndim == 1):
             raise ValueError(
                 'a recording needs t, voltage and throttle of one shape (n,); got '

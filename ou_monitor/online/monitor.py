@@ -23,8 +23,10 @@ from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
 from ou_monitor.online.risk.forecast import Forecast
 from ou_monitor.online.settings import AUTO, MonitorSettings
 from ou_monitor.online.trust import Doubt, InputTrust, patience, Stamps
-from ou_monitor.records import Counters, Estimate, Flag, Level, NAN, Status
-from ou_monitor.timeline.line import MOST_CURRENT, plausible, plausible_samples, TimeLine
+from ou_monitor.records import (
+    as_numbers, as_seconds, Counters, Estimate, Flag, Level, NAN, Status)
+from ou_monitor.timeline.line import (
+    as_column, MOST_CURRENT, plausible, plausible_samples, TimeLine)
 
 if TYPE_CHECKING:
     from ou_monitor.model.supply import SupplyModel
@@ -140,11 +142,9 @@ class SupplyMonitor:
             When the shapes differ.
 
         """
-        stamps = np.atleast_1d(np.asarray(t, dtype=np.float64))
-        volts = np.atleast_1d(np.asarray(voltage, dtype=np.float64))
-        load = None if throttle is None else np.broadcast_to(
-            np.asarray(throttle, dtype=np.float64), volts.shape)
-        times = None if arrival is None else np.atleast_1d(np.asarray(arrival, dtype=np.float64))
+        stamps, volts = np.atleast_1d(as_seconds(t)), as_column(voltage)
+        load = None if throttle is None else np.broadcast_to(as_numbers(throttle), volts.shape)
+        times = None if arrival is None else np.atleast_1d(as_seconds(arrival))
         stamps, volts, load = plausible_samples(stamps, volts, load)
         self._trust.push(stamps, volts, load, times)
         self._flag.push(stamps, volts, times, self._trust.interval)
@@ -153,7 +153,7 @@ class SupplyMonitor:
         self._thinned += stamps.size - stamps[part].size
         load = None if load is None else load[part]
         drawn = None if current is None else plausible(np.broadcast_to(
-            np.asarray(current, dtype=np.float64), stamps.shape)[part], MOST_CURRENT)
+            as_numbers(current), stamps.shape)[part], MOST_CURRENT)
         came = math.inf if times is None or not times.size else float(times[-1])
         try:
             for batch in self._line.take(stamps[part], volts[part], load, drawn,

@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.records import Counters, FloatArray, NAN, Recording
+from ou_monitor.records import as_numbers, Counters, FloatArray, NAN, Recording
 from ou_monitor.text import counted
 
 # Gaps that may differ from the pattern: lost samples, a logger that was late.
@@ -620,4 +620,4 @@ def _late_words(steps: int, t: FloatArray) -> str:
 
 def as_column(values: npt.ArrayLike) -> FloatArray:
     """Return values as a float64 array of shape (n,); a scalar becomes one sample."""
-    return np.atleast_1d(np.asarray(values, dtype=np.float64))
+    return np.atleast_1d(as_numbers(values))

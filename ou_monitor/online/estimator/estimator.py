@@ -36,8 +36,8 @@ from ou_monitor.online.estimator.quality import (
 from ou_monitor.online.estimator.window import (
     FACTOR, FEWEST, LAGS, LOST, Resolution, Sums, T, Thinner, U, Y)
 from ou_monitor.records import (
-    Counters, Estimate, Flag, FloatArray, LARGEST_LOG_SE, MOST_READINGS, NAN, OU_WINDOWS, OuFacts,
-    Status)
+    as_numbers, as_seconds, Counters, Estimate, Flag, FloatArray, LARGEST_LOG_SE, MOST_READINGS,
+    NAN, OU_WINDOWS, OuFacts, Status)
 from ou_monitor.text import Z95
 from ou_monitor.timeline.line import as_column, BATCH, Batch, TAIL, TimeLine
 
@@ -164,7 +164,7 @@ class SlidingEstimator:
                     self._work_off()
                     self._line.put_one(stamps, volts, throttle)
                 return
-            stamps, volts = as_column(stamps), as_column(volts)
+            stamps, volts = np.atleast_1d(as_seconds(stamps)), as_column(volts)
         if len(stamps) != len(volts) or stamps.ndim != 1 or volts.ndim != 1:
             raise ValueError(
                 f't and voltage must have one shape (n,): got {stamps.shape} and {volts.shape}')
@@ -173,7 +173,7 @@ class SlidingEstimator:
                 throttle.shape == stamps.shape):
             load = throttle
         elif throttle is not None:
-            load = np.asarray(throttle, dtype=np.float64)
+            load = as_numbers(throttle)
             if load.ndim == 0:
                 load = float(load)
             elif load.shape != stamps.shape:
