@@ -24,9 +24,9 @@ from ou_monitor.stream.files import open_regular
 from ou_monitor.text import printable
 
 # Endings of logs of autopilots; what of these is one is told by its first bytes.
-_LOGS = ('', '.ulg', '.bin', '.log', '.bbl', '.bfl', '.db3')
+_LOGS = ('', '.ulg', '.bin', '.log', '.bbl', '.bfl', '.txt', '.db3')
 # Other files end so too: they are passed over without a word.
-_COMMON = ('', '.log')
+_COMMON = ('', '.log', '.txt')
 _BLOCK = 1 << 20
 # Folders within folders that are searched.
 _MOST_DEPTH = 50

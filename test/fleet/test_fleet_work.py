@@ -175,18 +175,21 @@ def test_logs_are_read_as_analyze_reads_them(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / 'test/recordings/importers'))
     from made_logs import crazyflie, hover
     events, records, _ = hover(3000, refresh=5)
-    log = tmp_path / 'log00'
+    log = tmp_path / 'LOG.TXT'
     log.write_bytes(b''.join(crazyflie(events, records)))
     cut = tmp_path / 'cut.bin'
     cut.write_bytes(b''.join(crazyflie(events, records))[:40])
-    (tmp_path / 'notes').write_text('these are notes')
+    (tmp_path / 'log00').write_bytes(log.read_bytes())
+    (tmp_path / 'notes.txt').write_text('these are notes')
     (tmp_path / 'other.bin').write_bytes(b'something else')
     found = find_recordings([str(tmp_path)])
-    assert [source.path.name for source in found.sources] == ['cut.bin', 'log00']
+    assert [source.path.name for source in found.sources] == [
+        'LOG.TXT', 'cut.bin', 'log00']
     assert len(found.notes) == 1 and 'other.bin' in found.notes[0]
     results = {source.path.name: work(str(source.path), Options().as_data())
                for source in found.sources}
-    assert results['log00']['samples'] == read_recording(log).n and results['cut.bin']['error']
+    assert results['LOG.TXT']['samples'] == results['log00']['samples'] == read_recording(log).n
+    assert results['cut.bin']['error']
 
 
 def test_copies_are_found_by_content_not_by_name(tmp_path):
