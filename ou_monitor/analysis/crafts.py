@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -128,14 +129,16 @@ def cells_of(recording: Recording, given: int = 0) -> tuple[int, str]:
 def stated_cells(source: Mapping[str, str]) -> tuple[int, str] | None:
     """Return the cells that the header of a log states."""
     text = source.get('cells', source.get('log_cells', ''))
-    return (int(text), 'log') if text.isascii() and text.isdigit() and int(text) else None
+    # A bag may hold any text there.
+    return (int(text), 'log') if re.fullmatch('[1-9][0-9]?', text) else None
 
 
 def stated_limit(source: Mapping[str, str]) -> tuple[int, float] | None:
     """Return the cells, and the lowest voltage of the pack, V, that the header of a log states."""
     cells = stated_cells(source)
-    text = source.get('cell_minimum', source.get('log_cell_minimum'))
-    return None if cells is None or text is None else (cells[0], cells[0] * float(text))
+    text = source.get('cell_minimum', source.get('log_cell_minimum', ''))
+    return (cells[0], cells[0] * float(text)) if cells and re.fullmatch(
+        r'[23]\.?[0-9]{0,6}', text) else None
 
 
 def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:

@@ -35,6 +35,8 @@ def test_who_says_the_cells():
     assert cells_of(flown(source=log)) == (6, 'log')
     assert cells_of(flown()) == (4, 'guessed')
     assert stated_limit(log) == (6, 21.0) and stated_limit({'log_cells': '4'}) is None
+    for cells, low in (('4', 'nan'), ('4', 'x'), ('4', '1e9'), ('x', '3.5'), ('9' * 9, '3.5')):
+        assert stated_limit({'log_cells': cells, 'log_cell_minimum': low}) is None
 
 
 def test_usual_high_and_low():
