@@ -130,7 +130,7 @@ def _of_log(path: Path, names: frozenset[str], columns: CsvColumns | None, fligh
     """Read the supply of a log, and the log with the series of these names."""
     named = columns or CsvColumns()
     if named != CsvColumns(voltage=named.voltage, throttle=named.throttle,
-                            current=named.current):
+                           current=named.current):
         raise InputError(f'{path} is a log: its time and units are known')
     wanted = (name for name in (named.voltage, named.throttle, named.current)
               if name is not None)
