@@ -94,8 +94,10 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     for k, level in enumerate(found):
         results.append(fit_level(recording, left, level, len(found)))
         report(0.5 * (k + 1) / len(found))
+    sliding = slide(recording, window, voltage, brownout_horizon,
+                    lambda share: report(0.5 + 0.5 * share))
     seen = overview(recording, None if math.isnan(voltage) else voltage, results, cells,
-                    left, brownout_horizon)
+                    left, sliding.monitor)
     judged = judge_levels(results, seen.load)
     throttles = [level.throttle for level in judged]
     estimates = [level.estimate for level in judged]
@@ -106,8 +108,6 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     wanders = any(level.wanders for level in judged)
     alpha = alpha_constancy(throttles, estimates,
                             [wanders or level.doubted for level in judged])
-    sliding = slide(recording, window, voltage, brownout_horizon,
-                    lambda share: report(0.5 + 0.5 * share))
     return Analysis(
         recording, judged, relaxations, tuple(judge_cause(r, alpha) for r in relaxations), alpha,
         by_throttle(seen, voltage, brownout_horizon), sliding,

@@ -14,6 +14,7 @@ import numpy as np
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.supply import facts_and_end, Remainder, SupplyFacts, THROTTLES
 from ou_monitor.online.load.supply_load import SupplyLoad
+from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.report import MonitorReport
 from ou_monitor.records import NAN, OuFacts, Recording
 from ou_monitor.text import number, volts, Z95
@@ -111,14 +112,14 @@ def _next_to(throttle: float) -> int:
 
 def overview(recording: Recording, limit: float | None = None,
              levels: Sequence[LevelResult] = (), cells: int = 0,
-             left: Remainder | None = None, horizon: float | None = None) -> Overview:
+             left: Remainder | None = None, monitor: SupplyMonitor | None = None) -> Overview:
     """
     Return what is known.
 
-    limit in V, of so many cells; levels: where lines were found; left: the recording's
-    `remainder`, found when left out; horizon of the risk in s.
+    limit in V, of so many cells; levels: where lines were found; left and monitor as of
+    `facts_and_end`.
     """
-    facts, load, end = facts_and_end(recording, limit, left, horizon)
+    facts, load, end = facts_and_end(recording, limit, left, monitor)
     known = recording.throttle[np.isfinite(recording.throttle)]
     return Overview(facts, recording.duration if recording.n else 0.0, load,
                     float(known.max()) if known.size else NAN, _strongest(levels), cells, end)

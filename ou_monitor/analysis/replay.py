@@ -15,16 +15,12 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.analysis.overview import Overview
-from ou_monitor.analysis.supply import THROTTLES
+from ou_monitor.analysis.supply import node_for, THROTTLES
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.report import MonitorReport
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
 from ou_monitor.text import Z95
-
-MAX_POINTS = 300
-# The node estimates at least so often, s; here, up to so many times in all.
-_STEP, _MOST = 0.5, 1200
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +40,8 @@ class Sliding:
         Probability of a brown-out within the horizon; NaN when unknown.
     brownout_voltage, brownout_horizon : float
         What the risk is of, V and s.
+    monitor : SupplyMonitor
+        As it is at the end of the recording.
 
     """
 
@@ -53,6 +51,7 @@ class Sliding:
     risk: FloatArray
     brownout_voltage: float
     brownout_horizon: float
+    monitor: SupplyMonitor
 
     def series(self, name: str) -> FloatArray:
         """Return one field of the estimates as an array."""
@@ -80,39 +79,20 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
     settings = MonitorSettings(window=window, brownout_horizon=brownout_horizon)
     if asked:
         settings = replace(settings, brownout_voltage=brownout_voltage)
-    monitor = SupplyMonitor(settings)
-    t, voltage, throttle = recording.t, recording.voltage, recording.throttle
-    known, drawn = recording.has_throttle, recording.current
-
-    def push(part: slice) -> None:
-        monitor.push(t[part], voltage[part], throttle[part] if known else None,
-                     current=None if drawn is None else drawn[part])
-
     reports: list[MonitorReport] = []
-    step = max(0.25 * window, recording.duration / MAX_POINTS)
-    # In between, reports are for what the monitor learns from its own estimates.
-    parts = max(1, min(math.ceil(step / _STEP), _MOST // MAX_POINTS))
-    first = float(t[0]) if t.size else 0.0
-    count = int(recording.duration / step) * parts
-    done = 0
-    for k in range(1, count + 1):
-        stop = int(np.searchsorted(t, first + k * step / parts, side='right'))
-        if stop == done:
-            continue
-        push(slice(done, stop))
-        done = stop
+    monitor, parts = node_for(recording, settings)
+    for now, shown in parts:
+        # In between, reports are for what the monitor learns from its own estimates.
         last = monitor.report(0.0)
         # Until the first window is full its estimates would only look poor.
-        filling = t[stop - 1] - first < min(window, 0.5 * recording.duration)
-        if filling or k % parts:
-            continue
-        reports.append(last)
-        if progress is not None:
-            progress(k / count)
+        if shown and now >= min(window, 0.5 * recording.duration):
+            reports.append(last)
+            if progress is not None:
+                progress(now / recording.duration)
     return Sliding(window, np.array([report.estimate.t for report in reports]),
                    tuple(report.estimate for report in reports),
                    np.array([report.risk if asked else NAN for report in reports]),
-                   brownout_voltage, brownout_horizon)
+                   brownout_voltage, brownout_horizon, monitor)
 
 
 @dataclass(frozen=True, eq=False)

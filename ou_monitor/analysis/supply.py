@@ -13,6 +13,8 @@ for 130 s at 200 Hz, and 4 s with a limit, for the budget.
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
 import math
 from typing import Any
@@ -26,6 +28,7 @@ from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.report import MonitorReport
+from ou_monitor.online.risk.forecast import LOOK
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
 from ou_monitor.timeline.line import readings_of
@@ -35,6 +38,11 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 THROTTLES = tuple(k / 10.0 for k in range(11))
 # Part, s, of a recording of which the noise is the residual of one regression.
 _PART = 60.0
+# Looks of the risk at a recording at most: 15 minutes of the node's.
+_LOOKS = 900.0 / LOOK
+# Points along a recording at which the node is shown; at least every so many s, and at most so
+# often in all, it reports in between.
+_POINTS, _STEP, _MOST = 300, 0.5, 1200
 # A current comes at most so much late or early, s.
 _LATE = 0.06
 # Throttle is steady while it spans at most this for so long, s.
@@ -173,13 +181,13 @@ def supply_facts(recording: Recording, limit: float | None = None) -> SupplyFact
 
 
 def facts_and_end(recording: Recording, limit: float | None = None, left: Remainder | None = None,
-                  horizon: float | None = None,
+                  monitor: SupplyMonitor | None = None,
                   ) -> tuple[SupplyFacts, SupplyLoad, MonitorReport | None]:
     """
     Return the facts, and load and report of the node at the end; without a limit no report.
 
-    limit in V; left: the recording's `remainder`, found when left out; horizon of the report's
-    risk in s: the node's default when left out.
+    limit in V; left: the recording's `remainder`, and monitor: `node_for` it that has taken the
+    recording; both found when left out.
     """
     if limit is not None and not math.isfinite(limit):
         raise ValueError(f'the limit must be finite, got {limit} V')
@@ -196,7 +204,7 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
             OuFacts('no_data'), None), SupplyLoad(), None
     k = int(np.argmin(v))
     noise = noise_of(recording, left)
-    load, budget, last = _at_the_end(recording, limit, horizon)
+    load, budget, last = _at_the_end(recording, limit, monitor)
     return SupplyFacts(
         Lowest(float(v[k]), float(t[k] - t[0]), float(u[k])),
         None if limit is None else _dips(t, v, u, limit, noise),
@@ -210,23 +218,54 @@ def _tuple(values: FloatArray) -> tuple[float, ...]:
     return tuple(float(x) for x in values)
 
 
-def _at_the_end(recording: Recording, limit: float | None, horizon: float | None,
+def node_for(recording: Recording, settings: MonitorSettings,
+             ) -> tuple[SupplyMonitor, Iterator[tuple[float, bool]]]:
+    """
+    Return a monitor, and an iterator that feeds it with a recording part by part.
+
+    After each part it says how far it is, s, and whether this is one of `_POINTS`.
+    """
+    monitor = SupplyMonitor(settings, look=max(LOOK, recording.duration / _LOOKS))
+    t, drawn = recording.t, recording.current
+    window = SLIDING if isinstance(settings.window, str) else settings.window
+    step = max(0.25 * window, recording.duration / _POINTS)
+    each = max(1, min(math.ceil(step / _STEP), _MOST // _POINTS))
+    ends = np.searchsorted(t, t[:1] + step / each * np.arange(
+        1, int(recording.duration / step) * each + 1), 'right').tolist()
+
+    def feed() -> Iterator[tuple[float, bool]]:
+        done = 0
+        for k, stop in enumerate([*ends, t.size], 1):
+            if stop > done:
+                part, done = slice(done, stop), stop
+                monitor.push(t[part], recording.voltage[part],
+                             recording.throttle[part] if recording.has_throttle else None,
+                             current=None if drawn is None else drawn[part])
+                yield float(t[stop - 1] - t[0]), k <= len(ends) and not k % each
+
+    return monitor, feed()
+
+
+def _at_the_end(recording: Recording, limit: float | None, monitor: SupplyMonitor | None,
                 ) -> tuple[SupplyLoad, Budget | None, MonitorReport | None]:
     """Return what the node knows at the end."""
-    throttle = recording.throttle if recording.has_throttle else None
+    if monitor is None:
+        if limit is None:
+            load = LoadFilter()
+            load.push(recording.t, recording.voltage,
+                      recording.throttle if recording.has_throttle else None, recording.current)
+            return load.load(), None, None
+        # The fit of `window: auto` is none of the budget's.
+        monitor, parts = node_for(
+            recording, MonitorSettings(window=SLIDING, brownout_voltage=limit))
+        deque(parts, 0)
     if limit is None:
-        load = LoadFilter()
-        load.push(recording.t, recording.voltage, throttle, recording.current)
-        return load.load(), None, None
-    # The fit of `window: auto` is none of the budget's.
-    settings = MonitorSettings(window=SLIDING, brownout_voltage=limit)
-    monitor = SupplyMonitor(settings)
-    monitor.push(recording.t, recording.voltage, throttle, current=recording.current)
+        return monitor.load_filter.load(), None, None
+    asked, usual = monitor.settings, MonitorSettings()
+    monitor.configure(replace(usual, window=asked.window, brownout_voltage=limit))
+    budget = Budget(monitor.report(0.0).budget, limit, usual.brownout_horizon, usual.budget_limit)
+    monitor.configure(asked)
     last = monitor.report(0.0)
-    budget = Budget(last.budget, limit, settings.brownout_horizon, settings.budget_limit)
-    if horizon is not None and horizon != settings.brownout_horizon:
-        monitor.configure(replace(settings, brownout_horizon=horizon))
-        last = monitor.report(0.0)
     return last.load, budget, last
 
 

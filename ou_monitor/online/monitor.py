@@ -20,7 +20,7 @@ from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.report import MonitorReport
 from ou_monitor.online.risk.budget import Ahead, look_ahead
 from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
-from ou_monitor.online.risk.forecast import Forecast
+from ou_monitor.online.risk.forecast import Forecast, LOOK
 from ou_monitor.online.settings import AUTO, MonitorSettings
 from ou_monitor.online.trust import Doubt, InputTrust, patience, Stamps
 from ou_monitor.records import (
@@ -49,13 +49,16 @@ class SupplyMonitor:
     background : bool
         Whether with window ``auto`` the fits of alpha, sigma and Var_inf are made in a thread,
         so that reports never wait.
+    look : float
+        Time between two looks of the risk at what became of its forecasts, s.
 
     """
 
     def __init__(self, settings: MonitorSettings | None = None,
-                 model: SupplyModel | None = None, *, background: bool = False) -> None:
+                 model: SupplyModel | None = None, *, background: bool = False,
+                 look: float = LOOK) -> None:
         self._settings = settings or MonitorSettings()
-        self._background = background
+        self._background, self._look = background, look
         self._model = model
         self._flag = BrownoutFlag(self._settings)
         self._trust = InputTrust()
@@ -79,7 +82,7 @@ class SupplyMonitor:
         self._load_filter, self._load = LoadFilter(), SupplyLoad()
         self._load_filter.begin_with(None if self._model is None else self._model.load)
         self._newest = Estimate()
-        self._forecast = Forecast(self._load_filter)
+        self._forecast = Forecast(self._load_filter, self._look)
         # Risk and budget of the last report.
         self._ahead = Ahead()
 

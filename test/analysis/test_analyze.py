@@ -6,8 +6,10 @@ import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.process_type import ProcessType
 from ou_monitor.analysis.replay import slide
+from ou_monitor.analysis.supply import supply_facts
 from ou_monitor.model.ou import simulate
 from ou_monitor.online.estimator.estimator import SlidingEstimator
+from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.records import Recording, Status
 import pytest
 from scipy.signal import lfilter
@@ -210,6 +212,17 @@ def test_sliding_is_what_the_node_would_say():
     assert sliding.series('sigma')[-1] == pytest.approx(node.estimate().sigma, rel=1e-4)
     assert np.all(np.diff(sliding.t) > 0.0) and sliding.t[0] >= 1.9
     assert np.isnan(sliding.risk).all()
+
+
+def test_the_node_takes_each_reading_once(monkeypatch):
+    """Its reports along the recording and the facts at the end are of one run."""
+    taken, push = [], SupplyMonitor.push
+    monkeypatch.setattr(SupplyMonitor, 'push', lambda self, t, *rest, **more: (
+        taken.append(np.size(t)), push(self, t, *rest, **more))[1])
+    simulated = recording(12, TRUTH, seconds=4.0)
+    found = analyze(simulated, brownout_voltage=4.0)
+    assert sum(taken) == simulated.n
+    assert found.overview.facts.to_dict() == supply_facts(simulated, 4.0).to_dict()
 
 
 def test_sliding_risk_grows_with_the_threshold():

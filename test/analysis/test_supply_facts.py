@@ -5,7 +5,9 @@ import json
 
 import numpy as np
 from ou_monitor import read_recording, Recording, supply_facts
+from ou_monitor.analysis.supply import node_for
 from ou_monitor.online.load.load_filter import LoadFilter
+from ou_monitor.online.settings import MonitorSettings
 from project import ROOT
 import pytest
 
@@ -101,3 +103,16 @@ def test_recordings_that_ship(name, status):
     """What is known of them; of the flight the relaxation at hover is 63 1/s by its truth."""
     found = supply_facts(read_recording(ROOT / 'bags' / name)).ou
     assert found.status == status
+
+
+def test_a_long_recording_is_looked_at_no_more_often_than_15_minutes(monkeypatch):
+    """Once every 0.8 s of an hour, as every 0.2 s of a flight."""
+    looks, load = [], LoadFilter.load
+    monkeypatch.setattr(LoadFilter, 'load', lambda self: (looks.append(1), load(self))[1])
+    t = np.arange(500) / 50.0
+    for seconds, wanted in ((600.0, 50), (3600.0, 12.5)):
+        ends = np.array([0.0, seconds])
+        looks.clear()
+        monitor, _ = node_for(Recording(ends, ends, ends), MonitorSettings())
+        monitor.push(t, 12.0 - t / 1e3, t / 10.0)
+        assert abs(len(looks) - wanted) <= 1.5

@@ -29,7 +29,7 @@ _WALK = 0.003
 # Least time to empty a pack at the largest current, s; the level stands where nothing discharges.
 _EMPTY = 100.0
 # Change of each coefficient: 2 % of a fall of 12 % in 100 s.
-_CHANGE = (0.02 * 0.12) ** 2 / 100.0
+_DRIFT = (0.02 * 0.12) ** 2 / 100.0 * np.eye(_SHARES.size)
 # Known: relative error of the resistance below this; its least one, as the filter's own does not
 # count how a pack warms.
 _KNOWN, LEAST_ERROR = 0.33, 0.1
@@ -121,7 +121,7 @@ class CurrentFilter:
         P[0] -= P[1] * used
         P[:, 0] -= P[:, 1] * used
         P[0, 0] += (_WALK * cells) ** 2 * dt
-        P[range(2, _STATES), range(2, _STATES)] += _CHANGE * self._volts ** 2 * dt
+        P[2:, 2:] += _DRIFT * (self._volts ** 2 * dt)
         h = self._regressors()
         noise = self.noise
         # The noise follows the current as it follows throttle: most at the largest.
@@ -142,7 +142,7 @@ class CurrentFilter:
         noise.learn(e, s, u, du, block.n, block.within)
         noise.follow(z)
         m += g * (e / total)
-        P -= np.outer(g, g) / total
+        P -= g[:, None] * (g / total)
 
     @property
     def resistance(self) -> tuple[float, float]:

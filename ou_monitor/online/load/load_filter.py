@@ -64,6 +64,7 @@ _LOWEST, _PER_VOLT = 3.4, 100.0
 _SLOPE_AT = np.interp(_LOWEST + np.arange(91) / _PER_VOLT, LEVELS, SLOPES).tolist()
 _MEAN, _COV, _SIZE = usual_coefficients()
 _STATES = 2 + _MEAN.size
+_DRIFT = _CHANGE * np.eye(_MEAN.size) * _SIZE ** 2
 
 
 class FastLevel:
@@ -224,12 +225,13 @@ class LoadFilter:
             if self._opening or math.isfinite(u) is not math.isfinite(self._throttle):
                 self._open(block.voltage, u)
             else:
+                du = abs(u - self._throttle)
+                legs = [(block.t, u)]
                 if u != self._throttle and self._last > self._t:
                     # The last throttle held to the end of its block.
-                    self._predict(self._last)
-                du = abs(u - self._throttle)
+                    legs.insert(0, (self._last, self._throttle))
                 self._throttle = u
-                self._predict(block.t)
+                self._predict(legs)
                 self._correct(block, du)
         if self._current is not None:
             self._current.take(block, self._cells, fresh=fresh)
@@ -341,15 +343,20 @@ class LoadFilter:
         place = int((level / self._cells - _LOWEST) * _PER_VOLT + 0.5)
         return self._cells * float(_SLOPE_AT[min(len(_SLOPE_AT) - 1, max(0, place))])
 
-    def _predict(self, t: float) -> None:
-        dt, u = t - self._t, self._throttle
-        self._t = t
-        m, P = self._m, self._P
-        if math.isnan(u):
+    def _predict(self, legs: list[tuple[float, float]]) -> None:
+        """Go on to the last of some stamps, s, each with the throttle until then."""
+        m, P, used = self._m, self._P, 0.0
+        dt = legs[-1][0] - self._t
+        if math.isnan(self._throttle):
+            self._t = legs[-1][0]
             P[0, 0] += (_WALK * self._cells) ** 2 * dt
             return
-        x = self._advance(dt, u)
-        used = x * dt * self._fall(float(m[0]))
+        self._flown *= 1.0 - min(dt / _FLOWN_MEMORY, 1.0)
+        for t, u in legs:
+            used += self._advance(t - self._t, u) * (t - self._t)
+            self._flown[0, int(u * _BINS + 0.5)] += t - self._t
+            self._t = t
+        used *= self._fall(float(m[0]))
         m[0] -= used * m[1]
         self._fast.fall(used * float(m[1]))
         P[0] -= P[1] * used
@@ -358,10 +365,8 @@ class LoadFilter:
         self._resize(dt)
         P[0, 0] += (_WALK * self._cells) ** 2 * dt + (
             0.02 * self._volts) ** 2 * max(0.0, dt - 2.0) / 60.0
-        P[2:, 2:] += (_WARMING * dt) * np.outer(m[2:], m[2:])
-        P[range(2, _STATES), range(2, _STATES)] += _CHANGE * dt * (_SIZE * self._volts) ** 2
-        self._flown *= 1.0 - min(dt / _FLOWN_MEMORY, 1.0)
-        self._flown[0, int(u * _BINS + 0.5)] += dt
+        a = m[2:]
+        P[2:, 2:] += dt * (_WARMING * a[:, None] * a + self._volts ** 2 * _DRIFT)
 
     def _correct(self, block: Block, du: float) -> None:
         """Take a block, V, whose throttle differs by du from the last one's."""
@@ -401,7 +406,7 @@ class LoadFilter:
         self._fast.take(block.t, block.voltage - float(h[2:] @ m[2:]), total, float(m[0]),
                         _FAST_WALK * self._cells)
         m += g * (e / total)
-        P -= np.outer(g, g) / total
+        P -= g[:, None] * (g / total)
         self._rest = block.voltage - float(h[2:] @ m[2:])
 
     def _deviations(self) -> tuple[float, ...]:

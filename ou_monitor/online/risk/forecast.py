@@ -236,13 +236,13 @@ class Forecast:
     """
     Risk with throttle to come, and what a throttle would do.
 
-    `take` feeds the load filter, `follow` tells the newest estimate.
+    `take` feeds the load filter, `follow` tells the newest estimate; look: time between looks, s.
     """
 
-    def __init__(self, loads: LoadFilter) -> None:
+    def __init__(self, loads: LoadFilter, look: float = LOOK) -> None:
         # A third of a second, once: not while samples are coming.
         prepare()
-        self._loads = loads
+        self._loads, self._look_time = loads, look
         self.follow(Estimate(), 0.0)
         self._rungs = tuple(_Rung(horizon) for horizon in RUNGS)
         self.new_time_line()
@@ -281,7 +281,7 @@ class Forecast:
             self._loads.push(t[part], v[part], u[part], drawn[part])
             self._take(t[part], v[part], np.clip(u[part], 0.0, 1.0))
             if self._newest >= self._next and came >= self._rested:
-                self._next = self._newest + LOOK
+                self._next = self._newest + self._look_time
                 self._rested = came + _REST if math.isfinite(came) else -math.inf
                 self._look()
             begin = end
@@ -351,7 +351,8 @@ class Forecast:
                     rung.learn(look, *became, self._sampling)
             if self._newest < rung.next:
                 continue
-            rung.next = self._newest + max(LOOK, _LOOK_SHARE * rung.horizon) - 0.5 * BLOCK
+            rung.next = self._newest + max(
+                self._look_time, _LOOK_SHARE * rung.horizon) - 0.5 * BLOCK
             mean, deviation, done = self._flight(rung.horizon)
             if math.isnan(deviation) or math.isnan(self.voltage):
                 continue
