@@ -7,16 +7,15 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor.analysis.cause import Cause, judge_cause
 from ou_monitor.analysis.level_comparison import alpha_constancy, AlphaTest
 from ou_monitor.analysis.level_result import fit_level, judge_levels, LevelResult
 from ou_monitor.analysis.levels import find_levels, LoadLevel
 from ou_monitor.analysis.overview import Overview, overview
 from ou_monitor.analysis.quality import (
     coupling_items, line_item, quality_list, QualityItem, second_items)
-from ou_monitor.analysis.relaxation import fit_relaxation, Relaxation
+from ou_monitor.analysis.relaxation import (
+    find_steps, fit_relaxation, judge_cause, Relaxation, ReleaseCause)
 from ou_monitor.analysis.replay import by_throttle, ByThrottle, slide, Sliding
-from ou_monitor.analysis.steps import find_steps
 from ou_monitor.analysis.supply import remainder
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import NAN, Recording
@@ -63,7 +62,7 @@ class Analysis:
     recording: Recording
     levels: tuple[LevelResult, ...]
     relaxations: tuple[Relaxation, ...]
-    causes: tuple[Cause, ...]
+    causes: tuple[ReleaseCause, ...]
     alpha_test: AlphaTest
     by_throttle: ByThrottle
     sliding: Sliding

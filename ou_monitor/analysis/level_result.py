@@ -6,30 +6,302 @@ what they leave in the segments of the level, without its spectral lines, is fit
 that all commands share (`ou_monitor.model.ou_fit`).
 
 Limits: a relaxation slower than half of a segment, or than 2.5 s, is the level's.
+
+Kind of process: the words are those of the paper's Table 1; the paper names the kinds by eye,
+here each has tests (`ou_monitor.criticism.level_tests`), adjusted so
+that a recording of stationary OU levels has any of them reject once in a
+hundred times.  The first that applies names the level:
+
+1. mean or intensity changes from block to block: 'quasi-stationary' (the
+   verdict also names what the level is apart from that);
+2. single innovations far out, or heavy tails: 'with impulses';
+3. another shape than the normal law: 'not Gaussian';
+4. too few samples to detect heavy tails: 'undetermined';
+5. neighbours uncorrelated, or more white noise than relaxation, or relaxation
+   faster than the sampling: 'Gaussian';
+6. lines carry most of the variance, or one relaxation does not leave
+   independent innovations, or a second one is detected: 'stationary stochastic'; if it does:
+   'diffusion';
+   without a usable fit 'undetermined'.
+
+Limits of the words: one stands for what was found, and the tests that did not reject
+have a power that depends on the length; impulses and an intensity that
+wanders within a block look alike.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+import enum
 import math
 
 import numpy as np
-from ou_monitor.analysis.levels import LoadLevel, Segment
-from ou_monitor.analysis.process_type import classify, ProcessType, Verdict
-from ou_monitor.analysis.spectrum import level_spectrum, Spectrum
+from ou_monitor.analysis.levels import LoadLevel, Stay
 from ou_monitor.analysis.supply import Remainder
-from ou_monitor.criticism.curves import bin_width
+from ou_monitor.criticism.curves import bin_width, even_on_log
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations
-from ou_monitor.criticism.level_tests import examine_level, holm, Shape
+from ou_monitor.criticism.level_tests import examine_level, holm, Shape, TestResult
 from ou_monitor.model.ou_fit import fit_pieces
-from ou_monitor.model.spectral_lines import find_lines, Grid, LineSearch, on_grid, without_lines
+from ou_monitor.model.spectral_lines import (
+    EvenGrid, find_lines, LineSearch, on_grid, without_lines)
 from ou_monitor.online.estimator.quality import examine, input_flags
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.records import (
     Counters, Estimate, Flag, FloatArray, NAN, OuFacts, Recording, Status)
-from ou_monitor.text import Z95
+from ou_monitor.text import p_words, Z95
 from ou_monitor.timeline.line import TAIL
+from scipy import stats
+from scipy.signal import welch
+
+
+# A level is called Gaussian only when the tests would have detected this excess kurtosis.
+VISIBLE_KURTOSIS = 1.0
+_POWER = 0.9
+# More of the variance than this in spectral lines is most of it.
+_LINE_SHARE = 0.5
+
+
+class ProcessType(enum.Enum):
+    """Kind of process; the value is the word for the table."""
+
+    CONSTANT = 'constant'
+    QUASI_STATIONARY = 'quasi-stationary'
+    IMPULSES = 'with impulses'
+    NOT_GAUSSIAN = 'not Gaussian'
+    GAUSSIAN = 'Gaussian'
+    STATIONARY = 'stationary stochastic'
+    DIFFUSION = 'diffusion'
+    UNDETERMINED = 'undetermined'
+
+
+def detectable_kurtosis(n: int) -> float:
+    """Return the excess kurtosis that n innovations reveal with 90 % probability."""
+    if n < 1:
+        return math.inf
+    # Half of the level goes to the largest innovation.
+    reach = float(stats.norm.isf(0.5 * FAMILY_WISE) + stats.norm.ppf(_POWER))
+    return reach * math.sqrt(24.0 / n)
+
+
+@dataclass(frozen=True)
+class KindVerdict:
+    """
+    What a level is called, and why.
+
+    Attributes
+    ----------
+    kind : ProcessType
+        Kind.
+    why : str
+        The reason without numbers, so that levels of one reason can stand together.
+    figures : str
+        The numbers behind it; may be empty.
+    within : ProcessType
+        For 'quasi-stationary' what the level is called apart from its changes; else `kind`.
+
+    """
+
+    kind: ProcessType
+    why: str
+    figures: str = ''
+    within: ProcessType = ProcessType.UNDETERMINED
+
+    @property
+    def sentence(self) -> str:
+        """Reason and numbers, one sentence."""
+        why = self.why.rstrip('.')
+        figures = f' ({self.figures})' if self.figures else ''
+        return f'{why[0].upper()}{why[1:]}{figures}.'
+
+
+def classify(estimate: Estimate, shape: Shape, line_share: float = 0.0) -> KindVerdict:
+    """Name the kind of process and the reason."""
+    if estimate.status is Status.CONSTANT:
+        return _plain(ProcessType.CONSTANT, 'the voltage never changes')
+    if all(math.isnan(test.p_value) for test in shape.tests):
+        return _plain(ProcessType.UNDETERMINED, estimate.status.value)
+    drift, intensity = shape['mean_drift'], shape['variance_drift']
+    rest = _apart_from_changes(estimate, shape, line_share)
+    if not (drift.rejects or intensity.rejects):
+        return rest
+    moves, figures = [], []
+    if drift.rejects:
+        moves.append('the mean moves')
+        figures.append(f'the mean by {drift.effect:.2g} standard deviations, {_p(drift)}')
+    if intensity.rejects:
+        moves.append('the intensity changes')
+        figures.append(f'the intensity by {100.0 * intensity.effect:.0f} %, {_p(intensity)}')
+    return KindVerdict(
+        ProcessType.QUASI_STATIONARY,
+        f'from block to block {" and ".join(moves)}; apart from that {rest.kind.value}',
+        '; '.join(figures), rest.kind)
+
+
+def _apart_from_changes(estimate: Estimate, shape: Shape, line_share: float) -> KindVerdict:
+    """Return the kind of a level as if nothing moved from block to block."""
+    tails, normal = shape['impulses'], shape['gaussian']
+    if tails.rejects:
+        return _plain(ProcessType.IMPULSES, 'single innovations lie beyond the range of '
+                      'the noise, or the tails are heavy',
+                      f'{shape.impulses} of {shape.n}, excess kurtosis {shape.kurtosis:.2g}, '
+                      f'{_p(tails)}')
+    if normal.rejects:
+        return _plain(ProcessType.NOT_GAUSSIAN, 'the innovations do not follow the normal '
+                      'law', f'skewness {shape.skewness:.2g}, excess kurtosis '
+                      f'{shape.kurtosis:.2g}, {_p(normal)}')
+    if tails.why_not:
+        return _plain(ProcessType.UNDETERMINED, tails.why_not)
+    visible = detectable_kurtosis(shape.n)
+    if visible > VISIBLE_KURTOSIS:
+        return _plain(ProcessType.UNDETERMINED, 'no test rejects, but so few samples cannot '
+                      'reveal heavy tails',
+                      f'{shape.n} samples, excess kurtosis up to {visible:.2g}')
+    return _gaussian(estimate, shape, line_share, f'no excess kurtosis above {visible:.2g}')
+
+
+def _gaussian(estimate: Estimate, shape: Shape, line_share: float, normal: str) -> KindVerdict:
+    """Return the kind of a level whose shape no test rejects as Gaussian."""
+    correlated = shape['correlated']
+    if not correlated.rejects:
+        return _plain(ProcessType.GAUSSIAN, 'neighbouring samples are uncorrelated', normal)
+    if line_share > _LINE_SHARE:
+        return _plain(ProcessType.STATIONARY, 'spectral lines carry most of the variance',
+                      f'{100.0 * line_share:.0f} %; {normal}')
+    if estimate.status is Status.NO_RELAXATION:
+        return _plain(ProcessType.STATIONARY, 'neighbouring samples are correlated, but not as '
+                      'a relaxation would correlate them', f'{_p(correlated)}; {normal}')
+    if not estimate.usable:
+        return _plain(ProcessType.UNDETERMINED, estimate.status.value)
+    step = estimate.alpha / estimate.rate
+    if step > 1.0:
+        return _plain(ProcessType.GAUSSIAN, 'relaxation is faster than the sampling',
+                      f'alpha dt = {step:.2g}; {normal}')
+    noise = estimate.noise_std ** 2
+    if noise > estimate.var_inf:
+        return _plain(ProcessType.GAUSSIAN, 'white noise carries most of the variance',
+                      f'{100.0 * (noise / (noise + estimate.var_inf)):.0f} %; {normal}')
+    rest = shape['one_relaxation']
+    if rest.rejects:
+        return _plain(ProcessType.STATIONARY, 'one relaxation leaves correlated innovations',
+                      f'{_p(rest)}; {normal}')
+    second = shape['second_relaxation']
+    if second.rejects:
+        return _plain(ProcessType.STATIONARY, 'the innovations show a second relaxation, '
+                      'slower or faster than the fitted one: alpha is that of neither',
+                      f'{_share(second.effect)}, {_p(second)}; {normal}')
+    beside = f'; beside lines of {100.0 * line_share:.2g} % of the variance' if line_share else ''
+    return _plain(ProcessType.DIFFUSION, 'one relaxation, slower than the sampling, leaves '
+                  'independent Gaussian innovations', f'alpha dt = {step:.2g}; {normal}{beside}')
+
+
+def _share(share: float) -> str:
+    """Return a share of Var_inf to first order, which beyond the whole says no more than that."""
+    return 'as large as Var_inf' if share > 1.0 else f'some {100.0 * share:.0f} % of Var_inf'
+
+
+def _plain(kind: ProcessType, why: str, figures: str = '') -> KindVerdict:
+    return KindVerdict(kind, why, figures, kind)
+
+
+def _p(test: TestResult) -> str:
+    return p_words(test.p_adjusted)
+
+
+_MIN_LENGTH = 32
+# About this many averages: the estimate scatters by 1/sqrt(8), and there is
+# still a decade below the corner in a segment of 25 relaxation times.
+_AVERAGES = 8
+# Enough to show a tone as a line of its own.
+_PER_DECADE = 40
+
+
+def _empty() -> FloatArray:
+    return np.zeros(0)
+
+
+@dataclass(frozen=True, eq=False)
+class LevelSpectrum:
+    """
+    One-sided power spectral density of a level.
+
+    Attributes
+    ----------
+    frequency : ndarray, shape (k,)
+        Hz, > 0, even on a log axis.
+    density : ndarray, shape (k,)
+        Measured, V^2/Hz.
+    fitted : ndarray, shape (k,)
+        Of the fitted OU in white noise, sampled as the data are, V^2/Hz; NaN without a fit.
+
+    """
+
+    frequency: FloatArray = field(default_factory=_empty)
+    density: FloatArray = field(default_factory=_empty)
+    fitted: FloatArray = field(default_factory=_empty)
+
+
+def level_spectrum(recording: Recording, segments: Sequence[Stay],
+                   estimate: Estimate) -> LevelSpectrum:
+    """
+    Return the PSD of a level (Welch, Hann), averaged over its segments.
+
+    Limits: the samples are taken as evenly spaced at their mean rate; where
+    they are not, frequencies near the Nyquist frequency are smeared.
+    """
+    longest = max((s.stop - s.start for s in segments), default=0)
+    rate = segment_rate(recording, segments)
+    if longest < _MIN_LENGTH or not rate > 0.0:
+        return LevelSpectrum()
+    length = longest
+    while length > _MIN_LENGTH and _pieces(segments, length) < _AVERAGES:
+        length = max(_MIN_LENGTH, length * 4 // 5)
+    frequency, summed, weight = np.zeros(0), np.zeros(length // 2 + 1), 0
+    for s in segments:
+        n = s.stop - s.start
+        if n >= length:
+            frequency, density = welch(recording.voltage[s.start:s.stop], fs=rate,
+                                       nperseg=length, detrend='constant')
+            summed, weight = summed + n * density, weight + n
+    # The first bin above zero is what removing the mean has left; the last,
+    # at the Nyquist frequency, is not doubled as the others are.
+    frequency, density = even_on_log(frequency[2:-1], summed[2:-1] / weight, _PER_DECADE)
+    fitted = np.full(frequency.size, math.nan)
+    if estimate.usable:
+        fitted = ou_spectrum(frequency, estimate.alpha, estimate.sigma, rate, estimate.noise_std)
+    return LevelSpectrum(frequency, density, fitted)
+
+
+def segment_rate(recording: Recording, segments: Sequence[Stay]) -> float:
+    """Return the mean rate of the samples within segments, Hz; 0 when there is no time."""
+    steps = sum(s.stop - s.start - 1 for s in segments)
+    time = float(sum(recording.t[s.stop - 1] - recording.t[s.start] for s in segments))
+    return steps / time if time > 0.0 else 0.0
+
+
+def _pieces(segments: Sequence[Stay], length: int) -> int:
+    """Return how many half-overlapping pieces of that length the segments hold."""
+    return sum(max(0, 2 * (s.stop - s.start) // length - 1) for s in segments)
+
+
+def ou_spectrum(frequency: FloatArray, alpha: float, sigma: float, rate: float,
+                noise_std: float = 0.0) -> FloatArray:
+    """
+    Return the one-sided PSD of a *sampled* OU in white noise.
+
+    The Lorentzian 2 sigma^2 / (alpha^2 + (2 pi f)^2) with its aliases folded
+    in, which is the spectrum of an AR(1) of coefficient exp(-alpha/rate).
+
+    frequency in Hz, rate in Hz, noise_std in V.
+    """
+    phi = math.exp(-alpha / rate)
+    var_inf = sigma * sigma / (2.0 * alpha)
+    omega = 2.0 * math.pi * frequency / rate
+    ar1 = var_inf * (1.0 - phi * phi) / (1.0 - 2.0 * phi * np.cos(omega) + phi * phi)
+    white = noise_std * noise_std if math.isfinite(noise_std) else 0.0
+    density: FloatArray = 2.0 / rate * (ar1 + white)
+    return density
+
 
 # Fewer samples than this have no spectrum, tests or lines.
 _MIN_SEGMENT = 16
@@ -68,7 +340,7 @@ def mean_variance(time: float, n: int, estimate: Estimate, rms: float) -> float:
     return of_ou + noise * noise / max(n, 1)
 
 
-def fit_parts(recording: Recording, left: Remainder, segments: Sequence[Segment],
+def fit_parts(recording: Recording, left: Remainder, segments: Sequence[Stay],
               throttle: float = NAN) -> tuple[OuFacts, Estimate]:
     """Fit segments of a recording, and return the fit as facts and as the node's record."""
     n = sum(s.stop - s.start for s in segments)
@@ -112,7 +384,7 @@ class LevelResult:
     ----------
     throttle : float
         Throttle, 0..1; NaN for a level that holds the whole recording.
-    segments : tuple of Segment
+    segments : tuple of Stay
         Segments of samples that were used.
     time : float
         Time in them, s.
@@ -131,11 +403,11 @@ class LevelResult:
         The same, as the node gives it.
     shape : Shape
         Tests of the kind of process, adjusted over all levels.
-    verdict : Verdict
+    verdict : KindVerdict
         Kind of process, and why.
     sag : LevelSag
         How far the mean lies below that of the lowest throttle.
-    spectrum : Spectrum
+    spectrum : LevelSpectrum
         PSD, measured and fitted.
     lines : LineSearch
         Spectral lines, and what would have been found.
@@ -145,7 +417,7 @@ class LevelResult:
     """
 
     throttle: float
-    segments: tuple[Segment, ...]
+    segments: tuple[Stay, ...]
     time: float
     n: int
     mean: float
@@ -156,9 +428,9 @@ class LevelResult:
     ou: OuFacts
     estimate: Estimate
     shape: Shape
-    verdict: Verdict = Verdict(ProcessType.UNDETERMINED, 'not judged')
+    verdict: KindVerdict = KindVerdict(ProcessType.UNDETERMINED, 'not judged')
     sag: LevelSag = LevelSag()
-    spectrum: Spectrum = field(default_factory=Spectrum)
+    spectrum: LevelSpectrum = field(default_factory=LevelSpectrum)
     lines: LineSearch = field(default_factory=LineSearch)
     with_lines: Estimate | None = None
 
@@ -243,14 +515,14 @@ def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: i
         lines=lines, with_lines=with_lines)
 
 
-def _known(segment: Segment, voltage: FloatArray) -> list[Segment]:
+def _known(segment: Stay, voltage: FloatArray) -> list[Stay]:
     """Return the parts of a segment without gaps, for which the remainder is known."""
     known = np.isfinite(voltage[segment.start:segment.stop])
     turns = np.flatnonzero(np.diff(known, prepend=False, append=False)) + segment.start
-    return [Segment(a, b) for a, b in zip(turns[::2].tolist(), turns[1::2].tolist()) if b - a > 1]
+    return [Stay(a, b) for a, b in zip(turns[::2].tolist(), turns[1::2].tolist()) if b - a > 1]
 
 
-def _parts(recording: Recording, segments: Sequence[Segment]
+def _parts(recording: Recording, segments: Sequence[Stay]
            ) -> list[tuple[FloatArray, FloatArray]]:
     """Return stamps and voltages of segments."""
     return [(recording.t[s.start:s.stop], recording.voltage[s.start:s.stop]) for s in segments]
@@ -263,14 +535,14 @@ def _white(t: FloatArray, voltage: FloatArray, estimate: Estimate) -> FloatArray
                                   noise * noise)).values
 
 
-def _grid_rate(grids: Sequence[Grid]) -> float:
+def _grid_rate(grids: Sequence[EvenGrid]) -> float:
     """Return the rate of the clock of segments, Hz; 0 when there is no time."""
     steps = sum(grid.values.size - 1 for grid in grids)
     time = sum((grid.values.size - 1) / grid.rate for grid in grids)
     return steps / time if time > 0.0 else 0.0
 
 
-def _without_lines(recording: Recording, segments: Sequence[Segment], rate: float,
+def _without_lines(recording: Recording, segments: Sequence[Stay], rate: float,
                    lines: LineSearch) -> Recording:
     """Return the recording without the spectral lines of a level, in its segments."""
     voltage = recording.voltage.copy()

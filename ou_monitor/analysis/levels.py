@@ -54,7 +54,7 @@ _VALLEY = 0.7
 
 
 @dataclass(frozen=True)
-class Segment:
+class Stay:
     """A segment of samples: indices ``start <= k < stop`` of the recording."""
 
     start: int
@@ -70,7 +70,7 @@ class LoadLevel:
     ----------
     throttle : float
         Throttle of the level, 0..1; NaN for a level that holds everything.
-    segments : tuple of Segment
+    segments : tuple of Stay
         Segments at this throttle, settling left out.
     settling : float
         Time left out after changes of throttle, s.
@@ -78,7 +78,7 @@ class LoadLevel:
     """
 
     throttle: float
-    segments: tuple[Segment, ...]
+    segments: tuple[Stay, ...]
     settling: float = 0.0
 
 
@@ -90,7 +90,7 @@ def find_levels(t: FloatArray, throttle: FloatArray,
     width = half_width(t, throttle)
     if given is not None:
         return _split(t, throttle, _checked(given), width, True)
-    whole = (LoadLevel(NAN, tuple(_cut(Segment(0, t.size), _gaps(t)))),)
+    whole = (LoadLevel(NAN, tuple(_cut(Stay(0, t.size), _gaps(t)))),)
     centres = _modes(t, throttle, width)
     while centres:
         found = _split(t, throttle, centres, width, False)
@@ -143,7 +143,7 @@ def _split(t: FloatArray, throttle: FloatArray, centres: list[float], width: flo
            named: bool) -> tuple[LoadLevel, ...]:
     """Give each level its segments, without passages through a level that nobody named."""
     broken = _gaps(t)
-    runs: list[list[Segment]] = [[] for _ in centres]
+    runs: list[list[Stay]] = [[] for _ in centres]
     for run, k in stays(throttle, centres, width):
         runs[k] += _cut(run, broken)
     found = []
@@ -221,7 +221,7 @@ def _apart(density: FloatArray, peak: int, other: int, reach: int) -> bool:
 
 
 def stays(throttle: FloatArray, centres: Sequence[float], width: float
-          ) -> list[tuple[Segment, int]]:
+          ) -> list[tuple[Stay, int]]:
     """Return the stays of throttle at levels."""
     if not centres:
         return []
@@ -238,19 +238,19 @@ def stays(throttle: FloatArray, centres: Sequence[float], width: float
     at = np.where((away <= inner).any(axis=1), away.argmin(axis=1), -1).tolist()
     near = (away <= outer).tolist()
     starts = np.flatnonzero(np.diff(zone, prepend=-1))
-    found: list[tuple[Segment, int]] = []
+    found: list[tuple[Stay, int]] = []
     here, begin, last = -1, 0, 0
     for start, stop, where in zip(starts.tolist(), [*starts[1:].tolist(), throttle.size],
                                   zone[starts].tolist()):
         if here >= 0 and not near[where][here]:
-            found.append((Segment(begin, last), here))
+            found.append((Stay(begin, last), here))
             here = -1
         if here < 0 and at[where] >= 0:
             here, begin = at[where], start
         if here >= 0 and at[where] == here:
             last = stop
     if here >= 0:
-        found.append((Segment(begin, last), here))
+        found.append((Stay(begin, last), here))
     return found
 
 
@@ -265,14 +265,14 @@ def _inner(centres: Sequence[float], width: float) -> FloatArray:
     return np.minimum(width, 0.5 * _nearest(centres)) + 1e-9
 
 
-def _cut(run: Segment, broken: BoolArray) -> list[Segment]:
+def _cut(run: Stay, broken: BoolArray) -> list[Stay]:
     """Return the pieces of a segment between pauses."""
     cuts = run.start + 1 + np.flatnonzero(broken[run.start + 1:run.stop])
     ends = [run.start, *cuts.tolist(), run.stop]
-    return [Segment(a, b) for a, b in zip(ends, ends[1:])]
+    return [Stay(a, b) for a, b in zip(ends, ends[1:])]
 
 
-def _passage(t: FloatArray, throttle: FloatArray, run: Segment, width: float) -> bool:
+def _passage(t: FloatArray, throttle: FloatArray, run: Stay, width: float) -> bool:
     """Tell whether throttle only passes through, from one side to the other."""
     if t[run.stop - 1] - t[run.start] >= _PASSAGE:
         return False
@@ -282,8 +282,8 @@ def _passage(t: FloatArray, throttle: FloatArray, run: Segment, width: float) ->
     return moved > max(_CROSSED * width, _STEADY * float(np.ptp(inside)))
 
 
-def _settle(t: FloatArray, runs: Sequence[Segment], away: BoolArray,
-            broken: BoolArray) -> tuple[tuple[Segment, ...], float]:
+def _settle(t: FloatArray, runs: Sequence[Stay], away: BoolArray,
+            broken: BoolArray) -> tuple[tuple[Stay, ...], float]:
     """Leave out the time after throttle came from far away; jitter is not a step."""
     kept, lost = [], 0.0
     for run in runs:
@@ -296,5 +296,5 @@ def _settle(t: FloatArray, runs: Sequence[Segment], away: BoolArray,
         start = min(max(start, run.start), run.stop)
         lost += float(t[min(start, run.stop - 1)] - t[run.start])
         if start < run.stop - 1:
-            kept.append(Segment(start, run.stop))
+            kept.append(Stay(start, run.stop))
     return tuple(kept), lost

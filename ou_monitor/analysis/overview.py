@@ -28,7 +28,7 @@ _LOUD = 0.25
 
 
 @dataclass(frozen=True)
-class Line:
+class LoudestLine:
     """
     The strongest spectral line of all load levels.
 
@@ -68,7 +68,7 @@ class Overview:
         The load at the end, of which the facts hold eleven points.
     highest : float
         Highest throttle; NaN without throttle.
-    line : Line or None
+    line : LoudestLine or None
         Strongest spectral line; None when there is none.
     cells : int
         Cells in series that the limit is of; 0 when it is of the whole.
@@ -81,7 +81,7 @@ class Overview:
     duration: float
     load: SupplyLoad
     highest: float
-    line: Line | None = None
+    line: LoudestLine | None = None
     cells: int = 0
     end: MonitorReport | None = None
 
@@ -125,14 +125,14 @@ def overview(recording: Recording, limit: float | None = None,
                     float(known.max()) if known.size else NAN, _strongest(levels), cells, end)
 
 
-def _strongest(levels: Sequence[LevelResult]) -> Line | None:
+def _strongest(levels: Sequence[LevelResult]) -> LoudestLine | None:
     found = [(line, level) for level in levels for line in level.lines.lines]
     if not found:
         return None
     line, level = max(found, key=lambda pair: pair[0].rms)
     lines = level.lines.lines
-    return Line(line.frequency, line.rms, line.share, level.label, len(lines),
-                min(1.0, sum(each.share for each in lines)))
+    return LoudestLine(line.frequency, line.rms, line.share, level.label, len(lines),
+                       min(1.0, sum(each.share for each in lines)))
 
 
 def headline(found: Overview) -> str:

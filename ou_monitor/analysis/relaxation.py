@@ -13,9 +13,17 @@ Whether one exponential is enough is tested with two more, four times as fast an
 change with amplitudes of its own.  Where it is not, the first third of tau is left out, if that
 makes it fit: late motors, or a rail much faster than the instrument, are over by then.
 
-Limits: one exponential; alpha, sigma and noise of the level count as known; motors that follow
-their command late bend the first milliseconds; after slow ramps little is left to relax, which
-widens the interval and does no harm.
+What relaxes is the rail as its noise shows it, or the instrument.  An AC-coupled input is a
+high-pass: whatever the rail does, a step comes out of it as a decay to the level before, at its
+own corner, and the noise shows the same corner.  So a supply that comes back to the level that it
+had under the other load says nothing about the rail.  One that settles at another level excludes
+the high-pass, for a high-pass keeps no level.
+
+Limits: throttle is a command; motors follow it some 5 to 20 ms later, which a relaxation watched
+from the end of the step does not know, and which bends the first milliseconds.  One exponential;
+alpha, sigma and noise of the level count as known; after slow ramps little is left to relax, which
+widens the interval and does no harm.  A regulator that compensates a change of load looks like a
+high-pass; the stay before has to last some time constants, or its level is not known.
 """
 
 from __future__ import annotations
@@ -25,11 +33,156 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from ou_monitor.analysis.level_comparison import AlphaTest, LEVEL
 from ou_monitor.analysis.level_result import mean_variance
-from ou_monitor.analysis.steps import Step, Window
-from ou_monitor.records import determined, Estimate, FloatArray, NAN, Recording
-from ou_monitor.text import p_words, Z95
+from ou_monitor.analysis.levels import HALF_WIDTH, half_width, stays
+from ou_monitor.criticism.innovations import ou_filter
+from ou_monitor.records import determined, Estimate, FloatArray, log_interval, NAN, Recording
+from ou_monitor.text import number, p_words, volts, Z95
 from scipy import stats
+
+
+# Longest way from one level to the other, s: after a slower one nothing is left to relax.
+LONGEST_RAMP = 1.0
+# Shorter stays at a level are passages through it, s.
+SHORTEST_STAY = 0.1
+# Throttle has arrived, and stays, within this share of the change.
+_STILL = 0.1
+# What is watched after a change: so many relaxation times of the noise, and seconds, at least.
+_WATCHED, _WATCHED_S = 20.0, 0.5
+_MOST = 2000
+# Time constants of the exponentials that are tried beside the one that is fitted, in tau.
+_BESIDE = (0.25, 4.0)
+
+
+@dataclass(frozen=True)
+class LevelChange:
+    """
+    A change of load level.
+
+    Attributes
+    ----------
+    before, after : int
+        Numbers of the levels.
+    leave : int
+        Index of the first sample that is no longer at the level before.
+    enter : int
+        Index of the sample from which throttle stands still at the level after.
+    begin, stop : int
+        First sample of the stay before; one past the last that throttle stands still after.
+
+    """
+
+    before: int
+    after: int
+    leave: int
+    enter: int
+    begin: int
+    stop: int
+
+
+def find_steps(recording: Recording, throttles: Sequence[float]) -> tuple[LevelChange, ...]:
+    """Find the changes between load levels (throttles 0..1)."""
+    t, throttle = recording.t, recording.throttle
+    if not np.isfinite(throttles).all():
+        return ()
+    width = half_width(t, throttle)
+    runs = [(run.start, run.stop, k) for run, k in stays(throttle, throttles, width)
+            if t[run.stop - 1] - t[run.start] >= SHORTEST_STAY]
+    found = []
+    for (begin, leave, before), (start, stop, after) in zip(runs, runs[1:]):
+        change = abs(throttles[after] - throttles[before])
+        if before == after or change < 2.0 * HALF_WIDTH or start < leave:
+            continue
+        if t[start] - t[leave - 1] > LONGEST_RAMP:
+            continue
+        stay = throttle[start:stop]
+        # Where the stick jitters as wide as that, what is still is as wide as the jitter.
+        wide = width if width > HALF_WIDTH else 0.0
+        still = np.abs(stay - np.median(stay)) <= max(_STILL * change, wide)
+        enter = start + int(still.argmax())
+        moved = np.flatnonzero(~still[enter - start:])
+        end = enter + int(moved[0]) if moved.size else stop
+        if t[end - 1] - t[enter] >= SHORTEST_STAY:
+            found.append(LevelChange(before, after, leave, enter, begin, end))
+    return tuple(found)
+
+
+class Window:
+    """The samples after one change, whitened."""
+
+    def __init__(self, recording: Recording, step: LevelChange, estimate: Estimate, rms: float,
+                 before: float, later: float = 0.0) -> None:
+        """Take the samples (rms in V, before in V^2, later in s)."""
+        t = recording.t
+        alpha = estimate.alpha if estimate.usable else math.inf
+        reach = max(_WATCHED / alpha, _WATCHED_S) if math.isfinite(alpha) else 2.0 * _WATCHED_S
+        stop = min(step.stop, int(np.searchsorted(t, t[step.enter] + later + reach)))
+        start = min(stop, int(np.searchsorted(t, t[step.enter] + later)))
+        stride = max(1, -(-(stop - start) // _MOST))
+        self.since = t[start:stop:stride] - t[step.enter]
+        self.voltage = recording.voltage[start:stop:stride]
+        self.n = self.since.size
+        noise = estimate.noise_std if estimate.noise_std > 0.0 else 0.0
+        if not math.isfinite(alpha):
+            self.var_inf, self.noise_var = 0.0, rms * rms
+            self.filter = None
+            self.sd = np.full(self.n, rms)
+        else:
+            self.var_inf, self.noise_var = estimate.var_inf, noise * noise
+            louder = np.exp(-2.0 * alpha * self.since) * max(0.0, before - self.var_inf)
+            first = self.var_inf + float(louder[0])
+            self.filter = ou_filter(self.since, alpha, self.var_inf, self.noise_var, first)
+            self.sd = np.sqrt(self.var_inf + self.noise_var + louder)
+        e = self.whitened(np.column_stack([self.voltage, np.ones(self.n)]))
+        self._one = e[:, 1]
+        self._y = e[:, 0] - _project(self._one, e[:, 0])
+        self.rss_flat = float(self._y @ self._y)
+
+    def whitened(self, columns: FloatArray) -> FloatArray:
+        """Return columns as standardised innovations."""
+        if self.filter is None:
+            return columns / math.sqrt(self.noise_var)
+        e = self.filter.innovations(columns)
+        return np.asarray(e / np.sqrt(self.filter.variance)[:, None])
+
+    def rss(self, taus: FloatArray) -> FloatArray:
+        """Return the residual sum of squares for each tau, level and amplitude fitted."""
+        basis = self.whitened(np.exp(-self.since[:, None] / taus[None, :]))
+        basis -= np.outer(self._one, self._one @ basis) / float(self._one @ self._one)
+        size = np.maximum((basis ** 2).sum(axis=0), 1e-300)
+        found: FloatArray = self.rss_flat - (self._y @ basis) ** 2 / size
+        return found
+
+    def more(self, tau: float) -> tuple[float, int]:
+        """Return by how much exponentials beside tau lower the sum of squares, and how many."""
+        times = tau * np.array((1.0, *_BESIDE))
+        basis = self.whitened(np.exp(-self.since[:, None] / times[None, :]))
+        basis -= np.outer(self._one, self._one @ basis) / float(self._one @ self._one)
+        basis /= np.maximum(np.sqrt((basis ** 2).sum(axis=0)), 1e-300)
+        found, _, rank, _ = np.linalg.lstsq(basis, self._y, rcond=1e-6)
+        rest = self._y - basis @ found
+        alone = self._y - basis[:, 0] * float(basis[:, 0] @ self._y)
+        return max(0.0, float(alone @ alone - rest @ rest)), int(rank) - 1
+
+    def solve(self, tau: float, scale: float) -> tuple[float, float, float, float]:
+        """Return U0 and A with their standard errors; of U0 alone without a tau."""
+        x = self.whitened(np.column_stack([self.voltage, np.ones(self.n)]))
+        if not tau < self.since[-1]:
+            size = float(x[:, 1] @ x[:, 1])
+            return float(x[:, 1] @ x[:, 0]) / size, math.sqrt(scale / size), NAN, NAN
+        decay = np.exp(-self.since / tau)
+        x = np.column_stack([x, self.whitened(decay[:, None])])
+        found = np.linalg.lstsq(x[:, 1:], x[:, 0], rcond=None)[0]
+        bend = self.whitened((found[1] * decay * self.since / tau)[:, None])
+        jacobian = np.column_stack([x[:, 1:], bend])
+        errors = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian) * scale))
+        return float(found[0]), float(errors[0]), float(found[1]), float(errors[1])
+
+
+def _project(direction: FloatArray, y: FloatArray) -> FloatArray:
+    return np.asarray(direction * float(direction @ y) / float(direction @ direction))
+
 
 _FEWEST = 12
 _COARSE, _FINE = 41, 61
@@ -179,7 +332,7 @@ class Relaxation:
             self.likelihood_gain > _limit(len(self.releases)))
 
 
-def fit_relaxation(recording: Recording, kind: str, steps: Sequence[Step],
+def fit_relaxation(recording: Recording, kind: str, steps: Sequence[LevelChange],
                    throttles: Sequence[float], estimates: Sequence[Estimate],
                    rms: Sequence[float]) -> Relaxation:
     """Fit one tau to several changes of load (throttles 0..1, rms in V)."""
@@ -213,8 +366,8 @@ def fit_relaxation(recording: Recording, kind: str, steps: Sequence[Step],
                       scale, drop, misfit_p, left_out)
 
 
-def _watched(recording: Recording, steps: Sequence[Step], estimates: Sequence[Estimate],
-             rms: Sequence[float], later: float) -> tuple[list[Step], list[Window]]:
+def _watched(recording: Recording, steps: Sequence[LevelChange], estimates: Sequence[Estimate],
+             rms: Sequence[float], later: float) -> tuple[list[LevelChange], list[Window]]:
     """Return the changes with enough to watch from `later` s after throttle arrived."""
     used, windows = [], []
     for step in steps:
@@ -228,7 +381,7 @@ def _watched(recording: Recording, steps: Sequence[Step], estimates: Sequence[Es
     return used, windows
 
 
-def _later(recording: Recording, steps: Sequence[Step], estimates: Sequence[Estimate],
+def _later(recording: Recording, steps: Sequence[LevelChange], estimates: Sequence[Estimate],
            rms: Sequence[float], later: float
            ) -> tuple[list[Window], tuple[float, float, float, float, float], float]:
     """Return windows that begin later, what `_profile` finds in them, and how well it fits."""
@@ -316,7 +469,7 @@ def _crossing(x: FloatArray, fall: FloatArray) -> float:
     return float(x[k - 1] + share * (x[k] - x[k - 1]))
 
 
-def _level_before(recording: Recording, step: Step, estimate: Estimate, rms: float
+def _level_before(recording: Recording, step: LevelChange, estimate: Estimate, rms: float
                   ) -> tuple[float, float]:
     """Return the mean voltage at the end of the stay before, and its standard error."""
     t = recording.t
@@ -328,3 +481,137 @@ def _level_before(recording: Recording, step: Step, estimate: Estimate, rms: flo
         return NAN, NAN
     mean = float(recording.voltage[begin:step.leave].mean())
     return mean, math.sqrt(mean_variance(last - first, n, estimate, rms))
+
+
+# A level that is off by more than this share of the transient has settled elsewhere; by less
+# than the other, it has come back.
+_ELSEWHERE, _BACK = 0.5, 0.25
+_SURE = 4.0
+# tau and 1/alpha nearer than this factor, with 95 %, are called the same.
+_CLOSE = 1.5
+
+
+@dataclass(frozen=True)
+class ReleaseCause:
+    """
+    How tau compares with the noise, and whether the instrument explains it.
+
+    Attributes
+    ----------
+    noise : str
+        ``agrees`` (tau alpha within a factor of 1.5 of 1 with 95 %), ``differs`` or
+        ``undetermined``.
+    ratio, ratio_low, ratio_high : float
+        tau alpha, with alpha that of the noise, common to all levels, and its 95 % interval; that
+        is NaN where one exponential does not describe the transient.
+    p_value : float
+        Of a ratio so far from 1.
+    instrument : str
+        ``excluded``, ``possible`` or ``undetermined``.
+    corner : float
+        Of the high-pass that would explain it, 1/(2 pi tau), Hz.
+    step, step_se : float
+        Level after less level before in the direction of the transient, mean of the changes
+        that have an amplitude, V; NaN when none has.
+    sentence : str
+        Both verdicts in words.
+
+    """
+
+    noise: str
+    ratio: float
+    ratio_low: float
+    ratio_high: float
+    p_value: float
+    instrument: str
+    corner: float
+    step: float
+    step_se: float
+    sentence: str
+
+
+def judge_cause(relaxation: Relaxation, alpha: AlphaTest) -> ReleaseCause:
+    """Compare a relaxation with the noise and with an AC-coupled instrument."""
+    if not relaxation.detected:
+        return ReleaseCause('undetermined', NAN, NAN, NAN, NAN, 'undetermined', NAN, NAN, NAN,
+                            _nothing(relaxation))
+    noise, ratio, low, high, p = _against_noise(relaxation, alpha)
+    instrument, step, step_se = _against_instrument(relaxation)
+    corner = 1.0 / (2.0 * math.pi * relaxation.tau)
+    of_noise = {
+        'agrees': 'tau agrees with 1/alpha of the noise',
+        'differs': f'tau is not 1/alpha of the noise ({p_words(p)})',
+        'undetermined': 'the data neither separate tau from 1/alpha of the noise nor show '
+                        'them equal'}[noise]
+    if math.isfinite(low):
+        of_noise += f' (tau alpha = {ratio:.2f}, 95 % {low:.2f} to {high:.2f})'
+    of_instrument = {
+        'excluded': f'the level changes with the load by {volts(step)} and stays, so '
+                    'this is not the high-pass of an AC-coupled instrument',
+        'possible': 'the voltage returns to the level before although the load has changed: a '
+                    f'high-pass of {corner:.2g} Hz (AC coupling) would do the same to the '
+                    'transient and to the noise, a regulator to the transient; this recording '
+                    'cannot separate them',
+        'undetermined': 'the level before is not known well enough to decide whether a high-pass '
+                        f'of the instrument ({corner:.2g} Hz) explains it'}[instrument]
+    return ReleaseCause(noise, ratio, low, high, p, instrument, corner, step, step_se,
+                        f'{of_noise[0].upper()}{of_noise[1:]}; {of_instrument}.')
+
+
+def _nothing(relaxation: Relaxation) -> str:
+    what = 'falls' if relaxation.kind == 'release' else 'rises'
+    if not relaxation.releases:
+        return f'Throttle never {what} from one load level to another and stays there.'
+    if relaxation.moves_on:
+        return (f'After throttle {what}, the voltage keeps moving for the whole time observed '
+                'and settles at no level that could be fitted.')
+    if relaxation.bounded:
+        return (f'After throttle {what}, the voltage settles in tau < '
+                f'{number(1e3 * relaxation.tau_high)} ms (95 %); how much less is not determined.')
+    return f'No relaxation is detected after throttle {what}.'
+
+
+def _against_noise(relaxation: Relaxation, alpha: AlphaTest
+                   ) -> tuple[str, float, float, float, float]:
+    se = math.hypot(relaxation.log_se, alpha.alpha_se)
+    if not (math.isfinite(se) and se > 0.0 and alpha.alpha > 0.0):
+        return 'undetermined', NAN, NAN, NAN, NAN
+    log = math.log(relaxation.tau * alpha.alpha)
+    p = 2.0 * float(stats.norm.sf(abs(log) / se))
+    reach = abs(log) + Z95 * se
+    if relaxation.badly_fitted:
+        # The p-value and the interval rest on an error of tau that does not hold.
+        return 'undetermined', math.exp(log), NAN, NAN, NAN
+    word = 'differs' if p < LEVEL else 'agrees' if reach < math.log(_CLOSE) else 'undetermined'
+    ratio = math.exp(log)
+    low, high = log_interval(ratio, se)
+    if not determined(ratio, low, high):
+        ratio = low = high = NAN
+    return word, ratio, low, high, p
+
+
+def _against_instrument(relaxation: Relaxation) -> tuple[str, float, float]:
+    """Return the verdict and the mean step of the level that stays, with its error."""
+    steps, errors, sizes = [], [], []
+    for change in relaxation.releases:
+        if math.isfinite(change.level_before_se) and _tells(change):
+            # The transient starts on the side of the level before.
+            steps.append(-math.copysign(1.0, change.amplitude)
+                         * (change.level - change.level_before))
+            errors.append(math.hypot(change.level_se, change.level_before_se))
+            sizes.append(abs(change.amplitude))
+    if not steps:
+        return 'undetermined', NAN, NAN
+    weight = 1.0 / np.square(errors)
+    step = float(weight @ steps / weight.sum())
+    se, size = float(1.0 / math.sqrt(weight.sum())), float(weight @ sizes / weight.sum())
+    if abs(step) > _SURE * se and abs(step) > _ELSEWHERE * size:
+        return 'excluded', step, se
+    if abs(step) + Z95 * se < _BACK * size:
+        return 'possible', step, se
+    return 'undetermined', step, se
+
+
+def _tells(change: Release) -> bool:
+    """Whether a change has an amplitude to compare its level with."""
+    return abs(change.amplitude) > _SURE * change.amplitude_se

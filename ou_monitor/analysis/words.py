@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.analysis.analyze import Analysis
-from ou_monitor.analysis.cause import Cause
 from ou_monitor.analysis.crafts import craft_of
 from ou_monitor.analysis.level_comparison import LEVEL, sigma_change
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.overview import answers, headline as answer, known_lines, Overview
 from ou_monitor.analysis.quality import QualityItem, Severity
-from ou_monitor.analysis.relaxation import Relaxation
+from ou_monitor.analysis.relaxation import Relaxation, ReleaseCause
 from ou_monitor.analysis.replay import ByThrottle
 from ou_monitor.criticism.innovations import FAMILY_WISE
 from ou_monitor.criticism.level_tests import EFFECT, LEAST
@@ -255,7 +254,7 @@ def _level(level: LevelResult) -> dict[str, Any]:
     }
 
 
-def _relaxation(fit: Relaxation, cause: Cause) -> dict[str, Any]:
+def _relaxation(fit: Relaxation, cause: ReleaseCause) -> dict[str, Any]:
     return {
         'kind': fit.kind,
         'tau': fit.tau, 'tau_ci95': [fit.tau_low, fit.tau_high],

@@ -20,8 +20,7 @@ from ou_monitor.criticism.samples import (
     choose_samples, events_between, lines_between, Samples, without_tones)
 from ou_monitor.criticism.stamps import judge_stamps
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.clock_jitter import ClockJitter
-from ou_monitor.model.terms.reading import HeldSamples, Quantization, Saturation
+from ou_monitor.model.terms.reading import ClockJitter, HeldSamples, Quantization, Saturation
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted

@@ -91,7 +91,7 @@ class LineSearch:
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class EvenGrid:
     """Samples on an even clock, those that are missing put in on straight lines."""
 
     values: FloatArray  # Samples
@@ -99,7 +99,7 @@ class Grid:
     rate: float  # Samples per second, Hz
 
 
-def on_grid(t: FloatArray, values: FloatArray) -> Grid:
+def on_grid(t: FloatArray, values: FloatArray) -> EvenGrid:
     """Return samples on the even clock that their stamps follow, steps rounded (t in s)."""
     step = np.diff(t)
     usual = float(np.median(step)) if step.size else math.inf
@@ -110,8 +110,8 @@ def on_grid(t: FloatArray, values: FloatArray) -> Grid:
     where = np.append(0.0, np.cumsum(number)).astype(np.intp)
     rate = float(where[-1] / (t[-1] - t[0])) if step.size else NAN
     if where[-1] == step.size:
-        return Grid(values, where, rate)
-    return Grid(np.interp(np.arange(where[-1] + 1.0), where, values), where, rate)
+        return EvenGrid(values, where, rate)
+    return EvenGrid(np.interp(np.arange(where[-1] + 1.0), where, values), where, rate)
 
 
 def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float = FALSE_ALARM,

@@ -41,7 +41,7 @@ from ou_monitor.online.notch.notch import AdaptiveNotch
 from ou_monitor.online.notch.settings import notch_options, NOTCH_PARAMETERS, NotchSettings
 from ou_monitor.online.settings import (
     FILTER_PARAMETERS, filter_settings, FilterSettings, Parameter)
-from ou_monitor.online.trust import InputClock, SLOW_MISSED, SourceInterval, Stamps
+from ou_monitor.online.trust import InputClock, SLOW_MISSED, SourceInterval, StampOrder
 from ou_monitor.records import Level
 from std_msgs.msg import Float64
 
@@ -302,7 +302,7 @@ class AdaptiveFilterNode(MonitorNode):
                 ' yet.' if age is None else f' for {age:.1f} s.')
         if self._stamper.waiting and self._unplaced:
             return Level.WARN, 'use_sim_time is set, but nothing comes on /clock (any more).'
-        if self._input_clock.stamps is not Stamps.GOOD:
+        if self._input_clock.stamps is not StampOrder.GOOD:
             return Level.WARN, f'{self._topic}: {self._input_clock.stamps.by_arrival}'
         if _not_a_voltage(self._type, s):
             return Level.WARN, (

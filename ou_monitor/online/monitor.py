@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.estimator.estimator import (
-    of_estimate, Relaxation, SLIDING, SlidingEstimator)
+    of_estimate, RelaxationFits, SLIDING, SlidingEstimator)
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.report import MonitorReport
@@ -22,7 +22,7 @@ from ou_monitor.online.risk.budget import Ahead, look_ahead
 from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
 from ou_monitor.online.risk.forecast import Forecast, LOOK
 from ou_monitor.online.settings import AUTO, MonitorSettings
-from ou_monitor.online.trust import Doubt, InputTrust, patience, Stamps
+from ou_monitor.online.trust import Doubt, InputTrust, patience, StampOrder
 from ou_monitor.records import (
     as_numbers, as_seconds, Counters, Estimate, Flag, Level, NAN, Status)
 from ou_monitor.timeline.line import (
@@ -63,7 +63,7 @@ class SupplyMonitor:
         self._flag = BrownoutFlag(self._settings)
         self._trust = InputTrust()
         # As the last report judged them.
-        self._stamps, self._doubt = Stamps.GOOD, Doubt.NONE
+        self._stamps, self._doubt = StampOrder.GOOD, Doubt.NONE
         self._reset_reason = ''
         self._restarts, self._fault, self._faulty = 0, '', False
         # Of samples that are thinned: how many were left out, and where the next one is.
@@ -78,7 +78,7 @@ class SupplyMonitor:
         """Begin with nothing known of the supply."""
         self._line = TimeLine()
         self._estimator = SlidingEstimator(self._sliding, line=self._line)
-        self._relaxation = Relaxation(background=self._background)
+        self._relaxation = RelaxationFits(background=self._background)
         self._load_filter, self._load = LoadFilter(), SupplyLoad()
         self._load_filter.begin_with(None if self._model is None else self._model.load)
         self._newest = Estimate()
@@ -291,7 +291,7 @@ class SupplyMonitor:
             # As in `push`.
             self.restart(error)
             e = Estimate(counters=self._counters())
-            limit, stamps, fresh = self._settings.stale_after, Stamps.GOOD, False
+            limit, stamps, fresh = self._settings.stale_after, StampOrder.GOOD, False
             doubt, why = Doubt.NONE, ''
             self._ahead = Ahead()
             told, ou, ou_age = e, of_estimate(e), 0.0

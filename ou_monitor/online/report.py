@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.risk.flag import FlagState
-from ou_monitor.online.trust import Doubt, Stamps
+from ou_monitor.online.trust import Doubt, StampOrder
 from ou_monitor.records import Estimate, Level, OuFacts
 
 # Throttles of `risk_curve`.
@@ -42,7 +42,7 @@ class MonitorReport:
     patience : float
         Age from which the input is stale, s: `stale_after`, less for a fast source, more for a
         slow one.
-    stamps : Stamps
+    stamps : StampOrder
         What the stamps are good for.
     doubt : Doubt
         Why the input is not trusted.
@@ -81,7 +81,7 @@ class MonitorReport:
     summary: str
     age: float
     patience: float
-    stamps: Stamps
+    stamps: StampOrder
     doubt: Doubt
     fresh: bool
     thinned: int

@@ -94,7 +94,7 @@ class SourceInterval:
         self.value = lengths[(len(lengths) - 1) // 2] if slow else 0.0
 
 
-class Stamps(enum.Enum):
+class StampOrder(enum.Enum):
     """What the stamps are good for; the value is the sentence for the pilot."""
 
     GOOD = 'The stamps increase.'
@@ -167,7 +167,7 @@ class StampWatch:
         self.newest = -math.inf
         self._count(1, 1)
 
-    def judge(self, limit: float, interval: float) -> Stamps:
+    def judge(self, limit: float, interval: float) -> StampOrder:
         """Return what the stamps are good for (limit of what is fresh and interval in s)."""
         if self._since >= _FEWEST:
             stopped = self._arrived - self._advanced
@@ -175,10 +175,10 @@ class StampWatch:
                 stopped = self._since * interval
             # Where no interval was ever known the stamps never advanced.
             if not stopped <= limit:
-                return Stamps.FROZEN
+                return StampOrder.FROZEN
         if self._looked >= _FEWEST and self._late > _IRREGULAR * self._looked:
-            return Stamps.IRREGULAR
-        return Stamps.GOOD
+            return StampOrder.IRREGULAR
+        return StampOrder.GOOD
 
 
 class InputClock:
@@ -189,7 +189,7 @@ class InputClock:
     """
 
     def __init__(self) -> None:
-        self.stamps = Stamps.GOOD
+        self.stamps = StampOrder.GOOD
         self.by_arrival = 0
         self._watch = StampWatch()
         # Arrival and time of the last message, and what is added to stamps, s.
@@ -202,9 +202,9 @@ class InputClock:
             self._watch.start_anew()
         self._watch.push_one(stamp, arrived)
         before, self.stamps = self.stamps, self._watch.judge(FROZEN_AFTER, NAN)
-        if self.stamps is not Stamps.GOOD:
+        if self.stamps is not StampOrder.GOOD:
             self.by_arrival += 1
-        if Stamps.GOOD is before is self.stamps or math.isnan(self._time):
+        if StampOrder.GOOD is before is self.stamps or math.isnan(self._time):
             self._time = stamp + self._shift
         else:
             # Where the stamps are good again they go on from here.
@@ -360,15 +360,15 @@ class InputTrust:
         """Interval between arrivals of a slow source, s; 0 for a fast one."""
         return self._interval.value
 
-    def stamps(self, limit: float, interval: float) -> Stamps:
+    def stamps(self, limit: float, interval: float) -> StampOrder:
         """Return what the stamps are good for; see `StampWatch.judge`."""
         return self._stamps.judge(limit, interval)
 
-    def doubt(self, stamps: Stamps, limit: float) -> tuple[Doubt, str]:
+    def doubt(self, stamps: StampOrder, limit: float) -> tuple[Doubt, str]:
         """Return why the input is not trusted beside a voltage limit, V, and the sentence."""
         if self.outside:
             return Doubt.OTHER, self.outside
-        if stamps is not Stamps.GOOD:
+        if stamps is not StampOrder.GOOD:
             return Doubt.STAMPS, stamps.value
         if limit <= 0.0:
             return Doubt.LIMIT, (

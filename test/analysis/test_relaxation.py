@@ -4,10 +4,8 @@ from dataclasses import replace
 import math
 
 import numpy as np
-from ou_monitor.analysis.cause import judge_cause
 from ou_monitor.analysis.level_comparison import AlphaTest
-from ou_monitor.analysis.relaxation import fit_relaxation
-from ou_monitor.analysis.steps import find_steps
+from ou_monitor.analysis.relaxation import find_steps, fit_relaxation, judge_cause
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Estimate, Recording, Status
 import pytest

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
-from ou_monitor.analysis.spectrum import level_spectrum, ou_spectrum
+from ou_monitor.analysis.level_result import level_spectrum, ou_spectrum
 import pytest
 from simulated_recordings import ALPHA, recording
 

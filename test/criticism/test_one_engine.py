@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
 from ou_monitor.analysis.level_result import fit_level, fit_parts
-from ou_monitor.analysis.levels import LoadLevel, Segment
+from ou_monitor.analysis.levels import LoadLevel, Stay
 from ou_monitor.criticism.battery import statistics
 from ou_monitor.criticism.composite import (
     Composite, covariates_of, fit_composite, pole_beside, view_of)
@@ -48,7 +48,7 @@ CLEAR = 1e-3 * FALSE_ALARM
 
 def as_one_level(recording):
     """Return what `analyze` says of a recording as one load level."""
-    whole = LoadLevel(NAN, (Segment(0, recording.n),))
+    whole = LoadLevel(NAN, (Stay(0, recording.n),))
     return fit_level(recording, bare(recording), whole, 1)
 
 
@@ -185,7 +185,7 @@ def over_throttle(*terms, seed):
     samples, composite = fitted(*terms, throttle=throttle, seed=seed)
     found = statistics(composite.z, covariates_of(samples, composite))
     recording = Recording(samples.t, samples.voltage, throttle, 'levels')
-    low, high = (fit_parts(recording, bare(recording), [Segment(*ends)])[1]
+    low, high = (fit_parts(recording, bare(recording), [Stay(*ends)])[1]
                  for ends in ((0, N // 2), (N // 2, N)))
     alpha, sigma = alpha_constancy((0.2, 0.6), (low, high)), sigma_change(low, high)
     reach = math.log(sigma.ratio_high / sigma.ratio)

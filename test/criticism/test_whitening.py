@@ -2,7 +2,7 @@
 
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
-from ou_monitor.analysis.process_type import ProcessType
+from ou_monitor.analysis.level_result import ProcessType
 from ou_monitor.analysis.quality import coupling_items, second_items
 from ou_monitor.criticism.innovations import FAMILY_WISE, other_pole
 from ou_monitor.records import Recording

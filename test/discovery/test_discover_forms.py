@@ -9,13 +9,12 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import fit_gaussian
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ac_coupling import ACCoupling
-from ou_monitor.model.terms.clock_jitter import ClockJitter
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import order_lines
 from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.reading import MeasurementNoise
+from ou_monitor.model.terms.reading import ClockJitter, MeasurementNoise
 from ou_monitor.model.terms.regime_switching import RegimeSwitching
 import pytest
 from scipy.signal import lfilter

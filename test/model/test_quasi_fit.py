@@ -6,7 +6,7 @@ from dense import block_autocovariances, fisher, restricted
 import numpy as np
 from ou_monitor.model import arma
 from ou_monitor.model.ou import simulate
-from ou_monitor.online.estimator.irregular import fit_exact, Likelihood
+from ou_monitor.online.estimator.fit import fit_exact, Likelihood
 import pytest
 from scipy.linalg import toeplitz
 from scipy.optimize import minimize

@@ -5,8 +5,7 @@ import math
 import numpy as np
 from ou_monitor.model.hidden_chain import forward, log_likelihood, smoothed
 from ou_monitor.model.terms.laws import normal_scores, View
-from ou_monitor.model.terms.switching_chain import (
-    calm_levels, chain_of, Scores, without_levels)
+from ou_monitor.model.terms.regime_switching import calm_levels, chain_of, Scores, without_levels
 import pytest
 from scipy.signal import lfilter
 from scipy.special import ndtr

@@ -6,8 +6,8 @@ import math
 import numpy as np
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import order_power
+from ou_monitor.model.terms.regime_switching import relaxing
 from ou_monitor.model.terms.slow import FlickerNoise, SecondRelaxation
-from ou_monitor.model.terms.switching_chain import relaxing
 import pytest
 from scipy.linalg import dft
 from scipy.stats import median_abs_deviation

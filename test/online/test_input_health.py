@@ -10,7 +10,7 @@ from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.risk.forecast import Forecast
 from ou_monitor.online.settings import monitor_settings, MonitorSettings
-from ou_monitor.online.trust import Stamps, StampWatch
+from ou_monitor.online.trust import StampOrder, StampWatch
 from ou_monitor.records import Flag, Level
 import pytest
 
@@ -67,11 +67,11 @@ def test_good_stamps_again_are_good_again():
     monitor, start = good()
     arrived = start + DT * np.arange(1, 1001)
     monitor.push(np.full(1000, 2.999), ou(1000), arrival=arrived)
-    assert monitor.report(0.0, now=4.0).stamps is Stamps.FROZEN
+    assert monitor.report(0.0, now=4.0).stamps is StampOrder.FROZEN
     t = 4.0 + DT * np.arange(1, 3001)
     monitor.push(t, ou(3000, 5), arrival=t)
     report = monitor.report(0.0, now=7.0)
-    assert report.stamps is Stamps.GOOD and report.brownout is False
+    assert report.stamps is StampOrder.GOOD and report.brownout is False
 
 
 def test_repeats_and_a_few_late_samples_are_no_disorder():
@@ -79,11 +79,11 @@ def test_repeats_and_a_few_late_samples_are_no_disorder():
     watch = StampWatch()
     t = np.repeat(np.arange(1000) * DT, 2)
     watch.push(t, t)
-    assert watch.judge(0.3, DT) is Stamps.GOOD
+    assert watch.judge(0.3, DT) is StampOrder.GOOD
     late = 1.0 + np.arange(1000) * DT
     late[::20] -= 0.0015
     watch.push(late, 1.0 + np.arange(1000) * DT)
-    assert watch.judge(0.3, DT) is Stamps.GOOD
+    assert watch.judge(0.3, DT) is StampOrder.GOOD
 
 
 def test_irregular_is_never_ok_and_ends():

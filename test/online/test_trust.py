@@ -10,7 +10,7 @@ from ou_monitor.model.ou import simulate
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.online.trust import Doubt, InputClock, SourceInterval, Stamps, StillReading
+from ou_monitor.online.trust import Doubt, InputClock, SourceInterval, StampOrder, StillReading
 from ou_monitor.records import Level
 import pytest
 
@@ -217,11 +217,11 @@ def test_a_filter_whose_stamps_are_no_time_goes_on_by_arrival(kind):
         at.append(clock.time_of(float(stamp), float(came)))
         out.append(low_pass.filter(at[-1], 5.0 if 200 < k < 1500 else 1.0, 0.3))
         if k in (100, 1499):
-            assert clock.stamps is not Stamps.GOOD, k
+            assert clock.stamps is not StampOrder.GOOD, k
     assert clock.by_arrival > 1400
     assert np.diff(at)[100:1500] == pytest.approx(np.full(1400, 0.002), abs=1e-9)
     assert out[300] == pytest.approx(5.0, abs=1e-6) and out[1499] == pytest.approx(5.0, abs=1e-6)
-    assert clock.stamps is Stamps.GOOD and out[-1] == pytest.approx(1.0, abs=1e-6)
+    assert clock.stamps is StampOrder.GOOD and out[-1] == pytest.approx(1.0, abs=1e-6)
     assert 20.0 <= low_pass.cutoff <= 150.0
 
 

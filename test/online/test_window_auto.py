@@ -7,7 +7,7 @@ import time
 import numpy as np
 from ou_monitor import supply_facts
 from ou_monitor.model.ou_fit import known_ou
-from ou_monitor.online.estimator.estimator import Relaxation, SlidingEstimator
+from ou_monitor.online.estimator.estimator import RelaxationFits, SlidingEstimator
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import check_values, ESTIMATOR_PARAMETERS, MonitorSettings
 from ou_monitor.records import Recording, Status
@@ -131,7 +131,7 @@ def test_what_is_too_old_is_not_known():
     plain = SlidingEstimator(2.0)
     plain.push(recording.t, recording.voltage, recording.throttle)
     e = plain.estimate()
-    relaxation = Relaxation(background=False)
+    relaxation = RelaxationFits(background=False)
     monitor = SupplyMonitor()
     monitor._relaxation = relaxation
     push(monitor, recording)

@@ -2,7 +2,7 @@
 
 import numpy as np
 from ou_monitor.analysis.level_result import fit_parts
-from ou_monitor.analysis.levels import Segment
+from ou_monitor.analysis.levels import Stay
 from ou_monitor.analysis.supply import Remainder
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Estimate, Recording
@@ -34,4 +34,4 @@ def bare(simulated: Recording) -> Remainder:
 
 def fitted(simulated: Recording, start: int, stop: int) -> Estimate:
     """Return what a level of these samples would say."""
-    return fit_parts(simulated, bare(simulated), [Segment(start, stop)])[1]
+    return fit_parts(simulated, bare(simulated), [Stay(start, stop)])[1]

@@ -29,8 +29,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.model import arma
 from ou_monitor.model.ou_fit import known_ou
-from ou_monitor.online.estimator.fit import fit_window, Fitted, from_window, TREND_SCORE
-from ou_monitor.online.estimator.irregular import ExactFit, fit_irregular, MOST
+from ou_monitor.online.estimator.fit import (
+    ExactFit, fit_irregular, fit_window, Fitted, from_window, MOST, TREND_SCORE)
 from ou_monitor.online.estimator.quality import (
     examine, input_flags, judge, Quality, recount)
 from ou_monitor.online.estimator.window import (
@@ -390,7 +390,7 @@ def _positive(name: str, value: float, unit: str) -> float:
     return number
 
 
-class Relaxation:
+class RelaxationFits:
     """Readings of the last minute, and the newest fit of them; `end`: its last stamp, s."""
 
     def __init__(self, *, background: bool) -> None:

@@ -19,7 +19,7 @@ import math
 from typing import Any
 
 import numpy as np
-from ou_monitor.online.estimator.fit import Fitted, Outcome
+from ou_monitor.online.estimator.fit import FitEnd, Fitted
 from ou_monitor.records import Counters, Estimate, Flag, FloatArray, NAN, Status
 
 # Fewest samples from which anything is told.
@@ -148,7 +148,7 @@ def judge(fit: Fitted, measured: Mapping[str, Any], quality: Quality, throttle_s
     level, sag = _level(fit, measured['throttle'], moves)
     noise = math.sqrt(max(fit.noise_var, 0.0))
     known = {**measured, 'u0': level, 'sag': sag, 'noise_std': noise}
-    if fit.outcome is Outcome.UNCORRELATED:
+    if fit.outcome is FitEnd.UNCORRELATED:
         return Estimate(status=Status.NO_RELAXATION, flags=tuple(flags), **known)
     duration = measured['duration']
     se = log_errors(fit, duration)
@@ -159,7 +159,7 @@ def judge(fit: Fitted, measured: Mapping[str, Any], quality: Quality, throttle_s
         flags.append(Flag.LOWPASS_UPSTREAM)
     known.update(sigma=fit.sigma, sigma_se=se[1])
     relaxations = fit.alpha * duration - _HIGH_BY
-    if fit.outcome is Outcome.UNBOUND or relaxations < 0.5:
+    if fit.outcome is FitEnd.UNBOUND or relaxations < 0.5:
         return Estimate(status=Status.UNBOUND, flags=tuple(flags), **known)
     if fit.log_var[0] > max(_BURIED ** 2, _BURIED_BY ** 2 * 2.0 / relaxations):
         return Estimate(status=Status.BURIED, flags=tuple(flags), **known)

@@ -96,7 +96,7 @@ def lagged(t: FloatArray, u: FloatArray, tau: float, before: tuple[float, float,
     return out
 
 
-class Series:
+class WindowColumns:
     """
     Columns over a sliding window, addressed by a sample number that only grows.
 
@@ -459,7 +459,7 @@ class Sums:
 class LagSums:
     """Slots of a length, s, counted from `origin`, s, over one `Series`, for so many lags."""
 
-    def __init__(self, series: Series, lags: int, slot: float) -> None:
+    def __init__(self, series: WindowColumns, lags: int, slot: float) -> None:
         self._series = series
         self._lags = lags
         self.origin = 0.0
@@ -656,7 +656,7 @@ class Resolution:
     """Samples and sums at one resolution of a window, s, taken from the next finer one."""
 
     def __init__(self, window: float, parent: Resolution | None = None) -> None:
-        self.series = Series(LAGS)
+        self.series = WindowColumns(LAGS)
         self.sums = LagSums(self.series, LAGS, window / SLOTS)
         self._window = window
         self._parent = parent
@@ -713,7 +713,7 @@ class Resolution:
         self._coarser._take(self.series)
         return self._coarser
 
-    def _take(self, fine: Series) -> None:
+    def _take(self, fine: WindowColumns) -> None:
         """Take what a finer series has got since the last time."""
         begin = max(self._taken, fine.first)
         skipped = begin != self._taken

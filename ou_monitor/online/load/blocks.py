@@ -34,17 +34,34 @@ _CHANGES = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
-    """Samples in a row with one throttle."""
+class LoadBlock:
+    """
+    Samples in a row with one throttle.
 
-    # Mean and last stamp, s.
+    Attributes
+    ----------
+    t, last : float
+        Mean and last stamp, s.
+    voltage : float
+        Mean voltage, V.
+    throttle : float
+        Mean throttle, 0..1; NaN where unknown.
+    current : float
+        Mean of the currents that are known, A; NaN without one.
+    n : int
+        Samples.
+    within : float
+        Variance of one sample about the mean, V^2; NaN of a single one.
+
+    """
+
     t: float
     last: float
-    voltage: float  # Mean voltage, V.
-    throttle: float  # Mean throttle, 0..1; NaN where unknown.
-    current: float  # Mean of the currents that are known, A; NaN without one.
-    n: int  # Samples.
-    within: float  # Variance of one sample about the mean, V^2; NaN of a single one.
+    voltage: float
+    throttle: float
+    current: float
+    n: int
+    within: float
 
 
 class LoadBlocks:
@@ -65,7 +82,7 @@ class LoadBlocks:
         self._last = (-math.inf, NAN, math.inf, 0)
         self._zero = NAN
 
-    def push(self, columns: FloatArray) -> list[Block]:
+    def push(self, columns: FloatArray) -> list[LoadBlock]:
         """
         Return the blocks that samples complete.
 
@@ -110,11 +127,11 @@ class LoadBlocks:
             self._sums = None
         return done
 
-    def _block(self, sums: FloatArray) -> Block:
+    def _block(self, sums: FloatArray) -> LoadBlock:
         n, t, off, square, throttle, current, known, last = sums.tolist()
         within = max(0.0, square - off * off / n) / (n - 1.0) if n > 1.0 else NAN
-        return Block(t / n, last, self._zero + off / n, throttle / n,
-                     current / known if known else NAN, int(n), within)
+        return LoadBlock(t / n, last, self._zero + off / n, throttle / n,
+                         current / known if known else NAN, int(n), within)
 
 
 DELAYS: FloatArray = np.array([0.0, 0.05, 0.1, 0.15, 0.2])  # s

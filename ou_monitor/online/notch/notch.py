@@ -4,25 +4,363 @@ Notches that follow the motors: from their speed, else from throttle; off where 
 samples -> frames -> spectrum -> law (throttle to frequency) and choice (which notches, or none)
 -> frequency, width and share of each notch, sample by sample -> output.
 
+Frequencies of the motors: as their speeds come, else from throttle by a law that is learned.
+
+The law is f = a + b sqrt(u), learned from the noise itself.  A motor in hover gives thrust in
+proportion to its speed squared, so that f grows with the square root of throttle where the
+controller makes throttle a thrust, and with an offset where it does not.  Each pair of a frequency
+at `LOW` and one at `HIGH` is a law; each frame tells how much of its noise a notch at each
+frequency would take away; a law is as good as the share of all noise so far that it would have
+taken away, old frames forgotten.  The best one is in force: a median of the data would follow the
+most frequent peak, this follows the loud ones, which are what is to be removed.  No data of the
+future enter.
+
+Limits of that: lines that fold at half the sample rate fall with throttle and are not followed;
+speeds of single motors are not told apart.
+
+Which notches pay: the noise of a D term at equal lag, by the signal's own spectrum.
+
+The noise of a candidate is the power that its notches and a low-pass of order 2 leave of the
+derivative above `fmin`, the cutoff of the low-pass so much higher that both lag as much as the
+low-pass alone.  Running means of it, of frames that the law had not seen yet, tell what
+each candidate would have come to behind a slower and a faster low-pass too; "no notch" is one of
+them.  A channel takes the best where that leaves less than `_ON` of the rms of none, and harms
+behind none of the low-passes; it changes for one that is better by a tenth in power, and gives
+up where `_OFF` or more is left or harm is done.
+
 Limits: it takes away what follows the motors, and nothing else.  It needs motor speeds or
 throttle.  What lies above half the sample rate has folded down and is followed by neither.
-A change of the vehicle is learned within half a minute.
+A change of the vehicle is learned within half a minute.  The past decides what is worth a notch.
+A frame with a gap of more than five intervals is thrown away; smaller unevenness is interpolated.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.filter.cutoff_control import SampleInterval
 from ou_monitor.online.filter.lowpass import FilterCounters
 from ou_monitor.online.notch.biquads import HIGHEST, Notch, phase_lag
-from ou_monitor.online.notch.choice import Candidate, Choice, Frames
-from ou_monitor.online.notch.motors import MotorLaw, MotorSpeeds
 from ou_monitor.online.notch.settings import NotchSettings
 from ou_monitor.records import FloatArray
+
+
+# A speed that has changed so often, and then not for so many mean times between changes (and
+# never less than s), has stopped coming: no motor in flight holds its speed to the last digit.
+_CHANGES, _FROZEN, _STUCK = 20, 50.0, 1.0
+
+
+class NewestSpeeds:
+    """Newest speeds of the motors (per_unit: Hz for one of what comes; stale_after in s)."""
+
+    def __init__(self, per_unit: float, stale_after: float) -> None:
+        self._per_unit, self._stale_after = per_unit, stale_after
+        self._speeds: list[float] = []
+        self._heard = self._changed = self._first = -math.inf
+        self._changes = 0
+
+    def configure(self, per_unit: float, stale_after: float) -> None:
+        """Change the unit, and the age that is too old, s."""
+        if per_unit != self._per_unit:
+            self._speeds = []
+        self._per_unit, self._stale_after = per_unit, stale_after
+
+    def take(self, t: float, values: Sequence[float]) -> None:
+        """Take what came at t, s; nothing that is a number: nothing came."""
+        speeds = [abs(one) * self._per_unit if math.isfinite(one) else NAN for one in values]
+        if all(one != one for one in speeds):
+            return
+        if self._first == -math.inf or t < self._heard:
+            self._first, self._changes = t, 0
+            self._changed = t
+        elif any(one != other for one, other in zip(speeds, self._speeds)
+                 if one == one or other == other):
+            self._changes += 1
+            self._changed = t
+        self._speeds, self._heard = speeds, t
+
+    def now(self, t: float, most: int) -> list[float]:
+        """Return the speeds of at most so many groups of motors, Hz; empty: not known."""
+        if not most or not t - self._heard <= self._stale_after:
+            return []
+        if self._changes >= _CHANGES:
+            usual = (self._changed - self._first) / self._changes
+            if t - self._changed > max(_FROZEN * usual, _STUCK):
+                return []
+        if len(self._speeds) <= most:
+            return self._speeds
+        # Places of motors that are not there stay 0.
+        known = sorted(one for one in self._speeds if one > 0.0)
+        if len(known) <= most:
+            return known
+        # Neighbours in speed share a notch.
+        edges = [round(k * len(known) / most) for k in range(most + 1)]
+        return [sum(known[a:b]) / (b - a) for a, b in zip(edges, edges[1:])]
+
+
+# Square roots of throttle at which a law is told: the middle of what is flown.
+LOW, HIGH = 0.4, 0.85
+_GRID = 48
+# Width of the notch that weighs the laws, over frequency.
+_WIDTH = 0.5
+# s over which frames are forgotten: the speed at one throttle falls with the charge, in minutes.
+_LAW_MEMORY = 30.0
+# Share of noise that the prior gives to the law f ~ sqrt(u), frames that it counts for, and
+# its spread in a / f(HIGH).
+_PRIOR, _FRAMES, _SPREAD = 0.1, 8.0, 0.3
+
+
+class MotorLaw:
+    """The law in force, `a` and `b` in Hz, NaN while not known, and all others (all in Hz)."""
+
+    def __init__(self, frequencies: FloatArray, fmin: float, rate: float) -> None:
+        highest = HIGHEST * rate
+        self._grid: FloatArray = np.geomspace(fmin, max(highest, fmin * 1.01), _GRID)
+        warped = np.tan(np.pi * np.minimum(frequencies / rate, 0.499))
+        off = warped[None, :] / np.tan(np.pi * self._grid / rate)[:, None]
+        cut = (_WIDTH * off)**2
+        self._removed: FloatArray = cut / ((1.0 - off * off)**2 + cut)
+        at_low, at_high = np.meshgrid(self._grid, self._grid, indexing='ij')
+        rising = at_high >= at_low * (1.0 - 1e-9)
+        self._low, self._high = at_low[rising], at_high[rising]
+        self._b = (self._high - self._low) / (HIGH - LOW)
+        self._a = self._low - self._b * LOW
+        off = self._a / (_SPREAD * self._high)
+        self._prior: FloatArray = _FRAMES * _PRIOR * np.exp(-0.5 * off**2)
+        self._found: FloatArray = np.zeros_like(self._low)
+        self._log = (np.log(self._grid[0]), np.log(self._grid[1] / self._grid[0]))
+        self.a = self.b = np.nan
+
+    def frequency(self, root: float) -> float:
+        """Return the frequency at a square root of throttle, Hz."""
+        return float(self.a + self.b * root)
+
+    def learn(self, power: FloatArray, root: float, passed: float,
+              lost: float) -> None:
+        """
+        Take a frame.
+
+        power: share of the usual noise in each bin, summed over the channels, shape (K,);
+        passed in s; lost: factor by which what was counts for less.
+        """
+        keep = float(np.exp(-passed / _LAW_MEMORY))
+        removed = self._removed @ power
+        f = self._a + self._b * root
+        place = np.clip((np.log(np.maximum(f, self._grid[0])) - self._log[0]) / self._log[1],
+                        0.0, _GRID - 1.001)
+        whole = place.astype(np.intp)
+        part = place - whole
+        got = removed[whole] * (1.0 - part) + removed[whole + 1] * part
+        # Outside the grid there is no notch.
+        got = np.where((f >= self._grid[0] * 0.999) & (f <= self._grid[-1] * 1.001), got, 0.0)
+        self._found = keep * lost * self._found + got
+        score = self._found + self._prior
+        best = int(np.argmax(score))
+        # Around the best one all that are nearly as good: the mean is finer than the grid.
+        near = score - 0.98 * score[best]
+        near = np.where((near > 0.0)
+                        & (np.abs(np.log(self._low / self._low[best])) < 2.5 * self._log[1])
+                        & (np.abs(np.log(self._high / self._high[best])) < 2.5 * self._log[1]),
+                        near, 0.0)
+        total = float(np.sum(near))
+        low, high = (float(np.sum(near * one)) / total for one in (self._low, self._high))
+        self.b = (high - low) / (HIGH - LOW)
+        self.a = low - self.b * LOW
+
+
+# A notch is learned on what a quarter of a second shows: 4 Hz of resolution, and throttle moves
+# little in it; four looks at each sample.
+FRAME, HOP = 0.25, 0.0625
+_SMALLEST, _LONGEST = 16, 4096
+_MISSING, _UNEVEN = 5.0, 0.3
+
+
+class NotchFrames:
+    """Spectra of samples of an interval, s, and what went with them; `frequencies` in Hz."""
+
+    def __init__(self, interval: float) -> None:
+        self.interval = interval
+        self.size = int(min(max(round(FRAME / interval), _SMALLEST), _LONGEST))
+        self.hop = max(int(round(self.size * HOP / FRAME)), 1)
+        self._window = np.hanning(self.size + 2)[1:-1]
+        self._scale = 1.0 / (interval * float(np.sqrt(np.sum(self._window**2) * self.size / 2.0)))
+        self.frequencies = np.asarray(np.fft.rfftfreq(self.size, interval), dtype=np.float64)
+        self._t: list[float] = []
+        self._rows: list[list[float]] = []
+        self._due = self.size + 1
+
+    def add(self, t: float, row: list[float]) -> bool:
+        """Take a sample (channels, then what goes with it); tell whether a frame is due."""
+        if self._t and t - self._t[-1] > _MISSING * self.interval:
+            self._t, self._rows, self._due = [], [], self.size + 1
+        self._t.append(t)
+        self._rows.append(row)
+        self._due -= 1
+        return self._due <= 0
+
+    def take(self, channels: int) -> tuple[FloatArray, FloatArray]:
+        """Return the power in each bin, shape (channels, K), and the means of the rest."""
+        keep = self.size + 1
+        self._t, self._rows = self._t[-keep:], self._rows[-keep:]
+        self._due = self.hop
+        rows = np.array(self._rows)
+        signal = rows[:, :channels].T
+        t = np.array(self._t)
+        if np.max(np.abs(np.diff(t) - self.interval)) > _UNEVEN * self.interval:
+            even = t[-1] - self.interval * np.arange(keep - 1, -1, -1)
+            signal = np.array([np.interp(even, t, one) for one in signal])
+        spectra = np.fft.rfft(np.diff(signal, axis=1) * self._window, axis=1)
+        power = (np.abs(spectra) * self._scale)**2
+        return power, rows[:, channels:].mean(axis=0)
+
+
+# Bandwidths over frequency that are tried, of one notch and of one notch for each motor.
+WIDTHS: FloatArray = np.array([1.0, 0.66, 0.45, 0.3, 0.2, 0.13, 0.085])
+# Low-passes behind, over `cutoff`; none is faster than that share of the sample rate.
+_BEHIND, _FASTEST = (0.5, 1.0, 1.5), 0.25
+_ON, _OFF, _HARM, _BETTER = 0.9, 0.97, 0.99, 0.9
+# s over which the noise is averaged, and the loudest is forgotten; frames before anything is
+# decided.
+_MEMORY, _LEVEL, _FEWEST = 5.0, 2.0, 6
+# Least share of the lag that is left to the low-pass in a frame (one ten times as fast hardly
+# filters), and in the mean of frames.
+_LEAST, _LEAST_MEAN = 0.1, 0.4
+# Frames count by their amplitude: by power one crash would be all that is remembered.
+_BY_AMPLITUDE = 0.5
+_TINY = 1e-300
+
+
+class Family(NamedTuple):
+    """Notches but for their width."""
+
+    source: str  # 'rpm' or 'throttle'
+    many: bool  # Whether each motor has its own
+    times: int  # How often the same notch
+
+
+class Candidate(NamedTuple):
+    """Some notches."""
+
+    family: Family  # Which
+    width: float  # Bandwidth over frequency
+
+
+def families(count: int) -> tuple[Family, ...]:
+    """Return what is tried with at most so many notches."""
+    found = [Family(source, False, times) for source in ('throttle', 'rpm')
+             for times in range(1, min(count, 2) + 1)]
+    return (*found, Family('rpm', True, 1)) if count > 1 else tuple(found)
+
+
+class NotchChoice:
+    """
+    Choice of the candidate of each channel; `chosen`: one a channel, None: no notch.
+
+    frequencies of the bins, Hz; settings: `fmin` and `cutoff`, Hz; rate of the samples, Hz.
+    """
+
+    def __init__(self, frequencies: FloatArray, settings: tuple[float, float], rate: float,
+                 channels: int, count: int) -> None:
+        self._fmin, cutoff = settings
+        self._rate = rate
+        self._used = frequencies >= self._fmin
+        self._warped: FloatArray = np.tan(
+            np.pi * np.minimum(frequencies[self._used] / rate, 0.499))
+        # Low-passes by the bilinear rule, as most are.
+        at = np.tan(np.pi * np.minimum(cutoff / rate * np.array(_BEHIND), _FASTEST))
+        self._fourth: FloatArray = (self._warped[None, :] / at[:, None])**4
+        self._lag: FloatArray = np.sqrt(2.0) / (2.0 * rate * at)
+        self._low: FloatArray = 1.0 / (1.0 + self._fourth)
+        self.families = families(count)
+        shape = (len(self.families), WIDTHS.size, channels, len(_BEHIND))
+        self._noise: FloatArray = np.zeros(shape)
+        self._none: FloatArray = np.zeros((shape[0], 1, *shape[2:]))
+        self._left: FloatArray = np.ones((*shape[:2], len(_BEHIND)))
+        self._frames = [0] * len(self.families)
+        self._loudest: FloatArray = np.zeros(channels)
+        self.chosen: list[Candidate | None] = [None] * channels
+
+    def usual(self, power: FloatArray, passed: float) -> tuple[FloatArray, float]:
+        """
+        Return a frame over the loudest of late behind the low-pass, shape (channels, K).
+
+        Quiet frames count once the loud ones are past; a louder one makes those before it count
+        for less, by the factor that is returned beside it.
+        """
+        before = self._loudest * np.exp(-passed / _LEVEL)
+        self._loudest = np.maximum(power[:, self._used] @ self._low[1], before)
+        lost = (before / np.maximum(self._loudest, _TINY))**_BY_AMPLITUDE
+        self._noise *= lost[:, None]
+        self._none *= lost[:, None]
+        return power / np.maximum(self._loudest, _TINY)[:, None], float(np.mean(lost))
+
+    def low_passed(self, power: FloatArray) -> FloatArray:
+        """Return the power behind the low-pass, mean of the channels, shape (K,)."""
+        seen: FloatArray = np.zeros(self._used.size)
+        seen[self._used] = power[:, self._used].mean(axis=0) * self._low[1]
+        return seen
+
+    def take(self, power: FloatArray, throttle: float, motors: FloatArray,
+             passed: float) -> None:
+        """
+        Take a frame: power, shape (channels, K); frequencies by throttle and by the rpm, Hz.
+
+        throttle: NaN while not known; motors: empty while not known.
+        """
+        power = power[:, self._used]
+        none = power @ self._low.T
+        mean = motors.mean(keepdims=True) if motors.size else motors
+        for j, family in enumerate(self.families):
+            f = (np.array([throttle]) if family.source == 'throttle' else
+                 motors if family.many else mean)
+            f = f[(f >= self._fmin) & (f <= HIGHEST * self._rate)]
+            if not f.size:
+                continue
+            passes, delay = self._cascade(f, family.times)
+            left = np.maximum(1.0 - delay[:, None] / self._lag, _LEAST)
+            noise = np.einsum('ck,wk,wrk->wcr', power, passes,
+                              1.0 / (1.0 + self._fourth * left[..., None]**4))
+            self._frames[j] += 1
+            weight = max(1.0 / self._frames[j], passed / _MEMORY)
+            self._noise[j] += weight * (noise - self._noise[j])
+            self._none[j] += weight * (none - self._none[j])
+            self._left[j] += weight * (left - self._left[j])
+
+    def _cascade(self, f: FloatArray, times: int) -> tuple[FloatArray, FloatArray]:
+        """Return the power that notches pass for each width, shape (W, K), and delays, s."""
+        at = np.tan(np.pi * f / self._rate)
+        p = self._warped / at[:, None]
+        off = (1.0 - p * p)**2
+        passes = np.prod(off / (off + (WIDTHS[:, None, None] * p)**2), axis=1)
+        return passes**times, times * WIDTHS * float(np.sum(0.5 / (self._rate * at)))
+
+    def decide(self, sources: set[str]) -> None:
+        """Choose for each channel among the candidates whose source is known now."""
+        known = np.array([one.source in sources and frames >= _FEWEST for one, frames in
+                          zip(self.families, self._frames, strict=True)])
+        left = self._noise / np.maximum(self._none, _TINY)
+        harms: npt.NDArray[np.bool_] = (np.max(left, axis=3) > _HARM**2) | (
+            np.min(self._left, axis=2) < _LEAST_MEAN)[..., None]
+        gain = np.where(known[:, None, None], np.mean(left, axis=3), np.inf)
+        for c, old in enumerate(self.chosen):
+            able = np.where(harms[..., c], np.inf, gain[..., c])
+            j, w = np.unravel_index(int(np.argmin(able)), able.shape)
+            best, found = float(able[j, w]), Candidate(self.families[j], float(WIDTHS[w]))
+            now = np.inf
+            if old is not None:
+                k = self.families.index(old.family)
+                now = float(able[k, int(np.argmin(np.abs(WIDTHS - old.width)))])
+            # After a loss of the source the other one is held to what the first one was.
+            limit = _ON if old is None else _OFF
+            if best < limit**2 and best < _BETTER * now:
+                self.chosen[c] = found
+            elif now > _OFF**2:
+                self.chosen[c] = None
+
 
 NAN = math.nan
 # Beyond these a state could overflow, see `lowpass`.
@@ -59,16 +397,16 @@ class AdaptiveNotch:
 
     def __init__(self, **options: object) -> None:
         self._settings = NotchSettings.from_options(options)
-        self._speeds = MotorSpeeds(self._settings.per_unit, self._settings.stale_after)
+        self._speeds = NewestSpeeds(self._settings.per_unit, self._settings.stale_after)
         self.counters = FilterCounters()
         self._t: float | None = None
         self._out: list[float] = []
         self._banks: list[list[Notch]] = []
         self._interval = SampleInterval()
         self._since = 0
-        self._frames: Frames | None = None
+        self._frames: NotchFrames | None = None
         self._law: MotorLaw | None = None
-        self._choice: Choice | None = None
+        self._choice: NotchChoice | None = None
         # Square root of throttle as the motors follow it, and when throttle was heard.
         self._root, self._asked, self._heard = NAN, NAN, -math.inf
         self._motors: list[float] = []
@@ -261,10 +599,11 @@ class AdaptiveNotch:
         if self._frames is None:
             if not s.count or self._since < _KNOWN or HIGHEST / self._interval.mean < 1.2 * s.fmin:
                 return
-            self._frames = frames = Frames(self._interval.mean)
+            self._frames = frames = NotchFrames(self._interval.mean)
             rate = 1.0 / frames.interval
             self._law = MotorLaw(frames.frequencies, s.fmin, rate)
-            self._choice = Choice(frames.frequencies, (s.fmin, s.cutoff), rate, channels, s.count)
+            self._choice = NotchChoice(frames.frequencies, (s.fmin, s.cutoff), rate, channels,
+                                       s.count)
         speeds = self._motors + [NAN] * (s.count - len(self._motors))
         due = self._frames.add(t, [*values, self._root, *speeds])
         sources = {name for name, known in (('throttle', self._root == self._root),

@@ -9,7 +9,7 @@ of the bias, so that a constant wrong by a fifth is found thirty times over.
 import math
 
 import numpy as np
-from ou_monitor.online.estimator.irregular import fit_exact, Likelihood
+from ou_monitor.online.estimator.fit import fit_exact, Likelihood
 from ou_monitor.records import Flag, Status
 import pytest
 from simulated_windows import (

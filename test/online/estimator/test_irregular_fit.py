@@ -7,9 +7,8 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.model.ou import simulate
-from ou_monitor.online.estimator import irregular
-from ou_monitor.online.estimator.irregular import (
-    fit_exact, Likelihood, noise_scale, solve_tridiagonal)
+from ou_monitor.online.estimator import fit
+from ou_monitor.online.estimator.fit import fit_exact, Likelihood, noise_scale, solve_tridiagonal
 import pytest
 
 
@@ -158,8 +157,8 @@ def test_an_estimate_takes_a_handful_of_evaluations(how, noise, monkeypatch):
     """Each evaluation solves one system; searching by differences took 120 to 160 of them."""
     rng = np.random.default_rng(7)
     solved = []
-    solve = irregular.solve_tridiagonal
-    monkeypatch.setattr(irregular, 'solve_tridiagonal', lambda *args: (
+    solve = fit.solve_tridiagonal
+    monkeypatch.setattr(fit, 'solve_tridiagonal', lambda *args: (
         solved.append(1), solve(*args))[1])
     counts = []
     for _ in range(12):

@@ -4,13 +4,13 @@ from dataclasses import replace
 import math
 
 import numpy as np
-from ou_monitor.online.estimator.fit import Fitted, Outcome
+from ou_monitor.online.estimator.fit import FitEnd, Fitted
 from ou_monitor.online.estimator.quality import input_flags, judge, log_errors, Quality
 from ou_monitor.records import Counters, Flag, Status
 import pytest
 
 NAN = math.nan
-FIT = Fitted(Outcome.FOUND, 63.0, 0.632, 25e-6, 5.0, (0.016, 0.001, 0.016), 3e-3,
+FIT = Fitted(FitEnd.FOUND, 63.0, 0.632, 25e-6, 5.0, (0.016, 0.001, 0.016), 3e-3,
              np.array([5.0]), np.empty(0), np.empty((0, 0)), False, 2000, 0.063)
 BASE = {'t': 2.0, 'voltage': 5.0, 'throttle': NAN, 'n': 2000, 'duration': 2.0, 'rate': 1000.0,
         'counters': Counters()}
@@ -79,11 +79,11 @@ def test_buried(alpha, se, buried):
 
 
 def test_no_relaxation_keeps_what_is_known():
-    e = judged(outcome=Outcome.UNCORRELATED, alpha=NAN, sigma=NAN)
+    e = judged(outcome=FitEnd.UNCORRELATED, alpha=NAN, sigma=NAN)
     assert e.status is Status.NO_RELAXATION
     assert (e.u0, e.noise_std) == (5.0, pytest.approx(5e-3))
     assert math.isnan(e.alpha) and math.isnan(e.sigma)
-    assert judged(outcome=Outcome.UNBOUND, alpha=0.1).status is Status.UNBOUND
+    assert judged(outcome=FitEnd.UNBOUND, alpha=0.1).status is Status.UNBOUND
 
 
 @pytest.mark.parametrize('smoothness, n, told', [

@@ -2,7 +2,7 @@
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.online.estimator.window import LAGS, Resolution, Series, SLOTS
+from ou_monitor.online.estimator.window import LAGS, Resolution, SLOTS, WindowColumns
 import pytest
 
 DT = 1e-3
@@ -119,7 +119,7 @@ def test_lags_and_slots_are_enough():
     Fewer lags would lose the noise of 20 mV at 1 kHz (theta = 0.42 to 0.8), twice
     as many cost twice the time of a push.
     """
-    series = Series(LAGS)
+    series = WindowColumns(LAGS)
     series.append(np.arange(100.0), np.zeros(100), None, np.array([0]))
     assert series.runs(0, 100).max() == LAGS == 24
     assert SLOTS == 40

@@ -4,7 +4,8 @@ import math
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.online.estimator.window import FAST, lagged, LOAD_LAGS, Series, SLOW, T, U, Y
+from ou_monitor.online.estimator.window import (
+    FAST, lagged, LOAD_LAGS, SLOW, T, U, WindowColumns, Y)
 import pytest
 
 START = np.array([0], dtype=np.int64)
@@ -36,7 +37,7 @@ def test_lagged_is_the_exact_solution_for_held_input(seed, n, step, tau):
 
 def test_lags_are_ten_and_forty_milliseconds():
     """A step reaches 1 - 1/e after one lag: motors 5..20 ms, current within 40 ms."""
-    series = Series(24)
+    series = WindowColumns(24)
     t = np.arange(200) * 1e-3
     u = np.where(t >= 0.0495, 1.0, 0.0)
     series.append(t, np.zeros(200), u, START)
@@ -48,7 +49,7 @@ def test_lags_are_ten_and_forty_milliseconds():
 
 def test_moves_until_lags_have_settled():
     """Still at first; moving for as long as the window, or a lag in it, remembers."""
-    series = Series(24)
+    series = WindowColumns(24)
     series.append(np.arange(100) * 0.01, np.zeros(100), np.full(100, 0.3), START)
     assert not series.moves
     series.append(1.0 + np.arange(300) * 0.01, np.zeros(300), np.full(300, 0.5), NONE)
@@ -64,7 +65,7 @@ def test_moves_until_lags_have_settled():
 
 def test_throttle_that_is_not_known():
     """Unknown is not movement, and is told from a throttle that is known."""
-    series = Series(24)
+    series = WindowColumns(24)
     series.append(np.arange(50) * 0.01, np.zeros(50), None, START)
     assert math.isnan(series.last(U)) and not series.moves and not series.known
     assert np.isnan(series.column(SLOW)).all()
@@ -81,7 +82,7 @@ def test_throttle_that_is_not_known():
 def test_columns_are_what_was_put_in(steps):
     """Any appends and drops: contents, numbering, runs, and what stays readable behind."""
     reach = 24
-    series = Series(reach)
+    series = WindowColumns(reach)
     t, y, run, first = [], [], [], 0
     for n, drop, broken in steps:
         begin = len(t)
@@ -105,7 +106,7 @@ def test_columns_are_what_was_put_in(steps):
 
 def test_memory_is_bounded_by_the_window():
     """A million samples through a window of a thousand: no array beyond 100 times that."""
-    series = Series(24)
+    series = WindowColumns(24)
     for begin in range(0, 1_000_000, 5000):
         t = np.arange(begin, begin + 5000, dtype=float)
         series.append(t, t, np.zeros(5000), START if not begin else NONE)
@@ -115,7 +116,7 @@ def test_memory_is_bounded_by_the_window():
 
 
 def test_clear_goes_on_counting():
-    series = Series(24)
+    series = WindowColumns(24)
     series.append(np.arange(10.0), np.arange(10.0), np.full(10, 0.1), START)
     series.clear()
     assert (series.size, series.first, series.end, series.behind) == (0, 10, 10, 0)
@@ -129,7 +130,7 @@ def test_throttle_is_known_from_behind_its_last_gap_on():
     """Throttle is NaN in samples 5 to 7 and 15: it is known once the window begins at 16."""
     u = np.full(30, 0.4)
     u[[5, 6, 7, 15]] = np.nan
-    series = Series(24)
+    series = WindowColumns(24)
     series.append(np.arange(30) * 0.01, np.zeros(30), u, START)
     for begin, known in ((0, False), (8, False), (15, False), (16, True), (25, True)):
         series.drop_before(begin)

@@ -10,7 +10,7 @@ from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
 from ou_monitor.analysis.words import as_data
 from ou_monitor.cli.analyze import render
-from ou_monitor.online.estimator.fit import Fitted, Outcome
+from ou_monitor.online.estimator.fit import FitEnd, Fitted
 from ou_monitor.online.estimator.quality import judge, Quality
 from ou_monitor.records import (
     Counters, Estimate, LARGEST_FACTOR, LARGEST_LOG_SE, Recording, Status)
@@ -71,7 +71,7 @@ def test_an_interval_of_any_width(z):
        duration=st.floats(min_value=1e-9, max_value=1e9))
 def test_any_information_is_judged(log_var, score, alpha, duration):
     """Singular, negative, infinite: what is usable is known to a factor of 10."""
-    fit = Fitted(Outcome.FOUND, alpha, 0.6, 0.0, score, log_var, 3e-3, np.array([5.0]),
+    fit = Fitted(FitEnd.FOUND, alpha, 0.6, 0.0, score, log_var, 3e-3, np.array([5.0]),
                  np.empty(0), np.empty((0, 0)), False, 2000, 0.06)
     e = judge(fit, {'t': 0.0, 'voltage': 5.0, 'throttle': NAN, 'n': 2000, 'duration': duration,
                     'rate': 1e3, 'counters': Counters()}, Quality(), NAN, NAN)

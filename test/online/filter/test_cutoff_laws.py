@@ -5,11 +5,10 @@ import math
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.online.filter.cutoff_laws import (
-    cutoff_for_noise, LAWS, least_error, relative_cutoff, sampled_error, squared_error,
-    supply_noise, wanted_cutoff)
+    cutoff_for_noise, held_cutoff, LAWS, least_error, relative_cutoff, sampled_error,
+    squared_error, supply_noise, wanted_cutoff, white_noise)
 from ou_monitor.online.filter.filter_state import LowPassState
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass
-from ou_monitor.online.filter.white_noise import held_cutoff, white_noise
 from ou_monitor.online.settings import FilterSettings, LAWS as NAMES
 import pytest
 from scipy import integrate, optimize, signal

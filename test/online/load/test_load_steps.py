@@ -6,9 +6,8 @@ import math
 import numpy as np
 from ou_monitor.model.load import usual_coefficients
 from ou_monitor.online.load import load_filter as volts
-from ou_monitor.online.load.blocks import Block, CLIP
-from ou_monitor.online.load.current import CurrentFilter
-from ou_monitor.online.load.load_filter import LoadFilter
+from ou_monitor.online.load.blocks import CLIP, LoadBlock
+from ou_monitor.online.load.load_filter import CurrentFilter, LoadFilter
 from ou_monitor.online.load.supply_load import LAGS, LoadStatus, POWER, static
 import pytest
 
@@ -28,7 +27,7 @@ def weighed(noise, e, s, R, rounding=0.0):
 
 def block(t, v, u=math.nan, x=math.nan):
     """Return a block of one sample."""
-    return Block(t, t, v, u, x, 1, math.nan)
+    return LoadBlock(t, t, v, u, x, 1, math.nan)
 
 
 def flown(throttles=(0.2, 0.6)):

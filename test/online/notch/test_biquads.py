@@ -6,7 +6,7 @@ import random
 
 import numpy as np
 from ou_monitor.online.notch.biquads import bound, HIGHEST, NARROWEST, Notch, phase_lag, WIDEST
-from ou_monitor.online.notch.choice import WIDTHS
+from ou_monitor.online.notch.notch import WIDTHS
 import pytest
 
 

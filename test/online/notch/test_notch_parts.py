@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 from numpy.testing import assert_allclose
-from ou_monitor.online.notch.choice import Candidate, Choice, families, Family, Frames
-from ou_monitor.online.notch.motors import HIGH, LOW, MotorLaw, MotorSpeeds
+from ou_monitor.online.notch.notch import (
+    Candidate, families, Family, HIGH, LOW, MotorLaw, NewestSpeeds, NotchChoice, NotchFrames)
 import pytest
 
 NAN = math.nan
@@ -13,7 +13,7 @@ NAN = math.nan
 
 def test_speeds_in_hertz_and_how_old_they_may_be():
     """The sign is the sense of rotation; NaN: nothing came of that motor."""
-    speeds = MotorSpeeds(1.0 / 60.0, 0.5)
+    speeds = NewestSpeeds(1.0 / 60.0, 0.5)
     assert speeds.now(0.0, 4) == []
     speeds.take(1.0, [6000.0, -9000.0])
     assert speeds.now(1.5, 4) == [100.0, 150.0] and speeds.now(1.51, 4) == []
@@ -31,7 +31,7 @@ def test_speeds_in_hertz_and_how_old_they_may_be():
     (4, [10.0, 20.0, 35.0, 50.0]), (3, [15.0, 30.0, 45.0]), (2, [15.0, 40.0]), (1, [30.0])])
 def test_more_motors_than_notches_share_them_with_their_neighbours(most, expected):
     """Groups of equal size, as near as may be; places without a motor, at 0, are left out."""
-    speeds = MotorSpeeds(1.0, 1.0)
+    speeds = NewestSpeeds(1.0, 1.0)
     speeds.take(0.0, [0.0, 40.0, 10.0, 30.0, 20.0, 50.0])
     assert speeds.now(0.0, most) == expected
 
@@ -39,7 +39,7 @@ def test_more_motors_than_notches_share_them_with_their_neighbours(most, expecte
 @pytest.mark.parametrize('changes, usual', [(20, 0.01), (20, 0.1), (19, 0.1)])
 def test_speeds_that_freeze_are_not_known(changes, usual):
     """After 20 changes, and 50 usual times between them, but not within a second."""
-    speeds = MotorSpeeds(1.0, 100.0)
+    speeds = NewestSpeeds(1.0, 100.0)
     for k in range(changes + 1):
         speeds.take(k * usual, [100.0 + k])
     last = changes * usual
@@ -55,7 +55,7 @@ def test_speeds_that_freeze_are_not_known(changes, usual):
 def test_a_frame_is_the_spectrum_of_the_slope():
     """Of a sine of amplitude A at a bin: the bins beside it hold (2 pi f A)^2 / 2 together."""
     interval, f, amplitude = 1e-3, 40.0, 3.0
-    frames = Frames(interval)
+    frames = NotchFrames(interval)
     assert (frames.size, frames.hop) == (250, 62)
     assert_allclose(frames.frequencies, np.arange(126) * 4.0)
     due = []
@@ -81,7 +81,7 @@ def test_a_frame_is_the_spectrum_of_the_slope():
 def test_samples_at_uneven_times_are_put_onto_an_even_grid():
     """A straight line stays one: its slope is constant, all in the lowest bins."""
     rng = np.random.default_rng(1)
-    frames = Frames(1e-3)
+    frames = NotchFrames(1e-3)
     t = 0.0
     for _ in range(251):
         t += 1e-3 * rng.uniform(0.5, 1.5)
@@ -89,8 +89,8 @@ def test_samples_at_uneven_times_are_put_onto_an_even_grid():
     assert due
     power, _ = frames.take(1)
     assert power[0, 4:].sum() < 1e-6 * power[0].sum()
-    assert Frames(0.1).size == 16 and Frames(1e-6).size == 4096
-    assert Frames(0.1).hop == 4
+    assert NotchFrames(0.1).size == 16 and NotchFrames(1e-6).size == 4096
+    assert NotchFrames(0.1).hop == 4
 
 
 @pytest.mark.parametrize('a, b', [(0.0, 300.0), (-40.0, 420.0), (60.0, 250.0)])
@@ -123,7 +123,7 @@ def test_families():
 
 
 def choice(count=1, channels=1):
-    return Choice(np.arange(126) * 4.0, (60.0, 90.0), 1000.0, channels, count)
+    return NotchChoice(np.arange(126) * 4.0, (60.0, 90.0), 1000.0, channels, count)
 
 
 def frame(line=0.0, f=160.0):
