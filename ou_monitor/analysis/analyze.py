@@ -29,47 +29,22 @@ RAIL = (4.0, 6.0)
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """
-    Result of `analyze`.
+    """Result of `analyze`."""
 
-    Attributes
-    ----------
-    recording : Recording
-        What was analysed.
-    levels : tuple of LevelResult
-        In order of throttle.
-    relaxations : tuple of Relaxation
-        After falls of throttle (``release``) and rises (``load``).
-    causes : tuple of Cause
-        Of each relaxation: the noise's own time constant, or the instrument.
-    alpha_test : AlphaTest
-        Whether alpha is the same at all levels.
-    by_throttle : ByThrottle
-        Sag, noise and risk over throttle.
-    sliding : Sliding
-        What the node would have published.
-    quality : tuple of QualityItem
-        What to know before using the numbers, worst first.
-    brownout_default : bool
-        Whether the voltage of the risk is the node's default, not one that was asked for.
-    notes : tuple of str
-        What was dropped or left out, one sentence each.
-    overview : Overview
-        Lowest voltage, dips, sag and noise: what is known of every recording.
-
-    """
-
-    recording: Recording
-    levels: tuple[LevelResult, ...]
+    recording: Recording  # What was analysed
+    levels: tuple[LevelResult, ...]  # In order of throttle
+    # After falls of throttle (``release``) and rises (``load``).
     relaxations: tuple[Relaxation, ...]
+    # Of each relaxation: the noise's own time constant, or the instrument.
     causes: tuple[ReleaseCause, ...]
-    alpha_test: AlphaTest
-    by_throttle: ByThrottle
-    sliding: Sliding
-    quality: tuple[QualityItem, ...]
+    alpha_test: AlphaTest  # Whether alpha is the same at all levels
+    by_throttle: ByThrottle  # Sag, noise and risk over throttle
+    sliding: Sliding  # What the node would have published
+    quality: tuple[QualityItem, ...]  # What to know before using the numbers, worst first
+    # Whether the voltage of the risk is the node's default, not one that was asked for.
     brownout_default: bool
-    notes: tuple[str, ...]
-    overview: Overview
+    notes: tuple[str, ...]  # What was dropped or left out, one sentence each
+    overview: Overview  # Lowest voltage, dips, sag and noise: what is known of every recording
 
 
 def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,

@@ -38,41 +38,27 @@ NARROW = 1.5
 
 @dataclass(frozen=True)
 class AlphaTest:
-    """
-    Result of the test.
+    """Result of the test."""
 
-    Attributes
-    ----------
-    verdict : str
-        ``differs``, ``constant`` (the test would have detected a change by `NARROW`) or
-        ``undetermined``.
-    levels : int
-        Levels that count.
-    alpha, alpha_se : float
-        Common alpha, 1/s, and the standard error of its logarithm.
-    statistic, p_value : float
-        chi^2 with levels - 1 degrees of freedom.
-    detectable_ratio : float
-        Ratio of alpha between the lowest and the highest level that the test detects with 90 %
-        probability, where ln(alpha) is a straight line over throttle.
-    ratio, ratio_low, ratio_high : float
-        That ratio as fitted, highest over lowest throttle (NaN where it is not determined), and
-        its 95 % interval.
-    withheld : tuple of float
-        Throttles of usable levels that one OU in white noise does not describe.
-
-    """
-
+    # ``differs``, ``constant`` (the test would have detected a change by `NARROW`) or
+    # ``undetermined``.
     verdict: str
-    levels: int
+    levels: int  # Levels that count
+    # Common alpha, 1/s, and the standard error of its logarithm.
     alpha: float = NAN
     alpha_se: float = NAN
+    # chi^2 with levels - 1 degrees of freedom.
     statistic: float = NAN
     p_value: float = NAN
+    # Ratio of alpha between the lowest and the highest level that the test detects with 90 %
+    # probability, where ln(alpha) is a straight line over throttle.
     detectable_ratio: float = NAN
+    # That ratio as fitted, highest over lowest throttle (NaN where it is not determined), and its
+    # 95 % interval.
     ratio: float = NAN
     ratio_low: float = NAN
     ratio_high: float = NAN
+    # Throttles of usable levels that one OU in white noise does not describe.
     withheld: tuple[float, ...] = ()
 
     @property
@@ -167,16 +153,9 @@ def at_common_alpha(logs: FloatArray, errors: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class SigmaChange:
-    """
-    Sigma of one level over that of another.
+    """Sigma of one level over that of another."""
 
-    Attributes
-    ----------
-    ratio, ratio_low, ratio_high : float
-        As fitted (NaN where it is not determined), and its 95 % interval.
-
-    """
-
+    # As fitted (NaN where it is not determined), and its 95 % interval.
     ratio: float
     ratio_low: float
     ratio_high: float

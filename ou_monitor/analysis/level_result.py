@@ -86,25 +86,12 @@ def detectable_kurtosis(n: int) -> float:
 
 @dataclass(frozen=True)
 class KindVerdict:
-    """
-    What a level is called, and why.
+    """What a level is called, and why."""
 
-    Attributes
-    ----------
-    kind : ProcessType
-        Kind.
-    why : str
-        The reason without numbers, so that levels of one reason can stand together.
-    figures : str
-        The numbers behind it; may be empty.
-    within : ProcessType
-        For 'quasi-stationary' what the level is called apart from its changes; else `kind`.
-
-    """
-
-    kind: ProcessType
-    why: str
-    figures: str = ''
+    kind: ProcessType  # Kind
+    why: str  # The reason without numbers, so that levels of one reason can stand together
+    figures: str = ''  # The numbers behind it; may be empty
+    # For 'quasi-stationary' what the level is called apart from its changes; else `kind`.
     within: ProcessType = ProcessType.UNDETERMINED
 
     @property
@@ -222,22 +209,13 @@ def _empty() -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class LevelSpectrum:
-    """
-    One-sided power spectral density of a level.
+    """One-sided power spectral density of a level."""
 
-    Attributes
-    ----------
-    frequency : ndarray, shape (k,)
-        Hz, > 0, even on a log axis.
-    density : ndarray, shape (k,)
-        Measured, V^2/Hz.
-    fitted : ndarray, shape (k,)
-        Of the fitted OU in white noise, sampled as the data are, V^2/Hz; NaN without a fit.
-
-    """
-
+    # Hz, > 0, even on a log axis; shape (k,).
     frequency: FloatArray = field(default_factory=_empty)
-    density: FloatArray = field(default_factory=_empty)
+    density: FloatArray = field(default_factory=_empty)  # Measured, V^2/Hz; shape (k,)
+    # Of the fitted OU in white noise, sampled as the data are, V^2/Hz; NaN without a fit; shape
+    # (k,).
     fitted: FloatArray = field(default_factory=_empty)
 
 
@@ -377,61 +355,29 @@ def fit_parts(recording: Recording, left: Remainder, segments: Sequence[Stay],
 
 @dataclass(frozen=True, eq=False)
 class LevelResult:
-    """
-    What one load level shows.
+    """What one load level shows."""
 
-    Attributes
-    ----------
-    throttle : float
-        Throttle, 0..1; NaN for a level that holds the whole recording.
-    segments : tuple of Stay
-        Segments of samples that were used.
-    time : float
-        Time in them, s.
-    n : int
-        Samples in them.
-    mean : float
-        Mean voltage, V.
-    vpp, peak, vrms : float
-        Peak to peak, largest absolute value and rms of the deviation from the
-        mean of its segment, V (as an AC-coupled oscilloscope would show it).
-    deviation : ndarray, shape (n,)
-        That deviation, V.
-    ou : OuFacts
-        Relaxation in what level and load leave, without its lines, or its bounds.
-    estimate : Estimate
-        The same, as the node gives it.
-    shape : Shape
-        Tests of the kind of process, adjusted over all levels.
-    verdict : KindVerdict
-        Kind of process, and why.
-    sag : LevelSag
-        How far the mean lies below that of the lowest throttle.
-    spectrum : LevelSpectrum
-        PSD, measured and fitted.
-    lines : LineSearch
-        Spectral lines, and what would have been found.
-    with_lines : Estimate or None
-        With its lines, when these were taken out; None when they were not.
-
-    """
-
-    throttle: float
-    segments: tuple[Stay, ...]
-    time: float
-    n: int
-    mean: float
+    throttle: float  # Throttle, 0..1; NaN for a level that holds the whole recording
+    segments: tuple[Stay, ...]  # Segments of samples that were used
+    time: float  # Time in them, s
+    n: int  # Samples in them
+    mean: float  # Mean voltage, V
+    # Peak to peak, largest absolute value and rms of the deviation from the mean of its segment, V
+    # (as an AC-coupled oscilloscope would show it).
     vpp: float
     peak: float
     vrms: float
-    deviation: FloatArray
-    ou: OuFacts
-    estimate: Estimate
-    shape: Shape
+    deviation: FloatArray  # That deviation, V; shape (n,)
+    ou: OuFacts  # Relaxation in what level and load leave, without its lines, or its bounds
+    estimate: Estimate  # The same, as the node gives it
+    shape: Shape  # Tests of the kind of process, adjusted over all levels
+    # Kind of process, and why.
     verdict: KindVerdict = KindVerdict(ProcessType.UNDETERMINED, 'not judged')
-    sag: LevelSag = LevelSag()
-    spectrum: LevelSpectrum = field(default_factory=LevelSpectrum)
+    sag: LevelSag = LevelSag()  # How far the mean lies below that of the lowest throttle
+    spectrum: LevelSpectrum = field(default_factory=LevelSpectrum)  # PSD, measured and fitted
+    # Spectral lines, and what would have been found.
     lines: LineSearch = field(default_factory=LineSearch)
+    # With its lines, when these were taken out; None when they were not.
     with_lines: Estimate | None = None
 
     @property

@@ -63,23 +63,11 @@ class Stay:
 
 @dataclass(frozen=True)
 class LoadLevel:
-    """
-    One throttle and where in the recording it was held.
+    """One throttle and where in the recording it was held."""
 
-    Attributes
-    ----------
-    throttle : float
-        Throttle of the level, 0..1; NaN for a level that holds everything.
-    segments : tuple of Stay
-        Segments at this throttle, settling left out.
-    settling : float
-        Time left out after changes of throttle, s.
-
-    """
-
-    throttle: float
-    segments: tuple[Stay, ...]
-    settling: float = 0.0
+    throttle: float  # Throttle of the level, 0..1; NaN for a level that holds everything
+    segments: tuple[Stay, ...]  # Segments at this throttle, settling left out
+    settling: float = 0.0  # Time left out after changes of throttle, s
 
 
 def find_levels(t: FloatArray, throttle: FloatArray,

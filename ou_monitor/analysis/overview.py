@@ -29,61 +29,29 @@ _LOUD = 0.25
 
 @dataclass(frozen=True)
 class LoudestLine:
-    """
-    The strongest spectral line of all load levels.
+    """The strongest spectral line of all load levels."""
 
-    Attributes
-    ----------
-    frequency, rms : float
-        Hz and V.
-    share : float
-        Of the variance of its level, 0..1.
-    level : str
-        Throttle of that level, in words.
-    lines, all_share : int, float
-        How many lines that level has, and their share together.
-
-    """
-
+    # Hz and V.
     frequency: float
     rms: float
-    share: float
-    level: str
+    share: float  # Of the variance of its level, 0..1
+    level: str  # Throttle of that level, in words
+    # How many lines that level has, and their share together.
     lines: int
     all_share: float
 
 
 @dataclass(frozen=True)
 class Overview:
-    """
-    What every command says first of a recording.
+    """What every command says first of a recording."""
 
-    Attributes
-    ----------
-    facts : SupplyFacts
-        What is known of the supply.
-    duration : float
-        Of the recording, s.
-    load : SupplyLoad
-        The load at the end, of which the facts hold eleven points.
-    highest : float
-        Highest throttle; NaN without throttle.
-    line : LoudestLine or None
-        Strongest spectral line; None when there is none.
-    cells : int
-        Cells in series that the limit is of; 0 when it is of the whole.
-    end : MonitorReport or None
-        What the node says at the end; None without a limit.
-
-    """
-
-    facts: SupplyFacts
-    duration: float
-    load: SupplyLoad
-    highest: float
-    line: LoudestLine | None = None
-    cells: int = 0
-    end: MonitorReport | None = None
+    facts: SupplyFacts  # What is known of the supply
+    duration: float  # Of the recording, s
+    load: SupplyLoad  # The load at the end, of which the facts hold eleven points
+    highest: float  # Highest throttle; NaN without throttle
+    line: LoudestLine | None = None  # Strongest spectral line; None when there is none
+    cells: int = 0  # Cells in series that the limit is of; 0 when it is of the whole
+    end: MonitorReport | None = None  # What the node says at the end; None without a limit
 
     @property
     def limit(self) -> float:

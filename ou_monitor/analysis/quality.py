@@ -51,25 +51,13 @@ class Severity(enum.IntEnum):
 
 @dataclass(frozen=True)
 class QualityItem:
-    """
-    One thing to know before using the numbers.
+    """One thing to know before using the numbers."""
 
-    Attributes
-    ----------
-    name : str
-        Stable key in capitals.
-    severity : Severity
-        ERROR: there are no numbers; WARNING: they are doubtful; INFO: good to know.
-    text : str
-        One sentence.
-    throttles : tuple of float
-        Levels it is true of; empty when it is of the whole recording.
-
-    """
-
-    name: str
+    name: str  # Stable key in capitals
+    # ERROR: there are no numbers; WARNING: they are doubtful; INFO: good to know.
     severity: Severity
-    text: str
+    text: str  # One sentence
+    # Levels it is true of; empty when it is of the whole recording.
     throttles: tuple[float, ...] = ()
 
 

@@ -57,26 +57,14 @@ _BESIDE = (0.25, 4.0)
 
 @dataclass(frozen=True)
 class LevelChange:
-    """
-    A change of load level.
+    """A change of load level."""
 
-    Attributes
-    ----------
-    before, after : int
-        Numbers of the levels.
-    leave : int
-        Index of the first sample that is no longer at the level before.
-    enter : int
-        Index of the sample from which throttle stands still at the level after.
-    begin, stop : int
-        First sample of the stay before; one past the last that throttle stands still after.
-
-    """
-
+    # Numbers of the levels.
     before: int
     after: int
-    leave: int
-    enter: int
+    leave: int  # Index of the first sample that is no longer at the level before
+    enter: int  # Index of the sample from which throttle stands still at the level after
+    # First sample of the stay before; one past the last that throttle stands still after.
     begin: int
     stop: int
 
@@ -202,86 +190,52 @@ _LATER, _WELL = 1.0 / 3.0, 0.05
 
 @dataclass(frozen=True)
 class Release:
-    """
-    One change of load.
+    """One change of load."""
 
-    Attributes
-    ----------
-    t : float
-        When throttle had arrived, s, by the recording's clock.
-    throttle_before, throttle_after : float
-        Levels, 0..1.
-    level_before, level_before_se : float
-        Mean voltage at the end of the stay before and its standard error, V; NaN when the stay
-        was too short.
-    level, level_se : float
-        Voltage U0 that it settles at, V.
-    amplitude, amplitude_se : float
-        A: how far from U0 it is when throttle has arrived, V; negative after a release.
-    beyond : float
-        How far it goes beyond U0 to the other side, V: overshoot after a release, undershoot
-        after a load.
-    beyond_p : float
-        Probability that noise goes as far (a bound, over all changes of the kind).
-    duration : float
-        Time watched, s.
-    n : int
-        Samples used.
-
-    """
-
-    t: float
+    t: float  # When throttle had arrived, s, by the recording's clock
+    # Levels, 0..1.
     throttle_before: float
     throttle_after: float
+    # Mean voltage at the end of the stay before and its standard error, V; NaN when the stay was
+    # too short.
     level_before: float
     level_before_se: float
+    # Voltage U0 that it settles at, V.
     level: float
     level_se: float
+    # A: how far from U0 it is when throttle has arrived, V; negative after a release.
     amplitude: float
     amplitude_se: float
+    # How far it goes beyond U0 to the other side, V: overshoot after a release, undershoot after a
+    # load.
     beyond: float
-    beyond_p: float
-    duration: float
-    n: int
+    beyond_p: float  # Probability that noise goes as far (a bound, over all changes of the kind)
+    duration: float  # Time watched, s
+    n: int  # Samples used
 
 
 @dataclass(frozen=True)
 class Relaxation:
-    """
-    All changes of one kind, fitted with one tau.
+    """All changes of one kind, fitted with one tau."""
 
-    Attributes
-    ----------
-    kind : str
-        ``release`` (throttle falls) or ``load`` (it rises).
-    releases : tuple of Release
-        Those fitted.
-    tau, tau_low, tau_high : float
-        s, and 95 % interval; tau is NaN where the interval spans more than a factor of 10 either
-        way, an open end is 0 or inf; all NaN when no relaxation is detected.
-    misfit : float
-        Mean square of the standardised innovations: 1 when one exponential in the level's noise
-        describes it.
-    misfit_p : float
-        Probability that further exponentials take as much out of the residuals where one is all
-        there is; NaN when no relaxation is detected.
-    likelihood_gain : float
-        Twice the gain of log likelihood over no relaxation at all; large without a tau when the
-        voltage moves on over the whole time watched.
-    left_out : float
-        Time after throttle arrived that the fit leaves out, s: one exponential describes only
-        what follows.
-
-    """
-
-    kind: str
-    releases: tuple[Release, ...]
+    kind: str  # ``release`` (throttle falls) or ``load`` (it rises)
+    releases: tuple[Release, ...]  # Those fitted
+    # s, and 95 % interval; tau is NaN where the interval spans more than a factor of 10 either
+    # way, an open end is 0 or inf; all NaN when no relaxation is detected.
     tau: float = NAN
     tau_low: float = NAN
     tau_high: float = NAN
+    # Mean square of the standardised innovations: 1 when one exponential in the level's noise
+    # describes it.
     misfit: float = NAN
+    # Twice the gain of log likelihood over no relaxation at all; large without a tau when the
+    # voltage moves on over the whole time watched.
     likelihood_gain: float = NAN
+    # Probability that further exponentials take as much out of the residuals where one is all
+    # there is; NaN when no relaxation is detected.
     misfit_p: float = NAN
+    # Time after throttle arrived that the fit leaves out, s: one exponential describes only what
+    # follows.
     left_out: float = 0.0
 
     @property
@@ -493,41 +447,24 @@ _CLOSE = 1.5
 
 @dataclass(frozen=True)
 class ReleaseCause:
-    """
-    How tau compares with the noise, and whether the instrument explains it.
+    """How tau compares with the noise, and whether the instrument explains it."""
 
-    Attributes
-    ----------
-    noise : str
-        ``agrees`` (tau alpha within a factor of 1.5 of 1 with 95 %), ``differs`` or
-        ``undetermined``.
-    ratio, ratio_low, ratio_high : float
-        tau alpha, with alpha that of the noise, common to all levels, and its 95 % interval; that
-        is NaN where one exponential does not describe the transient.
-    p_value : float
-        Of a ratio so far from 1.
-    instrument : str
-        ``excluded``, ``possible`` or ``undetermined``.
-    corner : float
-        Of the high-pass that would explain it, 1/(2 pi tau), Hz.
-    step, step_se : float
-        Level after less level before in the direction of the transient, mean of the changes
-        that have an amplitude, V; NaN when none has.
-    sentence : str
-        Both verdicts in words.
-
-    """
-
+    # ``agrees`` (tau alpha within a factor of 1.5 of 1 with 95 %), ``differs`` or
+    # ``undetermined``.
     noise: str
+    # tau alpha, with alpha that of the noise, common to all levels, and its 95 % interval; that is
+    # NaN where one exponential does not describe the transient.
     ratio: float
     ratio_low: float
     ratio_high: float
-    p_value: float
-    instrument: str
-    corner: float
+    p_value: float  # Of a ratio so far from 1
+    instrument: str  # ``excluded``, ``possible`` or ``undetermined``
+    corner: float  # Of the high-pass that would explain it, 1/(2 pi tau), Hz
+    # Level after less level before in the direction of the transient, mean of the changes that
+    # have an amplitude, V; NaN when none has.
     step: float
     step_se: float
-    sentence: str
+    sentence: str  # Both verdicts in words
 
 
 def judge_cause(relaxation: Relaxation, alpha: AlphaTest) -> ReleaseCause:

@@ -25,33 +25,17 @@ from ou_monitor.text import Z95
 
 @dataclass(frozen=True, eq=False)
 class Sliding:
-    """
-    Sliding estimates of a whole recording.
+    """Sliding estimates of a whole recording."""
 
-    Attributes
-    ----------
-    window : float
-        Length of the window, s.
-    t : ndarray, shape (k,)
-        Stamps of the newest sample of each window, s.
-    estimates : tuple of Estimate
-        One a stamp; the numbers of those that are not usable are NaN.
-    risk : ndarray, shape (k,)
-        Probability of a brown-out within the horizon; NaN when unknown.
-    brownout_voltage, brownout_horizon : float
-        What the risk is of, V and s.
-    monitor : SupplyMonitor
-        As it is at the end of the recording.
-
-    """
-
-    window: float
-    t: FloatArray
+    window: float  # Length of the window, s
+    t: FloatArray  # Stamps of the newest sample of each window, s; shape (k,)
+    # One a stamp; the numbers of those that are not usable are NaN.
     estimates: tuple[Estimate, ...]
-    risk: FloatArray
+    risk: FloatArray  # Probability of a brown-out within the horizon; NaN when unknown; shape (k,)
+    # What the risk is of, V and s.
     brownout_voltage: float
     brownout_horizon: float
-    monitor: SupplyMonitor
+    monitor: SupplyMonitor  # As it is at the end of the recording
 
     def series(self, name: str) -> FloatArray:
         """Return one field of the estimates as an array."""
@@ -97,47 +81,27 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
 
 @dataclass(frozen=True, eq=False)
 class ByThrottle:
-    """
-    Curves over throttle.
+    """Curves over throttle."""
 
-    Attributes
-    ----------
-    throttle : ndarray, shape (k,)
-        0, 0.1, .. 1.
-    known : ndarray of bool, shape (k,)
-        Whether that throttle was flown; beyond, sag and noise are extrapolated.
-    sag, sag_low, sag_high : ndarray, shape (k,)
-        Sag of the facts and its 95 % interval, V; NaN where it is not known.
-    noise : ndarray, shape (k,)
-        Rms of what the load does not explain, of the facts, V.
-    risk : ndarray, shape (k,)
-        Probability of a brown-out within the horizon; NaN well beyond the highest throttle.
-    budget : float
-        Highest throttle that keeps the risk within `limit`; NaN when unknown.
-    budget_reason : str
-        What ends it, or why it is not known.
-    limit : float
-        That risk.
-    voltage, horizon : float
-        What the risk is of, V and s.
-    time : float
-        Stamp at which the risk is told, s; NaN of a recording too short for a window.
-
-    """
-
+    # 0, 0.1, .. 1; shape (k,).
     throttle: FloatArray
+    # Whether that throttle was flown; beyond, sag and noise are extrapolated; shape (k,).
     known: npt.NDArray[np.bool_]
+    # Sag of the facts and its 95 % interval, V; NaN where it is not known; shape (k,).
     sag: FloatArray
     sag_low: FloatArray
     sag_high: FloatArray
-    noise: FloatArray
+    noise: FloatArray  # Rms of what the load does not explain, of the facts, V; shape (k,)
+    # Probability of a brown-out within the horizon; NaN well beyond the highest throttle; shape
+    # (k,).
     risk: FloatArray
-    budget: float
-    budget_reason: str
-    limit: float
+    budget: float  # Highest throttle that keeps the risk within `limit`; NaN when unknown
+    budget_reason: str  # What ends it, or why it is not known
+    limit: float  # That risk
+    # What the risk is of, V and s.
     voltage: float
     horizon: float
-    time: float
+    time: float  # Stamp at which the risk is told, s; NaN of a recording too short for a window
 
     def at(self, throttle: float, name: str) -> float:
         """Return one curve at a throttle, between its points; NaN when unknown."""

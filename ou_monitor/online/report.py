@@ -15,84 +15,41 @@ RISK_CURVE = tuple(k / 10.0 for k in range(11))
 
 @dataclass(frozen=True)
 class MonitorReport:
-    """
-    What is known at one instant.
+    """What is known at one instant."""
 
-    Attributes
-    ----------
-    estimate : Estimate
-        Newest estimate; its alpha, sigma and var_inf are those of `ou`.
-    risk : float
-        Probability of a brown-out within the horizon; NaN when not known.
-    budget : float
-        Highest throttle, 0..1, that keeps the risk under
-        `brownout.budget_limit`; NaN when not known.
-    budget_reason : str
-        What ends the budget, or why it is not known.
-    left_out : tuple of str
-        Terms of the model file that move the supply and that the risk does not know of.
-    flag : FlagState
-        The brown-out flag, and why.
-    level : Level
-        Level for the diagnostics.
-    summary : str
-        One line for the pilot.
-    age : float
-        Age of the newest voltage, s; inf when none ever came.
-    patience : float
-        Age from which the input is stale, s: `stale_after`, less for a fast source, more for a
-        slow one.
-    stamps : StampOrder
-        What the stamps are good for.
-    doubt : Doubt
-        Why the input is not trusted.
-    fresh : bool
-        Whether the numbers rest on samples that are trusted and not too old.
-    thinned : int
-        Samples that only the floor has judged, because there were more than could be estimated
-        from.
-    restarts : int
-        Times the estimator was started anew because of an error.
-    fault : str
-        The last such error, in one line; empty when there was none.
-    load : SupplyLoad
-        Level, sag and noise under load, as far as they are known; needs no relaxation.
-    risk_basis : str
-        Leg on which the risk stands: ``first_passage``, ``load``, ``excursions`` or ``none``.
-    risk_cause : str
-        What makes most of the risk: noise, load now, or throttle to come; empty: not known.
-    risk_curve : tuple of float
-        Risk if throttle goes to each of `RISK_CURVE` and stays for the horizon; empty or NaN:
-        not known.
-    ou : OuFacts
-        Relaxation, or its bounds, and the window that it is of.
-    ou_age : float
-        How long before the newest sample that window ended, s.
-
-    """
-
-    estimate: Estimate
-    risk: float
+    estimate: Estimate  # Newest estimate; its alpha, sigma and var_inf are those of `ou`
+    risk: float  # Probability of a brown-out within the horizon; NaN when not known
+    # Highest throttle, 0..1, that keeps the risk under `brownout.budget_limit`; NaN when not
+    # known.
     budget: float
-    budget_reason: str
+    budget_reason: str  # What ends the budget, or why it is not known
+    # Terms of the model file that move the supply and that the risk does not know of.
     left_out: tuple[str, ...]
-    flag: FlagState
-    level: Level
-    summary: str
-    age: float
+    flag: FlagState  # The brown-out flag, and why
+    level: Level  # Level for the diagnostics
+    summary: str  # One line for the pilot
+    age: float  # Age of the newest voltage, s; inf when none ever came
+    # Age from which the input is stale, s: `stale_after`, less for a fast source, more for a slow
+    # one.
     patience: float
-    stamps: StampOrder
-    doubt: Doubt
-    fresh: bool
+    stamps: StampOrder  # What the stamps are good for
+    doubt: Doubt  # Why the input is not trusted
+    fresh: bool  # Whether the numbers rest on samples that are trusted and not too old
+    # Samples that only the floor has judged, because there were more than could be estimated from.
     thinned: int
-    restarts: int
-    fault: str
+    restarts: int  # Times the estimator was started anew because of an error
+    fault: str  # The last such error, in one line; empty when there was none
+    # Level, sag and noise under load, as far as they are known; needs no relaxation.
     load: SupplyLoad = SupplyLoad()
+    # Leg on which the risk stands: ``first_passage``, ``load``, ``excursions`` or ``none``.
     risk_basis: str = 'none'
+    # What makes most of the risk: noise, load now, or throttle to come; empty: not known.
     risk_cause: str = ''
+    # Risk if throttle goes to each of `RISK_CURVE` and stays for the horizon; empty or NaN: not
+    # known.
     risk_curve: tuple[float, ...] = ()
-    ou: OuFacts = OuFacts('no_data')
-    ou_age: float = 0.0
+    ou: OuFacts = OuFacts('no_data')  # Relaxation, or its bounds, and the window that it is of
+    ou_age: float = 0.0  # How long before the newest sample that window ended, s
 
     @property
     def brownout(self) -> bool | None:

@@ -21,29 +21,15 @@ from ou_monitor.online.filter.lag import cutoff_for_lag, most_lag
 
 @dataclass(frozen=True)
 class Parameter:
-    """
-    One parameter of a node.
+    """One parameter of a node."""
 
-    Attributes
-    ----------
-    name : str
-        Dotted name as in YAML.
-    default : bool, int, float or str
-        Default; its type is the parameter's type.
-    description : str
-        One sentence with the unit.
-    low, high : float or None
-        Range, inclusive; None where the type has none.
-    choices : tuple of str
-        Accepted words; empty when free.  With a range, numbers within it are accepted too.
-
-    """
-
-    name: str
-    default: bool | int | float | str
-    description: str
+    name: str  # Dotted name as in YAML
+    default: bool | int | float | str  # Default; its type is the parameter's type
+    description: str  # One sentence with the unit
+    # Range, inclusive; None where the type has none.
     low: float | None = None
     high: float | None = None
+    # Accepted words; empty when free.  With a range, numbers within it are accepted too.
     choices: tuple[str, ...] = ()
 
     @property

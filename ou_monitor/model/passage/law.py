@@ -124,20 +124,11 @@ def passage_probability(start: npt.ArrayLike, barrier: npt.ArrayLike, span: npt.
 
 @dataclass(frozen=True, eq=False)
 class PassageTable:
-    """
-    What is made once.
+    """What is made once."""
 
-    Attributes
-    ----------
-    coefficients : ndarray, shape (barriers, w, lambda)
-        Spline coefficients of R.
-    log_rate : ndarray, shape (barriers,)
-        Spline coefficients of the logarithm of the long-run rate of passages,
-        1/tau.
-
-    """
-
-    coefficients: FloatArray
+    coefficients: FloatArray  # Spline coefficients of R; shape (barriers, w, lambda)
+    # Spline coefficients of the logarithm of the long-run rate of passages, 1/tau; shape
+    # (barriers,).
     log_rate: FloatArray
 
     def probability(self, x: FloatArray, b: FloatArray, s: FloatArray) -> FloatArray:

@@ -35,33 +35,16 @@ _CHANGES = 3
 
 @dataclass(frozen=True, slots=True)
 class LoadBlock:
-    """
-    Samples in a row with one throttle.
+    """Samples in a row with one throttle."""
 
-    Attributes
-    ----------
-    t, last : float
-        Mean and last stamp, s.
-    voltage : float
-        Mean voltage, V.
-    throttle : float
-        Mean throttle, 0..1; NaN where unknown.
-    current : float
-        Mean of the currents that are known, A; NaN without one.
-    n : int
-        Samples.
-    within : float
-        Variance of one sample about the mean, V^2; NaN of a single one.
-
-    """
-
+    # Mean and last stamp, s.
     t: float
     last: float
-    voltage: float
-    throttle: float
-    current: float
-    n: int
-    within: float
+    voltage: float  # Mean voltage, V
+    throttle: float  # Mean throttle, 0..1; NaN where unknown
+    current: float  # Mean of the currents that are known, A; NaN without one
+    n: int  # Samples
+    within: float  # Variance of one sample about the mean, V^2; NaN of a single one
 
 
 class LoadBlocks:
