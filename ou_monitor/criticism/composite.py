@@ -105,7 +105,7 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
         offset = moved if moved.any() else None
         structural = list(gaussian.terms)
     fitted = (*gaussian.terms, *(fit.term for fit in fits))
-    free = sum(len(term.free()) + len(term.LINEAR) for term in gaussian.terms) + 1
+    free = sum(len(term.free()) + len(term.LINEAR) + term.APART for term in gaussian.terms) + 1
     return Composite(fitted, (*gaussian.se, *(fit.se for fit in fits)), gaussian, z, density,
                      free + sum(fit.free for fit in fits), sum(term.SEARCH for term in fitted),
                      events, offset, cost)

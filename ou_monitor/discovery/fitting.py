@@ -29,6 +29,8 @@ from ou_monitor.records import FloatArray
 
 # Starting points that are fitted in full, and samples that decide which.
 _FULL, _GLANCE = 2, 8000
+# Times that a term finds its parameters beside those of the fit.
+_AGAIN = 3
 # Nats by which two fits to one spectrum differ at least.
 _ALIKE = 0.1
 
@@ -79,6 +81,24 @@ class Fitter:
             # Parameters have left what a term allows, or numbers can hold.
             return None
         self.cost += 0.0 if found is None else found.cost
+        return found if found is None or rough else self._apart(found, self.samples.train)
+
+    def _apart(self, found: Composite, part: slice) -> Composite:
+        """Return a model whose terms have found again what the fit does not."""
+        for _ in range(_AGAIN):
+            if not any(term.APART for term in found.terms):
+                break
+            view = view_of(self.samples, found.gaussian, found.z, part)
+            terms = [term.apart(view) if term.APART else term for term in found.terms]
+            try:
+                again = fit_composite(self.samples, terms, part, found, whole_mean=True,
+                                      rough=True)
+            except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+                break
+            self.cost += 0.0 if again is None else again.cost
+            if again is None or not self.evidence(again) > self.evidence(found) + _ALIKE:
+                break
+            found = again
         return found
 
     def whole(self, model: Composite) -> Composite:
@@ -89,7 +109,9 @@ class Fitter:
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             return model
         self.cost += 0.0 if again is None else again.cost
-        return again if again is not None and math.isfinite(float(again.density.sum())) else model
+        if again is None or not math.isfinite(float(again.density.sum())):
+            return model
+        return self._apart(again, slice(0, self.samples.n))
 
     def join(self, composite: Composite, starts: Sequence[Term], rough: bool) -> Composite | None:
         """Return the fit with more terms, the last before the laws."""

@@ -23,7 +23,7 @@ from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
 from ou_monitor.model.terms.load_dependent import LoadDependentNoise, LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
-from ou_monitor.model.terms.term import Role, Term
+from ou_monitor.model.terms.term import NEXT_TO_ZERO, Role, Term
 
 # Rate, 1/s, from which a fit finds what the load leaves: minutes and tenths of a second are both
 # within reach of it.
@@ -147,9 +147,9 @@ def choose_answer(fitter: Fitter, search: Search, start: Sequence[Term]) -> None
     composite = search.composite
     answer = mean_answer(fitter.samples, composite, fitter.view(composite), start)
     own = [term for term in composite.terms if decision.is_answer(type(term))]
-    shape = [replace(term, **dict.fromkeys(term.LINEAR, 0.0)) for term in own]
-    if not start and len(own) == len(answer.terms) and all(
-            replace(term, **dict.fromkeys(term.LINEAR, 0.0)) in shape for term in answer.terms):
+    shapes, others = ([replace(term, **dict.fromkeys(term.LINEAR, NEXT_TO_ZERO)) for term in terms]
+                      for terms in (own, answer.terms))
+    if not start and len(shapes) == len(others) and all(one in shapes for one in others):
         return
     structural = [term for term in composite.terms
                   if term.ROLE is not Role.LAW and not decision.is_answer(type(term))]

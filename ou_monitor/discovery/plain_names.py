@@ -20,7 +20,7 @@ PLAIN_NAMES = {
     'held_samples': 'a logger that repeats its last value',
     'jumps': 'kicks of the load',
     'load_dependent_alpha': 'a relaxation that changes with throttle',
-    'load_dependent_noise': 'ripple that grows with throttle',
+    'load_dependent_noise': 'sensor noise that follows throttle',
     'load_dependent_sigma': 'noise that changes with throttle',
     'load_sag': 'sag',
     'load_transient': 'slow recovery after throttle',

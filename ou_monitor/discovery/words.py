@@ -67,7 +67,7 @@ def parameters(term: Term, se: Mapping[str, Any]) -> str:
     return '; '.join(
         f'{name} = {with_error(value, se.get(name), positive=term.positive(name))}'
         f'{_unit(term, name)}' for name, value in term.values().items()
-        if se.get(name) != math.inf)
+        if se.get(name) != math.inf and value != term.usual().get(name))
 
 
 def with_error(value: Any, error: Any, *, positive: bool = False) -> str:

@@ -136,7 +136,8 @@ def test_every_cause_has_its_words(name):
     kind = catalogue()[name]
     values = dict.fromkeys(kind.parameters(), 0.7)
     values.update({'low': 0.1} if 'low' in values else {})
-    values.update({p: [0.7] for p in ('throttle', 'log_factor') if p in values})
+    values.update({p: [0.7] for p in ('throttle', 'log_factor', 'at') if p in values})
+    values.update({'number': [0.0]} if 'number' in values else {})
     values.update({p: v for p, v in (('dof', 5.0), ('states', 2.0)) if p in values})
     text = explain(kind.read(values), {}, 0.01, 0.001, ['drift'], False)
     assert len(text) > 120 and 'what would' in text and '(for drift)' in text

@@ -17,7 +17,8 @@ from ou_monitor.model.terms.reading import MeasurementNoise
 import pytest
 
 WHITE = MeasurementNoise(0.01)
-LAWS = {'s': LoadDependentSigma((0.0, 1.0), (0.0, 0.5)), 'n': LoadDependentNoise(1.0, 0.0),
+LAWS = {'s': LoadDependentSigma((0.0, 1.0), (0.0, 0.5)),
+        'n': LoadDependentNoise((0.0, 0.0), (0.0, 1.0), (0.0, 0.5)),
         'a': LoadDependentAlpha(0.5)}
 LETTER = {term.NAME: letter for letter, term in LAWS.items()}
 

@@ -13,10 +13,13 @@ OU = {'alpha': ALPHA, 'sigma': SIGMA, 'u0': U0}
 EXAMPLES = {
     'ou': OU,
     'load_sag': {'linear': 0.3, 'square': 0.1},
-    'load_transient': {'gain': -0.2, 'tau': 0.03, 'delay': 0.0125},
+    'load_transient': {'gain': -0.2, 'tau': 0.03, 'delay': 0.0125, 'rise': 0.1},
     'load_dependent_sigma': {'throttle': [0.0, 0.4, 1.0], 'log_factor': [0.0, 0.7, 0.4]},
     'load_dependent_alpha': {'slope': 0.8},
-    'load_dependent_noise': {'ripple': 2.0, 'step': 3.0},
+    'load_dependent_noise': {
+        'number': [0, 0, 0, *np.repeat(np.arange(1, 10), 2).tolist()],
+        'at': [0.0, 0.5, 1.0, *[0.0, 0.2] * 9],
+        'log_factor': [0.0, 0.8, 1.0, *[0.0, 0.3, 0.0, -0.2, 0.0, 0.4] * 3]},
     'drift': {'rate': -0.01, 'curvature': 0.002},
     'measurement_noise': {'std': 0.02},
     'quantization': {'step': 0.01},

@@ -62,10 +62,11 @@ _HAIR = 1e-9
 @dataclass(frozen=True)
 class LoadTransient(Term):
     """
-    Add gain * (throttle - its low-pass of time constant tau), after a delay.
+    Add gain * (throttle - its low-pass of time constant tau), after a delay, and rise * its rises.
 
-    A step of throttle shows as gain * exp(-t/tau).  gain of the sign of the sag
-    (> 0 when the voltage falls) delays the sag: with gain equal to the sag it is
+    A step of throttle shows as gain * exp(-t/tau), one upwards as (gain + rise) * exp(-t/tau):
+    motors draw more as they run up, and give nothing back as they run down.  gain of the sign of
+    the sag (> 0 when the voltage falls) delays the sag: with gain equal to the sag it is
     low-passed.  gain < 0 deepens the fall at first (inrush).
     """
 
@@ -74,7 +75,9 @@ class LoadTransient(Term):
     STAGE: ClassVar[Stage] = Stage.LEVEL
     NEEDS_THROTTLE: ClassVar[bool] = True
     ROLE: ClassVar[Role] = Role.MEAN
-    LINEAR: ClassVar[tuple[str, ...]] = ('gain',)
+    # The rise is left out of a fit where it is 0.
+    LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
+        ('gain', 'rise'), lambda term: ('gain', 'rise') if term.rise else ('gain',))
     SIGNS: ClassVar[tuple[str, ...]] = ('throttle',)
     SEARCH: ClassVar[float] = 3.4
     MEASURED: ClassVar[bool] = True
@@ -91,6 +94,7 @@ class LoadTransient(Term):
     gain: float = parameter('V', 'answer to a step of full throttle, at once')
     tau: float = parameter('s', 'time in which it dies out', 0.0, above=True)
     delay: float = parameter('s', 'time until the answer begins', 0.0)
+    rise: float = parameter('V', 'more of it where throttle rises', default=0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
@@ -116,7 +120,8 @@ class LoadTransient(Term):
             phi = np.exp(-s.step / self.tau)
             low = first_order(phi, (1.0 - phi) * throttle, slow)
             slow = float(low[-1])
-            s.level += self.gain * (throttle - low)
+            change = throttle - low
+            s.level += self.gain * change + self.rise * np.maximum(change, 0.0)
 
         return effect
 
@@ -132,9 +137,13 @@ class LoadTransient(Term):
         # Late by whole steps, and for good: a delay.
         latest = max(_LATEST, 4.0 * step)
         late = np.unique(np.rint(np.geomspace(step, latest, _DELAYS) / step)) * step
-        return [*lags, *(cls(0.0, _FOR_GOOD * 4.0 * longest, float(delay)) for delay in late)]
+        inrush = [cls(0.0, lag.tau, 0.0, NEXT_TO_ZERO) for lag in lags if lag.tau < _INRUSH]
+        return [*lags, *inrush, *(
+            cls(0.0, _FOR_GOOD * 4.0 * longest, float(delay)) for delay in late)]
 
 
+# Longest time in which motors run up, s.
+_INRUSH = 0.2
 # Delays tried, and the longest of them, s.
 _DELAYS, _LATEST = 12, 0.1
 # Durations of a recording in which an answer loses a hundredth: it follows no trend.

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.load import ripple
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.reading import MeasurementNoise
-from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
 from ou_monitor.model.terms.term import by_parameters, parameter, parameters, Role, Term
 from ou_monitor.records import FloatArray
 
@@ -87,14 +86,16 @@ class LoadDependentSigma(Term):
         low, high = np.quantile(u, [0.01, 0.99])
         if high - low < _APART:
             return ()
-        bins = _binned(view.z[view.train] ** 2, u, low, high)
+        bins = _binned(view.z[view.train] ** 2, u, np.linspace(low, high, _BINS + 1))
         price = 0.5 * math.log(u.size)
         forms = []
         inner = np.unique(np.quantile(u, np.linspace(0.05, 0.95, 91)))
         ends = _ends(view.throttle)
-        for knots in (ends, _greedy(bins, ends, price + _KNOT_PRICE),
-                      *(np.array([at - _EDGE, at + _EDGE]) for at in inner)):
-            factors, misfit = _to_bins(bins, knots)
+        steps = np.column_stack((inner - _EDGE, inner + _EDGE))
+        line, bent = _to_bins(bins, ends[None]), _greedy(bins, ends, price + _KNOT_PRICE, _APART)
+        for knots, factors, misfit in (
+                (ends, line[0][0], float(line[1][0])), bent,
+                *zip(steps, *_to_bins(bins, steps), strict=True)):
             found = _STEP_PRICE if knots[-1] - knots[0] < 3.0 * _EDGE else (
                 _KNOT_PRICE * (knots.size - 2))
             forms.append((misfit + price * knots.size + found, knots, factors))
@@ -141,42 +142,64 @@ def _ends(throttle: FloatArray) -> FloatArray:
 Bins = tuple[FloatArray, FloatArray, FloatArray]
 
 
-def _binned(square: FloatArray, u: FloatArray, low: float, high: float) -> Bins:
-    """Return throttle, ln of the deviation of the scores, and samples, of bins that have some."""
-    edges = np.linspace(low, high, _BINS + 1)
-    where = np.clip(np.searchsorted(edges, u, side='right') - 1, 0, _BINS - 1)
-    count = np.bincount(where, minlength=_BINS).astype(np.float64)
+def _binned(square: FloatArray, x: FloatArray, edges: FloatArray) -> Bins:
+    """Return inputs, ln of the deviation of the scores, and samples, of bins that have some."""
+    last = edges.size - 2
+    where = np.clip(np.searchsorted(edges, x, side='right') - 1, 0, last)
+    count = np.bincount(where, minlength=last + 1).astype(np.float64)
     some = count >= _IN_BIN
-    centre = np.bincount(where, u, _BINS)[some] / count[some]
-    power = np.bincount(where, square, _BINS)[some] / count[some]
+    centre = np.bincount(where, x, last + 1)[some] / count[some]
+    power = np.bincount(where, square, last + 1)[some] / count[some]
     return centre, 0.5 * np.log(np.maximum(power, 1e-12)), count[some]
 
 
-def _to_bins(bins: Bins, knots: FloatArray) -> tuple[FloatArray, float]:
-    """Return factors at the knots that fit the bins, and what is left, nats."""
+def _hats(x: FloatArray, knots: FloatArray) -> FloatArray:
+    """Return the shares of knots, shape (sets, knots), in inputs: (sets, inputs, knots)."""
+    sets, count = knots.shape
+    at = np.clip((x[None, :, None] >= knots[:, None, :]).sum(axis=2) - 1, 0, count - 2)
+    rows = np.arange(sets)[:, None]
+    low, high = knots[rows, at], knots[rows, at + 1]
+    share = np.clip((x - low) / (high - low), 0.0, 1.0)
+    hats = np.zeros((sets, x.size, count))
+    places = rows, np.arange(x.size)[None, :]
+    hats[(*places, at)] = 1.0 - share
+    hats[(*places, at + 1)] += share
+    return hats
+
+
+def _to_bins(bins: Bins, knots: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return factors that fit the bins, for sets of knots, and what is left of each, nats."""
     centre, log, count = bins
     # The logarithm of a deviation found from n scores has a variance of 1/(2 n).
-    weight = np.sqrt(2.0 * count)
-    hats = np.stack([np.interp(centre, knots, row) for row in np.eye(knots.size)], axis=1)
-    factors: FloatArray = np.asarray(
-        np.linalg.lstsq(hats * weight[:, None], log * weight, rcond=1e-6)[0], dtype=np.float64)
-    left = (log - hats @ factors) * weight
-    return factors, 0.5 * float(left @ left)
+    weight = 2.0 * count
+    hats = _hats(centre, knots)
+    gram = np.einsum('sik,i,sil->skl', hats, weight, hats)
+    product = np.einsum('sik,i->sk', hats, weight * log)
+    factors = np.einsum('skl,sl->sk', np.linalg.pinv(gram, rcond=1e-9, hermitian=True), product)
+    left = log - np.einsum('sik,sk->si', hats, factors)
+    return factors, 0.5 * (left * left) @ weight
 
 
-def _greedy(bins: Bins, knots: FloatArray, price: float) -> FloatArray:
-    """Return knots: the ends, and one after the other where it helps most, while it pays."""
-    misfit = _to_bins(bins, knots)[1]
-    while knots.size < _MOST_KNOTS:
-        tried = [np.sort(np.append(knots, at)) for at in bins[0].tolist()
-                 if float(np.abs(knots - at).min()) > _APART]
+def _greedy(bins: Bins, knots: FloatArray, price: float, apart: float
+            ) -> tuple[FloatArray, FloatArray, float]:
+    """
+    Return knots, factors there, and what is left, nats.
+
+    The ends, and one after the other where it helps most, while it pays; nearer ones are one.
+    """
+    factors, misfit = _to_bins(bins, knots[None])
+    found = knots, factors[0], float(misfit[0])
+    while found[0].size < _MOST_KNOTS:
+        tried = [np.sort(np.append(found[0], at)) for at in bins[0].tolist()
+                 if float(np.abs(found[0] - at).min()) > apart]
         if not tried:
             break
-        value, best = min(((_to_bins(bins, more)[1], k) for k, more in enumerate(tried)))
-        if misfit - value < price:
+        factors, misfit = _to_bins(bins, np.array(tried))
+        best = int(np.argmin(misfit))
+        if found[2] - misfit[best] < price:
             break
-        knots, misfit = tried[best], value
-    return knots
+        found = tried[best], factors[best], float(misfit[best])
+    return found
 
 
 @dataclass(frozen=True)
@@ -220,28 +243,34 @@ class LoadDependentAlpha(Term):
         return () if view.throttle is None else (cls(0.0),)
 
 
-# A change of throttle is counted over this time, s, or over one sample where those are farther
-# apart: what the filter onboard takes as one correction.
-_SPAN = 0.02
-# Stamps nearer than this are one, s.
-_HAIR = 1e-9
-# A fit stays within a factor of e^4 on the deviation at the ripple's peak; and within these ratios
-# for a step of throttle, of which the least is none.
-_MOST_RIPPLE = 8.0
-_LEAST_STEP, _MOST_STEP = 1e-3, 1e5
-# Ratios that a start is chosen from.
-_STEPS = np.geomspace(0.1, 1e4, 26)
+# Spans of the means of throttle that its changes are counted from, s.
+_FAST, _SLOW = 0.03, 0.2
+# What the noise may follow, by number, and the span, s: throttle; its distance from its mean of
+# the last 30 ms; its change from sample to sample; the distance between its means of the last 30
+# and 200 ms; and its rises and falls as they are remembered.
+INPUTS = (('throttle', 0.0), ('fast', _FAST), ('step', 0.0), ('slow', _SLOW), *(
+    (what, span) for span in (0.1, 0.5, 2.5) for what in ('rises', 'falls')))
+# What the choice of an input costs, nats: ln of their number.
+_INPUT_PRICE = math.log(len(INPUTS))
+# Share of white noise in the errors of one step below which they are not taken apart.
+_LEAST_WHITE = 0.05
+# Shares of the samples between which inputs are binned: changes are mostly none.
+_SHARES = np.array([*np.linspace(0.0, 0.95, 39), 0.97, 0.98, 0.985, 0.99, 0.995, 0.998, 1.0])
+# A square counts up to this where the curves are known by and large: wrong samples are no law of
+# throttle.
+_LARGEST = 25.0
+# Rounds in which each curve is fitted beside the others; knots nearer than this share of the
+# range are one.
+_ROUNDS, _SPACING = 2, 0.02
 
 
 @dataclass(frozen=True)
 class LoadDependentNoise(Term):
     """
-    Multiply the variance of the white noise by exp(ripple r(u)) + (step du)^2.
+    Multiply the white noise by a factor whose ln is a sum of curves over throttle and its changes.
 
-    r(u) = u (1.4 - u)/0.49 is the ripple current of an ESC over throttle, 1 at u = 0.7; du is the
-    change of throttle in the last 20 ms: throttle and voltage are not read at one moment, so that
-    an error as large as the change is added.  It changes what `measurement_noise` adds, and
-    nothing without one.
+    Each curve is straight between knots and level beyond the outer ones, over one of `INPUTS`.  It
+    changes what `measurement_noise` adds, and nothing without one.
     """
 
     NAME: ClassVar[str] = 'load_dependent_noise'
@@ -251,8 +280,11 @@ class LoadDependentNoise(Term):
     ROLE: ClassVar[Role] = Role.DRIVE
     SIGNS: ClassVar[tuple[str, ...]] = ('variance throttle', 'variance change')
     MEASURED: ClassVar[bool] = True
+    # Where its knots are was searched for, and which of the inputs have any.
+    SEARCH: ClassVar[float] = by_parameters(0.0, lambda term: sum(
+        _KNOT_PRICE * (values.size - 2) + _INPUT_PRICE for _, values in term.curves().values()))
+    APART: ClassVar[int] = by_parameters(0, lambda term: len(term.at) - len(set(term.number)))
     CHANGES: ClassVar[type[Term] | None] = MeasurementNoise
-    # In white noise that the rail hides, one looks like the other.
     MEANING: ClassVar[str] = (
         'The white noise of the reading grows with throttle or with its changes: ripple of the '
         'ESCs, which the ADC samples.')
@@ -263,80 +295,130 @@ class LoadDependentNoise(Term):
         'the same flight at several times the sampling rate: white noise has no memory there '
         'either')
 
-    ripple: float = parameter('', 'ln of the factor on the variance at throttle 0.7')
-    step: float = parameter(
-        '', 'what a change of throttle from 0 to 1 within 20 ms adds, over that deviation', 0.0)
+    number: tuple[float, ...] = parameters('', 'which input each knot is of: see INPUTS')
+    at: tuple[float, ...] = parameters('', 'where it is, rising for one input')
+    log_factor: tuple[float, ...] = parameters('', 'ln of the factor on the deviation there')
+
+    def check(self) -> None:
+        """Check that the knots rise and match."""
+        whole = all(float(k).is_integer() and 0 <= k < len(INPUTS) for k in self.number)
+        if not whole or not len(self.number) == len(self.at) == len(self.log_factor):
+            raise ValueError(f'{self.NAME}: number (0 to {len(INPUTS) - 1}), at and log_factor '
+                             f'need the same length, got {list(self.number)}, {list(self.at)} and '
+                             f'{list(self.log_factor)}')
+        for knots, _ in self.curves().values():
+            if any(b <= a for a, b in zip(knots, knots[1:])):
+                raise ValueError(f'{self.NAME}.at must rise for one input, got {list(knots)}')
+
+    def curves(self) -> dict[int, tuple[FloatArray, FloatArray]]:
+        """Return knots and factors by the number of the input."""
+        numbers = np.asarray(self.number, dtype=int)
+        return {k: (np.asarray(self.at)[numbers == k], np.asarray(self.log_factor)[numbers == k])
+                for k in np.unique(numbers).tolist()}
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        recent = _Recent()
+        inputs = Inputs(self.curves())
 
         def effect(s: Segment) -> None:
-            factor = np.exp(np.clip(self.ripple * ripple(s.throttle), -_MOST_RIPPLE, _MOST_RIPPLE))
-            if self.step:
-                factor += np.square(self.step * (s.throttle - recent(s.at, s.throttle)))
-            s.noise = s.noise * np.sqrt(factor)
+            s.noise = s.noise * np.exp(self.log_of(inputs(s.step, s.throttle)))
 
         return effect
 
-    def free(self) -> tuple[str, ...]:
-        """Return both: logarithms, the first of either sign."""
-        return 'ripple', 'step'
-
-    def moved(self, name: str, by: float) -> LoadDependentNoise:
-        """Return the term with one logarithm moved."""
-        if name == 'step':
-            return replace(self, step=min(max(
-                self.step * math.exp(by), _LEAST_STEP), _MOST_STEP))
-        return replace(self, ripple=min(max(self.ripple + by, -_MOST_RIPPLE), _MOST_RIPPLE))
-
-    def per_coordinate(self, name: str) -> float:
-        """Return the derivative of a parameter with respect to its logarithm."""
-        return self.step if name == 'step' else 1.0
+    def log_of(self, inputs: Mapping[int, FloatArray]) -> FloatArray:
+        """Return ln of the factor for inputs, as `Inputs` returns them."""
+        size = next((x.size for x in inputs.values()), 1)
+        return np.asarray(sum((np.interp(inputs[k], *curve)
+                               for k, curve in self.curves().items()), np.zeros(size)))
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the slope that the logarithms of the squared scores have, and the best step."""
-        if view.throttle is None:
-            return ()
-        u = view.throttle[view.train]
+        """Return the curves that the squares of the scores have."""
+        return [] if view.throttle is None else [cls((), (), ()).apart(view)]
+
+    def apart(self, view: View) -> LoadDependentNoise:
+        """Return the curves that the scores of a model with this term have."""
+        assert view.throttle is not None
+        inputs = {k: x[view.train] for k, x in Inputs(range(len(INPUTS)))(
+            view.step, view.throttle).items()}
         square = view.z[view.train] ** 2
-        moved = np.square(u - _Recent()(view.at[view.train], u))
-        # Where throttle rests, ripple alone is seen.  The logarithm of a squared normal score, cut
-        # from below: those next to zero say nothing.
-        still = moved <= float(np.median(moved))
-        columns = np.column_stack((np.ones(u.size), ripple(u)))
-        log = np.log(np.maximum(square[still], 1e-3))
-        beta = np.linalg.lstsq(columns[still], log, rcond=1e-8)[0]
-        slope = float(np.clip(beta[1], -0.5 * _MOST_RIPPLE, 0.5 * _MOST_RIPPLE))
-        base = np.exp(slope * ripple(u))
+        white = 1.0 - np.broadcast_to(view.trust, view.z.shape)[view.train]
+        if float(white.mean()) > _LEAST_WHITE:
+            # What the rail adds is not multiplied.
+            square = np.maximum(square - (1.0 - white), 0.0) / np.maximum(white, _LEAST_WHITE)
+        square = square * np.exp(2.0 * self.log_of(inputs))
+        price = 0.5 * math.log(square.size)
+        edges = {k: np.unique(np.quantile(x, _SHARES)) for k, x in inputs.items()}
+        found: dict[int, tuple[FloatArray, FloatArray]] = {}
+        logs = {k: np.zeros(square.size) for k in inputs}
+        for turn in range(_ROUNDS):
+            for k, x in inputs.items():
+                if edges[k].size < 3:
+                    continue
+                rest = square * np.exp(-2.0 * (sum(logs.values()) - logs[k]))
+                if turn:
+                    usual = float(np.mean(np.minimum(rest, _LARGEST * float(np.mean(rest)))))
+                    rest = np.minimum(rest, _LARGEST * usual * np.exp(2.0 * logs[k]))
+                centre, log, count = bins = _binned(rest, x, edges[k])
+                flat = float(np.sum(count * (log - np.average(log, weights=count)) ** 2))
+                if centre.size < 2 or flat < price + _INPUT_PRICE:
+                    found.pop(k, None)
+                    logs[k] = np.zeros(square.size)
+                    continue
+                knots, values, misfit = _greedy(
+                    bins, centre[[0, -1]], price + _KNOT_PRICE, _SPACING * float(np.ptp(centre)))
+                if flat - misfit < price * (knots.size - 1) + _KNOT_PRICE * (
+                        knots.size - 2) + _INPUT_PRICE:
+                    found.pop(k, None)
+                    logs[k] = np.zeros(square.size)
+                    continue
+                found[k] = knots, np.clip(values - values[0], -_MOST, _MOST)
+                logs[k] = np.interp(x, *found[k])
+        return LoadDependentNoise(*(tuple(float(value) for part in parts for value in part)
+                                    for parts in (
+            [[k] * knots.size for k, (knots, _) in found.items()],
+            [knots for knots, _ in found.values()], [values for _, values in found.values()])))
 
-        def cost(step: float) -> float:
-            factor = base + step * step * moved
-            # Of any scale: the measurement noise beside it is fitted.
-            return 0.5 * float(np.log(factor).mean()) + 0.5 * math.log(
-                max(float((square / factor).mean()), 1e-300))
 
-        return (cls(slope, min(_STEPS.tolist(), key=cost)),)
+class Inputs:
+    """Some of INPUTS, from segment to segment."""
 
+    def __init__(self, wanted: Iterable[int]) -> None:
+        self._wanted = list(wanted)
+        self._last = math.nan
+        self._before: dict[tuple[str, float], float] = {}
 
-class _Recent:
-    """Throttle `_SPAN` before each sample, or that of the sample before where it is older."""
+    def __call__(self, step: FloatArray, throttle: FloatArray) -> dict[int, FloatArray]:
+        """Return the inputs of the next samples by number (step in s)."""
+        if math.isnan(self._last):
+            self._last = float(throttle[0])
+            self._before = {('mean', span): self._last for span in (_FAST, _SLOW)}
+        change = np.diff(throttle, prepend=self._last)
+        self._last = float(throttle[-1])
+        known: dict[tuple[str, float], FloatArray] = {}
 
-    def __init__(self) -> None:
-        self._times = np.empty(0)
-        self._values = np.empty(0)
+        def through(what: str, span: float) -> FloatArray:
+            """Return throttle averaged, or its rises or falls remembered, over a span (s)."""
+            if (what, span) not in known:
+                keep = np.exp(-step / span)
+                added = ((1.0 - keep) * throttle if what == 'mean' else
+                         np.maximum(change if what == 'rises' else -change, 0.0))
+                series = first_order(keep, added, self._before.get((what, span), 0.0))
+                self._before[what, span] = float(series[-1])
+                known[what, span] = series
+            return known[what, span]
 
-    def __call__(self, at: FloatArray, throttle: FloatArray) -> FloatArray:
-        """Return it for the next samples (at in s)."""
-        done = self._times.size
-        times = np.concatenate((self._times, at))
-        values = np.concatenate((self._values, throttle))
-        hair = _HAIR + 2.0 * np.spacing(np.abs(at))
-        then = np.searchsorted(times, at - _SPAN + hair, side='right') - 1
-        then = np.clip(then, 0, None)
-        # Never later than the sample before.
-        then = np.minimum(then, np.maximum(np.arange(done, times.size) - 1, 0))
-        keep = max(int(then[-1]) - 1, 0)
-        self._times, self._values = times[keep:], values[keep:]
-        return np.asarray(values[then], dtype=np.float64)
+        found = {}
+        for k in self._wanted:
+            what, span = INPUTS[k]
+            if what == 'throttle':
+                found[k] = throttle
+            elif what == 'step':
+                found[k] = np.abs(change)
+            elif what == 'fast':
+                found[k] = np.abs(throttle - through('mean', _FAST))
+            elif what == 'slow':
+                found[k] = np.abs(through('mean', _FAST) - through('mean', _SLOW))
+            else:
+                found[k] = through(what, span)
+        return found

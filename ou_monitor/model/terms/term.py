@@ -13,7 +13,7 @@ know of it from the class.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, MISSING, replace
 import enum
 import math
 from typing import Any, cast, ClassVar, Generic, Self, TypeVar
@@ -47,9 +47,10 @@ class Role(enum.Enum):
 
 
 def parameter(unit: str, text: str, low: float = -math.inf, high: float = math.inf, *,
-              above: bool = False) -> Any:
-    """Declare a parameter of a term."""
-    return field(metadata={'unit': unit, 'text': text, 'low': low, 'high': high, 'above': above})
+              above: bool = False, default: float | None = None) -> Any:
+    """Declare a parameter of a term; one with a default may be left out, in a file too."""
+    about = {'unit': unit, 'text': text, 'low': low, 'high': high, 'above': above}
+    return field(metadata=about) if default is None else field(default=default, metadata=about)
 
 
 def parameters(unit: str, text: str) -> Any:
@@ -120,6 +121,8 @@ class Term:
         Statistics that it cannot leave.
     SEARCH : float
         Penalty for what is searched beside the free parameters, nats.
+    APART : int
+        Parameters that the term finds from the scores, and not the fit (`apart`).
     DEAR : bool
         Whether a fit takes seconds, so that cheaper terms are tried first.
     BROAD : bool
@@ -157,6 +160,7 @@ class Term:
     MAY_LEAVE: ClassVar[float] = 0.0
     REFUTED_BY: ClassVar[tuple[str, ...]] = ()
     SEARCH: ClassVar[float] = 0.0
+    APART: ClassVar[int] = 0
     DEAR: ClassVar[bool] = False
     BROAD: ClassVar[bool] = False
     STATES: ClassVar[int] = 0
@@ -272,6 +276,10 @@ class Term:
         """Return the term with one coordinate moved; the default moves the logarithm."""
         return replace(self, **{name: getattr(self, name) * math.exp(by)})
 
+    def apart(self, view: View) -> Self:
+        """Return the term with the parameters that it finds itself, from the scores with it."""
+        return self
+
     def per_coordinate(self, name: str) -> float:
         """Return the derivative of a parameter with respect to its coordinate."""
         return float(getattr(self, name))
@@ -332,6 +340,11 @@ class Term:
         return tuple(spec.name for spec in fields(cls))
 
     @classmethod
+    def usual(cls) -> dict[str, Any]:
+        """Return the values of parameters that may be left out."""
+        return {spec.name: spec.default for spec in fields(cls) if spec.default is not MISSING}
+
+    @classmethod
     def unit(cls, name: str) -> str:
         """Return the unit of a parameter; empty for a pure number."""
         return next(str(spec.metadata['unit']) for spec in fields(cls) if spec.name == name)
@@ -364,7 +377,7 @@ class Term:
 
         """
         names = cls.parameters()
-        missing = [name for name in names if name not in params]
+        missing = [name for name in names if name not in {**cls.usual(), **params}]
         unknown = [name for name in params if name not in names]
         if missing:
             raise ValueError(f"term '{cls.NAME}' lacks {_listed(missing)}")

@@ -1,0 +1,104 @@
+"""An effect is first an input and a place: rises of throttle, white noise in any form."""
+
+import numpy as np
+from ou_monitor import discover, Recording
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.laws import View
+from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
+from ou_monitor.model.terms.load_dependent import Inputs, INPUTS, LoadDependentNoise
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.reading import MeasurementNoise
+import pytest
+from scipy.signal import lfilter
+
+RATE, N = 100.0, 5000
+T = np.arange(N) / RATE
+RAIL = OU(8.0, 0.1, 15.0)
+
+
+def flown(seed, rate=RATE, n=N):
+    """Return throttle that a pilot moves within tenths of a second."""
+    rng = np.random.default_rng([seed, 77])
+    held = np.repeat(rng.uniform(0.1, 0.9, n), rng.integers(20, 120, n))[:n]
+    return lfilter([0.3], [1.0, -0.7], held)
+
+
+def named(found):
+    """Return the names of the causes."""
+    return [cause.name for cause in found.causes]
+
+
+def scores_of(log, u):
+    """Return what a law sees: white scores whose deviation has that logarithm."""
+    z = np.exp(log) * np.random.default_rng(5).standard_normal(u.size)
+    step = np.full(u.size, 1.0 / RATE)
+    step[0] = np.inf
+    return View(z / z.std(), np.ones(u.size), np.zeros(u.size), np.zeros(u.size), z, T, step, u,
+                slice(0, u.size), 0.0)
+
+
+@pytest.mark.parametrize('form', [
+    lambda u: 1.5 * u * u, lambda u: 1.2 * np.exp(-np.square((u - 0.5) / 0.12)),
+    lambda u: 12.0 * np.abs(np.diff(u, prepend=u[0])),
+    lambda u: 1.5 * lfilter([1.0], [1.0, -np.exp(-1.0 / (0.5 * RATE))],
+                            np.maximum(np.diff(u, prepend=u[0]), 0.0))])
+def test_the_law_of_white_noise_is_free(form):
+    """Over throttle, its changes and its rises: the curves have nine tenths of the gain."""
+    u = flown(1)
+    view = scores_of(form(u), u)
+    (term,) = LoadDependentNoise.candidates(view)
+    segment_noise = SupplyModel((OU(1.0, 0.0, 0.0), MeasurementNoise(1.0), term))
+    drawn = np.log(np.abs(np.mean([np.square(segment_noise.simulate(
+        T, np.random.default_rng(k), u)) for k in range(40)], axis=0))) / 2.0
+
+    def gain(log):
+        log = log - 0.5 * np.log(np.mean(view.z**2 * np.exp(-2.0 * log)))
+        log = log - log.mean()
+        scale = np.mean(view.z**2 * np.exp(-2.0 * log))
+        return -float(log.sum()) - 0.5 * view.z.size * float(np.log(scale))
+
+    found = term.log_of(Inputs(range(len(INPUTS)))(view.step, u))
+    assert gain(found) > 0.9 * gain(form(u)) > 50.0
+    # What is simulated has the same law.
+    assert np.corrcoef(drawn, found)[0, 1] > 0.8
+
+
+def test_noise_that_follows_nothing_gets_no_curve():
+    """Of 20 recordings of constant noise none has a knot."""
+    u = flown(2)
+    for seed in range(20):
+        z = np.random.default_rng(seed).standard_normal(N)
+        view = scores_of(np.zeros(N), u)
+        (term,) = LoadDependentNoise.candidates(View(
+            z, view.variance, view.phi, view.state, z, T, view.step, u, view.train, 0.0))
+        assert not term.at, seed
+
+
+def test_white_noise_that_grows_as_the_square_of_throttle_is_white_noise():
+    """It was alpha over throttle and a second pole, whose forms were freer."""
+    u = flown(3)
+    rng = np.random.default_rng(3)
+    v = SupplyModel((RAIL, LoadSag(0.5, 0.0))).simulate(T, rng, u)
+    v = v + 0.08 * u * u * rng.standard_normal(N)
+    found = discover(Recording(T, v, u, 'made'))
+    assert {'load_sag', 'load_dependent_noise'} <= set(named(found))
+    assert not {'load_dependent_alpha', 'second_relaxation'} & set(named(found))
+
+
+def test_an_inrush_answers_to_rises_alone():
+    """A dip as throttle rises and none upwards as it falls is one transient, with its rise."""
+    u = flown(6)
+    rng = np.random.default_rng(6)
+    truth = SupplyModel((OU(30.0, 0.1, 15.0), LoadSag(0.5, 0.0),
+                         LoadTransient(0.0, 0.08, 0.0, -0.8)))
+    found = discover(Recording(T, truth.simulate(T, rng, u), u, 'made'))
+    (term,) = [cause.term for cause in found.causes if cause.name == 'load_transient']
+    assert term.rise < -0.5 and abs(term.gain) < 0.25 * abs(term.rise)
+
+
+def test_a_model_of_before_the_rise_is_read():
+    """A file without it has none."""
+    old = {'gain': 0.1, 'tau': 0.02, 'delay': 0.0}
+    assert LoadTransient.read(old).rise == 0.0
+    with pytest.raises(ValueError, match="'tau'"):
+        LoadTransient.read({'gain': 0.1, 'delay': 0.0})
