@@ -92,12 +92,14 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
     current = current_at(recording, t)
     if current is None or not float(np.ptp(current)) > 0.0:
         return u
-    late, sign = timing(t, v, current)
+    some = slice(None, None, -(-v.size // _LOOK))
+    late, sign = timing(t[some], v[some], current[some])
     full = sign * float(np.quantile(np.abs(current), _FULL))
     if not full:
         return u
     load = np.interp(t + late, t, current) / full
-    gain = _said(t, v, load) - (0.0 if u is None else _said(t, v, u))
+    gain = _said(t[some], v[some], load[some]) - (
+        0.0 if u is None else _said(t[some], v[some], u[some]))
     if not gain > 0.5 * _LAGS.size * math.log(v.size):
         return u
     notes.append(f'The measured current says more of the voltage than throttle (by {gain:.3g} '

@@ -74,6 +74,17 @@ def test_noise_that_follows_nothing_gets_no_curve():
         assert not term.at, seed
 
 
+@pytest.mark.parametrize('n', [30, 60, 400])
+def test_a_few_samples_have_a_law_of_few_knots_or_none(n):
+    """Of 399 samples of a robot each bin had less than twenty, and the search broke off."""
+    u = flown(1)[:n]
+    whole = scores_of(np.zeros(N), flown(1))
+    (term,) = LoadDependentNoise.candidates(View(
+        whole.z[:n], whole.variance[:n], whole.phi[:n], whole.state[:n], whole.z[:n], T[:n],
+        whole.step[:n], u, slice(0, n), 0.0))
+    assert term.APART <= 1
+
+
 def test_white_noise_that_grows_as_the_square_of_throttle_is_white_noise():
     """It was alpha over throttle and a second pole, whose forms were freer."""
     u = flown(3)

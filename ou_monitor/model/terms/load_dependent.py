@@ -348,7 +348,9 @@ class LoadDependentNoise(Term):
             square = np.maximum(square - (1.0 - white), 0.0) / np.maximum(white, _LEAST_WHITE)
         square = square * np.exp(2.0 * self.log_of(inputs))
         price = 0.5 * math.log(square.size)
-        edges = {k: np.unique(np.quantile(x, _SHARES)) for k, x in inputs.items()}
+        few = max(1, math.ceil(2.0 * _IN_BIN * _SHARES.size / square.size))
+        shares = np.append(_SHARES[:-1:few], 1.0)
+        edges = {k: np.unique(np.quantile(x, shares)) for k, x in inputs.items()}
         found: dict[int, tuple[FloatArray, FloatArray]] = {}
         logs = {k: np.zeros(square.size) for k in inputs}
         for turn in range(_ROUNDS):
@@ -360,8 +362,9 @@ class LoadDependentNoise(Term):
                     usual = float(np.mean(np.minimum(rest, _LARGEST * float(np.mean(rest)))))
                     rest = np.minimum(rest, _LARGEST * usual * np.exp(2.0 * logs[k]))
                 centre, log, count = bins = _binned(rest, x, edges[k])
-                flat = float(np.sum(count * (log - np.average(log, weights=count)) ** 2))
-                if centre.size < 2 or flat < price + _INPUT_PRICE:
+                flat = 0.0 if centre.size < 2 else float(np.sum(
+                    count * (log - np.average(log, weights=count)) ** 2))
+                if flat < price + _INPUT_PRICE:
                     found.pop(k, None)
                     logs[k] = np.zeros(square.size)
                     continue
