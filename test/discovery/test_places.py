@@ -5,7 +5,7 @@ from ou_monitor import discover, Recording
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
-from ou_monitor.model.terms.load_dependent import Inputs, INPUTS, LoadDependentNoise
+from ou_monitor.model.terms.load_dependent import INPUTS, Inputs, LoadDependentNoise
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 import pytest
