@@ -1,10 +1,11 @@
 """
 How the brown-out risk compares with what happens, and with the alarms that fly.
 
-    python benchmarks/risk.py calibration --table doc/risk_accuracy.md
-        --figure doc/risk_reliability.svg
-    python benchmarks/risk.py alarms --table doc/risk_accuracy.md --figure doc/risk_alarms.svg
-    python benchmarks/risk.py cost --table doc/risk.md
+    python benchmarks/risk.py calibration --table doc/results/risk.md
+        --figure doc/results/risk_reliability.svg
+    python benchmarks/risk.py alarms --table doc/results/risk.md
+        --figure doc/results/risk_alarms.svg
+    python benchmarks/risk.py cost --table doc/results/risk.md
 """
 
 from __future__ import annotations

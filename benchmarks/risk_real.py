@@ -7,7 +7,7 @@ samples, or single samples.  Horizons overlap: n of them count as n / (5 Hz x ho
 less the Brier score over that of the climatology so far.  Flights that are not there are left out,
 with a word on stderr.
 
-    OU_MONITOR_REALDATA=... python benchmarks/risk_real.py --page doc/risk.md
+    OU_MONITOR_REALDATA=... python benchmarks/risk_real.py --page doc/results/risk_real.md
 """
 
 from __future__ import annotations

@@ -157,7 +157,7 @@ def test_brownout_parameters_are_listed():
     for path in [ROOT / 'README.md', *PAGES]:
         assert set(re.findall(r'`(brownout\.\w+)`', path.read_text('utf-8'))) <= set(defaults)
     rows = dict(re.findall(r'^\| (`(?:brownout\.|model_file)[^|]*) \| ([^|]*) \|',
-                           page('brownout.md'), re.MULTILINE))
+                           page('risk.md'), re.MULTILINE))
     listed = {}
     for names, values in rows.items():
         for name, value in zip(names.split(', '), (values + ', ').split(', ')):
