@@ -44,11 +44,18 @@ def how_to_install(extra: str) -> str:
     return f"run pip install '.[{extra}]' in the folder of its source"
 
 
+def closest(word: str, valid: Iterable[str]) -> str | None:
+    """Return the valid word that one begins, or that a misspelt one is most like."""
+    choices = list(itertools.islice(valid, _MOST_CHOICES))
+    begun = [choice for choice in choices if word.strip('-') and choice.startswith(word)]
+    return next(iter(begun or difflib.get_close_matches(word, choices, n=1, cutoff=0.5)), None)
+
+
 def nearest(word: str, valid: Iterable[str]) -> str:
     """Return a hint that names the valid word nearest to a misspelt one."""
     choices = [printable(word, 60) for word in itertools.islice(valid, _MOST_CHOICES)]
-    close = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
-    if close:
-        return f"did you mean '{close[0]}'?"
+    close = closest(word, choices)
+    if close is not None:
+        return f"did you mean '{close}'?"
     shown = sorted(choices)[:_MOST_SHOWN]
     return 'valid: ' + ', '.join(shown) + (', ...' if len(shown) < len(choices) else '')

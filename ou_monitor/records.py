@@ -7,6 +7,7 @@ found; unknown numbers are NaN, never 0.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 import enum
 import math
@@ -113,6 +114,58 @@ class Status(enum.Enum):
         'No relaxation visible at this rate: neighbouring samples are uncorrelated, so '
         'the rail is faster than the sampling, or the noise is that of the sensor; raise '
         'the sampling rate.')
+
+
+class Severity(enum.IntEnum):
+    """How much a note matters."""
+
+    ERROR = 3  # There are no numbers
+    WARNING = 2  # They are doubtful
+    INFO = 1  # Good to know
+
+
+class Defect(enum.Enum):
+    """What a note of a reader is about; the value is how much it matters."""
+
+    DAMAGED_FILE = 'damaged', Severity.WARNING
+    GAPS = 'gaps', Severity.WARNING
+    UNORDERED = 'unordered', Severity.WARNING
+    REPEATED_STAMPS = 'repeated stamps', Severity.WARNING
+    NON_FINITE = 'not finite', Severity.WARNING
+    DROPPED = 'dropped', Severity.INFO
+    READER = 'anything else', Severity.INFO
+
+    @property
+    def severity(self) -> Severity:
+        """Return how much it matters."""
+        return self.value[1]
+
+    @property
+    def drops(self) -> bool:
+        """Return whether samples are missing for it."""
+        return self in (Defect.REPEATED_STAMPS, Defect.NON_FINITE, Defect.DROPPED)
+
+
+class Note(str):
+    """A sentence of a reader that knows what it is about."""
+
+    defect: Defect
+
+    def __new__(cls, text: str, defect: Defect = Defect.READER) -> Note:
+        """Return the sentence."""
+        note = super().__new__(cls, text)
+        note.defect = defect
+        return note
+
+
+def defect_of(note: str) -> Defect:
+    """Return what a note is about; a bare sentence is about nothing in particular."""
+    return note.defect if isinstance(note, Note) else Defect.READER
+
+
+def led(name: str, notes: Iterable[str]) -> list[str]:
+    """Return notes led by the name of what they are about."""
+    return [Note(f'{name}: {note}', defect_of(note)) for note in notes]
 
 
 class Level(enum.IntEnum):

@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from ou_monitor.analysis.analyze import analyze  # noqa: E402
-from ou_monitor.analysis.words import as_data  # noqa: E402
+from ou_monitor.analysis.data import as_data  # noqa: E402
 from ou_monitor.cli.output import plain  # noqa: E402, I100
 from ou_monitor.recordings.read import read_recording  # noqa: E402
 
@@ -48,7 +48,7 @@ def golden(name: str) -> Any:
     # Where it was read from is the reader's to say.
     del data['source']
     # Told by the load filter, which has tests of its own.
-    del data['headline'], data['overview']
+    del data['overview']
     return thinned(plain(data))
 
 

@@ -17,7 +17,7 @@ from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.report import MonitorReport
 from ou_monitor.records import NAN, OuFacts, Recording
-from ou_monitor.text import number, volts, Z95
+from ou_monitor.text import counted, number, volts, Z95
 
 # The noise follows throttle when it differs by more than that factor between its ends.
 _GROWS = 1.25
@@ -103,31 +103,25 @@ def _strongest(levels: Sequence[LevelResult]) -> LoudestLine | None:
                        min(1.0, sum(each.share for each in lines)))
 
 
-def headline(found: Overview) -> str:
-    """Return the answer in one sentence."""
-    parts = answers(found)
-    return '; '.join(parts) + '.' if parts else 'The recording holds no samples.'
-
-
 def answers(found: Overview) -> list[str]:
-    """Return the parts of the answer: the lowest voltage, then sag and lines."""
+    """Return the answer, a sentence each: the lowest voltage, then sag and lines."""
     parts, least = [], found.facts.lowest
     if math.isfinite(found.limit) and math.isfinite(least.voltage_v):
         lowest = f'the lowest was {number(least.voltage_v, 4)} V at {number(least.time_s)} s'
-        parts.append(f'{dips}: {lowest}' if (dips := _dips(found)) else
-                     f'The voltage stayed above {found.limit:g} V: {lowest}')
+        parts.append(f'{dips}: {lowest}.' if (dips := _dips(found, found.limit)) else
+                     f'The voltage stayed above {found.limit:g} V: {lowest}.')
     elif math.isfinite(least.voltage_v):
         parts.append(f'The voltage fell to {number(least.voltage_v, 4)} V at '
-                     f'{number(least.time_s)} s')
+                     f'{number(least.time_s)} s.')
     if found.facts.sag.known:
         at, sag, _ = found.sag
-        parts.append(f'the rail sags by {volts(sag)} at {100.0 * at:.0f} % throttle')
+        parts.append(f'The rail sags by {volts(sag)} at {100.0 * at:.0f} % throttle.')
     if found.line is not None and found.line.all_share > _LOUD:
         line = found.line
-        what = (f'a line at {number(line.frequency, 4)} Hz makes' if line.lines == 1 else
+        what = (f'A line at {number(line.frequency, 4)} Hz makes' if line.lines == 1 else
                 f'{line.lines} lines, the strongest at {number(line.frequency, 4)} Hz, make')
         where = '' if line.level == 'all' else f' at {line.level} throttle'
-        parts.append(f'{what} {100.0 * line.all_share:.0f} % of the noise{where}')
+        parts.append(f'{what} {100.0 * line.all_share:.0f} % of the noise{where}.')
     return parts
 
 
@@ -158,13 +152,14 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
     return lines
 
 
-def _dips(found: Overview) -> str:
-    """Return the dips in words; empty when there is none."""
+def _dips(found: Overview, below: float = NAN) -> str:
+    """Return the dips in words, with the limit where it is given; empty when there is none."""
     dips = found.facts.dips
     if dips is None or not dips.count:
         return ''
     share = 100.0 * dips.seconds / found.duration if found.duration > 0.0 else 100.0
-    return (f'{dips.count} dip{"" if dips.count == 1 else "s"} below {dips.limit_v:g} V, '
+    limit = '' if math.isnan(below) else f' below {below:g} V'
+    return (f'{counted(dips.count, "dip")}{limit}, '
             f'{number(dips.seconds, 2)} s in all ({share:.2g} % of the time)')
 
 

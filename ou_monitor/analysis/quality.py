@@ -11,13 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-import enum
 import math
 
 import numpy as np
 from ou_monitor.analysis.levels import GAP_STEPS
 from ou_monitor.online.estimator.quality import examine
-from ou_monitor.records import Estimate, Flag, Recording, Status
+from ou_monitor.records import defect_of, Estimate, Flag, Recording, Severity, Status
 from ou_monitor.text import counted, Z95
 from ou_monitor.timeline.line import TAIL
 
@@ -34,19 +33,6 @@ _LONG_STEP, _SLOW, _LONG_FLIGHT = 5.0, 0.9, 10_800.0
 _TRIM, _RARE = 0.05, 0.01
 # Segments of samples examined for ADC steps.
 _LOOKS = 8
-# What the reader's sentences are about: a word in them, the name, and whether numbers suffer.
-_READER = (('cannot be decoded', 'DAMAGED_FILE', True), ('damaged', 'DAMAGED_FILE', True),
-           ('gap', 'GAPS', True), ('sorted by stamp', 'UNORDERED', True),
-           ('clock went back', 'UNORDERED', True), ('stamp was there', 'REPEATED_STAMPS', True),
-           ('not a finite', 'NON_FINITE', True))
-
-
-class Severity(enum.IntEnum):
-    """How much it matters."""
-
-    ERROR = 3
-    WARNING = 2
-    INFO = 1
 
 
 @dataclass(frozen=True)
@@ -86,10 +72,8 @@ def _of_estimate(e: Estimate) -> list[tuple[str, Severity, str]]:
 
 
 def _of_reader(note: str) -> QualityItem:
-    for word, name, suffers in _READER:
-        if word in note:
-            return QualityItem(name, Severity.WARNING if suffers else Severity.INFO, note)
-    return QualityItem('READER', Severity.INFO, note)
+    defect = defect_of(note)
+    return QualityItem(defect.name, defect.severity, note)
 
 
 def _of_units(recording: Recording) -> list[QualityItem]:

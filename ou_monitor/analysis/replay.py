@@ -124,6 +124,6 @@ def by_throttle(found: Overview, voltage: float, horizon: float) -> ByThrottle:
     return ByThrottle(
         grid, (grid >= low) & (grid <= high), middle, middle - reach, middle + reach,
         np.array(found.facts.noise.rms_v), risk, NAN if last is None else last.budget,
-        'No voltage was asked for.' if last is None else
-        last.budget_reason.split(' Brown-out:')[0], MonitorSettings().budget_limit, voltage,
-        horizon, NAN if last is None else last.estimate.t)
+        'No voltage was asked for.' if last is None else last.budget_reason,
+        MonitorSettings().budget_limit, voltage, horizon,
+        NAN if last is None else last.estimate.t)

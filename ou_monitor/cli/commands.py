@@ -174,7 +174,7 @@ _DESIGN = Command(
      Option('--network', metavar='FILE.yaml',
             help='components as a YAML mapping of name to value; --set goes first'),
      Option('--list', action='store_true', help='list the components and their defaults'),
-     *TOPICS, *FILES, JSON, FORCE),
+     *TOPICS, *FILES, REPORT, JSON, FORCE),
     ('--from flight.bbl --set cells=4', '--risk 1e-3 --throttle 0.6 --set cells=4',
      '--list'),
     'Values are in SI units, or with prefix and unit: 470uF, 40mOhm, 24kHz.')

@@ -9,6 +9,7 @@ from typing import Any
 from ou_monitor.cli import output
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
+from ou_monitor.report import terminal
 
 # Endings that OUT cannot have: a folder of that name would mislead.
 LOG_ENDINGS = ('.csv', '.ulg', '.bin', '.bbl', '.bfl', '.log', '.db3', '.bag', '.txt')
@@ -127,7 +128,7 @@ def _list(args: argparse.Namespace, log: Any) -> int:
         return 0
     output.say(f'{args.log}: {log.format}' + ''.join(
         f', {name} {value}' for name, value in log.facts.items()))
-    output.say(output.table(
+    output.say(terminal.table(
         ('', 'quantity', 'name', 'samples', 'rate Hz', 'min', 'max', 'unit', 'repeats', 'what'),
         [('*' if row['default'] else '', row['quantity'], row['name'], str(row['n']),
           *(f'{row[key]:.4g}' for key in ('rate_hz', 'min', 'max')), row['unit'],

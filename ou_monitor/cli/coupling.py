@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 import math
 import shlex
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
     brownout_limit, check_outputs, limit_of, part_of_recording, read_given_beside, repeated)
-from ou_monitor.coupling.coupling import (
-    Coupling, estimate_coupling, facts, headline, parts, remarks)
+from ou_monitor.coupling.coupling import Coupling, estimate_coupling
 from ou_monitor.errors import InputError
-
-if TYPE_CHECKING:
-    pass
 
 
 def run(args: argparse.Namespace) -> int:
@@ -25,8 +20,9 @@ def run(args: argparse.Namespace) -> int:
     band, level, limit = _band(args.band), _level(args.level), brownout_limit(args)
     start, end = part_of_recording(args.start, args.end)
 
-    from ou_monitor.analysis.overview import answers, known_lines, overview
+    from ou_monitor.analysis.overview import overview
     from ou_monitor.recordings.importers.log import UNKNOWN
+    from ou_monitor.report.coupling_document import coupling_document
     from ou_monitor.timeline.line import readings_of
 
     recording, series = read_given_beside(args, start, end)
@@ -45,19 +41,11 @@ def run(args: argparse.Namespace) -> int:
     # From here on as `analyze` reads it.
     recording = readings_of(recording)
     seen = overview(recording, limit, cells=args.cells or 0)
-    known = known_lines(seen)
-    if args.report is not None:
-        from ou_monitor.report.coupling_page import coupling_page
-        output.write_text(coupling_page(found, recording, (t, values), args.signal, unit, known,
-                                        seen, command_line(args)), args.report)
-    if args.json is not None:
-        output.write_json({
-            **as_data(found, recording.name, args.signal, unit, recording.notes),
-            'supply': seen.facts.to_dict()}, args.json)
-    if args.json != output.STDOUT:
-        output.say(render(found, recording.name, args.signal, unit, recording.notes, known))
-        output.summary(headline(found, args.signal, unit),
-                       f'{answers(seen)[0]}.', report=args.report, json=args.json)
+    output.deliver(
+        args, coupling_document(found, recording, (t, values), args.signal, unit, seen,
+                                command_line(args)),
+        {**as_data(found, recording.name, args.signal, unit, recording.notes),
+         'supply': seen.facts.to_dict()})
     return 0
 
 
@@ -78,18 +66,6 @@ def as_data(found: Coupling, name: str, signal: str, unit: str, notes: tuple[str
         'frequency_hz': found.frequency, 'coherence': found.coherence,
         'coherence_threshold': found.threshold, 'gain_by_frequency': abs(found.response),
         'notes': [*notes, *found.notes]}
-
-
-def render(found: Coupling, name: str, signal: str, unit: str, notes: tuple[str, ...],
-           known: Sequence[tuple[str, str]] = ()) -> str:
-    """Return the finding for a terminal; known: what is known of the voltage anyway."""
-    lines = [f'{name}, {signal}: {parts(found)}', '',
-             output.paragraph(headline(found, signal, unit)), '',
-             output.facts_table([*known, *facts(found, unit)])]
-    said = remarks(found, notes)
-    if said:
-        lines += ['', *[output.item(text) for text in said]]
-    return '\n'.join(lines)
 
 
 def command_line(args: argparse.Namespace) -> str:

@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 from ou_monitor.analysis.crafts import check_cells
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import read_given
-from ou_monitor.cli.output import paragraph, table
+from ou_monitor.cli.arguments import check_outputs, read_given
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.paper.network.components import (
     completed, PowerNetwork, UNITS)
 from ou_monitor.paper.network.design import (
     answer, as_data, default_voltage, Design, design, effect, probability, remarks)
 from ou_monitor.paper.network.measured import Flight, network_of
+from ou_monitor.report.document import Document, Table, Text
+from ou_monitor.report.terminal import table
 from ou_monitor.stream.files import read_yaml
 from ou_monitor.text import number
 
@@ -43,7 +44,7 @@ def _list(target: str | None) -> None:
                                   'unit': UNITS.get(name, '')}
                            for name, value in values.items()}, target)
     if target != output.STDOUT:
-        output.say(output.table(['component', 'default', 'unit'], [
+        output.say(table(['component', 'default', 'unit'], [
             [name, _shown(value, network), UNITS.get(name, '')]
             for name, value in values.items()], left=[0, 2]))
 
@@ -56,8 +57,7 @@ def _shown(value: object, network: PowerNetwork) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    output.check_paths({'--network': args.network, '--from': args.recording},
-                       {'--json': args.json}, args.force)
+    check_outputs(args, 'report', **{'--network': args.network, '--from': args.recording})
     if args.list:
         _list(args.json)
         return 0
@@ -79,7 +79,6 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"--set: '{word}' is not NAME=VALUE, such as bulk_esr=20mOhm")
         name = component(name.strip(), '--set')
         values[name] = value_of(f'--set {name}', name, text)
-    output.check_writable(args.json)
 
     try:
         if flight is not None:
@@ -100,10 +99,8 @@ def run(args: argparse.Namespace) -> int:
     except ValueError as error:
         raise InputError(str(error)) from error
     taken = '' if flight is None else _taken(flight, network, numbers['throttle'], values)
-    if args.json is not None:
-        output.write_json({**as_data(result, source), 'measured': taken or None}, args.json)
-    if args.json != output.STDOUT:
-        output.say(render(result, source) + ('\n' + paragraph(taken) if taken else ''))
+    output.deliver(args, design_document(result, source, taken),
+                   {**as_data(result, source), 'measured': taken or None})
     return 0
 
 
@@ -138,8 +135,8 @@ def _taken(flight: Flight, network: PowerNetwork, throttle: float, values: dict[
             + ' The bulk capacitor and its ESR cannot be seen: --set bulk_capacitance=470uF.')
 
 
-def render(result: Design, source: str) -> str:
-    """Return the answer and its table for a terminal 100 columns wide."""
+def design_document(result: Design, source: str, taken: str) -> Document:
+    """Return what is said of a design; taken: what came from a flight, if anything did."""
     present = result.present
     chosen = [(present, 'present')]
     if result.least is not None:
@@ -152,20 +149,18 @@ def render(result: Design, source: str) -> str:
               probability(r.risk_ou), probability(r.risk_crossing), mark]
              for r, mark in sorted(chosen, key=lambda item: item[0].capacitance)]
     name = 'battery bus' if result.rail == 'bus' else 'regulated rail'
-    given = (f'{name} at throttle {result.throttle:g}: mean {present.mean:.4g} V (sag of the bus '
-             f'{present.sag:.3g} V), brown-out at {result.voltage:g} V ({source}), risk allowed '
-             f'{result.target:g} within {result.horizon:g} s')
-    lines = [
-        paragraph(answer(result)), '', paragraph(given), '',
-        table(['C uF', 'ESR mOhm', 'alpha 1/s', 'tau us', 'sigma V/sqrt(s)', 'Var_inf V^2',
-               'mean time', 'risk OU', 'crossing', ''], cells, left=[9]), '',
-        table(['what', 'unit', 'present', 'tried', 'risk then', f'for {result.target:g}'],
+    subject = (f'{name} at throttle {result.throttle:g}: mean {present.mean:.4g} V (sag of the '
+               f'bus {present.sag:.3g} V), brown-out at {result.voltage:g} V ({source}), risk '
+               f'allowed {result.target:g} within {result.horizon:g} s')
+    return Document('Which capacitance', subject, [answer(result)], [
+        Table(['C, uF', 'ESR, mOhm', 'alpha, 1/s', 'tau, us', 'sigma, V/sqrt(s)', 'Var_inf, V^2',
+               'mean time', 'risk OU', 'crossing', ''], cells, left=[9]),
+        Table(['what', 'unit', 'present', 'tried', 'risk then', f'for {result.target:g}'],
               [[lever.name, lever.unit, number(lever.present), number(lever.tried),
                 probability(lever.risk), number(lever.least)
                 if math.isfinite(lever.least) else 'out of reach'] for lever in result.levers],
-              left=[0, 1]), '']
-    lines += [paragraph(text) for text in (effect(result), *remarks(result)) if text]
-    return '\n'.join(lines)
+              left=[0, 1]),
+        *(Text(text) for text in (effect(result), *remarks(result), taken) if text)])
 
 
 def _time(value: float) -> str:

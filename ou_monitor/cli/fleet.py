@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from ou_monitor.fleet.fleet import Fleet
 
 TABLE, REPORT = 'fleet.parquet', 'fleet.html'
-# What is listed at most of one kind; all of it is in the report and in the table.
-_SHOWN = 10
 
 
 def run(args: argparse.Namespace) -> int:
@@ -93,22 +91,13 @@ def version() -> str:
 
 
 def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
-    from ou_monitor.fleet.table import write_whole
+    from ou_monitor.fleet.summary import as_data
     from ou_monitor.fleet.table import write_table
-    from ou_monitor.report.fleet_page import fleet_page
+    from ou_monitor.report.fleet_document import fleet_document
 
     write_table(fleet.rows, folder / TABLE)
-    page = fleet_page(fleet, command_line(args))
-    # A file name may hold bytes that are no text.
-    write_whole(folder / REPORT, page.encode(errors='backslashreplace'))
-    if args.json is not None:
-        from ou_monitor.fleet.summary import as_data
-        output.write_json(as_data(fleet), args.json)
-    if args.json != output.STDOUT:
-        from ou_monitor.fleet.summary import in_short
-        output.say(render(fleet))
-        output.summary(*in_short(fleet), table=folder / TABLE, report=folder / REPORT,
-                       json=args.json)
+    output.deliver(args, fleet_document(fleet, command_line(args)), as_data(fleet),
+                   table=folder / TABLE, report=folder / REPORT)
 
 
 def command_line(args: argparse.Namespace) -> str:
@@ -117,40 +106,6 @@ def command_line(args: argparse.Namespace) -> str:
         args, 'vehicle_from', 'levels', 'window', 'brownout_voltage', 'cells',
         'brownout_horizon')]
     return shlex.join(words + (['--discover', '--seed', str(args.seed)] if args.discover else []))
-
-
-def render(fleet: Fleet) -> str:
-    """Return the fleet for a terminal 100 columns wide."""
-    from ou_monitor.fleet import lowest
-    from ou_monitor.fleet.summary import (
-        comparison_words, failure_words, finding_words, headline, vehicle_table)
-
-    lines = [output.paragraph(headline(fleet))]
-    known = lowest.facts(fleet)
-    if known:
-        heads, rows = lowest.table(fleet, _SHOWN)
-        left = [k for k, (head, _) in enumerate(heads) if head in ('vehicle', 'recording')]
-        lines += ['', output.facts_table(known), '', output.table(
-            [head for head, _ in heads], rows, left=left)]
-        if fleet.analysed > _SHOWN:
-            lines.append(f'and {fleet.analysed - _SHOWN} more: see the report')
-    heads, rows = vehicle_table(fleet)
-    if rows:
-        lines += ['', output.table([head for head, _ in heads], rows[:2 * _SHOWN],
-                                   left=[0])]
-        if len(rows) > 2 * _SHOWN:
-            lines.append(f'and {len(rows) - 2 * _SHOWN} more vehicles: see the report')
-    for heading, items in (
-            ('What stands out', finding_words(fleet)),
-            ('Not analysed', failure_words(fleet)),
-            ('There twice, analysed once', [f"{row['path']} is {row['duplicate_of']}"
-                                            for row in fleet.duplicates])):
-        if items:
-            lines += ['', heading + ':', *[output.item(text) for text in items[:_SHOWN]]]
-            if len(items) > _SHOWN:
-                lines.append(output.item(f'and {len(items) - _SHOWN} more: see the report'))
-    lines += ['', *[output.item(note) for note in (*fleet.notes, *comparison_words(fleet))]]
-    return '\n'.join(lines)
 
 
 def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:

@@ -16,15 +16,16 @@ import os
 from pathlib import Path
 import shutil
 import sys
-from textwrap import fill
 import time
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-import numpy as np
 from ou_monitor.errors import InputError
 
+if TYPE_CHECKING:
+    from ou_monitor.report.document import Document
+
 # Seconds between two lines where there is no terminal, and until the time left is guessed.
-_EVERY, _FIRST = 10.0, 2.0
+_EVERY, _FIRST = 60.0, 2.0
 # Share that must be done before the time left is guessed.
 _LEAST = 0.02
 
@@ -33,8 +34,8 @@ class Progress:
     """
     How far a command is, on standard error; `quiet`: no lines where there is no terminal.
 
-    A terminal shows a bar and the time left; elsewhere a line comes every 10 s, so that what ends
-    sooner says nothing.
+    A terminal shows a bar and the time left; elsewhere a line comes every minute, so that
+    what ends sooner says nothing.
     """
 
     def __init__(self, label: str, quiet: bool = False) -> None:
@@ -101,8 +102,6 @@ def duration(seconds: float) -> str:
 
 
 STDOUT = '-'
-# Lines are broken to be read at this width, or at that of a narrower terminal, but for these.
-COLUMNS, _NARROWEST = 100, 40
 _NO_FILE = 'Nothing was written: --report FILE.html draws it, --json FILE keeps the numbers.'
 # Files of a rosbag2 folder, beside its metadata.yaml: storage files, compressed or not.
 _STORAGE = ('.mcap', '.db3', '.zst', '.zstd', '.lz4')
@@ -110,6 +109,9 @@ _STORAGE = ('.mcap', '.db3', '.zst', '.zstd', '.lz4')
 
 def plain(value: Any) -> Any:
     """Return a value as strict JSON can hold it."""
+    # Not above: `--help` does without.
+    import numpy as np
+
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
@@ -264,71 +266,29 @@ def check_writable(target: str | None) -> None:
         raise InputError(f"cannot write '{target}': the folder '{path.parent}' does not exist")
 
 
-def columns() -> int:
-    """Return the width to write for: of the terminal where there is one, at most `COLUMNS`."""
-    if not sys.stdout.isatty():
-        return COLUMNS
-    return max(_NARROWEST, min(COLUMNS, shutil.get_terminal_size().columns))
+def deliver(args: argparse.Namespace, document: Document, data: Mapping[str, Any],
+            report: str | Path | None = None, **files: object) -> None:
+    """Write what a command found where its arguments say: a page, JSON, a terminal."""
+    report = report or getattr(args, 'report', None)
+    if report is not None:
+        from ou_monitor.report.page import html
+        write_text(html(document), report)
+    if args.json is not None:
+        write_json(data, args.json)
+    if args.json != STDOUT:
+        from ou_monitor.report.terminal import terminal
+        say(terminal(document))
+        summary(document.answer, **files, report=report, json=args.json)
 
 
-def paragraph(text: str, begin: str = '') -> str:
-    """Break a paragraph into lines; words and paths stay whole."""
-    return fill(text, columns(), initial_indent=begin, subsequent_indent=' ' * len(begin),
-                break_long_words=False, break_on_hyphens=False)
+def summary(answer: Sequence[str], **files: object) -> None:
+    """Write what a terminal still shows when all has run through: two sentences, the files."""
+    from ou_monitor.report.terminal import paragraph
 
-
-def item(text: str) -> str:
-    """Break one entry of a list into lines."""
-    return paragraph(text, '- ')
-
-
-def summary(answer: str, detail: str, **files: object) -> None:
-    """Write the last three lines, which a terminal still shows: answer, detail, files."""
     made = {name: path for name, path in files.items()
             if path is not None and str(path) != STDOUT}
     if len(made) > 1:
         # Who asked for JSON will find it; people look for the page.
         made.pop('json', None)
     last = '; '.join(f'{name.capitalize()}: {path}' for name, path in made.items())
-    say('\n' + '\n'.join([paragraph(answer), paragraph(detail), last or paragraph(_NO_FILE)]))
-
-
-def facts_table(facts: Sequence[tuple[str, str]]) -> str:
-    """Lay out names and what is known of each, the words broken beside the names."""
-    width = max((len(name) for name, _ in facts), default=0) + 2
-    return '\n'.join(fill(words, columns(), initial_indent=name.ljust(width),
-                          subsequent_indent=' ' * width, break_long_words=False,
-                          break_on_hyphens=False) for name, words in facts)
-
-
-def table(headers: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:
-    """Lay out an aligned table in plain text; one too wide for a terminal in parts."""
-    grid = [list(headers), *[list(row) for row in rows]]
-    if sys.stdout.isatty():
-        return '\n\n'.join(_aligned([[line[k] for k in part] for line in grid],
-                                    [n for n, k in enumerate(part) if k in left])
-                           for part in _parts(grid, shutil.get_terminal_size().columns))
-    return _aligned(grid, left)
-
-
-def _parts(grid: Sequence[Sequence[str]], most: int) -> list[list[int]]:
-    """Return which columns stand together in `most` letters; the first leads each part."""
-    widths = [max(len(line[k]) for line in grid) for k in range(len(grid[0]))]
-    parts = [[0]]
-    for k in range(1, len(widths)):
-        if len(parts[-1]) > 1 and sum(widths[c] + 2 for c in (*parts[-1], k)) - 2 > most:
-            parts.append([0])
-        parts[-1].append(k)
-    return parts
-
-
-def _aligned(grid: Sequence[Sequence[str]], left: Sequence[int]) -> str:
-    widths = [max(len(line[k]) for line in grid) for k in range(len(grid[0]))]
-
-    def lay(line: Sequence[str]) -> str:
-        cells = [cell.ljust(width) if k in left else cell.rjust(width)
-                 for k, (cell, width) in enumerate(zip(line, widths))]
-        return '  '.join(cells).rstrip()
-
-    rule = '  '.join('-' * width for width in widths)
-    return '\n'.join([lay(grid[0]), rule, *[lay(line) for line in grid[1:]]])
+    say('\n' + '\n'.join([*map(paragraph, answer[:2]), last or paragraph(_NO_FILE)]))

@@ -10,6 +10,7 @@ from ou_monitor.cli import output
 from ou_monitor.cli.arguments import part_of_recording
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError, nearest
+from ou_monitor.report import terminal
 
 # From this rate on samples travel in blocks by default, Hz.
 _BLOCKS_FROM = 5000.0
@@ -36,10 +37,10 @@ def run(args: argparse.Namespace) -> int:
                 'profiles': {name: text for name, (_, text) in PROFILES.items()}}, args.json)
             if args.json == output.STDOUT:
                 return 0
-        output.say(output.table(['Preset', 'Throttle', 'Rate, Hz', 'Length, s', 'What it is'], [
+        output.say(terminal.table(['Preset', 'Throttle', 'Rate, Hz', 'Length, s', 'What it is'], [
             [name, p.throttle, f'{p.rate:g}', f'{p.duration:g}', p.text]
             for name, p in PRESETS.items()], left=[0, 1, 4]))
-        output.say(output.table(
+        output.say(terminal.table(
             ['Throttle profile', 'What it is'],
             [[name, text] for name, (_, text) in PROFILES.items()], left=[0, 1]))
         return 0

@@ -95,6 +95,7 @@ class Agreement:
     p_value: float  # Share of the simulations that are as odd among the others
     verdict: Verdict  # The verdict
     words: str  # What the simulation gets wrong most, as a part of a sentence
+    farthest: str  # Kind of that difference: lowest, falls, level, answer, spectrum, ks or path
     notes: tuple[str, ...]  # What was left out or assumed
     traces: Traces  # For a page
 

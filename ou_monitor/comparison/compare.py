@@ -205,7 +205,7 @@ def _agreement(recording: Recording, samples: Readings, own: Readings, yardstick
     error = path - own.voltage
     explained = 1.0 - float(error @ error) / float(
         np.sum((own.voltage - own.voltage.mean()) ** 2))
-    p, verdict, words = judge(found, explained, own.throttle is not None and bool(
+    p, verdict, words, farthest = judge(found, explained, own.throttle is not None and bool(
         np.ptp(own.throttle) >= MOVES))
     pooled = np.mean([m.distribution for m in measured], axis=0)
     answers = np.array([m.answer for m in measured])
@@ -226,7 +226,7 @@ def _agreement(recording: Recording, samples: Readings, own: Readings, yardstick
             float(real.power[k]), np.array([m.power[k] for m in measured])))
             for k, (a, b) in enumerate(zip(yardstick.bands, yardstick.bands[1:]))),
         dips[0] if dips else None, dips[1] if dips else None, int(yardstick.rises.size),
-        distance(real, pooled), seeds, p, verdict, words, tuple(notes),
+        distance(real, pooled), seeds, p, verdict, words, farthest, tuple(notes),
         Traces(own.t + offset, own.voltage,
                np.full(own.t.size, np.nan) if own.throttle is None else own.throttle, first,
                own.t[::stride] + offset, low, high, yardstick.after if answers.size else empty,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import math
 from typing import Any
 
-from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
+from ou_monitor.discovery.finding import Cause, Criticism, Verdict
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Term
@@ -181,7 +181,7 @@ def verdict_sentence(verdict: Verdict, causes: Sequence[Cause], left: Sequence[C
         return ('The simulation deviates from the recording; the search was stopped before it '
                 f'found a cause{rest}.')
     text = _verdict(verdict, causes, left, gain, gain_se, dropped, why, uncovered, doubts)
-    return f'{text} {refused}: believe its names, not its numbers.' if refused else text
+    return f'{text} {refused}: trust the named causes, not the fitted values.' if refused else text
 
 
 def _verdict(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism], gain: float,
@@ -218,19 +218,6 @@ def _counted(names: Sequence[str]) -> list[str]:
     """Return each name once, with how often it is there."""
     return [name if names.count(name) == 1 else f'{name} ({names.count(name)} terms)'
             for name in dict.fromkeys(names)]
-
-
-def crossing_words(finding: Finding) -> str:
-    """Return what a pilot feels, in some sentences."""
-    c = finding.crossing
-    if not math.isfinite(c.observed):
-        return finding.felt.words
-    extended = (f', the extended model {number(c.extended)} +- {number(c.extended_se, 2)}'
-                if finding.causes and math.isfinite(c.extended) else '')
-    return (f'The voltage fell through {number(c.level, 4)} V '
-            f'{number(c.observed)} +- {number(c.observed_se, 2)} times a minute; the plain OU '
-            f'predicts {number(c.baseline)} +- {number(c.baseline_se, 2)}{extended}. '
-            + finding.felt.words).rstrip()
 
 
 def plain_model_words(baseline: OU) -> str:

@@ -13,12 +13,8 @@ from ou_monitor.text import counted, number, volts
 
 # Characters of the name of a vehicle in a table.
 _NAME = 30
-# Heads of the table of recordings for a terminal and for a page.
-HEADS = (('vehicle', 'Vehicle'), ('recording', 'Recording'), ('lowest V', 'Lowest, V'),
-         ('at s', 'at, s'), ('dips', 'Dips'), ('below s', 'Below, s'), ('sag V', 'Sag, V'),
-         ('at throttle', 'at throttle'))
-# Terminal and page.
-Heads = Sequence[tuple[str, str]]
+# Heads of the table of recordings.
+HEADS = ('vehicle', 'recording', 'lowest, V', 'at, s', 'dips', 'below, s', 'sag, V', 'at throttle')
 UNKNOWN = '-'
 
 
@@ -51,11 +47,11 @@ def worst(fleet: Fleet) -> list[Row]:
     return sorted(once(fleet), key=lambda row: (-(row['dips'] or 0), row['lowest'], row['path']))
 
 
-def sentence(fleet: Fleet) -> str:
-    """Return what a pilot wants to know; empty where no recording has a voltage."""
+def sentences(fleet: Fleet) -> list[str]:
+    """Return what a pilot wants to know; nothing where no recording has a voltage."""
     rows = once(fleet)
     if not rows:
-        return ''
+        return []
     low = min(rows, key=lambda row: row['lowest'])
     lowest = (f'{number(low["lowest"], 4)} V at {number(low["lowest_at"])} s of '
               f'{_name(low)}')
@@ -72,11 +68,11 @@ def sentence(fleet: Fleet) -> str:
         text = (f'{counted(found.count, "dip")} below {fleet.limit:g} V {where}: the lowest was '
                 f'{lowest}')
     sags = [row for row in rows if row['sag'] is not None]
-    if sags:
-        row = max(sags, key=lambda row: row['sag'])
-        text += (f'; the rail sags by up to {volts(row["sag"])}, at '
-                 f'{100.0 * row["sag_throttle"]:.0f} % throttle')
-    return text + '.'
+    if not sags:
+        return [f'{text}.']
+    row = max(sags, key=lambda row: row['sag'])
+    return [f'{text}.', f'The rail sags by up to {volts(row["sag"])}, at '
+            f'{100.0 * row["sag_throttle"]:.0f} % throttle.']
 
 
 def facts(fleet: Fleet) -> list[tuple[str, str]]:
@@ -123,13 +119,14 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
     return {name: text if uses[text] == 1 else name for name, text in short.items()}
 
 
-def table(fleet: Fleet, most: int) -> tuple[Heads, list[list[str]]]:
+def table(fleet: Fleet, most: int) -> tuple[list[str], list[list[str]]]:
     """Return the recordings with the lowest voltages: heads and cells, no column empty."""
     names = short_names(fleet.vehicles)
     return without_empty(HEADS, [_cells(row, names) for row in worst(fleet)[:most]])
 
 
-def without_empty(heads: Heads, rows: list[list[str]]) -> tuple[Heads, list[list[str]]]:
+def without_empty(heads: Sequence[str], rows: list[list[str]],
+                  ) -> tuple[list[str], list[list[str]]]:
     """Return a table without the columns in which no row knows anything."""
     kept = [k for k in range(len(heads)) if any(row[k] != UNKNOWN for row in rows)]
     return [heads[k] for k in kept], [[row[k] for k in kept] for row in rows]

@@ -16,24 +16,20 @@ from ou_monitor.fleet.judgement import (
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.text import chance, counted, number, p_words
 
-# Heads of the table of vehicles for a terminal and for a page.
-VEHICLE_HEADS = (
-    ('vehicle', 'Vehicle'), ('flights', 'Flights'), ('lowest V', 'Lowest, V'), ('dips', 'Dips'),
-    ('sag V', 'Sag, V'), ('/flight', 'a flight'), ('sigma', '\u03c3, V/\u221as'),
-    ('/flight', 'a flight'), ('alpha', '\u03b1, 1/s'), ('/flight', 'a flight'))
+# Heads of the table of vehicles.
+VEHICLE_HEADS = ('vehicle', 'flights', 'lowest, V', 'dips', 'sag, V', '/flight',
+                 'sigma, V/sqrt(s)', '/flight', 'alpha, 1/s', '/flight')
+
+
+def answer(fleet: Fleet) -> list[str]:
+    """Return what the fleet says: the lowest voltage, what stands out, what was analysed."""
+    return [part for part in (*lowest.sentences(fleet), _standing_out(fleet), _analysed(fleet))
+            if part]
 
 
 def headline(fleet: Fleet) -> str:
-    """Return what the fleet says: the lowest voltage, what stands out, what was analysed."""
-    return ' '.join(part for part in (
-        lowest.sentence(fleet), _standing_out(fleet), _analysed(fleet)) if part)
-
-
-def in_short(fleet: Fleet) -> tuple[str, str]:
-    """Return the answer, and what stands out and was analysed, a line each."""
-    first = lowest.sentence(fleet).split('; ')[0].rstrip('.')
-    return (f'{first}.' if first else _analysed(fleet),
-            f'{_standing_out(fleet)} {_analysed(fleet) if first else ""}'.strip())
+    """Return the answer as a paragraph."""
+    return ' '.join(answer(fleet))
 
 
 def _analysed(fleet: Fleet) -> str:
@@ -180,7 +176,7 @@ def comparison_words(fleet: Fleet) -> list[str]:
     return notes
 
 
-def vehicle_table(fleet: Fleet) -> tuple[lowest.Heads, list[list[str]]]:
+def vehicle_table(fleet: Fleet) -> tuple[list[str], list[list[str]]]:
     """Return what is known of each vehicle: heads and cells, no column empty."""
     judged = fleet.judgement
     found, seen = [], lowest.once(fleet)

@@ -20,7 +20,7 @@ from ou_monitor.recordings.bag import BagReader, batches, last_before
 from ou_monitor.recordings.cdr import FieldColumn, IntArray, join
 from ou_monitor.recordings.importers.log import RawColumns
 from ou_monitor.recordings.mcap_file import moment
-from ou_monitor.records import FloatArray
+from ou_monitor.records import Defect, defect_of, FloatArray, Note
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
 from ou_monitor.stream.samples import BlockClock, ThrottleHold
 from ou_monitor.text import counted, printable, some
@@ -252,7 +252,8 @@ def read_bag(
     specs = _specs(bag, choice)
     notes = [*bag.notes, *choice.notes]
     if bag.damage is not None:
-        notes.append(f'The bag is damaged; what it still holds was read: {bag.damage}.')
+        notes.append(Note(f'The bag is damaged; what it still holds was read: {bag.damage}.',
+                          Defect.DAMAGED_FILE))
     if start is not None or end is not None:
         notes.append(part_words(start, end))
     broken: list[str] = []
@@ -282,10 +283,11 @@ def read_bag(
         if found:
             columns[which] = join(found)
     if broken:
-        notes.append(f"{counted(len(broken), 'message')} dropped, the first: {broken[0]}.")
+        notes.append(Note(f"{counted(len(broken), 'message')} dropped, the first: {broken[0]}.",
+                          Defect.DAMAGED_FILE))
     name = printable(bag.path.name)
     if VOLTAGE not in columns or not columns[VOLTAGE].values.size:
-        why = ' '.join(note for note in notes if 'dropped' in note)
+        why = ' '.join(note for note in notes if defect_of(note).drops)
         if (start is None and end is None) or why:
             raise InputError(f'{name} holds no usable sample' + (f': {why}' if why else ''))
         raise InputError(outside_words(name, start, end, (bag.end_ns - bag.start_ns) * 1e-9))
@@ -371,7 +373,8 @@ def _paired(name: str, specs: dict[str, FieldSpec], columns: dict[str, FieldColu
             unknown = int(np.count_nonzero(~np.isfinite(values)))
             known &= np.isfinite(values)
             if which == THROTTLE and unknown:
-                notes.append(f"{counted(unknown, 'throttle value')} dropped: not a finite number.")
+                notes.append(Note(f"{counted(unknown, 'throttle value')} dropped: not a finite "
+                                  'number.', Defect.NON_FINITE))
         if which == THROTTLE:
             check_throttle(name, values[known])
         # Of a voltage and a throttle logged at one time, the throttle counts as first.
@@ -380,7 +383,7 @@ def _paired(name: str, specs: dict[str, FieldSpec], columns: dict[str, FieldColu
                   stamped, before)
         held[which] = hold.at(t)
     if gaps:
-        notes.append(f'{counted(gaps, "gap")} between blocks of samples.')
+        notes.append(Note(f'{counted(gaps, "gap")} between blocks of samples.', Defect.GAPS))
     return RawColumns(t, voltage, held[THROTTLE], held[CURRENT], name, source, tuple(notes))
 
 

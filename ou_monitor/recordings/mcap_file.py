@@ -36,6 +36,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.cdr import gather, IntArray, Table
+from ou_monitor.records import Defect, Note
 from ou_monitor.stream.files import open_regular, parse_yaml, path_words
 from ou_monitor.text import counted, printable
 import zstandard
@@ -255,9 +256,10 @@ class McapFile:
             return make_reader(file).get_summary()
         # The library lets every kind of error through; each means the same here.
         except Exception as error:
-            self.notes.append(f'The summary of {printable(self.path.name)} is damaged '
-                              f'({printable(error, 200) or type(error).__name__}): the whole file '
-                              'was scanned, without a count of its messages to compare with.')
+            self.notes.append(Note(
+                f'The summary of {printable(self.path.name)} is damaged '
+                f'({printable(error, 200) or type(error).__name__}): the whole file was scanned, '
+                'without a count of its messages to compare with.', Defect.DAMAGED_FILE))
             return None
 
     def _use_summary(self, file: BinaryIO) -> bool:

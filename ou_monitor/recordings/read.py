@@ -28,7 +28,7 @@ from ou_monitor.recordings.importers.formats import import_log, is_csv, is_log
 from ou_monitor.recordings.importers.log import (
     CsvColumns, Log, RawColumns, Request, Series, SIGNAL, UNKNOWN)
 from ou_monitor.recordings.standard_types import IMU
-from ou_monitor.records import FloatArray, Recording
+from ou_monitor.records import defect_of, FloatArray, Recording
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.timeline.line import (
     in_order, MOST_THROTTLE, MOST_VOLTAGE, plausible, plausible_samples, readings_of)
@@ -174,7 +174,7 @@ def tidy(raw: RawColumns) -> Recording:
 
 
 def _unusable(name: str, notes: Sequence[str]) -> str:
-    why = ' '.join(note for note in notes if 'dropped' in note)
+    why = ' '.join(note for note in notes if defect_of(note).drops)
     return f'{name} holds no usable sample' + (f': {why}' if why else '')
 
 

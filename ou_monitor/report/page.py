@@ -8,7 +8,7 @@ request to a network.
 The data of a plot: one JSON object with one block of bytes, compressed by zlib, in base64.
 Rounding: columns of up to 4096 values are exact (float64).  Longer ones: x to 1/2000 of the median
 distance of the points embedded, y to 1 part in 16 million (float32) of the value or, where that is
-less, of the range.  Beyond 700 000 points in a plot a curve is an envelope: the lowest and the
+less, of the range.  Beyond 150 000 points in a plot a curve is an envelope: the lowest and the
 highest of each so many samples, so that every peak stays; the page says so.
 """
 
@@ -28,13 +28,14 @@ from typing import Any
 import zlib
 
 import numpy as np
-from ou_monitor.records import FloatArray
+from ou_monitor.records import FloatArray, Severity
+from ou_monitor.report.document import (
+    Code, Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.scale import extremes
 from ou_monitor.report.svg import Curve, Plot
-from ou_monitor.text import chance, number
 
-# Points of a plot that are embedded as they are.
-MOST = 700_000
+# Points of a plot that are embedded as they are: an hour at 1 kHz is then a page of 1.5 MB.
+MOST = 150_000
 _EXACT = 4096
 # Steps of a time stamp in the median distance of two samples.
 _GRID = 1000
@@ -253,9 +254,94 @@ def _script() -> tuple[str, str]:
     return text, f"'sha256-{digest}'"
 
 
-def page(title: str, subtitle: str, sections: Sequence[str]) -> str:
+# A minus, but for a hyphen within a word or a range of dates; signs that a terminal may not have.
+_MINUS = re.compile(r'(?<![\w.)^-])-(?=[\d.])')
+_SIGNS = {'+-': '\u00b1', ' -> ': ' \u2192 '}
+_SOFT, _LEFT = ' class="soft"', ' class="left"'
+# Of the heads of tables: symbols and units.
+_SYMBOLS = {'alpha': '\u03b1', 'sigma': '\u03c3', 'tau': '\u03c4', 'Var_inf': 'Var\u221e',
+            'V/sqrt(s)': 'V/\u221as', 'V^2': 'V\u00b2', 'uF': '\u00b5F', 'Ohm': '\u03a9'}
+_SYMBOL = re.compile(r'(?<!\w)(' + '|'.join(map(re.escape, _SYMBOLS)) + r')(?!\w)')
+
+
+def _set(text: str) -> str:
+    """Return a text with the signs that a page has and a terminal may not, escaped."""
+    for plain, sign in _SIGNS.items():
+        text = text.replace(plain, sign)
+    return escape(_MINUS.sub('\u2212', text))
+
+
+def _head(text: str) -> str:
+    """Return the head of a column, with symbols, its first word with a capital."""
+    text = _SYMBOL.sub(lambda found: _SYMBOLS[found[1]], text)
+    first = re.split(r'\W', text, maxsplit=1)[0]
+    return text[:1].upper() + text[1:] if first.isascii() and len(first) > 1 else text
+
+
+def html(document: Document) -> str:
+    """Return a document as a page."""
+    again = [Section('To repeat this', [Code(document.command)], folded=True)
+             ] if document.command else []
+    return _page(document.title, document.subject, (
+        f'<p class="headline">{_set(document.headline)}</p>\n'
+        + _joined([*document.parts, *again])))
+
+
+def _joined(parts: Sequence[Part]) -> str:
+    return '\n'.join(text for text in map(_part, parts) if text)
+
+
+def _part(part: Part) -> str:
+    """Return one part of a document."""
+    if isinstance(part, Text):
+        return f'<p{_SOFT if part.legend else ""}>{_set(part.text)}</p>'
+    if isinstance(part, Code):
+        return f'<p><code>{escape(part.text)}</code></p>'
+    if isinstance(part, Facts):
+        return '<dl class="facts">' + ''.join(
+            f'<dt>{_set(name)}</dt><dd>{_set(words)}</dd>' for name, words in part.pairs) + '</dl>'
+    if isinstance(part, Notes):
+        return '' if not part.notes else '<ul>' + ''.join(
+            f'<li>{_set(text)}</li>' if severity is Severity.INFO else
+            f'<li class="warn">{severity.name.lower()}: {_set(text)}</li>'
+            for severity, text in part.notes) + '</ul>'
+    if isinstance(part, Table):
+        return _table(part)
+    if isinstance(part, Figure):
+        drawn = part.drawing if isinstance(part.drawing, str) else (
+            part.drawing.svg() + embed(part.drawing))
+        below = f'<figcaption>{_set(part.caption)}</figcaption>' if part.caption else ''
+        return f'<figure>{drawn}{below}</figure>'
+    if isinstance(part, Pair):
+        # A lone one keeps its half.
+        more = '<div></div>' if len(part.figures) == 1 else ''
+        return f'<div class="pair">{"".join(map(_part, part.figures))}{more}</div>'
+    if isinstance(part, Section):
+        inside, heading = _joined(part.parts), f'<h2>{_set(part.heading)}</h2>'
+        if not inside:
+            return ''
+        return (f'<details class="section"><summary>{heading}</summary>\n{inside}\n</details>'
+                if part.folded else f'<section>{heading}\n{inside}\n</section>')
+    return _joined(part())
+
+
+def _table(part: Table) -> str:
+    def line(tag: str, cells: Sequence[str]) -> str:
+        out = []
+        for k, text in enumerate(cells):
+            main, _, small = (UNKNOWN if text == '-' else text).partition('\n')
+            inner = _set(main) + (f'<br/><small>{_set(small)}</small>' if small else '')
+            out.append(f'<{tag}{_LEFT if k in part.left else ""}>{inner}</{tag}>')
+        return '<tr>' + ''.join(out) + '</tr>'
+
+    return '' if not part.rows else (
+        '<div class="scroll"><table><thead>' + line('th', [_head(head) for head in part.heads])
+        + '</thead><tbody>' + ''.join(line('td', row) for row in part.rows)
+        + '</tbody></table></div>')
+
+
+def _page(title: str, subtitle: str, body: str) -> str:
     """Return a whole page that needs nothing but itself."""
-    body = '\n'.join(sections)
     text, source = _script() if 'class="plot-data"' in body else ('', "'none'")
     policy = (f"default-src 'none'; script-src {source}; style-src 'unsafe-inline'; "
               "base-uri 'none'; form-action 'none'")
@@ -267,84 +353,3 @@ def page(title: str, subtitle: str, sections: Sequence[str]) -> str:
             f'<title>{escape(title)}</title>\n<style>{style}</style></head>\n'
             f'<body>\n<h1>{escape(title)}</h1>\n<p class="soft">{escape(subtitle)}</p>\n'
             f'{body}\n{script}</body></html>\n')
-
-
-def headline(text: str) -> str:
-    """Return the sentence that says it all."""
-    return f'<p class="headline">{escape(text)}</p>'
-
-
-def section(heading: str, *content: str, folded: bool = False) -> str:
-    """Return a headed section; `content` is HTML.  A folded one opens at a click."""
-    inside = '\n'.join(content)
-    if folded:
-        return (f'<details class="section"><summary><h2>{escape(heading)}</h2></summary>\n'
-                f'{inside}\n</details>')
-    return f'<section><h2>{escape(heading)}</h2>\n{inside}\n</section>'
-
-
-def facts(pairs: Sequence[tuple[str, str]]) -> str:
-    """Return names and what is known of each, as a list."""
-    return '<dl class="facts">' + ''.join(
-        f'<dt>{escape(name)}</dt><dd>{escape(words)}</dd>' for name, words in pairs) + '</dl>'
-
-
-def paragraph(text: str, soft: bool = False) -> str:
-    """Return a paragraph of plain text."""
-    kind = ' class="soft"' if soft else ''
-    return f'<p{kind}>{escape(text)}</p>'
-
-
-def code(text: str) -> str:
-    """Return a command as a paragraph."""
-    return f'<p><code>{escape(text)}</code></p>'
-
-
-def bullets(items: Sequence[str], warn: bool = False) -> str:
-    """Return a list of plain sentences; nothing when there are none."""
-    if not items:
-        return ''
-    kind = ' class="warn"' if warn else ''
-    return '<ul>' + ''.join(f'<li{kind}>{escape(item)}</li>' for item in items) + '</ul>'
-
-
-def figure(drawing: Plot | str, caption: str = '') -> str:
-    """Return a drawing with a caption; a plot with its data, from which it becomes interactive."""
-    drawn = drawing.svg() + embed(drawing) if isinstance(drawing, Plot) else drawing
-    below = f'<figcaption>{escape(caption)}</figcaption>' if caption else ''
-    return f'<figure>{drawn}{below}</figure>'
-
-
-def pair(*figures: str) -> str:
-    """Return figures side by side where there is room."""
-    return f'<div class="pair">{"".join(figures)}</div>'
-
-
-def table(headers: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:
-    """Return a table."""
-    def cells(tag: str, line: Sequence[str]) -> str:
-        out = []
-        for k, text in enumerate(line):
-            main, _, small = text.partition('\n')
-            inner = escape(main) + (f'<br/><small>{escape(small)}</small>' if small else '')
-            kind = ' class="left"' if k in left else ''
-            out.append(f'<{tag}{kind}>{inner}</{tag}>')
-        return '<tr>' + ''.join(out) + '</tr>'
-
-    return ('<div class="scroll"><table><thead>' + cells('th', headers) + '</thead><tbody>'
-            + ''.join(cells('td', row) for row in rows) + '</tbody></table></div>')
-
-
-def typeset(text: str) -> str:
-    """Return a cell of a terminal's table as a page sets it."""
-    return UNKNOWN if text == '-' else text.replace('-', '\u2212')
-
-
-def rounded(value: float, digits: int = 3) -> str:
-    """Return a number to some significant digits."""
-    return typeset(number(value, digits))
-
-
-def probability(p: float) -> str:
-    """Return a probability to two digits; below 0.001 only that."""
-    return typeset(chance(p))

@@ -19,7 +19,7 @@ import re
 from typing import Any
 
 import numpy as np
-from ou_monitor.errors import InputError, nearest
+from ou_monitor.errors import closest, InputError, nearest
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.files import one_line, path_words, read_yaml
 from ou_monitor.text import printable
@@ -210,10 +210,10 @@ def _checked(
         raise InputError(f"{where}: expected keys ({', '.join(kinds)}), found none")
     for key, value in content.items():
         if key not in kinds:
-            hint = nearest(printable(key, 60), kinds)
+            shown = printable(key, 60)
             # The keys of a file that is none of ours are not told.
-            name = f" '{printable(key, 60)}'" if hint.startswith('did') else ''
-            raise InputError(f'{where}: unknown key{name}: {hint}')
+            name = '' if closest(shown, kinds) is None else f" '{shown}'"
+            raise InputError(f'{where}: unknown key{name}: {nearest(shown, kinds)}')
         accepted, word = kinds[key]
         # In Python true is an int; in a YAML it is never meant as a number.
         wrong_bool = isinstance(value, bool) and bool not in accepted

@@ -33,7 +33,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.records import as_numbers, Counters, FloatArray, NAN, Recording
+from ou_monitor.records import (
+    as_numbers, Counters, Defect, FloatArray, NAN, Note, Recording)
 from ou_monitor.text import counted
 
 # Gaps that may differ from the pattern: lost samples, a logger that was late.
@@ -587,19 +588,20 @@ def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
     """
     # The comparisons are false for NaN too.
     good = np.isfinite(t) & ((rows <= most) & (rows >= -most)).all(axis=1)
-    notes = []
+    notes: list[str] = []
     if not good.all():
         beyond = bool((np.isfinite(rows[~good]) & (np.abs(rows[~good]) > most)).any())
-        notes.append(f'{counted(t.size - int(good.sum()))} dropped: not a finite number'
-                     + (f', or beyond {most:g}{unit}.' if beyond else '.'))
+        notes.append(Note(f'{counted(t.size - int(good.sum()))} dropped: not a finite number'
+                          + (f', or beyond {most:g}{unit}.' if beyond else '.'),
+                          Defect.NON_FINITE))
     stamps = t[good]
     if (steps := int(np.count_nonzero(stamps[1:] < stamps[:-1]))):
-        notes.append(_late_words(steps, stamps))
+        notes.append(Note(_late_words(steps, stamps), Defect.UNORDERED))
     line = TimeLine()
     batches = line.order(stamps, np.flatnonzero(good).astype(np.float64), None, None, math.inf)
     if line.counters.late:
-        notes.append(f'{counted(line.counters.late)} dropped: the stamp was there before; the '
-                     'first of each was kept.')
+        notes.append(Note(f'{counted(line.counters.late)} dropped: the stamp was there before; '
+                          'the first of each was kept.', Defect.REPEATED_STAMPS))
     if line.used == t.size and not notes:
         # All as they are, without a copy.
         return slice(None), notes

@@ -1,10 +1,13 @@
 """One list of all that is doubtful: each thing is found, named and ranked."""
 
 from dataclasses import replace
+import math
+import pickle
 
 import numpy as np
-from ou_monitor.analysis.quality import quality_list, Severity
-from ou_monitor.records import Estimate, Flag, Recording, Status
+from ou_monitor.analysis.quality import quality_list
+from ou_monitor.records import (
+    Defect, defect_of, Estimate, Flag, led, Note, Recording, Severity, Status)
 from ou_monitor.timeline.line import in_order, readings_of
 import pytest
 from simulated_recordings import recording
@@ -39,23 +42,27 @@ def test_worst_comes_first_and_levels_share_an_entry():
         ('HELD_SAMPLES', Severity.INFO, (0.1, 0.3))]
 
 
-@pytest.mark.parametrize('note, name, severity', [
-    ('The bag is damaged; what it still holds was read: x.', 'DAMAGED_FILE', Severity.WARNING),
-    ('3 gaps between blocks of samples.', 'GAPS', Severity.WARNING),
-    ('2 samples came before the stamp ahead of them: sorted by stamp.', 'UNORDERED',
-     Severity.WARNING),
-    ('1 sample dropped: the stamp was there before; the first of each was kept.',
-     'REPEATED_STAMPS', Severity.WARNING),
-    ('1 sample dropped: not a finite number.', 'NON_FINITE', Severity.WARNING),
-    ('3 messages dropped, the first: x.mcap: a message of type y cannot be decoded (z).',
-     'DAMAGED_FILE', Severity.WARNING),
-    (*in_order(BACK, BACK[:, None], 1e6)[1][:1], 'UNORDERED', Severity.WARNING),
-    ('Something else.', 'READER', Severity.INFO)])
-def test_what_the_reader_noted_is_in_it(note, name, severity):
-    """As the reader words it."""
-    simulated = replace(recording(1, ((0.1, 0.3),)), notes=(note,))
-    (item,) = listed(simulated)
-    assert (item.name, item.severity, item.text) == (name, severity, note)
+@pytest.mark.parametrize('defect', Defect)
+def test_a_note_is_judged_by_what_it_is_about(defect):
+    """Not by its words, also led by a name; a bare sentence is good to know."""
+    text = 'The damaged bag has gaps.'
+    for note in (Note(text, defect), *led('vbat', [Note(text, defect)])):
+        simulated = replace(recording(1, ((0.1, 0.3),)), notes=(note,))
+        (item,) = listed(simulated)
+        assert (item.name, item.severity, item.text) == (defect.name, defect.severity, note)
+        assert defect_of(pickle.loads(pickle.dumps(note))) is defect
+    (item,) = listed(replace(simulated, notes=(text,)))
+    assert (item.name, item.severity) == ('READER', Severity.INFO)
+
+
+def test_the_stage_of_samples_says_what_it_notes():
+    """Out of order, there twice, not finite."""
+    t = np.array([0.0, 2.0, 1.0, 1.0, 3.0, 4.0])
+    notes = in_order(t, np.array([1.0, 1.0, 1.0, 1.0, math.nan, 1.0])[:, None], 1e6)[1]
+    assert {defect_of(note) for note in notes} == {
+        Defect.UNORDERED, Defect.REPEATED_STAMPS, Defect.NON_FINITE}
+    (back, *_) = in_order(BACK, BACK[:, None], 1e6)[1]
+    assert defect_of(back) is Defect.UNORDERED
 
 
 @pytest.mark.parametrize('factor, named', [(1.0, False), (80.0, False), (1e3, True), (3e3, True)])

@@ -7,12 +7,10 @@ import re
 from xml.etree import ElementTree
 
 import numpy as np
-from ou_monitor.cli.discover import render
 from ou_monitor.cli.main import main
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.finding import Cause, Finding, Verdict
-from ou_monitor.discovery.plain_names import (
-    both_names, headline, in_short, plain, PLAIN_NAMES)
+from ou_monitor.discovery.plain_names import both_names, plain, PLAIN_NAMES
 from ou_monitor.discovery.words import explain, parameters
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
@@ -24,7 +22,9 @@ from ou_monitor.model.terms.tones import Tone
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.read import read_recording
-from ou_monitor.report.discovery_page import discovery_page
+from ou_monitor.report.discovery_document import answer, discovery_document
+from ou_monitor.report.page import html as page_of
+from ou_monitor.report.terminal import terminal
 from project import ROOT
 import pytest
 
@@ -101,7 +101,7 @@ def test_summary_model_and_page(flight, tmp_path, capsys):
                  str(model), '--report', str(page)]) == 0
     out = capsys.readouterr().out
     assert all(len(line) <= 100 for line in out.replace(str(tmp_path), '').splitlines())
-    for part in ('A plain simulation lacks sag (load_sag)', 'gain mnat/sample', 'times a minute',
+    for part in ('A plain simulation lacks sag (load_sag)', 'gain, mnat/sample', 'falls through',
                  'Plain OU: alpha', str(model), str(page)):
         assert part in out
     file = read_model(model)
@@ -174,18 +174,19 @@ def test_what_is_not_known_is_said_and_what_is_worse_too():
     finding = made((LoadSag(0.6, 0.0), nan, nan, nan), (Tone(0.01, 9.0, 0.0, 0.0), -0.01, 0.002,
                                                         1e-9),
                    (Drift(0.1, 0.0), 0.001, 0.002, 0.5))
-    text, html = render(finding), discovery_page(finding)
+    said = discovery_document(finding)
+    text, html = terminal(said), page_of(said)
     for shown in (text, html):
         assert not re.search(r'\bnan\b|- \+- -|\u2013 \u00b1 \u2013', shown)
-        assert shown.count('worse on what was kept back') == 1
-        assert 'Worse on samples not used' in html
-    # What a pilot calls it, and below that its name.
-    rows = {row[0].split()[-1]: row for row in tables(html)}
-    assert rows['load_sag'][0] == 'sag load_sag'
-    assert rows['load_sag'][2].startswith('not known not measurable here; named for')
-    assert rows['load_sag'][3] == 'not known'
-    assert 'Gain not measurable here; named for what it explains' in ' '.join(text.split())
-    assert 'worse' in rows['tone'][2] and 'not distinguishable from none' in rows['drift'][2]
+        words = ' '.join(re.sub('<[^>]*>', ' ', shown).split())
+        assert words.count('worse on what was kept back') == 1
+        assert 'Worse on samples not used' in words
+        assert 'Gain not measurable here; named for what it explains' in words
+        assert 'Gain not distinguishable from none' in words
+    # Its name, and what a pilot calls it.
+    rows = {row[0]: row for row in tables(html)}
+    assert rows['load_sag'][:4] == ['load_sag', 'sag', 'load', 'not known']
+    assert rows['load_sag'][4] == 'not known'
     assert re.search(r'load_sag +sag +load +not known +not known', text)
     assert 'from means of blocks and from the errors of the parameters' in html
 
@@ -195,13 +196,13 @@ def test_terms_that_share_a_gain_are_one_row():
     tones = [Tone(0.01, frequency, 0.0, 0.0) for frequency in (11.0, 23.0, 31.0)]
     finding = made(*[(tone, 0.02, 0.002, 1e-9) for tone in tones],
                    (Tone(0.01, 41.0, 0.0, 0.0), 0.03, 0.002, 1e-9))
-    text, html = render(finding), discovery_page(finding)
+    said = discovery_document(finding)
+    text, html = terminal(said), page_of(said)
     named = PLAIN_NAMES['tone']
-    assert [row[0] for row in tables(html)[1:]] == [f'{named} tone x3', f'{named} tone']
-    assert text.count('20.0 +- 2.0') == 1 and text.count('tone x3') == 1
+    assert [row[:2] for row in tables(html)[1:]] == [['tone x3', named], ['tone', named]]
+    assert len(re.findall('^tone x3 ', text, re.MULTILINE)) == 1
     for tone in tones:
-        assert parameters(tone, {}) in ' '.join(text.split())
-        assert html.split('Parameters of the')[0].count(parameters(tone, {})) == 1
+        assert ' '.join(text.split()).count(parameters(tone, {})) == 1
     assert len(finding.as_data()['causes']) == 4
 
 
@@ -249,16 +250,17 @@ def test_the_headline_names_the_strongest_and_what_all_are_worth():
         gain=math.log(2.0), gain_se=0.1, shrink=0.2)
     first = ('A plain simulation lacks a line at a fixed frequency (tone), sag (load_sag) and '
              'discharge or warming (drift)')
-    assert headline(finding) == (
-        f'{first}. With them it passes every test. One-step errors on samples not used for the '
-        'fit shrink by 20 % (rms), and their size is better known, by 470 of the 693 +- 100 mnat '
-        'gained per sample.')
+    assert answer(finding) == [
+        f'{first}.', 'One-step errors on samples not used for the fit shrink by 20 % (rms), and '
+        'their size is better known, by 470 of the 693 +- 100 mnat gained per sample.',
+        'With them it passes every test.']
     more = replace(finding, verdict=Verdict.PARTLY_EXPLAINED, refused='It strays', causes=(
         *finding.causes, *made((MeasurementNoise(0.01), 0.1, 0.01, 0.0)).causes))
-    assert ('sag (load_sag), noise of the sensor (measurement_noise) and 1 more. With them it '
-            'comes closer, but is not yet right.') in headline(more)
-    assert headline(more).endswith('It strays: believe its names, not its numbers.')
-    assert in_short(replace(finding, gain=0.19))[1].startswith('No measurable gain')
+    strongest, _, closer, refused = answer(more)
+    assert strongest.endswith('sag (load_sag), noise of the sensor (measurement_noise) and 1 '
+                              'more.')
+    assert closer == 'With them it comes closer, but is not yet right.'
+    assert refused == 'It strays: trust the named causes, not the fitted values.'
+    assert answer(replace(finding, gain=0.19))[1].startswith('No measurable gain')
     nothing = replace(finding, causes=(), sentence='load_sag was tried.')
-    assert headline(nothing) == 'Sag (load_sag) was tried.'
-    assert in_short(nothing)[1] == '400 samples in 4 s.'
+    assert answer(nothing) == ['Sag (load_sag) was tried.']

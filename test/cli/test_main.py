@@ -64,6 +64,7 @@ def test_every_help_ends_with_examples(command, capsys):
     (['analyze'], 'RECORDING'),
     (['analyze', 'x', '--reprot', 'y'], "did you mean '--report'?"),
     (['analyze', 'x', '--reprot=y'], "did you mean '--report'?"),
+    (['analyze', 'x', '--brown', '4'], "did you mean '--brownout-voltage'?"),
     (['analyze', 'x', 'y'], 'no further argument'),
     (['analyze', 'x', '--json'], 'expected one argument'),
 ])
@@ -188,9 +189,9 @@ def test_a_reader_that_goes_away_is_quiet():
 
 
 def test_commands_load_nothing_heavy_for_help():
-    """SciPy, the readers and ROS wait for work to do; NumPy comes with the output."""
+    """NumPy, SciPy, the readers and ROS wait for work to do."""
     program = ('import sys; from ou_monitor.cli.main import main; main(["--help"]); '
-               'heavy = [m for m in ("scipy", "mcap", "rclpy") if m in sys.modules]; '
+               'heavy = [m for m in ("numpy", "scipy", "mcap", "rclpy") if m in sys.modules]; '
                'sys.exit(" ".join(heavy) or 0)')
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
                           timeout=60)

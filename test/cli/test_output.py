@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from ou_monitor.cli import output
 from ou_monitor.errors import InputError
+from ou_monitor.report import terminal
 import pytest
 
 
@@ -55,7 +56,7 @@ def test_what_cannot_be_written_is_named(tmp_path):
 
 def test_table_is_aligned():
     """Numbers flush right, words flush left, no trailing blanks."""
-    text = output.table(['n', 'word'], [['1', 'a'], ['1000', 'long one']], left=[1])
+    text = terminal.table(['n', 'word'], [['1', 'a'], ['1000', 'long one']], left=[1])
     assert text.splitlines() == ['   n  word', '----  --------', '   1  a', '1000  long one']
 
 
@@ -167,11 +168,11 @@ def test_the_width_of_the_terminal_is_kept(monkeypatch, width):
     monkeypatch.setattr('sys.stdout', Screen())
     monkeypatch.setattr('shutil.get_terminal_size', lambda *_: os.terminal_size((width, 24)))
     words = ' '.join(['word'] * 60)
-    for text in (output.paragraph(words), output.item(words),
-                 output.facts_table([('Sag', words), ('Noise', words)])):
+    for text in (terminal.paragraph(words), terminal.item(words),
+                 terminal.facts([('Sag', words), ('Noise', words)])):
         assert max(map(len, text.splitlines())) <= min(width, 100)
     heads = ['vehicle', *[f'column {k}' for k in range(8)]]
-    text = output.table(heads, [[f'uav{k}', *['12.34'] * 8] for k in range(3)], left=[0])
+    text = terminal.table(heads, [[f'uav{k}', *['12.34'] * 8] for k in range(3)], left=[0])
     assert max(map(len, text.splitlines())) <= width
     assert text.count('uav1') == text.count('vehicle') >= (2 if width < 92 else 1)
     for head in heads:
@@ -181,15 +182,16 @@ def test_the_width_of_the_terminal_is_kept(monkeypatch, width):
 def test_a_file_is_as_wide_as_ever(monkeypatch):
     """What no terminal shows is not broken by the width of one."""
     monkeypatch.setenv('COLUMNS', '40')
-    assert output.columns() == 100
+    assert terminal.columns() == 100
     heads = [f'column {k}' for k in range(20)]
-    assert len(output.table(heads, [['1'] * 20]).splitlines()) == 3
+    assert len(terminal.table(heads, [['1'] * 20]).splitlines()) == 3
 
 
 def test_the_last_lines(capsys):
     """Three: the answer, what stands behind it, and what was written where."""
-    output.summary('It fell to 13 V.', 'It sags by 2 V.', report='a.html', json='-', model=None)
-    output.summary('It fell to 13 V.', 'It sags by 2 V.', report=None)
+    said = ['It fell to 13 V.', 'It sags by 2 V.', 'It is safe up to half throttle.']
+    output.summary(said, report='a.html', json='-', model=None)
+    output.summary(said, report=None)
     first, second = capsys.readouterr().out.strip('\n').split('\n\n')
     assert first.splitlines() == ['It fell to 13 V.', 'It sags by 2 V.', 'Report: a.html']
     assert second.splitlines()[-1].startswith('Nothing was written: --report')

@@ -5,7 +5,6 @@ from ou_monitor.comparison.agreement import Verdict
 from ou_monitor.comparison.compare import compare
 from ou_monitor.comparison.flight_fit import damping
 from ou_monitor.comparison.flight_model import Readings
-from ou_monitor.comparison.judgement import path_rows
 from ou_monitor.errors import InputError
 from ou_monitor.model.load import LoadModel, lowpass
 from ou_monitor.model.supply import SupplyModel
@@ -102,8 +101,9 @@ def test_the_second_half_follows_from_the_first():
     assert 'load_sag' in found.model and 'load_dependent_noise' in found.model
     assert found.explained > 0.9
     assert found.lowest.inside and all(falls.inside for falls in found.falls)
-    # What is farthest off is said, too, though it is within chance.
-    assert path_rows(found)[-1] == ('Farthest off', found.words)
+    # What is farthest off is named, too, though it is within chance.
+    assert found.words
+    assert found.farthest in ('lowest', 'falls', 'level', 'answer', 'spectrum', 'ks')
 
 
 def test_jitter_of_throttle_is_no_noise_and_no_path():

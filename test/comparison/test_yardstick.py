@@ -86,11 +86,11 @@ def test_the_worst_is_the_farthest_in_half_bands():
         return Difference(kind, measured, seeds, least, lambda b: kind)
 
     level = of('level', 0.0)
-    p, _, worst = judge([of('lowest', 4.0), of('spectrum', 6.0), level], 0.9, True)
+    p, _, worst, kind = judge([of('lowest', 4.0), of('spectrum', 6.0), level], 0.9, True)
     # 6 at half the weight is less than 4.
-    assert worst == 'lowest'
+    assert worst == kind == 'lowest'
     assert p == pytest.approx(1.0 / 401.0)
-    p, _, _ = judge([of('lowest', 0.0), level], 0.9, True)
+    p, *_ = judge([of('lowest', 0.0), level], 0.9, True)
     assert p > 0.9
     # A band that is wide by what a pilot would not notice.
     wide = of('lowest', 4.0, least=100.0)
@@ -115,6 +115,6 @@ def test_the_verdict_follows_from_path_and_level():
     at = [(0.0, 0.1, True, looks), (0.0, -0.1, False, looks), (0.0, -0.1, True, differs),
           (2.2, 0.1, True, differs)]
     for level, explained, moved, verdict in at:
-        p, said, words = judge([*others, of('level', level)], explained, moved)
+        p, said, words, kind = judge([*others, of('level', level)], explained, moved)
         assert p > 0.05 and said is verdict
-    assert words == 'level'
+    assert words == kind == 'level'

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
-from ou_monitor.analysis.quality import line_item, Severity
+from ou_monitor.analysis.quality import line_item
 from ou_monitor.model.spectral_lines import find_lines, without_lines
-from ou_monitor.records import Estimate, Recording, Status
+from ou_monitor.records import Estimate, Recording, Severity, Status
 import pytest
 from scipy.signal import lfilter
 

@@ -62,11 +62,13 @@ from hidden_effects import causes, draw
 from hidden_registry import effect
 import numpy as np
 from ou_monitor import discover, Recording
-from ou_monitor.cli.discover import model_text, render
+from ou_monitor.cli.discover import model_text
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.recordings.model_file import read_model
-from ou_monitor.report.discovery_page import discovery_page
+from ou_monitor.report.discovery_document import discovery_document
+from ou_monitor.report.page import html
+from ou_monitor.report.terminal import terminal
 import pytest
 
 
@@ -102,8 +104,9 @@ def test_it_is_named_measured_and_explained(found):
 
 def test_terminal_page_and_model_file_have_it(found, tmp_path):
     _, finding = found
-    assert 'heartbeat' in render(finding)
-    page = discovery_page(finding)
+    said = discovery_document(finding)
+    assert 'heartbeat' in terminal(said)
+    page = html(said)
     assert 'heartbeat' in page and 'Look for a beacon' in page
     path = tmp_path / 'toy.yaml'
     path.write_text(model_text(finding))

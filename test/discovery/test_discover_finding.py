@@ -182,7 +182,8 @@ def test_a_model_that_has_not_earned_its_place_is_said_so():
     cause = finding().causes[0]
     text = verdict_sentence(Verdict.EXPLAINED, [cause], [], -0.015, 0.002,
                             refused='The extended model predicts worse than the plain OU')
-    assert text.endswith('predicts worse than the plain OU: believe its names, not its numbers.')
+    assert text.endswith('predicts worse than the plain OU: trust the named causes, not the '
+                         'fitted values.')
     assert 'believe' not in verdict_sentence(Verdict.EXPLAINED, [cause], [], 0.015, 0.002)
 
 

@@ -11,9 +11,7 @@ import sys
 import numpy as np
 import ou_monitor
 from ou_monitor import discover
-from ou_monitor.cli.discover import render
 from ou_monitor.discovery.finding import Verdict
-from ou_monitor.discovery.plain_names import headline
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_answer import LoadSag
@@ -21,7 +19,9 @@ from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import HeldSamples, MeasurementNoise, Quantization
 from ou_monitor.model.terms.slow import Drift
 from ou_monitor.records import Recording
-from ou_monitor.report.discovery_page import discovery_page
+from ou_monitor.report.discovery_document import answer, discovery_document
+from ou_monitor.report.page import html as page_of
+from ou_monitor.report.terminal import terminal
 from pages import parsed, self_contained
 from project import ROOT
 import pytest
@@ -131,7 +131,7 @@ def test_too_little_is_said_so(recording):
     data = found.as_data()
     json.dumps(data, allow_nan=False)
     assert data['n'] == recording.n and data['extended']['params'] == {}
-    assert found.sentence in ''.join(parsed(discovery_page(found)).itertext())
+    assert found.sentence in ''.join(parsed(page_of(discovery_document(found))).itertext())
 
 
 def test_without_throttle_its_causes_are_untestable():
@@ -174,7 +174,7 @@ def test_a_path_is_read(tmp_path):
 
 def test_the_page_shows_it_all(sag):
     """Well formed, escaped, finite; verdict, cause, pictures before and after, command."""
-    html = discovery_page(sag, 'ou-monitor discover x.csv')
+    html = page_of(discovery_document(sag, command='ou-monitor discover x.csv'))
     root = self_contained(html)
     text = ' '.join(''.join(root.itertext()).split())
     assert 'sag <b>' in text and '<b>' not in html
@@ -182,7 +182,7 @@ def test_the_page_shows_it_all(sag):
                  'Mean voltage by throttle', 'Spectrum', 'Autocorrelation', 'V/sqrt(s)'):
         assert part in text
     # Names of causes stand behind plain ones.
-    said = headline(sag)
+    said = ' '.join(answer(sag))
     assert 'sag (load_sag)' in said and ' '.join(said.replace('+-', '\u00b1').split()) in text
     drawings = root.findall('.//figure/svg')
     # The voltage over its simulations, rows of statistics, and six pictures twice.
@@ -238,12 +238,12 @@ def test_the_page_of_a_plain_rail_keeps_the_plain_model():
     """No extended model is shown where nothing was added: one picture each, and it is said so."""
     found = discover(drawn_from(seed=2, n=5000))
     assert found.verdict is Verdict.NO_EFFECT
-    root = parsed(discovery_page(found))
+    root = parsed(page_of(discovery_document(found)))
     text = ' '.join(''.join(root.itertext()).split())
     assert 'The plain OU is kept' in text and 'xtended' not in text
     assert 'simulations of the plain OU at each moment' in text
     assert len(root.findall('.//figure/svg')) == 2 + 6
-    assert 'xtended' not in render(found)
+    assert 'xtended' not in terminal(discovery_document(found))
 
 
 @pytest.mark.parametrize('code, count', [(0.011, 60), (0.0007, 400), (0.05, 7)])

@@ -12,7 +12,7 @@ from ou_monitor.discovery.gain import (
     why_unknown)
 from ou_monitor.discovery.validation import blocks_of, FOLDS, HeldOut
 from ou_monitor.discovery.words import (
-    cause_rows, crossing_words, explain, gain_remark, gain_text, gain_words, left_out_note,
+    cause_rows, explain, gain_remark, gain_text, gain_words, left_out_note,
     no_relaxation_note, overlap_words, remaining_words, throttles_note, unmeasured_words,
     verdict_sentence,
     why_named, with_error)
@@ -132,7 +132,6 @@ def test_notes_with_numbers():
     assert 'terms load_sag' not in explain(SAG.term, {}, 0.02, 0.003, [], False, together=1)
     assert 'terms load_sag' not in explain(SAG.term, {}, NAN, NAN, [], False, together=2)
     assert 'without a model' in explain(SAG.term, {}, 0.02, 0.003, [], True)
-    assert crossing_words.__doc__
 
 
 @pytest.mark.parametrize('gain, whole, said', [

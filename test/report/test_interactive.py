@@ -7,9 +7,9 @@ import time
 from browser import Browser, find_browser
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
-from ou_monitor.report import page
-from ou_monitor.report.analysis_page import analysis_page
-from ou_monitor.report.page import embed
+from ou_monitor.report.analysis_document import analysis_document
+from ou_monitor.report.document import Document, Figure, Pair
+from ou_monitor.report.page import embed, html
 from ou_monitor.report.svg import Plot
 import pytest
 from simulated_recordings import recording
@@ -51,9 +51,8 @@ def file(data, tmp_path_factory):
     outline.mark(0.9, EVIL)
     outline.bars(np.array([-0.75]), np.array([0.05]), np.array([0.2]), 'bar', 2)
     path = tmp_path_factory.mktemp('page') / 'it <b>.html'
-    path.write_text(page.page(EVIL, EVIL, [
-        page.figure(voltage, EVIL), page.figure(throttle),
-        page.pair(page.figure(spectrum), page.figure(outline))]))
+    path.write_text(html(Document(EVIL, EVIL, [EVIL], [
+        Figure(voltage, EVIL), Figure(throttle), Pair([Figure(spectrum), Figure(outline)])])))
     return path
 
 
@@ -160,10 +159,10 @@ def test_every_figure_becomes_interactive(tab):
 def test_an_analysis_becomes_interactive(browser, tmp_path):
     """Each drawing of a real page, those of one axis linked: time, and throttle."""
     path = tmp_path / 'a.html'
-    html = analysis_page(analyze(recording(1, seconds=3.0)))
-    path.write_text(html)
+    text = html(analysis_document(analyze(recording(1, seconds=3.0))))
+    path.write_text(text)
     axes = [json.loads(text)['x']['name'] for text in re.findall(
-        r'<script type="application/json"[^>]*>(.*?)</script>', html, re.DOTALL)]
+        r'<script type="application/json"[^>]*>(.*?)</script>', text, re.DOTALL)]
     browser.visit(path, 'document.documentElement.dataset.plots')
     drawn = browser.run('document.querySelectorAll("figure").length')
     assert shown(browser, 'canvas.live-curves') == drawn >= 6
@@ -375,9 +374,8 @@ def test_envelopes_say_that_they_are(browser, tmp_path, data):
     """A curve beyond the budget is drawn with its peak, and the page says what its points are."""
     t, v = data
     plot = Plot('Voltage', 'time, s', 'V').line(t, v)
-    html = page.page('t', 's', [f'<figure>{plot.svg()}{embed(plot, 20_000)}</figure>'])
     path = tmp_path / 'e.html'
-    path.write_text(html)
+    path.write_text(html(Document('t', 's', [], [Figure(plot.svg() + embed(plot, 20_000))])))
     browser.visit(path, 'document.documentElement.dataset.plots')
     note = browser.run('document.querySelector(".live-note").textContent')
     assert 'lowest and highest of each 4 samples' in note

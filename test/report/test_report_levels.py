@@ -8,7 +8,7 @@ from ou_monitor.criticism.curves import compare_curves
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.report.discovery_page import _plot
+from ou_monitor.report.discovery_document import _plot
 from ou_monitor.report.svg import Plot
 import pytest
 

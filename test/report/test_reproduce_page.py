@@ -6,7 +6,8 @@ import re
 from ou_monitor.paper.reproduce import published, reproduce as module
 from ou_monitor.paper.reproduce.reproduce import as_data, headline, recomputed
 from ou_monitor.paper.reproduce.row import Printed, Row, RowVerdict
-from ou_monitor.report.reproduction_page import reproduction_page
+from ou_monitor.report.page import html
+from ou_monitor.report.reproduction_document import reproduction_document
 from pages import self_contained
 import pytest
 
@@ -26,8 +27,7 @@ def result():
 @pytest.fixture(scope='module')
 def tree(result):
     """Return the page, parsed as XML."""
-    html = reproduction_page(result, 'ou-monitor reproduce --seed 3')
-    return self_contained(html)
+    return self_contained(html(reproduction_document(result, 'ou-monitor reproduce --seed 3')))
 
 
 def test_every_printed_number_has_its_row(result):

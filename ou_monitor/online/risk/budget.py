@@ -62,25 +62,23 @@ def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings) 
         why = '' if load.status is LoadStatus.NO_DATA else load.status.value if (
             not load.known) else 'Less than a second has been flown.'
         return Ahead(outcome, NAN, why, soon=soon)
-    budget = throttle_budget(risks, forecast.flown, s.budget_limit, voltage, horizon)
+    budget = throttle_budget(risks, forecast.flown, s.budget_limit)
     # NaN is not below.
     return Ahead(outcome, budget.throttle, budget.reason, tuple(risks[::5].tolist()), soon,
                  budget.throttle < forecast.used)
 
 
 def throttle_budget(risks: FloatArray, flown: tuple[float, float], limit: float,
-                    voltage: float, dwell: float) -> ThrottleBudget:
-    """Return the budget from the risks at `_GRID`, held for `dwell`, s; voltage in V."""
+                    ) -> ThrottleBudget:
+    """Return the budget from the risks at `_GRID`, and the limit of them."""
     lowest, highest = flown
     known = (_GRID >= lowest) & (_GRID <= highest)
-    what = f' Brown-out: below {voltage:g} V while it is held for {dwell:g} s.'
     # A risk that falls again beyond a peak is no way through.
     risks = np.maximum.accumulate(risks)
     within = int(np.searchsorted(risks, limit, 'right'))
     if within == 0:
         return ThrottleBudget(
-            0.0, f'Even at idle the risk is {risks[0]:.2g}, more than allowed.{what}', risks,
-            known)
+            0.0, f'Even at idle the risk is {risks[0]:.2g}, more than allowed.', risks, known)
     end = 1.0
     if within < _GRID.size:
         low, high = risks[within - 1], risks[within]
@@ -94,4 +92,4 @@ def throttle_budget(risks: FloatArray, flown: tuple[float, float], limit: float,
             reason = 'Within the limit up to full throttle.'
     else:
         throttle, reason = end, f'The risk passes the limit of {limit:.2g} at throttle {end:.2f}.'
-    return ThrottleBudget(float(throttle), reason + what, risks, known)
+    return ThrottleBudget(float(throttle), reason, risks, known)

@@ -106,10 +106,11 @@ def read(path: Path, request: Request) -> Log:
         facts['flight'] = f'{wanted} of {len(held)}'
     t = columns['time'] * 1e-6
     if request.flight is None and len(held) > 1:
-        sizes = '; '.join(f'{one.number}: {one.size} bytes' for one in held)
-        length = f'{t[-1] - t[0]:.0f} s' if t.size else 'empty'
-        notes.insert(0, f'The file holds {len(held)} flights ({sizes}); this is flight {wanted}, '
-                     f'the largest ({length}): --flight N chooses another.')
+        # Only this one is decoded; the others are as long as their bytes say.
+        pace = float(t[-1] - t[0]) / max(held[wanted - 1].size, 1) if t.size else 0.0
+        lengths = '; '.join(f'{one.number}: about {pace * one.size:.0f} s' for one in held)
+        notes.insert(0, f'The file holds {len(held)} flights ({lengths}); this is flight '
+                     f'{wanted}, the largest: --flight N chooses another.')
     series = [*_battery(t, columns, headers, notes), *_throttles(t, columns, headers)]
     known = {one.name for one in series}
     shows_gyro = _shows_gyro(headers, *_version(headers))

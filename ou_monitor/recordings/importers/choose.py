@@ -21,8 +21,8 @@ from ou_monitor.recordings.bag_samples import check_throttle
 from ou_monitor.recordings.importers.log import (
     ANY, clean, CURRENT, Inertial, Log, MotorSpeeds, RawColumns, Series, SIGNAL, sound, THROTTLE,
     UNKNOWN, VOLTAGE)
-from ou_monitor.records import FloatArray
-from ou_monitor.text import printable
+from ou_monitor.records import Defect, FloatArray, led, Note
+from ou_monitor.text import counted, printable
 
 # What leaves a quantity out.
 NONE = 'none'
@@ -58,7 +58,7 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
         second = _pick(path, log, CURRENT, current, option)
     else:
         second = _current(log, volts)
-    notes = []
+    notes: list[str] = []
     if second is None and current is None and (
             held := [one for one in _of(log, CURRENT) if not one.silent]):
         notes.append('No current is clearly that of this voltage: ' + _listed(held)
@@ -76,7 +76,8 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
             notes.append(f'{one.name} has no usable sample.')
         chosen.append(mended if mended.n else None)
     # What befell several alike, such as columns of one table, is said once.
-    notes = [f'{", ".join(names)}: {sentence}' for sentence, names in dropped.items()] + notes
+    notes = [note for sentence, names in dropped.items()
+             for note in led(', '.join(names), [sentence])] + notes
     if chosen[0] is None:
         raise InputError(f'{path}: {volts.name} has no usable sample'
                          + ''.join(f' ({note})' for note in notes))
@@ -185,7 +186,7 @@ def _no_voltage(path: Path, log: Log) -> str:
 
 def _also(log: Log, chosen: tuple[Series, Series | None], option: str) -> list[str]:
     """Say what else could have been taken."""
-    notes = []
+    notes: list[str] = []
     for quantity, one in zip((VOLTAGE, THROTTLE), chosen):
         others = [other for other in _of(log, quantity)
                   if not other.silent and (one is None or other.name != one.name)]
@@ -228,7 +229,7 @@ def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),
     inertial: dict[str, Inertial] = {}
     for one in _inertial(path, log, imus):
         kept, said = clean_inertial(one)
-        notes += [f'{one.name}: {sentence}' for sentence in said]
+        notes += led(one.name, said)
         if not kept.t.size:
             notes.append(f'{one.name} has no usable sample.')
             continue
@@ -243,12 +244,12 @@ def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),
     speeds = log.speeds
     if speeds is not None:
         speeds, said = clean_speeds(speeds)
-        notes += [f'{SPEEDS}: {sentence}' for sentence in said]
+        notes += led(SPEEDS, said)
         speeds = speeds if speeds.t.size else None
     named: dict[str, Series] = {}
     for name in dict.fromkeys(signals):
         series, said = clean(named_series(path, log, name))
-        notes += [f'{name}: {sentence}' for sentence in (*said, *pace_notes(series.t))]
+        notes += led(name, (*said, *pace_notes(series.t)))
         if not series.n:
             raise InputError(f'{path}: {name} has no usable sample'
                              + ''.join(f' ({sentence})' for sentence in said))
@@ -284,8 +285,7 @@ def signal_of(path: Path, log: Log, signal: str) -> tuple[Series, tuple[str, ...
     if not series.n:
         raise InputError(f'{path}: {signal} has no usable sample' + ''.join(
             f' ({sentence})' for sentence in said))
-    return series, tuple(f'{signal}: {sentence}'
-                         for sentence in (*said, *pace_notes(series.t)))
+    return series, tuple(led(signal, (*said, *pace_notes(series.t))))
 
 
 _RATE, _FORCE = 'angular_velocity', 'linear_acceleration'
@@ -381,11 +381,12 @@ def pace_notes(t: FloatArray) -> tuple[str, ...]:
         return ()
     steps = np.diff(t)
     usual = float(np.median(steps))
-    notes = []
+    notes: list[str] = []
     gaps = steps > _GAP * usual
     if gaps.any():
         count = int(gaps.sum())
-        notes.append(f'{count} gap{"s" * (count != 1)} of up to {float(steps.max()):.3g} s.')
+        notes.append(Note(f'{counted(count, "gap")} of up to {float(steps.max()):.3g} s.',
+                          Defect.GAPS))
     paces = [float(np.median(part)) for part in np.array_split(steps, _PARTS)]
     if max(paces) > _UNEQUAL * min(paces):
         notes.append(f'The rate changes between {1.0 / max(paces):.4g} and '

@@ -26,7 +26,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
     CURRENT, DEGREE, from_start, GRAVITY, Inertial, Log, one_flight, Request, Series, SIGNAL,
     start_of, THROTTLE, UNKNOWN, VOLTAGE)
-from ou_monitor.records import FloatArray
+from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.stream.files import open_regular
 from ou_monitor.text import counted
 
@@ -71,10 +71,10 @@ def read(path: Path, request: Request) -> Log:
     sound = len(data) >= begin + 4 and crc32(data[:-4]) == int.from_bytes(data[-4:], 'little')
     end = len(data) - 4 if sound else len(data)
     found, read_to = _places(data, begin, end, events)
-    notes = []
+    notes: list[str] = []
     if not sound:
-        notes.append('The checksum does not match: the log was cut off or is damaged, and wrong '
-                     'values cannot be told from right ones.')
+        notes.append(Note('The checksum does not match: the log was cut off or is damaged, and '
+                          'wrong values cannot be told from right ones.', Defect.DAMAGED_FILE))
     # Bytes that are too few for a record are the checksum, or its beginning.
     if end - read_to > (0 if sound else 4):
         notes.append(f'{counted(end - read_to, "byte")} from byte {read_to} on were not read: no '

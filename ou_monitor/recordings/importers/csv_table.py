@@ -28,8 +28,8 @@ from ou_monitor.recordings.importers.csv_form import (
     TIME, TIME_UNITS, TIME_WORDS, unit_of, VOLT_WORDS, VOLTAGE, VOLTAGE_UNITS)
 from ou_monitor.recordings.importers.log import (
     ANY, CsvColumns, Log, one_flight, RawColumns, Request, Series)
-from ou_monitor.records import FloatArray
-from ou_monitor.text import printable
+from ou_monitor.records import Defect, FloatArray, Note
+from ou_monitor.text import counted, printable
 from ou_monitor.timeline.line import hold, MOST_THROTTLE
 
 
@@ -127,11 +127,11 @@ def read(path: Path, request: Request) -> Log:
               for quantity, (column, values) in table.found.items()]
     series += [Series(name, ANY, t, values, '1', 'column')
                for name, values in table.named.items() if name not in taken]
-    notes = [table.note] if table.note else []
+    notes: list[str] = [table.note] if table.note else []
     late = int(np.count_nonzero(np.diff(t) < 0.0))
     if late:
-        notes.append(f'{late} line{"s" * (late != 1)} came before the stamp ahead of them: '
-                     'sorted by stamp.')
+        notes.append(Note(f'{counted(late, "line")} came before the stamp ahead of them: sorted '
+                          'by stamp.', Defect.UNORDERED))
         order = np.argsort(t, kind='stable')
         series = [replace(one, t=t[order], values=one.values[order]) for one in series]
     if request.everything:

@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
-from ou_monitor.records import FloatArray
+from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.text import counted, printable
 from ou_monitor.timeline.line import in_order, Picked
 
@@ -236,15 +236,16 @@ def one_flight(path: Path, request: Request) -> None:
 
 def sound(t: FloatArray, rows: FloatArray) -> tuple[Picked, list[str]]:
     """Return samples as `in_order`, without those whose stamps only broken bytes make."""
-    notes = []
+    notes: list[str] = []
     places = np.flatnonzero(np.isfinite(t) & np.isfinite(rows).all(axis=1))
     if places.size < t.size:
-        notes.append(f'{counted(t.size - places.size)} dropped: not a finite number.')
+        notes.append(Note(f'{counted(t.size - places.size)} dropped: not a finite number.',
+                          Defect.NON_FINITE))
     for good_of, why in ((near, f'the stamp is over {_FAR:g} s away from all others'),
                          (rising, 'the stamp goes back')):
         good = good_of(t[places])
         if not good.all():
-            notes.append(f'{counted(int((~good).sum()))} dropped: {why}.')
+            notes.append(Note(f'{counted(int((~good).sum()))} dropped: {why}.', Defect.DROPPED))
             places = places[good]
     which, said = in_order(t[places], rows[places], LARGEST)
     return places[which], notes + said

@@ -19,7 +19,7 @@ import numpy as np
 from ou_monitor.recordings.importers.log import (
     CURRENT, FRD_TO_FLU, from_start, Inertial, Log, MotorSpeeds, one_flight, Progress, quiet,
     Request, RPM, Series, SIGNAL, start_of, THROTTLE, UNKNOWN, VOLTAGE)
-from ou_monitor.records import FloatArray
+from ou_monitor.records import Defect, FloatArray, Note
 from pyulog import ULog
 
 TOPICS = ('battery_status', 'system_power', 'power_monitor', 'esc_status', 'actuator_motors',
@@ -117,16 +117,17 @@ def read(path: Path, request: Request) -> Log:
         with _Watched(io.FileIO(path)) as file:
             file.size, file.progress = size, request.progress
             ulog = ULog(file, None if request.everything else _topics(request.names))
-    notes = []
+    notes: list[str] = []
     if file.cut_at is not None:
         notes.append(f'The log was cut off within its last message, at byte {file.cut_at} of '
                      f'{size}; all before that was read.')
     elif file.end < size:
-        notes.append(f'Only {file.end} of {size} bytes were read: the log is damaged.')
+        notes.append(Note(f'Only {file.end} of {size} bytes were read: the log is damaged.',
+                          Defect.DAMAGED_FILE))
     if ulog.file_corruption or file.unknown_at is not None or said.getvalue():
         where = '' if file.unknown_at is None else f' from byte {file.unknown_at} of {size} on'
-        notes.append(f'The log is damaged{where}: messages that pyulog could not read are '
-                     'missing, those after them were read.')
+        notes.append(Note(f'The log is damaged{where}: messages that pyulog could not read are '
+                          'missing, those after them were read.', Defect.DAMAGED_FILE))
     lost = sum(one.duration for one in ulog.dropouts) * 1e-3
     if ulog.dropouts:
         notes.append(f'The logger lost data {len(ulog.dropouts)} '

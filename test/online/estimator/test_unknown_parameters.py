@@ -8,7 +8,7 @@ import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
-from ou_monitor.analysis.words import as_data
+from ou_monitor.analysis.data import as_data
 from ou_monitor.cli.analyze import render
 from ou_monitor.online.estimator.fit import FitEnd, Fitted
 from ou_monitor.online.estimator.quality import judge, Quality

@@ -11,8 +11,8 @@ GRID = np.linspace(0.0, 1.0, 51)
 
 
 def budget(risks, limit=1e-2, flown=(0.1, 0.9)):
-    """Return the budget of 14 V held for 2 s."""
-    return throttle_budget(np.asarray(risks), flown, limit, 14.0, 2.0)
+    """Return the budget."""
+    return throttle_budget(np.asarray(risks), flown, limit)
 
 
 @pytest.mark.parametrize('limit', [1e-6, 1e-4, 1e-3, 1e-2, 0.1])
@@ -47,7 +47,7 @@ def test_a_risk_that_falls_again_is_no_way_through():
 
 def test_above_the_limit_from_the_start():
     found = budget(np.full(51, 0.3))
-    assert found.throttle == 0.0 and 'idle' in found.reason and '14 V' in found.reason
+    assert found.throttle == 0.0 and 'idle' in found.reason
 
 
 def test_without_a_load_it_is_unknown_and_says_why():

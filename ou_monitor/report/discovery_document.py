@@ -1,26 +1,29 @@
-"""The report of `discover`: what the simulation gets wrong, why, and the gain."""
+"""What `discover` says: what the simulation gets wrong, why, and the gain."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from html import escape
 import math
 
 import numpy as np
+from ou_monitor.analysis.overview import known_lines, other_scale, Overview
 from ou_monitor.criticism.curves import compare_curves, Comparison
-from ou_monitor.discovery.finding import Criticism, Finding
-from ou_monitor.discovery.plain_names import headline, PLAIN_NAMES
+from ou_monitor.discovery.finding import Criticism, Finding, Verdict
+from ou_monitor.discovery.plain_names import both_names, plain, PLAIN_NAMES
 from ou_monitor.discovery.words import (
-    cause_rows, crossing_words, gain_remark, MNAT, NOT_KNOWN, overlap_words, plain_model_words,
-    plain_words, with_error)
+    cause_rows, gain_words, MNAT, NOT_KNOWN, overlap_words, plain_model_words, plain_words,
+    with_error)
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.report import page
-from ou_monitor.report.page import rounded, UNKNOWN
+from ou_monitor.report.document import (
+    Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.scale import span
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import chance, number
+from ou_monitor.text import listed, number, Z95
 
+# Causes in the first sentence; rows of what is left on a terminal.
+_FIRST, _SHOWN = 3, 8
 # Rows of statistics drawn at most.
 _ROWS = 18
 # Rows of dots: sizes, in pixels.
@@ -32,38 +35,62 @@ _STRAIGHT = 4.0
 _TICKS = (0.0, 4.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 10000.0)
 
 
-def discovery_page(finding: Finding, command: str = '',
-                   progress: Callable[[float], None] | None = None,
-                   facts: Sequence[tuple[str, str]] = ()) -> str:
-    """Return the report of a discovery; facts: what is known of the recording anyway."""
-    subtitle = f'{finding.n} samples in {number(finding.duration, 4)} s'
-    if finding.samples is not None and finding.samples.n != finding.n:
-        subtitle += f', of which {finding.samples.n} were used'
-    sections = [page.headline(_typeset(headline(finding)))]
-    if finding.samples is not None:
-        sections.append(page.figure(_voltage(finding), _VOLTAGE.format(_model_name(finding))
-                                    if finding.simulated else ''))
-    if facts:
-        sections.append(page.facts([(name, _typeset(words)) for name, words in facts]))
-    if finding.baseline is not None:
-        sections += [page.section('Causes', *_causes(finding)),
-                     page.section('Gain' if finding.causes else 'What it predicts',
-                                  *_gain(finding)),
-                     page.section(
-                         'Statistics before and after' if finding.causes else 'Statistics',
-                         *_statistics(finding), folded=True),
-                     page.section('Data beside simulations', *_comparisons(finding), folded=True),
-                     page.section('What is left', *_left(finding), folded=True),
-                     page.section('Parameters', *_parameters(finding), folded=True)]
-    if progress is not None:
-        progress(1.0)
-    sections.append(page.section('Where it comes from', *_origin(finding, command), folded=True))
-    return page.page(f'What the simulation gets wrong: {finding.recording or "recording"}',
-                     subtitle, sections)
+def discovery_document(finding: Finding, seen: Overview | None = None, command: str = '',
+                       ) -> Document:
+    """Return what is said of a discovery; seen: what is known of the recording anyway."""
+    samples, baseline = finding.samples, finding.baseline
+    used = '' if samples is None or samples.n == finding.n else f', {samples.n} used'
+    subject = (f'{finding.recording or "recording"}: {finding.n} samples in '
+               f'{number(finding.duration, 4)} s{used}')
+    known = [] if seen is None else known_lines(seen)
+    if seen is not None and baseline is not None and other_scale(
+            seen.facts.ou, baseline.alpha, 0.0, baseline.sigma, 0.0):
+        known.append(('Plain OU', 'describes another time scale than this relaxation: level and '
+                      'load are in it'))
+    parts: list[Part] = [
+        lambda: [] if samples is None else [Figure(_voltage(finding), (
+            f'Band: range of {_DRAWS} simulations of the {_model_name(finding)} at each moment, '
+            'with the throttle of the recording.') if finding.simulated else '')],
+        *([Facts(known)] if known else [])]
+    if baseline is not None:
+        after = ' before and after' if finding.causes else ''
+        parts += [Section('Causes', _causes(finding)),
+                  Section('Gain' if finding.causes else 'What it predicts', _gain(finding)),
+                  lambda: [Section(f'Statistics{after}', _statistics(finding), folded=True),
+                           Section('Data beside simulations', _comparisons(finding),
+                                   folded=True)],
+                  Section('What is left', [_left(finding)], folded=True),
+                  lambda: [Section('Parameters', _parameters(finding), folded=True)]]
+    parts.append(Section('What to know before using these numbers', [Notes.of(finding.notes)]))
+    return Document('What the simulation gets wrong', subject, answer(finding), parts, command)
 
 
-_VOLTAGE = ('Band: range of 20 simulations of the {} at each moment, with the throttle of the '
-            'recording.')
+def answer(finding: Finding) -> list[str]:
+    """Return the strongest causes, and what all are worth in errors of prediction."""
+    if not finding.causes:
+        return [plain(finding.sentence)]
+    order = sorted(finding.causes, key=lambda c: -c.gain if math.isfinite(c.gain) else math.inf)
+    names = [both_names(name) for name in dict.fromkeys(cause.name for cause in order)]
+    more = len(names) - _FIRST
+    others = [f'{more} more'] if more > 0 else []
+    closer = ('With them it passes every test.' if finding.verdict is Verdict.EXPLAINED else
+              'With them it comes closer, but is not yet right.')
+    refused = [f'{finding.refused}: trust the named causes, not the fitted values.'
+               ] if finding.refused else []
+    return [f'A plain simulation lacks {listed([*names[:_FIRST], *others])}.',
+            _worth(finding), closer, *refused]
+
+
+def _worth(finding: Finding) -> str:
+    """Return a gain in two parts: smaller errors of prediction, and their size better known."""
+    gain, shrink, size = finding.gain, finding.shrink, finding.size_gain
+    if not gain > Z95 * finding.gain_se or not math.isfinite(size):
+        return gain_words(gain, finding.gain_se)
+    errors = ('shrink by ' if shrink > 0.0 else 'grow by ') + f'{number(100.0 * abs(shrink), 2)} %'
+    return (f'One-step errors on samples not used for the fit {errors} (rms), and their size is '
+            f'{"better" if size >= 0.0 else "worse"} known, by {number(1e3 * abs(size), 2)} of '
+            f'the {number(1e3 * gain)} +- {number(1e3 * finding.gain_se, 2)} mnat gained per '
+            'sample.')
 
 
 def _model_name(finding: Finding) -> str:
@@ -92,76 +119,50 @@ def _voltage(finding: Finding) -> Plot:
     return plot.line(t, samples.logged, 'measured', 0)
 
 
-def _typeset(text: str) -> str:
-    return text.replace('+-', '\u00b1')
-
-
-def _value(value: float, digits: int = 3) -> str:
-    return rounded(value, digits) if math.isfinite(value) else NOT_KNOWN
-
-
 def _with_error(value: float, error: float) -> str:
     if not math.isfinite(value):
         return NOT_KNOWN
-    return _value(value) + (f' \u00b1 {_value(error, 2)}' if math.isfinite(error) else '')
+    return number(value) + (f' +- {number(error, 2)}' if math.isfinite(error) else '')
 
 
-def _minus(text: str) -> str:
-    """Return a number that stands at the front with a true minus."""
-    return '\u2212' + text[1:] if text.startswith('-') else text
-
-
-def _total_gain(finding: Finding) -> str:
-    remark = gain_remark(finding.gain, finding.gain_se) if finding.causes else ''
-    return (f'gain {_with_error(finding.gain, finding.gain_se)}'
-            + (f'\n{remark}' if remark else ''))
-
-
-def _causes(finding: Finding) -> list[str]:
+def _causes(finding: Finding) -> list[Part]:
     if not finding.causes:
-        return [page.paragraph('No cause was named.')]
+        return [Text('No cause was named.')]
     found = cause_rows(finding.causes)
     overlap = overlap_words(finding.causes, finding.gain)
-    rows = [[f'{PLAIN_NAMES.get(row.name, row.name)}\n{row.label}', row.family,
-             _minus(_typeset(row.gain)) + (f'\n{row.remark}' if row.remark else ''),
-             row.chance, ', '.join(row.alternatives) or UNKNOWN] for row in found]
+    remarks = [f'Gain {remark}: ' + ', '.join(
+        f'{row.label} ({row.gain})' for row in found if row.remark == remark)
+        for remark in dict.fromkeys(row.remark for row in found if row.remark)]
     return [
-        page.table(['Cause', 'Family', 'Gain, mnat per sample', 'p', 'Alternatives'], rows,
-                   left=[0, 1, 4]),
-        *([page.paragraph(overlap)] if overlap else []),
-        page.bullets([_typeset(
-            f'{PLAIN_NAMES.get(row.name, row.name)} ({row.label}): {row.explanation}')
-            for row in found]),
-        page.paragraph(
-            'Gain: the loss of held-out score when the cause is left out and the rest is fitted '
-            'again; its standard error comes from means of blocks and from the errors of the '
-            'parameters. p: twice the smaller of two chances, that of the likelihood ratio on the '
-            'part fitted (its search counted) and that of the gain. The samples themselves show '
-            'exact findings; those undone in the samples share one gain. Terms of one kind that '
-            'share a gain are one row.',
-            soft=True),
-        page.paragraph(MNAT, soft=True)]
+        Table(['cause', 'what it is', 'family', 'gain,\nmnat/sample', 'p', 'alternatives'],
+              [[row.label, PLAIN_NAMES.get(row.name, row.name), row.family, row.gain, row.chance,
+                ', '.join(row.alternatives) or '-'] for row in found], left=[0, 1, 2, 5]),
+        Notes.of([*remarks, *([overlap] if overlap else []),
+                  *(f'{row.label}: {row.explanation}' for row in found)]),
+        Text(f'{MNAT} Gain: the loss of held-out score when the cause is left out and the rest is '
+             'fitted again; its standard error comes from means of blocks and from the errors of '
+             'the parameters. p: twice the smaller of two chances, that of the likelihood ratio '
+             'on the part fitted (its search counted) and that of the gain. The samples '
+             'themselves show exact findings; those undone in the samples share one gain. Terms '
+             'of one kind that share a gain are one row.', legend=True)]
 
 
-def _gain(finding: Finding) -> list[str]:
-    c = finding.crossing
-    rows = [['Score on blocks kept back, nats per sample', _value(finding.baseline_score, 4),
-             _value(finding.score, 4), _total_gain(finding)]]
+def _gain(finding: Finding) -> list[Part]:
+    c, baseline = finding.crossing, finding.baseline
+    assert baseline is not None
+    rows = [['score kept back, nats/sample', '-', number(finding.baseline_score, 4),
+             number(finding.score, 4), _with_error(finding.gain, finding.gain_se)]]
     if math.isfinite(c.level):
-        rows.append([
-            f'Falls through {_value(c.level, 4)} V per minute',
-            _with_error(c.baseline, c.baseline_se), _with_error(c.extended, c.extended_se),
-            f'{_with_error(c.observed, c.observed_se)}, observed'])
-    head = ['', 'Plain OU', 'Extended', '']
-    if not finding.causes:
-        # Nothing was added to the plain OU: there is nothing to compare it with.
-        head, rows = ['', 'Plain OU', ''], [
-            [row[0], row[1], row[3] if 'observed' in row[3] else ''] for row in rows]
-    assert finding.baseline is not None
-    return [page.table(head, rows, left=[0]),
-            page.paragraph(_typeset(crossing_words(finding))),
-            page.paragraph(f'Plain OU, with nothing else in the model: '
-                           f'{plain_model_words(finding.baseline)}.', soft=True)]
+        rows.append([f'falls through {number(c.level, 4)} V, 1/min',
+                     *(_with_error(*pair) for pair in (
+                         (c.observed, c.observed_se), (c.baseline, c.baseline_se),
+                         (c.extended, c.extended_se))), '-'])
+    # Where nothing was added to the plain OU there is nothing to compare it with.
+    kept = 5 if finding.causes else 3
+    felt = finding.felt.words
+    return [Table(['', 'observed', 'plain OU', 'extended', 'gain'][:kept],
+                  [row[:kept] for row in rows], left=[0]), *([Text(felt)] if felt else []),
+            Text(f'Plain OU, with nothing else in the model: {plain_model_words(baseline)}.')]
 
 
 def _shown(finding: Finding) -> list[Criticism]:
@@ -170,31 +171,31 @@ def _shown(finding: Finding) -> list[Criticism]:
     return worst[:_ROWS]
 
 
-def _statistics(finding: Finding) -> list[str]:
+def _statistics(finding: Finding) -> list[Part]:
     rows = [(c.statistic, c.low, c.high, c.before, c.after) for c in _shown(finding)]
     text = (f'{len(finding.discrepancies)} of {len(finding.criticism)} statistics of the '
             'one-step errors lie outside the band for the plain OU'
             + (f', {len(finding.remaining)} for the extended model. ' if finding.causes else '. '))
     dots = 'Hollow: plain OU. Full: extended model' if finding.causes else 'Dot: plain OU'
-    return [page.figure(
+    return [Figure(
         _dot_rows(f'{dots}. Band: what simulations produce', 'standard scores', rows),
         text + 'The band comes from simulations that pass through the same fit: under a right '
         'model one recording in a hundred has a statistic outside it.')]
 
 
-def _comparisons(finding: Finding) -> list[str]:
+def _comparisons(finding: Finding) -> list[Part]:
     samples, baseline, extended = finding.samples, finding.baseline, finding.simulated
     assert samples is not None and baseline is not None and extended is not None
     plain = SupplyModel((baseline,))
     named = ('plain OU', 'extended model') if finding.causes else ('plain OU',)
     compared = compare_curves(samples, [plain, extended] if finding.causes else [plain],
                               np.random.default_rng(finding.seed))
-    drawn = [page.figure(_plot(curve, k, name))
+    drawn = [Figure(_plot(curve, k, name))
              for curve in compared for k, name in enumerate(named)]
-    return [*[page.pair(*drawn[k:k + 2]) for k in range(0, len(drawn), 2)], page.paragraph(
+    return [*[Pair(drawn[k:k + 2]) for k in range(0, len(drawn), 2)], Text(
         'Line or dots: the data. Band or bars: the range of 40 simulations with the stamps and '
         'the throttle of the data; about one point in twenty of a right model lies outside.',
-        soft=True)]
+        legend=True)]
 
 
 def _plot(curve: Comparison, k: int, name: str) -> Plot:
@@ -222,18 +223,21 @@ def _plot(curve: Comparison, k: int, name: str) -> Plot:
     return plot.line(curve.x, data, 'data', 7, 'thick')
 
 
-def _left(finding: Finding) -> list[str]:
+def _left(finding: Finding) -> Part:
     if not finding.remaining:
-        return [page.paragraph(f'Nothing: no statistic of the {_model_name(finding)} lies outside '
-                               'the band.')]
-    rows = [[c.statistic, _value(c.before), *([_value(c.after)] if finding.causes else []),
-             chance(c.p_after) if math.isfinite(c.p_after) else NOT_KNOWN,
-             plain_words(c.statistic)] for c in finding.remaining]
-    head = ['Statistic', 'Plain OU', *(['Extended'] if finding.causes else []), 'p', 'In words']
-    return [page.table(head, rows, left=[0, len(head) - 1])]
+        return Text(f'Nothing: no statistic of the {_model_name(finding)} lies outside the band.')
+    rows = [[c.statistic, *([_known(c.before)] if finding.causes else []), _known(c.after),
+             f'[{number(c.low)}, {number(c.high)}]', plain_words(c.statistic)]
+            for c in finding.remaining]
+    return Table(['statistic', *(['plain OU'] if finding.causes else []), 'score',
+                  'band', 'in words'], rows, left=[0, len(rows[0]) - 1], most=_SHOWN)
 
 
-def _parameters(finding: Finding) -> list[str]:
+def _known(value: float) -> str:
+    return number(value) if math.isfinite(value) else NOT_KNOWN
+
+
+def _parameters(finding: Finding) -> list[Part]:
     rows = []
     assert finding.model is not None
     for term, se in zip(finding.model.terms, finding.se):
@@ -241,24 +245,15 @@ def _parameters(finding: Finding) -> list[str]:
             value = getattr(term, spec.name)
             value = list(value) if isinstance(value, tuple) else value
             rows.append([term.NAME, spec.name,
-                         _typeset(with_error(value, se.get(spec.name),
-                                             positive=term.positive(spec.name))),
-                         spec.metadata['unit'] or UNKNOWN, spec.metadata['text']])
+                         with_error(value, se.get(spec.name), positive=term.positive(spec.name)),
+                         spec.metadata['unit'] or '-', spec.metadata['text']])
     about = ('Extended model: all terms fitted together on the whole recording. Its alpha and '
              'sigma describe what remains of relaxation and noise beside all causes; those of the '
              'plain OU above include the causes.'
              if finding.causes else
              'The plain OU is kept, as no cause was named: the model above.')
-    return [page.paragraph(about),
-            page.table(['Term', 'Parameter', 'Estimate \u00b1 standard error', 'Unit',
-                        'What it is'], rows, left=[0, 1, 4])]
-
-
-def _origin(finding: Finding, command: str) -> list[str]:
-    parts = [page.bullets(list(finding.notes))]
-    if command:
-        parts += [page.paragraph('To repeat this:'), page.code(command)]
-    return parts
+    return [Text(about), Table(['term', 'parameter', 'estimate +- standard error', 'unit',
+                                'what it is'], rows, left=[0, 1, 4])]
 
 
 def _dot_rows(title: str, x_label: str,

@@ -1,11 +1,9 @@
-"""The report of `reproduce`: every printed number beside its recomputation."""
+"""What `reproduce` says: every printed number beside its recomputation."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from html import escape
+from collections.abc import Callable, Sequence
 import math
-import re
 
 import numpy as np
 from ou_monitor.criticism.curves import outline
@@ -16,70 +14,49 @@ from ou_monitor.paper.reproduce.network import share_above
 from ou_monitor.paper.reproduce.reproduce import headline, recomputed, Reproduction, tally
 from ou_monitor.paper.reproduce.row import Row
 from ou_monitor.paper.reproduce.table2 import sigma_of
-from ou_monitor.report import page
+from ou_monitor.report.document import (
+    Document, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.scale import span
 from ou_monitor.report.svg import Plot
 
-_NONE = '\u2013'
 _BINS = 40
 
 
-def reproduction_page(result: Reproduction, command: str = '') -> str:
-    """Return the report of a reproduction."""
-    sections = [
-        page.headline(headline(result)),
-        page.section('Figures, simulated from the numbers printed', *_figures(result)),
-        page.section('Eight points to read the paper with', *_points(result)),
-        page.section('Every number', page.paragraph(
+def reproduction_document(result: Reproduction, command: str = '') -> Document:
+    """Return what is said of a reproduction."""
+    parts: list[Part] = [
+        lambda: [Section('Figures, simulated from the numbers printed', [
+            *_screens(result), *_transient(), *_spectrum(result), *_crest_and_factor(result)])],
+        Section('Eight points to read the paper with', [
+            Text(f'{point.number}. {point.title} ({point.outcome}): {point.text}')
+            for point in result.points]),
+        Section('Every number', [Text(
             'Agrees: the recomputed number rounds to the printed one, or its interval (3 standard '
             'errors, or the range given) reaches it. Rounding: it agrees once the underlying '
             'readings move within their own rounding. Claims are written as bounds: "> 0" claims '
-            'that something rises.', soft=True)),
-        *[page.section(f'{where}: {tally(rows)}', _table(rows), page.bullets(
-            [_typeset(f'{row.quantity}: {row.sentence} How: {row.how}.') for row in rows]),
-            folded=True)
+            'that something rises.', legend=True)]),
+        *[Section(f'{where}, {tally(rows)}', [_table(rows), _how(rows)], folded=True)
           for where, rows in result.parts()],
-        page.section('Where it comes from', page.paragraph(
-            f'Random numbers from seed {result.seed}; another seed moves the simulated numbers '
-            'within their standard errors.'),
-            *([page.paragraph('To repeat this:'), page.code(command)] if command else []))]
-    return page.page('The paper, recomputed',
-                     'Deterministic and stochastic matrix modeling of radiophysical processes in '
-                     'UAV microcontroller systems', sections)
+        Text(f'Random numbers from seed {result.seed}; another seed moves the simulated numbers '
+             'within their standard errors.', legend=True)]
+    return Document('The paper, recomputed', 'Deterministic and stochastic matrix modeling of '
+                    'radiophysical processes in UAV microcontroller systems',
+                    [headline(result)], parts, command)
 
 
-def _typeset(text: str) -> str:
-    """Return a sentence with the signs that a page has and a terminal may not."""
-    text = re.sub(r'(?<![\w.)^])-(?=[\d.])', '\u2212', text.replace('+-', '\u00b1'))
-    return text.replace(' -> ', ' \u2192 ')
+def _table(rows: Sequence[Row]) -> Table:
+    return Table(
+        ['where', 'quantity', 'printed', 'recomputed', 'verdict'],
+        [[row.where, row.quantity + (f', {row.unit}' if row.unit else ''), row.printed.text,
+          recomputed(row), row.verdict.value] for row in rows], left=[0, 1, 4])
 
 
-def _table(rows: Sequence[Row]) -> str:
-    return page.table(
-        ['Quantity', 'Unit', 'Printed', 'Recomputed', 'Verdict'],
-        [[f'{_typeset(row.quantity)}\n{row.where}', row.unit or _NONE, row.printed.text,
-          _cell(row), row.verdict.value] for row in rows], left=[0, 1, 4])
+def _how(rows: Sequence[Row]) -> Callable[[], list[Part]]:
+    """Return what each row means and how it was recomputed, for a page."""
+    return lambda: [Notes.of(f'{row.quantity}: {row.sentence} How: {row.how}.' for row in rows)]
 
 
-def _cell(row: Row) -> str:
-    """Return the recomputed number; its band, if it has one, on a second line."""
-    text = _typeset(recomputed(row))
-    if row.band is not None:
-        text += '\n' + _typeset(f'{row.band[0]:.4g} to {row.band[1]:.4g}')
-    return text
-
-
-def _points(result: Reproduction) -> list[str]:
-    return [f'<p><strong>{point.number}. {escape(point.title)}</strong> '
-            f'<span class="soft">({escape(point.outcome)})</span><br/>'
-            f'{escape(_typeset(point.text))}</p>' for point in result.points]
-
-
-def _figures(result: Reproduction) -> list[str]:
-    return [*_screens(result), *_transient(), *_spectrum(result), *_crest_and_factor(result)]
-
-
-def _screens(result: Reproduction) -> list[str]:
+def _screens(result: Reproduction) -> list[Part]:
     """Return Figs. 1 to 4."""
     drawn = []
     for k, screen in enumerate(result.figures.screens):
@@ -91,16 +68,16 @@ def _screens(result: Reproduction) -> list[str]:
         for sign, label in ((1.0, 'Vpp as printed'), (-1.0, '')):
             plot.line(np.array([0.0, 1e3 * screen.t[-1]]), np.full(2, sign * half), label, 7,
                       'dash')
-        drawn.append(page.figure(
+        drawn.append(Figure(
             plot, f'Vpp {1e3 * float(np.ptp(screen.u)):.4g} mV here, '
             f'{state.vpp.text} mV printed.'))
-    return [page.pair(*drawn), page.paragraph(
+    return [Pair(drawn), Text(
         'As Figs. 1 to 4: an OU with the printed alpha and Vrms (motors off: half a step), 1 MHz, '
         'in steps of the oscilloscope. Where the printed Vpp is much wider than the trace, '
-        'something faster rides on the rail.', soft=True)]
+        'something faster rides on the rail.', legend=True)]
 
 
-def _transient() -> list[str]:
+def _transient() -> list[Part]:
     """Return Fig. 5 with its fits, in voltages and in logarithms."""
     line = transient.paper_fit()
     plain, shifted = (transient.fit_curve(transient.TIME, transient.VALUE, offset)
@@ -121,15 +98,15 @@ def _transient() -> list[str]:
         for k, (y, label, style) in enumerate(curves):
             plot.line(1e3 * t, np.where(y > 0.0, y, math.nan) if log else y, label, k, style)
         plot.markers(1e3 * transient.TIME, transient.VALUE, 'points of Fig. 5', 7)
-        drawn.append(page.figure(plot))
-    return [page.pair(*drawn), page.paragraph(
+        drawn.append(Figure(plot))
+    return [Pair(drawn), Text(
         f'Dashed: a rail {rail / published.ALPHA.value:.0f} times faster, behind an AC '
         f'coupling of {transient.CORNER_HZ:g} Hz, comes within {100 * worst:.0f} % of the four '
         'points of the fit. The last point lies below it and below both exponentials.',
-        soft=True)]
+        legend=True)]
 
 
-def _spectrum(result: Reproduction) -> list[str]:
+def _spectrum(result: Reproduction) -> list[Part]:
     """Return the spectra with the Lorentzian, the ESC lines and the corner."""
     plot = Plot('Spectrum of the OU', 'frequency, Hz', 'PSD, V\u00b2/Hz', height=320, log_x=True,
                 log_y=True, legend_low=True)
@@ -149,14 +126,14 @@ def _spectrum(result: Reproduction) -> list[str]:
     low, high = published.ESC_HZ
     plot.shade(low, high, 4)
     plot.mark(low, '').mark(high, 'ESC 24..48 kHz')
-    return [page.figure(plot, (
+    return [Figure(plot, (
         f'The ESC lines that section 4.5 expects would stand at {1e-3 * low:g} to '
         f'{1e-3 * high:g} kHz, where the OU holds {100 * share_above(low):.2g} % of its variance; '
         'an OU alone has no peak there. The AC coupling has its corner where the Lorentzian has '
         'its own.'))]
 
 
-def _crest_and_factor(result: Reproduction) -> list[str]:
+def _crest_and_factor(result: Reproduction) -> list[Part]:
     """Return the crest factors, and the variance that decides about (6)."""
     crests = Plot('Vpp/Vrms of one OU', 'Vpp/Vrms', 'density', width=450, height=300)
     edges = np.linspace(2.5, 10.0, 1 + _BINS)
@@ -175,8 +152,8 @@ def _crest_and_factor(result: Reproduction) -> list[str]:
     factor.line(t, 1e6 * s.variance, '', 0)
     factor.line(t, 1e6 * s.printed * s.t, '(6) as printed', 1, 'thick')
     factor.line(t, 1e6 * s.correct * s.t, '(6) with the 2', 2, 'dash thick')
-    left = page.figure(crests, 'Vertical: Table 1. Screens of 10, 100 and 500 ms at 1 MHz.')
-    right = page.figure(factor, (
+    left = Figure(crests, 'Vertical: Table 1. Screens of 10, 100 and 500 ms at 1 MHz.')
+    right = Figure(factor, (
         'dU/dt = \u00b11 V/s, 1000 switches a second each way; the system itself lags (6) by the '
         'memory of the chain.'))
-    return [page.pair(left, right)]
+    return [Pair([left, right])]

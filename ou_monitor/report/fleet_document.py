@@ -1,4 +1,4 @@
-"""The report of `fleet`: what stands out first, then the fleet, then every recording."""
+"""What `fleet` says: what stands out first, then the fleet, then every recording."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ from ou_monitor.fleet.comparison import LOGARITHMIC, QUANTITIES, USABLE, Values
 from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import DRIFT_RATE, Trend
 from ou_monitor.fleet.summary import (
-    change, comparison_words, failure_words, finding_words, headline, quality_counts,
-    vehicle_table)
+    answer, change, comparison_words, failure_words, finding_words, quality_counts, vehicle_table)
 from ou_monitor.fleet.table import Row
-from ou_monitor.records import FloatArray
-from ou_monitor.report import page
-from ou_monitor.report.page import typeset, UNKNOWN
+from ou_monitor.records import FloatArray, Severity
+from ou_monitor.report.document import (
+    Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot
 from ou_monitor.text import chance, counted, number
 
@@ -29,41 +28,48 @@ _UNITS = {'sigma': 'V/\u221as', 'alpha': '1/s', 'sag': 'V'}
 _DRAWN, _LIKELY = 8, 2
 # Trends in the table: at least, with those of p below 5 %, and at most.
 _LEAST, _MOST = 6, 30
-# Recordings in the table of the lowest voltages.
-_WORST = 12
+# Recordings in the table of the lowest voltages; rows and sentences on a terminal.
+_WORST, _SHOWN = 12, 10
 # Sentences and recordings listed at most; the table has all of them.
 _SENTENCES, _RECORDINGS = 40, 500
 
 
-def fleet_page(fleet: Fleet, command: str = '') -> str:
-    """Return the report of a fleet."""
+def fleet_document(fleet: Fleet, command: str = '') -> Document:
+    """Return what is said of a fleet."""
     rows = lowest.worst(fleet)
-    sections = [page.headline(_sentence(headline(fleet)))]
-    if rows:
-        sections += [page.figure(_lowest(fleet, rows), 'Each dot is a recording.'),
-                     page.facts([(name, _sentence(words)) for name, words in lowest.facts(fleet)])]
-    sections.append(page.section('What stands out', *_odd(fleet)))
-    if rows:
-        sections.append(page.section('Lowest voltages', *_worst(fleet)))
-    if fleet.failed or fleet.duplicates:
-        sections.append(page.section('Not in the comparison', *_left_out(fleet)))
-    sections += [
-        page.section('Vehicles', *_vehicles(fleet)),
-        page.section('Drift over the flights', *_drift(fleet)),
-        page.section('Distributions', *_distributions(fleet), folded=True),
-        page.section('Quality', *_quality(fleet), folded=True),
-        page.section('What to know before using these numbers', page.bullets(
-            [_sentence(note) for note in (*fleet.notes, *comparison_words(fleet))])),
-        page.section('Recordings', *_recordings(fleet), folded=True),
-    ]
-    if command:
-        sections.append(page.section('Where it comes from', page.paragraph(
-            'To repeat this, or to go on with recordings that came later:'), page.code(command),
-            folded=True))
-    subtitle = (f'{counted(fleet.recordings, "recording")}, '
-                f'{counted(len(fleet.vehicles), "vehicle")}, '
-                f'{counted(len(fleet.rows), "row")} in the table')
-    return page.page('Supply noise of a fleet', subtitle, sections)
+    odd = finding_words(fleet)
+    vehicles, lows = vehicle_table(fleet), lowest.table(fleet, _WORST)
+    copies = [f"{row['path']} is {row['duplicate_of']}" for row in fleet.duplicates]
+    subject = (f'{counted(fleet.recordings, "recording")}, '
+               f'{counted(len(fleet.vehicles), "vehicle")}, '
+               f'{counted(len(fleet.rows), "row")} in the table')
+    parts: list[Part] = [
+        lambda: [Figure(_lowest(fleet, rows), 'Each dot is a recording.')] if rows else [],
+        Facts(lowest.facts(fleet)),
+        Section('What stands out', [
+            Notes.of(odd[:_SENTENCES], Severity.WARNING, _SHOWN),
+            *([Text(f'and {len(odd) - _SENTENCES} more: see the table.')]
+              if len(odd) > _SENTENCES else [])] if odd else [
+                  Text('Nothing, at the false-alarm rates stated below.')]),
+        Section('Lowest voltages', [Table(
+            *lows, left=[lows[0].index(name) for name in ('vehicle', 'recording')
+                         if name in lows[0]], most=_SHOWN)]),
+        Section('Not analysed: the next run tries them again', [
+            Notes.of(failure_words(fleet), Severity.ERROR, _SHOWN)] if fleet.failed else []),
+        Section('There twice, analysed once', [Notes.of(copies, most=_SHOWN)] if copies else []),
+        Section('Vehicles', [
+            Table(*vehicles, left=[0], most=2 * _SHOWN),
+            Text('The lowest of all flights, their dips together; the rest are medians of what '
+                 'was measured, and the change a flight of what is compared. A star marks what '
+                 'stands out.', legend=True), lambda: _strips(fleet)]
+                if vehicles[1] else [Text('No vehicle was identified.', legend=True)]),
+        lambda: [Section('Drift over the flights', _drift(fleet)),
+                 Section('Distributions', _distributions(fleet), folded=True),
+                 Section('Quality', _quality(fleet), folded=True)],
+        Section('What to know before using these numbers', [
+            Notes.of([*fleet.notes, *comparison_words(fleet)])]),
+        lambda: [Section('Recordings', _recordings(fleet), folded=True)]]
+    return Document('Supply noise of a fleet', subject, answer(fleet), parts, command)
 
 
 def _lowest(fleet: Fleet, rows: list[Row]) -> Plot:
@@ -96,59 +102,10 @@ def _side_by_side(at: FloatArray, flights: FloatArray) -> FloatArray:
     return moved
 
 
-def _worst(fleet: Fleet) -> list[str]:
-    heads, rows = lowest.table(fleet, _WORST)
-    names = [k for k, (head, _) in enumerate(heads) if head in ('vehicle', 'recording')]
-    listed = [[cell if k in names else typeset(cell) for k, cell in enumerate(row)]
-              for row in rows]
-    more = len(lowest.once(fleet)) - len(listed)
-    return [page.table([head for _, head in heads], listed, left=names)] + (
-        [page.paragraph(f'{more} more are below, under Recordings.', soft=True)] if more else [])
-
-
-def _sentence(text: str) -> str:
-    return text.replace('+-', '\u00b1')
-
-
-def _odd(fleet: Fleet) -> list[str]:
-    found = finding_words(fleet)
-    if not found:
-        return [page.paragraph('Nothing, at the false-alarm rates stated below.')]
-    more = len(found) - _SENTENCES
-    last = [f'and {more} more: see the table.'] if more > 0 else []
-    return [page.bullets([*found[:_SENTENCES], *last], warn=True)]
-
-
-def _left_out(fleet: Fleet) -> list[str]:
-    parts = []
-    if fleet.failed:
-        parts += [page.paragraph(f'{len(fleet.failed)} could not be analysed; the next run tries '
-                                 'them again:'),
-                  page.bullets(failure_words(fleet), warn=True)]
-    if fleet.duplicates:
-        parts += [page.paragraph(f'{len(fleet.duplicates)} have the same content as another one '
-                                 'and were not analysed again:'),
-                  page.bullets([f"{row['path']} is {row['duplicate_of']}"
-                                for row in fleet.duplicates])]
-    return parts
-
-
-def _vehicles(fleet: Fleet) -> list[str]:
-    heads, rows = vehicle_table(fleet)
-    if not rows:
-        return [page.paragraph('No vehicle was identified.', soft=True)]
-    parts = [page.table([head for _, head in heads],
-                        [[row[0], *map(typeset, row[1:])] for row in rows], left=[0]),
-             page.paragraph('The lowest of all flights, their dips together; the rest are medians '
-                            'of what was measured, and the change a flight of what is compared. '
-                            'A star marks what stands out.', soft=True)]
-    for name in LOGARITHMIC:
-        values = fleet.judgement.values[name]
-        if values.value.size:
-            parts.append(page.figure(_by_vehicle(fleet, values), (
-                'As measured: the mean over the levels of each recording.'
-                if name == 'sigma' else '')))
-    return parts
+def _strips(fleet: Fleet) -> list[Part]:
+    return [Figure(_by_vehicle(fleet, values), (
+        'As measured: the mean over the levels of each recording.' if name == 'sigma' else ''))
+        for name in LOGARITHMIC if (values := fleet.judgement.values[name]).value.size]
 
 
 def _by_vehicle(fleet: Fleet, values: Values) -> Plot:
@@ -170,35 +127,30 @@ def _by_vehicle(fleet: Fleet, values: Values) -> Plot:
     return plot
 
 
-def _drift(fleet: Fleet) -> list[str]:
+def _drift(fleet: Fleet) -> list[Part]:
     judged = fleet.judgement
     drawn = list(judged.drifting[:_DRAWN]) or list(judged.trends[:_LIKELY])
     if not drawn:
-        return [page.paragraph('No vehicle has enough flights for a test.', soft=True)]
-    parts = []
-    if not judged.drifting:
-        parts.append(page.paragraph('No drift stands at the rate of the fleet; the most likely '
-                                    'ones are drawn.'))
-    parts += _pairs([page.figure(_trend_plot(judged.values[t.quantity], t), _caption(t, fleet))
+        return [Text('No vehicle has enough flights for a test.')]
+    parts: list[Part] = [] if judged.drifting else [
+        Text('No drift stands at the rate of the fleet; the most likely ones are drawn.')]
+    parts += _pairs([Figure(_trend_plot(judged.values[t.quantity], t), _caption(t, fleet))
                      for t in drawn])
     listed = [t for k, t in enumerate(judged.trends) if k < _LEAST or t.p_value < DRIFT_RATE]
-    rows = [[t.vehicle, t.quantity, str(t.flights), typeset(change(t.quantity, t.slope)) + '\n'
-             + f'{typeset(change(t.quantity, t.low))} to {typeset(change(t.quantity, t.high))}',
+    rows = [[t.vehicle, t.quantity, str(t.flights), change(t.quantity, t.slope) + '\n'
+             + f'[{change(t.quantity, t.low)}, {change(t.quantity, t.high)}]',
              chance(t.p_value), chance(t.p_family),
              'yes' if t.p_family <= DRIFT_RATE else 'no'] for t in listed[:_MOST]]
-    parts.append(page.table(['Vehicle', 'Quantity', 'Flights', 'Change a flight', 'p',
-                             'p over the fleet', 'Stands'], rows, left=[0, 1]))
     more = len(judged.trends) - len(rows)
-    parts.append(page.paragraph(
-        'Small: 95 % interval (Theil and Sen). p is that of Mann and Kendall, the next one after '
-        'Holm.' + (f' {more} less likely trends are not shown.' if more > 0 else ''), soft=True))
-    return parts
+    return [*parts, Table(['vehicle', 'quantity', 'flights', 'change a flight\n[95 %]', 'p',
+                           'p over the fleet', 'stands'], rows, left=[0, 1]), Text(
+        'Intervals by Theil and Sen. p is that of Mann and Kendall, the next one after Holm.'
+        + (f' {more} less likely trends are not shown.' if more > 0 else ''), legend=True)]
 
 
-def _pairs(figures: list[str]) -> list[str]:
-    """Return figures two by two; a lone one keeps half of the width."""
-    return [page.pair(*(figures[k:k + 2] + ['<div></div>'])[:2])
-            for k in range(0, len(figures), 2)]
+def _pairs(figures: list[Figure]) -> list[Part]:
+    """Return figures two by two."""
+    return [Pair(figures[k:k + 2]) for k in range(0, len(figures), 2)]
 
 
 def _compared(name: str, fleet: Fleet) -> str:
@@ -209,7 +161,7 @@ def _compared(name: str, fleet: Fleet) -> str:
 
 
 def _caption(trend: Trend, fleet: Fleet) -> str:
-    return (f'{typeset(change(trend.quantity, trend.slope))} a flight; p over the fleet '
+    return (f'{change(trend.quantity, trend.slope)} a flight; p over the fleet '
             f'{chance(trend.p_family)}. At {_compared(trend.quantity, fleet)}, with its error.')
 
 
@@ -226,7 +178,7 @@ def _trend_plot(values: Values, trend: Trend) -> Plot:
     return plot.line(at, values.shown(trend.line(at)), '', 1, 'thick')
 
 
-def _distributions(fleet: Fleet) -> list[str]:
+def _distributions(fleet: Fleet) -> list[Part]:
     figures = []
     for name in QUANTITIES:
         values = fleet.judgement.values[name]
@@ -237,20 +189,20 @@ def _distributions(fleet: Fleet) -> list[str]:
             plot = Plot(f'{_TITLES[name]}, all recordings', _UNITS[name], 'recordings', width=450,
                         height=240, log_x=name in LOGARITHMIC)
             plot.limits(y=(0.0, 1.08 * float(count.max())))
-            figures.append(page.figure(plot.line(
+            figures.append(Figure(plot.line(
                 values.shown(np.concatenate((x[:1], x, x[-1:]))),
                 np.concatenate(([0.0], height, [0.0])), '', 0, 'thick')))
     over = _over_throttle(fleet)
     if over:
-        figures.append(page.figure(over))
+        figures.append(Figure(over))
     if not figures:
-        return [page.paragraph('Fewer than five recordings have an estimate.', soft=True)]
+        return [Text('Fewer than five recordings have an estimate.', legend=True)]
     parts = _pairs(figures)
     if over:
-        parts.append(page.paragraph(
+        parts.append(Text(
             'Histograms are at the reference throttle. Over throttle: every level of every '
             'recording, and the common curve that is taken out, through the median of all.',
-            soft=True))
+            legend=True))
     return parts
 
 
@@ -268,14 +220,14 @@ def _over_throttle(fleet: Fleet) -> Plot | None:
     return plot.line(100.0 * at, values.common_curve(at), '', 1, 'thick')
 
 
-def _quality(fleet: Fleet) -> list[str]:
+def _quality(fleet: Fleet) -> list[Part]:
     counts = quality_counts(fleet)
     if not counts:
-        return [page.paragraph('Every level has an estimate, and no flag was raised.')]
-    return [page.table(['What', 'How often'], [[text, str(n)] for text, n in counts], left=[0])]
+        return [Text('Every level has an estimate, and no flag was raised.')]
+    return [Table(['what', 'how often'], [[text, str(n)] for text, n in counts], left=[0])]
 
 
-def _recordings(fleet: Fleet) -> list[str]:
+def _recordings(fleet: Fleet) -> list[Part]:
     judged = fleet.judgement
     places: dict[str, dict[str, int]] = {
         name: {path: k for k, path in enumerate(values.paths)}
@@ -289,23 +241,22 @@ def _recordings(fleet: Fleet) -> list[str]:
         flags.setdefault(row['path'], set()).update(row['flags'] or ())
     rows, names = [], lowest.short_names(fleet.vehicles)
     for path, first in list(once.items())[:_RECORDINGS]:
-        cells = [names.get(first['vehicle'], UNKNOWN), str(first['flight'] or UNKNOWN),
+        cells = [names.get(first['vehicle'], '-'), str(first['flight'] or '-'),
                  f"{first['recording']}\n{_date(first)}",
-                 typeset(number(first['duration_s'] or math.nan))]
+                 number(first['duration_s'] or math.nan)]
         for name, values in judged.values.items():
             cells.append(_cell(values, judged.recordings[name].score, places[name].get(path)))
-        cells[4:4] = [UNKNOWN if first['lowest'] is None else number(first['lowest'], 4),
-                      UNKNOWN if first['dips'] is None else f"{first['dips']:g}"]
-        rows.append([*cells, ', '.join(sorted(flags[path])) or UNKNOWN])
-    heads = ['Vehicle', 'Flight', 'Recording', 's', 'Lowest, V', 'Dips', *[
-        f'{symbol}, {_UNITS[name]}' for name, symbol in zip(
-            QUANTITIES, ('\u03c3', '\u03b1', 'Sag'))], 'Flags']
+        cells[4:4] = ['-' if first['lowest'] is None else number(first['lowest'], 4),
+                      '-' if first['dips'] is None else f"{first['dips']:g}"]
+        rows.append([*cells, ', '.join(sorted(flags[path])) or '-'])
+    heads = ['vehicle', 'flight', 'recording', 's', 'lowest, V', 'dips', *[
+        f'{name}, {_UNITS[name]}' for name in QUANTITIES], 'flags']
     more = len(once) - _RECORDINGS
-    return [page.table(heads, rows, left=[0, 2, 9]), page.paragraph(
+    return [Table(heads, rows, left=[0, 2, 9]), Text(
         'As measured. Small: at which throttle, and, where the vehicle has enough flights, how '
         'far from the others of it, in standard deviations.' + (
             f' {more} more recordings are in the Parquet table.' if more > 0 else ''),
-        soft=True)]
+        legend=True)]
 
 
 def _date(row: Mapping[str, Any]) -> str:
@@ -314,8 +265,8 @@ def _date(row: Mapping[str, Any]) -> str:
 
 def _cell(values: Values, score: FloatArray, k: int | None) -> str:
     if k is None:
-        return UNKNOWN
+        return '-'
     at = values.throttle[k]
     small = [f'at {100.0 * at:.0f} %'] if math.isfinite(at) else []
-    small += [typeset(f'{score[k]:+.1f} sd')] if math.isfinite(score[k]) else []
-    return typeset(number(float(values.measured[k]))) + '\n' + ', '.join(small)
+    small += [f'{score[k]:+.1f} sd'] if math.isfinite(score[k]) else []
+    return number(float(values.measured[k])) + '\n' + ', '.join(small)

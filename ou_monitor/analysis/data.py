@@ -1,154 +1,19 @@
-"""An analysis in words, and as plain data: the JSON of `analyze`, see doc/analysis.md."""
-
+"""An analysis as plain data: the JSON of `analyze`, see doc/analysis.md."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-import numpy as np
 from ou_monitor.analysis.analyze import Analysis
 from ou_monitor.analysis.crafts import craft_of
-from ou_monitor.analysis.level_comparison import LEVEL, sigma_change
+from ou_monitor.analysis.level_comparison import LEVEL
 from ou_monitor.analysis.level_result import LevelResult
-from ou_monitor.analysis.overview import answers, headline as answer, known_lines, Overview
-from ou_monitor.analysis.quality import QualityItem, Severity
+from ou_monitor.analysis.overview import Overview
 from ou_monitor.analysis.relaxation import Relaxation, ReleaseCause
-from ou_monitor.analysis.replay import ByThrottle
 from ou_monitor.criticism.innovations import FAMILY_WISE
 from ou_monitor.criticism.level_tests import EFFECT, LEAST
 from ou_monitor.model.spectral_lines import FALSE_ALARM
-from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.records import NAN, OuFacts
-from ou_monitor.text import counted, number
-
-# What changes the meaning of the numbers in the headline itself.
-_BEWARE = {
-    'VOLTAGE_UNIT': 'Beware: the voltages seem to be millivolts or counts, not volts.',
-    'TIME_UNIT': 'Beware: the time seems to be in ms or us, not in s.'}
-
-
-def headline(analysis: Analysis) -> str:
-    """Return what the recording says: what was seen, then sigma and tau where they are known."""
-    beware = ''.join(f' {words}' for name, words in _BEWARE.items()
-                     if any(item.name == name for item in analysis.quality))
-    numbers = _numbers(analysis.overview.facts.ou) + _change(analysis)
-    curves = analysis.by_throttle
-    safe = '' if math.isnan(curves.budget) else (
-        f' Safe up to {100.0 * curves.budget:.0f} % throttle.' if curves.budget > 0.0 else
-        f' No throttle keeps the risk within {curves.horizon:g} s below '
-        f'{100.0 * curves.limit:g} %.')
-    return answer(analysis.overview) + safe + numbers + beware
-
-
-def in_short(analysis: Analysis) -> tuple[str, str]:
-    """Return the answer and what stands behind it, a line each."""
-    first, *others = answers(analysis.overview) or ['The recording holds no samples']
-    budget = analysis.by_throttle.budget
-    if budget > 0.0:
-        others.insert(1, f'safe up to {100.0 * budget:.0f} % throttle')
-    if not others:
-        others = ['the sag is unknown']
-    text = '; '.join(others[:2])
-    return f'{first}.', f'{text[0].upper()}{text[1:]}.'
-
-
-def _budget_words(curves: ByThrottle) -> str:
-    """Return the budget, and what a throttle beyond it would risk."""
-    if not curves.budget:
-        return f'no throttle, held for {curves.horizon:g} s. {curves.budget_reason}'
-    words = (f'{100.0 * curves.budget:.0f} % throttle, held for {curves.horizon:g} s: the risk of '
-             f'falling below {curves.voltage:g} V stays under {100.0 * curves.limit:g} %')
-    beyond = [(u, p) for u, p in zip(curves.throttle, curves.risk)
-              if u > curves.budget and p >= max(0.05, 2.0 * curves.limit)]
-    if beyond:
-        u, p = beyond[0]
-        words += f'; at {100.0 * u:.0f} % it is {100.0 * p:.2g} %'
-    return words
-
-
-def facts(analysis: Analysis) -> list[tuple[str, str]]:
-    """Return what is always known, as names and words."""
-    found = known_lines(analysis.overview)
-    curves = analysis.by_throttle
-    if math.isfinite(curves.budget):
-        after = 1 + [name for name, _ in found].index('Relaxation')
-        found.insert(after, ('Safe up to', _budget_words(curves)))
-    return found
-
-
-def _numbers(ou: OuFacts) -> str:
-    """Return sigma and tau, where they are known."""
-    if ou.status != 'ok':
-        return ''
-    low, high = ou.alpha_95
-    return (f' Beside level and load the supply wanders with sigma = {number(ou.sigma)} (95 % '
-            f'{number(ou.sigma_95[0])} to {number(ou.sigma_95[1])}) V/sqrt(s) and relaxes in '
-            f'tau = {number(1e3 / ou.alpha)} (95 % {number(1e3 / high)} to {number(1e3 / low)}) '
-            f'ms: a standard deviation of {number(1e3 * math.sqrt(ou.var_inf))} mV.')
-
-
-def _change(analysis: Analysis) -> str:
-    """Return how sigma goes with throttle."""
-    good = [level for level in analysis.levels if level.estimate.usable]
-    if len(good) < 2:
-        return ''
-    low, high = good[0], good[-1]
-    found = sigma_change(low.estimate, high.estimate)
-    if math.isnan(found.ratio):
-        return ''
-    verb = 'does not change measurably' if not found.differs else (
-        'grows' if found.ratio_low > 1.0 else 'falls')
-    return (f' Sigma {verb} from {low.label} to {high.label} throttle (factor '
-            f'{number(found.ratio)}, 95 % {number(found.ratio_low)} to '
-            f'{number(found.ratio_high)}).')
-
-
-def cautions(analysis: Analysis, least: Severity = Severity.INFO) -> list[str]:
-    """Return what to know before using the numbers."""
-    return [caution(item) for item in analysis.quality if item.severity >= least]
-
-
-def caution(item: QualityItem) -> str:
-    """Return one sentence, led by the levels it is true of."""
-    labels = ['all' if math.isnan(x) else f'{100.0 * x:.3g} %' for x in item.throttles]
-    return f'{", ".join(labels)}: {item.text}' if labels else item.text
-
-
-def brownout_sentence(analysis: Analysis) -> str:
-    """Return what the risk is of, and the throttle budget."""
-    curves = analysis.by_throttle
-    if math.isnan(curves.voltage) and analysis.brownout_default:
-        middle = float(np.median(analysis.recording.voltage)) if analysis.recording.n else NAN
-        return (f"No brown-out risk: the node's default of {MonitorSettings().brownout_voltage:g} "
-                f'V is for a 5 V rail, and this supply is at {number(middle)} V; '
-                '--brownout-voltage sets another.')
-    if math.isnan(curves.voltage):
-        return 'No brown-out voltage was given.'
-    which = ("the node's default for a 5 V rail; --brownout-voltage sets another"
-             if analysis.brownout_default else 'as asked for')
-    text = (f'Brown-out: going below {curves.voltage:g} V ({which}) within '
-            f'{curves.horizon:g} s, with the supply as it was at the end of the recording.')
-    if math.isnan(curves.budget):
-        return f'{text} Throttle budget unknown: {curves.budget_reason}'
-    return (f'{text} Throttle budget for a risk of {curves.limit:g}: '
-            f'{100.0 * curves.budget:.3g} %. {curves.budget_reason}')
-
-
-def relaxation_sentence(analysis: Analysis, k: int) -> str:
-    """Return what follows falls (k = 0) or rises (k = 1) of throttle."""
-    fit, cause = analysis.relaxations[k], analysis.causes[k]
-    if not fit.detected:
-        return cause.sentence
-    count = len(fit.releases)
-    what = {'release': 'fall', 'load': 'rise'}[fit.kind]
-    return (f'After {counted(count, what)} of throttle the voltage relaxes in '
-            f'tau = {number(1e3 * fit.tau)} (95 % {number(1e3 * fit.tau_low)} to '
-            f'{number(1e3 * fit.tau_high)}) ms. {_led(fit.caveat)}{cause.sentence}')
-
-
-def _led(text: str) -> str:
-    return f'{text} ' if text else ''
 
 
 def as_data(analysis: Analysis) -> dict[str, Any]:
@@ -162,7 +27,6 @@ def as_data(analysis: Analysis) -> dict[str, Any]:
         'duration_s': duration,
         'rate_hz': (recording.n - 1) / duration if duration > 0.0 else math.nan,
         'source': dict(recording.source),
-        'headline': headline(analysis),
         'overview': _overview(analysis.overview),
         'levels': [_level(level) for level in analysis.levels],
         'process_tests': {'family_wise_error': FAMILY_WISE, 'adjusted': 'Holm',

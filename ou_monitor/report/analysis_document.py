@@ -1,0 +1,521 @@
+"""What `analyze` says: facts, what to know of them, the paper's tables, what they rest on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import math
+
+import numpy as np
+from ou_monitor.analysis.analyze import Analysis
+from ou_monitor.analysis.level_comparison import sigma_change
+from ou_monitor.analysis.level_result import LevelResult
+from ou_monitor.analysis.overview import answers, known_lines
+from ou_monitor.analysis.quality import QualityItem
+from ou_monitor.analysis.relaxation import Relaxation
+from ou_monitor.criticism.curves import outline
+from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.records import FloatArray, NAN, OuFacts, Severity
+from ou_monitor.report.document import (
+    Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, worst_first)
+from ou_monitor.report.scale import span
+from ou_monitor.report.svg import Plot
+from ou_monitor.text import chance, counted, number
+
+# Changes drawn in one plot, and relaxation times of them.
+_MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
+# Rows of a table on a terminal.
+_MOST_LINES, _MOST_CHANGES = 12, 8
+# Smaller risks are drawn as this.
+_LEAST_RISK = 1e-4
+# More levels than colours would repeat colours; lines marked in the spectrum of one level.
+_MAX_DRAWN, _MAX_MARKED = 6, 3
+_TESTS = {'mean_drift': 'mean moves', 'variance_drift': 'intensity moves',
+          'gaussian': 'not Gaussian', 'impulses': 'impulses', 'correlated': 'correlated',
+          'one_relaxation': 'not one relaxation', 'second_relaxation': 'second relaxation'}
+# What changes the meaning of every number.
+_BEWARE = {
+    'VOLTAGE_UNIT': 'Beware: the voltages seem to be millivolts or counts, not volts.',
+    'TIME_UNIT': 'Beware: the time seems to be in ms or us, not in s.'}
+_UNKNOWN = '-'
+
+
+def analysis_document(analysis: Analysis, command: str = '') -> Document:
+    """Return what is said of an analysis."""
+    recording = analysis.recording
+    rate = (recording.n - 1) / recording.duration if recording.duration > 0.0 else NAN
+    subject = (f'{recording.name or "recording"}: {recording.n} samples in '
+               f'{recording.duration:.4g} s ({number(rate)} Hz)')
+    parts: list[Part] = [
+        lambda: [Figure(_voltage(analysis))], Facts([*facts(analysis), *_origin(analysis)]),
+        Section('What to know before using these numbers', [notes(analysis)]),
+        lambda: _over_time(analysis),
+        Section('Over throttle', [_by_throttle(analysis), lambda: _curves(analysis),
+                                  Text(analysis.alpha_test.sentence)]),
+        Section('Load levels', [*_levels(analysis.levels)]),
+        lambda: [Section('Sigma and alpha over time', _sliding(analysis), folded=True)],
+        Section('After changes of throttle', _transients(analysis), folded=True),
+        Section('Shape', [lambda: _shape(analysis), *_lines(analysis)], folded=True),
+        Section('Type of process', _process(analysis), folded=True)]
+    if recording.source:
+        parts.append(lambda: [Section('Where it comes from', [Facts(list(
+            recording.source.items()))], folded=True)])
+    return Document('Supply noise', subject, answer(analysis), parts, command)
+
+
+def answer(analysis: Analysis) -> list[str]:
+    """Return the answer: what was seen, what is safe, sigma and tau where they are known."""
+    curves, names = analysis.by_throttle, {item.name for item in analysis.quality}
+    first, *others = answers(analysis.overview) or ['The recording holds no samples.']
+    safe = [] if math.isnan(curves.budget) else [
+        f'Safe up to {100.0 * curves.budget:.0f} % throttle.' if curves.budget > 0.0 else
+        f'No throttle is safe {_why_none(analysis)}.']
+    return [first, *safe, *others, *_numbers(analysis.overview.facts.ou), *_change(analysis),
+            *(words for name, words in _BEWARE.items() if name in names)]
+
+
+def facts(analysis: Analysis) -> list[tuple[str, str]]:
+    """Return what is always known, as names and words."""
+    found = known_lines(analysis.overview)
+    return [*found[:-1], ('Safe up to', _budget(analysis)), *found[-1:]] if found else []
+
+
+def _budget(analysis: Analysis) -> str:
+    """Return the throttle budget, and what a throttle beyond it would risk."""
+    curves = analysis.by_throttle
+    if math.isnan(curves.voltage):
+        middle = float(np.median(analysis.recording.voltage))
+        return ('unknown: no limit; --brownout-voltage or --cells sets one (the default of '
+                f'{MonitorSettings().brownout_voltage:g} V is for a 5 V rail, and this supply is '
+                f'at {number(middle)} V)')
+    what = (f'of falling below {curves.voltage:g} V '
+            + ('(the default for a 5 V rail) ' if analysis.brownout_default else '')
+            + f'within {curves.horizon:g} s')
+    if math.isnan(curves.budget):
+        return f'unknown: {curves.budget_reason} The risk is that {what}.'
+    if not curves.budget:
+        return f'no throttle, {_why_none(analysis)}: the risk {what} is {curves.risk[0]:.2g}'
+    words = (f'{100.0 * curves.budget:.0f} % throttle, held: the risk {what} stays under '
+             f'{100.0 * curves.limit:g} %')
+    beyond = [(u, p) for u, p in zip(curves.throttle, curves.risk)
+              if u > curves.budget and p >= max(0.05, 2.0 * curves.limit)]
+    if beyond:
+        u, p = beyond[0]
+        words += f'; at {100.0 * u:.0f} % it is {100.0 * p:.2g} %'
+    elif curves.budget < 1.0:
+        words += '; more was not flown'
+    return words
+
+
+def _why_none(analysis: Analysis) -> str:
+    """Say whether it is the supply at rest or what was flown that leaves no budget."""
+    rest = analysis.overview.load.level
+    if rest > analysis.by_throttle.voltage:
+        return (f'right after what was flown, though the supply at rest is at {number(rest, 4)} V')
+    return f'even at idle, as the supply at rest is at {number(rest, 4)} V'
+
+
+def _origin(analysis: Analysis) -> list[tuple[str, str]]:
+    """Say which topics or columns voltage and throttle came from."""
+    source, found = analysis.recording.source, []
+    if 'voltage' in source:
+        return [('Read from', f"voltage: {source['voltage']}; throttle: "
+                 f"{source.get('throttle', 'none')}")]
+    if source and 'voltage_topic' not in source:
+        throttle = 'column throttle' if analysis.recording.has_throttle else 'none'
+        return [('Read from', f'voltage: column voltage_v; throttle: {throttle}')]
+    for name in ('voltage', 'throttle'):
+        kind = source.get(f'{name}_type', '').split('/')[-1]
+        if f'{name}_topic' in source:
+            found.append(f"{name}: {source[f'{name}_topic']} ({kind}."
+                         f"{source.get(f'{name}_field', '')})")
+    return [('Read from', '; '.join([*found, f"config: {source['msg_config']}"]))] if found else []
+
+
+def _numbers(ou: OuFacts) -> list[str]:
+    """Return sigma and tau, where they are known."""
+    if ou.status != 'ok':
+        return []
+    low, high = ou.alpha_95
+    return [f'Beside level and load the supply wanders with sigma = {number(ou.sigma)} (95 % '
+            f'{number(ou.sigma_95[0])} to {number(ou.sigma_95[1])}) V/sqrt(s) and relaxes in '
+            f'tau = {number(1e3 / ou.alpha)} (95 % {number(1e3 / high)} to {number(1e3 / low)}) '
+            f'ms: a standard deviation of {number(1e3 * math.sqrt(ou.var_inf))} mV.']
+
+
+def _change(analysis: Analysis) -> list[str]:
+    """Return how sigma goes with throttle."""
+    good = [level for level in analysis.levels if level.estimate.usable]
+    if len(good) < 2:
+        return []
+    low, high = good[0], good[-1]
+    found = sigma_change(low.estimate, high.estimate)
+    if math.isnan(found.ratio):
+        return []
+    verb = 'does not change measurably' if not found.differs else (
+        'grows' if found.ratio_low > 1.0 else 'falls')
+    return [f'Sigma {verb} from {low.label} to {high.label} throttle (factor '
+            f'{number(found.ratio)}, 95 % {number(found.ratio_low)} to '
+            f'{number(found.ratio_high)}).']
+
+
+def notes(analysis: Analysis) -> Notes:
+    """Return what to know before using the numbers, worst first."""
+    return worst_first([*((item.severity, _caution(item)) for item in analysis.quality),
+                        *((Severity.INFO, note) for note in analysis.notes
+                          if note not in {item.text for item in analysis.quality})])
+
+
+def _caution(item: QualityItem) -> str:
+    """Return one sentence, led by the levels it is true of."""
+    labels = ['all' if math.isnan(x) else f'{100.0 * x:.3g} %' for x in item.throttles]
+    return f'{", ".join(labels)}: {item.text}' if labels else item.text
+
+
+def _by_throttle(analysis: Analysis) -> Part:
+    """Return the table of sag, noise and risk: those of `supply`, at its throttles."""
+    curves, sag, noise = (analysis.by_throttle, analysis.overview.facts.sag,
+                          analysis.overview.facts.noise)
+    low, high = noise.flown
+    if math.isnan(low):
+        return Text('The recording has no throttle: sag and risk over throttle are unknown.')
+
+    def millivolts(value: float) -> str:
+        return number(1e3 * value) if not abs(value) < 5e-7 else '0'
+
+    rows = []
+    for u, fall, se, rms, still in zip(sag.throttle, sag.sag_v, sag.se_v, noise.rms_v,
+                                       noise.steady_rms_v):
+        flown = low - 0.05 <= u <= high + 0.05
+        rows.append([
+            f'{100.0 * u:.0f} %' + ('' if flown else '\nnot flown'),
+            f'{millivolts(fall)} +- {millivolts(2.0 * se)}' if math.isfinite(fall) else _UNKNOWN,
+            millivolts(rms) if flown else _UNKNOWN, millivolts(still) if flown else _UNKNOWN,
+            chance(curves.at(u, 'risk'))])
+    heads = ['throttle', 'sag, mV', 'noise, mV rms', 'steady, mV rms', 'brown-out risk']
+    kept = [k for k in range(len(heads)) if k == 0 or any(row[k] != _UNKNOWN for row in rows)]
+    return Table([heads[k] for k in kept], [[row[k] for k in kept] for row in rows], left=[0])
+
+
+def _curves(analysis: Analysis) -> list[Part]:
+    """Return sag, noise, intensity, alpha and risk over throttle."""
+    learned, found = analysis.by_throttle, analysis.overview.facts
+    levels = [level for level in analysis.levels if math.isfinite(level.throttle) and level.n]
+    if math.isnan(found.noise.flown[0]):
+        return []
+    x = 100.0 * np.array(found.sag.throttle)
+    at = _column([100.0 * level.throttle for level in levels])
+    answer, error = 1e3 * _column(found.sag.sag_v), 2e3 * _column(found.sag.se_v)
+    sag = _empty('Sag', 'mV').band(x, np.maximum(answer - error, 0.0), answer + error, '95 %', 0)
+    sag.line(x, answer, 'of the table', 0, 'thick')
+    _with_levels(sag, at, 1e3 * _column([level.sag.sag for level in levels]),
+                 1e3 * _column([level.sag.interval for level in levels]))
+    noise = _empty('Noise', 'mV rms')
+    low, high = found.noise.flown
+    for values, label, colour in ((found.noise.rms_v, 'as flown', 0),
+                                  (found.noise.steady_rms_v, 'throttle steady', 2)):
+        rms = np.where((x >= 100.0 * low - 5.0) & (x <= 100.0 * high + 5.0),
+                       1e3 * _column(values), NAN)
+        noise.line(x, rms, label, colour, 'thick').markers(x, rms, '', colour)
+    highest = np.nanmax(np.concatenate([[1e-6], *(curve.y for curve in noise.curves)]))
+    noise.limits(y=(0.0, 1.1 * float(highest)))
+    sigma, alpha = _empty('Noise intensity \u03c3', 'V/\u221as'), _empty(
+        'Relaxation rate \u03b1', '1/s')
+    _with_estimates(sigma, at, levels, 'sigma')
+    risk = _empty(f'Risk of going below {learned.voltage:g} V within {learned.horizon:g} s',
+                  'probability', log=True).limits(y=(_LEAST_RISK, 2.0))
+    risk.line(100.0 * learned.throttle, np.where(
+        np.isfinite(learned.risk), np.maximum(learned.risk, _LEAST_RISK), np.nan), '', 1, 'thick')
+    if math.isfinite(learned.budget):
+        risk.mark(100.0 * learned.budget, f'budget {100.0 * learned.budget:.0f} %')
+    least, most = analysis.alpha_test.interval
+    alpha.band(np.array([0.0, 100.0]), np.full(2, least), np.full(2, most), 'common, 95 %', 2)
+    _with_estimates(alpha, at, levels, 'alpha')
+    drawn = [Figure(plot) for plot, values in (
+        (sag, answer), (noise, noise.curves[0].y), (risk, learned.risk),
+        (sigma, [level.estimate.sigma for level in levels]),
+        (alpha, [level.estimate.alpha for level in levels])) if np.isfinite(values).any()]
+    return [Pair(drawn[k:k + 2]) for k in range(0, len(drawn), 2)]
+
+
+def _empty(title: str, unit: str, log: bool = False) -> Plot:
+    return Plot(title, 'throttle, %', unit, width=450, height=270, log_y=log,
+                legend_row=not log).limits(x=(-2.0, 102.0))
+
+
+def _column(values: Sequence[float] | Sequence[tuple[float, float]]) -> FloatArray:
+    return np.array(values, dtype=np.float64)
+
+
+def _with_levels(plot: Plot, x: FloatArray, y: FloatArray, ends: FloatArray) -> None:
+    """Add the load levels with their intervals, shape (n, 2)."""
+    low, high = ends.reshape(-1, 2).T
+    plot.bars(x, low, high, '', 7).markers(x, y, 'load levels', 7)
+
+
+def _with_estimates(plot: Plot, x: FloatArray, levels: Sequence[LevelResult], name: str) -> None:
+    _with_levels(plot, x, _column([getattr(level.estimate, name) for level in levels]),
+                 _column([level.estimate.interval(name) for level in levels]))
+
+
+def _levels(levels: Sequence[LevelResult]) -> list[Part]:
+    rows = [[level.label, number(level.time), str(level.n), number(level.mean, 4),
+             *[number(1e3 * v) for v in (level.vpp, level.peak, level.vrms)],
+             number(level.crest), number(1e3 * level.estimate.noise_std), level.kind.value]
+            for level in levels]
+    fits = [[level.label, *[_interval(level, name) for name in ('alpha', 'sigma', 'var_inf')],
+             number(1e3 * level.estimate.tau)] for level in levels if level.estimate.usable]
+    return [
+        Table(['throttle', 'time, s', 'samples', 'mean, V', 'Vpp, mV', 'peak, mV', 'Vrms, mV',
+               'Vpp/Vrms', 'white, mV', 'process'], rows, left=[0, 9]),
+        Table(['throttle', 'alpha, 1/s\n[95 %]', 'sigma, V/sqrt(s)\n[95 %]',
+               'Var_inf, V^2\n[95 %]', 'tau, ms'], fits, left=[0]),
+        Text('dU = \u2212\u03b1 (U \u2212 U\u2080) dt + \u03c3 dW; \u03c4 = 1/\u03b1; '
+             'Var\u221e = \u03c3\u00b2/(2\u03b1). Vpp, peak and Vrms are of the deviation from '
+             'the mean of each segment.', legend=True)]
+
+
+def _interval(level: LevelResult, name: str) -> str:
+    value = getattr(level.estimate, name)
+    if not math.isfinite(value):
+        return _UNKNOWN
+    low, high = level.estimate.interval(name)
+    return f'{number(value)}\n[{number(low)}, {number(high)}]'
+
+
+def _process(analysis: Analysis) -> list[Part]:
+    """Return the tests behind the kind of process of each level, and the reasons in words."""
+    rows = []
+    for level in analysis.levels:
+        cells = []
+        for test in level.shape.tests:
+            strength = f'\n{number(test.effect, 2)}' if math.isfinite(test.effect) else ''
+            cells.append(chance(test.p_adjusted) + (' *' if test.rejects else '') + strength)
+        rows.append([level.label, *cells])
+    groups: dict[tuple[str, str], list[LevelResult]] = {}
+    for level in analysis.levels:
+        if level.n:
+            groups.setdefault((level.kind.value, level.verdict.why), []).append(level)
+    reasons = []
+    for (kind, why), levels in groups.items():
+        said = levels[0].verdict.sentence if len(levels) == 1 else (
+            f'{why[0].upper()}{why[1:].rstrip(".")}.')
+        reasons.append(f'{", ".join(level.label for level in levels)}, {kind}: {said}')
+    return [
+        lambda: [Table(['throttle', *_TESTS.values()], rows, left=[0]), Text(
+            'p-values, adjusted by Holm over all tests of all levels, and below each the effect; '
+            '* rejects: p below 0.01 and an effect of consequence. In one of a hundred recordings '
+            'of stationary OU levels any test but "Correlated" rejects; "Correlated" rejects '
+            'wherever the supply relaxes.')],
+        Notes.of(reasons)]
+
+
+def _lines(analysis: Analysis) -> list[Part]:
+    """Return the spectral lines, and the least that would have been detected."""
+    searched = [level for level in analysis.levels if not level.lines.why_not]
+    if not searched:
+        return []
+    rows = [[level.label, f'{number(line.frequency, 4)} +- {number(line.resolution, 2)}',
+             f'{number(1e3 * line.rms)}\n[{number(1e3 * line.rms_low)}, '
+             f'{number(1e3 * line.rms_high)}]', f'{100.0 * line.share:.2g} %',
+             chance(line.p_value)]
+            for level in searched for line in level.lines.lines]
+    least = max(level.lines.detectable for level in searched)
+    detectable = ('how large one would have to be is not known with so few samples'
+                  if not math.isfinite(least) else
+                  f'one of {number(1e3 * least)} mV rms would have been detected at each of '
+                  'those searched (90 %)')
+    return [Table(['throttle', 'line, Hz', 'rms, mV\n[95 %]', 'of variance', 'p'], rows,
+                  left=[0], most=_MOST_LINES) if rows else
+            Text(f'No spectral line at any level (1 % false alarms); {detectable}.')]
+
+
+def _transients(analysis: Analysis) -> list[Part]:
+    """Return what follows changes of load."""
+    parts: list[Part] = []
+    for k, fit in enumerate(analysis.relaxations):
+        if fit.releases:
+            parts.append(Text(_relaxation_sentence(analysis, k)))
+        if fit.detected:
+            parts += [_drawn_relaxation(analysis, fit), _changes(analysis, fit)]
+    return parts
+
+
+def _drawn_relaxation(analysis: Analysis, fit: Relaxation) -> Callable[[], list[Part]]:
+    return lambda: [Figure(_relaxing(analysis, fit))]
+
+
+def _relaxation_sentence(analysis: Analysis, k: int) -> str:
+    """Return what follows falls (k = 0) or rises (k = 1) of throttle."""
+    fit, cause = analysis.relaxations[k], analysis.causes[k]
+    if not fit.detected:
+        return cause.sentence
+    count, caveat = len(fit.releases), f'{fit.caveat} ' if fit.caveat else ''
+    what = {'release': 'fall', 'load': 'rise'}[fit.kind]
+    return (f'After {counted(count, what)} of throttle the voltage relaxes in '
+            f'tau = {number(1e3 * fit.tau)} (95 % {number(1e3 * fit.tau_low)} to '
+            f'{number(1e3 * fit.tau_high)}) ms. {caveat}{cause.sentence}')
+
+
+def _relaxing(analysis: Analysis, fit: Relaxation) -> Plot:
+    """Return voltages less the level that they settle at, and the fit."""
+    recording = analysis.recording
+    what = 'falls' if fit.kind == 'release' else 'rises'
+    plot = Plot(f'After throttle {what} (dashed: fit)', 'time since throttle arrived, ms', 'mV',
+                height=240)
+    for k, change in enumerate(fit.releases[:_MOST_DRAWN]):
+        if not math.isfinite(change.amplitude):
+            continue
+        stop = change.t + min(change.duration, _DRAWN_TAUS * fit.tau)
+        here = slice(int(np.searchsorted(recording.t, change.t)),
+                     int(np.searchsorted(recording.t, stop, side='right')))
+        since = recording.t[here] - change.t
+        plot.line(1e3 * since, 1e3 * (recording.voltage[here] - change.level),
+                  f'{100.0 * change.throttle_before:.3g} to '
+                  f'{100.0 * change.throttle_after:.3g} %', k, 'faint')
+        plot.line(1e3 * since, 1e3 * fit.decay(change, since), '', k, 'dash thick')
+    return plot
+
+
+def _changes(analysis: Analysis, fit: Relaxation) -> Table:
+    start = float(analysis.recording.t[0])
+    side = 'overshoot, mV' if fit.kind == 'release' else 'undershoot, mV'
+
+    def with_error(value: float, se: float, digits: int, scale: float) -> str:
+        return _UNKNOWN if not math.isfinite(value) else (
+            f'{number(scale * value, digits)} +- {number(scale * se, 2)}')
+
+    rows = [[number(change.t - start, 4),
+             f'{100.0 * change.throttle_before:.3g} to {100.0 * change.throttle_after:.3g} %',
+             with_error(change.level_before, change.level_before_se, 4, 1.0),
+             with_error(change.level, change.level_se, 4, 1.0),
+             with_error(change.amplitude, change.amplitude_se, 3, 1e3),
+             number(1e3 * change.beyond), chance(change.beyond_p)] for change in fit.clear]
+    return Table(['at, s', 'throttle', 'before, V', 'after, V', 'A, mV', side, 'p of noise'],
+                 rows, left=[1], most=_MOST_CHANGES)
+
+
+def _voltage(analysis: Analysis) -> Plot:
+    """Return the voltage, with its limit and the load levels."""
+    recording = analysis.recording
+    t = recording.t - (float(recording.t[0]) if recording.n else 0.0)
+    limits = (0.0, max(recording.duration, 1e-9))
+    plot = Plot('Voltage', 'time, s', 'V', height=230).limits(x=limits)
+    plot.line(t, recording.voltage, colour=0)
+    limit = analysis.overview.limit
+    if math.isfinite(limit):
+        plot.line(np.array(limits), np.full(2, limit), f'limit {limit:g} V', 1, 'dash thick')
+    return _with_segments(plot, analysis) if recording.has_throttle else plot
+
+
+def _with_segments(plot: Plot, analysis: Analysis) -> Plot:
+    """Shade the segments used for the load levels."""
+    t = analysis.recording.t - float(analysis.recording.t[0])
+    for k, level in enumerate(_drawn(analysis)):
+        for s in level.segments:
+            plot.shade(float(t[s.start]), float(t[s.stop - 1]), k, level.label)
+    return plot
+
+
+def _over_time(analysis: Analysis) -> list[Part]:
+    """Return throttle and risk over time."""
+    recording, sliding = analysis.recording, analysis.sliding
+    limits = (0.0, max(recording.duration, 1e-9))
+    drawn: list[Part] = []
+    if recording.has_throttle:
+        plot = Plot('Throttle, and the load levels found in it', 'time, s', '%', height=150)
+        plot.limits(x=limits, y=(-5.0, 105.0)).steps(
+            recording.t - float(recording.t[0]), 100.0 * recording.throttle, colour=7)
+        drawn.append(Figure(_with_segments(plot, analysis), (
+            'Shaded: the segments used for the load levels, in the colours of the plots of the '
+            'shape. Every peak is shown.')))
+    if np.isfinite(sliding.risk).any():
+        plot = Plot(f'Risk of going below {sliding.brownout_voltage:g} V within '
+                    f'{sliding.brownout_horizon:g} s', 'time, s', 'probability', height=170)
+        plot.limits(x=limits, y=(-0.02, 1.02))
+        drawn.append(Figure(plot.line(sliding.t - float(recording.t[0]), sliding.risk, colour=1,
+                                      style='thick')))
+    return drawn
+
+
+def _sliding(analysis: Analysis) -> list[Part]:
+    """Return the plots of the sliding estimate, and why some windows have none."""
+    recording, sliding = analysis.recording, analysis.sliding
+    if not sliding.t.size:
+        return [Text(
+            f'No sliding estimate: the recording is shorter than half a window of '
+            f'{sliding.window:g} s.', legend=True)]
+    start = float(recording.t[0])
+    limits = (0.0, max(recording.duration, 1e-9))
+    drawn: list[Part] = []
+    known = np.array([e.usable for e in sliding.estimates])
+    for name, title, unit in (('sigma', 'Noise intensity \u03c3', 'V/\u221as'),
+                              ('alpha', 'Relaxation rate \u03b1', '1/s')):
+        value = sliding.series(name)
+        if not np.isfinite(value).any():
+            continue
+        low, high = sliding.interval(name)
+        plot = Plot(f'{title} in a sliding window of {sliding.window:g} s', 'time, s', unit,
+                    height=200, log_y=True).limits(x=limits)
+        # One window without information must not flatten all the others.
+        plot.limits(y=span([value, low, high], log=True, trim=0.01))
+        plot.band(sliding.t - start, low, high, '95 % interval')
+        plot.line(sliding.t - start, value, 'estimate', style='thick')
+        drawn.append(Figure(plot))
+    lost = int((~known).sum())
+    if lost:
+        counts: dict[str, int] = {}
+        for e in sliding.estimates:
+            if not e.usable:
+                counts[e.status.value] = counts.get(e.status.value, 0) + 1
+        drawn.append(Text(f'{lost} of {known.size} windows carry no estimate:'))
+        drawn.append(Notes.of((f'{n} windows: {text}' for text, n in counts.items()),
+                              Severity.WARNING))
+    return drawn
+
+
+def _drawn(analysis: Analysis) -> list[LevelResult]:
+    """Return the levels that get a colour: those with most time, in order of throttle."""
+    longest = sorted(analysis.levels, key=lambda level: -level.time)[:_MAX_DRAWN]
+    return [level for level in analysis.levels if level in longest]
+
+
+def _shape(analysis: Analysis) -> list[Part]:
+    spectrum = Plot('Spectrum (dashed: fitted OU and white noise)', 'frequency, Hz',
+                    'PSD, V\u00b2/Hz', width=450, height=330, log_x=True, log_y=True,
+                    legend_low=True)
+    histogram = Plot('Deviation and the normal law',
+                     'deviation / standard deviation', 'density', width=450, height=330,
+                     log_y=True)
+    drawn = _drawn(analysis)
+    fitted, counted = 0, 0
+    for k, level in enumerate(drawn):
+        measured = level.spectrum
+        if measured.frequency.size:
+            fitted += 1
+            spectrum.line(measured.frequency, measured.density, level.label, k, 'faint')
+            spectrum.line(measured.frequency, measured.fitted, '', k, 'dash thick')
+            for line in level.lines.lines[:_MAX_MARKED]:
+                spectrum.mark(line.frequency, f'{line.frequency:.4g} Hz')
+        edges, density = level.density()
+        if density.size:
+            counted += 1
+            # An empty bin has no place on a logarithmic axis.
+            histogram.line(*outline(edges, np.where(density > 0.0, density, np.nan)),
+                           level.label, k)
+    z = np.linspace(-5.0, 5.0, 201)
+    histogram.line(z, np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi), 'normal', 7, 'dash thick')
+    histogram.limits(x=(-6.0, 6.0), y=(1e-5, 1.0))
+    figures = []
+    if fitted:
+        figures.append(Figure(spectrum))
+    if counted:
+        figures.append(Figure(histogram))
+    if not figures:
+        return [Text('No level holds enough samples for a spectrum.', legend=True)]
+    text = ('An OU is flat below its corner \u03b1/(2\u03c0) and falls with the square of '
+            'frequency above it; a line that stands out is a tone, a flat floor at high '
+            'frequency is white noise of the sensor.')
+    extra = len(analysis.levels) - len(drawn)
+    if extra > 0:
+        text += f' The {extra} shortest levels are in the tables only.'
+    return [Pair(figures), Text(text, legend=True)]

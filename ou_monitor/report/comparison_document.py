@@ -1,0 +1,127 @@
+"""What `compare` says: a recording and its simulations over each other."""
+
+from __future__ import annotations
+
+import numpy as np
+from ou_monitor.analysis.overview import known_lines, Overview
+from ou_monitor.comparison.agreement import Agreement, Band, Verdict
+from ou_monitor.report.document import (
+    Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
+from ou_monitor.report.svg import Plot
+from ou_monitor.text import number
+
+# Colours: measured, simulated.
+_MEASURED, _SIMULATED = 7, 1
+_VOLTAGE = ('Line: measured. Band: 95 % of the simulations at each moment. Pale line: one of '
+            'them. Broken lines: the levels whose falls are counted.')
+# What was fitted where a model was given.
+_NOTHING = (0.0, 0.0)
+
+
+def comparison_document(found: Agreement, seen: Overview, command: str = '') -> Document:
+    """Return what is said of a comparison; seen: what is known of the recording anyway."""
+    first, last = found.simulated
+    subject = (f'{found.recording or "recording"}: '
+               + ('' if found.fitted == _NOTHING else
+                  f'fitted 0 to {number(found.fitted[1], 4)} s, ')
+               + f'simulated {number(first, 4)} to {number(last, 4)} s'
+               + (' with the model given' if found.fitted == _NOTHING else '')
+               + f'; {", ".join(found.model)}')
+    parts: list[Part] = [
+        lambda: [Figure(_voltage(found), _VOLTAGE)],
+        Table(['', 'measured', 'simulated\n[95 %]', ''], _rows(found), left=[0, 3]),
+        Facts(_path(found)), Section('The whole recording', [Facts(known_lines(seen))]),
+        lambda: [Section('Throttle, answer to its rises, distribution, spectrum', _others(found),
+                         folded=True)],
+        Notes.of(found.notes),
+        Text(f'{found.seeds} simulations with the stamps, the throttle and the steps of the ADC '
+             f'of the recording. {100.0 * found.p_value:.0f} % of them, the recording counted '
+             'with them, are as far off as the recording is; below 5 % it is said to differ.',
+             legend=True)]
+    return Document('Beside its simulation', subject, _answer(found), parts, command)
+
+
+def _answer(found: Agreement) -> list[str]:
+    low = found.lowest
+    lowest = (f'lowest voltage is {number(low.median, 4)} V ({number(low.low, 4)} to '
+              f'{number(low.high, 4)}), measured {number(low.measured, 4)} V')
+    if found.verdict is Verdict.LOOKS_LIKE_IT:
+        # Without throttle the path is a level, which may explain nothing.
+        path = [] if not found.explained > 0.0 else [
+            f'Its mean path explains {100.0 * found.explained:.0f} % of the variance.']
+        return [f'{found.verdict.value}: its {lowest}.', *path]
+    more = [] if found.farthest == 'lowest' else [f'Its {lowest}.']
+    return [f'{found.verdict.value}: {found.words}.', *more]
+
+
+def _rows(found: Agreement) -> list[tuple[str, str, str, str]]:
+    """Return quantity, measured, simulated with its 95 % band, and a remark."""
+    def row(name: str, of: Band, digits: int, factor: float = 1.0) -> tuple[str, str, str, str]:
+        low, high = sorted((factor * of.low, factor * of.high))
+        return (name, number(factor * of.measured, digits),
+                f'{number(factor * of.median, digits)}\n[{number(low, digits)}, '
+                f'{number(high, digits)}]', '' if of.inside else 'outside')
+
+    out = [row('lowest voltage, V', found.lowest, 4), row('mean voltage, V', found.mean, 4)]
+    out += [row(f'falls through {number(level, 4)} V, 1/min', falls, 3)
+            for level, falls in zip(found.levels, found.falls)]
+    if found.dip is not None and found.recovery is not None:
+        out += [row(f'dip after {found.rises} rises, mV', found.dip, 3, -1e3),
+                row('1 s after a rise, mV', found.recovery, 3, -1e3)]
+    out += [row(f'rms {number(one.low_hz, 2)} to {number(one.high_hz, 2)} Hz, mV',
+                Band(*(max(x, 0.0) ** 0.5 for x in (
+                    one.power.measured, one.power.low, one.power.median, one.power.high))), 3,
+                1e3) for one in found.spectrum]
+    return out
+
+
+def _path(found: Agreement) -> list[tuple[str, str]]:
+    """Return what is said of the mean path and of the distribution."""
+    thirds = ', '.join(number(1e3 * b, 2) for b in found.bias_by_third)
+    worst = [('Farthest off', found.words)] if found.verdict is Verdict.LOOKS_LIKE_IT else []
+    return [('Mean path', f'explains {number(100.0 * found.explained, 3)} % of the variance; rms '
+             f'error {number(1e3 * found.rmse, 3)} mV, bias {number(1e3 * found.bias, 2)} mV (by '
+             f'thirds {thirds})'),
+            ('Distributions', f'{number(found.ks_distance, 2)} apart (KS distance)'), *worst]
+
+
+def _voltage(found: Agreement) -> Plot:
+    at = found.traces
+    plot = Plot('Voltage, measured and simulated', 'time, s', 'voltage, V', height=300,
+                legend_row=True)
+    plot.band(at.at, at.low, at.high, 'simulated, 95 %', _SIMULATED)
+    plot.line(at.t, at.simulated, 'one simulation', _SIMULATED, 'faint')
+    plot.line(at.t, at.voltage, 'measured', 0)
+    for level in found.levels:
+        plot.line(np.array([at.t[0], at.t[-1]]), np.full(2, level), '', _MEASURED, 'dash')
+    return plot
+
+
+def _others(found: Agreement) -> list[Part]:
+    at = found.traces
+    drawn: list[Part] = []
+    if np.isfinite(at.throttle).any():
+        drawn.append(Figure(Plot('Throttle', 'time, s', 'throttle', height=160).line(
+            at.t, at.throttle, '', 2)))
+    beside = []
+    if at.answer.size:
+        plot = Plot('Mean answer to rises of throttle', 'time after, s', 'change, V', width=450,
+                    height=250, legend_row=True)
+        plot.band(at.after, at.answer_low, at.answer_high, 'simulated, 95 %', _SIMULATED)
+        beside.append(Figure(plot.line(at.after, at.answer, 'measured', 0, 'thick')))
+    plot = Plot('Distribution', 'voltage, V', 'share of time below', width=450, height=250,
+                legend_row=True)
+    plot.line(at.edges, at.simulated_distribution, 'simulated', _SIMULATED, 'thick')
+    beside.append(Figure(plot.line(at.edges, at.distribution, 'measured', 0, 'thick')))
+    return [*drawn, Pair(beside), Figure(_spectrum(found))]
+
+
+def _spectrum(found: Agreement) -> Plot:
+    middle = np.array([np.sqrt(one.low_hz * one.high_hz) for one in found.spectrum])
+    power = [one.power for one in found.spectrum]
+    plot = Plot('Power by band of frequency', 'frequency, Hz', 'power, V\u00b2', height=220,
+                log_x=True, log_y=True, legend_row=True)
+    plot.bars(middle, np.array([one.low for one in power]), np.array([one.high for one in power]),
+              'simulated, 95 %', _SIMULATED)
+    plot.markers(middle, np.array([one.measured for one in power]), 'measured', 0)
+    return plot.limits((found.spectrum[0].low_hz, found.spectrum[-1].high_hz))

@@ -1,0 +1,105 @@
+"""What `coupling` says: how much of a signal is noise of the supply, and how they go together."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from ou_monitor.analysis.overview import answers, known_lines, Overview
+from ou_monitor.coupling.coupling import Coupling, POWER
+from ou_monitor.records import FloatArray, Recording
+from ou_monitor.report.document import Document, Facts, Figure, Notes, Part, Section
+from ou_monitor.report.svg import Plot
+from ou_monitor.text import chance, counted, number, p_words
+
+
+def coupling_document(found: Coupling, recording: Recording, signal: tuple[FloatArray, FloatArray],
+                      name: str, unit: str, seen: Overview, command: str = '') -> Document:
+    """Return what is said of a coupling; signal: stamps, s, and values."""
+    grid, per = found.grid, f'{unit} per V'.lstrip()
+    subject = (f'{recording.name or "recording"}, {name}: {grid.duration:.4g} s in common, '
+               f'{found.segments:.0f} segments'
+               + (', throttle taken out' if found.partial else ''))
+    lost = [f'{counted(n)} of the {what} dropped.' for n, what in
+            zip(grid.lost, ('voltage', 'signal')) if n]
+    gaps = [f'{counted(grid.gaps, "gap")} left out.'] if grid.gaps else []
+    parts: list[Part] = [
+        lambda: [Figure(_voltage(recording, seen))],
+        Facts([*_facts(found, per), *known_lines(seen)]),
+        lambda: [Figure(_coherence(found), 'Squared coherence of the two: 1 where the signal is '
+                        'the voltage, 0 where they have nothing to do with each other.'),
+                 Section('Signal and gain', [
+                     Figure(_signal(recording, signal, name, unit)),
+                     Figure(_gain(found, per),
+                            'Where the coherence is below its limit the gain is noise.')],
+                         folded=True)],
+        Section('What to know before using these numbers',
+                [Notes.of([*recording.notes, *lost, *gaps, *found.notes])])]
+    return Document(f'Supply noise in {name}', subject,
+                    [_answer(found, name, per), answers(seen)[0]], parts, command)
+
+
+def _answer(found: Coupling, name: str, per: str) -> str:
+    band = f'{number(found.frequency[0], 2)} to {number(found.frequency[-1], 2)} Hz'
+    if found.seen:
+        return (f'{number(100.0 * found.noise_share, 2)} % of {name} from {band} is noise of the '
+                f'supply: {number(found.gain)} {per}.')
+    return (f'No noise of the supply is seen in {name} from {band}; a gain of '
+            f'{number(found.limit)} {per} would have been.')
+
+
+def _facts(found: Coupling, per: str) -> list[tuple[str, str]]:
+    """Return what was found, or would have been."""
+    peak = int(found.coherence.argmax())
+    if found.seen:
+        low, high = found.gain_ci95
+        lines = [('Gain', f'{number(found.gain, 4)} {per} (95 %: {number(low, 4)} to '
+                  f'{number(high, 4)})'),
+                 ('Lag', f'{number(1e3 * found.lag)} ms of the signal behind the voltage '
+                  f'(+- {number(2e3 * found.lag_se, 2)} ms)'),
+                 ('For the filter', f'coupling: {number(abs(found.gain))}')]
+    else:
+        lines = [('Would be seen', f'a gain of {number(found.limit, 4)} {per}, in '
+                  f'{100.0 * POWER:.0f} % of such recordings'),
+                 ('For the filter', 'no law that follows sigma helps this signal')]
+    return [*lines, ('Chance', f'{p_words(found.p_value)}; seen is what is below '
+                     f'{chance(found.level)}'),
+            ('Largest coherence', f'{number(found.coherence[peak])} (squared) at '
+             f'{number(found.frequency[peak])} Hz; by chance up to {number(found.threshold)}')]
+
+
+def _voltage(recording: Recording, seen: Overview) -> Plot:
+    t = recording.t - recording.t[0]
+    limits = (0.0, max(recording.duration, 1e-9))
+    plot = Plot('Voltage', 'time, s', 'V', height=210).limits(x=limits)
+    plot.line(t, recording.voltage, colour=0)
+    if math.isfinite(seen.limit):
+        plot.line(np.array(limits), np.full(2, seen.limit), f'limit {seen.limit:g} V', 1,
+                  'dash thick')
+    return plot
+
+
+def _signal(recording: Recording, signal: tuple[FloatArray, FloatArray], name: str, unit: str
+            ) -> Plot:
+    plot = Plot(name, 'time, s', unit or 'as recorded', height=180)
+    plot.limits(x=(0.0, max(recording.duration, 1e-9)))
+    return plot.line(signal[0] - recording.t[0], signal[1], colour=2)
+
+
+def _coherence(found: Coupling) -> Plot:
+    low, high = float(found.frequency[0]), float(found.frequency[-1])
+    plot = Plot('What the voltage and the signal share', 'frequency, Hz', 'coherence', height=220)
+    plot.limits((low, high), (0.0, 1.05 * max(found.threshold, float(found.coherence.max()))))
+    plot.line(found.frequency, found.coherence, 'measured', 0)
+    return plot.line(np.array([low, high]), np.full(2, found.threshold),
+                     f'by chance up to {found.threshold:.2g}', 1, 'dash')
+
+
+def _gain(found: Coupling, per: str) -> Plot:
+    plot = Plot('Gain by frequency', 'frequency, Hz', per, height=200)
+    plot.line(found.frequency, np.abs(found.response), 'measured', 0)
+    if found.seen:
+        low, high = found.gain_ci95
+        ends = np.array([found.frequency[0], found.frequency[-1]])
+        plot.band(ends, np.full(2, low), np.full(2, high), 'of the band, 95 %', 1)
+    return plot

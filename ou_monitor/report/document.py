@@ -1,0 +1,117 @@
+"""
+What a command says, as records; `page` and `terminal` are the two that write them.
+
+Texts are ASCII: '+-', 'sigma' and 'V/sqrt(s)' in the head of a table become signs on a page.  In a
+cell or a head, what follows a line end is small on a page and goes on in the line on a terminal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Union
+
+from ou_monitor.records import Severity
+
+if TYPE_CHECKING:
+    from ou_monitor.report.svg import Plot
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph; a legend is for a page only."""
+
+    text: str
+    legend: bool = False
+
+
+@dataclass(frozen=True)
+class Code:
+    """A command, for a page."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Names, and what is known of each."""
+
+    pairs: Sequence[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Notes:
+    """Sentences of a list, each with what it weighs."""
+
+    notes: Sequence[tuple[Severity, str]]
+    most: int | None = None  # Sentences on a terminal; the page has all
+
+    @classmethod
+    def of(cls, texts: Iterable[str], severity: Severity = Severity.INFO,
+           most: int | None = None) -> Notes:
+        """Return notes of one severity."""
+        return cls([(severity, text) for text in texts], most)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells under heads."""
+
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    left: Sequence[int] = ()  # Columns flush left
+    most: int | None = None  # Rows on a terminal; the page has all
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A plot, or a drawing of its own as SVG, for a page."""
+
+    drawing: Plot | str
+    caption: str = ''
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Figures side by side where there is room; a lone one keeps its half."""
+
+    figures: Sequence[Figure]
+
+
+@dataclass(frozen=True)
+class Section:
+    """Parts under a heading; a page shows a folded one at a click."""
+
+    heading: str
+    parts: Sequence[Part]
+    folded: bool = False
+
+
+# What is drawn for a page only is a function, so that a terminal does not pay for it.
+Part = Union[Text, Code, Facts, Notes, Table, Figure, Pair, Section,
+             Callable[[], 'Sequence[Part]']]
+
+
+@dataclass(frozen=True)
+class Document:
+    """All that a command says."""
+
+    title: str  # What it is of, for a page
+    subject: str  # What was read and how much of it, one line
+    answer: Sequence[str]  # Sentences, the one that matters most first
+    parts: Sequence[Part]
+    command: str = ''  # That repeats it
+
+    @property
+    def headline(self) -> str:
+        """Return the answer as a paragraph."""
+        return ' '.join(self.answer)
+
+
+def worst_first(notes: Iterable[tuple[Severity, str]]) -> Notes:
+    """Return notes in the order in which they matter, each sentence once."""
+    said: dict[str, Severity] = {}
+    for severity, text in notes:
+        said[text] = max(severity, said.get(text, severity))
+    return Notes(sorted(((severity, text) for text, severity in said.items()),
+                        key=lambda note: -note[0]))

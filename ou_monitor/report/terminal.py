@@ -1,0 +1,105 @@
+"""A document as plain text: paragraphs, aligned tables, lists; legends and plots are for pages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import shutil
+import sys
+from textwrap import fill
+
+from ou_monitor.records import Severity
+from ou_monitor.report.document import (
+    Document, Facts, Notes, Part, Section, Table, Text)
+
+# Lines are broken to be read at this width, or at that of a narrower terminal, but for these.
+COLUMNS, _NARROWEST = 100, 40
+
+
+def columns() -> int:
+    """Return the width to write for: of the terminal where there is one, at most `COLUMNS`."""
+    if not sys.stdout.isatty():
+        return COLUMNS
+    return max(_NARROWEST, min(COLUMNS, shutil.get_terminal_size().columns))
+
+
+def terminal(document: Document) -> str:
+    """Return a document as text."""
+    parts = [paragraph(document.subject), paragraph(document.headline)]
+    return '\n\n'.join(part for part in (*parts, *map(_part, document.parts)) if part)
+
+
+def _part(part: Part) -> str:
+    """Return one part; empty when it is for a page only."""
+    if isinstance(part, Text):
+        return '' if part.legend else paragraph(part.text)
+    if isinstance(part, Facts):
+        return facts(part.pairs)
+    if isinstance(part, Notes):
+        lines = [item(text if severity is Severity.INFO else f'{severity.name.lower()}: {text}')
+                 for severity, text in part.notes[:part.most]]
+        return '\n'.join(lines + _more(len(part.notes), part.most))
+    if isinstance(part, Table):
+        return '\n'.join([table(part.heads, part.rows[:part.most], part.left),
+                          *_more(len(part.rows), part.most)]) if part.rows else ''
+    if isinstance(part, Section):
+        inside = '\n\n'.join(text for text in map(_part, part.parts) if text)
+        return f'{part.heading}:\n{inside}' if inside else ''
+    return ''
+
+
+def _more(count: int, most: int | None) -> list[str]:
+    """Return a line that says how much is left out."""
+    return [] if most is None or count <= most else [
+        f'and {count - most} more: --report and --json have all']
+
+
+def paragraph(text: str, begin: str = '') -> str:
+    """Break a paragraph into lines; words and paths stay whole."""
+    return fill(text, columns(), initial_indent=begin, subsequent_indent=' ' * len(begin),
+                break_long_words=False, break_on_hyphens=False)
+
+
+def item(text: str) -> str:
+    """Break one entry of a list into lines."""
+    return paragraph(text, '- ')
+
+
+def facts(pairs: Sequence[tuple[str, str]]) -> str:
+    """Lay out names and what is known of each, the words broken beside the names."""
+    width = max((len(name) for name, _ in pairs), default=0) + 2
+    return '\n'.join(fill(words, columns(), initial_indent=name.ljust(width),
+                          subsequent_indent=' ' * width, break_long_words=False,
+                          break_on_hyphens=False) for name, words in pairs)
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:
+    """Lay out an aligned table; one too wide for a terminal in parts."""
+    grid = [[cell.replace('\n', ' ') for cell in line] for line in (heads, *rows)]
+    if sys.stdout.isatty():
+        return '\n\n'.join(_aligned([[line[k] for k in part] for line in grid],
+                                    [n for n, k in enumerate(part) if k in left])
+                           for part in _parts(grid, shutil.get_terminal_size().columns))
+    return _aligned(grid, left)
+
+
+def _parts(grid: Sequence[Sequence[str]], most: int) -> list[list[int]]:
+    """Return which columns stand together in `most` letters; the first leads each part."""
+    widths = [max(len(line[k]) for line in grid) for k in range(len(grid[0]))]
+    parts = [[0]]
+    for k in range(1, len(widths)):
+        if len(parts[-1]) > 1 and sum(widths[c] + 2 for c in (*parts[-1], k)) - 2 > most:
+            parts.append([0])
+        parts[-1].append(k)
+    return parts
+
+
+def _aligned(grid: Sequence[Sequence[str]], left: Sequence[int]) -> str:
+    widths = [max(len(line[k]) for line in grid) for k in range(len(grid[0]))]
+
+    def lay(line: Sequence[str]) -> str:
+        cells = [cell.ljust(width) if k in left else cell.rjust(width)
+                 for k, (cell, width) in enumerate(zip(line, widths))]
+        return '  '.join(cells).rstrip()
+
+    rule = '  '.join('-' * width for width in widths)
+    return '\n'.join([lay(grid[0]), rule, *[lay(line) for line in grid[1:]]])

@@ -1,0 +1,88 @@
+"""What `analyze` says: its records, in the order in which they matter."""
+
+from dataclasses import replace
+
+import numpy as np
+from ou_monitor.analysis.analyze import analyze
+from ou_monitor.analysis.quality import quality_list
+from ou_monitor.records import Flag, Severity
+from ou_monitor.report.analysis_document import analysis_document, answer, facts, notes
+import pytest
+from simulated_recordings import recording, without_throttle
+
+TRUTH = ((0.1, 0.3156), (0.4, 0.632))
+
+
+def test_headline_tells_growth_with_its_interval():
+    """A doubled sigma grows; an equal one does not change measurably."""
+    grown = answer(analyze(recording(1, TRUTH)))[-1]
+    assert grown.startswith('Sigma grows from 10 % to 40 % throttle')
+    same = answer(analyze(recording(2, ((0.1, 0.3), (0.4, 0.3)))))[-1]
+    assert 'does not change measurably' in same
+    fallen = answer(analyze(recording(3, ((0.1, 0.6), (0.4, 0.3)))))[-1]
+    assert fallen.startswith('Sigma falls from')
+
+
+def test_headline_of_one_level_and_of_none():
+    """One level is described; without any the facts say why."""
+    simulated = without_throttle(recording(4, ((0.1, 0.3),)))
+    assert ' the supply wanders with sigma = 0.' in answer(analyze(simulated))[-1]
+    short = recording(5, ((0.1, 0.3),), seconds=0.012)
+    analysis = analyze(short)
+    assert answer(analysis)[0].startswith('The voltage stayed above 4.5 V')
+    assert facts(analysis)[-1] == ('Relaxation', 'unknown: too few readings')
+
+
+def test_headline_warns_of_what_changes_its_own_numbers():
+    """Millivolts; nothing where nothing is wrong."""
+    simulated = recording(1, TRUTH)
+    assert not any('Beware' in one for one in answer(analyze(simulated)))
+    sentence = answer(analyze(replace(simulated, voltage=1e3 * simulated.voltage)))[-1]
+    assert sentence == ('Beware: the voltages seem to be millivolts or counts, not volts.')
+    found = analyze(replace(simulated, t=1e3 * simulated.t[::20], voltage=simulated.voltage[::20],
+                            throttle=simulated.throttle[::20], current=None))
+    assert answer(found)[-1] == 'Beware: the time seems to be in ms or us, not in s.'
+    assert 'TIME_UNIT' in {item.name for item in found.quality}
+
+
+def test_the_same_caution_of_two_levels_is_said_once():
+    """It is led by both labels."""
+    analysis = analyze(recording(7, TRUTH))
+
+    def said(**changes):
+        items = quality_list(
+            analysis.recording, [level.throttle for level in analysis.levels],
+            [replace(level.estimate, **changes) for level in analysis.levels])
+        return list(notes(replace(analysis, quality=items, notes=())).notes)
+
+    assert said(flags=(Flag.QUANTIZED,), noise_std=0.001) == [
+        (Severity.WARNING, f'10 %, 40 %: {Flag.QUANTIZED.value}')]
+    assert said(flags=(), noise_std=0.001) == []
+
+
+def test_the_table_over_throttle_is_that_of_the_facts():
+    """Sag and noise at the tenths of throttle, as `supply` has them; no others."""
+    analysis = analyze(recording(1, TRUTH), brownout_voltage=4.5)
+    table, *_ = next(part for part in analysis_document(analysis).parts
+                     if getattr(part, 'heading', '') == 'Over throttle').parts
+    assert table.heads[0] == 'throttle' and table.heads[-1] == 'brown-out risk'
+    known = {row[0]: dict(zip(table.heads, row)) for row in table.rows}
+    noise = analysis.overview.facts.noise
+    for k in (1, 4):
+        assert float(known[f'{10 * k} %']['noise, mV rms']) == pytest.approx(
+            1e3 * noise.rms_v[k], rel=5e-3)
+    assert known['100 %\nnot flown']['noise, mV rms'] == '-'
+
+
+@pytest.mark.parametrize('level, words', [(14.0, 'right after what was flown'),
+                                          (13.0, 'even at idle')])
+def test_no_budget_is_told_from_its_cause(level, words):
+    """The supply at rest is below the limit, or what was flown just now takes it there."""
+    analysis = analyze(recording(1, TRUTH), brownout_voltage=4.5)
+    curves = analysis.by_throttle
+    none = replace(analysis, by_throttle=replace(
+        curves, voltage=13.2, budget=0.0, risk=np.full(curves.throttle.size, 0.3)),
+        overview=replace(analysis.overview, load=replace(analysis.overview.load, level=level)))
+    safe = dict(facts(none))['Safe up to']
+    assert safe.startswith(f'no throttle, {words}') and f'{level:.2f} V' in safe
+    assert safe.endswith('within 5 s is 0.3')
