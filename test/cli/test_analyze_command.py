@@ -151,7 +151,7 @@ def test_bad_options_are_named(flight, options, word, capsys):
 @pytest.mark.parametrize('content, word', [
     (None, 'bad.csv'), ('', 'empty'), ('time_s,voltage_v\n', 'no usable sample'),
     ('time_s,voltage_v\n0,5\n', '1 usable sample'),
-    ('time_s,voltage_v\n0,5\n1,5.1\n', '2 usable samples'), ('time_s,volts\n0,5\n1,5\n', 'volt'),
+    ('time_s,voltage_v\n0,5\n1,5.1\n', '2 usable samples'), ('time_s,amps\n0,5\n1,5\n', 'volt'),
     ('time_s,voltage_v\n0,nan\n1,nan\n', 'no usable sample'),
 ])
 def test_bad_recordings_are_named(tmp_path, content, word, capsys):

@@ -94,7 +94,7 @@ def test_a_file_name_that_the_terminal_cannot_show(tmp_path, encoding):
     """Its bytes are no text, or not in the encoding: shown by their numbers."""
     path = os.fsdecode(os.path.join(os.fsencode(tmp_path), b'\xff\xc3\xa4.csv'))
     with open(path, 'w') as file:
-        file.writelines(['time_s,voltage_v\n', '0,5\n', '1,5\n'])
+        file.writelines(['time_s,voltage_v\n', '0,5\n', '1,5\n', '2,5\n'])
     page = tmp_path / 'page.html'
     done = subprocess.run(
         [sys.executable, '-m', 'ou_monitor.cli.main', 'analyze', path, '--report', str(page)],
