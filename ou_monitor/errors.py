@@ -26,6 +26,16 @@ class InputError(Exception):
     Command-line programs print it after their name and exit with status 2;
     nodes log it at FATAL and exit with status 2.  What came into it from a file or
     from its name cannot command a terminal (`text.printable`).
+
+    Examples
+    --------
+    >>> from ou_monitor import InputError, read_recording
+    >>> try:
+    ...     read_recording('no_such.csv')
+    ... except InputError as error:
+    ...     print(error)
+    cannot read no_such.csv: No such file or directory
+
     """
 
     def __init__(self, text: str) -> None:

@@ -88,6 +88,15 @@ class Status(enum.Enum):
     Only `OK` and `SHORT_WINDOW` carry numbers that may be acted on
     (`Estimate.usable`); with every other status the numbers that could not be
     had are NaN.
+
+    Examples
+    --------
+    >>> from ou_monitor import Status
+    >>> Status.OK.name in Status.__members__
+    True
+    >>> print(Status.TOO_SHORT.value[:42])
+    The window holds too few relaxation times:
+
     """
 
     OK = 'Estimate is good.'
@@ -178,7 +187,16 @@ class Level(enum.IntEnum):
 
 
 class Flag(enum.Enum):
-    """A caution about the input; the value is the sentence for the pilot."""
+    """
+    A caution about the input; the value is the sentence for the pilot.
+
+    Examples
+    --------
+    >>> from ou_monitor import Flag
+    >>> print(Flag.HELD_SAMPLES.value)
+    The source repeats its last value between refreshes; the repeats were dropped.
+
+    """
 
     SLOW_RATE = (
         'Sampling is slower than the rail (alpha dt > 1): alpha and sigma rest on few '
@@ -294,6 +312,16 @@ class Estimate:
         Mean rate of the samples in the window, Hz.
     counters : Counters
         What became of the samples pushed so far.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ou_monitor import SlidingEstimator
+    >>> estimator = SlidingEstimator(window=1.0)
+    >>> estimator.push(np.arange(20) / 1000.0, np.full(20, 5.0))
+    >>> estimate = estimator.estimate()
+    >>> estimate.usable, estimate.voltage, bool(np.isnan(estimate.alpha))
+    (False, 5.0, True)
 
     """
 
@@ -417,6 +445,15 @@ class Recording:
         Current drawn, A, the last value known at each stamp, NaN where unknown; None without.
     held : int
         Samples left out because the logger repeated a reading in them.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ou_monitor import Recording
+    >>> voltage, throttle = np.array([5.0, 4.9]), np.array([0.2, np.nan])
+    >>> recording = Recording(np.array([0.0, 0.1]), voltage, throttle, 'mine')
+    >>> recording.n
+    2
 
     """
 

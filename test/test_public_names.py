@@ -1,11 +1,14 @@
 """`import ou_monitor`: quick, complete, and honest about what is not there."""
 
+import doctest
 import pathlib
 import re
 import subprocess
 import sys
 
 import ou_monitor
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.term import Term
 import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -16,6 +19,19 @@ def test_every_public_name_is_there(name):
     """It can be had, is listed, and is the same the second time."""
     value = getattr(ou_monitor, name)
     assert name in dir(ou_monitor) and getattr(ou_monitor, name) is value
+
+
+@pytest.mark.parametrize('value', [
+    *(getattr(ou_monitor, name) for name in ou_monitor.__all__ if name != '__version__'),
+    SupplyModel, Term], ids=lambda value: value.__name__)
+def test_the_example_of_every_public_name_runs(value, monkeypatch):
+    """Its docstring has one, and it prints what it says."""
+    monkeypatch.chdir(ROOT)
+    (example,) = doctest.DocTestFinder(recurse=False).find(value, value.__name__)
+    assert example.examples, f'{value.__name__} has no example'
+    failed = []
+    doctest.DocTestRunner().run(example, out=failed.append)
+    assert not failed, ''.join(failed)
 
 
 def test_unknown_names_are_attribute_errors():
@@ -37,9 +53,10 @@ def test_import_loads_nothing_else():
 
 
 def test_version_is_that_of_the_package():
-    """One number in __init__, which pyproject.toml reads, and package.xml."""
+    """One number in __init__, which pyproject.toml reads, package.xml and CITATION.cff."""
     package = re.search(r'<version>([^<]+)<', (ROOT / 'package.xml').read_text()).group(1)
-    assert ou_monitor.__version__ == package
+    cited = re.search(r'^version: (\S+)$', (ROOT / 'CITATION.cff').read_text(), re.M).group(1)
+    assert ou_monitor.__version__ == package == cited
 
 
 def test_public_names_are_not_folders():

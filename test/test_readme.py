@@ -17,8 +17,8 @@ PAGES = sorted((ROOT / 'doc').glob('*.md'))
 # Tables that benchmarks write.
 RESULTS = sorted((ROOT / 'doc/results').glob('*.md'))
 # Documents with relative links: what a reader clicks through.
-LINKED = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'benchmarks/README.md', *PAGES,
-          *RESULTS]
+LINKED = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'benchmarks/README.md',
+          ROOT / 'SECURITY.md', *PAGES, *RESULTS]
 # What names a file that a reader makes or has, rather than one of the project.
 OTHERS = {'my_adc.yaml', 'flight.yaml', 'rail.yaml', 'metadata.yaml', 'px4_motors.yaml',
           'crazyflie.yaml', 'crazyflies.yaml', 'dds_topics.yaml'}
@@ -282,6 +282,22 @@ def test_the_glossary_has_the_words_of_the_screens():
         assert re.search(rf'\b{word.lower()}\b', known), word
     for page in ('README.md', 'doc/commands.md', 'doc/analysis.md', 'doc/index.rst'):
         assert 'glossary' in (ROOT / page).read_text(), page
+
+
+def test_every_cause_has_a_formula_and_a_sketch():
+    """A row of the glossary for each term of the catalogue, and a picture for each row."""
+    from ou_monitor.model.terms.catalogue import catalogue
+    rows = re.findall(r'^\| `(\w+)` \| [^|]+ \| !\[\1\]\((causes/\w+\.svg)\) \| [^|]+ \|$',
+                      page('glossary.md'), re.M)
+    assert sorted(name for name, _ in rows) == sorted(catalogue()) and rows[0][0] == 'ou'
+    assert all(picture == f'causes/{name}.svg' and (ROOT / 'doc' / picture).is_file()
+               for name, picture in rows)
+
+
+def test_continuous_integration_runs_the_suite():
+    """The workflow and .ci/run start the same script."""
+    for path in ('.github/workflows/test.yml', '.ci/run'):
+        assert './scripts/test' in (ROOT / path).read_text(encoding='utf-8')
 
 
 def test_the_limit_is_documented_as_it_is():

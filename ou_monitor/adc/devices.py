@@ -1,12 +1,11 @@
 """
-The voltage of a Linux device: found by name, read when asked for, or in blocks from a buffer.
+The voltage of a Linux IIO or hwmon device: polled, or in blocks from the kernel's buffer.
 
-Limits: what may be read and written is decided by the rights on the files; errors say what to do.
-A voltage that is asked for (hwmon `inN_input`, or an IIO channel without a buffer, `_raw`) is as
-old as the driver's last conversion, which many drivers keep for `update_interval`; asking more
-often gives the same number again.  Of a buffer one channel is read; no more than one program can
-use it.  Without a timestamp channel a block has the time at which it was read, which is late by
-what the scheduler took.
+Limits: file permissions decide what can be read and written; errors say what to do.  A polled
+voltage (hwmon `inN_input`, or IIO `_raw` without a buffer) is as old as the driver's last
+conversion; polling faster than its `update_interval` repeats the number.  A buffer serves one
+program, and one channel is read.  Without a timestamp channel a block has the time at which it
+was read, which includes the scheduler's delay.
 
 The kernel's ABI (Documentation/ABI/testing/sysfs-bus-iio, iio_devbuf): an element of a scan is
 `[be|le]:[s|u]bits/storagebits[>>shift]`, lies at a multiple of its own size, in the order of the
@@ -35,7 +34,7 @@ IIO, HWMON = 'bus/iio/devices', 'class/hwmon'
 
 
 def read_attribute(path: Path) -> str:
-    """Return the content of an attribute, without blanks around it."""
+    """Return the content of an attribute, stripped."""
     try:
         return path.read_text(encoding='ascii', errors='replace').strip()
     except OSError as error:
@@ -54,7 +53,7 @@ def number_of(path: Path) -> float:
 def write_attribute(path: Path, value: object) -> None:
     """Set an attribute."""
     try:
-        # Not created where it is missing: sysfs would refuse, and a plain folder would not.
+        # Without O_CREAT: a missing attribute is an error in a plain folder too.
         handle = os.open(path, os.O_WRONLY | os.O_TRUNC)
         try:
             os.write(handle, f'{value}\n'.encode('ascii', 'replace'))
@@ -65,7 +64,7 @@ def write_attribute(path: Path, value: object) -> None:
 
 
 def why(error: OSError) -> str:
-    """Return what went wrong with a file, and what to do, in words."""
+    """Return the reason of a file error, and what to do."""
     if error.errno in (errno.EACCES, errno.EPERM):
         return ('not permitted; give the user of this node the right by a udev rule or a group '
                 '(doc/deploy.md)')
@@ -78,19 +77,19 @@ def find_device(device: str, sysfs: Path) -> Path:
     """
     Return the folder of a device.
 
-    device: a path, or under `sysfs` the name of a folder ('iio:device0', 'hwmon2') or what the
-    driver calls it ('ads1015').
+    device: a path, or a name under `sysfs`: of the folder ('iio:device0', 'hwmon2') or of the
+    driver ('ads1015').
     """
     if not device:
-        raise InputError(f'device is not given; there are: {_known(sysfs)}')
+        raise InputError(f'no device given; available: {_known(sysfs)}')
     if '/' in device:
         path = Path(device)
         if not path.is_dir():
-            raise InputError(f'no such device: {path} is no folder; there are: {_known(sysfs)}')
+            raise InputError(f'no such device: {path} is not a folder; available: {_known(sysfs)}')
         return path
     found = [path for path in _all(sysfs) if device in (path.name, _name(path))]
     if not found:
-        raise InputError(f"no such device: '{device}'; there are: {_known(sysfs)}")
+        raise InputError(f"no such device: '{device}'; available: {_known(sysfs)}")
     if len(found) > 1:
         raise InputError(f"several devices are called '{device}': give one of "
                          f"{', '.join(path.name for path in found)}")
@@ -113,7 +112,7 @@ def _known(sysfs: Path) -> str:
     return ', '.join(f'{path.name} ({_name(path)})' for path in _all(sysfs)) or 'none'
 
 
-# Asked so often where the driver does not say how often it converts, Hz.
+# Polling rate where the driver does not state its own, Hz.
 USUAL_RATE = 10.0
 
 
@@ -121,7 +120,7 @@ class PolledChannel:
     """
     One channel ('in1', 'in_voltage0'; empty: the only one) of a hwmon or IIO device.
 
-    `rate` is how often the driver converts, Hz, or 10 where it does not say.
+    `rate` is the driver's conversion rate, Hz, or 10 if unknown.
     """
 
     def __init__(self, folder: Path, channel: str = '') -> None:
@@ -150,7 +149,7 @@ class PolledChannel:
         return default
 
     def read(self) -> float:
-        """Return the voltage now, V (both kinds count in mV)."""
+        """Return the present voltage, V (both kinds count in mV)."""
         return (number_of(self._path) + self._offset) * self._scale * 1e-3
 
 
@@ -175,10 +174,10 @@ class Element:
     shift: int
 
     def integers(self, raw: npt.NDArray[np.unsignedinteger]) -> npt.NDArray[np.int64]:
-        """Return the numbers in what is stored."""
+        """Return the numbers in stored words."""
         stored = raw.astype(np.uint64) >> np.uint64(self.shift)
         unused = np.uint64(64 - self.bits)
-        # To the top and back: the sign is extended, or what is above masked out.
+        # Shift to the top and back: extends the sign, or masks the bits above.
         top = stored << unused
         if self.signed:
             return top.view(np.int64) >> np.int64(unused)
@@ -202,7 +201,7 @@ def parse_element(name: str, index: int, kind: str) -> Element:
 
 
 class Scan:
-    """Layout of the scans of a buffer with the elements that are enabled; `size` in bytes."""
+    """Layout of a buffer's scans with the enabled elements; `size` in bytes."""
 
     def __init__(self, elements: Sequence[Element]) -> None:
         self._elements = {element.name: element for element in elements}
@@ -230,13 +229,13 @@ class Scan:
 
 
 STAMP = 'in_timestamp'
-# An interval of more than this many usual ones is a hole: samples the buffer had no room for.
+# Interval, in typical ones, above which samples are missing: the buffer was full.
 HOLE = 1.5
-# Newest intervals whose median is the usual one.
+# Number of newest intervals whose median is the typical one.
 INTERVALS = 64
-# Blocks that the kernel's buffer holds: what may pass before samples are lost.
+# Size of the kernel's buffer, blocks: the longest delay without loss.
 BLOCKS = 64
-# Longest wait for samples, s: bounds how late an end is noticed.
+# Maximum wait for samples, s; also the maximum delay at shutdown.
 NAP = 0.1
 _CLOCKS: dict[str, int] = {
     'realtime': time.CLOCK_REALTIME, 'realtime_coarse': time.CLOCK_REALTIME,
@@ -261,9 +260,9 @@ class IioBuffer:
     """
     The buffer of one IIO device: its folder in sysfs and its character device.
 
-    `channel` is 'in_voltage0' or empty (the only one), `block` samples are read at a time (0: as
-    many as in 10 ms), `rate`, Hz, and `trigger` are set unless 0 and empty.  Then `rate` is that
-    of the device, NaN when it does not say; `holes`: when samples were missing, by its stamps.
+    `channel` is 'in_voltage0' or empty (the only one); `block` samples are read at a time (0: as
+    many as in 10 ms); `rate`, Hz, and `trigger` are set unless 0 or empty.  Afterwards `rate` is
+    the device's, NaN if unknown, and `holes` counts the gaps in its stamps.
     """
 
     def __init__(self, folder: Path, character: Path, channel: str = '', block: int = 0,
@@ -274,7 +273,7 @@ class IioBuffer:
                              'polled, give polled:=true')
         self.channel = _choose(folder, channel)
         self.holes = 0
-        # Of the kernel's stamps, ns: the newest, and the newest intervals.
+        # Newest stamp of the kernel, and newest intervals, ns.
         self._newest: int | None = None
         self._intervals: deque[int] = deque(maxlen=INTERVALS)
         write_attribute(folder / 'buffer/enable', 0)
@@ -297,7 +296,7 @@ class IioBuffer:
         self._handle = self._open()
 
     def _attribute(self, what: str) -> Path:
-        """Return the attribute of the channel, else the one shared by its kind, or by all."""
+        """Return the attribute of the channel, of its kind, or of the device."""
         for name in (f'{self.channel}_{what}', f'in_voltage_{what}', what):
             if (self._folder / name).exists():
                 return self._folder / name
@@ -346,14 +345,14 @@ class IioBuffer:
         return handle
 
     def blocks(self) -> Iterator[Block | None]:
-        """Yield blocks as they come; None when none came for a tenth of a second."""
+        """Yield blocks as they arrive; None after a tenth of a second without one."""
         kept = b''
         whole = self.block * self._scan.size
         poll = select.poll()
         poll.register(self._handle, select.POLLIN)
         while True:
             if not poll.poll(1e3 * NAP):
-                # Less than a block only where the device is slower than it says.
+                # An incomplete block: the device is slower than its stated rate.
                 ready = len(kept) // self._scan.size * self._scan.size
                 if ready:
                     yield from self._decode(kept[:ready], time.time())
@@ -367,7 +366,7 @@ class IioBuffer:
             except OSError as error:
                 raise InputError(f'cannot read {self._character}: {why(error)}') from error
             if not data:
-                # A device that is gone, or a writer that has closed its end.
+                # The device is gone, or the writer has closed its end.
                 time.sleep(NAP)
                 yield None
                 continue
@@ -381,12 +380,12 @@ class IioBuffer:
         if self._clock is None:
             yield Block(now, volts, float('nan'))
             return
-        # Nanoseconds since 1970 need all 64 bits: the difference of the clocks is added to them.
+        # Integers: nanoseconds since 1970 exceed the precision of a float.
         apart = 0 if self._clock == time.CLOCK_REALTIME else (
             time.time_ns() - time.clock_gettime_ns(self._clock))
         kernel = self._scan.integers(data, STAMP)
         stamps = kernel + apart
-        # The first sample of all follows nothing.
+        # There is no step before the very first sample.
         before = int(kernel[0]) if self._newest is None else self._newest
         steps = np.diff(kernel, prepend=before)
         self._intervals += steps[1 if self._newest is None else 0:].tolist()
@@ -394,7 +393,7 @@ class IioBuffer:
         typical = float(np.median(self._intervals)) if self._intervals else float('nan')
         holes = np.flatnonzero(steps > HOLE * typical)
         self.holes += holes.size
-        # One before the first sample splits nothing.
+        # A hole before the first sample does not split the block.
         cuts = holes[holes > 0].tolist()
         for first, last in zip([0, *cuts], [*cuts, volts.size], strict=True):
             yield Block(float(stamps[last - 1]) * 1e-9, volts[first:last], 1e-9 * typical)
@@ -410,13 +409,13 @@ def _names(known: list[str]) -> str:
 
 
 def _choose(folder: Path, channel: str) -> str:
-    """Return the channel that is meant."""
+    """Return the given channel, or the only one."""
     known = sorted(path.name.removesuffix('_en') for path in (folder / 'scan_elements').glob(
         'in_voltage*_en'))
     if channel in known:
         return channel
     if channel:
-        raise InputError(f"{folder.name} has no channel '{channel}'; there are: {_names(known)}")
+        raise InputError(f"{folder.name} has no channel '{channel}'; available: {_names(known)}")
     if len(known) != 1:
         raise InputError(f'{folder.name} has {len(known)} voltage channels: give channel:= one of '
                          f'{_names(known)}')

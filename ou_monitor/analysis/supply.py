@@ -131,6 +131,13 @@ class SupplyFacts:
     budget : Budget or None
         Throttle budget; None without a limit.
 
+    Examples
+    --------
+    >>> from ou_monitor import read_recording, supply_facts
+    >>> data = supply_facts(read_recording('bags/load_40', end=2.0)).to_dict()   # as in --json
+    >>> sorted(data)
+    ['budget', 'dips', 'lowest', 'noise', 'ou', 'resistance', 'sag']
+
     """
 
     lowest: Lowest
@@ -175,6 +182,13 @@ def supply_facts(recording: Recording, limit: float | None = None) -> SupplyFact
     ------
     ValueError
         When the limit is not finite.
+
+    Examples
+    --------
+    >>> from ou_monitor import read_recording, supply_facts
+    >>> facts = supply_facts(read_recording('bags/flight'), limit=4.5)
+    >>> round(facts.lowest.voltage_v, 2), facts.dips.count, facts.sag.known
+    (4.58, 0, True)
 
     """
     return facts_and_end(recording, limit)[0]

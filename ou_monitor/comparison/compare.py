@@ -70,6 +70,13 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     ValueError
         When seeds is out of its range.
 
+    Examples
+    --------
+    >>> from ou_monitor import compare, read_recording
+    >>> found = compare(read_recording('bags/flight', end=10.0), seeds=20)
+    >>> round(found.lowest.measured, 2), found.seeds
+    (4.66, 20)
+
     """
     report = progress or (lambda share: None)
     if not _FEWEST_SEEDS <= seeds <= _MOST_SEEDS:

@@ -1,22 +1,18 @@
 """
-Whether two series share anything: a test at its stated level whatever their spectra do.
+Test whether two series share anything, at a stated level whatever their spectra.
 
-Limits first: the series must be zero-mean in the band and as likely as their
-negatives, given their sizes; a line of the same frequency and of one phase in both is
-found, and is no coupling (`narrow` tells it).  What both owe to throttle must have
-been taken out, or counts as shared.
+Limits: given their sizes, the series must be zero-mean in the band and as likely as their
+negatives.  A line of the same frequency and phase in both is found although it is not coupling
+(`narrow`).  Effects of throttle on both must be regressed out, or count as shared.
 
-A vehicle that manoeuvres changes the shape of a gyro's spectrum, not only its
-size.  With one weight for each segment the quiet segments then decide the
-high bins, and fewer count than are averaged.  So each bin of each segment is
-divided by the root mean square of the signal over the bins around it.  If the
-signal is then white Gaussian the squared partial coherence of a bin exceeds c
-by chance with probability (1 - c)^(K - 1 - p), whatever the voltage is: K
-segments and p causes taken out (Halliday et al., 1995).  A line that moves, or bursts, are
-not made white by that.  Therefore the same statistics are computed with the
-signs of the signal drawn at random for blocks of neighbouring segments, which leaves
-every size as it is (Freedman and Lane, 1983); a coherence must be too large for
-either law.
+A manoeuvre changes the shape of a gyro's spectrum, not only its size.  With one weight for each
+segment the quiet segments would decide the high bins.  So each bin of each segment is divided by
+the root mean square of the signal over the bins around it.  If the signal is then white Gaussian,
+the squared partial coherence of a bin exceeds c by chance with probability (1 - c)^(K - 1 - p),
+for any voltage, with K segments and p causes regressed out (Halliday et al., 1995).  Moving lines
+and bursts are not whitened by that.  So the same statistics are computed with random signs of the
+signal for blocks of neighbouring segments, which keep every size (Freedman and Lane, 1983); a
+coherence must be too large for both laws.
 """
 
 from __future__ import annotations
@@ -39,35 +35,33 @@ _AROUND = 11
 STRIDE = 2
 # Power correlation of half-overlapping Hann segments: (1/6)^2.
 OVERLAP = 1.0 / 36.0
-# Draws of signs, and how many of them must reach a statistic to be counted
+# Random draws of signs; number that must reach a statistic for its p-value to be their share
 # rather than extrapolated.
 _DRAWS, _COUNTED = 499, 10
-# Segments that share a sign: the overlap correlates neighbours, and a line or what leaks from
-# slow manoeuvres does so further.  Few segments make shorter blocks, so that there are
-# 2^16 draws.
+# Segments that share a sign: overlap correlates neighbours, lines and slow manoeuvres more
+# distant ones.  With few segments blocks are shorter, so that 2^16 draws exist.
 _BLOCK, _BLOCKS = 16, 16
-# Family-wise level of the bins that may be a line: surely not chance.
+# Family-wise level of bins that may be a line: far beyond chance.
 _LINE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Coherence:
-    """What a voltage explains of a signal, bin by bin, and how surely."""
+    """Share of a signal that a voltage explains, for each bin, with its tests."""
 
     p_value: float  # Family-wise: of the sum over bins and the largest bin, each at half the level
     squared: FloatArray  # Squared partial coherence, 0..1; shape (m,)
     response: ComplexArray  # Signal units per volt; shape (m,)
-    # Power of the voltage over that of the rest of the signal, 1 / gain^2, as far as the test can
-    # use it; shape (m,).
+    # Power of the voltage over the power of the unexplained signal, 1 / gain^2; shape (m,).
     ratio: FloatArray
     threshold: float  # Coherence that the largest bin must exceed
-    # Segments averaged, overlap counted out; those less what was fitted.
+    # Effective number of segments; the same less the fitted parameters.
     segments: float
     spare: float
-    narrow: bool  # Whether a few bins make the finding, and the others contradict their gain
+    narrow: bool  # Only a few bins are coherent, and the others contradict their gain
 
     def limit(self, level: float, power: float) -> float:
-        """Return the gain that the sum would have shown with probability `power`."""
+        """Return the gain that the sum would detect with probability `power`."""
         ratio = self.ratio[::STRIDE]
         freedom = 2 * ratio.size
         needed = float(stats.chi2.isf(0.5 * level, freedom))
@@ -77,15 +71,15 @@ class Coherence:
 
 
 def effective_segments(count: int) -> float:
-    """Return how many segments without overlap average as well."""
+    """Return the equivalent number of segments without overlap."""
     return count / (1.0 + 2.0 * OVERLAP * (count - 1) / count)
 
 
 def measure_coherence(voltage: ComplexArray, signal: ComplexArray, causes: list[ComplexArray],
                       level: float, rng: np.random.Generator) -> Coherence:
-    """Test Fourier coefficients of shape (segments, bins), the causes' share taken out."""
+    """Test Fourier coefficients of shape (segments, bins), with the causes regressed out."""
     weight = 1.0 / local_size(signal)
-    # The weights hold the signal itself: as if one of so many powers were taken away.
+    # The weights contain the signal: equivalent to losing one of so many independent powers.
     share = 1.0 - 1.0 / _independent(signal.shape[1])
     whole = weight * signal
     basis = basis_of([weight * cause for cause in causes])
@@ -112,14 +106,14 @@ def local_size(signal: ComplexArray) -> FloatArray:
         mean = uniform_filter1d(power, _AROUND, axis=1, mode='reflect')
     else:
         mean = np.broadcast_to(power.mean(axis=1, keepdims=True), power.shape)
-    # A running sum leaves rounding where a loud bin has left the window.
+    # A running sum leaves rounding errors behind a loud bin.
     floor = max(1e-14 * float(power.max()), float(np.finfo(np.float64).tiny))
     size: FloatArray = np.sqrt(np.maximum(mean, floor))
     return size
 
 
 def _independent(bins: int) -> float:
-    """Return how many powers without correlation would scatter as the mean of those around."""
+    """Return the equivalent number of independent powers in a local mean."""
     around = min(bins, _AROUND)
     pairs = (1.0 - 1.0 / around) * (2.0 / 3.0)**2 + max(0.0, 1.0 - 2.0 / around) / 36.0
     return around / (1.0 + 2.0 * pairs)
@@ -132,15 +126,14 @@ def basis_of(causes: list[ComplexArray]) -> list[ComplexArray]:
         size = (np.abs(cause)**2).sum(0)
         part = without(cause, basis)
         norm = np.sqrt((np.abs(part)**2).sum(0))
-        # What is left of a cause that says the same as another is rounding
-        # (of float32, relative 1e-7).
+        # A cause that repeats another leaves rounding only (float32: 1e-7).
         basis.append(np.where(norm**2 > 1e-10 * size, part / np.where(norm > 0.0, norm, 1.0),
                               0.0))
     return basis
 
 
 def without(y: ComplexArray, basis: list[ComplexArray]) -> ComplexArray:
-    """Return what a regression on orthonormal directions, bin by bin, leaves of y."""
+    """Return the residual of y after regression on orthonormal directions in each bin."""
     rest = y.copy()
     for one in basis:
         rest -= (np.conj(one) * rest).sum(0) * one
@@ -163,30 +156,30 @@ def _drawn(v: ComplexArray, x: ComplexArray, basis: list[ComplexArray],
     length = max(1, min(_BLOCK, count // _BLOCKS))
     starts = np.arange(0, count, length)
     signs = rng.choice((-1.0, 1.0), (_DRAWS + 1, starts.size))
-    # The first draw is what was measured.
+    # The first row is the measurement.
     signs[0] = 1.0
     power = (np.abs(x)**2).sum(0)
     size = (np.abs(v)**2).sum(0)
-    # The causes are taken out of the signal anew, with its drawn signs.
+    # Regress the causes out of the signal with the drawn signs.
     taken = np.zeros((len(signs), x.shape[1]))
     for one in basis:
         taken += _power(signs, np.add.reduceat(np.conj(one) * x, starts))
     shared = _power(signs, np.add.reduceat(np.conj(v) * x, starts))
     squared = shared / np.where(size > 0.0, size, 1.0) / np.maximum(power - taken, 1e-12 * power)
     information = -np.log1p(-np.clip(squared, 0.0, 1.0 - 1e-12))
-    # Drawn signs lose the correlation of neighbours across the ends of blocks.
+    # Random signs remove the correlation across ends of blocks.
     information[0] /= 1.0 + 2.0 * OVERLAP * (starts.size - 1) / count
     return _tail(information.sum(1), 'gamma'), _tail(information.max(1), 'gumbel')
 
 
 def _power(signs: FloatArray, parts: ComplexArray) -> FloatArray:
-    """Return squared sums of the parts of blocks, shape (draws, bins)."""
+    """Return squared sums over the blocks, shape (draws, bins)."""
     power: FloatArray = (signs @ parts.real)**2 + (signs @ parts.imag)**2
     return power
 
 
 def _tail(drawn: FloatArray, law: str) -> float:
-    """Return the share of draws that reach the first; the tail of a law where few do."""
+    """Return the share of draws that reach the first; with few, the tail of a fitted law."""
     reached = int((drawn >= drawn[0] * (1.0 - 1e-12)).sum())
     if reached > _COUNTED:
         return reached / drawn.size
@@ -200,7 +193,7 @@ def _tail(drawn: FloatArray, law: str) -> float:
 
 
 def _narrow(squared: FloatArray, response: ComplexArray, ratio: FloatArray, spare: float) -> bool:
-    """Return whether a few bins make the finding, and the others contradict their gain."""
+    """Return whether only a few bins are coherent and the others contradict their gain."""
     loud = squared > chance(squared[::STRIDE], spare, _LINE)[2]
     # A line spreads over the main lobe of the window and its first side lobes.
     near = np.convolve(loud, np.ones(9), 'same') > 0

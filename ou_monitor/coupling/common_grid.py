@@ -1,11 +1,10 @@
 """
 Several series of different rates on one even grid of stamps.
 
-Limits first: what a series lost when it was sampled (aliases) stays lost; a
-linear phase of the order of a sample's jitter remains where stamps jitter.
-The faster series sets the grid and the slower ones are splined onto it, so
-nothing is aliased here.  Above a quarter of the slowest rate the spline
-attenuates by more than 3 %, so the grid says that this is where it ends.
+The fastest series sets the grid; slower ones are interpolated by cubic splines, so nothing is
+aliased here.  Above a quarter of the slowest rate the spline attenuates by more than 3 %: there
+the usable band ends.  Limits: aliases of the original sampling stay, and jittering stamps leave a
+phase error of the order of their jitter.
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ from ou_monitor.errors import InputError
 from ou_monitor.records import FloatArray
 from scipy.interpolate import CubicSpline
 
-# A pause of this many usual steps is a gap: nothing is interpolated across it.
+# Pause, in typical steps, from which it is a gap; gaps are not interpolated.
 GAP = 3.0
-# A much faster series is averaged over the steps of a grid of this many times
-# the slowest rate.
+# Ratio of rates above which the fastest series is averaged onto a slower grid; rate of that grid
+# over the slowest rate.
 _FASTEST = 8.0
 _STEPS = 4.0
 # Cubic splines need four points.
@@ -32,14 +31,14 @@ class Grid:
     """Series on one grid."""
 
     rate: float  # Of the grid, Hz
-    usable: float  # Highest frequency at which all series are what they were, Hz
-    # Stretches without a gap in any series, the series in the order given; shape (n,).
+    usable: float  # Highest frequency at which all series are unattenuated, Hz
+    # Stretches without a gap in any series; each a tuple of the series, shape (n,).
     runs: list[tuple[FloatArray, ...]]
     rates: tuple[float, ...]  # Usual rate of each series, Hz
-    # Samples of each series that were dropped: not finite, or a stamp not after the one before.
+    # Dropped samples of each series: not finite, or with a repeated stamp.
     lost: tuple[int, ...]
     gaps: int  # Gaps between the stretches
-    shared: float  # From the first to the last moment that all series have, s
+    shared: float  # Time between the latest start and the earliest end of the series, s
 
     @property
     def duration(self) -> float:
@@ -97,7 +96,7 @@ def _spans(t: FloatArray, step: float) -> list[tuple[float, float]]:
 
 def _shared(one: list[tuple[float, float]], other: list[tuple[float, float]],
             ) -> list[tuple[float, float]]:
-    """Return what two lists of stretches, each in order, have in common."""
+    """Return the intersection of two ordered lists of stretches."""
     found, i, j = [], 0, 0
     while i < len(one) and j < len(other):
         low, high = max(one[i][0], other[j][0]), min(one[i][1], other[j][1])

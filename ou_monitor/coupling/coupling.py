@@ -1,22 +1,17 @@
 """
 How much of a signal, such as a gyro axis, is noise of the supply.
 
-Limits first.  White noise of the voltage sensor makes the gain too small: by
-the share of it in the voltage within the band.  What throttle does to both is
-taken out as far as it follows throttle and its square linearly, with any lag
-shorter than a segment; a motor's rotation that shakes the gyro and ripples the
-supply is a cause of both that throttle does not carry, and is told apart by
-being narrow only.  A signal that *leads* the voltage is rather its cause, by
-way of the motors.  Both are said, neither is corrected.
+Limits: white noise of the voltage sensor makes the gain too small, by its share of the voltage in
+the band.  Effects of throttle are regressed out if they are linear in throttle and its square,
+with a lag shorter than a segment.  Motor rotation shakes the gyro and ripples the supply; only its
+narrow line reveals that common cause.  A signal that *leads* the voltage is its cause, by way of
+the motors.  Both are reported, neither is corrected.
 
-Method: Fourier coefficients of half-overlapping Hann segments.  `measure_coherence`
-says whether there is coupling.  If there is, the signal's coefficients are
-regressed on those of the voltage, of throttle and of its square, each segment
-weighted by the noise of the signal in it, which grows with throttle as that
-of the supply does: unweighted a few loud segments would decide.
-
-A voltage that a logger repeats until the ADC is read again is taken where it
-was read: the steps between would be a signal of the logger's.
+Method: Fourier coefficients of half-overlapping Hann segments.  `measure_coherence` tests for
+coupling.  If there is any, the signal is regressed on voltage, throttle and its square.  Each
+segment is weighted by the signal's noise in it, which grows with throttle as the supply's does:
+otherwise a few loud segments would decide.  Repeated readings of the ADC are dropped, because the
+steps between them come from the logger.
 """
 
 from __future__ import annotations
@@ -34,34 +29,34 @@ from ou_monitor.timeline.line import refreshes
 from scipy import stats
 from scipy.signal.windows import hann
 
-# Pilot and discharge lie below, Hz.
+# Lower end of the band, Hz: pilot and discharge are below.
 LOWEST = 5.0
-# Longest and shortest segment, s, and how many the recording is cut into.
+# Longest and shortest segment, s; number of segments aimed at.
 _LONGEST, _SHORTEST, _PIECES = 1.0, 0.1, 40
 FEWEST = 16
 LONGEST_LAG = 0.05
-# Share of the common time that may be lost in gaps without a word.
+# Share of the common time below which a note reports what gaps cost.
 _MOST = 0.9
 _BLOCKS = 12
-# With which probability a coupling of the limiting gain would have been seen.
+# Probability of detection at the limiting gain.
 POWER = 0.9
 
 
 @dataclass(frozen=True, eq=False)
 class Coupling:
-    """What was found."""
+    """Result of a coupling estimate."""
 
     seen: bool  # Whether there is coupling, at the family-wise `level`
     p_value: float  # Family-wise
-    # Signal units per volt, signed, lag taken out; NaN when none was seen.
+    # Signal units per volt, signed, lag removed; NaN when no coupling was seen.
     gain: float
     gain_ci95: tuple[float, float]
-    # Of the signal behind the voltage, s; NaN when none was seen.
+    # Delay of the signal behind the voltage, s; NaN when no coupling was seen.
     lag: float
     lag_se: float
-    limit: float  # Gain that would have been seen with probability `POWER`, signal units per volt
-    narrow: bool  # Whether what was seen is in a few bins only: a line that both share
-    signal_leads: bool  # Whether the signal is surely ahead of the voltage
+    limit: float  # Gain that would be detected with probability `POWER`, signal units per volt
+    narrow: bool  # Only a few bins are coherent: a line that both share
+    signal_leads: bool  # The signal is ahead of the voltage by three standard errors
     noise_share: float  # Share of the signal's power in the band that the voltage explains
     # Bins of the band, Hz; squared partial coherence; signal units per volt; shape (m,).
     frequency: FloatArray
@@ -69,8 +64,8 @@ class Coupling:
     response: ComplexArray
     threshold: float  # Coherence that the largest bin must exceed
     level: float  # Family-wise probability of a false alarm
-    segments: float  # Segments averaged, overlap counted out
-    partial: bool  # Whether throttle was taken out
+    segments: float  # Effective number of segments
+    partial: bool  # Whether throttle was regressed out
     grid: Grid  # Resampled series
     notes: tuple[str, ...]  # Cautions, one sentence each
 
@@ -89,12 +84,12 @@ def estimate_coupling(
     if known and throttle is not None and np.nanmax(throttle) > np.nanmin(throttle):
         series['the throttle'] = (t, throttle)
     elif not known:
-        notes.append('Throttle is not known: what it does to both would be taken for coupling.')
+        notes.append('Throttle is unknown: its effect on both series would count as coupling.')
     grid = on_grid(series)
     if grid.duration < _MOST * grid.shared:
         notes.append(f'Only {grid.duration:.3g} s of the {grid.shared:.3g} s in common were used: '
-                     'the rest lies between gaps, or a series has another rate there; --from and '
-                     '--to choose a part.')
+                     'the rest has gaps, or a series has another rate there; --from and --to '
+                     'choose a part.')
     low, high = _band(band, grid)
     length = _segment_length(grid, low)
     frequency, pieces = _segments(grid, length, low, high)
@@ -106,7 +101,7 @@ def estimate_coupling(
         raise InputError(
             f'the series share {grid.duration:.3g} s in {count} segments without a gap: at least '
             f'{FEWEST} segments of {length / grid.rate:.2g} s are needed')
-    # The same recording is always judged alike.
+    # A fixed seed: the same recording always gives the same result.
     found = measure_coherence(pieces[0], pieces[1], pieces[2:], level,
                               np.random.default_rng(0) if rng is None else rng)
     seen = found.p_value <= level
@@ -119,8 +114,8 @@ def estimate_coupling(
     if seen:
         share = 1.0 - float(rest.sum() / (np.abs(x)**2).sum())
         gain, lag = _fit(frequency, v, x, rest / count)
-        # Weights by the whole signal lean to segments in which its noise
-        # opposes the voltage; those by the noise alone do not.
+        # Weights by the whole signal favour segments in which its noise opposes the voltage;
+        # weights by the noise alone do not.
         turned = gain * np.exp(-2j * math.pi * frequency * lag) * v
         noise = np.sqrt((np.abs(x - turned)**2 / rest).sum(1))[:, None]
         v, x, turned = v / noise, x / noise, turned / noise
@@ -135,11 +130,11 @@ def estimate_coupling(
         lag_se = 1.0 / math.sqrt(known_by) if known_by > 0.0 else NAN
     leads = bool(seen and lag < -3.0 * lag_se and lag < -0.25 / grid.rate)
     if found.narrow:
-        notes.append('What was seen is in a few frequencies only: a line that both share, such as '
-                     'the rotation of the motors, rather than coupling.')
+        notes.append('Only a few frequencies are coherent: a line that both share, such as motor '
+                     'rotation, rather than coupling.')
     if leads:
-        notes.append('The signal is ahead of the voltage: it is rather the load, by way of the '
-                     'motors, that answers to the signal than the other way round.')
+        notes.append('The signal is ahead of the voltage: the signal drives the motors and so the '
+                     'load, rather than the other way round.')
     return Coupling(
         seen, found.p_value, gain, interval, lag, lag_se, found.limit(level, POWER),
         found.narrow, leads, share, frequency, found.squared, response, found.threshold, level,
@@ -148,24 +143,24 @@ def estimate_coupling(
 
 def _as_read(t: FloatArray, voltage: FloatArray, notes: list[str],
              ) -> tuple[FloatArray, FloatArray]:
-    """Return the voltage where its ADC was read, and say so in the notes."""
+    """Return the voltage without repeated readings, with a note."""
     good = np.isfinite(t) & np.isfinite(voltage)
     at, values, period = refreshes(t[good], voltage[good])
     if period > 1.0:
         notes.append(f'The voltage was refreshed every {period:.4g} samples: the '
-                     f'{int(good.sum()) - at.size} repeats between were left out.')
+                     f'{int(good.sum()) - at.size} repeats were left out.')
         return at, values
     return t, voltage
 
 
-# Least rms of a segment of the signal, as a share of the loudest.
+# Minimum rms of a segment of the signal, as a share of the loudest.
 _QUIET = 1e-9
 
 
 def _weighted(pieces: list[ComplexArray]) -> tuple[ComplexArray, ComplexArray, FloatArray]:
-    """Return voltage and signal, causes out and segments weighted, and the rest of the signal."""
+    """Return weighted voltage and signal without the causes, and the signal's residual power."""
     weight = np.sqrt(np.mean(np.abs(pieces[1])**2, axis=1))
-    # What is quieter is rounding, or a signal that decays after it stood still.
+    # Anything quieter is rounding, or a signal that decays after standing still.
     weight = np.maximum(weight, _QUIET * weight.max())
     scaled = [one / weight[:, None] for one in pieces]
     basis = basis_of(scaled[2:])
@@ -207,7 +202,7 @@ def _segments(grid: Grid, length: int, low: float, high: float,
     for run in grid.runs:
         columns = list(run)
         if len(columns) == 3:
-            # Motors pull with the square as well.
+            # Motor load also follows the square of throttle.
             columns.append(columns[2]**2)
             if len(found) == 3:
                 found.append([])
@@ -242,7 +237,7 @@ def _gain(frequency: FloatArray, cross: ComplexArray, power: FloatArray, lag: fl
 
 def _jackknife(frequency: FloatArray, v: ComplexArray, x: ComplexArray, density: FloatArray,
                lag: float) -> tuple[float, float]:
-    """Return the 95 % interval of the gain, from blocks of segments left out in turn."""
+    """Return the 95 % interval of the gain by a jackknife over blocks of segments."""
     blocks = np.array_split(np.arange(v.shape[0]), _BLOCKS)
     turn = np.exp(2j * math.pi * frequency * lag)
     above = np.array([(np.real(turn * np.conj(v[b]) * x[b]).sum(0) / density).sum()

@@ -71,6 +71,13 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
     InputError
         When a path cannot be read.
 
+    Examples
+    --------
+    >>> from ou_monitor import discover, read_recording
+    >>> finding = discover(read_recording('bags/flight', end=6.0))
+    >>> 'load_sag' in [cause.name for cause in finding.causes]
+    True
+
     """
     if not isinstance(recording, Recording):
         # Here, for a recording that is given needs no reader: it is a third of all modules.

@@ -50,6 +50,18 @@ class SupplyModel:
         When the first term is not the `ou`, or a term that can be there once
         is there twice.
 
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ou_monitor.model.supply import SupplyModel
+    >>> from ou_monitor.model.terms.load_answer import LoadSag
+    >>> from ou_monitor.model.terms.ou import OU
+    >>> model = SupplyModel((OU(alpha=63.0, sigma=0.3, u0=5.0), LoadSag(linear=0.4, square=0.0)))
+    >>> t = np.arange(1000) / 1000.0
+    >>> voltage = model.simulate(t, np.random.default_rng(1), throttle=np.where(t < 0.5, 0.0, 0.5))
+    >>> bool(abs(voltage[:500].mean() - voltage[500:].mean() - 0.2) < 0.02)
+    True
+
     """
 
     terms: tuple[Term, ...]

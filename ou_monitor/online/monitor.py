@@ -52,6 +52,16 @@ class SupplyMonitor:
     look : float
         Time between two looks of the risk at what became of its forecasts, s.
 
+    Examples
+    --------
+    >>> from ou_monitor import MonitorSettings, read_recording, SupplyMonitor
+    >>> recording = read_recording('bags/flight', end=12.0)
+    >>> monitor = SupplyMonitor(MonitorSettings(brownout_voltage=4.5))
+    >>> monitor.push(recording.t, recording.voltage, recording.throttle)
+    >>> report = monitor.report(age=0.0)
+    >>> 0.0 <= report.risk <= 1.0
+    True
+
     """
 
     def __init__(self, settings: MonitorSettings | None = None,

@@ -178,6 +178,13 @@ class MonitorSettings:
     model_file : str
         Model file of the supply; empty: none.
 
+    Examples
+    --------
+    >>> from ou_monitor import MonitorSettings
+    >>> settings = MonitorSettings(brownout_voltage=14.0, brownout_horizon=2.0)
+    >>> settings.window, settings.brownout_latch
+    ('auto', False)
+
     """
 
     window: float | str = AUTO

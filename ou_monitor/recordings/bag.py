@@ -42,7 +42,7 @@ import yaml
 FILE = 'metadata.yaml'
 _ROOT = 'rosbag2_bagfile_information'
 
-# rosbag2 writes "for ever" of the middleware as the greatest duration.
+# rosbag2 writes the middleware's "for ever" as the largest duration.
 _FOR_EVER = {'sec': 9223372036, 'nsec': 854775807}
 
 # Before version 9 policies were numbers (rmw/types.h).
@@ -68,7 +68,7 @@ class TopicInfo:
 
 
 class BagFiles(NamedTuple):
-    """What a path to a bag stands for."""
+    """Files and metadata of a bag."""
 
     # MCAP files in recorded order.
     paths: list[Path]
@@ -76,7 +76,7 @@ class BagFiles(NamedTuple):
     qos: dict[str, Any]
     # Custom data of the recording, such as its vehicle.
     about: dict[str, str]
-    # What is missing; '' when nothing is.
+    # Description of missing files; '' when complete.
     missing: str
 
 
@@ -98,7 +98,7 @@ def parse_qos(text_or_list: Any) -> tuple[str, str, int]:
         try:
             profiles = parse_yaml(profiles, 'QoS', most_bytes=100_000)
         except InputError:
-            # A QoS nobody can read is no reason to refuse the messages.
+            # Ignore an unreadable QoS: the messages can still be read.
             profiles = None
     first: dict[str, Any] = {}
     if isinstance(profiles, list) and profiles and isinstance(profiles[0], dict):
@@ -116,7 +116,7 @@ def _policy(value: Any, numbers: Mapping[int, str], default: str) -> str:
 
 
 def read_metadata(folder: Path) -> BagFiles:
-    """Return the MCAP files of a rosbag2 directory, and what is said of them."""
+    """Return the MCAP files and the metadata of a rosbag2 directory."""
     with one_line():
         return _metadata(folder)
 
@@ -159,7 +159,7 @@ def is_part(file: Path, folder: Path) -> bool:
 
 
 def find_files(path: Path, partial: bool) -> BagFiles:
-    """Return what a path to a bag stands for."""
+    """Return the files and metadata of the bag at a path."""
     if path.name == FILE and path.is_file():
         path = path.parent
     if not path.exists():
@@ -182,7 +182,7 @@ def find_files(path: Path, partial: bool) -> BagFiles:
             raise InputError(
                 f'{path}: {FILE} is missing: name one of the .mcap files in it; if they are one '
                 'recording that was cut off, use --partial')
-        raise InputError(f'{path}: {missing}; use --partial to take what it still holds')
+        raise InputError(f'{path}: {missing}; use --partial to read the intact part')
     return BagFiles(files, {}, {}, missing)
 
 
@@ -217,7 +217,7 @@ class Part(NamedTuple):
 
 class BagReader:
     """
-    Reads a bag, .mcap file or rosbag2 directory; with `partial` as far as a damaged one holds.
+    Reads a bag (.mcap file or rosbag2 directory); with `partial` also a damaged one.
 
     max_chunk: bytes that a chunk may unpack to; else OU_MONITOR_MAX_CHUNK_MB, or 256 times the
     file, at least 64 MiB and at most an eighth of the memory.  By topic: message types in
@@ -230,12 +230,12 @@ class BagReader:
 
     def __init__(self, path: Path | str, *, partial: bool = False,
                  max_chunk: int | None = None) -> None:
-        """Index the bag; messages are read later, and no file stays open between reads."""
+        """Index the bag; messages are read later, and files are closed between reads."""
         self.path = Path(path)
         self.partial = partial
         paths, qos, about, missing = find_files(self.path, partial)
         self._files = [McapFile(file, partial, max_chunk) for file in paths]
-        # The table of the directory is what a person edits: it holds.
+        # The metadata of the directory wins: people edit it.
         self.about = {key: value for known in (*(file.about for file in self._files), about)
                       for key, value in known.items()}
         held = [file for file in self._files if file.spans]
@@ -247,8 +247,8 @@ class BagReader:
                    for file in self._files if file.damage]
         if damages and not partial:
             broken = next(file for file in self._files if file.damage)
-            raise InputError(f'{broken.path} is damaged {broken.damage}; use --partial to take '
-                             'what it still holds')
+            raise InputError(f'{broken.path} is damaged {broken.damage}; use --partial to read '
+                             'the intact part')
         self.damage = '; '.join(([missing] if missing else []) + damages) or None
         self.info: dict[str, TopicInfo] = {}
         self.sample_rates: dict[str, float] = {}
@@ -264,7 +264,7 @@ class BagReader:
             raise InputError(f'{self.path} holds no messages ({why})')
 
     def _collect(self, qos: Mapping[str, Any]) -> None:
-        """Bring together what the files say of each topic."""
+        """Merge the topics of all files."""
         spent = 0
         for file in self._files:
             for key, topic in file.topics.items():
@@ -341,7 +341,7 @@ class BagReader:
         """Yield the messages in the order of their log times."""
         pending: list[RawMessage] = []
         for part in self.tables(self.topics if topics is None else topics):
-            # Of one time, in the order of the file.
+            # Messages of equal time stay in file order.
             rows = sorted((begin, end, log_time, name) for name, table in part.tables.items()
                           for begin, end, log_time in zip(
                               table.begin.tolist(), table.end.tolist(), table.log_time.tolist()))
@@ -349,7 +349,7 @@ class BagReader:
                                    part.tables[name].data[begin:end])
                         for begin, end, log_time, name in rows]
             pending.sort(key=lambda message: message.log_time_ns)
-            # What is older than all that is still to be read can go.
+            # Yield messages older than everything still to be read.
             ready = len(pending) if part.later_ns is None else bisect.bisect_left(
                 pending, part.later_ns, key=lambda message: message.log_time_ns)
             yield from pending[:ready]
@@ -371,7 +371,7 @@ class BagReader:
             return InputError(f'{self.path}: a message of type {kind} cannot be decoded '
                               f'({type(error).__name__}: {printable(error, 200)})')
         try:
-            # The library tells a definition that it cannot read on standard error as well.
+            # The library also prints unreadable definitions to standard error.
             with redirect_stderr(io.StringIO()):
                 decode = DecoderFactory().decoder_for('cdr', self._schemas[kind])
                 definitions = _definitions(kind, self.definition(kind))
@@ -385,7 +385,7 @@ class BagReader:
         def checked(data: bytes) -> Any:
             try:
                 if data[:1] != b'\0' or data[1:2] > b'\1':
-                    # The library would read the other encodings as this one.
+                    # The library would misread other encodings.
                     raise ValueError('it is not plain CDR')
                 if unsafe:
                     check_extent(data, name, definitions)
@@ -429,7 +429,7 @@ def _definitions(kind: str, text: str) -> Definitions:
 
 def _within(tables: dict[str, Table], start_ns: int | None, end_ns: int | None,
             ) -> dict[str, Table]:
-    """Return what is in a span of log times of each table, and only tables with messages."""
+    """Return the tables cut to a span of log times, without empty ones."""
     if start_ns is not None:
         tables = {name: table.where(table.log_time >= np.uint64(start_ns))
                   for name, table in tables.items()}
@@ -489,13 +489,13 @@ def _check_count(bag: BagReader, topic: str, found: int) -> None:
     if found < stated:
         raise InputError(
             f"{bag.path} is damaged: it states {stated} messages of topic '{topic}', {found} were "
-            'found; use --partial to take what it still holds')
+            'found; use --partial to read the intact part')
 
 
 def last_before(bag: BagReader, spec: FieldSpec, before_ns: int,
                 broken: Broken | None = None) -> FieldColumn:
     """
-    Return messages of a topic up to the last one before a log time that says something.
+    Return messages of a topic up to the last one with a value before a log time.
 
     before_ns in ns.
     """
@@ -520,8 +520,7 @@ def last_before(bag: BagReader, spec: FieldSpec, before_ns: int,
 # Chunks are read together up to this size, bytes unpacked.
 _TOGETHER = 1024 * 1024
 
-# Small chunks: a recording cut off by the brown-out it was made for loses what
-# is in the last one, here about a second at 1 kHz.
+# Small chunks: a recording cut off by a brown-out loses its last chunk, about a second at 1 kHz.
 CHUNK_SIZE = 128 * 1024  # bytes
 
 
@@ -533,7 +532,7 @@ class BagTarget:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the target; nothing that exists is touched."""
+        """Open the target; never overwrite anything."""
         self.path = path
         self._folder = None if path.suffix == '.mcap' else path
         if path.exists() or path.is_symlink():
@@ -560,8 +559,8 @@ class BagTarget:
                            custom)
 
     def remove(self) -> None:
-        """Take away what was written; it was made by this object and by no other."""
-        # On a full disk closing fails as well: what is still in the buffer has no place.
+        """Remove the files that this object has written."""
+        # On a full disk closing fails too, because the buffer cannot be flushed.
         with suppress(OSError):
             self.file.close()
         if self._folder is not None:
@@ -574,14 +573,14 @@ class BagWriter:
     """
     Writes a bag: an .mcap file when the path ends in .mcap, else a rosbag2 directory.
 
-    A context manager; when its block is left by an exception, what was written is removed.
+    A context manager; after an exception in its block the files are removed.
     `about`, where the data came from, is kept in a metadata record of the file, and in the custom
     data of metadata.yaml.  InputError: the target exists or cannot be written.
     """
 
     def __init__(self, path: Path | str, *, about: Mapping[str, str] | None = None) -> None:
         """Open the target."""
-        # A file name may hold bytes that are no text, which neither MCAP nor YAML can hold.
+        # A file name may hold bytes that are not text; MCAP and YAML cannot store those.
         self._about = {key: _as_text(value) for key, value in (about or {}).items()}
         self.path = Path(path)
         self._target = BagTarget(self.path)
@@ -603,7 +602,7 @@ class BagWriter:
         schema: str | None = None, reliability: str = 'reliable',
         sample_rate: float | None = None, origin: Mapping[str, str] | None = None,
     ) -> str:
-        """Announce a topic (sample_rate in Hz)."""
+        """Add a topic (sample_rate in Hz)."""
         topic = '/' + name.lstrip('/')
         if topic in self._topics:
             raise ValueError(f"topic '{topic}' was added before")
@@ -626,7 +625,7 @@ class BagWriter:
         return topic
 
     def write(self, topic: str, t_ns: int, message: Any) -> None:
-        """Write one message (topic in A, t_ns in ns)."""
+        """Write one message (t_ns in ns)."""
         name = topic if topic in self._counts else '/' + topic
         if name not in self._counts:
             raise ValueError(f"topic '{topic}' was not added")
@@ -644,10 +643,9 @@ class BagWriter:
         self._end_ns = max(t_ns, self._end_ns)
 
     def _encode(self, kind: str, message: Any) -> bytes:
-        """Serialize a message that was not given as bytes."""
+        """Serialize a message object."""
         if kind not in self._encoders:
-            # The library's public writer cannot set the QoS of a channel, so its
-            # encoder is taken alone.
+            # The library's writer cannot set the QoS of a channel: use only its encoder.
             from mcap_ros2._dynamic import serialize_dynamic
             self._encoders[kind] = serialize_dynamic(kind, self._definitions[kind])[kind]
         return self._encoders[kind](message)

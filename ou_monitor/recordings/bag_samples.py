@@ -1,10 +1,9 @@
 """
-The samples of a bag, as its messages hold them, with the throttle and the current of each.
+The voltage samples of a bag with their throttle and current.
 
-A msg config fits by name when the bag has its topic (or one that ends with it, as in a namespace)
-with its type; a generic one fits by type alone when there is only one topic of that type.  One
-choice is taken, several are put to the user.  Limits: a bag is read whole; an hour at 1 kHz takes
-up to 420 MB.
+A msg config fits by name when the bag has its topic (or one ending with it, as in a namespace)
+with its type; a generic one also fits by type when only one topic has it.  If several fit, the
+user must choose.  Limits: a bag is read whole; an hour at 1 kHz takes up to 420 MB.
 """
 
 from __future__ import annotations
@@ -29,15 +28,15 @@ from ou_monitor.timeline.line import MOST_CURRENT, MOST_THROTTLE
 
 @dataclass(frozen=True)
 class TopicChoice:
-    """What is read from a bag."""
+    """The fields to read from a bag."""
 
     # The source.
     config: MsgConfig
-    # With the topics of this bag; throttle and current are None where there is none.
+    # With the topics of this bag; throttle and current may be None.
     voltage: FieldSpec
     throttle: FieldSpec | None
     current: FieldSpec | None
-    # One sentence for each thing that was not as expected.
+    # One sentence for each surprise.
     notes: tuple[str, ...]
 
 
@@ -86,7 +85,7 @@ def _absolute(topic: str) -> str:
 
 
 def _named(spec: FieldSpec, topics: Mapping[str, str]) -> list[str]:
-    """Return the topics that a spec means by name, of its type."""
+    """Return the topics that match a spec by name and type."""
     exact = _absolute(spec.topic)
     if topics.get(exact) == spec.type:
         return [exact]
@@ -94,13 +93,13 @@ def _named(spec: FieldSpec, topics: Mapping[str, str]) -> list[str]:
 
 
 def _alike(spec: FieldSpec, topics: Mapping[str, str]) -> list[str]:
-    """Return the topics of its type that end with the name that a spec means."""
+    """Return the topics of a spec's type that end with its name."""
     return sorted(name for name, kind in topics.items()
                   if kind == spec.type and name.endswith(_absolute(spec.topic)))
 
 
 def _only_of_type(config: MsgConfig, topics: Mapping[str, str]) -> list[str]:
-    """Return the topics of the voltage's type, those that are the throttle by name left out."""
+    """Return the topics of the voltage's type that are not the throttle by name."""
     taken = set() if config.throttle is None else set(_named(config.throttle, topics))
     return sorted(name for name, kind in topics.items()
                   if kind == config.voltage.type and name not in taken)
@@ -112,8 +111,8 @@ def _detect(path: Path, topics: Mapping[str, str], voltage_topic: str | None) ->
         _absolute(voltage_topic): topics[_absolute(voltage_topic)]}
     fitting = [config for config in configs if _named(config.voltage, considered)]
     if not fitting:
-        # With a topic named by the user its type decides; else the throttle's
-        # topic must be known, to leave it out.
+        # A topic named by the user decides by its type; otherwise the throttle's topic must be
+        # known, to exclude it.
         known = considered if voltage_topic is not None else topics
         fitting = [config for config in configs
                    if config.generic and _only_of_type(config, known)]
@@ -139,7 +138,7 @@ def _not_there(path: Path, config: MsgConfig, topics: Mapping[str, str]) -> str:
 
 
 def _current(config: MsgConfig, topics: Mapping[str, str], voltage: str) -> FieldSpec | None:
-    """Return where the current is: a topic of that name beside the voltage, or as configured."""
+    """Return the field of the current: a topic `current` beside the voltage, or as configured."""
     beside = voltage.rsplit('/', 1)[0] + '/current'
     if topics.get(beside) in ('std_msgs/msg/Float32', 'std_msgs/msg/Float64'):
         return FieldSpec(beside, topics[beside], 'data', nan='unknown')
@@ -153,12 +152,11 @@ def _throttle(
     path: Path, config: MsgConfig, topics: Mapping[str, str], voltage: str,
     throttle_topic: str | None,
 ) -> tuple[FieldSpec | None, tuple[str, ...]]:
-    """Return where the throttle is, or why there is none."""
+    """Return the field of the throttle, or a note why it is unknown."""
     spec = config.throttle
     if throttle_topic is not None:
         topic = _absolute(throttle_topic)
-        # A source without a throttle of its own, or one of another type, is
-        # read as any shipped config reads that type.
+        # Read a topic named by the user as any shipped config reads its type.
         specs = [spec] + [c.throttle for c in list_msg_configs().values()]
         for one in specs:
             if one is not None and one.type == topics[topic]:
@@ -172,7 +170,7 @@ def _throttle(
     found = _named(spec, topics)
     if not found and not config.generic:
         found = [name for name, kind in topics.items() if kind == spec.type and name != voltage]
-    # In a bag of several vehicles the one beside the voltage is meant.
+    # In a bag of several vehicles take the one beside the voltage.
     beside = [name for name in found if name.rsplit('/', 1)[0] == voltage.rsplit('/', 1)[0]]
     found = beside or found
     if len(found) == 1:
@@ -188,14 +186,14 @@ def _throttle(
 
 
 VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
-# Share of implausible throttles up to which they are errors of single samples.
+# Share of implausible throttles up to which they count as errors of single samples.
 _WILD = 0.05
 
 
 def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None = None) -> None:
-    """Refuse a throttle in percent, microseconds or counts, or one that is the voltage."""
+    """Refuse a throttle in percent, microseconds or counts, or swapped with the voltage."""
     known = throttle[np.isfinite(throttle)]
-    # A few wild values are no unit: they are unknown, here as in the node.
+    # A few wild values are errors, not another unit: they become NaN, here as in the node.
     if float(np.count_nonzero(np.abs(known) > MOST_THROTTLE)) <= _WILD * known.size:
         return
     if voltage is not None and float(np.nanmax(np.abs(voltage), initial=0.0)) <= 1.0 \
@@ -210,7 +208,7 @@ def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None =
 
 
 def known_current(current: FloatArray) -> FloatArray | None:
-    """Return a current with NaN for what is not finite; None where none is known."""
+    """Return a current with NaN for implausible values; None if all are."""
     known = np.abs(current) <= MOST_CURRENT
     return np.where(known, current, np.nan) if known.any() else None
 
@@ -221,7 +219,7 @@ def span_words(start: float | None, end: float | None) -> str:
 
 
 def outside_words(name: str, start: float | None, end: float | None, length: float) -> str:
-    """Return that a recording of a length, s, holds nothing in a part."""
+    """Return the error that a recording of a length, s, has no sample in a part."""
     return f'{name} holds no sample {span_words(start, end)}: it lasts {length:.3f} s'
 
 
@@ -231,7 +229,7 @@ def part_words(start: float | None, end: float | None) -> str:
 
 
 def _has_field(bag: BagReader, spec: FieldSpec) -> bool:
-    """Whether messages of a type, as the bag defines it, have a field of that name."""
+    """Return whether a type, as the bag defines it, has a field."""
     own = re.split(r'^=+$', bag.definition(spec.type), maxsplit=1, flags=re.M)[0]
     return re.search(rf'^\s*\S+\s+{re.escape(spec.field)}\b', own, re.M) is not None
 
@@ -244,8 +242,8 @@ def read_bag(
     """
     Read voltage, throttle and current of a bag in the order of the log.
 
-    Topics as in `read_recording`, `start` and `end` in s after the first message.  InputError:
-    the topics cannot be told, or there is no voltage.
+    Topics as in `read_recording`; `start` and `end` in s after the first message.  InputError:
+    several topics fit, or there is no voltage.
     """
     choice = choose(bag.path, bag.topics, msg_config=msg_config, voltage_topic=voltage_topic,
                     throttle_topic=throttle_topic)
@@ -262,7 +260,7 @@ def read_bag(
         broken.append('' if broken else f'{error} ({moment(log_time, bag.start_ns)})')
 
     first, last = (_limit(bag, at) for at in (start, end))
-    # Where the messages of the voltage hold the current, each is that of its own.
+    # A current in the messages of the voltage belongs to the same message's voltage.
     together = CURRENT in specs and specs[CURRENT].topic == specs[VOLTAGE].topic
     parts: dict[str, list[FieldColumn]] = {name: [] for name in specs}
     if first is not None:
@@ -296,11 +294,11 @@ def read_bag(
 
 
 def _specs(bag: BagReader, choice: TopicChoice) -> dict[str, FieldSpec]:
-    """Return what is read, by its name."""
+    """Return the fields to read, by name."""
     spec = choice.voltage
     stated = bag.sample_rates.get(spec.topic)
     if spec.sample_rate is not None and stated is not None:
-        # The bag knows better than a config that is made for many.
+        # The rate stated in the bag overrides the config's.
         spec = replace(spec, sample_rate=stated)
     specs = {VOLTAGE: spec}
     if choice.throttle is not None:
@@ -311,7 +309,7 @@ def _specs(bag: BagReader, choice: TopicChoice) -> dict[str, FieldSpec]:
 
 
 def _source(bag: BagReader, choice: TopicChoice, name: str) -> dict[str, str]:
-    """Return topics, types, files and what the bag says of itself."""
+    """Return topics, types, files and metadata of the bag."""
     source = {
         **bag.about, 'file': name, 'format': 'mcap', 'msg_config': choice.config.name,
         'voltage_topic': choice.voltage.topic, 'voltage_type': choice.voltage.type,
@@ -320,7 +318,7 @@ def _source(bag: BagReader, choice: TopicChoice, name: str) -> dict[str, str]:
         source |= {'throttle_topic': choice.throttle.topic, 'throttle_type': choice.throttle.type,
                    'throttle_field': choice.throttle.field,
                    **bag.origins.get(choice.throttle.topic, {})}
-    # `ou-monitor convert` keeps what the log says apart from what people say of the bag.
+    # `ou-monitor convert` stores the log's own vehicle apart from the user's.
     vehicle = source.get('vehicle') or source.get('log_vehicle')
     return {**source, 'vehicle': vehicle} if vehicle else source
 
@@ -329,12 +327,12 @@ def _limit(bag: BagReader, at: float | None) -> int | None:
     """Return a time of the recording, s, as log time, ns."""
     if at is None:
         return None
-    # Beyond the bag every time is the same.
+    # Limit times beyond the end of the bag.
     return bag.start_ns + round(min(at * 1e9, float(bag.end_ns - bag.start_ns + 1)))
 
 
 def _beside(volts: FieldColumn, other: FieldColumn | None) -> FloatArray:
-    """Return another field of each message of the voltage; NaN where it holds none."""
+    """Return another field of each message of the voltage; NaN where it is missing."""
     found = np.full(volts.n, np.nan)
     if other is not None:
         single = other.count == 1
@@ -342,7 +340,7 @@ def _beside(volts: FieldColumn, other: FieldColumn | None) -> FloatArray:
         if other.n == volts.n:
             found[single] = values
         elif values.size:
-            # Of a damaged bag not every message gives both.
+            # In a damaged bag some messages lack one of them.
             at = np.searchsorted(other.log_time[single], volts.log_time).clip(0, values.size - 1)
             same = other.log_time[single][at] == volts.log_time
             found[same] = values[at][same]
@@ -377,7 +375,7 @@ def _paired(name: str, specs: dict[str, FieldSpec], columns: dict[str, FieldColu
                                   'number.', Defect.NON_FINITE))
         if which == THROTTLE:
             check_throttle(name, values[known])
-        # Of a voltage and a throttle logged at one time, the throttle counts as first.
+        # At equal log times the throttle counts as earlier than the voltage.
         before = np.searchsorted(logged, np.repeat(column.log_time, counts)[known], 'left')
         hold.take(at[known], values[known], np.repeat(column.stamped, counts)[known], ends,
                   stamped, before)

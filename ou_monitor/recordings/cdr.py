@@ -281,15 +281,15 @@ class _Walk:
         return int(value)
 
     def _take(self, size: int, align: int) -> int:
-        """Pass over some bytes; return where they begin."""
+        """Skip some bytes; return their start."""
         begin = self._at + (_HEADER - self._at) % align
         self._at = begin + size
         if self._at > len(self._data):
-            raise _NoLayoutError('it is shorter than what it says of itself')
+            raise _NoLayoutError('it is shorter than its own lengths state')
         return begin
 
 
-# Arrays that the general decoder slices, without a look whether so many bytes are there.
+# Arrays that the general decoder slices without checking that enough bytes exist.
 _SLICED = frozenset(('uint8', 'byte'))
 _FREE_STEPS = 1000
 
@@ -346,7 +346,7 @@ class Table:
     channel: npt.NDArray[np.uint16]
     #: Log times, ns.
     log_time: TimeArray
-    #: Where the serialized messages begin and end in `data`.
+    #: Start and end of the serialized messages in `data`.
     begin: IntArray
     end: IntArray
 
@@ -420,7 +420,7 @@ class FieldColumn:
                             self.count[at:], self.values[cut:]))
 
     def in_time_order(self) -> FieldColumn:
-        """Return the messages by log time; those of one time as they are."""
+        """Return the messages by log time; equal times keep their order."""
         if (self.log_time[1:] >= self.log_time[:-1]).all():
             return self
         return self.take(np.argsort(self.log_time, kind='stable'))
@@ -455,7 +455,7 @@ class FieldReader:
     """
     Reads one field, and its stamp, of messages of one type (ros2msg text `definition`).
 
-    The `nan` rule of `spec` is not applied: what is not finite is NaN.  `decoder` returns the
+    The `nan` rule of `spec` is not applied: all non-finite values are NaN.  `decoder` returns the
     general decoder, and is asked only when needed; `broken` is called with the log time, ns, of a
     message that cannot be decoded and the error.  `general` counts messages that went that way.
     """

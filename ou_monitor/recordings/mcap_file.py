@@ -1,13 +1,13 @@
 """
-One .mcap file, by the MCAP library: its topics, where their messages are, and its damage.
+One .mcap file, read by the MCAP library: topics, places of their messages, and damage.
 
-A file with an intact summary is read by it; any other, and each that is read with `partial`,
-is walked record by record.  Each stated size is compared with its limit before anything is
-read or unpacked, and the message indexes behind a chunk are used only if the records that they
-name fill the chunk.  Damage is reported by chunk.  https://mcap.dev/spec
+A file with an intact summary is read by its summary; any other, and every file read with
+`partial`, is walked record by record.  Every stated size is compared with its limit before
+anything is read or unpacked.  The message indexes behind a chunk are used only if their records
+fill the chunk.  Damage is reported by chunk.  https://mcap.dev/spec
 
-Limits: without checksums in the file, a wrong byte within a message goes unnoticed, and a lost
-message is only missed where the summary counts the messages or the walk stumbles.
+Limits: without checksums a wrong byte within a message is not detected.  A lost message is
+detected only if the summary counts the messages, or the walk meets a broken record.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ MAGIC = b'\x89MCAP0\r\n'
 # Opcode and length of a record; channel, sequence, log time and publish time of a message.
 _HEAD, _MESSAGE = struct.Struct('<BQ'), struct.Struct('<HIQQ')
 _FOOTER = _HEAD.size + 20 + len(MAGIC)
-# Where the message in a record begins.
+# Offset of the message in its record.
 _DATA = _HEAD.size + _MESSAGE.size
-# Opcodes from here on are private to a writer.
+# First opcode that is private to a writer.
 _PRIVATE = 0x80
-# Records that may stand before the end of the data, and after it: a record whose opcode has a
-# wrong bit must not be skipped as another kind.
+# Records allowed before and after the end of the data: a wrong bit in an opcode must not turn a
+# record into one that is skipped.
 _IN_DATA = {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK,
             Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END,
             Opcode.FOOTER}
@@ -58,8 +58,8 @@ _IN_SUMMARY = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.ATTACHM
                Opcode.STATISTICS, Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER}
 _LENGTHS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 
-# Where a channel's metadata holds the rate of the samples within a block, Hz, and what its keys
-# begin with that say where the values came from.
+# Keys in a channel's metadata: rate of the samples within a block, Hz; prefix of the keys about
+# the origin of the values.
 SAMPLE_RATE, ORIGIN = 'sample_rate_hz', 'origin.'
 # Metadata records that say where the recording came from: written here, and by rosbag2, whose
 # record holds the text of a metadata.yaml of at most so many bytes and values (2000 topics).
@@ -72,32 +72,32 @@ _MOST_DEFINITION, _MOST_OF_NAME = 256 * 1024, 256
 # Damages after which the walk ends, topics left out that are named, and records of a chunk
 # beside its messages: one schema and one channel for each number.
 _MOST_BREAKS, _MOST_NOTES, _MOST_OTHERS = 10_000, 20, 2 * 65536
-# Messages outside of chunks are read in blocks of so many bytes.
+# Block size for messages outside of chunks, bytes.
 _BLOCK = 64 * 1024
 # Of more channels only those in a chunk are looked for.
 _FEW_CHANNELS = 8
 
-# Ratio of what the chunks unpack to and the file: 20 to 30 for logs of a constant voltage, and
-# 30 000 for zeros.
+# Maximum ratio of unpacked chunks to the file: 20 to 30 for logs of a constant voltage, 30 000 for
+# zeros.
 _MOST_RATIO = 256
-# Least limit of a chunk in bytes, and its greatest share of the memory.
+# Lowest limit of a chunk, bytes, and its largest share of the memory.
 _LEAST_LIMIT, _CHUNKS_AT_ONCE = 64 * 1024 * 1024, 8
 _VARIABLE = 'OU_MONITOR_MAX_CHUNK_MB'
 
 
 class Damage(Exception):
-    """A part of the file that makes no sense."""
+    """A part of the file that is broken."""
 
 
 class Break(NamedTuple):
-    """A damage: the byte where it begins, and the reason."""
+    """Damage: its first byte, and the reason."""
 
     offset: int
     why: str
 
 
 class Span(NamedTuple):
-    """A part of the file that holds messages and is read in one go."""
+    """A part of the file with messages that is read at once."""
 
     #: Log times of its first and last message, ns.
     start_ns: int
@@ -106,7 +106,7 @@ class Span(NamedTuple):
     offset: int
     length: int
     chunk: bool
-    #: Channels with messages in it; None: not known.
+    #: Channels with messages in it; None: unknown.
     channels: frozenset[int] | None = None
     #: Bytes of message indexes right behind it.
     index_length: int = 0
@@ -129,7 +129,7 @@ class Topic(NamedTuple):
 
 
 def usable_memory() -> int:
-    """Return the least of the machine's, the control group's and the process's memory, bytes."""
+    """Return the smallest memory limit of machine, control group and process, bytes."""
     limits = [os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')]
     for file in ('/sys/fs/cgroup/memory.max', '/sys/fs/cgroup/memory/memory.limit_in_bytes'):
         # Not there, or the word "max".
@@ -184,7 +184,7 @@ class McapFile:
         self.about: dict[str, str] = {}
         self.notes: list[str] = []
         self.start_ns = self.end_ns = 0
-        # Definitions by number, those of topics left out included.
+        # Definitions by number, including unused topics.
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._unpacked = self._tables = self._metadata = 0
@@ -194,7 +194,7 @@ class McapFile:
             self._limit_of_all = max(16 * self._limit, _MOST_RATIO * self._size)
             self._check_magic(file)
             self._summary = self._read_summary(file)
-            # A partial reading trusts nothing.
+            # With `partial` the summary is not trusted.
             if partial or not self._use_summary(file):
                 self._walk(file)
             else:
@@ -211,7 +211,7 @@ class McapFile:
 
     @property
     def damage(self) -> str:
-        """Where the file is damaged, in words; '' when it is not."""
+        """Return a description of the damage; '' for an intact file."""
         if not self.breaks:
             return ''
         first, rest = self.breaks[0], len(self.breaks) - 1
@@ -254,7 +254,7 @@ class McapFile:
                 raise Damage('its checksum is wrong')
             file.seek(0)
             return make_reader(file).get_summary()
-        # The library lets every kind of error through; each means the same here.
+        # The library raises errors of many kinds; all mean damage here.
         except Exception as error:
             self.notes.append(Note(
                 f'The summary of {printable(self.path.name)} is damaged '
@@ -274,8 +274,8 @@ class McapFile:
             return False
         end = len(MAGIC)
         for index in indexes:
-            # A chunk that is listed twice, or within another, would be read twice; what is
-            # listed nowhere would be lost.
+            # A chunk listed twice, or within another, would be read twice; an unlisted one would
+            # be lost.
             begin = index.chunk_start_offset
             if (begin < end or index.chunk_length < _HEAD.size
                     or _messages_between(file, end, begin)):
@@ -320,7 +320,7 @@ class McapFile:
                 break
 
     def _walk(self, file: BinaryIO) -> None:
-        """Read the whole file once, noting where its messages are and where it breaks."""
+        """Walk the whole file once; note the places of its messages and its damage."""
         summary = self._summary
         starts = [] if summary is None else sorted(
             index.chunk_start_offset for index in summary.chunk_indexes)
@@ -332,7 +332,7 @@ class McapFile:
                 op, length = _frame(file, at, self._size, in_data)
             except Damage as error:
                 self._break(at, error)
-                # An intact summary says where the next chunk begins.
+                # An intact summary gives the start of the next chunk.
                 place = bisect.bisect_right(starts, at)
                 if place == len(starts):
                     break
@@ -345,7 +345,7 @@ class McapFile:
                 elif op == Opcode.CHUNK:
                     self._walk_chunk(file, length)
                 elif op == Opcode.DATA_END:
-                    # What follows repeats schemas and channels for the summary.
+                    # Only repeats of schemas and channels, for the summary, follow.
                     in_data = False
                     stated = int.from_bytes(file.read(4), 'little')
                     file.seek(0)
@@ -365,7 +365,7 @@ class McapFile:
                     private.append(Break(at, f'a record of a private kind (0x{op:02x}, {length} '
                                          'bytes)'))
             except Damage as error:
-                # The frame is whole: what comes after it may be good.
+                # The frame is whole: later records may be intact.
                 self._break(at, error)
             at = end
         if op == Opcode.FOOTER:
@@ -377,7 +377,7 @@ class McapFile:
                             'end of the recording, which may be another one')
         for one in private:
             if self.breaks or counted_there is None:
-                # Nothing says that these were not messages once.
+                # These bytes may have been messages.
                 self._break(one.offset, f'{one.why}, and no count of the messages to tell that '
                             'none is missing')
             else:
@@ -401,7 +401,7 @@ class McapFile:
         return file.read(length)
 
     def _learn(self, op: int, content: bytes) -> None:
-        """Take a schema or a channel; Damage where it cannot be read, or was another before."""
+        """Register a schema or a channel; Damage if unreadable or defined differently before."""
         kind: Any = Schema if op == Opcode.SCHEMA else Channel
         found = _parse(kind, content)
         known = (self._schemas if kind is Schema else self._channels).get(found.id, found)
@@ -420,7 +420,7 @@ class McapFile:
                 self._learn(op, data[begin:end])
 
     def _learn_about(self, file: BinaryIO, length: int) -> None:
-        """Take what the metadata record whose head was just read says of the recording."""
+        """Read the metadata record whose head was just read."""
         self._metadata += length
         if self._metadata > 2 * _MOST_METADATA:
             raise Damage('the metadata records before it are too many')
@@ -436,7 +436,7 @@ class McapFile:
                     most_bytes=MOST_BYTES, most_nodes=MOST_NODES))
 
     def _add_channel(self, channel: Channel) -> None:
-        """Take a channel, once."""
+        """Register a channel, once."""
         if channel.id in self._channels:
             return
         self._channels[channel.id] = channel
@@ -470,7 +470,7 @@ class McapFile:
                          in channel.metadata.items() if key.startswith(ORIGIN)}))
 
     def _walk_chunk(self, file: BinaryIO, length: int) -> None:
-        """Count the messages of a chunk, and learn its channels."""
+        """Count the messages of a chunk and register its channels."""
         span = Span(0, 0, file.tell(), length, True)
         try:
             data = self._data(file, span)
@@ -500,14 +500,14 @@ class McapFile:
         """Count a message index to the chunk right before it."""
         size = int.from_bytes(file.read(6)[2:], 'little')
         if length < 6 or size % 16 or size != length - 6:
-            raise Damage(f'a message index of {length} bytes does not hold what it should')
+            raise Damage(f'a message index of {length} bytes is inconsistent')
         last = self.spans[-1] if self.spans else None
         if last is not None and last.chunk and (
                 last.offset + last.length + last.index_length == at):
             self.spans[-1] = last._replace(index_length=last.index_length + _HEAD.size + length)
 
     def _add_span(self, table: Table, span: Span) -> None:
-        """Add the messages of a span to what is known."""
+        """Add the messages of a span to the index."""
         keys, counts = np.unique(table.channel, return_counts=True)
         for key, n in zip(keys.tolist(), counts.tolist()):
             if key not in self._channels and self._summary is not None and (
@@ -550,7 +550,7 @@ class McapFile:
         return data
 
     def _check_times(self, data: bytes, places: IntArray, span: Span) -> None:
-        """Check that a chunk is of the time by which its index has it found."""
+        """Check that the times of a chunk agree with its index."""
         times = gather(data, places + _HEAD.size + 6, '<u8')
         if span.unpacked and times.size and (
                 int(times.max()) > span.end_ns or int(times.min()) < span.start_ns):
@@ -578,11 +578,11 @@ class McapFile:
                     raise InputError(
                         f'{self.path} is damaged at byte {span.offset - _HEAD.size}: the chunk '
                         f'there is broken ({error}) ({moment(span.start_ns, self.origin_ns)}); '
-                        'use --partial to take what it still holds') from error
+                        'use --partial to read the intact part') from error
                 blocks.append(data)
                 places.append(found + size)
                 size += len(data)
-        # One table of many small chunks costs what one of them does.
+        # One table of many small chunks costs as much as one chunk.
         table = _table(b''.join(blocks), np.concatenate(places))
         topics: dict[str, npt.NDArray[np.bool_]] = {}
         channels = self.channels_of(wanted)
@@ -597,10 +597,10 @@ class McapFile:
 
 
 class _Strict(ReadDataStream):
-    """The library's stream, which does not take the rest of a record for all of a text."""
+    """The library's stream, made to refuse a text longer than its record."""
 
     def read(self, length: int) -> bytes:
-        """Return bytes, exactly so many."""
+        """Return exactly `length` bytes."""
         data: bytes = super().read(length)
         if len(data) < length:
             raise EndOfFile
@@ -620,7 +620,7 @@ def _parse(kind: Any, content: bytes) -> Any:
 
 
 def _rate(text: str) -> float | None:
-    """Return a stated rate, Hz; None when there is none that makes sense."""
+    """Return a stated rate, Hz; None if missing or implausible."""
     with suppress(ValueError):
         if 0.0 < (rate := float(text)) < math.inf:
             return rate
@@ -628,7 +628,7 @@ def _rate(text: str) -> float | None:
 
 
 def plain_texts(found: Any) -> dict[str, str]:
-    """Return what a recording says of itself as names and texts of one line each."""
+    """Return the metadata of a recording as names and texts of one line each."""
     return {printable(key, 100): printable(value, 1000)
             for key, value in list(found.items())[:1000]}
 
@@ -645,14 +645,14 @@ def custom_data(content: Any) -> dict[str, str]:
 
 
 def _frame(file: BinaryIO, at: int, size: int, in_data: bool) -> tuple[int, int]:
-    """Return opcode and length of a record that may stand there."""
+    """Return opcode and length of a record; Damage if it is not allowed there."""
     file.seek(min(at, size))
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
         raise Damage('the file ends without a footer')
     op, length = _HEAD.unpack(head)
     if op == 0 or Opcode.DATA_END < op < _PRIVATE:
-        raise Damage(f'no record begins with 0x{op:02x}')
+        raise Damage(f'no record starts with 0x{op:02x}')
     if at + _HEAD.size + length > size:
         raise Damage(f'a record of {length} bytes is cut off after {size - at - _HEAD.size}')
     if op < _PRIVATE and (op not in (_IN_DATA if in_data else _IN_SUMMARY)
@@ -680,7 +680,7 @@ def _check_attachment(file: BinaryIO, length: int) -> None:
     """Check the checksum of an attachment, whose head was just read."""
     found = _crc(file, length - 4)
     if length < 36 or int.from_bytes(file.read(4), 'little') not in (0, found):
-        raise Damage(f'an attachment of {length} bytes does not hold what it should')
+        raise Damage(f'an attachment of {length} bytes is inconsistent')
 
 
 def _crc(file: BinaryIO, length: int) -> int:
@@ -693,7 +693,7 @@ def _crc(file: BinaryIO, length: int) -> int:
 
 
 def _decompressed(compression: str, data: bytes, stated: int) -> bytes:
-    """Return the content of a chunk; never more memory than it states, whatever it holds."""
+    """Return the content of a chunk, in at most the memory that it states."""
     if compression == 'zstd':
         size = zstandard.frame_content_size(data)
         if size not in (-1, stated):
@@ -708,7 +708,7 @@ def _decompressed(compression: str, data: bytes, stated: int) -> bytes:
     elif compression == '':
         plain = data
     else:
-        # The library takes what it does not know for plain bytes.
+        # The library treats unknown compressions as plain bytes.
         raise Damage(f"unknown compression '{compression}'")
     return plain
 
@@ -716,7 +716,7 @@ def _decompressed(compression: str, data: bytes, stated: int) -> bytes:
 def _records(data: bytes, *, messages_only: bool = False, at: int = 0, end: int | None = None,
              ) -> tuple[IntArray, list[tuple[int, int, int]], int]:
     """
-    Return where records of messages begin in a block, the others, and where whole ones end.
+    Return the starts of message records in a block, the other records, and the end of the last.
 
     The others are (opcode, begin, end) of the content.
     """
@@ -739,7 +739,7 @@ def _records(data: bytes, *, messages_only: bool = False, at: int = 0, end: int 
             break
         else:
             if len(others) == _MOST_OTHERS:
-                raise Damage(f'more than {_MOST_OTHERS} records in it are no messages')
+                raise Damage(f'more than {_MOST_OTHERS} records in it are not messages')
             others.append((op, at + head, behind))
         at = behind
     return np.frombuffer(places, np.int64) if places else np.empty(0, np.int64), others, at
@@ -790,7 +790,7 @@ def _by_index(data: bytes, index: bytes) -> tuple[IntArray, list[tuple[int, int,
 
 
 def _table(data: bytes, at: IntArray) -> Table:
-    """Return the messages whose records begin at given offsets."""
+    """Return the messages whose records start at given offsets."""
     length = gather(data, at + 1, '<u8').astype(np.int64)
     return Table(data, gather(data, at + _HEAD.size, '<u2'), gather(data, at + _HEAD.size + 6,
                  '<u8'), at + _DATA, at + _HEAD.size + length)
@@ -813,7 +813,7 @@ _FOREIGN = {
 
 
 def kind_of_foreign(head: bytes, path: Path = Path('LOG')) -> str:
-    """Return what a file that is not MCAP seems to be, and what to do with it."""
+    """Return the likely kind of a file that is not MCAP, and what to do with it."""
     if head.startswith(b'SQLite format 3'):
         return ("it is an SQLite rosbag2 (.db3): convert it with 'ros2 bag convert' to the "
                 'storage mcap')

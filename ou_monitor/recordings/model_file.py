@@ -1,10 +1,9 @@
 """
 Model files: the terms of a supply as YAML.
 
-`model:` is a list of terms, each `{term: NAME, params: {...}, se: {...}}`, the
-first being `ou`; `load:`, where it is, is what the load filter knows at take-off;
-`provenance:` tells where it comes from.  Written by
-`discover`, read by `simulate` and by the estimator node.
+`model:` is a list of terms, each `{term: NAME, params: {...}, se: {...}}`, the first being `ou`;
+`load:` (optional) is the start of the load filter at take-off; `provenance:` is free text.
+Written by `discover`, read by `simulate` and by the estimator node.
 """
 
 from __future__ import annotations
@@ -31,12 +30,11 @@ _EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d{1,3}')
 
 @dataclass(frozen=True)
 class ModelFile:
-    """What a model file holds."""
+    """Content of a model file."""
 
     # The terms.
     model: SupplyModel
-    # Standard errors by parameter, one dict a term, empty where not known; in the unit of the
-    # parameter.
+    # Standard errors by parameter, one dict a term, empty if unknown; in the parameter's unit.
     se: tuple[dict[str, Any], ...] = ()
     # Recording, commit, date, held-out score; free text.
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -46,7 +44,7 @@ def read_model(path: str | Path) -> ModelFile:
     """
     Read a model file: a regular file of at most 1 MB.
 
-    The largest takes 2 to 5 s: a node reads it beside its executor, not in a callback.
+    The largest takes 2 to 5 s: a node reads it in a thread, not in a callback.
     """
     data = read_yaml(path, 'the model file')
     with one_line():
@@ -54,7 +52,7 @@ def read_model(path: str | Path) -> ModelFile:
 
 
 def parse_model(data: Any, where: str) -> ModelFile:
-    """Return the model that parsed YAML describes."""
+    """Return the model in parsed YAML."""
     if not isinstance(data, dict) or 'model' not in data:
         raise InputError(f"{where}: a model file needs 'model:', a list of terms")
     for key in data:
@@ -76,7 +74,7 @@ def parse_model(data: Any, where: str) -> ModelFile:
 
 
 def _load(entry: Any) -> LoadStart | None:
-    """Return the entry `load`; null as none at all."""
+    """Return the entry `load`; None for null."""
     if entry is None:
         return None
     if not isinstance(entry, dict):
@@ -101,7 +99,7 @@ def _term(entry: Any, where: str) -> tuple[Term, dict[str, Any]]:
             raise InputError(f"{where} ('{name}'): '{what}' must be a mapping of names to numbers")
     for key in se:
         if key not in terms[name].parameters():
-            raise InputError(f"{where} ('{name}'): 'se' names '{key}', which is no parameter: "
+            raise InputError(f"{where} ('{name}'): 'se' names '{key}', which is not a parameter: "
                              f'{nearest(str(key), terms[name].parameters())}')
     try:
         return (terms[name].read({k: _numbers(v) for k, v in params.items()}),
@@ -111,7 +109,7 @@ def _term(entry: Any, where: str) -> tuple[Term, dict[str, Any]]:
 
 
 def _numbers(value: Any) -> Any:
-    """Return a value with 1e-3 as a number: to YAML 1.1 it is text, as it has no point."""
+    """Return a value with texts such as 1e-3 as numbers (YAML 1.1 wants a point: 1.0e-3)."""
     if isinstance(value, list):
         return [_numbers(v) for v in value]
     return float(value) if isinstance(value, str) and _EXPONENT.fullmatch(value) else value

@@ -1,10 +1,9 @@
 """
-Any recording -> `Recording`: bag, CSV or log of an autopilot; and any scalar beside it.
+Read any recording (bag, CSV or autopilot log) as a `Recording`, and any scalar beside it.
 
-Limits: stamps of a bag are seconds of its own clock in float64, which for a clock
-that counts from 1970 resolves 0.24 us; more than that is not kept.  Stamps of a signal
-are those of the message's header where it has one, else the bag's log times; a voltage
-with the other kind is off by the delay of the transmission.
+Limits: stamps of a bag are float64 seconds of its own clock, with a resolution of 0.24 us for a
+clock from 1970.  A signal has the stamps of its messages' headers, or else the bag's log times;
+beside a voltage with the other kind it is off by the transmission delay.
 """
 
 from __future__ import annotations
@@ -33,10 +32,10 @@ from ou_monitor.stream.config import FieldSpec
 from ou_monitor.timeline.line import (
     in_order, MOST_THROTTLE, MOST_VOLTAGE, plausible, plausible_samples, readings_of)
 
-# Samples further apart, s, are more likely of another unit of time than of a slow logger.
+# Spacing, s, from which another unit of time is more likely than a slow logger.
 _SPARSE = 5.0
 
-# Types whose only number need not be named.
+# Types with a single number, whose field need not be named.
 _SCALARS = ('std_msgs/msg/Float32', 'std_msgs/msg/Float64')
 
 
@@ -52,22 +51,19 @@ def read_recording(
     Parameters
     ----------
     path : str or path
-        An .mcap file, a rosbag2 directory, a CSV, or a log of an autopilot that
-        `convert` reads (its extra installed).
+        An .mcap file, a rosbag2 directory, a CSV, or an autopilot log (with its extra installed).
     msg_config : str or path, optional
-        Name of a msg config, or a YAML file; found out when the bag leaves
-        one choice.
+        Name of a msg config, or a YAML file; needed if several fit the bag.
     voltage_topic, throttle_topic : str, optional
-        Topics, where the config's are not meant.
+        Topics other than the config's.
     partial : bool
-        Whether a damaged bag is read as far as it holds; a note says so.
+        Whether to read the intact part of a damaged bag, with a note.
     start, end : float, optional
-        Part to read, s after the first message of the bag (by log time) or
-        the first sample of the CSV or log: start <= t < end.  Of a bag only the
-        chunks in it are read, and those before it back to the last throttle,
-        which is held.
+        Part to read, s after the first message of the bag (by log time) or the first sample of
+        the CSV or log: start <= t < end.  Of a bag only the chunks in it are read, and earlier
+        ones back to the last throttle, which is held.
     flight : int, optional
-        Which flight of a log with several, from 1; the largest when left out.
+        Flight of a log with several, from 1; default: the largest.
     columns : CsvColumns, optional
         Names and units of the columns of a CSV; names of the series of a log.
     progress : callable, optional
@@ -76,14 +72,20 @@ def read_recording(
     Returns
     -------
     Recording
-        Stamps (s), voltage (V), throttle (0..1) and, where there is one, current (A), each of
-        shape (n,), n >= 1; what was dropped or mended is in `notes`.
+        Stamps (s), voltage (V), throttle (0..1) and, if there is one, current (A), each of shape
+        (n,), n >= 1; `notes` say what was dropped or repaired.
 
     Raises
     ------
     InputError
-        When it cannot be read, the topics cannot be told, or no sample is
-        left.
+        When the file cannot be read, several topics fit, or no sample is left.
+
+    Examples
+    --------
+    >>> from ou_monitor import read_recording
+    >>> recording = read_recording('bags/flight', start=10.0, end=20.0)
+    >>> recording.n, round(float(recording.t[-1] - recording.t[0]))
+    (10000, 10)
 
     """
     return readings_of(_read(
@@ -97,7 +99,7 @@ def _read(
     throttle_topic: str | None, partial: bool, start: float | None, end: float | None,
     flight: int | None, columns: CsvColumns | None, progress: Callable[[float], None] | None,
 ) -> Recording:
-    """Read a recording with what its logger repeats."""
+    """Read a recording with the repeats of its logger."""
     _check_part(start, end)
     topics = {'--msg-config': msg_config, '--voltage-topic': voltage_topic,
               '--throttle-topic': throttle_topic}
@@ -127,7 +129,7 @@ def _refuse_topics(path: Path, kind: str, topics: Mapping[str, object]) -> None:
 def _of_log(path: Path, names: frozenset[str], columns: CsvColumns | None, flight: int | None,
             start: float | None, end: float | None,
             progress: Callable[[float], None] | None) -> tuple[Recording, Log]:
-    """Read the supply of a log, and the log with the series of these names."""
+    """Read the supply of a log; return also the log with the named series."""
     named = columns or CsvColumns()
     if named != CsvColumns(voltage=named.voltage, throttle=named.throttle,
                            current=named.current):
@@ -146,29 +148,29 @@ def _of_log(path: Path, names: frozenset[str], columns: CsvColumns | None, fligh
 
 def _samples(recording: Recording, which: slice | npt.NDArray[np.bool_], notes: tuple[str, ...],
              ) -> Recording:
-    """Return some samples of a recording."""
+    """Return the selected samples of a recording."""
     return replace(recording, t=recording.t[which], voltage=recording.voltage[which],
                    throttle=recording.throttle[which], notes=notes,
                    current=None if recording.current is None else recording.current[which])
 
 
 def tidy(raw: RawColumns) -> Recording:
-    """Return a `Recording`: in order, each stamp once; notes say what that took."""
+    """Return a `Recording` in order, each stamp once, with notes on dropped samples."""
     name = raw.name
     check_throttle(name, raw.throttle, raw.voltage)
     t, _, _ = plausible_samples(raw.t, raw.voltage, None)
     throttle = plausible(raw.throttle, MOST_THROTTLE)
     stamps = raw.t[np.isfinite(raw.t)]
     if stamps.size and not np.isfinite(t).any():
-        raise InputError(f'{name}: its stamps, {stamps[0]:.4g} s, are those of no clock: is the '
-                         'time in ms, us or ns? --time-unit says so of a CSV')
+        raise InputError(f'{name}: stamps of {stamps[0]:.4g} s are implausible: is the time in '
+                         'ms, us or ns? Give --time-unit for a CSV')
     which, said = in_order(t, raw.voltage[:, None], MOST_VOLTAGE, ' V')
     notes, t = [*raw.notes, *said], t[which]
     if not t.size:
         raise InputError(_unusable(name, notes))
     if t.size > 2 and (spacing := float(np.median(np.diff(t)))) >= _SPARSE:
         notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '
-                     '--time-unit says so of a CSV.')
+                     'Give --time-unit for a CSV.')
     return Recording(t, raw.voltage[which], throttle[which], name, raw.source, tuple(notes),
                      known_current(raw.current[which]))
 
@@ -179,7 +181,7 @@ def _unusable(name: str, notes: Sequence[str]) -> str:
 
 
 def _check_part(start: float | None, end: float | None) -> None:
-    """Refuse a part that cannot hold anything."""
+    """Refuse an empty or negative part."""
     for name, value in (('start', start), ('end', end)):
         if value is not None and not (math.isfinite(value) and value >= 0.0):
             raise InputError(f'the {name} of the part to read must be 0 s or later, got {value} s')
@@ -206,10 +208,10 @@ def read_beside(
     columns: CsvColumns | None = None, progress: Callable[[float], None] | None = None,
 ) -> tuple[Recording, Series]:
     """
-    Read a recording, and the whole of one scalar beside it; options as for `read_recording`.
+    Read a recording, and one whole scalar beside it; options as for `read_recording`.
 
-    What its logger repeats is kept, for between two readings of the voltage the throttle goes on:
-    see `readings_of`.  A log is read once.
+    Repeats of the logger are kept, because throttle changes between readings of the voltage (see
+    `readings_of`).  A log is read once.
     """
     path = Path(path)
     if is_log(path):
@@ -231,7 +233,7 @@ def read_beside(
 
 def read_signal(path: str | Path, signal: str, *, partial: bool = False,
                 columns: CsvColumns | None = None) -> tuple[FloatArray, FloatArray]:
-    """Read one scalar over time; of a CSV `columns` says which is the time."""
+    """Read one scalar over time; `columns` names the time of a CSV."""
     path = Path(path)
     if not signal:
         raise InputError('the name of the signal is empty: TOPIC/FIELD or a column')
@@ -252,7 +254,7 @@ def read_signal(path: str | Path, signal: str, *, partial: bool = False,
 
 
 def signal_unit(path: str | Path, signal: str, *, partial: bool = False) -> str:
-    """Return the unit of a scalar of a bag; empty where nothing states it."""
+    """Return the unit of a scalar of a bag; empty if not stated."""
     path = Path(path)
     if is_csv(path):
         return ''
@@ -266,7 +268,7 @@ def signal_unit(path: str | Path, signal: str, *, partial: bool = False) -> str:
 
 
 def _has_header(bag: BagReader, topic: str) -> bool:
-    """Whether messages of a topic carry a stamp in their header."""
+    """Return whether messages of a topic carry a stamp in their header."""
     first = next(bag.decoded([topic]), None)
     header = None if first is None else getattr(first.message, 'header', None)
     return hasattr(header, 'stamp')

@@ -31,7 +31,7 @@ int32 sec
 uint32 nanosec
 """
 
-# package/msg/Type -> its definition and those of the types in it.
+# package/msg/Type -> its definition and the definitions it uses.
 SCHEMAS: dict[str, str] = {
     'std_msgs/msg/Float32': 'float32 data\n',
     'std_msgs/msg/Float64': 'float64 data\n',
@@ -203,7 +203,7 @@ def encode_imu(stamps_ns: npt.NDArray[np.int64], angular_velocity: npt.NDArray[n
     rows['sec'], rows['nanosec'] = stamps_ns // 1_000_000_000, stamps_ns % 1_000_000_000
     rows['frame_length'], rows['frame'] = 10, np.void(b'base_link\0\0\0')
     rows['orientation'][:, 3] = 1.0
-    # The message says -1 of what is not measured, and 0 of a covariance not known.
+    # By the message definition -1 means not measured, and 0 an unknown covariance.
     rows['orientation_covariance'][:, 0] = -1.0
     for name, values in (('angular_velocity', angular_velocity),
                          ('linear_acceleration', acceleration)):

@@ -42,8 +42,8 @@ SLICE = 1024
 BLOCK_RATE = 10000.0
 BLOCK = 100
 
-# An unchanged throttle is repeated this often, so that a subscriber that comes
-# late, or a bag played from the middle, knows it soon.
+# Period, s, after which an unchanged throttle is repeated, for late subscribers and bags played
+# from the middle.
 THROTTLE_PERIOD_NS = 1_000_000_000
 
 # Stamps of 64 bits with room to be moved.

@@ -1,9 +1,8 @@
 """
-What `msg_config/*.yaml` says: which topic, type and field is the voltage; and its values.
+Read `msg_config/*.yaml` (topic, type and field of a voltage), and extract values by it.
 
-One file describes one source (an autopilot bridge, an ADC driver).  Adding a
-message type is adding a file: no code.  Every mistake in a file is one line
-that names the file, the key and the nearest valid key.
+One file describes one source (an autopilot bridge, an ADC driver); a new message type needs a new
+file and no code.  An error in a file is one line with the file, the key and the nearest valid key.
 
 Extractors work on any object with attributes: rclpy messages and decoded MCAP messages.
 """
@@ -51,17 +50,17 @@ class FieldSpec:
     sign: int = 1
     # Added after scaling, SI units.
     offset: float = 0.0
-    # What NaN or infinity in the field means: noise of the transmission, to be ignored and
-    # counted ('drop'), or the driver saying "not measured" ('unknown').
+    # Meaning of NaN or infinity: a transmission error, dropped and counted ('drop'), or "not
+    # measured" ('unknown').
     nan: str = 'drop'
-    # What an exact 0 means: a value; the driver saying "not measured" ('unknown'); or that, as
-    # long as there was nothing else ('unknown_at_first').
+    # Meaning of an exact 0: 'value'; "not measured" ('unknown'); or "not measured" until another
+    # value has come ('unknown_at_first').
     zero: str = 'value'
-    # Hz; when given the field is an array, a block of samples at this rate, and the stamp is that
-    # of the LAST sample of the block.
+    # Hz; if given, the field is an array, a block of samples at this rate, and the stamp belongs
+    # to the LAST sample of the block.
     sample_rate: float | None = None
-    # Path of a builtin_interfaces/Time ('header.stamp') or of a number ('timestamp'); None takes
-    # the source timestamp of the middleware.
+    # Path of a builtin_interfaces/Time ('header.stamp') or of a number ('timestamp'); None: the
+    # middleware's source timestamp.
     stamp_field: str | None = None
     # Seconds per unit of a numeric stamp (1e-6 for microseconds).
     stamp_factor: float = 1.0
@@ -69,7 +68,7 @@ class FieldSpec:
 
 @dataclass(frozen=True)
 class MsgConfig:
-    """One source of voltage, and of throttle where it has one."""
+    """One source of voltage, with its throttle, current and motor speeds if it has them."""
 
     # Name of the file without its ending.
     name: str
@@ -79,21 +78,20 @@ class MsgConfig:
     package: str
     # What to install when that package is missing.
     install: str
-    # Whether the topics are ours (relative, to be remapped) rather than those of a certain driver.
+    # Whether the topics are relative, to be remapped, rather than fixed by a driver.
     generic: bool
     # Where the voltage is, V.
     voltage: FieldSpec
     # Where the throttle is, 0..1.
     throttle: FieldSpec | None
-    # Where in the messages of the voltage the current drawn is, A.
+    # Where the current drawn is, A, in the messages of the voltage.
     current: FieldSpec | None = None
     # Where the speeds of the motors are, 1/min of the shaft unless `notch.rpm_unit` says
     # otherwise; the field may be an array, or name each element of one, 'esc[].esc_rpm'.
     rpm: FieldSpec | None = None
 
 
-# What each key holds, as (accepted YAML types, word for it); the kinds of
-# FieldSpec and MsgConfig, for a YAML has no types of its own.
+# Accepted YAML types of each key of FieldSpec and MsgConfig, and a word for them.
 _NUMBER = ((int, float), 'a number')
 _TEXT = ((str,), 'text')
 _FIELD_KINDS: dict[str, tuple[tuple[type, ...], str]] = {
@@ -128,7 +126,7 @@ def parse_field_path(path: str) -> FieldPath:
 
 
 def parse_each_path(path: str) -> tuple[FieldPath, FieldPath | None]:
-    """Split 'esc[].rpm' into the path of an array and that in each element; else with None."""
+    """Split 'esc[].rpm' into the array's path and the path in an element (None without '[]')."""
     array, each, rest = path.partition('[]')
     if not each:
         return parse_field_path(path), None
@@ -140,9 +138,8 @@ def msg_config_dir() -> Path:
     """
     Return the folder of the shipped msg configs.
 
-    In a source tree it lies beside the package; installed (colcon, a virtual
-    environment, /usr/local) it is ``share/ou_monitor/msg_config`` of the
-    prefix, found by walking up from this file.
+    In a source tree it is beside the package; installed (colcon, a virtual environment,
+    /usr/local) it is ``share/ou_monitor/msg_config`` of the prefix, found by walking up.
     """
     here = Path(__file__).resolve()
     root = here.parents[2]
@@ -188,7 +185,7 @@ def _load(path: Path) -> MsgConfig:
         top = _checked(content, _CONFIG_KINDS, _CONFIG_NEEDED, where)
         throttle, current, rpm = (top.get(key) for key in ('throttle', 'current', 'rpm'))
         if current is not None:
-            # It is read from the messages of the voltage, with their stamps.
+            # The current comes from the messages of the voltage, with their stamps.
             shared = ('topic', 'type', 'stamp_field', 'stamp_factor')
             current = {**{key: top['voltage'][key] for key in shared if key in top['voltage']},
                        'nan': 'unknown', **current}
@@ -205,22 +202,22 @@ def _checked(
     content: Any, kinds: Mapping[str, tuple[tuple[type, ...], str]],
     needed: tuple[str, ...], where: str,
 ) -> dict[str, Any]:
-    """Return the group of keys when every key and kind is known, or say which is not."""
+    """Return the group of keys; InputError names the first wrong one."""
     if not isinstance(content, dict):
         raise InputError(f"{where}: expected keys ({', '.join(kinds)}), found none")
     for key, value in content.items():
         if key not in kinds:
             shown = printable(key, 60)
-            # The keys of a file that is none of ours are not told.
+            # Do not quote keys of a file that is probably no msg config.
             name = '' if closest(shown, kinds) is None else f" '{shown}'"
             raise InputError(f'{where}: unknown key{name}: {nearest(shown, kinds)}')
         accepted, word = kinds[key]
-        # In Python true is an int; in a YAML it is never meant as a number.
+        # In Python true is an int; in YAML it is not a number.
         wrong_bool = isinstance(value, bool) and bool not in accepted
         if wrong_bool or not isinstance(value, accepted):
             hint = ''
             if isinstance(value, str) and float in accepted:
-                # YAML 1.1 takes 1e-3 for text; 1.0e-3 is a number.
+                # YAML 1.1 reads 1e-3 as text, 1.0e-3 as a number.
                 hint = ' (a number with an exponent needs a point: 1.0e-3)'
             raise InputError(f"{where}: '{key}' must be {word}, found "
                              f'{printable(repr(value), 60)}{hint}')
@@ -260,8 +257,7 @@ def _field_spec(content: Any, where: str,
             raise InputError(
                 f"{where}: '{key}' must be above 0 (use sign: -1 to invert), "
                 f'found {getattr(spec, key)}')
-    # A malformed path is better told now, with the file's name, than at the
-    # first message.
+    # Report a malformed path now, with the file's name, rather than at the first message.
     for key, parsed in (('field', parse), ('stamp_field', parse_field_path)):
         path = getattr(spec, key)
         if path is not None:
@@ -273,13 +269,13 @@ def _field_spec(content: Any, where: str,
 
 
 class ZeroRule:
-    """Makes NaN of zeros that are none, as a msg_config's `zero` says."""
+    """Turns zeros that mean "not measured" into NaN, by a msg_config's `zero`."""
 
     def __init__(self, rule: str) -> None:
         self._rule = rule
 
     def apply(self, values: FloatArray) -> FloatArray:
-        """Return values in order of arrival, zeros that are none as NaN."""
+        """Return values, in order of arrival, with such zeros as NaN."""
         if self._rule == 'value':
             return values
         nothing = values == 0.0
@@ -293,21 +289,21 @@ class ZeroRule:
 
 @dataclass(frozen=True, eq=False)
 class Extracted:
-    """What one message said."""
+    """Stamp and values of one message."""
 
-    # Stamp, s (of the LAST sample of a block); None when the message has none, or a zero one: take
-    # the source timestamp of the middleware.
+    # Stamp, s (of the LAST sample of a block); None where it is missing or zero: use the
+    # middleware's source timestamp.
     stamp: float | None
-    # Values in SI units, in order.  With the rule ``drop`` a number that is not finite is left out
-    # (n may be 0); with ``unknown``, and in blocks (where every sample holds its place on the time
-    # line), it is NaN; shape (n,).
+    # Values in SI units, in order, shape (n,).  Numbers that are not finite are left out with the
+    # rule ``drop`` (n may be 0); with ``unknown``, and in blocks, whose samples keep their places
+    # in time, they are NaN.
     values: FloatArray
-    # Numbers that were not finite, or not there.
+    # Number of values that were not finite, or missing.
     missing: int
 
 
 class Extractor:
-    """Takes one field and its stamp out of messages of one type; InputError: malformed path."""
+    """Extracts one field and its stamp from messages of one type; InputError: malformed path."""
 
     def __init__(self, spec: FieldSpec) -> None:
         """Prepare the paths once; messages arrive at kHz."""
@@ -323,7 +319,7 @@ class Extractor:
         raw = self._value(msg)
         if raw is None:
             return Extracted(stamp, np.empty(0), 1)
-        # A damaged message may hold a signalling NaN, of which NumPy would warn.
+        # A damaged message may hold a signalling NaN, which makes NumPy warn.
         with np.errstate(invalid='ignore'):
             values = self._zero.apply(self._numbers(raw) * self._scale + self.spec.offset)
         finite = np.isfinite(values)
@@ -355,7 +351,7 @@ class Extractor:
         return values
 
     def _read_stamp(self, raw: Any) -> float | None:
-        """Return a stamp in seconds, or None for "no stamp" (zero)."""
+        """Return a stamp in seconds; None for zero, which means "no stamp"."""
         if raw is None:
             return None
         if hasattr(raw, 'sec') and hasattr(raw, 'nanosec'):
@@ -365,11 +361,11 @@ class Extractor:
         else:
             raise InputError(
                 f"stamp_field '{self.spec.stamp_field}' of {self.spec.type} is a "
-                f'{type(raw).__name__}: neither a builtin_interfaces/Time nor a number')
+                f'{type(raw).__name__}, not a builtin_interfaces/Time or a number')
         return seconds if math.isfinite(seconds) and seconds != 0.0 else None
 
     def _getter(self, path: str) -> Callable[[object], Any]:
-        """Return a function from message to the content at `path`."""
+        """Return a function that reads `path` from a message."""
         steps = parse_field_path(path)
         names = [step for step in steps if isinstance(step, str)]
         if len(names) == len(steps):
@@ -407,9 +403,9 @@ class Extractor:
 
 class ManyExtractor:
     """
-    Takes several numbers out of messages of one type: a number, an array, or a field of each.
+    Extracts several numbers: a number, an array, or a field of each element of an array.
 
-    'esc[].esc_rpm' is that field of each element of `esc`.  InputError when a path is malformed.
+    'esc[].esc_rpm' is the field `esc_rpm` of each element of `esc`.  InputError: malformed path.
     """
 
     def __init__(self, spec: FieldSpec) -> None:
@@ -418,7 +414,7 @@ class ManyExtractor:
         self._walker = Extractor(replace(spec, field=spec.field.partition('[]')[0]))
 
     def extract(self, msg: object) -> FloatArray:
-        """Return the values of one message in SI units, shape (n,); NaN: not known."""
+        """Return the values of one message in SI units, shape (n,); NaN: unknown."""
         path = self.spec.field
         raw = self._walker.walk(msg, self._array, path)
         if raw is None:

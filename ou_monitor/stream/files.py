@@ -1,9 +1,8 @@
 """
-Files that users name, within limits: regular ones only, and YAML of bounded size and shape.
+Files named by users: regular ones only, and YAML of bounded size and shape.
 
-A FIFO, a device or a file without end is refused before a byte of it is read.  What is
-said of YAML that cannot be loaded is one line of at most 300 characters, and quotes
-nothing of the file: the file may not have been meant for us.
+A FIFO or a device is refused before a byte is read.  Errors about YAML are one line of at most
+300 characters and quote nothing of the file, which may have been named by mistake.
 """
 
 from __future__ import annotations
@@ -20,19 +19,17 @@ from ou_monitor.errors import InputError
 from ou_monitor.text import printable
 import yaml
 
-# Longest line about a file, and how much of it may be the path.
+# Maximum length of an error line, and of the path in it.
 MOST_CHARACTERS = 300
 _MOST_OF_PATH = 150
 
-# A model file has some kB, a msg config less.  PyYAML takes 2 to 5 s for so much.
+# Maximum size of a YAML file: a model file has some kB.  PyYAML takes 2 to 5 s for 1 MB.
 MOST_BYTES = 1_000_000
-# Aliases count as often as they stand for something: a mapping that is named a
-# hundred times in lists of a hundred is a bomb, whatever its size in bytes.
+# Maximum number of values with aliases expanded, against "billion laughs" files; depth; aliases.
 MOST_NODES = 20_000
 MOST_DEPTH = 64
 MOST_ALIASES = 100
-# The greatest float64 has 309 digits before the point; a number of more is a mistake,
-# and turning digits into an integer costs their square.
+# Maximum digits of a number: the largest float64 has 309, and conversion costs their square.
 MOST_DIGITS = 400
 
 
@@ -43,9 +40,9 @@ def path_words(path: str | Path) -> str:
 
 def open_regular(path: str | Path) -> BinaryIO:
     """
-    Open a regular file for reading, whatever waits behind the path.
+    Open a regular file for reading, without waiting for a FIFO's writer.
 
-    Never waits for a FIFO's writer.  Raises OSError, also for what is not a regular file.
+    Raises OSError, also if it is not a regular file.
     """
     file = open(path, 'rb', opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -99,7 +96,7 @@ def parse_yaml(text: str, where: str, *, most_bytes: int = MOST_BYTES,
 
 @contextmanager
 def one_line() -> Iterator[None]:
-    """Bound the length of what is raised about the content of a YAML file."""
+    """Limit the length of an InputError about the content of a YAML file."""
     try:
         yield
     except InputError as error:
@@ -107,7 +104,7 @@ def one_line() -> Iterator[None]:
 
 
 def _without_content(error: yaml.MarkedYAMLError) -> str:
-    """Return where and why YAML is wrong; PyYAML quotes the file in what is cut off."""
+    """Return the place and reason of a YAML error, without PyYAML's quotes of the file."""
     why = re.split(r'[\'":<]|,? but found', error.problem or '')[0].strip()
     if why in ('', 'found character', 'expected'):
         why = 'something cannot stand there'
@@ -122,11 +119,11 @@ class _BoundedLoader(yaml.SafeLoader):
         super().__init__(text)
         self._most_nodes = most_nodes
         self._nodes = self._depth = self._aliases = 0
-        # Anchor -> nodes that it stands for; one that is still open is not in it.
+        # Anchor -> number of nodes it expands to; anchors still open are not in it.
         self._sizes: dict[str, int] = {}
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Compose a node, counting what it adds."""
+        """Compose a node and count it, with aliases expanded."""
         event = self.peek_event()
         if isinstance(event, yaml.AliasEvent):
             self._aliases += 1
@@ -148,14 +145,14 @@ class _BoundedLoader(yaml.SafeLoader):
         return node
 
     def construct_object(self, node: Any, deep: bool = False) -> Any:
-        """Construct a node; a number of too many digits, or a false date, has its place named."""
+        """Construct a node; refuse numbers of too many digits and impossible values."""
         if isinstance(node, yaml.ScalarNode) and len(node.value) > MOST_DIGITS and (
                 node.tag in ('tag:yaml.org,2002:int', 'tag:yaml.org,2002:float')):
             self._refuse(f'a number has more than {MOST_DIGITS} digits', node)
         try:
             return super().construct_object(node, deep)
         except (ValueError, OverflowError, TypeError, LookupError, AttributeError):
-            # PyYAML lets through what Python says of a value with a tag that does not fit.
+            # PyYAML passes on Python's errors for a value that does not fit its tag.
             self._refuse('a value does not exist or does not fit its tag', node)
 
     def _count(self, nodes: int, at: Any) -> None:

@@ -1,24 +1,20 @@
 """
 Messages -> samples in order, throttle beside each, ready for the monitor.
 
-The nodes hand over messages, when they were sent, and by number who sent them.  Limits first: what
-has been handed to the monitor stays; throttle that arrives after that, with a stamp before it,
-counts for later samples only.  Publishers are told apart by the numbers that each gives its
-messages, for rclpy does not say who sent one; two whose numbers and times agree to a message
-cannot be told apart.
+Publishers: rclpy does not report the sender, so the sequence numbers of the messages tell
+publishers apart; two with equal numbers and times cannot be told apart.
 
-Which throttle held when a sample was taken is one rule, for node and bench alike.  A throttle
-holds from its own stamp on, as long as its clock is the voltage's; where the clocks differ it
-holds from the next voltage message on.  The clocks are compared at each throttle message, with
-the newest voltage stamp that had arrived by then.  A throttle holds for ever; whether it is too
-old to be believed is for the caller to say, who knows what "now" is.
+Throttle: one rule for node and bench.  A throttle holds from its own stamp on if its clock is the
+voltage's, otherwise from the next voltage message on.  The clocks are compared at each throttle
+message, with the newest voltage stamp received by then.  A throttle holds for ever; the caller,
+who knows the present time, decides when it is too old.  Samples handed to the monitor are final: a
+throttle that arrives later applies to later samples only.
 
-A block of ADC samples carries one stamp, of its last sample, and that is an *arrival* time: late
-by what the bus and the scheduler took, some milliseconds, different for every block.  The samples
-themselves are taken by a quartz at a steady rate: so their time line runs at the stated rate and
-only leans slowly towards the stamps.  A constant delay of arrival stays in it; one lost block
-(within max(2 blocks, 0.25 s)) cannot be told from jitter, is not counted as a gap, and is made up
-slowly.
+Blocks: the stamp of a block of ADC samples is the *arrival* time of its last sample, late by some
+milliseconds of bus and scheduler that vary from block to block.  A quartz times the samples
+themselves, so their time line runs at the stated rate and drifts only slowly towards the stamps.
+A constant delay stays; one lost block (within max(2 blocks, 0.25 s)) looks like jitter, is not
+counted as a gap, and is made up slowly.
 """
 
 from __future__ import annotations
@@ -38,27 +34,27 @@ if TYPE_CHECKING:
     from ou_monitor.online.monitor import SupplyMonitor
 
 
-# A stamp is of the clock by which messages are received when it lies no further ahead of that
-# clock, and no further behind, s: what unsynchronized clocks, and queues, make.
+# Largest lead and lag of a stamp that is taken from the receiver's clock, s: unsynchronized clocks
+# and queues.
 AHEAD, BEHIND = 0.25, 5.0
-# Once it was, a delay up to this, s, is one; no queue holds ten minutes.
+# Largest delay once the clock is known, s: no queue holds ten minutes.
 MOST_DELAY = 600.0
-# A publisher that sends nothing for so long, s, while another does is followed no more.
+# Silence of the followed publisher, s, after which another one is followed.
 GIVE_UP = 1.0
-# Intervals from which on a silence may be a pause of the publisher.
+# Silence, in message intervals, that may be a pause of the publisher rather than a loss.
 PAUSE = 10.0
-# Tracks kept beyond the publishers that there are, until a batch is over.
+# Tracks kept beyond the number of publishers, until the end of a batch.
 _MORE = 4
-# Share of a new interval in the interval of a publisher.
+# Weight of a new interval in the mean interval of a publisher.
 _LEARN = 0.05
 
 
 class SourceClock:
     """
-    Age of the newest sample, counted from its stamp where that is of our clock.
+    Age of the newest sample, from its stamp if it was taken from the node's clock.
 
-    `name` is 'ros' for stamps of the node's clock, 'foreign' where only the arrival counts, and
-    'unknown' before anything has arrived.
+    `name` is 'ros' for stamps of the node's clock, 'foreign' if only the arrival counts, and
+    'unknown' before the first message.
     """
 
     def __init__(self) -> None:
@@ -68,10 +64,9 @@ class SourceClock:
 
     def take(self, stamps: FloatArray, received: FloatArray, arrived: float) -> None:
         """
-        Take samples.
+        Register samples: stamps and times of reception on the node's clock, s.
 
-        Stamps, and when they were received on the node's clock, s; arrived: when the last of
-        them was, on the monotonic clock, s.
+        arrived: arrival of the last one on the monotonic clock, s.
         """
         newest = int(np.argmax(stamps))
         delay = float(received[newest] - stamps[newest])
@@ -94,7 +89,7 @@ class SourceClock:
 
 @dataclass
 class _Track:
-    """The messages of one publisher: number, time and arrival of the last, and the interval."""
+    """One publisher: number, time and arrival of its last message, and its mean interval."""
 
     number: int
     time: float
@@ -102,19 +97,19 @@ class _Track:
     interval: float = math.nan
 
     def off(self, number: int, time: float) -> float:
-        """Return how many messages a message lies off what is expected of this publisher."""
+        """Return the deviation of a message from this publisher's expected number, messages."""
         if number <= self.number or time < self.time:
             return math.inf
         step = number - self.number
         if math.isnan(self.interval) or self.interval <= 0.0:
             return float(step - 1)
         expected = (time - self.time) / self.interval
-        # Behind a silence either messages were lost, or (less likely by half a message) none was
+        # After a silence either messages were lost, or (less likely, by half a message) none was
         # sent.
         return min(abs(step - expected), step - 0.5 if expected > PAUSE else math.inf)
 
     def take(self, number: int, time: float, arrived: float) -> None:
-        """Take a message."""
+        """Update the track by a message."""
         if number > self.number:
             interval = (time - self.time) / (number - self.number)
             self.interval = interval if math.isnan(self.interval) else (
@@ -124,10 +119,10 @@ class _Track:
 
 class Publishers:
     """
-    Follows the first of several publishers of one topic, and counts what is lost of it.
+    Follows the first of several publishers of one topic, and counts its lost messages.
 
-    `lost`: its messages that never came, by their numbers; `foreign`: those of others; `numbered`:
-    whether the middleware numbers messages: without, nothing is known of either.
+    `lost`: messages missing from its sequence numbers; `foreign`: messages of others; `numbered`:
+    whether the middleware numbers messages (if not, both are unknown).
     """
 
     def __init__(self) -> None:
@@ -138,10 +133,10 @@ class Publishers:
     def follow(self, numbers: list[int | None], times: FloatArray, arrived: FloatArray,
                publishers: int) -> npt.NDArray[np.bool_]:
         """
-        Return which messages are those of the publisher followed.
+        Return which messages are from the followed publisher.
 
-        Numbers of the messages, when they were sent and when they arrived, s; `publishers`: how
-        many there are just now.
+        numbers: sequence numbers; times and arrived: sending and arrival, s; publishers: their
+        present number.
         """
         kept = np.ones(len(numbers), dtype=np.bool_)
         if not numbers:
@@ -152,7 +147,7 @@ class Publishers:
         whole = np.array(numbers, dtype=np.int64)
         if publishers <= 1 and self._tracks and (
                 arrived[0] - max(track.arrived for track in self._tracks) > GIVE_UP):
-            # The only one begins anew behind a silence: whoever else was here is gone.
+            # The only publisher restarts after a silence: all others are gone.
             del self._tracks[1:]
         if publishers <= 1 and len(self._tracks) <= 1:
             self._alone(whole, times, arrived)
@@ -165,13 +160,12 @@ class Publishers:
 
     def _give_up(self, publishers: int) -> None:
         """
-        Forget who is gone, and follow another where the one followed sends nothing.
+        Forget publishers that are gone; follow another if the followed one is silent.
 
-        Only after all that came: behind a stall, when nobody was heard, the first message may be
-        anybody's.
+        Only after the whole batch: after a stall the first message may be from any of them.
         """
         while len(self._tracks) > max(publishers, 2):
-            # Somebody began anew: who has been silent for longest is gone.
+            # A publisher has restarted: the one that has been silent longest is gone.
             gone = min(range(len(self._tracks)), key=lambda k: self._tracks[k].arrived)
             del self._tracks[gone]
             if gone == 0:
@@ -182,7 +176,7 @@ class Publishers:
 
     def _alone(self, numbers: npt.NDArray[np.int64], times: FloatArray, arrived: FloatArray
                ) -> None:
-        """Take messages of the only publisher; numbers that begin anew are a new one."""
+        """Register messages of the only publisher; numbers that start again are a new one."""
         if self._tracks:
             steps = np.diff(numbers, prepend=self._tracks[0].number)
             self.lost += int(np.sum(steps[steps > 0] - 1))
@@ -199,10 +193,10 @@ class Publishers:
                                      track.interval)
 
     def _one(self, number: int, time: float, arrived: float, publishers: int) -> bool:
-        """Assign one message; return whether it is of the publisher followed."""
+        """Assign one message to a publisher; return whether it is the followed one."""
         off = [track.off(number, time) for track in self._tracks]
         best = min(range(len(off)), key=off.__getitem__, default=-1)
-        # A number that fits nobody well is a newcomer's, as long as not all have been heard.
+        # A number that fits no track well belongs to a publisher not seen yet, if there is one.
         new = best < 0 or off[best] == math.inf or (
             len(self._tracks) < publishers and off[best] > 0.5 * max(
                 10, self._tracks[best].number))
@@ -222,22 +216,21 @@ class Publishers:
 
 BoolArray = npt.NDArray[np.bool_]
 
-# The time line leans towards the stamps with this time constant.  5 ms of
-# jitter then changes the spacing by at most 5e-4 (0.05 us at 10 kHz), and a
-# clock that is wrong by 100 ppm is followed 1 ms behind.
+# Time constant with which the time line follows the stamps.  5 ms of jitter then changes the
+# spacing by at most 5e-4 (0.05 us at 10 kHz); a clock error of 100 ppm is followed 1 ms behind.
 FOLLOW = 10.0  # s
 
-# A difference beyond this, and beyond two blocks, is a real gap: a busy
-# companion computer holds blocks back by some 100 ms and then sends them all.
+# Difference from which (and from two blocks) there is a gap: a busy companion computer delays
+# blocks by about 100 ms and then sends them all.
 GAP_LEAST = 0.25  # s
 
 
 class BlockClock:
     """
-    Turns the stamps of blocks into stamps of samples of a rate, Hz.
+    Turns the stamps of blocks into stamps of samples at a rate, Hz.
 
-    `gaps` counts when the time line was started anew, because a stamp was further than
-    max(2 blocks, 0.25 s) from where it was expected.
+    `gaps` counts restarts of the time line, after a stamp more than max(2 blocks, 0.25 s) from
+    its expected place.
     """
 
     def __init__(self, sample_rate: float) -> None:
@@ -246,14 +239,13 @@ class BlockClock:
             raise ValueError(f'sample_rate must be positive and finite, got {sample_rate} Hz')
         self.gaps = 0
         self._dt = 1.0 / sample_rate
-        # The time line as seconds since an anchor: added up on a clock that
-        # counts from 1970 they would be rounded to 0.24 us at every block, always
-        # the same way.
+        # Seconds since an anchor: sums on a clock from 1970 would be rounded to 0.24 us at every
+        # block, always the same way.
         self._anchor: float | None = None
         self._elapsed = 0.0
 
     def reset(self) -> None:
-        """Forget the time line, as after a clock that jumped back; not a gap."""
+        """Forget the time line, as after a clock that jumped back; this is not a gap."""
         self._anchor = None
 
     def stamps(self, end_stamp: float, n: int) -> FloatArray:
@@ -296,8 +288,7 @@ class BlockClock:
             start = self._elapsed
             error = (end_stamp - self._anchor) - (start + length)
             if abs(error) <= max(2.0 * length, GAP_LEAST):
-                # The correction is spread over the block, so that no step
-                # shows where two blocks meet.
+                # Spread the correction over the block, so that blocks join without a step.
                 lean = error * -math.expm1(-length / FOLLOW)
                 self._elapsed = start + length + lean
                 return start, 1, (length + lean) / n
@@ -306,20 +297,19 @@ class BlockClock:
         return 0.0, 1 - n, self._dt
 
 
-# Stamps of voltage and throttle further apart than this, s, come from two clocks (an autopilot's
-# boot time and a wall clock differ by years).
+# Distance of voltage and throttle stamps, s, from which their clocks differ (an autopilot's boot
+# time and a wall clock differ by years).
 APART = 5.0
-# The same where only one of the two carries a stamp of its own, and the other is known by when it
-# was sent or logged: transmission takes milliseconds, and unsynchronized clocks may differ by
-# little.
+# The same, s, if only one of the two has its own stamp and the other its time of sending or
+# logging: transmission takes milliseconds, and unsynchronized clocks may differ by little.
 APART_MIXED = 0.25
-# Stamps within a block are computed, and may be a rounding short of a throttle that was meant to
-# hold for that sample: this share of a step is allowed for.
+# Tolerance of a sample's stamp against a throttle's, as a share of a step: stamps within a block
+# are computed and may be a rounding too early.
 SLACK = 0.1
 
 
 class ThrottleHold:
-    """Places throttle on the time line of the voltage (blocks: rate, Hz), and looks it up."""
+    """Throttle on the time line of the voltage (sample_rate of blocks, Hz)."""
 
     def __init__(self, sample_rate: float | None = None) -> None:
         self._slack = 0.0 if sample_rate is None else SLACK / sample_rate
@@ -330,11 +320,11 @@ class ThrottleHold:
              voltage_stamps: FloatArray, voltage_own: BoolArray,
              before: npt.NDArray[np.int64]) -> None:
         """
-        Take the throttle values and the voltage messages that have arrived since the last call.
+        Register the throttle values and voltage messages received since the last call.
 
-        Both in order of arrival: stamps in s (NaN: not known), `own` where a message carries its
-        stamp, and `before` the number of these voltage messages ahead of each throttle value.
-        At least one voltage message must have come, now or earlier.
+        Both in order of arrival: stamps in s (NaN: unknown), `own` whether a message carries its
+        stamp, `before` the number of these voltage messages ahead of each throttle value.  At
+        least one voltage message must have arrived, now or earlier.
         """
         newest = np.maximum.accumulate(np.concatenate([[self._newest], voltage_stamps]))
         owns = np.concatenate([[self._own], voltage_own])
@@ -342,13 +332,13 @@ class ThrottleHold:
             after, after_own = newest[before], owns[before]
             compared = after
             if self._newest == -math.inf:
-                # No voltage had come: the first one to come tells.
+                # No voltage had arrived: compare with the first one that does.
                 early = before == 0
                 compared = np.where(early, voltage_stamps[0], after)
                 after_own = np.where(early, voltage_own[0], after_own)
             apart = np.where(own == after_own, APART, APART_MIXED)
             one_clock = np.abs(stamps - compared) <= apart
-            # By arrival: behind the newest voltage, and behind each throttle before.
+            # By arrival: after the newest voltage and after each earlier throttle.
             least = self._places[-1] if self._places.size else -math.inf
             latest = np.maximum.accumulate(np.concatenate([[least], np.where(
                 one_clock, stamps, np.nextafter(after + 2.0 * self._slack, math.inf))]))[1:]
@@ -359,22 +349,22 @@ class ThrottleHold:
         self._newest, self._own = float(newest[-1]), bool(owns[-1])
 
     def at(self, t: FloatArray) -> FloatArray:
-        """Return the throttle that held at each stamp, s; NaN where none was known."""
+        """Return the throttle at each stamp, s; NaN before the first one."""
         asked = t + self._slack
         places, values = self._places, np.append(np.nan, self._values)
         if places.size < asked.size and (asked[1:] >= asked[:-1]).all():
-            # Both in order, and throttles are few: from which sample on each one holds.
+            # Both in order, few throttles: find the first sample of each.
             first = np.searchsorted(asked, places, 'left')
             return np.repeat(values, np.diff(np.concatenate([[0], first, [asked.size]])))
         return values[np.searchsorted(places, asked, 'right')]
 
     def forget_before(self, t: float) -> None:
-        """Let go of the values that no sample from `t` on, s, can be paired with."""
+        """Drop the values that no sample from `t` (s) on can need."""
         past = max(int(np.searchsorted(self._places, t + self._slack, 'right')) - 1, 0)
         self._places, self._values = self._places[past:], self._values[past:]
 
     def restart(self, value: float = math.nan) -> None:
-        """Begin a new time line of the voltage, in which `value` holds from the beginning."""
+        """Start a new time line of the voltage, in which `value` holds from the start."""
         self._places, self._values = np.array([-math.inf]), np.array([value])
         self._newest, self._own = -math.inf, False
 
@@ -383,19 +373,19 @@ class ThrottleHold:
         return int(self._places.size)
 
 
-# A stamp that is older than the newest by more than this, s, is a clock or a bag that went back.
-# One publisher's messages arrive in order; what several interleave is milliseconds.
+# Backward step of a stamp, s, from which a clock or a bag went back.  One publisher's messages
+# arrive in order; interleaved publishers differ by milliseconds.
 BACK = 0.1
-# Throttle values kept until a voltage follows them: 20 s of a 50 Hz stick, or 1 s of a 1 kHz one.
+# Throttle values kept until the next voltage: 20 s of a 50 Hz stick, or 1 s at 1 kHz.
 KEEP = 1024
 
 
 class SampleStream:
     """
-    Collects samples between two reports, for the monitor; throttle is paired at each `flush`.
+    Collects samples between two reports for the monitor; throttle is paired at each `flush`.
 
-    `messages` of voltage were taken, `unplaced` could not be placed in time (`/clock` not there
-    yet) and only the floor judges them; of `thin` samples one is estimated from.
+    `messages`: voltage messages received; `unplaced`: those without a time (`/clock` has not
+    started), checked against the voltage floor only; one of `thin` samples enters the estimate.
     """
 
     def __init__(self, monitor: SupplyMonitor) -> None:
@@ -405,13 +395,14 @@ class SampleStream:
         self._block: BlockClock | None = None
         self._throttle_block: BlockClock | None = None
         self._hold = ThrottleHold()
-        # Stamps, voltages, arrivals and currents (NaN: not known) since the last flush.
+        # Stamps, voltages, arrivals and currents (NaN: unknown) since the last flush.
         self._samples: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = []
-        # Of each voltage message since then: stamp, and whether it carries that itself.
+        # Stamp of each voltage message since then, and whether the message carries it.
         self._ends: list[FloatArray] = []
         self._own: list[BoolArray] = []
         self._count = 0
-        # Throttle since then: stamp, value, whether it carries its stamp, voltage messages ahead.
+        # Throttles since then: stamp, value, whether the message carries it, voltage messages
+        # before it.
         self._loads: deque[tuple[float, float, bool, int]] = deque(maxlen=KEEP)
         self._empty = True
         self._newest = self._newest_throttle = -math.inf
@@ -420,14 +411,14 @@ class SampleStream:
         self.messages = self.unplaced = 0
 
     def open_voltage(self, extractor: Extractor) -> None:
-        """Set where the voltage is in its messages."""
+        """Set the extractor of the voltage."""
         self._voltage = extractor
         rate = extractor.spec.sample_rate
         self._block = None if rate is None else BlockClock(rate)
         self._hold = ThrottleHold(rate)
 
     def open_throttle(self, extractor: Extractor) -> None:
-        """Set where the throttle is in its messages."""
+        """Set the extractor of the throttle."""
         self._throttle = extractor
         rate = extractor.spec.sample_rate
         self._throttle_block = None if rate is None else BlockClock(rate)
@@ -438,7 +429,7 @@ class SampleStream:
         return self._last_throttle
 
     def take_voltage(self, message: object, source_time: Callable[[], float]) -> bool:
-        """Take one voltage message (source_time in s); return whether it held a voltage."""
+        """Add one voltage message (source_time in s); return whether it held a voltage."""
         if self._voltage is None:
             raise ValueError('take_voltage before open_voltage')
         found = self._voltage.extract(message)
@@ -451,11 +442,11 @@ class SampleStream:
                       values: FloatArray, arrived: FloatArray | None = None,
                       current: FloatArray | None = None) -> BoolArray:
         """
-        Take voltage messages in order of arrival; return which held a voltage.
+        Add voltage messages in order of arrival; return which held a voltage.
 
-        Of each: stamp (of the last sample of a block), s, NaN when not known yet; whether it
-        carries that itself; and how many of the values, V, are its own; and when it arrived, s,
-        on a monotonic clock, and the current, A.
+        For each message: ends, the stamp (of the last sample of a block), s, NaN if unknown; own,
+        whether the message carries it; counts, its number of values, V; arrived, its arrival on a
+        monotonic clock, s; current, A.
         """
         self.messages += ends.size
         unknown = np.full(ends.size, math.nan)
@@ -464,7 +455,7 @@ class SampleStream:
         placed = np.isfinite(ends)
         self.unplaced += ends.size - int(np.count_nonzero(placed))
         if self._block is None:
-            # What the extractor dropped goes on as NaN: the monitor counts it.
+            # Values that the extractor dropped become NaN: the monitor counts them.
             values = _one_each(counts, values)
             counts = np.ones(ends.size, dtype=np.int64)
         else:
@@ -474,7 +465,7 @@ class SampleStream:
         if not placed.all():
             lost = np.repeat(~placed, counts)
             if lost.any():
-                # The floor judges them all the same, behind what came before.
+                # Check them against the voltage floor, after the earlier samples.
                 self.flush()
                 self._monitor.watch(values[lost], np.repeat(arrived, counts)[lost])
             values = values[np.repeat(placed, counts)]
@@ -486,12 +477,11 @@ class SampleStream:
         last = np.cumsum(counts) - 1
         firsts, ends = stamps[last + 1 - counts], stamps[last]
         columns = stamps, values, np.repeat(arrived, counts), np.repeat(current, counts)
-        # Blocks that come late are on one time line all the same: it goes back where it begins
-        # anew.
+        # Late blocks stay on one time line; only its restart goes back.
         before = np.concatenate(([self._newest], ends[:-1]))
         back = np.flatnonzero(firsts < before - BACK)
         if back.size:
-            # Of several steps back within so short a time the last counts.
+            # The last of several backward steps in one call counts.
             begin = int(back[-1])
             at = int(counts[:begin].sum())
             self._add(ends[:begin], own[:begin], *(column[:at] for column in columns))
@@ -503,7 +493,7 @@ class SampleStream:
 
     def _add(self, ends: FloatArray, own: BoolArray, stamps: FloatArray, values: FloatArray,
              arrived: FloatArray, current: FloatArray) -> None:
-        """Add messages whose stamps do not go back: two columns of them, and of their samples."""
+        """Add messages whose stamps do not go back, with the columns of their samples."""
         if not ends.size:
             return
         self._samples.append((stamps, values, arrived, current))
@@ -513,7 +503,7 @@ class SampleStream:
         self._newest = max(self._newest, float(ends.max()))
 
     def take_throttle(self, message: object, source_time: Callable[[], float]) -> bool:
-        """Take one throttle message (source_time in s); return whether it held a throttle."""
+        """Add one throttle message (source_time in s); return whether it held a throttle."""
         if self._throttle is None:
             raise ValueError('take_throttle before open_throttle')
         found = self._throttle.extract(message)
@@ -523,7 +513,7 @@ class SampleStream:
         return self.take_throttles(end, found.stamp is not None, found.values)
 
     def take_throttles(self, end: float, own: bool, found: FloatArray) -> bool:
-        """Take the values of one throttle message; its stamp in s, of the last value."""
+        """Add the values of one throttle message; end: stamp of the last value, s."""
         if self._throttle is None:
             raise ValueError('take_throttles before open_throttle')
         values = found.tolist()
@@ -545,7 +535,7 @@ class SampleStream:
         return math.isfinite(self._last_throttle)
 
     def lose_throttle(self) -> None:
-        """Take the throttle for unknown from here on: its source has fallen silent."""
+        """Set the throttle to unknown from here on: its source is silent."""
         self._last_throttle = math.nan
         self._loads.append((math.nan, math.nan, False, self._count))
 
@@ -556,7 +546,7 @@ class SampleStream:
         t, v, arrived, current = (np.concatenate(column) for column in zip(*self._samples))
         ends, owns = np.concatenate(self._ends), np.concatenate(self._own)
         stamps, values, own, before = np.array(self._loads, dtype=np.float64).reshape(-1, 4).T
-        # First, so that no error of the monitor meets these samples twice.
+        # Clear first: after an error of the monitor these samples must not be pushed again.
         self._samples, self._ends, self._own, self._count = [], [], [], 0
         self._loads.clear()
         self._empty = False
@@ -567,13 +557,13 @@ class SampleStream:
         self._hold.forget_before(self._newest - BACK)
 
     def reset(self, reason: str) -> None:
-        """Clear the window: what came before belongs to another time line."""
+        """Clear the window and start a new time line."""
         self._begin_anew(reason)
         if self._block is not None:
             self._block.reset()
 
     def _begin_anew(self, reason: str) -> None:
-        """Clear the window; blocks are on a new time line already."""
+        """Clear the window; blocks have started a new time line already."""
         self.flush()
         if not self._empty:
             self._monitor.reset(reason)
@@ -583,7 +573,7 @@ class SampleStream:
 
 
 def _one_each(counts: npt.NDArray[np.int64], values: FloatArray) -> FloatArray:
-    """Return one value a message; NaN where there is none."""
+    """Return one value for each message; NaN where it has none."""
     if (counts == 1).all():
         return values
     single = np.full(counts.size, math.nan)

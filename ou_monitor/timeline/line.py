@@ -1,28 +1,24 @@
 """
-One time line: samples of any source, in order, each reading once, and an account of all of them.
+The time line: samples of any source in order, each reading once, with counters for the rest.
 
-Node, estimator and bench take their samples from here, so the rules of a sample cannot differ:
+Node, estimator and bench share these rules:
 
-- a stamp or a voltage that is not finite, or implausible, is dropped (`non_finite`);
-- an implausible throttle or current is unknown at that sample;
-- a stamp behind the newest is sorted in where it comes in one push with what it is late for;
-  what comes later than that, or has the stamp of another sample, is dropped (`late`);
-- a stamp that is earlier, or later, by more than a pause begins a new time line;
+- samples with a non-finite or implausible stamp or voltage are dropped (`non_finite`);
+- an implausible throttle or current becomes NaN;
+- late stamps are sorted within one push; later ones, and repeated stamps, are dropped (`late`);
+- a stamp more than a pause earlier or later starts a new time line;
 - a reading that a logger repeats counts once (`held`).
 
-Limits: repeats are recognised from 64 samples on; until then they count as readings, and what is
-taken from here says so when it begins again without them (`Batch.again`).
+Repeats: a voltage read at 100 Hz and logged at 1 kHz appears ten times, and the repeats would look
+like increments of zero.  They are recognised by the gaps between changes, all multiples of one
+period, which need not be whole (3, 3, 4).  A coarse ADC also makes ties, but at irregular
+distances.  A ramp, square wave or ripple through a coarse ADC changes at regular distances, but
+always by one code, and two neighbouring gaps always have the same sum.
 
-A voltage read at 100 Hz and logged at 1 kHz stands in the log ten times.  Taken as samples, the
-repeats look like increments of zero.  They are recognised by the gaps between changes: all are
-multiples of one period, which need not be whole (3, 3, 4).  A coarse ADC makes ties as well, but
-at irregular distances.  A ramp, a square wave or a ripple through a coarse ADC changes at regular
-distances, but always by one code, and two neighbouring gaps of it always add up to the same.
-
-Limits of that: at least two samples a reading; where the ADC step is larger than 1.3 times the
-increment between readings, and the source is read more often than every fourth sample, repeats
-are not told from the ADC's own ties; nor is a source whose readings come early or late by more
-than a tenth of a period (standard deviation).
+Limits: repeats are recognised from 64 samples on and need at least two samples a reading; until
+then they count as readings, and `Batch.again` marks the restart without them.  They are not
+recognised where the ADC step exceeds 1.3 times the increment between readings at fewer than four
+samples a reading, or where readings jitter by more than a tenth of a period (standard deviation).
 """
 
 from __future__ import annotations
@@ -37,30 +33,30 @@ from ou_monitor.records import (
     as_numbers, Counters, Defect, FloatArray, NAN, Note, Recording)
 from ou_monitor.text import counted
 
-# Gaps that may differ from the pattern: lost samples, a logger that was late.
+# Share of gaps that may differ from the pattern: lost samples, late logger.
 _ODD = 0.05
-# Widest pattern, in periods: gaps of 7..13 where 10 is meant.
+# Largest deviation of a gap from the pattern, in periods: 7..13 for a period of 10.
 _WIDEST = 0.35
-# Evidence against gaps of independent changes, nats: by chance once in 5e8.
+# Evidence required against gaps of independent changes, nats: exp(-20) is one in 5e8.
 _EVIDENCE = 20.0
-# Share of changes that must be of another size than the commonest.
+# Minimum share of changes whose size differs from the most common size.
 _SIZES = 0.1
-# Least share of regular gaps with which a known period is kept.
+# Minimum share of regular gaps that keeps a period found earlier.
 _KEEP = 0.8
-# Fewest gaps from which a known period is given up.
+# Minimum number of gaps before that period can be given up.
 _FEWEST = 8
-# Sizes of steps that differ by less than this share are one (rounding of float32).
+# Relative difference below which two step sizes are equal (float32 rounding).
 _SAME = 1e-3
-# Periods nearer than this to a whole number are whole.
+# Distance from a whole number below which a period is whole, samples.
 _WHOLE = 0.02
-# Times a period is refined: the numbers of periods in the gaps follow from it.
+# Refinements of a period; each recomputes the number of periods in every gap.
 _REFINED = 3
-# Shortest gaps tried as the period.
+# Maximum number of gap lengths tried as the period, shortest first.
 _TRIED = 40
-# Where all changes are of one size, the shortest period: ripple of one code changes every two or
-# three samples as well.
+# Minimum period when all changes have one size, samples: a ripple of one ADC code also changes
+# every two or three samples.
 _ONE_CODE = 4.0
-# Samples in which the period of a whole recording is looked for: their middle.
+# Samples, from the middle of a recording, in which its period is searched.
 _MIDDLE = 200_000
 
 
@@ -74,8 +70,8 @@ class Batch:
     i: FloatArray | None  # current, A, NaN where unknown; None: unknown throughout
     shortest: float  # least step, from the sample before on, s
     longest: float  # largest step, s
-    restart: bool  # whether everything before this batch is to be forgotten
-    again: bool = False  # whether this batch holds, without repeats, what was passed on before
+    restart: bool  # a new time line starts here: forget all earlier samples
+    again: bool = False  # samples already passed on, now without their repeats
 
     @classmethod
     def of(cls, columns: FloatArray, restart: bool, *, again: bool = False,
@@ -83,7 +79,7 @@ class Batch:
         """Return columns t, V, throttle, current, shape (4, n), n > 0; `before`: last stamp, s."""
         t, y, u, i = columns
         steps = np.diff(t, prepend=before)
-        # The first sample of all follows nothing: no pause lies before it.
+        # There is no pause before the very first sample.
         rest = steps if steps[0] < math.inf or t.size == 1 else steps[1:]
         return cls(t, y, None if np.isnan(u).all() else u, None if np.isnan(i).all() else i,
                    float(steps.min()), float(rest.max()), restart, again)
@@ -110,7 +106,7 @@ def refresh_period(y: FloatArray, known: float = 1.0) -> float:
     usual = float(np.median(gaps))
     if usual < 2.0:
         return 1.0
-    # Few readings may change the code: the period is a gap at most as long as the usual one.
+    # Where few readings change the ADC code, gaps span several periods: try no longer ones.
     evidence, period = 0.0, 1.0
     for first in np.unique(gaps[gaps <= 1.5 * usual])[:_TRIED].tolist():
         about = _period(gaps, float(gaps[np.abs(gaps - first) <= max(1.0, 0.1 * first)].mean()))
@@ -128,23 +124,23 @@ def _evidence(gaps: FloatArray, period: float) -> float:
     """Return the evidence against gaps of independent changes, nats."""
     distance = np.sort(np.abs(_excess(gaps, period)))
     width = float(distance[math.ceil((1.0 - _ODD) * gaps.size) - 1])
-    # Whole samples: less than one is one of two neighbouring lengths.
+    # Gaps are whole samples: a deviation below one means two neighbouring lengths.
     if width >= 1.0 and width > _WIDEST * period:
         return 0.0
     if abs(period - round(period)) > _WHOLE:
-        # Of a period that is not whole the gaps are off by half a sample and more.
+        # With a fractional period gaps deviate by half a sample or more.
         width = max(width, 0.5)
     return gaps.size * _divergence(1.0 - _ODD, _chance(period, width, int(gaps.max())))
 
 
 def _irregular(gaps: FloatArray, period: float) -> bool:
-    """Return whether two neighbouring gaps add up to several numbers of periods."""
+    """Return whether sums of two neighbouring gaps vary in their number of periods."""
     number = np.rint((gaps[1:] + gaps[:-1]) / period).astype(np.int64)
     return bool(np.bincount(number).max(initial=0) <= (1.0 - _SIZES) * number.size)
 
 
 def _period(gaps: FloatArray, near: float) -> float:
-    """Return the mean period of the gaps, given one close to it; outliers are left out."""
+    """Return the mean period of the gaps without outliers, given an approximate period."""
     number = np.maximum(1.0, np.rint(gaps / near))
     good = np.abs(gaps - near * number) <= max(1.0, _WIDEST * near)
     return float(gaps[good].sum() / number[good].sum()) if good.any() else near
@@ -157,14 +153,14 @@ def _excess(gaps: FloatArray, period: float) -> FloatArray:
 
 
 def _chance(period: float, width: float, longest: int) -> float:
-    """Return how many gaps of independent changes would fit the pattern (geometric law)."""
+    """Return the share of gaps between independent changes that would fit (geometric law)."""
     gaps = np.arange(1.0, max(longest, 20.0 * period) + 1.0)
     law = np.power(1.0 - 1.0 / period, gaps - 1.0) / period
     return float(law[np.abs(_excess(gaps, period)) <= width + 1e-9].sum())
 
 
 def _divergence(share: float, chance: float) -> float:
-    """Return the Kullback-Leibler divergence of two Bernoulli laws, nats; 0 when not above."""
+    """Return the Kullback-Leibler divergence of two Bernoulli laws, nats; 0 if share <= chance."""
     if chance >= share:
         return 0.0
     return (share * math.log(share / max(chance, 1e-12))
@@ -172,9 +168,9 @@ def _divergence(share: float, chance: float) -> float:
 
 
 def _several_sizes(sizes: FloatArray) -> bool:
-    """Whether a tenth of the steps are of another size than the commonest."""
+    """Return whether a tenth of the steps differ in size from the most common one."""
     ordered = np.sort(sizes)
-    # A new size begins where the next step is larger by more than rounding.
+    # A new size starts where the next step is larger by more than rounding.
     begins = np.flatnonzero(np.diff(ordered) > _SAME * ordered[1:]) + 1
     counts = np.diff(np.concatenate(([0], begins, [ordered.size])))
     return bool(counts.max() <= (1.0 - _SIZES) * ordered.size)
@@ -184,9 +180,9 @@ class Repeats:
     """
     Drops repeats from a stream, in batches of any size; `period`: samples per refresh.
 
-    A refresh may happen to give the value of the one before: in a run that is longer than a period
-    it is put where it belongs, so that dropping repeats does not select changes.  It is passed on
-    when half a period after it has been seen.
+    A refresh may return the same value as the one before.  In a run longer than a period it is
+    placed where it is due, so that dropping repeats does not select changes.  It is passed on half
+    a period later.
     """
 
     def __init__(self) -> None:
@@ -194,7 +190,7 @@ class Repeats:
         self.forget()
 
     def forget(self) -> None:
-        """Take the next sample as the first one; the period stays known."""
+        """Start a new time line with the next sample; keep the period."""
         self._waiting = np.empty((4, 0))
         self._value = math.nan
         self._place = 0
@@ -210,13 +206,13 @@ class Repeats:
         return Batch.of(columns, batch.restart, again=batch.again, before=before)
 
     def fresh(self, columns: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return which samples are refreshes; those not known yet are kept waiting."""
+        """Return which samples are refreshes; undecided samples wait for the next call."""
         y = columns[1]
         n = y.size
         starts = np.concatenate(([0], np.flatnonzero(y[1:] != y[:-1]) + 1))
         begins = starts.copy()
         if y[0] == self._value:
-            # The first run began before these samples.
+            # The first run started before these samples.
             begins[0] = -self._place
         sizes = np.diff(np.append(starts, n))
         place = np.arange(n) - np.repeat(begins, sizes)
@@ -224,7 +220,7 @@ class Repeats:
         number = np.rint(place / self.period)
         due = np.rint(number * self.period) == place
         if math.isnan(self._value):
-            # Since when the first value of a time line had been there is not known.
+            # The age of the first value of a time line is unknown.
             due[0] = False
         sure = (number == 0.0) | (length >= (number + 0.5) * self.period)
         last = int(starts[-1])
@@ -239,7 +235,7 @@ class Repeats:
 
 
 def reading_places(y: FloatArray) -> tuple[npt.NDArray[np.intp], float]:
-    """Return where a recorded voltage, V, was read anew, and samples per reading (1: all)."""
+    """Return the places of new readings in a voltage, V, and samples per reading (1: all)."""
     first = max(0, (y.size - _MIDDLE) // 2)
     repeats = Repeats()
     repeats.period = refresh_period(y[first:first + _MIDDLE])
@@ -249,17 +245,17 @@ def reading_places(y: FloatArray) -> tuple[npt.NDArray[np.intp], float]:
 
 
 def refreshes(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return a series where its source was read, and samples per reading (t in s)."""
+    """Return the readings of a series (t in s) and the samples per reading."""
     places, period = reading_places(y)
     return reading_times(t[places], period), y[places], period
 
 
 def reading_times(t: FloatArray, period: float) -> FloatArray:
     """
-    Return when a source was read, from when that was logged first, s.
+    Return the reading times of a source from the stamps of their first log entries, s.
 
-    A logger is late by up to one of its own steps: where the source keeps a clock of its own, of
-    no whole number of these steps, its readings lie on the even grid nearest to their stamps.
+    A logger is late by up to one of its steps.  A source with its own clock, whose period is not a
+    whole number of those steps, was read on the even grid nearest to the stamps.
     """
     if t.size < 2 or abs(period - round(period)) < _WHOLE:
         return t
@@ -279,7 +275,7 @@ def on_grid(t: FloatArray, number: FloatArray) -> FloatArray:
 
 
 def readings_of(recording: Recording) -> Recording:
-    """Return a recording with each reading of its source once; a note says what that took."""
+    """Return a recording with each reading of its source once; a note counts the repeats."""
     places, period = reading_places(recording.voltage)
     if period <= 1.0:
         return recording
@@ -294,36 +290,35 @@ def readings_of(recording: Recording) -> Recording:
         notes=(*recording.notes, note), held=recording.held + held)
 
 
-# No supply that this monitors comes near it, V; squares and cubes of what is beyond overflow.
+# Largest accepted magnitude of a voltage, V: far above any supply, with squares and cubes finite.
 MOST_VOLTAGE = 1.0e6
-# No current that this monitors comes near it, A.
+# Largest accepted magnitude of a current, A: far above any supply.
 MOST_CURRENT = 1.0e6
-# A throttle beyond this is none in 0..1, however generous its ends.
+# Largest magnitude accepted as a throttle of 0..1, with generous ends.
 MOST_THROTTLE = 2.0
-# No stamp: a century of nanoseconds since 1970 is 3e9 s.
+# Largest magnitude accepted as a stamp, s: a century since 1970 is 3e9 s.
 _MOST_STAMP = 1.0e12
-# Samples collected before a batch is worked off: large enough that NumPy's
-# overhead per call vanishes, small enough to stay in the cache.
+# Buffer size, samples: NumPy's overhead per call vanishes, and the buffer stays in the cache.
 BATCH = 32768
-# Samples looked at for repeats, the fewest, and new ones from one look to the next.
+# Search for repeats: samples used, minimum number, new samples between two searches.
 TAIL, _ENOUGH, _LOOK = 1024, 64, 256
-# So many samples behind for each step back are not a few that came late.
+# Samples behind for each step back from which the clock itself went back.
 _STRETCH = 20
 # Places of samples; all of them as a slice.
 Picked = npt.NDArray[np.intp] | slice
-# Where repeats are looked for: a third of the samples repeat at two a reading, or more.
+# Share of ties above which repeats are searched: two samples a reading make a third or more.
 _TIED = 0.25
 
 
 def plausible(values: FloatArray, most: float) -> FloatArray:
-    """Return values with NaN in place of what is beyond `most` either way."""
-    # The comparison is false for NaN too, which stays one.
+    """Return values with NaN where the magnitude exceeds `most`."""
+    # The comparison is also false for NaN, which stays NaN.
     beyond = ~(np.abs(values) <= most)
     return np.where(beyond, NAN, values) if beyond.any() else values
 
 
 def hold(values: FloatArray) -> FloatArray:
-    """Return values with each unknown one replaced by the last that is known."""
+    """Return values with each NaN replaced by the last finite value."""
     known = np.isfinite(values)
     place = np.maximum.accumulate(np.where(known, np.arange(values.size), -1))
     return np.where(place < 0, NAN, values[place]) if values.size else values
@@ -331,43 +326,43 @@ def hold(values: FloatArray) -> FloatArray:
 
 def plausible_samples(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None
                       ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Return samples with NaN in place of what is implausible (t in s, V, throttle 0..1)."""
+    """Return samples with NaN for implausible values (t in s, V, throttle 0..1)."""
     return (plausible(t, _MOST_STAMP), plausible(voltage, MOST_VOLTAGE),
             None if throttle is None else plausible(throttle, MOST_THROTTLE))
 
 
 class TimeLine:
-    """Buffer, order and account of the samples of one source."""
+    """Buffer, order and counters of the samples of one source."""
 
     def __init__(self) -> None:
         self._columns = np.empty((4, BATCH))
         self._see()
-        # Whether there are throttles and currents in the buffer; if not, theirs are old.
+        # Whether the buffer's throttle and current columns hold values of this batch.
         self._loaded = [False, False]
         self._fill = 0
         self._counts: dict[str, int] = {}
         self.newest = -math.inf
         self._repeats = Repeats()
-        # Raw samples of this time line, t, V, throttle and current; new ones since the last look.
+        # Last raw samples (t, V, throttle, current); new ones since the last search for repeats.
         self._tail = np.empty((4, 0))
         self._unseen, self._looked = 0, False
 
     def _see(self) -> None:
-        # Copying into a slice takes half the time through these that it takes through NumPy.
+        # Copying into a slice takes half as long through a memoryview as through NumPy.
         self._into: tuple[Any, ...] = tuple(column.data for column in self._columns)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy needs: all but the views of the buffers."""
+        """Return the state without the views of the buffers."""
         return {k: v for k, v in self.__dict__.items() if k != '_into'}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take the state of another one."""
+        """Restore a state and make new views of the buffers."""
         self.__dict__.update(state)
         self._see()
 
     @property
     def counters(self) -> Counters:
-        """Return what became of all samples so far."""
+        """Return the counts of samples by outcome."""
         return Counters(**self._counts)
 
     @property
@@ -377,17 +372,17 @@ class TimeLine:
 
     @property
     def waiting(self) -> int:
-        """Return the number of samples not yet worked off."""
+        """Return the number of samples in the buffer."""
         return self._fill
 
     @property
     def period(self) -> float:
-        """Return the samples a reading; 1 where none repeats."""
+        """Return the samples per reading; 1 without repeats."""
         return self._repeats.period
 
     def put(self, t: FloatArray, y: FloatArray, u: FloatArray | float | None,
             i: FloatArray | None = None) -> bool:
-        """Copy samples into the buffer; return False, and do nothing, without room."""
+        """Copy samples into the buffer; return False, changing nothing, if they do not fit."""
         begin = self._fill
         end = begin + len(t)
         if end > BATCH:
@@ -400,7 +395,7 @@ class TimeLine:
                 if type(more) is np.ndarray:
                     into[2 + k][begin:end] = more
         except ValueError:
-            # Unaligned ones, say columns of packed records.
+            # Unaligned arrays, for instance columns of packed records.
             return self.put(t.copy(), y.copy(), u if u is None else u + 0.0,
                             i if i is None else i + 0.0)
         for k, more in enumerate((u, i)):
@@ -409,7 +404,7 @@ class TimeLine:
         return True
 
     def put_one(self, t: float, y: float, u: float | None) -> bool:
-        """Copy one sample into the buffer; return False, and do nothing, without room."""
+        """Copy one sample into the buffer; return False, changing nothing, if it is full."""
         at = self._fill
         if at == BATCH:
             return False
@@ -423,7 +418,7 @@ class TimeLine:
         return True
 
     def _fill_load(self, k: int, more: FloatArray | float | None, begin: int, end: int) -> None:
-        """Take throttle (0) or current (1) of the samples from `begin` on."""
+        """Fill the throttle (0) or current (1) column from `begin` to `end`."""
         column = self._columns[2 + k]
         if more is not None:
             if not self._loaded[k]:
@@ -441,7 +436,7 @@ class TimeLine:
             counts[name] = counts.get(name, 0) + number
 
     def forget(self) -> None:
-        """Take the next sample as the first one; the period of repeats stays known."""
+        """Start a new time line with the next sample; keep the period of repeats."""
         self.newest = -math.inf
         self._begin_anew()
 
@@ -451,7 +446,7 @@ class TimeLine:
         self._unseen, self._looked = 0, False
 
     def work_off(self, pause: float) -> list[Batch]:
-        """Empty the buffer; return what is to be taken, in order (pause in s)."""
+        """Empty the buffer; return its readings in order (pause in s)."""
         n = self._fill
         self._fill = 0
         t, y = self._columns[0, :n], self._columns[1, :n]
@@ -462,7 +457,7 @@ class TimeLine:
     def take(self, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,
              pause: float) -> list[Batch]:
         """
-        Take samples past the buffer; return the readings among them, in order.
+        Process samples without the buffer; return their readings in order.
 
         t in s, y in V, throttle 0..1, current in A, each of shape (n,); pause in s.
         """
@@ -470,9 +465,9 @@ class TimeLine:
 
     def order(self, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,
               pause: float) -> list[Batch]:
-        """Take samples as `take` does; return all of them, repeats included, in order."""
+        """Process samples as `take` does, but keep repeats."""
         self.count(pushed=t.size)
-        # One pass says whether all is finite: a sum of finite stamps and volts is.
+        # One pass checks that all are finite: then their sum is.
         if not math.isfinite(np.add.reduce(t) + np.add.reduce(y)):
             good = np.isfinite(t) & np.isfinite(y)
             self.count(non_finite=t.size - int(good.sum()))
@@ -484,7 +479,7 @@ class TimeLine:
         if t.size > 1:
             steps = t[1:] - t[:-1]
             shortest = min(first, float(np.minimum.reduce(steps)))
-            # The first sample of all follows nothing: no pause lies before it.
+            # There is no pause before the very first sample.
             longest = float(np.maximum.reduce(steps))
             longest = longest if first == math.inf else max(longest, first)
         if shortest > 0.0 and (longest <= pause or first == longest == math.inf):
@@ -498,7 +493,7 @@ class TimeLine:
 
     def _untangle(self, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,
                   pause: float) -> list[Batch]:
-        """Split where time starts anew, sort what is late, drop stamps that are there twice."""
+        """Split at jumps of time, sort late samples, drop repeated stamps."""
         if pause == math.inf:
             batch = self._ordered(t, y, u, i, restart=False)
             return [] if batch is None else [batch]
@@ -541,7 +536,7 @@ class TimeLine:
         return Batch(t, y, u, i, float(steps.min()), float(steps.max()), restart)
 
     def _readings(self, batch: Batch) -> list[Batch]:
-        """Drop repeats; begin again without them when the source is found to repeat."""
+        """Drop repeats; when they are first recognised, restart the tail without them."""
         if batch.restart:
             self._begin_anew()
         whole = np.concatenate([self._tail, batch.columns()], axis=1)
@@ -565,7 +560,7 @@ class TimeLine:
         return [] if kept is None else [kept]
 
     def _refresh(self, known: float) -> float:
-        """Return the samples a reading in the tail."""
+        """Return the samples per reading in the tail."""
         y = self._tail[1]
         if known == 1.0 and float(np.mean(y[1:] == y[:-1])) <= _TIED:
             return 1.0
@@ -574,7 +569,7 @@ class TimeLine:
 
 def _picked(which: Any, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,
             ) -> tuple[FloatArray, FloatArray, FloatArray | None, FloatArray | None]:
-    """Return some of the samples."""
+    """Return the selected samples."""
     return (t[which], y[which], None if u is None else u[which],
             None if i is None else i[which])
 
@@ -582,11 +577,11 @@ def _picked(which: Any, t: FloatArray, y: FloatArray, u: FloatArray | None, i: F
 def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
              ) -> tuple[Picked, list[str]]:
     """
-    Return which samples the time line takes, in its order, and notes of what that took.
+    Return the samples that the time line keeps, in its order, and notes on the others.
 
-    t in s, rows of shape (n, m), each of which counts as a whole, with values up to `most`.
+    t in s; rows of shape (n, m) are kept or dropped as a whole, with values up to `most`.
     """
-    # The comparisons are false for NaN too.
+    # The comparisons are also false for NaN.
     good = np.isfinite(t) & ((rows <= most) & (rows >= -most)).all(axis=1)
     notes: list[str] = []
     if not good.all():
@@ -603,13 +598,13 @@ def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
         notes.append(Note(f'{counted(line.counters.late)} dropped: the stamp was there before; '
                           'the first of each was kept.', Defect.REPEATED_STAMPS))
     if line.used == t.size and not notes:
-        # All as they are, without a copy.
+        # Everything is kept: a slice avoids a copy.
         return slice(None), notes
     return (batches[0].y if batches else np.empty(0)).astype(np.intp), notes
 
 
 def _late_words(steps: int, t: FloatArray) -> str:
-    """Return the note on samples out of order, `steps` of which go back (t in s)."""
+    """Return the note on samples out of order, with `steps` backward steps (t in s)."""
     ahead = np.maximum.accumulate(t) - t
     behind = int(np.count_nonzero(ahead))
     if behind < _STRETCH * steps:

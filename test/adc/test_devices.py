@@ -131,7 +131,7 @@ def test_a_device_is_found_by_each_of_its_names(tmp_path):
     (lambda f, c: (f / 'current_timestamp_clock').write_text('sundial\n'), 'sundial'),
     (lambda f, c: c.unlink(), 'cannot open .*No such file'),
     (lambda f, c: os.rename(f / 'scan_elements', f / 'x'), 'has no buffer')])
-def test_what_is_wrong_with_a_device_is_said(tmp_path, spoil, words):
+def test_device_errors_name_the_cause(tmp_path, spoil, words):
     folder, character = iio_device(tmp_path)
     spoil(folder, character)
     with pytest.raises(InputError, match=words):
@@ -148,7 +148,7 @@ def test_the_channel_must_be_known(tmp_path, channel, words):
         PolledChannel(folder, channel)
 
 
-def test_rights_that_are_missing_are_said(tmp_path, monkeypatch):
+def test_missing_permission_is_reported(tmp_path, monkeypatch):
     """In the place of a file that root could write all the same."""
     folder, character = iio_device(tmp_path)
 

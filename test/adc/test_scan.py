@@ -44,6 +44,6 @@ def test_volts():
     ('le:s12', 'not of the form'), ('xx:s12/16', 'not of the form'),
     ('le:s24/24', 'bits of storage'), ('le:s16/16X2', 'without repetition'),
     ('le:s13/16>>4', 'do not fit'), ('le:s0/16', 'do not fit')])
-def test_what_cannot_be_read_is_refused(kind, words):
+def test_unsupported_elements_are_refused(kind, words):
     with pytest.raises(InputError, match=words):
         parse_element('in_voltage0', 0, kind)

@@ -59,7 +59,7 @@ def test_gain_is_within_its_interval_as_often_as_stated():
 
 
 @pytest.mark.parametrize('cause', [{}, {'common': 20.0}, {'square': 20.0}])
-def test_no_coupling_is_not_seen(cause):
+def test_no_coupling_is_detected_where_there_is_none(cause):
     """At most the stated 5 % of false alarms, throttle moving both or not."""
     rng, alarms = np.random.default_rng(2), 0
     for _ in range(DRAWS):
@@ -75,11 +75,11 @@ def test_a_common_cause_is_taken_for_coupling_where_throttle_is_not_known():
     t, voltage, signal, throttle = flight(np.random.default_rng(3), common=40.0)
     found = estimate_coupling(t, voltage, t, signal)
     assert found.seen and not found.partial
-    assert any('Throttle is not known' in note for note in found.notes)
+    assert any('Throttle is unknown' in note for note in found.notes)
     assert not estimate_coupling(t, voltage, t, signal, throttle=throttle).seen
 
 
-def test_the_limit_is_what_would_have_been_seen():
+def test_limit_is_the_gain_detected_with_the_stated_power():
     """A coupling of the limiting gain is seen as often as promised; a quarter of it rarely."""
     rng = np.random.default_rng(4)
     t, voltage, signal, throttle = flight(rng)
@@ -118,7 +118,7 @@ def test_rates_gaps_nan_and_order():
     assert found.grid.lost[1] >= 3 and found.grid.lost[0] == 0
 
 
-def test_a_jump_of_the_rate_is_told():
+def test_jump_of_the_rate_is_noted():
     """From 500 Hz to 50 Hz: what is used is said, with the remedy; the gain holds."""
     rng = np.random.default_rng(15)
     t, voltage, signal, throttle = flight(rng, 60.0, seconds=40.0)
@@ -157,7 +157,7 @@ def test_a_line_that_both_share_is_called_narrow():
     assert found.frequency[found.coherence.argmax()] == pytest.approx(81.0, abs=2.0)
 
 
-def test_a_signal_that_leads_is_told():
+def test_leading_signal_is_noted():
     """The voltage answers to the signal: said, with the lag negative."""
     rng = np.random.default_rng(8)
     t, voltage, signal, throttle = flight(rng)
@@ -180,7 +180,7 @@ T = np.arange(5000) / RATE
     (T, np.sin(99 * T), {'band': (20.0, 20.1)}, 'widen it'),
     (T, np.sin(99 * T), {'level': 0.0}, 'between 0 and 1'),
 ])
-def test_what_cannot_be_told_is_refused(signal_t, signal, options, words):
+def test_undecidable_input_is_refused(signal_t, signal, options, words):
     """One line that says why."""
     voltage = 5.0 + np.random.default_rng(9).standard_normal(T.size)
     with pytest.raises(InputError, match=words):

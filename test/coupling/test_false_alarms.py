@@ -141,7 +141,7 @@ def test_small_chances_are_extrapolated():
     assert p_sum < 1e-4 and p_max < 1e-3
 
 
-def test_repeats_of_a_logger_are_no_signal(gyro):
+def test_repeats_of_a_logger_are_not_a_signal(gyro):
     """A voltage is taken where its ADC was read, and the gain is that of the readings."""
     t, logged, throttle, axes = gyro
     found = estimate_coupling(t, logged, t, axes[0], throttle=throttle)

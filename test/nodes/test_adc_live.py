@@ -93,4 +93,4 @@ def test_no_such_device(world, tmp_path):
     adc = world.start('adc', '--ros-args', '-p', 'device:=ads1115', '-p', f'sysfs:={tmp_path}/sys')
     assert adc.wait() == 2
     (line,) = [line for line in adc.err.splitlines() if 'FATAL' in line]
-    assert "no such device: 'ads1115'; there are: iio:device0 (ads1015)" in line
+    assert "no such device: 'ads1115'; available: iio:device0 (ads1015)" in line

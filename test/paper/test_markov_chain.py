@@ -32,7 +32,7 @@ FIVE = Generator(np.array([
       [0.0, 0.0, 1.0, -1.0]], r'2 closed classes \(states 0, 1; states 2, 3\)'),
     ([[-1.0, 1.0, 0.0], [0.0, -1.0, 1.0], [0.0, 1.0, -1.0]], 'state 0 transient'),
 ])
-def test_what_is_no_ergodic_generator_is_refused(q, message):
+def test_non_ergodic_generators_are_refused(q, message):
     with pytest.raises(ValueError, match=message):
         Generator(np.array(q))
 

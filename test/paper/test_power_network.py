@@ -215,7 +215,7 @@ def test_where_capacitance_does_not_help():
 
 @pytest.mark.parametrize('name', sorted(UNITS))
 @pytest.mark.parametrize('value', [-1.0, math.nan, math.inf, '5', True])
-def test_what_no_component_has_is_refused(name, value):
+def test_impossible_components_are_refused(name, value):
     with pytest.raises(ValueError, match=name) as error:
         PowerNetwork(**{name: value})
     assert f' {UNITS[name]}'.rstrip() in str(error.value)

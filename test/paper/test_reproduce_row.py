@@ -24,7 +24,7 @@ def test_rounding_is_half_a_unit_of_the_last_digit(text, value, half_unit):
 
 
 @pytest.mark.parametrize('text', ['abc', '', 'nan', 'inf'])
-def test_what_is_no_number_is_refused(text):
+def test_text_without_a_number_is_refused(text):
     """Its text is named."""
     with pytest.raises(ValueError, match=f"'{text}'"):
         Printed(text)
@@ -90,7 +90,7 @@ def test_the_verdict_cannot_be_given():
 @pytest.mark.parametrize('recomputed, ranges', [
     (math.nan, {}), (math.inf, {}), (1.0, {'error': math.nan}), (1.0, {'error': -1.0}),
     (1.0, {'band': (2.0, 1.0)}), (1.0, {'inputs': (math.nan, 1.0)})])
-def test_what_would_have_no_verdict_is_refused(recomputed, ranges):
+def test_rows_without_a_verdict_are_refused(recomputed, ranges):
     """NaN, infinities and ranges upside down."""
     with pytest.raises(ValueError, match='x: '):
         row('1', recomputed, **ranges)

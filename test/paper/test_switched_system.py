@@ -64,7 +64,7 @@ def test_paths_are_exact_along_their_jumps():
     assert found[:, 1:] == pytest.approx(2.0 * np.exp(exponent), rel=1e-12)
 
 
-def test_mean_is_that_of_feynman_and_kac():
+def test_mean_follows_feynman_and_kac():
     """E exp(integral of r(x)) = pi exp((Q + diag r) t) 1."""
     rates = np.array([-1.0, 0.5, -3.0])
     system = SwitchedSystem(CYCLE, rates[:, None, None])

@@ -243,7 +243,7 @@ def test_stamps_and_their_absence(stamp, counts):
     assert stamps[0] == (stamp[0] + 1e-9 * stamp[1] if counts else 3.0)
 
 
-def test_what_goes_the_general_way():
+def test_unusual_messages_use_the_general_decoder():
     """Big endian, XCDR2, no text, cut off: only these, one by one."""
     good = cdr.encode_scalars(cdr.FLOAT32, [1.0, 2.0, 4.0])
     big = b'\0\0\0\0' + np.array([8.0], '>f4').tobytes()
@@ -325,7 +325,7 @@ def test_a_definition():
     assert found['p/Cell'] == () and found['std_msgs/Header'] == (Field('q', 'uint8'),)
 
 
-def test_a_wrong_path_is_told_by_the_general_way():
+def test_wrong_path_gives_the_general_decoders_error():
     """The nearest field is named, as it is for messages one by one."""
     spec = FieldSpec('/v', cdr.BATTERY_STATE, 'voltagee')
     text = SCHEMAS[cdr.BATTERY_STATE]

@@ -98,7 +98,7 @@ def test_bad_input(tmp_path, monkeypatch, capsys, log_text, arguments, words):
     assert not (tmp_path / 'out').exists()
 
 
-def test_a_name_that_is_no_text(tmp_path, capsys):
+def test_file_name_of_invalid_text(tmp_path, capsys):
     """Bytes of a file name are shown as what they are, in the bag as in the JSON."""
     path = os.path.join(os.fsencode(tmp_path), b'\xff.csv')
     Path(os.fsdecode(path)).write_text(GOOD)

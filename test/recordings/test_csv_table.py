@@ -85,7 +85,7 @@ def test_not_text(tmp_path):
         read_recording(tmp_path / 'no.csv')
 
 
-def test_what_is_mended(tmp_path):
+def test_repairs_are_noted(tmp_path):
     """Not finite: dropped. Unsorted: sorted. Repeated: the first kept. Each is counted."""
     text = ('time_s,voltage_v,throttle\n0,5.0,0.0\n2,5.2,\n1,5.1,inf\n1,9.9,0.5\n'
             '3,NaN,0.5\n4,inf,0.5\n5,,0.5\ninf,5,0.5\n6,5.6,0.6\n')
@@ -113,7 +113,7 @@ def test_options_of_bags(tmp_path):
         read_recording(path, msg_config='px4')
 
 
-def test_swapped_columns_and_odd_times_are_told(tmp_path):
+def test_swapped_columns_and_odd_times_are_reported(tmp_path):
     """A time that jumps about beside a voltage that only rises; samples minutes apart."""
     rng = np.random.default_rng(1)
     volts, times = 16.0 + 0.1 * rng.standard_normal(200), 0.01 * np.arange(200)

@@ -42,7 +42,7 @@ def test_a_topic_of_its_own_goes_first_and_holds(tmp_path):
     np.testing.assert_array_equal(read_recording(path).current, [np.nan, 20.0, 20.0, 30.0, 30.0])
 
 
-def test_no_current_is_none(tmp_path):
+def test_missing_current_is_none(tmp_path):
     """All NaN, or no column."""
     assert read_recording(bag(tmp_path / 'a.mcap', [np.nan] * 5)).current is None
     path = tmp_path / 'a.csv'

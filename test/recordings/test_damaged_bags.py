@@ -83,7 +83,7 @@ def test_cut_at_records_and_anywhere(sound, tmp_path):
         refusal(lambda: BagReader(tmp_path / 'head.mcap', partial=True))
 
 
-def test_what_follows_the_end_is_reported(sound, tmp_path):
+def test_bytes_after_the_end_are_reported(sound, tmp_path):
     """Another file behind the first would be lost without a word."""
     _, data = sound
     for more in (data, b'\0', bytes(100)):
@@ -338,7 +338,7 @@ def test_a_recording_that_was_cut_off_has_no_metadata(folder):
     ({'relative_file_paths': ['gone.mcap']}, "'gone.mcap'"),
     ({'relative_file_paths': []}, 'relative_file_paths'),
     ({'relative_file_paths': 'x'}, 'relative_file_paths')])
-def test_metadata_that_does_not_fit(folder, change, words):
+def test_mismatched_metadata_is_refused(folder, change, words):
     """What is wrong in metadata.yaml is named."""
     content = yaml.safe_load((folder / 'metadata.yaml').read_text())
     content['rosbag2_bagfile_information'] |= change
@@ -347,13 +347,13 @@ def test_metadata_that_does_not_fit(folder, change, words):
 
 
 @pytest.mark.parametrize('text', ['', 'a: [', 'a: 1', '- 1', '\x00'])
-def test_metadata_that_is_none(folder, text):
+def test_wrong_metadata_is_refused(folder, text):
     """Empty or broken YAML is one line."""
     (folder / 'metadata.yaml').write_text(text)
     assert 'metadata.yaml' in complaint(folder)
 
 
-def test_a_file_that_may_not_be_read(tmp_path, monkeypatch):
+def test_file_without_permission_is_refused(tmp_path, monkeypatch):
     """The reason is that of the system, in one line."""
     path = write(tmp_path / 'bag.mcap', ROWS)
 

@@ -113,7 +113,7 @@ def test_options_that_do_not_fit_are_refused(options, words, tmp_path, capsys):
     assert status == 2 and words in capsys.readouterr().err
 
 
-def test_what_looks_like_another_unit_or_column_is_said(tmp_path):
+def test_suspicious_units_and_columns_are_noted(tmp_path):
     """Swapped columns are refused; stamps seconds apart are noted; a folder names fleet."""
     path = tmp_path / 'odd.csv'
     path.write_text('time_s,voltage_v,throttle\n0,0.1,16.1\n1,0.2,16.0\n2,0.2,15.9\n')

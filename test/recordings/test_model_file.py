@@ -171,7 +171,7 @@ def test_bad_files(data, words):
     (b'model: &a [*a]\n', 'an alias stands for what it is in itself'),
 ], ids=['empty', 'comment', 'syntax', 'tab', 'binary', 'nul', 'python', 'date', 'deep', 'two',
         'loop'])
-def test_files_that_are_none(tmp_path, content, words):
+def test_files_of_other_kinds_are_refused(tmp_path, content, words):
     """One line that names the file, whatever its bytes."""
     path = tmp_path / 'bad.yaml'
     path.write_bytes(content)
@@ -181,7 +181,7 @@ def test_files_that_are_none(tmp_path, content, words):
     assert str(path) in text and words in text and '\n' not in text
 
 
-def test_files_that_cannot_be_read(tmp_path):
+def test_unreadable_files_are_refused(tmp_path):
     """Missing, and a folder."""
     for path in (tmp_path / 'none.yaml', tmp_path):
         with pytest.raises(InputError, match='cannot read the model file') as caught:

@@ -167,7 +167,7 @@ def test_only_the_chunks_needed_are_read(bag, monkeypatch):
     (-1.0, None, '0 s or later'), (float('nan'), None, '0 s or later'), (2.0, 2.0, 'not after'),
     (None, 0.0, 'not after'), (50.0, None, 'no sample from 50 s to the end: it lasts 3.0'),
     (50.0, 60.0, 'no sample from 50 s to 60 s')])
-def test_parts_that_are_none(bag, start, end, words):
+def test_empty_parts_are_refused(bag, start, end, words):
     """One line says why."""
     with pytest.raises(InputError, match=words):
         read_recording(bag, start=start, end=end)

@@ -91,7 +91,7 @@ def test_the_vehicle_of_a_bag(tmp_path, name, content, vehicle, partial):
     assert found.source['file'] == 'a.mcap' and 'pilot' not in found.source
 
 
-def test_metadata_that_cannot_be_read(tmp_path):
+def test_unreadable_metadata_is_ignored_or_refused(tmp_path):
     """The messages are read all the same, and a note says what is not known."""
     path = with_metadata(tmp_path / 'a.mcap', 'ou_monitor', {'vehicle': 'uav7'})
     content = path.read_bytes()
@@ -129,7 +129,7 @@ def test_header_stamps(tmp_path):
 
 
 @pytest.mark.parametrize('frame', ['x', 'base_link'])
-def test_header_stamps_the_general_way(tmp_path, frame):
+def test_header_stamps_by_the_general_decoder(tmp_path, frame):
     """Messages of unequal length are decoded one by one, with the same outcome."""
     messages = []
     for t, data in battery([100 * MS, 101 * MS], [5.0, 5.25]):
@@ -227,7 +227,7 @@ def test_several_choices(tmp_path):
     assert read_recording(path, voltage_topic='/voltage').voltage.tolist() == [5.0]
 
 
-def test_topics_that_are_not_there(tmp_path):
+def test_missing_topics_are_refused(tmp_path):
     """What there is is listed; a misspelt topic gets the nearest."""
     path = make(tmp_path / 'bag.mcap', ('/camera', STRING, [(MS, {'data': 'x'})]))
     text = complaint(path)
@@ -279,7 +279,7 @@ def test_a_config_of_ones_own(tmp_path):
 
 
 @pytest.mark.parametrize('kind', [FLOAT32, BATTERY_STATE])
-def test_what_is_mended(tmp_path, kind):
+def test_repairs_are_noted(tmp_path, kind):
     """Values that are not finite dropped, order restored, repeats dropped; each is noted."""
     values = [5.0, np.nan, 5.2, np.inf, 5.1, 9.0, 5.5]
     stamps = np.array([1, 2, 4, 5, 3, 3, 6]) * MS
@@ -310,7 +310,7 @@ def test_no_sample_and_one(tmp_path):
     assert read_recording(path).n == 1
 
 
-def test_throttle_that_is_not_a_number(tmp_path):
+def test_throttle_of_nan_is_unknown(tmp_path):
     """The last value that was one holds."""
     path = make(tmp_path / 'bag.mcap', ('voltage', FLOAT32, scalars([5.0, 5.1, 5.2])),
                 ('throttle', FLOAT32, scalars([0.5, np.nan])))
@@ -331,7 +331,7 @@ def test_epochs_are_kept_to_what_a_float_holds(tmp_path):
 
 
 @pytest.mark.parametrize('kind', ['csv', 'mcap'])
-def test_what_no_supply_has_is_dropped_and_told(tmp_path, kind):
+def test_implausible_samples_are_dropped_and_noted(tmp_path, kind):
     """One value that would overflow everything behind."""
     values = np.full(50, 5.0)
     values[7] = 1e300
@@ -357,7 +357,7 @@ def test_throttle_in_other_units_is_refused(tmp_path, throttle):
 
 
 @pytest.mark.parametrize('kind', ['csv', 'mcap'])
-def test_a_clock_that_goes_back_is_told_by_how_far(tmp_path, kind):
+def test_backward_clock_is_noted_with_its_step(tmp_path, kind):
     """A stretch that lies in a time that was is more than a few late samples."""
     t = np.concatenate((np.arange(100), 60.5 + np.arange(100))) * 1e-3 + 1.0
     path = tmp_path / f'a.{kind}'

@@ -62,7 +62,7 @@ def test_a_gap_is_kept(gap):
     np.testing.assert_allclose(t[:, -1], ends, rtol=0, atol=1e-9)
 
 
-def test_just_below_is_no_gap():
+def test_difference_below_the_limit_is_not_a_gap():
     """19.9 ms at blocks of 10 ms is jitter."""
     ends = LENGTH * np.arange(1, 21)
     ends[10:] += 0.0199
@@ -72,7 +72,7 @@ def test_just_below_is_no_gap():
     assert np.diff(t).max() * RATE < 1.0 + 0.0199 / FOLLOW * 1.01
 
 
-def test_two_long_blocks_are_no_gap():
+def test_two_long_blocks_are_not_a_gap():
     """With blocks of 200 ms a difference of 350 ms is jitter, 450 ms is not."""
     for late, gaps in ((0.35, 0), (0.45, 1)):
         clock = BlockClock(1000.0)
@@ -105,13 +105,13 @@ def test_reset_forgets():
 
 
 @pytest.mark.parametrize('rate', [0.0, -1.0, float('nan'), float('inf')])
-def test_rates_that_are_none(rate):
+def test_wrong_rates_are_refused(rate):
     """A caller's bug."""
     with pytest.raises(ValueError, match='Hz'):
         BlockClock(rate)
 
 
-def test_stamps_that_are_none():
+def test_wrong_stamps_are_refused():
     """A caller's bug."""
     with pytest.raises(ValueError, match='finite'):
         BlockClock(RATE).stamps(float('nan'), 1)

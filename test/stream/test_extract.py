@@ -45,7 +45,7 @@ def test_units_and_stamp():
 @pytest.mark.parametrize('stamp, expected', [
     (1_500_000, 1.5), (0, None), (float('nan'), None), (Message(sec=0, nanosec=0), None),
     (Message(sec=0, nanosec=1), 1e-9)])
-def test_zero_is_no_stamp(stamp, expected):
+def test_zero_stamp_means_no_stamp(stamp, expected):
     """A stamp that nobody filled in is not 1970."""
     found = extractor(stamp_field='timestamp', stamp_factor=1e-6).extract(
         Message(data=1.0, timestamp=stamp))
@@ -85,7 +85,7 @@ def test_a_block_is_a_copy():
     assert found.values.tolist() == [1.0, 2.0]
 
 
-def test_an_element_that_is_not_there():
+def test_missing_element_gives_no_value():
     """A message with too few channels is a missing value, not an error."""
     found = extractor('channels[3].value').extract(Message(channels=[Message(value=1.0)]))
     assert (found.values.size, found.missing) == (0, 1)
@@ -99,7 +99,7 @@ def test_an_element_that_is_not_there():
     ('data', Message(data=[1.0, 2.0]), ['array', "'data[0]'", 'sample_rate']),
     ('data[0]', Message(data=1.0), ['not an array']),
 ])
-def test_a_field_that_is_not_what_it_should_be(field, msg, words):
+def test_field_of_the_wrong_type_is_refused(field, msg, words):
     """One line with the path, the type and the way out."""
     with pytest.raises(InputError) as caught:
         extractor(field).extract(msg)
@@ -107,7 +107,7 @@ def test_a_field_that_is_not_what_it_should_be(field, msg, words):
         assert word in str(caught.value)
 
 
-def test_a_stamp_that_is_none():
+def test_wrong_stamp_field_is_refused():
     """Text is no stamp."""
     with pytest.raises(InputError, match="stamp_field 'frame'"):
         extractor(stamp_field='frame').extract(Message(data=1.0, frame='base'))
@@ -175,7 +175,7 @@ def test_several_numbers(field, values):
 @pytest.mark.parametrize('field, words', [
     ('esc[].rp', "did you mean 'rpm'"), ('name', 'holds no numbers'), ('esc', 'holds no numbers'),
     ('esc[]]', 'not of the form'), ('one[]', 'holds no numbers')])
-def test_what_is_no_list_of_numbers(field, words):
+def test_lists_without_numbers_are_refused(field, words):
     """Refused in one line."""
     with pytest.raises(InputError, match=words):
         ManyExtractor(FieldSpec('rpm', 'my_msgs/msg/Escs', field)).extract(Escs())

@@ -72,7 +72,7 @@ def test_bad_yaml_is_one_line_that_quotes_nothing(tmp_path, read, name):
 @pytest.mark.parametrize('text', [
     f'{SECRET}: 1', f'[{SECRET}]', SECRET, f'root: {SECRET}', f'{SECRET}:{SECRET}:0:0'])
 @pytest.mark.parametrize('read', [read_model, load_msg_config])
-def test_what_is_none_of_our_files_is_not_told(tmp_path, read, text):
+def test_errors_do_not_quote_foreign_files(tmp_path, read, text):
     """A path of a wrong file must not make a node read it out."""
     path = tmp_path / 'passwords.yaml'
     path.write_text(text)
@@ -80,7 +80,7 @@ def test_what_is_none_of_our_files_is_not_told(tmp_path, read, text):
 
 
 @pytest.mark.parametrize('read', [read_model, load_msg_config, open_regular])
-def test_what_is_no_regular_file_is_not_waited_for(tmp_path, read):
+def test_irregular_files_are_refused_at_once(tmp_path, read):
     """A FIFO without a writer, a device without end, a folder, a loop of links."""
     os.mkfifo(tmp_path / 'fifo.yaml')
     (tmp_path / 'link.yaml').symlink_to(tmp_path / 'link.yaml')
@@ -114,7 +114,7 @@ def test_honest_yaml_is_read():
 @pytest.mark.parametrize('text', [
     '- {reliability: [1], durability: {a: 1}, depth: x}', bomb(), '[' * 5000, 'x' * 200_000,
     '- {depth: 1' + '0' * 399 + '}', '- {reliability: true}', '\x00', '!!int x'])
-def test_qos_that_nobody_can_read_is_the_default(text):
+def test_unreadable_qos_becomes_the_default(text):
     """A QoS profile is no reason to refuse messages, whatever it is."""
     assert parse_qos(text) == ('reliable', 'volatile', 10)
 

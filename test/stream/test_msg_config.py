@@ -101,7 +101,7 @@ def test_a_missing_key_is_named(tmp_path, key):
 
 @pytest.mark.parametrize('text, expected', [
     ('a: [', 'not YAML'), ('', 'expected keys'), ('- 1\n', 'expected keys')])
-def test_a_file_that_is_no_mapping(tmp_path, text, expected):
+def test_file_without_a_mapping_is_refused(tmp_path, text, expected):
     """Broken YAML and empty files are one line."""
     path = tmp_path / 'rail.yaml'
     path.write_text(text, encoding='utf-8')

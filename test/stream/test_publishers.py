@@ -68,7 +68,7 @@ def test_without_numbers_nothing_is_known():
     assert not publishers.numbered
 
 
-def test_age_counts_from_the_stamp_where_the_clock_is_ours():
+def test_age_counts_from_the_stamp_of_the_nodes_clock():
     clock = SourceClock()
     assert clock.name == 'unknown' and clock.age(5.0) is None
     clock.take(np.array([100.0, 100.1]), np.array([100.11, 100.11]), 5.0)
@@ -86,7 +86,7 @@ def test_of_a_foreign_clock_only_the_arrival_counts(stamp):
     assert clock.name == 'foreign' and clock.age(5.5) == pytest.approx(0.5)
 
 
-def test_a_clock_that_is_set_meanwhile_is_ours():
+def test_clock_set_during_the_run_counts_as_the_nodes():
     clock = SourceClock()
     clock.take(np.array([12.0]), np.array([1.7e9]), 5.0)
     clock.take(np.array([1.7e9]), np.array([1.7e9 + 0.01]), 6.0)
@@ -104,7 +104,7 @@ def test_after_a_stall_the_first_is_followed_still(first):
 
 
 @pytest.mark.parametrize('pause', [0.2, 0.6, 3.0])
-def test_a_pause_of_the_first_does_not_lose_it_its_place(pause):
+def test_first_publisher_is_followed_after_a_pause(pause):
     """Its numbers go on where they were; the other begins meanwhile, or after."""
     publishers = Publishers()
     follow(publishers, sent(1, 400, 500.0, 0.0), count=2)
@@ -114,7 +114,7 @@ def test_a_pause_of_the_first_does_not_lose_it_its_place(pause):
     assert kept == {0: 500, 1: 0} and publishers.foreign == 100
 
 
-def test_two_that_begin_anew_are_two():
+def test_two_restarted_publishers_are_told_apart():
     """The first ends and begins anew beside another: it is followed within a batch."""
     publishers = Publishers()
     follow(publishers, sent(1, 1000, 1e3, 0.0), sent(1, 100, 100.0, 0.0004), count=2)
@@ -122,7 +122,7 @@ def test_two_that_begin_anew_are_two():
     assert kept[0] + kept[1] >= 900
 
 
-def test_the_only_one_begins_anew_without_loss():
+def test_restart_of_the_only_publisher_counts_no_loss():
     """Another was there before; behind a silence its first messages, many at once, are kept."""
     publishers = Publishers()
     follow(publishers, sent(1, 1000, 1e3, 0.0), sent(1, 200, 200.0, 0.0004), count=2)

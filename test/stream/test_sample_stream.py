@@ -100,7 +100,7 @@ def test_throttle_without_voltage_takes_no_more_memory_than_it_may():
     assert sink.u[0] == 4998 / 5000.0
 
 
-def test_a_throttle_that_goes_back_starts_anew():
+def test_backward_throttle_restarts_the_pairing():
     """As in a bag that is replayed in a loop: what came before does not hold after it."""
     stream, sink = stream_of('stamp', 'stamp')
     stream.take_throttle(stamped(4.0, 0.9), None)

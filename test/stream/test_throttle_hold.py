@@ -40,7 +40,7 @@ def test_agrees_with_its_definition(pushed, asked):
                                   np.repeat(np.array(expected)[order], 31))
 
 
-def test_what_no_sample_can_meet_is_forgotten():
+def test_unneeded_throttles_are_dropped():
     """Only the value that holds at the stamp and those after it are kept."""
     hold = hold_of([(k / 1000.0, k / 1000.0) for k in range(1000)])
     hold.forget_before(0.9895)

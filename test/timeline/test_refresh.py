@@ -35,7 +35,7 @@ def lowpassed(y, corner):
 
 
 @pytest.mark.parametrize('factor', FACTORS + RATIOS)
-def test_repeats_are_told(factor):
+def test_repeats_are_counted_and_noted(factor):
     """
     Twenty sources of each: the period is right to one sample in the whole.
 
@@ -108,7 +108,7 @@ COARSE = {
 
 
 @pytest.mark.parametrize('name', COARSE)
-def test_coarse_adcs_are_no_repeats(name):
+def test_coarse_adcs_are_not_repeats(name):
     """
     Steps of 0.5 to 3 increments, 200 windows each: never, of 1000.
 
@@ -127,7 +127,7 @@ def test_coarse_adcs_are_no_repeats(name):
     # A square wave, a glitch once in a hundred samples, a triangle through a coarse ADC.
     np.repeat(np.arange(100) % 2, 10), (np.arange(1024) % 100 == 7) * 1.0,
     np.abs(np.arange(1024) // 10 % 20 - 10.0)])
-def test_regular_patterns_are_no_repeats(y):
+def test_regular_patterns_are_not_repeats(y):
     """Constants, and what a coarse ADC makes of a signal with a period."""
     assert refresh_period(y.astype(np.float64)) == 1.0
 

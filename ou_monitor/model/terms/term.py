@@ -141,6 +141,13 @@ class Term:
     ValueError
         When a parameter is not a number or out of its range.
 
+    Examples
+    --------
+    >>> from ou_monitor.model.terms.catalogue import catalogue
+    >>> sag = catalogue()['load_sag'](linear=0.3, square=0.1)
+    >>> sag.NAME, sag.linear, sag.NEEDS_THROTTLE
+    ('load_sag', 0.3, True)
+
     """
 
     NAME: ClassVar[str] = ''

@@ -89,6 +89,19 @@ class SlidingEstimator:
     ValueError
         When the window or the rate is not a positive finite number.
 
+    Examples
+    --------
+    >>> from ou_monitor import read_recording, SlidingEstimator
+    >>> recording = read_recording('bags/load_40')      # simulated: sigma 0.632 V/sqrt(s)
+    >>> estimator = SlidingEstimator(window=2.0)
+    >>> estimator.push(recording.t, recording.voltage, recording.throttle)
+    >>> estimate = estimator.estimate()
+    >>> estimate.status.name, estimate.usable
+    ('OK', True)
+    >>> low, high = estimate.interval('sigma')
+    >>> low < 0.632 < high
+    True
+
     """
 
     def __init__(self, window: float = 2.0, *, fastest: float = 1.0e4,

@@ -270,6 +270,16 @@ class AdaptiveLowPass:
         For an option that is unknown or out of range, or that contradicts
         another.
 
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ou_monitor import AdaptiveLowPass
+    >>> lowpass = AdaptiveLowPass(law='threshold', sigma_ref=0.3, fmin=20.0, fmax=100.0)
+    >>> t = np.arange(2000) / 1000.0
+    >>> y = lowpass.filter(t, np.sin(6.0 * t), sigma=0.1)      # quiet supply: open
+    >>> y.shape, round(lowpass.cutoff)
+    ((2000,), 100)
+
     """
 
     def __init__(self, **options: object) -> None:

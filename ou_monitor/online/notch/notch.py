@@ -393,6 +393,17 @@ class AdaptiveNotch:
         For an option that is unknown or out of range, or eRPM without the
         number of poles.
 
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ou_monitor import AdaptiveNotch
+    >>> t = np.arange(4000) / 1000.0
+    >>> hum = np.sin(2.0 * np.pi * 150.0 * t)                  # a motor at 150 Hz
+    >>> notch = AdaptiveNotch(rpm_unit='hz')
+    >>> y = notch.filter(t, hum, rpm=np.full((t.size, 1), 150.0))
+    >>> notch.active, bool(np.std(y[2000:]) < 0.5 * np.std(hum))
+    (True, True)
+
     """
 
     def __init__(self, **options: object) -> None:

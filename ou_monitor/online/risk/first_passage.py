@@ -78,6 +78,17 @@ def brownout_probability(e: Estimate, voltage: float, horizon: float,
     ValueError
         When the horizon is not positive, or the voltage not finite.
 
+    Examples
+    --------
+    >>> from ou_monitor import brownout_probability, read_recording, SlidingEstimator
+    >>> recording = read_recording('bags/load_40')
+    >>> estimator = SlidingEstimator(window=2.0)
+    >>> estimator.push(recording.t, recording.voltage, recording.throttle)
+    >>> estimate = estimator.estimate()
+    >>> near, far = (brownout_probability(estimate, voltage=v, horizon=1.0) for v in (4.9, 4.7))
+    >>> near > 0.9 and far < 0.01
+    True
+
     """
     if not (math.isfinite(horizon) and horizon > 0.0):
         raise ValueError(f'horizon must be a positive number of seconds, got {horizon}')

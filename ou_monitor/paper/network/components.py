@@ -5,12 +5,11 @@ The components of a multirotor's power network, and the load at a throttle.
                    |         |              |                                    |
                ESC current   C + ESR        Cf + ESR                   Co + ESR, MCU current
 
-Limits: linear about the operating point; no inductance of leads, so nothing
-about edges faster than R/L, some 0.1 us to 1 us; the battery is one resistance,
-without polarisation, so recovery over 0.3 s and more is not in it; the random
-part of the ESC current is the paper's Markov switching, which spreads over all
-frequencies what a regular PWM keeps at multiples of its own, so it is an upper
-bound until `switching_scale` is set from a measured rail.
+Limits: linear about the operating point.  Leads have no inductance, so edges faster than R/L
+(0.1 to 1 us) are not modelled.  The battery is one resistance without polarisation, so recovery
+over 0.3 s and more is missing.  The random part of the ESC current is the paper's Markov
+switching, which spreads over all frequencies the power that a regular PWM keeps at its multiples:
+it is an upper bound until `switching_scale` is set from a measured rail.
 """
 
 from __future__ import annotations

@@ -1,15 +1,12 @@
 """
-Which bulk capacitance brings the brown-out risk of a rail under a target: figures and words.
+Find the bulk capacitance that brings the brown-out risk of a rail under a target.
 
-Limits: a linear network and Gaussian noise (see `ou_monitor.paper.network`),
-constant throttle for the whole horizon, ideal capacitors of one series, no
-ageing, no cold.  Two calculations of the risk are shown, and the larger one
-decides.  The first takes the rail as the OU of its slowest excited pole and
-its variance, with the exact mean first passage.  The second is the
-high-level crossing rate of the whole Gaussian process.  Against simulated
-paths at 2.5 and 3.2 standard deviations, their step extrapolated to 0, the
-first was from 60 times too low (noise through a large ESR) to 4 times too high
-(no ESR), the second from 1.1 to 3 times too high.
+Limits: a linear network with Gaussian noise (see `ou_monitor.paper.network`), constant throttle,
+ideal capacitors of one series, no ageing, no cold.  The larger of two risks decides: the exact
+mean first passage of the OU with the rail's slowest excited pole and its variance, and the
+high-level crossing rate of the whole Gaussian process.  Against simulated paths at 2.5 and 3.2
+standard deviations (step extrapolated to 0) the first was from 60 times too low (noise through a
+large ESR) to 4 times too high (no ESR), the second 1.1 to 3 times too high.
 
 Without LC filter, and once the network is slower than the noise, both fall as
 C rises; with less C the second rose by up to 1.44 times in 39 of 6000 drawn

@@ -1,17 +1,16 @@
 """
-What a rail of a power network does at one throttle: poles, variance, density, OU.
+A rail of a power network at one throttle: poles, variance, density, OU.
 
-The network is linear about its operating point, dx = A x dt + B dW, and the
-rail's deviation is c x.  Noise enters coloured, as one state a source, so that
-the variance is finite where the ESR of a capacitor passes current straight to
-voltage.
+The network is linear about its operating point, dx = A x dt + B dW, and the rail's deviation is
+c x.  Noise is coloured, with one state a source, so that the variance stays finite where a
+capacitor's ESR turns current directly into voltage.
 
-What adding bulk capacitance does.  Without LC filter the bus carries the ESC
+Effect of more bulk capacitance.  Without LC filter the bus carries the ESC
 current through |Z(f)|^2 = R^2 (1 + (w r C)^2) / (1 + (w (R + r) C)^2), which
 falls with C at every frequency: Var_inf falls for noise of any colour, on both
 rails, and so does the pole 1/((R + r) C): the paper's section 4.5 has alpha
 rise.  These poles are fast: with 40 mOhm the paper's 63 1/s would take 0.4 F.
-Where that is not the whole answer:
+Exceptions:
 
 - Slow noise.  When the noise relaxes more slowly than the pole (a small C, or
   flutter), alpha is the rate of the noise and does not move with C.
@@ -176,8 +175,8 @@ class Rail:
         and v the variance of the smooth part of its slope, the larger of
         q/(2 Var) d/sqrt(2 pi) exp(-d^2/2) (rough paths: Pickands, Trans. AMS
         145 (1969) 51) and sqrt(v/Var)/(2 pi) exp(-d^2/2) (smooth paths: Rice,
-        Bell Syst. Tech. J. 24 (1945) 46).  For an OU the first is that of its
-        mean first passage.
+        Bell Syst. Tech. J. 24 (1945) 46).  For an OU the first equals the
+        rate of its mean first passage.
 
         voltage in V.
         """

@@ -1,10 +1,9 @@
 """
-Vpp over Vrms: what one Ornstein-Uhlenbeck process shows on a screen.
+Vpp over Vrms of one Ornstein-Uhlenbeck process on a screen.
 
-Paths are drawn with the exact transition of the process, a hundred of the
-paper's samples at a time, and their extremes in between from the law of the
-Brownian bridge, to which the process comes over such a step up to a share
-alpha dt = 0.006.  The crest factor does not depend on sigma.
+Paths are drawn with the exact transition over a hundred of the paper's samples; the extremes in
+between follow the law of the Brownian bridge, which differs from the process by a share
+alpha dt = 0.006 over such a step.  The crest factor does not depend on sigma.
 """
 
 from __future__ import annotations
@@ -78,7 +77,7 @@ def simulate_crests(rng: np.random.Generator, paths: int,
 
 
 def _draw(rng: np.random.Generator, paths: int) -> dict[int, FloatArray]:
-    """Return the crest factors of all screens within so many segments."""
+    """Return the crest factors of all screens of `paths` simulated segments."""
     dt = _SAMPLES / published.SAMPLING_HZ
     # Of stationary variance 1.
     sigma = math.sqrt(2.0 * published.ALPHA.value)

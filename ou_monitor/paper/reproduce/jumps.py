@@ -1,4 +1,4 @@
-"""Section 5, "diffusion and jump components": what jumps would have to be like."""
+"""Section 5, "diffusion and jump components": the jumps that would explain the screens."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def simulate_jumps(rng: np.random.Generator, seconds: float,
     """Draw screens of OUs with jumps (seconds in s, progress 0..1)."""
     alpha = published.ALPHA.value
     longest = max(SCREENS_MS)
-    # One screen more: in the first the jumps begin.
+    # One extra screen, dropped later, in which the jumps reach their stationary law.
     t = np.arange(round((seconds + 1e-3 * longest) * _SAMPLING)) / _SAMPLING
     begin = round(1e-3 * longest * _SAMPLING)
     found = []

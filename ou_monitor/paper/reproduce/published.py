@@ -1,5 +1,5 @@
 """
-What the paper prints, and where; everything else is computed from this.
+Numbers as printed in the paper; everything else is computed from them.
 
 Units are the paper's own: mV, ms, 1/s, V/sqrt(s), V^2.
 """

@@ -1,7 +1,7 @@
 """
 One printed number beside its recomputation, and the verdict that follows.
 
-The verdict is a property: it follows from the ranges and cannot be given.
+The verdict is a property, computed from the ranges.
 """
 
 from __future__ import annotations
@@ -13,15 +13,14 @@ import math
 
 Range = tuple[float, float]
 
-# A recomputed number with a standard error counts as known to so many of them:
-# 1 in 370 rows would then be called wrong by chance.
+# Standard errors allowed to a recomputed number: one row in 370 is called wrong by chance.
 STANDARD_ERRORS = 3.0
 # A number printed at half a unit from the true one is rounded rightly either way.
 _TIE = 1e-9
 
 
 class RowVerdict(enum.Enum):
-    """What became of a printed number; the value is how it is called."""
+    """Verdict on a printed number; the value is its wording."""
 
     AGREES = 'agrees'
     ROUNDING = 'rounding'

@@ -11,7 +11,7 @@ from ou_monitor.paper.reproduce.row import Printed, Range, Row
 from ou_monitor.text import counted
 
 WHERE = 'Table 1'
-# A step finer than the smallest reading over this says nothing.
+# Finest step tried: the smallest reading over this.
 _FINEST = 64
 
 

@@ -37,7 +37,7 @@ def rows() -> list[Row]:
         Row('Section 5', 'sqrt(2 alpha)', '1/sqrt(s)', published.ROOT_2_ALPHA, root,
             f'sqrt(2 x {published.ALPHA.text})', 'The arithmetic is right.'),
         Row(WHERE, 'tau', 'ms', published.TAU_MS, 1e3 / alpha, f'1 / {published.ALPHA.text}',
-            'The arithmetic is right; its five digits are those of the division, not of alpha.')]
+            'The arithmetic is right; its five digits come from the division; alpha has fewer.')]
     for state in (published.MEDIUM, published.HIGH):
         found += _of_load(state)
     return found + _restated()
@@ -71,9 +71,9 @@ def _of_load(state: published.PrintedLoad) -> list[Row]:
 def _restated() -> list[Row]:
     line = paper_fit()
     said = {
-        'Section 4.5': 'The number is that of Fig. 5; that it shows filtration at its limit needs '
-                       'the network, not the oscilloscope, to have set it.',
-        'Section 8': 'The number is that of Fig. 5; a rate alone confirms no OU, since every '
+        'Section 4.5': 'The number is from Fig. 5. It shows a limit of the filtration only if the '
+                       'network, and not the oscilloscope, set it.',
+        'Section 8': 'The number is from Fig. 5. A rate alone does not confirm an OU: every '
                      'first-order system has one, AC coupling included.'}
     return [Row(
         where, quantity, unit, printed,

@@ -1,9 +1,8 @@
 """
-Fig. 5: the relaxation rate, from how many points, and of what.
+Fig. 5: the relaxation rate from its points, and whether it is the rail's or the instrument's.
 
-An AC-coupled oscilloscope is a first-order high-pass: a step of the rail comes
-out of it as a decay at 2 pi times its corner, unless the rail is the slower of
-the two.
+An AC-coupled oscilloscope is a first-order high-pass: it shows a step of the rail as a decay at
+2 pi times its corner, unless the rail is slower.
 """
 
 from __future__ import annotations

@@ -125,7 +125,7 @@ def read(path: Path, request: Request) -> Log:
 
 
 def _wanted(names: list[str], request: Request) -> list[str]:
-    """Return the fields that carry what is looked for, the time first."""
+    """Return the wanted fields, the time first."""
     kinds = ('vbatLatest', 'vbat', 'sagCompensatedVBat', 'amperageLatest', 'amperage',
              'rcCommand[3]', 'setpoint[3]')
     arrays = r'(motor|gyroADC|gyroUnfilt|accSmooth|eRPM|debug)\[\d+\]'
@@ -142,7 +142,7 @@ def _frames(parser: Any, places: list[int], request: Request) -> tuple[FloatArra
     dropped, invalid, sound = 0, 0, False
     count = 0
     before = -1
-    # The parser stops at what it cannot digest; it is set going again behind that.
+    # The parser stops at bytes it cannot parse; it is restarted behind them.
     while reader.tell() < len(reader) and reader.tell() > before and not parser._end_of_log:
         before = reader.tell()
         try:
@@ -160,7 +160,7 @@ def _frames(parser: Any, places: list[int], request: Request) -> tuple[FloatArra
                     request.progress(reader.tell() / max(1, len(reader)))
         except (TypeError, IndexError, KeyError, ValueError, ZeroDivisionError,
                 AttributeError, StopIteration, OverflowError, RuntimeError):
-            # At the end of the bytes, or in broken ones; the bytes read are told in a note.
+            # At the end, or in broken bytes; a note reports the bytes read.
             sound = False
     table = np.array(rows, dtype=np.float64).reshape(len(rows), len(places))
     return table, dropped
@@ -190,7 +190,7 @@ def _facts(headers: Headers) -> dict[str, str]:
     for fact, key in (('firmware', 'Firmware revision'), ('vehicle', 'Craft name'),
                       ('board', 'Board information'), ('started', 'Log start datetime')):
         value = headers.get(key)
-        # Without a clock the date is that of the year 0.
+        # Without a clock the date is in the year 0.
         if value not in (None, '') and not str(value).startswith('0000-'):
             facts[fact] = str(value)
     return facts | _cells(headers)

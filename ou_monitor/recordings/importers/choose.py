@@ -33,7 +33,7 @@ MOST = 4
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """What is taken from a log."""
+    """The series chosen from a log."""
 
     # At least one sample.
     voltage: Series
@@ -61,7 +61,7 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
     notes: list[str] = []
     if second is None and current is None and (
             held := [one for one in _of(log, CURRENT) if not one.silent]):
-        notes.append('No current is clearly that of this voltage: ' + _listed(held)
+        notes.append('No current clearly belongs to this voltage: ' + _listed(held)
                      + '; none taken (--current NAME).')
     chosen: list[Series | None] = []
     dropped: dict[str, list[str]] = {}
@@ -202,15 +202,15 @@ def _also(log: Log, chosen: tuple[Series, Series | None], option: str) -> list[s
 IMU, SPEEDS = 'imu', 'motor_speed'
 # Topics that a named series must not take.
 _TAKEN = ('voltage', 'throttle', 'current', IMU, SPEEDS)
-# Parts of a series whose spacings are compared, and how unequal is told.
+# Parts of a series whose spacings are compared; ratio from which a note reports a change.
 _PARTS, _UNEQUAL = 10, 1.5
-# A pause of so many usual steps is a gap.
+# Pause, in typical steps, from which it is a gap.
 _GAP = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class Extras:
-    """What is taken from a log beside voltage, throttle and current."""
+    """Series chosen from a log beside voltage, throttle and current."""
 
     # By topic, without the slash.
     inertial: dict[str, Inertial]
@@ -236,7 +236,7 @@ def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),
         name = IMU if not inertial else f'{IMU}_{topic_of(one.name)}'
         inertial[name] = kept
     if not inertial and NONE not in imus and log.format != 'csv':
-        notes.append('The log holds no gyro: there is no topic /imu.')
+        notes.append('The log holds no gyro, so there is no topic /imu.')
     others = [one.name for one in log.inertial if one.name not in {
         kept.name for kept in inertial.values()}]
     if others:

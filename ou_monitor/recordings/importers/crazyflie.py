@@ -96,7 +96,7 @@ def read(path: Path, request: Request) -> Log:
 
 
 def _events(path: Path, data: bytes, number: int, stamp: str) -> tuple[dict[int, _Event], int]:
-    """Return the events by their number, and the byte where their records begin."""
+    """Return the events by number, and the first byte of their records."""
     at = 5
     events: dict[int, _Event] = {}
 
@@ -132,7 +132,7 @@ def _events(path: Path, data: bytes, number: int, stamp: str) -> tuple[dict[int,
 
 def _places(data: bytes, begin: int, end: int, events: dict[int, _Event],
             ) -> tuple[dict[int, list[int]], int]:
-    """Return where the records of each event begin, and where the last one ends."""
+    """Return the starts of the records of each event, and the end of the last record."""
     found: dict[int, list[int]] = {key: [] for key in events}
     sizes = {key: event.row.itemsize for key, event in events.items()}
     at = begin
@@ -148,7 +148,7 @@ def _places(data: bytes, begin: int, end: int, events: dict[int, _Event],
 
 def _series(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Iterator[Series]:
     """Yield each variable in SI, and the mean of the motors."""
-    # What an event holds is no battery to be taken unasked: it has no steady rate.
+    # Values of an event are not offered as a battery: they have no steady rate.
     ranked = not prefix
     motors = [f'motor.m{k}' for k in range(1, 5)]
     if all(name in columns for name in motors):

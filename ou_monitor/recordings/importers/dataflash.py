@@ -208,7 +208,7 @@ def _lost_binary(log: Any) -> list[str]:
                 end = max(end, at + length)
     lost = size - read_bytes
     tail = bytes(log.data_map[end:size])
-    # Flash is filled up to a page with what it is erased to.
+    # The last page of flash is padded with its erased value.
     if tail.strip(b'\xff') == b'' or tail.strip(b'\0') == b'':
         lost -= len(tail)
         tail = b''
@@ -250,7 +250,7 @@ def _cells(parameters: dict[str, float]) -> dict[str, str]:
 
 
 def _facts(banner: list[str]) -> dict[str, str]:
-    """Return the firmware and the board from the words a log begins with."""
+    """Return firmware and board from the first messages of a log."""
     facts: dict[str, str] = {}
     for line in banner:
         if 'firmware' not in facts and re.match(r'(Ardu\w+|APM:\w+|Blimp|AntennaTracker)\b', line):

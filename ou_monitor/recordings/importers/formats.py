@@ -37,7 +37,7 @@ class Format(NamedTuple):
     name: str
     # What it is, with its usual ending.
     words: str
-    # Whether a file that begins with these bytes is one.
+    # Whether a file with these first bytes has this format.
     fits: Callable[[bytes], bool]
     # Name of the module that reads it, beside this one; empty: not a log.
     module: str
@@ -80,7 +80,7 @@ FORMATS = (
 
 
 def format_of(head: bytes) -> Format | None:
-    """Return the format of a file that begins with these bytes."""
+    """Return the format of a file by its first bytes."""
     return next((one for one in FORMATS if head and one.fits(head)), None)
 
 

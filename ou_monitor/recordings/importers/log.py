@@ -46,7 +46,7 @@ class Inertial:
     # gravity; None where the log has none; shape (n, 3).
     angular_velocity: FloatArray | None
     acceleration: FloatArray | None
-    # How the values were made; what it is.
+    # Conversion of the values; kind of series.
     scale: str
     words: str
     # Taken when nothing of a smaller rank is there; None: only by name.
@@ -63,15 +63,15 @@ class MotorSpeeds:
     t: FloatArray
     # Of the rotor, rad/s; shape (n, m).
     values: FloatArray
-    # How the values were made, poles included; what they are.
+    # Conversion of the values, poles included; kind of series.
     scale: str
     words: str
 
 
 VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
-# A column of a table that says nothing about what it is.
+# A column of unknown kind.
 ANY = 'any'
-# What is none of these, such as a gyro axis: taken by name only.
+# Any other series, such as a gyro axis: chosen by name only.
 SIGNAL = 'signal'
 UNITS = {VOLTAGE: 'V', THROTTLE: '0..1', CURRENT: 'A'}
 UNKNOWN = '?'
@@ -97,7 +97,7 @@ class Series:
     # V, 0..1, or A (positive when the battery is drained); NaN where the log says "unknown";
     # shape (n,).
     values: FloatArray
-    # How the value was made from what is logged.
+    # Conversion from the logged value.
     scale: str
     # What it is, for people.
     words: str = ''
@@ -153,7 +153,7 @@ class Log:
     format: str  # noqa: A003
     # Candidates.
     series: tuple[Series, ...]
-    # Vehicle, firmware, number of the flight: what is known.
+    # Vehicle, firmware, number of the flight, as far as known.
     facts: dict[str, str] = field(default_factory=dict)
     # What was dropped or could not be read, one sentence each.
     notes: tuple[str, ...] = ()
@@ -179,11 +179,11 @@ class RawColumns:
     current: FloatArray
     # Of the file, printable.
     name: str
-    # What is known of its origin: file, format, the series taken, firmware.
+    # Origin: file, format, chosen series, firmware.
     source: dict[str, str]
     # What was dropped or could not be read, one sentence each.
     notes: tuple[str, ...] = ()
-    # Quantity -> how its SI values were made from what is logged, where the file says so.
+    # Quantity -> conversion of the logged values to SI, where the file states it.
     scales: dict[str, str] = field(default_factory=dict)
 
 
@@ -216,7 +216,7 @@ class Request:
 
     # Which flight of a file with several.
     flight: int | None = None
-    # Series the user named, for formats that read only what is asked for.
+    # Series named by the user, for formats that read only wanted ones.
     names: frozenset[str] = frozenset()
     # Magnets of a motor's rotor, where the log does not say; eRPM needs it.
     poles: int | None = None

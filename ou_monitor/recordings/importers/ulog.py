@@ -57,14 +57,14 @@ PLAIN = (
 # Bytes before the content of a message: its length and its kind.
 HEAD = 3
 KINDS = frozenset(b'BFIMPQARDLCSO')
-# Messages of no known kind that are larger are broken bytes to pyulog, which begins anew one byte
+# Messages of unknown kind that are larger are broken bytes to pyulog, which restarts one byte
 # behind their first.
 LARGEST = 10_000
 
 
 class _Watched(io.BufferedReader):
     """
-    A file that remembers what its reader passes over without a word.
+    A file that records the bytes its reader skips silently.
 
     pyulog steps back by the length that a message claims, also where the file ended before: for
     ever.  And it reads all of it, at each byte of a damaged part.
@@ -76,12 +76,12 @@ class _Watched(io.BufferedReader):
     cut_at: int | None = None
     unknown_at: int | None = None
     end = 0
-    # Of the last read: bytes read, and bytes short of what was asked for.
+    # Last read: bytes returned, and bytes missing.
     had = missing = 0
     broken = False
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read, and note the first message of no known kind, and one that is cut off."""
+        """Read, and note the first message of unknown kind and a message that is cut off."""
         if self.broken and size is not None and size > LARGEST:
             self.had, self.missing, self.broken = 0, size, False
             return bytes(size)
@@ -151,7 +151,7 @@ def read(path: Path, request: Request) -> Log:
 
 
 def _topics(names: frozenset[str]) -> list[str]:
-    """Return the topics read unasked, and those of the series named."""
+    """Return the default topics and the topics of the named series."""
     return list(dict.fromkeys((*TOPICS, *(re.split(r'[.\[]', name)[0] for name in names))))
 
 
@@ -202,7 +202,7 @@ def _axes(columns: dict[str, Any], stem: str) -> FloatArray | None:
 
 
 def _speeds(topic: str, columns: dict[str, Any]) -> MotorSpeeds | None:
-    """Return the speeds that ESCs reported; None when there are none."""
+    """Return the speeds reported by ESCs, or None."""
     fields = [f'esc[{k}].esc_rpm' for k in range(16) if f'esc[{k}].esc_rpm' in columns]
     fields = [name for name in fields if np.any(columns[name])]
     if topic != 'esc_status' or not fields:
@@ -240,7 +240,7 @@ def _facts(ulog: Any) -> dict[str, str]:
 def _series(name: str, topic: str, columns: dict[str, Any]) -> Iterator[Series]:
     t = np.asarray(columns['timestamp'], dtype=np.float64) * 1e-6
     connected = columns.get('connected')
-    # A battery that was never connected is listed, but nobody's first choice.
+    # A battery that was never connected is listed last.
     there = connected is None or bool(np.any(connected))
     for source, field, quantity, rank, words in PLAIN:
         if source != topic or field not in columns:
@@ -278,7 +278,7 @@ def _stack(columns: dict[str, Any], stem: str) -> FloatArray:
 
 def _motors(name: str, t: FloatArray, columns: dict[str, Any]) -> Iterator[Series]:
     control = _stack(columns, 'control')
-    # NaN: there is no such motor, or it is stopped.
+    # NaN: motor missing or stopped.
     used = control[np.isfinite(control).any(axis=1)] if control.size else control
     if used.size:
         known = np.isfinite(used).sum(axis=0)

@@ -70,7 +70,7 @@ def test_a_log_that_was_cut_off(tmp_path, cut):
     assert any('checksum does not match' in note for note in log.notes)
 
 
-def test_wrong_bytes_are_told(tmp_path):
+def test_wrong_bytes_are_reported(tmp_path):
     """A bit in a value breaks the checksum; an unknown event ends the reading, with its byte."""
     events, records, _ = hover()
     pieces = crazyflie(events, records)
@@ -89,7 +89,7 @@ def test_wrong_bytes_are_told(tmp_path):
 @pytest.mark.parametrize('events, words', [
     ([(FIXED, 'fixedFrequency', ['pm.vbat(f)']), (FIXED, 'a', ['b(f)'])], 'two events 65535'),
     ([(FIXED, 'fixedFrequency', ['pm.vbat(z)'])], "no type for 'pm.vbat.z.'")])
-def test_a_header_that_makes_no_sense(tmp_path, events, words):
+def test_senseless_header_is_refused(tmp_path, events, words):
     """One line; nothing is guessed."""
     with pytest.raises(InputError, match=words):
         load(tmp_path, crazyflie(events, []))

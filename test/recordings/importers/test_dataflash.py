@@ -125,7 +125,7 @@ def test_cut_anywhere(tmp_path):
             assert log.notes == ()
 
 
-def test_an_erased_page_is_no_damage(tmp_path):
+def test_erased_page_is_not_damage(tmp_path):
     """Flash is read to the end of a page, which may be empty."""
     _, log = load(tmp_path, copter(30)[0].binary + b'\xff' * 200)
     assert log.notes == ()
@@ -156,7 +156,7 @@ def test_broken_anywhere(tmp_path, form):
     assert mended and (refused or form == 'binary')
 
 
-def test_a_text_log_with_bytes_that_are_no_text(tmp_path):
+def test_text_log_with_binary_bytes(tmp_path):
     """They cost their line, not the log."""
     text = copter(30)[0].text
     at = text.index(b'BAT, ', len(text) // 2)

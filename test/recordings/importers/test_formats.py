@@ -40,7 +40,7 @@ def test_the_first_bytes_decide(tmp_path, name, ending):
     (b'ULog\x01\x12', 'none of the formats'), (b'\xa3\x95', 'none of the formats'),
     (b'nothing here', "no column 'time_s'"),
 ])
-def test_what_is_no_log(tmp_path, content, words):
+def test_other_files_are_not_logs(tmp_path, content, words):
     """One line says what it is, or what is read."""
     path = tmp_path / 'a.ulg'
     path.write_bytes(content)
@@ -66,7 +66,7 @@ def test_no_file(tmp_path):
         detect(tmp_path)
 
 
-def test_a_flight_that_is_not_there(tmp_path):
+def test_missing_flight_is_refused(tmp_path):
     """Formats with one flight a file have no second one."""
     path = tmp_path / 'a'
     for name in ('ulog', 'dataflash', 'csv'):

@@ -187,7 +187,7 @@ def test_what_a_bag_gets(tmp_path, capsys):
     (['--imu', 'gyro'], "did you mean 'gyroADC'"), (['--imu', 'none', '--imu', 'debug'], 'none'),
     (['--poles', '7'], 'even number'),
 ])
-def test_what_is_not_there_is_one_line(tmp_path, capsys, arguments, words):
+def test_missing_series_are_refused_in_one_line(tmp_path, capsys, arguments, words):
     """With the nearest name, and no bag."""
     rows, _ = frames(100)
     path, _ = load(tmp_path, blackbox(rows, FIELDS, HEADERS))

@@ -110,7 +110,7 @@ def test_no_battery(tmp_path):
         choose(path, log)
 
 
-def test_dropouts_are_told(tmp_path):
+def test_dropouts_are_reported(tmp_path):
     """What the logger lost is in the notes."""
     topics, *_ = px4_flight()
     _, log = load(tmp_path, ulog(topics, extra=ulog_message('O', b'\x2c\x01')))
