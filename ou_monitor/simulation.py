@@ -299,21 +299,61 @@ PRESETS: dict[str, Preset] = {
 LARGEST = 1e9
 
 
+class RunningSupply:
+    """
+    A supply that runs: sample k is taken at k/rate, under the throttle that is given with it.
+
+    `simulate` and the node `supply_simulator` both draw from here, so that a seed gives one path,
+    whatever the pieces.  rate in Hz; charge and resistance as in `Simulation`.
+    """
+
+    def __init__(self, model: SupplyModel, *, rate: float, seed: int,
+                 charge: float | None = None, resistance: float = 1.0) -> None:
+        self.rate = rate
+        self.samples = 0
+        self.simulation = Simulation(model, np.random.default_rng(seed), charge=charge,
+                                     resistance=resistance)
+
+    def times(self, n: int) -> FloatArray:
+        """Return the stamps of the next n samples, s."""
+        return np.arange(self.samples, self.samples + n) / self.rate
+
+    def draw(self, throttle: FloatArray) -> FloatArray:
+        """Return the next voltages, V, one for each throttle."""
+        with np.errstate(over='ignore', invalid='ignore'):
+            voltage = self.simulation.advance(
+                self.times(throttle.size),
+                # As a message holds it, so that the truth is what the bag says.
+                throttle.astype(np.float32).astype(np.float64))
+        if not (np.abs(voltage) <= LARGEST).all():
+            raise ValueError(
+                f'the model gives voltages beyond {LARGEST:g} V: check its parameters')
+        self.samples += throttle.size
+        return voltage
+
+
+def lacks(model: SupplyModel) -> tuple[str, ...]:
+    """Return what a simulation of the model leaves out of a supply under load."""
+    names = {term.NAME for term in model.terms}
+    missing = []
+    if not any(term.FAMILY == 'load' for term in model.terms):
+        missing.append('no answer to throttle (load_sag)')
+    if model.load is None:
+        missing.append('no charge (load)' + ('' if 'drift' in names else ' and no drift')
+                       + ': it does not run empty')
+    return tuple(missing)
+
+
 def simulated(model: SupplyModel, profile: Profile, *, duration: float, rate: float, seed: int,
-              name: str = 'simulated') -> Iterator[Recording]:
+              name: str = 'simulated', charge: float | None = None, resistance: float = 1.0,
+              ) -> Iterator[Recording]:
     """Yield a recording in pieces (profile in s, duration in s, rate in Hz)."""
     total = round(duration * rate)
-    run = Simulation(model, np.random.default_rng(seed))
-    for first in range(0, total, SEGMENT):
-        t = np.arange(first, min(first + SEGMENT, total)) / rate
-        # As a bag can hold it, so that the truth is what the bag says.
-        throttle = profile(t).astype(np.float32).astype(np.float64)
-        try:
-            with np.errstate(over='ignore', invalid='ignore'):
-                voltage = run.advance(t, throttle)
-        except ValueError as error:
-            raise InputError(str(error)) from error
-        if not (np.abs(voltage) <= LARGEST).all():
-            raise InputError(
-                f'the model gives voltages beyond {LARGEST:g} V: check its parameters')
-        yield Recording(t, voltage, throttle, name)
+    try:
+        run = RunningSupply(model, rate=rate, seed=seed, charge=charge, resistance=resistance)
+        while run.samples < total:
+            t = run.times(min(SEGMENT, total - run.samples))
+            throttle = profile(t).astype(np.float32).astype(np.float64)
+            yield Recording(t, run.draw(throttle), throttle, name)
+    except ValueError as error:
+        raise InputError(str(error)) from error

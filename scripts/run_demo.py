@@ -2,10 +2,10 @@
 """
 Drive the demo: start the nodes, replay a bag into them, show a live table, write a report.
 
-Estimator, adaptive filter and replay run as processes of their own and talk
-over DDS, as on a vehicle; this program only listens.  Exit status: 0 when
-estimates and filtered samples arrived, 1 when they did not, 2 when the demo
-could not start, 130 after Ctrl-C.
+Estimator, adaptive filter and replay (or, with --simulated, supply_simulator under the recorded
+throttle) run as processes of their own and talk over DDS, as on a vehicle; this program only
+listens.  Exit status: 0 when estimates and filtered samples arrived, 1 when they did not, 2 when
+the demo could not start, 130 after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ ROOT = Path(__file__).resolve().parent.parent
 START_TIMEOUT = 30.0
 # A node that has not ended so long after SIGINT is killed.
 STOP_TIMEOUT = 5.0
-# A recorded flight of a 4S quad, 3.3 V a cell as its limit; a simulated 5 V rail with the nodes'
-# own limit.
-RECORDED, LIMIT, SIMULATED = 'bags/recorded/gecko', 13.2, 'bags/flight'
+# A recorded flight of a 4S quad, 3.3 V a cell as its limit; a model of it.
+RECORDED, LIMIT, MODEL = 'bags/recorded/gecko', 13.2, 'models/gecko.yaml'
+# With --simulated: seed, samples per second, Hz, and how old the pack is in the second half.
+SEED, RATE, OLD = 1, 200.0, 1.6
 HEADER = (f'{"t":>6} {"throttle":>8} {"level":>7} {"noise":>6} {"sag":>6} {"error":>6} '
           f'{"alpha":>7} {"risk":>7} {"cutoff":>7}  load, relaxation\n'
           f'{"s":>6} {"0..1":>8} {"V":>7} {"mV":>6} {"V":>6} {"V":>6} {"1/s":>7} '
@@ -171,7 +172,8 @@ class Listener:
         text = ' '.join(f'{value:{width}{form}}' if math.isfinite(value) else f'{"-":>{width}}'
                         for value, width, form in cells)
         return (f'{text}  {self.fields.get("load_status", "waiting")}, '
-                f'{self.fields.get("status", "waiting")}')
+                f'{self.fields.get("status", "waiting")}'
+                + (', CRITICAL' if self.fields.get('brownout_level') == 'CRITICAL' else ''))
 
 
 class Table:
@@ -222,8 +224,18 @@ def live_page(children: Children) -> str:
     return ''
 
 
-def watch(bag: str, seconds: float, logs: Path, limit: float | None) -> Listener:
-    """Run the nodes, replay the bag into them and show what they publish."""
+def make_old(node: Any) -> None:
+    """Turn the simulated pack old while it flies."""
+    from rclpy.parameter import Parameter
+    from rclpy.parameter_client import AsyncParameterClient
+    AsyncParameterClient(node, '/supply_simulator').set_parameters(
+        [Parameter('scale_resistance', value=OLD)])
+    print(f'The pack grows old: its answer to throttle is {OLD:g} times as large', flush=True)
+
+
+def watch(bag: str, seconds: float, logs: Path, limit: float | None,
+          simulated: bool = False) -> Listener:
+    """Run the nodes, replay the bag or its simulation into them and show what they publish."""
     from ou_monitor.nodes.run import make_executor
     import rclpy
     from rclpy.signals import SignalHandlerOptions
@@ -251,20 +263,41 @@ def watch(bag: str, seconds: float, logs: Path, limit: float | None) -> Listener
             address = live_page(children)
             if address:
                 print(address, flush=True)
-            children.start('replay', bag)
+            source = 'supply_simulator' if simulated else 'replay'
+            children.start(source, *((
+                '--ros-args', '-p', f'model_file:={ROOT / MODEL}', '-p', f'rate:={RATE}', '-p',
+                f'seed:={SEED}', '-p', f'throttle.play:={Path(bag).resolve()}'
+            ) if simulated else (bag,)))
             table = Table()
             end = time.monotonic() + seconds
-            while children.status('replay') is None and time.monotonic() < end:
+            old = end - 0.5 * seconds if simulated else math.inf
+            while children.status(source) is None and time.monotonic() < end:
                 Interrupt.spin(executor, 0.05)
                 children.check('estimator', 'adaptive_filter')
                 table.show(listener)
+                if time.monotonic() > old:
+                    old = math.inf
+                    make_old(node)
             table.close()
-            if children.status('replay'):
-                children.check('replay')
+            if children.status(source):
+                children.check(source)
         return listener
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
+
+
+def simulate(bag: str, report: Path) -> str:
+    """Return a recording of the supply of the demo: the same seed, the same path, not aged."""
+    path = report.with_suffix('.mcap')
+    done = subprocess.run(
+        [sys.executable, '-m', 'ou_monitor.cli.main', 'simulate', '--model', str(ROOT / MODEL),
+         '--throttle', bag, '--rate', f'{RATE}', '--seed', f'{SEED}', '--capacity-left', '-1',
+         '--output', str(path), '--force'],
+        cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
+    if done.returncode:
+        raise DemoError(f'the simulation failed: {done.stderr.strip()[-300:]}')
+    return str(path)
 
 
 def write_report(bag: str, report: Path) -> None:
@@ -286,8 +319,9 @@ def options() -> argparse.Namespace:
         'processes, a bag replayed into them, a live table, and an HTML report.')
     parser.add_argument('--bag', default=RECORDED,
                         help=f'bag to replay ({RECORDED}, a recorded flight)')
-    parser.add_argument('--simulated', action='store_const', dest='bag', const=SIMULATED,
-                        help=f'replay {SIMULATED}, a simulated 5 V rail at 1 kHz')
+    parser.add_argument('--simulated', action='store_true',
+                        help=f'simulate {MODEL} under the throttle of the bag; in the second half '
+                             f'the pack is {OLD:g} times as weak')
     parser.add_argument('--limit', type=float, metavar='V',
                         help=f"voltage of a brown-out ({LIMIT} for {RECORDED}, else the nodes' "
                              'own)')
@@ -335,16 +369,18 @@ def main() -> int:
         if 'ROS_DOMAIN_ID' not in os.environ:
             os.environ['ROS_DOMAIN_ID'] = str(unused_domain())
         topic, _ = signal_of(chosen.bag)
-        print(f'Replaying {chosen.bag} over DDS (domain {os.environ["ROS_DOMAIN_ID"]}) into '
+        print(f"{f'Simulating {MODEL} under' if chosen.simulated else 'Replaying'} "
+              f'{chosen.bag} over DDS (domain {os.environ["ROS_DOMAIN_ID"]}) into '
               f'estimator and adaptive_filter (which filters {topic})', flush=True)
         limit = LIMIT if chosen.limit is None and chosen.bag == RECORDED else chosen.limit
-        heard = watch(chosen.bag, chosen.seconds, chosen.report.parent, limit)
+        heard = watch(chosen.bag, chosen.seconds, chosen.report.parent, limit, chosen.simulated)
         print(f'{heard.estimates} estimates and {heard.outputs} filtered samples arrived')
         if not (heard.estimates and heard.outputs):
             print(f'scripts/demo: nothing usable arrived; last status: {heard.line()}',
                   file=sys.stderr)
             return 1
-        write_report(chosen.bag, chosen.report)
+        write_report(simulate(chosen.bag, chosen.report) if chosen.simulated else chosen.bag,
+                     chosen.report)
     except (DemoError, InputError) as error:
         print(f'scripts/demo: {error}', file=sys.stderr)
         return 2

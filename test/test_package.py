@@ -25,7 +25,8 @@ import pytest
 import yaml
 
 PYPROJECT = tomllib.loads((ROOT / 'pyproject.toml').read_text(encoding='utf-8'))
-EXECUTABLES = ['adaptive_filter', 'adc', 'estimator', 'ou-monitor', 'replay']
+EXECUTABLES = [
+    'adaptive_filter', 'adc', 'estimator', 'ou-monitor', 'replay', 'supply_simulator']
 SHARED = ('msg_config', 'launch', 'config', 'layouts', 'security', 'deploy')
 # Starting Python, ROS and DDS on a busy machine.
 START_TIMEOUT = 60.0

@@ -222,14 +222,15 @@ def marked(folder: Path) -> list[int]:
     return found
 
 
-def test_demo_shows_estimates_and_leaves_a_report(tmp_path):
+@pytest.mark.parametrize('source', [(), ('--simulated',)], ids=['recorded', 'simulated'])
+def test_demo_shows_estimates_and_leaves_a_report(tmp_path, source):
     """A short demo hears estimates and filtered samples, and writes its report."""
     report = tmp_path / 'report.html'
     environment = dict(os.environ)
     environment.pop('ROS_DOMAIN_ID', None)
     done = subprocess.run(
-        [sys.executable, 'scripts/run_demo.py', '--seconds', '8', '--report', report], cwd=ROOT,
-        env=environment, capture_output=True, text=True, timeout=300)
+        [sys.executable, 'scripts/run_demo.py', '--seconds', '8', '--report', report, *source],
+        cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert str(report) in done.stdout and '<html' in report.read_text(encoding='utf-8').lower()
     rows = [line.split() for line in done.stdout.splitlines() if line[:6].strip()
@@ -238,5 +239,6 @@ def test_demo_shows_estimates_and_leaves_a_report(tmp_path):
     # column but, at most, sag, alpha and risk.
     assert 3 <= len(rows) <= 10
     assert all(float(cell) > 0.0 for cell in (*rows[-1][2:4], rows[-1][8]))
-    # Open-circuit voltage of the 4S pack of the recorded flight.
+    # Open-circuit voltage of the 4S pack of the recorded flight, or of its model.
+    assert ('grows old' in done.stdout) == bool(source)
     assert 15.0 < float(rows[-1][2]) < 17.5

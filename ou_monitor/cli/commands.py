@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
+import math
 from typing import Any
 
 from ou_monitor.cli.options import (
@@ -259,6 +260,17 @@ _SIMULATE = Command(
             help='name of a profile, a number 0..1, points T:U,T:U,..., a CSV file with time_s '
             'and throttle, or a recording, whose length is then the default'),
      *PART,
+     Option('--capacity-left', metavar='X', type=float,
+            help='charge at the begin, 0..1, which throttle then draws, in place of drift; -1: '
+            'where the recording of the model began'),
+     Option('--scale-resistance', metavar='X', type=float, default=1.0,
+            help='factor on the answer to throttle: 1.4 is a pack aged by 40 %% (default '
+            '%(default)s)'),
+     Option('--export', metavar='TARGET', choices=('gazebo', 'px4', 'ardupilot', 'json'),
+            help='print the model in the parameters of another simulator, and what that cannot '
+            'express over --throttle: gazebo, px4, ardupilot, json'),
+     Option('--full-current', metavar='A', type=float, default=math.nan,
+            help='with --export: current at full throttle'),
      Option('--output', metavar='PATH', type=path_argument,
             help='NAME.mcap for one file, NAME for a rosbag2 folder'),
      Option('--type', choices=TYPES,
@@ -267,7 +279,8 @@ _SIMULATE = Command(
             help='write the model that was simulated'),
      Option('--list', action='store_true', help='list presets and profiles'), JSON, FORCE),
     ('--preset load_40 --output load_40.mcap',
-     '--model flight.yaml --throttle flight.mcap --from 10 --to 70 --output again.mcap'))
+     '--model flight.yaml --throttle flight.mcap --from 10 --to 70 --output again.mcap',
+     '--model flight.yaml --throttle flight.mcap --export px4'))
 
 COMMANDS = {command.name: command for command in (
     _ANALYZE, _COMPARE, _CONVERT, _COUPLING, _DESIGN, _DISCOVER, _FLEET, _LIVE, _REPRODUCE,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from typing import Any
 
 from ou_monitor.cli import output
@@ -18,6 +19,8 @@ _BLOCKS_FROM = 5000.0
 _NO_BAG = ('.bag', '.bin', '.csv', '.db3', '.json', '.txt', '.ulg', '.yaml', '.yml')
 # Above it stamps would fall together, Hz.
 _RATE_MOST = 1e9
+# Samples at most over which the cost of an export is measured.
+_EXPORT_MOST = 200_000
 # After it stamps would not fit into a bag, s.
 _DURATION_MOST = 9e9
 
@@ -87,6 +90,9 @@ def run(args: argparse.Namespace) -> int:
     if rate > _RATE_MOST:
         raise InputError(f'--rate must be at most {_RATE_MOST:g} Hz, as bags count in ns; got '
                          f'{rate:g}')
+    if args.export is not None:
+        _export(args, file.model, profile, rate, duration, start, end, recorded)
+        return 0
     kind = args.type or ('adc_block' if rate >= _BLOCKS_FROM else 'battery_state')
     if args.output is None:
         if args.save_model is None:
@@ -121,11 +127,37 @@ def _write(args: argparse.Namespace, model: Any, profile: Any, duration: float, 
             RecordingWriter(args.output, type=kind, sample_rate=rate) as writer, \
             Progress('simulating', args.json == output.STDOUT) as progress:
         for piece in simulated(model, profile, duration=duration, rate=rate, seed=args.seed,
-                               name=name):
+                               name=name, charge=_charge(args.capacity_left),
+                               resistance=args.scale_resistance):
             writer.write(piece)
             done += piece.n
             progress(done / total)
     return {'n': done, 'topics': writer.topics}
+
+
+def _export(args: argparse.Namespace, model: Any, profile: Any, rate: float, duration: float,
+            start: float | None, end: float | None, recorded: bool) -> None:
+    """Print the model for another simulator; what is lost goes to stderr."""
+    import numpy as np
+    from ou_monitor.comparison.export import export
+    from ou_monitor.recordings.read import read_recording
+
+    count = min(round(duration * rate), _EXPORT_MOST)
+    recording = read_recording(args.throttle, start=start, end=end) if recorded else None
+    found = export(model, args.export, throttle=profile(np.arange(count) / rate), rate=rate,
+                   full_current=args.full_current, recording=recording)
+    output.say(found.text)
+    for note in found.notes:
+        print(note, file=sys.stderr)
+
+
+def _charge(left: float | None) -> float | None:
+    """Return the charge at the begin, as `RunningSupply` takes it."""
+    if left is None:
+        return None
+    if left != -1.0 and not 0.0 <= left <= 1.0:
+        raise InputError(f'--capacity-left must lie within 0..1, or be -1, got {left:g}')
+    return math.nan if left == -1.0 else left
 
 
 def _positive(name: str, value: float, unit: str) -> float:

@@ -7,13 +7,12 @@ wandering sigma); what is exact in law and what is not is said by each term.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.load import LoadStart
+from ou_monitor.model.load import charge_at, LoadStart, open_circuit
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import Term
@@ -134,17 +133,48 @@ class SupplyModel:
         return voltage
 
 
+# The exponent of current over throttle that `LoadStart.discharge` counts by.
+_POWER = 1.8
+
+
+class Discharge:
+    """The level that a pack loses as throttle draws its charge; `charge` is what is left, 0..1."""
+
+    def __init__(self, load: LoadStart, level: float, charge: float = math.nan) -> None:
+        self._load = load
+        # The level of the model is the level at this charge.
+        self._origin = charge_at(level / load.cells)
+        self.charge = self._origin if math.isnan(charge) else charge
+
+    def __call__(self, s: Segment) -> None:
+        """Lower the level."""
+        step = np.where(np.isfinite(s.step), s.step, 0.0)
+        left = self.charge - np.cumsum(self._load.discharge * s.throttle ** _POWER * step)
+        s.level += self._load.cells * (open_circuit(left) - open_circuit(self._origin))
+        self.charge = float(left[-1])
+
+
 class Simulation:
     """
     A simulation that goes on from segment to segment; each term gets a child of `rng`.
 
-    The same seed gives the same samples, to rounding, whatever the segments.
+    The same seed gives the same samples, to rounding, whatever the segments.  `resistance`
+    multiplies the answer to throttle, and may change on the way: an old pack.  `charge`, 0..1,
+    at the first sample has the level follow the charge that throttle draws (`model.load`), in
+    place of the recording's drift; NaN: the charge at which the recording began.
     """
 
-    def __init__(self, model: SupplyModel, rng: np.random.Generator) -> None:
+    def __init__(self, model: SupplyModel, rng: np.random.Generator, *,
+                 charge: float | None = None, resistance: float = 1.0) -> None:
         self._model = model
+        self.resistance = resistance
+        self.discharge: Discharge | None = None
+        if charge is not None:
+            if model.load is None:
+                raise ValueError("the model has no entry 'load': nothing is known of its charge")
+            self.discharge = Discharge(model.load, model.ou.u0, charge)
         np.empty(_KEPT)
-        self._effects = _in_order(model.terms, rng)
+        self._effects = self._in_order(rng)
         # Only then does a term change alpha, sigma, power or push: else they are
         # one number each, broadcast n times.
         self._driven = any(term.STAGE is Stage.DRIVE for term in model.terms)
@@ -172,9 +202,46 @@ class Simulation:
         self._last = float(stamps[-1])
         return s.voltage
 
+    def _in_order(self, rng: np.random.Generator) -> list[Effect]:
+        """Return the effects of all terms in the order of their stages."""
+        # A term's draws depend on its name and on how many of that name came before
+        # it, so that adding another term leaves them as they were.
+        seeds = rng.integers(0, 2**63, size=2).tolist()
+        counts: dict[str, int] = {}
+        pairs: list[tuple[Stage, Effect]] = []
+        for term in self._model.terms:
+            nth = counts[term.NAME] = counts.get(term.NAME, 0) + 1
+            own = np.random.default_rng([*seeds, nth, *term.NAME.encode()])
+            effect = term.start(own)
+            if term.NAME == 'drift' and self.discharge is not None:
+                effect = self.discharge
+            elif term.FAMILY == 'load':
+                effect = self._scaled(effect)
+            pairs.append((term.STAGE, effect))
+        if self.discharge is not None and not counts.get('drift'):
+            pairs.append((Stage.LEVEL, self.discharge))
+        effects = [effect for _, effect in sorted(pairs, key=lambda pair: pair[0])]
+        at = sum(stage <= Stage.LEVEL for stage, _ in pairs)
+        effects.insert(at, _join)
+        return effects
+
+    def _scaled(self, effect: Effect) -> Effect:
+        """Return the effect of an answer to throttle, times the resistance."""
+        def scaled(s: Segment) -> None:
+            if self.resistance == 1.0:
+                effect(s)
+                return
+            before = s.level.copy()
+            effect(s)
+            s.level = before + self.resistance * (s.level - before)
+
+        return scaled
+
     def _load(self, throttle: npt.ArrayLike | None, stamps: FloatArray) -> FloatArray:
         """Return throttle for all samples; NaN where no term asks for it."""
         needs = self._model.needs_throttle
+        if self.discharge is not None:
+            needs = (*needs, 'load')
         if throttle is None:
             if needs:
                 raise ValueError(f"the term '{needs[0]}' needs throttle, and none is given")
@@ -199,23 +266,6 @@ class Simulation:
             alpha=of(ou.alpha), sigma=of(ou.sigma), power=of(1.0), push=of(0.0), bend=(0.0, 0.0),
             x=np.broadcast_to(0.0, n), level=np.full(n, ou.u0),
             noise=np.broadcast_to(1.0, n), voltage=np.broadcast_to(0.0, n))
-
-
-def _in_order(terms: Sequence[Term], rng: np.random.Generator) -> list[Effect]:
-    """Return the effects of all terms in the order of their stages."""
-    # A term's draws depend on its name and on how many of that name came before
-    # it, so that adding another term leaves them as they were.
-    seeds = rng.integers(0, 2**63, size=2).tolist()
-    counts: dict[str, int] = {}
-    pairs = []
-    for term in terms:
-        nth = counts[term.NAME] = counts.get(term.NAME, 0) + 1
-        own = np.random.default_rng([*seeds, nth, *term.NAME.encode()])
-        pairs.append((term.STAGE, term.start(own)))
-    effects = [effect for stage, effect in sorted(pairs, key=lambda pair: pair[0])]
-    at = sum(term.STAGE <= term.STAGE.LEVEL for term in terms)
-    effects.insert(at, _join)
-    return effects
 
 
 def _join(s: Segment) -> None:

@@ -311,3 +311,22 @@ def test_a_bag_is_not_named_like_another_file(name, tmp_path, capsys):
     out, err = capsys.readouterr()
     assert out == '' and err.count('\n') == 1 and '.mcap' in err and name in err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_export_and_an_old_pack(tmp_path, capsys):
+    """Parameters on stdout, what is lost on stderr; the pack that is aged sags more."""
+    model = str(ROOT / 'models' / 'gecko.yaml')
+    assert main(['simulate', '--model', model, '--duration', '5', '--export', 'px4']) == 0
+    said = capsys.readouterr()
+    assert 'param set SIM_BAT_DRAIN' in said.out and 'load_sag is left out' in said.err
+    lowest = []
+    for name, scale in (('new', '1'), ('old', '1.4')):
+        path = tmp_path / f'{name}.mcap'
+        assert main(['simulate', '--model', model, '--duration', '10', '--rate', '100',
+                     '--capacity-left', '0.8', '--scale-resistance', scale, '--output',
+                     str(path)]) == 0
+        lowest.append(read_recording(path).voltage.min())
+    assert lowest[0] - lowest[1] > 0.2
+    assert main(['simulate', '--model', model, '--capacity-left', '2', '--output',
+                 str(tmp_path / 'no.mcap')]) == 2
+    assert '--capacity-left' in capsys.readouterr().err

@@ -1,6 +1,7 @@
 """The shipped parameter file and launch file agree with the program."""
 
 import ast
+from pathlib import Path
 import re
 import sys
 from types import ModuleType
@@ -11,6 +12,7 @@ from ou_monitor.nodes.adc_node import ADC_PARAMETERS
 from ou_monitor.nodes.base import LOCK, PUBLISH_RATE
 from ou_monitor.nodes.estimator_node import STATE_FILE
 from ou_monitor.nodes.sources import SOURCE_PARAMETERS
+from ou_monitor.nodes.supply_simulator_node import FIXED_PARAMETERS, LIVE_PARAMETERS
 from ou_monitor.online.settings import ESTIMATOR_PARAMETERS
 from project import metadata
 import pytest
@@ -24,6 +26,7 @@ DECLARED = {
 FILE = ROOT / 'config' / 'ou_monitor.yaml'
 ADC_FILE = ROOT / 'config' / 'adc.yaml'
 LAUNCH = ROOT / 'launch' / 'ou_monitor_launch.py'
+SIMULATED = ROOT / 'launch' / 'ou_monitor_simulated_launch.py'
 TWO = ROOT / 'launch' / 'ou_monitor_two_batteries_launch.py'
 
 
@@ -85,7 +88,8 @@ def described(request, monkeypatch):
              'launch.launch_description_sources': ['PythonLaunchDescriptionSource'],
              'launch.substitutions': ['EnvironmentVariable', 'LaunchConfiguration'],
              'launch_ros': [],
-             'launch_ros.actions': ['Node']}
+             'launch_ros.actions': ['Node'],
+             'launch_ros.parameter_descriptions': ['ParameterValue']}
     for module, classes in kinds.items():
         stand_in = ModuleType(module)
         for name in classes:
@@ -178,6 +182,28 @@ def test_two_batteries(described):
         assert set(given) <= known and given.pop('filter') == 'false'
         used = {value.args[0] for value in given.values()}
         assert used <= declared and f'voltage_{number}' in used
+
+
+@pytest.mark.parametrize('described', [SIMULATED], indirect=True)
+def test_simulated(described):
+    """The other launch file first, with arguments that it has; parameters that the node has."""
+    (include,), (node,) = of_kind(described, 'IncludeLaunchDescription'), of_kind(
+        described, 'Node')
+    kinds = [type(entry).__name__ for entry in described]
+    assert kinds.index('IncludeLaunchDescription') < kinds.index('Node')
+    assert include.args[0].args == (str(LAUNCH),)
+    known = {name for name, _, _ in _arguments_of(LAUNCH)}
+    assert set(dict(include.kwargs['launch_arguments'])) <= known
+    arguments = {a.args[0]: a.kwargs['default_value']
+                 for a in of_kind(described, 'DeclareLaunchArgument')}
+    for name in ('model_file', 'params_file'):
+        assert Path(arguments[name]).is_file()
+    (values,) = node.kwargs['parameters']
+    assert set(values) - {'use_sim_time'} <= {
+        p.name for p in (*LIVE_PARAMETERS, *FIXED_PARAMETERS)}
+    own = yaml.safe_load((ROOT / 'config' / 'simulated.yaml').read_text())
+    assert set(flat(own['/**/ou_estimator']['ros__parameters'])) <= {
+        p.name for p in DECLARED['ou_estimator']}
 
 
 def _arguments_of(path):

@@ -15,7 +15,9 @@ pytestmark = pytest.mark.skipif(
 
 FILES = {'ou_monitor_launch.py': ['/ou_estimator', '/ou_adaptive_filter'],
          'ou_monitor_two_batteries_launch.py': [
-             '/battery_1/ou_estimator', '/battery_2/ou_estimator']}
+             '/battery_1/ou_estimator', '/battery_2/ou_estimator'],
+         'ou_monitor_simulated_launch.py': [
+             '/supply_simulator', '/ou_estimator', '/ou_adaptive_filter']}
 
 
 @pytest.mark.parametrize('file', FILES)

@@ -1,0 +1,205 @@
+"""
+A model in the terms of another simulator, and what that simulator cannot express.
+
+What each of them can express is read from its sources (`SOURCES`): PX4 a straight fall from full
+to empty, Gazebo the same less the sag of a constant load, ArduPilot a charge curve less a current
+times a resistance.  None has noise, lags, an inrush or an ADC.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+import json
+import math
+
+import numpy as np
+from ou_monitor.comparison.compare import compare
+from ou_monitor.errors import InputError
+from ou_monitor.model.load import cells_in_series, charge_at
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.slow import Drift
+from ou_monitor.records import FloatArray, Recording
+from ou_monitor.simulation import RunningSupply
+
+# Where the names and the equations are from: repository, file, commit.
+SOURCES = {
+    'px4': ('PX4/PX4-Autopilot src/modules/simulation/battery_simulator/BatterySimulator.cpp '
+            '1295561, battery_simulator_params.yaml 3debe5b, src/lib/battery/module.yaml 042778a'),
+    'gazebo': 'gazebosim/gz-sim src/systems/battery_plugin/LinearBatteryPlugin.cc 01d9d94',
+    'ardupilot': ('ArduPilot/ardupilot libraries/SITL/SITL.cpp 0061411, SIM_Battery.cpp 018c7ee, '
+                  'SIM_Frame.h 07b1fa1, libraries/AP_BattMonitor/AP_BattMonitor_Params.cpp '
+                  '000ecd1'),
+}
+TARGETS = ('gazebo', 'px4', 'ardupilot', 'json')
+# Terms of which a target keeps something.
+_KEPT = {'px4': ('drift',), 'gazebo': ('drift', 'load_sag'), 'ardupilot': ('drift', 'load_sag')}
+# Voltages of a cell that counts as empty, and as critical, V.
+_EMPTY, _CRITICAL = 3.5, 3.3
+# The exponent of current over throttle that the model's discharge counts by.
+_POWER = 1.8
+_SEEDS = 20
+
+
+@dataclass(frozen=True)
+class Export:
+    """A model for another simulator."""
+
+    text: str  # What that simulator reads
+    notes: tuple[str, ...]  # A line for each term that it cannot express, and what that costs
+    model: SupplyModel  # What it simulates, as a model
+
+
+@dataclass(frozen=True)
+class _Numbers:
+    """What the targets have parameters for."""
+
+    cells: int
+    full: float  # Level at the begin, V
+    empty: float  # Level that counts as empty, V
+    drain: float  # Time from the one to the other under the usual load, s; inf: it does not fall
+    charge: float  # Charge drawn meanwhile, 0..1 of the pack
+    share: float  # The usual load, of that at full throttle
+    sag: float  # Sag at full throttle, V
+    usual_sag: float  # Sag under the usual load, V
+
+
+def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float,
+           full_current: float = math.nan, recording: Recording | None = None) -> Export:
+    """
+    Return a model for another simulator (throttle at rate, Hz; full_current in A).
+
+    Throttle says what load is usual, and over which the cost of each term is measured; the
+    recording beside it what the exported model explains of it.
+    """
+    if target == 'json':
+        data = {'model': [{'term': t.NAME, 'params': t.values()} for t in model.terms],
+                'load': None if model.load is None else model.load.values()}
+        return Export(json.dumps(data, indent=1, allow_nan=False), (), model)
+    n = _numbers(model, throttle)
+    known = math.isfinite(full_current) and full_current > 0.0
+    if target != 'px4' and not known:
+        raise InputError(f'--export {target} needs --full-current A, the current at full '
+                         'throttle: the model knows throttle alone')
+    text = _WRITERS[target](n, full_current)
+    left = SupplyModel((replace(model.ou, sigma=0.0, u0=n.full - (
+        n.usual_sag if target == 'gazebo' else 0.0)), *(
+        () if math.isinf(n.drain) else (Drift((n.empty - n.full) / n.drain, 0.0),)), *(
+        t for t in model.terms if target == 'ardupilot' and isinstance(t, LoadSag))))
+    notes = _lost(model, target, throttle, rate)
+    if target == 'gazebo' and n.usual_sag:
+        notes.append(f'load_sag is that of a constant load, {n.usual_sag:.3g} V: throttle does '
+                     'not move it')
+    if recording is not None:
+        notes += _cost(model, left, recording)
+    return Export(text, tuple(notes), left)
+
+
+def _numbers(model: SupplyModel, throttle: FloatArray) -> _Numbers:
+    load, u0 = model.load, model.ou.u0
+    cells = round(load.cells) if load is not None else cells_in_series(u0)
+    share = float(np.mean(throttle ** _POWER))
+    empty = min(cells * _EMPTY, u0)
+    drain, charge = math.inf, math.nan
+    drift = next((t for t in model.terms if isinstance(t, Drift)), None)
+    if load is not None:
+        charge = charge_at(u0 / load.cells) - charge_at(empty / load.cells)
+        if load.discharge * share > 0.0:
+            drain = charge / (load.discharge * share)
+    elif drift is not None and drift.rate < 0.0:
+        drain = (empty - u0) / drift.rate
+    sags = [t for t in model.terms if isinstance(t, LoadSag)]
+
+    def sag(u: FloatArray) -> float:
+        return float(sum(np.mean(t.linear * u + t.square * u * u) for t in sags))
+
+    return _Numbers(cells, u0, empty, drain if drain > 0.0 else math.inf, charge, share,
+                    sag(np.ones(1)), sag(throttle))
+
+
+def _px4(n: _Numbers, full_current: float) -> str:
+    return '\n'.join((
+        f'# {SOURCES["px4"]}', f'param set BAT1_N_CELLS {n.cells}',
+        f'param set BAT1_V_CHARGED {n.full / n.cells:.3f}',
+        f'param set BAT1_V_EMPTY {n.empty / n.cells:.3f}',
+        # 0 would switch it off.
+        f'param set SIM_BAT_DRAIN {n.drain if math.isfinite(n.drain) else 1e6:.0f}',
+        'param set SIM_BAT_MIN_PCT 0'))
+
+
+def _capacity(n: _Numbers, full_current: float) -> float:
+    """Return the capacity of the pack, Ah."""
+    if not (math.isfinite(n.charge) and math.isfinite(n.drain)) or not n.charge > 0.0:
+        raise InputError('the model does not say how fast throttle empties the pack (load): '
+                         'no capacity can be given')
+    return full_current * n.share * n.drain / n.charge / 3600.0
+
+
+def _gazebo(n: _Numbers, full_current: float) -> str:
+    current = full_current * n.share
+    capacity = _capacity(n, full_current)
+    # The line through level now and empty, over charge drawn: E = e0 + e1 (1 - q/c).
+    slope = (n.empty - n.full) / n.charge
+    return '\n'.join((
+        f'<!-- {SOURCES["gazebo"]} -->',
+        '<plugin filename="gz-sim-linearbatteryplugin-system"',
+        '        name="gz::sim::systems::LinearBatteryPlugin">',
+        '  <battery_name>battery</battery_name>',
+        f'  <voltage>{n.full:.3f}</voltage>',
+        f'  <open_circuit_voltage_constant_coef>{n.full:.3f}</open_circuit_voltage_constant_coef>',
+        f'  <open_circuit_voltage_linear_coef>{slope:.3f}</open_circuit_voltage_linear_coef>',
+        f'  <capacity>{capacity:.4f}</capacity>',
+        f'  <initial_charge>{capacity:.4f}</initial_charge>',
+        f'  <resistance>{n.usual_sag / current:.5f}</resistance>',
+        '  <smooth_current_tau>1.0</smooth_current_tau>',
+        f'  <power_load>{current * (n.full - n.usual_sag):.2f}</power_load>',
+        '  <fix_issue_225>true</fix_issue_225>', '</plugin>'))
+
+
+def _ardupilot(n: _Numbers, full_current: float) -> str:
+    capacity = _capacity(n, full_current)
+    return '\n'.join((
+        f'# {SOURCES["ardupilot"]}', f'SIM_BATT_VOLTAGE {n.full:.2f}',
+        f'SIM_BATT_CAP_AH {capacity:.3f}', f'BATT_CAPACITY {1e3 * capacity:.0f}',
+        f'BATT_LOW_VOLT {n.cells * _EMPTY:.2f}', f'BATT_CRT_VOLT {n.cells * _CRITICAL:.2f}',
+        '# In the JSON of the frame (sim_vehicle.py --model NAME:frame.json):',
+        f'# "maxVoltage": {n.cells * 4.2:.1f}, "battCapacityAh": {capacity:.3f}, '
+        f'"refBatRes": {n.sag / full_current:.5f}'))
+
+
+_WRITERS: dict[str, Callable[[_Numbers, float], str]] = {
+    'px4': _px4, 'gazebo': _gazebo, 'ardupilot': _ardupilot}
+
+
+def _lost(model: SupplyModel, target: str, throttle: FloatArray, rate: float) -> list[str]:
+    """Return a line for each term that is left out: how much it moves the simulated voltage."""
+    whole = _drawn(model, throttle, rate)
+    notes = []
+    for k, term in enumerate(model.terms):
+        if term.NAME in _KEPT[target]:
+            continue
+        rest = (replace(model.ou, sigma=0.0), *model.terms[1:]) if k == 0 else (
+            *model.terms[:k], *model.terms[k + 1:])
+        # A term's draws do not depend on the others: the difference is what it does.
+        moved = whole - _drawn(SupplyModel(rest, model.load), throttle, rate)
+        notes.append(f'{term.NAME} is left out: {1e3 * float(np.std(moved)):.3g} mV rms, up to '
+                     f'{1e3 * float(np.abs(moved).max()):.3g} mV')
+    return notes
+
+
+def _drawn(model: SupplyModel, throttle: FloatArray, rate: float) -> FloatArray:
+    return RunningSupply(model, rate=rate, seed=0).draw(throttle)
+
+
+def _cost(model: SupplyModel, left: SupplyModel, recording: Recording) -> list[str]:
+    """Return what the model and what is left of it say of a recording."""
+    notes = []
+    for words, one in (('the model', model), ('what is exported', left)):
+        found = compare(recording, one, seeds=_SEEDS).as_data()
+        path, lowest = found['mean_path'], found['lowest_v']
+        notes.append(
+            f"{words}: explains {100.0 * max(path['variance_explained'], 0.0):.0f} % of "
+            f"{recording.name}, lowest voltage {lowest['simulated_median']:.2f} V (measured "
+            f"{lowest['measured']:.2f} V), {found['verdict']}")
+    return notes

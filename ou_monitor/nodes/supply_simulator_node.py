@@ -1,0 +1,370 @@
+"""
+The node of `supply_simulator`.
+
+A thread draws samples under the newest throttle and publishes them by the node's clock (simulated
+time too) as `msg_config` says: sensor_msgs/BatteryState on `voltage` by default.  Throttle comes
+from its topic, or is played and published (`throttle.play`).  `~/reset` (std_srvs/Trigger) begins
+anew; `/diagnostics` at 1 Hz.
+
+Limits: one voltage, no current.  Above 200 Hz samples are drawn for 20 ms at a time: throttle acts
+so much later, and messages that carry a stamp leave together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+import math
+import threading
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.nodes.base import diagnostic, MonitorNode
+from ou_monitor.nodes.console import PublisherWatch
+from ou_monitor.nodes.inputs import PolledInput, Silence, types_on
+from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
+from ou_monitor.online.settings import Parameter
+from ou_monitor.recordings.model_file import read_model
+from ou_monitor.records import FloatArray, Level
+from ou_monitor.simulation import (
+    is_recording, lacks, Profile, read_profile, read_throttle, RunningSupply, STICK_RATE)
+from ou_monitor.stream.config import Extractor, parse_field_path
+from std_srvs.srv import Trigger
+
+# Read again at each reset, but for the last one, which is in force at once.
+LIVE_PARAMETERS: tuple[Parameter, ...] = (
+    Parameter('seed', 0, 'Seed of all that is random, from the next ~/reset on.', 0, 2**31 - 1),
+    Parameter('capacity_left', -1.0,
+              'Charge of the pack at the start, 0..1, from the next ~/reset on; -1: as where the '
+              "model's recording began.", -1.0, 1.0),
+    Parameter('scale_resistance', 1.0,
+              'Factor on the answer to throttle: 1.4 is a pack aged by 40 %; in force at once.',
+              0.0, 100.0),
+)
+FIXED_PARAMETERS: tuple[Parameter, ...] = (
+    Parameter('model_file', '', 'Model of the supply, from discover --save-model.'),
+    Parameter('rate', 100.0, 'Samples per second, Hz.', 0.1, 1000.0),
+    Parameter('throttle.play', '',
+              'Throttle that is played, repeated and published: a profile (flight, hover), 0..1, '
+              'points T:U, or a recording; empty: the topic of the throttle.'),
+)
+_SOURCES = tuple(p for p in SOURCE_PARAMETERS if p.name not in (
+    'adc.sample_rate', 'smooth_stamps'))
+# What is published or played where the parameters leave the type open.
+_USUAL = {'voltage': 'sensor_msgs/msg/BatteryState', 'throttle': 'std_msgs/msg/Float32'}
+# Up to this rate, Hz, each sample is drawn on its own; above, those of this time, s, in one go: a
+# call of the model costs 0.2 ms of CPU, and a wake of the thread as much as a message.
+_EACH, _AHEAD = 200.0, 0.02
+# Throttle that falls silent is held for this time, s; then the craft idles.
+_HOLD = 1.0
+# Throttle beyond this is none (as the estimator's rule); below, it is taken within 0..1.
+_MOST_THROTTLE = 2.0
+# A clock that is so far from the next sample, s, was set: samples go on from where it is.  A
+# machine under load pauses for a second.
+_JUMP = 5.0
+# Longest sleep, s; and how often simulated time is looked at, s.
+_NAP, _LOOK = 0.05, 0.002
+
+
+class Sender:
+    """Publishes a number and its stamp as a msg_config says."""
+
+    def __init__(self, node: MonitorNode, source: Source) -> None:
+        if source.spec is None:
+            usual = source.choose([_USUAL[source.quantity]])
+            assert usual is not None
+            source = usual
+        self.source = source
+        kind, extractor = source.open()
+        spec = extractor.spec
+        if spec.sample_rate is not None:
+            raise InputError(f"msg_config '{source.config}' has blocks of samples, which are not "
+                             'simulated live: ou-monitor simulate --type adc_block, and replay')
+        self.message = kind()
+        if spec.type == _USUAL['voltage']:
+            # What is not simulated is not known.
+            for name in ('current', 'charge', 'capacity', 'design_capacity', 'percentage',
+                         'temperature'):
+                setattr(self.message, name, math.nan)
+            self.message.present = True
+        self._set = _setter(self.message, spec.field, extractor)
+        self._scale, self._offset = spec.sign * spec.unit_factor, spec.offset
+        # Writes the stamp, where there is one.
+        self.stamp = None if spec.stamp_field is None else _setter(
+            self.message, spec.stamp_field, extractor, stamp_factor=spec.stamp_factor)
+        self._output = node.create_publisher(kind, source.topic, 100)
+
+    def send(self, stamp: float, value: float) -> None:
+        """Publish (stamp in s)."""
+        self._set((value - self._offset) / self._scale)
+        if self.stamp is not None:
+            self.stamp(stamp)
+        self._output.publish(self.message)
+
+
+def _setter(message: Any, path: str, extractor: Extractor, stamp_factor: float = math.nan
+            ) -> Callable[[float], None]:
+    """Return what writes a number, or a stamp in s, at a field path."""
+    *steps, last = parse_field_path(path)
+    owner = extractor.walk(message, tuple(steps), path)
+    now = None if owner is None else extractor.walk(owner, (last,), path)
+    if now is None:
+        raise InputError(f"field '{path}' has no element to write to")
+    if hasattr(now, 'nanosec'):
+        def stamp(value: float) -> None:
+            now.sec, now.nanosec = divmod(round(value * 1e9), 10**9)
+        return stamp
+    if isinstance(now, int):
+        def convert(value: float) -> Any:
+            return round(value / stamp_factor if stamp_factor > 0.0 else value)
+    else:
+        def convert(value: float) -> Any:
+            return value / stamp_factor if stamp_factor > 0.0 else value
+
+    def write(value: float) -> None:
+        if isinstance(last, int):
+            owner[last] = convert(value)
+        else:
+            setattr(owner, last, convert(value))
+    return write
+
+
+class SupplySimulatorNode(MonitorNode):
+    """The voltage of a model, as a node."""
+
+    def __init__(self, name: str) -> None:
+        self._lock = threading.Lock()
+        self._end = threading.Event()
+        self._thread: threading.Thread | None = None
+        super().__init__(name, LIVE_PARAMETERS, (*_SOURCES, *FIXED_PARAMETERS))
+        self.begin()
+
+    def start(self) -> None:
+        """Read the model and begin."""
+        values = {p.name: self.get_parameter(p.name).value
+                  for p in (*_SOURCES, *FIXED_PARAMETERS)}
+        values['adc.sample_rate'] = 0.0
+        if not values['model_file']:
+            raise InputError('model_file is needed: ou-monitor discover RECORDING --save-model '
+                             'm.yaml makes one')
+        self._model = read_model(values['model_file']).model
+        self._needs_throttle = bool(self._model.needs_throttle) or self._model.load is not None
+        self._lacks = lacks(self._model)
+        self._rate = values['rate']
+        self._problem, self._lost, self._sent = '', 0, 0
+        self._reset()
+        voltage = find_source('voltage', values)
+        assert voltage is not None
+        self._voltage = Sender(self, voltage)
+        self._throttle_source = find_source('throttle', values)
+        self._played = self._play(values['throttle.play'])
+        self._input: PolledInput | None = None
+        self._heard = Silence(self.steady_now)
+        self._throttle, self._turn = 0.0, -1
+        self._watched = PublisherWatch()
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self.create_service(Trigger, '~/reset', self.guarded(self._on_reset))
+        self.refuse_other_overrides(['/diagnostics', '/clock', self._voltage.source.topic, *(
+            () if self._throttle_source is None else (self._throttle_source.topic,))])
+        self.get_logger().info(
+            f"{', '.join(term.NAME for term in self._model.terms)} at {self._rate:g} Hz on "
+            f'{self.resolve_topic_name(self._voltage.source.topic)}'
+            + ''.join(f'; {one}' for one in self._lacks))
+        self._watch()
+        self.every(0.2, self._watch)
+        self.every(1.0, self._diagnose)
+        self._thread = threading.Thread(target=self._run, name='supply', daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread before what it publishes on is closed."""
+        self._end.set()
+        if self._thread is not None:
+            self._thread.join()
+        super().stop()
+
+    def apply(self, values: Mapping[str, Any]) -> None:
+        """Bring the resistance into force."""
+        self._run_now.simulation.resistance = values['scale_resistance']
+
+    def check(self, values: Mapping[str, Any]) -> None:
+        """Raise `ValueError` when the parameters cannot be used."""
+        if -1.0 < values['capacity_left'] < 0.0:
+            raise ValueError('capacity_left must lie within 0..1, or be -1')
+
+    def _reset(self) -> None:
+        values = self.values()
+        left = values['capacity_left']
+        charge = math.nan if left < 0.0 else left
+        if self._model.load is None and left >= 0.0:
+            raise InputError("capacity_left: the model has no entry 'load', so nothing is known "
+                             'of its charge')
+        with self._lock:
+            self._run_now = RunningSupply(
+                self._model, rate=self._rate, seed=values['seed'],
+                charge=None if self._model.load is None else charge,
+                resistance=values['scale_resistance'])
+            # Stamp of the first sample, s; NaN: where the clock is then.
+            self._begin = math.nan
+            self._problem = ''
+
+    def _on_reset(self, request: Any, response: Any) -> Any:
+        try:
+            self._reset()
+        except InputError as error:
+            response.success, response.message = False, str(error)
+            return response
+        response.success = True
+        response.message = f"Begun anew with seed {self.values()['seed']}."
+        return response
+
+    def _play(self, text: str) -> tuple[Profile, float, Sender] | None:
+        """Return the throttle that is played, its length, s, and what publishes it."""
+        if not text:
+            return None
+        if self._throttle_source is None:
+            raise InputError('throttle.play: the msg_config has no throttle to publish it on')
+        sender = Sender(self, self._throttle_source)
+        if is_recording(text):
+            found = read_throttle(text)
+            return found.profile, found.duration, sender
+        return read_profile(text), math.inf, sender
+
+    # -- throttle
+
+    def _watch(self) -> None:
+        """Look at who publishes throttle, 5 times a second."""
+        source = self._throttle_source
+        if self._played is not None or source is None:
+            return
+        topic = self.resolve_topic_name(source.topic)
+        if self._input is None:
+            known = source if source.spec is not None else source.choose(types_on(self, topic))
+            if known is None:
+                return
+            kind, extractor = known.open()
+            self._input = PolledInput(self, kind, source.topic, extractor.spec)
+        self._watched.look(self.get_publishers_info_by_topic(topic), self._input.publishers,
+                           self.steady_now())
+
+    def _hear(self) -> float:
+        """Return the throttle now: the newest, held for a second; then 0."""
+        found = None if self._input is None else self._input.take()
+        if found is not None:
+            good = np.flatnonzero(np.abs(found.values) <= _MOST_THROTTLE)
+            if good.size:
+                self._throttle = min(max(float(found.values[good[-1]]), 0.0), 1.0)
+                self._heard.heard()
+        if self._idles:
+            self._throttle = 0.0
+        return self._throttle
+
+    @property
+    def _idles(self) -> bool:
+        age = self._heard.age
+        return age is None or age > _HOLD
+
+    # -- the thread
+
+    def _run(self) -> None:
+        try:
+            while not self._end.is_set():
+                self._piece()
+        except Exception as error:
+            # A publisher that is gone after a shutdown is no failure.
+            if not self._end.is_set() and self.context.ok():
+                self._problem = f'{type(error).__name__}: {error}'
+                self.get_logger().error(self._problem)
+
+    def _piece(self) -> None:
+        """Draw the next samples and publish each when it is due."""
+        now = self.stamp_now()
+        if now <= 0.0 or self._problem:
+            time.sleep(_NAP)
+            return
+        with self._lock:
+            run = self._run_now
+            due = self._begin + run.samples / self._rate
+            if not abs(now - due) <= _JUMP + 1.0 / self._rate:
+                if not math.isnan(self._begin):
+                    self._lost += max(0, int((now - due) * self._rate))
+                    self.get_logger().warning(f'the clock went by {now - due:+.3g} s: the supply '
+                                              'goes on from where it was')
+                self._begin = now - run.samples / self._rate
+            begin = self._begin
+            times = run.times(1 if self._rate <= _EACH else int(_AHEAD * self._rate))
+            throttle = self._throttle_at(times)
+            try:
+                voltage = run.draw(throttle)
+            except ValueError as error:
+                self._problem = str(error)
+                self.get_logger().error(self._problem)
+                return
+        if run.simulation.discharge is not None and hasattr(self._voltage.message, 'percentage'):
+            self._voltage.message.percentage = min(max(run.simulation.discharge.charge, 0.0), 1.0)
+        for t, u, v in zip(times.tolist(), throttle.tolist(), voltage.tolist()):
+            due = times[-1] if self._voltage.stamp is not None else t
+            if not self._wait(begin + due) or run is not self._run_now:
+                return
+            turn = math.floor(t * STICK_RATE + 1e-6)
+            if self._played is not None and turn != self._turn:
+                self._turn = turn
+                self._played[2].send(begin + t, u)
+            self._voltage.send(begin + t, v)
+            self._sent += 1
+
+    def _throttle_at(self, times: FloatArray) -> FloatArray:
+        if self._played is None:
+            return np.full(times.size, self._hear())
+        profile, length, _ = self._played
+        throttle = profile(times % length if math.isfinite(length) else times)
+        self._throttle = float(throttle[-1])
+        return throttle
+
+    def _wait(self, due: float) -> bool:
+        """Wait until the node's clock is there, or was set; return whether to go on."""
+        while not self._end.is_set():
+            simulated = self.get_clock().ros_time_is_active
+            left = due - (self.stamp_now() if simulated else time.time())
+            if left <= 0.0 or left > _JUMP + 1.0 / self._rate:
+                return True
+            time.sleep(_LOOK if simulated else min(left, _NAP))
+        return False
+
+    # -- diagnostics
+
+    def _diagnose(self) -> None:
+        level, notes = Level.OK, []
+        topic = '' if self._throttle_source is None else self.resolve_topic_name(
+            self._throttle_source.topic)
+        voltage = self.resolve_topic_name(self._voltage.source.topic)
+        if self._played is None and self._needs_throttle and self._idles:
+            age = self._heard.age
+            notes.append(f'No throttle {f"on {topic}" if topic else "in this msg_config"}'
+                         + ('' if age is None else f' for {age:.1f} s') + ': it idles.')
+        notes += self._watched.notes(topic)
+        if self.count_publishers(voltage) > 1:
+            notes.append(f'{voltage} has another publisher.')
+        if self.faulty:
+            notes.append(f'A callback failed ({self.faults} times so far): {self.fault}.')
+        if self.stamp_now() <= 0.0:
+            notes.append('use_sim_time is set, but nothing comes on /clock.')
+        if notes:
+            level = Level.WARN
+        if self._problem:
+            level, notes = Level.ERROR, [f'{self._problem} (~/reset begins anew).']
+        run = self._run_now
+        discharge = run.simulation.discharge
+        fields = {
+            'rate': repr(self._rate), 'samples': str(self._sent), 'lost': str(self._lost),
+            'throttle': repr(self._throttle), 'seed': str(self.values()['seed']),
+            'charge': repr(math.nan if discharge is None else discharge.charge),
+            'scale_resistance': repr(run.simulation.resistance),
+            'model_terms': ','.join(term.NAME for term in self._model.terms),
+            'lacks': '; '.join(self._lacks), **self._watched.fields()}
+        self._diagnostics.publish(diagnostic(
+            f'{self.get_fully_qualified_name()[1:]}: supply', level,
+            ' '.join(notes) or f'A simulated supply at {self._rate:g} Hz on {voltage}.', fields,
+            self.stamp_now(), hardware_id=voltage))
