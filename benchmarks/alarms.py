@@ -24,8 +24,8 @@ BATT_FS_VOLTSRC = 1 that at rest.  Also with BATT_LOW_VOLT set to the limit.
 
 The closed loop is simulated: dips that no throttle announces, and an hour without any.
 
-    OU_MONITOR_REALDATA=... python benchmarks/alarms.py flights --page doc/results/alarms.md \
-        --strips doc/results
+    OU_MONITOR_REALDATA=... python benchmarks/alarms.py flights --page doc/results/alarms.md
+    OU_MONITOR_REALDATA=... python benchmarks/alarms.py flights gecko --strips doc/results
     python benchmarks/alarms.py loop --page doc/results/alarms.md
 """
 
