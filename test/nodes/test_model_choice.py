@@ -63,5 +63,9 @@ def test_a_file_that_is_never_read_is_refused(tmp_path, monkeypatch):
     path = tmp_path / 'model.yaml'
     path.write_text('')
     monkeypatch.setattr(node_files, 'PATIENCE', 0.1)
+    meanwhile = slow(monkeypatch, 50, lambda: None)
     with pytest.raises(ValueError, match='was not read within 0.1 s'):
-        ModelChoice().check(str(path), slow(monkeypatch, 50, lambda: None))
+        ModelChoice().check(str(path), meanwhile)
+    # Its thread ends, else the interpreter would wait for it.
+    for _ in range(50):
+        meanwhile()
