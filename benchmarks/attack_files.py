@@ -380,7 +380,9 @@ def numbers(line: str) -> list[float]:
 
 def verdict_of_sheet(data: bytes, found: Recording) -> str:
     """Return what came of a CSV that was read."""
-    lines = [line for line in re.split('\r\n|\n|\r', data.decode('utf-8-sig'))
+    wide = 'utf-16' if data[:2] in (b'\xff\xfe', b'\xfe\xff') else 'utf-16-le'
+    code = wide if wide == 'utf-16' or data[1:2] == b'\0' else 'utf-8-sig'
+    lines = [line for line in re.split('\r\n|\n|\r', data.decode(code, 'replace'))
              if line.strip() and not line.lstrip().startswith('#')][1:]
     stand: dict[float, list[list[float]]] = {}
     everything = {math.nan}

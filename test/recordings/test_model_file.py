@@ -56,12 +56,13 @@ def test_round_trip(tmp_path):
 def test_every_term_goes_through_a_file(name):
     """With a number for every parameter that all ranges allow."""
     cls = catalogue()[name]
-    params = {key: [0.25, 0.5] if key in ('throttle', 'log_factor')
+    params = {key: [0.25, 0.5] if key in ('at', 'throttle', 'log_factor')
               else 0.5 + 2.0 * k + 2.0 * (key == 'dof')
               for k, key in enumerate(cls.parameters())}
     # Shares, and a number of states, have a range of their own.
     params.update({key: value for key, value in (
-        ('probability', 0.5), ('at_once', 0.25), ('states', 3.0), ('tilt', -0.5))
+        ('probability', 0.5), ('at_once', 0.25), ('states', 3.0), ('tilt', -0.5),
+        ('number', [0.0, 0.0]))
         if key in params})
     file = ModelFile(model(('ou', OU['params']), (name, params)), ({}, {}))
     back = parse_model(yaml.safe_load(as_yaml(file)), 'x')

@@ -71,9 +71,9 @@ def _of_load(state: published.PrintedLoad) -> list[Row]:
 def _restated() -> list[Row]:
     line = paper_fit()
     said = {
-        'Section 4.5': 'The number is from Fig. 5. It shows a limit of the filtration only if the '
+        'Section 4.5': 'The number, from Fig. 5, shows a limit of the filtration only if the '
                        'network, and not the oscilloscope, set it.',
-        'Section 8': 'The number is from Fig. 5. A rate alone does not confirm an OU: every '
+        'Section 8': 'The number is from Fig. 5, and a rate alone does not confirm an OU: every '
                      'first-order system has one, AC coupling included.'}
     return [Row(
         where, quantity, unit, printed,

@@ -7,13 +7,14 @@ from hypothesis import given, strategies as st
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.analysis.analyze import analyze
-from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
 from ou_monitor.analysis.data import as_data
-from ou_monitor.cli.analyze import render
+from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
 from ou_monitor.online.estimator.fit import FitEnd, Fitted
 from ou_monitor.online.estimator.quality import judge, Quality
 from ou_monitor.records import (
     Counters, Estimate, LARGEST_FACTOR, LARGEST_LOG_SE, Recording, Status)
+from ou_monitor.report.analysis_document import analysis_document
+from ou_monitor.report.terminal import terminal
 import pytest
 
 NAMES = ('alpha', 'sigma', 'var_inf')
@@ -39,7 +40,7 @@ def test_a_nearly_white_rail_is_analysed(seed):
     analysis = analyze(nearly_white(seed))
     (level,) = as_data(analysis)['levels']
     assert math.isnan(level['sigma']) and np.isnan(level['sigma_ci95']).all()
-    assert 'sigma =' not in render(analysis)
+    assert 'sigma =' not in terminal(analysis_document(analysis))
 
 
 @given(value=POSITIVE, error=ERRORS)
