@@ -317,13 +317,15 @@ class _Likelihood:
         if half and points.shape[0] * max(self._count.size, self._cross.shape[1]) > _AT_ONCE:
             value, variance = zip(self.at(points[:half]), self.at(points[half:]))
             return np.concatenate(value), np.concatenate(variance)
-        a = np.exp(points[:, :1])
+        # A grid has few rates, and the spectrum of each is dear.
+        rates, of = np.unique(points[:, 0], return_inverse=True)
+        a = np.exp(rates)[:, None]
         share = 1.0 / (1.0 + np.exp(-points[:, 1:2]))
         w = np.exp(-a - 1j * self._omega)
         # Expectation of an ordinate: sum of (1 - |l|/n) phi^|l| exp(-i omega l).
         rest = -np.expm1(-a * self._n)
         one = w / (1.0 - w) - w * rest / (self._n * (1.0 - w) ** 2)
-        S = (share * (1.0 + 2.0 * one.real) + 1.0 - share
+        S = (1.0 + share * (2.0 * one.real)[of]
              + np.exp(points[:, 2:]) / self._walk)
         size = self._p + 1
         G = ((1.0 / S) @ self._cross).reshape(-1, size, size)
