@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from ou_monitor.analysis.crafts import Craft, craft_of
 from ou_monitor.analysis.level_comparison import alpha_constancy, AlphaTest
 from ou_monitor.analysis.level_result import fit_level, judge_levels, LevelResult
 from ou_monitor.analysis.levels import find_levels, LoadLevel
@@ -45,6 +46,7 @@ class Analysis:
     brownout_default: bool
     notes: tuple[str, ...]  # What was dropped or left out, one sentence each
     overview: Overview  # Lowest voltage, dips, sag and noise: what is known of every recording
+    craft: Craft  # Cells, and sag, noise and resistance beside those of known crafts
 
 
 def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
@@ -88,7 +90,8 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
         quality_list(recording, throttles, estimates,
                      lines + second_items([level.throttle for level in judged if level.wanders])
                      + coupling_items([level.throttle for level in judged if level.coupled])),
-        brownout_voltage is None, recording.notes + _left_out(recording, found), seen)
+        brownout_voltage is None, recording.notes + _left_out(recording, found), seen,
+        craft_of(recording, seen.facts, cells))
 
 
 def _default_voltage(recording: Recording) -> float:

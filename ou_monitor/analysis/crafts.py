@@ -18,6 +18,7 @@ import numpy as np
 from ou_monitor.analysis.supply import SupplyFacts
 from ou_monitor.errors import InputError
 from ou_monitor.records import NAN, Recording
+from ou_monitor.text import counted, number
 
 # Throttle at which crafts are compared; it must be within what was flown by this much.
 _AT, _NEAR = 0.5, 0.15
@@ -42,6 +43,8 @@ KNOWN: dict[str, dict[str, tuple[float, float, float, float]]] = {
            '3s_erpm2': (3, 0.280, 0.217, NAN), 'ar8': (6, 1.511, 0.051, 0.0248),
            'hiro': (4, 0.504, 0.767, NAN), 'roma': (6, 0.968, 0.538, 0.0302),
            'erle': (3, 0.625, 0.109, NAN), 'jd': (4, 0.394, NAN, 0.0168)}}
+_UNITS = {'sag': 'mV a cell at 50 % throttle', 'noise': 'mV rms a cell at 50 % throttle',
+          'resistance': 'mOhm a cell'}
 # Measure, whether high -> (likely reason, remedy).
 _REASONS = {
     ('sag', True): ('a small, aged or cold pack, thin or long leads, or a poor connector',
@@ -150,7 +153,8 @@ def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
     low, high = facts.sag.flown
     seen = low - _NEAR <= _AT <= high + _NEAR
     values = {
-        'sag': float(np.interp(_AT, facts.sag.throttle, facts.sag.sag_v)) if seen else NAN,
+        'sag': float(np.interp(_AT, facts.sag.throttle, facts.sag.sag_v))
+        if seen and facts.sag.known else NAN,
         'noise': float(np.interp(_AT, facts.noise.throttle, facts.noise.rms_v)) if seen else NAN,
         'resistance': facts.resistance.ohm}
     found = []
@@ -170,3 +174,31 @@ def _measure(name: str, value: float, middle: float) -> Measure:
         return Measure(name, value, usual, 'usual', '', '')
     high = value > usual[1]
     return Measure(name, value, usual, 'high' if high else 'low', *_REASONS[name, high])
+
+
+def craft_line(craft: Craft) -> str:
+    """Return in words how each measure stands; empty where none can be judged."""
+    found = []
+    for one in craft.measures:
+        if one.verdict != 'unknown':
+            low, high = (number(1e3 * x, 2) for x in one.usual)
+            found.append(f'{one.name} {number(1e3 * one.value)} {_UNITS[one.name]} is '
+                         f'{one.verdict}' + ('' if one.verdict == 'usual' else
+                                             f' (usual: {low} to {high})'))
+    if not found:
+        return ''
+    source = {'given': '', 'log': ' by the log', 'guessed': ' by the voltage'}[craft.cells_from]
+    return f'{counted(craft.cells, "cell")}{source} ({craft.kind}): {"; ".join(found)}'
+
+
+def craft_advice(craft: Craft) -> list[str]:
+    """
+    Return a sentence for each measure that is high: the likely reason, and what to do.
+
+    None where the cells are a guess, for it may be no pack at all.
+    """
+    if craft.cells_from == 'guessed':
+        return []
+    return [f'The {one.name} is {_USUAL * one.value / one.usual[1]:.1f} times that of known crafts '
+            f'({craft.kind}): likely {one.reason}. Remedy: {one.remedy}.'
+            for one in craft.measures if one.verdict == 'high']

@@ -6,7 +6,6 @@ import math
 from typing import Any
 
 from ou_monitor.analysis.analyze import Analysis
-from ou_monitor.analysis.crafts import craft_of
 from ou_monitor.analysis.level_comparison import LEVEL
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.overview import Overview
@@ -51,7 +50,7 @@ def as_data(analysis: Analysis) -> dict[str, Any]:
         'quality': [{'name': item.name, 'severity': item.severity.name.lower(),
                      'text': item.text, 'throttles': list(item.throttles)}
                     for item in analysis.quality],
-        'craft': craft_of(recording, analysis.overview.facts, analysis.overview.cells).to_dict(),
+        'craft': analysis.craft.to_dict(),
         'notes': list(analysis.notes),
     }
 

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 from ou_monitor.analysis.analyze import Analysis
+from ou_monitor.analysis.crafts import craft_advice, craft_line
 from ou_monitor.analysis.level_comparison import sigma_change
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.overview import answers, known_lines
@@ -69,14 +70,19 @@ def answer(analysis: Analysis) -> list[str]:
     safe = [] if math.isnan(curves.budget) else [
         f'Safe up to {100.0 * curves.budget:.0f} % throttle.' if curves.budget > 0.0 else
         f'No throttle is safe {_why_none(analysis)}.']
-    return [first, *safe, *others, *_numbers(analysis.overview.facts.ou), *_change(analysis),
+    return [first, *safe, *others, *craft_advice(analysis.craft),
+            *_numbers(analysis.overview.facts.ou), *_change(analysis),
             *(words for name, words in _BEWARE.items() if name in names)]
 
 
 def facts(analysis: Analysis) -> list[tuple[str, str]]:
     """Return what is always known, as names and words."""
     found = known_lines(analysis.overview)
-    return [*found[:-1], ('Safe up to', _budget(analysis)), *found[-1:]] if found else []
+    if not found:
+        return []
+    beside = craft_line(analysis.craft)
+    return [*found[:-1], *([('Known crafts', beside)] if beside else []),
+            ('Safe up to', _budget(analysis)), *found[-1:]]
 
 
 def _budget(analysis: Analysis) -> str:

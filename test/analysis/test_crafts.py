@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 from ou_monitor.analysis.crafts import (
-    cell_count, cells_of, craft_of, KNOWN, MICRO, QUAD, stated_limit)
+    cell_count, cells_of, craft_advice, craft_line, craft_of, KNOWN, MICRO, QUAD, stated_limit)
 from ou_monitor.analysis.supply import supply_facts
 from ou_monitor.cli.main import main
 from ou_monitor.records import NAN, Recording
@@ -54,6 +54,10 @@ def test_usual_high_and_low():
             assert found[name].verdict == verdict, (name, found[name])
             assert found[name].value == pytest.approx(factor * middle[name], rel=0.25)
             assert bool(found[name].remedy) == (verdict != 'usual')
+            known = craft_of(one, supply_facts(one), 4)
+            assert f'is {verdict}' in craft_line(known) and not craft_advice(craft)
+            assert [found[name].remedy in said for said in craft_advice(known)] == (
+                [True] if verdict == 'high' else [])
     micro = flown(cells=1, sag=0.1, noise=0.02)
     found = craft_of(micro, supply_facts(micro))
     assert found.kind == MICRO
