@@ -64,15 +64,16 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
     if asked:
         settings = replace(settings, brownout_voltage=brownout_voltage)
     reports: list[MonitorReport] = []
+    duration = recording.duration
     monitor, parts = node_for(recording, settings)
     for now, shown in parts:
         # In between, reports are for what the monitor learns from its own estimates.
         last = monitor.report(0.0)
         # Until the first window is full its estimates would only look poor.
-        if shown and now >= min(window, 0.5 * recording.duration):
+        if shown and now >= min(window, 0.5 * duration):
             reports.append(last)
             if progress is not None:
-                progress(now / recording.duration)
+                progress(now / duration)
     return Sliding(window, np.array([report.estimate.t for report in reports]),
                    tuple(report.estimate for report in reports),
                    np.array([report.risk if asked else NAN for report in reports]),

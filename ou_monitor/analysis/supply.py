@@ -239,13 +239,14 @@ def node_for(recording: Recording, settings: MonitorSettings,
 
     After each part it says how far it is, s, and whether this is one of `_POINTS`.
     """
-    monitor = SupplyMonitor(settings, look=max(LOOK, recording.duration / _LOOKS))
-    t, drawn = recording.t, recording.current
+    t, drawn, duration = recording.t, recording.current, recording.duration
+    throttle = recording.throttle if recording.has_throttle else None
+    monitor = SupplyMonitor(settings, look=max(LOOK, duration / _LOOKS))
     window = SLIDING if isinstance(settings.window, str) else settings.window
-    step = max(0.25 * window, recording.duration / _POINTS)
+    step = max(0.25 * window, duration / _POINTS)
     each = max(1, min(math.ceil(step / _STEP), _MOST // _POINTS))
     ends = np.searchsorted(t, t[:1] + step / each * np.arange(
-        1, int(recording.duration / step) * each + 1), 'right').tolist()
+        1, int(duration / step) * each + 1), 'right').tolist()
 
     def feed() -> Iterator[tuple[float, bool]]:
         done = 0
@@ -253,7 +254,7 @@ def node_for(recording: Recording, settings: MonitorSettings,
             if stop > done:
                 part, done = slice(done, stop), stop
                 monitor.push(t[part], recording.voltage[part],
-                             recording.throttle[part] if recording.has_throttle else None,
+                             None if throttle is None else throttle[part],
                              current=None if drawn is None else drawn[part])
                 yield float(t[stop - 1] - t[0]), k <= len(ends) and not k % each
 

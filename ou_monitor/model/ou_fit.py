@@ -125,14 +125,14 @@ def _filled(t: FloatArray, x: FloatArray | None) -> FloatArray | None:
     return full if np.ptp(full) > _MOVED * max(1.0, float(np.abs(full).max())) else None
 
 
-def _basis(columns: Sequence[FloatArray]) -> FloatArray:
-    """Return an orthonormal basis of the columns, which stand in order of importance."""
-    X = np.stack(columns, axis=1)
-    size = np.sqrt(np.mean(X * X, axis=0))
-    X = X[:, size > 0.0] / size[size > 0.0]
-    Q, R = np.linalg.qr(X)
-    spanned = np.abs(R.diagonal()) < _SPANNED * math.sqrt(X.shape[0])
-    return np.asarray(Q[:, ~spanned])
+def _basis(rows: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of rows, which stand in order of importance."""
+    size = np.sqrt(np.mean(rows * rows, axis=1))
+    rows = rows[size > 0.0] / size[size > 0.0, None]
+    R = np.linalg.qr(rows.T, mode='r')
+    kept = np.flatnonzero(np.abs(R.diagonal()) >= _SPANNED * math.sqrt(rows.shape[1]))
+    # A third of the time of Householder's Q, whose later columns lack what a spanned one took.
+    return np.asarray(np.linalg.inv(np.linalg.qr(R[:, kept], mode='r')).T @ rows[kept])
 
 
 def _moved(x: FloatArray, late: int) -> FloatArray:
@@ -152,7 +152,7 @@ class Regression:
     places: npt.NDArray[np.intp]  # of the readings in stretches without gaps, shape (n,)
     voltage: FloatArray  # V, what the regressors leave, shape (n,)
     size: FloatArray  # of the noise beside its rms, shape (n,)
-    # Orthonormal regressors, in units of the size, shape (n, p); without any each stretch has a
+    # Orthonormal regressors, in units of the size, shape (p, n); without any each stretch has a
     # mean of its own.
     basis: FloatArray
     lengths: list[int]  # of the stretches
@@ -162,7 +162,7 @@ class Regression:
     @property
     def free(self) -> int:
         """Return the readings beyond the number of regressors."""
-        return int(self.basis.shape[0] - (self.basis.shape[1] or len(self.lengths)))
+        return int(self.voltage.size - (self.basis.shape[0] or len(self.lengths)))
 
 
 def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | None,
@@ -195,13 +195,15 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
 
     def best(x: FloatArray, regressors: Any, most: int = _DELAYS) -> list[FloatArray]:
         """Return the regressors of a load at the delay that leaves least."""
-        left = {}
+        left, held, rest = {}, _basis(np.stack(columns)[:, last]), v[last]
         for late in sorted(range(-most, most + 1), key=abs):
-            Q = _basis([c[last] for c in (*columns, *regressors(_moved(x, late))[:5])])
-            left[late] = float(v[last] @ v[last] - np.sum((Q.T @ v[last]) ** 2))
+            # Those before the last ones are for the lags to settle.
+            loads = regressors(_moved(x[-2 * _DELAY_READINGS:], late))[:5]
+            Q = _basis(np.stack([*held, *(c[last] for c in loads)]))
+            left[late] = float(rest @ rest - np.sum((Q @ rest) ** 2))
         least = min(left, key=left.__getitem__)
         # A delay must pay, or noise would choose it.
-        late = least if left[least] < left[0] * (1.0 - 10.0 / v[last].size) else 0
+        late = least if left[least] < left[0] * (1.0 - 10.0 / rest.size) else 0
         found: list[FloatArray] = regressors(_moved(x, late))
         return found
 
@@ -218,18 +220,20 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
     if u is not None or i is not None:
         # What the load was before the window is unknown.
         columns = [*columns, *(np.exp((t[0] - t) / tau) for tau in taus)]
-    columns, v = [c[places] for c in columns], v[places]
+    rows, v = np.stack([c[places] for c in columns]), v[places]
     size = np.ones(v.size)
     signs = [sign[places] for x in (u, i) if x is not None for sign in _activity(x, dt)]
     # First all readings count alike, then each by the size of its noise.
-    for _ in range(3 if signs and v.size else 1):
-        basis, left = _basis([c / size for c in columns]), v / size
+    left = v
+    for again in range(3 if signs and v.size else 1):
+        if again:
+            size = _size(left, signs)
+        basis, left = _basis(rows / size), v / size
         # Twice, against rounding.
         for _ in range(2):
-            left = left - basis @ (basis.T @ left)
-        found, left = size, left * size
-        size = _size(left, signs)
-    return Regression(dt, places, left, found, basis, [s.stop - s.start for s in stretches],
+            left = left - (basis @ left) @ basis
+        left = left * size
+    return Regression(dt, places, left, size, basis, [s.stop - s.start for s in stretches],
                       walk, 0.5 * float(knots[1] - knots[0]))
 
 
@@ -247,15 +251,15 @@ def _size(left: FloatArray, signs: list[FloatArray]) -> FloatArray:
         return np.ones(left.size)
     laws = [np.log1p(sign / (0.3 * math.sqrt(float(sign @ sign) / sign.size)))
             for sign in signs if sign.any()]
-    X = np.stack([np.ones(left.size), *(law - law.mean() for law in laws)], axis=1)
+    X = np.stack([np.ones(left.size), *(law - law.mean() for law in laws)])
     square = left * left / mean
-    prior = np.append(0.0, np.full(X.shape[1] - 1, 2.0 / _SIZE_SD ** 2))
-    beta, H = np.zeros(X.shape[1]), X.T @ X + np.diag(prior)
+    prior = np.append(0.0, np.full(len(laws), 2.0 / _SIZE_SD ** 2))
+    beta, H = np.zeros(len(X)), X @ X.T + np.diag(prior)
     for _ in range(_SIZE_ROUNDS):
         # A score of the Gamma law of squares.
-        score = X.T @ (square * np.exp(-np.clip(X @ beta, -6.0, 6.0)) - 1.0) - prior * beta
+        score = X @ (square * np.exp(-np.clip(beta @ X, -6.0, 6.0)) - 1.0) - prior * beta
         beta = beta + np.clip(np.linalg.solve(H, score), -1.0, 1.0)
-    variance = np.exp(np.clip(X @ beta, -6.0, 6.0))
+    variance = np.exp(np.clip(beta @ X, -6.0, 6.0))
     return np.asarray(np.sqrt(variance / variance.mean()))
 
 
@@ -264,7 +268,7 @@ class _Likelihood:
 
     def __init__(self, part: Regression) -> None:
         self.free = part.free
-        Z = np.column_stack([part.basis, part.voltage / part.size])
+        Z = np.vstack([part.basis, part.voltage / part.size]).T
         # Stretches of nearly one length share their bins: lost messages make hundreds of them.
         groups: dict[int, list[FloatArray]] = {}
         for rows in np.split(Z, np.cumsum(part.lengths)[:-1]):
@@ -285,7 +289,7 @@ class _Likelihood:
                 F = np.fft.rfft(rows, axis=0) / math.sqrt(n)
                 weight = np.full(F.shape[0], 2.0)
                 # Without regressors each stretch has a mean of its own.
-                weight[0] = 1.0 if part.basis.shape[1] else 0.0
+                weight[0] = 1.0 if part.basis.shape[0] else 0.0
                 if n % 2 == 0:
                     weight[-1] = 1.0
                 omega = 2.0 * np.pi * np.arange(F.shape[0]) / n
@@ -438,7 +442,7 @@ def fit_pieces(parts: Sequence[tuple[FloatArray, FloatArray]], dt: float, walk: 
     size = np.concatenate([piece[1] for piece in cut])
     return fit_ou(Regression(
         dt, np.arange(voltage.size), voltage, size / math.sqrt(float(size @ size) / size.size),
-        np.zeros((voltage.size, 0)), [n] * len(cut), walk, 0.5 * n * dt), span)
+        np.zeros((0, voltage.size)), [n] * len(cut), walk, 0.5 * n * dt), span)
 
 
 def known_ou(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | None) -> OuFacts:

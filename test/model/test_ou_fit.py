@@ -56,6 +56,15 @@ def test_white_noise_is_no_relaxation(seed):
     assert 0.0 < found.tau_below_s <= 2.5 and 0.0 < found.var_inf_below < 0.5 * 0.01 ** 2
 
 
+def test_the_answer_to_a_switched_load_leaves_nothing():
+    """Powers of a throttle of 0 and 1 are equal: one counts, and its lags count whole."""
+    t = np.arange(700) / 1000.0
+    u = (np.arange(700) // 90 % 2).astype(float)
+    share = -np.expm1(-0.001 / 0.02)
+    v = 12.0 - 0.3 * u - 2.0 * lfilter([share], [1.0, share - 1.0], u)
+    assert np.abs(regress(t, v, u, None).voltage).max() < 1e-9
+
+
 def test_buried_relaxations_lie_within_the_bounds():
     """
     Of 20 rails with an OU a fifth as large as white noise, 17 lie within the bounds.

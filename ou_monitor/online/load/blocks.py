@@ -16,8 +16,10 @@ samples the part that scatters within a block counts 1/n.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
+from operator import add
 
 import numpy as np
 from ou_monitor.model.load import ripple
@@ -117,7 +119,7 @@ class LoadBlocks:
                          current / known if known else NAN, int(n), within)
 
 
-DELAYS: FloatArray = np.array([0.0, 0.05, 0.1, 0.15, 0.2])  # s
+DELAYS = (0.0, 0.05, 0.1, 0.15, 0.2)  # s
 # What is slower than this, s, is no answer to a stick but discharge and recovery.
 _SLOW = 1.0
 # A third of the answer lags by 60 ms: the prior of the filter.
@@ -139,12 +141,16 @@ _LONGEST = 0.15
 
 
 class LoadDelay:
-    """Running correlations of voltage and load, relative to full load, at several delays."""
+    """
+    Running correlations of voltage and load, relative to full load, at several delays.
+
+    Lists rather than arrays: five numbers a block cost NumPy six times as much.
+    """
 
     def __init__(self, delay: float = 0.0, *, either: bool = False) -> None:
         # Whether the load may have either sign.
         self._either = either
-        self.delay = float(DELAYS[np.argmin(np.abs(DELAYS - delay))])
+        self.delay = min(DELAYS, key=lambda one: abs(one - delay))
         self.forget()
 
     def forget(self) -> None:
@@ -153,11 +159,12 @@ class LoadDelay:
         self._past: deque[tuple[float, float]] = deque()
         self._seen = self._better = 0.0
         self._xx = 0.0
-        self._xv, self._vv = np.zeros(DELAYS.size), np.zeros(DELAYS.size)
+        none = [0.0] * len(DELAYS)
+        self._xv, self._vv = none, none
         # Of the piece that fills: time, load squared, products, voltage squared; of the
         # correlations of whole pieces: weight, sums and sums of squares.
-        self._filled, self._own = 0.0, np.zeros((3, DELAYS.size))
-        self._pieces, self._sum, self._squares = 0.0, self._xv * 0.0, self._xv * 0.0
+        self._filled, self._own = 0.0, (0.0, none, none)
+        self._pieces, self._sum, self._squares = 0.0, none, none
 
     def take(self, t: float, v: float, x: float) -> bool:
         """Take a block, s, V, load as it was heard; return whether the delay is another one."""
@@ -178,24 +185,27 @@ class LoadDelay:
         past.append((t, v - self._slow_volts))
         while len(past) > 1 and past[1][0] <= t - DELAYS[-1]:
             past.popleft()
-        times, volts = zip(*past)
-        then = np.array(volts)[np.maximum(np.searchsorted(times, t + 1e-6 - DELAYS, 'right') - 1,
-                                          0)]
-        forgotten = 1.0 - dt / _MEMORY
-        self._xx = self._xx * forgotten + x * x * dt
-        self._xv = self._xv * forgotten + then * (x * dt)
-        self._vv = self._vv * forgotten + then * then * dt
-        self._filled += dt
-        self._own += np.stack((np.full(DELAYS.size, x * x), x * then, then * then)) * dt
+        volts, k = [], len(past) - 1
+        for delay in DELAYS:
+            while k and past[k][0] > t + 1e-6 - delay:
+                k -= 1
+            volts.append(past[k][1])
+        keep, load, square = 1.0 - dt / _MEMORY, x * dt, x * x * dt
+        products, squares = [load * v for v in volts], [v * v * dt for v in volts]
+        self._xx = self._xx * keep + square
+        self._xv = [keep * old + new for old, new in zip(self._xv, products)]
+        self._vv = [keep * old + new for old, new in zip(self._vv, squares)]
+        xx, xv, vv = self._own
+        xx, xv, vv = xx + square, list(map(add, xv, products)), list(map(add, vv, squares))
+        self._filled, self._own = self._filled + dt, (xx, xv, vv)
         if self._filled >= _PIECE:
-            xx, xv, vv = self._own
-            if xx[0] > _MOVED ** 2 * self._filled:
-                r = xv / np.sqrt(np.maximum(xx * vv, 1e-300))
+            if xx > _MOVED ** 2 * self._filled:
+                r = [one / math.sqrt(max(xx * other, 1e-300)) for one, other in zip(xv, vv)]
                 keep = 1.0 - _PIECE / _PIECES_MEMORY
                 self._pieces = self._pieces * keep + 1.0
-                self._sum = self._sum * keep + r
-                self._squares = self._squares * keep + r * r
-            self._filled, self._own = 0.0, np.zeros((3, DELAYS.size))
+                self._sum = [keep * old + one for old, one in zip(self._sum, r)]
+                self._squares = [keep * old + one * one for old, one in zip(self._squares, r)]
+            self._filled, self._own = 0.0, (0.0, [0.0] * len(volts), [0.0] * len(volts))
         # The load must have changed, by a stick and not by rounding.
         self._seen += dt * (x * x > 1e-6)
         return self._seen >= _FIRST and self._choose(dt)
@@ -205,21 +215,23 @@ class LoadDelay:
         """Whether the correlations in pieces of 2 s are not below zero, by a t-test."""
         if self._pieces < _FEWEST:
             return False
-        now = int(np.searchsorted(DELAYS, self.delay - 1e-9))
+        now = DELAYS.index(self.delay)
         mean = self._sum[now] / self._pieces
         variance = self._squares[now] / self._pieces - mean * mean
         return bool(mean > -_SIGNIFICANT * math.sqrt(max(0.0, variance) / (self._pieces - 1.0)))
 
     def _choose(self, dt: float) -> bool:
-        falls = self._xv if self._either else np.minimum(self._xv, 0.0)
-        left = 1.0 - falls ** 2 / np.maximum(self._xx * self._vv, 1e-300)
-        best = int(np.argmin(left))
-        now = int(np.searchsorted(DELAYS, self.delay - 1e-9))
+        # Of a load of one sign only what falls with it counts.
+        falls = self._xv if self._either else [min(one, 0.0) for one in self._xv]
+        left = [1.0 - one * one / max(self._xx * other, 1e-300)
+                for one, other in zip(falls, self._vv)]
+        best = left.index(min(left))
+        now = DELAYS.index(self.delay)
         self._better = self._better + dt if left[best] < _BETTER * left[now] else 0.0
         if self._better < _LASTING:
             return False
         self._better = 0.0
-        self.delay = float(DELAYS[best])
+        self.delay = DELAYS[best]
         return True
 
 
@@ -237,14 +249,19 @@ _HELD = 1e-3
 _NOISE_MEMORY, _NOISE_FIRST, _NOISE_SHARE = 2000.0, 50.0, 1.0 / 3.0
 
 
+def _dot(x: Sequence[float], y: Sequence[float]) -> float:
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+
+
 class LoadNoise:
     """Noise of blocks of samples of a pack of `volts`, V."""
 
     def __init__(self, volts: float, b: tuple[float, float, float] | None = None) -> None:
         # 0.4 % of the voltage, and what ripple and changes of throttle usually add; or as it
         # was in another flight, to a factor of 1.4 in the deviation.
-        self.b = np.array([math.log((0.004 * volts) ** 2), 2.0, 4.0] if b is None else b)
-        self._covariance = np.diag([4.0, 4.0, 9.0] if b is None else [0.5, 0.5, 1.0])
+        self.b = [math.log((0.004 * volts) ** 2), 2.0, 4.0] if b is None else list(b)
+        x, y, z = (4.0, 4.0, 9.0) if b is None else (0.5, 0.5, 1.0)
+        self._covariance = [[x, 0.0, 0.0], [0.0, y, 0.0], [0.0, 0.0, z]]
         # Of the standard scores: mean square, and correlation from one to the next.
         self.scale, self.correlation = 1.0, 0.0
         self._last, self._n = 0.0, 0
@@ -256,7 +273,7 @@ class LoadNoise:
 
     def variance(self, u: float, du: float, n: int) -> float:
         """Return the variance of a mean of n samples, V^2."""
-        whole = math.exp(float(self.b[0] + self.b[1] * ripple(u) + self.b[2] * math.sqrt(du)))
+        whole = math.exp(_dot(self.b, (1.0, ripple(u), math.sqrt(du))))
         return whole + self._within * max(0.0, 1.0 / n - 1.0 / self._size)
 
     @property
@@ -266,18 +283,18 @@ class LoadNoise:
         if self._between > 0.0:
             own += self._within * (1.0 - 1.0 / self._size) / self._between
         least = 0.0 if math.isinf(self._step) else self._step ** 2 / 12.0
-        whole = math.exp(float(self.b[0])) * own + least
-        return math.log(whole), float(self.b[1]), float(self.b[2])
+        whole = math.exp(self.b[0]) * own + least
+        return math.log(whole), self.b[1], self.b[2]
 
     @property
     def ripple_se(self) -> float:
         """Return the standard error of the second b."""
-        return math.sqrt(max(float(self._covariance[1, 1]), 0.0))
+        return math.sqrt(max(self._covariance[1][1], 0.0))
 
     @property
     def of_blocks(self) -> tuple[float, float, float]:
         """Return b of the mean of a block."""
-        return float(self.b[0]), float(self.b[1]), float(self.b[2])
+        return self.b[0], self.b[1], self.b[2]
 
     def see(self, voltage: float) -> None:
         """Look at the steps of the ADC in the means of blocks, V."""
@@ -311,26 +328,28 @@ class LoadNoise:
         e in V; s, the variance of what is predicted, and `within`, that of one of the n samples
         about their mean (NaN: unknown), in V^2.
         """
-        f: FloatArray = np.array([1.0, ripple(u), math.sqrt(du)])
+        f = 1.0, ripple(u), math.sqrt(du)
         R = self.variance(u, du, n)
         square = min(e * e / (s + R), _OUTLIER)
         # What the state does not know is not noise.
         share = max(R / (s + R), 0.05)
-        C = self._covariance
-        C *= 1.0 + 1.0 / min(_NOISE_MEMORY, _NOISE_FIRST + _NOISE_SHARE * self._n)
-        g = C @ f
-        own = float(f @ g)
+        grown = 1.0 + 1.0 / min(_NOISE_MEMORY, _NOISE_FIRST + _NOISE_SHARE * self._n)
+        C = [[grown * one for one in row] for row in self._covariance]
+        g = [_dot(row, f) for row in C]
+        own = _dot(f, g)
         # The square of a standard normal has the variance 2.
         total = own + 2.0 / share ** 2
-        self.b += g * min((square - 1.0) / share / total, 0.7 / own)
-        C -= np.outer(g, g) / total
-        C *= min(1.0, 9.0 / float(C.diagonal().max()))
+        step = min((square - 1.0) / share / total, 0.7 / own)
+        self.b = [b + one * step for b, one in zip(self.b, g)]
+        C = [[c - one * other / total for c, other in zip(row, g)] for row, one in zip(C, g)]
+        most = min(1.0, 9.0 / max(C[0][0], C[1][1], C[2][2]))
+        self._covariance = [[most * one for one in row] for row in C]
         weight = max(0.002, 1.0 / (self._n + 20.0))
         self.scale += weight * (square - self.scale)
         self._size += weight * (n - self._size)
         if n > 1 and du < _HELD:
             self._within += weight * (within - self._within)
-            self._between += weight * (math.exp(float(f @ self.b)) - self._between)
+            self._between += weight * (math.exp(_dot(f, self.b)) - self._between)
 
 
 def log_density(z: float, variance: float) -> float:

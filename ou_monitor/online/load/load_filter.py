@@ -111,8 +111,9 @@ class CurrentFilter:
         if self._largest < _LEAST:
             return
         if math.isfinite(block.throttle) and not lost:
-            h = np.array([1.0, *static(block.throttle)[:3], x])
-            self._squares = self._squares * math.exp(-dt / _MEMORY) + dt * np.outer(h, h)
+            u = block.throttle
+            h = np.array([1.0, u ** POWER, u, u ** 3, x])
+            self._squares = self._squares * math.exp(-dt / _MEMORY) + dt * h * h[:, None]
         if not self._largest <= _MORE * self._unit:
             self._begin(block.voltage)
         elif lost:

@@ -110,20 +110,34 @@ def risk_of(supply: Supply, voltage: npt.ArrayLike, horizon: float, now: float |
 
     voltage in V, of any shape; horizon in s, now and noise_std in V.
     """
-    u0, ln_alpha, ln_sigma, weight = _nodes(supply, *(_FEW if coarse else _MANY))
-    sd = np.exp(ln_sigma - 0.5 * ln_alpha) / math.sqrt(2.0)
-    barrier = (u0 - np.asarray(voltage, dtype=np.float64)[..., None]) / sd
-    span = np.exp(ln_alpha) * horizon
-    if now is None:
-        start = np.zeros_like(barrier)
-    elif not noise_std > 0.0:
-        start = (u0 - now) / sd
-    else:
-        start, nodes = _start(u0, sd, now, noise_std)
-        barrier, span = barrier[..., None], span[..., None]
-        weight = weight[..., None] * nodes
-        return _averaged(start, barrier, span, weight, 2)
-    return _averaged(start, barrier, span, weight, 1)
+    return _Paths(supply, now, noise_std, *(_FEW if coarse else _MANY)).risk(voltage, horizon)
+
+
+class _Paths:
+    """Where the path begins and how it moves, over the errors of what is known of both."""
+
+    def __init__(self, supply: Supply, now: float | None, noise_std: float, grid: FloatArray,
+                 weights: FloatArray) -> None:
+        u0, ln_alpha, ln_sigma, weight = _nodes(supply, grid, weights)
+        sd, alpha = np.exp(ln_sigma - 0.5 * ln_alpha) / math.sqrt(2.0), np.exp(ln_alpha)
+        start = np.zeros_like(u0) if now is None else (u0 - now) / sd
+        if now is not None and noise_std > 0.0:
+            # Where the path may be, given one noisy look at it.
+            keep = 1.0 / (1.0 + (noise_std / sd) ** 2)
+            nodes, shares = _hermite(_START_NODES)
+            u0, sd, alpha = (np.repeat(x, nodes.size, axis=-1) for x in (u0, sd, alpha))
+            shape = u0.shape
+            start = ((keep * start)[..., None] + np.sqrt(1.0 - keep)[..., None] * nodes).reshape(
+                shape)
+            weight = (weight[..., None] * shares).reshape(shape)
+        self._u0, self._sd, self._alpha, self._start, self._weight = u0, sd, alpha, start, weight
+
+    def risk(self, voltage: npt.ArrayLike, horizon: float) -> FloatArray:
+        """Return the probability of going below voltages, V, within a horizon, s."""
+        barrier = (self._u0 - np.asarray(voltage, dtype=np.float64)[..., None]) / self._sd
+        chance: FloatArray = self._weight * passage_probability(
+            self._start, barrier, self._alpha * horizon)
+        return np.clip(chance.sum(axis=-1), 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -134,22 +148,19 @@ class Passage:
     now: float
     noise_std: float
 
+    @functools.cached_property
+    def _paths(self) -> _Paths:
+        return _Paths(self.supply, self.now, self.noise_std, *_FEW)
+
     def density(self, low: float, horizon: float) -> float:
         """Return the density, 1/V, at a lowest voltage, over what noise or a tenth of it hides."""
         sd = math.exp(float(np.asarray(self.supply.ln_sigma)) - 0.5 * float(
             np.asarray(self.supply.ln_alpha))) / math.sqrt(2.0)
         half = max(self.noise_std, 0.1 * sd)
         levels = np.array([low + half, low - half])
-        above, below = np.where(levels >= self.now, 1.0, risk_of(
-            self.supply, levels, horizon, self.now, self.noise_std, coarse=True)).tolist()
+        above, below = np.where(
+            levels >= self.now, 1.0, self._paths.risk(levels, horizon)).tolist()
         return float((above - below) / (2.0 * half))
-
-
-def _averaged(start: FloatArray, barrier: FloatArray, span: FloatArray, weight: FloatArray,
-              axes: int) -> FloatArray:
-    chance: FloatArray = passage_probability(start, barrier, span) * weight
-    total: FloatArray = chance.sum(axis=tuple(range(-axes, 0)))
-    return np.clip(total, 0.0, 1.0)
 
 
 def _nodes(supply: Supply, grid: FloatArray, weights: FloatArray
@@ -169,15 +180,6 @@ def _nodes(supply: Supply, grid: FloatArray, weights: FloatArray
     more_sigma = 0.5 * (by_variance + more_alpha)
     return (u0 + u0_se * grid[2], ln_alpha + more_alpha, ln_sigma + more_sigma,
             np.broadcast_to(weights, np.broadcast_shapes(u0.shape, weights.shape)))
-
-
-def _start(u0: FloatArray, sd: FloatArray, now: float, noise_std: float
-           ) -> tuple[FloatArray, FloatArray]:
-    """Return where the path may be, given one noisy look at it, and the weights."""
-    keep = 1.0 / (1.0 + (noise_std / sd)**2)
-    middle = keep * (u0 - now) / sd
-    nodes, weights = _hermite(_START_NODES)
-    return middle[..., None] + np.sqrt(1.0 - keep)[..., None] * nodes, weights
 
 
 def _error(value: float) -> float:

@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, replace
 import math
+from statistics import median
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +49,7 @@ _TAIL = [8.0 / (3.0 * math.pi) * math.comb(2 * k, k) / 4.0**k / (2 * k + 5)
 # Horizons' worth of the prior, its variance, and the prior of bias and gain.
 _PRIOR, _PRIOR_VARIANCE = 5.0, 3.0
 _BIAS, _GAIN = 0.5, 0.4
+_PRECISION = (_BIAS ** -2, 0.0, _GAIN ** -2)
 # Memory, s; largest square of a miss that counts; misses beyond 3 deviations weigh less.
 MEMORY, _LARGEST, _HUBER = 120.0, 36.0, 3.0
 # Error of the model as a share of the drop.
@@ -92,33 +94,37 @@ class Calibrator:
     """Learns a `LowestLaw` from completed horizons."""
 
     def __init__(self) -> None:
-        self._prior = np.diag([_BIAS ** -2, _GAIN ** -2])
-        self._first = self._prior @ (0.0, 1.0)
-        self._information, self._weighted = self._prior.copy(), self._first.copy()
+        # Of 1 and x: squares and product, and products with y.
+        self._information: tuple[float, ...] = _PRECISION
+        self._weighted: tuple[float, ...] = _PRECISION[1:]
         self._count = self._squares = 0.0
         self._settle()
 
     def _settle(self) -> None:
-        self._b = np.linalg.solve(self._information, self._weighted)
-        self._variance = (_PRIOR * _PRIOR_VARIANCE + self._squares) / (_PRIOR + self._count)
-        errors = np.linalg.inv(self._information) * self._variance
-        self.law = LowestLaw(np.array([*self._b, self._variance, errors[0, 0], errors[0, 1],
-                                       errors[1, 1]]))
+        a, both, b = self._information
+        first, second = self._weighted
+        whole = a * b - both * both
+        self._b = (b * first - both * second) / whole, (a * second - both * first) / whole
+        variance = (_PRIOR * _PRIOR_VARIANCE + self._squares) / (_PRIOR + self._count)
+        self.law = LowestLaw(np.array([*self._b, variance, *(
+            variance / whole * one for one in (b, -both, a))]))
 
     def add(self, low: float, mean: float, deviation: float, start: float, weight: float,
             elapsed: float) -> None:
         """Learn from a completed horizon: lowest, predicted and first voltage, V."""
         deviation = math.hypot(deviation, _SHARE * (start - mean))
         keep = math.exp(-elapsed / MEMORY)
-        row = np.array([1.0, (mean - start) / deviation])
-        y = (low - start) / deviation
-        miss = y - float(row @ self._b)
-        least = weight * min(1.0, _HUBER * math.sqrt(self._variance) / max(abs(miss), 1e-9))
+        x, y = (mean - start) / deviation, (low - start) / deviation
+        miss = y - self._b[0] - self._b[1] * x
+        least = weight * min(1.0, _HUBER * math.sqrt(self.law.values[2]) / max(abs(miss), 1e-9))
         self._count = self._count * keep + weight
         self._squares = self._squares * keep + weight * min(miss * miss, _LARGEST)
-        self._information = self._prior + (
-            self._information - self._prior) * keep + least * np.outer(row, row)
-        self._weighted = self._first + (self._weighted - self._first) * keep + least * y * row
+        self._information = tuple(
+            prior + (old - prior) * keep + least * one
+            for prior, old, one in zip(_PRECISION, self._information, (1.0, x, x * x)))
+        self._weighted = tuple(
+            prior + (old - prior) * keep + least * y * one
+            for prior, old, one in zip(_PRECISION[1:], self._weighted, (1.0, x)))
         self._settle()
 
 
@@ -306,7 +312,7 @@ class Forecast:
     @property
     def voltage(self) -> float:
         """Where the supply is now, V: the middle one of the last three samples; NaN of one."""
-        return float(np.median(self._last)) if self._last.size > 1 else NAN
+        return median(self._last.tolist()) if self._last.size > 1 else NAN
 
     def follow(self, e: Estimate, window: float, ago: float = 0.0) -> None:
         """Take the newest estimate; alpha and sigma are of a window, s, that ended so long ago."""
@@ -327,8 +333,8 @@ class Forecast:
         return replace(plain, ln_sigma=plain.ln_sigma - less, ln_sigma_se=min(math.hypot(
             plain.ln_sigma_se, 0.5 * state.ripple_se * float(apart.mean())), _LARGEST_ERROR))
 
-    def passage(self, horizon: float) -> Passage | None:
-        """Return the law of the lowest voltage within a horizon, s; None when not known."""
+    def passage(self) -> Passage | None:
+        """Return the law of the lowest voltage from here on; None when not known."""
         supply, now = self.supply(), self.voltage
         noise = self.estimate.noise_std
         return None if supply is None or math.isnan(now) else Passage(
@@ -343,6 +349,7 @@ class Forecast:
             interval = (self._newest - self._begun) / (self._samples - 1)
             self._sampling = Sampling(interval, self._past.activity())
         state = self._loads.state() if self._known else None
+        now, passage = self.voltage, self.passage()
         for rung in self._rungs:
             while rung.looks and self._past.end >= rung.looks[0].t + rung.horizon + BLOCK:
                 look = rung.looks.popleft()
@@ -354,12 +361,11 @@ class Forecast:
             rung.next = self._newest + max(
                 self._look_time, _LOOK_SHARE * rung.horizon) - 0.5 * BLOCK
             mean, deviation, done = self._flight(rung.horizon)
-            if math.isnan(deviation) or math.isnan(self.voltage):
+            if math.isnan(deviation) or math.isnan(now):
                 continue
             rung.looks.append(_Look(
-                self._newest, self.voltage, mean, deviation, state,
-                None if state is None else pilot(done, state.throttle, rung.horizon),
-                self.passage(rung.horizon)))
+                self._newest, now, mean, deviation, state,
+                None if state is None else pilot(done, state.throttle, rung.horizon), passage))
 
     def _flight(self, horizon: float) -> tuple[float, float, Flown]:
         """Return excursions and futures of the flight, found once between two looks."""

@@ -121,22 +121,22 @@ def _groups(state: LoadState, u: FloatArray, tau: FloatArray, inrush: FloatArray
     rows[..., 1] = -state.fall * np.cumsum(x * tau, axis=1)
     rows[..., 2], rows[..., 3], rows[..., 4] = g * x, g * u, g * u ** 3
     rows[..., 8] = g * inrush
-    for column, (low, lag) in enumerate(zip(state.lags, LAGS), start=5):
-        decay = np.exp(-tau / lag)
-        share = (1.0 - decay) * lag / np.maximum(tau, 1e-9)
-        now: FloatArray = np.full(u.shape[0], low)
-        for j in range(u.shape[1]):
-            apart = now - x[:, j]
-            rows[:, j, column] = g * (x[:, j] + apart * share[:, j])
-            now = x[:, j] + apart * decay[:, j]
+    time, now, lags = tau[..., None], np.array(state.lags), np.array(LAGS)
+    decay = np.exp(-time / lags)
+    share = (1.0 - decay) * lags / np.maximum(time, 1e-9)
+    for j in range(u.shape[1]):
+        load = x[:, j, None]
+        apart = now - load
+        rows[:, j, 5:8] = g * (load + apart * share[:, j])
+        now = load + apart * decay[:, j]
     return rows
 
 
 def mean_now(state: LoadState) -> float:
     """Return the mean voltage, V, at the present throttle and lags, without inrush."""
-    one = np.ones((1, 1))
-    rows = _groups(state, one * state.throttle, one * 1e-9, 0.0 * one)
-    return float(rows[0, 0] @ state.mean)
+    u = state.throttle
+    answers = np.array([u ** POWER, u, u ** 3, *state.lags])
+    return float(state.mean[0] - state.size * (answers @ state.mean[2:8]))
 
 
 def lowest(state: LoadState, futures: Futures, horizon: float, sampling: Sampling
@@ -372,9 +372,10 @@ def flown(past: Past, horizon: float) -> Flown:
     within = sliding_window_view(mean[1:], width)[at]
     near = within >= peak[:, None] - AT_PEAK
     count = near.sum(axis=1)
-    rest = np.where(count < width, (within.sum(axis=1) - (within * near).sum(axis=1))
+    total = within.sum(axis=1)
+    rest = np.where(count < width, (total - (within * near).sum(axis=1))
                     / np.maximum(width - count, 1), peak)
-    good = np.isfinite(within.sum(axis=1) + mean[at])
+    good = np.isfinite(total + mean[at])
     # A block that holds the peak may have a mean below it.
     dwell = np.maximum(count, 1) * BLOCK
     return Flown(*(x[good] for x in (mean[at], peak, dwell, rest, (n - 1 - at) * BLOCK)))

@@ -26,7 +26,7 @@ def loaded(t, v, u):
     return loads
 
 
-@pytest.mark.parametrize('late', DELAYS.tolist())
+@pytest.mark.parametrize('late', DELAYS)
 def test_late_throttle_is_found_and_costs_nothing(flight, late):
     """The sag is that of throttle in time, within its error; so is the path."""
     t, v, u = flight
