@@ -11,7 +11,7 @@ from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.overview import Overview
 from ou_monitor.analysis.relaxation import Relaxation, ReleaseCause
 from ou_monitor.criticism.innovations import FAMILY_WISE
-from ou_monitor.criticism.level_tests import EFFECT, LEAST
+from ou_monitor.analysis.level_tests import EFFECT, LEAST
 from ou_monitor.model.spectral_lines import FALSE_ALARM
 
 

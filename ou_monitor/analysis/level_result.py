@@ -8,7 +8,7 @@ that all commands share (`ou_monitor.model.ou_fit`).
 Limits: a relaxation slower than half of a segment, or than 2.5 s, is the level's.
 
 Kind of process: the words are those of the paper's Table 1; the paper names the kinds by eye,
-here each has tests (`ou_monitor.criticism.level_tests`), adjusted so
+here each has tests (`ou_monitor.analysis.level_tests`), adjusted so
 that a recording of stationary OU levels has any of them reject once in a
 hundred times.  The first that applies names the level:
 
@@ -41,7 +41,7 @@ from ou_monitor.analysis.levels import LoadLevel, Stay
 from ou_monitor.analysis.supply import Remainder
 from ou_monitor.criticism.curves import bin_width, even_on_log
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations
-from ou_monitor.criticism.level_tests import examine_level, holm, Shape, TestResult
+from ou_monitor.analysis.level_tests import examine_level, holm, Shape, TestResult
 from ou_monitor.model.ou_fit import fit_pieces
 from ou_monitor.model.spectral_lines import (
     EvenGrid, find_lines, LineSearch, on_grid, without_lines)

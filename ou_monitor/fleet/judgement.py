@@ -65,7 +65,7 @@ class Trend:
 
 def trends(all_values: Sequence[Values]) -> tuple[Trend, ...]:
     """Test every vehicle and quantity with enough flights."""
-    from ou_monitor.criticism.level_tests import adjusted
+    from ou_monitor.analysis.level_tests import adjusted
     found = [trend for values in all_values for trend in _of_values(values)]
     done = [replace(trend, p_family=p) for trend, p in zip(
         found, adjusted([trend.p_value for trend in found]))]

@@ -4,7 +4,7 @@ from dataclasses import replace
 import math
 
 from ou_monitor.analysis.level_result import classify, detectable_kurtosis, ProcessType
-from ou_monitor.criticism.level_tests import EFFECT, examine_level, Shape, TestResult
+from ou_monitor.analysis.level_tests import EFFECT, examine_level, Shape, TestResult
 from ou_monitor.records import Estimate, Status
 import pytest
 from scipy import stats
