@@ -8,10 +8,10 @@ from typing import Any
 from ou_monitor.analysis.analyze import Analysis
 from ou_monitor.analysis.level_comparison import LEVEL
 from ou_monitor.analysis.level_result import LevelResult
+from ou_monitor.analysis.level_tests import EFFECT, LEAST
 from ou_monitor.analysis.overview import Overview
 from ou_monitor.analysis.relaxation import Relaxation, ReleaseCause
 from ou_monitor.criticism.innovations import FAMILY_WISE
-from ou_monitor.analysis.level_tests import EFFECT, LEAST
 from ou_monitor.model.spectral_lines import FALSE_ALARM
 
 

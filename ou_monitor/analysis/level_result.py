@@ -37,11 +37,11 @@ import enum
 import math
 
 import numpy as np
+from ou_monitor.analysis.level_tests import examine_level, holm, Shape, TestResult
 from ou_monitor.analysis.levels import LoadLevel, Stay
 from ou_monitor.analysis.supply import Remainder
 from ou_monitor.criticism.curves import bin_width, even_on_log
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations
-from ou_monitor.analysis.level_tests import examine_level, holm, Shape, TestResult
 from ou_monitor.model.ou_fit import fit_pieces
 from ou_monitor.model.spectral_lines import (
     EvenGrid, find_lines, LineSearch, on_grid, without_lines)

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from ou_monitor.criticism.innovations import innovations
 from ou_monitor.analysis.level_tests import (
     adjusted, EFFECT, examine_level, FAMILY_WISE, holm, Shape, TestResult)
+from ou_monitor.criticism.innovations import innovations
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Estimate, Flag, Recording, Status
 import pytest

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import numpy as np
 from numpy.testing import assert_allclose
+from ou_monitor.analysis.level_tests import _correlated, _mean_drift
 from ou_monitor.criticism.adc import find_rails, redraw
 from ou_monitor.criticism.composite import _same
 from ou_monitor.criticism.curves import _bins, compare_curves
-from ou_monitor.analysis.level_tests import _correlated, _mean_drift
 from ou_monitor.criticism.mean_columns import solved
 from ou_monitor.criticism.readings import why_nothing
 from ou_monitor.criticism.samples import Samples

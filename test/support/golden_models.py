@@ -6,12 +6,12 @@ import math
 from golden_runs import flight, table
 import numpy as np
 from ou_monitor import discover
+from ou_monitor.analysis.level_tests import examine_level, holm
 from ou_monitor.criticism.battery import statistics
 from ou_monitor.criticism.composite import (
     covariates_of, fit_composite, pole_beside, view_of)
 from ou_monitor.criticism.curves import compare_curves
 from ou_monitor.criticism.integrity import examine
-from ou_monitor.analysis.level_tests import examine_level, holm
 from ou_monitor.criticism.null_bank import criticise, simulate_bank, simulate_bank_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, Events, fit_gaussian

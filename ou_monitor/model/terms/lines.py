@@ -216,10 +216,11 @@ def _refined(z: FloatArray, u: FloatArray, rate: float, idle: float, slope: floa
         slopes = slope + np.linspace(-1.0, 1.0, 9) * min(1.0 / spread, 4.0 * width / 0.02)
         idles = idle + np.linspace(-1.0, 1.0, 9) * reach
         top = -1.0
+        waves = np.exp(-2j * math.pi * idles[:, None] * at)
         for s in slopes:
             warped = z * np.exp(-2j * math.pi * s * turns)
-            for f in idles:
-                wave = (warped * np.exp(-2j * math.pi * f * at))[:pieces * size]
+            for f, turning in zip(idles, waves, strict=True):
+                wave = (warped * turning)[:pieces * size]
                 value = float((np.abs(wave.reshape(pieces, size).sum(axis=1)) ** 2).sum()) / size
                 if value > top:
                     top, idle_best, slope_best = value, float(f), float(s)
