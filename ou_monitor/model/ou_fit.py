@@ -20,8 +20,8 @@ s (a sixth of a window below 15 s) is the level's; OU and white noise change the
 and are told at their mean size; repeats or rounding of slow changes, a load that neither throttle
 nor current shows, and noise of another spectrum (a filtered sensor), pass for the OU. On 330
 simulated rails under a quad's throttle (alpha 2 to 500 1/s, 50 to 1000 Hz, white noise to 30 mV,
-windows of 20 s, above 300 Hz of 8 s) 92 % of the 95 % intervals held alpha (the rest but one were
-too high), 92 % sigma, 95 % Var_inf. Of the bounds 91 % held: the others excluded relaxations that
+windows of 20 s, above 300 Hz of 8 s) 92 % of the 95 % intervals held alpha (the others lay
+above it), 92 % sigma, 95 % Var_inf. Of the bounds 91 % held: the others excluded relaxations that
 look like a walk of the level, most of them of 0.2 to 0.5 s.
 """
 
