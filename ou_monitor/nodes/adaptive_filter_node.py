@@ -31,9 +31,8 @@ from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import diagnostic, MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.console import Console
 from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of, IMU
-from ou_monitor.nodes.filter_frames import Frames
 from ou_monitor.nodes.filter_inputs import KnownSupply, MotorInputs, SupplyInput
-from ou_monitor.nodes.inputs import INPUT_QOS, Silence, Stamper, types_on
+from ou_monitor.nodes.inputs import decode, INPUT_QOS, Silence, Stamper, types_on
 from ou_monitor.nodes.sources import message_class, MOTOR_PARAMETERS
 from ou_monitor.online.filter.cutoff_control import Bound
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass, FilterCounters
@@ -167,23 +166,26 @@ class AdaptiveFilterNode(MonitorNode):
                          for _ in channels.names]
         self._output = self.create_publisher(
             message_class(channels.output or kind), '~/output', 10)
-        self._frames = Frames(kind, channels, self._topic)
+        self._message = message
+        self._stamped = message.get_fields_and_field_types().get('header') == 'std_msgs/Header'
         self.create_subscription(
             message, 'input', self.with_info(self._take_input), INPUT_QOS, raw=True)
         self.get_logger().info(
             f"filtering {self._topic} ({kind}, {', '.join(channels.names)})")
 
     def _take_input(self, data: bytes, info: Any) -> None:
+        assert self._channels is not None
         arrived = self.steady_now()
         self._input_silence.heard(arrived)
         self._input_interval.push_one(arrived)
         try:
-            frame = self._frames.open(data)
+            message = decode(data, self._message, self._topic)
         except InputError:
             self._dropped += 1
             return
-        values = frame.values
-        stamp = self._stamper.time_of(frame.stamp, info)
+        values = self._channels.take(message)
+        own = message.header.stamp if self._stamped else None
+        stamp = self._stamper.time_of(own.sec + own.nanosec * 1e-9 if own else 0.0, info)
         self._unplaced = math.isnan(stamp)
         if not values or not all(map(math.isfinite, (stamp, *values))):
             self._dropped += 1
@@ -191,7 +193,7 @@ class AdaptiveFilterNode(MonitorNode):
         stamp = self._input_clock.time_of(stamp, arrived)
         supply = self._known()
         values = self._notched(stamp, values, supply)
-        self._output.publish(frame.put([
+        self._output.publish(self._channels.put(message, [
             channel.step(stamp, value, supply.sigma, supply.sigma_se, supply.alpha,
                          supply.throttle, supply.level, supply.level_se)
             for channel, value in zip(self._filters, values, strict=True)],

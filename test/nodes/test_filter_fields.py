@@ -2,15 +2,19 @@
 
 import math
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, PoseWithCovariance, Vector3Stamped
-from live import wait_until
+from live import values_of, wait_until
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.filter_channels import CHANNELS, channels_of
 from ou_monitor.nodes.filter_inputs import SupplyInput
+from ou_monitor.nodes.inputs import decode
 import pytest
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
+from std_msgs.msg import Header
 
 
 @pytest.mark.parametrize('message, field', [
@@ -218,3 +222,32 @@ def test_acceleration_is_refused_where_there_is_none(kind, field, mode):
     """One line at the start."""
     with pytest.raises(InputError, match='input.acceleration'):
         channels_of(kind, field, mode=mode, acceleration=True)
+
+
+@pytest.mark.parametrize('length', [0, 3, 4, 11, 60, 200])
+def test_a_message_cut_short_is_refused(length):
+    with pytest.raises(InputError, match='a message on /input cannot be read'):
+        decode(serialize_message(Imu())[:length], Imu, '/input')
+
+
+def test_the_node_counts_what_cannot_be_read(world):
+    """A message cut short is dropped, which is no failure of a callback; the next goes through."""
+    probe = world.probe()
+    output = probe.listen('/ou_adaptive_filter/output', Imu)
+    told = probe.listen('/diagnostics', DiagnosticArray)
+    sender = probe.publisher('/input', Imu)
+    process = world.start('adaptive_filter')
+    wait_until(sender.get_subscription_count, what='subscription')
+    wait_until(lambda: probe.node.count_publishers('/ou_adaptive_filter/output'))
+    whole = serialize_message(Imu(header=Header(stamp=Time(sec=3), frame_id='base')))
+
+    def sent():
+        sender.publish(whole[:100])
+        sender.publish(whole)
+        return output
+    wait_until(sent, what='an output')
+    assert output[-1].header == Header(stamp=Time(sec=3), frame_id='base')
+    fields = wait_until(lambda: next(
+        (f for f in map(values_of, (m.status[0] for m in told)) if f['passed'] != '0'), None))
+    assert int(fields['dropped']) > 0 and fields['callback_errors'] == '0'
+    assert process.stop() == 0
