@@ -19,6 +19,7 @@ from typing import Any
 
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.online.settings import Parameter
+from ou_monitor.recordings.cdr import Definitions, Field
 from ou_monitor.stream.config import (
     Extractor, FieldSpec, list_msg_configs, load_msg_config, ManyExtractor, MsgConfig)
 
@@ -173,7 +174,7 @@ def _overridden(source: Source, topic: str, field: str, rate: float) -> Source:
 # Where the ament index of a prefix lists its packages, a file each.
 _INDEX = 'share/ament_index/resource_index/packages'
 
-# What rosidl calls the primitives in Python, and in ros2msg.
+# What rosidl calls the primitives in Python, and in a definition.
 _WORDS = {'float': 'float32', 'double': 'float64', 'boolean': 'bool', 'octet': 'byte'}
 _SEQUENCE = re.compile(r'sequence<(.*?)(?:, \d+)?>')
 _ARRAY = re.compile(r'(.*)\[(\d+)\]')
@@ -208,27 +209,23 @@ def message_class(name: str, install: str = '') -> Any:
     return getattr(module, kind)
 
 
-def definition_of(kind: Any) -> str:
-    """Return the ros2msg text of a message class, with those of the types in it."""
-    texts: dict[str, str] = {}
+def definition_of(kind: Any) -> Definitions:
+    """Return the fields of a message class, and of those in it."""
+    found: Definitions = {}
 
     def add(name: str, message: Any) -> None:
-        lines = []
-        texts[name] = ''
+        fields = []
         for field, of in message.get_fields_and_field_types().items():
-            inside, size = of, ''
+            inside, array, size = of, False, None
             if match := _SEQUENCE.fullmatch(of):
-                inside, size = match[1], '[]'
+                inside, array = match[1], True
             elif match := _ARRAY.fullmatch(of):
-                inside, size = match[1], f'[{match[2]}]'
-            lines.append(f'{_WORDS.get(inside, inside)}{size} {field}')
-            if '/' in inside and inside not in texts:
+                inside, array, size = match[1], True, int(match[2])
+            fields.append(Field(field, _WORDS.get(inside, inside), array, size))
+            if '/' in inside and inside not in found:
                 package, _, other = inside.partition('/')
                 add(inside, getattr(importlib.import_module(package + '.msg'), other))
-        texts[name] = '\n'.join(lines) + '\n'
+        found[name] = tuple(fields)
 
-    first = f"{kind.__module__.partition('.')[0]}/{kind.__name__}"
-    add(first, kind)
-    others = ''.join(f"{80 * '='}\nMSG: {name}\n{text}"
-                     for name, text in texts.items() if name != first)
-    return texts[first] + others
+    add(f"{kind.__module__.partition('.')[0]}/{kind.__name__}", kind)
+    return found

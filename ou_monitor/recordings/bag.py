@@ -30,7 +30,7 @@ import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.cdr import (
     Broken, check_extent, DEFAULTS, Definitions, endless, Field, FieldColumn, FieldReader, join,
-    parse_definition, short_name, Table)
+    short_name, Table)
 from ou_monitor.recordings.mcap_file import (
     ABOUT, custom_data, McapFile, moment, MOST_BYTES, MOST_NODES, ORIGIN, SAMPLE_RATE, Span)
 from ou_monitor.recordings.standard_types import SCHEMAS, TYPE_HASHES
@@ -282,7 +282,7 @@ class BagReader:
                     raise InputError(f"{self.path}: topic '{topic.name}' has two types, "
                                      f'{known.type} and {topic.type}')
                 schema = self._schemas.setdefault(topic.type, topic.schema)
-                if schema.data != topic.schema.data and _fields(schema) != _fields(topic.schema):
+                if schema.data != topic.schema.data and not _alike(schema, topic.schema):
                     raise InputError(f'{self.path}: type {topic.type} has two definitions, which '
                                      'differ: read the files of the bag one by one')
                 self.info[topic.name] = replace(
@@ -374,7 +374,7 @@ class BagReader:
             # The library also prints unreadable definitions to standard error.
             with redirect_stderr(io.StringIO()):
                 decode = DecoderFactory().decoder_for('cdr', self._schemas[kind])
-                definitions = _definitions(kind, self.definition(kind))
+            definitions = parse_definition(kind, self.definition(kind))
         except Exception as error:
             raise complain(error) from error
         if decode is None:
@@ -407,12 +407,15 @@ def _text(schema: Any) -> str:
     return str(schema.data.decode('utf-8', 'replace'))
 
 
-def _fields(schema: Any) -> object:
-    """Return the fields of a type; its text where it cannot be parsed."""
-    return parse_definition(schema.name, _text(schema)) or schema.data
+def _alike(schema: Any, other: Any) -> bool:
+    """Return whether two definitions of a type have the same fields."""
+    with suppress(Exception):
+        return (parse_definition(schema.name, _text(schema))
+                == parse_definition(other.name, _text(other)))
+    return False
 
 
-def _definitions(kind: str, text: str) -> Definitions:
+def parse_definition(kind: str, text: str) -> Definitions:
     """Return the fields of a type and of those in it, as the library understands them."""
     found = dict(DEFAULTS)
 
@@ -423,7 +426,9 @@ def _definitions(kind: str, text: str) -> Definitions:
                   field.type.array_size if field.type.is_fixed_size_array() else None)
             for field in parsed.fields)
 
-    _for_each_msgdef(kind, text, add)
+    # The library also prints unreadable definitions to standard error.
+    with redirect_stderr(io.StringIO()):
+        _for_each_msgdef(kind, text, add)
     return found
 
 
@@ -445,7 +450,11 @@ def field_reader(bag: BagReader, spec: FieldSpec, broken: Broken | None = None) 
         raise InputError(f'{error} ({moment(log_time, bag.start_ns)}); use --partial to leave it '
                          'out') from error
 
-    return FieldReader(spec, bag.definition(spec.type), functools.partial(bag.decoder, spec.type),
+    definitions = None
+    # The decoder names what is wrong with a definition.
+    with suppress(Exception):
+        definitions = parse_definition(spec.type, bag.definition(spec.type))
+    return FieldReader(spec, definitions, functools.partial(bag.decoder, spec.type),
                        broken or refuse)
 
 

@@ -9,16 +9,14 @@ to the general decoder one by one, and so does everything that it would refuse; 
 outcome is the same, bit for bit.
 
 Plain CDR version 1, little endian (OMG DDS-XTypes 7.4.3): alignment is counted
-from after the 4-byte header.  The fields come from the definition of the type
-(ros2msg text) as `rosidl` writes it into bags; one with anything else in it gives
-no layout.  https://docs.ros.org/en/jazzy/Concepts/Basic/About-Interfaces.html
+from after the 4-byte header.  The fields come from the definition in a bag or from the message
+class; a type that is not in `PRIMITIVES` gives no layout.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-import re
 import struct
 from typing import Any
 
@@ -39,13 +37,6 @@ PRIMITIVES = {
     'float32': '<f4', 'float64': '<f8',
 }
 TEXT = 'string'
-
-_SEPARATOR = re.compile(r'^={3,}$', re.MULTILINE)
-_NAME = re.compile(r'MSG:\s+([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)')
-_CONSTANT = re.compile(r'\w+(?:<=\d+)?\s+[A-Z]\w*\s*=')
-_FIELD = re.compile(
-    r'(?:([A-Za-z]\w*)/)?([A-Za-z]\w*)(?:<=\d+)?(\[(?:<=\d+|\d*)\])?\s+([a-z]\w*)'
-    r'(?:\s+[^=\s][^=]*)?')
 
 Rows = npt.NDArray[np.uint8]
 
@@ -84,48 +75,6 @@ def short_name(kind: str) -> str:
     """Return 'package/Type' for 'package/msg/Type'."""
     words = kind.split('/')
     return f'{words[0]}/{words[-1]}'
-
-
-def parse_definition(kind: str, text: str) -> Definitions | None:
-    """Return the fields of a type and of those that it uses."""
-    found = dict(DEFAULTS)
-    name = short_name(kind)
-    for part in _SEPARATOR.split(text.replace('\r', '')):
-        lines = [line.strip() for line in part.splitlines()]
-        lines = [line for line in lines if line]
-        if lines and (match := _NAME.fullmatch(lines[0])):
-            name = f'{match[1]}/{match[2]}'
-            lines = lines[1:]
-        fields = []
-        for line in lines:
-            if '#' in line and ('"' in line or "'" in line.partition('#')[0]):
-                return None
-            line = line.partition('#')[0].strip()
-            if not line or _CONSTANT.match(line):
-                continue
-            field = _field(line, name.partition('/')[0])
-            if field is None:
-                return None
-            fields.append(field)
-        found[name] = tuple(fields)
-    return found if short_name(kind) in found else None
-
-
-def _field(line: str, package: str) -> Field | None:
-    match = _FIELD.fullmatch(line)
-    if match is None:
-        return None
-    other, kind, array, name = match.groups()
-    if other is not None:
-        kind = f'{other}/{kind}'
-    elif kind[0].isupper():
-        kind = f'{package}/{kind}'
-    elif kind not in PRIMITIVES and kind != TEXT:
-        return None
-    if array is None:
-        return Field(name, kind)
-    inside = array[1:-1]
-    return Field(name, kind, True, int(inside) if inside.isdigit() else None)
 
 
 class _NoLayoutError(ValueError):
@@ -453,7 +402,7 @@ def _spread(begin: IntArray, count: IntArray) -> IntArray:
 
 class FieldReader:
     """
-    Reads one field, and its stamp, of messages of one type (ros2msg text `definition`).
+    Reads one field, and its stamp, of messages of one type (definitions: None where unreadable).
 
     The `nan` rule of `spec` is not applied: all non-finite values are NaN.  `decoder` returns the
     general decoder, and is asked only when needed; `broken` is called with the log time, ns, of a
@@ -461,10 +410,11 @@ class FieldReader:
     """
 
     def __init__(
-        self, spec: FieldSpec, definition: str, decoder: Callable[[], Callable[[bytes], Any]],
+        self, spec: FieldSpec, definitions: Definitions | None,
+        decoder: Callable[[], Callable[[bytes], Any]],
         broken: Callable[[int, InputError], None] | None = None,
     ) -> None:
-        """Parse the definition; layouts are learned from messages."""
+        """Prepare the paths; layouts are learned from messages."""
         self.spec = spec
         self.general = 0
         self._extractor = Extractor(replace(spec, nan='unknown', zero='value'))
@@ -473,7 +423,7 @@ class FieldReader:
         self._broken = broken
         self._decode: Callable[[bytes], Any] | None = None
         self._kind = short_name(spec.type)
-        self._definitions = parse_definition(spec.type, definition)
+        self._definitions = definitions
         self._value = parse_field_path(spec.field)
         self._stamp: FieldPath | None = None
         self._paths = [self._value]

@@ -10,8 +10,8 @@ from mcap_ros2.decoder import DecoderFactory
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings import standard_types as cdr
-from ou_monitor.recordings.cdr import (
-    Field, FieldReader, join, parse_definition, seconds, Table)
+from ou_monitor.recordings.bag import parse_definition
+from ou_monitor.recordings.cdr import FieldReader, join, seconds, Table
 from ou_monitor.recordings.standard_types import SCHEMAS
 from ou_monitor.stream.config import Extractor, FieldSpec
 import pytest
@@ -58,9 +58,15 @@ def one_by_one(spec, text, messages, table):
     return np.array(stamps), np.array(counts), np.concatenate(values)
 
 
+def reader_of(spec, text):
+    """Return a reader of a field."""
+    return FieldReader(spec, parse_definition(spec.type, text),
+                       partial(general_decoder, spec.type, text))
+
+
 def in_bulk(spec, text, table):
     """Return the same in bulk, and how many messages went the general way."""
-    reader = FieldReader(spec, text, partial(general_decoder, spec.type, text))
+    reader = reader_of(spec, text)
     try:
         column = reader.read(table)
     except Exception:
@@ -169,7 +175,6 @@ def test_any_schema_any_message(rnd, data):
     """Random definitions, paths, shapes, texts, broken bytes: one outcome, both ways."""
     maker = Maker(rnd)
     text = maker.text()
-    assert parse_definition(KIND, text) is not None
     encode = serialize_dynamic(KIND, text)[KIND]
     base = maker.message()
     messages = []
@@ -290,7 +295,7 @@ def test_in_time_order_keeps_what_belongs_together():
     messages = [cdr.encode_block([float(k)] * n) for k, n in enumerate((2, 1, 3, 0, 2))]
     table = table_of(messages, [30, 10, 10, 5, 20])
     spec = FieldSpec('/v', cdr.FLOAT32_ARRAY, 'data', sample_rate=10.0)
-    reader = FieldReader(spec, SCHEMAS[cdr.FLOAT32_ARRAY], lambda: None)
+    reader = FieldReader(spec, parse_definition(spec.type, SCHEMAS[spec.type]), lambda: None)
     column = reader.read(table).in_time_order()
     assert column.count.tolist() == [0, 1, 3, 2, 2]
     assert column.values.tolist() == [1, 2, 2, 2, 4, 4, 0, 0]
@@ -305,31 +310,11 @@ def test_log_times_of_any_size():
         0.0, 1e-9, 18446744073 + 0.709551615]
 
 
-@pytest.mark.parametrize('line', [
-    'wstring name', 'time t', 'float32 Name', 'float32 x = 3', 'string s "a#b"', 'float32',
-    '@key float32 x', 'float32[a] x'])
-def test_definitions_with_something_unknown(line):
-    """They are left to the general decoder."""
-    assert parse_definition(KIND, f'float32 volts\n{line}\n') is None
-
-
-def test_a_definition():
-    """Comments, constants, defaults, bounds, arrays and nested types."""
-    text = ('# all\nint8 A=1\nstring B="x"\nfloat32 x 1.5 # V\nstring<=5 s "ab"\nint16[<=3] u\n'
-            'int16[2] w\nCell[] c\nstd_msgs/Header h\n' + 80 * '='
-            + '\nMSG: p/Cell\n\n' + 80 * '=' + '\nMSG: std_msgs/msg/Header\nuint8 q\n')
-    found = parse_definition(KIND, text)
-    assert found['p/Top'] == (
-        Field('x', 'float32'), Field('s', 'string'), Field('u', 'int16', True),
-        Field('w', 'int16', True, 2), Field('c', 'p/Cell', True), Field('h', 'std_msgs/Header'))
-    assert found['p/Cell'] == () and found['std_msgs/Header'] == (Field('q', 'uint8'),)
-
-
 def test_wrong_path_gives_the_general_decoders_error():
     """The nearest field is named, as it is for messages one by one."""
     spec = FieldSpec('/v', cdr.BATTERY_STATE, 'voltagee')
     text = SCHEMAS[cdr.BATTERY_STATE]
-    reader = FieldReader(spec, text, partial(general_decoder, spec.type, text))
+    reader = reader_of(spec, text)
     with pytest.raises(InputError, match="did you mean 'voltage'"):
         reader.read(table_of([battery('', 5.0)]))
 
