@@ -45,19 +45,6 @@ class Options:
         return asdict(self)
 
 
-_NUMBERS = frozenset((
-    'start', 'duration_s', 'samples', 'rate_hz', 'lowest', 'dips', 'sag', 'sag_se', 'sag_full',
-    'sag_full_se', 'risk_max', 'alpha_p', 'gain', 'gain_se'))
-
-
-def is_result(found: Mapping[str, Any]) -> bool:
-    """Whether a part of an earlier run holds what `work` returns."""
-    levels, vehicle = found.get('levels'), found.get('vehicle')
-    return isinstance(vehicle, str) and isinstance(levels, list) and all(
-        isinstance(level, dict) for level in levels) and all(
-        isinstance(found.get(name), (int, float)) for name in _NUMBERS)
-
-
 def work(path: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """Analyse one recording; whatever is wrong with it is in the result."""
     try:

@@ -17,11 +17,11 @@ import re
 from typing import Any
 
 from ou_monitor.errors import InputError
-from ou_monitor.fleet.analysis import is_result, Options, work
+from ou_monitor.fleet.analysis import Options, work
 from ou_monitor.fleet.find import duplicates, Found, FoundRecording
 from ou_monitor.fleet.judgement import judge, Judgement
 from ou_monitor.fleet.table import reason, Row, rows_of, write_whole
-from ou_monitor.fleet.vehicles import assign, match_paths, number_flights
+from ou_monitor.fleet.vehicles import assign, number_flights
 from ou_monitor.fleet.workers import LocalWorkers, Workers
 from ou_monitor.records import NAN
 from ou_monitor.stream.files import open_regular
@@ -113,8 +113,6 @@ def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[]
               pattern: re.Pattern[str] | None = None, stated_options: dict[str, Any] | None = None,
               comparing: Progress | None = None, progress: Progress | None = None) -> Fleet:
     """Analyse all recordings that are not done yet, and judge the fleet."""
-    # A pattern that takes for ever is told before the work, not after it.
-    match_paths(pattern, tuple(source.path for source in found.sources))
     parts = Parts(folder, {**options.as_data(), **(stated_options or {}), 'version': version()})
     twice = duplicates(found.sources, comparing)
     results: dict[Path, dict[str, Any]] = {}
@@ -123,7 +121,7 @@ def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[]
         if source.path in twice:
             continue
         known = parts.load(source)
-        if known is None or not is_result(known):
+        if known is None:
             missing.append(source)
         else:
             results[source.path] = known

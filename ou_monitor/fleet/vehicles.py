@@ -11,32 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-import json
 import math
 from pathlib import Path
 import re
-import subprocess
-import sys
 
 from ou_monitor.errors import InputError
 from ou_monitor.text import counted, printable
 
 METADATA, PATTERN, FOLDER = 'metadata', 'pattern', 'folder'
 _SHOWN = 3
-
-_MOST_OF_PATTERN = 1000
-# Seconds for the pattern and all paths; a million paths take 2.
-_PATIENCE = 10.0
-# Run in a process of its own.
-_MATCH = """
-import json, re, resource, sys
-resource.setrlimit(resource.RLIMIT_AS, (2 ** 31, 2 ** 31))
-text, paths = json.load(sys.stdin)
-pattern = re.compile(text)
-key = 'vehicle' if 'vehicle' in pattern.groupindex else 1 if pattern.groups else 0
-found = map(pattern.search, paths)
-json.dump([(match and match[key]) or '' for match in found], sys.stdout)
-"""
 
 
 @dataclass(frozen=True)
@@ -49,9 +32,6 @@ class Vehicle:
 
 def read_pattern(text: str) -> re.Pattern[str]:
     """Return the pattern of ``--vehicle-from``."""
-    if len(text) > _MOST_OF_PATTERN:
-        raise InputError(f'--vehicle-from has {len(text)} characters, and {_MOST_OF_PATTERN} is '
-                         'the limit')
     try:
         return re.compile(text)
     except (re.error, OverflowError, RecursionError) as error:
@@ -67,9 +47,8 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
     folders = _folder_names({path.parent for path, name in stated.items() if not name})
     named = {path.parent for path, name in stated.items() if name}
     mixed = []
-    matched = match_paths(pattern, tuple(stated))
     for path, name in stated.items():
-        by_pattern = matched[path]
+        by_pattern = _match(pattern, path)
         if name:
             found[path] = Vehicle(name, METADATA)
             if by_pattern and by_pattern != name:
@@ -103,28 +82,13 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
     return found, notes
 
 
-def match_paths(pattern: re.Pattern[str] | None, paths: tuple[Path, ...]) -> dict[Path, str]:
-    """
-    Return what a pattern finds in each path; InputError when it takes longer than it may.
-
-    Such as ``(a+)+$`` takes years, and nothing ends it but the end of its process.
-    """
-    if pattern is None or not paths:
-        return dict.fromkeys(paths, '')
-    given = json.dumps([pattern.pattern, [str(path) for path in paths]])
-    try:
-        done = subprocess.run([sys.executable, '-I', '-S', '-c', _MATCH], input=given, text=True,
-                              capture_output=True, timeout=_PATIENCE, check=True)
-    except subprocess.CalledProcessError as error:
-        why = (error.stderr.splitlines() or ['no reason'])[-1]
-        raise InputError(f"--vehicle-from: '{pattern.pattern}' cannot be used "
-                         f'({printable(why, 100)})') from None
-    except subprocess.TimeoutExpired:
-        raise InputError(f"--vehicle-from: '{pattern.pattern}' takes more than "
-                         f'{_PATIENCE:g} s for {counted(len(paths), "path")}: avoid repeats of '
-                         'repeats, such as (a+)+') from None
-    return {path: printable(name, 200)
-            for path, name in zip(paths, json.loads(done.stdout), strict=True)}
+def _match(pattern: re.Pattern[str] | None, path: Path) -> str:
+    """Return the vehicle that a pattern finds in a path; empty: none."""
+    found = None if pattern is None else pattern.search(str(path))
+    if found is None:
+        return ''
+    key = 'vehicle' if 'vehicle' in found.re.groupindex else 1 if found.re.groups else 0
+    return printable(found[key] or '', 200)
 
 
 def _folder_names(folders: set[Path]) -> dict[Path, str]:
