@@ -204,12 +204,12 @@ def signal_of(bag: str) -> tuple[str, str]:
     """Return what the filter shall filter: an IMU, else the busiest scalar but the throttle."""
     from ou_monitor.nodes.filter_channels import CHANNELS
     from ou_monitor.recordings.bag import BagReader
-    known = [topic for topic in BagReader(bag).info.values() if topic.type in CHANNELS]
+    reader = BagReader(bag)
+    known = [(name, kind) for name, kind in reader.topics.items() if kind in CHANNELS]
     if not known:
         raise DemoError(f'{bag} has no topic that the filter takes ({", ".join(CHANNELS)})')
-    best = max(known, key=lambda topic: (
-        topic.type.endswith('/Imu'), not topic.name.endswith('throttle'), topic.count))
-    return best.name, best.type
+    return max(known, key=lambda topic: (
+        topic[1].endswith('/Imu'), not topic[0].endswith('throttle'), reader.counts[topic[0]]))
 
 
 def live_page(children: Children) -> str:

@@ -5,7 +5,7 @@ Bags: an .mcap file, or a rosbag2 directory of several with its `metadata.yaml`.
 log times; memory holds the chunks that overlap in time.  A bag that is cut off or damaged is
 refused with the byte and the recording time where the trouble begins or, when asked, read as
 far as it is intact.  `BagWriter` writes bags, metadata.yaml as of version 9 (ROS 2 Jazzy); every
-version is read, for only the list of files, the QoS and the custom data are used.
+version is read, for only the list of files and the custom data are used.
 
 This module and `mcap_file.py` are the only ones that import mcap.
 """
@@ -15,7 +15,6 @@ from __future__ import annotations
 import bisect
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import redirect_stderr, suppress
-from dataclasses import dataclass, replace
 import functools
 import io
 from pathlib import Path, PurePosixPath
@@ -26,7 +25,6 @@ from typing import Any, BinaryIO, NamedTuple
 from mcap.writer import CompressionType, Writer
 from mcap_ros2._dynamic import _for_each_msgdef
 from mcap_ros2.decoder import DecoderFactory
-import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.cdr import (
     Broken, check_extent, DEFAULTS, Definitions, endless, Field, FieldColumn, FieldReader, join,
@@ -35,7 +33,7 @@ from ou_monitor.recordings.mcap_file import (
     ABOUT, custom_data, McapFile, moment, MOST_BYTES, MOST_NODES, ORIGIN, SAMPLE_RATE, Span)
 from ou_monitor.recordings.standard_types import SCHEMAS, TYPE_HASHES
 from ou_monitor.stream.config import FieldSpec
-from ou_monitor.stream.files import one_line, parse_yaml, path_words, read_yaml
+from ou_monitor.stream.files import one_line, path_words, read_yaml
 from ou_monitor.text import printable, some
 import yaml
 
@@ -45,74 +43,24 @@ _ROOT = 'rosbag2_bagfile_information'
 # rosbag2 writes the middleware's "for ever" as the largest duration.
 _FOR_EVER = {'sec': 9223372036, 'nsec': 854775807}
 
-# Before version 9 policies were numbers (rmw/types.h).
-_RELIABILITY: dict[int, str] = {1: 'reliable', 2: 'best_effort'}
-_DURABILITY: dict[int, str] = {1: 'transient_local', 2: 'volatile'}
-
-
-@dataclass(frozen=True)
-class TopicInfo:
-    """One topic of a bag."""
-
-    # Topic name, absolute.
-    name: str
-    # Message type, 'package/msg/Type'.
-    type: str  # noqa: A003
-    # Number of messages.
-    count: int
-    # QoS that the publisher offered.
-    reliability: str = 'reliable'
-    durability: str = 'volatile'
-    # Depth of the publisher's history, messages.
-    depth: int = 10
-
 
 class BagFiles(NamedTuple):
     """Files and metadata of a bag."""
 
     # MCAP files in recorded order.
     paths: list[Path]
-    # Topic name -> offered QoS.
-    qos: dict[str, Any]
     # Custom data of the recording, such as its vehicle.
     about: dict[str, str]
     # Description of missing files; '' when complete.
     missing: str
 
 
-def qos_profile(topic: TopicInfo) -> list[dict[str, Any]]:
-    """Return the offered QoS of a topic as rosbag2 writes it."""
+def _qos() -> list[dict[str, Any]]:
+    """Return the QoS that bags are written with, as rosbag2 writes it; no alias in the YAML."""
     return [{
-        'history': 'keep_last', 'depth': topic.depth, 'reliability': topic.reliability,
-        'durability': topic.durability, 'deadline': dict(_FOR_EVER),
-        'lifespan': dict(_FOR_EVER), 'liveliness': 'automatic',
-        'liveliness_lease_duration': dict(_FOR_EVER),
-        'avoid_ros_namespace_conventions': False,
-    }]
-
-
-def parse_qos(text_or_list: Any) -> tuple[str, str, int]:
-    """Return (reliability, durability, depth) of a recorded QoS."""
-    profiles = text_or_list
-    if isinstance(profiles, str):
-        try:
-            profiles = parse_yaml(profiles, 'QoS', most_bytes=100_000)
-        except InputError:
-            # Ignore an unreadable QoS: the messages can still be read.
-            profiles = None
-    first: dict[str, Any] = {}
-    if isinstance(profiles, list) and profiles and isinstance(profiles[0], dict):
-        first = profiles[0]
-    depth = first.get('depth')
-    return (_policy(first.get('reliability'), _RELIABILITY, 'reliable'),
-            _policy(first.get('durability'), _DURABILITY, 'volatile'),
-            depth if isinstance(depth, int) and 0 < depth < 2**31 else 10)
-
-
-def _policy(value: Any, numbers: Mapping[int, str], default: str) -> str:
-    """Return a policy by its name or number."""
-    name = numbers.get(value) if isinstance(value, int) else value
-    return str(name) if name in list(numbers.values()) else default
+        'history': 'keep_last', 'depth': 10, 'reliability': 'reliable', 'durability': 'volatile',
+        'deadline': dict(_FOR_EVER), 'lifespan': dict(_FOR_EVER), 'liveliness': 'automatic',
+        'liveliness_lease_duration': dict(_FOR_EVER), 'avoid_ros_namespace_conventions': False}]
 
 
 def read_metadata(folder: Path) -> BagFiles:
@@ -143,13 +91,7 @@ def _metadata(folder: Path) -> BagFiles:
         if not file.is_file():
             raise InputError(f"{where} names '{printable(file.name, 60)}', which is not in its "
                              'folder')
-    qos: dict[str, Any] = {}
-    entries = info.get('topics_with_message_count')
-    for entry in entries if isinstance(entries, list) else ():
-        topic = entry.get('topic_metadata') if isinstance(entry, dict) else None
-        if isinstance(topic, dict):
-            qos[str(topic.get('name'))] = topic.get('offered_qos_profiles')
-    return BagFiles(files, qos, custom_data(info), '')
+    return BagFiles(files, custom_data(info), '')
 
 
 def is_part(file: Path, folder: Path) -> bool:
@@ -166,7 +108,7 @@ def find_files(path: Path, partial: bool) -> BagFiles:
         raise InputError(f'{path} is a link that leads nowhere' if path.is_symlink()
                          else f'there is no bag {path}: check the path')
     if not path.is_dir():
-        return BagFiles([path], {}, {}, '')
+        return BagFiles([path], {}, '')
     if (path / FILE).exists():
         return read_metadata(path)
     # NAME_0.mcap .. NAME_10.mcap: the shorter name is the earlier one.
@@ -183,7 +125,7 @@ def find_files(path: Path, partial: bool) -> BagFiles:
                 f'{path}: {FILE} is missing: name one of the .mcap files in it; if they are one '
                 'recording that was cut off, use --partial')
         raise InputError(f'{path}: {missing}; use --partial to read the intact part')
-    return BagFiles(files, {}, {}, missing)
+    return BagFiles(files, {}, missing)
 
 
 class RawMessage(NamedTuple):
@@ -221,7 +163,7 @@ class BagReader:
 
     max_chunk: bytes that a chunk may unpack to; else OU_MONITOR_MAX_CHUNK_MB, or 256 times the
     file, at least 64 MiB and at most an eighth of the memory.  By topic: message types in
-    `topics`, number and QoS in `info`, rate of the samples within blocks, Hz, in `sample_rates`,
+    `topics`, numbers in `counts`, rate of the samples within blocks, Hz, in `sample_rates`,
     and where values came from in `origins`, as far as the bag states it.  `about` is the custom
     data of metadata.yaml or of the files; `start_ns`, `end_ns` the log times of the first and last
     message; `damage` where and how the bag is damaged, else None; `notes` topics left out, and the
@@ -233,7 +175,7 @@ class BagReader:
         """Index the bag; messages are read later, and files are closed between reads."""
         self.path = Path(path)
         self.partial = partial
-        paths, qos, about, missing = find_files(self.path, partial)
+        paths, about, missing = find_files(self.path, partial)
         self._files = [McapFile(file, partial, max_chunk) for file in paths]
         # The metadata of the directory wins: people edit it.
         self.about = {key: value for known in (*(file.about for file in self._files), about)
@@ -250,43 +192,37 @@ class BagReader:
             raise InputError(f'{broken.path} is damaged {broken.damage}; use --partial to read '
                              'the intact part')
         self.damage = '; '.join(([missing] if missing else []) + damages) or None
-        self.info: dict[str, TopicInfo] = {}
+        self.topics: dict[str, str] = {}
+        self.counts: dict[str, int] = {}
         self.sample_rates: dict[str, float] = {}
         self.origins: dict[str, dict[str, str]] = {}
         self._schemas: dict[str, Any] = {}
-        self._collect(qos)
+        self._collect()
         self.notes = tuple(dict.fromkeys(note for file in self._files for note in file.notes))
-        self.topics = {name: info.type for name, info in self.info.items()}
-        self.message_count = sum(info.count for info in self.info.values())
+        self.message_count = sum(self.counts.values())
         if self.message_count == 0:
             why = self.damage or ' '.join(self.notes) or (
                 'topics: ' + (some(self.topics) or 'none'))
             raise InputError(f'{self.path} holds no messages ({why})')
 
-    def _collect(self, qos: Mapping[str, Any]) -> None:
+    def _collect(self) -> None:
         """Merge the topics of all files."""
-        spent = 0
         for file in self._files:
             for key, topic in file.topics.items():
                 if topic.sample_rate is not None:
                     self.sample_rates[topic.name] = topic.sample_rate
                 if topic.origin:
                     self.origins[topic.name] = topic.origin
-                known = self.info.get(topic.name)
-                if known is None:
-                    profiles = qos.get(topic.name) or topic.qos
-                    spent += len(profiles) if isinstance(profiles, str) else 0
-                    known = TopicInfo(topic.name, topic.type, 0, *parse_qos(
-                        profiles if spent < MOST_BYTES else None))
-                if known.type != topic.type:
+                known = self.topics.setdefault(topic.name, topic.type)
+                if known != topic.type:
                     raise InputError(f"{self.path}: topic '{topic.name}' has two types, "
-                                     f'{known.type} and {topic.type}')
+                                     f'{known} and {topic.type}')
                 schema = self._schemas.setdefault(topic.type, topic.schema)
                 if schema.data != topic.schema.data and not _alike(schema, topic.schema):
                     raise InputError(f'{self.path}: type {topic.type} has two definitions, which '
                                      'differ: read the files of the bag one by one')
-                self.info[topic.name] = replace(
-                    known, count=known.count + file.counts.get(key, 0))
+                self.counts[topic.name] = (
+                    self.counts.get(topic.name, 0) + file.counts.get(key, 0))
 
     def _spans(self, wanted: set[str]) -> list[tuple[Span, McapFile]]:
         """Return where topics are, in the order of the first log times."""
@@ -297,18 +233,11 @@ class BagReader:
                       if span.channels is None or span.channels & channels]
         return sorted(spans, key=lambda pair: pair[0].start_ns)
 
-    def tables(
-        self, topics: Iterable[str], *, start_ns: int | None = None, end_ns: int | None = None,
-    ) -> Iterator[Part]:
-        """
-        Yield where the messages are, chunk by chunk, for reading them in bulk.
-
-        start_ns, end_ns in ns.
-        """
+    def tables(self, topics: Iterable[str], end_ns: int | None = None) -> Iterator[Part]:
+        """Yield where the messages are, chunk by chunk; none that begins after `end_ns`, ns."""
         wanted = self._wanted(topics)
         spans = [(span, file) for span, file in self._spans(wanted)
-                 if (start_ns is None or span.end_ns >= start_ns)
-                 and (end_ns is None or span.start_ns < end_ns)]
+                 if end_ns is None or span.start_ns < end_ns]
         total = sum(span.length for span, _ in spans)
         read = place = 0
         while place < len(spans):
@@ -321,21 +250,7 @@ class BagReader:
                 place += 1
             tables = file.tables([span for span, _ in spans[first:place]], wanted)
             later = None if place == len(spans) else spans[place][0].start_ns
-            yield Part(_within(tables, start_ns, end_ns), later, read / total)
-
-    def tables_before(self, topic: str, before_ns: int) -> Iterator[tuple[Table, int]]:
-        """
-        Yield the messages of a topic before a log time, the chunk that ends last first.
-
-        before_ns in ns; with each the log time that all later ones are before.
-        """
-        wanted = self._wanted([topic])
-        spans = [pair for pair in self._spans(wanted) if pair[0].start_ns < before_ns]
-        spans.sort(key=lambda pair: pair[0].end_ns, reverse=True)
-        for place, (span, file) in enumerate(spans):
-            older = spans[place + 1][0].end_ns if place + 1 < len(spans) else 0
-            for table in _within(file.tables([span], wanted), None, before_ns).values():
-                yield table, older
+            yield Part(tables, later, read / total)
 
     def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
         """Yield the messages in the order of their log times."""
@@ -358,6 +273,14 @@ class BagReader:
     def definition(self, kind: str) -> str:
         """Return the ros2msg text of a type in the bag."""
         return _text(self._schemas[kind])
+
+    def has_header(self, topic: str) -> bool:
+        """Return whether messages of a topic have a header, and so a stamp."""
+        kind = self.topics[topic]
+        with suppress(Exception):
+            fields = parse_definition(kind, self.definition(kind))[short_name(kind)]
+            return Field('header', 'std_msgs/Header') in fields
+        return False
 
     def decoded(self, topics: Iterable[str] | None = None) -> Iterator[DecodedMessage]:
         """Yield the messages with their fields as attributes, in log-time order."""
@@ -432,19 +355,7 @@ def parse_definition(kind: str, text: str) -> Definitions:
     return found
 
 
-def _within(tables: dict[str, Table], start_ns: int | None, end_ns: int | None,
-            ) -> dict[str, Table]:
-    """Return the tables cut to a span of log times, without empty ones."""
-    if start_ns is not None:
-        tables = {name: table.where(table.log_time >= np.uint64(start_ns))
-                  for name, table in tables.items()}
-    if end_ns is not None:
-        tables = {name: table.where(table.log_time < np.uint64(end_ns))
-                  for name, table in tables.items()}
-    return {name: table for name, table in tables.items() if table.n}
-
-
-def field_reader(bag: BagReader, spec: FieldSpec, broken: Broken | None = None) -> FieldReader:
+def _reader(bag: BagReader, spec: FieldSpec, broken: Broken | None) -> FieldReader:
     """Return the reader of a field of a topic of a bag; `broken` as of `batches`."""
     def refuse(log_time: int, error: InputError) -> None:
         raise InputError(f'{error} ({moment(log_time, bag.start_ns)}); use --partial to leave it '
@@ -459,16 +370,15 @@ def field_reader(bag: BagReader, spec: FieldSpec, broken: Broken | None = None) 
 
 
 def batches(
-    bag: BagReader, specs: Mapping[str, FieldSpec], *, start_ns: int | None = None,
-    end_ns: int | None = None, progress: Callable[[float], None] | None = None,
-    broken: Broken | None = None,
+    bag: BagReader, specs: Mapping[str, FieldSpec], *, end_ns: int | None = None,
+    progress: Callable[[float], None] | None = None, broken: Broken | None = None,
 ) -> Iterator[dict[str, FieldColumn]]:
-    """Yield fields of a bag, batch by batch (start_ns, end_ns in ns, progress 0..1)."""
-    readers = {name: field_reader(bag, spec, broken) for name, spec in specs.items()}
+    """Yield fields of a bag by log time, batch by batch, at least to `end_ns`, ns."""
+    readers = {name: _reader(bag, spec, broken) for name, spec in specs.items()}
     pending: dict[str, list[FieldColumn]] = {name: [] for name in specs}
     counts = dict.fromkeys(specs, 0)
     topics = [spec.topic for spec in specs.values()]
-    for part in bag.tables(topics, start_ns=start_ns, end_ns=end_ns):
+    for part in bag.tables(topics, end_ns):
         ready = {}
         for name, reader in readers.items():
             table = part.tables.get(reader.spec.topic)
@@ -479,8 +389,7 @@ def batches(
                 continue
             column = join(pending[name]).in_time_order()
             if part.later_ns is not None:
-                until = np.searchsorted(column.log_time, np.uint64(part.later_ns), 'left')
-                column, left = column.split(int(until))
+                column, left = column.split(column.place(part.later_ns))
                 pending[name] = [left] if left.n else []
             if column.n:
                 ready[name] = column
@@ -488,42 +397,12 @@ def batches(
             progress(part.done)
         if ready:
             yield ready
-    if start_ns is None and end_ns is None:
-        for name, spec in specs.items():
-            _check_count(bag, spec.topic, counts[name])
-
-
-def _check_count(bag: BagReader, topic: str, found: int) -> None:
-    stated = bag.info[topic].count
-    if found < stated:
-        raise InputError(
-            f"{bag.path} is damaged: it states {stated} messages of topic '{topic}', {found} were "
-            'found; use --partial to read the intact part')
-
-
-def last_before(bag: BagReader, spec: FieldSpec, before_ns: int,
-                broken: Broken | None = None) -> FieldColumn:
-    """
-    Return messages of a topic up to the last one with a value before a log time.
-
-    before_ns in ns.
-    """
-    reader = field_reader(bag, spec, broken)
-    found: list[FieldColumn] = []
-    newest = -1
-    for table, older in bag.tables_before(spec.topic, before_ns):
-        column = reader.read(table)
-        found.append(column)
-        says = column.count > 0
-        if spec.nan == 'drop':
-            finite = np.add.reduceat(np.append(np.isfinite(column.values), False),
-                                     np.cumsum(column.count) - column.count) > 0
-            says &= finite
-        if says.any():
-            newest = max(newest, int(column.log_time[says].max()))
-        if newest > older:
-            break
-    return join(found[::-1]).in_time_order()
+    for name, spec in specs.items() if end_ns is None else ():
+        stated = bag.counts[spec.topic]
+        if counts[name] < stated:
+            raise InputError(
+                f"{bag.path} is damaged: it states {stated} messages of topic '{spec.topic}', "
+                f'{counts[name]} were found; use --partial to read the intact part')
 
 
 # Chunks are read together up to this size, bytes unpacked.
@@ -557,14 +436,12 @@ class BagTarget:
         except OSError as error:
             raise InputError(f'cannot write {path}: {error.strerror}') from error
 
-    def finish(
-        self, topics: Iterable[TopicInfo], hashes: dict[str, str], start_ns: int, end_ns: int,
-        custom: Mapping[str, str] | None = None,
-    ) -> None:
+    def finish(self, topics: Mapping[str, str], counts: Mapping[str, int], start_ns: int,
+               end_ns: int, custom: Mapping[str, str]) -> None:
         """Close the file and, in a directory, write its metadata.yaml."""
         self.file.close()
         if self._folder is not None:
-            write_metadata(self._folder, self._mcap.name, topics, hashes, start_ns, end_ns,
+            write_metadata(self._folder, self._mcap.name, topics, counts, start_ns, end_ns,
                            custom)
 
     def remove(self) -> None:
@@ -593,7 +470,7 @@ class BagWriter:
         self._about = {key: _as_text(value) for key, value in (about or {}).items()}
         self.path = Path(path)
         self._target = BagTarget(self.path)
-        self._topics: dict[str, TopicInfo] = {}
+        self._topics: dict[str, str] = {}
         self._channels: dict[str, int] = {}
         self._counts: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
@@ -608,8 +485,8 @@ class BagWriter:
 
     def add_topic(
         self, name: str, type: str, *,  # noqa: A002
-        schema: str | None = None, reliability: str = 'reliable',
-        sample_rate: float | None = None, origin: Mapping[str, str] | None = None,
+        schema: str | None = None, sample_rate: float | None = None,
+        origin: Mapping[str, str] | None = None,
     ) -> str:
         """Add a topic (sample_rate in Hz)."""
         topic = '/' + name.lstrip('/')
@@ -621,9 +498,8 @@ class BagWriter:
         if type not in self._schemas:
             self._schemas[type] = self._writer.register_schema(type, 'ros2msg', text.encode())
             self._definitions[type] = text
-        info = TopicInfo(topic, type, 0, reliability)
-        self._topics[topic] = info
-        metadata = {'offered_qos_profiles': yaml.safe_dump(qos_profile(info), sort_keys=False),
+        self._topics[topic] = type
+        metadata = {'offered_qos_profiles': yaml.safe_dump(_qos(), sort_keys=False),
                     'topic_type_hash': TYPE_HASHES.get(type, '')}
         if sample_rate is not None:
             metadata[SAMPLE_RATE] = repr(float(sample_rate))
@@ -641,7 +517,7 @@ class BagWriter:
         if t_ns < 0:
             raise ValueError(f'a bag cannot hold a negative log time, got {t_ns} ns')
         data = message if isinstance(message, bytes) else self._encode(
-            self._topics[name].type, message)
+            self._topics[name], message)
         try:
             self._writer.add_message(
                 self._channels[name], t_ns, data, t_ns, self._counts[name])
@@ -666,9 +542,8 @@ class BagWriter:
         finish: Callable[[], None] = self._writer.finish
         try:
             finish()
-            self._target.finish(
-                [replace(info, count=self._counts[name]) for name, info in self._topics.items()],
-                TYPE_HASHES, self._start_ns or 0, self._end_ns, self._about)
+            self._target.finish(self._topics, self._counts, self._start_ns or 0, self._end_ns,
+                                self._about)
         except OSError as error:
             self._target.remove()
             raise InputError(f'cannot write {self.path}: {error.strerror}') from error
@@ -692,13 +567,10 @@ def _as_text(value: str) -> str:
     return value.encode('utf-8', 'backslashreplace').decode()
 
 
-def write_metadata(
-    folder: Path, file: str, topics: Iterable[TopicInfo], hashes: dict[str, str],
-    start_ns: int, end_ns: int, custom: Mapping[str, str] | None = None,
-) -> None:
+def write_metadata(folder: Path, file: str, topics: Mapping[str, str], counts: Mapping[str, int],
+                   start_ns: int, end_ns: int, custom: Mapping[str, str]) -> None:
     """Write metadata.yaml (version 9) of a directory with one MCAP file."""
-    infos = list(topics)
-    count = sum(topic.count for topic in infos)
+    count = sum(counts.values())
     content = {_ROOT: {
         'version': 9,
         'storage_identifier': 'mcap',
@@ -707,12 +579,12 @@ def write_metadata(
         'message_count': count,
         'topics_with_message_count': [{
             'topic_metadata': {
-                'name': topic.name, 'type': topic.type, 'serialization_format': 'cdr',
-                'offered_qos_profiles': qos_profile(topic),
-                'type_description_hash': hashes.get(topic.type, ''),
+                'name': name, 'type': kind, 'serialization_format': 'cdr',
+                'offered_qos_profiles': _qos(),
+                'type_description_hash': TYPE_HASHES.get(kind, ''),
             },
-            'message_count': topic.count,
-        } for topic in infos],
+            'message_count': counts[name],
+        } for name, kind in topics.items()],
         'compression_format': '',
         'compression_mode': '',
         'relative_file_paths': [file],

@@ -15,7 +15,7 @@ import re
 
 import numpy as np
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.recordings.bag import BagReader, batches, last_before
+from ou_monitor.recordings.bag import BagReader, batches
 from ou_monitor.recordings.cdr import FieldColumn, IntArray, join
 from ou_monitor.recordings.importers.log import RawColumns
 from ou_monitor.recordings.mcap_file import moment
@@ -259,17 +259,22 @@ def read_bag(
     def leave_out(log_time: int, error: InputError) -> None:
         broken.append('' if broken else f'{error} ({moment(log_time, bag.start_ns)})')
 
-    first, last = (_limit(bag, at) for at in (start, end))
+    first = 0 if start is None else _limit(bag, start)
+    last = None if end is None else _limit(bag, end)
     # A current in the messages of the voltage belongs to the same message's voltage.
     together = CURRENT in specs and specs[CURRENT].topic == specs[VOLTAGE].topic
     parts: dict[str, list[FieldColumn]] = {name: [] for name in specs}
-    if first is not None:
-        for name in specs.keys() - {VOLTAGE} - ({CURRENT} if together else set()):
-            parts[name].append(last_before(
-                bag, specs[name], first, leave_out if bag.partial else None))
     beside: list[FloatArray] = []
-    for batch in batches(bag, specs, start_ns=first, end_ns=last, progress=progress,
+    for batch in batches(bag, specs, end_ns=last, progress=progress,
                          broken=leave_out if bag.partial else None):
+        for name, column in batch.items():
+            before, column = column.split(column.place(first))
+            if before.n and name != VOLTAGE and not (together and name == CURRENT):
+                # What was said last holds in the part.
+                parts[name] = ([] if np.isfinite(before.values).any() else parts[name]) + [before]
+            if last is not None:
+                column, _ = column.split(column.place(last))
+            batch[name] = column
         current = batch.pop(CURRENT, None) if together else None
         if together and VOLTAGE in batch:
             beside.append(_beside(batch[VOLTAGE], current))
@@ -323,10 +328,8 @@ def _source(bag: BagReader, choice: TopicChoice, name: str) -> dict[str, str]:
     return {**source, 'vehicle': vehicle} if vehicle else source
 
 
-def _limit(bag: BagReader, at: float | None) -> int | None:
+def _limit(bag: BagReader, at: float) -> int:
     """Return a time of the recording, s, as log time, ns."""
-    if at is None:
-        return None
     # Limit times beyond the end of the bag.
     return bag.start_ns + round(min(at * 1e9, float(bag.end_ns - bag.start_ns + 1)))
 

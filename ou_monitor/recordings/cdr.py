@@ -368,6 +368,10 @@ class FieldColumn:
                 FieldColumn(self.log_time[at:], self.stamp[at:], self.stamped[at:],
                             self.count[at:], self.values[cut:]))
 
+    def place(self, log_time: int) -> int:
+        """Return how many of the messages, in order, are before a log time, ns."""
+        return int(np.searchsorted(self.log_time, np.uint64(log_time), 'left'))
+
     def in_time_order(self) -> FieldColumn:
         """Return the messages by log time; equal times keep their order."""
         if (self.log_time[1:] >= self.log_time[:-1]).all():

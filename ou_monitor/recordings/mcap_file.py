@@ -120,8 +120,6 @@ class Topic(NamedTuple):
     name: str
     type: str  # noqa: A003
     schema: Any
-    #: QoS offered, as written.
-    qos: str
     #: Rate of the samples within a block, Hz.
     sample_rate: float | None
     #: Where its values came from.
@@ -464,7 +462,6 @@ class McapFile:
         assert schema is not None
         self.topics[channel.id] = Topic(
             name, printable(schema.name), schema,
-            channel.metadata.get('offered_qos_profiles', ''),
             _rate(channel.metadata.get(SAMPLE_RATE, '')),
             plain_texts({key.removeprefix(ORIGIN): value for key, value
                          in channel.metadata.items() if key.startswith(ORIGIN)}))

@@ -27,7 +27,7 @@ from ou_monitor.recordings.importers.formats import import_log, is_csv, is_log
 from ou_monitor.recordings.importers.log import (
     CsvColumns, Log, RawColumns, Request, Series, SIGNAL, UNKNOWN)
 from ou_monitor.recordings.standard_types import IMU
-from ou_monitor.records import defect_of, FloatArray, Recording
+from ou_monitor.records import defect_of, Recording
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.timeline.line import (
     in_order, MOST_THROTTLE, MOST_VOLTAGE, plausible, plausible_samples, readings_of)
@@ -60,8 +60,7 @@ def read_recording(
         Whether to read the intact part of a damaged bag, with a note.
     start, end : float, optional
         Part to read, s after the first message of the bag (by log time) or the first sample of
-        the CSV or log: start <= t < end.  Of a bag only the chunks in it are read, and earlier
-        ones back to the last throttle, which is held.
+        the CSV or log: start <= t < end.  The throttle of before is held.
     flight : int, optional
         Flight of a log with several, from 1; default: the largest.
     columns : CsvColumns, optional
@@ -226,52 +225,31 @@ def read_beside(
     recording = _read(
         path, msg_config=msg_config, voltage_topic=voltage_topic, throttle_topic=throttle_topic,
         partial=partial, start=start, end=end, flight=flight, columns=columns, progress=progress)
-    t, values = read_signal(path, signal, partial=partial, columns=columns)
-    unit = signal_unit(path, signal, partial=partial) or UNKNOWN
-    return recording, Series(signal, SIGNAL, t, values, '1', own_unit=unit)
+    return recording, read_signal(path, signal, partial=partial, columns=columns)
 
 
 def read_signal(path: str | Path, signal: str, *, partial: bool = False,
-                columns: CsvColumns | None = None) -> tuple[FloatArray, FloatArray]:
+                columns: CsvColumns | None = None) -> Series:
     """Read one scalar over time; `columns` names the time of a CSV."""
     path = Path(path)
     if not signal:
         raise InputError('the name of the signal is empty: TOPIC/FIELD or a column')
     if is_csv(path):
-        return read_column(path, signal, columns)
+        return Series(signal, SIGNAL, *read_column(path, signal, columns), '1')
     bag = BagReader(path, partial=partial)
     topic, field = _split(path, signal, bag.topics)
-    kind = bag.topics[topic]
-    spec = FieldSpec(topic, kind, field, nan='unknown',
-                     stamp_field='header.stamp' if _has_header(bag, topic) else None)
-    parts = [batch['signal'] for batch in batches(bag, {'signal': spec})]
-    column = join(parts)
+    spec = FieldSpec(topic, bag.topics[topic], field, nan='unknown',
+                     stamp_field='header.stamp' if bag.has_header(topic) else None)
+    column = join([batch['signal'] for batch in batches(bag, {'signal': spec})])
     if not column.n:
         raise InputError(f"{path}: topic '{topic}' holds no message")
     values = np.full(column.n, np.nan)
     values[column.count > 0] = column.values
-    return column.stamp, values
-
-
-def signal_unit(path: str | Path, signal: str, *, partial: bool = False) -> str:
-    """Return the unit of a scalar of a bag; empty if not stated."""
-    path = Path(path)
-    if is_csv(path):
-        return ''
-    bag = BagReader(path, partial=partial)
-    topic, field = _split(path, signal, bag.topics)
-    if bag.topics[topic] == IMU:
-        return {'angular_velocity': 'rad/s', 'linear_acceleration': 'm/s^2'}.get(
-            field.partition('.')[0], '')
-    unit = bag.origins.get(topic, {}).get(f'{topic[1:]}_unit', '')
-    return '' if unit == UNKNOWN else unit
-
-
-def _has_header(bag: BagReader, topic: str) -> bool:
-    """Return whether messages of a topic carry a stamp in their header."""
-    first = next(bag.decoded([topic]), None)
-    header = None if first is None else getattr(first.message, 'header', None)
-    return hasattr(header, 'stamp')
+    unit = bag.origins.get(topic, {}).get(f'{topic[1:]}_unit', UNKNOWN)
+    if spec.type == IMU:
+        unit = {'angular_velocity': 'rad/s', 'linear_acceleration': 'm/s^2'}.get(
+            field.partition('.')[0], UNKNOWN)
+    return Series(signal, SIGNAL, column.stamp, values, '1', own_unit=unit)
 
 
 def _split(path: Path, signal: str, topics: Mapping[str, str]) -> tuple[str, str]:

@@ -134,7 +134,7 @@ def test_columns_of_a_csv(tmp_path, capsys):
     np.testing.assert_allclose(back.voltage, [5.0, 5.1, 5.2], rtol=1e-7)
     np.testing.assert_allclose(back.throttle, [0.1, 0.2, 0.3], rtol=1e-7)
     assert back.source['voltage_field'] == 'bus'
-    np.testing.assert_allclose(read_signal(tmp_path / 'b', '/current/data')[1], [2, 3, 4])
+    np.testing.assert_allclose(read_signal(tmp_path / 'b', '/current/data').values, [2, 3, 4])
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ from mcap.writer import CompressionType, IndexType, Writer
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings import bag as bag_module
-from ou_monitor.recordings.mcap_file import McapFile
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.recordings.standard_types import (
     BATTERY_STATE, encode_battery, encode_scalars, FLOAT32, SCHEMAS)
@@ -147,20 +146,6 @@ def test_parts_side_by_side_are_the_whole(tmp_path):
     t = np.concatenate([part.t for part in parts])
     np.testing.assert_array_equal(t, whole.t)
     np.testing.assert_array_equal(np.concatenate([p.throttle for p in parts]), whole.throttle)
-
-
-def test_only_the_chunks_needed_are_read(bag, monkeypatch):
-    """A part in the middle costs what is in it, and the way back to the last throttle."""
-    monkeypatch.setattr(bag_module, '_TOGETHER', 1)
-    read = []
-    original = McapFile.tables
-    monkeypatch.setattr(McapFile, 'tables', lambda self, spans, wanted: read.extend(spans)
-                        or original(self, spans, wanted))
-    read_recording(bag, start=1.5, end=1.6)
-    touched = len(set(read))
-    read.clear()
-    read_recording(bag)
-    assert touched <= 6 < 12 < len(set(read))
 
 
 @pytest.mark.parametrize('start, end, words', [

@@ -4,7 +4,7 @@ import os
 import time
 
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.bag import find_files, parse_qos
+from ou_monitor.recordings.bag import find_files
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.stream.config import load_msg_config
 from ou_monitor.stream.files import (
@@ -109,14 +109,6 @@ def test_honest_yaml_is_read():
                        f'number: 1.{"3" * (MOST_DIGITS - 2)}\ndeep: {"[" * 50}{"]" * 50}\n', 'x')
     assert found['one'] == {'unit': 'V', 'list': [1, 2], 'more': [1, 2]}
     assert found['number'] == pytest.approx(4.0 / 3.0)
-
-
-@pytest.mark.parametrize('text', [
-    '- {reliability: [1], durability: {a: 1}, depth: x}', bomb(), '[' * 5000, 'x' * 200_000,
-    '- {depth: 1' + '0' * 399 + '}', '- {reliability: true}', '\x00', '!!int x'])
-def test_unreadable_qos_becomes_the_default(text):
-    """A QoS profile is no reason to refuse messages, whatever it is."""
-    assert parse_qos(text) == ('reliable', 'volatile', 10)
 
 
 def test_printable():

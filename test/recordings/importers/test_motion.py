@@ -10,7 +10,7 @@ from ou_monitor.recordings.importers.choose import (
     choose_extras, clean_inertial, pace_notes, topic_of)
 from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import Inertial, Log, Request, Series
-from ou_monitor.recordings.read import read_signal, signal_unit
+from ou_monitor.recordings.read import read_signal
 import pytest
 
 FIELDS = ('loopIteration', 'time', 'rcCommand[3]', 'vbatLatest', 'amperageLatest', 'motor[0]',
@@ -170,15 +170,16 @@ def test_what_a_bag_gets(tmp_path, capsys):
         '/motor_speed': 'sensor_msgs/msg/JointState', '/debug_3': 'std_msgs/msg/Float64',
         '/gyroADC_2': 'std_msgs/msg/Float64'}
     assert any('debug[3]: the log does not state its unit' in note for note in said['notes'])
-    t, values = read_signal(out, '/imu/angular_velocity.z')
-    np.testing.assert_allclose(values, moving[:, 2] * DEGREE, rtol=1e-12)
-    np.testing.assert_allclose(t, 0.002 * np.arange(len(rows)), atol=1e-8)
-    np.testing.assert_allclose(read_signal(out, '/gyroADC_2')[1], values, rtol=1e-12)
-    np.testing.assert_allclose(read_signal(out, '/motor_speed/velocity[1]')[1],
+    found = read_signal(out, '/imu/angular_velocity.z')
+    np.testing.assert_allclose(found.values, moving[:, 2] * DEGREE, rtol=1e-12)
+    np.testing.assert_allclose(found.t, 0.002 * np.arange(len(rows)), atol=1e-8)
+    np.testing.assert_allclose(read_signal(out, '/gyroADC_2').values, found.values,
+                               rtol=1e-12)
+    np.testing.assert_allclose(read_signal(out, '/motor_speed/velocity[1]').values,
                                moving[:, 11] * 100 / 60 * 2 * np.pi / 6, rtol=1e-12)
-    assert [signal_unit(out, name) for name in (
+    assert [read_signal(out, name).own_unit for name in (
         '/imu/linear_acceleration.x', '/gyroADC_2', '/debug_3', '/motor_speed/velocity[0]')] == [
-            'm/s^2', 'rad/s', '', 'rad/s']
+            'm/s^2', 'rad/s', '?', 'rad/s']
 
 
 @pytest.mark.parametrize('arguments, words', [

@@ -71,7 +71,7 @@ def test_px4(folder, tmp_path, capsys):
         assert back.source['voltage_field'] == name
         assert back.voltage.mean() == pytest.approx(level, abs=0.2)
         # The throttle keeps its own rate.
-        _, throttle = read_signal(out, '/throttle/data')
+        throttle = read_signal(out, '/throttle/data').values
         assert throttle.size == 1812 and throttle.max() == pytest.approx(0.407273, abs=1e-6)
 
 

@@ -66,9 +66,9 @@ def test_log_to_bag_and_back(tmp_path, log, name, kind):
     last = np.searchsorted(np.rint(throttle[0] * 1e6), np.rint(volts[0] * 1e6), 'right') - 1
     held = np.where(last >= 0, throttle[1][last].astype(np.float32), np.nan)
     np.testing.assert_array_equal(back.throttle, held)
-    stamps, current = read_signal(out, '/current/data')
-    np.testing.assert_allclose(stamps, amperes[0], rtol=0, atol=2e-9)
-    np.testing.assert_array_equal(current, amperes[1].astype(np.float32))
+    current = read_signal(out, '/current/data')
+    np.testing.assert_allclose(current.t, amperes[0], rtol=0, atol=2e-9)
+    np.testing.assert_array_equal(current.values, amperes[1].astype(np.float32))
     assert back.source['voltage_field'] == field
     assert back.source['voltage_unit'] == 'V' and back.source['throttle_unit'] == '0..1'
     assert back.source['log_firmware'] == firmware
