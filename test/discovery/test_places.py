@@ -74,6 +74,19 @@ def test_noise_that_follows_nothing_gets_no_curve():
         assert not term.at, seed
 
 
+def test_heavy_tails_are_no_curves():
+    """Squares of few large errors say less of their mean: of 8 recordings none has a knot."""
+    u = flown(2)
+    knots = []
+    for seed in range(8):
+        z = np.random.default_rng(seed).standard_t(3.0, N)
+        view = scores_of(np.zeros(N), u)
+        (term,) = LoadDependentNoise.candidates(View(
+            z / z.std(), view.variance, view.phi, view.state, z, T, view.step, u, view.train, 0.0))
+        knots.append(len(term.at))
+    assert knots == [0] * 8
+
+
 @pytest.mark.parametrize('n', [30, 60, 400])
 def test_a_few_samples_have_a_law_of_few_knots_or_none(n):
     """Of 399 samples of a robot each bin had less than twenty, and the search broke off."""

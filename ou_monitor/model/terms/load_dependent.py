@@ -361,7 +361,13 @@ class LoadDependentNoise(Term):
                 if turn:
                     usual = float(np.mean(np.minimum(rest, _LARGEST * float(np.mean(rest)))))
                     rest = np.minimum(rest, _LARGEST * usual * np.exp(2.0 * logs[k]))
-                centre, log, count = bins = _binned(rest, x, edges[k])
+                centre, log, count = _binned(rest, x, edges[k])
+                if turn:
+                    # Squares with heavy tails say less of their mean than those of normal scores.
+                    alike = rest * np.exp(-2.0 * logs[k])
+                    count = count / max(0.5 * float(np.mean(alike**2) / np.mean(alike)**2) - 0.5,
+                                        1.0)
+                bins = centre, log, count
                 flat = 0.0 if centre.size < 2 else float(np.sum(
                     count * (log - np.average(log, weights=count)) ** 2))
                 if flat < price + _INPUT_PRICE:
