@@ -17,8 +17,8 @@ from ou_monitor.errors import InputError, nearest
 from ou_monitor.paper.network.components import (
     completed, PowerNetwork, UNITS)
 from ou_monitor.paper.network.design import (
-    answer, as_data, default_voltage, Design, design, effect, probability, remarks)
-from ou_monitor.paper.network.measured import Flight, network_of
+    answer, as_data, default_voltage, Design, design, effect, Flight, network_of, probability,
+    remarks)
 from ou_monitor.report.document import Document, Table, Text
 from ou_monitor.report.terminal import table
 from ou_monitor.stream.files import read_yaml

@@ -20,7 +20,6 @@ the paper, both with a small eps; eps = 1 is the system as given, D and d are no
   Equation (6) of the paper lacks the 2, which (4) as printed needs: the variance of the integral
   of C(x(t)) grows at the rate of twice the integral of its autocovariance over positive lags
   (Korolyuk & Limnios, Stochastic Systems in Merging Phase Space, 2005, give it with the 2).
-   is the printed one.
 
 Between two jumps a switched system is affine, its average is affine, and so are drift and noise of
 its diffusion limit.
@@ -28,7 +27,7 @@ its diffusion limit.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
@@ -166,25 +165,6 @@ def check_starts(u0: npt.ArrayLike, paths: int, d: int) -> FloatArray:
     return np.array(np.broadcast_to(first, (paths, d)))
 
 
-COMPONENTS = ('amplitude', 'phase', 'power')
-
-
-@dataclass(frozen=True)
-class Stability:
-    """What the matrix does to each component."""
-
-    # Diagonal entry of each component, 1/s; the matrix is triangular, so these are its
-    # eigenvalues.
-    rates: dict[str, float]
-    growing: tuple[str, ...]  # Components that grow exponentially
-    text: str  # One sentence: ``stable`` or ``unstable: ...`` with the rates
-
-    @property
-    def stable(self) -> bool:
-        """Tell whether no component grows exponentially."""
-        return not self.growing
-
-
 @dataclass(frozen=True)
 class MatrixModel:
     """
@@ -228,20 +208,6 @@ class MatrixModel:
         return AffineSystem(
             np.array([[-self.alpha, 0.0, 0.0], [0.0, turning, 0.0], [self.beta, 0.0, power]]),
             np.array([0.0, 0.0 if self.printed else self.omega, 0.0]))
-
-    def stability(self) -> Stability:
-        """Say which components grow, and how fast; a carrier's phase advances, which is none."""
-        rates = dict(zip(COMPONENTS, np.diag(self.affine.matrix).tolist(), strict=True))
-        growing = tuple(name for name in COMPONENTS if rates[name] > 0.0)
-        if not growing:
-            return Stability(rates, (), 'stable')
-        said = ', '.join(f'{name} grows as exp({rates[name]:g} t)' for name in growing)
-        cure = []
-        if 'power' in growing:
-            cure.append('a power that relaxes needs -alpha_p on the diagonal')
-        if 'phase' in growing:
-            cure.append('a carrier of frequency omega has dphi/dt = omega')
-        return Stability(rates, growing, f'unstable: {said}; ' + '; '.join(cure))
 
     def solve(self, t: npt.ArrayLike, u0: npt.ArrayLike) -> FloatArray:
         """Return amplitude, phase and power at the given times, exactly (t in s)."""
@@ -333,9 +299,10 @@ class Generator:
         return np.asarray(p)
 
     @cached_property
-    def _table(self) -> AliasTable:
-        """Return the alias table of the embedded chain."""
-        return AliasTable(self.jump_probabilities)
+    def _below(self) -> FloatArray:
+        """Return the cumulative kernel, shape (n, n); 1 from the last possible state on."""
+        below = np.cumsum(self.jump_probabilities, axis=1)
+        return np.asarray(below / below[:, -1:])
 
     def sped_up(self, factor: float) -> Generator:
         """Return the chain on the clock factor * t, with `factor` times the rates."""
@@ -380,57 +347,12 @@ class Generator:
                 held, at = hold[which], state[which]
                 yield k, which, at, held
                 rest = left[which] - held
-                at = self._table.draw(at, rng)
+                at = (rng.random(at.size)[:, None] >= self._below[at]).sum(axis=1)
                 new = rng.standard_exponential(which.size) / rates[at]
                 left[which], state[which], hold[which] = rest, at, new
                 which = which[new < rest]
             yield k, everyone, state.copy(), left
             hold -= left
-
-
-class AliasTable:
-    """
-    Draws from the rows of a stochastic matrix in constant time.
-
-    Walker, ACM Trans. Math. Software 3 (1977) 253: `keep`, shape (n, n), the chance to keep the
-    column first chosen, `other` the column taken otherwise.
-    """
-
-    def __init__(self, probabilities: FloatArray) -> None:
-        """Build the table of a stochastic matrix of shape (n, n)."""
-        n = len(probabilities)
-        self.size = n
-        self.keep = np.zeros((n, n))
-        self.other = np.zeros((n, n), dtype=np.intp)
-        for row, law in enumerate(probabilities):
-            weight = (law * n).tolist()
-            # What rounding leaves of an impossible column goes to the likeliest one.
-            self.other[row] = int(np.argmax(law))
-            small = [k for k, w in enumerate(weight) if w < 1.0]
-            large = [k for k, w in enumerate(weight) if w >= 1.0]
-            while small and large:
-                less, more = small.pop(), large[-1]
-                self.keep[row, less], self.other[row, less] = weight[less], more
-                weight[more] -= 1.0 - weight[less]
-                if weight[more] < 1.0:
-                    small.append(large.pop())
-            for k in large + small:
-                self.keep[row, k] = 1.0 if law[k] > 0.0 else 0.0
-        self._flat_keep, self._flat_other = self.keep.ravel(), self.other.ravel()
-
-    def draw(self, rows: IntArray, rng: np.random.Generator) -> IntArray:
-        """Return one column for each of the given rows, any shape."""
-        u = rng.random(rows.shape) * self.size
-        column = u.astype(np.intp)
-        cell = rows * self.size + column
-        return np.where(u - column < self._flat_keep[cell], column, self._flat_other[cell])
-
-
-def _named(states: Sequence[int] | npt.NDArray[np.intp]) -> str:
-    """Return ``state 2`` or ``states 0, 3``, cut where there are many."""
-    names = [str(int(state)) for state in states]
-    said = ', '.join(names[:8]) + (', ...' if len(names) > 8 else '')
-    return ('state ' if len(names) == 1 else 'states ') + said
 
 
 def check_rates(q: FloatArray) -> None:
@@ -459,23 +381,12 @@ def check_rates(q: FloatArray) -> None:
 
 def check_classes(rates: FloatArray) -> None:
     """Refuse chains that do not visit every state for ever (rates in 1/s)."""
-    absorbing = np.flatnonzero(rates.sum(axis=1) == 0.0)
-    if absorbing.size:
-        raise ValueError(f'{_named(absorbing)} absorbing: no rate leaves, so the switching stops')
     count, label = connected_components(rates > 0.0, directed=True, connection='strong')
-    if count == 1:
-        return
-    leaks = (rates > 0.0) & (label[:, None] != label[None, :])
-    closed = [c for c in range(count) if not leaks[label == c].any()]
-    if len(closed) > 1:
-        classes = '; '.join(_named(np.flatnonzero(label == c)) for c in closed[:4])
+    if count > 1:
+        classes = [np.flatnonzero(label == c).tolist() for c in range(count)]
         raise ValueError(
-            f'the chain falls apart into {len(closed)} closed classes ({classes}): it has no '
-            'single stationary law; give each class its own generator')
-    transient = np.flatnonzero(label != closed[0])
-    raise ValueError(
-        f'{_named(transient)} transient: left once and for all; give the generator of the '
-        'other states')
+            f'the chain has no single stationary law: not every state is reached from every other '
+            f'(states that reach one another: {", ".join(map(str, classes))})')
 
 
 Scaling = Literal['averaging', 'diffusion']

@@ -6,7 +6,7 @@ import re
 import numpy as np
 from ou_monitor.paper.reproduce import (
     network, probability, published, switching, table1, table2, transient)
-from ou_monitor.paper.reproduce.row import Printed, RowVerdict
+from ou_monitor.paper.reproduce.published import Printed, RowVerdict
 import pytest
 from scipy.integrate import trapezoid
 from scipy.signal import lsim

@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from ou_monitor.paper.reproduce import crest, jumps, published, switching
-from ou_monitor.paper.reproduce.row import RowVerdict
+from ou_monitor.paper.reproduce import crest, published, switching
+from ou_monitor.paper.reproduce.published import RowVerdict
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
@@ -183,19 +183,19 @@ def test_jumps_have_the_kurtosis_said():
     x += math.sqrt(1.0 - share) * rng.standard_normal(draws)
     assert x.var() == pytest.approx(1.0, rel=0.03)
     kurtosis = np.mean(x ** 4) / x.var() ** 2 - 3.0
-    assert kurtosis == pytest.approx(jumps.excess_kurtosis(rate, share), rel=0.15)
+    assert kurtosis == pytest.approx(crest.excess_kurtosis(rate, share), rel=0.15)
 
 
 def test_jumps_raise_the_crest_factor_of_long_screens(crests):
     """Beyond the OU on 500 ms; rows name what was best, and size gives back the variance."""
-    found = jumps.simulate_jumps(np.random.default_rng(17), 20.0)
-    best = jumps.largest(found, 500)
+    found = crest.simulate_jumps(np.random.default_rng(17), 20.0)
+    best = crest.largest(found, 500)
     assert best.mean == max(c.mean for c in found if c.screen == 500)
     assert best.mean - crests.mean(500)[0] > 5.0 * best.error
     share = best.size(1.0) ** 2 * best.rate / (2.0 * published.ALPHA.value)
     assert share == pytest.approx(best.share)
-    rows = jumps.rows(found, crests)
+    rows = crest.jump_rows(found, crests)
     assert len(rows) == 5
     assert rows[0].recomputed == pytest.approx((287.5 / 56.3) / (81.3 / 9.38))
-    assert jumps.impulse_height(published.LOW, crests) == pytest.approx(
+    assert crest.impulse_height(published.LOW, crests) == pytest.approx(
         81.3 - 9.38 * crests.mean(100)[0])

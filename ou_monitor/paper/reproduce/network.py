@@ -9,7 +9,7 @@ import numpy as np
 from ou_monitor.paper.network.components import PowerNetwork
 from ou_monitor.paper.network.rail import Rail, rail_at
 from ou_monitor.paper.reproduce import published
-from ou_monitor.paper.reproduce.row import Printed, Row
+from ou_monitor.paper.reproduce.published import Printed, Row
 from ou_monitor.paper.reproduce.table1 import exponent, over, vrms_range
 from scipy.linalg import solve_continuous_lyapunov
 

@@ -8,7 +8,7 @@ import numpy as np
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.passage.law import mean_first_passage
 from ou_monitor.paper.reproduce import published
-from ou_monitor.paper.reproduce.row import Printed, Row
+from ou_monitor.paper.reproduce.published import Printed, Row
 from ou_monitor.paper.reproduce.table1 import over, vrms_range
 from ou_monitor.paper.reproduce.table2 import sigma_of
 from scipy.integrate import quad

@@ -1,5 +1,5 @@
 """
-Numbers as printed in the paper; everything else is computed from them.
+Numbers as printed in the paper, and each beside its recomputation with the verdict that follows.
 
 Units are the paper's own: mV, ms, 1/s, V/sqrt(s), V^2.
 """
@@ -7,8 +7,137 @@ Units are the paper's own: mV, ms, 1/s, V/sqrt(s), V^2.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+import enum
+import math
 
-from ou_monitor.paper.reproduce.row import Printed
+Range = tuple[float, float]
+
+# Standard errors allowed to a recomputed number: one row in 370 is called wrong by chance.
+STANDARD_ERRORS = 3.0
+# A number printed at half a unit from the true one is rounded rightly either way.
+_TIE = 1e-9
+
+
+class RowVerdict(enum.Enum):
+    """Verdict on a printed number; the value is its wording."""
+
+    AGREES = 'agrees'
+    ROUNDING = 'rounding'
+    DOES_NOT_HOLD = 'does not hold'
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A number or a bound, as the paper has it."""
+
+    # As printed, with all of its digits (``63.0``, ``315.6e-3``), or a claim as a bound (``> 0``,
+    # ``< 0``).
+    text: str
+    # Half a unit of the last printed digit, which is how far rounding may have moved it; follows
+    # from the text unless given (``~0`` has no digits).
+    half_unit: float = math.nan
+
+    def __post_init__(self) -> None:
+        """Read the number."""
+        bare = self.text.lstrip('<>~ ')
+        try:
+            number = Decimal(bare)
+        except InvalidOperation:
+            raise ValueError(f"'{self.text}' is not a printed number") from None
+        exponent = number.as_tuple().exponent
+        if not isinstance(exponent, int):
+            raise ValueError(f"'{self.text}' is not a finite number")
+        if self.is_bound:
+            object.__setattr__(self, 'half_unit', 0.0)
+        elif math.isnan(self.half_unit):
+            object.__setattr__(self, 'half_unit', float(Decimal((0, (5,), exponent - 1))))
+
+    @property
+    def is_bound(self) -> bool:
+        """Tell whether this is a claim that something is above or below a number."""
+        return self.text[0] in '<>'
+
+    @property
+    def value(self) -> float:
+        """Return the number itself; of a claim, the bound."""
+        return float(self.text.lstrip('<>~ '))
+
+    @property
+    def ends(self) -> Range:
+        """All values that may have been printed like this."""
+        if self.text[0] == '>':
+            return math.nextafter(self.value, math.inf), math.inf
+        if self.text[0] == '<':
+            return -math.inf, math.nextafter(self.value, -math.inf)
+        slack = _TIE * abs(self.value)
+        return self.value - self.half_unit - slack, self.value + self.half_unit + slack
+
+
+@dataclass(frozen=True)
+class Row:
+    """One printed number, recomputed."""
+
+    where: str  # Table, figure or section of the paper.
+    # What it is; the unit is the paper's.
+    quantity: str
+    unit: str
+    printed: Printed  # As printed.
+    recomputed: float  # The same from what it was computed from, finite.
+    how: str  # How it was recomputed.
+    sentence: str  # What this says.
+    error: float | None = None  # Standard error of `recomputed`; None for arithmetic.
+    # Where the recomputed number lies if it is one draw of something random, or if its error
+    # is not normal; replaces 3 standard errors.
+    band: Range | None = None
+    # Range of the printed number when what *it* was computed from is changed within its
+    # rounding.
+    printed_inputs: Range | None = None
+    inputs: Range | None = None  # Likewise of the recomputed one.
+    point: int = 0  # Which of the eight points it belongs to; 0 for none.
+
+    def __post_init__(self) -> None:
+        """Refuse what would make the verdict meaningless."""
+        if not math.isfinite(self.recomputed):
+            raise ValueError(f'{self.quantity}: recomputed is {self.recomputed}')
+        if self.error is not None and not 0.0 <= self.error < math.inf:
+            raise ValueError(f'{self.quantity}: standard error is {self.error}')
+        for name in ('band', 'printed_inputs', 'inputs'):
+            found = getattr(self, name)
+            if found is not None and not found[0] <= found[1]:
+                raise ValueError(f'{self.quantity}: {name} is {found}')
+
+    @property
+    def interval(self) -> Range:
+        """Where the recomputed number lies: the band, or 3 standard errors each way."""
+        if self.band is not None:
+            return self.band
+        reach = STANDARD_ERRORS * (self.error or 0.0)
+        return self.recomputed - reach, self.recomputed + reach
+
+    @property
+    def verdict(self) -> RowVerdict:
+        """
+        Return what follows from the ranges.
+
+        `AGREES`: the recomputed number rounds to the printed one, or its
+        interval reaches it. `ROUNDING`: it does once what either was computed
+        from may move within its own rounding. `DOES_NOT_HOLD`: not even then.
+        """
+        if _meet(self.printed.ends, self.interval):
+            return RowVerdict.AGREES
+        if _meet(_join(self.printed.ends, self.printed_inputs),
+                 _join(self.interval, self.inputs)):
+            return RowVerdict.ROUNDING
+        return RowVerdict.DOES_NOT_HOLD
+
+
+def _meet(a: Range, b: Range) -> bool:
+    return a[0] <= b[1] and b[0] <= a[1]
+
+
+def _join(a: Range, b: Range | None) -> Range:
+    return a if b is None else (min(a[0], b[0]), max(a[1], b[1]))
 
 
 @dataclass(frozen=True)

@@ -12,18 +12,25 @@ import math
 from typing import Any
 
 import numpy as np
+from ou_monitor.criticism.curves import even_on_log
+from ou_monitor.model.ou import simulate
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.ac_coupling import ACCoupling
+from ou_monitor.model.terms.ou import OU
 from ou_monitor.paper.network.components import PowerNetwork
 from ou_monitor.paper.reproduce import (
-    jumps, network, probability, published, switching, table1, table2, transient)
+    network, probability, published, switching, table1, table2, transient)
 from ou_monitor.paper.reproduce.crest import (
-    crest, Crests, mean_and_error, rows as crest_rows, simulate_crests)
-from ou_monitor.paper.reproduce.figures import draw, Figures
-from ou_monitor.paper.reproduce.jumps import JumpCrest
-from ou_monitor.paper.reproduce.row import Row, RowVerdict
+    crest, Crests, impulse_height, jump_rows, JUMP_SCREENS_MS, JumpCrest, largest, mean_and_error,
+    rows as crest_rows, simulate_crests, simulate_jumps)
+from ou_monitor.paper.reproduce.published import Row, RowVerdict
 from ou_monitor.paper.reproduce.switching import Spreading
 from ou_monitor.paper.reproduce.table1 import exponent, vpp_step, vrms_step
 from ou_monitor.paper.reproduce.table2 import sigma_half_width, sigma_of
+from ou_monitor.paper.reproduce.transient import CORNER_HZ
+from ou_monitor.records import FloatArray
 from ou_monitor.text import number
+from scipy.signal import welch
 
 Progress = Callable[[float], None]
 # Independent segments of half a second, so that the 95 % quantile is known to 0.03; and
@@ -203,15 +210,15 @@ def _capacitance() -> str:
 
 def _jumps(crests: Crests, found: list[JumpCrest]) -> str:
     parts = []
-    for ms in jumps.SCREENS_MS:
-        best = jumps.largest(found, ms)
+    for ms in JUMP_SCREENS_MS:
+        best = largest(found, ms)
         parts.append(
             f'{best.mean:.1f} on {ms} ms screens ({best.rate:g} a second, '
             f'{100 * best.share:.0f} % of the variance, '
             f'{best.size(published.LOW.vrms.value):.0f} mV rms at 5 % and '
             f'{best.size(published.MEDIUM.vrms.value):.0f} mV at 10 %, excess kurtosis '
             f'{best.kurtosis:.0f})')
-    heights = ', '.join(f'{jumps.impulse_height(s, crests):.0f} mV at {s.label}'
+    heights = ', '.join(f'{impulse_height(s, crests):.0f} mV at {s.label}'
                         for s in published.LOADED)
     (low, low_in), (high, high_in) = crest(published.LOW), crest(published.HIGH)
     return ('The paper says that its data justify diffusion and jump components, and fits no '
@@ -258,9 +265,9 @@ def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:
     # Each part has its own generator, so that none depends on what others draw.
     rngs = np.random.default_rng(seed).spawn(8)
     crests = simulate_crests(rngs[0], CREST_PATHS, within(0.0, 0.35))
-    found = jumps.simulate_jumps(rngs[1], JUMP_SECONDS, within(0.35, 0.6))
+    found = simulate_jumps(rngs[1], JUMP_SECONDS, within(0.35, 0.6))
     rows = [*table1.rows(*mean_and_error(crests.white)), *crest_rows(crests),
-            *table2.rows(), *network.rows(), *jumps.rows(found, crests)]
+            *table2.rows(), *network.rows(), *jump_rows(found, crests)]
     rows += transient.rows(rngs[2])
     report(0.76)
     rows += probability.rows(rngs[3])
@@ -318,3 +325,75 @@ def _row_data(row: Row) -> dict[str, Any]:
         'inputs': row.inputs, 'how': row.how, 'verdict': row.verdict.name,
         'sentence': row.sentence, 'point': row.point or None,
     }
+
+# Length of a drawn screen, s.
+SCREEN = 0.1
+# For the spectrum: length, s, and points a decade.
+_SPECTRUM, _PER_DECADE = 2.0, 12
+
+
+@dataclass(frozen=True, eq=False)
+class Screen:
+    """One simulated oscilloscope screen."""
+
+    state: published.PrintedLoad  # The row of Table 1 it stands for
+    # s and V, in steps of the oscilloscope; shape (n,).
+    t: FloatArray
+    u: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnSpectrum:
+    """One-sided density of a load state."""
+
+    state: published.PrintedLoad  # The row of Table 1 it stands for
+    # Hz and V^2/Hz, of a simulated recording at 1 MHz; shape (k,).
+    frequency: FloatArray
+    density: FloatArray
+    coupled: FloatArray  # Of the same OU through an AC coupling of 10 Hz, V^2/Hz; shape (k,)
+
+
+@dataclass(frozen=True, eq=False)
+class Figures:
+    """All series."""
+
+    screens: tuple[Screen, ...]  # One a load state
+    spectra: tuple[DrawnSpectrum, ...]  # Of 10 and 40 %
+
+
+def sigma_shown(state: published.PrintedLoad) -> float:
+    """Return the sigma to draw, V/sqrt(s); motors off, half a step of Vrms."""
+    if state is published.IDLE:
+        return 0.5e-3 * vrms_step().size * math.sqrt(2.0 * published.ALPHA.value)
+    return sigma_of(state)
+
+
+def lorentzian(frequency: FloatArray, alpha: float, sigma: float) -> FloatArray:
+    """Return the one-sided density of an OU (frequency in Hz)."""
+    return np.asarray(2.0 * sigma ** 2 / (alpha ** 2 + (2.0 * math.pi * frequency) ** 2))
+
+
+def draw(rng: np.random.Generator) -> Figures:
+    """Simulate what the figures show."""
+    t = np.arange(round(SCREEN * published.SAMPLING_HZ)) / published.SAMPLING_HZ
+    step = 1e-3 * vpp_step().size
+    screens = tuple(
+        Screen(state, t, step * np.round(
+            simulate(t, published.ALPHA.value, sigma_shown(state), rng) / step))
+        for state in published.TABLE_1)
+    return Figures(screens, tuple(
+        _spectrum(state, rng) for state in (published.MEDIUM, published.HIGH)))
+
+
+def _spectrum(state: published.PrintedLoad, rng: np.random.Generator) -> DrawnSpectrum:
+    """Return the spectrum of a simulated recording at 1 MHz, even on a log axis."""
+    t = np.arange(round(_SPECTRUM * published.SAMPLING_HZ)) / published.SAMPLING_HZ
+    ou = OU(published.ALPHA.value, sigma_of(state), 0.0)
+    plain = _density(simulate(t, ou.alpha, ou.sigma, rng))
+    coupled = _density(SupplyModel((ou, ACCoupling(CORNER_HZ, 0.0))).simulate(t, rng))
+    return DrawnSpectrum(state, plain[0], plain[1], coupled[1])
+
+
+def _density(u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    frequency, density = welch(u, published.SAMPLING_HZ, nperseg=u.size // 4)
+    return even_on_log(frequency[2:-1], density[2:-1], _PER_DECADE)

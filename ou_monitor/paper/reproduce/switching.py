@@ -13,7 +13,7 @@ import math
 import numpy as np
 from ou_monitor.paper.reproduce import published
 from ou_monitor.paper.reproduce.crest import mean_and_error
-from ou_monitor.paper.reproduce.row import Printed, Row
+from ou_monitor.paper.reproduce.published import Printed, Row
 from ou_monitor.paper.theory import (
     CORRECT_FACTOR, diffusion_limit, Generator, MatrixModel, PRINTED_FACTOR, SwitchedSystem,
     switching_drift)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import math
 
 from ou_monitor.paper.reproduce import published
-from ou_monitor.paper.reproduce.row import Printed, Range, Row
+from ou_monitor.paper.reproduce.published import Printed, Range, Row
 from ou_monitor.text import counted
 
 WHERE = 'Table 1'

@@ -6,7 +6,7 @@ import math
 
 from ou_monitor.model.ou import stationary_variance
 from ou_monitor.paper.reproduce import published
-from ou_monitor.paper.reproduce.row import Printed, Row
+from ou_monitor.paper.reproduce.published import Printed, Row
 from ou_monitor.paper.reproduce.table1 import vrms_range, vrms_step
 from ou_monitor.paper.reproduce.transient import LogLine, paper_fit
 

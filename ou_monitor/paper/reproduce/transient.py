@@ -16,7 +16,7 @@ from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.paper.reproduce import published
-from ou_monitor.paper.reproduce.row import Printed, Range, Row
+from ou_monitor.paper.reproduce.published import Printed, Range, Row
 from ou_monitor.paper.reproduce.table1 import vrms_step
 from ou_monitor.records import FloatArray
 from ou_monitor.text import Z95
