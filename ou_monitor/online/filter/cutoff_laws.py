@@ -34,21 +34,22 @@ rate, which folds down, is not in them.
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable
 from functools import cache, lru_cache
 import math
 
 import numpy as np
+from ou_monitor.online.filter.cutoff_control import OF_RATE
 from ou_monitor.online.filter.filter_state import LowPassState
 from ou_monitor.online.settings import FilterSettings
-from ou_monitor.records import FloatArray
+from ou_monitor.records import FloatArray, NAN
 
 
-# Angles (2 pi cutoff interval) of the table, and the step of their logarithms.
-_LEAST_ANGLE, _MOST_ANGLE, _STEP = 1e-4, 300.0, 0.04
+# Angles (2 pi cutoff interval) of the table, and the step of their logarithms: straight lines
+# between them, and the power below the first, are right to 1e-4.
+_LEAST_ANGLE, _MOST_ANGLE, _STEP = 1e-4, 300.0, 0.02
+# Rise of the logarithm of the noise below which all of it passes.
 _STILL = 1e-6
-_LOG_LEAST = math.log(_LEAST_ANGLE)
 
 
 def white_noise(mode: str, order: int, angle: float) -> float:
@@ -86,117 +87,43 @@ def _step(order: int, angle: float, y: float, slope: float, start: float, end: f
     return state.y, state.slope
 
 
-class _CutoffTable:
+@cache
+def _table(mode: str, order: int) -> tuple[FloatArray, FloatArray, float]:
     """
-    Logarithm of the noise over that of the angle, and back: cubics between points of `_STEP`.
+    Return logarithms of angles and of the noise at them, both rising, and its power below.
 
-    Below its first angle the noise is that power of the angle which it has far below the
-    sample rate, times 1 + c angle; with the step of 0.04 the cubics are off by 3e-7.
+    Far below the sample rate the noise is a power of the angle; above it all of it passes.
     """
-
-    def __init__(self, mode: str, order: int) -> None:
-        self._of = mode, order
-        count = math.ceil(math.log(_MOST_ANGLE / _LEAST_ANGLE) / _STEP) + 1
-        self._noise: list[float] = []
-        for k in range(count):
-            now = math.log(white_noise(mode, order, _LEAST_ANGLE * math.exp(_STEP * k)))
-            if self._noise and now - self._noise[-1] < _STILL:
-                # Above the sample rate all of it passes, or less than before.
-                break
-            self._noise.append(now)
-        count = len(self._noise)
-        n = self._noise
-        inner = [(8.0 * (n[k + 1] - n[k - 1]) - n[k + 2] + n[k - 2]) / 12.0
-                 for k in range(2, count - 2)]
-        self._power = 1.0 if mode == 'lowpass' else 1.0 + order
-        # Relative change of noise over angle^power with the angle.
-        self._bend = (n[1] - n[0] - self._power * _STEP) / (
-            _LEAST_ANGLE * math.expm1(_STEP))
-        self._slopes = [n[1] - n[0], n[2] - n[1], *inner, n[-2] - n[-3], n[-1] - n[-2]]
-
-    def noise(self, log: float) -> float:
-        """Return the logarithm of the noise at that of an angle."""
-        place = (log - _LOG_LEAST) / _STEP
-        if place < 0.0:
-            return self._noise[0] + self._power * (log - _LOG_LEAST) + self._bend * (
-                math.exp(log) - _LEAST_ANGLE)
-        if place >= len(self._noise) - 1:
-            return math.log(white_noise(*self._of, math.exp(log)))
-        k = int(place)
-        return self._cubic(k, place - k)[0]
-
-    def angle(self, noise: float) -> float:
-        """Return the logarithm of the angle at that of the noise."""
-        k = bisect_right(self._noise, noise) - 1
-        if k < 0:
-            log = _LOG_LEAST
-            for _ in range(3):
-                bent = self._bend * (math.exp(log) - _LEAST_ANGLE)
-                log = _LOG_LEAST + (noise - self._noise[0] - bent) / self._power
-            return log
-        if k >= len(self._noise) - 1:
-            return _LOG_LEAST + _STEP * (len(self._noise) - 1)
-        part = (noise - self._noise[k]) / (self._noise[k + 1] - self._noise[k])
-        for _ in range(3):
-            value, slope = self._cubic(k, part)
-            part -= (value - noise) / slope
-        return _LOG_LEAST + _STEP * (k + part)
-
-    def angles(self, noise: FloatArray) -> FloatArray:
-        """Return `angle` of many."""
-        points, slopes = np.array(self._noise), np.array(self._slopes)
-        k = np.clip(np.searchsorted(points, noise, side='right') - 1, 0, points.size - 2)
-        rise = points[k + 1] - points[k]
-        m, n = slopes[k], slopes[k + 1]
-        b, c = 3.0 * rise - 2.0 * m - n, m + n - 2.0 * rise
-        part = (noise - points[k]) / rise
-        for _ in range(3):
-            value = points[k] + part * (m + part * (b + part * c))
-            part -= (value - noise) / (m + part * (2.0 * b + 3.0 * part * c))
-        found: FloatArray = _LOG_LEAST + _STEP * (k + part)
-        for at in np.flatnonzero((noise < points[0]) | (noise >= points[-1])).tolist():
-            found[at] = self.angle(float(noise[at]))
-        return found
-
-    def _cubic(self, k: int, u: float) -> tuple[float, float]:
-        """Return value and slope within the k-th interval, u in 0..1."""
-        rise = self._noise[k + 1] - self._noise[k]
-        m, n = self._slopes[k], self._slopes[k + 1]
-        b, c = 3.0 * rise - 2.0 * m - n, m + n - 2.0 * rise
-        return (self._noise[k] + u * (m + u * (b + u * c)), m + u * (2.0 * b + 3.0 * u * c))
-
-
-_table = cache(_CutoffTable)
+    count = math.ceil(math.log(_MOST_ANGLE / _LEAST_ANGLE) / _STEP) + 1
+    angle = math.log(_LEAST_ANGLE) + _STEP * np.arange(count)
+    noise = np.log([white_noise(mode, order, one) for one in np.exp(angle).tolist()])
+    rises = np.diff(noise) >= _STILL
+    if not rises.all():
+        angle, noise = (one[:1 + int(np.argmin(rises))] for one in (angle, noise))
+    return angle, noise, 1.0 if mode == 'lowpass' else 1.0 + order
 
 
 def held_cutoffs(mode: str, order: int, fmax: float, times: FloatArray, interval: float,
                  ) -> FloatArray:
-    """Return `held_cutoff` of many, Hz, shape (n,)."""
-    table = _table(mode, order)
-    scale = math.log(TWO_PI * interval)
-    return np.asarray(np.exp(table.angles(
-        table.noise(math.log(fmax) + scale) - 2.0 * np.log(times)) - scale))
-
-
-def held_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
     """
-    Return the cutoff at which `times` as much white noise comes out as it did at fmax.
+    Return the cutoffs, Hz, at which `times` as much white noise comes out as it did at fmax.
 
-    fmax in Hz, interval in s.
+    fmax in Hz, interval in s; shape (n,).
     """
-    table = _table(mode, order)
-    scale = math.log(TWO_PI * interval)
-    return math.exp(
-        table.angle(table.noise(math.log(fmax) + scale) - 2.0 * math.log(times)) - scale)
+    angle, noise, power = _table(mode, order)
+    log = math.log(TWO_PI * fmax * interval)
+    before = math.log(white_noise(mode, order, math.exp(log))) if log > angle[-1] else (
+        np.interp(log, angle, noise) + power * min(log - angle[0], 0.0))
+    wanted = before - 2.0 * np.log(times)
+    found = np.where(wanted < noise[0], angle[0] + (wanted - noise[0]) / power,
+                     np.interp(wanted, noise, angle))
+    return np.asarray(np.exp(found) / (TWO_PI * interval))
 
 
 TWO_PI = 2.0 * math.pi
 _ROOT2 = math.sqrt(2.0)
-NAN = math.nan
 _ROOT8 = 2.0 * _ROOT2
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
-# Highest cutoff that a sampled filter gets, as a share of the sample rate.
-_OF_RATE = 0.45
 
 
 def squared_error(order: int, w: float, signal: tuple[float, float],
@@ -292,7 +219,7 @@ def least_sampled_error(settings: FilterSettings, sigma: float, alpha: float,
                         interval: float) -> float:
     """Return the cutoff of the least `sampled_error` within the limits, Hz."""
     s = settings
-    low, high = s.lowest, min(s.fmax, _OF_RATE / interval)
+    low, high = s.lowest, min(s.fmax, OF_RATE / interval)
     if not low < high:
         return low
     var, white = sigma * (sigma / (2.0 * alpha)), s.n0 / interval
@@ -394,7 +321,7 @@ def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: 
     """
     Return the cutoff, Hz, that makes `times` as much white noise come out as at fmax once did.
 
-    Of the sampled filter, see `white_noise.held_cutoff`; interval in s, 0: as if sampled without
+    Of the sampled filter, see `held_cutoffs`; interval in s, 0: as if sampled without
     end.  Far below the sample rate: white noise of two-sided density N through a low-pass has the
     variance N w / 2 (order 1) or N w / (2 sqrt 2) (order 2): rms ~ sqrt(fc), so fc = fmax /
     times^2 for both.  Derivative, order 2: N int w'^2 |H|^2 dw' / 2 pi = N w^3 / (2 sqrt 2), so
@@ -403,7 +330,7 @@ def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: 
     times.
     """
     if _held(fmax, times, interval):
-        return held_cutoff(mode, order, fmax, times, interval)
+        return float(held_cutoffs(mode, order, fmax, np.array([times]), interval)[0])
     if mode == 'lowpass':
         return fmax / (times * times)
     return float(fmax * times ** (-2.0 / 3.0)) if order == 2 else fmax / times

