@@ -18,8 +18,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from ou_monitor.analysis.analyze import analyze  # noqa: E402
-from ou_monitor.analysis.data import as_data  # noqa: E402
+from ou_monitor.analysis.analyze import analyze, as_data  # noqa: E402
 from ou_monitor.cli.output import plain  # noqa: E402, I100
 from ou_monitor.recordings.read import read_recording  # noqa: E402
 

@@ -170,7 +170,7 @@ def test_brownout_parameters_are_listed():
 
 def test_filter_parameters_are_listed():
     """Each with its default, on the page of the filter."""
-    from ou_monitor.online.notch.settings import NOTCH_PARAMETERS
+    from ou_monitor.online.settings import NOTCH_PARAMETERS
     from ou_monitor.online.settings import FILTER_PARAMETERS
     section = page('filter.md').split('## Parameters')[1].split('\n## ')[0]
     listed = {}

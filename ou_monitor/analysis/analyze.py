@@ -1,25 +1,39 @@
-"""A recording -> the paper's Tables 1 and 2 for it, with intervals, and what they rest on."""
+"""
+A recording -> the paper's Tables 1 and 2 for it, with intervals, and what they rest on.
+
+The recording also goes through `SupplyMonitor`, as in flight, so that both say the same of the
+same data, also where throttle never stands still.  Limits: those of the monitor; the risk is that
+of the supply as it was at the end of the recording.  What has not been flown is NaN.
+
+`as_data` writes the JSON of `analyze`, see doc/analysis.md.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.analysis.crafts import Craft, craft_of
-from ou_monitor.analysis.level_comparison import alpha_constancy, AlphaTest
+from ou_monitor.analysis.level_comparison import alpha_constancy, AlphaTest, LEVEL
 from ou_monitor.analysis.level_result import fit_level, judge_levels, LevelResult
+from ou_monitor.analysis.level_tests import EFFECT, LEAST
 from ou_monitor.analysis.levels import find_levels, LoadLevel
 from ou_monitor.analysis.overview import Overview, overview
 from ou_monitor.analysis.quality import (
     coupling_items, line_item, quality_list, QualityItem, second_items)
 from ou_monitor.analysis.relaxation import (
     find_steps, fit_relaxation, judge_cause, Relaxation, ReleaseCause)
-from ou_monitor.analysis.replay import by_throttle, ByThrottle, slide, Sliding
-from ou_monitor.analysis.supply import remainder
+from ou_monitor.analysis.supply import node_for, remainder, THROTTLES
+from ou_monitor.criticism.innovations import FAMILY_WISE
+from ou_monitor.model.spectral_lines import FALSE_ALARM
+from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.records import NAN, Recording
+from ou_monitor.records import Estimate, FloatArray, NAN, Recording
+from ou_monitor.text import Z95
 from ou_monitor.timeline.line import readings_of
 
 Progress = Callable[[float], None]
@@ -137,3 +151,265 @@ def _left_out(recording: Recording, found: tuple[LoadLevel, ...]) -> tuple[str, 
         notes.append(f'{moving:.3g} of {recording.duration:.3g} s were spent between load '
                      'levels.')
     return tuple(notes)
+
+
+@dataclass(frozen=True, eq=False)
+class Sliding:
+    """Sliding estimates of a whole recording."""
+
+    window: float  # Length of the window, s
+    t: FloatArray  # Stamps of the newest sample of each window, s; shape (k,)
+    # One a stamp; the numbers of those that are not usable are NaN.
+    estimates: tuple[Estimate, ...]
+    risk: FloatArray  # Probability of a brown-out within the horizon; NaN when unknown; shape (k,)
+    # What the risk is of, V and s.
+    brownout_voltage: float
+    brownout_horizon: float
+    monitor: SupplyMonitor  # As it is at the end of the recording
+
+    def series(self, name: str) -> FloatArray:
+        """Return one field of the estimates as an array."""
+        return np.array([getattr(e, name) for e in self.estimates], dtype=np.float64)
+
+    def interval(self, name: str) -> tuple[FloatArray, FloatArray]:
+        """Return the ends of the 95 % intervals of a field."""
+        value = self.series(name)
+        factor = np.exp(Z95 * self.series(name + '_se'))
+        return value / factor, value * factor
+
+
+def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
+          brownout_horizon: float = 5.0,
+          progress: Callable[[float], None] | None = None) -> Sliding:
+    """
+    Run the node's monitor over a recording.
+
+    window in s, brownout_voltage in V, brownout_horizon in s, progress 0..1.
+    """
+    if not (math.isfinite(brownout_horizon) and brownout_horizon > 0.0):
+        raise ValueError(f'the horizon must be a positive number of seconds, got '
+                         f'{brownout_horizon}')
+    asked = math.isfinite(brownout_voltage)
+    settings = MonitorSettings(window=window, brownout_horizon=brownout_horizon)
+    if asked:
+        settings = replace(settings, brownout_voltage=brownout_voltage)
+    reports: list[MonitorReport] = []
+    duration = recording.duration
+    monitor, parts = node_for(recording, settings)
+    for now, shown in parts:
+        # In between, reports are for what the monitor learns from its own estimates.
+        last = monitor.report(0.0)
+        # Until the first window is full its estimates would only look poor.
+        if shown and now >= min(window, 0.5 * duration):
+            reports.append(last)
+            if progress is not None:
+                progress(now / duration)
+    return Sliding(window, np.array([report.estimate.t for report in reports]),
+                   tuple(report.estimate for report in reports),
+                   np.array([report.risk if asked else NAN for report in reports]),
+                   brownout_voltage, brownout_horizon, monitor)
+
+
+@dataclass(frozen=True, eq=False)
+class ByThrottle:
+    """Curves over throttle."""
+
+    # 0, 0.1, .. 1; shape (k,).
+    throttle: FloatArray
+    # Whether that throttle was flown; beyond, sag and noise are extrapolated; shape (k,).
+    known: npt.NDArray[np.bool_]
+    # Sag of the facts and its 95 % interval, V; NaN where it is not known; shape (k,).
+    sag: FloatArray
+    sag_low: FloatArray
+    sag_high: FloatArray
+    noise: FloatArray  # Rms of what the load does not explain, of the facts, V; shape (k,)
+    # Probability of a brown-out within the horizon; NaN well beyond the highest throttle; shape
+    # (k,).
+    risk: FloatArray
+    budget: float  # Highest throttle that keeps the risk within `limit`; NaN when unknown
+    budget_reason: str  # What ends it, or why it is not known
+    limit: float  # That risk
+    # What the risk is of, V and s.
+    voltage: float
+    horizon: float
+    time: float  # Stamp at which the risk is told, s; NaN of a recording too short for a window
+
+    def at(self, throttle: float, name: str) -> float:
+        """Return one curve at a throttle, between its points; NaN when unknown."""
+        if math.isnan(throttle):
+            return NAN
+        return float(np.interp(throttle, self.throttle, getattr(self, name)))
+
+
+def by_throttle(found: Overview, voltage: float, horizon: float) -> ByThrottle:
+    """Return what the facts, and the node at the end, say over throttle (V, s)."""
+    grid, sag, last = np.array(THROTTLES), found.facts.sag, found.end
+    low, high = sag.flown
+    middle, reach = np.array(sag.sag_v), Z95 * np.array(sag.se_v)
+    if not sag.known:
+        middle = np.full(grid.size, NAN)
+    risk = np.full(grid.size, NAN)
+    if last is not None and last.risk_curve:
+        # RISK_CURVE has the same throttles; one beyond the highest, to interpolate.
+        risk = np.where(grid < found.highest + 0.1, last.risk_curve, NAN)
+    return ByThrottle(
+        grid, (grid >= low) & (grid <= high), middle, middle - reach, middle + reach,
+        np.array(found.facts.noise.rms_v), risk, NAN if last is None else last.budget,
+        'No voltage was asked for.' if last is None else last.budget_reason,
+        MonitorSettings().budget_limit, voltage, horizon,
+        NAN if last is None else last.estimate.t)
+
+
+def as_data(analysis: Analysis) -> dict[str, Any]:
+    """Return an analysis as plain data; NaN stands for unknown."""
+    recording = analysis.recording
+    sliding = analysis.sliding
+    duration = recording.duration
+    return {
+        'recording': recording.name,
+        'n': recording.n,
+        'duration_s': duration,
+        'rate_hz': (recording.n - 1) / duration if duration > 0.0 else math.nan,
+        'source': dict(recording.source),
+        'overview': _overview(analysis.overview),
+        'levels': [_level(level) for level in analysis.levels],
+        'process_tests': {'family_wise_error': FAMILY_WISE, 'adjusted': 'Holm',
+                          'effects': {name: {'meaning': EFFECT[name], 'least': LEAST[name]}
+                                      for name in EFFECT}},
+        'lines': {'false_alarm': FALSE_ALARM},
+        'transients': [_relaxation(fit, cause)
+                       for fit, cause in zip(analysis.relaxations, analysis.causes)],
+        'alpha_constant': _alpha(analysis),
+        'by_throttle': _by_throttle(analysis),
+        'brownout': _brownout(analysis),
+        'sliding': {
+            'window_s': sliding.window,
+            't': sliding.t,
+            **{name: sliding.series(name) for name in (
+                'alpha', 'alpha_se', 'sigma', 'sigma_se', 'var_inf', 'var_inf_se', 'u0')},
+            'status': [e.status.name for e in sliding.estimates],
+            'brownout_voltage': sliding.brownout_voltage,
+            'brownout_horizon_s': sliding.brownout_horizon,
+            'brownout_risk': sliding.risk,
+        },
+        'quality': [{'name': item.name, 'severity': item.severity.name.lower(),
+                     'text': item.text, 'throttles': list(item.throttles)}
+                    for item in analysis.quality],
+        'craft': analysis.craft.to_dict(),
+        'notes': list(analysis.notes),
+    }
+
+
+def _overview(found: Overview) -> dict[str, Any]:
+    line = found.line
+    return {
+        'load_status': found.load.status.name, 'level_v': found.load.level,
+        'highest_throttle': found.highest,
+        'strongest_line': None if line is None else {
+            'frequency_hz': line.frequency, 'rms_v': line.rms, 'share_of_variance': line.share,
+            'level': line.level},
+    }
+
+
+def _level(level: LevelResult) -> dict[str, Any]:
+    e, shape = level.estimate, level.shape
+    alpha_low, alpha_high = e.interval('alpha')
+    rate, rate_low, rate_high = shape.impulse_rate
+    return {
+        'throttle': level.throttle,
+        'segments': len(level.segments),
+        'time_s': level.time,
+        'n': level.n,
+        'mean': level.mean,
+        'vpp': level.vpp,
+        'peak': level.peak,
+        'vrms': level.vrms,
+        'crest': level.crest,
+        'alpha': e.alpha, 'alpha_se': e.alpha_se, 'alpha_ci95': [alpha_low, alpha_high],
+        'tau': e.tau, 'tau_se': e.alpha_se, 'tau_ci95': [1.0 / alpha_high, 1.0 / alpha_low],
+        'sigma': e.sigma, 'sigma_se': e.sigma_se, 'sigma_ci95': list(e.interval('sigma')),
+        'var_inf': e.var_inf, 'var_inf_se': e.var_inf_se,
+        'var_inf_ci95': list(e.interval('var_inf')),
+        'tau_below_s': level.ou.tau_below_s, 'var_inf_below': level.ou.var_inf_below,
+        'sag': level.sag.sag, 'sag_se': level.sag.sag_se, 'sag_ci95': list(level.sag.interval),
+        'u0': e.u0, 'u0_se': e.u0_se,
+        'noise_std': e.noise_std,
+        'process_type': level.kind.value,
+        'process_within': level.verdict.within.value,
+        'process_reason': level.verdict.sentence,
+        'process_tests': [{'name': test.name, 'p_value': test.p_value,
+                           'p_adjusted': test.p_adjusted, 'effect': test.effect,
+                           'rejects': test.rejects, 'not_done': test.why_not}
+                          for test in shape.tests],
+        'skewness': shape.skewness,
+        'excess_kurtosis': shape.kurtosis,
+        'impulses': shape.impulses,
+        'impulse_rate_hz': rate, 'impulse_rate_ci95': [rate_low, rate_high],
+        'lines': [{'frequency_hz': line.frequency, 'resolution_hz': line.resolution,
+                   'rms': line.rms, 'rms_ci95': [line.rms_low, line.rms_high],
+                   'share_of_variance': line.share, 'p_value': line.p_value}
+                  for line in level.lines.lines],
+        'with_lines': None if level.with_lines is None else {
+            name: getattr(level.with_lines, name) for name in ('alpha', 'sigma', 'var_inf')},
+        'line_search': {'from_hz': level.lines.lowest, 'to_hz': level.lines.highest,
+                        'tested': level.lines.tested, 'detectable_rms': level.lines.detectable,
+                        'not_done': level.lines.why_not},
+        'psd': {'frequency_hz': level.spectrum.frequency, 'measured': level.spectrum.density,
+                'fitted': level.spectrum.fitted},
+        'status': e.status.name,
+        'status_text': e.status.value,
+        'flags': [{'name': flag.name, 'text': flag.value} for flag in e.flags],
+    }
+
+
+def _relaxation(fit: Relaxation, cause: ReleaseCause) -> dict[str, Any]:
+    return {
+        'kind': fit.kind,
+        'tau': fit.tau, 'tau_ci95': [fit.tau_low, fit.tau_high],
+        'misfit': fit.misfit, 'misfit_p_value': fit.misfit_p, 'badly_fitted': fit.badly_fitted,
+        'left_out_s': fit.left_out, 'likelihood_gain': fit.likelihood_gain,
+        'tau_alpha': cause.ratio, 'tau_alpha_ci95': [cause.ratio_low, cause.ratio_high],
+        'tau_alpha_p_value': cause.p_value,
+        'against_noise': cause.noise,
+        'instrument': cause.instrument,
+        'instrument_corner_hz': cause.corner,
+        'level_step': cause.step, 'level_step_se': cause.step_se,
+        'sentence': f'{fit.caveat} {cause.sentence}'.strip(),
+        'changes': [{
+            't': change.t, 'throttle_before': change.throttle_before,
+            'throttle_after': change.throttle_after, 'level_before': change.level_before,
+            'level_before_se': change.level_before_se, 'level': change.level,
+            'level_se': change.level_se, 'amplitude': change.amplitude,
+            'amplitude_se': change.amplitude_se, 'beyond': change.beyond,
+            'beyond_p_value': change.beyond_p, 'duration_s': change.duration, 'n': change.n}
+            for change in fit.releases],
+    }
+
+
+def _alpha(analysis: Analysis) -> dict[str, Any]:
+    test = analysis.alpha_test
+    return {
+        'verdict': test.verdict, 'level': LEVEL, 'levels': test.levels,
+        'alpha': test.alpha, 'alpha_se': test.alpha_se,
+        'chi2': test.statistic, 'p_value': test.p_value,
+        'ratio': test.ratio, 'ratio_ci95': [test.ratio_low, test.ratio_high],
+        'detectable_ratio': test.detectable_ratio, 'withheld': list(test.withheld),
+        'sentence': test.sentence}
+
+
+def _by_throttle(analysis: Analysis) -> dict[str, Any]:
+    curves = analysis.by_throttle
+    return {
+        'throttle': curves.throttle, 'known': curves.known,
+        'sag': curves.sag, 'sag_low': curves.sag_low, 'sag_high': curves.sag_high,
+        'noise': curves.noise,
+        'brownout_risk': curves.risk}
+
+
+def _brownout(analysis: Analysis) -> dict[str, Any]:
+    curves = analysis.by_throttle
+    return {
+        'voltage': curves.voltage, 'horizon_s': curves.horizon,
+        'voltage_source': 'default' if analysis.brownout_default else 'given',
+        'throttle_budget': curves.budget, 'budget_limit': curves.limit,
+        'budget_reason': curves.budget_reason, 't': curves.time}

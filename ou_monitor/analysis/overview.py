@@ -14,8 +14,7 @@ import numpy as np
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.supply import facts_and_end, Remainder, SupplyFacts, THROTTLES
 from ou_monitor.online.load.supply_load import SupplyLoad
-from ou_monitor.online.monitor import SupplyMonitor
-from ou_monitor.online.report import MonitorReport
+from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.records import NAN, OuFacts, Recording
 from ou_monitor.text import counted, number, volts, Z95
 

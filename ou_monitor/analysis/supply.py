@@ -26,8 +26,7 @@ from ou_monitor.model.ou_fit import FEWEST, known_ou, regress
 from ou_monitor.online.estimator.estimator import SLIDING
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import SupplyLoad
-from ou_monitor.online.monitor import SupplyMonitor
-from ou_monitor.online.report import MonitorReport
+from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.online.risk.forecast import LOOK
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import FloatArray, NAN, OuFacts, Recording

@@ -6,8 +6,7 @@ import argparse
 from dataclasses import replace
 import shlex
 
-from ou_monitor.analysis.analyze import analyze
-from ou_monitor.analysis.data import as_data
+from ou_monitor.analysis.analyze import analyze, as_data
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
     brownout_limit, check_outputs, limit_of, part_of_recording, positive_number, read_given,

@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 from ou_monitor.comparison.agreement import Agreement, SpectrumBand, Traces
-from ou_monitor.comparison.flight_fit import fit_flight, MOVES
-from ou_monitor.comparison.flight_model import Drawn, FiledModel, FlightModel, Readings
+from ou_monitor.comparison.flight_model import (
+    Drawn, FiledModel, fit_flight, FlightModel, MOVES, Readings)
 from ou_monitor.comparison.judgement import band, differences, distance, judge
 from ou_monitor.comparison.yardstick import Measures, Yardstick
 from ou_monitor.criticism.curves import stray

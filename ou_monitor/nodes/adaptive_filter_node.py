@@ -37,9 +37,9 @@ from ou_monitor.nodes.sources import message_class, MOTOR_PARAMETERS
 from ou_monitor.online.filter.cutoff_control import Bound
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass, FilterCounters
 from ou_monitor.online.notch.notch import AdaptiveNotch
-from ou_monitor.online.notch.settings import notch_options, NOTCH_PARAMETERS, NotchSettings
 from ou_monitor.online.settings import (
-    FILTER_PARAMETERS, filter_settings, FilterSettings, Parameter)
+    FILTER_PARAMETERS, filter_settings, FilterSettings, notch_options, NOTCH_PARAMETERS,
+    NotchSettings, Parameter)
 from ou_monitor.online.trust import InputClock, SLOW_MISSED, SourceInterval, StampOrder
 from ou_monitor.records import Level
 from std_msgs.msg import Float64

@@ -36,8 +36,7 @@ from ou_monitor.nodes.console import Console, PublisherWatch
 from ou_monitor.nodes.inputs import Arrivals, PolledInput, Silence, Stamper, types_on, within
 from ou_monitor.nodes.node_files import LatchFile, ModelChoice
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
-from ou_monitor.online.monitor import SupplyMonitor
-from ou_monitor.online.report import MonitorReport
+from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.settings import ESTIMATOR_PARAMETERS, monitor_settings, Parameter
 from ou_monitor.records import FloatArray, Level

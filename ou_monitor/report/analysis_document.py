@@ -20,7 +20,7 @@ from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, worst_first)
 from ou_monitor.report.scale import span
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import chance, counted, number
+from ou_monitor.text import chance, counted, listed, number
 
 # Changes drawn in one plot, and relaxation times of them.
 _MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
@@ -172,9 +172,9 @@ def notes(analysis: Analysis) -> Notes:
 
 
 def _caution(item: QualityItem) -> str:
-    """Return one sentence, led by the levels it is true of."""
-    labels = ['all' if math.isnan(x) else f'{100.0 * x:.3g} %' for x in item.throttles]
-    return f'{", ".join(labels)}: {item.text}' if labels else item.text
+    """Return one sentence, led by the throttles at which it is true."""
+    at = [f'{100.0 * x:.3g}' for x in item.throttles if math.isfinite(x)]
+    return f'At {listed(at)} % throttle: {item.text}' if at else item.text
 
 
 def _by_throttle(analysis: Analysis) -> Part:

@@ -9,10 +9,10 @@ import numpy as np
 from ou_monitor.criticism.curves import outline
 from ou_monitor.paper.reproduce import published, transient
 from ou_monitor.paper.reproduce.crest import crest
-from ou_monitor.paper.reproduce.reproduce import (
-    headline, lorentzian, recomputed, Reproduction, tally)
 from ou_monitor.paper.reproduce.network import share_above
 from ou_monitor.paper.reproduce.published import Row
+from ou_monitor.paper.reproduce.reproduce import (
+    headline, lorentzian, recomputed, Reproduction, tally)
 from ou_monitor.paper.reproduce.table2 import sigma_of
 from ou_monitor.report.document import (
     Document, Figure, Notes, Pair, Part, Section, Table, Text)

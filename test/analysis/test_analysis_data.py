@@ -3,8 +3,7 @@
 import math
 import re
 
-from ou_monitor.analysis.analyze import analyze
-from ou_monitor.analysis.data import as_data
+from ou_monitor.analysis.analyze import analyze, as_data
 from ou_monitor.cli.output import plain
 from ou_monitor.recordings.read import read_recording
 from project import ROOT

@@ -3,9 +3,8 @@
 import math
 
 import numpy as np
-from ou_monitor.analysis.analyze import analyze
+from ou_monitor.analysis.analyze import analyze, slide
 from ou_monitor.analysis.level_result import ProcessType
-from ou_monitor.analysis.replay import slide
 from ou_monitor.analysis.supply import supply_facts
 from ou_monitor.model.ou import simulate
 from ou_monitor.online.estimator.estimator import SlidingEstimator

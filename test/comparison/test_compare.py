@@ -3,8 +3,7 @@
 import numpy as np
 from ou_monitor.comparison.agreement import Verdict
 from ou_monitor.comparison.compare import compare
-from ou_monitor.comparison.flight_fit import damping
-from ou_monitor.comparison.flight_model import Readings
+from ou_monitor.comparison.flight_model import damping, Readings
 from ou_monitor.errors import InputError
 from ou_monitor.model.load import LoadModel, lowpass
 from ou_monitor.model.supply import SupplyModel

@@ -1,8 +1,7 @@
 """Coupling of supply noise into a signal: gain, false alarms, common causes, resampling."""
 
 import numpy as np
-from ou_monitor.coupling.common_grid import on_grid
-from ou_monitor.coupling.coupling import estimate_coupling, POWER
+from ou_monitor.coupling.coupling import estimate_coupling, on_grid, POWER
 from ou_monitor.errors import InputError
 import pytest
 from scipy.signal import lfilter

@@ -56,7 +56,7 @@ def test_the_same_caution_of_two_levels_is_said_once():
         return list(notes(replace(analysis, quality=items, notes=())).notes)
 
     assert said(flags=(Flag.QUANTIZED,), noise_std=0.001) == [
-        (Severity.WARNING, f'10 %, 40 %: {Flag.QUANTIZED.value}')]
+        (Severity.WARNING, f'At 10 and 40 % throttle: {Flag.QUANTIZED.value}')]
     assert said(flags=(), noise_std=0.001) == []
 
 

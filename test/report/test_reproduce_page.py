@@ -4,8 +4,8 @@ from collections import Counter
 import re
 
 from ou_monitor.paper.reproduce import published, reproduce as module
-from ou_monitor.paper.reproduce.reproduce import as_data, headline, recomputed
 from ou_monitor.paper.reproduce.published import Printed, Row, RowVerdict
+from ou_monitor.paper.reproduce.reproduce import as_data, headline, recomputed
 from ou_monitor.report.page import html
 from ou_monitor.report.reproduction_document import reproduction_document
 from pages import self_contained

@@ -100,7 +100,8 @@ def _table(mode: str, order: int) -> tuple[FloatArray, FloatArray, float]:
     rises = np.diff(noise) >= _STILL
     if not rises.all():
         angle, noise = (one[:1 + int(np.argmin(rises))] for one in (angle, noise))
-    return angle, noise, 1.0 if mode == 'lowpass' else 1.0 + order
+    return (np.asarray(angle, np.float64), np.asarray(noise, np.float64),
+            1.0 if mode == 'lowpass' else 1.0 + order)
 
 
 def held_cutoffs(mode: str, order: int, fmax: float, times: FloatArray, interval: float,

@@ -45,7 +45,7 @@ import numpy.typing as npt
 from ou_monitor.online.filter.cutoff_control import SampleInterval
 from ou_monitor.online.filter.lowpass import FilterCounters
 from ou_monitor.online.notch.biquads import HIGHEST, Notch, phase_lag
-from ou_monitor.online.notch.settings import NotchSettings
+from ou_monitor.online.settings import NotchSettings
 from ou_monitor.records import FloatArray
 
 

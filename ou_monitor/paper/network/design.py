@@ -420,6 +420,7 @@ def probability(value: float) -> str:
     """Return a probability to two digits; below 1e-12 only that."""
     return '<1e-12' if 0.0 < value < 1e-12 else number(value, 2)
 
+
 # Throttle from which a sag is more than what stands in the way of its exponent.
 _FROM = 0.1
 # Bounds of the exponent of the current over throttle.

@@ -146,6 +146,7 @@ def rows(crests: Crests) -> list[Row]:
             error=error, band=crests.band, printed_inputs=inputs, point=5))
     return found
 
+
 WHERE = 'Section 5'
 # Jumps per second, and their share of the variance, that are tried.
 RATES = (2.0, 5.0, 10.0, 20.0, 50.0)

@@ -326,6 +326,7 @@ def _row_data(row: Row) -> dict[str, Any]:
         'sentence': row.sentence, 'point': row.point or None,
     }
 
+
 # Length of a drawn screen, s.
 SCREEN = 0.1
 # For the spectrum: length, s, and points a decade.

@@ -6,8 +6,7 @@ import math
 from hypothesis import given, strategies as st
 import numpy as np
 from ou_monitor import SlidingEstimator
-from ou_monitor.analysis.analyze import analyze
-from ou_monitor.analysis.data import as_data
+from ou_monitor.analysis.analyze import analyze, as_data
 from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
 from ou_monitor.online.estimator.fit import FitEnd, Fitted
 from ou_monitor.online.estimator.quality import judge, Quality

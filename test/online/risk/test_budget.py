@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 from ou_monitor.online.monitor import SupplyMonitor
-from ou_monitor.online.risk.budget import throttle_budget
+from ou_monitor.online.risk.forecast import throttle_budget
 import pytest
 
 GRID = np.linspace(0.0, 1.0, 51)
