@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np  # noqa: E402
 from ou_monitor import MonitorSettings, SupplyMonitor  # noqa: E402
-from ou_monitor.online.risk.futures import AT_PEAK, excursion_risk, excursions, Past  # noqa: E402
+from ou_monitor.online.risk.courses import AT_PEAK, excursion_risk, excursions, Past  # noqa: E402
 from ou_monitor.records import Recording  # noqa: E402
 from real_flights import flights  # noqa: E402
 from scipy.special import expit  # noqa: E402

@@ -116,7 +116,6 @@ def _default_voltage(recording: Recording) -> float:
 
 
 def _relaxations(recording: Recording, levels: Sequence[LevelResult]) -> tuple[Relaxation, ...]:
-    """Fit what follows falls and rises of throttle."""
     throttles = [level.throttle for level in levels]
     estimates, rms = [level.estimate for level in levels], [level.vrms for level in levels]
     steps = find_steps(recording, throttles)

@@ -470,7 +470,6 @@ def _known(segment: Stay, voltage: FloatArray) -> list[Stay]:
 
 def _parts(recording: Recording, segments: Sequence[Stay]
            ) -> list[tuple[FloatArray, FloatArray]]:
-    """Return stamps and voltages of segments."""
     return [(recording.t[s.start:s.stop], recording.voltage[s.start:s.stop]) for s in segments]
 
 

@@ -262,7 +262,6 @@ def node_for(recording: Recording, settings: MonitorSettings,
 
 def _at_the_end(recording: Recording, limit: float | None, monitor: SupplyMonitor | None,
                 ) -> tuple[SupplyLoad, Budget | None, MonitorReport | None]:
-    """Return what the node knows at the end."""
     if monitor is None:
         if limit is None:
             load = LoadFilter()
@@ -284,7 +283,6 @@ def _at_the_end(recording: Recording, limit: float | None, monitor: SupplyMonito
 
 
 def _dips(t: FloatArray, v: FloatArray, u: FloatArray, limit: float, noise: Noise) -> Dips:
-    """Count dips as runs."""
     begins = dip_begins(v, limit, rise_that_ends(v, u, noise))
     if not begins.size:
         return Dips(limit, 0, 0.0, 0.0)

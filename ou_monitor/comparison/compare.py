@@ -205,7 +205,6 @@ def _agreement(recording: Recording, samples: Readings, own: Readings, yardstick
                traces: np.ndarray, first: FloatArray, notes: list[str],
                fitted: tuple[float, float], seeds: int, offset: float,
                simulated: tuple[float, float]) -> Agreement:
-    """Put the numbers together."""
     real = yardstick.measure(own.voltage)
     spread = float(np.ptp(own.voltage))
     found = differences(yardstick, real, measured, spread)

@@ -32,7 +32,6 @@ SOURCES = {
                   'SIM_Frame.h 07b1fa1, libraries/AP_BattMonitor/AP_BattMonitor_Params.cpp '
                   '000ecd1'),
 }
-TARGETS = ('gazebo', 'px4', 'ardupilot', 'json')
 # Terms of which a target keeps something.
 _KEPT = {'px4': ('drift',), 'gazebo': ('drift', 'load_sag'), 'ardupilot': ('drift', 'load_sag')}
 # Voltages of a cell that counts as empty, and as critical, V.

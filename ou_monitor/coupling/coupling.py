@@ -531,7 +531,6 @@ def _drawn(v: ComplexArray, x: ComplexArray, basis: list[ComplexArray],
 
 
 def _power(signs: FloatArray, parts: ComplexArray) -> FloatArray:
-    """Return squared sums over the blocks, shape (draws, bins)."""
     power: FloatArray = (signs @ parts.real)**2 + (signs @ parts.imag)**2
     return power
 

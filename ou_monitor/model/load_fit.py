@@ -101,7 +101,6 @@ def _theta(model: LoadModel) -> FloatArray:
 
 
 def _moved(model: LoadModel, theta: FloatArray) -> LoadModel:
-    """Return a model with other parameters."""
     values: dict[str, Any] = {name: float(x) if name in _LINEAR else math.exp(x)
                               for name, x in zip(_NAMES, theta)}
     if math.isfinite(model.stands):

@@ -83,7 +83,6 @@ class SupplyMonitor:
         self._begin()
 
     def _begin(self) -> None:
-        """Begin with nothing known of the supply."""
         self._line = TimeLine()
         self._estimator = SlidingEstimator(self._sliding, line=self._line)
         self._relaxation = RelaxationFits(background=self._background)
@@ -199,7 +198,6 @@ class SupplyMonitor:
         self._begin()
 
     def _counters(self) -> Counters:
-        """Return the counters of all estimators so far."""
         now = self._estimator.counters
         return Counters(**{f.name: getattr(now, f.name) + getattr(self._counted, f.name)
                            for f in fields(Counters)})

@@ -87,7 +87,6 @@ def flow(matrix: FloatArray, offset: FloatArray, tau: FloatArray, u: FloatArray)
 
 
 def _times(matrix: FloatArray, u: FloatArray) -> FloatArray:
-    """Return A u for each of the m states."""
     if matrix.ndim == 2:
         return u @ matrix.T
     if u.shape[1] == 1:
@@ -393,7 +392,6 @@ Scaling = Literal['averaging', 'diffusion']
 
 
 def _left_out() -> FloatArray:
-    """Return an array without entries, which stands for zeros."""
     return np.empty(0)
 
 

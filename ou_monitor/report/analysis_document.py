@@ -138,7 +138,6 @@ def _origin(analysis: Analysis) -> list[tuple[str, str]]:
 
 
 def _numbers(ou: OuFacts) -> list[str]:
-    """Return sigma and tau, where they are known."""
     if ou.status != 'ok':
         return []
     low, high = ou.alpha_95
@@ -149,7 +148,6 @@ def _numbers(ou: OuFacts) -> list[str]:
 
 
 def _change(analysis: Analysis) -> list[str]:
-    """Return how sigma goes with throttle."""
     good = [level for level in analysis.levels if level.estimate.usable]
     if len(good) < 2:
         return []
@@ -203,7 +201,6 @@ def _by_throttle(analysis: Analysis) -> Part:
 
 
 def _curves(analysis: Analysis) -> list[Part]:
-    """Return sag, noise, intensity, alpha and risk over throttle."""
     learned, found = analysis.by_throttle, analysis.overview.facts
     levels = [level for level in analysis.levels if math.isfinite(level.throttle) and level.n]
     if math.isnan(found.noise.flown[0]):
@@ -336,7 +333,6 @@ def _lines(analysis: Analysis) -> list[Part]:
 
 
 def _transients(analysis: Analysis) -> list[Part]:
-    """Return what follows changes of load."""
     parts: list[Part] = []
     for k, fit in enumerate(analysis.relaxations):
         if fit.releases:
@@ -363,7 +359,6 @@ def _relaxation_sentence(analysis: Analysis, k: int) -> str:
 
 
 def _relaxing(analysis: Analysis, fit: Relaxation) -> Plot:
-    """Return voltages less the level that they settle at, and the fit."""
     recording = analysis.recording
     what = 'falls' if fit.kind == 'release' else 'rises'
     plot = Plot(f'After throttle {what} (dashed: fit)', 'time since throttle arrived, ms', 'mV',
@@ -423,7 +418,6 @@ def _with_segments(plot: Plot, analysis: Analysis) -> Plot:
 
 
 def _over_time(analysis: Analysis) -> list[Part]:
-    """Return throttle and risk over time."""
     recording, sliding = analysis.recording, analysis.sliding
     limits = (0.0, max(recording.duration, 1e-9))
     drawn: list[Part] = []

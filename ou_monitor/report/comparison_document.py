@@ -76,7 +76,6 @@ def _rows(found: Agreement) -> list[tuple[str, str, str, str]]:
 
 
 def _path(found: Agreement) -> list[tuple[str, str]]:
-    """Return what is said of the mean path and of the distribution."""
     thirds = ', '.join(number(1e3 * b, 2) for b in found.bias_by_third)
     worst = [('Farthest off', found.words)] if found.verdict is Verdict.LOOKS_LIKE_IT else []
     return [('Mean path', f'explains {number(100.0 * found.explained, 3)} % of the variance; rms '

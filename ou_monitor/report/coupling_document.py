@@ -49,7 +49,6 @@ def _answer(found: Coupling, name: str, per: str) -> str:
 
 
 def _facts(found: Coupling, per: str) -> list[tuple[str, str]]:
-    """Return what was found, or would have been."""
     peak = int(found.coherence.argmax())
     if found.seen:
         low, high = found.gain_ci95

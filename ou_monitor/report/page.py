@@ -240,7 +240,6 @@ def _stylesheet() -> str:
 
 @cache
 def _file(name: str) -> str:
-    """Return a text file of this folder."""
     return resources.files(__package__).joinpath(name).read_text(encoding='utf-8')
 
 

@@ -57,7 +57,6 @@ def _how(rows: Sequence[Row]) -> Callable[[], list[Part]]:
 
 
 def _screens(result: Reproduction) -> list[Part]:
-    """Return Figs. 1 to 4."""
     drawn = []
     for k, screen in enumerate(result.figures.screens):
         state = screen.state
@@ -78,7 +77,6 @@ def _screens(result: Reproduction) -> list[Part]:
 
 
 def _transient() -> list[Part]:
-    """Return Fig. 5 with its fits, in voltages and in logarithms."""
     line = transient.paper_fit()
     plain, shifted = (transient.fit_curve(transient.TIME, transient.VALUE, offset)
                       for offset in (False, True))
@@ -107,7 +105,6 @@ def _transient() -> list[Part]:
 
 
 def _spectrum(result: Reproduction) -> list[Part]:
-    """Return the spectra with the Lorentzian, the ESC lines and the corner."""
     plot = Plot('Spectrum of the OU', 'frequency, Hz', 'PSD, V\u00b2/Hz', height=320, log_x=True,
                 log_y=True, legend_low=True)
     wide = np.geomspace(1.0, 5e5, 200)

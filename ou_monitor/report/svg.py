@@ -172,7 +172,6 @@ class Plot:
 
     @property
     def _named(self) -> list[Curve]:
-        """Return the curves of the legend."""
         return [c for c in self.curves if c.label]
 
     @property
@@ -291,7 +290,6 @@ def _pixels(*columns: FloatArray) -> list[list[float]]:
 
 
 def _runs(good: np.ndarray) -> list[slice]:
-    """Return the unbroken runs of True."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], good.astype(np.int8), [0]))))
     return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2])]
 

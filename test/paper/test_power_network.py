@@ -17,6 +17,23 @@ RC = PowerNetwork(bulk_esr=0.0, mcu_current=0.0, mcu_noise=0.0)
 FILTERED = PowerNetwork(filter_inductance=10e-6)
 
 
+def gains(f, a, b, c):
+    """Return c (s - A)^-1 B at frequencies, Hz."""
+    s = 2j * math.pi * np.asarray(f, dtype=float)[..., None, None] * np.eye(len(a)) - a
+    return c @ np.linalg.solve(s, np.broadcast_to(b, (*np.shape(f), *b.shape)))
+
+
+def impedance(rail, f):
+    """Return the fall of a rail per ampere of ESC current, whose source is the third last."""
+    k = len(rail.a) - 3
+    return -(gains(f, rail.a[:k, :k], rail.a[:k, k:k + 1], rail.c[:k])[..., 0] + rail.c[k])
+
+
+def density(rail, f):
+    """Return the one-sided power spectral density of a rail."""
+    return float(2.0 * np.sum(np.abs(gains(f, rail.a, rail.b, rail.c)) ** 2))
+
+
 def test_rc_has_the_textbook_pole_and_variance():
     """Var = v R^2 a / (a + lambda) for a current of variance v that relaxes at lambda."""
     rail = rail_at(RC, 0.4)
@@ -47,8 +64,8 @@ def test_esr_moves_the_pole_and_leaves_a_floor():
     a, both = 1.0 / (0.07 * 470e-6), 0.04 * 0.03 / 0.07
     rate, variance = rail.load.switching_rate, rail.load.switching_rms**2
     assert rail.alpha == pytest.approx(a, rel=1e-12)
-    assert rail.impedance(0.0).real == pytest.approx(0.04, rel=1e-12)
-    assert np.abs(rail.impedance([1e8, 1e9])) == pytest.approx(both, rel=1e-6)
+    assert impedance(rail, 0.0).real == pytest.approx(0.04, rel=1e-12)
+    assert np.abs(impedance(rail, [1e8, 1e9])) == pytest.approx(both, rel=1e-6)
     expected = variance * (both**2 + (0.04**2 - both**2) * a / (a + rate))
     assert rail.var_inf == pytest.approx(expected, rel=1e-10)
     large = rail_at(replace(network, bulk_capacitance=1e3), 0.4)
@@ -81,7 +98,7 @@ def test_constant_power_is_a_negative_resistance():
     assert rail.mean == pytest.approx(22.2 - 0.04 * (current + power / rail.mean), rel=1e-13)
     through = 0.04 / (1.0 - 0.04 * power / rail.mean**2)
     assert rail.alpha == pytest.approx(1.0 / ((through + 0.03) * 470e-6), rel=1e-10)
-    assert rail.impedance(0.0).real == pytest.approx(through, rel=1e-12)
+    assert impedance(rail, 0.0).real == pytest.approx(through, rel=1e-12)
 
 
 def test_the_regulated_rail_in_its_own_noise():
@@ -102,7 +119,7 @@ def test_the_regulator_passes_what_is_faster_than_its_bandwidth(network):
     s = 2j * math.pi * f
     ratio = network.line_feedthrough * s / (s + 2.0 * math.pi * 20e3) * (
         1.0 + s * 0.003 * 44e-6) / (1.0 + s * 0.033 * 44e-6)
-    bus, regulated = (rail_at(network, 0.4, name).impedance(f) for name in ('bus', 'regulated'))
+    bus, regulated = (impedance(rail_at(network, 0.4, name), f) for name in ('bus', 'regulated'))
     assert regulated == pytest.approx(ratio * bus, rel=1e-9, abs=1e-15)
     assert PowerNetwork().line_feedthrough == pytest.approx(5.0 / 22.2)
 
@@ -112,7 +129,7 @@ def test_the_regulator_passes_what_is_faster_than_its_bandwidth(network):
 def test_variance_is_the_integral_of_the_density(network, rail):
     """Lyapunov's equation against quadrature of the one-sided PSD over ln f."""
     here = rail_at(network, 0.4, rail)
-    area = quad(lambda x: float(here.psd(math.exp(x))) * math.exp(x), math.log(1e-4),
+    area = quad(lambda x: density(here, math.exp(x)) * math.exp(x), math.log(1e-4),
                 math.log(1e11), limit=500, epsrel=1e-8)[0]
     assert here.var_inf == pytest.approx(area, rel=1e-5)
     assert here.shares.sum() == pytest.approx(1.0, rel=1e-8)

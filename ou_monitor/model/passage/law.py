@@ -185,7 +185,6 @@ _DL = float(_LAMBDA[1] - _LAMBDA[0])
 
 
 def _build() -> PassageTable:
-    """Solve for R at all barriers, w and lambda."""
     b = _B_SCALE * np.sinh(_U)
     # The steps err by the squares of their lengths: the leading error is taken out.
     table = (4.0 * _solve(b, _FINE_W, _FINE_S) - _solve(b, _FINE_W // 2, _FINE_S // 2)) / 3.0
@@ -303,7 +302,6 @@ def _differences(w: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _parabola(w: FloatArray, at: float) -> FloatArray:
-    """Return the weights of three nodes in the parabola through them."""
     return np.array([(at - w[(k + 1) % 3]) * (at - w[(k + 2) % 3])
                      / ((w[k] - w[(k + 1) % 3]) * (w[k] - w[(k + 2) % 3])) for k in range(3)])
 

@@ -264,7 +264,6 @@ class SlidingEstimator:
         return self._quality
 
     def _estimate(self) -> Estimate:
-        """Fit the window."""
         series, line = self._finest.series, self._line
         quality = self._look(line.newest) if series.size else self._quality
         counters = line.counters

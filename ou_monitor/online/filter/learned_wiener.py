@@ -267,7 +267,6 @@ class LearnedWiener:
 
     def _noise_now(self, interval: float, sigma: float, error: float,
                    alpha: float) -> FloatArray:
-        """Return the covariance of the noise; sigma is followed in its logarithm."""
         s = self._settings
         wanted = math.log(min(max(sigma, 1.0 / _LARGEST), _LARGEST))
         constant = time_constant(s, error)
@@ -306,7 +305,6 @@ class LearnedWiener:
         self._noise = self._noise + share * (noise - self._noise)
 
     def _limit(self, weights: FloatArray, interval: float) -> None:
-        """Take weights, with so much of the input as the limit of the lag needs."""
         s = self._settings
         response = self._span.response(interval, s.lag_frequency)
         if self._slope:

@@ -179,7 +179,6 @@ class VoltageKalman:
             self._tell(even.phi, gain, interval)
 
     def _gain_over(self, step: KalmanStep, white: float) -> tuple[FloatArray, FloatArray]:
-        """Return the gain after a step and the covariance with it."""
         p = np.diag(step.still) if self._cov is None else (
             step.phi[:, None] * self._cov * step.phi + np.diag(step.drive))
         seen = p.sum(axis=1)

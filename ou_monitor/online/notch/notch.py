@@ -589,7 +589,6 @@ class AdaptiveNotch:
             self._interval.add(dt)
 
     def _listen(self, t: float, dt: float, throttle: float, rpm: Sequence[float]) -> None:
-        """Take throttle and motor speeds."""
         if throttle == throttle:
             self._asked, self._heard = math.sqrt(min(max(throttle, 0.0), 1.0)), t
         elif not t - self._heard <= _HELD:
@@ -605,7 +604,6 @@ class AdaptiveNotch:
                         if self._settings.fmin <= one <= highest]
 
     def _watch(self, t: float, values: Sequence[float], dt: float) -> None:
-        """Learn from the signal."""
         s, channels = self._settings, len(values)
         if self._frames is None:
             if not s.count or self._since < _KNOWN or HIGHEST / self._interval.mean < 1.2 * s.fmin:

@@ -25,7 +25,7 @@ throttle budget; no throttle above the highest flown in the last minutes is call
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 import math
 from statistics import median
 
@@ -35,10 +35,10 @@ from ou_monitor.model.load import ripple
 from ou_monitor.model.passage.law import prepare
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import LoadState, LoadStatus, SupplyLoad
-from ou_monitor.online.risk.first_passage import Passage, risk_of, Supply
-from ou_monitor.online.risk.futures import (
-    BLOCK, excursion_risk, excursions, Flown, flown, Futures, held, lowest, mean_now, Past, pilot,
+from ou_monitor.online.risk.courses import (
+    BLOCK, Courses, excursion_risk, excursions, Flown, flown, held, lowest, mean_now, Past, pilot,
     Sampling)
+from ou_monitor.online.risk.first_passage import Passage, risk_of, Supply
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN
 from ou_monitor.timeline.line import Batch
@@ -192,7 +192,7 @@ class _Look:
     mean: float
     deviation: float
     state: LoadState | None
-    futures: tuple[Futures, FloatArray] | None
+    courses: tuple[Courses, FloatArray] | None
     passage: Passage | None
 
 
@@ -224,11 +224,11 @@ class _Rung:
         y = np.array([low])
         far = float(density(y, y * 0.0 + look.voltage - look.mean, y * 0.0 + look.deviation)[0])
         other = far
-        if look.state is not None and look.futures is not None and math.isfinite(peak):
+        if look.state is not None and look.courses is not None and math.isfinite(peak):
             start, law = mean_now(look.state), self.calibrator.law
-            futures, shares = look.futures
+            courses, shares = look.courses
             mean, deviation = lowest(
-                look.state, futures.after(held(peak, dwell, look.state.throttle)), self.horizon,
+                look.state, courses.after(held(peak, dwell, look.state.throttle)), self.horizon,
                 sampling)
             middle, spread = law.moments(mean, deviation, start)
             found = density(y, middle, spread)
@@ -372,7 +372,7 @@ class Forecast:
                 None if state is None else pilot(done, state.throttle, rung.horizon), passage))
 
     def _flight(self, horizon: float) -> tuple[float, float, Flown]:
-        """Return excursions and futures of the flight, found once between two looks."""
+        """Return excursions and courses of the flight, found once between two looks."""
         if horizon not in self._kept:
             self._kept[horizon] = *excursions(self._past, horizon), flown(self._past, horizon)
         return self._kept[horizon]
@@ -398,9 +398,9 @@ class Forecast:
             excursion_risk(now, level, horizon, mean, deviation)[0])
         risk, basis, cause = far, 'excursions', ''
         if state is not None and not math.isnan(far):
-            futures, shares = pilot(done, state.throttle, horizon)
+            courses, shares = pilot(done, state.throttle, horizon)
             # Idle, throttle as it is, and what the pilot may do.
-            every = futures.after(held([0.0, state.throttle], horizon, state.throttle))
+            every = courses.after(held([0.0, state.throttle], horizon, state.throttle))
             each = below(voltage, *law.moments(*lowest(state, every, horizon, self._sampling),
                                                mean_now(state)))
             parts = each.item(0), each.item(1), float(shares @ each[2:])
@@ -444,8 +444,8 @@ class Forecast:
         if state is None or math.isnan(deviation) or math.isnan(now):
             return np.full(u.shape, NAN)
         law, wrong, *_ = self._learned(horizon)
-        futures = held(u, dwell, state.throttle)
-        middle, spread = law.moments(*lowest(state, futures, horizon, self._sampling),
+        courses = held(u, dwell, state.throttle)
+        middle, spread = law.moments(*lowest(state, courses, horizon, self._sampling),
                                      mean_now(state))
         return np.asarray(wrong * below(voltage, middle, np.hypot(spread, deviation))
                           + (1.0 - wrong) * below(voltage, middle, spread))
@@ -459,19 +459,6 @@ class Forecast:
 _GRID = np.linspace(0.0, 1.0, 51)
 # Time ahead, s, for which the flag asks what happens if throttle stays as it is.
 SOON = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class ThrottleBudget:
-    """The highest throttle that keeps the risk under a limit."""
-
-    # The budget, 0..1; NaN when unknown; 0 when even idle, flown, is above the limit.
-    throttle: float
-    reason: str  # What ends the budget, or why it is unknown, in words.
-    # Risk at throttles from 0 to 1; empty when nothing could be computed.
-    risks: FloatArray = field(default_factory=lambda: np.empty(0))
-    # Whether that throttle lies within those flown.
-    known: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
 
 
 @dataclass(frozen=True)
@@ -501,34 +488,29 @@ def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings) 
         why = '' if load.status is LoadStatus.NO_DATA else load.status.value if (
             not load.known) else 'Less than a second has been flown.'
         return Ahead(outcome, NAN, why, soon=soon)
-    budget = throttle_budget(risks, forecast.flown, s.budget_limit)
+    budget, reason = throttle_budget(risks, forecast.flown[1], s.budget_limit)
     # NaN is not below.
-    return Ahead(outcome, budget.throttle, budget.reason, tuple(risks[::5].tolist()), soon,
-                 budget.throttle < forecast.used)
+    return Ahead(outcome, budget, reason, tuple(risks[::5].tolist()), soon, budget < forecast.used)
 
 
-def throttle_budget(risks: FloatArray, flown: tuple[float, float], limit: float,
-                    ) -> ThrottleBudget:
-    """Return the budget from the risks at `_GRID`, and the limit of them."""
-    lowest, highest = flown
-    known = (_GRID >= lowest) & (_GRID <= highest)
+def throttle_budget(risks: FloatArray, highest: float, limit: float) -> tuple[float, str]:
+    """
+    Return the highest throttle that keeps the risk under a limit, and what ends it, in words.
+
+    risks: at `_GRID`; highest: throttle flown.  0 when even idle is above the limit.
+    """
     # A risk that falls again beyond a peak is no way through.
     risks = np.maximum.accumulate(risks)
     within = int(np.searchsorted(risks, limit, 'right'))
     if within == 0:
-        return ThrottleBudget(
-            0.0, f'Even at idle the risk is {risks[0]:.2g}, more than allowed.', risks, known)
+        return 0.0, f'Even at idle the risk is {risks[0]:.2g}, more than allowed.'
     end = 1.0
     if within < _GRID.size:
         low, high = risks[within - 1], risks[within]
         # The logarithm of the risk is nearly straight over so short a way.
-        end = _GRID[within - 1] + (_GRID[within] - _GRID[within - 1]) * (
-            math.log(limit / low) / math.log(high / low) if low > 0.0 else 0.0)
-    if end > highest:
-        throttle, reason = highest, (f'No data above {highest:.2f}; within the limit up to '
-                                     'there.')
-        if highest == 1.0:
-            reason = 'Within the limit up to full throttle.'
-    else:
-        throttle, reason = end, f'The risk passes the limit of {limit:.2g} at throttle {end:.2f}.'
-    return ThrottleBudget(float(throttle), reason, risks, known)
+        end = float(_GRID[within - 1] + (_GRID[within] - _GRID[within - 1]) * (
+            math.log(limit / low) / math.log(high / low) if low > 0.0 else 0.0))
+    if end <= highest:
+        return end, f'The risk passes the limit of {limit:.2g} at throttle {end:.2f}.'
+    return highest, ('Within the limit up to full throttle.' if highest == 1.0 else
+                     f'No data above {highest:.2f}; within the limit up to there.')

@@ -340,7 +340,6 @@ def answer(result: Design) -> str:
 
 
 def _others(result: Design) -> str:
-    """Return what meets the target in place of a capacitor, in words."""
     found = [f'{lever.name} {number(lever.least, 3)} {lever.unit}'.rstrip()
              for lever in result.levers[1:] if math.isfinite(lever.least)]
     if found:

@@ -148,24 +148,6 @@ class Rail:
                              damping=float(-pole.real / abs(pole)),
                              share=2.0 * float(self.shares[k]))
 
-    def psd(self, frequency: npt.ArrayLike) -> FloatArray:
-        """Return the one-sided power spectral density (frequency in Hz)."""
-        gains = self._gain(frequency, self.a, self.b, self.c)
-        return np.asarray(2.0 * np.sum(np.abs(gains) ** 2, axis=-1))
-
-    def impedance(self, frequency: npt.ArrayLike) -> ComplexArray:
-        """Return the fall of the rail per ampere of ESC current (frequency in Hz)."""
-        k = self.a.shape[0] - len(SOURCES)
-        gains = self._gain(frequency, self.a[:k, :k], self.a[:k, k:k + 1], self.c[:k])
-        return np.asarray(-(gains[..., 0] + self.c[k]))
-
-    @staticmethod
-    def _gain(frequency: npt.ArrayLike, a: FloatArray, b: FloatArray,
-              c: FloatArray) -> ComplexArray:
-        f = np.asarray(frequency, dtype=np.float64)
-        s = 2j * math.pi * f[..., None, None] * np.eye(a.shape[0]) - a
-        return np.asarray(c @ np.linalg.solve(s, np.broadcast_to(b, (*f.shape, *b.shape))))
-
     def crossing_rate(self, voltage: float) -> float:
         """
         Return the rate of passages below a voltage at high levels, 1/s.

@@ -161,7 +161,6 @@ def switched() -> SwitchedSystem:
 
 
 def _late_over_early(path: FloatArray) -> FloatArray:
-    """Return the log-decay of the second half over that of the first, by column."""
     log = np.log(path)
     return np.asarray((log[2] - log[1]) / (log[1] - log[0]))
 

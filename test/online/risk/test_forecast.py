@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.monitor import SupplyMonitor
+from ou_monitor.online.risk.courses import held, lowest, mean_now
 from ou_monitor.online.risk.first_passage import brownout_probability
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.risk.forecast import Forecast
-from ou_monitor.online.risk.futures import held, lowest, mean_now
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, Status
 from ou_monitor.timeline.line import Batch

@@ -1,13 +1,13 @@
-"""The lowest voltage of a future: Monte Carlo, closed forms, and what a flight makes of it."""
+"""The lowest voltage of a course: Monte Carlo, closed forms, and what a flight makes of it."""
 
 from dataclasses import replace
 import math
 
 import numpy as np
 from ou_monitor.online.load.supply_load import LoadState
-from ou_monitor.online.risk import futures
+from ou_monitor.online.risk import courses
+from ou_monitor.online.risk.courses import held, lowest, mean_now, Sampling
 from ou_monitor.online.risk.forecast import below, Calibrator, density, FarShare
-from ou_monitor.online.risk.futures import held, lowest, mean_now, Sampling
 import pytest
 from scipy.stats import t as student
 
@@ -32,8 +32,8 @@ def test_the_largest_of_running_medians(n):
     count = 20000 if n < 100 else 4000
     x = rng.standard_normal((count, n + 2))
     middle = np.median(np.stack((x[:, :-2], x[:, 1:-1], x[:, 2:])), axis=0).max(axis=1)
-    mean = np.interp(math.log(n), futures._LN_N, futures._MEAN)
-    deviation = np.interp(math.log(n), futures._LN_N, futures._DEVIATION)
+    mean = np.interp(math.log(n), courses._LN_N, courses._MEAN)
+    deviation = np.interp(math.log(n), courses._LN_N, courses._DEVIATION)
     assert mean == pytest.approx(middle.mean(), abs=4.0 * middle.std() / math.sqrt(count))
     # The kurtosis is below 4.5, so the error of a deviation below 0.94 / sqrt(n).
     assert deviation == pytest.approx(middle.std(), rel=4.0 * 0.94 / math.sqrt(count))

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from ou_monitor.online.risk.futures import (
+from ou_monitor.online.risk.courses import (
     BLOCK, excursion_risk, excursions, flown, Past, pilot, sliding)
 import pytest
 from scipy.special import expit
@@ -138,17 +138,17 @@ def test_futures_are_those_flown():
     assert done.dwell[k] == pytest.approx(near.sum() * BLOCK)
     assert done.rest[k] == pytest.approx(mean[window][~near].mean())
     assert done.age[k] == pytest.approx((n - 1 - at[k]) * BLOCK)
-    futures, weight = pilot(done, 0.5, 2.0)
+    courses, weight = pilot(done, 0.5, 2.0)
     assert weight.sum() == pytest.approx(1.0)
     flown_weight = np.exp(-0.5 * ((done.first - 0.5) / 0.25) ** 2 - done.age / 100.0) * 0.1
-    # Five futures that were never flown share one horizon.
+    # Five courses that were never flown share one horizon.
     np.testing.assert_allclose(weight[:-5] / weight[-1], flown_weight * 5.0)
-    np.testing.assert_allclose(futures.peak[-5:], 0.5 + 0.5 * np.array([.1, .3, .5, .7, .9]))
-    np.testing.assert_allclose(futures.dwell[-5:], 0.4)
-    assert (futures.peak[:-5] >= 0.5).all()
+    np.testing.assert_allclose(courses.peak[-5:], 0.5 + 0.5 * np.array([.1, .3, .5, .7, .9]))
+    np.testing.assert_allclose(courses.dwell[-5:], 0.4)
+    assert (courses.peak[:-5] >= 0.5).all()
 
 
 def test_without_any_past_a_pilot_may_rise():
-    futures, weight = pilot(flown(Past(), 2.0), 0.2, 2.0)
+    courses, weight = pilot(flown(Past(), 2.0), 0.2, 2.0)
     np.testing.assert_allclose(weight, 0.2)
-    np.testing.assert_allclose(futures.rest, 0.2)
+    np.testing.assert_allclose(courses.rest, 0.2)

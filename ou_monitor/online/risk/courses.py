@@ -1,16 +1,16 @@
 """
-The last minutes of a flight, what throttle may do next, and the lowest voltage of each future.
+The last minutes of a flight, what throttle may do next, and the lowest voltage of each course.
 
-A future is three groups of samples: throttle goes to a peak at once, with the inrush of a rise,
+A course is three groups of samples: throttle goes to a peak at once, with the inrush of a rise,
 stays, and goes to a rest.  Its lowest voltage has nearly the mean mu = min over groups of
 (mean path - sd a(n)) and the variance of the path there plus (sd b(n))^2; a and b are mean and
 deviation of the largest of n running medians of three normal samples.  Limits: the mean path
 within a group is its average; groups count as if only the lowest could be the lowest of all;
 samples of noise are independent, as the load filter takes them.
 
-The pilot: each completed horizon is one future, with its highest throttle, the time spent there,
+The pilot: each completed horizon is one course, with its highest throttle, the time spent there,
 and the mean of the rest.  It weighs the more the nearer its first throttle is to the present one
-and the more recent it is.  One horizon's worth of futures is never flown: a rise into each fifth
+and the more recent it is.  One horizon's worth of courses is never flown: a rise into each fifth
 of the throttle that is left (rule of succession).  Limits: what a pilot has never done has the
 weight of one horizon; the order within a horizon is peak first.
 
@@ -83,7 +83,7 @@ _LN_N, _MEAN, _DEVIATION = _largest_medians()
 
 
 @dataclass(frozen=True, eq=False)
-class Futures:
+class Courses:
     """Throttle to come, in k ways."""
 
     # Throttle at first, and after that, 0..1.
@@ -91,9 +91,9 @@ class Futures:
     dwell: FloatArray  # Time at the peak, s.
     rest: FloatArray
 
-    def after(self, first: Futures) -> Futures:
+    def after(self, first: Courses) -> Courses:
         """Return the first and then these."""
-        return Futures(*(np.concatenate(pair) for pair in (
+        return Courses(*(np.concatenate(pair) for pair in (
             (first.peak, self.peak), (first.dwell, self.dwell), (first.rest, self.rest))))
 
 
@@ -105,10 +105,10 @@ class Sampling:
     activity: float
 
 
-def held(throttle: npt.ArrayLike, dwell: npt.ArrayLike, rest: float) -> Futures:
-    """Return futures that go to a throttle, stay for a time, s, and come back to `rest`."""
+def held(throttle: npt.ArrayLike, dwell: npt.ArrayLike, rest: float) -> Courses:
+    """Return courses that go to a throttle, stay for a time, s, and come back to `rest`."""
     peak, times = np.broadcast_arrays(*np.atleast_1d(throttle, dwell))
-    return Futures(peak.astype(np.float64), times.astype(np.float64),
+    return Courses(peak.astype(np.float64), times.astype(np.float64),
                    np.full(peak.shape, rest))
 
 
@@ -139,15 +139,15 @@ def mean_now(state: LoadState) -> float:
     return float(state.mean[0] - state.size * (answers @ state.mean[2:8]))
 
 
-def lowest(state: LoadState, futures: Futures, horizon: float, sampling: Sampling
+def lowest(state: LoadState, courses: Courses, horizon: float, sampling: Sampling
            ) -> tuple[FloatArray, FloatArray]:
-    """Return mean and deviation, V, of the lowest voltage of each future, shape (k,)."""
-    peak, dt = futures.peak, sampling.interval
+    """Return mean and deviation, V, of the lowest voltage of each course, shape (k,)."""
+    peak, dt = courses.peak, sampling.interval
     span = max(horizon, dt)
-    stay = np.clip(futures.dwell, dt, span)
+    stay = np.clip(courses.dwell, dt, span)
     first = np.minimum(stay, max(2.0 * dt, _RISE * INRUSH_TIME))
     tau = np.stack([first, stay - first, span - stay], axis=1)
-    u = np.stack([peak, peak, futures.rest], axis=1)
+    u = np.stack([peak, peak, courses.rest], axis=1)
     up = np.maximum(0.0, peak - state.throttle) * _SHARE_OF_RISE
     inrush = np.zeros_like(u)
     inrush[:, 0] = up
@@ -341,7 +341,7 @@ def excursion_risk(now: float, levels: FloatArray, horizon: float, mean: float, 
 
 # Throttle that makes a past instant like the present, and s in which it is forgotten.
 _LIKE, _MEMORY = 0.25, 100.0
-# Share of the throttle that is left to which futures never flown rise, and their dwell.
+# Share of the throttle that is left to which courses never flown rise, and their dwell.
 _RISES, _RISE_DWELL = (0.1, 0.3, 0.5, 0.7, 0.9), 0.2
 # Starts are so far apart, s and in horizons, and no more than so many.
 _APART, _SHARE, _MOST = 0.2, 0.1, 320
@@ -381,16 +381,16 @@ def flown(past: Past, horizon: float) -> Flown:
     return Flown(*(x[good] for x in (mean[at], peak, dwell, rest, (n - 1 - at) * BLOCK)))
 
 
-def pilot(past: Flown, throttle: float, horizon: float) -> tuple[Futures, FloatArray]:
-    """Return futures from a throttle on, and their weights, which add up to 1."""
+def pilot(past: Flown, throttle: float, horizon: float) -> tuple[Courses, FloatArray]:
+    """Return courses from a throttle on, and their weights, which add up to 1."""
     weight = np.exp(-0.5 * ((past.first - throttle) / _LIKE) ** 2 - past.age / _MEMORY)
     if past.age.size > 1:
         weight *= min((past.age[0] - past.age[1]) / horizon, 1.0)
     n = len(_RISES)
     ahead = throttle + (1.0 - throttle) * np.array(_RISES)
     weight = np.concatenate((weight, np.full(n, 1.0 / n)))
-    futures = Futures(
+    courses = Courses(
         np.concatenate((np.maximum(past.peak, throttle), ahead)),
         np.concatenate((past.dwell, np.full(n, _RISE_DWELL * horizon))),
         np.concatenate((past.rest, np.full(n, throttle))))
-    return futures, weight / weight.sum()
+    return courses, weight / weight.sum()
