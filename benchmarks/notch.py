@@ -37,7 +37,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import gyros  # noqa: E402
 import numpy as np  # noqa: E402
 from ou_monitor import AdaptiveNotch  # noqa: E402
-from ou_monitor.online.notch.biquads import Notch, phase_lag  # noqa: E402
+from ou_monitor.online.notch.notch import Notch, phase_lag  # noqa: E402
 from scipy import optimize, signal  # noqa: E402
 from tables import put, table  # noqa: E402
 

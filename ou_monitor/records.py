@@ -222,36 +222,16 @@ class Flag(enum.Enum):
 
 @dataclass(frozen=True)
 class Counters:
-    """
-    What became of every sample pushed so far.
+    """Samples pushed so far: used, non-finite, late and held ones add up to them."""
 
-    `used`, `non_finite`, `late` and `held` add up to `pushed`.
-
-    Attributes
-    ----------
-    pushed : int
-        Samples given to `push`.
-    used : int
-        Samples that entered the window.
-    non_finite : int
-        NaN or infinite stamps or voltages, dropped.
-    late : int
-        Stamps at or before one already used, dropped.
-    held : int
-        Repeats of the last value by a logger that is faster than its source,
-        dropped.  Repeats in the window when that is found out are counted
-        then; those that left it before stay in `used`.
-    resets : int
-        Times the window was cleared (gap, or a clock that jumped back).
-
-    """
-
-    pushed: int = 0
-    used: int = 0
-    non_finite: int = 0
-    late: int = 0
+    pushed: int = 0  # Given to `push`
+    used: int = 0  # Entered the window
+    non_finite: int = 0  # NaN or infinite stamps or voltages, dropped
+    late: int = 0  # Stamps at or before one already used, dropped
+    # Repeats of the last value by a logger that is faster than its source, dropped.  Repeats in
+    # the window when that is found out are counted then; those that left it before stay in `used`.
     held: int = 0
-    resets: int = 0
+    resets: int = 0  # Times the window was cleared (gap, or a clock that jumped back)
 
 
 # Parameters of an estimate whose standard errors are those of the logarithm.
@@ -420,6 +400,11 @@ class OuFacts:
     var_inf_95: tuple[float, float] = (NAN, NAN)  # V^2
     tau_below_s: float = NAN  # s
     var_inf_below: float = NAN  # V^2
+
+    def log_se(self, name: str) -> float:
+        """Return the standard error of ln of alpha, sigma or var_inf, by its interval."""
+        low, high = getattr(self, name + '_95')
+        return math.log(high / low) / (2.0 * Z95)
 
 
 @dataclass(frozen=True, eq=False)

@@ -163,20 +163,11 @@ _HEAD = 4096
 
 @dataclass(frozen=True, eq=False)
 class RecordedThrottle:
-    """
-    Throttle as it was recorded.
+    """Throttle as it was recorded."""
 
-    Attributes
-    ----------
-    profile : callable
-        Stamps, s after the begin of the part, to throttle 0..1; each value holds until the next.
-    duration : float
-        Length of the part, s.
-
-    """
-
+    # Stamps, s after the begin of the part, to throttle 0..1; each value holds until the next.
     profile: Profile
-    duration: float
+    duration: float  # Length of the part, s
 
 
 def is_recording(text: str) -> bool:
@@ -233,29 +224,13 @@ FLIGHT_NOISE = 2e-3
 
 @dataclass(frozen=True)
 class Preset:
-    """
-    A supply, and how it is flown and sampled.
+    """A supply, and how it is flown and sampled."""
 
-    Attributes
-    ----------
-    text : str
-        What it is.
-    model : SupplyModel
-        The supply.
-    throttle : str
-        Its throttle, as `profiles.read_profile` takes it.
-    rate : float
-        Samples per second, Hz.
-    duration : float
-        Length, s.
-
-    """
-
-    text: str
-    model: SupplyModel
-    throttle: str
-    rate: float
-    duration: float
+    text: str  # What it is
+    model: SupplyModel  # The supply
+    throttle: str  # Its throttle, as `read_profile` takes it
+    rate: float  # Samples per second, Hz
+    duration: float  # Length, s
 
 
 def _load(throttle: float) -> Preset:

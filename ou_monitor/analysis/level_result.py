@@ -35,6 +35,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import enum
 import math
+from typing import Any
 
 import numpy as np
 from ou_monitor.analysis.level_tests import examine_level, holm, Shape, TestResult
@@ -48,7 +49,7 @@ from ou_monitor.model.spectral_lines import (
 from ou_monitor.online.estimator.quality import examine, input_flags
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.records import (
-    Counters, Estimate, Flag, FloatArray, NAN, OuFacts, Recording, Status)
+    Counters, Estimate, Flag, FloatArray, LOG_NAMES, NAN, OuFacts, Recording, Status)
 from ou_monitor.text import p_words, Z95
 from ou_monitor.timeline.line import TAIL
 from scipy import stats
@@ -344,11 +345,9 @@ def fit_parts(recording: Recording, left: Remainder, segments: Sequence[Stay],
         return ou, replace(blank, status=status)
     # Of the mean square of steps, what the relaxation does not make.
     white = math.sqrt(max(0.0, 0.5 * steps + ou.var_inf * math.expm1(-ou.alpha * left.dt)))
-    alpha_se, sigma_se, var_inf_se = (0.5 / Z95 * math.log(high / low) for low, high in (
-        ou.alpha_95, ou.sigma_95, ou.var_inf_95))
-    e = replace(
-        blank, status=Status.OK, alpha=ou.alpha, sigma=ou.sigma, var_inf=ou.var_inf,
-        noise_std=white, alpha_se=alpha_se, sigma_se=sigma_se, var_inf_se=var_inf_se)
+    errors: dict[str, Any] = {f'{name}_se': ou.log_se(name) for name in LOG_NAMES}
+    e = replace(blank, status=Status.OK, alpha=ou.alpha, sigma=ou.sigma, var_inf=ou.var_inf,
+                noise_std=white, **errors)
     flags = (*e.flags, Flag.SLOW_RATE) if ou.alpha * left.dt > 1.0 else e.flags
     return ou, replace(e, flags=flags, u0_se=math.sqrt(mean_variance(time, n, e, NAN)))
 

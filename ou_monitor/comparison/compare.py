@@ -14,8 +14,7 @@ import numpy as np
 from ou_monitor.comparison.agreement import Agreement, SpectrumBand, Traces
 from ou_monitor.comparison.flight_model import (
     Drawn, FiledModel, fit_flight, FlightModel, MOVES, Readings)
-from ou_monitor.comparison.judgement import band, differences, distance, judge
-from ou_monitor.comparison.yardstick import Measures, Yardstick
+from ou_monitor.comparison.yardstick import band, differences, distance, judge, Measures, Yardstick
 from ou_monitor.criticism.curves import stray
 from ou_monitor.criticism.readings import current_at, usable, why_nothing
 from ou_monitor.criticism.repeats import without_repeats

@@ -15,7 +15,7 @@ from ou_monitor.analysis.quality import QualityItem
 from ou_monitor.analysis.relaxation import Relaxation
 from ou_monitor.criticism.curves import outline
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.records import FloatArray, NAN, OuFacts, Severity
+from ou_monitor.records import FloatArray, NAN, OuFacts, Recording, Severity
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, worst_first)
 from ou_monitor.report.scale import span
@@ -237,7 +237,7 @@ def _curves(analysis: Analysis) -> list[Part]:
         (sag, answer), (noise, noise.curves[0].y), (risk, learned.risk),
         (sigma, [level.estimate.sigma for level in levels]),
         (alpha, [level.estimate.alpha for level in levels])) if np.isfinite(values).any()]
-    return [Pair(drawn[k:k + 2]) for k in range(0, len(drawn), 2)]
+    return list(Pair.two_by_two(drawn))
 
 
 def _empty(title: str, unit: str, log: bool = False) -> Plot:
@@ -397,15 +397,19 @@ def _changes(analysis: Analysis, fit: Relaxation) -> Table:
 
 def _voltage(analysis: Analysis) -> Plot:
     """Return the voltage, with its limit and the load levels."""
-    recording = analysis.recording
+    plot = voltage_plot(analysis.recording, analysis.overview.limit)
+    return _with_segments(plot, analysis) if analysis.recording.has_throttle else plot
+
+
+def voltage_plot(recording: Recording, limit: float) -> Plot:
+    """Return the voltage, with its limit, V."""
     t = recording.t - (float(recording.t[0]) if recording.n else 0.0)
     limits = (0.0, max(recording.duration, 1e-9))
     plot = Plot('Voltage', 'time, s', 'V', height=230).limits(x=limits)
     plot.line(t, recording.voltage, colour=0)
-    limit = analysis.overview.limit
     if math.isfinite(limit):
         plot.line(np.array(limits), np.full(2, limit), f'limit {limit:g} V', 1, 'dash thick')
-    return _with_segments(plot, analysis) if recording.has_throttle else plot
+    return plot
 
 
 def _with_segments(plot: Plot, analysis: Analysis) -> Plot:

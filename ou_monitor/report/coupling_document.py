@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from ou_monitor.analysis.overview import answers, known_lines, Overview
 from ou_monitor.coupling.coupling import Coupling, POWER
 from ou_monitor.records import FloatArray, Recording
+from ou_monitor.report.analysis_document import voltage_plot
 from ou_monitor.report.document import Document, Facts, Figure, Notes, Part, Section
 from ou_monitor.report.svg import Plot
 from ou_monitor.text import chance, counted, number, p_words
@@ -24,7 +23,7 @@ def coupling_document(found: Coupling, recording: Recording, signal: tuple[Float
             zip(grid.lost, ('voltage', 'signal')) if n]
     gaps = [f'{counted(grid.gaps, "gap")} left out.'] if grid.gaps else []
     parts: list[Part] = [
-        lambda: [Figure(_voltage(recording, seen))],
+        lambda: [Figure(voltage_plot(recording, seen.limit))],
         Facts([*_facts(found, per), *known_lines(seen)]),
         lambda: [Figure(_coherence(found), 'Squared coherence of the two: 1 where the signal is '
                         'the voltage, 0 where they have nothing to do with each other.'),
@@ -65,17 +64,6 @@ def _facts(found: Coupling, per: str) -> list[tuple[str, str]]:
                      f'{chance(found.level)}'),
             ('Largest coherence', f'{number(found.coherence[peak])} (squared) at '
              f'{number(found.frequency[peak])} Hz; by chance up to {number(found.threshold)}')]
-
-
-def _voltage(recording: Recording, seen: Overview) -> Plot:
-    t = recording.t - recording.t[0]
-    limits = (0.0, max(recording.duration, 1e-9))
-    plot = Plot('Voltage', 'time, s', 'V', height=210).limits(x=limits)
-    plot.line(t, recording.voltage, colour=0)
-    if math.isfinite(seen.limit):
-        plot.line(np.array(limits), np.full(2, seen.limit), f'limit {seen.limit:g} V', 1,
-                  'dash thick')
-    return plot
 
 
 def _signal(recording: Recording, signal: tuple[FloatArray, FloatArray], name: str, unit: str

@@ -134,7 +134,7 @@ def _drift(fleet: Fleet) -> list[Part]:
         return [Text('No vehicle has enough flights for a test.')]
     parts: list[Part] = [] if judged.drifting else [
         Text('No drift stands at the rate of the fleet; the most likely ones are drawn.')]
-    parts += _pairs([Figure(_trend_plot(judged.values[t.quantity], t), _caption(t, fleet))
+    parts += Pair.two_by_two([Figure(_trend_plot(judged.values[t.quantity], t), _caption(t, fleet))
                      for t in drawn])
     listed = [t for k, t in enumerate(judged.trends) if k < _LEAST or t.p_value < DRIFT_RATE]
     rows = [[t.vehicle, t.quantity, str(t.flights), change(t.quantity, t.slope) + '\n'
@@ -146,11 +146,6 @@ def _drift(fleet: Fleet) -> list[Part]:
                            'p over the fleet', 'stands'], rows, left=[0, 1]), Text(
         'Intervals by Theil and Sen. p is that of Mann and Kendall, the next one after Holm.'
         + (f' {more} less likely trends are not shown.' if more > 0 else ''), legend=True)]
-
-
-def _pairs(figures: list[Figure]) -> list[Part]:
-    """Return figures two by two."""
-    return [Pair(figures[k:k + 2]) for k in range(0, len(figures), 2)]
 
 
 def _compared(name: str, fleet: Fleet) -> str:
@@ -197,7 +192,7 @@ def _distributions(fleet: Fleet) -> list[Part]:
         figures.append(Figure(over))
     if not figures:
         return [Text('Fewer than five recordings have an estimate.', legend=True)]
-    parts = _pairs(figures)
+    parts: list[Part] = [*Pair.two_by_two(figures)]
     if over:
         parts.append(Text(
             'Histograms are at the reference throttle. Over throttle: every level of every '

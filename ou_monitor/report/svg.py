@@ -67,40 +67,36 @@ class Plot:
         self._x_range: tuple[float, float] | None = None
         self._y_range: tuple[float, float] | None = None
 
+    def _add(self, kind: str, x: FloatArray, y: FloatArray, high: FloatArray | None, label: str,
+             colour: int, style: str = '') -> Plot:
+        self.curves.append(Curve(
+            np.asarray(x, float), np.asarray(y, float),
+            None if high is None else np.asarray(high, float), label,
+            f's{colour % SERIES} {style}'.strip(), kind))
+        return self
+
     def line(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0,
              style: str = '') -> Plot:
         """Add a line; NaN breaks it."""
-        self.curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
-                                 f's{colour % SERIES} {style}'.strip(), 'line'))
-        return self
+        return self._add('line', x, y, None, label, colour, style)
 
     def steps(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0) -> Plot:
         """Add a line that holds each value until the next point."""
-        self.curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
-                                 f's{colour % SERIES}', 'steps'))
-        return self
+        return self._add('steps', x, y, None, label, colour)
 
     def band(self, x: FloatArray, low: FloatArray, high: FloatArray, label: str = '',
              colour: int = 0) -> Plot:
         """Add a shaded band; NaN breaks it."""
-        self.curves.append(Curve(
-            np.asarray(x, float), np.asarray(low, float), np.asarray(high, float), label,
-            f's{colour % SERIES}', 'band'))
-        return self
+        return self._add('band', x, low, high, label, colour)
 
     def markers(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0) -> Plot:
         """Add a dot at each point; none where it is NaN."""
-        self.curves.append(Curve(np.asarray(x, float), np.asarray(y, float), None, label,
-                                 f's{colour % SERIES}', 'markers'))
-        return self
+        return self._add('markers', x, y, None, label, colour)
 
     def bars(self, x: FloatArray, low: FloatArray, high: FloatArray, label: str = '',
              colour: int = 0) -> Plot:
         """Add a bar from `low` to `high` at each point, with caps; none where one is NaN."""
-        self.curves.append(Curve(
-            np.asarray(x, float), np.asarray(low, float), np.asarray(high, float), label,
-            f's{colour % SERIES}', 'bars'))
-        return self
+        return self._add('bars', x, low, high, label, colour)
 
     def shade(self, start: float, stop: float, colour: int = 0, label: str = '') -> Plot:
         """Shade a span of the x axis; its label is drawn where there is room."""

@@ -4,8 +4,7 @@ import numpy as np
 from ou_monitor.analysis.supply import supply_facts
 from ou_monitor.comparison.agreement import Verdict
 from ou_monitor.comparison.flight_model import Readings
-from ou_monitor.comparison.judgement import band, Difference, judge
-from ou_monitor.comparison.yardstick import between_codes, Yardstick
+from ou_monitor.comparison.yardstick import band, between_codes, Difference, judge, Yardstick
 from ou_monitor.records import Recording
 import pytest
 from scipy.stats import norm

@@ -36,9 +36,8 @@ from ou_monitor.online.estimator.quality import (
 from ou_monitor.online.estimator.window import (
     FACTOR, FEWEST, LAGS, LOST, Resolution, Sums, T, Thinner, U, Y)
 from ou_monitor.records import (
-    as_numbers, as_seconds, Counters, Estimate, Flag, FloatArray, LARGEST_LOG_SE, MOST_READINGS,
-    NAN, OU_WINDOWS, OuFacts, Status)
-from ou_monitor.text import Z95
+    as_numbers, as_seconds, Counters, Estimate, Flag, FloatArray, LARGEST_LOG_SE, LOG_NAMES,
+    MOST_READINGS, NAN, OU_WINDOWS, OuFacts, Status)
 from ou_monitor.timeline.line import as_column, BATCH, Batch, TAIL, TimeLine
 
 # Samples from which a fit is tried.
@@ -510,10 +509,10 @@ class RelaxationFits:
                 _overlap(facts.alpha_95, sliding.alpha_95)
                 and _overlap(facts.sigma_95, sliding.sigma_95)):
             return e, sliding, 0.0
+        errors: dict[str, Any] = {
+            f'{name}_se': min(facts.log_se(name), LARGEST_LOG_SE) for name in LOG_NAMES}
         return replace(
-            e, alpha=facts.alpha, sigma=facts.sigma, var_inf=facts.var_inf,
-            alpha_se=_log_se(facts.alpha_95), sigma_se=_log_se(facts.sigma_95),
-            var_inf_se=_log_se(facts.var_inf_95),
+            e, alpha=facts.alpha, sigma=facts.sigma, var_inf=facts.var_inf, **errors,
             status=Status.OK if math.isfinite(e.u0) else e.status,
             flags=tuple(flag for flag in e.flags if flag not in _SLIDING_ONLY)), facts, age
 
@@ -535,8 +534,3 @@ def _unknown(e: Estimate, status: Status) -> Estimate:
 
 def _overlap(one: tuple[float, float], other: tuple[float, float]) -> bool:
     return one[0] <= other[1] and other[0] <= one[1]
-
-
-def _log_se(ends: tuple[float, float]) -> float:
-    """Return the standard error of a logarithm by its 95 % interval."""
-    return min(math.log(ends[1] / ends[0]) / (2.0 * Z95), LARGEST_LOG_SE)

@@ -209,37 +209,16 @@ class FlagLevel(enum.Enum):
 
 @dataclass(frozen=True)
 class FlagState:
-    """
-    The flag at one instant.
-
-    Attributes
-    ----------
-    level : FlagLevel
-        Level.
-    brownout : bool or None
-        True at CRITICAL; False at OK and WARN when the risk is known; None
-        when it is not.
-    since : float
-        When the level was entered, s, on the caller's clock; NaN before the
-        first update.
-    reason : str
-        Why, in words: a clause without a full stop.
-    age : float
-        Time spent in the level, s; NaN when the time is not known.
-    low : bool
-        Whether the voltage is at or below the floor, or was since the last update.
-    dips : int
-        How often it has gone down to the floor so far.
-
-    """
+    """The flag at one instant."""
 
     level: FlagLevel = FlagLevel.UNKNOWN
+    # True at CRITICAL; False at OK and WARN when the risk is known; None when it is not.
     brownout: bool | None = None
-    since: float = NAN
-    reason: str = 'nothing is known yet'
-    age: float = NAN
-    low: bool = False
-    dips: int = 0
+    since: float = NAN  # When the level was entered, s, on the caller's clock
+    reason: str = 'nothing is known yet'  # Why: a clause without a full stop
+    age: float = NAN  # Time spent in the level, s
+    low: bool = False  # Whether the voltage is at or below the floor, or was since the last update
+    dips: int = 0  # How often it has gone down to the floor so far
 
 
 class BrownoutFlag:

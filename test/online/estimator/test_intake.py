@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 from ou_monitor.online.estimator.window import Thinner
-from ou_monitor.timeline.line import as_column, BATCH, TimeLine
+from ou_monitor.timeline.line import BATCH, TimeLine
 import pytest
 
 DT = 1e-3
@@ -196,7 +196,3 @@ def test_block_size_that_changes_restarts():
     assert not kept[4] and thinner.m == 10
     kept = thinner.take(batches(0.01 + np.arange(1000) * 1e-6, intake=intake)[0][0])
     assert kept[4] and thinner.m == 100
-
-
-def test_columns():
-    assert as_column(3).tolist() == [3.0] and as_column([1, 2]).dtype == np.float64

@@ -2,7 +2,7 @@
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.online.estimator.window import LAGS, Resolution, SLOTS, WindowColumns
+from ou_monitor.online.estimator.window import LAGS, Resolution, SLOTS
 import pytest
 
 DT = 1e-3
@@ -110,16 +110,3 @@ def test_coarser_samples_are_means_of_four():
     assert coarse.series.columns(0, 250) == pytest.approx(expected, abs=1e-12)
     assert coarse.series.size == 250 and coarse.series.even
     check(coarse.sums.total(), loops(*expected, [], coarse.sums.reference))
-
-
-def test_lags_and_slots_are_enough():
-    """
-    What they are there for: theta^24 < 5 % up to theta = 0.88; a window to 2.5 %.
-
-    Fewer lags would lose the noise of 20 mV at 1 kHz (theta = 0.42 to 0.8), twice
-    as many cost twice the time of a push.
-    """
-    series = WindowColumns(LAGS)
-    series.append(np.arange(100.0), np.zeros(100), None, np.array([0]))
-    assert series.runs(0, 100).max() == LAGS == 24
-    assert SLOTS == 40

@@ -47,36 +47,6 @@ def test_lags_are_ten_and_forty_milliseconds():
     assert series.column(U).tolist() == u.tolist()
 
 
-def test_moves_until_lags_have_settled():
-    """Still at first; moving for as long as the window, or a lag in it, remembers."""
-    series = WindowColumns(24)
-    series.append(np.arange(100) * 0.01, np.zeros(100), np.full(100, 0.3), START)
-    assert not series.moves
-    series.append(1.0 + np.arange(300) * 0.01, np.zeros(300), np.full(300, 0.5), NONE)
-    assert series.moves
-    series.drop_before(110)
-    assert series.moves
-    # 16 time constants of the slower lag after the step nothing is left but 1e-7.
-    series.drop_before(100 + 100)
-    assert not series.moves
-    series.drop_before(400)
-    assert not series.moves and series.size == 0
-
-
-def test_throttle_that_is_not_known():
-    """Unknown is not movement, and is told from a throttle that is known."""
-    series = WindowColumns(24)
-    series.append(np.arange(50) * 0.01, np.zeros(50), None, START)
-    assert math.isnan(series.last(U)) and not series.moves and not series.known
-    assert np.isnan(series.column(SLOW)).all()
-    u = np.full(50, 0.4)
-    u[10:20] = np.nan
-    series.append(0.5 + np.arange(50) * 0.01, np.zeros(50), u, NONE)
-    assert series.last(U) == 0.4 and not series.known
-    series.drop_before(75)
-    assert series.known and series.column(U).tolist() == [0.4] * 25
-
-
 @settings(deadline=None, max_examples=60)
 @given(st.lists(st.tuples(st.integers(1, 400), st.integers(0, 500), st.booleans()), max_size=25))
 def test_columns_are_what_was_put_in(steps):
@@ -102,42 +72,3 @@ def test_columns_are_what_was_put_in(steps):
         back = series.behind
         assert back <= reach
         assert series.columns(first - back, len(t))[T].tolist() == t[first - back:]
-
-
-def test_memory_is_bounded_by_the_window():
-    """A million samples through a window of a thousand: no array beyond 100 times that."""
-    series = WindowColumns(24)
-    for begin in range(0, 1_000_000, 5000):
-        t = np.arange(begin, begin + 5000, dtype=float)
-        series.append(t, t, np.zeros(5000), START if not begin else NONE)
-        series.drop_before(series.end - 1000)
-    held = sum(value.nbytes for value in vars(series).values() if isinstance(value, np.ndarray))
-    assert series.size == 1000 and held < 100_000 * 8 * 5
-
-
-def test_clear_goes_on_counting():
-    series = WindowColumns(24)
-    series.append(np.arange(10.0), np.arange(10.0), np.full(10, 0.1), START)
-    series.clear()
-    assert (series.size, series.first, series.end, series.behind) == (0, 10, 10, 0)
-    assert math.isnan(series.last(Y)) and math.isnan(series.last(U))
-    series.append(np.arange(3.0), np.ones(3), None, START)
-    assert series.column(Y).tolist() == [1.0, 1.0, 1.0]
-    assert series.runs(10, 13).tolist() == [0, 1, 2]
-
-
-def test_throttle_is_known_from_behind_its_last_gap_on():
-    """Throttle is NaN in samples 5 to 7 and 15: it is known once the window begins at 16."""
-    u = np.full(30, 0.4)
-    u[[5, 6, 7, 15]] = np.nan
-    series = WindowColumns(24)
-    series.append(np.arange(30) * 0.01, np.zeros(30), u, START)
-    for begin, known in ((0, False), (8, False), (15, False), (16, True), (25, True)):
-        series.drop_before(begin)
-        assert series.first == begin and series.known is known
-    u = np.full(4, 0.4)
-    u[2] = np.nan
-    series.append(0.3 + np.arange(4) * 0.01, np.zeros(4), u, NONE)
-    for begin, known in ((25, False), (32, False), (33, True)):
-        series.drop_before(begin)
-        assert series.known is known

@@ -5,9 +5,35 @@ import math
 import random
 
 import numpy as np
-from ou_monitor.online.notch.biquads import bound, HIGHEST, NARROWEST, Notch, phase_lag, WIDEST
-from ou_monitor.online.notch.notch import WIDTHS
+from ou_monitor.online.notch.notch import HIGHEST, Notch, phase_lag, WIDTHS
 import pytest
+
+# Bandwidths over frequency that the proof is for.
+NARROWEST, WIDEST = 0.08, 2.0
+
+
+def bound(narrowest, highest):
+    """
+    Return how much larger than the input one notch can ever come out, whatever its sequence.
+
+    narrowest: least bandwidth over frequency; highest: most frequency over sample rate.
+    """
+    g = math.tan(math.pi * highest)
+    e = 2.0 * narrowest / (4.0 + narrowest * narrowest)
+    p = np.array([[1.0, e], [e, 1.0]])
+    q, turned = math.inf, np.hypot(1.0, e)
+    worst = 0.0
+    for k in np.linspace(narrowest, WIDEST, 400):
+        a = np.array([[-k, -1.0], [1.0, 0.0]])
+        q = min(q, np.linalg.eigvalsh(-(a.T @ p + p @ a))[0])
+        worst = max(worst, np.linalg.norm(np.eye(2) - g * a, 2))
+    # Largest v that does not lose energy, the state that goes with it, and one step beyond.
+    v = 2.0 * turned / q
+    state = worst * v + g
+    energy = (1.0 + e) * state * state + 2.0 * g * turned * turned / q
+    most = math.sqrt(energy / (1.0 - e))
+    # v1 is half of s1 before and after; y = x - m k v1.
+    return 1.0 + WIDEST * most
 
 
 def notch(ratio, width, share=1.0, x=0.0):

@@ -43,16 +43,27 @@ def test_levels_are_entered_at_their_probability():
     assert [s.brownout for s in states] == [False] * 4 + [True] * 2
 
 
-def test_levels_are_left_below_their_share():
-    """Entered at 0.1 and 0.01, left below 0.05 and 0.005, one level at a time or two."""
-    check(line(made(), [0.1, 0.06, 0.05, 0.049, 0.01, 0.005, 0.0049]), 'c c c w w w o')
-    check(line(made(), [0.2, 0.006, 0.2, 0.004]), 'c w c o')
-    check(line(made(brownout_leave=0.9), [0.1, 0.091, 0.089, 0.0091, 0.0089]), 'c c w w o')
-
-
-def test_a_level_that_was_not_entered_is_not_held():
-    """Between leave and enter from below: nothing happens."""
-    check(line(made(), [0.006, 0.06, 0.06, 0.006]), 'o w w w')
+@pytest.mark.parametrize('changes, risks, letters', [
+    # Entered at 0.1 and 0.01, left below 0.05 and 0.005, one level at a time or two.
+    ({}, [0.1, 0.06, 0.05, 0.049, 0.01, 0.005, 0.0049], 'c c c w w w o'),
+    ({}, [0.2, 0.006, 0.2, 0.004], 'c w c o'),
+    ({'leave': 0.9}, [0.1, 0.091, 0.089, 0.0091, 0.0089], 'c c w w o'),
+    # Between leave and enter from below: nothing happens.
+    ({}, [0.006, 0.06, 0.06, 0.006], 'o w w w'),
+    # WARN that follows CRITICAL is held as a level of its own; a rise is never held back.
+    ({'hold': 2.0}, [0.5, 0.02, 0.02, 0.0, 0.0, 0.0], 'c c w w o o'),
+    ({'hold': 10.0}, [0.0, 0.02, 0.5], 'o w c'),
+    # Only a risk that lasts; a break starts the delay anew; without a delay at once.
+    ({'delay': 2.0}, [0.0, 0.5, 0.5, 0.0, 0.5, 0.5, 0.5, 0.5], 'o o o o o o c c'),
+    ({}, [0.0, 0.5], 'o c'),
+    # A risk that swings about critical has been above warn all the time.
+    ({'delay': 2.0}, [0.0, 0.5, 0.05, 0.5, 0.5, 0.5], 'o o o w w c'),
+    ({'latch': True}, [0.02, 0.0], 'w o'),
+    # A single gap does not flicker.
+    ({'hold': 2.0}, [0.5] * 9 + [NAN] + [0.5], 'c' * 11)])
+def test_time_lines(changes, risks, letters):
+    check(line(made(**{f'brownout_{name}': value for name, value in changes.items()}), risks),
+          letters)
 
 
 def test_hold():
@@ -62,24 +73,6 @@ def test_hold():
     check(states, 'o c c c o o')
     assert [s.since for s in states] == [0.0, 1.0, 1.0, 1.0, 4.0, 4.0]
     assert 'brownout.hold (3 s)' in states[2].reason and states[3].age == 2.0
-
-
-def test_hold_is_counted_for_each_level():
-    """WARN that follows CRITICAL is held as a level of its own; a rise is never held back."""
-    check(line(made(brownout_hold=2.0), [0.5, 0.02, 0.02, 0.0, 0.0, 0.0]), 'c c w w o o')
-    check(line(made(brownout_hold=10.0), [0.0, 0.02, 0.5]), 'o w c')
-
-
-def test_delay():
-    """Only a risk that lasts; a break starts it anew; without a delay at once."""
-    flag = made(brownout_delay=2.0)
-    check(line(flag, [0.0, 0.5, 0.5, 0.0, 0.5, 0.5, 0.5, 0.5]), 'o o o o o o c c')
-    check(line(made(), [0.0, 0.5]), 'o c')
-
-
-def test_delay_counts_each_level():
-    """A risk that swings about critical has been above warn all the time."""
-    check(line(made(brownout_delay=2.0), [0.0, 0.5, 0.05, 0.5, 0.5, 0.5]), 'o o o w w c')
 
 
 def test_delay_does_not_turn_unknown_into_ok():
@@ -124,10 +117,6 @@ def test_latch_switched_off_ends_it_and_on_begins_it():
     check(line(flag, [0.0], start=5.0), 'c')
 
 
-def test_latch_keeps_no_warning():
-    check(line(made(brownout_latch=True), [0.02, 0.0]), 'w o')
-
-
 def test_unknown_at_once_from_ok():
     """A NaN, and data that stopped; a risk that is given but stale is not believed."""
     states = line(made(), [0.0, NAN, 0.0, None])
@@ -149,10 +138,6 @@ def test_a_held_warning_never_says_false():
     states = line(made(brownout_hold=3.0), [0.02, NAN, NAN, NAN, 0.0])
     check(states, 'w w w u o')
     assert [s.brownout for s in states] == [False, None, None, None, False]
-
-
-def test_a_single_gap_does_not_flicker():
-    check(line(made(brownout_hold=2.0), [0.5] * 9 + [NAN] + [0.5]), 'c' * 11)
 
 
 def test_parameters_do_not_reset_it():

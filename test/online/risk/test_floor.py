@@ -267,22 +267,3 @@ def test_against_the_definition(steps, sizes, random):
             assert floor.take() == any(expected[at:stop])
             assert was == (at > 0 and expected[at - 1])
         at = stop
-
-
-def test_the_usual_interval_is_learned_over_many_samples():
-    """One sample that is late by nine intervals counts as two, and moves it little."""
-    floor = watch()
-    for k in range(50):
-        floor.push(0.01 * (10 * k + np.arange(10)), np.full(10, 4.9))
-    before = floor._usual
-    assert abs(before - 0.01) < 1e-9
-    floor.push(np.array([4.99 + 0.1]), np.array([4.9]))
-    assert 0.0 < floor._usual - before < 0.2 * before
-
-
-def test_arrivals_that_go_back_do_not_take_the_time_line_with_them():
-    """Samples without a stamp lie where they arrive; one that seems earlier waits for nothing."""
-    floor = watch()
-    floor.push(np.full(1, np.nan), np.full(1, 4.9), np.array([10.0]))
-    floor.push(np.full(3, np.nan), np.full(3, 4.9), np.array([10.1, 9.9, 9.95]))
-    assert np.diff(floor._t)[-2:] == pytest.approx([0.0, 0.05])

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.monitor import SupplyMonitor
-from ou_monitor.online.risk.courses import held, lowest, mean_now
 from ou_monitor.online.risk.first_passage import brownout_probability
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.risk.forecast import Forecast
@@ -18,7 +17,6 @@ from ou_monitor.timeline.line import Batch
 from project import ROOT
 import pytest
 from scipy.signal import lfilter
-from scipy.stats import t as student
 
 RATE, SECONDS, FLOWN = 50.0, 80.0, 3000
 DT = 1.0 / RATE
@@ -336,24 +334,3 @@ def test_the_leg_that_predicts_better_stands(wrong):
     for k in range(0, 3000, 10):
         forecast.take(batch((k + np.arange(10)) * DT, v[k:k + 10]))
     assert forecast.risk(14.0, 1.0).basis == ('excursions' if wrong else 'first_passage')
-
-
-@pytest.mark.parametrize('voltage', [12.5, 14.0, 14.6, 15.5])
-def test_the_condition_is_a_mixture_of_two_laws(voltage):
-    """As often as it was wrong that as wide as the flight's excursions; Student's t both."""
-    monitor, _ = monitor_of()
-    forecast, horizon = monitor._forecast, 1.0
-    law, wrong, *_ = forecast._learned(horizon)
-    state = forecast._state()
-    _, wide, _ = forecast._flight(horizon)
-    u = np.array([0.1, 0.5, 0.9])
-    middle, spread = law.moments(
-        *lowest(state, held(u, 0.5, state.throttle), horizon, forecast._sampling),
-        mean_now(state))
-
-    def below(deviation):
-        return student.cdf((voltage - middle) / deviation * math.sqrt(5.0 / 3.0), 5.0)
-
-    expected = wrong * below(np.hypot(spread, wide)) + (1.0 - wrong) * below(spread)
-    assert 0.0 < wrong < 1.0 and wide > 0.0
-    assert forecast.risk_if(u, 0.5, voltage, horizon) == pytest.approx(expected, rel=1e-6)
