@@ -458,7 +458,7 @@ class AdaptiveLowPass:
                     f'{name} must be one number or of the shape of t, {stamps.shape}: got '
                     f'{one.shape}')
         if stamps.ndim == 0:
-            return self._step(float(stamps), float(signal), *map(float, others))
+            return self.step(float(stamps), float(signal), *map(float, others))
         out: FloatArray = np.empty(stamps.size)
         k = 0
         while k < stamps.size:
@@ -467,7 +467,7 @@ class AdaptiveLowPass:
                 many = WORTH
                 at = slice(k, k + many)
                 wide = [np.broadcast_to(one, stamps.shape)[at].tolist() for one in others]
-                out[at] = [self._step(*one) for one in zip(
+                out[at] = [self.step(*one) for one in zip(
                     stamps[at].tolist(), signal[at].tolist(), *wide, strict=True)]
             k += many
         return out
@@ -523,10 +523,6 @@ class AdaptiveLowPass:
              alpha: float = NAN, throttle: float = NAN, level: float = NAN,
              level_se: float = NAN) -> float:
         """Filter one sample; as `filter`, NaN for what is not known (the node's short way)."""
-        return self._step(t, x, sigma, sigma_se, alpha, throttle, level, level_se)
-
-    def _step(self, t: float, x: float, sigma: float, sigma_se: float, alpha: float,
-              throttle: float, level: float, level_se: float) -> float:
         if not (abs(x) < _LARGEST and abs(t) < _LATEST):
             self.counters.non_finite += 1
             return self._out
