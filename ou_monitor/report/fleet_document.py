@@ -134,8 +134,8 @@ def _drift(fleet: Fleet) -> list[Part]:
         return [Text('No vehicle has enough flights for a test.')]
     parts: list[Part] = [] if judged.drifting else [
         Text('No drift stands at the rate of the fleet; the most likely ones are drawn.')]
-    parts += Pair.two_by_two([Figure(_trend_plot(judged.values[t.quantity], t), _caption(t, fleet))
-                     for t in drawn])
+    parts += Pair.two_by_two([
+        Figure(_trend_plot(judged.values[t.quantity], t), _caption(t, fleet)) for t in drawn])
     listed = [t for k, t in enumerate(judged.trends) if k < _LEAST or t.p_value < DRIFT_RATE]
     rows = [[t.vehicle, t.quantity, str(t.flights), change(t.quantity, t.slope) + '\n'
              + f'[{change(t.quantity, t.low)}, {change(t.quantity, t.high)}]',
