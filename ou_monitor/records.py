@@ -387,7 +387,7 @@ class OuFacts:
     The relaxation beside white noise, or bounds.
 
     `not_visible`: a relaxation slower than `tau_below_s`, but faster than the level, has a
-    variance below `var_inf_below` (97.5 %, nominal); a faster one may be all of the noise.
+    variance below `var_inf_below` (95 %); a faster one may be all of the noise.
     """
 
     status: str  # ok, not_visible, too_short or no_data

@@ -69,7 +69,7 @@ def test_buried_relaxations_lie_within_the_bounds():
     """
     Of 20 rails with an OU a fifth as large as white noise, 17 lie within the bounds.
 
-    97.5 % each; fewer than 17 of 20 has a chance of 0.1 %.
+    95 % each; fewer than 17 of 20 has a chance of 1.6 %.
     """
     inside = 0
     for seed in range(20):
@@ -84,7 +84,7 @@ def test_slow_relaxations_lie_within_the_bounds():
     """
     Of 16 rails with a slow OU beside fast readings, the intervals or bounds hold 13.
 
-    95 % and 97.5 %; fewer than 13 of 16 has a chance of 0.7 %.
+    95 % each; fewer than 13 of 16 has a chance of 0.7 %.
     """
     inside = 0
     for seed in range(16):
