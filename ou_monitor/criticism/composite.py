@@ -14,12 +14,10 @@ import math
 
 import numpy as np
 from ou_monitor.criticism.battery import Covariates, large_ones, throttle_paths
-from ou_monitor.criticism.innovations import other_pole, OtherPole
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import (
     driven, Events, fit_gaussian, GaussianFit, white_noise)
 from ou_monitor.model.terms.laws import LawFit, View
-from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray
 
@@ -140,22 +138,6 @@ def view_of(samples: Samples, gaussian: GaussianFit, z: FloatArray, part: slice)
                 at=samples.t - samples.t[0], step=samples.step, throttle=samples.throttle,
                 train=part, trust=np.clip(1.0 - white / gaussian.variance, 0.0, 1.0),
                 driven=np.clip(added / gaussian.variance, 0.0, 1.0))
-
-
-def pole_beside(samples: Samples, composite: Composite) -> OtherPole:
-    """
-    Return the test of `analyze` for another pole, of the scores of a model.
-
-    Only where the noise is one OU in white noise, as in a load level: other states of a model
-    change the spectrum that the test is about.
-    """
-    ou, *others = composite.terms
-    if any(term.ROLE is Role.BLOCK for term in others):
-        return OtherPole()
-    assert isinstance(ou, OU)
-    rate = 1.0 / float(np.median(samples.step[1:]))
-    return other_pole([composite.z], rate, ou.alpha, ou.sigma ** 2 / (2.0 * ou.alpha),
-                      samples.blur + sum(term.variance() for term in others))
 
 
 def covariates_of(samples: Samples, composite: Composite) -> Covariates:

@@ -57,16 +57,6 @@ class OtherPole:
     second_share: float = NAN  # Its variance, over Var_inf
     coupling_p: float = NAN  # Probability that noise looks as much like an AC-coupled instrument
 
-    @property
-    def second(self) -> bool:
-        """Whether there is a second relaxation of consequence."""
-        return self.second_p < FAMILY_WISE and self.second_share >= LEAST_SHARE
-
-    @property
-    def coupled(self) -> bool:
-        """Whether an AC-coupled instrument has taken out slow noise."""
-        return self.coupling_p < FAMILY_WISE
-
 
 def steps_before(t: FloatArray) -> FloatArray:
     """Return the time before each sample, s; infinite before the first."""

@@ -7,14 +7,13 @@ log-likelihood on the part fitted, less its price, plus that on the part kept.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 import math
 
 import numpy as np
-from ou_monitor.criticism.composite import (
-    Composite, fit_composite, LAW_COST, pole_beside, view_of)
-from ou_monitor.criticism.null_bank import criticise, NullBank
+from ou_monitor.criticism.composite import Composite, fit_composite, LAW_COST, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.spectral_start import from_spectrum
 from ou_monitor.criticism.structure import evaluate
@@ -23,16 +22,21 @@ from ou_monitor.discovery.free_law import free_law
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.slow import Drift
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray
 
-# Starting points that are fitted in full, and samples that decide which.
-_FULL, _GLANCE = 2, 8000
+# Starting points that are fitted, samples that decide which, and kinds that are fitted in full.
+_FULL, _GLANCE, _FEW = 2, 8000, 4
+# Share of the best that a glance has to see: what is fitted in full gains at most twice as much.
+_WITHIN = 0.5
 # Times that a term finds its parameters beside those of the fit.
 _AGAIN = 3
 # Nats by which two fits to one spectrum differ at least.
 _ALIKE = 0.1
+
+
+# Nats that a kind gains at first sight, the kind, and a start; None for a law, which has none.
+_Glance = tuple[float, type[Term], Composite | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +46,6 @@ class Trial:
     name: str  # Of the cause
     composite: Composite  # The model with it
     evidence: float  # nats
-    # Statistics of the model with it; None where its evidence is not clear.
-    left: dict[str, float] | None = None
-    # Causes that the score test of another pole shows beside it; empty where `left` is None.
-    shown: frozenset[str] = frozenset()
     beside: str = ''  # Name of a cause that comes with it; empty where none does
 
 
@@ -55,7 +55,9 @@ class Fitter:
 
     samples: Samples  # The recording
     cost: float = 0.0  # Processor time of the fits, s, estimated from their filters
-    # Latent laws with clear evidence, most of which a free law of throttle explains.
+    # Kinds that were tried in vain, and what score tests said of them, nats.
+    failed: dict[str, float] = field(default_factory=dict)
+    # Latent laws with evidence, most of which a free law of throttle explains.
     throttles: set[str] = field(default_factory=set)
 
     def evidence(self, composite: Composite) -> float:
@@ -120,100 +122,111 @@ class Fitter:
         structural[0] = starts[-1].beside(structural[0])
         return self.fit([*structural, *starts, *laws], composite, rough)
 
-    def trials(self, composite: Composite, values: dict[str, float], given: Collection[str],
-               tier: int, bank: NullBank, only: str = '') -> list[Trial]:
-        """Return the candidates of a tier that something asks for, fitted, the dear ones last."""
-        view = self.view(composite)
-        before = self.evidence(composite)
-        found: list[Trial] = []
-        free: FloatArray | None = None
-        asked = False
-        model = [type(term) for term in composite.terms]
-        for kind in decision.kinds_to_try(catalogue().values(), model, values, given, tier,
-                                          self.samples.throttle is not None,
-                                          self.poles_shown(composite)):
-            if only and kind.NAME != only or not decision.affordable(kind, self.cost):
+    def trials(self, composite: Composite, kinds: Sequence[type[Term]],
+               statistics: Callable[[Composite], Mapping[str, float]]) -> list[Trial]:
+        """
+        Return kinds that gain beside a model: a glance at all, the best few fitted in full.
+
+        What was tried in vain comes again where score tests show more than then.  Kinds whose
+        fit takes seconds come last, and only where score tests show them beside the best of the
+        others, unless they imitate it.  statistics are those of a model.
+        """
+        view, values = self.view(composite), statistics(composite)
+        free = _FreeLaw(self.samples, view.z)
+        shown = {kind: decision.scored(kind, values) for kind in kinds}
+        tried = [kind for kind in kinds if not kind.DEAR
+                 and shown[kind] > self.failed.get(kind.NAME, -1.0)]
+        glances = self._glances(composite, tried, free, 0.0)
+        found = self._in_full(composite, glances, [])
+        dear = [kind for kind in kinds if kind.DEAR and decision.affordable(kind, self.cost)
+                and shown[kind] > self.failed.get(
+                    kind.NAME, decision.TIE if kind.ROLE is Role.LAW else -1.0)]
+        top = max((glance[0] for glance in glances), default=0.0)
+        if dear and found:
+            best = max(found, key=lambda trial: trial.evidence)
+            left = statistics(best.composite)
+            dear = [kind for kind in dear if decision.imitate(kind, catalogue()[best.name])
+                    or decision.scored(kind, left) > decision.TIE]
+        if dear:
+            glances += self._glances(composite, dear, free, _WITHIN * top)
+            found = self._in_full(composite, glances, found)
+            # Of what the spectrum shows to gain less than another kind more is not known.
+            tried += [kind for kind in dear if not top or not kind.BROAD]
+        gained = {glance[1] for glance in glances}
+        self.failed |= {kind.NAME: shown[kind] for kind in tried if kind not in gained}
+        return found
+
+    def _glances(self, composite: Composite, kinds: Sequence[type[Term]], free: _FreeLaw,
+                 least: float) -> list[_Glance]:
+        """Return what kinds gain at first sight, if it is enough, nats."""
+        view, before = self.view(composite), self.evidence(composite)
+        found = []
+        for kind in kinds:
+            if kind.ROLE is Role.LAW:
+                gain, start = self._latent_gain(kind, view, free), None
+            else:
+                start = self.best_start(composite, kind, view, least)
+                gain = -math.inf if start is None else self.evidence(start) - before
+            if gain > least:
+                found.append((gain, kind, start))
+        return found
+
+    def _in_full(self, composite: Composite, glances: Sequence[_Glance], known: list[Trial]
+                 ) -> list[Trial]:
+        """Return the trials of the best glances, fitted in full, those known as they are."""
+        found, names = list(known), {trial.name for trial in known}
+        best = sorted(glances, key=lambda glance: -glance[0])[:_FEW]
+        for gain, kind, start in best:
+            if gain < _WITHIN * best[0][0] or kind.NAME in names:
                 continue
-            if any(decision.settled(catalogue()[trial.name], trial.left, kind, trial.shown)
-                   or decision.comes_first(catalogue()[trial.name], trial.evidence, kind, values)
-                   for trial in found):
-                continue
-            if kind.ROLE is Role.LAW and decision.is_latent(kind):
-                if not asked:
-                    free, asked = free_law(self.samples, view.z), True
-                if free is not None and self._is_throttles(kind, view, free):
-                    continue
-            best = self.best_start(composite, kind, view)
-            if best is not None:
+            full = self.fit([*composite.terms, kind] if start is None else start.terms,
+                            start or composite)
+            if start is not None and (full is None or self.evidence(full) < self.evidence(start)):
+                full = start
+            if full is not None and (full.terms[-1] if start is None else _joined(full)
+                                     ).holds(self.view(composite)):
                 with_it = kind.CHANGES is not None and not composite.has(kind.CHANGES.NAME)
-                trial = Trial(kind.NAME, best, self.evidence(best) - before,
-                              beside=kind.CHANGES.NAME if kind.CHANGES and with_it else '')
-                if trial.evidence > decision.CLEAR:
-                    trial = replace(trial, left=criticise(self.samples, best, bank),
-                                    shown=self.poles_shown(best))
-                found.append(trial)
-        if any(decision.may_be_a_trend(catalogue()[trial.name]) for trial in found):
-            found += self._trend(composite, view, before, given)
+                found.append(Trial(
+                    kind.NAME, full, self.evidence(full) - self.evidence(composite),
+                    kind.CHANGES.NAME if kind.CHANGES and with_it else ''))
         return found
 
-    def _trend(self, composite: Composite, view: View, before: float, given: Collection[str]
-               ) -> list[Trial]:
-        """Return a trial of `drift`, which is measured, beside latent causes that are slow."""
-        if composite.has(Drift.NAME) or Drift.NAME in given or Drift.NAME not in catalogue():
-            return []
-        best = self.best_start(composite, Drift, view)
-        return [] if best is None else [Trial(Drift.NAME, best, self.evidence(best) - before)]
+    def _law_gain(self, kind: type[Term], view: View) -> float:
+        """Return the evidence for a law of scores, nats."""
+        if kind.DEAR:
+            self.cost += LAW_COST * self.samples.n
+        try:
+            fit = kind.fit_law(view)
+        except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+            return -math.inf
+        return -math.inf if fit is None else (
+            float(fit.gain.sum()) - fit.term.SEARCH
+            - 0.5 * fit.free * math.log(self.samples.train.stop))
 
-    def _is_throttles(self, kind: type[Term], view: View, free: FloatArray) -> bool:
-        """Return whether a free law of throttle, a log-variance, explains what a kind does."""
-        def evidence(view: View) -> float:
-            if kind.DEAR:
-                self.cost += LAW_COST * self.samples.n
-            try:
-                fit = kind.fit_law(view)
-            except (ValueError, ArithmeticError, np.linalg.LinAlgError):
-                return -math.inf
-            return -math.inf if fit is None else (
-                float(fit.gain.sum()) - fit.term.SEARCH
-                - 0.5 * fit.free * math.log(self.samples.train.stop))
-
-        beside = evidence(replace(view, z=view.z * np.exp(-0.5 * free),
-                                  variance=view.variance * np.exp(free)))
-        alone = evidence(view) if beside > decision.ACCEPT else 0.0
-        found = decision.is_throttles(alone, beside)
-        if found and alone > decision.CLEAR:
+    def _latent_gain(self, kind: type[Term], view: View, free: _FreeLaw) -> float:
+        """Return the same, if a free law of throttle, a log-variance, does not explain it."""
+        log = free.log if decision.is_latent(kind) else None
+        if log is None:
+            return self._law_gain(kind, view)
+        beside = self._law_gain(kind, replace(
+            view, z=view.z * np.exp(-0.5 * log), variance=view.variance * np.exp(log)))
+        alone = self._law_gain(kind, view) if beside > decision.ACCEPT else 0.0
+        if not decision.is_throttles(alone, beside):
+            return alone
+        if alone > decision.ACCEPT:
             self.throttles.add(kind.NAME)
-        return found
+        return -math.inf
 
-    def poles_shown(self, composite: Composite) -> frozenset[str]:
-        """Return the causes that the score test of another pole shows beside a model."""
-        return decision.poles_shown(pole_beside(self.samples, composite))
-
-    def refine(self, composite: Composite, trials: Sequence[Trial]) -> list[Trial]:
-        """Return trials, the best first, those near it fitted to all samples."""
-        top = max(trial.evidence for trial in trials)
-        before = self.evidence(composite)
-        refined = []
-        for trial in trials:
-            if (trial.evidence > top - decision.ROUGH
-                    and catalogue()[trial.name].ROLE is not Role.LAW):
-                start = trial.composite
-                full = self.fit(start.terms, start)
-                if full is not None and self.evidence(full) - before > trial.evidence:
-                    trial = replace(trial, composite=full,
-                                    evidence=self.evidence(full) - before)
-            refined.append(trial)
-        return sorted(refined, key=lambda trial: -trial.evidence)
-
-    def best_start(self, composite: Composite, kind: type[Term], view: View) -> Composite | None:
-        """Return the best fit with one more term of a kind."""
+    def best_start(self, composite: Composite, kind: type[Term], view: View, least: float = 0.0
+                   ) -> Composite | None:
+        """Return the best fit with one more term of a kind, if its spectrum gains so many nats."""
         if kind.ROLE is Role.LAW:
             found = self.fit([*composite.terms, kind], composite)
             return found if found is not None and found.terms[-1].holds(view) else None
         starts = list(kind.candidates(view))
         if kind.BROAD and not any(term.ROLE is Role.BLOCK and term.NEEDS_THROTTLE
                                   for term in composite.terms):
-            return self._by_spectrum(composite, starts, view)
+            return self._by_spectrum(composite, starts, view, least)
         known = [term for term in starts if term.ROLE is Role.MEAN]
         hidden = [term for term in starts if term.ROLE is not Role.MEAN]
         if len(known) > _FULL:
@@ -230,14 +243,16 @@ class Fitter:
                 best = found
         return best
 
-    def _by_spectrum(self, composite: Composite, starts: Sequence[Term], view: View
-                     ) -> Composite | None:
+    def _by_spectrum(self, composite: Composite, starts: Sequence[Term], view: View,
+                     least: float) -> Composite | None:
         """Return the best fit from starts that the spectrum of the scores has moved."""
         ou, *others = composite.gaussian.terms
         laws = [term for term in composite.terms if term.ROLE is Role.LAW]
         moved = [from_spectrum(self.samples, composite, [start.beside(ou), *others, start])
                  for start in starts]
-        moved = sorted((way for way in moved if way[0][-1].holds(view)), key=lambda way: -way[1])
+        # What gains less than its price in the spectrum gains no more in the samples.
+        moved = sorted((way for way in moved if way[0][-1].holds(view)
+                        and way[1] > max(decision.ACCEPT, least)), key=lambda way: -way[1])
         # Those that went the same way are one.
         ways = [way for k, way in enumerate(moved)
                 if not any(way[1] > other[1] - _ALIKE for other in moved[:k])]
@@ -245,14 +260,6 @@ class Fitter:
                 for terms, _ in ways[:_FULL]]
         return max((fit for fit in fits if fit is not None and _joined(fit).holds(view)),
                    default=None, key=self.evidence)
-
-    def simplest(self, composite: Composite, index: int) -> Composite | None:
-        """Return the fit with one term in its simplest form; None where it is that already."""
-        term = composite.terms[index]
-        forms = sorted(type(term).simplest(self.view(composite)), key=_size)
-        if not forms or _size(forms[0]) >= _size(term):
-            return None
-        return self.fit([*composite.terms[:index], forms[0], *composite.terms[index + 1:]], None)
 
     def _by_likelihood(self, composite: Composite, starts: list[Term]) -> list[Term]:
         """Return starts in the order of their likelihood as they are, on a part."""
@@ -278,14 +285,22 @@ def is_trend(samples: Samples, model: Composite) -> bool:
     return not decision.relaxes(ou.alpha, float(samples.t[-1] - samples.t[0]))
 
 
+@dataclass(eq=False)
+class _FreeLaw:
+    """What throttle says of the noise of scores, found when first asked for."""
+
+    samples: Samples
+    z: FloatArray
+
+    @cached_property
+    def log(self) -> FloatArray | None:
+        """Return the logarithm of the variance; None where throttle says nothing."""
+        return free_law(self.samples, self.z)
+
+
 def _joined(composite: Composite) -> Term:
     """Return the term that was joined last."""
     return [term for term in composite.terms if term.ROLE is not Role.LAW][-1]
-
-
-def _size(term: Term) -> int:
-    """Return the number of parameters that are fitted."""
-    return len(term.free()) + len(term.LINEAR)
 
 
 def _by_scores(samples: Samples, starts: list[Term], view: View) -> list[Term]:

@@ -14,16 +14,15 @@ import numpy as np
 from ou_monitor.criticism.composite import Composite
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import Fitter, is_trend
-from ou_monitor.discovery.regression import load_terms, mean_answer
-from ou_monitor.discovery.search_state import Search
-from ou_monitor.discovery.throttle_laws import compare_laws
+from ou_monitor.discovery.regression import load_terms
+from ou_monitor.discovery.search import backward, choose_answer, Search
 from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
 from ou_monitor.model.terms.load_dependent import LoadDependentNoise, LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
-from ou_monitor.model.terms.term import NEXT_TO_ZERO, Role, Term
+from ou_monitor.model.terms.term import Role, Term
 
 # Rate, 1/s, from which a fit finds what the load leaves: minutes and tenths of a second are both
 # within reach of it.
@@ -64,7 +63,7 @@ def under_load(fitter: Fitter, search: Search) -> None:
             search.accepted.append(term.NAME)
             search.rivals.setdefault(term.NAME, [])
             search.log.append(f'{term.NAME}: with the load')
-    compare_laws(fitter, search)
+    backward(fitter, search)
     choose_answer(fitter, search, ())
     _coupled(fitter, search)
 
@@ -140,31 +139,3 @@ def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:
         if top is None or gain < decision.ACCEPT:
             return best
         best = top
-
-
-def choose_answer(fitter: Fitter, search: Search, start: Sequence[Term]) -> None:
-    """Choose the answers of the mean to what is measured anew, beside the noise found so far."""
-    composite = search.composite
-    answer = mean_answer(fitter.samples, composite, fitter.view(composite), start)
-    own = [term for term in composite.terms if decision.is_answer(type(term))]
-    shapes, others = ([replace(term, **dict.fromkeys(term.LINEAR, NEXT_TO_ZERO)) for term in terms]
-                      for terms in (own, answer.terms))
-    if not start and len(shapes) == len(others) and all(one in shapes for one in others):
-        return
-    structural = [term for term in composite.terms
-                  if term.ROLE is not Role.LAW and not decision.is_answer(type(term))]
-    laws = [term for term in composite.terms if term.ROLE is Role.LAW]
-    gone = {term.NAME for term in own} - {term.NAME for term in answer.terms}
-    if gone and is_trend(fitter.samples, composite):
-        return
-    fit = fitter.fit([*structural, *answer.terms, *laws], composite)
-    if fit is None or (not start and fitter.evidence(fit) < fitter.evidence(composite)):
-        return
-    search.composite = fit
-    before = [name for name in search.accepted if decision.is_answer(catalogue()[name])]
-    names = [term.NAME for term in answer.terms]
-    search.accepted = [*names, *(name for name in search.accepted if name not in before)]
-    for term, worth, rivals in zip(answer.terms, answer.worth, answer.rivals, strict=True):
-        search.rivals[term.NAME] = list(rivals)
-        search.largest = max(search.largest, worth)
-        search.log.append(f'{term.NAME}: {worth:.1f} nats')

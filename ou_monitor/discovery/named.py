@@ -20,13 +20,17 @@ from ou_monitor.discovery import decision
 from ou_monitor.discovery.errors import standard_errors
 from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.load_start import under_load
-from ou_monitor.discovery.search import kinds_of, name_causes, position, Progress
-from ou_monitor.discovery.search_state import Search
+from ou_monitor.discovery.search import (
+    kinds_of, name_causes, position, Progress, Search, without_causes)
 from ou_monitor.model.terms.lines import prominence
-from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.slow import Drift, SecondRelaxation
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.model.terms.tones import Resonance, Tone
+
+# Searches, each without what the criticism of those before withdrew.
+_TURNS = 3
+# Standard errors from which a line is there, whatever else is left.
+_SURE = 25.0
 
 # Note where the search was cut short.
 STOPPED = ('The search for causes was cut short where the next ones would have taken long; there '
@@ -67,56 +71,70 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         bank = simulate_bank(covariates_of(samples, start), phi, rng)
     before = criticise(samples, start, bank)
     fitter = Fitter(samples, start.cost)
+    search = Search(fitter.fit(start.terms, start) or start)
+    found = _Result(search.copy(), start, before)
     # Beside lines that were taken out there may be slower ones.
     given = [term.NAME for term in exact if term.FAMILY != 'line']
-    begun = Search(fitter.fit(start.terms, start) or start)
-    bare, search, failure, loaded = begun.composite, begun, '', False
+    failure, begun = '', None
+    dropped: list[str] = []
     try:
-        under_load(fitter, begun)
-        loaded = any(kind.FAMILY == LoadSag.FAMILY for kind in kinds_of(begun.accepted))
-        search = begun.copy()
-        name_causes(fitter, search, bank, given=given,
-                    progress=lambda share: progress(0.1 + 0.9 * share))
-        failure = STOPPED if search.stopped else ''
+        under_load(fitter, search)
+        begun = found = _finished(fitter, search, bank)
+        for turn in range(_TURNS):
+            # At last without latent causes, which were withdrawn again and again.
+            name_causes(fitter, search, bank, given=[*given, *dropped],
+                        latent=turn < _TURNS - 1,
+                        progress=None if turn else lambda share: progress(0.1 + 0.9 * share))
+            found = _finished(fitter, search, bank)
+            out = _withdrawn(fitter, found, begun)
+            if not out:
+                break
+            dropped += [search.accepted[k] for k in out]
+            found = begun
+            less = without_causes(fitter, search, out)
+            if less is None:
+                break
+            search = less
+            found = _finished(fitter, search, bank)
     except KeyboardInterrupt:
         failure = INTERRUPTED
-        # In the middle of the load there is no model that belongs to the names.
-        search = search if search is not begun else Search(bare)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         # A fit outside of what numbers can hold; the criticism still stands.
         failure = f'The search for causes broke off: {error}.'
-        search = search if search is not begun else Search(bare)
-    # Fitted to everything, so that an event in the part kept does not count against a cause.
+    if failure and begun is not None:
+        # Causes found until then; in the middle of the load no model belongs to the names.
+        found = _finished(fitter, search, bank)
+    names = found.search.accepted
+    return Named(found.whole, bank, tuple(names),
+                 _with_trends(samples, found.whole, found.search.rivals),
+                 tuple(name for name in dict.fromkeys(dropped) if name not in names), before,
+                 found.after, failure or (STOPPED if search.stopped else ''),
+                 tuple(sorted(fitter.throttles.difference(names))))
+
+
+@dataclass(frozen=True)
+class _Result:
+    """A search, its model fitted to everything, and what that leaves."""
+
+    search: Search
+    whole: Composite
+    after: Mapping[str, float]
+
+
+def _finished(fitter: Fitter, search: Search, bank: NullBank) -> _Result:
+    """Return a search with its model fitted to everything: an event in the part kept counts."""
     whole = fitter.whole(search.composite)
-    after = criticise(samples, whole, bank) if search.accepted else before
-    kinds = kinds_of(search.accepted)
-    # What the measured causes left, which the load begins with.
-    measured = before
-    if loaded and any(map(decision.is_latent, kinds)):
-        measured = criticise(samples, begun.composite, bank)
-    out = decision.withdrawn(measured, after, kinds, search.asked)
+    return _Result(search.copy(), whole, criticise(fitter.samples, whole, bank))
+
+
+def _withdrawn(fitter: Fitter, found: _Result, begun: _Result) -> list[int]:
+    """Return the causes that claim what they do not explain, or are something else by now."""
+    names = found.search.accepted
+    out = decision.withdrawn(begun.after, found.after, kinds_of(names), found.search.asked)
     # Noise that the load needs is part of it.
-    out = [k for k in out if not (loaded and search.accepted[k] in begun.accepted)]
-    out = _in_doubt(samples, whole, search.accepted, out)
-    out = sorted({*out, *_other(fitter, whole, search.accepted)})
-    dropped = tuple(search.accepted[k] for k in out)
-    found = _Result(search, whole, after)
-    if dropped and failure != INTERRUPTED:
-        stays = [search.composite.terms[position(search.composite, search.accepted, k)]
-                 for k, kind in enumerate(kinds) if k not in out and not kind.MEASURED]
-        # What is sure whatever comes now.
-        sure = begun if loaded else Search(bare)
-        found = _Result(sure, sure.composite, criticise(samples, sure.composite, bank))
-        try:
-            found = _without(fitter, search, begun, dropped, stays, measured, bank, given,
-                             loaded)
-        except KeyboardInterrupt:
-            failure = INTERRUPTED
-        dropped = tuple(name for name in dropped if name not in found.search.accepted)
-    return Named(found.whole, bank, tuple(found.search.accepted),
-                 _with_trends(samples, found.whole, found.search.rivals), dropped, before,
-                 found.after, failure,
-                 tuple(sorted(fitter.throttles.difference(found.search.accepted))))
+    out = [k for k in out if names[k] not in begun.search.accepted]
+    return sorted({*_in_doubt(fitter.samples, found.whole, names, out),
+                   *_other(fitter, found.whole, names)})
 
 
 def _with_trends(samples: Samples, whole: Composite, rivals: Mapping[str, list[str]]
@@ -128,15 +146,6 @@ def _with_trends(samples: Samples, whole: Composite, rivals: Mapping[str, list[s
         for term in whole.terms)
     return {name: [*others, Drift.NAME] if slow and name == SecondRelaxation.NAME
             and Drift.NAME not in others else others for name, others in rivals.items()}
-
-
-@dataclass(frozen=True)
-class _Result:
-    """A search, its model fitted to everything, and what that leaves."""
-
-    search: Search
-    whole: Composite
-    after: Mapping[str, float]
 
 
 def _in_doubt(samples: Samples, whole: Composite, names: Sequence[str], out: Sequence[int]
@@ -152,12 +161,12 @@ def _in_doubt(samples: Samples, whole: Composite, names: Sequence[str], out: Seq
         at = position(whole, names, k)
         term = whole.terms[at]
         if isinstance(term, Tone):
-            return term.amplitude > decision.SURE * errors[at].get('amplitude', math.inf)
+            return term.amplitude > _SURE * errors[at].get('amplitude', math.inf)
         assert isinstance(term, Resonance)
         z = evaluate(samples, [other for other in whole.terms
                                if other is not term and other.ROLE is not Role.LAW]).z
         rate = 1.0 / float(np.median(samples.step[1:]))
-        return prominence(z, rate, term.frequency, term.damping / math.pi) > decision.OFF
+        return prominence(z, rate, term.frequency, term.damping / math.pi) > decision.FAILS
 
     return [k for k in out if not is_sure(k)]
 
@@ -167,68 +176,3 @@ def _other(fitter: Fitter, whole: Composite, names: Sequence[str]) -> list[int]:
     view = fitter.view(whole)
     return [k for k, kind in enumerate(kinds_of(names)) if kind.ROLE is Role.BLOCK
             and not whole.terms[position(whole, names, k)].holds(view)]
-
-
-def _without(fitter: Fitter, search: Search, begun: Search, dropped: Sequence[str],
-             stays: Sequence[Term], measured: Mapping[str, float],
-             bank: NullBank, given: Sequence[str], loaded: bool) -> _Result:
-    """Search again without what was withdrawn; `measured` is what the measured causes left."""
-    # The causes withdrawn may have hidden measured ones.  A trend that another slow cause
-    # replaced is not tried again.
-    slow = [kind.NAME for kind in kinds_of(search.removed) if kind.FAMILY == 'slow']
-    # Nor are they the last that could explain it: what did less well may be right.
-    if decision.searched_again(loaded, fitter.cost):
-        again = begun.copy()
-        name_causes(fitter, again, bank, given=[*given, *slow, *dropped])
-        kinds = kinds_of(again.accepted)
-        other = fitter.whole(again.composite)
-        left = criticise(fitter.samples, other, bank)
-        out = [*_in_doubt(fitter.samples, other, again.accepted,
-                          decision.withdrawn(measured, left, kinds, again.asked)),
-               *_other(fitter, other, again.accepted)]
-        if any(map(decision.is_latent, kinds)) and not out:
-            return _Result(again, other, left)
-    asked, search = search.asked, begun.copy()
-    latent = [term for term in stays if decision.is_latent(type(term))]
-    for term in stays:
-        # What follows throttle without being an answer of the mean: it may be too dear by now.
-        fit = None if term in latent else fitter.join(search.composite, [term], rough=False)
-        if fit and fitter.evidence(fit) - fitter.evidence(search.composite) >= decision.ACCEPT:
-            search.take(term.NAME, fit)
-    name_causes(fitter, search, bank, latent=False, given=[*given, *slow])
-    search.asked = {**search.asked, **asked}
-    return _Result(search, *_kept_beside(fitter, search, latent, measured, bank))
-
-
-def _kept_beside(fitter: Fitter, search: Search, stays: Sequence[Term],
-                 before: Mapping[str, float], bank: NullBank
-                 ) -> tuple[Composite, dict[str, float]]:
-    """Put latent causes that were not withdrawn beside the measured ones; return what is left."""
-    samples = fitter.samples
-    whole = fitter.whole(search.composite)
-    after = criticise(samples, whole, bank)
-    # Lines come at once: none explains what the others do.
-    lines = [term for term in stays if isinstance(term, Tone)]
-    groups: list[list[Term]] = [[*lines], *([term] for term in stays if term not in lines)]
-    for terms in groups:
-        more = [term for term in terms if term.SEVERAL or not search.composite.has(term.NAME)]
-        while more:
-            fit = fitter.join(search.composite, more, rough=False)
-            if fit is None or (fitter.evidence(fit) - fitter.evidence(search.composite)
-                               < decision.ACCEPT * len(more)):
-                break
-            again = fitter.whole(fit)
-            left = criticise(samples, again, bank)
-            names = [*search.accepted, *(term.NAME for term in more)]
-            kinds = kinds_of(names)
-            out = _in_doubt(samples, again, names,
-                            decision.withdrawn(before, left, kinds, search.asked))
-            out += _other(fitter, again, names)
-            bad = [k - len(search.accepted) for k in out if k >= len(search.accepted)]
-            if not bad:
-                search.composite, whole, after, search.accepted = fit, again, left, names
-                for term in more:
-                    search.rivals.setdefault(term.NAME, [])
-                break
-            more = [term for k, term in enumerate(more) if k not in bad]
-    return whole, after

@@ -1,108 +1,133 @@
 """
 The search for causes: which ones a recording shows.
 
-Candidates are fitted, scored and criticised again, one round after the other.  Measured
-inputs come before anything latent; a cause stays only while it is needed beside the
-others; causes that do as well are named as its alternatives.  What is tried, accepted
-and withdrawn is decided in `decision`.
+Every candidate of the catalogue is fitted beside the model so far, and the one of most evidence is
+accepted; then what is no longer worth its price goes, and a law of throttle in the place of
+another stays where it does better.  Measured inputs come before anything latent, which can
+imitate them; causes that do as well are named as alternatives.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 import math
 
 import numpy as np
-from ou_monitor.criticism.composite import Composite, view_of
+from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.null_bank import criticise, NullBank
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import Fitter, is_trend, Trial
-from ou_monitor.discovery.gain import BLOCKS, mean_difference
-from ou_monitor.discovery.load_start import choose_answer
-from ou_monitor.discovery.search_state import Search
-from ou_monitor.discovery.throttle_laws import compare_laws, LAWS, OTHER_CURVE, worth
+from ou_monitor.discovery.gain import BLOCKS
+from ou_monitor.discovery.regression import mean_answer
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.load_dependent import LoadDependentSigma
-from ou_monitor.model.terms.term import Role, Term
+from ou_monitor.model.terms.load_dependent import (
+    LoadDependentAlpha, LoadDependentNoise, LoadDependentSigma)
+from ou_monitor.model.terms.term import NEXT_TO_ZERO, Role, Term
 from ou_monitor.model.terms.tones import lines_of, Tone
+from ou_monitor.text import Z95
 
 Progress = Callable[[float], None]
 
+# Laws of throttle: in errors of one step each can stand for another.
+LAWS: tuple[type[Term], ...] = (LoadDependentSigma, LoadDependentNoise, LoadDependentAlpha)
+# Intensities that follow throttle: each may only mend the form of the other.
+_CURVES = {LoadDependentSigma.NAME: LoadDependentNoise.NAME,
+           LoadDependentNoise.NAME: LoadDependentSigma.NAME}
+# Nats that a fit of few rounds may lack.
+_ROUGH = 20.0
 # Time of one fit, s, up to which the mean is chosen anew after each cause.
 _SOON = 1.0
+# Turns in which lines are joined to a tone: three motors or converters, each with its harmonics;
+# and lines joined at once.
+_LINE_TURNS, _MOST_LINES = 3, 12
 
-# Turns in which lines are joined to a tone: three motors or converters, each with its harmonics.
-_LINE_TURNS = 3
+
+@dataclass(eq=False)
+class Search:
+    """State of the search."""
+
+    composite: Composite  # The model so far
+    accepted: list[str] = field(default_factory=list)  # Causes in the order of their acceptance
+    # For each cause, those that did as well in its round.
+    rivals: dict[str, list[str]] = field(default_factory=dict)
+    log: list[str] = field(default_factory=list)  # Trials and their results, one line each
+    # For each latent cause, the statistics before it was accepted.
+    asked: dict[str, Mapping[str, float]] = field(default_factory=dict)
+    stopped: bool = False  # Whether the search ended because it took too long
+
+    def copy(self) -> Search:
+        """Return a search that goes on from here and leaves this one as it is."""
+        return replace(self, accepted=list(self.accepted), rivals=dict(self.rivals),
+                       log=list(self.log), asked=dict(self.asked))
 
 
 def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
                 given: Sequence[str] = (), latent: bool = True,
                 progress: Progress | None = None) -> None:
     """Accept causes one after the other, the best first, beside those found so far."""
-    samples = fitter.samples
-    values = criticise(samples, search.composite, bank)
-    only, reformed = '', False
     for turn in range(decision.MOST):
         if progress is not None:
             progress(turn / decision.MOST)
-        trials, good = [], []
-        hidden = {kind for kind in kinds_of(search.accepted) if not kind.MEASURED}
-        deep = latent and len(hidden) < decision.MOST_LATENT
-        for tier in range(decision.TIERS if deep else 1):
-            # Measured inputs first: latent causes can imitate them, and cost more.
-            trials += fitter.trials(
-                search.composite, values, [*given, *search.hopeless, *_in_vain(search, values)],
-                tier, bank, only)
-            search.hopeless |= {trial.name for trial in trials
-                                if _only_form(fitter, trial, search)}
-            good = [trial for trial in trials if trial.name not in search.hopeless
-                    and _acceptable(trial, search, values)]
-            search.failed |= {
-                trial.name: decision.asks(catalogue()[trial.name], values) for trial in trials
-                if trial.evidence <= decision.ACCEPT}
-            if good:
-                break
-            if tier == 0 and not reformed and decision.any_off(values):
-                # Before a latent cause imitates what the form of a measured one leaves.
-                reformed = True
-                if _reform(fitter, search):
-                    values = criticise(samples, search.composite, bank)
-        if not good:
+        trials = _round(fitter, search, bank, given, latent)
+        if not trials:
             break
-        trials = fitter.refine(search.composite, trials)
-        named = {trial.name for trial in good}
-        name = decision.best_of([(trial.name, trial.evidence) for trial in trials
-                                 if trial.name in named])
-        best = next(trial for trial in trials if trial.name == name)
+        best = trials[0]
+        if decision.is_latent(catalogue()[best.name]):
+            search.asked[best.name] = criticise(fitter.samples, search.composite, bank)
         _accept(search, best, trials)
-        search.asked[best.name] = values
-        chosen = best.composite.gaussian.cost < _SOON
-        if chosen:
+        if best.composite.gaussian.cost < _SOON:
             choose_answer(fitter, search, ())
-        after = criticise(samples, search.composite, bank)
-        if best.name == Tone.NAME and _more_lines(fitter, search):
+        if best.name == Tone.NAME:
             # Beside the strongest the next ones show.
-            for _ in range(_LINE_TURNS - 1):
+            for _ in range(_LINE_TURNS):
                 if not _more_lines(fitter, search):
                     break
-            after = criticise(samples, search.composite, bank)
-        _prune(fitter, search, chosen)
-        kind = catalogue()[best.name]
-        if kind in LAWS or kind.ROLE is Role.NOISE:
-            compare_laws(fitter, search)
-            after = criticise(samples, search.composite, bank)
-        if decision.tier_of(kind, values) > 0 and not (
-                decision.helped(values, after) or decision.helped(values, after, kind)):
-            # The effect may not be in the catalogue; other terms would only imitate it.  One
-            # more term of the same kind may still be missing.
-            search.log.append(f'{best.name} leaves most of what is wrong')
-            if not kind.RECURS or only:
-                break
-            only = best.name
-        values = after
-    if fitter.cost <= decision.MOST_COST:
-        compare_laws(fitter, search)
+        backward(fitter, search)
     search.stopped = fitter.cost > decision.MOST_COST
+
+
+def backward(fitter: Fitter, search: Search) -> None:
+    """Take out or exchange causes, the move that is best first, while one of them pays."""
+    for _ in range(2 * decision.MOST):
+        if not _moved(fitter, search):
+            return
+
+
+def without_causes(fitter: Fitter, search: Search, out: Sequence[int]) -> Search | None:
+    """Return a search that has not accepted some of its causes; None where that has no fit."""
+    at = {position(search.composite, search.accepted, k) for k in out}
+    kept = [term for k, term in enumerate(search.composite.terms) if k not in at]
+    fit = fitter.fit(kept, None)
+    return None if fit is None else replace(search.copy(), composite=fit, accepted=[
+        name for k, name in enumerate(search.accepted) if k not in out])
+
+
+def choose_answer(fitter: Fitter, search: Search, start: Sequence[Term]) -> None:
+    """Choose the answers of the mean to what is measured anew, beside the noise found so far."""
+    composite = search.composite
+    answer = mean_answer(fitter.samples, composite, fitter.view(composite), start)
+    own = [term for term in composite.terms if decision.is_answer(type(term))]
+    shapes, others = ([term.with_linear([NEXT_TO_ZERO] * len(term.LINEAR)) for term in terms]
+                      for terms in (own, answer.terms))
+    if not start and len(shapes) == len(others) and all(one in shapes for one in others):
+        return
+    structural = [term for term in composite.terms
+                  if term.ROLE is not Role.LAW and not decision.is_answer(type(term))]
+    laws = [term for term in composite.terms if term.ROLE is Role.LAW]
+    gone = {term.NAME for term in own} - {term.NAME for term in answer.terms}
+    if gone and is_trend(fitter.samples, composite):
+        return
+    fit = fitter.fit([*structural, *answer.terms, *laws], composite)
+    if fit is None or (not start and fitter.evidence(fit) < fitter.evidence(composite)):
+        return
+    search.composite = fit
+    before = [name for name in search.accepted if decision.is_answer(catalogue()[name])]
+    names = [term.NAME for term in answer.terms]
+    search.accepted = [*names, *(name for name in search.accepted if name not in before)]
+    for term, worth, rivals in zip(answer.terms, answer.worth, answer.rivals, strict=True):
+        search.rivals[term.NAME] = list(rivals)
+        search.log.append(f'{term.NAME}: {worth:.1f} nats')
 
 
 def position(model: Composite, names: Sequence[str], k: int) -> int:
@@ -116,27 +141,44 @@ def kinds_of(names: Sequence[str]) -> list[type[Term]]:
     return [catalogue()[name] for name in names]
 
 
-def _acceptable(trial: Trial, search: Search, values: Mapping[str, float]) -> bool:
-    """Return whether a trial may be accepted."""
-    kind = catalogue()[trial.name]
-    new, old = trial.composite.density, search.composite.density
-    gains = [float(part.sum()) for part in np.array_split(new - old, BLOCKS)]
-    return decision.acceptable(
-        kind, trial.evidence, decision.is_ragged(values),
-        decision.is_throughout(*mean_difference(new, old), gains))
+def _round(fitter: Fitter, search: Search, bank: NullBank, given: Sequence[str], latent: bool
+           ) -> list[Trial]:
+    """
+    Return the trials of a round that may be accepted, the one to accept first.
+
+    A measured input comes before latent causes where its gain holds throughout: a few outliers
+    that coincide with one throttle by chance imitate an answer to it.
+    """
+    trials: list[Trial] = []
+    for first in (True, False)[:1 + latent]:
+        kinds = decision.kinds_to_try(
+            catalogue().values(), [type(term) for term in search.composite.terms], given,
+            fitter.samples.throttle is not None, first)
+        trials += [trial for trial in fitter.trials(
+            search.composite, kinds, lambda model: criticise(fitter.samples, model, bank))
+                   if trial.evidence > _price(fitter, search.composite, trial.name)]
+        steady = [trial for trial in trials if _is_steady(trial, search)]
+        if first and steady:
+            return steady
+    trials.sort(key=lambda trial: -trial.evidence)
+    # Time is measured: a trend comes before a latent cause that does as well.
+    return sorted(trials, key=lambda trial: not (
+        catalogue()[trial.name].MEASURED and trial.evidence > trials[0].evidence - decision.TIE))
 
 
-def _in_vain(search: Search, values: Mapping[str, float]) -> list[str]:
-    """Return the dear kinds that have failed, and that nothing asks for more than it did then."""
-    return [name for name, asked in search.failed.items() if catalogue()[name].DEAR
-            and decision.asks(catalogue()[name], values) <= asked]
+def _is_steady(trial: Trial, search: Search) -> bool:
+    gains = trial.composite.density - search.composite.density
+    return decision.is_shared([float(part.sum()) for part in np.array_split(gains, BLOCKS)], Z95)
 
 
-def _only_form(fitter: Fitter, trial: Trial, search: Search) -> bool:
-    """Return whether a curve over throttle may only mend the form of another one."""
-    other = OTHER_CURVE.get(trial.name, '')
-    return search.composite.has(other) and trial.evidence > decision.ACCEPT and (
-        trial.evidence < decision.FORM * worth(fitter, search.composite, other))
+def _price(fitter: Fitter, beside: Composite, name: str, least: float = decision.ACCEPT) -> float:
+    """Return the evidence that a cause must bring beside a model, at least, nats."""
+    other = _CURVES.get(name, '')
+    if not beside.has(other):
+        return least
+    less = _without(fitter, beside, other)
+    worth = fitter.evidence(beside) - (0.0 if less is None else fitter.evidence(less))
+    return max(least, decision.CURVE * worth)
 
 
 def _accept(search: Search, best: Trial, trials: Sequence[Trial]) -> None:
@@ -148,7 +190,6 @@ def _accept(search: Search, best: Trial, trials: Sequence[Trial]) -> None:
                                   if t is not best))
     search.composite = best.composite
     search.accepted += [name for name in (best.beside, best.name) if name]
-    search.largest = max(search.largest, best.evidence)
 
 
 def _more_lines(fitter: Fitter, search: Search) -> bool:
@@ -158,7 +199,7 @@ def _more_lines(fitter: Fitter, search: Search) -> bool:
     # An amplitude, a phase, and what was searched for the frequency.
     price = math.log(samples.train.stop) + Tone.SEARCH
     # A line of the scores, which have variance 1, gains n rms^2 / 2 nats.
-    lines = [Tone.at(line, view) for line in lines_of(view)[:decision.MOST_LINES]
+    lines = [Tone.at(line, view) for line in lines_of(view)[:_MOST_LINES]
              if 0.5 * samples.n * line.rms ** 2 > price + decision.ACCEPT]
     fit = fitter.join(composite, lines, rough=True) if lines else None
     if fit is None or (fitter.evidence(fit) - fitter.evidence(composite)
@@ -170,58 +211,71 @@ def _more_lines(fitter: Fitter, search: Search) -> bool:
     return True
 
 
-def _reform(fitter: Fitter, search: Search) -> bool:
-    """Look for better knots of sigma(throttle) beside all else; return whether there are any."""
-    composite = search.composite
-    index = next((k for k, term in enumerate(composite.terms)
-                  if isinstance(term, LoadDependentSigma)), None)
-    if index is None:
+@dataclass(frozen=True)
+class _Move:
+    """A model without a cause, or with another one in its place."""
+
+    name: str  # Of the cause
+    instead: str  # Name of the other one; empty where it goes
+    model: Composite
+    gain: float  # By what its evidence is more than it has to be, nats
+
+
+def _moved(fitter: Fitter, search: Search) -> bool:
+    """Take out or exchange one cause, the move that is best; return whether there was one."""
+    value, moves = fitter.evidence(search.composite), []
+    names = dict.fromkeys(name for name in search.accepted
+                          if not decision.is_answer(catalogue()[name]))
+    swapped: dict[str, list[str]] = {name: [] for name in names if catalogue()[name] in LAWS}
+    for name in names:
+        less = _without(fitter, search.composite, name)
+        if less is None:
+            continue
+        needed = _price(fitter, less, name, decision.TIE)
+        if value - fitter.evidence(less) < needed + _ROUGH:
+            less = _in_full(fitter, less)
+        if fitter.holds(less):
+            moves.append(_Move(name, '', less, needed - value + fitter.evidence(less)))
+        for kind in _instead(less, name):
+            found = fitter.best_start(less, kind, fitter.view(less))
+            if found is None or fitter.evidence(found) < value - _ROUGH or not fitter.holds(found):
+                continue
+            found = _in_full(fitter, found)
+            moves.append(_Move(name, kind.NAME, found, fitter.evidence(found) - value))
+            if moves[-1].gain > -decision.TIE and kind.NAME != name:
+                swapped[name].append(kind.NAME)
+    best = max(moves, default=None, key=lambda move: move.gain)
+    if best is None or not best.gain > 0.1:
+        for name, others in swapped.items():
+            search.rivals[name] = others
         return False
-    term = composite.terms[index]
-    assert isinstance(term, LoadDependentSigma)
-    # Its scores before any law of the noise.
-    gaussian = composite.gaussian
-    view = view_of(fitter.samples, gaussian, gaussian.z, fitter.samples.train)
-    for start in term.candidates(term.relative(view)):
-        terms = [*composite.terms[:index], start, *composite.terms[index + 1:]]
-        fit = fitter.fit(terms, composite)
-        if fit is not None and fitter.evidence(fit) > (
-                fitter.evidence(search.composite) + decision.TIE):
-            search.composite = fit
-    return search.composite is not composite
+    at = len(search.accepted) - 1 - search.accepted[::-1].index(best.name)
+    search.accepted[at:at + 1] = [best.instead] if best.instead else []
+    search.accepted = [name for name in search.accepted if best.model.has(name)]
+    search.log.append(f'{best.instead or "nothing"} in place of {best.name}: {best.gain:.1f} nats')
+    search.composite = best.model
+    return True
 
 
-def _prune(fitter: Fitter, search: Search, chosen: bool) -> None:
-    """
-    Take out causes that are not needed beside those accepted since.
+def _instead(less: Composite, name: str) -> list[type[Term]]:
+    """Return what may stand in the place of a law of throttle: another one, or other knots."""
+    return [kind for kind in LAWS if kind.NAME in catalogue() and not less.has(kind.NAME)
+            and (kind.CHANGES is None or less.has(kind.CHANGES.NAME))
+            and (kind.NAME != name or kind is LoadDependentSigma)
+            ] if catalogue()[name] in LAWS else []
 
-    chosen: whether the regression has just decided on the answers to what is measured.
-    """
-    full = fitter.evidence(search.composite)
-    last = catalogue()[search.accepted[-1]]
-    for name in dict.fromkeys(search.accepted[:-1]):
-        kind = catalogue()[name]
-        if not decision.in_doubt(kind, last) or (chosen and decision.is_answer(kind)):
-            continue
-        index = next(k for k, term in enumerate(search.composite.terms) if term.NAME == name)
-        kept = [term for k, term in enumerate(search.composite.terms) if k != index]
-        same = search.composite if search.composite.terms[index].ROLE is not Role.LAW else None
-        less = fitter.fit(kept, same, rough=True)
-        needed = decision.needed_evidence(kind)
-        if less is not None and full - fitter.evidence(less) < needed + decision.ROUGH:
-            less = fitter.fit(kept, less)
-        if less is None or not full - fitter.evidence(less) < needed or not fitter.holds(less):
-            continue
-        if decision.is_answer(kind) and is_trend(fitter.samples, less):
-            # The `ou` has taken its place: a trend, and no relaxation any more.
-            continue
-        plain = fitter.simplest(search.composite, index)
-        if plain is not None and fitter.evidence(plain) - fitter.evidence(less) > needed:
-            search.log.append(f'{name} in a simpler form')
-            search.composite, full = plain, fitter.evidence(plain)
-            continue
-        lost = full - fitter.evidence(less)
-        search.log.append(f'{name} is not needed any more: {lost:.1f}')
-        search.composite, full = less, fitter.evidence(less)
-        search.accepted.remove(name)
-        search.removed.append(name)
+
+def _without(fitter: Fitter, composite: Composite, name: str) -> Composite | None:
+    """Return the fit without the last term of a name, and without what changes it."""
+    terms = list(composite.terms)
+    del terms[max(k for k, term in enumerate(terms) if term.NAME == name)]
+    kinds = {type(term) for term in terms}
+    terms = [term for term in terms if term.CHANGES is None or term.CHANGES in kinds]
+    law = catalogue()[name].ROLE is Role.LAW
+    return fitter.fit(terms, None if law else composite, rough=True)
+
+
+def _in_full(fitter: Fitter, found: Composite) -> Composite:
+    """Return the better of a rough fit and one in full."""
+    full = fitter.fit(found.terms, found)
+    return full if full is not None and fitter.evidence(full) > fitter.evidence(found) else found

@@ -16,17 +16,14 @@ from ou_monitor.analysis.level_result import fit_level, fit_parts
 from ou_monitor.analysis.levels import LoadLevel, Stay
 from ou_monitor.criticism.battery import statistics
 from ou_monitor.criticism.composite import (
-    Composite, covariates_of, fit_composite, pole_beside, view_of)
-from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, other_pole, OtherPole
+    covariates_of, fit_composite, view_of)
+from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, other_pole
 from ou_monitor.criticism.integrity import examine
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
-from ou_monitor.discovery.decision import kinds_to_try, poles_shown, settled
-from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.model.spectral_lines import FALSE_ALARM, find_lines, on_grid
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ac_coupling import ACCoupling
-from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_dependent import LoadDependentAlpha, LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
@@ -138,45 +135,6 @@ def fitted(*terms, throttle=None, seed=0):
     voltage = SupplyModel((RAIL, *terms)).simulate(T, np.random.default_rng(seed), throttle)
     samples = Samples(T, voltage, throttle)
     return samples, fit_composite(samples, [RAIL], slice(0, N))
-
-
-@pytest.mark.parametrize('terms, shown', [
-    ((), set()), ((SLOW,), {'second_relaxation'}), ((COUPLED,), {'ac_coupling'})])
-def test_discover_tries_the_pole_that_analyze_reports(terms, shown):
-    """The test of a level and that of the search: the same question, the same answer."""
-    samples, composite = fitted(*terms)
-    level = as_one_level(Recording(samples.t, samples.voltage, np.full(N, NAN), 'same'))
-    pole = pole_beside(samples, composite)
-    # One level, one family of one: Holm leaves its p-values as they are.
-    of_level = level.shape['second_relaxation']
-    assert pole.second == (of_level.p_value < FAMILY_WISE and of_level.effect >= 0.1)
-    assert pole.coupled == level.coupled
-    assert Fitter(samples).poles_shown(composite) == shown
-    # Shown, it is tried though no statistic asks for it.
-    tried = kinds_to_try(catalogue().values(), [OU], {'band 1': 0.0}, (), 2, False, shown)
-    assert {kind.NAME for kind in tried} == shown
-    quiet = {'band 1': 0.0}
-    for kind in (SecondRelaxation, ACCoupling):
-        tone = catalogue()['tone']
-        assert settled(tone, quiet, kind) and not settled(tone, quiet, kind, {kind.NAME})
-
-
-def test_a_pole_in_the_model_is_not_tested_for():
-    """Its states change the spectrum that the test is about."""
-    samples, plain = fitted(SLOW)
-    assert pole_beside(samples, plain).second
-    both = fit_composite(samples, [RAIL, SLOW], slice(0, N))
-    assert isinstance(both, Composite) and math.isnan(pole_beside(samples, both).second_p)
-
-
-@pytest.mark.parametrize('pole, shown', [
-    (OtherPole(), set()),
-    (OtherPole(0.0099, 0.1, 1.0), {'second_relaxation'}), (OtherPole(0.0101, 0.1, 1.0), set()),
-    (OtherPole(0.0001, 0.099, 1.0), set()),
-    (OtherPole(1.0, NAN, 0.0099), {'ac_coupling'}), (OtherPole(1.0, NAN, 0.0101), set())])
-def test_the_threshold_of_a_pole(pole, shown):
-    """One in a hundred, and a tenth of Var_inf for a second relaxation."""
-    assert poles_shown(pole) == shown
 
 
 def over_throttle(*terms, seed):

@@ -6,14 +6,11 @@ import math
 import numpy as np
 from numpy.testing import assert_allclose
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discovery import decision
 from ou_monitor.discovery.finding import Cause, Criticism, Verdict
 from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.gain import crossings
 from ou_monitor.discovery.words import cause_rows, coupling_note, verdict_sentence
-from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.term import Role
 from ou_monitor.model.terms.tones import Tone
 import pytest
 from scipy.signal import lfilter
@@ -59,42 +56,6 @@ def test_each_verdict_has_its_sentence(verdict, begin, gain, left):
     assert text.startswith(begin) and ('mnat' in text) == gain
     assert ('lopsided' in text) == (left and verdict in (Verdict.UNEXPLAINED,
                                                          Verdict.PARTLY_EXPLAINED))
-
-
-QUIET = {'kurtosis': 0.0, 'small errors lag 1': 0.0}
-SHAPED = {'kurtosis': decision.OUTLIERS + 0.1, 'small errors lag 1': 0.0}
-HISS = {**SHAPED, 'small errors lag 1': decision.WHITE - 0.1}
-
-
-@pytest.mark.parametrize('kind', [kind for kind in catalogue().values()
-                                  if kind.NAME != 'ou' and kind.SIGNS], ids=lambda k: k.NAME)
-def test_a_kind_has_its_turn(kind):
-    """Measured inputs and certain white noise first; laws before the rest where outliers are."""
-    turns = [decision.tier_of(kind, values) for values in (QUIET, SHAPED, HISS)]
-    wanted = ([0, 0, 0] if kind.MEASURED else [0, 1, 0] if kind.ROLE is Role.NOISE else
-              [2, 1, 1] if kind.ROLE is Role.LAW else [2, 2, 2])
-    assert turns == wanted
-    for name, clear in kind.CLEAR_ABOVE.items():
-        assert decision.tier_of(kind, {**QUIET, name: clear + 0.1}) == 0
-
-
-def test_a_clear_trial_spares_a_dear_kind_of_another_family():
-    """Only where the statistics that it leaves are known, calm, and ask for nothing."""
-    dear = [kind for kind in catalogue().values() if kind.DEAR and kind.SIGNS]
-    assert dear
-    for kind in dear:
-        tried = next(one for one in catalogue().values() if one.FAMILY != kind.FAMILY
-                     and not decision.imitate(kind, one) and one.NAME != 'ou' and not one.DEAR)
-        calm = {'skewness': 0.0}
-        sign = kind.SIGNS[0]
-        asking = {sign.lstrip('+-'): (-1.0 if sign[0] == '-' else 1.0) * (decision.ASK_DEAR + 9.0)}
-        assert decision.settled(tried, calm, kind)
-        assert not decision.settled(tried, None, kind)
-        assert not decision.settled(tried, asking, kind)
-        assert not decision.settled(tried, calm, kind, {kind.NAME})
-        assert not decision.settled(tried, {'x': decision.OFF + 0.1}, kind)
-        assert not decision.settled(kind, calm, kind)
-        assert not decision.settled(kind, calm, tried)
 
 
 def test_crossings_count_falls_between_scored_neighbours():

@@ -8,15 +8,12 @@ import numpy as np
 from ou_monitor import discover
 from ou_monitor.analysis.level_result import fit_level
 from ou_monitor.analysis.levels import LoadLevel, Stay
-from ou_monitor.criticism.composite import Composite, covariates_of, fit_composite
-from ou_monitor.criticism.null_bank import criticise, simulate_bank
+from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
-from ou_monitor.discovery import decision
 from ou_monitor.discovery.errors import standard_errors
 from ou_monitor.discovery.fitting import Fitter
-from ou_monitor.discovery.named import _in_doubt, _kept_beside, _other
-from ou_monitor.discovery.search_state import Search
+from ou_monitor.discovery.named import _in_doubt, _other, _SURE
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
@@ -43,7 +40,7 @@ def test_only_a_sure_line_is_never_withdrawn(amplitude, stays):
     samples = Samples(T, voltage(Tone(amplitude, 13.0, 0.5, 0.0)), None)
     whole = fit_composite(samples, [RAIL, Tone(0.0, 13.0, 0.0, 0.0)], slice(0, samples.n))
     error = standard_errors(samples, whole, slice(0, samples.n))[1]['amplitude']
-    assert (amplitude > decision.SURE * error) == stays
+    assert (amplitude > _SURE * error) == stays
     assert _in_doubt(samples, whole, ['tone'], [0]) == ([] if stays else [0])
 
 
@@ -77,18 +74,6 @@ def test_ringing_that_dies_out_before_it_turns_is_something_else(damping, other)
     gaussian = evaluate(samples, terms)
     whole = Composite(terms, ({}, {}), gaussian, gaussian.z, gaussian.density, 6, 0.0)
     assert _other(Fitter(samples), whole, ['resonance']) == other
-
-
-def test_lines_are_put_back_together():
-    """One at a time each would leave what the other explains, and go again."""
-    tones = [Tone(0.05, 13.0, 0.5, 0.0), Tone(0.04, 7.0, 0.5, 0.0)]
-    samples = Samples(T, voltage(*tones), None)
-    start = fit_composite(samples, [RAIL], samples.train)
-    bank = simulate_bank(covariates_of(samples, start), float(start.gaussian.phi[1]),
-                         np.random.default_rng(0))
-    search = Search(start)
-    _kept_beside(Fitter(samples), search, tones, criticise(samples, start, bank), bank)
-    assert search.accepted == ['tone', 'tone']
 
 
 @pytest.mark.parametrize('frequency, terms', [

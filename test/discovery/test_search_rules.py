@@ -3,11 +3,12 @@
 from types import SimpleNamespace
 
 import numpy as np
+from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision, fitting, search as rules
 from ou_monitor.discovery.fitting import Fitter, Trial
-from ou_monitor.discovery.search_state import Search
-from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.discovery.search import Search
+from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.load_dependent import LoadDependentNoise, LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
@@ -69,40 +70,42 @@ def searched(*names):
 @pytest.mark.parametrize('without, stays', [
     (20.0, False), (17.5, False), (17.0, True), (16.5, True), (5.0, True), (None, True)])
 def test_a_cause_that_others_replace_is_taken_out(without, stays):
-    """It must bring three nats beside the last one; a rough fit near that is made a fine one."""
+    """It must bring three nats beside the others; a rough fit near that is made a fine one."""
     search = searched('measurement_noise', 'second_relaxation')
-    fitter = Table({('second_relaxation',): without})
-    fitter.simplest = lambda composite, index: None
-    needed = decision.needed_evidence(MeasurementNoise)
-    assert needed == 3.0 and decision.in_doubt(MeasurementNoise, SecondRelaxation)
-    rules._prune(fitter, search, chosen=False)
+    fitter = Table({('second_relaxation',): without, ('measurement_noise',): 0.0, (): -99.0})
+    rules.backward(fitter, search)
     assert ('measurement_noise' in search.accepted) is stays
-    assert search.removed == ([] if stays else ['measurement_noise'])
     assert search.composite.has('measurement_noise') is stays
     # Rough first; then in full, unless it is far off or there is none.
-    near = without is not None and 20.0 - (without - 1.0) < needed + decision.ROUGH
-    assert fitter.asked == [(('second_relaxation',), rough)
-                            for rough in ([True, False] if near else [True])]
+    near = without is not None and 20.0 - (without - 1.0) < decision.TIE + 20.0
+    assert fitter.asked[:2] == [(('second_relaxation',), rough) for rough in (True, False)][
+        :1 + near] + ([] if near else [(('measurement_noise',), True)])
 
 
-def test_a_cause_may_stay_in_its_simplest_form():
-    """Where that brings what the whole one does not, nothing is removed."""
+def test_the_move_that_pays_most_comes_first():
+    """Of two causes that could go the one whose loss costs less, and then no other."""
     search = searched('measurement_noise', 'second_relaxation')
-    plain = Model(search.composite.terms, 21.5)
-    fitter = Table({('second_relaxation',): 18.0})
-    fitter.simplest = lambda composite, index: plain if index == 1 else None
-    rules._prune(fitter, search, chosen=False)
-    assert search.composite is plain and search.removed == []
-    assert search.log == ['measurement_noise in a simpler form']
+    rules.backward(Table({('second_relaxation',): 18.0, ('measurement_noise',): 19.0,
+                          (): 5.0}), search)
+    assert search.accepted == ['measurement_noise'] and search.composite.worth == 19.0
 
 
-def test_the_last_one_and_answers_just_chosen_are_not_in_doubt():
+def test_what_changes_a_term_goes_with_it():
+    """Noise that follows throttle is nothing without white noise."""
+    law = LoadDependentNoise((0.0, 0.0), (0.0, 1.0), (0.0, 0.5))
+    search = Search(Model([BASE, NOISE, law], 20.0), [NOISE.NAME, law.NAME])
+    fitter = Table({(): 19.0, ('measurement_noise',): 0.0})
+    fitter.best_start = lambda composite, kind, view: None
+    rules.backward(fitter, search)
+    assert search.accepted == [] and search.composite.terms == (BASE,)
+
+
+def test_answers_of_the_mean_are_left_to_the_regression():
     """Nothing is fitted for them."""
-    search = Search(Model([BASE, LoadSag(0.1, 0.0), SLOW], 20.0),
-                    ['load_sag', 'second_relaxation'])
+    search = Search(Model([BASE, LoadSag(0.1, 0.0)], 20.0), ['load_sag'])
     fitter = Table({})
-    rules._prune(fitter, search, chosen=True)
-    assert fitter.asked == [] and search.accepted == ['load_sag', 'second_relaxation']
+    rules.backward(fitter, search)
+    assert fitter.asked == [] and search.accepted == ['load_sag']
 
 
 def trial(name, evidence, *terms):
@@ -110,19 +113,20 @@ def trial(name, evidence, *terms):
     return Trial(name, Model([BASE, *terms], 10.0 + evidence), evidence)
 
 
-def test_trials_near_the_best_are_fitted_again():
-    """Laws are fitted in full anyway; what a full fit makes worse stays as it was."""
-    fitter = Table({('measurement_noise',): 26.0, ('second_relaxation',): 14.0, ('drift',): 30.0})
-    top = 15.0
-    given = [trial('measurement_noise', top, NOISE), trial('second_relaxation', top - 1.0, SLOW),
-             trial('heavy_tails', top - 0.5),
-             trial('drift', top - decision.ROUGH, Drift(0.1, 0.0))]
-    found = fitter.refine(Model([BASE], 10.0), given)
-    assert fitter.asked == [(('measurement_noise',), False), (('second_relaxation',), False)]
+def test_the_best_glances_are_fitted_in_full():
+    """Those that gain at least half as much as the best; what a full fit makes worse stays."""
+    kinds = {MeasurementNoise: NOISE, LoadDependentSigma: SIGMA, Drift: Drift(0.1, 0.0)}
+    fitter = Table({('measurement_noise',): 26.0, ('load_dependent_sigma',): 14.0})
+    rough = {MeasurementNoise: 25.0, LoadDependentSigma: 24.0, Drift: 17.0, Tone: 9.0}
+    fitter.view = lambda composite: SimpleNamespace(
+        z=np.zeros(9), variance=np.full(9, 1e-4), at=np.array([0.0, 1e3]))
+    fitter.best_start = lambda composite, kind, view, least: Model(
+        [BASE, kinds.get(kind, NOISE)], rough[kind])
+    found = fitter.trials(Model([BASE], 10.0), list(rough), lambda model: {})
+    assert fitter.asked == [(('measurement_noise',), False), (('load_dependent_sigma',), False)]
     assert [(one.name, one.evidence) for one in found] == [
-        ('measurement_noise', 16.0), ('heavy_tails', 14.5), ('second_relaxation', 14.0),
-        ('drift', top - decision.ROUGH)]
-    assert found[0].composite.worth == 26.0 and found[2].composite.worth == 24.0
+        ('measurement_noise', 16.0), ('load_dependent_sigma', 14.0)]
+    assert found[0].composite.worth == 26.0 and found[1].composite.worth == 24.0
 
 
 @pytest.mark.parametrize('held, best', [
@@ -169,25 +173,6 @@ def test_what_scores_explain():
     assert fitting._by_scores(samples, [sag, drift], view) == [sag, drift]
 
 
-def test_the_simplest_form_has_fewer_parameters(monkeypatch):
-    """It is fitted in the place of the whole one; None where it is that already."""
-    wide = LoadDependentSigma((0.0, 0.5, 1.0), (0.0, 0.3, 0.5))
-    forms = [wide, SIGMA]
-    monkeypatch.setattr(LoadDependentSigma, 'simplest', classmethod(lambda cls, view: forms))
-    fitter = Table({('load_dependent_sigma', 'measurement_noise'): 1.0})
-    found = fitter.simplest(Model([BASE, wide, NOISE], 0.0), 1)
-    assert found.terms == (BASE, SIGMA, NOISE)
-    assert fitter.simplest(Model([BASE, SIGMA, NOISE], 0.0), 1) is None
-    forms.clear()
-    assert fitter.simplest(Model([BASE, wide, NOISE], 0.0), 1) is None
-
-
-@pytest.mark.parametrize('term, size', [(NOISE, 1), (SLOW, 2), (LoadSag(0.1, 0.2), 2)])
-def test_the_number_of_parameters_fitted(term, size):
-    """Those that the search moves, and those that are linear."""
-    assert fitting._size(term) == size
-
-
 def test_positions_of_causes_that_recur():
     """The n-th of a kind is the n-th of the model."""
     tones = [Tone(0.01, 10.0 * k, 0.0, 0.0) for k in (1, 2)]
@@ -196,47 +181,33 @@ def test_positions_of_causes_that_recur():
     assert [rules.position(model, names, k) for k in range(3)] == [1, 2, 3]
 
 
-@pytest.mark.parametrize('evidence, only', [(9.9, True), (10.1, False)])
-def test_a_curve_that_mends_another_one(evidence, only):
-    """Below a share of what the other one explains it may only mend its form."""
-    search = Search(Model([BASE, NOISE, SIGMA], 500.0), ['load_dependent_sigma'], largest=1e6)
+@pytest.mark.parametrize('name, price', [
+    ('load_dependent_noise', 10.0), ('drift', 6.0), ('load_dependent_sigma', 6.0)])
+def test_a_curve_that_may_only_mend_another_one(name, price):
+    """It must bring a tenth of what the other one explains."""
     # A rough fit of the table is a nat worse.
-    fitter = Table({('measurement_noise',): 501.0 - 10.0 / decision.FORM})
-    one = Trial('load_dependent_noise', Model([BASE], 0.0), evidence)
-    assert rules._only_form(fitter, one, search) is only
-    assert not rules._only_form(fitter, Trial('drift', Model([BASE], 0.0), evidence), search)
-    alone = Search(Model([BASE], 0.0), [])
-    assert not rules._only_form(fitter, one, alone)
-    assert LoadDependentNoise.NAME in rules.OTHER_CURVE
+    fitter = Table({('measurement_noise',): 401.0})
+    assert rules._price(fitter, Model([BASE, NOISE, SIGMA], 500.0), name) == pytest.approx(price)
+    assert rules._price(fitter, Model([BASE], 0.0), 'load_dependent_noise') == decision.ACCEPT
 
 
 def test_a_trial_that_is_accepted():
     """With what comes beside it, its rivals, and the largest evidence so far."""
-    search = Search(Model([BASE], 0.0), ['tone'], largest=12.0)
+    search = Search(Model([BASE], 0.0), ['tone'])
     best = Trial('ac_coupling', Model([BASE], 9.0), 9.0, beside='measurement_noise')
     other = Trial('drift', Model([BASE], 8.9), 9.0 - 0.5 * decision.TIE)
     rules._accept(search, best, [best, other, Trial('tone', Model([BASE], 0.0), 0.1)])
     assert search.accepted == ['tone', 'measurement_noise', 'ac_coupling']
-    assert search.rivals == {'ac_coupling': ['drift']} and search.largest == 12.0
+    assert search.rivals == {'ac_coupling': ['drift']}
     assert search.composite is best.composite
     rules._accept(search, other, [other])
-    assert search.rivals['drift'] == [] and search.largest == 12.0
-
-
-def test_dear_kinds_fail_until_something_asks_for_more():
-    """Cheap ones are tried again each time."""
-    dear = next(kind for kind in catalogue().values() if kind.DEAR and kind.SIGNS)
-    sign = dear.SIGNS[0]
-    by = -1.0 if sign[0] == '-' else 1.0
-    search = Search(Model([BASE], 0.0), failed={dear.NAME: 6.0, 'measurement_noise': 99.0})
-    assert rules._in_vain(search, {sign.lstrip('+-'): 5.9 * by}) == [dear.NAME]
-    assert rules._in_vain(search, {sign.lstrip('+-'): 6.1 * by}) == []
+    assert search.rivals['drift'] == []
 
 
 def test_starts_that_the_spectrum_moved_the_same_way_are_one(monkeypatch):
     """The best of those that hold are fitted, roughly and from there on."""
     starts = [SecondRelaxation(float(k), 0.1) for k in range(1, 6)]
-    gains = dict(zip(starts, (5.0, 4.95, 3.0, 9.0, 2.0)))
+    gains = dict(zip(starts, (9.0, 8.95, 7.0, 19.0, 5.9)))
     monkeypatch.setattr(fitting, 'from_spectrum', lambda samples, composite, terms: (
         terms, gains[terms[-1]]))
     monkeypatch.setattr(SecondRelaxation, 'holds', lambda self, view: self.alpha != 4.0)
@@ -247,7 +218,19 @@ def test_starts_that_the_spectrum_moved_the_same_way_are_one(monkeypatch):
         return Model(terms, -terms[-1].alpha)
 
     fitter.fit = fit
-    found = fitter._by_spectrum(Model([BASE], 0.0), starts, None)
-    # 4 does not hold, and 2 went the way of 1.
+    found = fitter._by_spectrum(Model([BASE], 0.0), starts, None, 0.0)
+    # 4 does not hold, 2 went the way of 1, and 5 gains less than any price.
     assert asked == [(1.0, True, True), (3.0, True, True)]
     assert found.terms[-1].alpha == 1.0
+
+
+def test_no_statistic_admits_a_cause():
+    """White noise that no score is a sign of is found by what it gains."""
+    t = np.arange(4000) * 1e-2
+    voltage = SupplyModel((OU(3.0, 0.1, 5.0), MeasurementNoise(0.01))).simulate(
+        t, np.random.default_rng(3))
+    samples = Samples(t, voltage, None)
+    plain = fit_composite(samples, [OU(3.0, 0.1, 5.0)], samples.train)
+    (found,) = Fitter(samples).trials(plain, [MeasurementNoise], lambda model: {})
+    assert found.name == 'measurement_noise' and found.evidence > decision.ACCEPT
+    assert found.composite.terms[1].std == pytest.approx(0.01, rel=0.15)

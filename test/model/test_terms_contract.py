@@ -272,8 +272,6 @@ def test_what_the_search_and_the_live_risk_know():
     assert {n: c.MAY_LEAVE for n, c in kinds.items() if c.MAY_LEAVE} == MAY_LEAVE
     assert {n: c.STATES for n, c in kinds.items() if c.STATES} == STATES
     assert {n for n, c in kinds.items() if c.LIVE} == BY_THROTTLE
-    assert {n: dict(c.CLEAR_ABOVE) for n, c in kinds.items() if c.CLEAR_ABOVE} == {
-        'throttle_tone': {'order line': 10.0}}
     assert {n: c.LEAST_SHARE for n, c in kinds.items() if c.LEAST_SHARE} == {'drift': 0.02}
     assert {n: c.REFUTED_BY for n, c in kinds.items() if c.REFUTED_BY} == {
         'resonance': ('bursts', 'products of three')}

@@ -8,13 +8,13 @@ import numpy as np
 from ou_monitor import discover
 from ou_monitor.analysis.level_tests import examine_level, holm
 from ou_monitor.criticism.battery import statistics
-from ou_monitor.criticism.composite import (
-    covariates_of, fit_composite, pole_beside, view_of)
+from ou_monitor.criticism.composite import covariates_of, fit_composite, view_of
 from ou_monitor.criticism.curves import compare_curves
 from ou_monitor.criticism.integrity import examine
 from ou_monitor.criticism.null_bank import criticise, simulate_bank, simulate_bank_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, Events, fit_gaussian
+from ou_monitor.discovery.decision import kinds_to_try
 from ou_monitor.discovery.errors import standard_errors
 from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.gain import (
@@ -71,7 +71,6 @@ def terms():
         if one.ROLE is not Role.EXACT and name != 'ou':
             view = view_at(samples_of(4000, *more), *beside, share=0.8)
             part['candidates'] = [table(other.values()) for other in type(one).candidates(view)]
-            part['simplest'] = [table(other.values()) for other in type(one).simplest(view)]
             part['holds'] = one.holds(view)
             part['beside'] = table(one.beside(term('ou', **OU)).values())
         found[name] = table(part)
@@ -158,9 +157,7 @@ def criticism():
         given = covariates_of(samples, plain)
         values = statistics(plain.z, given)
         part = {'plain': [plain.terms[0].values(), plain.se, plain.free, plain.score(samples)],
-                # Among glitches two shares are as likely: a rounding decides.
                 'statistics': values,
-                'pole': None if name == 'glitches' else pole_beside(samples, plain),
                 'first': statistics(plain.z, replace(given, throttle=None), lines=False)}
         # The likelihood of a second relaxation is flat: versions of SciPy differ by 1e-3.
         if others and others[0].ROLE is not Role.LAW and name != 'slow':
@@ -212,7 +209,7 @@ def discovery():
         scored = covered(samples)
         fitter = Fitter(samples)
         bank = simulate_bank(covariates_of(samples, plain), 0.94, np.random.default_rng(1), 4)
-        values = criticise(samples, plain, bank)
+        kinds = kinds_to_try(catalogue().values(), [type(plain.terms[0])], (), True, True)
         answer = mean_answer(samples, plain, fitter.view(plain), load_terms(samples))
         found[name] = table({
             'errors': standard_errors(samples, full, every),
@@ -226,7 +223,7 @@ def discovery():
             'load': [[one.NAME, one.values()] for one in load_terms(samples)],
             'answer': [[one.NAME for one in answer.terms], answer.worth, answer.rivals],
             'trials': [[one.name, float(one.evidence)] for one in fitter.trials(
-                plain, values, (), 0, bank)][:4]})
+                plain, kinds, lambda model: criticise(samples, model, bank))][:4]})
     return found
 
 

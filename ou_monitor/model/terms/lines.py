@@ -104,7 +104,10 @@ def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
         # The lowest bins are those of slow noise, not of ringing.
         density[:3] = 0.0
         at = int(np.argmax(density))
-        found.append((float(frequency[at]), 4.0 * math.pi * rate / length))
+        # A mean of exponentials, by its tail (Cramer), beside the bins that were looked at.
+        mean, segments = float(density[at] / np.median(density[3:])), z.size / length
+        if segments * (mean - 1.0 - math.log(max(mean, 1e-9))) > math.log(density.size):
+            found.append((float(frequency[at]), 4.0 * math.pi * rate / length))
     return found
 
 

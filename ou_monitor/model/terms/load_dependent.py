@@ -103,20 +103,6 @@ class LoadDependentSigma(Term):
         return [cls(tuple(knots.tolist()), tuple((factors - factors[0]).tolist()))
                 for _, knots, factors in forms[:2]]
 
-    def relative(self, view: View) -> View:
-        """Return scores as they are without this term, for candidates in its place."""
-        assert view.throttle is not None
-        factor = np.exp(np.interp(view.throttle, self.throttle, self.log_factor))
-        return replace(view, z=view.z * factor)
-
-    @classmethod
-    def simplest(cls, view: View) -> Sequence[Term]:
-        """Return a straight line."""
-        if view.throttle is None:
-            return ()
-        low, high = _ends(view.throttle).tolist()
-        return (cls((low, high), (0.0, 0.5)),) if high - low > _APART else ()
-
 
 # What the search for the edge of a step costs, nats: ln of the edges tried.
 _STEP_PRICE = 4.5

@@ -169,6 +169,7 @@ class ClockJitter(Term):
     FAMILY: ClassVar[str] = 'sensor'
     STAGE: ClassVar[Stage] = Stage.CLOCK
     ROLE: ClassVar[Role] = Role.LAW
+    DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis', 'clustering')
     IMITATES: ClassVar[tuple[str, ...]] = ('glitches', 'heavy_tails', 'jumps')
     MEANING: ClassVar[str] = 'Time stamps are off by a random amount.'

@@ -370,12 +370,14 @@ class _Mixture:
         ends = np.log(gammaincinv(half, _OUTSIDE)), np.log(gammainccinv(half, _OUTSIDE))
         gamma = np.exp(np.linspace(*ends, _POINTS))
         log = half * np.log(gamma) - gamma
-        weight = np.exp(log - log.max())
-        self._weight = weight / weight.sum()
+        # In logarithms, for among many degrees of freedom most weights vanish.
+        log -= log.max()
+        log -= math.log(float(np.exp(log).sum()))
+        self._weight = np.exp(log)
         self._factor = (half - 1.0) / gamma
         self._scale, self._square = scale, square
         self._variance = scale * scale * (1.0 + share[:, None] * (self._factor - 1.0))
-        log = np.log(self._weight) - 0.5 * (
+        log = log - 0.5 * (
             np.log(2.0 * math.pi * self._variance) + square[:, None] / self._variance)
         top = log.max(axis=1)
         self._density = np.exp(log - top[:, None])

@@ -98,13 +98,11 @@ class Term:
         Positive parameters found by maximum likelihood, on a log scale
         (`Role.DRIVE`, `BLOCK`, `NOISE`).
     SIGNS : tuple of str
-        Statistics that ask for this term, by the beginning of their names,
+        Statistics that show this term, by the beginning of their names,
         after + or - where only one direction does.
     MEASURED : bool
         Whether it answers to throttle or time alone, so that the search tries
         it before latent causes.
-    CLEAR_ABOVE : dict of str to float
-        Scores of statistics above which it is tried as early as those.
     IMITATES : tuple of str
         Causes that it imitates, and that imitate it: one beside the other would
         only refine its form.  It suffices that one of the two names the other.
@@ -124,7 +122,7 @@ class Term:
     APART : int
         Parameters that the term finds from the scores, and not the fit (`apart`).
     DEAR : bool
-        Whether a fit takes seconds, so that cheaper terms are tried first.
+        Whether a fit takes seconds, so that none is begun late in a search.
     BROAD : bool
         Whether its spectrum is broad and the same throughout, so that a fit starts from that of
         the scores (`Role.BLOCK`).
@@ -159,7 +157,6 @@ class Term:
     FREE: ClassVar[tuple[str, ...]] = ()
     SIGNS: ClassVar[tuple[str, ...]] = ()
     MEASURED: ClassVar[bool] = False
-    CLEAR_ABOVE: ClassVar[Mapping[str, float]] = {}
     IMITATES: ClassVar[tuple[str, ...]] = ()
     SEVERAL: ClassVar[bool] = False
     RECURS: ClassVar[bool] = False
@@ -229,11 +226,6 @@ class Term:
 
         """
         return ()
-
-    @classmethod
-    def simplest(cls, view: View) -> Sequence[Term]:
-        """Return starting points with the fewest parameters; the default are the candidates."""
-        return cls.candidates(view) if cls.ROLE is not Role.LAW else ()
 
     def holds(self, view: View) -> bool:
         """Return whether fitted parameters still mean what the name says; the default: yes."""

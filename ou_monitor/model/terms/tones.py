@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import ClassVar
@@ -247,9 +247,6 @@ class ThrottleTone(Term):
     STATES: ClassVar[int] = 2
     SEVERAL: ClassVar[bool] = True
     RECURS: ClassVar[bool] = True
-    # A line that is clearly there would pass for sigma or alpha that follow throttle; by
-    # chance no score is as high.
-    CLEAR_ABOVE: ClassVar[Mapping[str, float]] = {'order line': 10.0}
     MAY_LEAVE: ClassVar[float] = 0.3
     MEANING: ClassVar[str] = 'A line whose frequency follows throttle: commutation of the motors.'
     REMEDY: ClassVar[str] = 'Capacitance at the ESC; a notch that follows throttle.'
