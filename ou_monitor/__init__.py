@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ou_monitor.recordings.read import read_recording
     from ou_monitor.records import Estimate, Flag, Recording, Status
 
-__version__ = '0.2.0'
+__version__ = '0.3.0'
 
 _HOMES = {
     'AdaptiveLowPass': 'ou_monitor.online.filter.lowpass',
