@@ -9,7 +9,7 @@ cost: doc/estimation.md.
 
 `Relaxation` is `window: auto`: it keeps the readings of a minute, and `known_ou` of `ou_fit`,
 which serves `supply_facts` too, fits the shortest of 2, 8, 30 and 60 s in which alpha is known
-well.  A fit costs 50 to 400 ms of CPU, so it is made anew only after an eighth of its window, 1 s
+well.  A fit costs 30 to 600 ms of CPU, so it is made anew only after a quarter of its window, 1 s
 at least; in the background it runs in a thread, which takes 5 % of a core at most.
 
 Between two fits of a window of 2 s the sliding estimate of 2 s goes on from the fit as long as
@@ -61,7 +61,7 @@ _DOUBLE = np.dtype(np.float64)
 # Length of the sliding estimate beside the fit, s.
 SLIDING = OU_WINDOWS[0]
 # A fit is made anew after this share of its window, and no sooner than so many s.
-_SHARE, _SOONEST = 0.125, 1.0
+_SHARE, _SOONEST = 0.25, 1.0
 # Share of one core that fits in the background may take.
 _CPU = 0.05
 # What an estimate without a relaxation is called where the window is too short for a fit.
