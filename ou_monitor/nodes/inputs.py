@@ -149,10 +149,8 @@ class PolledInput:
         self._topic = node.resolve_topic_name(topic)
         self._input = node.create_polled(
             kind, topic, INPUT_QOS if spec.sample_rate is None else BLOCK_QOS)
-        self._reader = FieldReader(spec, definition_of(kind), lambda: self._decode, self._broken)
-        # A message that cannot be read is counted once.
-        self._beside = None if beside is None else FieldReader(
-            beside, definition_of(kind), lambda: self._decode, lambda index, error: None)
+        self._reader = FieldReader(spec, definition_of(kind), lambda: self._decode, self._broken,
+                                   beside)
         self._kind = kind
         self.publishers = Publishers()
         self.unreadable = 0
@@ -213,17 +211,11 @@ class PolledInput:
         table = Table(b''.join(data), np.zeros(ends.size, np.uint16),
                       np.arange(ends.size, dtype=np.uint64), begins, ends)
         column = self._reader.read(table)
-        beside = np.full(ends.size, np.nan)
-        if self._beside is not None:
-            other = self._beside.read(table)
-            single = other.count == 1
-            beside[other.log_time[single].astype(np.int64)] = other.values[
-                (np.cumsum(other.count) - 1)[single]]
         # In the place of log times: the number of each that could be read.
         read = np.flatnonzero(kept)[column.log_time.astype(np.int64)]
         return Arrivals(np.where(column.stamped, column.stamp, times[read]), column.stamped,
-                        column.count, column.values, received[read], arrived[read],
-                        beside[column.log_time.astype(np.int64)])
+                        column.counts, column.values, received[read], arrived[read],
+                        column.beside)
 
 
 def decode(data: bytes, kind: Any, topic: str) -> Any:

@@ -355,7 +355,8 @@ def parse_definition(kind: str, text: str) -> Definitions:
     return found
 
 
-def _reader(bag: BagReader, spec: FieldSpec, broken: Broken | None) -> FieldReader:
+def _reader(bag: BagReader, spec: FieldSpec, broken: Broken | None,
+            beside: FieldSpec | None) -> FieldReader:
     """Return the reader of a field of a topic of a bag; `broken` as of `batches`."""
     def refuse(log_time: int, error: InputError) -> None:
         raise InputError(f'{error} ({moment(log_time, bag.start_ns)}); use --partial to leave it '
@@ -366,15 +367,21 @@ def _reader(bag: BagReader, spec: FieldSpec, broken: Broken | None) -> FieldRead
     with suppress(Exception):
         definitions = parse_definition(spec.type, bag.definition(spec.type))
     return FieldReader(spec, definitions, functools.partial(bag.decoder, spec.type),
-                       broken or refuse)
+                       broken or refuse, beside)
 
 
 def batches(
     bag: BagReader, specs: Mapping[str, FieldSpec], *, end_ns: int | None = None,
     progress: Callable[[float], None] | None = None, broken: Broken | None = None,
+    beside: Mapping[str, FieldSpec] | None = None,
 ) -> Iterator[dict[str, FieldColumn]]:
-    """Yield fields of a bag by log time, batch by batch, at least to `end_ns`, ns."""
-    readers = {name: _reader(bag, spec, broken) for name, spec in specs.items()}
+    """
+    Yield fields of a bag by log time, batch by batch, at least to `end_ns`, ns.
+
+    `beside`: a second field of the messages of a name.
+    """
+    readers = {name: _reader(bag, spec, broken, (beside or {}).get(name))
+               for name, spec in specs.items()}
     pending: dict[str, list[FieldColumn]] = {name: [] for name in specs}
     counts = dict.fromkeys(specs, 0)
     topics = [spec.topic for spec in specs.values()]

@@ -3,27 +3,29 @@ The voltage samples of a bag with their throttle and current.
 
 A msg config fits by name when the bag has its topic (or one ending with it, as in a namespace)
 with its type; a generic one also fits by type when only one topic has it.  If several fit, the
-user must choose.  Limits: a bag is read whole; an hour at 1 kHz takes up to 420 MB.
+user must choose.  Limits: a bag is read whole; an hour at 1 kHz takes some 170 MB.
 """
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 import re
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagReader, batches
-from ou_monitor.recordings.cdr import FieldColumn, IntArray, join
+from ou_monitor.recordings.cdr import FieldColumn, join, TimeArray
 from ou_monitor.recordings.importers.log import RawColumns
 from ou_monitor.recordings.mcap_file import moment
 from ou_monitor.records import Defect, defect_of, FloatArray, Note
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
 from ou_monitor.stream.samples import BlockClock, ThrottleHold
 from ou_monitor.text import counted, printable, some
-from ou_monitor.timeline.line import MOST_CURRENT, MOST_THROTTLE
+from ou_monitor.timeline.line import MOST_CURRENT, MOST_THROTTLE, plausible
 
 
 @dataclass(frozen=True)
@@ -192,6 +194,8 @@ _WILD = 0.05
 
 def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None = None) -> None:
     """Refuse a throttle in percent, microseconds or counts, or swapped with the voltage."""
+    if plausible(throttle, MOST_THROTTLE) is throttle:
+        return
     known = throttle[np.isfinite(throttle)]
     # A few wild values are errors, not another unit: they become NaN, here as in the node.
     if float(np.count_nonzero(np.abs(known) > MOST_THROTTLE)) <= _WILD * known.size:
@@ -207,10 +211,10 @@ def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None =
         'a pulse of w microseconds into (w - 1000) / 1000')
 
 
-def known_current(current: FloatArray) -> FloatArray | None:
+def known_current(current: FloatArray | None) -> FloatArray | None:
     """Return a current with NaN for implausible values; None if all are."""
-    known = np.abs(current) <= MOST_CURRENT
-    return np.where(known, current, np.nan) if known.any() else None
+    known = None if current is None else plausible(current, MOST_CURRENT)
+    return None if known is None or np.isnan(known).all() else known
 
 
 def span_words(start: float | None, end: float | None) -> str:
@@ -262,40 +266,29 @@ def read_bag(
     first = 0 if start is None else _limit(bag, start)
     last = None if end is None else _limit(bag, end)
     # A current in the messages of the voltage belongs to the same message's voltage.
-    together = CURRENT in specs and specs[CURRENT].topic == specs[VOLTAGE].topic
-    parts: dict[str, list[FieldColumn]] = {name: [] for name in specs}
-    beside: list[FloatArray] = []
-    for batch in batches(bag, specs, end_ns=last, progress=progress,
+    own = CURRENT in specs and specs[CURRENT].topic == specs[VOLTAGE].topic
+    beside = {VOLTAGE: specs.pop(CURRENT)} if own else {}
+    supply = _Supply(specs, own)
+    for batch in batches(bag, specs, end_ns=last, progress=progress, beside=beside,
                          broken=leave_out if bag.partial else None):
         for name, column in batch.items():
             before, column = column.split(column.place(first))
-            if before.n and name != VOLTAGE and not (together and name == CURRENT):
-                # What was said last holds in the part.
-                parts[name] = ([] if np.isfinite(before.values).any() else parts[name]) + [before]
             if last is not None:
                 column, _ = column.split(column.place(last))
             batch[name] = column
-        current = batch.pop(CURRENT, None) if together else None
-        if together and VOLTAGE in batch:
-            beside.append(_beside(batch[VOLTAGE], current))
-        for name, column in batch.items():
-            parts[name].append(column)
-    columns = {}
-    while parts:
-        which, found = parts.popitem()
-        if found:
-            columns[which] = join(found)
+            if before.n and name != VOLTAGE:
+                supply.loads[name].before(before)
+        supply.take(batch)
     if broken:
         notes.append(Note(f"{counted(len(broken), 'message')} dropped, the first: {broken[0]}.",
                           Defect.DAMAGED_FILE))
     name = printable(bag.path.name)
-    if VOLTAGE not in columns or not columns[VOLTAGE].values.size:
+    if not supply.t:
         why = ' '.join(note for note in notes if defect_of(note).drops)
         if (start is None and end is None) or why:
             raise InputError(f'{name} holds no usable sample' + (f': {why}' if why else ''))
         raise InputError(outside_words(name, start, end, (bag.end_ns - bag.start_ns) * 1e-9))
-    return _paired(name, specs, columns, np.concatenate(beside) if together else None,
-                   _source(bag, choice, name), notes)
+    return supply.columns(name, _source(bag, choice, name), notes)
 
 
 def _specs(bag: BagReader, choice: TopicChoice) -> dict[str, FieldSpec]:
@@ -334,68 +327,102 @@ def _limit(bag: BagReader, at: float) -> int:
     return bag.start_ns + round(min(at * 1e9, float(bag.end_ns - bag.start_ns + 1)))
 
 
-def _beside(volts: FieldColumn, other: FieldColumn | None) -> FloatArray:
-    """Return another field of each message of the voltage; NaN where it is missing."""
-    found = np.full(volts.n, np.nan)
-    if other is not None:
-        single = other.count == 1
-        values = other.values[(np.cumsum(other.count) - 1)[single]]
-        if other.n == volts.n:
-            found[single] = values
-        elif values.size:
-            # In a damaged bag some messages lack one of them.
-            at = np.searchsorted(other.log_time[single], volts.log_time).clip(0, values.size - 1)
-            same = other.log_time[single][at] == volts.log_time
-            found[same] = values[at][same]
-    return found
+class _Load:
+    """Throttle or current from a topic of its own."""
+
+    def __init__(self, spec: FieldSpec, sample_rate: float | None) -> None:
+        self._spec = spec
+        self._clock = _clock(spec)
+        self.hold = ThrottleHold(sample_rate)
+        # Messages since the last voltage.
+        self.waiting: list[FieldColumn] = []
+        self.unknown = 0
+
+    def before(self, column: FieldColumn) -> None:
+        """Take messages before the part to read: what was said last holds in it."""
+        if np.isfinite(column.values).any():
+            self.waiting.clear()
+        self.waiting.append(column)
+
+    def take(self, log_time: TimeArray, ends: FloatArray, own: npt.NDArray[np.bool_]) -> None:
+        """Place what waits among the next voltage messages (ends in s)."""
+        at = values = np.empty(0)
+        stamped, before = np.empty(0, np.bool_), np.empty(0, np.int64)
+        if self.waiting:
+            column = join(self.waiting)
+            self.waiting.clear()
+            at, values = _stamps(self._clock, column), column.values
+            known = np.isfinite(at)
+            if self._spec.nan == 'drop':
+                finite = np.isfinite(values)
+                self.unknown += int(np.count_nonzero(~finite))
+                known &= finite
+            at, values = at[known], values[known]
+            stamped = np.repeat(column.stamped, column.counts)[known]
+            # At equal log times the throttle counts as earlier than the voltage.
+            before = np.searchsorted(
+                log_time, np.repeat(column.log_time, column.counts)[known], 'left')
+        self.hold.take(at, values, stamped, ends, own, before)
 
 
-def _paired(name: str, specs: dict[str, FieldSpec], columns: dict[str, FieldColumn],
-            beside: FloatArray | None, source: dict[str, str], notes: list[str]) -> RawColumns:
-    """Place throttle and current beside each voltage; `beside`: the current of each message."""
-    volts = columns.pop(VOLTAGE)
-    t, voltage, sizes, gaps = _samples(specs[VOLTAGE], volts)
-    logged, stamped, ends = volts.log_time, volts.stamped, t
-    if specs[VOLTAGE].sample_rate is not None:
-        some = sizes > 0
-        logged, stamped, ends = logged[some], stamped[some], t[np.cumsum(sizes)[some] - 1]
-        beside = None if beside is None else np.repeat(beside, sizes)
-    del volts
-    held = {} if beside is None else {CURRENT: beside}
-    for which in (THROTTLE, CURRENT):
-        if which not in columns:
-            held.setdefault(which, np.full(t.size, np.nan))
-            continue
-        hold = ThrottleHold(specs[VOLTAGE].sample_rate)
-        column = columns.pop(which)
-        at, values, counts, _ = _samples(specs[which], column)
-        known = np.isfinite(at)
-        if specs[which].nan == 'drop':
-            unknown = int(np.count_nonzero(~np.isfinite(values)))
-            known &= np.isfinite(values)
-            if which == THROTTLE and unknown:
-                notes.append(Note(f"{counted(unknown, 'throttle value')} dropped: not a finite "
-                                  'number.', Defect.NON_FINITE))
-        if which == THROTTLE:
-            check_throttle(name, values[known])
-        # At equal log times the throttle counts as earlier than the voltage.
-        before = np.searchsorted(logged, np.repeat(column.log_time, counts)[known], 'left')
-        hold.take(at[known], values[known], np.repeat(column.stamped, counts)[known], ends,
-                  stamped, before)
-        held[which] = hold.at(t)
-    if gaps:
-        notes.append(Note(f'{counted(gaps, "gap")} between blocks of samples.', Defect.GAPS))
-    return RawColumns(t, voltage, held[THROTTLE], held[CURRENT], name, source, tuple(notes))
+class _Supply:
+    """Samples of the voltage, with what is known beside them, as they come from a bag."""
+
+    def __init__(self, specs: Mapping[str, FieldSpec], own_current: bool) -> None:
+        volts = specs[VOLTAGE]
+        self._clock = _clock(volts)
+        # These grow in place: parts and the whole together would take twice the memory.
+        self.t, self._voltage, self._current = array('d'), array('d'), array('d')
+        self._own_current = own_current
+        self.loads = {name: _Load(spec, volts.sample_rate) for name, spec in specs.items()
+                      if name != VOLTAGE}
+
+    def take(self, batch: Mapping[str, FieldColumn]) -> None:
+        """Take messages in the order of the log."""
+        for name, load in self.loads.items():
+            if name in batch:
+                load.waiting.append(batch[name])
+        column = batch.get(VOLTAGE)
+        if column is None or not column.values.size:
+            return
+        stamps = _stamps(self._clock, column)
+        some = column.counts > 0
+        last = (np.cumsum(column.counts) - 1)[some]
+        for load in self.loads.values():
+            load.take(column.log_time[some], stamps[last], column.stamped[some])
+        more = [(self.t, stamps), (self._voltage, column.values)]
+        if self._own_current:
+            more.append((self._current, np.repeat(column.beside, column.counts)))
+        for whole, part in more:
+            whole.frombytes(np.ascontiguousarray(part).view(np.uint8))
+
+    def columns(self, name: str, source: dict[str, str], notes: list[str]) -> RawColumns:
+        """Return all that was taken."""
+        t = np.frombuffer(self.t)
+        found: dict[str, FloatArray] = {}
+        for which, load in self.loads.items():
+            load.take(np.empty(0, np.uint64), np.empty(0), np.empty(0, np.bool_))
+            if which == THROTTLE:
+                if load.unknown:
+                    notes.append(Note(f"{counted(load.unknown, 'throttle value')} dropped: not a "
+                                      'finite number.', Defect.NON_FINITE))
+                check_throttle(name, load.hold.held()[1])
+            found[which] = load.hold.at(t)
+        if self._own_current:
+            found[CURRENT] = np.frombuffer(self._current)
+        if self._clock is not None and self._clock.gaps:
+            notes.append(Note(f'{counted(self._clock.gaps, "gap")} between blocks of samples.',
+                              Defect.GAPS))
+        if THROTTLE not in found:
+            found[THROTTLE] = np.full(t.size, np.nan)
+        return RawColumns(t, np.frombuffer(self._voltage), found[THROTTLE],
+                          found.get(CURRENT), name, source, tuple(notes))
 
 
-def _samples(spec: FieldSpec, column: FieldColumn) -> tuple[FloatArray, FloatArray, IntArray, int]:
-    """Return stamps (s), values (NaN where a message holds none), samples a message, and gaps."""
-    if spec.sample_rate is not None:
-        clock = BlockClock(spec.sample_rate)
-        t = clock.stamps_of_many(column.stamp, column.count)
-        return t, column.values, column.count, clock.gaps
-    if (column.count == 1).all():
-        return column.stamp, column.values, column.count, 0
-    values = np.full(column.n, np.nan)
-    values[column.count > 0] = column.values
-    return column.stamp, values, np.ones(column.n, np.int64), 0
+def _clock(spec: FieldSpec) -> BlockClock | None:
+    return None if spec.sample_rate is None else BlockClock(spec.sample_rate)
+
+
+def _stamps(clock: BlockClock | None, column: FieldColumn) -> FloatArray:
+    """Return the stamp of each value, s."""
+    return column.stamp if clock is None else clock.stamps_of_many(column.stamp, column.counts)

@@ -18,14 +18,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 import struct
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.config import (
-    Extracted, Extractor, FieldPath, FieldSpec, parse_field_path, ZeroRule)
+    Extractor, FieldPath, FieldSpec, parse_field_path, ZeroRule)
 
 IntArray = npt.NDArray[np.int64]
 TimeArray = npt.NDArray[np.uint64]
@@ -329,9 +329,8 @@ def gather(data: bytes, at: IntArray, kind: str) -> npt.NDArray[Any]:
     return everywhere[at]
 
 
-@dataclass(frozen=True, eq=False)
-class FieldColumn:
-    """A field of many messages."""
+class FieldColumn(NamedTuple):
+    """A field of many messages, and a second one of each."""
 
     # Log times, ns; shape (m,).
     log_time: TimeArray
@@ -340,10 +339,12 @@ class FieldColumn:
     stamp: FloatArray
     # Whether the message carries its stamp; shape (m,).
     stamped: npt.NDArray[np.bool_]
-    # Values in each message; 0 where the field's array is too short; shape (m,).
-    count: IntArray
-    # Values in SI units; NaN where one is not a finite number; shape (count.sum(),).
+    # Values in each message: 1, unless the field is a block; shape (m,).
+    counts: IntArray
+    # Values in SI units; NaN where missing or not finite; shape (counts.sum(),).
     values: FloatArray
+    # The second field in SI units; NaN where missing, not finite or not asked for; shape (m,).
+    beside: FloatArray
 
     @property
     def n(self) -> int:
@@ -352,21 +353,16 @@ class FieldColumn:
 
     def take(self, order: IntArray) -> FieldColumn:
         """Return the messages of given indices, shape (k,), in their order."""
-        if (self.count == 1).all():
-            values = self.values[order]
-        else:
-            begins = np.cumsum(self.count) - self.count
-            values = self.values[_spread(begins[order], self.count[order])]
-        return FieldColumn(self.log_time[order], self.stamp[order], self.stamped[order],
-                           self.count[order], values)
+        begins = np.cumsum(self.counts) - self.counts
+        return FieldColumn._make(
+            column[_spread(begins[order], self.counts[order]) if column is self.values else order]
+            for column in self)
 
     def split(self, at: int) -> tuple[FieldColumn, FieldColumn]:
         """Return the first `at` messages, and the rest."""
-        cut = int(self.count[:at].sum())
-        return (FieldColumn(self.log_time[:at], self.stamp[:at], self.stamped[:at],
-                            self.count[:at], self.values[:cut]),
-                FieldColumn(self.log_time[at:], self.stamp[at:], self.stamped[at:],
-                            self.count[at:], self.values[cut:]))
+        cut = [int(self.counts[:at].sum()) if column is self.values else at for column in self]
+        return (FieldColumn._make(column[:k] for column, k in zip(self, cut)),
+                FieldColumn._make(column[k:] for column, k in zip(self, cut)))
 
     def place(self, log_time: int) -> int:
         """Return how many of the messages, in order, are before a log time, ns."""
@@ -380,15 +376,8 @@ class FieldColumn:
 
 
 def join(parts: Sequence[FieldColumn]) -> FieldColumn:
-    """Return columns one after another; an empty one for none."""
-    if len(parts) == 1:
-        return parts[0]
-    return FieldColumn(
-        np.concatenate([np.empty(0, np.uint64), *(part.log_time for part in parts)]),
-        np.concatenate([np.empty(0), *(part.stamp for part in parts)]),
-        np.concatenate([np.empty(0, np.bool_), *(part.stamped for part in parts)]),
-        np.concatenate([np.empty(0, np.int64), *(part.count for part in parts)]),
-        np.concatenate([np.empty(0), *(part.values for part in parts)]))
+    """Return columns, one or more, one after another."""
+    return parts[0] if len(parts) == 1 else FieldColumn._make(map(np.concatenate, zip(*parts)))
 
 
 def seconds(log_time: TimeArray) -> FloatArray:
@@ -404,33 +393,44 @@ def _spread(begin: IntArray, count: IntArray) -> IntArray:
     return places + np.arange(places.size)
 
 
+class _Found:
+    """What messages hold, while they are read."""
+
+    def __init__(self, n: int) -> None:
+        self.stamp, self.beside = np.full(n, np.nan), np.full(n, np.nan)
+        # Places of messages alike, shape (k,), and their values, shape (k, values in each).
+        self.blocks: list[tuple[IntArray, FloatArray]] = []
+
+
 class FieldReader:
     """
     Reads one field, and its stamp, of messages of one type (definitions: None where unreadable).
 
-    The `nan` rule of `spec` is not applied: all non-finite values are NaN.  `decoder` returns the
-    general decoder, and is asked only when needed; `broken` is called with the log time, ns, of a
-    message that cannot be decoded and the error.  `general` counts messages that went that way.
+    `beside` is a second field, of one number in each message.  The `nan` rules are not applied: a
+    value that is missing or not finite is NaN.  `decoder` returns the general decoder, and is
+    asked only when needed; `broken` is called with the log time, ns, of a message that cannot be
+    decoded and the error.  `general` counts messages that went that way.
     """
 
     def __init__(
         self, spec: FieldSpec, definitions: Definitions | None,
         decoder: Callable[[], Callable[[bytes], Any]],
-        broken: Callable[[int, InputError], None] | None = None,
+        broken: Callable[[int, InputError], None] | None = None, beside: FieldSpec | None = None,
     ) -> None:
         """Prepare the paths; layouts are learned from messages."""
         self.spec = spec
         self.general = 0
-        self._extractor = Extractor(replace(spec, nan='unknown', zero='value'))
-        self._zero = ZeroRule(spec.zero)
+        # Field, its path, its general way and its zeros; the second one where it is asked for.
+        self._fields = [(one, parse_field_path(one.field),
+                         Extractor(replace(one, nan='unknown', zero='value')), ZeroRule(one.zero))
+                        for one in (spec, beside) if one is not None]
         self._decoder = decoder
         self._broken = broken
         self._decode: Callable[[bytes], Any] | None = None
         self._kind = short_name(spec.type)
         self._definitions = definitions
-        self._value = parse_field_path(spec.field)
         self._stamp: FieldPath | None = None
-        self._paths = [self._value]
+        self._paths = [path for _, path, _, _ in self._fields]
         if spec.stamp_field is not None:
             self._stamp = parse_field_path(spec.stamp_field)
             self._paths += [self._stamp, (*self._stamp, 'sec'), (*self._stamp, 'nanosec')]
@@ -442,13 +442,13 @@ class FieldReader:
         # A damaged message may hold a signalling NaN, of which NumPy would warn.
         with np.errstate(invalid='ignore'):
             column = self._read(table)
-        return replace(column, values=self._zero.apply(column.values))
+        zero, *other = (rule for _, _, _, rule in self._fields)
+        return column._replace(values=zero.apply(column.values),
+                               beside=other[0].apply(column.beside) if other else column.beside)
 
     def _read(self, table: Table) -> FieldColumn:
         """Return the field with zeros as they are."""
-        stamp = np.full(table.n, np.nan)
-        count = np.ones(table.n, np.int64)
-        bulk: list[tuple[IntArray, FloatArray]] = []
+        found = _Found(table.n)
         rest: list[IntArray] = []
         lengths = table.end - table.begin
         # A comparison costs a tenth of a sort, and most messages of a topic are of one length.
@@ -456,68 +456,49 @@ class FieldReader:
         for length in (lengths[:1] if alike else np.unique(lengths)).tolist():
             left = np.nonzero(lengths == length)[0]
             if self._definitions is not None and length:
-                left = self._in_bulk(table, left, length, stamp, bulk)
+                left = self._in_bulk(table, left, length, found)
             rest.append(left)
-        for picked, block in bulk:
-            count[picked] = block.shape[1]
-        single = {}
-        broken: list[int] = []
+        kept = np.ones(table.n, dtype=bool)
         for k in np.sort(np.concatenate([np.empty(0, np.int64), *rest])).tolist():
-            found = self._one(
-                bytes(table.data[table.begin[k]:table.end[k]]), int(table.log_time[k]))
-            if found is None:
-                broken.append(k)
-                count[k] = 0
-                continue
-            single[k] = found.values
-            count[k] = found.values.size
-            if found.stamp is not None:
-                stamp[k] = found.stamp
-        self.general += len(single)
+            kept[k] = self._one(table, k, found)
+        stamp, count = found.stamp, np.zeros(table.n, np.int64)
+        for picked, block in found.blocks:
+            count[picked] = block.shape[1]
         stamped = ~np.isnan(stamp)
         if not stamped.all():
             stamp[~stamped] = seconds(table.log_time[~stamped])
-        if not single and not broken and len(bulk) == 1:
+        if len(found.blocks) == 1 and kept.all():
             # All alike, and in order.
-            return FieldColumn(table.log_time, stamp, stamped, count, bulk[0][1].reshape(-1))
-        begin = np.cumsum(count) - count
-        values = np.empty(int(count.sum()))
-        for picked, block in bulk:
-            values[begin[picked][:, None] + np.arange(block.shape[1])] = block
-        for k, block in single.items():
-            values[begin[k]:begin[k] + block.size] = block
-        if not broken:
-            return FieldColumn(table.log_time, stamp, stamped, count, values)
-        kept = np.ones(table.n, dtype=bool)
-        kept[broken] = False
-        return FieldColumn(table.log_time[kept], stamp[kept], stamped[kept], count[kept], values)
+            values = found.blocks[0][1].reshape(-1)
+        else:
+            begin = np.cumsum(count) - count
+            values = np.empty(int(count.sum()))
+            for picked, block in found.blocks:
+                values[begin[picked][:, None] + np.arange(block.shape[1])] = block
+        column = FieldColumn(table.log_time, stamp, stamped, count, values, found.beside)
+        return column if kept.all() else column.take(np.flatnonzero(kept))
 
-    def _in_bulk(
-        self, table: Table, left: IntArray, length: int, stamp: FloatArray,
-        bulk: list[tuple[IntArray, FloatArray]],
-    ) -> IntArray:
+    def _in_bulk(self, table: Table, left: IntArray, length: int, found: _Found) -> IntArray:
         """Read messages of one length by layouts; return those that have none."""
         known = self._layouts.setdefault(length, [])
         rows = table.rows(left, length)
         for layout in known:
-            left, rows = self._by_layout(layout, left, rows, stamp, bulk)
+            left, rows = self._by_layout(layout, left, rows, found)
             if not left.size:
                 return left
         strange: list[IntArray] = []
         while left.size and len(known) < MOST_LAYOUTS and len(strange) < MOST_LAYOUTS:
-            found = self._learn(rows[0].tobytes())
-            if found is None or not found.holds_for(rows[:1])[0]:
+            learned = self._learn(rows[0].tobytes())
+            if learned is None or not learned.holds_for(rows[:1])[0]:
                 strange.append(left[:1])
                 left, rows = left[1:], rows[1:]
                 continue
-            known.append(found)
-            left, rows = self._by_layout(found, left, rows, stamp, bulk)
+            known.append(learned)
+            left, rows = self._by_layout(learned, left, rows, found)
         return np.concatenate([*strange, left])
 
-    def _by_layout(
-        self, layout: Layout, left: IntArray, rows: Rows, stamp: FloatArray,
-        bulk: list[tuple[IntArray, FloatArray]],
-    ) -> tuple[IntArray, Rows]:
+    def _by_layout(self, layout: Layout, left: IntArray, rows: Rows, found: _Found,
+                   ) -> tuple[IntArray, Rows]:
         """Read the messages with a layout; return the others."""
         fits = layout.holds_for(rows)
         if not fits.any():
@@ -527,14 +508,12 @@ class FieldReader:
         own = self._stamps(layout, mine)
         if own is not None:
             known = np.isfinite(own) & (own != 0.0)
-            stamp[picked[known]] = own[known]
-        block = layout.places[self._value].column(mine).reshape(picked.size, -1)
-        block *= self.spec.sign * self.spec.unit_factor
-        block += self.spec.offset
-        finite = np.isfinite(block)
-        if not finite.all():
-            block[~finite] = np.nan
-        bulk.append((picked, block))
+            found.stamp[picked[known]] = own[known]
+        block, *other = (_scaled(layout.places[path].column(mine).reshape(picked.size, -1), spec)
+                         for spec, path, _, _ in self._fields)
+        found.blocks.append((picked, block))
+        if other and other[0].shape[1] == 1:
+            found.beside[picked] = other[0][:, 0]
         return (left[:0], rows[:0]) if everything else (left[~fits], rows[~fits])
 
     def _stamps(self, layout: Layout, rows: Rows) -> FloatArray | None:
@@ -553,10 +532,10 @@ class FieldReader:
         if layout is None:
             return None
         found = layout.places
-        value = found.get(self._value)
-        # An array is a block of samples, or a mistake that the general way names.
-        if value is None or (value.size is not None and self.spec.sample_rate is None):
-            return None
+        for spec, path, _, _ in self._fields:
+            # An array is a block of samples, or a mistake that the general way names.
+            if path not in found or (found[path].size is not None and spec.sample_rate is None):
+                return None
         if self._stamp is not None:
             number = found.get(self._stamp)
             time = [found.get((*self._stamp, part)) for part in ('sec', 'nanosec')]
@@ -565,15 +544,34 @@ class FieldReader:
                 return None
         return layout
 
-    def _one(self, message: bytes, log_time: int) -> Extracted | None:
-        """Return the field of one message the general way; None: it is to be left out."""
+    def _one(self, table: Table, k: int, found: _Found) -> bool:
+        """Read one message the general way; False: it is to be left out."""
         if self._decode is None:
             self._decode = self._decoder()
         try:
-            decoded = self._decode(message)
+            decoded = self._decode(bytes(table.data[table.begin[k]:table.end[k]]))
         except InputError as error:
             if self._broken is None:
                 raise
-            self._broken(log_time, error)
-            return None
-        return self._extractor.extract(decoded)
+            self._broken(int(table.log_time[k]), error)
+            return False
+        self.general += 1
+        field, *other = (extractor.extract(decoded) for _, _, extractor, _ in self._fields)
+        if field.stamp is not None:
+            found.stamp[k] = field.stamp
+        missing = self.spec.sample_rate is None and not field.values.size
+        found.blocks.append((np.array([k]), np.array([[np.nan]]) if missing
+                             else field.values[None, :]))
+        if other and other[0].values.size == 1:
+            found.beside[k] = other[0].values[0]
+        return True
+
+
+def _scaled(block: FloatArray, spec: FieldSpec) -> FloatArray:
+    """Return raw numbers, changed in place, in SI units; NaN where one is not finite."""
+    block *= spec.sign * spec.unit_factor
+    block += spec.offset
+    finite = np.isfinite(block)
+    if not finite.all():
+        block[~finite] = np.nan
+    return block

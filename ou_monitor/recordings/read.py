@@ -159,19 +159,20 @@ def tidy(raw: RawColumns) -> Recording:
     check_throttle(name, raw.throttle, raw.voltage)
     t, _, _ = plausible_samples(raw.t, raw.voltage, None)
     throttle = plausible(raw.throttle, MOST_THROTTLE)
-    stamps = raw.t[np.isfinite(raw.t)]
-    if stamps.size and not np.isfinite(t).any():
+    if not np.isfinite(t).any() and (stamps := raw.t[np.isfinite(raw.t)]).size:
         raise InputError(f'{name}: stamps of {stamps[0]:.4g} s are implausible: is the time in '
                          'ms, us or ns? Give --time-unit for a CSV')
     which, said = in_order(t, raw.voltage[:, None], MOST_VOLTAGE, ' V')
     notes, t = [*raw.notes, *said], t[which]
     if not t.size:
         raise InputError(_unusable(name, notes))
-    if t.size > 2 and (spacing := float(np.median(np.diff(t)))) >= _SPARSE:
+    # A median of so much needs half of it on average.
+    if t.size > 2 and t[-1] - t[0] >= 0.5 * _SPARSE * (t.size - 1) - 1.0 and (
+            spacing := float(np.median(np.diff(t)))) >= _SPARSE:
         notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '
                      'Give --time-unit for a CSV.')
     return Recording(t, raw.voltage[which], throttle[which], name, raw.source, tuple(notes),
-                     known_current(raw.current[which]))
+                     known_current(None if raw.current is None else raw.current[which]))
 
 
 def _unusable(name: str, notes: Sequence[str]) -> str:
@@ -240,16 +241,15 @@ def read_signal(path: str | Path, signal: str, *, partial: bool = False,
     topic, field = _split(path, signal, bag.topics)
     spec = FieldSpec(topic, bag.topics[topic], field, nan='unknown',
                      stamp_field='header.stamp' if bag.has_header(topic) else None)
-    column = join([batch['signal'] for batch in batches(bag, {'signal': spec})])
-    if not column.n:
+    parts = [batch['signal'] for batch in batches(bag, {'signal': spec})]
+    if not parts:
         raise InputError(f"{path}: topic '{topic}' holds no message")
-    values = np.full(column.n, np.nan)
-    values[column.count > 0] = column.values
+    column = join(parts)
     unit = bag.origins.get(topic, {}).get(f'{topic[1:]}_unit', UNKNOWN)
     if spec.type == IMU:
         unit = {'angular_velocity': 'rad/s', 'linear_acceleration': 'm/s^2'}.get(
             field.partition('.')[0], UNKNOWN)
-    return Series(signal, SIGNAL, column.stamp, values, '1', own_unit=unit)
+    return Series(signal, SIGNAL, column.stamp, column.values, '1', own_unit=unit)
 
 
 def _split(path: Path, signal: str, topics: Mapping[str, str]) -> tuple[str, str]:

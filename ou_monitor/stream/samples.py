@@ -313,8 +313,10 @@ class ThrottleHold:
 
     def __init__(self, sample_rate: float | None = None) -> None:
         self._slack = 0.0 if sample_rate is None else SLACK / sample_rate
-        self._places, self._values = np.empty(0), np.empty(0)
-        self._newest, self._own = -math.inf, False
+        # Stamps from which values hold, and the values: of each call; joined and in order where
+        # there is one of each.
+        self._places, self._values = [np.empty(0)], [np.empty(0)]
+        self._latest, self._newest, self._own = -math.inf, -math.inf, False
 
     def take(self, stamps: FloatArray, values: FloatArray, own: BoolArray,
              voltage_stamps: FloatArray, voltage_own: BoolArray,
@@ -339,19 +341,25 @@ class ThrottleHold:
             apart = np.where(own == after_own, APART, APART_MIXED)
             one_clock = np.abs(stamps - compared) <= apart
             # By arrival: after the newest voltage and after each earlier throttle.
-            least = self._places[-1] if self._places.size else -math.inf
-            latest = np.maximum.accumulate(np.concatenate([[least], np.where(
+            latest = np.maximum.accumulate(np.concatenate([[self._latest], np.where(
                 one_clock, stamps, np.nextafter(after + 2.0 * self._slack, math.inf))]))[1:]
-            places = np.concatenate([self._places, np.where(one_clock, stamps, latest)])
-            values = np.concatenate([self._values, values])
-            order = np.argsort(places, kind='stable')
-            self._places, self._values = places[order], values[order]
+            self._places.append(np.where(one_clock, stamps, latest))
+            self._values.append(values)
+            self._latest = float(latest[-1])
         self._newest, self._own = float(newest[-1]), bool(owns[-1])
+
+    def held(self) -> tuple[FloatArray, FloatArray]:
+        """Return the stamps, s, from which values hold, in order, and the values."""
+        if len(self._places) > 1:
+            places, values = np.concatenate(self._places), np.concatenate(self._values)
+            order = np.argsort(places, kind='stable')
+            self._places, self._values = [places[order]], [values[order]]
+        return self._places[0], self._values[0]
 
     def at(self, t: FloatArray) -> FloatArray:
         """Return the throttle at each stamp, s; NaN before the first one."""
-        asked = t + self._slack
-        places, values = self._places, np.append(np.nan, self._values)
+        places, values = self.held()
+        asked, values = t + self._slack if self._slack else t, np.append(np.nan, values)
         if places.size < asked.size and (asked[1:] >= asked[:-1]).all():
             # Both in order, few throttles: find the first sample of each.
             first = np.searchsorted(asked, places, 'left')
@@ -360,17 +368,18 @@ class ThrottleHold:
 
     def forget_before(self, t: float) -> None:
         """Drop the values that no sample from `t` (s) on can need."""
-        past = max(int(np.searchsorted(self._places, t + self._slack, 'right')) - 1, 0)
-        self._places, self._values = self._places[past:], self._values[past:]
+        places, values = self.held()
+        past = max(int(np.searchsorted(places, t + self._slack, 'right')) - 1, 0)
+        self._places, self._values = [places[past:]], [values[past:]]
 
     def restart(self, value: float = math.nan) -> None:
         """Start a new time line of the voltage, in which `value` holds from the start."""
-        self._places, self._values = np.array([-math.inf]), np.array([value])
-        self._newest, self._own = -math.inf, False
+        self._places, self._values = [np.array([-math.inf])], [np.array([value])]
+        self._latest, self._newest, self._own = -math.inf, -math.inf, False
 
     def __len__(self) -> int:
         """Return the number of values kept."""
-        return int(self._places.size)
+        return int(self.held()[0].size)
 
 
 # Backward step of a stamp, s, from which a clock or a bag went back.  One publisher's messages

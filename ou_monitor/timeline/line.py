@@ -234,11 +234,16 @@ class Repeats:
         return fresh
 
 
+def reading_period(y: FloatArray) -> float:
+    """Return the samples per reading of a voltage, V."""
+    first = max(0, (y.size - _MIDDLE) // 2)
+    return refresh_period(y[first:first + _MIDDLE])
+
+
 def reading_places(y: FloatArray) -> tuple[npt.NDArray[np.intp], float]:
     """Return the places of new readings in a voltage, V, and samples per reading (1: all)."""
-    first = max(0, (y.size - _MIDDLE) // 2)
     repeats = Repeats()
-    repeats.period = refresh_period(y[first:first + _MIDDLE])
+    repeats.period = reading_period(y)
     if repeats.period <= 1.0:
         return np.arange(y.size), 1.0
     return np.flatnonzero(repeats.fresh(np.stack([np.empty(y.size), y]))), repeats.period
@@ -276,9 +281,9 @@ def on_grid(t: FloatArray, number: FloatArray) -> FloatArray:
 
 def readings_of(recording: Recording) -> Recording:
     """Return a recording with each reading of its source once; a note counts the repeats."""
-    places, period = reading_places(recording.voltage)
-    if period <= 1.0:
+    if reading_period(recording.voltage) <= 1.0:
         return recording
+    places, period = reading_places(recording.voltage)
     t = reading_times(recording.t[places], period)
     held = recording.n - t.size
     logged = (recording.n - 1) / recording.duration
@@ -312,8 +317,8 @@ _TIED = 0.25
 
 def plausible(values: FloatArray, most: float) -> FloatArray:
     """Return values with NaN where the magnitude exceeds `most`."""
-    # The comparison is also false for NaN, which stays NaN.
-    beyond = ~(np.abs(values) <= most)
+    # NaN is not beyond, and stays.
+    beyond = (values > most) | (values < -most)
     return np.where(beyond, NAN, values) if beyond.any() else values
 
 
@@ -583,6 +588,9 @@ def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
     """
     # The comparisons are also false for NaN.
     good = np.isfinite(t) & ((rows <= most) & (rows >= -most)).all(axis=1)
+    if good.all() and (t[1:] > t[:-1]).all():
+        # Everything is kept: a slice avoids a copy.
+        return slice(None), []
     notes: list[str] = []
     if not good.all():
         beyond = bool((np.isfinite(rows[~good]) & (np.abs(rows[~good]) > most)).any())
@@ -597,9 +605,6 @@ def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
     if line.counters.late:
         notes.append(Note(f'{counted(line.counters.late)} dropped: the stamp was there before; '
                           'the first of each was kept.', Defect.REPEATED_STAMPS))
-    if line.used == t.size and not notes:
-        # Everything is kept: a slice avoids a copy.
-        return slice(None), notes
     return (batches[0].y if batches else np.empty(0)).astype(np.intp), notes
 
 

@@ -52,9 +52,12 @@ def one_by_one(spec, text, messages, table):
             found = extractor.extract(decode(message))
         except Exception:
             return None
+        held = found.values
+        if not held.size and spec.sample_rate is None:
+            held = np.array([np.nan])
         stamps.append(logged if found.stamp is None else found.stamp)
-        counts.append(found.values.size)
-        values.append(found.values)
+        counts.append(held.size)
+        values.append(held)
     return np.array(stamps), np.array(counts), np.concatenate(values)
 
 
@@ -71,7 +74,7 @@ def in_bulk(spec, text, table):
         column = reader.read(table)
     except Exception:
         return None, reader.general
-    return (column.stamp, column.count, column.values), reader.general
+    return (column.stamp, column.counts, column.values), reader.general
 
 
 def assert_same(found, expected):
@@ -297,7 +300,7 @@ def test_in_time_order_keeps_what_belongs_together():
     spec = FieldSpec('/v', cdr.FLOAT32_ARRAY, 'data', sample_rate=10.0)
     reader = FieldReader(spec, parse_definition(spec.type, SCHEMAS[spec.type]), lambda: None)
     column = reader.read(table).in_time_order()
-    assert column.count.tolist() == [0, 1, 3, 2, 2]
+    assert column.counts.tolist() == [0, 1, 3, 2, 2]
     assert column.values.tolist() == [1, 2, 2, 2, 4, 4, 0, 0]
     first, rest = column.split(3)
     assert (first.values.tolist(), rest.log_time.tolist()) == ([1, 2, 2, 2], [20, 30])

@@ -67,3 +67,15 @@ def test_each_message_of_a_battery_has_a_current_of_its_own(tmp_path, monkeypatc
     monkeypatch.setattr('test_current.STAMPS', STAMPS // 2 * 2 // 200_000_000 * 200_000_000)
     recording = read_recording(bag(tmp_path / 'a.mcap', [-1.0, -2.0, -3.0, -4.0, -5.0]))
     np.testing.assert_array_equal(recording.current, [1.0, 3.0, 5.0])
+
+
+def test_a_broken_message_counts_once(tmp_path):
+    """Voltage and current are read from it together."""
+    path, message = tmp_path / 'a.mcap', encode_battery(STAMPS, np.full(5, 16.0))
+    with BagWriter(path) as writer:
+        writer.add_topic('voltage', BATTERY_STATE)
+        for k, t in enumerate(STAMPS.tolist()):
+            writer.write('/voltage', t, message[k][:20] if k in (1, 3) else message[k])
+    recording = read_recording(path, partial=True)
+    assert recording.n == 3
+    assert [note for note in recording.notes if note.startswith('2 messages dropped')]

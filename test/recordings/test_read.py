@@ -1,12 +1,15 @@
 """Bags -> Recording: which topics, which stamps, what was mended."""
 
+import tracemalloc
+
 from mcap.writer import Writer
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagWriter
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.recordings.standard_types import (
-    BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, FLOAT64)
+    BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, FLOAT64,
+    SCHEMAS)
 import pytest
 from rosbags.typesys import get_typestore, Stores
 
@@ -381,3 +384,33 @@ def test_another_topic_that_would_fit_is_named(tmp_path):
     assert recording.voltage.tolist() == [5.0]
     assert any('/bec/voltage would fit too' in note for note in recording.notes)
     assert 'fit too' not in ''.join(read_recording(path, voltage_topic='/bec/voltage').notes)
+
+
+def test_memory_holds_little_beside_the_result(tmp_path):
+    """Every array grows in place: neither parts nor copies of the whole lie beside it."""
+    n = 200_000
+    path = tmp_path / 'long.mcap'
+    data = encode_battery(np.arange(n, dtype=np.int64) * MS, 12.0 + np.arange(n) % 997 / 997)
+    with path.open('wb') as file:
+        writer = Writer(file)
+        writer.start(profile='ros2', library='test')
+        channels = [writer.register_channel('/' + name, 'cdr', writer.register_schema(
+            kind, 'ros2msg', SCHEMAS[kind].encode())) for name, kind in (
+                ('voltage', BATTERY_STATE), ('throttle', FLOAT32))]
+        half = encode_scalars(FLOAT32, [0.5])[0]
+        for k, message in enumerate(data):
+            if k % 20 == 0:
+                writer.add_message(channels[1], k * MS, half, k * MS)
+            writer.add_message(channels[0], k * MS, message, k * MS)
+        writer.finish()
+    read_recording(path, end=1.0)
+    tracemalloc.start()
+    try:
+        recording = read_recording(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    result = sum(column.nbytes for column in (
+        recording.t, recording.voltage, recording.throttle))
+    assert recording.n == n
+    assert peak < 2 * result + 6_000_000

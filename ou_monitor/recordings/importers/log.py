@@ -175,8 +175,8 @@ class RawColumns:
     voltage: FloatArray
     # 0..1, held from its last value on; NaN where not known.
     throttle: FloatArray
-    # A, positive while the battery is drained; NaN where not known.
-    current: FloatArray
+    # A, positive while the battery is drained; NaN where not known; None: unknown throughout.
+    current: FloatArray | None
     # Of the file, printable.
     name: str
     # Origin: file, format, chosen series, firmware.
