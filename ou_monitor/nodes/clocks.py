@@ -17,11 +17,8 @@ Xia 2002, "Clock synchronization algorithms for network measurements").  The
 hull must span many pauses, whatever the rate: a burst of 400 messages sent
 10 us apart is a straight line, too.
 
-A driver that empties a buffer sends nothing but bursts, and hardly a message lies near the line.
-The last message of each burst does, for its sample is the newest: the line is drawn under those.
-
 Limits: a constant delay stays; a source that is not steady is left as it is, and `in_bursts` says
-so where its intervals cannot be those of samples.
+so where its intervals cannot be those of samples, as of a driver that empties a buffer.
 
 `SimClockMap`: the middleware stamps every message with the wall clock of its sender.  When a
 bag is replayed at four times its speed, those stamps lie four times too close
@@ -37,7 +34,6 @@ from collections.abc import Sequence
 import math
 
 import numpy as np
-import numpy.typing as npt
 from ou_monitor.records import FloatArray
 
 # Looked at: so many messages, and so many seconds of them, whichever is more.
@@ -57,18 +53,13 @@ JUDGE, JUDGE_SPAN = 100, 0.1
 # 5..50 ms, 21 % when one message in a hundred is lost besides.
 NEAR, ON_LINE = 0.1, 0.2
 # A source sends in bursts when half of its intervals are below this share of their mean (of a
-# Poisson source: below 0.69); an interval of more than so many means ends a burst.
-SHORT, APART = 0.25, 1.5
-# Judged by so many bursts.  On the line is a burst whose last message is within so much of a
-# burst's length of it.  Measured over 20 bursts: on the line are 50 % at least (first percentile)
-# of a buffer that is emptied at a mark by a process that pauses for 5..40 ms, and 38 % at most
-# (99th) where bursts come at random.
-BURSTS, NEAR_BURST, ON_BURST_LINE = 20, 0.3, 0.5
+# Poisson source: below 0.69).
+SHORT = 0.25
 # Messages of a burst behind which there is a gap.
 LUMP = 8
 IN_BURSTS = (
-    'The messages come in bursts and carry no stamps, and no steady source is seen behind them '
-    '(yet): no estimate can be made of them; stamp them in the driver, or send blocks of samples '
+    'The messages come in bursts and carry no stamps, and no steady source is seen behind '
+    'them: no estimate can be made of them; stamp them in the driver, or send blocks of samples '
     'with adc.sample_rate.')
 # The line follows the source with this time constant, s: 50 ms of delay, made up within 50 ms,
 # move it by 1.2 ms.
@@ -102,31 +93,6 @@ def line_under(times: Sequence[float] | FloatArray) -> tuple[float, float]:
     return period, float(near.mean())
 
 
-def burst_ends(stamps: FloatArray) -> npt.NDArray[np.int64] | None:
-    """Return the last message of each burst but the newest; None: they do not come in bursts."""
-    steps = np.diff(stamps)
-    mean = float(steps.mean())
-    if not np.median(steps) < SHORT * mean:
-        return None
-    return np.flatnonzero(steps > APART * mean)
-
-
-def line_under_bursts(stamps: FloatArray, ends: npt.NDArray[np.int64]
-                      ) -> tuple[float, float, float, float]:
-    """
-    Return the period of a source that sends in bursts, and how steady it is.
-
-    And how late the messages are against the line, s: on average, and the last (stamps in s).
-    """
-    times = stamps[ends] - stamps[0]
-    at, period = _hull_edge(ends.tolist(), times.tolist())
-    line = float(stamps[at]) + period * (np.arange(stamps.size) - at)
-    above = stamps - line
-    length = period * float(ends[-1] - ends[0]) / (ends.size - 1)
-    share = float((above[ends] <= NEAR_BURST * length).mean())
-    return period, share, float(above[ends[0] + 1:ends[-1] + 1].mean()), float(above[-1])
-
-
 def _hull_edge(numbers: list[int], times: list[float]) -> tuple[int, float]:
     """
     Return where the middle edge of the lower convex hull starts, and its slope.
@@ -158,7 +124,6 @@ class SendClock:
     def __init__(self) -> None:
         self.in_bursts = False
         self.settled = 0
-        self._late = 0.0
         self._lumps = 0
         self._times = array('d')
         self._fresh = self._doubts = 0
@@ -208,27 +173,19 @@ class SendClock:
             return
         begin = min(int(np.searchsorted(looked, end - SPAN)), max(len(times) - KEEP, 0))
         period, share = line_under(looked[begin:])
-        late = last = 0.0
-        steady, ends = share >= ON_LINE, None
-        if not steady:
-            ends = burst_ends(looked)
-        if ends is not None:
-            begin = min(begin, int(ends[-BURSTS]) if ends.size >= BURSTS else 0)
-        begin = max(begin, len(times) - MOST)
-        del times[:begin]
+        bursts = False
+        if share < ON_LINE:
+            steps = np.diff(looked)
+            bursts = bool(np.median(steps) < SHORT * steps.mean())
+        del times[:max(begin, len(times) - MOST)]
         self._doubts += self._fresh
         self._fresh, self._judged = 0, end
-        if ends is not None and (ends >= begin).sum() >= BURSTS:
-            period, share, late, last = line_under_bursts(
-                looked[begin:], ends[ends >= begin] - begin)
-            steady = share >= ON_BURST_LINE
-        if steady and period > 0.0:
-            # The line of a source in bursts runs where their last messages are.
-            self._period, self._late, self._doubts = period, late, 0
+        if share >= ON_LINE and period > 0.0:
+            self._period, self._doubts = period, 0
         elif self._doubts > len(times):
-            self._period, self._late = math.nan, 0.0
-        if not self._tell(ends is not None and math.isnan(self._period)):
-            self._last = end - last - self._period
+            self._period = math.nan
+        if not self._tell(bursts and math.isnan(self._period)):
+            self._last = end - self._period
 
     def _tell(self, in_bursts: bool) -> bool:
         """Note whether times are worth nothing; return false when they begin to be worth more."""
@@ -241,7 +198,7 @@ class SendClock:
         if math.isnan(self._period) or math.isnan(self._last):
             return source
         expected = self._last + self._period
-        error = source - self._late - expected
+        error = source - expected
         if not -BACK < error < self._gap:
             return source
         return expected - math.expm1(-self._period / FOLLOW) * error

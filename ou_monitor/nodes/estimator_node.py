@@ -235,12 +235,12 @@ class EstimatorNode(MonitorNode):
         message, extractor = source.open()
         topic = self.resolve_topic_name(source.topic)
         if source.quantity == 'voltage':
-            self._stream.open_voltage(extractor)
+            self._stream.open_voltage(extractor.spec)
             if extractor.spec.sample_rate is not None:
                 # Blocks have a time line of their own.
                 self._send_clock = None
         else:
-            self._stream.open_throttle(extractor)
+            self._stream.open_throttle(extractor.spec)
         self._inputs[source.quantity] = PolledInput(
             self, message, source.topic, extractor.spec, source.current)
         self._opened[source.quantity] = source

@@ -413,7 +413,7 @@ def batches(
 
 
 # Chunks are read together up to this size, bytes unpacked.
-_TOGETHER = 1024 * 1024
+_TOGETHER = 2 * 1024 * 1024
 
 # Small chunks: a recording cut off by a brown-out loses its last chunk, about a second at 1 kHz.
 CHUNK_SIZE = 128 * 1024  # bytes

@@ -475,7 +475,7 @@ class McapFile:
             if self._unpacked > self._limit_of_all:
                 raise Damage(_over_limit('it and those before it hold', self._unpacked,
                                          self._limit_of_all))
-            places, others = _all_records(data)
+            places, others = _all_records(data, np.array([0, len(data)]))
             self._learn_all(data, others)
         except Damage as error:
             raise Damage(f'the chunk there is broken ({error})') from error
@@ -546,41 +546,23 @@ class McapFile:
             raise Damage('its checksum is wrong')
         return data
 
-    def _check_times(self, data: bytes, places: IntArray, span: Span) -> None:
-        """Check that the times of a chunk agree with its index."""
-        times = gather(data, places + _HEAD.size + 6, '<u8')
-        if span.unpacked and times.size and (
-                int(times.max()) > span.end_ns or int(times.min()) < span.start_ns):
-            raise Damage('its messages are not of the time that its index states')
-
     def channels_of(self, wanted: set[str]) -> dict[int, str]:
         """Return channel -> topic of some topics."""
         return {key: topic.name for key, topic in self.topics.items() if topic.name in wanted}
 
     def tables(self, spans: Sequence[Span], wanted: set[str]) -> dict[str, Table]:
         """Return the messages of some spans by topic, in the order of the file."""
-        blocks: list[bytes] = []
-        places: list[IntArray] = []
-        size = 0
-        with self._open() as file:
-            for span in spans:
-                try:
-                    data = self._data(file, span)
-                    file.seek(span.offset + span.length)
-                    index = file.read(span.index_length)
-                    found, others = _by_index(data, index) or _all_records(data)
-                    self._check_times(data, found, span)
-                    self._learn_all(data, others)
-                except Damage as error:
-                    raise InputError(
-                        f'{self.path} is damaged at byte {span.offset - _HEAD.size}: the chunk '
-                        f'there is broken ({error}) ({moment(span.start_ns, self.origin_ns)}); '
-                        'use --partial to read the intact part') from error
-                blocks.append(data)
-                places.append(found + size)
-                size += len(data)
-        # One table of many small chunks costs as much as one chunk.
-        table = _table(b''.join(blocks), np.concatenate(places))
+        try:
+            table = self._table_of(spans)
+        except Damage as error:
+            if len(spans) > 1:
+                # One by one: the first broken one is named.
+                for span in spans:
+                    self.tables([span], wanted)
+            raise InputError(
+                f'{self.path} is damaged at byte {spans[0].offset - _HEAD.size}: the chunk there '
+                f'is broken ({error}) ({moment(spans[0].start_ns, self.origin_ns)}); use '
+                '--partial to read the intact part') from error
         topics: dict[str, npt.NDArray[np.bool_]] = {}
         channels = self.channels_of(wanted)
         if len(channels) > _FEW_CHANNELS:
@@ -591,6 +573,28 @@ class McapFile:
             topics[name] = topics.get(name, False) | (table.channel == key)
         parts = {name: table.where(mine) for name, mine in topics.items()}
         return {name: part for name, part in parts.items() if part.n}
+
+    def _table_of(self, spans: Sequence[Span]) -> Table:
+        """Return the messages of some spans; register their schemas and channels."""
+        blocks: list[bytes] = []
+        indexes: list[bytes] = []
+        with self._open() as file:
+            for span in spans:
+                blocks.append(self._data(file, span))
+                file.seek(span.offset + span.length)
+                indexes.append(file.read(span.index_length))
+        # One table of many small chunks costs as much as one chunk.
+        data = b''.join(blocks)
+        begins = np.cumsum([0, *map(len, blocks)])
+        places, others = _by_index(data, indexes, begins) or _all_records(data, begins)
+        table = _table(data, places)
+        limits = np.array([(span.start_ns, span.end_ns) if span.unpacked else (0, 2**64 - 1)
+                           for span in spans], np.uint64)
+        low, high = np.repeat(limits, np.diff(np.searchsorted(places, begins)), axis=0).T
+        if (table.log_time < low).any() or (table.log_time > high).any():
+            raise Damage('its messages are not of the time that its index states')
+        self._learn_all(data, others)
+        return table
 
 
 class _Strict(ReadDataStream):
@@ -742,41 +746,57 @@ def _records(data: bytes, *, messages_only: bool = False, at: int = 0, end: int 
     return np.frombuffer(places, np.int64) if places else np.empty(0, np.int64), others, at
 
 
-def _all_records(data: bytes) -> tuple[IntArray, list[tuple[int, int, int]]]:
-    """Return the records of a chunk as `_records`."""
-    places, others, end = _records(data)
-    if end < len(data):
-        raise Damage('a record within it is cut off')
-    return places, others
-
-
-def _by_index(data: bytes, index: bytes) -> tuple[IntArray, list[tuple[int, int, int]]] | None:
-    """
-    Return the records of a chunk as `_records`, by the message indexes behind it.
-
-    None where the messages that these name and records of other kinds do not fill the chunk from
-    end to end: then the indexes do not tell what the chunk holds.
-    """
+def _all_records(data: bytes, begins: IntArray) -> tuple[IntArray, list[tuple[int, int, int]]]:
+    """Return the records of chunks as `_records`; begins: as of `_by_index`."""
     parts: list[IntArray] = []
-    at = 0
-    while at < len(index):
-        if at + _HEAD.size + 6 > len(index):
-            return None
-        op, length = _HEAD.unpack_from(index, at)
-        count, odd = divmod(length - 6, 16)
-        if op != Opcode.MESSAGE_INDEX or odd or count < 0 or at + _HEAD.size + length > len(index):
-            return None
-        parts.append(np.frombuffer(index, '<i8', 2 * count, at + _HEAD.size + 6)[1::2])
-        at += _HEAD.size + length
-    places = np.sort(np.concatenate([np.empty(0, np.int64), *parts]), kind='stable')
-    if not places.size or places[0] < 0 or places[-1] > len(data) - _DATA:
+    others: list[tuple[int, int, int]] = []
+    for begin, end in zip(begins.tolist(), begins[1:].tolist()):
+        places, more, reached = _records(data, at=begin, end=end)
+        if reached < end:
+            raise Damage('a record within it is cut off')
+        parts.append(places)
+        others += more
+    return np.concatenate(parts), others
+
+
+def _by_index(data: bytes, indexes: Sequence[bytes], begins: IntArray,
+              ) -> tuple[IntArray, list[tuple[int, int, int]]] | None:
+    """
+    Return the records of chunks as `_records`, by the message indexes behind each.
+
+    begins: start of each chunk in `data`, and the end of the last.  None where the messages that
+    these name and records of other kinds do not fill each chunk from end to end: then the indexes
+    do not tell what the chunks hold.
+    """
+    parts = [np.empty(0, np.int64)]
+    for first, index in zip(begins.tolist(), indexes):
+        at = 0
+        while at < len(index):
+            if at + _HEAD.size + 6 > len(index):
+                return None
+            op, length = _HEAD.unpack_from(index, at)
+            count, odd = divmod(length - 6, 16)
+            if op != Opcode.MESSAGE_INDEX or odd or count < 0 or (
+                    at + _HEAD.size + length > len(index)):
+                return None
+            offsets = np.frombuffer(index, '<i8', 2 * count, at + _HEAD.size + 6)[1::2]
+            if count and not 0 <= int(offsets.min()) <= int(offsets.max()) < len(data):
+                return None
+            parts.append(offsets + first)
+            at += _HEAD.size + length
+    places = np.sort(np.concatenate(parts), kind='stable')
+    if not places.size or places[-1] > len(data) - _DATA:
         return None
     ends = places + _HEAD.size + gather(data, places + 1, '<i8')
     # A length of 2^63 or more is negative here; one beyond the chunk is too long.
     if not ((gather(data, places, 'u1') == Opcode.MESSAGE) & (ends >= places + _DATA)
             & (ends <= len(data))).all():
         return None
-    behind, ahead = np.append(0, ends), np.append(places, len(data))
+    # No record goes on from one chunk to the next.
+    inner = begins[1:-1]
+    at_inner = np.searchsorted(places, inner)
+    behind = np.append(0, np.insert(ends, at_inner, inner))
+    ahead = np.append(np.insert(places, at_inner, inner), len(data))
     others: list[tuple[int, int, int]] = []
     for gap in np.nonzero(behind != ahead)[0].tolist():
         inside, more, end = _records(data, at=int(behind[gap]), end=int(ahead[gap]))

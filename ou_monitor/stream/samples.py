@@ -20,7 +20,6 @@ counted as a gap, and is made up slowly.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 import math
 from typing import TYPE_CHECKING
@@ -28,7 +27,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
-from ou_monitor.stream.config import Extractor
+from ou_monitor.stream.config import FieldSpec
 
 if TYPE_CHECKING:
     from ou_monitor.online.monitor import SupplyMonitor
@@ -399,10 +398,10 @@ class SampleStream:
 
     def __init__(self, monitor: SupplyMonitor) -> None:
         self._monitor = monitor
-        self._voltage: Extractor | None = None
-        self._throttle: Extractor | None = None
         self._block: BlockClock | None = None
         self._throttle_block: BlockClock | None = None
+        # Whether throttles that are not finite are transmission errors.
+        self._drop = True
         self._hold = ThrottleHold()
         # Stamps, voltages, arrivals and currents (NaN: unknown) since the last flush.
         self._samples: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = []
@@ -419,33 +418,21 @@ class SampleStream:
         self.thin = 1
         self.messages = self.unplaced = 0
 
-    def open_voltage(self, extractor: Extractor) -> None:
-        """Set the extractor of the voltage."""
-        self._voltage = extractor
-        rate = extractor.spec.sample_rate
-        self._block = None if rate is None else BlockClock(rate)
-        self._hold = ThrottleHold(rate)
+    def open_voltage(self, spec: FieldSpec) -> None:
+        """Set what the messages of the voltage hold."""
+        self._block = None if spec.sample_rate is None else BlockClock(spec.sample_rate)
+        self._hold = ThrottleHold(spec.sample_rate)
 
-    def open_throttle(self, extractor: Extractor) -> None:
-        """Set the extractor of the throttle."""
-        self._throttle = extractor
-        rate = extractor.spec.sample_rate
-        self._throttle_block = None if rate is None else BlockClock(rate)
+    def open_throttle(self, spec: FieldSpec) -> None:
+        """Set what the messages of the throttle hold."""
+        self._drop = spec.nan == 'drop'
+        self._throttle_block = (
+            None if spec.sample_rate is None else BlockClock(spec.sample_rate))
 
     @property
     def throttle(self) -> float:
         """Newest throttle, 0..1; NaN when unknown."""
         return self._last_throttle
-
-    def take_voltage(self, message: object, source_time: Callable[[], float]) -> bool:
-        """Add one voltage message (source_time in s); return whether it held a voltage."""
-        if self._voltage is None:
-            raise ValueError('take_voltage before open_voltage')
-        found = self._voltage.extract(message)
-        end = source_time() if found.stamp is None else found.stamp
-        return bool(self.take_voltages(
-            np.array([end]), np.array([found.stamp is not None]),
-            np.array([found.values.size]), found.values)[0])
 
     def take_voltages(self, ends: FloatArray, own: BoolArray, counts: npt.NDArray[np.int64],
                       values: FloatArray, arrived: FloatArray | None = None,
@@ -463,12 +450,7 @@ class SampleStream:
         current = unknown if current is None else current
         placed = np.isfinite(ends)
         self.unplaced += ends.size - int(np.count_nonzero(placed))
-        if self._block is None:
-            # Values that the extractor dropped become NaN: the monitor counts them.
-            values = _one_each(counts, values)
-            counts = np.ones(ends.size, dtype=np.int64)
-        else:
-            placed &= counts > 0
+        placed &= counts > 0
         held = placed & (np.add.reduceat(np.append(np.isfinite(values), False).astype(np.int64),
                                          np.cumsum(counts) - counts) * (counts > 0) > 0)
         if not placed.all():
@@ -511,20 +493,8 @@ class SampleStream:
         self._count += ends.size
         self._newest = max(self._newest, float(ends.max()))
 
-    def take_throttle(self, message: object, source_time: Callable[[], float]) -> bool:
-        """Add one throttle message (source_time in s); return whether it held a throttle."""
-        if self._throttle is None:
-            raise ValueError('take_throttle before open_throttle')
-        found = self._throttle.extract(message)
-        if not found.values.size:
-            return False
-        end = source_time() if found.stamp is None else found.stamp
-        return self.take_throttles(end, found.stamp is not None, found.values)
-
     def take_throttles(self, end: float, own: bool, found: FloatArray) -> bool:
         """Add the values of one throttle message; end: stamp of the last value, s."""
-        if self._throttle is None:
-            raise ValueError('take_throttles before open_throttle')
         values = found.tolist()
         stamps = [end]
         if self._throttle_block is not None and math.isfinite(end):
@@ -536,9 +506,8 @@ class SampleStream:
             self._hold.restart(self._last_throttle)
         if math.isfinite(stamps[-1]):
             self._newest_throttle = stamps[-1]
-        drop = self._throttle.spec.nan == 'drop'
         for stamp, value in zip(stamps, values[-len(stamps):], strict=True):
-            if math.isfinite(value) or not drop:
+            if math.isfinite(value) or not self._drop:
                 self._loads.append((stamp, value, own, self._count))
                 self._last_throttle = value
         return math.isfinite(self._last_throttle)
@@ -579,12 +548,3 @@ class SampleStream:
             self._empty = True
         self._newest = -math.inf
         self._hold.restart(self._last_throttle)
-
-
-def _one_each(counts: npt.NDArray[np.int64], values: FloatArray) -> FloatArray:
-    """Return one value for each message; NaN where it has none."""
-    if (counts == 1).all():
-        return values
-    single = np.full(counts.size, math.nan)
-    single[counts > 0] = values
-    return single

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.model.ou import simulate
-from ou_monitor.nodes.clocks import line_under, NEAR, ON_LINE, SendClock, SPAN
+from ou_monitor.nodes.clocks import line_under, NEAR, ON_LINE, SendClock
 import pytest
 
 
@@ -226,39 +226,22 @@ def test_a_gap_at_10_khz_keeps_the_rate():
     np.testing.assert_allclose(rates[2200:], 1e4, rtol=0.01)
 
 
-def emptied_buffer(rng, n, period, mark):
-    """Return source times of a buffer emptied at a mark, by a process that pauses at times."""
-    ends = period * mark * np.arange(1, n // mark + 1)
-    ends = ends + rng.exponential(0.1 * mark * period, ends.size)
-    ends += np.where(rng.random(ends.size) < 0.1, rng.uniform(0.005, 0.04, ends.size), 0.0)
-    sent = []
-    for end in ends:
-        begin = max(end, sent[-1] + 20e-6 if sent else 0.0)
-        sent += [begin + 20e-6 * k for k in range(mark)]
-    return 1.7e9 + np.array(sent)
-
-
 @pytest.mark.parametrize('period, mark', [(0.001, 50), (0.0001, 160)])
-def test_an_emptied_buffer_becomes_even(period, mark):
-    """The samples of a burst are spread over the time in which they were taken."""
-    n = int(4.0 / period)
-    sent = emptied_buffer(np.random.default_rng(7), n, period, mark)
+def test_an_emptied_buffer_is_told(period, mark):
+    """When the samples of a burst were taken is not known, and is not guessed."""
+    rng = np.random.default_rng(7)
+    ends = period * mark * np.arange(1, int(4.0 / (period * mark)))
+    ends = np.maximum.accumulate(ends + rng.exponential(0.1 * mark * period, ends.size))
+    sent = np.maximum.accumulate((1.7e9 + ends[:, None] + 20e-6 * np.arange(mark)).ravel())
     clock = SendClock()
-    out, bursts = [], []
+    told = []
     for source in sent.tolist():
-        out.append(clock(source))
-        bursts.append(clock.in_bursts)
-    # Told from 0.2 s on (`FIRST_SPAN`), until there are 20 bursts, and 0.1 s for the judgement.
-    told = np.flatnonzero(bursts)
-    assert sent[told[0]] - sent[0] < 0.4 and clock.settled == 1
-    assert sent[told[-1]] - sent[0] < max(20.0 * mark * period, 0.2) + 0.25
-    assert clock.rate == pytest.approx(1.0 / period, rel=0.005)
-    # The last message of a burst is the newest sample: true but for the delays, 40 ms at most,
-    # which move the spacing by 40 ms / FOLLOW and the burst's own length.
-    late = np.array(out)[n // 2:] - (1.7e9 + period * np.arange(1, len(out) + 1)[n // 2:])
-    assert np.abs(late).max() < 0.01
-    spacing = np.diff(out[n // 2:]) / period
-    assert np.abs(spacing - 1.0).max() < (0.04 + mark * period) / SPAN
+        assert clock(source) == source
+        told.append(clock.in_bursts)
+    # From 0.2 s on (`FIRST_SPAN`), with 0.1 s for the judgement.
+    first = told.index(True)
+    assert sent[first] - sent[0] < 0.4 and all(told[first:])
+    assert math.isnan(clock.rate) and clock.settled == 0
 
 
 def test_bursts_at_random_are_told():

@@ -3,14 +3,13 @@
 import math
 from pathlib import Path
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import ou_monitor
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Status
-from ou_monitor.stream.config import Extractor, FieldSpec
+from ou_monitor.stream.config import FieldSpec
 from ou_monitor.stream.samples import SampleStream
 import pytest
 
@@ -41,26 +40,27 @@ def test_one_voltage_message_to_one_report(moving):
     rng = np.random.default_rng(1)
     monitor = SupplyMonitor(MonitorSettings(brownout_voltage=4.5, brownout_horizon=1.0))
     stream = SampleStream(monitor)
-    stream.open_voltage(Extractor(FieldSpec('voltage', 'x/msg/X', 'data')))
-    stream.open_throttle(Extractor(FieldSpec('throttle', 'x/msg/X', 'data')))
+    stream.open_voltage(FieldSpec('voltage', 'x/msg/X', 'data'))
+    stream.open_throttle(FieldSpec('throttle', 'x/msg/X', 'data'))
     away, passed = 0.0, []
     for k in range(6000):
         t = 1e-3 * k
         throttle = 0.5 + 0.3 * math.sin(2.0 * t) * moving
         away = away * math.exp(-0.063) + 0.0187 * rng.standard_normal()
-        message = SimpleNamespace(data=5.0 - 0.3 * throttle + away)
+        voltages = (np.array([t]), np.zeros(1, bool), np.ones(1, int),
+                    np.array([5.0 - 0.3 * throttle + away]))
         if k % 20 == 0:
-            stream.take_throttle(SimpleNamespace(data=throttle), lambda now=t: now)
+            stream.take_throttles(t, False, np.array([throttle]))
         if k % 100 or k < 5000:
-            stream.take_voltage(message, lambda now=t: now)
+            stream.take_voltages(*voltages)
             if k % 100 == 0:
                 stream.flush()
                 monitor.report(0.0)
             continue
         reports = []
 
-        def pass_on(message=message, now=t, reports=reports):
-            stream.take_voltage(message, lambda: now)
+        def pass_on(voltages=voltages, reports=reports):
+            stream.take_voltages(*voltages)
             stream.flush()
             reports.append(monitor.report(0.0))
 

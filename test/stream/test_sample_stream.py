@@ -4,8 +4,8 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
-from ou_monitor.stream.config import Extractor, FieldSpec
-from ou_monitor.stream.samples import SampleStream
+from one_by_one import OneByOne
+from ou_monitor.stream.config import FieldSpec
 import pytest
 
 
@@ -48,11 +48,10 @@ def stamped(stamp, value):
 def stream_of(voltage_stamp=None, throttle_stamp=None, **voltage):
     """Return a stream of field `data` and its sink."""
     sink = Sink()
-    stream = SampleStream(sink)
-    stream.open_voltage(Extractor(FieldSpec(
-        'voltage', 'x/msg/X', 'data', stamp_field=voltage_stamp, **voltage)))
-    stream.open_throttle(Extractor(FieldSpec(
-        'throttle', 'x/msg/X', 'data', stamp_field=throttle_stamp)))
+    stream = OneByOne(sink)
+    stream.open_voltage(FieldSpec(
+        'voltage', 'x/msg/X', 'data', stamp_field=voltage_stamp, **voltage))
+    stream.open_throttle(FieldSpec('throttle', 'x/msg/X', 'data', stamp_field=throttle_stamp))
     return stream, sink
 
 

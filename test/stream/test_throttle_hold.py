@@ -5,10 +5,11 @@ from types import SimpleNamespace
 
 from hypothesis import example, given, HealthCheck, settings, strategies as st
 import numpy as np
+from one_by_one import OneByOne
 from ou_monitor.recordings.bag import BagWriter
 from ou_monitor.recordings.read import read_recording
-from ou_monitor.stream.config import Extractor, load_msg_config
-from ou_monitor.stream.samples import APART, APART_MIXED, SampleStream, ThrottleHold
+from ou_monitor.stream.config import load_msg_config
+from ou_monitor.stream.samples import APART, APART_MIXED, ThrottleHold
 import pytest
 
 STAMPS = st.floats(0.0, 4.0).map(lambda x: round(x, 2))
@@ -144,9 +145,9 @@ def node(config, messages, flushes):
     """Return (messages come, t, voltage, throttle) of what the node hands to its monitor."""
     config = load_msg_config(config)
     sink = Sink()
-    stream = SampleStream(sink)
-    stream.open_voltage(Extractor(config.voltage))
-    stream.open_throttle(Extractor(config.throttle))
+    stream = OneByOne(sink)
+    stream.open_voltage(config.voltage)
+    stream.open_throttle(config.throttle)
     for sink.come, (name, logged, stamp, data) in enumerate(messages, 1):
         take = stream.take_voltage if name == 'voltage' else stream.take_throttle
         # As `recordings` turns ns into s.

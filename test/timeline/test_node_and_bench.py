@@ -7,7 +7,7 @@ from ou_monitor.recordings.bag import BagWriter
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.recordings.standard_types import (
     BATTERY_STATE, encode_battery, encode_scalars, FLOAT32)
-from ou_monitor.stream.config import Extractor, load_msg_config
+from ou_monitor.stream.config import load_msg_config
 from ou_monitor.stream.samples import SampleStream
 import pytest
 
@@ -70,8 +70,8 @@ def of_the_node(rng, sent, monkeypatch):
     config = load_msg_config('battery_state')
     monitor = SupplyMonitor()
     stream = SampleStream(monitor)
-    stream.open_voltage(Extractor(config.voltage))
-    stream.open_throttle(Extractor(config.throttle))
+    stream.open_voltage(config.voltage)
+    stream.open_throttle(config.throttle)
     at = 0
     # A pair that is late together is handed over together.
     cuts = np.flatnonzero(np.diff(stamp, prepend=stamp[0], append=stamp[-1] + 1) > 0)
