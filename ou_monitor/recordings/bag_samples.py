@@ -386,13 +386,17 @@ class _Supply:
         if column is None or not column.values.size:
             return
         stamps = _stamps(self._clock, column)
-        some = column.counts > 0
-        last = (np.cumsum(column.counts) - 1)[some]
+        log_time, ends, own = column.log_time, stamps, column.stamped
+        if self._clock is not None:
+            some = column.counts > 0
+            log_time, own = log_time[some], own[some]
+            ends = stamps[(np.cumsum(column.counts) - 1)[some]]
         for load in self.loads.values():
-            load.take(column.log_time[some], stamps[last], column.stamped[some])
+            load.take(log_time, ends, own)
         more = [(self.t, stamps), (self._voltage, column.values)]
         if self._own_current:
-            more.append((self._current, np.repeat(column.beside, column.counts)))
+            more.append((self._current, column.beside if self._clock is None else
+                         np.repeat(column.beside, column.counts)))
         for whole, part in more:
             whole.frombytes(np.ascontiguousarray(part).view(np.uint8))
 

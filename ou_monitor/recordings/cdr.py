@@ -123,8 +123,12 @@ class Layout:
             word: npt.NDArray[np.uint32] = np.ndarray(
                 rows.shape[:1], '<u4', rows, offset, rows.strides[:1])
             same &= word == value
+        high = np.zeros(rows.shape[0], np.uint8)
         for offset, size in self.texts:
-            same &= (rows[:, offset:offset + size] < 0x80).all(axis=1)
+            # By columns, which are long; rows are short.
+            for k in range(offset, offset + size):
+                high |= rows[:, k]
+        same &= high < 0x80
         return same
 
 
@@ -505,15 +509,17 @@ class FieldReader:
             return left, rows
         everything = bool(fits.all())
         picked, mine = (left, rows) if everything else (left[fits], rows[fits])
+        # A slice is written far faster than places are.
+        at = slice(None) if picked.size == found.stamp.size else picked
         own = self._stamps(layout, mine)
         if own is not None:
-            known = np.isfinite(own) & (own != 0.0)
-            found.stamp[picked[known]] = own[known]
+            own[~np.isfinite(own) | (own == 0.0)] = np.nan
+            found.stamp[at] = own
         block, *other = (_scaled(layout.places[path].column(mine).reshape(picked.size, -1), spec)
                          for spec, path, _, _ in self._fields)
         found.blocks.append((picked, block))
         if other and other[0].shape[1] == 1:
-            found.beside[picked] = other[0][:, 0]
+            found.beside[at] = other[0][:, 0]
         return (left[:0], rows[:0]) if everything else (left[~fits], rows[~fits])
 
     def _stamps(self, layout: Layout, rows: Rows) -> FloatArray | None:

@@ -186,6 +186,8 @@ class McapFile:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._unpacked = self._tables = self._metadata = 0
+        # To make one costs as much as to unpack a small chunk.
+        self._zstd = zstandard.ZstdDecompressor()
         with self._open() as file:
             self._size = file.seek(0, os.SEEK_END)
             self._limit = _chunk_limit(self._size, max_chunk)
@@ -536,7 +538,7 @@ class McapFile:
         if stated > self._limit:
             raise Damage(_over_limit('it unpacks to', stated, self._limit))
         try:
-            data = _decompressed(chunk.compression, chunk.data, stated)
+            data = _decompressed(chunk.compression, chunk.data, stated, self._zstd)
         # zstd and lz4 have errors of their own.
         except Exception as error:
             raise Damage(printable(error, 200) or type(error).__name__) from error
@@ -693,13 +695,14 @@ def _crc(file: BinaryIO, length: int) -> int:
     return found
 
 
-def _decompressed(compression: str, data: bytes, stated: int) -> bytes:
+def _decompressed(compression: str, data: bytes, stated: int,
+                  zstd: zstandard.ZstdDecompressor) -> bytes:
     """Return the content of a chunk, in at most the memory that it states."""
     if compression == 'zstd':
         size = zstandard.frame_content_size(data)
         if size not in (-1, stated):
             raise Damage(f'{size} bytes in place of {stated}')
-        plain: bytes = zstandard.decompress(data, stated)
+        plain: bytes = zstd.decompress(data, stated)
     elif compression == 'lz4':
         # The library would unpack a frame of any size.
         frame = lz4.frame.LZ4FrameDecompressor()
