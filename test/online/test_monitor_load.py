@@ -1,6 +1,5 @@
 """The load inside the monitor: what feeds it, what resets it, what never does."""
 
-import math
 
 import numpy as np
 from ou_monitor.model.load import LoadModel
@@ -56,20 +55,6 @@ def test_a_reset_of_time_keeps_the_sag(flight):
     after = monitor.report(0.0).load
     assert after.known and after.level == pytest.approx(before.level - 1.0, abs=0.4)
     assert float(after.sag(0.5)) == pytest.approx(float(before.sag(0.5)), rel=0.2)
-
-
-def test_without_throttle_the_rest_is_known():
-    """Level and noise; NaN, huge values and current do no harm."""
-    rng = np.random.default_rng(2)
-    t = np.arange(0.0, 10.0, 0.02)
-    v = 5.0 + 0.01 * rng.standard_normal(t.size)
-    v[::50], v[7::50] = math.nan, 1e30
-    monitor = SupplyMonitor()
-    monitor.push(t, v, current=math.nan)
-    load = monitor.report(0.0).load
-    assert load.status is LoadStatus.NO_THROTTLE
-    assert load.level == pytest.approx(5.0, abs=0.01)
-    assert float(load.noise(0.0)) == pytest.approx(0.01, rel=0.2)
 
 
 def test_what_needs_no_alpha_is_told_first(flight):

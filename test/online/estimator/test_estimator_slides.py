@@ -21,28 +21,6 @@ def numbers(e):
 
 
 @pytest.mark.parametrize('moving', [False, True])
-@pytest.mark.parametrize('block', [1, 7, 100, 1000, 6000])
-def test_blocks_of_any_size_agree(block, moving):
-    """
-    Sums are of the same terms in another order: 1e-12, and the search settles to 1e-6.
-
-    It starts the same way in each (no estimate came before), so 1e-9 is left.
-    """
-    whole, parts = SlidingEstimator(2.0), SlidingEstimator(2.0)
-    y = Y - 0.6 * U if moving else Y
-    whole.push(T, y, U if moving else None)
-    for begin in range(0, 6000, block):
-        part = slice(begin, begin + block)
-        if block == 1:
-            parts.push(float(T[begin]), float(y[begin]), float(U[begin]) if moving else None)
-        else:
-            parts.push(T[part], y[part], U[part] if moving else None)
-    a, b = whole.estimate(), parts.estimate()
-    assert numbers(a) == pytest.approx(numbers(b), rel=1e-9, nan_ok=True)
-    assert (a.n, a.duration, a.status, a.flags) == (b.n, b.duration, b.status, b.flags)
-
-
-@pytest.mark.parametrize('moving', [False, True])
 def test_estimates_on_the_way_change_nothing(moving):
     """
     With 60 estimates on the way sums are taken in pieces, and searches start warm.

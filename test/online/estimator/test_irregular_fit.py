@@ -5,10 +5,8 @@ import math
 from dense import kalman_log_likelihood, ou_covariance, restricted
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor import SlidingEstimator
 from ou_monitor.model.ou import simulate
-from ou_monitor.online.estimator import fit
-from ou_monitor.online.estimator.fit import fit_exact, Likelihood, noise_scale, solve_tridiagonal
+from ou_monitor.online.estimator.fit import fit_exact, Likelihood, noise_scale
 import pytest
 
 
@@ -106,30 +104,6 @@ def test_value_is_that_of_a_kalman_filter():
     assert fit.log_likelihood == pytest.approx(total, abs=1e-6)
 
 
-@settings(deadline=None, max_examples=15)
-@given(st.integers(0, 100), st.floats(0.01, 100.0), st.floats(-1e3, 1e3), st.floats(0.1, 10.0))
-def test_units_and_shifts(seed, scale, shift, slower):
-    """
-    Volts to other volts, another origin of time and another second.
-
-    The search stops within 1e-4 of the maximum, of a width of 0.2 or more.
-    """
-    t, y, x = made(seed, n=80, noise=0.05)
-    one = exact(t, y, x[:, :1])
-    two = exact(slower * (t - 17.0), shift + scale * y, x[:, :1])
-    if two.edge != one.edge:
-        # A search that ends at the edge, and one that ends beside it.
-        assert {one.edge, two.edge} in ({0, -1}, {0, 1})
-        assert two.alpha * slower == pytest.approx(one.alpha, rel=0.2)
-    assert two.log_likelihood == pytest.approx(
-        one.log_likelihood - (t.size - 1) * math.log(scale),
-        abs=1e-4 if two.edge == one.edge else 1e-2)
-    assert two.beta[0] == pytest.approx(shift + scale * one.beta[0], abs=1e-2 * scale)
-    if one.edge == two.edge == 0:
-        assert two.alpha * slower == pytest.approx(one.alpha, rel=5e-3)
-        assert two.sigma * math.sqrt(slower) == pytest.approx(scale * one.sigma, rel=5e-3)
-
-
 def test_edges_are_told():
     """A random walk has no restoring force, white noise no correlation."""
     rng = np.random.default_rng(5)
@@ -142,49 +116,6 @@ def test_edges_are_told():
     swing = rng.standard_normal(400) * 0.1 + (-1.0) ** np.arange(400)
     assert exact(t, swing, x).edge == 1
     assert exact(t, simulate(t, 30.0, 0.5, rng), x).edge == 0
-
-
-def damaged(rng, how):
-    """Return stamps of 2 s at 1 kHz: a share of them lost, or all jittered."""
-    t = np.arange(2000) * 1e-3
-    return t[rng.random(t.size) > how[1]] if how[0] == 'lost' else t + rng.uniform(
-        -how[1] * 1e-3, how[1] * 1e-3, t.size)
-
-
-@pytest.mark.parametrize('how', [('lost', 0.2), ('lost', 0.3), ('jitter', 0.3)])
-@pytest.mark.parametrize('noise', [0.0, 4e-3])
-def test_an_estimate_takes_a_handful_of_evaluations(how, noise, monkeypatch):
-    """Each evaluation solves one system; searching by differences took 120 to 160 of them."""
-    rng = np.random.default_rng(7)
-    solved = []
-    solve = fit.solve_tridiagonal
-    monkeypatch.setattr(fit, 'solve_tridiagonal', lambda *args: (
-        solved.append(1), solve(*args))[1])
-    counts = []
-    for _ in range(12):
-        t = damaged(rng, how)
-        y = 15.0 + simulate(t, 60.0, 0.3, rng) + noise * rng.standard_normal(t.size)
-        solved.clear()
-        estimator = SlidingEstimator(2.1)
-        estimator.push(t, y)
-        assert estimator.estimate().usable
-        counts.append(len(solved))
-    assert 0 < np.median(counts) <= 8 and max(counts) <= 20
-
-
-@pytest.mark.parametrize('n', [1, 2, 3, 4, 7, 64, 101])
-def test_tridiagonal_systems(n):
-    """Of any size, against a dense solver."""
-    rng = np.random.default_rng(n)
-    off, right = rng.standard_normal(n - 1), rng.standard_normal((n, 3))
-    diag = 1.0 + np.abs(np.append(off, 0.0)) + np.abs(np.append(0.0, off))
-    dense = np.diag(diag) + np.diag(off, 1) + np.diag(off, -1)
-    log_det, x, own, beside = solve_tridiagonal(diag, off, right.T)
-    assert log_det == pytest.approx(np.linalg.slogdet(dense)[1], rel=1e-12)
-    inverse = np.linalg.inv(dense)
-    np.testing.assert_allclose(x.T, np.linalg.solve(dense, right), rtol=1e-10)
-    np.testing.assert_allclose(own, inverse.diagonal(), rtol=1e-10)
-    np.testing.assert_allclose(beside, inverse.diagonal(1), rtol=1e-10, atol=1e-14)
 
 
 @pytest.mark.parametrize('alpha, seed', [(8.0, 15), (40.0, 47), (8.0, 3), (0.05, 61)])

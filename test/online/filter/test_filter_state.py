@@ -48,51 +48,6 @@ def test_equals_the_linear_input_solution_of_scipy(order, fc, mode):
 
 @pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
 @pytest.mark.parametrize('order', [1, 2])
-@pytest.mark.parametrize('fc', [10.0, 40.0, 150.0])
-@pytest.mark.parametrize('f', [5.0, 20.0, 80.0])
-def test_frequency_response(order, fc, f, mode):
-    """
-    Amplitude and phase of a sine are those of the continuous filter.
-
-    A sine that is linear between samples loses (pi f dt)^2 / 3 of its
-    amplitude, and has images at k fs +- f of the relative size (f / (k fs))^2:
-    in all 6.6 (f dt)^2, times what the filter passes at the images more than
-    at f, for a derivative fc / f at most.
-    """
-    dt, n = 1e-3, 3000
-    t = np.arange(n) * dt
-    y = run(order, fc, mode, t, np.sin(2.0 * math.pi * f * t))[1999:]
-    wave = np.exp(-2j * math.pi * f * t[2000:])
-    got = 2j * np.mean(y * wave)
-    expected = signal.freqs(*analog(order, fc, mode), worN=[2.0 * math.pi * f])[1][0]
-    limit = 7.0 * (f * dt) ** 2 * max(1.0, fc / f if mode == 'derivative' else 1.0)
-    assert abs(got / expected - 1.0) < limit + 1e-9
-
-
-@pytest.mark.parametrize('order', [1, 2])
-def test_linear_between_samples_beats_held(order):
-    """
-    Against the true answer to a 20 Hz sine at irregular stamps of 2 ms on average.
-
-    Held at the newest value the input leads by half a sample, an error near
-    pi f dt = 0.13 of the amplitude; linear its error is near (pi f dt)^2 / 3.
-    """
-    rng = np.random.default_rng(3)
-    fc, f = 40.0, 20.0
-    t = np.cumsum(rng.uniform(0.5e-3, 3.5e-3, 1500))
-    x = np.sin(2.0 * math.pi * f * t)
-    response = signal.freqs(*analog(order, fc, 'lowpass'), worN=[2.0 * math.pi * f])[1][0]
-    truth = np.imag(response * np.exp(2j * math.pi * f * t))[1:]
-    state, held = LowPassState(x[0]), []
-    for k in range(1, t.size):
-        held.append(state.advance(order, 2.0 * math.pi * fc * (t[k] - t[k - 1]), x[k], x[k]))
-    error = {name: float(np.sqrt(np.mean((y - truth)[500:] ** 2)))
-             for name, y in (('linear', run(order, fc, 'lowpass', t, x)), ('held', held))}
-    assert error['linear'] < 0.1 * error['held']
-
-
-@pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
-@pytest.mark.parametrize('order', [1, 2])
 def test_irregular_steps_and_moving_cutoffs_against_an_ode_solver(order, mode):
     """Each step integrated numerically, the cutoff another in each."""
     rng = np.random.default_rng(5)
@@ -126,19 +81,6 @@ def test_bounded_for_any_cutoffs_and_steps(order, steps):
         y = state.advance(order, angle, before, x)
         before = x
         assert abs(y) <= BOUND[order] * (1.0 + 1e-9)
-
-
-def test_the_bound_is_reached():
-    """The input that follows the sign of the impulse response comes to it."""
-    for order in (1, 2):
-        state = LowPassState()
-        # Half periods of the impulse response are sqrt(2) pi long, in units of 1 / w.
-        for sign in (1.0, -1.0, 1.0):
-            for _ in range(2000):
-                state.advance(order, math.sqrt(2.0) * math.pi / 2000, sign, sign)
-        for _ in range(0 if order == 2 else 4000):
-            state.advance(order, 0.01, 1.0, 1.0)
-        assert state.y > 0.999 * BOUND[order] - 0.001
 
 
 @pytest.mark.parametrize('order', [1, 2])

@@ -226,13 +226,6 @@ def test_floor_of_stale_data_decides_once():
     check([flag.update(0.3, NAN, fresh=False, arriving=True)], 'c')
 
 
-def test_reason_names_the_parameter():
-    flag = made()
-    assert 'brownout.critical: 0.1' in flag.update(0.0, 0.12).reason
-    assert 'brownout.leave' in flag.update(1.0, 0.06).reason
-    assert 'brownout.warn: 0.01' in flag.update(2.0, 0.0).reason
-
-
 def test_critical_is_of_the_next_second_and_warn_of_the_horizon():
     """Throttle held as it is decides what must be done now; the rest is a caution."""
     flag = made()

@@ -7,9 +7,7 @@ import numpy as np
 from ou_monitor.online.load.supply_load import LoadState
 from ou_monitor.online.risk import courses
 from ou_monitor.online.risk.courses import held, lowest, mean_now, Sampling
-from ou_monitor.online.risk.forecast import below, Calibrator, density, FarShare
 import pytest
-from scipy.stats import t as student
 
 # A pack that sags by 1.5 V of 16 V, without errors: x, u, u^3, three lags, inrush.
 COEFFICIENTS = np.array([16.0, 0.0, 1.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -92,71 +90,6 @@ def test_the_level_falls_as_charge_is_drawn():
     known = state(mean=coefficients, fall=8.0, log_variance=(2.0 * math.log(1e-6), 0.0, 0.0))
     mean, _ = lowest(known, held(0.8, 10.0, 0.4), 10.0, SAMPLING)
     assert mean[0] == pytest.approx(16.0 - 8.0 / 80.0 * 0.8 ** 1.8 * 10.0, abs=1e-4)
-
-
-def test_student():
-    """Density and distribution of that mean and deviation."""
-    scale = 0.2 * math.sqrt(3.0 / 5.0)
-    law = student(5.0, 15.0, scale)
-    x = np.linspace(13.0, 16.0, 7)
-    wide = np.full(7, 0.2)
-    np.testing.assert_allclose(density(x, np.full(7, 15.0), wide), law.pdf(x), rtol=1e-9)
-    for level in x.tolist():
-        np.testing.assert_allclose(below(level, np.array([15.0]), np.array([0.2])),
-                                   law.cdf(level), rtol=1e-6)
-
-
-def test_least_squares_that_forget():
-    """Bias, gain, spread and errors after 40 horizons are those of the normal equations."""
-    rng = np.random.default_rng(2)
-    calibrator = Calibrator()
-    rows, misses = [], []
-    for k in range(40):
-        start, mean = 15.0, 15.0 - rng.uniform(0.2, 1.0)
-        s = math.hypot(0.1, 0.1 * (start - mean))
-        low = start - 0.3 * s + 0.9 * (mean - start) + s * rng.uniform(-1.0, 1.0)
-        x, y = (mean - start) / s, (low - start) / s
-        bias, gain, variance = calibrator.law.values[:3]
-        misses.append(y - bias - gain * x)
-        assert abs(misses[-1]) < 3.0 * math.sqrt(variance)
-        calibrator.add(low, mean, 0.1, start, 0.5, 2.0)
-        rows.append((x, y))
-    keep = 0.5 * np.exp(-2.0 * np.arange(39, -1, -1) / 120.0)
-    design = np.array([(1.0, x) for x, _ in rows])
-    information = np.diag([4.0, 6.25]) + (design * keep[:, None]).T @ design
-    target = np.array([0.0, 6.25]) + (design * keep[:, None]).T @ np.array([y for _, y in rows])
-    b = np.linalg.solve(information, target)
-    variance = (15.0 + float(keep @ np.square(misses))) / (5.0 + keep.sum())
-    errors = np.linalg.inv(information) * variance
-    np.testing.assert_allclose(
-        calibrator.law.values, [*b, variance, errors[0, 0], errors[0, 1], errors[1, 1]],
-        rtol=1e-9)
-
-
-def test_far_out_counts_no_more_than_six_deviations():
-    calibrator = Calibrator()
-    calibrator.add(5.0, 15.0, 0.1, 15.0, 1.0, 0.0)
-    assert calibrator.law.values[2] == pytest.approx((15.0 + 36.0) / 6.0)
-
-
-def test_rule_of_succession():
-    """Half at first; after n horizons that the law has right 1 / (n + 2), by memory."""
-    share = FarShare()
-    assert share.value == 0.5
-    for _ in range(20):
-        share.add(1.0, 0.0, 1.0, 0.0)
-    assert share.value == pytest.approx(1.0 / 22.0)
-    share.add(0.0, 1.0, 1.0, 120.0 * math.log(2.0))
-    # Half of the twenty is forgotten, and one was wrong.
-    assert share.value == pytest.approx(2.0 / 13.0)
-    assert FarShare(19.0).value == pytest.approx(1.0 / 20.0)
-
-
-def test_densities_decide_which_was_right():
-    """Both together, and the posterior share of the far one."""
-    share = FarShare()
-    assert share.add(3.0, 1.0, 1.0, 0.0) == pytest.approx(2.0)
-    assert share.value == pytest.approx(1.25 / 3.0)
 
 
 def test_a_rise_is_noisier():
