@@ -35,16 +35,16 @@ def good(**changes):
 @pytest.mark.parametrize('arrivals', [True, False])
 @pytest.mark.parametrize('kind', ['frozen', 'jumping', 'back'])
 def test_stamps_that_are_no_time_end_freshness(kind, arrivals):
-    """54 s: no flag that says false once 0.3 s have passed, the dip is seen, and it is named."""
+    """15 s: no flag that says false once 0.3 s have passed, each dip is seen, and it is named."""
     monitor, start = good(brownout_hold=0.0)
     rng = np.random.default_rng(7)
     dips = []
-    for k in range(1080):
+    for k in range(300):
         arrived = start + 0.05 * k + DT * (1.0 + np.arange(50))
         stamps = {'frozen': np.full(50, 2.999), 'back': 3.0 - 0.05 * k - DT * np.arange(50),
                   'jumping': arrived + rng.uniform(-1.5, 1.5, 50)}[kind]
         volts = ou(50, seed=k)
-        if k % 200 == 100:
+        if k % 60 == 30:
             volts[5:45] = 3.0
         monitor.push(stamps, volts, 0.4, arrival=arrived if arrivals else None)
         report = monitor.report(0.0, now=arrived[-1])
@@ -59,8 +59,8 @@ def test_stamps_that_are_no_time_end_freshness(kind, arrivals):
             assert report.level is Level.STALE
         assert report.fields['stamps'] == report.stamps.name != 'GOOD'
         assert report.stamps.value in report.summary
-    assert {100, 300, 500, 700, 900} <= set(dips) <= {
-        k + j for k in range(100, 1100, 200) for j in (0, 1)}
+    low = range(30, 300, 60)
+    assert set(low) <= set(dips) <= {k + j for k in low for j in (0, 1)}
 
 
 def test_good_stamps_again_are_good_again():
@@ -220,14 +220,14 @@ def test_memory_is_flat_whatever_arrives():
                          rng.uniform(-3.0, 3.0, n), 0.2 * k + DT * np.arange(n))
             monitor.report(0.0, 0.2 * k)
 
-    fed(300)
+    fed(150)
     tracemalloc.start()
-    fed(300)
+    fed(150)
     before = tracemalloc.get_traced_memory()[0]
-    fed(600)
+    fed(300)
     after = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
-    assert after - before < 500_000
+    assert after - before < 250_000
 
 
 @pytest.mark.parametrize('stamps, least', [

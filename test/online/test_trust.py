@@ -100,14 +100,14 @@ def test_a_gap_is_no_still_reading():
 
 @pytest.mark.skipif(not REAL, reason='needs OU_MONITOR_REALDATA')
 def test_no_recorded_source_is_called_stuck():
-    """From 1 Hz to 5 kHz, on the ground and flown, with the source still for up to 2.81 s."""
+    """The first 20 000 readings, 1 Hz to 5 kHz, of sources that are still for up to 2.81 s."""
     looked = 0
     for path in sorted([*Path(REAL).glob('*.csv'), *Path(REAL).glob('raw/*')]):
         if path.suffix == '.ulg':
             continue
         recording = read_recording(path)
         watch = StillReading()
-        for k in range(0, recording.n, 7):
+        for k in range(0, min(recording.n, 20_000), 7):
             part = slice(k, k + 7)
             watch.push(recording.t[part], recording.voltage[part], recording.throttle[part])
             # An INAV, a Crazyflie and a thrust stand take up to 60 readings to the first change.

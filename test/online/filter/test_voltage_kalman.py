@@ -7,7 +7,7 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor import AdaptiveLowPass
 import pytest
-from scipy import linalg, signal
+from scipy import signal
 
 NAN = math.nan
 TWO_PI = 2.0 * math.pi
@@ -49,23 +49,6 @@ def test_it_is_the_kalman_filter():
     y = made().filter(t, x, sigma, alpha=63.0, level=5.0)
     wanted = 5.0 + dense(t, x, sigma, 63.0, 5.0, WHITE ** 2)
     assert y[1:] == pytest.approx(list(wanted[1:]), abs=1e-6)
-
-
-def test_its_gain_is_that_of_the_riccati_equation():
-    """The error that the settled filter makes, over draws, is what SciPy's solver says."""
-    rng, n, dt, alpha, sigma = np.random.default_rng(4), 400_000, 1e-3, 63.0, 0.6
-    phi = math.exp(-alpha * dt)
-    drive = -sigma ** 2 / (2.0 * alpha) * math.expm1(-2.0 * alpha * dt)
-    u = signal.lfilter([math.sqrt(drive)], [1.0, -phi], rng.standard_normal(n))
-    y = made().filter(np.arange(n) * dt, 5.0 + u + WHITE * rng.standard_normal(n), sigma,
-                      alpha=alpha, level=5.0)
-    ahead = linalg.solve_discrete_are(np.array([[phi]]), np.eye(1), np.array([[drive]]),
-                                      np.array([[WHITE ** 2]]))[0, 0]
-    left = ahead * WHITE ** 2 / (ahead + WHITE ** 2)
-    # Errors are an AR(1) of parameter r: (1 + r^2) / (1 - r^2) samples count as one.
-    r = phi * left / ahead
-    se = math.sqrt(2.0 / n * (1.0 + r * r) / (1.0 - r * r))
-    assert np.mean((y - 5.0 - u)[1000:] ** 2) == pytest.approx(left, rel=4.0 * se)
 
 
 def swing(f, frequency, n=6000, **known):
