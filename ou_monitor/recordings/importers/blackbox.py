@@ -27,8 +27,8 @@ from orangebox.reader import Reader
 from orangebox.types import FrameType
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, DEGREE, Flight, from_start, GRAVITY, Inertial, Log, MotorSpeeds, quiet, Request, RPM,
-    Series, SIGNAL, start_of, THROTTLE, UNKNOWN, VOLTAGE)
+    CURRENT, DEGREE, Flight, GRAVITY, Inertial, Log, log_of, MotorSpeeds, quiet, Request, RPM,
+    Series, SIGNAL, three_axes, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import FloatArray
 
 # The clock counts us in 32 bits.
@@ -117,11 +117,8 @@ def read(path: Path, request: Request) -> Log:
     series += _signals(t, columns, headers, known, debug_gyro=shows_gyro)
     inertial, speeds = _motion(t, columns, headers, notes, debug_gyro=shows_gyro,
                                poles=request.poles)
-    start = start_of(series)
-    return Log('blackbox', from_start(series, start), facts, tuple(notes),
-               from_start(inertial, start),
-               None if speeds is None else from_start([speeds], start)[0],
-               tuple(name for name in names if name != 'time'))
+    return log_of('blackbox', series, facts, notes, (name for name in names if name != 'time'),
+                  inertial, speeds)
 
 
 def _wanted(names: list[str], request: Request) -> list[str]:
@@ -316,7 +313,7 @@ def _motion(t: FloatArray, columns: Fields, headers: Headers, notes: list[str], 
             debug_gyro: bool, poles: int | None,
             ) -> tuple[tuple[Inertial, ...], MotorSpeeds | None]:
     """Return gyros with the accelerometer, and motor speeds (t in s)."""
-    acc = _three(columns, ACCELEROMETER)
+    acc = three_axes(columns, [f'{ACCELEROMETER}[{axis}]' for axis in range(3)])
     one_g = _number(headers, 'acc_1G')
     if acc is not None and not one_g:
         notes.append('accSmooth was left out of /imu: the header does not state acc_1G.')
@@ -330,7 +327,7 @@ def _motion(t: FloatArray, columns: Fields, headers: Headers, notes: list[str], 
             (UNFILTERED, gyro, 1, 'gyro before the filters'),
             (DEBUG, DEGREE if debug_gyro else None, 2,
              'gyro before the filters (debug_mode GYRO_SCALED)')):
-        values = _three(columns, name)
+        values = three_axes(columns, [f'{name}[{axis}]' for axis in range(3)])
         if values is None or (name == DEBUG and not debug_gyro):
             continue
         if scale is None:
@@ -408,14 +405,6 @@ def _speeds(t: FloatArray, columns: Fields, headers: Headers, notes: list[str],
 def _place(name: str) -> int:
     digits = name.partition('[')[2].rstrip(']')
     return int(digits) if digits.isdigit() else 0
-
-
-def _three(columns: Fields, stem: str) -> FloatArray | None:
-    """Return three axes as rows of (n, 3); None when one is missing."""
-    names = [f'{stem}[{axis}]' for axis in range(3)]
-    if not all(name in columns for name in names):
-        return None
-    return np.column_stack([columns[name] for name in names])
 
 
 def _number(headers: Headers, key: str) -> float:

@@ -24,8 +24,8 @@ from zlib import crc32
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, DEGREE, from_start, GRAVITY, Inertial, Log, one_flight, Request, Series, SIGNAL,
-    start_of, THROTTLE, UNKNOWN, VOLTAGE)
+    CURRENT, DEGREE, GRAVITY, Inertial, Log, log_of, one_flight, Request, Series, SIGNAL,
+    three_axes, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.stream.files import open_regular
 from ou_monitor.text import counted
@@ -90,9 +90,7 @@ def read(path: Path, request: Request) -> Log:
         prefix = '' if event.name == _STEADY else f'{event.name}.'
         series += _series(prefix, t, columns)
         inertial += _inertial(prefix, t, columns)
-    start = start_of(series)
-    return Log('crazyflie', from_start(series, start), {}, tuple(notes),
-               from_start(inertial, start), None, tuple(one.name for one in series))
+    return log_of('crazyflie', series, {}, notes, (one.name for one in series), inertial)
 
 
 def _events(path: Path, data: bytes, number: int, stamp: str) -> tuple[dict[int, _Event], int]:
@@ -168,15 +166,11 @@ def _series(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Itera
 
 def _inertial(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Iterator[Inertial]:
     """Yield the gyro with the accelerometer."""
-    def three(group: str) -> FloatArray | None:
-        names = [f'{group}.{axis}' for axis in 'xyz']
-        if not all(name in columns for name in names):
-            return None
-        return np.column_stack([columns[name] * _UNITS[name][1] for name in names])
-
-    rates, forces = three(_GYRO), three(_FORCE)
+    rates, forces = (three_axes(columns, [f'{group}.{axis}' for axis in 'xyz'])
+                     for group in (_GYRO, _FORCE))
     if rates is not None:
-        yield Inertial(f'{prefix}{_GYRO}', t, rates, forces,
+        yield Inertial(f'{prefix}{_GYRO}', t, rates * DEGREE,
+                       None if forces is None else forces * GRAVITY,
                        f'{_GYRO} {DEGREE:.6g}' + ('' if forces is None else
                                                   f', {_FORCE} {GRAVITY:g}'),
                        "gyro after the autopilot's filters", None if prefix else 0)

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, FRD_TO_FLU, from_start, Inertial, Log, MotorSpeeds, one_flight, quiet, quiet_process,
-    Request, RPM, Series, SIGNAL, start_of, THROTTLE, UNKNOWN, VOLTAGE)
+    CURRENT, FRD_TO_FLU, Inertial, Log, log_of, MotorSpeeds, one_flight, quiet, quiet_process,
+    Request, RPM, Series, SIGNAL, three_axes, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import FloatArray
 from pymavlink import DFReader
 
@@ -101,12 +101,9 @@ def read(path: Path, request: Request) -> Log:
         raise InputError(f'{path} holds none of the messages that carry a voltage or a throttle '
                          f'({", ".join(dict.fromkeys(row[0] for row in PLAIN))})'
                          + ''.join(f': {note}' for note in notes))
-    start = start_of(series)
-    speeds = _speeds(table)
-    return Log('dataflash_text' if text else 'dataflash', from_start(series, start),
-               _facts(banner) | _cells(parameters), tuple(notes), from_start(_gyros(table), start),
-               None if speeds is None else from_start([speeds], start)[0],
-               tuple(dict.fromkeys((*(one.name for one in series), *names))))
+    return log_of('dataflash_text' if text else 'dataflash', series,
+                  _facts(banner) | _cells(parameters), notes,
+                  (*(one.name for one in series), *names), _gyros(table), _speeds(table))
 
 
 @contextmanager
@@ -297,11 +294,9 @@ def _gyros(table: Table) -> Iterator[Inertial]:
     """Yield each gyro, with the accelerometer of its message, along front, left and up."""
     first: set[str] = set()
     for (kind, instance), columns in sorted(table.items()):
-        if kind not in GYROS or not all(field in columns for field in RATES):
+        rates, forces = three_axes(columns, RATES), three_axes(columns, FORCES)
+        if kind not in GYROS or rates is None:
             continue
-        rates = np.column_stack([columns[field] for field in RATES])
-        forces = (np.column_stack([columns[field] for field in FORCES])
-                  if all(field in columns for field in FORCES) else None)
         rank = None if kind in first else GYROS[kind]
         first.add(kind)
         yield Inertial(f'{kind}[{instance}]' if instance else kind, np.array(columns['t']),

@@ -9,7 +9,7 @@ time is not kept.  Importers know nothing of how a log is written as a bag.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
 import io
@@ -304,15 +304,27 @@ def rising(t: FloatArray) -> npt.NDArray[np.bool_]:
 _Timed = TypeVar('_Timed', bound=Any)
 
 
-def start_of(series: Iterable[_Timed], start: float = math.inf) -> float:
-    """Return the first moment of a log, s: of its series, or `start` where that is earlier."""
+def log_of(form: str, series: Sequence[Series], facts: dict[str, str], notes: Iterable[str],
+           names: Iterable[str], inertial: Iterable[Inertial] = (),
+           speeds: MotorSpeeds | None = None, start: float = math.inf) -> Log:
+    """Return a log, its stamps counted from the first of its series, or `start` (s) if earlier."""
     # Broken bytes make stamps near zero: a first sample counts when another is near it.
-    return min([start, *(float(one.t[near(one.t)].min()) for one in series if one.t.size)])
+    start = min([start, *(float(one.t[near(one.t)].min()) for one in series if one.t.size)])
+
+    def shifted(parts: Iterable[_Timed]) -> tuple[_Timed, ...]:
+        return tuple(replace(one, t=one.t - start) if math.isfinite(start) else one
+                     for one in parts)
+
+    return Log(form, shifted(series), facts, tuple(notes), shifted(inertial),
+               next(iter(shifted([speeds] if speeds else [])), None),
+               tuple(dict.fromkeys(names)))
 
 
-def from_start(series: Iterable[_Timed], start: float) -> tuple[_Timed, ...]:
-    """Return what has stamps `t` with these counted from the start of the log (start in s)."""
-    return tuple(replace(one, t=one.t - start) if math.isfinite(start) else one for one in series)
+def three_axes(columns: Mapping[str, Any], names: Sequence[str]) -> FloatArray | None:
+    """Return columns side by side, shape (n, 3); None when one is missing."""
+    if not all(name in columns for name in names):
+        return None
+    return np.column_stack([np.asarray(columns[name], dtype=np.float64) for name in names])
 
 
 @contextmanager

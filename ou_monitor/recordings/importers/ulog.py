@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.recordings.importers.log import (
-    CURRENT, FRD_TO_FLU, from_start, Inertial, Log, MotorSpeeds, one_flight, Progress, quiet,
-    Request, RPM, Series, SIGNAL, start_of, THROTTLE, UNKNOWN, VOLTAGE)
+    CURRENT, FRD_TO_FLU, Inertial, Log, log_of, MotorSpeeds, one_flight, Progress, quiet, Request,
+    RPM, Series, SIGNAL, three_axes, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
 from pyulog import ULog
 
@@ -143,11 +143,9 @@ def read(path: Path, request: Request) -> Log:
             series += [*found, *_others(name, data.name, columns, {one.name for one in found})]
             inertial += _gyros(name, data.name, columns)
             speeds = speeds or _speeds(data.name, columns)
-    start = start_of(series, ulog.start_timestamp * 1e-6)
-    return Log('ulog', from_start(series, start), _facts(ulog), tuple(notes),
-               from_start(inertial, start),
-               None if speeds is None else from_start([speeds], start)[0],
-               tuple(dict.fromkeys((*(one.name for one in series), *_declared(ulog)))))
+    return log_of('ulog', series, _facts(ulog), notes,
+                  (*(one.name for one in series), *_declared(ulog)), inertial, speeds,
+                  ulog.start_timestamp * 1e-6)
 
 
 def _topics(names: frozenset[str]) -> list[str]:
@@ -185,7 +183,8 @@ def _gyros(name: str, topic: str, columns: dict[str, Any]) -> Iterator[Inertial]
     for source, gyro, acc, rank, words in GYROS:
         if source != topic:
             continue
-        rates, forces = _axes(columns, gyro), _axes(columns, acc) if acc else None
+        rates = three_axes(columns, _axes(gyro))
+        forces = three_axes(columns, _axes(acc)) if acc else None
         if rates is not None:
             t = np.asarray(columns['timestamp'], dtype=np.float64) * 1e-6
             yield Inertial(name, t, rates * FRD_TO_FLU,
@@ -193,12 +192,9 @@ def _gyros(name: str, topic: str, columns: dict[str, Any]) -> Iterator[Inertial]
                            'front, right, down turned to front, left, up', words, rank)
 
 
-def _axes(columns: dict[str, Any], stem: str) -> FloatArray | None:
-    """Return three axes as rows of (n, 3); None when one is missing."""
-    names = [f'{stem}[{axis}]' for axis in range(3)] if stem else ['x', 'y', 'z']
-    if not all(name in columns for name in names):
-        return None
-    return np.column_stack([np.asarray(columns[name], dtype=np.float64) for name in names])
+def _axes(stem: str) -> list[str]:
+    """Return the fields of three axes."""
+    return [f'{stem}[{axis}]' for axis in range(3)] if stem else ['x', 'y', 'z']
 
 
 def _speeds(topic: str, columns: dict[str, Any]) -> MotorSpeeds | None:

@@ -6,7 +6,7 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.choose import choose
 from ou_monitor.recordings.importers.log import (
-    clean, CURRENT, from_start, Log, Series, start_of, THROTTLE, VOLTAGE)
+    clean, CURRENT, Log, log_of, Series, THROTTLE, VOLTAGE)
 import pytest
 
 PATH = Path('a.ulg')
@@ -119,12 +119,12 @@ def test_nothing_left():
     assert chosen.throttle is None and 'u has no usable sample.' in chosen.notes
 
 
-def test_from_start():
+def test_stamps_count_from_the_start():
     """The start is that of the log, or an earlier sample; not one of broken bytes."""
     one, two = series(t=(100.0, 101.0, 102.0)), series(t=(99.0, 101.0, 102.0))
     for given, firsts in ((99.5, [1.0, 0.0]), (90.0, [10.0, 9.0])):
-        start = start_of([one, two], given)
-        assert [x.t[0] for x in from_start([one, two], start)] == firsts
+        log = log_of('x', [one, two], {}, [], [], start=given)
+        assert [x.t[0] for x in log.series] == firsts
     t = np.concatenate(([0.0], 1e5 + np.arange(100.0)))
     broken = series(t=t, values=t)
-    assert from_start([broken], start_of([broken]))[0].t[1] == 0.0
+    assert log_of('x', [broken], {}, [], []).series[0].t[1] == 0.0
