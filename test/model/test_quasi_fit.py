@@ -2,11 +2,10 @@
 
 import math
 
-from dense import block_autocovariances, fisher, restricted
+from dense import fisher
 import numpy as np
 from ou_monitor.model import arma
 from ou_monitor.model.ou import simulate
-from ou_monitor.online.estimator.fit import fit_exact, Likelihood
 import pytest
 from scipy.linalg import toeplitz
 from scipy.optimize import minimize
@@ -83,59 +82,7 @@ def test_determinant_is_that_of_dense_matrices():
         assert value == pytest.approx(-0.5 * math.log(n), abs=1.5 / (n * a))
 
 
-def test_differences_of_dense_likelihoods():
-    """
-    Between two parameters near the optimum, one quasi-likelihood is the other's twin.
-
-    What is left comes from the ends: differences of parameters of one standard
-    error, n^(-1/2), change it by O(n^(-1/2)).  Four times the data must halve it.
-    """
-    def apart(n, seed):
-        y = made(seed, n)
-        c0, c = variogram(y)
-        a, theta = math.log(0.1), arma.theta_at(0.1, 1, 0.3)
-        step = math.sqrt(2.0 / (0.1 * n))
-        values = []
-        for x in (a - step, a + step):
-            dense = -restricted(arma_covariance(x, theta, n), y, np.ones((n, 1)))[0]
-            values.append(arma.objective(c0, c, n - 1.0, x, theta, 0.0, 0.0)[0] - dense)
-        return values[1] - values[0]
-
-    small = np.sqrt(np.mean([apart(150, seed) ** 2 for seed in range(24)]))
-    large = np.sqrt(np.mean([apart(1200, seed) ** 2 for seed in range(12)]))
-    # The points are a standard error, half a nat, either side of the truth.
-    assert large < 0.2 and large < 0.6 * small
-
-
-def optimum(y, m=1):
-    """Return the minimiser from a poor start."""
-    c0, c = variogram(y)
-    return arma.minimise(c0, c, y.size - 1.0, -1.0, 0.1, 0.0, 0.0, -20.0, 2.0, 0.0, 0.0)
-
-
-def test_optimum_is_that_of_the_exact_likelihood():
-    """To O(1/n) in ln(alpha), where the standard error is O(n^(-1/2)): 4 n, a quarter."""
-    def apart(n):
-        differences = []
-        for seed in range(24):
-            y = made(seed, n, a=0.2, share=0.3)
-            exact = fit_exact(Likelihood(np.arange(float(n)), y, np.ones((n, 1))), 1)
-            log_a, theta, _, _, _ = optimum(y)
-            own = (arma.theta_at(exact.alpha, 1, exact.noise_var / exact.sigma ** 2))
-            differences.append((log_a - math.log(exact.alpha), theta - own))
-        return np.sqrt(np.mean(np.square(differences), axis=0))
-
-    small, large = apart(500), apart(2000)
-    information = arma.information(math.log(0.2), arma.theta_at(0.2, 1, 0.3))
-    i_aa, i_at, i_tt = information
-    det = i_aa * i_tt - i_at ** 2
-    se = np.sqrt(np.array([i_tt, i_aa]) / det / 2000)
-    assert (large < 0.2 * se).all()
-    # Between a half (a bias of the order of the error) and a quarter.
-    assert (large < 0.4 * small).all()
-
-
-@pytest.mark.parametrize('seed', range(12))
+@pytest.mark.parametrize('seed', range(3))
 @pytest.mark.parametrize('a, share, floor, slope', [
     (0.05, 0.3, 0.0, 0.0), (0.05, 0.0, 0.0, 0.0), (0.3, 1.0, 0.0, 0.0), (0.1, 0.0, -0.2, 0.05),
     (0.02, 5.0, 0.0, 0.0)])
@@ -182,15 +129,3 @@ def test_information_is_that_of_dense_matrices():
                   - fisher(lambda p: arma_covariance(*p, 120), at, steps)) / 120
     expected = (per_sample[0, 0], per_sample[0, 1], per_sample[1, 1])
     assert arma.information(*at) == pytest.approx(expected, rel=1e-5)
-
-
-@pytest.mark.parametrize('m', [1, 4])
-def test_exact_autocovariances_give_the_truth(m):
-    """Many samples whose autocovariances are the model's: the optimum is the model."""
-    a, share, lags = 0.1, 0.3, 60
-    gamma = block_autocovariances(a, m, lags + 1)
-    log_a, theta, _, on_bound, _ = arma.minimise(
-        gamma[0] + share, gamma[1:].tolist(), 1e9, -1.0, 0.0,
-        arma.noise_free_theta(a, m), 0.0, -20.0, 2.0, 0.0, 0.0)
-    assert not on_bound
-    assert (math.exp(log_a), theta) == pytest.approx((a, arma.theta_at(a, m, share)), rel=1e-6)

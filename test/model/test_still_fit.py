@@ -110,13 +110,3 @@ def test_trend_score_is_that_of_generalised_least_squares(seed, slope):
                            [float(n - k) for k in lags], math.log(a),
                            arma.theta_at(a, 1, share))
     assert got == pytest.approx(expected, rel=0.05, abs=0.3)
-
-
-def test_guess_sees_the_noise():
-    """Straight through two lags of the variogram: right to a tenth for a fine step."""
-    gamma = block_autocovariances(0.01, 1, 4)
-    log_a, theta = arma.guess(gamma[0] + 10.0, gamma[1:].tolist())
-    assert math.exp(log_a) == pytest.approx(0.01, rel=0.1)
-    assert 0.0 < theta < math.exp(-math.exp(log_a))
-    log_a, theta = arma.guess(1.0, [-0.5, 0.2])
-    assert math.isfinite(log_a) and theta < math.exp(-math.exp(log_a))

@@ -61,15 +61,6 @@ def test_jumps_are_a_poisson_process():
     agrees(e[at].std(), 0.03, 0.03 / math.sqrt(2.0 * at.size), 0.09)
 
 
-def test_jumps_add_to_the_noise():
-    """Jumps and the ou add up, draw for draw."""
-    t = np.arange(3000) / 1000.0
-    both = supply(jumps()).simulate(t, np.random.default_rng(3))
-    alone = still(jumps()).simulate(t, np.random.default_rng(3))
-    np.testing.assert_allclose(both, supply().simulate(t, np.random.default_rng(3)) + alone,
-                               rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize('dof', [3.0, 5.0, 12.0])
 def test_heavy_tails(dof):
     """

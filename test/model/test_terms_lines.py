@@ -71,22 +71,6 @@ def test_wide_tone():
     assert np.abs(groups).max() <= amplitude and np.abs(groups).max() > 0.999 * amplitude
 
 
-def test_width_of_the_line():
-    """
-    Half of the power of a tone lies within its full width at half height.
-
-    Re-sampled power of 1000 s: some 3000 coherence times; the share of power
-    within +-width/2 of a Lorentzian is 1/2, found to about 1/sqrt(3000) = 2 %.
-    """
-    width, n, dt = 3.0, 250_000, 4e-3
-    x = still(term('tone', amplitude=1.0, frequency=50.0, phase=0.0, linewidth=width)).simulate(
-        np.arange(n) * dt, np.random.default_rng(4))
-    power = np.abs(np.fft.rfft(x)) ** 2
-    off = np.abs(np.fft.rfftfreq(n, dt) - 50.0)
-    share = power[off < 0.5 * width].sum() / power.sum()
-    agrees(share, 2.0 / math.pi * math.atan(1.0), 0.5 / math.sqrt(3000.0), 0.12)
-
-
 def test_throttle_tone_at_constant_throttle():
     """Frequency idle + slope throttle."""
     t = np.arange(3000) / 1000.0
