@@ -18,7 +18,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from ou_monitor.analysis.analyze import analyze, as_data  # noqa: E402
+from ou_monitor.analysis.analyze import Analysis, analyze, as_data  # noqa: E402
 from ou_monitor.cli.output import plain  # noqa: E402, I100
 from ou_monitor.recordings.read import read_recording  # noqa: E402
 
@@ -28,14 +28,14 @@ GOLDEN = ROOT / 'test' / 'analysis' / 'golden'
 _LONG, _EVERY = 64, 16
 
 
-def golden(name: str) -> Any:
+def table(analysis: Analysis) -> Any:
     """
-    Return the golden table of a bag, computed now.
+    Return the golden table of a bag's analysis.
 
     Parameters
     ----------
-    name : str
-        Folder in bags/.
+    analysis : Analysis
+        What `analyze` found.
 
     Returns
     -------
@@ -43,7 +43,7 @@ def golden(name: str) -> Any:
         Plain data.
 
     """
-    data = as_data(analyze(read_recording(BAGS / name)))
+    data = as_data(analysis)
     # Where it was read from is the reader's to say.
     del data['source']
     # Told by the load filter, which has tests of its own.
@@ -70,7 +70,8 @@ def main(argv: list[str]) -> int:
     runs = {**golden_runs.RUNS, **golden_models.RUNS, **golden_parts.RUNS}
     bags = sorted(path.parent.name for path in BAGS.glob('*/truth.yaml'))
     for name in argv or [*bags, *runs]:
-        found = runs[name]() if name in runs else golden(name)
+        found = runs[name]() if name in runs else table(
+            analyze(read_recording(BAGS / name)))
         path = (ROOT / 'test' / 'golden' if name in runs else GOLDEN) / f'{name}.json'
         # A table of a run is read by a program: one line for each part of it.
         text = json.dumps(found, indent=None if name in runs else 1, allow_nan=False,

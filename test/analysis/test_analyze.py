@@ -44,23 +44,6 @@ def test_two_levels_are_recovered():
         assert 5.0 < level.crest < 9.0
 
 
-def test_the_95_percent_intervals_hold():
-    """
-    Of 40 levels, alpha and sigma lie in their interval at least 33 times.
-
-    A binomial of 40 and 0.95 falls below 33 with probability 4e-4; intervals
-    half as wide hold 67 % and reach 33 with probability 2 %.
-    """
-    inside = {'alpha': 0, 'sigma': 0}
-    for seed in range(20):
-        for level, (_, sigma) in zip(analyze(recording(100 + seed, TRUTH, seconds=4.0)).levels,
-                                     TRUTH):
-            for name, truth in (('alpha', ALPHA), ('sigma', sigma)):
-                low, high = level.estimate.interval(name)
-                inside[name] += low < truth < high
-    assert inside['alpha'] >= 33 and inside['sigma'] >= 33
-
-
 def test_amplitudes_are_those_of_the_samples():
     """Vpp, peak and Vrms of an exact triangle, apart from its offset."""
     t = np.arange(4000) / 1000.0
@@ -222,13 +205,6 @@ def test_the_node_takes_each_reading_once(monkeypatch):
     found = analyze(simulated, brownout_voltage=4.0)
     assert sum(taken) == simulated.n
     assert found.overview.facts.to_dict() == supply_facts(simulated, 4.0).to_dict()
-
-
-def test_sliding_risk_grows_with_the_threshold():
-    """A threshold far below is safe, one above the voltage is certain."""
-    simulated = recording(13, ((0.1, 0.3),))
-    assert slide(simulated, 2.0, brownout_voltage=4.0).risk.max() < 1e-4
-    assert slide(simulated, 2.0, brownout_voltage=6.0).risk.min() == 1.0
 
 
 def test_progress_ends_at_one():

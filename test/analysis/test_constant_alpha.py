@@ -129,10 +129,3 @@ def test_a_tone_is_not_taken_for_another_alpha():
                                ).verdict == 'differs'
         assert analysis.alpha_test.verdict != 'differs'
         assert analysis.alpha_test.levels == 2
-
-
-def test_ratios_beyond_a_hundred_are_said_so():
-    """Digits of a ratio that nothing supports are not printed."""
-    vague = alpha_constancy((0.1, 0.5), [estimate(ALPHA, 1.1), estimate(ALPHA, 1.1)])
-    assert vague.detectable_ratio > 100.0
-    assert 'a factor of more than 100 from' in vague.sentence

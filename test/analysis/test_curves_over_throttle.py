@@ -5,11 +5,10 @@ import math
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.model.ou import simulate
-from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Recording
 import pytest
-from simulated_recordings import ALPHA, recording, without_throttle
+from simulated_recordings import ALPHA, recording
 
 
 def swept(seed, seconds=60.0, rate=500.0):
@@ -31,26 +30,6 @@ def test_throttle_that_only_passes_is_known():
     truth = (0.1 + at[inside]) / math.sqrt(2.0 * ALPHA)
     assert found.noise[inside] == pytest.approx(truth, rel=0.15)
     assert np.isfinite(found.risk[at <= 0.7]).all() and np.isnan(found.risk[at > 0.81]).all()
-
-
-def test_the_node_says_the_same():
-    """Fed as the node is, ten times a second, its monitor has the same budget."""
-    simulated = swept(2)
-    found = analyze(simulated, brownout_voltage=4.5).by_throttle
-    monitor = SupplyMonitor(MonitorSettings())
-    for part in np.array_split(np.arange(simulated.n), int(10 * simulated.duration)):
-        monitor.push(simulated.t[part], simulated.voltage[part], simulated.throttle[part])
-        report = monitor.report(age=0.0)
-    assert found.budget == pytest.approx(report.budget, abs=0.03)
-    assert np.nanmax(found.risk) > found.limit > np.nanmin(found.risk)
-
-
-def test_without_throttle_there_are_no_curves():
-    """And the budget says why."""
-    analysis = analyze(without_throttle(recording(1, ((0.1, 0.3),))))
-    assert not analysis.by_throttle.known.any()
-    assert np.isnan(analysis.by_throttle.risk).all()
-    assert 'Throttle is not known' in analysis.by_throttle.budget_reason
 
 
 def test_without_a_fit_the_budget_says_why():

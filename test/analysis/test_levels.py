@@ -73,13 +73,6 @@ def test_a_nervous_stick_breaks_no_level(spread, seed):
         assert sum(t[s.stop - 1] - t[s.start] for s in level.segments) > 0.9 * long
 
 
-def test_levels_five_percent_apart_are_separated_under_a_stick_of_one_percent():
-    """As the paper's lowest are."""
-    t, throttle = profile((0.30, 10), (0.35, 10))
-    levels = find_levels(t, throttle + stick(t, 0.01, 3))
-    assert [round(level.throttle, 2) for level in levels] == [0.30, 0.35]
-
-
 def test_a_ramp_between_stays_makes_no_level():
     """Five seconds from each level to the next, at 4 and 8 % a second."""
     t = np.arange(int(32 * RATE)) / RATE
@@ -103,12 +96,6 @@ def test_a_slow_drift_of_throttle_within_a_level_does_not_split_it():
     assert len(find_levels(t, throttle + 0.002 * t)) == 2
 
 
-def test_a_staircase_of_twelve_is_twelve_levels():
-    """None is left out."""
-    t, throttle = profile(*((0.08 * k, 4) for k in range(12)))
-    assert len(find_levels(t, throttle)) == 12
-
-
 def test_a_pause_breaks_a_segment():
     """Samples on both sides of a gap are not one segment."""
     t, throttle = profile((0.1, 4))
@@ -123,21 +110,6 @@ def test_given_levels_share_the_samples_between_them():
     low, high = find_levels(t, throttle, (0.12, 0.10))
     assert (low.throttle, high.throttle) == (0.10, 0.12)
     assert low.segments[0].stop == high.segments[0].start == int(2 * RATE)
-
-
-def test_a_level_that_was_never_flown_is_empty():
-    """It stays in the table, without segments."""
-    t, throttle = profile((0.1, 2))
-    levels = find_levels(t, throttle, (0.1, 0.9))
-    assert levels[1].throttle == 0.9 and levels[1].segments == ()
-
-
-def test_without_throttle_there_is_one_level():
-    """It is NaN and holds everything."""
-    t, throttle = profile((0.1, 2))
-    (level,) = find_levels(t, np.full_like(throttle, np.nan))
-    assert np.isnan(level.throttle)
-    assert [(s.start, s.stop) for s in level.segments] == [(0, t.size)]
 
 
 def test_a_throttle_that_never_rests_is_one_level():
@@ -166,11 +138,6 @@ def test_bad_levels_are_refused(given, word):
         find_levels(t, throttle, given)
 
 
-def test_no_samples_no_levels():
-    """An empty recording has none."""
-    assert find_levels(np.zeros(0), np.zeros(0)) == ()
-
-
 def test_short_segments_of_a_ramp_are_no_level():
     """
     Five passages of 0.35 s at 30 % between stays of 2 s: no level, though 1.75 s were spent there.
@@ -193,3 +160,8 @@ def test_a_staircase_of_short_stays_keeps_its_levels():
     throttle = np.tile(np.repeat([0.1, 0.3, 0.6], 400), 5)
     found = find_levels(np.arange(throttle.size) / 1000.0, throttle)
     assert [level.throttle for level in found] == [0.1, 0.3, 0.6]
+
+
+def test_no_samples_no_levels():
+    """An empty recording has none."""
+    assert find_levels(np.zeros(0), np.zeros(0)) == ()

@@ -59,13 +59,6 @@ def test_words_are_those_of_the_facts():
     assert f'{facts.lowest.voltage_v:.2f} V' in words['Lowest voltage']
 
 
-def test_a_constant_signal_has_no_noise():
-    """Neither noise nor relaxation."""
-    t = np.arange(1000) / 100.0
-    words = dict(known_lines(overview(Recording(t, np.full(1000, 12.0), np.full(1000, 0.5)))))
-    assert words['Noise'] == 'none' and words['Relaxation'].startswith('none')
-
-
 @pytest.mark.parametrize('alpha, se, other', [
     (20.0, 0.0, False), (8.0, 0.1, True), (8.0, 0.3, False), (60.0, 0.1, True),
     (math.nan, math.nan, False)])
