@@ -79,14 +79,6 @@ def test_rails_levels_and_esr(capsys):
     assert [narrow['rows'][k]['capacitance'] for k in (0, -1)] == pytest.approx([1e-4, 1e-3])
 
 
-def test_filter_and_sag_in_words(capsys):
-    """The corner and resonance of a filter; a sag below the level."""
-    assert 'LC filter: corner 5033 Hz' in said(
-        capsys, '--rail', 'regulated', '--set', 'filter_inductance=10uH')
-    assert 'No capacitor helps' in said(capsys, '--set', 'current_max=400')
-    assert 'No more capacitance is needed' in said(capsys, '--set', 'current_max=10')
-
-
 def test_list(capsys):
     """Every component with its default and unit."""
     assert main(['design', '--list']) == 0

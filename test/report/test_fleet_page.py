@@ -8,7 +8,7 @@ from ou_monitor.fleet import lowest
 from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import judge
 from ou_monitor.fleet.summary import (
-    as_data, change, finding_words, headline, vehicle_table)
+    as_data, finding_words, headline, vehicle_table)
 from ou_monitor.fleet.table import NAMES
 from ou_monitor.report.fleet_document import fleet_document
 from ou_monitor.report.page import html
@@ -86,13 +86,6 @@ def test_little_is_known(rows, words):
     """A fleet of failures, of one recording, without estimates or vehicles has its report."""
     simulated = fleet(rows)
     assert words in headline(simulated) and words in page_text(simulated)
-
-
-def test_changes_have_their_unit():
-    """Percent of what has a logarithm, a factor where it is large, mV of sag."""
-    assert [change('sigma', value) for value in (0.0296, -0.4, 1.2, float('nan'))] == [
-        '+3 %', '-33 %', 'x 3.32', '-']
-    assert change('sag', -0.0123) == '-12.3 mV' and change('sag', 1.98) == '+1.98 V'
 
 
 def seen(path: str, vehicle: str, lowest: float, dips: int | None, **more) -> dict:

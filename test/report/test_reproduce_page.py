@@ -46,16 +46,6 @@ def test_every_printed_number_has_its_row(result):
         assert any(row.where == where for row in result.rows), where
 
 
-def test_rows_are_complete(result):
-    """Each is unique, says how, and says what it means in one sentence."""
-    keys = [(row.where, row.quantity) for row in result.rows]
-    assert len(set(keys)) == len(keys)
-    for row in result.rows:
-        assert row.how and row.sentence.endswith('.'), row.quantity
-        assert not re.search(r'\b(nan|inf)\b', row.sentence + row.how), row.quantity
-        assert not re.search(r'[.!?] [A-Z]', row.sentence), f'two sentences: {row.sentence}'
-
-
 def test_eight_points_rest_on_rows(result):
     """Numbered 1 to 8, each with rows of its own and at least one number in its text."""
     assert [point.number for point in result.points] == list(range(1, 9))
@@ -65,17 +55,6 @@ def test_eight_points_rest_on_rows(result):
     doubted = {point.number for point in result.points
                if any(row.verdict is not RowVerdict.AGREES for row in point.rows)}
     assert doubted == set(range(1, 9))
-
-
-def test_points_hold_the_numbers_of_the_theory(result):
-    """Those that do not depend on chance, as THEORY prints them."""
-    texts = {point.number: point.text for point in result.points}
-    for number, words in (
-            (2, ['2 pi x 10.03 Hz']), (3, ['61.0, 61.1, 69.3, 126.5', 'alpha 56.5', '-14.7 mV']),
-            (4, ['50 % at 5 %', '17 % at 10 %', '8 % at 40 %', '1, 3, 6']),
-            (5, ['has 8.7', 'has 8.0', 'has 5.1']), (6, ['1.58', '0.50'])):
-        for word in words:
-            assert word in texts[number], (number, word)
 
 
 def test_headline_counts_the_rows(result):
