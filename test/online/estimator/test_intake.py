@@ -70,3 +70,13 @@ def test_uneven_steps_break_runs(factor, broken):
     t = np.arange(100) * DT
     t[60:] += (factor - 1.0) * DT
     assert taken(thinner, t)[3].tolist() == ([0, 60] if broken else [0])
+
+
+def test_block_size_that_changes_restarts():
+    """From 100 kHz to 1 MHz blocks of ten become blocks of a hundred."""
+    thinner = Thinner(1e4)
+    intake = TimeLine()
+    kept = thinner.take(batches(np.arange(1000) * 1e-5, intake=intake)[0][0])
+    assert not kept[4] and thinner.m == 10
+    kept = thinner.take(batches(0.01 + np.arange(1000) * 1e-6, intake=intake)[0][0])
+    assert kept[4] and thinner.m == 100

@@ -92,6 +92,8 @@ def test_odd_samples(samples):
     t[2000:] += np.arange(500) * 3e-3
     sigma[300:600] = np.nan
     alike(*both(t, x, sigma))
+    # The interval of a gap is in no mean, which bounds the cutoff soon after.
+    alike(*both(t[:805], x[:805], sigma[:805]))
 
 
 def test_a_change_of_parameters_between_arrays(samples):

@@ -248,3 +248,17 @@ def test_places_of_motors_that_are_not_there():
     notch = AdaptiveNotch()
     notch.filter(t, x, throttle, rpm)
     assert notch._motors == pytest.approx([f[-1], 1.1 * f[-1]])
+
+
+def test_more_motors_than_notches_share_them_with_their_neighbours():
+    """Two pairs, 10 Hz apart within each, and two notches: one at the mean of each pair."""
+    t, x, throttle, _ = flight(4.0, line=0.0)
+    speeds = np.array([330.0, 200.0, 210.0, 320.0])
+    for f in speeds:
+        x = x + 30.0 * np.sin(2.0 * np.pi * f * t)
+    notch = AdaptiveNotch(rpm_unit='hz', count=2)
+    # As speeds that are measured, they are never twice the same.
+    jitter = 1e-3 * np.random.default_rng(1).standard_normal((t.size, 1))
+    notch.filter(t, x, throttle, speeds + jitter)
+    assert notch.source == 'rpm'
+    assert sorted(notch.frequencies) == pytest.approx([205.0, 325.0], abs=0.1)
