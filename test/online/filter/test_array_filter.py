@@ -1,8 +1,11 @@
 """Arrays through the low-pass: the samples one by one, and how much faster."""
 
 
+import math
+
 import numpy as np
 from ou_monitor import AdaptiveLowPass
+from ou_monitor.online.filter.filter_state import sound_piece
 import pytest
 
 N = 2500
@@ -92,8 +95,6 @@ def test_odd_samples(samples):
     t[2000:] += np.arange(500) * 3e-3
     sigma[300:600] = np.nan
     alike(*both(t, x, sigma))
-    # The interval of a gap is in no mean, which bounds the cutoff soon after.
-    alike(*both(t[:805], x[:805], sigma[:805]))
 
 
 def test_a_change_of_parameters_between_arrays(samples):
@@ -106,3 +107,23 @@ def test_a_change_of_parameters_between_arrays(samples):
     y = filters[0].filter(t[1000:], x[1000:], 0.3)
     z = [filters[1].step(float(a), float(b), 0.3) for a, b in zip(t[1000:], x[1000:])]
     assert np.max(np.abs(y - z)) < 1e-12
+
+
+@pytest.mark.parametrize('place, change, sound', [
+    (30, {}, 60), (30, {'dt': 4.9e-3}, 60), (30, {'dt': 6e-3}, 30), (30, {'dt': 0.21e-3}, 60),
+    (30, {'dt': 0.19e-3}, 30), (0, {'dt': 6e-3}, 0), (30, {'x': math.nan}, 30),
+    (30, {'x': 2e6}, 30), (0, {'x': math.inf}, 0), (30, {'t': math.nan}, 30)])
+def test_samples_that_are_sound_together(place, change, sound):
+    """Up to the first of another interval, by a factor of five of the mean, or of no number."""
+    dt, x = np.full(60, 1e-3), np.ones(60)
+    dt[place] = change.get('dt', 1e-3)
+    t = 7.0 + np.cumsum(dt)
+    x[place], t[place] = change.get('x', 1.0), change.get('t', t[place])
+    piece = sound_piece(t, x, 7.0, 1e-3, (1e6, 1e9, 1e-6))
+    assert piece[0] == sound and piece[1].size == piece[2].size == sound
+    assert np.allclose(piece[1], dt[:sound])
+    # The mean interval forgets over a hundred.
+    mean = 1e-3
+    for step, told in zip(piece[1], piece[2]):
+        mean += (step - mean) / 100.0
+        assert told == pytest.approx(mean, rel=1e-9)
