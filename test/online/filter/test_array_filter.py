@@ -1,5 +1,4 @@
-"""Arrays through the low-pass: the samples one by one, and how much faster."""
-
+"""Arrays through the low-pass: the samples one by one."""
 
 import math
 
