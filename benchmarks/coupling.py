@@ -18,7 +18,7 @@ from pathlib import Path
 import sys
 
 import numpy as np
-from ou_monitor.coupling.coupling import estimate_coupling
+from ou_monitor.analysis.coupling import estimate_coupling
 from ou_monitor.recordings.importers.choose import choose
 from ou_monitor.recordings.importers.csv_table import read_column, read_csv
 from ou_monitor.recordings.importers.formats import import_log

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ou_monitor.analysis.supply import supply_facts, SupplyFacts
-    from ou_monitor.comparison.compare import compare
-    from ou_monitor.discovery.discover import discover
+    from ou_monitor.bench import (
+        analyze, compare, coupling, design, discover, reproduce, simulate)
     from ou_monitor.errors import InputError
     from ou_monitor.online.estimator.estimator import SlidingEstimator
     from ou_monitor.online.filter.lowpass import AdaptiveLowPass
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ou_monitor.online.settings import MonitorSettings
     from ou_monitor.recordings.read import read_recording
     from ou_monitor.records import Estimate, Flag, Recording, Status
+    from ou_monitor.report.result import Result
 
 __version__ = '0.3.0'
 
@@ -35,21 +36,23 @@ _HOMES = {
     'InputError': 'ou_monitor.errors',
     'MonitorSettings': 'ou_monitor.online.settings',
     'Recording': 'ou_monitor.records',
+    'Result': 'ou_monitor.report.result',
     'SlidingEstimator': 'ou_monitor.online.estimator.estimator',
     'Status': 'ou_monitor.records',
     'SupplyFacts': 'ou_monitor.analysis.supply',
     'SupplyMonitor': 'ou_monitor.online.monitor',
+    **dict.fromkeys(('analyze', 'compare', 'coupling', 'design', 'discover', 'reproduce',
+                     'simulate'), 'ou_monitor.bench'),
     'brownout_probability': 'ou_monitor.online.risk.first_passage',
-    'compare': 'ou_monitor.comparison.compare',
-    'discover': 'ou_monitor.discovery.discover',
     'read_recording': 'ou_monitor.recordings.read',
     'supply_facts': 'ou_monitor.analysis.supply',
 }
 
 __all__ = [
     'AdaptiveLowPass', 'AdaptiveNotch', 'Estimate', 'Flag', 'InputError', 'MonitorSettings',
-    'Recording', 'SlidingEstimator', 'Status', 'SupplyFacts', 'SupplyMonitor', '__version__',
-    'brownout_probability', 'compare', 'discover', 'read_recording', 'supply_facts',
+    'Recording', 'Result', 'SlidingEstimator', 'Status', 'SupplyFacts', 'SupplyMonitor',
+    '__version__', 'analyze', 'brownout_probability', 'compare', 'coupling', 'design', 'discover',
+    'read_recording', 'reproduce', 'simulate', 'supply_facts',
 ]
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 import math
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from ou_monitor.model.terms.load_dependent import LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise, Quantization
 from ou_monitor.model.terms.slow import Drift
+from ou_monitor.recordings.model_file import ModelFile, read_model
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import FloatArray, Recording
 
@@ -168,6 +170,7 @@ class RecordedThrottle:
     # Stamps, s after the begin of the part, to throttle 0..1; each value holds until the next.
     profile: Profile
     duration: float  # Length of the part, s
+    recording: Recording  # The part
 
 
 def is_recording(text: str) -> bool:
@@ -189,10 +192,14 @@ def is_recording(text: str) -> bool:
 def read_throttle(text: str, start: float | None = None, end: float | None = None
                   ) -> RecordedThrottle:
     """Return the throttle of a recording, of the part from start to end, s after its begin."""
-    recording = read_recording(text, start=start, end=end)
+    return recorded_throttle(read_recording(text, start=start, end=end), text)
+
+
+def recorded_throttle(recording: Recording, name: str) -> RecordedThrottle:
+    """Return the throttle of a recording; name: what it was asked for by."""
     known = np.isfinite(recording.throttle)
     if not known.any():
-        raise InputError(f"--throttle '{text}': the recording has no throttle")
+        raise InputError(f"--throttle '{name}': the recording has no throttle")
     t, u = recording.t[known] - recording.t[0], recording.throttle[known]
     # The reader has refused percent and pulses; calibrations reach a little beyond.
     u = np.clip(u, 0.0, 1.0)
@@ -201,7 +208,7 @@ def read_throttle(text: str, start: float | None = None, end: float | None = Non
         # A hair later, so that a stamp that is rounded is not before its own value.
         return np.asarray(u[np.maximum(np.searchsorted(t, at + 1e-9, side='right') - 1, 0)])
 
-    return RecordedThrottle(profile, float(recording.t[-1] - recording.t[0]))
+    return RecordedThrottle(profile, float(recording.t[-1] - recording.t[0]), recording)
 
 
 # The paper's rail, V, and relaxation rate, 1/s (Table 2).
@@ -332,3 +339,106 @@ def simulated(model: SupplyModel, profile: Profile, *, duration: float, rate: fl
             yield Recording(t, run.draw(throttle), throttle, name)
     except ValueError as error:
         raise InputError(str(error)) from error
+
+
+# Above it stamps would fall together, Hz; after the other they would not fit into a bag, s.
+_RATE_MOST, _DURATION_MOST = 1e9, 9e9
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A recording to be drawn."""
+
+    file: ModelFile  # The supply
+    name: str  # Of the preset or of the model file
+    profile: Profile  # Throttle, 0..1, over stamps, s
+    throttle: str  # What it was asked for by
+    flown: Recording | None  # Where the throttle is from; None: no recording
+    duration: float  # s
+    rate: float  # Hz
+    seed: int
+    charge: float | None  # At the begin, as `RunningSupply` takes it
+    resistance: float  # Factor on the answer to throttle
+
+    @property
+    def n(self) -> int:
+        """Return the number of samples."""
+        return round(self.duration * self.rate)
+
+    def pieces(self) -> Iterator[Recording]:
+        """Yield the recording in pieces."""
+        return simulated(self.file.model, self.profile, duration=self.duration, rate=self.rate,
+                         seed=self.seed, name=self.name, charge=self.charge,
+                         resistance=self.resistance)
+
+    @cached_property
+    def recording(self) -> Recording:
+        """Return the whole recording."""
+        pieces = list(self.pieces())
+        t, voltage, throttle = (np.concatenate([getattr(piece, column) for piece in pieces])
+                                for column in ('t', 'voltage', 'throttle'))
+        return Recording(t, voltage, throttle, self.name)
+
+    def as_data(self) -> dict[str, Any]:
+        """Return what is drawn, for JSON."""
+        return {'duration_s': self.duration, 'rate_hz': self.rate, 'seed': self.seed,
+                'throttle': self.throttle, 'n': self.n,
+                'model': [{'term': term.NAME, 'params': term.values()}
+                          for term in self.file.model.terms]}
+
+
+def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: str | None = None,
+         throttle: Any = None, start: float | None = None, end: float | None = None,
+         duration: float | None = None, rate: float | None = None, seed: int = 1,
+         capacity_left: float | None = None, resistance: float = 1.0) -> Run:
+    """Return what `simulate` is asked for: see `ou_monitor.simulate`."""
+    name = 'flight' if preset is None else preset
+    if name not in PRESETS:
+        raise InputError(f"no preset '{name}': {nearest(name, PRESETS)}")
+    usual = PRESETS[name]
+    if model is None:
+        file = ModelFile(usual.model, provenance={'preset': name})
+    elif isinstance(model, (str, Path)):
+        file, name = read_model(model), Path(model).stem
+    else:
+        file, name = model if isinstance(model, ModelFile) else ModelFile(model), 'model'
+    profile, words, flown = _throttle_of(usual.throttle if throttle is None else throttle,
+                                         start, end)
+    length = usual.duration if flown is None else float(flown.t[-1] - flown.t[0])
+    rate = _positive('--rate', usual.rate if rate is None else rate, 'Hz')
+    duration = _positive('--duration', length if duration is None else duration, 's')
+    if not 1.0 <= duration * rate <= 1e12:
+        raise InputError(f'{duration:g} s at {rate:g} Hz are {duration * rate:.3g} samples, '
+                         'outside 1 to 1e12')
+    for option, value, most, unit in (('--duration', duration, _DURATION_MOST, 's'),
+                                      ('--rate', rate, _RATE_MOST, 'Hz')):
+        if value > most:
+            raise InputError(f'{option} must be at most {most:g} {unit}, as bags count in ns; got '
+                             f'{value:g}')
+    if capacity_left is not None and capacity_left != -1.0 and not 0.0 <= capacity_left <= 1.0:
+        raise InputError(f'--capacity-left must lie within 0..1, or be -1, got {capacity_left:g}')
+    charge = math.nan if capacity_left == -1.0 else capacity_left
+    return Run(file, name, profile, words, flown, duration, rate, seed, charge, resistance)
+
+
+def _throttle_of(throttle: Any, start: float | None, end: float | None,
+                 ) -> tuple[Profile, str, Recording | None]:
+    """Return a profile, what it was asked for by, and the recording that it is from."""
+    if isinstance(throttle, Recording):
+        return recorded_throttle(throttle, throttle.name).profile, throttle.name, throttle
+    if callable(throttle):
+        return throttle, 'given', None
+    words = str(throttle)
+    if is_recording(words):
+        found = read_throttle(words, start, end)
+        return found.profile, words, found.recording
+    if start is not None or end is not None:
+        raise InputError('--from and --to take a part of a recorded throttle: give --throttle '
+                         'RECORDING')
+    return read_profile(words), words, None
+
+
+def _positive(name: str, value: float, unit: str) -> float:
+    if not (math.isfinite(value) and value > 0.0):
+        raise InputError(f'{name} must be a positive number of {unit}, got {value:g}')
+    return value

@@ -19,8 +19,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from ou_monitor.analysis.analyze import Analysis, analyze, as_data  # noqa: E402
-from ou_monitor.cli.output import plain  # noqa: E402, I100
 from ou_monitor.recordings.read import read_recording  # noqa: E402
+from ou_monitor.report.result import plain  # noqa: E402
 
 BAGS = ROOT / 'bags'
 GOLDEN = ROOT / 'test' / 'analysis' / 'golden'

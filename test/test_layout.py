@@ -15,7 +15,7 @@ PACKAGE = 'ou_monitor'
 LEVEL = {
     'errors': 0, 'text': 0, 'records': 0, 'timeline': 0.5, 'model': 1, 'online': 2,
     'stream': 3, 'adc': 3, 'recordings': 4, 'simulation': 5, 'criticism': 5, 'analysis': 6,
-    'comparison': 6.5, 'discovery': 6, 'coupling': 6, 'paper': 6, 'fleet': 7, 'report': 8,
+    'comparison': 6.5, 'discovery': 6, 'paper': 6, 'fleet': 7, 'report': 8, 'bench': 8.4,
     'nodes': 9, 'cli': 9,
 }
 # What users reach as `from ou_monitor import ...`: above all but the programs.
@@ -28,7 +28,7 @@ PARSERS = {'pyulog': 'ulog', 'pymavlink': 'dataflash', 'orangebox': 'blackbox'}
 CORE = {'numpy', 'scipy'}
 # Extras, each with the one module that may import it.
 EXTRAS = {'dask': 'fleet.cluster', 'distributed': 'fleet.cluster',
-          'pyarrow': 'fleet.table', 'tornado': 'nodes.live'}
+          'pandas': 'report.result', 'pyarrow': 'fleet.table', 'tornado': 'nodes.live'}
 # The one command that is a node: the table of commands names its module, and loads it last.
 NODE_COMMANDS = {('ou_monitor.cli.commands', 'ou_monitor.nodes.live')}
 # What each part may import beyond the standard library; ROS is for nodes alone.
@@ -36,7 +36,7 @@ ALLOWED = {
     'errors': set(), 'text': set(), 'stream': CORE | {'yaml'}, 'recordings': CORE | {'yaml'},
     'cli': CORE | {'yaml'}, **dict.fromkeys((
         'records', 'timeline', 'model', 'online', 'adc', 'simulation', 'criticism',
-        'analysis', 'comparison', 'discovery', 'coupling', 'paper', 'fleet', 'report',
+        'analysis', 'comparison', 'discovery', 'paper', 'fleet', 'report', 'bench',
         '__init__'), CORE),
 }
 

@@ -27,6 +27,9 @@ _USUAL = 2.0
 # A lithium cell at rest, V: the highest that a charger leaves (LiHV 4.35 V, 0.1 V for the sensor),
 # the lowest of one that is not destroyed, and the lowest with which a flight begins.
 HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.0, 3.0
+# A lithium cell under load is empty at that, V (Betaflight's vbat_min_cell_voltage, and design's
+# default).
+CELL_LIMIT = 3.3
 # The highest median of this time is the pack before the flight, glitches and noise left out, s.
 _FULL = 0.5
 

@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 import shlex
 
-from ou_monitor.analysis.analyze import analyze, as_data
+from ou_monitor.bench import analyze
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    brownout_limit, check_outputs, limit_of, part_of_recording, positive_number, read_given,
-    repeated, throttle_levels)
+    check_outputs, limit_given, part_of_recording, positive_number, read_given, repeated,
+    throttle_levels)
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
-from ou_monitor.report.analysis_document import analysis_document
-from ou_monitor.text import counted
-
-# Fewest samples that have a scatter beside their mean and their trend.
-_FEWEST = 3
 
 
 def run(args: argparse.Namespace) -> int:
@@ -26,27 +20,14 @@ def run(args: argparse.Namespace) -> int:
     levels = throttle_levels(args.levels)
     window = positive_number('--window', args.window)
     horizon = positive_number('--brownout-horizon', args.brownout_horizon)
-    voltage = brownout_limit(args)
-    _in_range(voltage, horizon)
+    limit = limit_given(args)
+    _in_range(limit['brownout_voltage'], horizon)
     start, end = part_of_recording(args.start, args.end)
     recording = read_given(args, start, end)
-    voltage = limit_of(args, recording, voltage)
-    if recording.n < _FEWEST:
-        raise InputError(f"'{args.recording}' holds {counted(recording.n, 'usable sample')}: "
-                         f'nothing can be estimated from fewer than {_FEWEST}')
-    if levels is not None and not recording.has_throttle:
-        raise InputError(f"--levels: '{args.recording}' has no throttle; leave --levels out, or "
-                         'name the topic with --throttle-topic')
     with Progress('analyzing', args.json == output.STDOUT) as progress:
-        analysis = analyze(recording, levels=levels, window=window, brownout_voltage=voltage,
-                           brownout_horizon=horizon, cells=args.cells or 0, progress=progress)
-    said = analysis_document(analysis, command_line(args))
-    found = analysis.overview.facts
-    if analysis.brownout_default:
-        # As other commands without a limit.
-        found = replace(found, dips=None, budget=None)
-    output.deliver(args, said, {**as_data(analysis), 'headline': said.headline,
-                                'supply': found.to_dict()})
+        found = analyze(recording, levels=levels, window=window, brownout_horizon=horizon,
+                        progress=progress, **limit)
+    output.deliver(args, found, command_line(args))
     return 0
 
 

@@ -6,6 +6,7 @@ import argparse
 import math
 from typing import Any, TYPE_CHECKING
 
+from ou_monitor.analysis.crafts import CELL_LIMIT
 from ou_monitor.cli import output
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
@@ -15,15 +16,14 @@ if TYPE_CHECKING:
     from ou_monitor.records import Recording
 
 _NAN = float('nan')
-# A lithium cell under load is empty at that, V (Betaflight's vbat_min_cell_voltage, and design's
-# default); none is ever charged to the other.
-CELL_LIMIT, _CELL_MOST = 3.3, 5.0
-# Options of the topics, by the names that the parser gives them.
+# No lithium cell is ever charged to it, V.
+_CELL_MOST = 5.0
 # Fields of `CsvColumns`, and the options that give them.
 _COLUMNS = {'time': 'time_column', 'voltage': 'voltage_column', 'throttle': 'throttle_column',
             'current': 'current_column', **{name: name for name in (
                 'unit', 'time_unit', 'throttle_unit', 'sample_interval', 'delimiter', 'decimal',
                 'skip_rows')}}
+# Options of the topics, by the names that the parser gives them.
 _TOPICS = ('msg_config', 'voltage_topic', 'throttle_topic', 'flight', *_COLUMNS.values())
 
 
@@ -110,21 +110,9 @@ def brownout_limit(args: argparse.Namespace) -> float | None:
     return float(args.cells * voltage)
 
 
-def limit_of(args: argparse.Namespace, recording: Recording, limit: float | None) -> float | None:
-    """
-    Return the limit that was given, V, else that of the log's header; None without either.
-
-    A number of cells that the voltage at rest cannot have is refused.
-    """
-    from ou_monitor.analysis.crafts import check_cells, full_voltage, stated_limit
-
-    if args.cells is not None:
-        check_cells(full_voltage(recording), args.cells)
-    stated = stated_limit(recording.source) if limit is None else None
-    if stated is None:
-        return limit
-    args.cells = stated[0]
-    return stated[1]
+def limit_given(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the limit and the cells as the functions of `ou_monitor.bench` take them."""
+    return {'brownout_voltage': brownout_limit(args), 'cells': args.cells or 0}
 
 
 def throttle_levels(text: str | None) -> tuple[float, ...] | None:

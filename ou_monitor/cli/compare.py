@@ -6,11 +6,13 @@ import argparse
 import math
 import shlex
 
+from ou_monitor.bench import compare
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    brownout_limit, check_outputs, limit_of, part_of_recording, read_given, repeated)
+    check_outputs, limit_given, part_of_recording, read_given, repeated)
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
+from ou_monitor.recordings.model_file import read_model
 
 # Simulations at least and at most, as `compare` has them.
 _FEWEST, _MOST = 20, 10_000
@@ -19,26 +21,15 @@ _FEWEST, _MOST = 20, 10_000
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     start, end = part_of_recording(args.start, args.end)
-    seeds, until, limit = _seeds(args.seeds), _until(args.fit_until), brownout_limit(args)
+    seeds, until, limit = _seeds(args.seeds), _until(args.fit_until), limit_given(args)
     check_outputs(args, 'report', RECORDING=args.recording,
                   **{'--msg-config': args.msg_config, '--model': args.model})
-
-    import numpy as np
-    from ou_monitor.analysis.overview import overview
-    from ou_monitor.comparison.compare import compare
-    from ou_monitor.recordings.model_file import read_model
-    from ou_monitor.report.comparison_document import comparison_document
-
     model = None if args.model is None else read_model(args.model).model
     recording = read_given(args, start, end)
-    limit = limit_of(args, recording, limit)
-    with Progress('comparing', args.json == output.STDOUT) as progress, \
-            np.errstate(over='ignore', under='ignore'):
+    with Progress('comparing', args.json == output.STDOUT) as progress:
         found = compare(recording, model, fit_until=until, seeds=seeds, seed=args.seed,
-                        levels=() if limit is None else (limit,), progress=progress)
-    seen = overview(recording, limit, cells=args.cells or 0)
-    output.deliver(args, comparison_document(found, seen, command_line(args)),
-                   {**found.as_data(), 'supply': seen.facts.to_dict()})
+                        progress=progress, **limit)
+    output.deliver(args, found, command_line(args))
     return 0
 
 

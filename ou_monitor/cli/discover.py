@@ -10,9 +10,10 @@ import shlex
 from typing import TYPE_CHECKING
 
 from ou_monitor import __version__
+from ou_monitor.bench import discover
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    brownout_limit, check_outputs, limit_of, part_of_recording, read_given, repeated)
+    check_outputs, limit_given, part_of_recording, read_given, repeated)
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
@@ -24,32 +25,21 @@ if TYPE_CHECKING:
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     start, end = part_of_recording(args.start, args.end)
-    limit = brownout_limit(args)
+    limit = limit_given(args)
     check_outputs(args, 'save_model', 'report', RECORDING=args.recording,
                   **{'--msg-config': args.msg_config})
 
-    import numpy as np
-    from ou_monitor.analysis.overview import overview
-    from ou_monitor.discovery.discover import discover
-    from ou_monitor.report.discovery_document import discovery_document
-
     recording = read_given(args, start, end)
-    limit = limit_of(args, recording, limit)
-    # What overflows on the way ends as not finite, which the search refuses: a user has no
-    # use for the source line of it.
-    with Progress('discovering', args.json == output.STDOUT) as progress, \
-            np.errstate(all='ignore'):
-        finding = discover(recording, seed=args.seed, progress=progress)
-    seen = overview(recording, limit, cells=args.cells or 0)
-    output.deliver(args, discovery_document(finding, seen, command_line(args)),
-                   {**finding.as_data(), 'supply': seen.facts.to_dict()},
+    with Progress('discovering', args.json == output.STDOUT) as progress:
+        finding = discover(recording, seed=args.seed, progress=progress, **limit)
+    output.deliver(args, finding, command_line(args),
                    model=args.save_model if args.force or not finding.refused else None)
     if args.save_model is not None:
         # Last: that there is none must not keep the others from being written.
         if finding.refused and not args.force:
             raise InputError(f'no model saved: {finding.refused[0].lower()}{finding.refused[1:]}; '
                              '--force saves it all the same')
-        output.write_text(model_text(finding, recording), args.save_model)
+        output.write_text(model_text(finding.record, recording), args.save_model)
     return 0
 
 

@@ -94,10 +94,12 @@ def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
     from ou_monitor.fleet.summary import as_data
     from ou_monitor.fleet.table import write_table
     from ou_monitor.report.fleet_document import fleet_document
+    from ou_monitor.report.result import Result
 
     write_table(fleet.rows, folder / TABLE)
-    output.deliver(args, fleet_document(fleet, command_line(args)), as_data(fleet),
-                   table=folder / TABLE, report=folder / REPORT)
+    found = Result(fleet, lambda command: fleet_document(fleet, command), lambda: as_data(fleet),
+                   lambda: fleet.rows)
+    output.deliver(args, found, command_line(args), table=folder / TABLE, report=folder / REPORT)
 
 
 def command_line(args: argparse.Namespace) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-import enum
 import json
 import math
 import os
@@ -22,7 +21,7 @@ from typing import Any, TYPE_CHECKING
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
-    from ou_monitor.report.document import Document
+    from ou_monitor.report.result import Result
 
 # Seconds between two lines where there is no terminal, and until the time left is guessed.
 _EVERY, _FIRST = 60.0, 2.0
@@ -107,28 +106,11 @@ _NO_FILE = 'Nothing was written: --report FILE.html draws it, --json FILE keeps 
 _STORAGE = ('.mcap', '.db3', '.zst', '.zstd', '.lz4')
 
 
-def plain(value: Any) -> Any:
-    """Return a value as strict JSON can hold it."""
-    # Not above: `--help` does without.
-    import numpy as np
-
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, enum.Enum):
-        return value.name
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
 def write_json(data: Mapping[str, Any], target: str) -> None:
     """Write strict JSON (target in A)."""
+    # Not above: `--help` does without NumPy.
+    from ou_monitor.report.result import plain
+
     # ASCII: whatever the encoding of standard output, and bytes of a file name that are no text.
     text = json.dumps(plain(data), indent=2, allow_nan=False)
     if target == STDOUT:
@@ -210,9 +192,9 @@ def check_paths(inputs: Mapping[str, str | Path | None],
 
 
 @contextmanager
-def replacing(bag: Path, force: bool) -> Iterator[None]:
-    """Make room for a bag; what was there comes back when writing fails."""
-    if not (bag.exists() or bag.is_symlink()):
+def replacing(bag: Path | None, force: bool) -> Iterator[None]:
+    """Make room for a bag, if one is written; what was there comes back when writing fails."""
+    if bag is None or not (bag.exists() or bag.is_symlink()):
         yield
         return
     if not force:
@@ -266,15 +248,16 @@ def check_writable(target: str | None) -> None:
         raise InputError(f"cannot write '{target}': the folder '{path.parent}' does not exist")
 
 
-def deliver(args: argparse.Namespace, document: Document, data: Mapping[str, Any],
+def deliver(args: argparse.Namespace, found: Result, command: str = '',
             report: str | Path | None = None, **files: object) -> None:
     """Write what a command found where its arguments say: a page, JSON, a terminal."""
     report = report or getattr(args, 'report', None)
+    document = found.document(command)
     if report is not None:
         from ou_monitor.report.page import html
         write_text(html(document), report)
     if args.json is not None:
-        write_json(data, args.json)
+        write_json(found.to_dict(), args.json)
     if args.json != STDOUT:
         from ou_monitor.report.terminal import terminal
         say(terminal(document))

@@ -32,6 +32,11 @@ class Band:
         hair = 1e-9 * abs(self.measured)
         return self.low - hair <= self.measured <= self.high + hair
 
+    def as_data(self) -> dict[str, float]:
+        """Return the four numbers by name."""
+        return {'measured': self.measured, 'simulated_low': self.low,
+                'simulated_median': self.median, 'simulated_high': self.high}
+
 
 @dataclass(frozen=True)
 class SpectrumBand:
@@ -105,19 +110,26 @@ class Agreement:
         begin = 'Most wrong' if self.verdict is Verdict.DIFFERS else 'Farthest, but within chance'
         return f'{begin}: in the simulation, {self.words}.'
 
+    def measures(self) -> list[dict[str, Any]]:
+        """Return every number of the recording beside those of the simulations."""
+        answer = [('dip after rises, V', self.dip), ('1 s after rises, V', self.recovery)]
+        bands = [('lowest voltage, V', self.lowest), ('mean voltage, V', self.mean),
+                 *((f'falls through {level:.4g} V, 1/min', falls)
+                   for level, falls in zip(self.levels, self.falls)),
+                 *((name, one) for name, one in answer if one is not None),
+                 *((f'power {one.low_hz:.3g} to {one.high_hz:.3g} Hz, V^2', one.power)
+                   for one in self.spectrum)]
+        return [{'measure': name, **one.as_data(), 'inside': one.inside} for name, one in bands]
+
     def as_data(self) -> dict[str, Any]:
         """Return what `--json` writes."""
-        def band(of: Band) -> dict[str, float]:
-            return {'measured': of.measured, 'simulated_low': of.low,
-                    'simulated_median': of.median, 'simulated_high': of.high}
-
         return {
             'recording': self.recording, 'fitted_s': list(self.fitted),
             'simulated_s': list(self.simulated), 'model': list(self.model),
             'mean_path': {'variance_explained': self.explained, 'rmse_v': self.rmse,
                           'bias_v': self.bias, 'bias_by_third_v': list(self.bias_by_third)},
-            'lowest_v': band(self.lowest),
-            'crossings_per_min': [{'level_v': level, **band(falls)}
+            'lowest_v': self.lowest.as_data(),
+            'crossings_per_min': [{'level_v': level, **falls.as_data()}
                                   for level, falls in zip(self.levels, self.falls)],
             'spectrum': [{'from_hz': one.low_hz, 'to_hz': one.high_hz,
                           'simulated_over_measured': _ratio(one.power)}

@@ -36,46 +36,9 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
             levels: tuple[float, ...] = (),
             progress: Callable[[float], None] | None = None) -> Agreement:
     """
-    Compare a recording with simulations of it.
+    Compare a recording with simulations of it: see `ou_monitor.compare`.
 
-    Parameters
-    ----------
-    recording : Recording
-        Voltage, V, and throttle, 0..1.
-    model : SupplyModel, optional
-        What is simulated; without it, a model is fitted to the part before fit_until.
-    fit_until : float, optional
-        Begin of the part that is simulated, s after the first sample; half of the recording, or
-        with a model its begin, where left out.
-    seeds : int
-        Simulations, 20 to 10000.
-    seed : int
-        The same one gives the same simulations.
-    levels : tuple of float
-        Further voltages, V, whose crossings are counted.
-    progress : callable, optional
-        Takes the share that is done, 0..1.
-
-    Returns
-    -------
-    Agreement
-        What the simulations get right and wrong.
-
-    Raises
-    ------
-    InputError
-        When the recording is too short, does not change, or lacks throttle that the model needs;
-        when fit_until lies outside it.
-    ValueError
-        When seeds is out of its range.
-
-    Examples
-    --------
-    >>> from ou_monitor import compare, read_recording
-    >>> found = compare(read_recording('bags/flight', end=10.0), seeds=20)
-    >>> round(found.lowest.measured, 2), found.seeds
-    (4.66, 20)
-
+    levels: voltages, V, whose crossings are counted beside two that are found.
     """
     report = progress or (lambda share: None)
     if not _FEWEST_SEEDS <= seeds <= _MOST_SEEDS:

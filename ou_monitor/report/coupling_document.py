@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from ou_monitor.analysis.coupling import Coupling, POWER
 from ou_monitor.analysis.overview import answers, known_lines, Overview
-from ou_monitor.coupling.coupling import Coupling, POWER
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.report.analysis_document import voltage_plot
 from ou_monitor.report.document import Document, Facts, Figure, Notes, Part, Section

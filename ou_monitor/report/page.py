@@ -286,12 +286,22 @@ def html(document: Document) -> str:
         + _joined([*document.parts, *again])))
 
 
-def _joined(parts: Sequence[Part]) -> str:
-    return '\n'.join(text for text in map(_part, parts) if text)
+def section(document: Document) -> str:
+    """Return a document as part of a page of somebody else: no script, and no data of plots."""
+    # Nested, the rules are for this section alone.
+    style = _stylesheet().replace(':root', 'article').replace('body {', 'article {')
+    return (f'<div class="ou-monitor"><style>.ou-monitor {{{style}}}</style><article>\n'
+            f'<h1>{escape(document.title)}</h1>\n<p{_SOFT}>{escape(document.subject)}</p>\n'
+            f'<p class="headline">{_set(document.headline)}</p>\n'
+            f'{_joined(document.parts, live=False)}\n</article></div>\n')
 
 
-def _part(part: Part) -> str:
-    """Return one part of a document."""
+def _joined(parts: Sequence[Part], live: bool = True) -> str:
+    return '\n'.join(text for text in (_part(part, live) for part in parts) if text)
+
+
+def _part(part: Part, live: bool = True) -> str:
+    """Return one part of a document; live: with the data of its plots."""
     if isinstance(part, Text):
         return f'<p{_SOFT if part.legend else ""}>{_set(part.text)}</p>'
     if isinstance(part, Code):
@@ -308,20 +318,21 @@ def _part(part: Part) -> str:
         return _table(part)
     if isinstance(part, Figure):
         drawn = part.drawing if isinstance(part.drawing, str) else (
-            part.drawing.svg() + embed(part.drawing))
+            part.drawing.svg() + (embed(part.drawing) if live else ''))
         below = f'<figcaption>{_set(part.caption)}</figcaption>' if part.caption else ''
         return f'<figure>{drawn}{below}</figure>'
     if isinstance(part, Pair):
         # A lone one keeps its half.
         more = '<div></div>' if len(part.figures) == 1 else ''
-        return f'<div class="pair">{"".join(map(_part, part.figures))}{more}</div>'
+        both = ''.join(_part(figure, live) for figure in part.figures)
+        return f'<div class="pair">{both}{more}</div>'
     if isinstance(part, Section):
-        inside, heading = _joined(part.parts), f'<h2>{_set(part.heading)}</h2>'
+        inside, heading = _joined(part.parts, live), f'<h2>{_set(part.heading)}</h2>'
         if not inside:
             return ''
         return (f'<details class="section"><summary>{heading}</summary>\n{inside}\n</details>'
                 if part.folded else f'<section>{heading}\n{inside}\n</section>')
-    return _joined(part())
+    return _joined(part(), live)
 
 
 def _table(part: Table) -> str:

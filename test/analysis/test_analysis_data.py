@@ -4,8 +4,8 @@ import math
 import re
 
 from ou_monitor.analysis.analyze import analyze, as_data
-from ou_monitor.cli.output import plain
 from ou_monitor.recordings.read import read_recording
+from ou_monitor.report.result import plain
 from project import ROOT
 import pytest
 from simulated_recordings import recording

@@ -48,7 +48,7 @@ def test_false_alarms_and_a_gain_of_five(bench, flights):
 
 def test_the_voltage_of_a_log_is_taken_where_it_was_read(bench, flights):
     """The quad's at 50 Hz of a log of 1 kHz."""
-    from ou_monitor.coupling.coupling import estimate_coupling
+    from ou_monitor.analysis.coupling import estimate_coupling
     flight = flights['nazgul']
     found = estimate_coupling(flight.t, flight.voltage, flight.gyro_t,
                               flight.axes['gyroADC x'], throttle=flight.throttle)

@@ -37,6 +37,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -88,6 +89,25 @@ class Coupling:
     partial: bool  # Whether throttle was regressed out
     grid: Grid  # Resampled series
     notes: tuple[str, ...]  # Cautions, one sentence each
+
+
+def as_data(found: Coupling, name: str, signal: str, unit: str, notes: tuple[str, ...],
+            ) -> dict[str, Any]:
+    """Return the result for JSON."""
+    return {
+        'recording': name, 'signal': signal, 'signal_unit': unit or None, 'seen': found.seen,
+        'p_value': found.p_value, 'level': found.level,
+        'gain_per_v': found.gain, 'gain_ci95': found.gain_ci95,
+        'gain_limit_per_v': found.limit, 'lag_s': found.lag, 'lag_se_s': found.lag_se,
+        'share_of_signal': found.noise_share, 'narrow': found.narrow,
+        'signal_leads': found.signal_leads, 'throttle_taken_out': found.partial,
+        'segments': found.segments, 'duration_s': found.grid.duration,
+        'rate_hz': found.grid.rate, 'voltage_rate_hz': found.grid.rates[0],
+        'signal_rate_hz': found.grid.rates[1], 'gaps': found.grid.gaps,
+        'dropped': {'voltage': found.grid.lost[0], 'signal': found.grid.lost[1]},
+        'frequency_hz': found.frequency, 'coherence': found.coherence,
+        'coherence_threshold': found.threshold, 'gain_by_frequency': abs(found.response),
+        'notes': [*notes, *found.notes]}
 
 
 def estimate_coupling(

@@ -4,8 +4,8 @@ import math
 from pathlib import Path
 
 import numpy as np
-from ou_monitor.coupling import coupling as engine
-from ou_monitor.coupling.coupling import estimate_coupling
+from ou_monitor.analysis import coupling as engine
+from ou_monitor.analysis.coupling import estimate_coupling
 import pytest
 from scipy import stats
 from scipy.signal import lfilter

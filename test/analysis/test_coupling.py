@@ -1,7 +1,7 @@
 """Coupling of supply noise into a signal: gain, false alarms, common causes, resampling."""
 
 import numpy as np
-from ou_monitor.coupling.coupling import estimate_coupling, on_grid, POWER
+from ou_monitor.analysis.coupling import estimate_coupling, on_grid, POWER
 from ou_monitor.errors import InputError
 import pytest
 from scipy.signal import lfilter

@@ -1,0 +1,544 @@
+"""
+The commands as functions: each reads what it is given and returns a `Result`.
+
+A recording is a `Recording`, or a path that `read_recording` reads.  Imports wait for the call, so
+that a function loads only what it uses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any, TYPE_CHECKING, Union
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.errors import InputError
+from ou_monitor.records import as_numbers, as_seconds, Recording
+from ou_monitor.report.result import Result
+from ou_monitor.text import counted
+
+if TYPE_CHECKING:
+    from ou_monitor.analysis.overview import Overview
+    from ou_monitor.model.supply import SupplyModel
+    from ou_monitor.paper.network.components import PowerNetwork
+    from ou_monitor.paper.network.design import Flight
+    from ou_monitor.recordings.importers.log import Series
+    from ou_monitor.recordings.model_file import ModelFile
+    from ou_monitor.simulation import Profile
+
+Given = Union[Recording, str, Path]
+Progress = Callable[[float], None]
+Pairs = tuple[npt.ArrayLike, npt.ArrayLike]
+
+# Fewest samples that have a scatter beside their mean and their trend.
+_FEWEST = 3
+# From this rate on samples travel in blocks by default, Hz.
+_BLOCKS_FROM = 5000.0
+
+
+def _read(recording: Given) -> Recording:
+    if isinstance(recording, Recording):
+        return recording
+    from ou_monitor.recordings.read import read_recording
+
+    return read_recording(recording)
+
+
+def _limit(recording: Recording, limit: float | None, cells: int) -> tuple[float | None, int]:
+    """Return the limit, V, and its cells: those given, else those of the log's header."""
+    from ou_monitor.analysis.crafts import CELL_LIMIT, check_cells, full_voltage, stated_limit
+
+    if cells:
+        check_cells(full_voltage(recording), cells)
+    if limit is not None:
+        return limit, cells
+    if cells:
+        return cells * CELL_LIMIT, cells
+    stated = stated_limit(recording.source)
+    return (None, 0) if stated is None else (stated[1], stated[0])
+
+
+def _seen(recording: Recording, limit: float | None, cells: int) -> Callable[[], Overview]:
+    """Return a function that finds what every command says of a recording, once."""
+    from ou_monitor.analysis.overview import overview
+
+    return cache(lambda: overview(recording, limit, cells=cells))
+
+
+def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window: float = 2.0,
+            brownout_voltage: float | None = None, brownout_horizon: float = 5.0, cells: int = 0,
+            progress: Progress | None = None) -> Result:
+    """
+    Analyze the noise of a supply, load level by load level.
+
+    Parameters
+    ----------
+    recording : Recording or path
+        What to look at.
+    levels : tuple of float, optional
+        Throttles, 0..1, of the load levels; found when left out.
+    window : float
+        Window of the sliding estimate, s.
+    brownout_voltage : float, optional
+        Voltage that must not be undershot, V; as the header of a log says, or the node's default,
+        when left out.
+    brownout_horizon : float
+        Horizon of the risk, s.
+    cells : int
+        Cells in series; without a voltage the limit is 3.3 V for each.
+    progress : callable, optional
+        Takes the share that is done, 0..1.
+
+    Returns
+    -------
+    Result
+        Its record has `levels`, `by_throttle`, `quality`, `craft`; its table a row a level.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, is too short, or cannot have so many cells.
+
+    Examples
+    --------
+    >>> from ou_monitor import analyze, read_recording
+    >>> found = analyze(read_recording('bags/load_40', end=5.0))
+    >>> round(found.supply.ou.sigma, 1), found.to_dict()['levels'][0]['process_type']
+    (0.6, 'diffusion')
+
+    """
+    from dataclasses import replace
+    from ou_monitor.analysis.analyze import analyze as analyzed, as_data
+    from ou_monitor.report.analysis_document import analysis_document
+
+    recording = _read(recording)
+    voltage, cells = _limit(recording, brownout_voltage, cells)
+    if recording.n < _FEWEST:
+        raise InputError(f"'{recording.name}' holds {counted(recording.n, 'usable sample')}: "
+                         f'nothing can be estimated from fewer than {_FEWEST}')
+    if levels is not None and not recording.has_throttle:
+        raise InputError(f"--levels: '{recording.name}' has no throttle; leave --levels out, or "
+                         'name the topic with --throttle-topic')
+    found = analyzed(recording, levels=levels, window=window, brownout_voltage=voltage,
+                     brownout_horizon=brownout_horizon, cells=cells, progress=progress)
+    facts = found.overview.facts
+    if found.brownout_default:
+        # As other commands without a limit.
+        facts = replace(facts, dips=None, budget=None)
+    return Result(
+        found, lambda command: analysis_document(found, command),
+        lambda: {**as_data(found), 'headline': analysis_document(found).headline,
+                 'supply': facts.to_dict()},
+        lambda: as_data(found)['levels'], lambda: facts)
+
+
+def compare(recording: Given, model: SupplyModel | str | Path | None = None, *,
+            fit_until: float | None = None, seeds: int = 50, seed: int = 0,
+            levels: tuple[float, ...] = (), brownout_voltage: float | None = None,
+            cells: int = 0, progress: Progress | None = None) -> Result:
+    """
+    Compare a recording with simulations of it.
+
+    Parameters
+    ----------
+    recording : Recording or path
+        Voltage, V, and throttle, 0..1.
+    model : SupplyModel or path, optional
+        What is simulated; without it, a model is fitted to the part before fit_until.
+    fit_until : float, optional
+        Begin of the part that is simulated, s after the first sample; half of the recording, or
+        with a model its begin, where left out.
+    seeds : int
+        Simulations, 20 to 10000.
+    seed : int
+        The same one gives the same simulations.
+    levels : tuple of float
+        Further voltages, V, whose crossings are counted.
+    brownout_voltage, cells
+        As for `analyze`; one more such voltage.
+    progress : callable, optional
+        Takes the share that is done, 0..1.
+
+    Returns
+    -------
+    Result
+        What the simulations get right and wrong: its table has a row a measure.
+
+    Raises
+    ------
+    InputError
+        When the recording is too short, does not change, or lacks throttle that the model needs;
+        when fit_until lies outside it.
+    ValueError
+        When seeds is out of its range.
+
+    Examples
+    --------
+    >>> from ou_monitor import compare, read_recording
+    >>> found = compare(read_recording('bags/flight', end=10.0), seeds=20)
+    >>> round(found.lowest.measured, 2), found.seeds
+    (4.66, 20)
+
+    """
+    from ou_monitor.comparison.compare import compare as compared
+    from ou_monitor.recordings.model_file import read_model
+    from ou_monitor.report.comparison_document import comparison_document
+
+    if isinstance(model, (str, Path)):
+        model = read_model(model).model
+    recording = _read(recording)
+    limit, cells = _limit(recording, brownout_voltage, cells)
+    with np.errstate(over='ignore', under='ignore'):
+        found = compared(recording, model, fit_until=fit_until, seeds=seeds, seed=seed,
+                         levels=levels if limit is None else (*levels, limit), progress=progress)
+    seen = _seen(recording, limit, cells)
+    return Result(
+        found, lambda command: comparison_document(found, seen(), command),
+        lambda: {**found.as_data(), 'supply': seen().facts.to_dict()},
+        found.measures, lambda: seen().facts)
+
+
+def coupling(recording: Given, signal: str | Series | Pairs, *,
+             band: tuple[float, float] | None = None, level: float = 0.05,
+             brownout_voltage: float | None = None, cells: int = 0) -> Result:
+    """
+    Estimate how much of a signal is noise of the supply.
+
+    Parameters
+    ----------
+    recording : Recording or path
+        The supply.
+    signal : str or pair of arrays
+        What is looked at: of a path, the name of a topic and field, a column or a series; beside a
+        `Recording`, stamps (s, or dates) and values.
+    band : tuple of float, optional
+        Frequencies looked at, Hz; from 5 Hz to a quarter of the slower rate when left out.
+    level : float
+        Probability of a false alarm.
+    brownout_voltage, cells
+        As for `analyze`; dips below that voltage are counted.
+
+    Returns
+    -------
+    Result
+        Gain, lag, coherence; its table has a row a frequency.
+
+    Raises
+    ------
+    InputError
+        When there is no such signal, or too little of it beside the voltage.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ou_monitor import coupling, read_recording
+    >>> supply = read_recording('bags/load_40', end=10.0)
+    >>> noise = np.random.default_rng(1).standard_normal(supply.n)
+    >>> found = coupling(supply, (supply.t, 3.0 * supply.voltage + 0.1 * noise))
+    >>> found.seen, round(found.gain, 1)
+    (True, 3.0)
+
+    """
+    from ou_monitor.analysis.coupling import as_data, estimate_coupling
+    from ou_monitor.recordings.importers.log import Series, UNKNOWN
+    from ou_monitor.recordings.read import read_beside
+    from ou_monitor.report.coupling_document import coupling_document
+    from ou_monitor.timeline.line import readings_of
+
+    name = signal if isinstance(signal, str) else 'signal'
+    if isinstance(signal, str):
+        if isinstance(recording, Recording):
+            raise InputError(f"the signal '{signal}' is in a file: give its path instead of a "
+                             'Recording, or stamps and values instead of a name')
+        recording, signal = read_beside(recording, signal)
+    recording = _read(recording)
+    unit = ''
+    if isinstance(signal, Series):
+        name = signal.name if name == 'signal' else name
+        unit = '' if signal.unit == UNKNOWN else signal.unit
+        signal = signal.t, signal.values
+    t, values = as_seconds(signal[0]), as_numbers(signal[1])
+    limit, cells = _limit(recording, brownout_voltage, cells)
+    try:
+        found = estimate_coupling(recording.t, recording.voltage, t, values,
+                                  throttle=recording.throttle, band=band, level=level)
+    except InputError as error:
+        raise InputError(f"'{recording.name}', signal '{name}': {error}") from error
+    # From here on as `analyze` reads it.
+    read = readings_of(recording)
+    seen = _seen(read, limit, cells)
+    return Result(
+        found, lambda command: coupling_document(found, read, (t, values), name, unit, seen(),
+                                                 command),
+        lambda: {**as_data(found, read.name, name, unit, read.notes),
+                 'supply': seen().facts.to_dict()},
+        lambda: {'frequency_hz': found.frequency, 'coherence': found.coherence,
+                 'gain_per_v': abs(found.response)}, lambda: seen().facts)
+
+
+def discover(recording: Given, *, seed: int = 0, brownout_voltage: float | None = None,
+             cells: int = 0, progress: Progress | None = None) -> Result:
+    """
+    Criticise the simulation of a recording, name the cause, extend, measure the gain.
+
+    Parameters
+    ----------
+    recording : Recording or path
+        What to look at.
+    seed : int
+        Same seed, same result.
+    brownout_voltage, cells
+        As for `analyze`; dips below that voltage are counted.
+    progress : callable, optional
+        Called with the share done, 0..1.
+
+    Returns
+    -------
+    Result
+        Verdict, causes, extended model, gain; its table has a row a cause.
+
+    Raises
+    ------
+    InputError
+        When a path cannot be read.
+
+    Examples
+    --------
+    >>> from ou_monitor import discover, read_recording
+    >>> finding = discover(read_recording('bags/flight', end=6.0))
+    >>> 'load_sag' in [cause.name for cause in finding.causes]
+    True
+
+    """
+    from ou_monitor.discovery.discover import discover as discovered
+    from ou_monitor.report.discovery_document import discovery_document
+
+    recording = _read(recording)
+    limit, cells = _limit(recording, brownout_voltage, cells)
+    # What overflows on the way ends as not finite, which the search refuses: a user has no
+    # use for the source line of it.
+    with np.errstate(all='ignore'):
+        found = discovered(recording, seed=seed, progress=progress)
+    seen = _seen(recording, limit, cells)
+    return Result(
+        found, lambda command: discovery_document(found, seen(), command),
+        lambda: {**found.as_data(), 'supply': seen().facts.to_dict()},
+        lambda: found.as_data()['causes'], lambda: seen().facts)
+
+
+def design(throttle: float | None = None, *, recording: Given | None = None,
+           network: Mapping[str, Any] | PowerNetwork | None = None, rail: str = 'bus',
+           voltage: float | None = None, horizon: float = 5.0, risk: float = 1e-3,
+           capacitances: tuple[float, float] | None = None, esr_fixed: bool = False) -> Result:
+    """
+    Find the bulk capacitance that brings the brown-out risk of a rail under a target.
+
+    Parameters
+    ----------
+    throttle : float, optional
+        Throttle, 0..1; the highest that was flown when left out with a recording.
+    recording : Recording or path, optional
+        A flight that level, sag, resistance and noise are taken from.
+    network : mapping or PowerNetwork, optional
+        Components in SI units, such as ``{'cells': 4, 'bulk_capacitance': 470e-6}``; they go
+        before what was measured.
+    rail : {'bus', 'regulated'}
+        The battery bus at the ESCs, or the regulated rail.
+    voltage : float, optional
+        Brown-out level, V; 3.3 V a cell on the bus when left out.
+    horizon : float
+        Horizon of the risk, s.
+    risk : float
+        Risk that is allowed, 0..1.
+    capacitances : tuple of float, optional
+        Least and most capacitance looked at, F.
+    esr_fixed : bool
+        Whether the ESR stays; else it falls as 1/C.
+
+    Returns
+    -------
+    Result
+        Verdict, the least capacitance and the levers; its table has a row a capacitance.
+
+    Raises
+    ------
+    InputError
+        When the recording has no throttle, or cannot have so many cells.
+    ValueError
+        When a number is out of its range, or the recording does not show sag or noise.
+
+    Examples
+    --------
+    >>> from ou_monitor import design
+    >>> found = design(0.3, network={'cells': 4}, risk=1e-3)
+    >>> found.verdict.name, 1e-6 < found.least.capacitance < 22e-3
+    ('FOUND', True)
+
+    """
+    from ou_monitor.analysis.crafts import check_cells
+    from ou_monitor.paper.network.components import completed, PowerNetwork
+    from ou_monitor.paper.network.design import (
+        as_data, default_voltage, design as designed, LEAST, MOST, network_of)
+    from ou_monitor.report.design_document import design_document, taken_words
+
+    flown = None if recording is None else _flight(_read(recording))
+    if throttle is None:
+        if flown is None:
+            raise ValueError('the throttle is missing: 0.4 asks for 40 %, and a recording gives '
+                             'that of a flight')
+        throttle = flown[0].highest
+    taken = ''
+    if isinstance(network, PowerNetwork):
+        circuit = network
+    elif flown is None:
+        circuit = PowerNetwork(**completed(dict(network or {})))
+    else:
+        flight, values = flown[0], dict(network or {})
+        cells = values.setdefault('cells', flight.cells)
+        if not cells:
+            raise InputError(f'{flight.full:.4g} V is no pack of cells: --set cells=N')
+        check_cells(flight.full, cells)
+        circuit = network_of(flight, throttle, values)
+        taken = taken_words(flight, circuit, throttle, values)
+    level, source = default_voltage(circuit, rail) if voltage is None else (voltage, 'given')
+    found = designed(circuit, throttle, voltage=level, horizon=horizon, risk=risk, rail=rail,
+                     esr_follows=not esr_fixed, capacitances=capacitances or (LEAST, MOST))
+    facts = None if flown is None else flown[1]
+    return Result(
+        found, lambda command: design_document(found, source, taken, command),
+        lambda: {**as_data(found, source), 'measured': taken or None,
+                 **({} if facts is None else {'supply': facts.to_dict()})},
+        lambda: as_data(found, source)['rows'], lambda: facts)
+
+
+def _flight(recording: Recording) -> tuple[Flight, Any]:
+    """Return what a recording says of its supply, and the facts."""
+    from ou_monitor.analysis.crafts import cells_of, full_voltage
+    from ou_monitor.analysis.supply import facts_and_end
+    from ou_monitor.paper.network.design import Flight
+
+    if not recording.has_throttle:
+        raise InputError(f'--from {recording.name}: the recording has no throttle')
+    facts, load, _ = facts_and_end(recording)
+    return Flight(load.level, full_voltage(recording), cells_of(recording)[0],
+                  facts.sag.throttle, facts.sag.sag_v, facts.noise.rms_v,
+                  facts.noise.steady_rms_v, facts.noise.flown,
+                  min(1.0, float(np.nanmax(recording.throttle))), facts.resistance.ohm,
+                  facts.ou.alpha, facts.ou.var_inf), facts
+
+
+def reproduce(*, seed: int = 1, progress: Progress | None = None) -> Result:
+    """
+    Recompute every number of the paper.
+
+    Parameters
+    ----------
+    seed : int
+        The same one gives the same simulations.
+    progress : callable, optional
+        Takes the share that is done, 0..1.
+
+    Returns
+    -------
+    Result
+        Its table has a row a printed number, with the verdict.
+
+    Examples
+    --------
+    >>> from ou_monitor import reproduce
+    >>> found = reproduce()
+    >>> sorted(found.to_dict()['counts'])
+    ['AGREES', 'DOES_NOT_HOLD', 'ROUNDING']
+
+    """
+    from ou_monitor.paper.reproduce.reproduce import as_data, reproduce as reproduced
+    from ou_monitor.report.reproduction_document import reproduction_document
+
+    found = reproduced(seed, progress)
+    return Result(found, lambda command: reproduction_document(found, command),
+                  lambda: as_data(found), lambda: as_data(found)['rows'])
+
+
+def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
+             preset: str | None = None, throttle: float | Given | Profile | None = None,
+             start: float | None = None, end: float | None = None, duration: float | None = None,
+             rate: float | None = None, seed: int = 1, capacity_left: float | None = None,
+             scale_resistance: float = 1.0, output: str | Path | None = None,
+             message: str | None = None, progress: Progress | None = None) -> Result:
+    """
+    Draw a recording from a model of a supply, exact in law at any rate.
+
+    Parameters
+    ----------
+    model : SupplyModel or path, optional
+        What to simulate; a model file as `discover` writes it.
+    preset : str, optional
+        Name of a supply, where there is no model; 'flight' when left out.
+    throttle : str, float, Recording, path or callable, optional
+        Name of a profile, throttle 0..1, points 'T:U,T:U,...', a recording, or a function of
+        stamps, s; that of the preset when left out.
+    start, end : float, optional
+        Part of a path that throttle names, s.
+    duration : float, optional
+        Length, s; of the preset or of the recorded throttle when left out.
+    rate : float, optional
+        Samples per second, Hz.
+    seed : int
+        The same one gives the same recording.
+    capacity_left : float, optional
+        Charge at the begin, 0..1; -1: where the recording of the model began.
+    scale_resistance : float
+        Factor on the answer to throttle.
+    output : path, optional
+        Bag to write, piece by piece; the samples are drawn when they are asked for otherwise.
+    message : str, optional
+        Message of the voltage in the bag.
+    progress : callable, optional
+        Takes the share of the bag that is written, 0..1.
+
+    Returns
+    -------
+    Result
+        Its record has the `recording`; its table a row a sample.
+
+    Raises
+    ------
+    InputError
+        When there is no such preset, profile or file, or a number is out of its range.
+
+    Examples
+    --------
+    >>> from ou_monitor import simulate
+    >>> found = simulate(preset='load_40', duration=10.0, rate=500.0)
+    >>> found.recording.n, round(found.supply.ou.alpha) in range(40, 90)
+    (5000, True)
+
+    """
+    from ou_monitor.analysis.supply import supply_facts
+    from ou_monitor.recordings.write import RecordingWriter
+    from ou_monitor.report.simulation_document import simulation_document
+    from ou_monitor.simulation import plan
+
+    run = plan(model, preset=preset, throttle=throttle, start=start, end=end, duration=duration,
+               rate=rate, seed=seed, capacity_left=capacity_left, resistance=scale_resistance)
+    written: dict[str, Any] = {}
+    if output is not None:
+        kind, done = message or ('adc_block' if run.rate >= _BLOCKS_FROM else 'battery_state'), 0
+        with RecordingWriter(output, type=kind, sample_rate=run.rate) as writer:
+            for piece in run.pieces():
+                writer.write(piece)
+                done += piece.n
+                if progress is not None:
+                    progress(done / run.n)
+        written = {'topics': writer.topics}
+
+    def columns() -> dict[str, Any]:
+        drawn = run.recording
+        return {'time_s': drawn.t, 'voltage_v': drawn.voltage, 'throttle': drawn.throttle}
+
+    return Result(
+        run, lambda command: simulation_document(run, output, command),
+        lambda: {'output': None if output is None else str(output), **run.as_data(), **written},
+        columns, lambda: supply_facts(run.recording))

@@ -1,1 +1,0 @@
-"""How much of a signal is noise of the supply."""

@@ -1,0 +1,79 @@
+"""What `design` says: the least capacitance, a table over others, and what else would help."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from ou_monitor.paper.network.components import PowerNetwork
+from ou_monitor.paper.network.design import (
+    answer, Design, effect, Flight, probability, remarks)
+from ou_monitor.report.document import Document, Figure, Table, Text
+from ou_monitor.report.svg import Plot
+from ou_monitor.text import number
+
+# One row of the printed table for this many rows of the calculation.
+_EVERY = 10
+# Smaller risks are drawn as this.
+_LEAST_RISK = 1e-9
+
+
+def design_document(result: Design, source: str, taken: str = '', command: str = '',
+                    ) -> Document:
+    """Return what is said of a design; taken: what came from a flight, if anything did."""
+    present = result.present
+    chosen = [(present, 'present')]
+    if result.least is not None:
+        chosen.append((result.least, 'least that meets it'))
+    for row in result.rows[::_EVERY]:
+        if not any(math.isclose(row.capacitance, r.capacitance, rel_tol=0.01) for r, _ in chosen):
+            chosen.append((row, '' if row.stable else 'unstable'))
+    cells = [[number(1e6 * r.capacitance), number(1e3 * r.esr), number(r.alpha),
+              number(1e6 * r.tau), number(r.sigma), number(r.var_inf), _time(r.mean_time),
+              probability(r.risk_ou), probability(r.risk_crossing), mark]
+             for r, mark in sorted(chosen, key=lambda item: item[0].capacitance)]
+    name = 'battery bus' if result.rail == 'bus' else 'regulated rail'
+    subject = (f'{name} at throttle {result.throttle:g}: mean {present.mean:.4g} V (sag of the '
+               f'bus {present.sag:.3g} V), brown-out at {result.voltage:g} V ({source}), risk '
+               f'allowed {result.target:g} within {result.horizon:g} s')
+    return Document('Which capacitance', subject, [answer(result)], [
+        lambda: [Figure(_risk(result))],
+        Table(['C, uF', 'ESR, mOhm', 'alpha, 1/s', 'tau, us', 'sigma, V/sqrt(s)', 'Var_inf, V^2',
+               'mean time', 'risk OU', 'crossing', ''], cells, left=[9]),
+        Table(['what', 'unit', 'present', 'tried', 'risk then', f'for {result.target:g}'],
+              [[lever.name, lever.unit, number(lever.present), number(lever.tried),
+                probability(lever.risk), number(lever.least)
+                if math.isfinite(lever.least) else 'out of reach'] for lever in result.levers],
+              left=[0, 1]),
+        *(Text(text) for text in (effect(result), *remarks(result), taken) if text)], command)
+
+
+def _risk(result: Design) -> Plot:
+    """Return the risk over capacitance, with the one allowed."""
+    farads = np.array([row.capacitance for row in result.rows])
+    plot = Plot('Risk by capacitance', 'bulk capacitance, uF', 'probability', log_x=True,
+                log_y=True, legend_row=True).limits(y=(_LEAST_RISK, 2.0))
+    plot.line(1e6 * farads, np.maximum([row.risk for row in result.rows], _LEAST_RISK),
+              f'within {result.horizon:g} s', 0, 'thick')
+    plot.line(1e6 * farads[[0, -1]], np.full(2, result.target), 'allowed', 1, 'dash')
+    return plot.mark(1e6 * result.present.capacitance, 'present')
+
+
+def _time(value: float) -> str:
+    return 'never' if value > 1e100 else f'{number(value)} s'
+
+
+def taken_words(flight: Flight, network: PowerNetwork, throttle: float, values: dict[str, Any],
+                ) -> str:
+    """Return what was taken from a flight, and what was not."""
+    known = flight.resistance > 0.0 and values.get('battery_resistance') is None
+    return (f'From the flight: {flight.level:.4g} V open at its end, {network.cells} cells '
+            f'({flight.full:.4g} V at most; --set cells=N), sag '
+            f'{float(np.interp(throttle, flight.throttle, flight.sag)):.3g} V and noise '
+            f'{1e3 * float(np.interp(throttle, flight.throttle, flight.noise)):.3g} mV rms at '
+            f'{throttle:.0%} throttle, resistance '
+            + (f'{1e3 * flight.resistance:.3g} mOhm.' if known else
+               f'{1e3 * network.battery_resistance:.3g} mOhm as given or assumed: the current is '
+               'scaled to the sag.')
+            + ' The bulk capacitor and its ESR cannot be seen: --set bulk_capacitance=470uF.')

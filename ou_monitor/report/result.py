@@ -1,0 +1,202 @@
+"""
+What a command found, in the forms that Python users hold: record, JSON, table, plot, HTML.
+
+Limits: the table and the plots are the main ones of the command; `to_dict` has everything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+import enum
+from functools import cached_property
+import math
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+from ou_monitor.errors import how_to_install, InputError, nearest
+from ou_monitor.report.document import Document, Figure, Pair, Part, Section
+from ou_monitor.report.svg import Plot
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from ou_monitor.analysis.supply import SupplyFacts
+    from pandas import DataFrame
+
+# Rows by name, or columns by name.
+Rows = Sequence[Mapping[str, Any]] | Mapping[str, Any]
+
+
+class Result:
+    """
+    What one of the functions `analyze`, `compare`, `coupling`, `design`, `discover`, .. found.
+
+    Attributes of the record can be had from the result itself: ``found.causes``.  Printed, it is
+    what the command prints; in a notebook, what its page shows.
+
+    Attributes
+    ----------
+    record : object
+        The record behind it, with all that was found.
+    supply : SupplyFacts or None
+        The facts of the supply; None where there is no recording.
+
+    Examples
+    --------
+    >>> from ou_monitor import simulate
+    >>> drawn = simulate(preset='idle', duration=2.0, rate=100.0)
+    >>> drawn.to_dict()['n'], drawn.recording.n        # of the JSON, and of the record
+    (200, 200)
+
+    """
+
+    def __init__(self, record: Any, document: Callable[[str], Document],
+                 data: Callable[[], Mapping[str, Any]], rows: Callable[[], Rows],
+                 supply: Callable[[], SupplyFacts | None] = lambda: None) -> None:
+        """Keep the record, and how the rest is made of it when it is asked for."""
+        self.record = record
+        self.document = document
+        self._data, self._rows, self._supply = data, rows, supply
+
+    @cached_property
+    def supply(self) -> SupplyFacts | None:
+        """Return the facts of the supply."""
+        return self._supply()
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the record."""
+        if name.startswith('_') or 'record' not in self.__dict__:
+            raise AttributeError(name)
+        return getattr(self.record, name)
+
+    def to_dict(self) -> dict[str, Any]:
+        """
+        Return all numbers, as `--json` of the command writes them.
+
+        Returns
+        -------
+        dict
+            Of plain values; unknown numbers are None.
+
+        """
+        found: dict[str, Any] = plain(self._data())
+        return found
+
+    def to_dataframe(self) -> DataFrame:
+        """
+        Return the main table; unknown numbers are NaN.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Load levels, causes, frequencies or rows; an interval ``x`` is two columns, ``x_low``
+            and ``x_high``.
+
+        Raises
+        ------
+        InputError
+            When pandas is not installed.
+
+        """
+        try:
+            from pandas import DataFrame
+        except ImportError as error:
+            raise InputError(f"to_dataframe needs pandas: {how_to_install('python')}") from error
+        rows = self._rows()
+        return DataFrame(dict(rows) if isinstance(rows, Mapping) else [
+            dict(_cells(row)) for row in rows])
+
+    def plots(self) -> dict[str, Plot]:
+        """
+        Return the plots of the page.
+
+        Returns
+        -------
+        dict
+            By title, the main one first.
+
+        """
+        return {plot.title: plot for plot in _plots(self.document('').parts)}
+
+    def plot(self, ax: Axes | None = None, title: str | None = None) -> Axes:
+        """
+        Draw one plot of the page.
+
+        Parameters
+        ----------
+        ax : matplotlib.axes.Axes, optional
+            Where to; axes of a new figure when left out.
+        title : str, optional
+            Which of `plots`; the main one when left out.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+            What was drawn on.
+
+        Raises
+        ------
+        InputError
+            When there is no such plot, or no matplotlib for a new figure.
+
+        """
+        from ou_monitor.report.axes import draw
+
+        found = self.plots()
+        if not found:
+            raise InputError('there is nothing to plot')
+        if title is not None and title not in found:
+            raise InputError(f"there is no plot '{title}': {nearest(title, found)}")
+        return draw(next(iter(found.values())) if title is None else found[title], ax)
+
+    def _repr_html_(self) -> str:
+        from ou_monitor.report.page import section
+
+        return section(self.document(''))
+
+    def __str__(self) -> str:
+        """Return what the command prints."""
+        from ou_monitor.report.terminal import terminal
+
+        return terminal(self.document(''))
+
+    def __repr__(self) -> str:
+        """Return the kind of the record, and the answer."""
+        return f'<{type(self.record).__name__}: {self.document("").headline}>'
+
+
+def _cells(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield the cells of a row: scalars, and the two ends of an interval; no deeper data."""
+    for name, value in row.items():
+        if isinstance(value, (list, tuple)) and len(value) == 2 and all(
+                isinstance(end, (int, float)) for end in value):
+            yield from zip((f'{name}_low', f'{name}_high'), value)
+        elif not isinstance(value, (list, tuple, Mapping, np.ndarray)):
+            yield name, value
+
+
+def _plots(parts: Sequence[Part]) -> Iterator[Plot]:
+    for part in parts:
+        if isinstance(part, Figure):
+            if isinstance(part.drawing, Plot):
+                yield part.drawing
+        elif isinstance(part, (Section, Pair)):
+            yield from _plots(part.parts if isinstance(part, Section) else part.figures)
+        elif callable(part):
+            yield from _plots(part())
+
+
+def plain(value: Any) -> Any:
+    """Return a value as strict JSON can hold it."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, enum.Enum):
+        return value.name
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

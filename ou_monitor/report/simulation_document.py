@@ -1,0 +1,26 @@
+"""What `simulate` says: what was drawn, and from which terms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ou_monitor.records import NAN
+from ou_monitor.report.analysis_document import voltage_plot
+from ou_monitor.report.document import Document, Facts, Figure
+from ou_monitor.report.svg import Plot
+from ou_monitor.simulation import Run
+
+
+def simulation_document(run: Run, output: str | Path | None = None, command: str = '',
+                        ) -> Document:
+    """Return what is said of a simulation; output: the bag, if one was written."""
+    terms = run.file.model.terms
+    said = (f"{run.n} samples of '{run.name}', {run.duration:g} s at {run.rate:g} Hz, "
+            f"{', '.join(term.NAME for term in terms)}; seed {run.seed}")
+    return Document(
+        'Simulation', f'{output or run.name}: {said}', [said], [
+            lambda: [Figure(voltage_plot(run.recording, NAN)),
+                     Figure(Plot('Throttle', 'time, s', 'throttle', height=160).line(
+                         run.recording.t, run.recording.throttle, '', 2))],
+            Facts([(term.NAME, ', '.join(f'{name} {value}' for name, value in
+                                         term.values().items())) for term in terms])], command)

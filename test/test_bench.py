@@ -1,0 +1,203 @@
+"""The commands as functions: their JSON, tables, plots and HTML, and what is missing without."""
+
+import json
+import re
+import sys
+from types import SimpleNamespace
+from xml.etree import ElementTree
+
+import numpy as np
+from ou_monitor import (
+    analyze, compare, coupling, design, discover, InputError, read_recording, Recording,
+    reproduce, simulate, supply_facts)
+from ou_monitor.cli.main import main
+from ou_monitor.report.terminal import terminal
+from project import ROOT
+import pytest
+
+FLIGHT, GECKO = str(ROOT / 'bags/flight'), str(ROOT / 'bags/recorded/gecko_gyro.csv')
+PART = {'start': 0.0, 'end': 4.0}
+# Arguments of the command, and the same of the function.
+CALLS = {
+    'analyze': ((FLIGHT, '--to', '4', '--brownout-voltage', '4.7'),
+                lambda: analyze(read_recording(FLIGHT, **PART), brownout_voltage=4.7)),
+    'compare': ((FLIGHT, '--to', '4', '--seeds', '20', '--cells', '2', '--brownout-voltage',
+                 '2.3'),
+                lambda: compare(read_recording(FLIGHT, **PART), seeds=20, brownout_voltage=4.6,
+                                cells=2)),
+    'coupling': ((GECKO, '--signal', 'gyro_x_deg_s', '--band', '10,45'),
+                 lambda: coupling(GECKO, 'gyro_x_deg_s', band=(10.0, 45.0))),
+    'discover': ((FLIGHT, '--to', '4'), lambda: discover(read_recording(FLIGHT, **PART))),
+    'design': (('--throttle', '0.3', '--set', 'cells=4', '--set', 'bulk_capacitance=220uF'),
+               lambda: design(0.3, network={'cells': 4, 'bulk_capacitance': 220e-6})),
+    'reproduce': (('--seed', '2'), lambda: reproduce(seed=2))}
+
+
+@pytest.fixture(scope='module')
+def found():
+    """Return every result once."""
+    return {name: call() for name, (_, call) in CALLS.items()}
+
+
+@pytest.mark.parametrize('name', CALLS)
+def test_to_dict_is_the_json_of_the_command(name, found, tmp_path):
+    """To the last digit; and where it has facts of a supply, they are those of the result."""
+    target = tmp_path / 'x.json'
+    assert main([name, *CALLS[name][0], '--json', str(target)]) == 0
+    data = json.loads(target.read_text())
+    assert found[name].to_dict() == data
+    supply = found[name].supply
+    assert data.get('supply') == (None if supply is None else supply.to_dict())
+    assert (supply is None) == (name in ('design', 'reproduce'))
+
+
+def test_a_design_of_a_flight_has_its_facts(tmp_path):
+    """With what is given going before what was measured."""
+    assert main(['design', '--from', GECKO, '--throttle', '0.5', '--set', 'cells=4', '--json',
+                 str(tmp_path / 'x.json')]) == 0
+    result = design(0.5, recording=GECKO, network={'cells': 4})
+    assert result.to_dict() == json.loads((tmp_path / 'x.json').read_text())
+    assert result.supply == supply_facts(read_recording(GECKO))
+
+
+def test_a_simulation_is_that_of_the_command(tmp_path):
+    """The samples of its bag, and its JSON; drawn in memory or written."""
+    bag, other = tmp_path / 'a.mcap', tmp_path / 'b.mcap'
+    assert main(['simulate', '--preset', 'flight_full', '--duration', '3', '--seed', '4',
+                 '--output', str(bag), '--type', 'float64', '--json', str(tmp_path / 'a.json')
+                 ]) == 0
+    drawn = simulate(preset='flight_full', duration=3.0, seed=4)
+    shares = []
+    written = simulate(preset='flight_full', duration=3.0, seed=4, output=other,
+                       message='float64', progress=shares.append)
+    assert bag.read_bytes() == other.read_bytes() and shares[-1] == 1.0
+    data = json.loads((tmp_path / 'a.json').read_text())
+    assert written.to_dict() == {**data, 'output': str(other)}
+    assert {'topics': data['topics'], **drawn.to_dict()} == {**data, 'output': None}
+    np.testing.assert_array_equal(read_recording(bag).voltage, drawn.recording.voltage)
+    # Over the throttle of another, of a function, and as a model.
+    again = simulate(drawn.file.model, throttle=drawn.recording, rate=1000.0, duration=3.0, seed=4)
+    np.testing.assert_array_equal(again.recording.voltage, drawn.recording.voltage)
+    full = simulate(throttle=np.ones_like, duration=1.0)
+    assert set(full.recording.throttle) == {1.0} and full.supply.ou.status != 'no_data'
+
+
+def test_attributes_are_those_of_the_record(found):
+    """And what is printed is what the command prints."""
+    finding = found['discover']
+    assert finding.causes is finding.record.causes and not hasattr(finding, 'nonsense')
+    assert str(finding) == terminal(finding.document(''))
+    assert repr(finding).startswith('<Finding: A plain simulation lacks')
+
+
+def frame(monkeypatch, result):
+    """Return what a table is made of."""
+    monkeypatch.setitem(sys.modules, 'pandas', SimpleNamespace(DataFrame=lambda rows: rows))
+    return result.to_dataframe()
+
+
+def test_the_main_table(found, monkeypatch):
+    """A row a level, measure, frequency, cause, capacitance, number; scalars, unknown as NaN."""
+    rows = {name: frame(monkeypatch, result) for name, result in found.items()}
+    lowest = found['compare'].lowest
+    assert [row['throttle'] for row in rows['analyze']] == [
+        level.throttle for level in found['analyze'].levels]
+    assert {'alpha', 'alpha_ci95_low', 'alpha_ci95_high'} <= set(rows['analyze'][0])
+    assert rows['compare'][0] == {'measure': 'lowest voltage, V', 'inside': lowest.inside,
+                                  **lowest.as_data()}
+    assert set(rows['coupling']) == {'frequency_hz', 'coherence', 'gain_per_v'}
+    assert rows['discover'][0]['name'] == found['discover'].causes[0].name
+    assert len(rows['design']) == 81 and rows['reproduce'][0]['printed']
+    for row in (row for table in rows.values() if isinstance(table, list) for row in table):
+        assert all(value is None or np.isscalar(value) for value in row.values())
+
+
+class Axes:
+    """What `plot` asks of axes, kept."""
+
+    def __init__(self):
+        """Begin with nothing drawn."""
+        self.calls = []
+
+    def __getattr__(self, name):
+        """Keep a call."""
+        return lambda *args, **more: self.calls.append((name, args, more))
+
+
+@pytest.mark.parametrize('name', CALLS)
+def test_every_plot_is_drawn_on_axes(name, found):
+    """Each curve by its kind, with its numbers and the labels and ends of the page."""
+    calls = {'line': 'plot', 'steps': 'plot', 'markers': 'plot', 'band': 'fill_between',
+             'bars': 'errorbar'}
+    plots = found[name].plots()
+    assert plots
+    for title, plot in plots.items():
+        ax = Axes()
+        assert found[name].plot(ax, title) is ax
+        drawn = [call for call in ax.calls if call[0] in calls.values()]
+        assert [call for call, _, _ in drawn] == [calls[curve.kind] for curve in plot.curves]
+        for (_, args, more), curve in zip(drawn, plot.curves):
+            np.testing.assert_array_equal(args[0], curve.x)
+            assert more['label'] == (curve.label or None)
+        (put,) = (more for call, _, more in ax.calls if call == 'set')
+        assert (put['xlabel'], put['ylim']) == (plot.x_label, plot.y_range)
+    with pytest.raises(InputError, match="no plot 'Voltages': did you mean|no plot 'Voltages'"):
+        found[name].plot(Axes(), 'Voltages')
+
+
+def test_without_the_extras_one_line_says_so(found, monkeypatch):
+    """For a table, and for a figure of its own; axes of the user's need no import here."""
+    for name in ('pandas', 'matplotlib'):
+        monkeypatch.setitem(sys.modules, name, None)
+    for call, words in ((found['analyze'].to_dataframe, 'pandas'),
+                        (found['analyze'].plot, 'matplotlib')):
+        with pytest.raises(InputError, match=rf'needs {words}: run pip install .*\[python\]'):
+            call()
+
+
+def test_pandas_and_matplotlib_take_it(found):
+    """Where they are installed."""
+    pandas, matplotlib = pytest.importorskip('pandas'), pytest.importorskip('matplotlib')
+    matplotlib.use('Agg')
+    for result in found.values():
+        table = result.to_dataframe()
+        assert isinstance(table, pandas.DataFrame) and len(table)
+        for title in result.plots():
+            assert result.plot(title=title).get_title() == title
+            matplotlib.pyplot.close('all')
+
+
+@pytest.mark.parametrize('name', CALLS)
+def test_html_is_a_section_with_rules_of_its_own(name, found):
+    """Well formed, without script; every rule of its style is nested in its class."""
+    html = found[name]._repr_html_()
+    root = ElementTree.fromstring(html.replace('<br>', '<br/>'))
+    assert root.tag == 'div' and root.get('class') == 'ou-monitor'
+    assert next(root.iter('svg')) is not None and not list(root.iter('script'))
+    (style,) = root.iter('style')
+    depth, outside = 0, ''
+    for sign in style.text:
+        depth += (sign == '{') - (sign == '}')
+        outside += sign if not depth else ''
+    assert re.sub(r'[\s}]', '', outside) == '.ou-monitor' and depth == 0
+    assert not re.search(r'(^|[\s,}])(html|body|:root)\b', style.text)
+
+
+def test_the_limit_of_a_log_holds_in_python_too(monkeypatch):
+    """Its cells and lowest voltage, where no limit is given; a given one goes first."""
+    t = np.arange(600) * 0.01
+    log = Recording(t, 15.5 + 0.01 * np.sin(9.0 * t), np.full(t.size, 0.4), 'log',
+                    {'log_cells': '4', 'log_cell_minimum': '3.5'})
+    assert coupling(log, (t, np.cos(t * 40.0))).supply.dips.limit_v == 14.0
+    assert analyze(log).supply.dips.limit_v == 14.0
+    assert analyze(log, cells=4).supply.dips.limit_v == pytest.approx(13.2)
+    assert analyze(log, brownout_voltage=15.0).supply.dips.limit_v == 15.0
+    with pytest.raises(InputError, match='likely 4 cells'):
+        discover(log, cells=9)
+
+
+def test_the_namespace_is_light():
+    """A name of a folder would hide a function, whichever is loaded first."""
+    import ou_monitor.analysis.coupling  # noqa: F401
+
+    assert ou_monitor.coupling is coupling
