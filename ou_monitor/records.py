@@ -52,9 +52,12 @@ def as_seconds(values: npt.ArrayLike) -> FloatArray:
     if type(values) is np.ndarray and values.dtype == np.float64:
         return values
     data = np.asarray(np.ma.getdata(values))
-    if data.dtype.kind == 'O' and data.size and hasattr(data.flat[0], 'timestamp'):
-        if data.flat[0].tzinfo is not None:
-            return np.array([one.timestamp() for one in data.flat]).reshape(data.shape)
+    # A date that is none is not itself.
+    dates = [one for one in data.flat if one == one] if data.dtype.kind == 'O' else []
+    if dates and all(hasattr(one, 'timestamp') for one in dates):
+        if dates[0].tzinfo is not None:
+            return np.array([one.timestamp() if one == one else NAN for one in data.flat]
+                            ).reshape(data.shape)
         data = data.astype('datetime64[us]')
     if data.dtype.kind not in 'mM':
         return as_numbers(values)

@@ -4,6 +4,7 @@ from datetime import datetime, timedelta, timezone
 
 import numpy as np
 from ou_monitor import MonitorSettings, Recording, SlidingEstimator, SupplyMonitor
+from ou_monitor.records import as_seconds
 import pytest
 
 N = 400
@@ -67,6 +68,11 @@ def test_what_is_masked_is_unknown():
     dates = DATES.copy()
     dates[3] = np.datetime64('NaT', 'ns')
     assert np.isnan(Recording(dates, VOLTS, VOLTS).t).tolist() == [k == 3 for k in range(N)]
+    # In a zone, pandas has them as objects.
+    zoned = [datetime.fromtimestamp(k, timezone.utc) for k in range(N)]
+    zoned[0] = np.datetime64('NaT', 'ns')
+    assert np.isnan(as_seconds(np.array(zoned, dtype=object))).tolist() == [
+        k == 0 for k in range(N)]
 
 
 @pytest.mark.parametrize('t, volts', [
