@@ -22,7 +22,7 @@ from ou_monitor.discovery.errors import standard_errors, with_reach
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.gain import (
-    crossing_rates, gain_of, guess, mean_score, shrink_of, why_unknown, without)
+    crossing_rates, gain_of, grown, guess, mean_score, shrink_of, why_unknown, without)
 from ou_monitor.discovery.load_start import whole_load
 from ou_monitor.discovery.named import INTERRUPTED, Named, named_causes
 from ou_monitor.discovery.regression import load_terms
@@ -38,6 +38,7 @@ from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Saturation
 from ou_monitor.model.terms.term import Role
 from ou_monitor.records import Recording
+from ou_monitor.text import Z95
 
 # Why the gain of a line is not known that was found in all samples, of which some are used.
 FAST = 'the samples that are used are too few to show a line so fast.'
@@ -120,14 +121,16 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
     why = unknown or ('' if math.isfinite(gain) else VAGUE)
     criticism = _criticism(named.before, after)
     remaining = sorted((c for c in criticism if c.is_off), key=lambda c: -abs(c.after))
-    refused = refusal(samples, whole.terms, gain, gain_se) if causes else ''
+    larger = grown(left.full, plain, scored, 1.0)
+    refused = refusal(samples, whole.terms, gain, gain_se, larger and grown(
+        left.full, plain, scored, Z95)) if causes else ''
     # The other exact terms were undone in the samples; the model needs them again.
     undone = tuple(t for t in state.exact if t.NAME != 'quantization')
     baseline = plain.model.terms[0]
     assert isinstance(baseline, OU)
     crossing = crossing_rates(samples, (baseline,), () if unknown else whole.terms, rng, scored)
     against = doubts(whole.terms, crossing, recording.duration,
-                     float(np.median(samples.step[1:]))) if causes else ()
+                     float(np.median(samples.step[1:])), larger) if causes else ()
     verdict = judge(after, len(causes), len(named.dropped), against)
     done(1.0)
     return Finding(
@@ -138,8 +141,8 @@ def discover(recording: Recording | str | Path, *, seed: int = 0,
         criticism=criticism, causes=causes, model=SupplyModel((*whole.terms, *undone)),
         se=(*se, *(with_reach(term, {}, samples) for term in undone)),
         score=mean_score(left.full.density, scored & left.full.known),
-        gain=gain, gain_se=gain_se, shrink=shrink_of(left.full, plain, scored), crossing=crossing,
-        notes=_notes(state, named, whole, dropped, samples, uncovered),
+        gain=gain, gain_se=gain_se, shrink=shrink_of(left.full, plain, scored), larger=larger,
+        crossing=crossing, notes=_notes(state, named, whole, dropped, samples, uncovered),
         samples=samples, simulated=SupplyModel(whole.terms), refused=refused,
         load='current' if state.current else 'throttle', seed=seed)
 

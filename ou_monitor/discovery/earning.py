@@ -179,14 +179,17 @@ def group_of(model: Composite, names: Sequence[str], k: int) -> tuple[int, ...]:
     return tuple(position(model, names, j) for j, name in enumerate(names) if name == names[k])
 
 
-def refusal(samples: Samples, terms: Sequence[Term], gain: float, gain_se: float) -> str:
+def refusal(samples: Samples, terms: Sequence[Term], gain: float, gain_se: float,
+            larger: bool = False) -> str:
     """
     Return why a model has not earned its place, for people; empty where it has.
 
-    gain, gain_se in nats per sample.
+    gain, gain_se in nats per sample; larger: whether its one-step errors are.
     """
     if math.isfinite(gain) and not decision.earns(gain, gain_se, 0.0):
         return 'The extended model predicts worse than the plain OU'
+    if larger:
+        return 'One-step errors of the extended model are larger than those of the plain OU'
     try:
         far = float(_far(samples, terms).max())
     except ValueError as error:

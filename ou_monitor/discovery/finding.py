@@ -125,6 +125,7 @@ class Finding:
     # Share by which the rms of its one-step errors on those blocks is smaller than that of the
     # plain OU.
     shrink: float = NAN
+    larger: bool = False  # Whether they are larger than those of the plain OU, by their error
     crossing: CrossingRate = field(default_factory=CrossingRate)  # What a pilot feels
     notes: tuple[str, ...] = ()  # What was dropped, left out or cannot be decided
     samples: Samples | None = None  # What was fitted
@@ -140,6 +141,11 @@ class Finding:
     def size_gain(self) -> float:
         """Return what of the gain is not in smaller errors: their size is better known, nats."""
         return self.gain + math.log1p(-self.shrink) if self.shrink < 1.0 else NAN
+
+    @property
+    def closer(self) -> bool:
+        """Whether the extended model is nowhere worse than the plain OU: errors and falls."""
+        return bool(self.causes) and not self.larger and not self.crossing.worse
 
     @property
     def discrepancies(self) -> tuple[Criticism, ...]:
@@ -189,7 +195,7 @@ class Finding:
             'extended': {
                 **self._extended(), 'heldout_score': self.score, 'gain': self.gain,
                 'gain_se': self.gain_se, 'errors_shrink': self.shrink,
-                'size_gain': self.size_gain,
+                'size_gain': self.size_gain, 'closer': self.closer,
                 'crossing_rate': {
                     'observed': self.crossing.observed, 'baseline': self.crossing.baseline,
                     'extended': self.crossing.extended, 'level_v': self.crossing.level,

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.finding import CrossingRate
-from ou_monitor.discovery.validation import HeldOut
+from ou_monitor.discovery.validation import errors_grow, HeldOut
 from ou_monitor.discovery.words import unmeasured_words
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
@@ -120,6 +120,12 @@ def shrink_of(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_]) -> floa
     if int(both.sum()) < BLOCKS or not old.error[both].any():
         return NAN
     return 1.0 - math.sqrt(float(np.mean(new.error[both] ** 2) / np.mean(old.error[both] ** 2)))
+
+
+def grown(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_], errors: float) -> bool:
+    """Return whether one-step errors are larger than before by so many errors of that."""
+    both = scored & new.known & old.known
+    return errors_grow(new.error[both], old.error[both], new.model.gaussian.variance[both], errors)
 
 
 def why_unknown(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_],

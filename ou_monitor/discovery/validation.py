@@ -14,6 +14,7 @@ likelihood of a fit exceeds that of the next recording by one nat a parameter (A
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,7 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, whitened
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray
+from ou_monitor.text import Z95
 
 # Blocks: with more, each is predicted from more of the recording, at more cost.
 FOLDS = 6
@@ -100,6 +102,21 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
     laws = model.free - sum(len(term.free()) + len(term.LINEAR) for term in terms) - 1
     density -= (laws + model.search) / samples.n
     return HeldOut(model, density, known & np.isfinite(density), error)
+
+
+def errors_grow(new: FloatArray, old: FloatArray, variance: FloatArray, errors: float = Z95
+                ) -> bool:
+    """
+    Return whether one-step errors of a model are larger (rms) than those of another one.
+
+    Under a right model its errors, of these variances (V^2), are independent of the difference,
+    which is known beforehand; a sum of their products has a standard error, and the squares have
+    to grow by so many of these.  A likelihood does not see it: calling a few bursts noise costs
+    less there than it gains elsewhere.
+    """
+    difference = old - new
+    error = 2.0 * math.sqrt(float(np.sum(variance * difference**2)))
+    return float(np.sum(new**2 - old**2)) > errors * error
 
 
 def _stepped(term: Term, name: str) -> tuple[Term, float]:

@@ -31,10 +31,14 @@ def judge(after: Mapping[str, float], causes: int, dropped: int, doubts: Sequenc
     return Verdict.EXPLAINED if passes and not doubts else Verdict.PARTLY_EXPLAINED
 
 
-def doubts(terms: Sequence[Term], crossing: CrossingRate, duration: float, step: float
-           ) -> tuple[str, ...]:
-    """Return what speaks against a model beside its statistics, for people (times in s)."""
-    found = []
+def doubts(terms: Sequence[Term], crossing: CrossingRate, duration: float, step: float,
+           larger: bool = False) -> tuple[str, ...]:
+    """
+    Return what speaks against a model beside its statistics, for people (times in s).
+
+    larger: whether its one-step errors are larger than those of the plain OU.
+    """
+    found = ['its one-step errors are larger than those of the plain OU'] if larger else []
     if crossing.worse:
         found.append(f'it falls through {number(crossing.level, 4)} V '
                      f'{number(crossing.extended)} times a minute, where '

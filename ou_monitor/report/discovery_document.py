@@ -73,8 +73,11 @@ def answer(finding: Finding) -> list[str]:
     names = [both_names(name) for name in dict.fromkeys(cause.name for cause in order)]
     more = len(names) - _FIRST
     others = [f'{more} more'] if more > 0 else []
+    worse = [*(['one-step errors are larger'] if finding.larger else []),
+             *(['falls are further from those measured'] if finding.crossing.worse else [])]
     closer = ('With them it passes every test.' if finding.verdict is Verdict.EXPLAINED else
-              'With them it comes closer, but is not yet right.')
+              'With them it comes closer, but is not yet right.' if finding.closer else
+              f'With them it does not come closer: {listed(worse)} than with the plain OU.')
     refused = [f'{finding.refused}: trust the named causes, not the fitted values.'
                ] if finding.refused else []
     return [f'A plain simulation lacks {listed([*names[:_FIRST], *others])}.',

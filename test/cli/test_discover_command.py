@@ -259,7 +259,11 @@ def test_the_headline_names_the_strongest_and_what_all_are_worth():
     strongest, _, closer, refused = answer(more)
     assert strongest.endswith('sag (load_sag), noise of the sensor (measurement_noise) and 1 '
                               'more.')
-    assert closer == 'With them it comes closer, but is not yet right.'
+    assert closer == 'With them it comes closer, but is not yet right.' and more.closer
+    worse = replace(more, larger=True)
+    assert not worse.closer and not worse.as_data()['extended']['closer']
+    assert answer(worse)[2] == (
+        'With them it does not come closer: one-step errors are larger than with the plain OU.')
     assert refused == 'It strays: trust the named causes, not the fitted values.'
     assert answer(replace(finding, gain=0.19))[1].startswith('No measurable gain')
     nothing = replace(finding, causes=(), sentence='load_sag was tried.')

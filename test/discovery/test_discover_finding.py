@@ -206,8 +206,8 @@ def test_what_is_left_may_be_throttle_never_flown():
         Verdict.EXPLAINED, [cause], [], 0.015, 0.002, uncovered=900)
 
 
-def test_explained_needs_statistics_falls_and_parameters():
-    """A statistic outside its band, more wrong falls, a parameter at an end: each forbids it."""
+def test_explained_needs_statistics_errors_falls_and_parameters():
+    """A statistic outside, larger errors, more wrong falls, a parameter at an end forbid it."""
     assert judge({'time': 0.5}, 1, 0) is Verdict.EXPLAINED
     edge = family_edge(NOTHING, 40)
     inside, outside = ({str(k): 0.999 * edge if inside else 1.001 * edge for k in range(40)}
@@ -221,6 +221,7 @@ def test_explained_needs_statistics_falls_and_parameters():
     assert judge({'time': 0.5}, 1, 0, (said,)) is Verdict.PARTLY_EXPLAINED
     assert all(words in said for words in ('2.9', '46', '15.5'))
     good = CrossingRate(14.0, 46.0, 15.5, 44.0, 2.0, 1.0, 0.5)
+    assert len(doubts((OU(60.0, 0.3, 5.0),), good, 60.0, 0.001, larger=True)) == 1
     lag = LoadTransient(0.2, 0.002, 0.0)
     assert doubts((lag,), good, 60.0, 0.001) == ('tau of load_transient stands at the end of the '
                                                  'range',)

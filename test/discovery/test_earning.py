@@ -148,3 +148,5 @@ def test_why_a_model_has_not_earned_its_place(gain, far, said, monkeypatch):
     monkeypatch.setattr(earning, '_far', given)
     text = refusal(None, (BASE,), gain, 0.01)
     assert said in text and bool(text) is bool(said)
+    if gain > 0.0:
+        assert 'errors' in refusal(None, (BASE,), gain, 0.01, larger=True)
