@@ -126,6 +126,9 @@ class Status(enum.Enum):
         'No relaxation visible at this rate: neighbouring samples are uncorrelated, so '
         'the rail is faster than the sampling, or the noise is that of the sensor; raise '
         'the sampling rate.')
+    UNTIMED = (
+        'The times of the samples are not trusted, and no rate can be had of them: see the reason '
+        'beside it.')
 
 
 class Severity(enum.IntEnum):

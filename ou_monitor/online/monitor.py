@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.estimator.estimator import (
-    of_estimate, RelaxationFits, SLIDING, SlidingEstimator)
+    of_estimate, RelaxationFits, SLIDING, SlidingEstimator, untimed)
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
@@ -283,6 +283,9 @@ class SupplyMonitor:
                 e = self._estimate()
             told, ou, ou_age = self._relaxation.in_force(e) if (
                 self._settings.window == AUTO) else (e, of_estimate(e), 0.0)
+            if doubt in (Doubt.STAMPS, Doubt.OTHER):
+                told = untimed(told)
+                ou = of_estimate(told)
             self._stamps, self._doubt = stamps, doubt
             fresh = (silent <= limit and e.status is not Status.NO_DATA and doubt is Doubt.NONE)
             if again or not fresh:

@@ -8,7 +8,7 @@ from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import (
     ESTIMATOR_PARAMETERS, FILTER_PARAMETERS, filter_settings, FilterSettings, monitor_settings,
     MonitorSettings)
-from ou_monitor.records import Level
+from ou_monitor.records import Level, Status
 import pytest
 
 
@@ -109,13 +109,17 @@ def test_bad_settings_are_refused_by_name(values, words):
 
 
 def test_distrusted_stamps_leave_the_floor():
-    """What rests on the stamps is unknown, with the reason; the floor needs none."""
-    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=4.5, brownout_floor=4.3))
-    t = 0.001 * np.arange(2000)
-    monitor.distrust('They come in bursts.')
-    monitor.push(t, 4.0 + 0.01 * np.random.default_rng(4).standard_normal(t.size))
-    report = monitor.report(0.0)
-    assert not report.fresh and math.isnan(report.risk) and report.brownout is True
-    assert 'They come in bursts.' in report.summary
-    monitor.distrust('')
-    assert monitor.report(0.0).fresh
+    """What rests on the stamps is unknown, the parameters of before too; the floor needs none."""
+    monitor = filled(u0=4.0, brownout_voltage=4.5, brownout_floor=4.3, window=2.0)
+    assert monitor.report(0.0).estimate.usable
+    for again in (False, True):
+        monitor.distrust('They come in bursts.')
+        report = monitor.report(0.0, again=again)
+        assert not report.fresh and math.isnan(report.risk) and report.brownout is True
+        assert 'They come in bursts.' in report.summary
+        assert report.estimate.status is Status.UNTIMED
+        assert {report.fields[name] for name in (
+            'alpha', 'alpha_se', 'sigma', 'var_inf', 'tau')} == {'nan'}
+        monitor.distrust('')
+        report = monitor.report(0.0, again=again)
+        assert report.fresh and report.estimate.usable

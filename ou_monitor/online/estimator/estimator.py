@@ -522,8 +522,14 @@ def of_estimate(e: Estimate) -> OuFacts:
     if e.usable:
         return OuFacts('ok', e.duration, e.alpha, e.interval('alpha'), e.sigma,
                        e.interval('sigma'), e.var_inf, e.interval('var_inf'))
-    return OuFacts('no_data' if e.status is Status.NO_DATA else
+    return OuFacts('no_data' if e.status in (Status.NO_DATA, Status.UNTIMED) else
                    'too_short' if e.status in _SHORT else 'not_visible', e.duration)
+
+
+def untimed(e: Estimate) -> Estimate:
+    """Return the estimate of samples whose times are worth nothing."""
+    return e if e.status is Status.NO_DATA else replace(_unknown(e, e.status),
+                                                        status=Status.UNTIMED)
 
 
 def _unknown(e: Estimate, status: Status) -> Estimate:
