@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -48,42 +47,9 @@ _REDRAWN = 2
 _BLIND = 1.0
 
 
-def discover(recording: Recording | str | Path, *, seed: int = 0,
+def discover(recording: Recording, *, seed: int = 0,
              progress: Progress | None = None) -> Finding:
-    """
-    Criticise the simulation of a recording, name the cause, extend, measure the gain.
-
-    Parameters
-    ----------
-    recording : Recording or path
-        What to look at; a path is read as `read_recording` does.
-    seed : int
-        Same seed, same result.
-    progress : callable, optional
-        Called with the share done, 0..1.
-
-    Returns
-    -------
-    Finding
-        With `as_data` for JSON.
-
-    Raises
-    ------
-    InputError
-        When a path cannot be read.
-
-    Examples
-    --------
-    >>> from ou_monitor import discover, read_recording
-    >>> finding = discover(read_recording('bags/flight', end=6.0))
-    >>> 'load_sag' in [cause.name for cause in finding.causes]
-    True
-
-    """
-    if not isinstance(recording, Recording):
-        # Here, for a recording that is given needs no reader: it is a third of all modules.
-        from ou_monitor.recordings.read import read_recording
-        recording = read_recording(recording)
+    """Criticise the simulation of a recording, name the cause, extend; see `ou_monitor`."""
     done: Progress = progress or (lambda share: None)
     state = examine(recording, lambda share: done(0.05 * share))
     samples = state.samples

@@ -2,6 +2,7 @@
 
 import numpy as np
 from ou_monitor import discover, Recording
+from ou_monitor.discovery import decision
 from ou_monitor.discovery.validation import errors_grow
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.laws import View
@@ -127,6 +128,27 @@ def test_a_model_of_before_the_rise_is_read():
     assert LoadTransient.read(old).rise == 0.0
     with pytest.raises(ValueError, match="'tau'"):
         LoadTransient.read({'gain': 0.1, 'delay': 0.0})
+
+
+def bursts(n=4000, rate=200.0):
+    """Return a rail that a load drives for a tenth of a second, four times; else it rests."""
+    rng = np.random.default_rng(1)
+    u, sigma = np.full(n, 0.1 + 0.05 * rng.random()), np.full(n, 0.002)
+    noise = rng.standard_normal(n)
+    for at in range(n // 8, n, n // 4):
+        u[at:at + 20] = 0.1 + 0.9 * np.hanning(22)[1:-1]
+        sigma[at:at + 20] = 1.0
+    keep, noise[0] = np.exp(-10.0 / rate), 0.0
+    rail = lfilter([1.0], [1.0, -keep], sigma * np.sqrt(1.0 - keep**2) * noise)
+    return Recording(np.arange(n) / rate, 12.0 + rail + 0.004 * rng.standard_normal(n), u)
+
+
+def test_a_model_that_takes_bursts_of_the_rail_for_noise_is_not_closer(monkeypatch):
+    """It gains nats to call them white, as most errors are small; the few double."""
+    monkeypatch.setattr(decision, 'MOST', 2)
+    found = discover(bursts())
+    assert found.larger and found.gain > 1.0 and found.shrink < -0.5
+    assert not found.closer and 'errors' in found.refused
 
 
 def test_errors_grow_where_a_model_takes_a_wander_for_noise():
